@@ -1,0 +1,100 @@
+"""What can go wrong, as one tree.
+
+Every error carries values and builds its own one-line sentence from them; each also inherits from
+the built-in that a caller who does not know magbridge would catch::
+
+    MagbridgeError
+    ├── WrongUse                          exit 2: the request itself cannot be meant
+    │   └── ConfigError (ValueError)      a key of a configuration or scenario file
+    ├── DataError                         exit 1: the data do not allow it
+    │   ├── FormatError (ValueError)      a file that does not say what it should, with row and column
+    │   ├── CalibrationError (ValueError) a calibration that cannot be fitted, read or used
+    │   └── OutOfRange (ValueError)       a date, position or grid cell that nothing covers
+    ├── PortError (OSError)               exit 1: a port that cannot be opened, read or written
+    └── MissingExtra (ImportError)        exit 2: an optional dependency that is not installed
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+__all__ = [
+    "CalibrationError",
+    "ConfigError",
+    "DataError",
+    "FormatError",
+    "MagbridgeError",
+    "MissingExtra",
+    "OutOfRange",
+    "PortError",
+    "WrongUse",
+]
+
+
+class MagbridgeError(Exception):
+    """Root of the tree; ``exit_code`` is what the command line ends with."""
+
+    exit_code = 1
+
+
+class WrongUse(MagbridgeError):
+    """The request cannot be meant as it stands."""
+
+    exit_code = 2
+
+
+class ConfigError(WrongUse, ValueError):
+    """A key of a configuration or scenario file: ``file: key: what was expected``."""
+
+    def __init__(self, file: str | Path, key: str, expected: str) -> None:
+        self.file, self.key, self.expected = Path(file), key, expected
+        super().__init__(f"{file}: {key}: {expected}" if key else f"{file}: {expected}")
+
+
+class DataError(MagbridgeError):
+    """The data do not allow what was asked."""
+
+
+class FormatError(DataError, ValueError):
+    """A file that does not say what it should: ``file: row 3, column 'mag_x': what was expected``."""
+
+    def __init__(
+        self, file: str | Path, expected: str, *, row: int | None = None, column: str | None = None
+    ) -> None:
+        self.file, self.expected, self.row, self.column = Path(file), expected, row, column
+        where = ", ".join(
+            part
+            for part in (f"row {row}" if row is not None else "", f"column {column!r}" if column else "")
+            if part
+        )
+        super().__init__(f"{file}: {where}: {expected}" if where else f"{file}: {expected}")
+
+
+class CalibrationError(DataError, ValueError):
+    """A calibration that cannot be fitted, read or used."""
+
+
+class OutOfRange(DataError, ValueError):
+    """A date, position or grid cell that nothing covers: ``what = value: what is covered``."""
+
+    def __init__(self, what: str, value: object, covered: str) -> None:
+        self.what, self.value, self.covered = what, value, covered
+        super().__init__(f"{what} = {value}: {covered}")
+
+
+class PortError(MagbridgeError, OSError):
+    """A port that cannot be opened, read or written: ``port: reason``."""
+
+    def __init__(self, port: str, reason: str) -> None:
+        self.port, self.reason = port, reason
+        super().__init__(f"{port}: {reason}")
+
+
+class MissingExtra(MagbridgeError, ImportError):
+    """An optional dependency that is not installed: names the extra that brings it."""
+
+    exit_code = 2
+
+    def __init__(self, package: str, extra: str) -> None:
+        self.package, self.extra = package, extra
+        super().__init__(f"{package} is not installed: pip install 'magbridge[{extra}]'")

@@ -1,0 +1,123 @@
+"""The records that rooms hand to each other, and the flags that go with a corrected sample.
+
+Units and frames as everywhere: fields in nT, sensor axes x forward, y starboard, z down.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum, IntFlag
+from math import nan
+
+import msgspec
+
+__all__ = ["Channel", "Corrected", "Quality", "Reading"]
+
+Vector = tuple[float, float, float]
+
+
+class Quality(IntFlag):
+    """Why a corrected sample is doubtful; 0 is a sample without reproach.
+
+    The lower-case names are the public ones: in files they stand in the column ``quality``, on the
+    link in ``MAG_FIELD.flags``.
+    """
+
+    STALE_TELEMETRY = 1
+    """A parameter the calibration needs is older than its ``max_age``, missing or NaN."""
+    EXTRAPOLATED = 2
+    """A parameter lies outside the range that the calibration has seen."""
+    MOVING = 4
+    """A mass moved between the telemetry around the sample."""
+    SATURATED = 8
+    """A channel stood at the end of its range."""
+    UNCALIBRATED = 16
+    """No calibration, or one that does not belong to this sensor."""
+    OFFSET_SUSPECT = 32
+    """The sensor was powered on anew since the calibration: its offset settled elsewhere."""
+    NO_BORESIGHT = 64
+    """The vector is known only up to one rotation; its magnitude is right."""
+    GAP = 128
+    """Samples are missing just before this one."""
+
+    def names(self) -> str:
+        """Return the public names, in order of value, separated by spaces; empty for no flag."""
+        return " ".join(str(flag.name).lower() for flag in self)
+
+    @classmethod
+    def parse(cls, names: str) -> Quality:
+        """Return the flags that `names` lists (inverse of :meth:`names`).
+
+        Raises
+        ------
+        KeyError
+            A name is not a flag.
+        """
+        flags = cls(0)
+        for name in names.split():
+            flags |= cls[name.upper()]
+        return flags
+
+
+class Channel(IntEnum):
+    """Whence a record of the log came; kept in the low two bits of its time stamp (µs)."""
+
+    SENT = 0
+    LINK = 1
+    SENSOR = 2
+    STATE = 3
+
+
+class Reading(msgspec.Struct, frozen=True, gc=False):
+    """One triple of channels, as an instrument gave it.
+
+    Attributes
+    ----------
+    field : tuple of 3 float
+        nT, sensor axes, uncorrected.
+    counts : tuple of 3 int or None
+        The converter's own numbers, where the instrument speaks counts.
+    sequence : int or None
+        Frame number, wrapping at the driver's ``SEQUENCE_MODULO``.
+    device_time : float
+        s on the instrument's clock; NaN where it has none.
+    channel_delay : tuple of 3 float
+        s after `device_time` at which each channel was sampled.
+    temperature, supply : float
+        degC at the fluxgate and V; NaN where unknown.
+    power_cycle : int or None
+        How often the instrument was powered on.
+    saturated : bool
+        A channel stood at the end of its range.
+    """
+
+    field: Vector
+    counts: tuple[int, int, int] | None = None
+    sequence: int | None = None
+    device_time: float = nan
+    channel_delay: Vector = (0.0, 0.0, 0.0)
+    temperature: float = nan
+    supply: float = nan
+    power_cycle: int | None = None
+    saturated: bool = False
+
+
+class Corrected(msgspec.Struct, frozen=True, gc=False):
+    """One sample after calibration.
+
+    Attributes
+    ----------
+    total_field, total_field_sigma : float
+        nT, magnitude and its 1-sigma.
+    field : tuple of 3 float
+        nT, body axes (sensor axes while ``no_boresight`` is set).
+    field_sigma : tuple of 3 float
+        nT, 1-sigma of each component.
+    quality : int
+        :class:`Quality` bits.
+    """
+
+    total_field: float
+    total_field_sigma: float
+    field: Vector
+    field_sigma: Vector
+    quality: int
