@@ -1,0 +1,232 @@
+"""``bridge.toml`` as frozen settings; an unknown key or a wrong type is one clear line.
+
+Everything is checked before anything is opened. Paths in the file are relative to the file.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+import msgspec
+from msgspec import Meta
+
+from magbridge.errors import ConfigError
+
+__all__ = [
+    "Align",
+    "CalibrationFile",
+    "Config",
+    "Link",
+    "Log",
+    "Sensor",
+    "Telemetry",
+    "convert",
+    "load",
+    "load_toml",
+]
+
+T = TypeVar("T")
+Positive = Annotated[float, Meta(gt=0)]
+NotNegative = Annotated[float, Meta(ge=0)]
+SystemId = Annotated[int, Meta(ge=1, le=255)]
+
+
+class Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A table of the file: its fields are the only keys it may have."""
+
+
+class Sensor(Table, frozen=True):
+    """``[sensor]``: which instrument, on which port.
+
+    Attributes
+    ----------
+    driver : str
+        A name from the driver table (:data:`magbridge.sensors.DRIVERS`).
+    port : str
+        A device, a pattern (``/dev/ttyUSB*``: the first that opens, so that a sensor that comes back
+        under another name is found again) or a pyserial URL (``socket://``, ``rfc2217://``, ``loop://``).
+    baudrate : int
+        bit/s.
+    timeout : float
+        s without a byte after which the sensor counts as silent.
+    options : dict
+        The driver's own settings.
+    """
+
+    driver: str
+    port: str
+    baudrate: Annotated[int, Meta(gt=0)] = 9600
+    timeout: Positive = 10.0
+    options: dict[str, Any] = msgspec.field(default_factory=dict)
+
+
+class Link(Table, frozen=True):
+    """``[link]``: the MAVLink side.
+
+    Attributes
+    ----------
+    url : str
+        As in the MAVLink world: ``udpin:``, ``udpout:``, ``tcp:``, ``tcpin:`` and an address, or a serial device.
+    system : int
+        The vehicle's system id: ours, and the only one we listen to.
+    component : int
+        Our own component id; 191 is an onboard computer.
+    autopilot : int
+        The autopilot's component id.
+    baudrate : int
+        bit/s, where the link is a serial device.
+    signing_key : str or None
+        File of 32 bytes; packets are signed and unsigned ones refused.
+    parameters : str
+        File that keeps parameters changed over the link.
+    """
+
+    url: str
+    system: SystemId = 1
+    component: SystemId = 191
+    autopilot: SystemId = 1
+    baudrate: Annotated[int, Meta(gt=0)] = 57600
+    signing_key: str | None = None
+    parameters: str = "parameters.json"
+
+
+class Telemetry(Table, frozen=True):
+    """``[telemetry.NAME]``: a field of a message that becomes the parameter NAME.
+
+    ``value = scale * message.field + offset``. `field` may carry an index, ``actuator[2]``. `match` holds
+    values that other fields of the message must have. `max_age` is in s; an older value is stale.
+    """
+
+    message: str
+    field: str
+    match: dict[str, str | int | float] = msgspec.field(default_factory=dict)
+    scale: float = 1.0
+    offset: float = 0.0
+    unit: str = ""
+    max_age: Positive = 30.0
+
+
+class CalibrationFile(Table, frozen=True):
+    """``[calibration]``: the ``cal.json`` to correct with."""
+
+    file: str
+
+
+class Align(Table, frozen=True):
+    """``[align]``: one time base for channels and telemetry; each is also a parameter on the link.
+
+    Attributes
+    ----------
+    filter_delay : float
+        s by which the anti-alias filter delays the channels.
+    gap_factor : float
+        A pause longer than this many sample periods is a gap.
+    moving_rate : float
+        A parameter that changes faster than this fraction of its calibrated range per second is moving.
+    settle_time : float
+        s after a movement during which samples stay flagged.
+    stale_growth : float
+        nT/s by which the sigma grows with the age of stale telemetry.
+    """
+
+    filter_delay: NotNegative = 0.0
+    gap_factor: Annotated[float, Meta(gt=1)] = 2.5
+    moving_rate: Positive = 0.005
+    settle_time: NotNegative = 0.0
+    stale_growth: NotNegative = 1.0
+
+
+class Log(Table, frozen=True):
+    """``[log]``: where the telemetry log goes, and when a new file begins."""
+
+    directory: str
+    max_size: Positive = 64.0
+    """MB."""
+    max_age: Positive = 24.0
+    """h."""
+
+
+class Config(Table, frozen=True):
+    """A whole ``bridge.toml``. `path` is the file itself, `digest` the first 8 bytes of its SHA-256 in hex."""
+
+    sensor: Sensor
+    link: Link
+    telemetry: dict[str, Telemetry] = msgspec.field(default_factory=dict)
+    calibration: CalibrationFile | None = None
+    align: Align = Align()
+    publish: dict[str, float] = msgspec.field(default_factory=lambda: {"MAG_FIELD": 0.0})
+    log: Log | None = None
+    path: Path = Path("bridge.toml")
+    digest: str = ""
+
+    def resolve(self, name: str) -> Path:
+        """Return the path that `name` means in this file: relative to the file itself."""
+        return self.path.parent / Path(name).expanduser()
+
+
+def load(path: str | Path) -> Config:
+    """Read and check a ``bridge.toml``.
+
+    Raises
+    ------
+    ConfigError
+        The file is missing or not TOML, a key is unknown or missing, a value has the wrong type or range, or a
+        file that it names does not exist.
+    """
+    path = Path(path)
+    table = load_toml(path)
+    for reserved in ("path", "digest"):
+        if reserved in table:
+            raise ConfigError(path, reserved, "unknown key")
+    # msgspec does not name the key of a dict, so each entry is checked under its own name first
+    for section, kind in (("telemetry", Telemetry), ("publish", float)):
+        for name, value in dict(table.get(section, {})).items():
+            convert(value, kind, path, f"{section}.{name}.")
+    config = msgspec.structs.replace(
+        convert(table, Config, path), path=path, digest=hashlib.sha256(path.read_bytes()).hexdigest()[:16]
+    )
+    named = {
+        "calibration.file": config.calibration.file if config.calibration else None,
+        "link.signing_key": config.link.signing_key,
+    }
+    for key, name in named.items():
+        if name is not None and not config.resolve(name).is_file():
+            raise ConfigError(path, key, f"no such file: {config.resolve(name)}")
+    return config
+
+
+def load_toml(path: str | Path) -> dict[str, Any]:
+    """Read a TOML file; raise :class:`ConfigError` where it is missing or not TOML."""
+    try:
+        return tomllib.loads(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(path, "", error.strerror or str(error)) from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(path, "", f"not TOML: {error}") from error
+
+
+def convert(table: Any, kind: type[T], path: str | Path, prefix: str = "") -> T:
+    """Convert what stands in a TOML file to `kind`, a struct or a plain type.
+
+    Raises
+    ------
+    ConfigError
+        Names the key (`prefix` before it) and what was expected.
+    """
+    try:
+        return msgspec.convert(table, kind)
+    except msgspec.ValidationError as error:
+        sentence, _, where = str(error).partition(" - at ")
+        keys = where.strip("`").removeprefix("$").lstrip(".")
+        for pattern in (
+            r"Object contains unknown field `(?P<key>[^`]*)`",
+            r"Object missing required field `(?P<key>[^`]*)`",
+        ):
+            if match := re.match(pattern, sentence):
+                keys = f"{keys}.{match['key']}".lstrip(".")
+                sentence = "unknown key" if "unknown" in sentence else "missing key"
+        raise ConfigError(path, f"{prefix}{keys}".rstrip("."), sentence[0].lower() + sentence[1:]) from error

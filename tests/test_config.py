@@ -1,0 +1,78 @@
+"""bridge.toml: what is accepted, and the one line that says what is not."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from magbridge.config import load
+from magbridge.errors import ConfigError
+
+GOOD = """
+[sensor]
+driver = "hmr2300"
+port = "/dev/ttyUSB0"
+[link]
+url = "udpout:192.0.2.1:14550"
+[telemetry.battpos]
+message = "NAMED_VALUE_FLOAT"
+match = {name = "battpos"}
+field = "value"
+unit = "in"
+[publish]
+MAG_FIELD = 0
+HIGHRES_IMU = 0
+NAMED_VALUE_FLOAT = 1
+[log]
+directory = "logs"
+"""
+
+
+def write(tmp_path: Path, text: str) -> Path:
+    path = tmp_path / "bridge.toml"
+    path.write_text(text)
+    return path
+
+
+def test_the_contract_s_example_is_read(tmp_path: Path) -> None:
+    config = load(write(tmp_path, GOOD))
+    assert config.sensor.driver == "hmr2300"
+    assert (config.link.system, config.link.component) == (1, 191)
+    assert config.telemetry["battpos"].match == {"name": "battpos"}
+    assert config.telemetry["battpos"].max_age == 30.0
+    assert config.publish == {"MAG_FIELD": 0, "HIGHRES_IMU": 0, "NAMED_VALUE_FLOAT": 1}
+    assert config.resolve("cal.json") == tmp_path / "cal.json"
+    assert len(config.digest) == 16
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "line"),
+    [
+        ("port =", "prt =", "sensor.prt: unknown key"),
+        ('port = "/dev/ttyUSB0"', "port = 3", "sensor.port: expected `str`, got `int`"),
+        ('port = "/dev/ttyUSB0"', "", "sensor.port: missing key"),
+        ('unit = "in"', "unit = 1", "telemetry.battpos.unit: expected `str`, got `int`"),
+        ("[log]", "[calibration]\nfile = 'cal.json'\n[log]", "calibration.file: no such file"),
+        ("[log]", "[log", "not TOML"),
+        ("HIGHRES_IMU = 0", "HIGHRES_IMU = 'fast'", "publish.HIGHRES_IMU: expected `float`, got `str`"),
+        (
+            'url = "udpout:192.0.2.1:14550"',
+            'url = "udpout:x"\nsystem = 256',
+            "link.system: expected `int` <= 255",
+        ),
+        ("[sensor]", "path = 'x'\n[sensor]", "path: unknown key"),
+    ],
+)
+def test_one_clear_line_names_the_key(tmp_path: Path, old: str, new: str, line: str) -> None:
+    path = write(tmp_path, GOOD.replace(old, new, 1))
+    with pytest.raises(ConfigError) as caught:
+        load(path)
+    assert line in str(caught.value)
+    assert str(caught.value).startswith(str(path))
+    assert "\n" not in str(caught.value)
+
+
+def test_a_missing_file_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"none\.toml: No such file"):
+        load(tmp_path / "none.toml")
