@@ -131,6 +131,8 @@ class Align(Table, frozen=True):
         s after a movement during which samples stay flagged.
     stale_growth : float
         nT/s by which the sigma grows with the age of stale telemetry.
+    turn_on_sigma : float
+        nT by which the offset settles differently at every power-on.
     """
 
     filter_delay: NotNegative = 0.0
@@ -138,6 +140,7 @@ class Align(Table, frozen=True):
     moving_rate: Positive = 0.005
     settle_time: NotNegative = 0.0
     stale_growth: NotNegative = 1.0
+    turn_on_sigma: NotNegative = 20.0
 
 
 class Log(Table, frozen=True):
@@ -184,7 +187,8 @@ def load(path: str | Path) -> Config:
             raise ConfigError(path, reserved, "unknown key")
     # msgspec does not name the key of a dict, so each entry is checked under its own name first
     for section, kind in (("telemetry", Telemetry), ("publish", float)):
-        for name, value in dict(table.get(section, {})).items():
+        entries = table.get(section)
+        for name, value in entries.items() if isinstance(entries, dict) else ():
             convert(value, kind, path, f"{section}.{name}.")
     config = msgspec.structs.replace(
         convert(table, Config, path), path=path, digest=hashlib.sha256(path.read_bytes()).hexdigest()[:16]

@@ -1,0 +1,236 @@
+"""One time base for three channels and the telemetry, causally.
+
+A multiplexed converter samples channel k at ``t + delay_k``. All three are interpolated to the time of the
+earliest one, between the frame before and this one, so nothing from the future is needed and the latency is
+``max(delay) - min(delay)``. The anti-alias filter holds the field back by ``filter_delay``; the sample's time
+is corrected for it, and the telemetry is looked up at that time.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from math import inf, isfinite
+from typing import NamedTuple
+
+import msgspec
+
+from magbridge.config import Align
+from magbridge.records import Quality, Reading, Vector
+
+__all__ = ["Aligner", "Input", "Sample", "Track"]
+
+STALE = int(Quality.STALE_TELEMETRY)
+MOVING = int(Quality.MOVING)
+SATURATED = int(Quality.SATURATED)
+OFFSET_SUSPECT = int(Quality.OFFSET_SUSPECT)
+GAP = int(Quality.GAP)
+NEVER = -(1 << 62)
+HISTORY = 64
+"""Telemetry values kept of one parameter: enough for 3 s at 20 Hz."""
+
+
+class Input(NamedTuple):
+    """A parameter that the calibration needs: its name, the range it has seen, and the oldest age in s."""
+
+    name: str
+    low: float
+    high: float
+    max_age: float
+
+
+class Sample(msgspec.Struct, frozen=True, gc=False):
+    """Three channels and the telemetry at one time.
+
+    Attributes
+    ----------
+    time_us : int
+        µs, common to all channels.
+    field : tuple of 3 float
+        nT, sensor axes, uncorrected.
+    values : tuple of float
+        The parameters at `time_us`, in the order of the calibration.
+    age : float
+        s, of the oldest telemetry used.
+    quality : int
+        :class:`~magbridge.records.Quality` bits.
+    sigma : float
+        nT, what the flags add to the uncertainty (in quadrature).
+    spans : tuple of (int, float, float)
+        Parameters that are not known exactly: index, and the two ends between which the value lies.
+    """
+
+    time_us: int
+    field: Vector
+    values: tuple[float, ...]
+    age: float
+    quality: int
+    sigma: float
+    spans: tuple[tuple[int, float, float], ...]
+
+
+class Track:
+    """The recent past of one parameter.
+
+    It moves when it has changed by more than ``moving_rate`` (fraction of its range per second) since an
+    anchor at least a second ago; over shorter times the telemetry's own noise would look like motion.
+    """
+
+    __slots__ = ("anchor", "history", "input", "lacking", "moved_us")
+
+    def __init__(self, what: Input) -> None:
+        self.input = what
+        self.history: deque[tuple[int, float]] = deque(maxlen=HISTORY)
+        self.lacking = True
+        self.anchor: tuple[int, float] | None = None
+        self.moved_us = NEVER
+
+    def update(self, time_us: int, value: float, moving_rate: float) -> None:
+        """Take a telemetry value; NaN says that it is not known now, a time gone back is ignored."""
+        self.lacking = not isfinite(value)
+        if self.lacking:
+            return
+        if self.history and time_us <= self.history[-1][0]:
+            return
+        self.history.append((time_us, value))
+        if self.anchor is None:
+            self.anchor = time_us, value
+        anchor_us, anchor = self.anchor
+        elapsed = (time_us - anchor_us) * 1e-6
+        if abs(value - anchor) > moving_rate * (self.input.high - self.input.low) * max(elapsed, 1.0):
+            self.moved_us = time_us
+        if elapsed >= 1.0:
+            self.anchor = time_us, value
+
+    def moving(self, time_us: int, settle_time: float) -> bool:
+        """Say whether it moved up to its latest value, or less than `settle_time` s before `time_us`."""
+        return self.moved_us == self.history[-1][0] or time_us - self.moved_us <= settle_time * 1e6
+
+    def at(self, time_us: int) -> tuple[float, float, float]:
+        """Return the value at `time_us`, its age in s, and the value before it.
+
+        Between two values it is interpolated (age 0); after the last it is held.
+        """
+        after_us, after = 0, 0.0
+        for then_us, value in reversed(self.history):
+            if then_us <= time_us:
+                if not after_us:
+                    before = self.history[-2][1] if len(self.history) > 1 else value
+                    return value, (time_us - then_us) * 1e-6, before
+                weight = (time_us - then_us) / (after_us - then_us)
+                return value + weight * (after - value), 0.0, value
+            after_us, after = then_us, value
+        return after, (after_us - time_us) * 1e-6, after
+
+
+class Aligner:
+    """Joins readings and telemetry into samples.
+
+    Parameters
+    ----------
+    inputs : sequence of Input
+        What the calibration needs, in its order.
+    settings : Align
+        May be replaced at any time.
+    power_cycle : int or None
+        The instrument's power-on counter when it was calibrated, where known.
+    """
+
+    def __init__(self, inputs: tuple[Input, ...], settings: Align, power_cycle: int | None = None) -> None:
+        self.settings = settings
+        self.tracks = tuple(Track(what) for what in inputs)
+        self.by_name = {what.name: track for what, track in zip(inputs, self.tracks, strict=True)}
+        self.power_cycle = power_cycle
+        self.offset_suspect = False
+        self._before: tuple[int, Reading] | None = None
+        self._period_us = 0.0
+
+    def telemetry(self, name: str, time_us: int, value: float) -> None:
+        """Take a telemetry value; a name that the calibration does not need is ignored."""
+        track = self.by_name.get(name)
+        if track is not None:
+            track.update(time_us, value, self.settings.moving_rate)
+
+    def reading(self, reading: Reading, time_us: int, *, restarted: bool = False, missing: int = 0) -> Sample:
+        """Turn a reading into a sample.
+
+        Parameters
+        ----------
+        reading : Reading
+            As the driver gave it.
+        time_us : int
+            µs, host time of ``reading.device_time``.
+        restarted : bool
+            The instrument's clock began anew.
+        missing : int
+            Readings that the sequence number says are missing before this one.
+        """
+        settings = self.settings
+        if reading.power_cycle is not None:
+            if self.power_cycle is None:
+                self.power_cycle = reading.power_cycle
+            restarted = restarted or reading.power_cycle != self.power_cycle
+        self.offset_suspect = self.offset_suspect or restarted
+        quality, variance = 0, 0.0
+        field, first_us = self._common_time(reading, time_us)
+        if self._is_gap(time_us) or missing:
+            quality |= GAP
+        self._before = time_us, reading
+        if self.offset_suspect:
+            quality |= OFFSET_SUSPECT
+            variance += settings.turn_on_sigma**2
+        if reading.saturated:
+            quality |= SATURATED
+            variance = inf
+
+        sample_us = first_us - round(settings.filter_delay * 1e6)
+        values: list[float] = []
+        spans: list[tuple[int, float, float]] = []
+        oldest = 0.0
+        for index, track in enumerate(self.tracks):
+            what = track.input
+            if not track.history:
+                values.append(0.5 * (what.low + what.high))
+                spans.append((index, what.low, what.high))
+                quality |= STALE
+                oldest = inf
+                continue
+            value, age, before = track.at(sample_us)
+            values.append(value)
+            oldest = max(oldest, age)
+            if track.lacking or age > what.max_age:
+                quality |= STALE
+                variance += (settings.stale_growth * age) ** 2
+            if track.moving(sample_us, settings.settle_time):
+                quality |= MOVING
+                spans.append((index, before, value))
+        sigma = variance**0.5
+        return Sample(sample_us - sample_us % 4, field, tuple(values), oldest, quality, sigma, tuple(spans))
+
+    def _common_time(self, reading: Reading, time_us: int) -> tuple[Vector, int]:
+        """Interpolate the channels to the earliest one's time: field in nT and that time in µs."""
+        delays = reading.channel_delay
+        earliest = min(delays)
+        first_us = time_us + round(earliest * 1e6)
+        if self._before is None or (delays[0] == delays[1] == delays[2]):
+            return reading.field, first_us
+        before_us, before = self._before
+        step = (time_us - before_us) * 1e-6
+        if step <= 0.0:
+            return reading.field, first_us
+        x, y, z = (
+            now - (now - then) * (delay - earliest) / (step + delay - then_delay)
+            for now, then, delay, then_delay in zip(
+                reading.field, before.field, delays, before.channel_delay, strict=True
+            )
+        )
+        return (x, y, z), first_us
+
+    def _is_gap(self, time_us: int) -> bool:
+        """Say whether samples are missing before `time_us`; learns the period from steps that are not gaps."""
+        if self._before is None:
+            return False
+        step = time_us - self._before[0]
+        if self._period_us and step > self.settings.gap_factor * self._period_us:
+            return True
+        self._period_us += (step - self._period_us) * (0.1 if self._period_us else 1.0)
+        return False
