@@ -1,0 +1,1 @@
+"""The bridge: a pure pipeline, and the threads and ports that feed it."""

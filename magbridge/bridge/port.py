@@ -1,0 +1,53 @@
+"""What the bridge asks of a port: bytes in and out, never blocking, and a clear word when it is gone.
+
+A port that is gone raises :class:`PortError` once and is closed; :meth:`Port.open` may then be tried again.
+Writing never blocks: what a slow reader does not take is dropped and counted.
+"""
+
+from __future__ import annotations
+
+from magbridge.errors import PortError
+
+__all__ = ["CHUNK", "Port"]
+
+CHUNK = 65536
+"""Bytes read at once."""
+
+
+class Port:
+    """What the bridge asks of a port."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.dropped = 0
+        """Bytes that could not be written."""
+
+    @property
+    def up(self) -> bool:
+        """Whether bytes can come and go."""
+        raise NotImplementedError
+
+    def open(self) -> None:
+        """Open it; raises :class:`PortError`."""
+        raise NotImplementedError
+
+    def fds(self) -> list[int]:
+        """Return the file descriptors to wait for."""
+        raise NotImplementedError
+
+    def read(self) -> bytes:
+        """Return what has come, possibly nothing; raises :class:`PortError` when the port is gone."""
+        raise NotImplementedError
+
+    def write(self, data: bytes) -> None:
+        """Send `data` whole or drop it; raises :class:`PortError` when the port is gone."""
+        raise NotImplementedError
+
+    def close(self) -> None:
+        """Close it; harmless when it is closed."""
+        raise NotImplementedError
+
+    def lost(self, reason: object) -> PortError:
+        """Close the port and return the error to raise."""
+        self.close()
+        return PortError(self.name, str(reason))

@@ -1,0 +1,122 @@
+"""Serial lines, by device, pattern or pyserial URL."""
+
+from __future__ import annotations
+
+import glob
+import os
+import threading
+from typing import Any
+
+import serial
+
+from magbridge.bridge.port import CHUNK, Port
+from magbridge.errors import PortError
+
+__all__ = ["SerialPort"]
+
+
+class SerialPort(Port):
+    """A serial line by device name, pattern (``/dev/ttyUSB*``) or pyserial URL."""
+
+    def __init__(self, name: str, baudrate: int) -> None:
+        super().__init__(name)
+        self.baudrate = baudrate
+        self._serial: Any = None
+        self._fd = -1
+        self._pump: _Pump | None = None
+
+    @property
+    def up(self) -> bool:
+        """Whether the device is open."""
+        return self._serial is not None
+
+    def open(self) -> None:
+        """Open the first device that the name or pattern finds; raises :class:`PortError`."""
+        # a pattern may be absolute, which pathlib does not glob
+        names = sorted(glob.glob(self.name)) if glob.has_magic(self.name) else [self.name]  # noqa: PTH207
+        reason: object = "no such device"
+        for name in names:
+            try:
+                opened = serial.serial_for_url(
+                    name, self.baudrate, timeout=0, write_timeout=0, do_not_open=True
+                )
+                opened.exclusive = (
+                    None if "://" in name else True
+                )  # two programs on one line lose bytes to each other
+                opened.open()
+            except (serial.SerialException, OSError, ValueError) as error:
+                reason = error.strerror if isinstance(error, OSError) and error.strerror else error
+                continue
+            try:
+                self._fd = opened.fileno()
+            except (AttributeError, OSError):  # loop:// and rfc2217:// have no descriptor
+                self._pump = _Pump(opened)
+                self._fd = self._pump.fd
+            self._serial = opened
+            return
+        raise PortError(self.name, str(reason))
+
+    def fds(self) -> list[int]:
+        """Return the one descriptor, if open."""
+        return [self._fd] if self._serial is not None else []
+
+    def read(self) -> bytes:
+        """Return what has come; an end of file or an error on the line is a lost port."""
+        try:
+            data = os.read(self._fd, CHUNK)
+        except BlockingIOError:
+            return b""
+        except OSError as error:
+            raise self.lost(error.strerror) from error
+        if not data:
+            raise self.lost("hung up")
+        return data
+
+    def write(self, data: bytes) -> None:
+        """Write what the line's buffer takes; drop and count the rest."""
+        try:
+            if self._pump is not None:
+                self._serial.write(data)
+            else:
+                self.dropped += len(data) - os.write(self._fd, data)
+        except BlockingIOError:
+            self.dropped += len(data)
+        except (serial.SerialException, OSError) as error:
+            raise self.lost(error) from error
+
+    def close(self) -> None:
+        """Close the device."""
+        if self._pump is not None:
+            self._pump.close()
+        if self._serial is not None:
+            self._serial.close()
+        self._serial, self._fd, self._pump = None, -1, None
+
+
+class _Pump:
+    """Moves bytes from a port that cannot be waited for into a pipe that can."""
+
+    def __init__(self, source: Any) -> None:
+        self._source = source
+        source.timeout = 0.05
+        self.fd, self._in = os.pipe()
+        os.set_blocking(self.fd, False)
+        self._running = True
+        self._thread = threading.Thread(target=self._run, name="serial pump", daemon=True)
+        self._thread.start()
+
+    def _run(self) -> None:
+        try:
+            while self._running:
+                data = self._source.read(max(1, self._source.in_waiting))
+                if data:
+                    os.write(self._in, data)
+        except (serial.SerialException, OSError):
+            self._running = False
+        finally:
+            os.close(self._in)  # the reader sees an end of file: the port is lost
+
+    def close(self) -> None:
+        self._running = False
+        self._thread.join()
+        os.close(self.fd)

@@ -1,0 +1,271 @@
+"""The MAVLink link: UDP and TCP sockets, or a serial line."""
+
+from __future__ import annotations
+
+import errno
+import socket
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from functools import partial
+
+from magbridge.bridge.port import CHUNK, Port
+from magbridge.bridge.serial_port import SerialPort
+from magbridge.errors import ConfigError, PortError
+
+__all__ = ["LINKS", "TcpClient", "TcpServer", "UdpPort", "open_link"]
+
+PENDING = 262144
+"""Bytes that may wait for a slow reader of a stream."""
+PEER_TIMEOUT = 30.0
+"""s without a packet after which a UDP peer is forgotten."""
+AWAY = (errno.ECONNREFUSED, errno.ENETUNREACH, errno.EHOSTUNREACH, errno.ENETDOWN, errno.EPERM)
+"""What a UDP socket reports when nobody listens (yet): no fault of the port."""
+
+
+class UdpPort(Port):
+    """``udpout`` sends to one address; ``udpin`` answers everyone it has heard from lately."""
+
+    def __init__(self, name: str, address: tuple[str, int], *, listen: bool) -> None:
+        super().__init__(name)
+        self._address, self._listen = address, listen
+        self._socket: socket.socket | None = None
+        self._peers: dict[tuple[str, int], float] = {}
+
+    @property
+    def up(self) -> bool:
+        """Whether the socket is open."""
+        return self._socket is not None
+
+    def open(self) -> None:
+        """Bind or connect; raises :class:`PortError`."""
+        opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        opened.setblocking(False)
+        opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
+        try:
+            if self._listen:
+                opened.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                opened.bind(self._address)
+            else:
+                opened.connect(self._address)
+        except OSError as error:
+            opened.close()
+            raise PortError(self.name, error.strerror or str(error)) from error
+        self._socket = opened
+
+    def fds(self) -> list[int]:
+        """Return the one descriptor, if open."""
+        return [self._socket.fileno()] if self._socket is not None else []
+
+    def read(self) -> bytes:
+        """Return one datagram; an unreachable peer is nothing, not an error."""
+        assert self._socket is not None
+        try:
+            data, peer = self._socket.recvfrom(CHUNK)
+        except BlockingIOError:
+            return b""
+        except OSError as error:
+            if error.errno in AWAY:
+                return b""
+            raise self.lost(error.strerror) from error
+        if self._listen:
+            self._peers[peer] = time.monotonic()
+        return data
+
+    def write(self, data: bytes) -> None:
+        """Send one datagram to each peer; what cannot be sent is dropped and counted."""
+        assert self._socket is not None
+        if not self._listen:
+            self._send(data, None)
+            return
+        now = time.monotonic()
+        for peer, heard in list(self._peers.items()):
+            if now - heard > PEER_TIMEOUT:
+                del self._peers[peer]
+            else:
+                self._send(data, peer)
+
+    def _send(self, data: bytes, peer: tuple[str, int] | None) -> None:
+        assert self._socket is not None
+        try:
+            if peer is None:
+                self._socket.send(data)
+            else:
+                self._socket.sendto(data, peer)
+        except BlockingIOError:
+            self.dropped += len(data)
+        except OSError as error:
+            if error.errno not in AWAY:
+                raise self.lost(error.strerror) from error
+            self.dropped += len(data)
+
+    def close(self) -> None:
+        """Close the socket."""
+        if self._socket is not None:
+            self._socket.close()
+        self._socket = None
+
+
+class _Stream(Port):
+    """One TCP connection, with what its reader has not yet taken."""
+
+    def __init__(self, name: str, address: tuple[str, int]) -> None:
+        super().__init__(name)
+        self._address = address
+        self._connection: socket.socket | None = None
+        self._pending = bytearray()
+
+    def fds(self) -> list[int]:
+        """Return the connection's descriptor, if there is one."""
+        return [self._connection.fileno()] if self._connection is not None else []
+
+    def read(self) -> bytes:
+        """Return what has come."""
+        assert self._connection is not None
+        try:
+            data = self._connection.recv(CHUNK)
+        except BlockingIOError:
+            return b""
+        except OSError as error:
+            raise self.lost(error.strerror) from error
+        if not data:
+            raise self.lost("closed by the other end")
+        return data
+
+    def write(self, data: bytes) -> None:
+        """Send `data`, or keep it until the reader takes more; a full backlog drops it whole."""
+        if self._connection is None:
+            self.dropped += len(data)
+            return
+        if len(self._pending) + len(data) > PENDING:
+            self.dropped += len(data)
+            data = b""
+        self._pending += data
+        try:
+            del self._pending[: self._connection.send(self._pending)]
+        except BlockingIOError:
+            pass
+        except OSError as error:
+            raise self.lost(error.strerror) from error
+
+    def adopt(self, connection: socket.socket) -> None:
+        """Make `connection` the one to use."""
+        connection.setblocking(False)
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self.drop()
+        self._connection = connection
+
+    def drop(self) -> None:
+        """Close the connection and forget what was to be sent on it."""
+        if self._connection is not None:
+            self._connection.close()
+        self._connection = None
+        self._pending.clear()
+
+
+class TcpClient(_Stream):
+    """``tcp``: connects to a server."""
+
+    @property
+    def up(self) -> bool:
+        """Whether it is connected."""
+        return self._connection is not None
+
+    def open(self) -> None:
+        """Connect, waiting at most a second; raises :class:`PortError`."""
+        try:
+            self.adopt(socket.create_connection(self._address, timeout=1.0))
+        except OSError as error:
+            raise PortError(self.name, error.strerror or str(error)) from error
+
+    def close(self) -> None:
+        """Close the connection."""
+        self.drop()
+
+
+class TcpServer(_Stream):
+    """``tcpin``: waits for a client; a new one takes the place of the old, which may be dead."""
+
+    def __init__(self, name: str, address: tuple[str, int]) -> None:
+        super().__init__(name, address)
+        self._listener: socket.socket | None = None
+
+    @property
+    def up(self) -> bool:
+        """Whether it listens."""
+        return self._listener is not None
+
+    def open(self) -> None:
+        """Listen; raises :class:`PortError`."""
+        try:
+            self._listener = socket.create_server(self._address, reuse_port=False)
+        except OSError as error:
+            raise PortError(self.name, error.strerror or str(error)) from error
+        self._listener.setblocking(False)
+
+    def fds(self) -> list[int]:
+        """Return the listener's descriptor and the client's."""
+        listener = [self._listener.fileno()] if self._listener is not None else []
+        return listener + super().fds()
+
+    def read(self) -> bytes:
+        """Accept a waiting client, then return what the client has sent; a client that leaves is no error."""
+        assert self._listener is not None
+        with suppress(BlockingIOError):
+            self.adopt(self._listener.accept()[0])
+        try:
+            return super().read() if self._connection is not None else b""
+        except PortError:
+            return b""
+
+    def write(self, data: bytes) -> None:
+        """Send to the client; a client that leaves is no error."""
+        try:
+            super().write(data)
+        except PortError:
+            self.dropped += len(data)
+
+    def lost(self, reason: object) -> PortError:
+        """Drop the client: the port itself is well."""
+        self.drop()
+        return PortError(self.name, str(reason))
+
+    def close(self) -> None:
+        """Close the client and the listener."""
+        self.drop()
+        if self._listener is not None:
+            self._listener.close()
+        self._listener = None
+
+
+def _address(text: str) -> tuple[str, int]:
+    host, _, port = text.rpartition(":")
+    if not port.isdigit() or int(port) > 65535:
+        raise ValueError("expected HOST:PORT")
+    return host.removeprefix("//"), int(port)
+
+
+LINKS: dict[str, Callable[[str, tuple[str, int]], Port]] = {
+    "udpin": partial(UdpPort, listen=True),
+    "udpout": partial(UdpPort, listen=False),
+    "tcp": TcpClient,
+    "tcpin": TcpServer,
+}
+"""Link kinds by the first part of the URL, as in the MAVLink world; any other URL is a serial device."""
+
+
+def open_link(url: str, baudrate: int, source: str = "bridge.toml") -> Port:
+    """Return the (unopened) port for a MAVLink URL.
+
+    Raises
+    ------
+    ConfigError
+        The address is not HOST:PORT.
+    """
+    kind, _, address = url.partition(":")
+    if kind not in LINKS:
+        return SerialPort(url.removeprefix("serial:"), baudrate)
+    try:
+        return LINKS[kind](url, _address(address))
+    except ValueError as error:
+        raise ConfigError(source, "link.url", f"{error}, got {url!r}") from error
