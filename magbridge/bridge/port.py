@@ -36,7 +36,10 @@ class Port:
         raise NotImplementedError
 
     def read(self) -> bytes:
-        """Return what has come, possibly nothing; raises :class:`PortError` when the port is gone."""
+        """Return what has come, when a descriptor is ready; raises :class:`PortError` when the port is gone.
+
+        A serial line that is ready and yet has nothing is one that hung up, so do not ask when none is ready.
+        """
         raise NotImplementedError
 
     def write(self, data: bytes) -> None:
