@@ -98,7 +98,7 @@ class _Pump:
 
     def __init__(self, source: Any) -> None:
         self._source = source
-        source.timeout = 0.05
+        source.timeout, source.write_timeout = 0.05, 1.0
         self.fd, self._in = os.pipe()
         os.set_blocking(self.fd, False)
         self._running = True

@@ -1,0 +1,55 @@
+"""What happens to the bridge: everything it can know, and so everything a log must hold."""
+
+from __future__ import annotations
+
+import time
+
+import msgspec
+
+from magbridge.records import Channel
+
+__all__ = ["Clock", "Event"]
+
+
+class Event(msgspec.Struct, frozen=True, gc=False):
+    """Something that came in.
+
+    Attributes
+    ----------
+    time_us : int
+        µs since 1970 UTC when it was stamped at the edge; a multiple of 4, never decreasing.
+    channel : Channel
+        ``SENSOR``: bytes as read; ``LINK``: bytes as read; ``STATE``: one MAVLink frame of our own dialect that
+        says what changed at the edge, or nothing when only time has passed.
+    data : bytes
+    """
+
+    time_us: int
+    channel: Channel
+    data: bytes
+
+
+class Clock:
+    """The one clock: begins at the host's UTC and then runs steadily, whatever happens to the host's.
+
+    A step of the host's clock is told apart (:meth:`step_us`), so that no interval is ever measured across it.
+    """
+
+    THRESHOLD_US = 50_000
+    """Smaller differences are the host's own slewing, and are left alone."""
+
+    def __init__(self) -> None:
+        self._offset_us = time.time_ns() // 1000 - time.monotonic_ns() // 1000
+        self._known_step_us = 0
+
+    def now_us(self) -> int:
+        """Return the time in µs, a multiple of 4."""
+        return (time.monotonic_ns() // 1000 + self._offset_us) & ~3
+
+    def step_us(self) -> int:
+        """Return by how much the host's clock was set since this was last asked; 0 where it was not."""
+        difference = time.time_ns() // 1000 - self.now_us() - self._known_step_us
+        if abs(difference) < self.THRESHOLD_US:
+            return 0
+        self._known_step_us += difference
+        return difference
