@@ -1,0 +1,97 @@
+"""The columns of a deployment: name, unit, meaning.
+
+These names are public (files, command line, the link). Any other name is telemetry in the unit it declares.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+__all__ = ["CHANNELS", "CHANNEL_TIMES", "COLUMNS", "CORRECTED", "Column", "factor"]
+
+
+class Column(NamedTuple):
+    """Unit and meaning of a column."""
+
+    unit: str
+    long_name: str
+
+
+CHANNELS = ("mag_x", "mag_y", "mag_z")
+"""The raw, uncorrected channels in sensor axes (x forward, y starboard, z down)."""
+CHANNEL_TIMES = ("mag_time_x", "mag_time_y", "mag_time_z")
+"""When each channel was sampled, where not all were at ``time``."""
+
+COLUMNS: dict[str, Column] = {
+    "time": Column("s", "seconds since 1970-01-01 UTC"),
+    "mag_x": Column("nT", "raw magnetic field, sensor x (forward)"),
+    "mag_y": Column("nT", "raw magnetic field, sensor y (starboard)"),
+    "mag_z": Column("nT", "raw magnetic field, sensor z (down)"),
+    "mag_time_x": Column("s", "time at which channel x was sampled"),
+    "mag_time_y": Column("s", "time at which channel y was sampled"),
+    "mag_time_z": Column("s", "time at which channel z was sampled"),
+    "sensor_temperature": Column("degC", "temperature at the fluxgate"),
+    "roll": Column("deg", "roll, starboard down positive"),
+    "pitch": Column("deg", "pitch, nose up positive"),
+    "heading": Column("deg", "heading, clockwise from north"),
+    "latitude": Column("deg", "latitude, north positive (WGS84)"),
+    "longitude": Column("deg", "longitude, east positive (WGS84)"),
+    "depth": Column("m", "depth below the surface"),
+    "reference_field": Column("nT", "true total magnetic field"),
+    "total_field": Column("nT", "corrected total magnetic field"),
+    "total_field_sigma": Column("nT", "1-sigma of the corrected total field"),
+    "field_x": Column("nT", "corrected magnetic field, body x (forward)"),
+    "field_y": Column("nT", "corrected magnetic field, body y (starboard)"),
+    "field_z": Column("nT", "corrected magnetic field, body z (down)"),
+    "anomaly": Column("nT", "corrected total field minus the reference model"),
+    "quality": Column("1", "flags of a doubtful sample"),
+}
+CORRECTED = ("total_field", "total_field_sigma", "field_x", "field_y", "field_z", "anomaly", "quality")
+"""What ``magbridge correct`` writes beside ``time``."""
+
+_FACTORS = {
+    ("T", "nT"): 1e9,
+    ("mT", "nT"): 1e6,
+    ("uT", "nT"): 1e3,
+    ("µT", "nT"): 1e3,
+    ("G", "nT"): 1e5,
+    ("gauss", "nT"): 1e5,
+    ("mG", "nT"): 1e2,
+    ("mgauss", "nT"): 1e2,
+    ("ms", "s"): 1e-3,
+    ("rad", "deg"): 57.29577951308232,
+    ("cm", "m"): 1e-2,
+    ("km", "m"): 1e3,
+}
+_SAME = {
+    "degrees": "deg",
+    "degree": "deg",
+    "degrees_north": "deg",
+    "degrees_east": "deg",
+    "°": "deg",
+    "metres": "m",
+    "meters": "m",
+    "metre": "m",
+    "meter": "m",
+    "seconds": "s",
+    "sec": "s",
+    "Celsius": "degC",
+    "celsius": "degC",
+    "degrees_Celsius": "degC",
+    "degree_Celsius": "degC",
+    "degree_C": "degC",
+    "°C": "degC",
+    "nanotesla": "nT",
+}
+
+
+def factor(unit: str, column: str) -> float | None:
+    """Return what turns a value in `unit` into the unit of `column`; None where nothing does.
+
+    A column that is not in the table stays in the unit it declares: 1.
+    """
+    if column not in COLUMNS or not unit:
+        return 1.0
+    wanted = COLUMNS[column].unit
+    unit = _SAME.get(unit, unit)
+    return 1.0 if unit == wanted else _FACTORS.get((unit, wanted))

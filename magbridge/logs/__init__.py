@@ -1,0 +1,216 @@
+"""Deployments in and out: one module a format, one table of them.
+
+A deployment is an ``xarray.Dataset`` on ``time`` (:mod:`magbridge.columns`). A row is one time of the
+magnetometer; every other column holds what was known at that time:
+
+- logs of a live link (``.tlog``, ``.BIN``, ``.ulg``): the last value received at or before the row, NaN before
+  the first and when it is older than 30 s. This is what the bridge itself would have known, so a
+  calibration learns from a log what it will meet live;
+- logs that were put together ashore (Slocum, Seaglider): linear between neighbours, headings on the circle, NaN
+  across gaps.
+
+Each module has ``chunks(path, rows)``, which yields deployments of at most `rows` rows in the order of the
+file, and, where the format can be written, ``FileWriter(path)`` with ``append(dataset, first=...)`` and ``close()``.
+A package adds a format with an entry point in the group ``magbridge.formats``: the suffix without its dot, and
+such a module.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import ExitStack
+from functools import cache
+from importlib import import_module
+from importlib.metadata import entry_points
+from pathlib import Path
+from types import ModuleType, TracebackType
+from typing import TYPE_CHECKING, Any, Self
+
+from magbridge.errors import FormatError
+from magbridge.files import atomic_path
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+__all__ = ["FORMATS", "Writer", "read", "read_chunks", "write"]
+
+FORMATS: dict[str, tuple[str, str, str]] = {
+    # suffix: (module, reader, writer or "")
+    ".csv": ("magbridge.logs.text", "chunks", "FileWriter"),
+    ".nc": ("magbridge.logs.netcdf", "chunks", "FileWriter"),
+    ".parquet": ("magbridge.logs.parquet", "chunks", "FileWriter"),
+    ".tlog": ("magbridge.logs.telemetry", "chunks", "FileWriter"),
+    ".bin": ("magbridge.logs.ardupilot", "chunks", ""),
+    ".ulg": ("magbridge.logs.px4", "chunks", ""),
+    **{
+        suffix: ("magbridge.logs.slocum", "chunks", "")
+        for suffix in (".dbd", ".ebd", ".sbd", ".tbd", ".mbd", ".nbd", ".dcd", ".ecd", ".scd", ".tcd", ".mcd", ".ncd")
+    },
+}
+
+Paths = str | os.PathLike[str] | Sequence[str | os.PathLike[str]]
+
+
+@cache
+def _plugins() -> dict[str, tuple[str, str, str]]:
+    return {
+        f".{point.name.lower()}": (point.value, "chunks", "FileWriter")
+        for point in entry_points(group="magbridge.formats")
+    }
+
+
+def _format(path: Path, *, write: bool = False) -> Any:
+    """Return the reader or the writer for the suffix of `path`."""
+    formats = {**_plugins(), **FORMATS}
+    module, reader, writer = formats.get(path.suffix.lower(), ("", "", ""))
+    name = writer if write else reader
+    if not name:
+        known = " ".join(sorted(suffix for suffix, entry in formats.items() if entry[2] or not write))
+        raise FormatError(path, f"expected a file name that ends in one of {known}")
+    loaded: ModuleType = import_module(module)
+    return getattr(loaded, name)
+
+
+def _paths(paths: Paths) -> list[Path]:
+    several = [paths] if isinstance(paths, (str, os.PathLike)) else paths
+    if not several:
+        raise ValueError("expected at least one file")
+    checked = [Path(path) for path in several]
+    for path in checked:
+        if path.is_dir():
+            raise FormatError(path, "expected a file, not a directory")
+        if not path.is_file():
+            raise FormatError(path, "expected a file, there is none")
+        _format(path)
+    return checked
+
+
+def _chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
+    if not path.stat().st_size:
+        raise FormatError(path, "expected a log, the file is empty")
+    try:
+        yield from _format(path)(path, rows)
+    except OSError as error:
+        raise FormatError(path, f"cannot be read: {error.strerror or error}") from error
+
+
+def _require(dataset: xr.Dataset, required: Iterable[str]) -> None:
+    for name in required:
+        if name not in dataset:
+            there = " ".join(str(name) for name in dataset.data_vars)
+            raise FormatError(dataset.attrs["source"], f"expected this column; there are: {there}", column=name)
+
+
+def read(paths: Paths, *, required: Iterable[str] = ()) -> xr.Dataset:
+    """Return one deployment from one file or several, sorted in time.
+
+    Parameters
+    ----------
+    paths : path or sequence of paths
+        Files of any readable format, also of different ones.
+    required : iterable of str
+        Columns that the result must have, as :data:`magbridge.columns.CHANNELS`.
+
+    Returns
+    -------
+    xarray.Dataset
+        On ``time``; each variable float64 with ``units`` and ``long_name``. Attributes: ``source`` (file names),
+        ``heading_reference`` where it is not true north, ``duplicate_rows`` and what the reader had to skip.
+
+    Raises
+    ------
+    FormatError
+        A file that does not say what it should: names file, row, column and what was expected.
+    MissingExtra
+        The format needs a package that is not installed.
+    """
+    from magbridge.logs.deployment import join  # noqa: PLC0415 - xarray is for ashore
+
+    dataset = join([part for path in _paths(paths) for part in _chunks(path, 1 << 40)])
+    _require(dataset, required)
+    return dataset
+
+
+def read_chunks(paths: Paths, rows: int = 65536, *, required: Iterable[str] = ()) -> Iterator[xr.Dataset]:
+    """Yield what :func:`read` returns in pieces of about `rows` rows, in bounded memory.
+
+    Every piece has the same columns. CSV, netCDF, Parquet and ``.tlog`` are streamed; files of the other
+    formats are held one at a time. Of files that overlap in time, one piece each is held.
+
+    Raises
+    ------
+    FormatError, MissingExtra
+        As :func:`read`.
+    """
+    from magbridge.logs.merge import merge  # noqa: PLC0415 - xarray is for ashore
+
+    sources = _paths(paths)
+    required = tuple(required)
+    for dataset in merge([lambda n, path=path: _chunks(path, n) for path in sources], rows):
+        _require(dataset, required)
+        yield dataset
+
+
+def write(dataset: xr.Dataset, path: str | os.PathLike[str]) -> None:
+    """Write a deployment; `path` is complete or as it was before.
+
+    Raises
+    ------
+    FormatError
+        The suffix is not that of a format that can be written.
+    """
+    with Writer(path) as writer:
+        writer.append(dataset)
+
+
+class Writer:
+    """A file that grows by deployments, one after the other in time, and appears when it is complete.
+
+    The columns are those of the first deployment; a later one that lacks a column has NaN there. When the block
+    raises, nothing is left behind.
+
+    >>> with Writer("out.nc") as writer:  # doctest: +SKIP
+    ...     for dataset in read_chunks("in.tlog"):
+    ...         writer.append(dataset)
+    """
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self._path = Path(path)
+        self._open = _format(self._path, write=True)
+        self._stack = ExitStack()
+        self._columns: dict[str, dict[str, Any]] = {}
+
+    def __enter__(self) -> Self:
+        self._stack.__enter__()
+        self._file = self._open(self._stack.enter_context(atomic_path(self._path)))
+        self._stack.callback(self._file.close)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._stack.__exit__(kind, error, trace)
+
+    def append(self, dataset: xr.Dataset) -> None:
+        """Write the rows of `dataset`, which begin after the last ones.
+
+        Raises
+        ------
+        FormatError
+            Time does not increase, or a column was not in the first deployment.
+        """
+        from magbridge.logs.deployment import increasing, same_columns  # noqa: PLC0415 - xarray is for ashore
+
+        first = not self._columns
+        if first:
+            self._columns = {str(name): dict(dataset[name].attrs) for name in dataset.data_vars}
+            self._last = float("-inf")
+        for name in dataset.data_vars:
+            if name not in self._columns:
+                raise FormatError(self._path, "expected only columns that the first rows had", column=str(name))
+        time = dataset["time"].values
+        increasing(self._path, time, after=self._last)
+        if len(time):
+            self._last = float(time[-1])
+        self._file.append(dataset if first else same_columns(dataset, self._columns), first=first)

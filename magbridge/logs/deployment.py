@@ -1,0 +1,178 @@
+"""A deployment in memory: one ``xarray.Dataset`` on ``time``, built, checked and joined here only."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import ArrayLike, NDArray
+
+from magbridge.columns import COLUMNS, factor
+from magbridge.errors import FormatError
+from magbridge.records import Quality
+
+__all__ = ["MEANING", "deployment", "increasing", "join", "same_columns"]
+
+Floats = NDArray[np.float64]
+
+MEANING = {"heading_reference": "true", "time_reference": "utc"}
+"""Attributes that change what values mean, and what holds where they are absent."""
+
+
+def deployment(
+    file: str | Path,
+    time: ArrayLike,
+    columns: Mapping[str, ArrayLike],
+    units: Mapping[str, str] | None = None,
+    attrs: Mapping[str, Any] | None = None,
+) -> xr.Dataset:
+    """Return the columns as a deployment, in the units of :data:`magbridge.columns.COLUMNS`.
+
+    Parameters
+    ----------
+    file : path
+        Named in errors and in the attribute ``source``.
+    time : (n,) array of float
+        s since 1970 UTC.
+    columns : mapping of str to (n,) array of float
+        NaN where a row lacks the value.
+    units : mapping of str to str, optional
+        Declared unit of a column; one that the table knows is converted to the table's.
+    attrs : mapping, optional
+        Attributes of the whole, as ``heading_reference``.
+
+    Raises
+    ------
+    FormatError
+        A declared unit that does not fit the column.
+    """
+    units = units or {}
+    variables = {}
+    for name, values in columns.items():
+        unit = units.get(name, "")
+        scale = factor(unit, name)
+        if scale is None:
+            raise FormatError(file, f"expected {COLUMNS[name].unit}, not {unit}", column=name)
+        array = np.asarray(values, dtype=np.float64)
+        variables[name] = ("time", array if scale == 1.0 else array * scale, _describe(name, unit))
+    dataset = xr.Dataset(
+        variables,
+        coords={"time": ("time", np.asarray(time, dtype=np.float64), _describe("time", ""))},
+        attrs={"source": Path(file).name, **(attrs or {})},
+    )
+    return dataset
+
+
+def _describe(name: str, unit: str) -> dict[str, Any]:
+    known = COLUMNS.get(name)
+    if known is None:
+        return {"units": unit or "1", "long_name": name.replace("_", " ")}
+    described: dict[str, Any] = {"units": known.unit, "long_name": known.long_name}
+    if name == "quality":
+        described |= {
+            "flag_masks": [int(flag) for flag in Quality],
+            "flag_meanings": " ".join(str(flag.name).lower() for flag in Quality),
+        }
+    return described
+
+
+def increasing(file: str | Path, time: Floats, *, first_row: int = 1, after: float = -np.inf) -> None:
+    """Check that `time` is finite and increases, also against the last time before it.
+
+    Raises
+    ------
+    FormatError
+        Names the first row that does not fit, counted from `first_row`.
+    """
+    steps = np.diff(time, prepend=after)
+    wrong = np.flatnonzero(~(np.isfinite(time) & (steps > 0)))
+    if not len(wrong):
+        return
+    k = int(wrong[0])
+    before = float(time[k - 1]) if k else after
+    expected = f"expected a time after {before!r}" if np.isfinite(before) else "expected a finite time"
+    raise FormatError(file, f"{expected}, not {float(time[k])!r}", row=first_row + k, column="time")
+
+
+def same_columns(dataset: xr.Dataset, like: Mapping[str, Mapping[str, Any]]) -> xr.Dataset:
+    """Return the deployment with exactly the columns of `like` (name to attributes), missing ones all NaN."""
+    empty = np.full(dataset.sizes["time"], np.nan)
+    return xr.Dataset(
+        {
+            name: dataset[name] if name in dataset else ("time", empty, dict(attrs))
+            for name, attrs in like.items()
+        },
+        coords={"time": dataset["time"]},
+        attrs=dataset.attrs,
+    )
+
+
+def join(parts: Sequence[xr.Dataset]) -> xr.Dataset:
+    """Return several deployments as one, sorted in time.
+
+    A part that lacks a column has NaN there. Of rows with the same time the first part's stays, filled
+    where it has NaN from those after it; the attribute ``duplicate_rows`` counts what went.
+
+    Raises
+    ------
+    FormatError
+        Two parts that disagree on an attribute that changes what values mean, as ``heading_reference``,
+        or on the unit of a column.
+    """
+    if len(parts) == 1:
+        return parts[0]
+    described: dict[str, dict[str, Any]] = {}
+    for part in parts:
+        for name in part.data_vars:
+            attrs = described.setdefault(str(name), part[name].attrs)
+            if attrs.get("units") != part[name].attrs.get("units"):
+                raise FormatError(
+                    part.attrs.get("source", ""),
+                    f"expected {attrs.get('units')} as in the files before, not {part[name].attrs.get('units')}",
+                    column=str(name),
+                )
+    time = np.concatenate([part["time"].values for part in parts])
+    order = np.argsort(time, kind="stable")
+    first = np.diff(time[order], prepend=-np.inf) > 0
+    starts = np.flatnonzero(first)
+    variables = {}
+    for name, attrs in described.items():
+        values = np.concatenate(
+            [part[name].values if name in part else np.full(part.sizes["time"], np.nan) for part in parts]
+        )[order]
+        variables[name] = ("time", _first_known(values, starts), attrs)
+    attrs = _join_attrs([part.attrs for part in parts])
+    if len(starts) < len(time):
+        attrs["duplicate_rows"] = attrs.get("duplicate_rows", 0) + len(time) - len(starts)
+    return xr.Dataset(variables, coords={"time": ("time", time[order][starts], parts[0]["time"].attrs)}, attrs=attrs)
+
+
+def _first_known(values: Floats, starts: NDArray[np.intp]) -> Floats:
+    """First value that is not NaN of each group of rows that begins at `starts`."""
+    result = values[starts]
+    sizes = np.diff(starts, append=len(values))
+    for k in range(1, int(sizes.max(initial=1))):
+        fill = np.flatnonzero(np.isnan(result) & (sizes > k))
+        result[fill] = values[starts[fill] + k]
+    return result
+
+
+def _join_attrs(all_attrs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    for key, usual in MEANING.items():
+        first = all_attrs[0].get(key, usual)
+        for attrs in all_attrs:
+            if (other := attrs.get(key, usual)) != first:
+                raise FormatError(attrs.get("source", ""), f"expected {key} {first} as before, not {other}")
+    joined: dict[str, Any] = {}
+    sources: list[str] = []
+    for attrs in all_attrs:
+        sources += [name for name in str(attrs.get("source", "")).split(", ") if name not in sources]
+        for key, value in attrs.items():
+            if isinstance(value, int) and key in joined:
+                joined[key] += value  # a counter
+            else:
+                joined.setdefault(key, value)
+    return joined | {"source": ", ".join(sources)}

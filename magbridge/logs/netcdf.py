@@ -1,0 +1,193 @@
+"""netCDF in the shape of OceanGliders OG1.0: one trajectory along ``N_MEASUREMENTS``, names in capitals.
+
+``TIME LATITUDE LONGITUDE DEPTH ROLL PITCH HEADING TEMP PRES`` are OG1.0's own names; the others are ours in
+capitals (``MAG_X``), and the attribute ``column`` keeps the exact name. A file by someone else is read by the same
+rules: any numeric variable along ``N_MEASUREMENTS`` becomes a column in small letters. What OG1.0 also demands about
+people, platform and quality control we do not know, so a file does not claim to comply. A basestation's
+Seaglider file is recognised by its dimensions and read by :mod:`magbridge.logs.seaglider`.
+
+References
+----------
+OceanGliders format 1.0, https://oceangliderscommunity.github.io/OG-format-user-manual/OG_Format.html
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from magbridge.errors import FormatError, MissingExtra
+from magbridge.logs import seaglider
+from magbridge.logs.deployment import deployment, increasing
+
+try:
+    import netCDF4
+except ImportError:
+    raise MissingExtra("netCDF4", "analysis") from None
+
+__all__ = ["FileWriter", "chunks"]
+
+DIMENSION = "N_MEASUREMENTS"
+EPOCH = "seconds since 1970-01-01T00:00:00Z"
+NAMES = {"water_temperature": "TEMP", "water_pressure": "PRES"}
+"""Columns whose name in OG1.0 is not simply ours in capitals."""
+ATTRIBUTES: dict[str, dict[str, Any]] = {
+    "time": {"standard_name": "time", "calendar": "gregorian", "units": EPOCH, "_FillValue": -1.0},
+    "latitude": {"standard_name": "latitude", "units": "degrees_north", "_FillValue": -9999.9},
+    "longitude": {"standard_name": "longitude", "units": "degrees_east", "_FillValue": -9999.9},
+    "depth": {"standard_name": "depth", "units": "m", "positive": "down", "_FillValue": -9999.9},
+    "roll": {"standard_name": "platform_roll"},
+    "pitch": {"standard_name": "platform_pitch"},
+    "heading": {"standard_name": "platform_yaw"},
+    "water_temperature": {"standard_name": "sea_water_temperature"},
+    "water_pressure": {"standard_name": "sea_water_pressure"},
+}
+CHUNK = 8192
+"""Rows stored together."""
+
+
+def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
+    """Yield the file as deployments of at most `rows` rows.
+
+    Raises
+    ------
+    FormatError
+        Not netCDF or cut short, neither of the two shapes, no ``TIME``, time that does not increase.
+    """
+    try:
+        with netCDF4.Dataset(path) as file:
+            file.set_auto_mask(False)  # its valid_min would turn a depth of -2 cm into nothing
+            if seaglider.DIMENSION in file.dimensions:
+                yield seaglider.dive(path, file)
+            elif DIMENSION in file.dimensions:
+                yield from _chunks(path, file, rows)
+            else:
+                raise FormatError(path, f"expected the dimension {DIMENSION} (OG1.0) or a Seaglider's file")
+    except (OSError, RuntimeError) as error:
+        raise FormatError(path, f"expected a whole netCDF file: {error}") from None
+
+
+def _chunks(path: Path, file: Any, rows: int) -> Iterator[xr.Dataset]:
+    ours = {capitals: name for name, capitals in NAMES.items()}
+    variables = {
+        getattr(variable, "column", ours.get(name, name.lower())): variable
+        for name, variable in file.variables.items()
+        if variable.dimensions == (DIMENSION,) and variable.dtype != str and variable.dtype.kind in "iuf"
+    }
+    if "time" not in variables:
+        raise FormatError(path, f"expected this variable along {DIMENSION}", column="TIME")
+    total = len(file.dimensions[DIMENSION])
+    if not total:
+        raise FormatError(path, "expected rows, there are none")
+    start, scale = _epoch(path, variables["time"])
+    units = {name: getattr(variable, "units", "1") for name, variable in variables.items() if name != "time"}
+    attrs = {key: _plain(value) for key, value in file.__dict__.items() if key not in GENERATED}
+    last = -np.inf
+    for row in range(0, total, rows):
+        columns = {name: _floats(variable, slice(row, row + rows)) for name, variable in variables.items()}
+        time = columns.pop("time") * scale + start
+        increasing(path, time, first_row=row + 1, after=last)
+        last = float(time[-1])
+        yield deployment(path, time, columns, units, attrs)
+
+
+def _floats(variable: Any, rows: slice) -> NDArray[np.float64]:
+    values = variable[rows].astype(np.float64)
+    for missing in ("_FillValue", "missing_value"):
+        if missing in variable.ncattrs():
+            values[values == float(np.float64(getattr(variable, missing)))] = np.nan
+    return np.asarray(values)
+
+
+def _epoch(path: Path, variable: Any) -> tuple[float, float]:
+    """Seconds since 1970 at which the time variable is 0, and seconds in one of its units."""
+    units = getattr(variable, "units", "")
+    try:
+        zero, one = netCDF4.num2date([0, 1], units, only_use_cftime_datetimes=False)
+    except ValueError:
+        raise FormatError(path, f"expected {EPOCH!r}, not {units!r}", column="TIME") from None
+    return zero.replace(tzinfo=UTC).timestamp(), (one - zero).total_seconds()
+
+
+def _plain(value: Any) -> Any:
+    return value.item() if isinstance(value, np.generic) else value
+
+
+GENERATED = ("Conventions", "featureType", "title", "start_date", "time_coverage_start", "time_coverage_end")
+
+
+class FileWriter:
+    """Writes deployments one after the other; the columns are those of the first."""
+
+    def __init__(self, path: Path) -> None:
+        self._file = netCDF4.Dataset(path, "w", format="NETCDF4")
+        self._variables: dict[str, Any] = {}
+        self._rows = 0
+
+    def append(self, dataset: xr.Dataset, *, first: bool) -> None:
+        """Write the rows, and before the first ones the definitions."""
+        if first:
+            self._define(dataset)
+        n = dataset.sizes["time"]
+        for name, variable in self._variables.items():
+            values = dataset[name].values
+            fill = variable.get_fill_value() if name in ATTRIBUTES else None
+            if fill is not None and fill == fill:
+                values = np.where(np.isnan(values), fill, values)
+            variable[self._rows : self._rows + n] = values
+        self._rows += n
+        if self._rows:
+            last = float(dataset["time"][-1]) if n else 0.0
+            if n:
+                self._file.time_coverage_end = _iso(last)
+
+    def _define(self, dataset: xr.Dataset) -> None:
+        file = self._file
+        file.set_auto_mask(False)
+        file.createDimension(DIMENSION, None)
+        first = float(dataset["time"][0]) if dataset.sizes["time"] else 0.0
+        file.setncatts(
+            {key: value for key, value in dataset.attrs.items() if isinstance(value, (str, int, float))}
+            | {
+                "title": "magnetometer deployment",
+                "featureType": "trajectory",
+                "Conventions": "CF-1.10, ACDD-1.3",
+                "start_date": _iso(first),
+                "time_coverage_start": _iso(first),
+            }
+        )
+        trajectory = file.createVariable("TRAJECTORY", str)
+        trajectory.setncatts({"cf_role": "trajectory_id", "long_name": "trajectory name"})
+        trajectory[...] = str(dataset.attrs.get("source", ""))
+        taken = {"TRAJECTORY"}
+        for name in ("time", *(str(name) for name in dataset.data_vars)):
+            capitals = NAMES.get(name, name.upper()).replace("/", "_")
+            while capitals in taken:
+                capitals += "_"
+            taken.add(capitals)
+            attrs = dict(dataset[name].attrs) | ATTRIBUTES.get(name, {})
+            variable = file.createVariable(
+                capitals,
+                "f8",
+                (DIMENSION,),
+                fill_value=attrs.pop("_FillValue", np.nan),
+                zlib=True,
+                complevel=1,
+                chunksizes=(CHUNK,),
+            )
+            variable.setncatts(attrs | {"column": name})
+            self._variables[name] = variable
+
+    def close(self) -> None:
+        """Bring everything to the file."""
+        self._file.close()
+
+
+def _iso(time: float) -> str:
+    return datetime.fromtimestamp(time, UTC).strftime("%Y%m%dT%H%M%S")

@@ -1,0 +1,66 @@
+"""Telemetry on its own time base, brought to the rows of a deployment."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["latest", "linear"]
+
+Floats = NDArray[np.float64]
+
+
+def latest(at: Floats, time: Floats, values: Floats, max_age: float) -> Floats:
+    """Return the last value at or before each time, as a live listener would know it.
+
+    Parameters
+    ----------
+    at : (n,) array
+        s, the rows.
+    time, values : (m,) array
+        s, increasing or equal, and what was said then; NaN is not a value.
+    max_age : float
+        s; an older value is NaN, as are rows before the first.
+
+    Returns
+    -------
+    (n,) array
+    """
+    known = np.isfinite(values)
+    time, values = time[known], values[known]
+    if not len(time):
+        return np.full(len(at), np.nan)
+    k = np.searchsorted(time, at, side="right") - 1
+    fresh = (k >= 0) & (at - time[k] <= max_age)
+    return np.where(fresh, values[k], np.nan)
+
+
+def linear(at: Floats, time: Floats, values: Floats, max_gap: float, period: float | None = None) -> Floats:
+    """Return values between their neighbours in time, for what changes smoothly and was measured ashore.
+
+    Parameters
+    ----------
+    at : (n,) array
+        s, the rows.
+    time, values : (m,) array
+        s, increasing, and what was measured then; NaN is not a value.
+    max_gap : float
+        s; between neighbours farther apart, or beyond an end by more, it is NaN.
+    period : float, optional
+        The values live on a circle of this circumference: 360 for a heading in degrees.
+
+    Returns
+    -------
+    (n,) array
+    """
+    known = np.isfinite(values) & np.isfinite(time)
+    time, values = time[known], values[known]
+    if not len(time):
+        return np.full(len(at), np.nan)
+    if period is not None:
+        values = np.unwrap(values, period=period)
+    result = np.interp(at, time, values)
+    right = np.searchsorted(time, at)
+    before, after = time[np.maximum(right - 1, 0)], time[np.minimum(right, len(time) - 1)]
+    result[(after - before > max_gap) | (at - time[-1] > max_gap) | (time[0] - at > max_gap)] = np.nan
+    return result if period is None else result % period

@@ -1,0 +1,144 @@
+"""CSV: a header row, one row a sample, an empty field for a value that is lacking.
+
+A heading is ``name`` or ``name [unit]``: ``battpos [in]``. Columns of the public table need no unit; one in
+another unit that we know (``mag_x [uT]``, ``roll [rad]``) is converted. Before the header there may be
+lines ``# heading_reference = magnetic``. ``quality`` holds the names of the flags, separated by spaces. Numbers
+are written with as many digits as bring back the same bits.
+"""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Iterator
+from itertools import islice
+from math import nan
+from pathlib import Path
+from typing import TextIO
+
+import numpy as np
+import xarray as xr
+
+from magbridge.columns import COLUMNS
+from magbridge.errors import FormatError
+from magbridge.logs.deployment import MEANING, deployment, increasing
+from magbridge.records import Quality
+
+__all__ = ["FileWriter", "chunks"]
+
+HEADING = re.compile(r"(?P<name>.*?)\s*(?:\[(?P<unit>[^\]]*)\])?")
+ATTRIBUTE = re.compile(r"#\s*(\w+)\s*=\s*(.*?)\s*")
+
+
+def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
+    """Yield the file as deployments of at most `rows` rows.
+
+    Raises
+    ------
+    FormatError
+        No header, a row of another length, a field that is not a number, time that does not increase.
+    """
+    with path.open(encoding="utf-8-sig", newline="") as file:
+        try:
+            yield from _chunks(path, file, rows)
+        except UnicodeDecodeError:
+            raise FormatError(path, "expected text, not binary data") from None
+        except csv.Error as error:
+            raise FormatError(path, f"expected comma-separated values: {error}") from None
+
+
+def _chunks(path: Path, file: TextIO, rows: int) -> Iterator[xr.Dataset]:
+    attrs: dict[str, str] = {}
+    line, row = file.readline(), 1
+    while line.startswith("#"):
+        if match := ATTRIBUTE.fullmatch(line.rstrip("\r\n")):
+            attrs[match[1]] = match[2]
+        line, row = file.readline(), row + 1
+    if not line.strip():
+        raise FormatError(path, "expected a header row, the file is empty", row=row)
+    matches = [HEADING.fullmatch(heading.strip()) for heading in next(csv.reader([line]))]
+    names = [match["name"] if match else "" for match in matches]
+    units = {match["name"]: match["unit"] for match in matches if match and match["unit"]}
+    for k, name in enumerate(names):
+        if not name or name in names[:k]:
+            raise FormatError(path, f"expected a name of its own for column {k + 1}, not {name!r}", row=row)
+    if "time" not in names:
+        raise FormatError(path, "expected this column", row=row, column="time")
+    reader, last, nothing = csv.reader(file), -np.inf, True
+    while block := [fields for fields in islice(reader, rows) if fields]:
+        first_row = row + reader.line_num - len(block) + 1
+        for k, fields in enumerate(block):
+            if len(fields) != len(names):
+                raise FormatError(path, f"expected {len(names)} fields, not {len(fields)}", row=first_row + k)
+        columns = {
+            name: np.array(_numbers(path, name, list(texts), first_row))
+            for name, texts in zip(names, zip(*block, strict=True), strict=True)
+        }
+        dataset = deployment(path, columns.pop("time"), columns, units, attrs)
+        increasing(path, dataset["time"].values, first_row=first_row, after=last)
+        last, nothing = float(dataset["time"][-1]), False
+        yield dataset
+    if nothing:
+        raise FormatError(path, "expected rows after the header", row=row + 1)
+
+
+def _numbers(path: Path, name: str, texts: list[str], first_row: int) -> list[float]:
+    number = _flags if name == "quality" else _float
+    try:
+        return [number(text) for text in texts]
+    except ValueError:
+        pass
+    for row, text in enumerate(texts, first_row):
+        try:
+            number(text)
+        except ValueError as error:
+            raise FormatError(path, f"expected {error}, not {text!r}", row=row, column=name) from None
+    raise AssertionError
+
+
+def _float(text: str) -> float:
+    try:
+        return float(text) if text else nan
+    except ValueError:
+        raise ValueError("a number") from None
+
+
+def _flags(text: str) -> float:
+    try:
+        return float(Quality.parse(text))
+    except KeyError:
+        raise ValueError("the names of flags") from None
+
+
+class FileWriter:
+    """Writes deployments one after the other; the columns are those of the first."""
+
+    def __init__(self, path: Path) -> None:
+        self._file = path.open("w", encoding="utf-8", newline="")
+        self._csv = csv.writer(self._file, lineterminator="\n")
+
+    def append(self, dataset: xr.Dataset, *, first: bool) -> None:
+        """Write the rows, and before the first ones the header."""
+        if first:
+            for key in MEANING:
+                if key in dataset.attrs:
+                    self._file.write(f"# {key} = {dataset.attrs[key]}\n")
+            self._csv.writerow(["time", *(_heading(dataset[name]) for name in dataset.data_vars)])
+        columns = [_texts("time", dataset["time"].values)]
+        columns += [_texts(str(name), dataset[name].values) for name in dataset.data_vars]
+        self._csv.writerows(zip(*columns, strict=True))
+
+    def close(self) -> None:
+        """Bring everything to the file."""
+        self._file.close()
+
+
+def _heading(column: xr.DataArray) -> str:
+    unit = column.attrs.get("units", "1")
+    return str(column.name) if column.name in COLUMNS or unit == "1" else f"{column.name} [{unit}]"
+
+
+def _texts(name: str, values: np.ndarray[tuple[int], np.dtype[np.float64]]) -> list[str]:
+    if name == "quality":  # a row that was not corrected is never taken for a good one
+        return [Quality(int(v)).names() if v == v else "uncalibrated" for v in values.tolist()]
+    return ["" if v != v else repr(v) for v in values.tolist()]
