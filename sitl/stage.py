@@ -1,0 +1,134 @@
+"""The stage of a replay: a pty and a socket, and the two devices that speak on them.
+
+An emulated fluxgate speaks its real protocol into a pty, an emulated autopilot speaks MAVLink on a real socket.
+Between them stands the bridge, unmodified, in a process of its own.
+"""
+
+from __future__ import annotations
+
+import os
+import pty
+import socket
+import subprocess
+import sys
+import threading
+import time
+import tty
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+from magbridge.bridge.events import Event
+from magbridge.errors import PortError
+from magbridge.records import Channel
+from sitl.timetable import Entry, pace
+
+__all__ = ["Stage"]
+
+BATCH = 2048
+"""Bytes sent at once when nothing has to wait: below what a pty holds."""
+CONNECT_TIMEOUT = 30.0
+"""s for the bridge to start and connect."""
+
+
+class Stage:
+    """Sets the stage, plays events to a bridge, and hands on what the bridge publishes.
+
+    Parameters
+    ----------
+    config : path
+        The bridge's own ``bridge.toml``; only its sensor port and its link are replaced by the stage's.
+    listener : callable
+        Takes the bytes that the bridge sends to the autopilot, as they come, on a thread of its own.
+    log : path or None
+        Folder for the bridge's own log of the replay.
+    """
+
+    def __init__(self, config: Path, listener: Callable[[bytes], None], log: Path | None = None) -> None:
+        self._listener = listener
+        self._master, self._slave = pty.openpty()
+        tty.setraw(
+            self._slave
+        )  # what is written before the bridge opens it must not be edited as a terminal would
+        server = socket.create_server(("127.0.0.1", 0))
+        server.settimeout(CONNECT_TIMEOUT)
+        times_out, self._times = os.pipe()
+        command = [
+            sys.executable, "-m", "sitl.understudy", str(config),
+            "--sensor", os.ttyname(self._slave),
+            "--link", f"tcp:127.0.0.1:{server.getsockname()[1]}",
+            "--timetable", str(times_out),
+            *(("--log", str(log)) if log else ()),
+        ]  # fmt: skip
+        self._bridge = subprocess.Popen(command, pass_fds=(times_out,), stderr=subprocess.PIPE)
+        os.close(times_out)
+        try:
+            self._link, _ = server.accept()
+        except TimeoutError as error:
+            raise PortError("replay", self._last_words() or "the bridge did not connect") from error
+        finally:
+            server.close()
+        self._link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._ear = threading.Thread(target=self._listen, name="autopilot's ear", daemon=True)
+        self._ear.start()
+        self._buffers = {Channel.SENSOR: bytearray(), Channel.LINK: bytearray(), Channel.STATE: bytearray()}
+
+    def _listen(self) -> None:
+        while data := self._link.recv(65536):
+            self._listener(data)
+
+    def _last_words(self) -> str:
+        """Return the bridge's last line on stderr, after it has ended."""
+        self._bridge.kill()
+        lines = self._bridge.communicate()[1].decode(errors="replace").strip().splitlines()
+        return lines[-1] if lines else ""
+
+    def play(self, events: Iterable[Event], speed: float = float("inf")) -> None:
+        """Play events in order, and wait until the bridge has dealt with all of them.
+
+        Raises
+        ------
+        PortError
+            The bridge ended before its time; tells its last words.
+        """
+        times = self._buffers[Channel.STATE]
+        pending = 0
+        try:
+            for wait, event in pace(events, speed):
+                if wait > 0.0:
+                    self._flush()
+                    pending = 0
+                    time.sleep(wait)
+                size = len(event.data)
+                times += Entry.pack(event.time_us | event.channel, size)
+                self._buffers[event.channel] += event.data
+                pending += size
+                if pending >= BATCH:
+                    self._flush()
+                    pending = 0
+            self._flush()
+            os.close(self._times)
+            if self._bridge.wait() != 0:
+                raise PortError(
+                    "replay", self._last_words() or f"the bridge ended with {self._bridge.returncode}"
+                )
+        except BrokenPipeError as error:
+            raise PortError("replay", self._last_words() or "the bridge ended") from error
+        finally:
+            self._ear.join(timeout=10.0)
+            self._close()
+
+    def _flush(self) -> None:
+        """Write what is due: bytes first, so that whatever the timetable announces is already there."""
+        sensor, link, times = self._buffers.values()
+        while sensor:
+            del sensor[: os.write(self._master, sensor)]
+        if link:
+            self._link.sendall(link)
+            link.clear()
+        while times:
+            del times[: os.write(self._times, times)]
+
+    def _close(self) -> None:
+        self._link.close()
+        os.close(self._master)
+        os.close(self._slave)

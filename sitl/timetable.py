@@ -1,0 +1,68 @@
+"""What happened, byte by byte, and when: the script that a replay plays through a pty and a socket.
+
+The bytes themselves go through the pty and the socket, as real devices would send them. *When* they came
+cannot: a pty keeps no time. So the times go beside them, through a pipe, as the timetable: one entry per event,
+which channel, how many bytes, at what time. The bridge under replay reads its ports in that order and takes
+those times for its clock; everything behind its ports is the same code as at sea.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+import time
+from collections.abc import Iterable, Iterator
+
+from magbridge.bridge.events import Event
+from magbridge.records import Channel
+
+__all__ = ["Entry", "pace", "read_entries"]
+
+Entry = struct.Struct("<QI")
+"""Stamp (µs, channel in the low two bits) and number of bytes; a ``STATE`` entry is followed by its bytes."""
+
+
+def read_entries(descriptor: int) -> Iterator[tuple[int, Channel, int, bytes]]:
+    """Read a timetable from a pipe: time in µs, channel, number of bytes, and the bytes of a ``STATE`` entry."""
+    buffer = bytearray()
+    channels = tuple(Channel)
+    while True:
+        position = 0
+        while len(buffer) - position >= Entry.size:
+            stamp, size = Entry.unpack_from(buffer, position)
+            channel = channels[stamp & 3]
+            inline = size if channel is Channel.STATE else 0
+            if len(buffer) - position < Entry.size + inline:
+                break
+            position += Entry.size
+            data = bytes(buffer[position : position + inline])
+            position += inline
+            yield stamp & ~3, channel, size, data
+        del buffer[:position]
+        chunk = os.read(descriptor, 65536)
+        if not chunk:
+            return
+        buffer += chunk
+
+
+def pace(events: Iterable[Event], speed: float) -> Iterator[tuple[float, Event]]:
+    """Yield how long to wait before each event, in s, and the event.
+
+    Parameters
+    ----------
+    events : iterable of Event
+        In order of time.
+    speed : float
+        How many times faster than they happened; ``inf`` waits for nothing.
+    """
+    begun = time.monotonic()
+    first_us: int | None = None
+    for event in events:
+        if first_us is None:
+            first_us = event.time_us
+        wait = (
+            begun + (event.time_us - first_us) * 1e-6 / speed - time.monotonic()
+            if speed != float("inf")
+            else 0.0
+        )
+        yield wait, event

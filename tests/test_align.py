@@ -1,0 +1,151 @@
+"""One time base: interpolation, ages, and a flag for everything that makes a sample doubtful."""
+
+from __future__ import annotations
+
+from math import inf, nan
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from magbridge.align import Aligner, Input, Sample
+from magbridge.config import Align
+from magbridge.records import Quality, Reading
+
+SECOND = 1_000_000
+START = 1_700_000_000 * SECOND
+BATTERY = Input("battpos", -1.0, 1.0, max_age=10.0)
+
+
+def reading(value: float = 100.0, **more: object) -> Reading:
+    return Reading((value, value, value), **more)  # type: ignore[arg-type]
+
+
+def flags(sample: Sample) -> set[str]:
+    return set(Quality(sample.quality).names().split())
+
+
+def test_multiplexed_channels_of_a_ramp_come_out_equal() -> None:
+    """A field that grows steadily reads the same on three channels once they share a time."""
+    aligner = Aligner((), Align())
+    delays = (0.0, 0.9, 1.8)
+    for k in range(5):
+        t = 4.0 * k
+        field = tuple(10.0 * (t + delay) for delay in delays)
+        sample = aligner.reading(Reading(field, channel_delay=delays), START + round(t * SECOND))  # type: ignore[arg-type]
+        if k:
+            np.testing.assert_allclose(sample.field, 10.0 * t, atol=1e-9)
+        assert sample.time_us == START + round(t * SECOND)
+
+
+@given(
+    st.tuples(*[st.floats(0, 2)] * 3),
+    st.floats(-1e3, 1e3),
+    st.floats(-50, 50),
+    st.floats(0.0, 3.0),
+)
+def test_any_order_of_channels_and_any_filter_delay(
+    delays: tuple[float, float, float], level: float, slope: float, filter_delay: float
+) -> None:
+    aligner = Aligner((), Align(filter_delay=filter_delay))
+    for t in (0.0, 4.0):
+        field = tuple(level + slope * (t + delay) for delay in delays)
+        sample = aligner.reading(Reading(field, channel_delay=delays), START + round(t * SECOND))  # type: ignore[arg-type]
+    expected = level + slope * (4.0 + min(delays))
+    np.testing.assert_allclose(sample.field, expected, atol=1e-6)
+    assert abs(sample.time_us - (START + (4.0 + min(delays) - filter_delay) * SECOND)) <= 5
+
+
+def test_telemetry_is_looked_up_at_the_sample_s_time() -> None:
+    aligner = Aligner((BATTERY,), Align(filter_delay=2.0, moving_rate=10.0))
+    for k in range(8):
+        aligner.telemetry("battpos", START + k * SECOND, 0.1 * k)
+    sample = aligner.reading(reading(), START + 7_500_000)
+    assert sample.values[0] == pytest.approx(0.55)  # at 5.5 s, between two values
+    assert sample.age == 0.0
+    late = aligner.reading(reading(), START + 12 * SECOND)
+    assert late.values[0] == pytest.approx(0.7)  # held
+    assert late.age == pytest.approx(3.0)
+
+
+def test_stale_telemetry_is_flagged_and_its_sigma_grows() -> None:
+    aligner = Aligner((BATTERY,), Align(stale_growth=2.0))
+    aligner.telemetry("battpos", START, 0.3)
+    sigmas = []
+    for k in range(1, 30):
+        sample = aligner.reading(reading(), START + k * SECOND)
+        assert ("stale_telemetry" in flags(sample)) == (k > 10)
+        assert sample.values == (0.3,)
+        sigmas.append(sample.sigma)
+    assert sigmas[5] == 0.0
+    assert sigmas[-1] == pytest.approx(2.0 * 29)
+
+
+def test_telemetry_never_seen_spans_the_whole_range() -> None:
+    sample = Aligner((BATTERY,), Align()).reading(reading(), START)
+    assert flags(sample) == {"stale_telemetry"}
+    assert sample.spans == ((0, -1.0, 1.0),)
+    assert sample.age == inf
+
+
+def test_nan_telemetry_keeps_the_last_value_but_flags() -> None:
+    aligner = Aligner((BATTERY,), Align())
+    aligner.telemetry("battpos", START, 0.3)
+    aligner.telemetry("battpos", START + SECOND, nan)
+    sample = aligner.reading(reading(), START + SECOND)
+    assert sample.values == (0.3,)
+    assert "stale_telemetry" in flags(sample)
+    aligner.telemetry("battpos", START + 2 * SECOND, 0.3)
+    assert flags(aligner.reading(reading(), START + 2 * SECOND)) == set()
+
+
+def test_a_moving_mass_is_flagged_until_it_rests() -> None:
+    aligner = Aligner((BATTERY,), Align(settle_time=3.0))
+    seen = []
+    for k in range(20):
+        position = min(max(k - 5, 0), 5) * 0.1  # moves from 5 s to 10 s
+        aligner.telemetry("battpos", START + k * SECOND, position)
+        seen.append("moving" in flags(aligner.reading(reading(), START + k * SECOND)))
+    assert seen == [False] * 6 + [True] * 5 + [True] * 3 + [False] * 6
+
+
+def test_noisy_telemetry_of_a_resting_mass_is_not_motion() -> None:
+    aligner = Aligner((BATTERY,), Align())
+    rng = np.random.default_rng(1)
+    for k in range(400):
+        aligner.telemetry("battpos", START + k * 50_000, 0.3 + 1e-3 * rng.standard_normal())
+        sample = aligner.reading(reading(), START + k * 50_000)
+        assert "moving" not in flags(sample)
+
+
+def test_out_of_order_and_duplicate_telemetry_is_ignored() -> None:
+    aligner = Aligner((BATTERY,), Align(moving_rate=100.0))
+    aligner.telemetry("battpos", START + SECOND, 0.2)
+    aligner.telemetry("battpos", START, 0.9)
+    aligner.telemetry("battpos", START + SECOND, 0.9)
+    assert aligner.reading(reading(), START + 2 * SECOND).values == (0.2,)
+
+
+def test_gap_and_missing_readings() -> None:
+    aligner = Aligner((), Align())
+    times = [0, 4, 8, 12, 24, 28]
+    gaps = ["gap" in flags(aligner.reading(reading(), START + t * SECOND)) for t in times]
+    assert gaps == [False, False, False, False, True, False]
+    assert "gap" in flags(aligner.reading(reading(), START + 32 * SECOND, missing=1))
+
+
+def test_a_power_cycle_makes_the_offset_suspect_for_good() -> None:
+    aligner = Aligner((), Align(turn_on_sigma=20.0), power_cycle=7)
+    assert flags(aligner.reading(reading(power_cycle=7), START)) == set()
+    after = aligner.reading(reading(power_cycle=8), START + 4 * SECOND)
+    assert flags(after) == {"offset_suspect"}
+    assert after.sigma == 20.0
+    assert "offset_suspect" in flags(aligner.reading(reading(power_cycle=8), START + 8 * SECOND))
+
+
+def test_a_saturated_sample_is_kept_with_infinite_sigma() -> None:
+    sample = Aligner((), Align()).reading(reading(65000.0, saturated=True), START)
+    assert flags(sample) == {"saturated"}
+    assert sample.sigma == inf
+    assert sample.field == (65000.0,) * 3
