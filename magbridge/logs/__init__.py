@@ -43,10 +43,10 @@ FORMATS: dict[str, tuple[str, str, str]] = {
     ".tlog": ("magbridge.logs.telemetry", "chunks", "FileWriter"),
     ".bin": ("magbridge.logs.ardupilot", "chunks", ""),
     ".ulg": ("magbridge.logs.px4", "chunks", ""),
-    **{
-        suffix: ("magbridge.logs.slocum", "chunks", "")
-        for suffix in (".dbd", ".ebd", ".sbd", ".tbd", ".mbd", ".nbd", ".dcd", ".ecd", ".scd", ".tcd", ".mcd", ".ncd")
-    },
+    **dict.fromkeys(
+        (".dbd", ".ebd", ".sbd", ".tbd", ".mbd", ".nbd", ".dcd", ".ecd", ".scd", ".tcd", ".mcd", ".ncd"),
+        ("magbridge.logs.slocum", "chunks", ""),
+    ),
 }
 
 Paths = str | os.PathLike[str] | Sequence[str | os.PathLike[str]]
@@ -99,7 +99,9 @@ def _require(dataset: xr.Dataset, required: Iterable[str]) -> None:
     for name in required:
         if name not in dataset:
             there = " ".join(str(name) for name in dataset.data_vars)
-            raise FormatError(dataset.attrs["source"], f"expected this column; there are: {there}", column=name)
+            raise FormatError(
+                dataset.attrs["source"], f"expected this column; there are: {there}", column=name
+            )
 
 
 def read(paths: Paths, *, required: Iterable[str] = ()) -> xr.Dataset:
@@ -208,7 +210,9 @@ class Writer:
             self._last = float("-inf")
         for name in dataset.data_vars:
             if name not in self._columns:
-                raise FormatError(self._path, "expected only columns that the first rows had", column=str(name))
+                raise FormatError(
+                    self._path, "expected only columns that the first rows had", column=str(name)
+                )
         time = dataset["time"].values
         increasing(self._path, time, after=self._last)
         if len(time):

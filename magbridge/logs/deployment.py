@@ -147,7 +147,9 @@ def join(parts: Sequence[xr.Dataset]) -> xr.Dataset:
     attrs = _join_attrs([part.attrs for part in parts])
     if len(starts) < len(time):
         attrs["duplicate_rows"] = attrs.get("duplicate_rows", 0) + len(time) - len(starts)
-    return xr.Dataset(variables, coords={"time": ("time", time[order][starts], parts[0]["time"].attrs)}, attrs=attrs)
+    return xr.Dataset(
+        variables, coords={"time": ("time", time[order][starts], parts[0]["time"].attrs)}, attrs=attrs
+    )
 
 
 def _first_known(values: Floats, starts: NDArray[np.intp]) -> Floats:

@@ -65,7 +65,9 @@ def _floats(path: Path, field: Any, array: Any) -> NDArray[np.float64]:
     if pa.types.is_timestamp(field.type):
         scale = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}[field.type.unit]
         array = array.cast(pa.int64())
-    elif not (pa.types.is_integer(field.type) or pa.types.is_floating(field.type) or pa.types.is_boolean(field.type)):
+    elif not (
+        pa.types.is_integer(field.type) or pa.types.is_floating(field.type) or pa.types.is_boolean(field.type)
+    ):
         raise FormatError(path, f"expected numbers, not {field.type}", column=field.name)
     values: NDArray[np.float64] = array.cast(pa.float64()).to_numpy(zero_copy_only=False)
     return values * scale
@@ -83,7 +85,9 @@ class FileWriter:
         columns = [dataset["time"], *(dataset[name] for name in dataset.data_vars)]
         if first:
             fields = [
-                pa.field(str(column.name), pa.float64(), metadata={k: str(v) for k, v in column.attrs.items()})
+                pa.field(
+                    str(column.name), pa.float64(), metadata={k: str(v) for k, v in column.attrs.items()}
+                )
                 for column in columns
             ]
             schema = pa.schema(fields, metadata={"magbridge": json.dumps(_plain(dataset.attrs))})

@@ -75,7 +75,9 @@ def dive(path: Path, file: Any) -> xr.Dataset:
     """
     for theirs in ("time", "eng_mag_x", "eng_mag_y", "eng_mag_z"):
         if theirs not in file.variables:
-            raise FormatError(path, "expected this variable, as of a Seaglider with a raw compass", column=theirs)
+            raise FormatError(
+                path, "expected this variable, as of a Seaglider with a raw compass", column=theirs
+            )
     time = _floats(file, "time")
     increasing(path, time)
     columns, units = {}, {}

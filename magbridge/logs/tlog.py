@@ -1,0 +1,215 @@
+"""The live log: everything read and sent, as a ``.tlog`` that any MAVLink tool reads.
+
+A record is an 8-byte big-endian stamp and a MAVLink frame. The stamp is the event's time in µs since 1970 UTC, a
+multiple of 4, plus the :class:`~magbridge.records.Channel` in its low two bits.
+
+The live thread only appends to a queue (about 0.3 µs); a thread of its own writes whole records. The first
+record after a pause is written at once, those that follow it in groups, every `WINDOW` s: after ``kill -9`` the
+file holds everything but the last group and reads to its end. A disk that stalls fills the queue, a disk that is
+full stops the log; either way records are dropped and counted, and the live thread never waits.
+"""
+
+from __future__ import annotations
+
+import os
+from collections import deque
+from datetime import UTC, datetime
+from pathlib import Path
+from struct import Struct
+from threading import Event, Thread
+from types import TracebackType
+from typing import Self
+
+from magbridge.errors import PortError
+
+__all__ = ["STAMP", "TlogWriter"]
+
+STAMP = Struct(">Q")
+WINDOW = 0.05
+"""s between two writes while records keep coming: a write for each would cost the live thread its processor."""
+QUEUE = 8_000_000
+"""bytes that wait for a stalled disk before records are dropped."""
+RETRY_US = 10_000_000
+"""µs of the events' time after which a log that failed is tried again, in a new file."""
+SYNC_US = 5_000_000
+"""µs of the events' time between two syncs: a power cut costs no more."""
+
+
+class TlogWriter:
+    """Writes records to ``UTC-start_index.tlog`` files in a directory.
+
+    Parameters
+    ----------
+    directory : path
+        Made if it is not there. Files already there are never touched.
+    max_size : float
+        MB after which a new file begins.
+    max_age : float
+        h of the events' time after which a new file begins.
+
+    Attributes
+    ----------
+    records : int
+        Written so far.
+    lost : int
+        Dropped so far, because the disk stalled or the log had failed.
+    failure : str
+        Why the log is stopped, in the words of the operating system; empty while it is well.
+
+    Raises
+    ------
+    PortError
+        The directory cannot be made.
+    """
+
+    def __init__(
+        self, directory: str | os.PathLike[str], *, max_size: float = 64.0, max_age: float = 24.0
+    ) -> None:
+        self._directory = Path(directory)
+        try:
+            self._directory.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise PortError(str(directory), error.strerror or str(error)) from error
+        self._max_size, self._max_age_us = round(max_size * 1e6), round(max_age * 3.6e9)
+        self.records, self.failure = 0, ""
+        # of the live thread
+        self._queue: deque[bytes] = deque()
+        self._put = self._refused = 0
+        self._idle, self._wake, self._closing = True, Event(), Event()
+        # of the writing thread
+        self._taken = self._dropped = 0
+        self._file = -1
+        self._size = self._index = 0
+        self._start_us = self._synced_us = self._failed_us = 0
+        self._thread = Thread(target=self._run, name="log writer", daemon=True)
+        self._thread.start()
+
+    @property
+    def lost(self) -> int:
+        """Records dropped so far."""
+        return self._refused + self._dropped
+
+    def write(self, time_us: int, channel: int, frame: bytes) -> None:
+        """Log one frame; returns at once and never raises.
+
+        Parameters
+        ----------
+        time_us : int
+            µs since 1970 UTC of the event, a multiple of 4.
+        channel : Channel
+            Whence the frame came.
+        frame : bytes
+            One whole MAVLink frame.
+        """
+        if self._put - self._taken > QUEUE:
+            self._refused += 1
+            return
+        record = STAMP.pack(time_us | channel) + frame
+        self._put += len(record)
+        self._queue.append(record)
+        if self._idle:
+            self._idle = False
+            self._wake.set()
+
+    def close(self, timeout: float = 5.0) -> None:
+        """Write what waits and end; give a stalled disk no more than `timeout` s."""
+        self._closing.set()
+        self._wake.set()
+        self._thread.join(timeout)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _run(self) -> None:
+        while True:
+            self._wake.wait()
+            self._wake.clear()
+            while self._queue:
+                self._drain()
+                self._closing.wait(WINDOW)
+            self._idle = True
+            if self._queue:  # came between the last look and the line above
+                self._wake.set()
+            elif self._closing.is_set():
+                break
+        self._end_file()
+
+    def _drain(self) -> None:
+        group: list[bytes] = []
+        size = 0
+        for record in [self._queue.popleft() for _ in range(len(self._queue))]:
+            self._taken += len(record)
+            time_us = STAMP.unpack_from(record)[0]
+            if self._file >= 0 and (
+                self._size + size + len(record) > self._max_size
+                or time_us - self._start_us > self._max_age_us
+            ):
+                self._put_down(group)
+                self._end_file()
+                group, size = [], 0
+            if self._file < 0 and not self._begin_file(time_us):
+                self._dropped += 1
+                continue
+            group.append(record)
+            size += len(record)
+        self._put_down(group)
+
+    def _begin_file(self, time_us: int) -> bool:
+        if self.failure and 0 <= time_us - self._failed_us < RETRY_US:
+            return False
+        begin = datetime.fromtimestamp(time_us // 1_000_000, UTC)
+        try:
+            while self._file < 0:
+                self._index += 1
+                name = f"{begin:%Y%m%dT%H%M%SZ}_{self._index:04d}.tlog"
+                try:
+                    self._file = os.open(self._directory / name, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644)
+                except FileExistsError:
+                    continue  # an earlier run whose clock began at the same second
+        except OSError as error:
+            self._fail(error, time_us)
+            return False
+        self._size, self._start_us, self._synced_us = 0, time_us, time_us
+        return True
+
+    def _put_down(self, group: list[bytes]) -> None:
+        """Write whole records; when that fails, leave none half-written."""
+        if not group:
+            return
+        data = memoryview(b"".join(group))
+        time_us = STAMP.unpack_from(group[-1])[0]
+        try:
+            while data:
+                data = data[os.write(self._file, data) :]
+            if not 0 <= time_us - self._synced_us < SYNC_US:
+                os.fdatasync(self._file)
+                self._synced_us = time_us
+        except OSError as error:
+            self._dropped += len(group)
+            self._fail(error, time_us)
+            return
+        self._size += sum(map(len, group))
+        self.records += len(group)
+        self.failure = ""
+
+    def _fail(self, error: OSError, time_us: int) -> None:
+        if self._file >= 0:
+            try:
+                os.ftruncate(self._file, self._size)
+            except OSError:
+                pass  # the reader skips a torn record
+        self._end_file()
+        self.failure, self._failed_us = error.strerror or str(error), time_us
+
+    def _end_file(self) -> None:
+        if self._file >= 0:
+            file, self._file = self._file, -1
+            try:
+                os.close(file)
+            except OSError as error:  # a network disk reports here what it could not write
+                self.failure = error.strerror or str(error)

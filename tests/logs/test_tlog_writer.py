@@ -1,0 +1,178 @@
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from magbridge.logs import tlog
+from magbridge.logs.tlog import STAMP, TlogWriter
+from magbridge.records import Channel
+
+T0 = 1_700_000_000_000_000  # µs, a multiple of 4
+FRAME = b"\xfd" + bytes(range(40))
+
+
+def records(path: Path, size: int = 8 + len(FRAME)) -> list[tuple[int, bytes]]:
+    data = path.read_bytes()
+    return [(STAMP.unpack_from(data, k)[0], data[k + 8 : k + size]) for k in range(0, len(data), size)]
+
+
+def test_records_carry_time_and_channel(tmp_path: Path) -> None:
+    with TlogWriter(tmp_path / "new" / "logs") as log:
+        for k, channel in enumerate(Channel):
+            log.write(T0 + 4 * k, channel, FRAME)
+    (path,) = (tmp_path / "new" / "logs").iterdir()
+    assert path.name == "20231114T221320Z_0001.tlog"
+    assert records(path) == [(T0 + 4 * k | channel, FRAME) for k, channel in enumerate(Channel)]
+    assert (log.records, log.lost, log.failure) == (4, 0, "")
+
+
+def test_first_record_after_a_pause_is_on_disk_at_once(tmp_path: Path) -> None:
+    with TlogWriter(tmp_path) as log:
+        for k in range(3):
+            log.write(T0 + 4 * k, 0, FRAME)
+            deadline = time.monotonic() + 5
+            while log.records <= k:
+                assert time.monotonic() < deadline
+                time.sleep(0.001)
+            time.sleep(2 * tlog.WINDOW)
+        (path,) = tmp_path.iterdir()
+        assert len(records(path)) == 3
+
+
+def test_new_file_by_size_and_by_age_loses_nothing(tmp_path: Path) -> None:
+    step = 4_000_000
+    with TlogWriter(tmp_path, max_size=1e-3, max_age=0.01) as log:  # 20 records, 36 s
+        for k in range(100):
+            log.write(T0 + step * k, 0, FRAME)
+    files = sorted(tmp_path.iterdir())
+    assert [record for path in files for record in records(path)] == [
+        (T0 + step * k, FRAME) for k in range(100)
+    ]
+    assert all(path.stat().st_size <= 1000 for path in files)
+    assert all(records(path)[-1][0] - records(path)[0][0] <= 36_000_000 for path in files)
+    assert len({path.name.rpartition("_")[2] for path in files}) == len(files)
+
+
+def test_files_of_an_earlier_run_are_left_alone(tmp_path: Path) -> None:
+    for text in (b"one", b"two"):
+        with TlogWriter(tmp_path) as log:
+            log.write(T0, 0, text)
+    assert [path.read_bytes()[8:] for path in sorted(tmp_path.iterdir())] == [b"one", b"two"]
+
+
+def test_directory_that_cannot_be_made_is_said(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OSError, match=r"file/logs: Not a directory"):
+        TlogWriter(tmp_path / "file" / "logs")
+
+
+def test_full_disk_stops_the_log_and_not_the_caller(tmp_path: Path) -> None:
+    """A file size limit is what a process can do to itself; the write fails half-way, as on a full disk."""
+    script = f"""
+import resource, signal, sys, time
+from magbridge.logs import tlog
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (1000, resource.RLIM_INFINITY))
+log = tlog.TlogWriter({str(tmp_path)!r})
+frame, k = bytes({FRAME!r}), 0
+def put(n, step):
+    global k
+    for _ in range(n):
+        log.write({T0} + step * k, 0, frame)
+        k += 1
+        time.sleep(0.0005)
+    time.sleep(0.2)
+put(100, 4)
+assert log.failure == 'File too large', log.failure
+full = log.records, log.lost
+assert sum(full) == 100 and 0 < full[0] <= 1000 // 49, full
+put(10, 4)
+assert log.records == full[0] and log.lost == full[1] + 10
+resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+put(10, 100_000)  # 11 s later, as the stamps tell
+assert log.failure == '', log.failure
+assert log.records == full[0] + 10, (log.records, full)
+log.close()
+print(full[0])
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    first, second = sorted(tmp_path.iterdir())
+    assert len(records(first)) == int(done.stdout)  # whole records only
+    assert len(records(second)) == 10
+
+
+def test_directory_that_vanishes_stops_the_log(tmp_path: Path) -> None:
+    directory = tmp_path / "logs"
+    with TlogWriter(directory) as log:
+        directory.rmdir()
+        log.write(T0, 0, FRAME)
+        log.close()
+    assert (log.records, log.lost, log.failure) == (0, 1, "No such file or directory")
+
+
+def test_stalled_disk_drops_and_counts_and_never_blocks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The file is a pipe that nobody empties: its writes block like those to a disk that hangs."""
+    inlet, outlet = os.pipe()
+    monkeypatch.setattr(tlog, "QUEUE", 100_000)
+    monkeypatch.setattr(os, "open", lambda *_: outlet)
+    log = TlogWriter(tmp_path)
+    log.write(T0, 0, FRAME)
+    time.sleep(0.1)
+    monkeypatch.undo()
+    monkeypatch.setattr(tlog, "QUEUE", 100_000)
+    slowest = 0.0
+    for k in range(20_000):
+        begin = time.perf_counter()
+        log.write(T0 + 4 * k, 0, FRAME)
+        slowest = max(slowest, time.perf_counter() - begin)
+        if k % 1000 == 0:
+            time.sleep(0.005)
+    assert log.lost > 10_000
+    assert slowest < 0.1
+    os.set_blocking(inlet, False)
+    while log._thread.is_alive():
+        log.close(timeout=0.01)
+        try:
+            os.read(inlet, 1 << 20)
+        except BlockingIOError:
+            pass
+    os.close(inlet)
+
+
+def test_kill_9_costs_no_more_than_the_last_group(tmp_path: Path) -> None:
+    script = f"""
+import sys, time
+from magbridge.logs.tlog import TlogWriter
+log = TlogWriter({str(tmp_path)!r})
+for k in range(100_000):
+    log.write({T0} + 4 * k, 0, bytes({FRAME!r}))
+    print(k, flush=True)
+    time.sleep(0.001)
+"""
+    child = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True)
+    assert child.stdout is not None
+    seen = [(int(child.stdout.readline()), time.monotonic()) for _ in range(400)]
+    killed = time.monotonic()
+    child.send_signal(signal.SIGKILL)
+    child.wait()
+    child.stdout.close()
+    (path,) = tmp_path.iterdir()
+    logged = records(path)
+    assert logged == [(T0 + 4 * k, FRAME) for k in range(len(logged))]
+    due = sum(when < killed - 0.5 for _, when in seen)  # 10 windows: a loaded machine is slow to wake
+    assert len(logged) >= max(due, 1)
+
+
+def test_live_import_is_light() -> None:
+    script = "import sys, magbridge.logs.tlog; print([m for m in ('xarray', 'scipy', 'pandas') if m in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
