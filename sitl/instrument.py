@@ -1,0 +1,167 @@
+"""The instrument chain of the paper's section 3: fluxgate, RC filter, one 24-bit converter for three channels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+from msgspec import Meta
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from magbridge.config import NotNegative, Positive, Table
+from sitl.signals import autoregressive, first_order, first_order_at
+
+__all__ = ["Instrument", "Samples"]
+
+Array = NDArray[np.float64]
+Vector = tuple[float, float, float]
+
+
+class Instrument(Table, frozen=True):
+    """``[instrument]``: a three-axis fluxgate and its digitiser.
+
+    Attributes
+    ----------
+    rate : float
+        Hz, triples a second.
+    scale, offset : tuple of 3 float
+        Gain of each axis, and nT.
+    orthogonality : tuple of 3 float
+        deg by which the angles xy, xz, yz differ from 90.
+    mounting : tuple of 3 float
+        deg roll, pitch, heading of the sensor in the body.
+    turn_on_sigma : float
+        nT an axis; the offset settles anew at every power-on.
+    power_on : tuple of float
+        s after the start at which the instrument is powered on again.
+    offset_per_degree, scale_per_degree : tuple of 3 float
+        nT/degC and 1/degC, about `reference_temperature`.
+    reference_temperature : float
+        degC at which offset and scale are as given.
+    start_temperature : float or None
+        degC of the fluxgate at the start; None has it settled in the water.
+    thermal_lag : float
+        s with which the fluxgate follows the water.
+    corner : float
+        Hz of the RC anti-alias filter; 0 leaves it out.
+    channel_delay : tuple of 3 float
+        s after the triple's time at which the converter reaches each channel.
+    bits, full_scale : int, float
+        Converter: bits, and nT either side of zero.
+    noise_sigma, noise_memory : float
+        nT of a channel's noise, and samples over which its correlation falls by e (0: white).
+    """
+
+    rate: Positive = 0.25
+    scale: Vector = (1.0, 1.0, 1.0)
+    offset: Vector = (0.0, 0.0, 0.0)
+    orthogonality: Vector = (0.0, 0.0, 0.0)
+    mounting: Vector = (0.0, 0.0, 0.0)
+    turn_on_sigma: NotNegative = 0.0
+    power_on: tuple[float, ...] = ()
+    offset_per_degree: Vector = (0.0, 0.0, 0.0)
+    scale_per_degree: Vector = (0.0, 0.0, 0.0)
+    reference_temperature: float = 2.0
+    start_temperature: float | None = None
+    thermal_lag: NotNegative = 3600.0
+    corner: NotNegative = 0.33
+    channel_delay: Vector = (0.0, 0.0, 0.0)
+    bits: Annotated[int, Meta(ge=2, le=32)] = 24
+    full_scale: Positive = 100_000.0
+    noise_sigma: NotNegative = 1.0
+    noise_memory: NotNegative = 0.0
+
+    def matrix(self) -> Array:
+        """Return the matrix (3, 3) that takes the field in body axes to the three channels, noise and offset aside.
+
+        Rows are the sensing axes in sensor axes: x is the reference, y lies in the x-y plane. The rotation from
+        body to sensor follows the 3-2-1 order.
+        """
+        xy, xz, yz = np.radians(self.orthogonality)
+        axes = np.array(
+            [
+                [1.0, 0.0, 0.0],
+                [np.sin(xy), np.cos(xy), 0.0],
+                [np.sin(xz), np.sin(yz), np.sqrt(1 - np.sin(xz) ** 2 - np.sin(yz) ** 2)],
+            ]
+        )
+        return np.asarray(np.diag(self.scale) @ axes @ rotation(*self.mounting).as_matrix().T)
+
+    def measure(
+        self, field: Array, water: Array, step: float, when: Array, rng: np.random.Generator
+    ) -> Samples:
+        """Measure a field given on a uniform grid.
+
+        Parameters
+        ----------
+        field : array (n, 3)
+            nT at the sensor, body axes.
+        water : array (n,)
+            degC around the instrument.
+        step : float
+            s between the grid's points.
+        when : array (m,)
+            s after the first point at which triples are taken; inside the grid, channel delays included.
+        """
+        temperature = first_order(water, step, self.thermal_lag, self.start_temperature)
+        warm = (temperature - self.reference_temperature)[:, None]
+        cycle = np.searchsorted(np.asarray(self.power_on), step * np.arange(len(field)), side="right")
+        turn_on = rng.normal(0, self.turn_on_sigma, (len(self.power_on) + 1, 3))
+        analogue = field @ self.matrix().T
+        analogue *= 1 + warm * np.asarray(self.scale_per_degree)
+        analogue += np.asarray(self.offset) + warm * np.asarray(self.offset_per_degree) + turn_on[cycle]
+
+        time_constant = 1 / (2 * np.pi * self.corner) if self.corner else 0.0
+        filtered = first_order(analogue, step, time_constant)
+        channels = autoregressive(rng, (len(when), 3), self.noise_sigma, self.noise_memory)
+        for axis, delay in enumerate(self.channel_delay):
+            channels[:, axis] += first_order_at(
+                analogue[:, axis], filtered[:, axis], step, time_constant, when + delay
+            )
+        grid = step * np.arange(len(field))
+        return Samples(
+            channels=self.digitise(channels),
+            times=when[:, None] + np.asarray(self.channel_delay),
+            temperature=np.interp(when, grid, temperature),
+            power_cycle=np.searchsorted(np.asarray(self.power_on), when, side="right").astype(np.float64),
+        )
+
+    def digitise(self, field: Array) -> Array:
+        """Return `field` (nT) as the converter gives it: rounded to its step, clipped at its ends."""
+        half = 2 ** (self.bits - 1)
+        step = self.full_scale / half
+        return np.asarray(np.clip(np.rint(field / step), -half, half - 1) * step)
+
+
+@dataclass(frozen=True)
+class Samples:
+    """What an :class:`Instrument` gave.
+
+    Attributes
+    ----------
+    channels : array (m, 3)
+        nT.
+    times : array (m, 3)
+        s after the grid's first point, when each channel was sampled.
+    temperature : array (m,)
+        degC at the fluxgate.
+    power_cycle : array (m,)
+        How often it was powered on again.
+    """
+
+    channels: Array
+    times: Array
+    temperature: Array
+    power_cycle: Array
+
+
+def rotation(roll: float | Array, pitch: float | Array, heading: float | Array) -> Rotation:
+    """Return the rotations that take body vectors to the world's axes, angles in deg, order 3-2-1.
+
+    ``rotation(...).apply(field_ned, inverse=True)`` is the field in body axes.
+    """
+    return Rotation.from_euler(
+        "ZYX", np.stack(np.broadcast_arrays(heading, pitch, roll), axis=-1), degrees=True
+    )

@@ -1,0 +1,114 @@
+"""The forward model driven by a real log: its attitude, position and masses, our world, vehicle and instrument."""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from magbridge.errors import FormatError
+from magbridge.field.igrf import igrf
+from sitl.scenario import Scenario
+from sitl.trajectory import Track
+from sitl.twin import FINE_STEP, Twin
+
+__all__ = ["simulate_like"]
+
+Array = NDArray[np.float64]
+
+POINTS = 8
+"""Points of the simulation between two rows of a slow log."""
+
+
+def simulate_like(log: xr.Dataset, scenario: Scenario, seed: int = 0) -> xr.Dataset:
+    """Simulate what the scenario's vehicle and instrument would have measured in a logged deployment.
+
+    Parameters
+    ----------
+    log : Dataset (time)
+        A deployment with attitude, position, depth and the position of every moving mass of the scenario. A
+        lacking value is interpolated in time; before the first and after the last one it is held.
+    scenario : Scenario
+        Its mission, place and start are not used.
+    seed : int
+
+    Returns
+    -------
+    Dataset (time)
+        The log's rows and columns, with ``mag_*``, ``sensor_temperature``, ``power_cycle``, ``truth_*`` and, as
+        the scenario asks, ``reference_field`` simulated. The log's own attitude and position are the truth.
+
+    Raises
+    ------
+    FormatError
+        The log lacks a column that the forward model needs, or one holds nothing.
+    """
+    track, when = read_track(log, scenario)
+    place = msgspec.structs.replace(
+        scenario.world,
+        latitude=float(np.median(track.latitude)),
+        longitude=float(np.median(track.longitude)),
+    )
+    start = msgspec.convert(track.start, type(scenario.start), strict=False)
+    twin = Twin.draw(msgspec.structs.replace(scenario, world=place, start=start), seed)
+    measured = twin.measure(track, when)
+    replaced = [name for name in log.data_vars if str(name).startswith(("mag_", "reference_field"))]
+    own = [
+        name
+        for name in measured.data_vars
+        if str(name).startswith(("mag_", "truth_", "reference_field", "sensor_temp", "power_cycle"))
+    ]
+    out = log.drop_vars(replaced).assign(
+        {name: ("time", measured[name].data, measured[name].attrs) for name in own}
+    )
+    out.attrs["source"] = f"simulated: {scenario.name}, driven by {log.attrs.get('source', 'a log')}"
+    return out
+
+
+def read_track(log: xr.Dataset, scenario: Scenario) -> tuple[Track, Array]:
+    """Return a log's track on a uniform grid, and the log's times in s after its start."""
+    time = log["time"].to_numpy().astype(np.float64)
+    if len(time) < 2:
+        raise FormatError(_source(log), "at least two rows")
+    when = time - time[0]
+    step = max(FINE_STEP, float(np.median(np.diff(when))) / POINTS)
+    last = when[-1] + max(scenario.instrument.channel_delay)
+    grid = np.arange(0.0, last + 2 * step, step)
+
+    def column(name: str) -> Array:
+        if name not in log:
+            raise FormatError(
+                _source(log), f"the forward model needs it; there are {', '.join(map(str, log))}", column=name
+            )
+        value = log[name].to_numpy().astype(np.float64)
+        known = np.isfinite(value)
+        if not known.any():
+            raise FormatError(_source(log), "a value in at least one row", column=name)
+        if name in ("heading", "longitude"):
+            value[known] = np.unwrap(value[known], period=360)
+        return np.interp(grid, when[known], value[known])
+
+    latitude, longitude, depth = column("latitude"), column("longitude"), column("depth")
+    heading = column("heading")
+    if log.attrs.get("heading_reference") == "magnetic":
+        field = igrf((longitude + 180) % 360 - 180, latitude, depth, time[0] + grid)
+        heading = heading + np.degrees(np.arctan2(field[:, 1], field[:, 0]))
+    masses = scenario.vehicle.mass if scenario.vehicle else scenario.masses
+    track = Track(
+        start=float(time[0]),
+        step=step,
+        latitude=latitude,
+        longitude=(longitude + 180) % 360 - 180,
+        depth=depth,
+        roll=column("roll"),
+        pitch=column("pitch"),
+        heading=heading,
+        parameters={name: column(name) for name in masses},
+        water=column("water_temperature") if "water_temperature" in log else None,
+    )
+    return track, when
+
+
+def _source(log: xr.Dataset) -> str:
+    return str(log.attrs.get("source", "the log"))

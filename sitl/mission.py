@@ -1,0 +1,156 @@
+"""What a deployment consists of: calibration spirals, a criss-cross survey, or a planner's list of legs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Literal
+
+import numpy as np
+from msgspec import Meta
+
+from magbridge.config import NotNegative, Positive, Table
+from sitl.trajectory import Leg, Limit
+
+__all__ = ["TABLE_1", "CrissCross", "Legs", "Part", "Spirals"]
+
+TABLE_1: tuple[tuple[int, float, float, float], ...] = (
+    (1, -14.0, 0.272, 0.226),
+    (2, 14.0, -0.181, -0.139),
+    (3, -18.0, 0.380, 0.274),
+    (4, 18.0, -0.234, -0.191),
+    (5, -22.0, 0.428, 0.375),
+    (6, 22.0, -0.289, -0.246),
+    (7, -26.0, 0.491, 0.400),
+    (8, 26.0, -0.344, -0.300),
+    (9, -30.0, 0.527, 0.472),
+    (10, 30.0, -0.401, -0.348),
+)
+"""The paper's Table 1: run, pitch (deg), battery position (in) in trial 1 and in trial 2.
+
+The ballast stands at -200 cm³ in a dive and at 200 cm³ in a climb.
+"""
+
+
+class Spirals(Table, frozen=True, tag_field="kind", tag="spirals"):
+    """The calibration runs of Table 1: ten spirals, clockwise, each with battery and ballast at rest.
+
+    Attributes
+    ----------
+    trial : int
+        1 or 2, which of the table's two columns.
+    duration : float
+        s of one descent or ascent; the paper's pair took about 30 minutes.
+    turns : float
+        Full turns in a descent or ascent.
+    roll : tuple of 2 float
+        deg, mean and spread of the bank.
+    segment : str
+    """
+
+    trial: Literal[1, 2] = 1
+    duration: Positive = 900.0
+    turns: float = 4.0
+    roll: tuple[float, NotNegative] = (6.0, 0.7)
+    segment: str = "calibration"
+
+    def legs(self, rng: np.random.Generator, limits: Mapping[str, Limit]) -> list[Leg]:
+        """Return the ten legs; masses that the table does not know are drawn anew for each."""
+        return [
+            Leg(
+                duration=self.duration,
+                pitch=pitch,
+                roll=float(rng.normal(*self.roll)),
+                turn=360 * self.turns / self.duration,
+                parameters=others(rng, limits)
+                | {"battpos": battery[self.trial - 1], "ballast": float(np.copysign(200, pitch))},
+                segment=self.segment,
+            )
+            for _, pitch, *battery in TABLE_1
+        ]
+
+
+class CrissCross(Table, frozen=True, tag_field="kind", tag="criss_cross"):
+    """The survey: straight dives and climbs, zigzagging out along an axis and back again.
+
+    Attributes
+    ----------
+    hours : float
+        Its length.
+    pitch, roll : tuple of 2 float
+        deg, mean and spread from leg to leg; the pitch changes sign between dives and climbs.
+    axis, zigzag : float
+        deg, the way out, and how far legs run to either side of it.
+    yos_per_leg : int
+        Dives and climbs between two changes of heading.
+    duration : float
+        s of one descent or ascent.
+    battery_spread : float
+        in, of the battery about where Table 1 has it at this pitch.
+    segment : str
+    """
+
+    hours: Positive = 6.0
+    pitch: tuple[float, NotNegative] = (26.0, 1.0)
+    roll: tuple[float, NotNegative] = (0.0, 2.0)
+    axis: float = 150.0
+    zigzag: float = 45.0
+    yos_per_leg: Annotated[int, Meta(ge=1)] = 3
+    duration: Positive = 900.0
+    battery_spread: NotNegative = 0.02
+    segment: str = "survey"
+
+    def legs(self, rng: np.random.Generator, limits: Mapping[str, Limit]) -> list[Leg]:
+        """Return dives and climbs in turn, as many as fit the hours."""
+        count = 2 * max(1, round(self.hours * 1800 / self.duration))
+        made = []
+        for k in range(count):
+            yo = k // 2
+            back = 180.0 if 2 * yo >= count // 2 else 0.0
+            side = 1.0 if (yo // self.yos_per_leg) % 2 else -1.0
+            pitch = float(np.copysign(rng.normal(*self.pitch), k % 2 - 0.5))
+            low, high = limits["battpos"].low, limits["battpos"].high
+            battery = _battery(pitch) + rng.normal(0, self.battery_spread)
+            made.append(
+                Leg(
+                    duration=self.duration,
+                    pitch=pitch,
+                    roll=float(rng.normal(*self.roll)),
+                    heading=(self.axis + back + side * self.zigzag) % 360,
+                    parameters=others(rng, limits)
+                    | {
+                        "battpos": float(np.clip(battery, low, high)),
+                        "ballast": float(np.copysign(200, pitch)),
+                    },
+                    segment=self.segment,
+                )
+            )
+        return made
+
+
+class Legs(Table, frozen=True, tag_field="kind", tag="legs"):
+    """Legs as they are listed: what a planner asked for."""
+
+    runs: tuple[Leg, ...]
+
+    def legs(self, rng: np.random.Generator, limits: Mapping[str, Limit]) -> list[Leg]:  # noqa: ARG002  the others draw
+        """Return the list."""
+        return [*self.runs]
+
+
+Part = Spirals | CrissCross | Legs
+
+
+def others(rng: np.random.Generator, limits: Mapping[str, Limit]) -> dict[str, float]:
+    """Draw a place for every mass that Table 1 does not know, in the inner nine tenths of its way."""
+    return {
+        name: float(rng.uniform(0.95 * limit.low + 0.05 * limit.high, 0.05 * limit.low + 0.95 * limit.high))
+        for name, limit in limits.items()
+        if name not in ("battpos", "ballast")
+    }
+
+
+def _battery(pitch: float) -> float:
+    """Return where the battery stands at `pitch`: both trials' mean, linear between the table's pitches."""
+    rows = sorted((p, (a + b) / 2) for _, p, a, b in TABLE_1)
+    pitches, places = zip(*rows, strict=True)
+    return float(np.interp(pitch, pitches, places))

@@ -1,0 +1,125 @@
+"""A scenario: one TOML file that says what the world, the vehicle, the instrument and the mission are."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import msgspec
+from msgspec import Meta
+
+from magbridge.config import NotNegative, Table, convert, load_toml
+from magbridge.errors import ConfigError
+from sitl.instrument import Instrument
+from sitl.mission import Part
+from sitl.platform import MOUNTINGS, Mass, Vehicle
+from sitl.trajectory import LIMITS, Limit, Motion
+from sitl.world import Geology, Water
+
+__all__ = ["SCENARIOS", "Place", "Scenario", "Telemetry", "load"]
+
+SCENARIOS = Path(__file__).parent / "scenarios"
+"""The scenarios that come with the package."""
+
+
+class Place(Table, frozen=True):
+    """``[world]``: where, with the rock and the water.
+
+    A scenario that is driven by a log takes the place from the log.
+    """
+
+    latitude: Annotated[float, Meta(ge=-90, le=90)] = 0.0
+    longitude: Annotated[float, Meta(ge=-180, le=360)] = 0.0
+    geology: Geology = Geology(sources=0)
+    water: Water = Water()
+
+
+class Telemetry(Table, frozen=True):
+    """``[telemetry]``: how well the vehicle knows itself.
+
+    Attributes
+    ----------
+    roll_pitch_sigma, heading_sigma : float
+        deg, white.
+    drift : float
+        m/s an axis, standard deviation of a steady current that the logged position lacks.
+    reference : str
+        What ``reference_field`` holds: ``none`` leaves it out, ``true`` is the true total field, ``map`` is the
+        IGRF with the anomaly of the map that an aeromagnetic survey would have made.
+    map_altitude : float
+        m of that survey.
+    """
+
+    roll_pitch_sigma: NotNegative = 0.1
+    heading_sigma: NotNegative = 1.0
+    drift: NotNegative = 0.0
+    reference: Literal["none", "true", "map"] = "none"
+    map_altitude: NotNegative = 90.0
+
+
+class Scenario(Table, frozen=True):
+    """A whole scenario file.
+
+    Attributes
+    ----------
+    name : str
+    start : datetime
+        With its offset from UTC (TOML: ``2013-12-11T12:00:00Z``).
+    masses : tuple of str
+        Kinds of moving mass (keys of :data:`sitl.platform.MOUNTINGS`) of a vehicle that is drawn from the seed.
+    vehicle : Vehicle or None
+        A vehicle whose magnetism is given; nothing is drawn then.
+    limits : dict of Limit
+        The vehicle's limits where they differ from those of its kind of mass.
+    world, motion, instrument, telemetry
+        The tables of these names.
+    mission : tuple
+        Spirals, surveys and legs, one after the other; empty where a log is to drive the scenario.
+    """
+
+    name: str
+    start: Annotated[datetime, Meta(tz=True)] = datetime(2013, 12, 11, 12, tzinfo=UTC)
+    masses: tuple[str, ...] = ("battpos", "ballast")
+    vehicle: Vehicle | None = None
+    limits: dict[str, Limit] = msgspec.field(default_factory=dict)
+    world: Place = Place()
+    motion: Motion = Motion()
+    instrument: Instrument = Instrument()
+    telemetry: Telemetry = Telemetry()
+    mission: tuple[Part, ...] = ()
+
+    @property
+    def all_limits(self) -> dict[str, Limit]:
+        """Limits of every mass the vehicle has, battery and ballast always among them."""
+        names = dict.fromkeys(("battpos", "ballast", *self.masses))
+        return {name: LIMITS[name] for name in names} | self.limits
+
+
+def load(path: str | Path) -> Scenario:
+    """Read and check a scenario file; a bare name is one that comes with the package.
+
+    Raises
+    ------
+    ConfigError
+        The file is missing or not TOML, a key is unknown or missing, or a value cannot be meant.
+    """
+    path = Path(path)
+    if path.suffix == "":
+        path = SCENARIOS / f"{path.name}.toml"
+    table = load_toml(path)
+    # msgspec does not name the key of a dict, so each entry is checked under its own name first
+    vehicle = table.get("vehicle")
+    _check_entries(vehicle if isinstance(vehicle, dict) else {}, "mass", Mass, path, "vehicle.")
+    _check_entries(table, "limits", Limit, path)
+    scenario = convert(table, Scenario, path)
+    for name in scenario.masses:
+        if name not in MOUNTINGS:
+            raise ConfigError(path, "masses", f"{name!r} is not one of {', '.join(MOUNTINGS)}")
+    return scenario
+
+
+def _check_entries(table: dict[str, Any], key: str, kind: type, path: Path, prefix: str = "") -> None:
+    entries = table.get(key)
+    for name, value in entries.items() if isinstance(entries, dict) else ():
+        convert(value, kind, path, f"{prefix}{key}.{name}.")

@@ -1,0 +1,90 @@
+"""Discretisations that are causal and exact: a first-order lag, and noise with a memory."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import lfilter
+
+__all__ = ["autoregressive", "first_order", "first_order_at"]
+
+Array = NDArray[np.float64]
+
+
+def first_order(u: Array, step: float, time_constant: float, start: Array | float | None = None) -> Array:
+    r"""Return the output of a first-order lag on a uniform grid.
+
+    Parameters
+    ----------
+    u : array (n,) or (n, k)
+        Input on a uniform grid; linear between the points.
+    step, time_constant : float
+        s. A time constant of 0 passes the input through.
+    start : array (k,) or float, optional
+        Output at the first point; without it the lag has settled at ``u[0]``.
+
+    Returns
+    -------
+    array, shape of `u`
+
+    Notes
+    -----
+    :math:`\tau \dot y = u - y` with u linear over a step h has the exact solution
+
+    .. math:: y_{k+1} = a y_k + (\rho - a) u_k + (1 - \rho) u_{k+1},
+              \quad a = e^{-h/\tau}, \quad \rho = (1 - a) \tau / h
+
+    (first-order hold: Franklin, Powell & Workman, *Digital Control of Dynamic Systems*, sec. 6.3).
+    """
+    if time_constant == 0:
+        return u.copy()
+    a = np.exp(-step / time_constant)
+    rho = -np.expm1(-step / time_constant) * time_constant / step
+    first = u[0] if start is None else np.broadcast_to(start, u[0].shape)
+    # direct form II transposed: y_0 = b_0 u_0 + z must give `first`
+    state = (first - (1 - rho) * u[0])[None]
+    y, _ = lfilter([1 - rho, rho - a], [1.0, -a], u, axis=0, zi=state)
+    return np.asarray(y, dtype=np.float64)
+
+
+def first_order_at(u: Array, y: Array, step: float, time_constant: float, when: Array) -> Array:
+    r"""Return a first-order lag's output between the points of its grid.
+
+    Parameters
+    ----------
+    u, y : array (n,)
+        Input, and output of :func:`first_order`, on the grid.
+    step, time_constant : float
+        s.
+    when : array (m,)
+        s after the first point; inside the grid.
+
+    Returns
+    -------
+    array (m,)
+
+    Notes
+    -----
+    Within a step, :math:`y(s) = a y_k + (1 - a)(u_k - c \tau) + c s` with :math:`a = e^{-s/\tau}` and c the
+    slope of u.
+    """
+    k = np.clip(np.floor(when / step).astype(np.intp), 0, len(u) - 2)
+    s = when - k * step
+    slope = (u[k + 1] - u[k]) / step
+    if time_constant == 0:
+        return np.asarray(u[k] + slope * s)
+    a = np.exp(-s / time_constant)
+    return np.asarray(a * y[k] + (1 - a) * (u[k] - slope * time_constant) + slope * s)
+
+
+def autoregressive(rng: np.random.Generator, shape: tuple[int, ...], sigma: float, memory: float) -> Array:
+    """Return stationary noise whose correlation falls by e every `memory` points of the first axis.
+
+    `sigma` is the standard deviation of the noise itself, not of its innovations; a memory of 0 is white noise.
+    """
+    white = rng.normal(0.0, sigma, shape)
+    if memory == 0:
+        return white
+    phi = np.exp(-1.0 / memory)
+    white[1:] *= np.sqrt(1 - phi**2)
+    return np.asarray(lfilter([1.0], [1.0, -phi], white, axis=0), dtype=np.float64)

@@ -1,0 +1,263 @@
+"""How the vehicle flies: legs of constant commands, flown with a real vehicle's sloth and wander."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated
+
+import msgspec
+import numpy as np
+from msgspec import Meta
+from numpy.typing import NDArray
+
+from magbridge.config import NotNegative, Positive, Table
+from magbridge.errors import OutOfRange
+from sitl.platform import MOUNTINGS
+from sitl.signals import autoregressive, first_order
+from sitl.world import from_local
+
+__all__ = ["Leg", "Limit", "Motion", "Track", "fly"]
+
+Array = NDArray[np.float64]
+
+
+class Limit(Table, frozen=True):
+    """``[limits.NAME]``: what the vehicle allows a moving mass: its ends (units) and speed (units/s)."""
+
+    low: float
+    high: float
+    rate: Positive
+    unit: str = ""
+
+
+LIMITS = {name: Limit(low=m.low, high=m.high, rate=m.rate, unit=m.unit) for name, m in MOUNTINGS.items()}
+
+
+class Leg(Table, frozen=True):
+    """One descent, ascent or level stretch with every commanded value held.
+
+    Attributes
+    ----------
+    duration : float
+        s.
+    pitch, roll : float
+        deg.
+    turn : float
+        deg/s, clockwise seen from above.
+    heading : float or None
+        deg at its start; None goes on from where the last leg ended.
+    parameters : dict of float
+        Positions of the moving masses; one that is not named stays where it is.
+    segment : str
+        Consecutive legs of one name are one segment of the deployment.
+    """
+
+    duration: Positive
+    pitch: Annotated[float, Meta(ge=-80, le=80)]
+    roll: Annotated[float, Meta(ge=-80, le=80)] = 0.0
+    turn: float = 0.0
+    heading: float | None = None
+    parameters: dict[str, float] = msgspec.field(default_factory=dict)
+    segment: str = "mission"
+
+
+class Motion(Table, frozen=True):
+    """``[motion]``: how the vehicle answers its commands.
+
+    Attributes
+    ----------
+    speed : float
+        m/s through the water.
+    angle_of_attack : float
+        deg by which the path is steeper than the pitch.
+    settle : float
+        s of the first-order approach to a commanded attitude.
+    wander : tuple of 3 float
+        deg, standard deviation of roll, pitch and heading about the command.
+    wander_memory : float
+        s over which the wander's correlation falls.
+    current : tuple of 2 float
+        m/s north, east of the water.
+    max_depth : float
+        m.
+    """
+
+    speed: Positive = 0.35
+    angle_of_attack: float = 3.0
+    settle: NotNegative = 15.0
+    wander: tuple[float, float, float] = (0.5, 0.4, 1.0)
+    wander_memory: Positive = 60.0
+    current: tuple[float, float] = (0.0, 0.0)
+    max_depth: Positive = 200.0
+
+
+STEADY = Motion()
+"""A small glider's way of answering."""
+
+
+@dataclass(frozen=True)
+class Track:
+    """What the vehicle really did, on a uniform grid.
+
+    Attributes
+    ----------
+    start, step : float
+        s since 1970, and s between points.
+    latitude, longitude, depth : array (n,)
+        deg, deg, m.
+    roll, pitch, heading : array (n,)
+        deg; the heading runs on past 360 (so that it can be interpolated).
+    parameters : dict of array (n,)
+        Positions of the moving masses.
+    segments : tuple of (name, first, last)
+        s after the start.
+    water : array (n,) or None
+        degC around the vehicle, where it was measured.
+    """
+
+    start: float
+    step: float
+    latitude: Array
+    longitude: Array
+    depth: Array
+    roll: Array
+    pitch: Array
+    heading: Array
+    parameters: dict[str, Array]
+    segments: tuple[tuple[str, float, float], ...] = ()
+    water: Array | None = None
+
+    @property
+    def elapsed(self) -> Array:
+        """Time since the start, s, (n,)."""
+        return np.asarray(self.step * np.arange(len(self.depth)))
+
+    def at(self, when: Array) -> dict[str, Array]:
+        """Return every quantity by name at `when` (s after the start), linear between the points."""
+        names = ("latitude", "longitude", "depth", "roll", "pitch", "heading")
+        columns = {name: getattr(self, name) for name in names} | self.parameters
+        elapsed = self.elapsed
+        return {name: np.interp(when, elapsed, column) for name, column in columns.items()}
+
+
+def fly(
+    legs: Sequence[Leg],
+    start: tuple[float, float, float],
+    step: float,
+    rng: np.random.Generator,
+    motion: Motion = STEADY,
+    limits: Mapping[str, Limit] = LIMITS,
+) -> Track:
+    """Fly `legs` one after the other.
+
+    Parameters
+    ----------
+    legs : sequence of Leg
+    start : tuple of 3 float
+        s since 1970, latitude and longitude in deg.
+    step : float
+        s between the points of the track.
+    rng : Generator
+        Of the wander.
+    motion : Motion
+    limits : mapping of Limit
+        For every moving mass; also where a mass that no leg has yet moved stands (mid-range).
+
+    Raises
+    ------
+    OutOfRange
+        A leg wants a mass beyond the vehicle's limits, or one that has none.
+    """
+    ends = np.cumsum([leg.duration for leg in legs])
+    t = np.arange(0.0, ends[-1], step)
+    leg_of = np.searchsorted(ends, t, side="right")
+    memory = motion.wander_memory / step
+    # a body of some inertia: wander without jitter, its standard deviation kept
+    wander = first_order(autoregressive(rng, (len(t), 3), 1.0, memory), step, motion.wander_memory / 3)
+    wander *= np.sqrt(4 / 3) * np.asarray(motion.wander)
+
+    def settled(command: Array) -> Array:
+        return first_order(command, step, motion.settle)
+
+    roll = settled(np.array([leg.roll for leg in legs])[leg_of]) + wander[:, 0]
+    pitch = settled(np.array([leg.pitch for leg in legs])[leg_of]) + wander[:, 1]
+    heading = settled(_headings(legs, ends, t, leg_of)) + wander[:, 2]
+
+    path = np.radians(pitch + motion.angle_of_attack * np.tanh(pitch / 5))
+    sink = np.cumsum(-motion.speed * np.sin(path)) * step
+    depth = np.minimum(
+        sink - np.minimum(np.minimum.accumulate(sink), 0.0), motion.max_depth
+    )  # floats at the surface
+    ahead = motion.speed * np.cos(path)
+    north = np.cumsum(ahead * np.cos(np.radians(heading)) + motion.current[0]) * step
+    east = np.cumsum(ahead * np.sin(np.radians(heading)) + motion.current[1]) * step
+    latitude, longitude = from_local(north, east, start[1:])
+    names = dict.fromkeys(name for leg in legs for name in leg.parameters)
+    return Track(
+        start=start[0],
+        step=step,
+        latitude=latitude,
+        longitude=longitude,
+        depth=depth,
+        roll=roll,
+        pitch=pitch,
+        heading=heading,
+        parameters={name: _mass_motion(name, legs, ends, t, leg_of, limits) for name in names},
+        segments=_segments(legs, ends),
+    )
+
+
+def _headings(legs: Sequence[Leg], ends: Array, t: Array, leg_of: NDArray[np.intp]) -> Array:
+    """Return the commanded heading, unwrapped: each leg turns the shorter way to its own start."""
+    first, last = [], legs[0].heading or 0.0
+    for leg in legs:
+        start = last if leg.heading is None else last + (leg.heading - last + 180) % 360 - 180
+        first.append(start)
+        last = start + leg.turn * leg.duration
+    begins = ends - [leg.duration for leg in legs]
+    turn = np.array([leg.turn for leg in legs])
+    return np.asarray(np.array(first)[leg_of] + turn[leg_of] * (t - begins[leg_of]))
+
+
+def _mass_motion(
+    name: str,
+    legs: Sequence[Leg],
+    ends: Array,
+    t: Array,
+    leg_of: NDArray[np.intp],
+    limits: Mapping[str, Limit],
+) -> Array:
+    """Return a mass's position (n,): at each leg's start it sets out for its target, as fast as it can."""
+    if name not in limits:
+        raise OutOfRange("moving mass", name, f"the vehicle has {', '.join(limits)}")
+    limit = limits[name]
+    wanted = [leg.parameters[name] for leg in legs if name in leg.parameters]
+    for value in wanted:
+        if not limit.low <= value <= limit.high:
+            raise OutOfRange(
+                name, value, f"the vehicle allows {limit.low:g} to {limit.high:g} {limit.unit}".rstrip()
+            )
+    position = wanted[0]
+    begin: list[float] = []
+    origin: list[float] = []
+    target: list[float] = []
+    for leg, end in zip(legs, ends, strict=True):
+        begin.append(end - leg.duration)
+        origin.append(position)
+        target.append(leg.parameters.get(name, position))
+        reach = limit.rate * leg.duration
+        position += min(max(target[-1] - position, -reach), reach)
+    way = np.array(target) - np.array(origin)
+    gone = limit.rate * (t - np.array(begin)[leg_of])
+    return np.asarray(np.array(origin)[leg_of] + np.clip(way[leg_of], -gone, gone))
+
+
+def _segments(legs: Sequence[Leg], ends: Array) -> tuple[tuple[str, float, float], ...]:
+    segments: list[tuple[str, float, float]] = []
+    for leg, end in zip(legs, ends, strict=True):
+        if segments and segments[-1][0] == leg.segment:
+            segments[-1] = (leg.segment, segments[-1][1], float(end))
+        else:
+            segments.append((leg.segment, float(end - leg.duration), float(end)))
+    return tuple(segments)

@@ -1,0 +1,237 @@
+"""The forward model: a scenario and a seed make a deployment.
+
+>>> from sitl import load, simulate
+>>> deployment = simulate(load("demo"), seed=1)
+>>> sorted(deployment.sizes)
+['time']
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+from scipy.interpolate import RegularGridInterpolator
+
+from magbridge.errors import WrongUse
+from magbridge.field.igrf import igrf
+from sitl.instrument import rotation
+from sitl.platform import MOUNTINGS, Vehicle, draw_vehicle
+from sitl.scenario import Scenario
+from sitl.trajectory import Track, fly
+from sitl.world import World, from_local, to_local
+
+__all__ = ["Twin", "segments", "simulate"]
+
+Array = NDArray[np.float64]
+
+FINE_STEP = 0.5
+"""s between the simulation's points: a spiral's arc departs from its chords by 0.1 nT."""
+FIELD_STEP = 4.0
+"""s between evaluations of the Earth's field, which varies by less than 0.01 nT about a line meanwhile."""
+
+COLUMNS = {
+    "mag_x": ("nT", "raw magnetometer channel, forward"),
+    "mag_y": ("nT", "raw magnetometer channel, starboard"),
+    "mag_z": ("nT", "raw magnetometer channel, down"),
+    "mag_time_x": ("s", "time of the forward channel's sample"),
+    "mag_time_y": ("s", "time of the starboard channel's sample"),
+    "mag_time_z": ("s", "time of the downward channel's sample"),
+    "sensor_temperature": ("degC", "temperature at the fluxgate"),
+    "power_cycle": ("1", "times the instrument was powered on again"),
+    "roll": ("deg", "roll, starboard down"),
+    "pitch": ("deg", "pitch, nose up"),
+    "heading": ("deg", "heading, true"),
+    "latitude": ("deg", "latitude as the vehicle knows it"),
+    "longitude": ("deg", "longitude as the vehicle knows it"),
+    "depth": ("m", "depth"),
+    "reference_field": ("nT", "total field to calibrate against"),
+    "truth_total_field": ("nT", "true total field"),
+    "truth_field_x": ("nT", "true field, body forward"),
+    "truth_field_y": ("nT", "true field, body starboard"),
+    "truth_field_z": ("nT", "true field, body down"),
+    "truth_latitude": ("deg", "true latitude"),
+    "truth_longitude": ("deg", "true longitude"),
+}
+"""Unit and meaning of each column, telemetry of the moving masses aside."""
+
+
+@dataclass(frozen=True)
+class Twin:
+    """A world and a vehicle, drawn from a seed, that a scenario can be run in.
+
+    Attributes
+    ----------
+    scenario : Scenario
+    seed : int
+    world : World
+    vehicle : Vehicle
+    """
+
+    scenario: Scenario
+    seed: int
+    world: World
+    vehicle: Vehicle
+
+    @classmethod
+    def draw(cls, scenario: Scenario, seed: int) -> Twin:
+        """Draw what the scenario leaves open.
+
+        World, vehicle, mission, instrument and telemetry each have a stream of their own, so that a change to
+        one does not draw the others anew.
+        """
+        place = scenario.world
+        world = World.draw(
+            (place.latitude, place.longitude),
+            scenario.start.timestamp(),
+            place.geology,
+            place.water,
+            _stream(seed, 0),
+        )
+        vehicle = scenario.vehicle or draw_vehicle(_stream(seed, 1), scenario.masses)
+        return cls(scenario, seed, world, vehicle)
+
+    def fly(self) -> Track:
+        """Fly the scenario's mission."""
+        rng = _stream(self.seed, 2)
+        limits = self.scenario.all_limits
+        legs = [leg for part in self.scenario.mission for leg in part.legs(rng, limits)]
+        if not legs:
+            raise WrongUse(f"scenario {self.scenario.name!r} has no mission: drive it with a log")
+        start = (self.scenario.start.timestamp(), *self.world.origin)
+        step = min(FINE_STEP, 1 / self.scenario.instrument.rate)
+        return fly(legs, start, step, rng, self.scenario.motion, limits)
+
+    def measure(self, track: Track, when: Array) -> xr.Dataset:
+        """Measure along a track.
+
+        Parameters
+        ----------
+        track : Track
+        when : array (n,)
+            s after the track's start of each triple; channel delays must end inside the track.
+
+        Returns
+        -------
+        Dataset (time)
+            The contract's columns and ``truth_*``.
+        """
+        instrument, reference = self.scenario.instrument, self.scenario.telemetry.reference
+        earth = self._earth_field(track)
+        attitude = rotation(track.roll, track.pitch, track.heading)
+        at_sensor = self.vehicle.field(attitude.apply(earth, inverse=True), track.parameters)
+        water = self.world.water.temperature(track.depth) if track.water is None else track.water
+        samples = instrument.measure(at_sensor, water, track.step, when, _stream(self.seed, 3))
+
+        true = track.at(when)
+        field_ned = np.column_stack([np.interp(when, track.elapsed, b) for b in earth.T])
+        field_body = rotation(true["roll"], true["pitch"], true["heading"]).apply(field_ned, inverse=True)
+        columns = self._telemetry(true, when) | {
+            "sensor_temperature": samples.temperature,
+            "power_cycle": samples.power_cycle,
+            "truth_total_field": np.linalg.norm(field_ned, axis=1),
+            "truth_latitude": true["latitude"],
+            "truth_longitude": true["longitude"],
+        }
+        for k, axis in enumerate("xyz"):
+            columns[f"mag_{axis}"] = samples.channels[:, k]
+            columns[f"truth_field_{axis}"] = field_body[:, k]
+            if any(instrument.channel_delay):
+                columns[f"mag_time_{axis}"] = track.start + samples.times[:, k]
+        if reference == "true":
+            columns["reference_field"] = columns["truth_total_field"]
+        elif reference == "map":
+            columns["reference_field"] = self._map_reference(columns, track.start + when)
+        return _dataset(track, when, columns, self.scenario.name)
+
+    def anomaly_map(self) -> xr.DataArray:
+        """Return the aeromagnetic map of the scenario's world: see :meth:`World.anomaly_map`."""
+        geology, altitude = self.scenario.world.geology, self.scenario.telemetry.map_altitude
+        return self.world.anomaly_map(
+            self.scenario.start.timestamp(),
+            altitude,
+            extent=0.75 * geology.extent,
+            spacing=(geology.top + altitude) / 3,  # an anomaly is about as wide as its source is deep
+        )
+
+    def _earth_field(self, track: Track) -> Array:
+        """Return the Earth's field (n, 3), nT NED, on the track's grid, linear between sparser points."""
+        stride = max(1, int(FIELD_STEP / track.step))
+        points = np.unique(np.append(np.arange(0, len(track.depth), stride), len(track.depth) - 1))
+        when = track.start + track.step * points
+        field = self.world.field(when, track.latitude[points], track.longitude[points], track.depth[points])
+        grid = np.arange(len(track.depth))
+        return np.column_stack([np.interp(grid, points, component) for component in field.T])
+
+    def _telemetry(self, true: dict[str, Array], when: Array) -> dict[str, Array]:
+        """Return what the vehicle believes of attitude, position and masses."""
+        settings, rng = self.scenario.telemetry, _stream(self.seed, 4)
+        seen = dict(true)
+        for name in ("roll", "pitch"):
+            seen[name] = true[name] + rng.normal(0, settings.roll_pitch_sigma, len(when))
+        seen["heading"] = (true["heading"] + rng.normal(0, settings.heading_sigma, len(when))) % 360
+        north, east = to_local(true["latitude"], true["longitude"], self.world.origin)
+        current = rng.normal(0, settings.drift, 2)
+        seen["latitude"], seen["longitude"] = from_local(
+            north - current[0] * when, east - current[1] * when, self.world.origin
+        )
+        return seen
+
+    def _map_reference(self, columns: dict[str, Array], time: Array) -> Array:
+        """Return the IGRF with the map's anomaly, nT, where the vehicle believes to be (eq. 4 of the paper)."""
+        grid = self.anomaly_map()
+        look_up = RegularGridInterpolator(
+            (grid["latitude"].to_numpy(), grid["longitude"].to_numpy()),
+            grid.to_numpy(),
+            bounds_error=False,
+        )
+        latitude, longitude = columns["latitude"], columns["longitude"]
+        main = igrf(longitude, latitude, columns["depth"], time)
+        return np.asarray(np.linalg.norm(main, axis=1) + look_up((latitude, longitude)))
+
+
+def simulate(scenario: Scenario, seed: int = 0) -> xr.Dataset:
+    """Simulate a deployment.
+
+    Returns
+    -------
+    Dataset (time)
+        Columns as in any deployment, ``truth_*`` beside them. ``attrs["segments"]`` lists the parts of the mission
+        (JSON: name, first and last time in s since 1970); :func:`segments` takes them apart.
+    """
+    twin = Twin.draw(scenario, seed)
+    track = twin.fly()
+    last = track.elapsed[-1] - max(scenario.instrument.channel_delay)
+    return twin.measure(track, np.arange(0.0, last, 1 / scenario.instrument.rate))
+
+
+def segments(deployment: xr.Dataset) -> dict[str, xr.Dataset]:
+    """Return the parts of a simulated deployment's mission by name."""
+    return {
+        name: deployment.sel(time=slice(first, np.nextafter(last, first)))
+        for name, first, last in json.loads(deployment.attrs["segments"])
+    }
+
+
+def _stream(seed: int, which: int) -> np.random.Generator:
+    return np.random.default_rng([seed, which])
+
+
+def _dataset(track: Track, when: Array, columns: dict[str, Array], name: str) -> xr.Dataset:
+    units = COLUMNS | {
+        parameter: (MOUNTINGS[parameter].unit if parameter in MOUNTINGS else "1", f"position of {parameter}")
+        for parameter in track.parameters
+    }
+    parts = [(part, track.start + first, track.start + last) for part, first, last in track.segments]
+    return xr.Dataset(
+        {
+            column: ("time", columns[column], dict(zip(("units", "long_name"), units[column], strict=True)))
+            for column in units
+            if column in columns
+        },
+        coords={"time": ("time", track.start + when, {"units": "s", "long_name": "time since 1970 UTC"})},
+        attrs={"source": f"simulated: {name}", "segments": json.dumps(parts)},
+    )

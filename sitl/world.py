@@ -1,0 +1,217 @@
+"""The simulated world: the Earth's main field, magnetised rock below the sea floor, water with a temperature."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from magbridge.config import Table
+from magbridge.field.igrf import igrf
+
+__all__ = ["Geology", "Rock", "Water", "World", "dipole_field", "from_local", "to_local"]
+
+Array = NDArray[np.float64]
+
+MU_0_OVER_4_PI = 100.0
+"""nT m / A: µ0/4π = 1e-7 T m/A."""
+EARTH_RADIUS = 6_371_200.0
+"""m, the reference sphere of the IGRF."""
+
+
+def dipole_field(r: Array, m: Array) -> Array:
+    r"""Return the field of point dipoles.
+
+    Parameters
+    ----------
+    r : array (..., 3)
+        m, from the dipole to the point of observation.
+    m : array (..., 3)
+        A m², moments in the same axes.
+
+    Returns
+    -------
+    array (..., 3)
+        nT.
+
+    Notes
+    -----
+    .. math:: \mathbf B = \frac{\mu_0}{4\pi} \left( \frac{3 (\mathbf m \cdot \mathbf r) \mathbf r}{r^5}
+              - \frac{\mathbf m}{r^3} \right)
+
+    Blakely 1995, *Potential Theory in Gravity and Magnetic Applications*, eq. 4.14.
+    """
+    r2 = np.sum(r * r, axis=-1, keepdims=True)
+    mr = np.sum(m * r, axis=-1, keepdims=True)
+    return np.asarray(MU_0_OVER_4_PI * (3 * mr * r / r2 - m) / (r2 * np.sqrt(r2)))
+
+
+def to_local(latitude: Array, longitude: Array, origin: tuple[float, float]) -> tuple[Array, Array]:
+    """Return metres (north, east) of `origin` (latitude, longitude in deg), on the plane that touches it."""
+    north = np.radians(latitude - origin[0]) * EARTH_RADIUS
+    east = (np.radians((longitude - origin[1] + 180) % 360 - 180) * EARTH_RADIUS) * np.cos(
+        np.radians(origin[0])
+    )
+    return north, east
+
+
+def from_local(north: Array, east: Array, origin: tuple[float, float]) -> tuple[Array, Array]:
+    """Return latitude and longitude (deg); the inverse of :func:`to_local`."""
+    latitude = origin[0] + np.degrees(north / EARTH_RADIUS)
+    longitude = origin[1] + np.degrees(east / (EARTH_RADIUS * np.cos(np.radians(origin[0]))))
+    return latitude, longitude
+
+
+class Geology(Table, frozen=True):
+    """``[world.geology]``: how rough the rock is.
+
+    Attributes
+    ----------
+    sources : int
+        How many magnetised bodies; 0 leaves the Earth's main field alone.
+    extent : float
+        m, half the side of the square that holds them, about the first position.
+    top, bottom : float
+        m below the surface, where the bodies lie: as many in each octave of depth. The vehicle stays above.
+    rms : float
+        nT of the total-field anomaly at the surface.
+    """
+
+    sources: int = 600
+    extent: float = 12_000.0
+    top: float = 350.0
+    bottom: float = 3_000.0
+    rms: float = 100.0
+
+
+class Water(Table, frozen=True):
+    """``[world.water]``: the temperature (degC) above and below a thermocline (m)."""
+
+    surface: float = 1.6
+    deep: float = 2.4
+    thermocline: float = 40.0
+    thickness: float = 15.0
+
+    def temperature(self, depth: Array) -> Array:
+        """Return degC at `depth` (m)."""
+        share = 0.5 * (1 + np.tanh((depth - self.thermocline) / self.thickness))
+        return np.asarray(self.surface + (self.deep - self.surface) * share)
+
+
+@dataclass(frozen=True)
+class Rock:
+    """Point dipoles below the sea floor: harmonic everywhere above them.
+
+    Attributes
+    ----------
+    position : array (m, 3)
+        m north, east, down of the world's origin.
+    moment : array (m, 3)
+        A m², the same axes.
+    """
+
+    position: Array
+    moment: Array
+
+    @classmethod
+    def draw(cls, geology: Geology, main_field: Array, rng: np.random.Generator) -> Rock:
+        """Draw bodies that give the anomaly `geology` asks for in a `main_field` (3,) nT.
+
+        A body's moment grows as the cube of its depth, so that each depth contributes alike; half of it is
+        induced, along the main field, and half remanence in any direction, of either sign.
+        """
+        n = geology.sources
+        depth = geology.top * (geology.bottom / geology.top) ** rng.random(n)
+        position = np.column_stack([rng.uniform(-geology.extent, geology.extent, (n, 2)), depth])
+        direction = rng.normal(0, 0.5, (n, 3)) + rng.choice(
+            [-1.0, 1.0], (n, 1)
+        ) * main_field / np.linalg.norm(main_field)
+        rock = cls(position, direction * rng.normal(0, 1, (n, 1)) * depth[:, None] ** 3)
+        if n == 0:
+            return rock
+        side = np.linspace(-geology.extent / 2, geology.extent / 2, 40)
+        grid = np.stack(np.meshgrid(side, side, [0.0]), axis=-1).reshape(-1, 3)
+        anomaly = rock.field(grid) @ main_field / np.linalg.norm(main_field)
+        return cls(position, rock.moment * geology.rms / np.std(anomaly))
+
+    def field(self, ned: Array, block: int = 4096) -> Array:
+        """Return the bodies' field (n, 3), nT, at local points (n, 3), m.
+
+        :func:`dipole_field` summed over the bodies, with the sums as matrix products.
+        """
+        s, m = self.position, self.moment
+        s2, ms = np.sum(s * s, axis=1), np.sum(m * s, axis=1)
+        out = np.zeros_like(ned)
+        for k in range(0, len(ned) if len(s) else 0, block):
+            x = ned[k : k + block]
+            r2 = np.sum(x * x, axis=1)[:, None] + s2 - 2 * x @ s.T
+            w3 = 1 / (r2 * np.sqrt(r2))
+            w5 = 3 * (x @ m.T - ms) * w3 / r2
+            out[k : k + block] = MU_0_OVER_4_PI * (x * np.sum(w5, axis=1)[:, None] - w5 @ s - w3 @ m)
+        return out
+
+
+@dataclass(frozen=True)
+class World:
+    """The magnetic field at any place and time.
+
+    Attributes
+    ----------
+    origin : tuple
+        Latitude and longitude (deg) of the local axes.
+    rock : Rock
+    water : Water
+    """
+
+    origin: tuple[float, float]
+    rock: Rock
+    water: Water
+
+    @classmethod
+    def draw(
+        cls,
+        origin: tuple[float, float],
+        time: float,
+        geology: Geology,
+        water: Water,
+        rng: np.random.Generator,
+    ) -> World:
+        """Draw the rock about `origin`; `time` (s since 1970) only says which main field magnetises it."""
+        latitude, longitude, depth, when = np.array([[origin[0]], [origin[1]], [0.0], [time]])
+        return cls(origin, Rock.draw(geology, igrf(longitude, latitude, depth, when)[0], rng), water)
+
+    def field(self, time: Array, latitude: Array, longitude: Array, depth: Array) -> Array:
+        """Return the field (n, 3) in nT, north-east-down, at times (s since 1970) and positions (deg, deg, m)."""
+        north, east = to_local(latitude, longitude, self.origin)
+        return igrf(longitude, latitude, depth, time) + self.rock.field(np.column_stack([north, east, depth]))
+
+    def anomaly_map(
+        self, time: float, altitude: float = 90.0, extent: float = 8_000.0, spacing: float = 150.0
+    ) -> xr.DataArray:
+        """Return the map an aeromagnetic survey would have made, upward-continued to `altitude` (m).
+
+        The same bodies seen from higher up, without the fine structure that a vehicle under water meets.
+
+        Returns
+        -------
+        DataArray (latitude, longitude)
+            nT, the total field less the main field's, as ``anomaly``.
+        """
+        side = np.arange(-extent, extent + spacing / 2, spacing)
+        latitude, longitude = from_local(side, side, self.origin)
+        lat, lon = (a.ravel() for a in np.meshgrid(latitude, longitude, indexing="ij"))
+        high = np.full(lat.shape, -altitude)
+        main = igrf(lon, lat, high, np.full(lat.shape, time))
+        total = self.field(np.full(lat.shape, time), lat, lon, high)
+        anomaly = np.linalg.norm(total, axis=1) - np.linalg.norm(main, axis=1)
+        return xr.DataArray(
+            anomaly.reshape(len(side), len(side)),
+            coords={
+                "latitude": ("latitude", latitude, {"units": "degrees_north"}),
+                "longitude": ("longitude", longitude, {"units": "degrees_east"}),
+            },
+            name="anomaly",
+            attrs={"units": "nT", "long_name": "total-field anomaly", "altitude": altitude},
+        )
