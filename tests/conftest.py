@@ -2,10 +2,21 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
+import shutil
+import sys
 from pathlib import Path
+from types import ModuleType
 
+import pymavlink
 import pytest
+from hypothesis import settings
+from pymavlink.generator import mavgen
+
+# the same examples every time, and none fails because the machine is busy
+settings.register_profile("magbridge", deadline=None, derandomize=True)
+settings.load_profile("magbridge")
 
 
 @pytest.fixture(scope="session")
@@ -18,3 +29,19 @@ def real_data() -> Path:
         if candidate and Path(candidate).is_dir():
             return Path(candidate)
     pytest.skip("no measured data: set MAGBRIDGE_REAL_DATA or put them in ../shared/data")
+
+
+@pytest.fixture(scope="session")
+def peer(tmp_path_factory: pytest.TempPathFactory) -> ModuleType:
+    """Our dialect as a ground station has it: classes that pymavlink's mavgen makes from our XML."""
+    folder = tmp_path_factory.mktemp("peer")
+    shutil.copy(Path(__file__).parents[1] / "magbridge" / "mavlink" / "magbridge.xml", folder)
+    for name in ("common", "standard", "minimal"):
+        shutil.copy(Path(pymavlink.__file__).parent / "dialects" / "v20" / f"{name}.xml", folder)
+    options = mavgen.Opts(str(folder / "magbridge_peer"), wire_protocol="2.0", language="Python3")
+    assert mavgen.mavgen(options, [str(folder / "magbridge.xml")])
+    place = importlib.util.spec_from_file_location("magbridge_peer", folder / "magbridge_peer.py")
+    module = importlib.util.module_from_spec(place)
+    sys.modules["magbridge_peer"] = module
+    place.loader.exec_module(module)
+    return module

@@ -1,0 +1,97 @@
+"""Bytes to messages and back, for one link."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from magbridge.mavlink.framing import MAGIC, MORE, frame_end, join, message
+from magbridge.mavlink.messages import BAD_DATA, REFUSED, Message, Spec, spec
+from magbridge.mavlink.signing import Signing
+
+__all__ = ["WINDOW", "Codec"]
+
+WINDOW = 4096
+"""bytes without a frame after which they are given up, whatever may have begun in them: memory stays bounded."""
+
+
+class Codec:
+    """MAVLink for one link, without global state, clock or port.
+
+    Parameters
+    ----------
+    system, component : int
+        Our own, in what we send.
+    signing : Signing or None
+        With it everything sent is signed and nothing unsigned taken.
+
+    Attributes
+    ----------
+    now_us : int
+        Event time that signatures carry; whoever feeds or sends sets it.
+    frames, bytes_skipped : int
+        Messages accepted, bytes that belonged to no frame.
+    """
+
+    def __init__(self, system: int, component: int, signing: Signing | None = None) -> None:
+        self.system, self.component = system, component
+        self.signing = signing
+        self.now_us = 0
+        self.sequence = 0
+        self.frames = self.bytes_skipped = 0
+        self._rest = b""
+        self._looked = 0
+
+    def parse(self, data: bytes) -> list[Message]:
+        """Take bytes as they come; return the messages that are complete with them.
+
+        Any bytes, however cut, give the same messages. Bytes that belong to no frame come back as a message of
+        id `BAD_DATA` just before the message that ended them (or every `WINDOW` bytes), so that a log which
+        keeps every ``frame`` keeps every byte. A frame whose signature is not accepted has the id `REFUSED`.
+        """
+        data = self._rest + data
+        found: list[Message] = []
+        begin, at = 0, self._looked  # begin: end of the last frame; at: no frame begins before
+        while begin < len(data):
+            stop = min(len(data), begin + WINDOW)
+            match = MAGIC.search(data, at, stop)
+            end = frame_end(data, match.start(), stop) if match else MORE
+            if match and end > 0:
+                if begin < match.start():
+                    found.append(self._skip(data[begin : match.start()]))
+                found.append(self._accept(message(data[match.start() : end])))
+                begin = at = end
+            elif match and end != MORE:
+                at = match.end()
+            elif stop == begin + WINDOW:
+                found.append(self._skip(data[begin:stop]))
+                begin = at = stop
+            else:
+                at = match.start() if match else stop
+                break
+        self._rest, self._looked = data[begin:], at - begin
+        return found
+
+    def pack(self, name: str, /, **fields: Any) -> bytes:
+        """Return the frame of a message; fields not named are zero."""
+        layout = spec(name)
+        return self.frame(layout, layout.payload(**fields))
+
+    def frame(self, layout: Spec, payload: bytes) -> bytes:
+        """Return the frame of a packed payload (``layout.struct.pack(...)``): the cheapest way to send."""
+        frame = join(
+            layout.id, payload, self.sequence, self.system, self.component, signed=self.signing is not None
+        )
+        self.sequence = self.sequence + 1 & 0xFF
+        return self.signing.sign(frame, self.now_us) if self.signing else frame
+
+    def _skip(self, data: bytes) -> Message:
+        self.bytes_skipped += len(data)
+        return Message(BAD_DATA, 0, 0, 0, b"", data, known=False)
+
+    def _accept(self, one: Message) -> Message:
+        if self.signing and not self.signing.accept(
+            one.frame, (one.system, one.component), one.id, self.now_us
+        ):
+            return Message(REFUSED, one.system, one.component, one.sequence, b"", one.frame, known=False)
+        self.frames += 1
+        return one

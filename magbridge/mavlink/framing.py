@@ -1,0 +1,100 @@
+"""Where a MAVLink frame ends, and whether it is one; versions 1 and 2.
+
+A frame is: a magic byte, a header with length and message id, the payload, a checksum (CRC-16/MCRF4XX) over
+all but the magic byte, closed with a byte that depends on the message's layout, and perhaps a signature.
+"""
+
+from __future__ import annotations
+
+import re
+from struct import Struct
+
+from fastcrc.crc16 import mcrf4xx
+
+from magbridge.mavlink.dialect import MESSAGES
+from magbridge.mavlink.messages import Message, spec
+
+__all__ = ["MAGIC", "MORE", "NOT_A_FRAME", "frame_end", "join", "message"]
+
+V1, V2 = 0xFE, 0xFD
+MAGIC = re.compile(b"[\xfd\xfe]")
+SIGNED = 1
+SIGNATURE = 13
+"""bytes: link id, 6 of time stamp, 6 of hash."""
+NOT_A_FRAME, MORE = 0, -1
+HEADER_V2 = Struct("<BBBBBBBHB")
+HEADER_V1 = Struct("<BBBBBB")
+EXTRA = {number: bytes((extra,)) for number, (_, extra, _) in MESSAGES.items()}
+
+
+def frame_end(data: bytes, start: int, stop: int, gap: int = 0, *, last: bool = False) -> int:
+    """Return where the frame ends that begins at ``data[start]``.
+
+    The checksum of a message outside the dialect cannot be checked; it is believed when another frame begins
+    `gap` bytes after its end, or when it ends with the data.
+
+    Parameters
+    ----------
+    data : bytes
+        What came; ``data[start]`` is a magic byte.
+    start, stop : int
+        Look at no more than ``data[start:stop]``.
+    gap : int
+        bytes between frames: 0 on a link, 8 in a log.
+    last : bool
+        Nothing comes after `stop`.
+
+    Returns
+    -------
+    int
+        The end, or `NOT_A_FRAME`, or `MORE` where `stop` came too early to tell.
+    """
+    available = stop - start
+    head = 10 if data[start] == V2 else 6
+    flags = data[start + 2] if head == 10 and available > 2 else 0
+    if flags > SIGNED:  # an incompatibility flag that we do not know: by the standard, not to be read
+        return NOT_A_FRAME
+    if available < head:
+        return MORE
+    number = data[start + 5] if head == 6 else int.from_bytes(data[start + 7 : start + 10], "little")
+    checksum = start + head + data[start + 1]
+    end = checksum + 2 + (SIGNATURE if flags else 0)
+    if end > stop:
+        return MORE
+    extra = EXTRA.get(number)
+    if extra is not None:
+        right = (
+            mcrf4xx(extra, mcrf4xx(data[start + 1 : checksum])) == data[checksum] | data[checksum + 1] << 8
+        )
+        return end if right else NOT_A_FRAME
+    if end + gap >= stop:
+        return end if last else MORE
+    return end if data[end + gap] in (V1, V2) else NOT_A_FRAME
+
+
+def message(frame: bytes) -> Message:
+    """Take apart a frame that :func:`frame_end` has accepted."""
+    if frame[0] == V2:
+        _, length, _, _, sequence, system, component, low, high = HEADER_V2.unpack_from(frame)
+        number, head = low | high << 16, 10
+    else:
+        _, length, sequence, system, component, number = HEADER_V1.unpack_from(frame)
+        head = 6
+    payload = frame[head : head + length]
+    known = number in EXTRA
+    if known:
+        payload = payload.ljust(spec(number).size, b"\0")
+    return Message(number, system, component, sequence, payload, frame, known)
+
+
+def join(
+    number: int, payload: bytes, sequence: int, system: int, component: int, *, signed: bool = False
+) -> bytes:
+    """Make a version 2 frame, without the signature that `signed` announces."""
+    payload = payload.rstrip(b"\0") or b"\0"
+    header = HEADER_V2.pack(
+        V2, len(payload), signed, 0, sequence, system, component, number & 0xFFFF, number >> 16
+    )
+    body = header + payload
+    crc = mcrf4xx(EXTRA[number], mcrf4xx(body[1:]))
+    return body + crc.to_bytes(2, "little")

@@ -1,0 +1,178 @@
+"""What a message looks like on the wire, and a received one."""
+
+from __future__ import annotations
+
+import re
+from functools import cache, cached_property
+from struct import Struct
+from typing import Any
+
+import msgspec
+
+from magbridge.mavlink.dialect import MESSAGES
+
+__all__ = ["BAD_DATA", "REFUSED", "Field", "Message", "Spec", "spec", "split_index"]
+
+BAD_DATA = -1
+"""`Message.id` of bytes that belonged to no frame."""
+REFUSED = -2
+"""`Message.id` of a frame whose signature is missing, wrong or old."""
+
+IDS = {name: number for number, (name, _, _) in MESSAGES.items()}
+
+
+class Field:
+    """One field of a message: where it lies in the payload, and how it reads.
+
+    Attributes
+    ----------
+    name, unit : str
+        As in the XML.
+    count : int
+        Length of an array, 0 for a scalar.
+    code : str
+        As in :mod:`struct`; ``s`` is text, ``B`` with a count is bytes.
+    """
+
+    __slots__ = ("code", "count", "name", "offset", "struct", "unit")
+
+    def __init__(self, text: str, offset: int) -> None:
+        form, self.name, self.unit = text.split(":")
+        self.count, self.code = int(form[:-1] or 0), form[-1]
+        self.offset = offset
+        packed_as_bytes = self.code == "B" and self.count  # 253 integers a message would be slow
+        self.struct = Struct(f"<{self.count}s" if packed_as_bytes else f"<{form}")
+
+    def get(self, payload: bytes) -> Any:
+        """Return the value in a full-length `payload`: int, float, str (text), bytes or a tuple."""
+        values = self.struct.unpack_from(payload, self.offset)
+        if self.code == "s":
+            return values[0].partition(b"\0")[0].decode("utf-8", "replace")
+        return values if self.count and self.code != "B" else values[0]
+
+    def put(self, value: Any) -> Any:
+        """Return `value` as :attr:`Spec.struct` takes it: a tuple for an array of numbers, else one."""
+        if self.code == "s":
+            return value.encode()[: self.count or 1] if isinstance(value, str) else value
+        return tuple(value) if self.count and self.code != "B" else value
+
+
+class Spec:
+    """The layout of one message.
+
+    Attributes
+    ----------
+    id : int
+    name : str
+    extra : bytes
+        The byte that the checksum is closed with: two dialects that differ do not understand each other.
+    size : int
+        bytes of a full payload.
+    struct : Struct
+        Packs the full payload, fields in the order of the wire.
+    fields : dict of str to Field
+        In the order of the wire.
+    """
+
+    def __init__(self, number: int) -> None:
+        self.id = number
+        self.name, extra, text = MESSAGES[number]
+        self.extra = bytes((extra,))
+        self.fields: dict[str, Field] = {}
+        offset, form = 0, "<"
+        for part in text.split(","):
+            field = Field(part, offset)
+            self.fields[field.name] = field
+            offset += field.struct.size
+            form += field.struct.format[1:]
+        self.size = offset
+        self.struct = Struct(form)
+
+    @cached_property
+    def defaults(self) -> dict[str, Any]:
+        """Zeros: what a field is that nobody names."""
+        return {name: field.get(bytes(self.size)) for name, field in self.fields.items()}
+
+    def payload(self, **fields: Any) -> bytes:
+        """Pack `fields` by name; those not named are zero.
+
+        Raises
+        ------
+        KeyError
+            The message has no such field.
+        struct.error
+            A value does not fit its field.
+        """
+        if unknown := fields.keys() - self.fields.keys():
+            raise KeyError(f"{self.name} has no field {', '.join(sorted(unknown))}")
+        values: list[Any] = []
+        for name, field in self.fields.items():
+            value = field.put(fields.get(name, self.defaults[name]))
+            if isinstance(value, tuple):
+                values += value
+            else:
+                values.append(value)
+        return self.struct.pack(*values)
+
+
+@cache
+def spec(message: int | str) -> Spec:
+    """Return the layout of a message, by id or name.
+
+    Raises
+    ------
+    KeyError
+        No such message.
+    """
+    return Spec(message) if isinstance(message, int) else spec(IDS[message])
+
+
+class Message(msgspec.Struct, frozen=True, gc=False):
+    """A received message. Its fields are read when asked for: ``message["roll"]``.
+
+    Attributes
+    ----------
+    id : int
+        Message id; `BAD_DATA` and `REFUSED` for what is not to be read.
+    system, component, sequence : int
+        The sender's.
+    payload : bytes
+        Zeros that the sender cut off are put back.
+    frame : bytes
+        The whole frame as it came.
+    known : bool
+        The message is in the dialect, and its checksum was right.
+    """
+
+    id: int
+    system: int
+    component: int
+    sequence: int
+    payload: bytes
+    frame: bytes
+    known: bool
+
+    @property
+    def name(self) -> str:
+        """The message's name; ``UNKNOWN_<id>`` where the dialect lacks it."""
+        if self.known:
+            return spec(self.id).name
+        return {BAD_DATA: "BAD_DATA", REFUSED: "REFUSED"}.get(self.id, f"UNKNOWN_{self.id}")
+
+    @property
+    def fields(self) -> dict[str, Any]:
+        """All fields by name, in the order of the wire; empty where the message is not known."""
+        if not self.known:
+            return {}
+        return {name: field.get(self.payload) for name, field in spec(self.id).fields.items()}
+
+    def __getitem__(self, name: str) -> Any:
+        return spec(self.id).fields[name].get(self.payload)
+
+
+def split_index(field: str) -> tuple[str, int | None]:
+    """Split ``"actuator[2]"`` into name and index; the index is None where there is none."""
+    match = re.fullmatch(r"(\w+)(?:\[(\d+)\])?", field)
+    if match is None:
+        return field, None
+    return match[1], int(match[2]) if match[2] else None

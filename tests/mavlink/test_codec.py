@@ -1,0 +1,128 @@
+"""Any bytes, however cut: messages or counted loss."""
+
+from __future__ import annotations
+
+import itertools
+import random
+import time
+
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+from magbridge.mavlink import BAD_DATA, Codec, Message, spec
+from magbridge.mavlink.codec import WINDOW
+
+
+def stream(count: int, system: int = 1) -> list[bytes]:
+    codec = Codec(system, 1)
+    return [codec.pack("ATTITUDE", time_boot_ms=1000 + i, roll=0.1 + i, yawspeed=1.0) for i in range(count)]
+
+
+def foreign(payload: bytes, number: int = 59_999) -> bytes:
+    """Frame of a message that nobody here knows; its checksum cannot be checked."""
+    return bytes((0xFD, len(payload), 0, 0, 9, 1, 1, *number.to_bytes(3, "little"))) + payload + b"\x12\x34"
+
+
+def cut(data: bytes, places: list[int]) -> list[bytes]:
+    edges = [0, *sorted({place % (len(data) + 1) for place in places}), len(data)]
+    return [data[a:b] for a, b in itertools.pairwise(edges)]
+
+
+def parse(chunks: list[bytes]) -> tuple[list[Message], Codec]:
+    codec = Codec(1, 191)
+    return [message for chunk in chunks for message in codec.parse(chunk)], codec
+
+
+PIECES = st.one_of(
+    st.binary(max_size=40),
+    st.sampled_from(stream(5)),
+    st.binary(min_size=1, max_size=20).map(foreign),
+    st.sampled_from([b"\xfd", b"\xfd\xff\x00", b"\xfe", b"\xfe\xff" * 200, b"\xfd\x00\x00" * 500]),
+)
+
+
+@given(st.lists(PIECES, max_size=20).map(b"".join), st.lists(st.integers(0, 10_000), max_size=30))
+@example(b"\xfd" * 5000, [1, 2, 3])
+@example(bytes(3 * WINDOW) + stream(1)[0], [WINDOW, WINDOW + 1])
+def test_any_bytes_however_cut(data, places):
+    whole, one = parse([data])
+    pieces, other = parse(cut(data, places))
+    assert pieces == whole
+    assert other.bytes_skipped == one.bytes_skipped
+    kept = b"".join(message.frame for message in whole)
+    assert data.startswith(kept)  # every byte is in a message, in order, or still waited for
+    assert len(data) - len(kept) <= WINDOW
+    assert one.bytes_skipped == sum(len(m.frame) for m in whole if m.id == BAD_DATA)
+    for message in whole:
+        assert isinstance(message.fields, dict)
+        assert message.name
+
+
+@given(st.lists(PIECES, max_size=6).map(b"".join))
+def test_a_genuine_frame_survives_what_is_around_it(noise):
+    noise = noise.replace(b"\xfd", b"\xfc").replace(b"\xfe", b"\xfc")[: WINDOW - 100]
+    frames = stream(3)
+    found, codec = parse([noise + frames[0] + noise + frames[1] + frames[2]])
+    assert [message.frame for message in found if message.known] == frames
+    assert codec.bytes_skipped == 2 * len(noise)
+    assert codec.frames == 3
+
+
+def test_a_damaged_frame_does_not_take_the_next_with_it():
+    first, second, third = stream(3)
+    damaged = first[:15] + bytes((first[15] ^ 1,)) + first[16:]
+    shortened = first[:-4]
+    for bad in (damaged, shortened, b"\xfd\xff"):
+        # 300 bytes on, even a header that promises the longest frame is found out
+        found, codec = parse([bad + second + third * 10])
+        assert [m.frame for m in found if m.known] == [second] + [third] * 10
+        assert codec.bytes_skipped == len(bad)
+
+
+def test_messages_outside_the_dialect_are_kept_when_another_frame_follows():
+    codec = Codec(1, 191)
+    frame = foreign(b"abc")
+    assert codec.parse(frame) == []
+    unknown, heard = codec.parse(stream(1)[0])
+    assert (unknown.name, unknown.frame, unknown.fields) == ("UNKNOWN_59999", frame, {})
+    assert heard.name == "ATTITUDE"
+
+
+def test_version_1_is_read(peer):
+    station = peer.MAVLink(None, 1, 1)
+    frame = peer.MAVLink_attitude_message(5, 0.5, 0, 0, 0, 0, 0).pack(station, force_mavlink1=True)
+    (message,) = Codec(1, 191).parse(frame)
+    assert message["roll"] == 0.5
+    assert message.system == 1
+
+
+def test_pymavlink_reads_what_we_send_and_we_what_it_sends(peer):
+    codec, station = Codec(1, 191), peer.MAVLink(None, 255, 190)
+    for i in range(300):
+        (message,) = station.parse_buffer(codec.pack("MAG_FIELD", time_usec=i, total_field=50_000.004))
+        assert message.total_field == 50_000.004
+        assert message.get_seq() == i % 256
+    assert station.total_receive_errors == 0
+    (message,) = codec.parse(peer.MAVLink_named_value_float_message(1, b"battpos", 0.25).pack(station))
+    assert (message["name"], message["value"]) == ("battpos", 0.25)
+
+
+def test_wrong_names_and_values_are_refused():
+    codec = Codec(1, 191)
+    with pytest.raises(KeyError, match="colour"):
+        codec.pack("HEARTBEAT", colour=1)
+    with pytest.raises(KeyError):
+        spec("NO_SUCH_MESSAGE")
+    assert codec.sequence == 0
+
+
+def test_garbage_is_cheap_even_byte_by_byte():
+    """A parser that starts anew at every byte would need minutes."""
+    for garbage in (b"\xfd" * 20_000, b"\xfe\xff" * 10_000, random.Random(1).randbytes(20_000)):
+        codec = Codec(1, 191)
+        begin = time.process_time()
+        for i in range(len(garbage)):
+            codec.parse(garbage[i : i + 1])
+        assert time.process_time() - begin < 2.0
+        assert codec.bytes_skipped > len(garbage) - WINDOW - 300
