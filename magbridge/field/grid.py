@@ -1,0 +1,302 @@
+"""A map of the magnetic anomaly, and its value, slope and curvature anywhere on it.
+
+The map is a bicubic B-spline through its nodes: continuous up to the curvature, which is what a filter
+needs that linearises the map, and knows where it may not. One look-up is a 4x4 patch of coefficients
+between two 3x4 matrices of weights: value, gradient and Hessian in one product.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+from math import inf, isfinite, nan, sqrt
+from pathlib import Path
+from typing import Generic, NamedTuple, TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from magbridge.errors import FormatError, OutOfRange
+from magbridge.field.earth import metres_per_degree
+from magbridge.files import atomic_path
+
+__all__ = ["AnomalyGrid", "Local"]
+
+Array = NDArray[np.float64]
+T = TypeVar("T", float, Array)
+
+EVEN = 1e-3  # of a step: what rounded coordinates may deviate from an even spacing
+HOLE = 9.9e4  # nT: beyond any anomaly; 99999 and 1.7e38 are how formats without NaN write a hole
+NOT_AN_ANOMALY = 15_000.0  # nT: a median this large is the whole field, not what is left of it
+PAD = 16  # nodes: an influence of a cubic spline's end that far in is 1e-9
+
+# Cubic B-spline on a uniform axis: weights of four nodes as cubics in the fraction t, powers t⁰ t¹ t² t³.
+VALUE = np.array([[1, -3, 3, -1], [4, 0, -6, 3], [1, 3, 3, -3], [0, 0, 0, 1]]) / 6.0
+SLOPE = np.array([[-3, 6, -3, 0], [0, -12, 9, 0], [3, 6, -9, 0], [0, 0, 3, 0]]) / 6.0
+CURVATURE = np.array([[6, -6, 0, 0], [-12, 18, 0, 0], [6, -18, 0, 0], [0, 6, 0, 0]]) / 6.0
+WEIGHTS = np.concatenate([VALUE, SLOPE, CURVATURE])  # (12, 4) times powers of t
+
+
+class Local(NamedTuple, Generic[T]):
+    """The map around one place or n places; NaN outside the map and in its holes.
+
+    ``anomaly`` nT; ``north``, ``east`` nT/m, its gradient; ``north_north``, ``north_east``, ``east_east``
+    nT/m², its Hessian; ``variance`` nT², of the map itself there.
+    """
+
+    anomaly: T
+    north: T
+    east: T
+    north_north: T
+    north_east: T
+    east_east: T
+    variance: T
+
+
+OFF_THE_MAP: Local[float] = Local(nan, nan, nan, nan, nan, nan, nan)
+
+
+class AnomalyGrid:
+    """Magnetic anomaly on an even grid of longitude and latitude.
+
+    Parameters
+    ----------
+    longitude : array_like, (nx,)
+        deg, evenly spaced, either direction, across the antimeridian if need be.
+    latitude : array_like, (ny,)
+        deg, evenly spaced, either direction.
+    anomaly : array_like, (ny, nx)
+        nT; NaN is a hole.
+    sigma : array_like, (ny, nx), or float, optional
+        nT, 1-sigma of the map at each node.
+    altitude : float, optional
+        m above the ellipsoid at which the map holds.
+    name : str, optional
+        What errors call the grid: its file.
+
+    Raises
+    ------
+    FormatError
+        Axes that are not geographic, not even or too short; a field that is no anomaly; nothing but holes.
+    """
+
+    def __init__(
+        self,
+        longitude: ArrayLike,
+        latitude: ArrayLike,
+        anomaly: ArrayLike,
+        sigma: ArrayLike = 0.0,
+        altitude: float = nan,
+        name: str = "grid",
+    ) -> None:
+        values = np.array(anomaly, float)
+        x, flip_x = _axis(longitude, name, "longitude")
+        y, flip_y = _axis(latitude, name, "latitude")
+        if values.shape != (y.size, x.size):
+            raise FormatError(
+                name, f"expected {y.size} rows of {x.size} values, found {' x '.join(map(str, values.shape))}"
+            )
+        scatter = np.broadcast_to(np.asarray(sigma, float), values.shape)
+        order = (slice(None, None, -1 if flip_y else 1), slice(None, None, -1 if flip_x else 1))
+        values, scatter = values[order], scatter[order].copy()
+        values[~(np.abs(values) < HOLE)] = nan
+        hole = np.isnan(values)
+        if hole.all():
+            raise FormatError(name, "expected an anomaly, found nothing but holes")
+        if abs(median := float(np.nanmedian(values))) > NOT_AN_ANOMALY:
+            raise FormatError(
+                name, f"expected an anomaly, found a median of {median:.0f} nT: subtract the IGRF first"
+            )
+        self.name, self.altitude = name, float(altitude)
+        self.longitude, self.latitude, self.anomaly, self.sigma = x, y, values, scatter
+        self._x0, self._dx = float(x[0]), float(x[-1] - x[0]) / (x.size - 1)
+        self._y0, self._dy = float(y[0]), float(y[-1] - y[0]) / (y.size - 1)
+        self._whole = ~(hole[1:, 1:] | hole[1:, :-1] | hole[:-1, 1:] | hole[:-1, :-1])
+        self._variance = np.nan_to_num(scatter**2)
+        self._even_sigma = bool(np.ptp(self._variance) == 0.0)
+
+    @cached_property
+    def _coefficients(self) -> Array:
+        """B-spline coefficients, (ny + 2, nx + 2): one beyond each edge, the curvature there being zero."""
+        from scipy.ndimage import spline_filter  # noqa: PLC0415  the live path runs without scipy
+
+        pad = [(min(PAD, n - 1),) * 2 for n in self.anomaly.shape]
+        padded = np.pad(filled(self.anomaly), pad, mode="reflect", reflect_type="odd")
+        coefficients: Array = spline_filter(padded, order=3, mode="mirror")
+        (a, _), (b, _) = pad
+        return np.ascontiguousarray(coefficients[a - 1 : -a + 1 or None, b - 1 : -b + 1 or None])
+
+    def look_up(self, longitude: float, latitude: float) -> Local[float]:
+        """Return the map around one place, all NaN off the map; the fast path of the filter."""
+        u = ((longitude - self._x0 + 180.0) % 360.0 - 180.0) / self._dx
+        if u < 0.0:  # a grid may span more than half the globe
+            u += 360.0 / self._dx
+        v = (latitude - self._y0) / self._dy
+        rows, columns = self._whole.shape
+        if not (0.0 <= u <= columns and 0.0 <= v <= rows):
+            return OFF_THE_MAP
+        j, i = min(int(u), columns - 1), min(int(v), rows - 1)
+        if not self._whole[i, j]:
+            return OFF_THE_MAP
+        s, t = u - j, v - i
+        across = (WEIGHTS @ (1.0, s, s * s, s * s * s)).reshape(3, 4)
+        along = (WEIGHTS @ (1.0, t, t * t, t * t * t)).reshape(3, 4)
+        (f, fx, fxx), (fy, fxy, _), (fyy, _, _) = (
+            along @ self._coefficients[i : i + 4, j : j + 4] @ across.T
+        ).tolist()
+        per_latitude, per_longitude = metres_per_degree(latitude)
+        north, east = 1.0 / (per_latitude * self._dy), 1.0 / (per_longitude * self._dx)
+        if self._even_sigma:
+            variance = float(self._variance[0, 0])
+        else:
+            a, b = self._variance[i, j : j + 2].tolist()
+            c, d = self._variance[i + 1, j : j + 2].tolist()
+            variance = (1 - t) * ((1 - s) * a + s * b) + t * ((1 - s) * c + s * d)
+        return Local(
+            f, fy * north, fx * east, fyy * north * north, fxy * north * east, fxx * east * east, variance
+        )
+
+    def evaluate(self, longitude: ArrayLike, latitude: ArrayLike) -> Local[Array]:
+        """Return the map around n places as arrays (n,), NaN off the map and for NaN positions."""
+        lon, lat = np.broadcast_arrays(
+            np.atleast_1d(np.asarray(longitude, float)), np.atleast_1d(np.asarray(latitude, float))
+        )
+        rows, columns = self._whole.shape
+        with np.errstate(invalid="ignore"):
+            u = ((lon - self._x0 + 180.0) % 360.0 - 180.0) / self._dx
+            u = np.where(u < 0.0, u + 360.0 / self._dx, u)
+            v = (lat - self._y0) / self._dy
+            inside = (u >= 0.0) & (u <= columns) & (v >= 0.0) & (v <= rows)
+        u, v = np.where(inside, u, 0.0), np.where(inside, v, 0.0)
+        j = np.minimum(u.astype(np.intp), columns - 1)
+        i = np.minimum(v.astype(np.intp), rows - 1)
+        inside &= self._whole[i, j]
+        s, t = u - j, v - i
+        across, along = _weights(s), _weights(t)
+        window = np.lib.stride_tricks.sliding_window_view(self._coefficients, (4, 4))
+        f = np.einsum("nai,nij,nbj->nab", along, window[i, j], across, optimize=True)
+        variance = (1 - t) * ((1 - s) * self._variance[i, j] + s * self._variance[i, j + 1]) + t * (
+            (1 - s) * self._variance[i + 1, j] + s * self._variance[i + 1, j + 1]
+        )
+        per_degree = metres_per_degree(np.where(inside, lat, 0.0))
+        north, east = 1.0 / (per_degree[0] * self._dy), 1.0 / (per_degree[1] * self._dx)
+        parts = (
+            f[:, 0, 0],
+            f[:, 1, 0] * north,
+            f[:, 0, 1] * east,
+            f[:, 2, 0] * north * north,
+            f[:, 1, 1] * north * east,
+            f[:, 0, 2] * east * east,
+            variance,
+        )
+        return Local(*(np.where(inside, part, nan) for part in parts))
+
+    def at(self, longitude: ArrayLike, latitude: ArrayLike) -> Array:
+        """Return the anomaly at n places, nT, (n,).
+
+        Raises
+        ------
+        OutOfRange
+            A place that the map does not cover.
+        """
+        anomaly = self.evaluate(longitude, latitude).anomaly
+        lon, lat = np.broadcast_arrays(np.atleast_1d(longitude), np.atleast_1d(latitude))
+        bad = np.flatnonzero(np.isnan(anomaly) & ~np.isnan(lon) & ~np.isnan(lat))
+        if bad.size:
+            raise OutOfRange("position", f"{lat[bad[0]]:.5f} {lon[bad[0]]:.5f}", f"{self} does not cover it")
+        return anomaly
+
+    @cached_property
+    def rms(self) -> float:
+        """nT, scatter of the map about its best plane."""
+        plane = np.stack(np.meshgrid(self.longitude, self.latitude), axis=-1)[~np.isnan(self.anomaly)]
+        design = np.column_stack([plane - plane.mean(axis=0), np.ones(len(plane))])
+        values = self.anomaly[~np.isnan(self.anomaly)]
+        left = values - design @ np.linalg.lstsq(design, values, rcond=None)[0]
+        return float(np.sqrt(np.mean(left**2)))
+
+    @cached_property
+    def correlation_length(self) -> float:
+        """m, over which the anomaly changes by its own scatter; infinite for a map without slopes.
+
+        Notes
+        -----
+        ``L = √2 rms(a) / rms|∇a|``, which is L of a covariance ``exp(-r²/2L²)``.
+        """
+        middle = float(np.mean(self.latitude))
+        per_latitude, per_longitude = metres_per_degree(middle)
+        north, east = np.gradient(self.anomaly, self._dy * per_latitude, self._dx * per_longitude)
+        flat = north - np.nanmean(north), east - np.nanmean(east)
+        slope = sqrt(float(np.nanmean(flat[0] ** 2 + flat[1] ** 2)))
+        return sqrt(2.0) * self.rms / slope if slope > 0.0 else inf
+
+    def save(self, path: str | Path) -> None:
+        """Write the grid as CF netCDF, which :func:`~magbridge.field.read.read_grid` and GMT read."""
+        import xarray as xr  # noqa: PLC0415  the live path runs without xarray
+
+        axes = {
+            "latitude": ("latitude", self.latitude, {"units": "degrees_north", "standard_name": "latitude"}),
+            "longitude": (
+                "longitude",
+                self.longitude,
+                {"units": "degrees_east", "standard_name": "longitude"},
+            ),
+        }
+        over = ("latitude", "longitude")
+        fields = {
+            "anomaly": (over, self.anomaly, {"units": "nT", "long_name": "magnetic anomaly"}),
+            "sigma": (over, self.sigma, {"units": "nT", "long_name": "1-sigma of the magnetic anomaly"}),
+        }
+        attrs: dict[str, object] = {"Conventions": "CF-1.8", "title": "magnetic anomaly"}
+        if isfinite(self.altitude):
+            attrs |= {"altitude": self.altitude, "altitude_units": "m above the ellipsoid"}
+        packed = {name: {"zlib": True, "dtype": "float32"} for name in fields}
+        with atomic_path(path) as beside:
+            xr.Dataset(fields, axes, attrs).to_netcdf(beside, engine="netcdf4", encoding=packed)
+
+    def __repr__(self) -> str:
+        return (
+            f"{self.name} (latitude {self.latitude[0]:.4f} to {self.latitude[-1]:.4f},"
+            f" longitude {self.longitude[0]:.4f} to {self.longitude[-1]:.4f})"
+        )
+
+
+def filled(values: Array) -> Array:
+    """Return the grid with each hole given the value of the nearest node, so that a filter can pass."""
+    hole = np.isnan(values)
+    if not hole.any():
+        return values
+    from scipy.ndimage import distance_transform_edt  # noqa: PLC0415  the live path runs without scipy
+
+    nearest = distance_transform_edt(hole, return_distances=False, return_indices=True)
+    patched: Array = values[tuple(nearest)]
+    return patched
+
+
+def _axis(values: ArrayLike, name: str, what: str) -> tuple[Array, bool]:
+    """Return the axis ascending and exactly even, and whether it was descending."""
+    axis = np.array(values, float).ravel()
+    if axis.size < 4 or not np.isfinite(axis).all():
+        raise FormatError(name, "expected at least 4 finite coordinates", column=what)
+    limit = 90.0 if what == "latitude" else 540.0  # 359 360 361 is how some write Greenwich
+    if np.abs(axis).max() > limit * (1 + 1e-9):
+        raise FormatError(
+            name,
+            f"expected degrees, found {axis[np.abs(axis).argmax()]:.6g}: projected coordinates;"
+            " reproject the grid to longitude and latitude",
+            column=what,
+        )
+    flip = bool(np.median(np.diff(axis)) < 0.0)
+    axis = axis[::-1] if flip else axis
+    if what == "longitude":  # 178 179 180 -179: the same meridians, unwound
+        axis = np.degrees(np.unwrap(np.radians(axis)))
+    even = np.linspace(axis[0], axis[-1], axis.size)
+    step = (axis[-1] - axis[0]) / (axis.size - 1)
+    if step <= 0.0 or np.abs(axis - even).max() > EVEN * step:
+        raise FormatError(name, "expected evenly spaced coordinates in order", column=what)
+    return even, flip
+
+
+def _weights(t: Array) -> Array:
+    powers = np.stack([np.ones_like(t), t, t * t, t * t * t])
+    weights: Array = (WEIGHTS @ powers).T.reshape(-1, 3, 4)
+    return weights

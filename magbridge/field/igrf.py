@@ -1,0 +1,203 @@
+"""The International Geomagnetic Reference Field at every sample's own position, depth and time.
+
+ppigrf carries the coefficients of the current generation; importing it costs a second (pandas), a call
+8 ms, and N dates at N positions give N x N fields. So its coefficient file is read as it stands, and the
+series is summed here: one pass over the degrees for a whole block of samples. ppigrf is the oracle of
+the tests.
+"""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from functools import cache
+from importlib.util import find_spec
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from magbridge.errors import FormatError, MissingExtra, OutOfRange
+
+__all__ = ["coverage", "igrf", "total_field"]
+
+Array = NDArray[np.float64]
+
+REFERENCE_RADIUS = 6_371_200.0  # m, of the model's sphere
+EQUATORIAL_RADIUS = 6_378_137.0  # m, WGS84
+ECCENTRICITY_SQUARED = 6.694_379_990_14e-3  # WGS84
+BLOCK = 2048  # samples; the working arrays of a block stay in the cache
+
+
+class Model(NamedTuple):
+    """Gauss coefficients: ``g[n - 1]`` (epochs, n + 1), ``h[n - 1]`` (epochs, n) nT, at `epochs` s."""
+
+    epochs: Array
+    g: list[Array]
+    h: list[Array]
+
+
+def igrf(longitude: ArrayLike, latitude: ArrayLike, depth: ArrayLike, time: ArrayLike) -> Array:
+    """Return the main field, north-east-down.
+
+    Parameters
+    ----------
+    longitude, latitude : array_like, (n,) or scalar
+        deg, geodetic (WGS84), longitude -180 to 360.
+    depth : array_like, (n,) or scalar
+        m below the ellipsoid; negative is height.
+    time : array_like, (n,) or scalar
+        s since 1970-01-01 UTC.
+
+    Returns
+    -------
+    field_ned : ndarray, (n, 3)
+        nT. NaN where a position or time is NaN.
+
+    Raises
+    ------
+    OutOfRange
+        A time outside the model's epochs, or a position that is none.
+
+    Notes
+    -----
+    Minus the gradient of ``V = a Σ_n (a/r)^(n+1) Σ_m (g_nm cos mφ + h_nm sin mφ) P_nm(cos θ)``, with
+    Schmidt semi-normalised P and coefficients linear in time between epochs (Alken et al. 2021,
+    Earth Planets Space 73:49, eq. 1). The sum runs on ``S_nm = P_nm / sin θ``, which is finite at the poles.
+    """
+    lon, lat, down, at = (
+        np.atleast_1d(np.asarray(a, float)).ravel() for a in (longitude, latitude, depth, time)
+    )
+    lon, lat, down, at = np.broadcast_arrays(lon, lat, down, at)
+    model = _model(newest())
+    _refuse("latitude", lat, -90.0, 90.0, "deg, -90 to 90")
+    _refuse("longitude", lon, -180.0, 360.0, "deg, -180 to 360")
+    start, end = model.epochs[0], model.epochs[-1]
+    if bad := _outside(at, start, end):
+        raise OutOfRange("time", _date(bad[0]), f"the IGRF covers {_date(start)} to {_date(end)}")
+    field = np.empty((lat.size, 3))
+    for i in range(0, lat.size, BLOCK):
+        part = slice(i, i + BLOCK)
+        field[part] = _block(model, lon[part], lat[part], down[part], at[part])
+    return field
+
+
+def total_field(longitude: ArrayLike, latitude: ArrayLike, depth: ArrayLike, time: ArrayLike) -> Array:
+    """Return the magnitude of :func:`igrf`, nT, (n,); same arguments and errors."""
+    field = igrf(longitude, latitude, depth, time)
+    total: Array = np.sqrt(np.einsum("ij,ij->i", field, field))
+    return total
+
+
+def coverage() -> tuple[float, float]:
+    """Return the first and last time, s since 1970 UTC, at which the model is defined."""
+    epochs = _model(newest()).epochs
+    return float(epochs[0]), float(epochs[-1])
+
+
+def newest() -> Path:
+    """Return the coefficient file of the latest generation that the installed ppigrf brings."""
+    spec = find_spec("ppigrf")  # locates the package without importing it, and pandas with it
+    if spec is None or not spec.submodule_search_locations:
+        raise MissingExtra("ppigrf", "analysis")
+    return max(Path(spec.submodule_search_locations[0]).glob("IGRF*.shc"))
+
+
+@cache
+def _model(path: Path) -> Model:
+    """Read a spherical-harmonic coefficient file (.shc): a header, epochs in years, rows ``n m value...``."""
+    rows = [line.split() for line in path.read_text().splitlines() if line and not line.startswith("#")]
+    try:
+        degree = int(rows[0][1])
+        years = [int(float(year)) for year in rows[1]]
+        table = {(int(n), int(m)): np.array(values, float) for n, m, *values in rows[2:]}
+        g = [np.stack([table[n, m] for m in range(n + 1)], axis=1) for n in range(1, degree + 1)]
+        h = [np.stack([table[n, -m] for m in range(1, n + 1)], axis=1) for n in range(1, degree + 1)]
+    except (IndexError, KeyError, ValueError) as error:
+        raise FormatError(path, "expected spherical-harmonic coefficients (.shc)") from error
+    epochs = np.array([datetime(year, 1, 1, tzinfo=UTC).timestamp() for year in years])
+    return Model(epochs, g, h)
+
+
+def _block(model: Model, lon: Array, lat: Array, depth: Array, time: Array) -> Array:
+    """Sum the series for one block of samples."""
+    first, weights = _weights(model.epochs, time)
+    nodes = slice(first, first + len(weights))
+    phi, geodetic = np.radians(lon), np.radians(lat)
+    r, geocentric = _geocentric(geodetic, -depth)
+    sin, cos = np.cos(geocentric), np.sin(geocentric)  # of the colatitude θ
+
+    degree = len(model.g)
+    order = np.arange(1, degree + 1)[:, None]
+    cos_m, sin_m = np.cos(order * phi), np.sin(order * phi)
+    up = np.zeros((len(weights), lat.size))
+    south, east = up.copy(), up.copy()
+    legendre = [np.ones_like(sin), cos]  # P_n0
+    before: Array = np.empty((0, lat.size))  # S_n-1, orders 1..n-1
+    two_before = before
+    ratio = REFERENCE_RADIUS / r
+    radial = ratio**3
+    for n in range(1, degree + 1):
+        m = np.arange(1, n + 1)[:, None]
+        s = np.empty((n, lat.size))
+        s[n - 1] = np.sqrt((2 * n - 1) / (2 * n)) * sin * before[n - 2] if n > 1 else 1.0
+        root = np.sqrt(n * n - m * m)  # 0 for m = n
+        s[: n - 1] = (2 * n - 1) * cos * before / root[: n - 1]
+        if n > 2:
+            s[: n - 2] -= np.sqrt((n - 1) ** 2 - m[: n - 2] ** 2) / root[: n - 2] * two_before
+        if n > 1:
+            legendre.append(((2 * n - 1) * cos * legendre[n - 1] - (n - 1) * legendre[n - 2]) / n)
+        slope = n * cos * s  # dP_nm/dθ, orders 1..n
+        slope[: n - 1] -= root[: n - 1] * before
+        slope_zero = -np.sqrt(n * (n + 1) / 2) * sin * s[0]
+
+        g, h = model.g[n - 1][nodes], model.h[n - 1][nodes]
+        c, d = cos_m[:n], sin_m[:n]
+        p = s * sin
+        up += (n + 1) * radial * (g[:, :1] * legendre[n] + g[:, 1:] @ (p * c) + h @ (p * d))
+        south -= radial * (g[:, :1] * slope_zero + g[:, 1:] @ (slope * c) + h @ (slope * d))
+        s_m = m * s
+        east += radial * (g[:, 1:] @ (s_m * d) - h @ (s_m * c))
+        two_before, before, radial = before, s, radial * ratio
+
+    up, south, east = (np.einsum("kn,kn->n", weights, part) for part in (up, south, east))
+    tilt = geodetic - geocentric  # the ellipsoid's normal leans this far north of the radius
+    sin_tilt, cos_tilt = np.sin(tilt), np.cos(tilt)
+    return np.stack(
+        [-south * cos_tilt - up * sin_tilt, east, -up * cos_tilt + south * sin_tilt],
+        axis=1,
+    )
+
+
+def _weights(epochs: Array, time: Array) -> tuple[int, Array]:
+    """Return the first epoch that the block needs and each sample's weights on it and its successors."""
+    index = np.clip(np.searchsorted(epochs, time, side="right") - 1, 0, epochs.size - 2)
+    first = int(index.min())
+    weights = np.zeros((int(index.max()) - first + 2, time.size))
+    fraction = (time - epochs[index]) / (epochs[index + 1] - epochs[index])
+    columns = np.arange(time.size)
+    weights[index - first, columns] = 1.0 - fraction
+    weights[index - first + 1, columns] = fraction
+    return first, weights
+
+
+def _geocentric(latitude: Array, height: Array) -> tuple[Array, Array]:
+    """Return radius (m) and geocentric latitude (rad) of a point over the ellipsoid."""
+    sin, cos = np.sin(latitude), np.cos(latitude)
+    normal = EQUATORIAL_RADIUS / np.sqrt(1.0 - ECCENTRICITY_SQUARED * sin * sin)
+    axis = (normal + height) * cos
+    polar = (normal * (1.0 - ECCENTRICITY_SQUARED) + height) * sin
+    return np.hypot(axis, polar), np.arctan2(polar, axis)
+
+
+def _outside(values: Array, low: float, high: float) -> list[float]:
+    return [float(value) for value in values[(values < low) | (values > high)][:1]]
+
+
+def _refuse(what: str, values: Array, low: float, high: float, covered: str) -> None:
+    if bad := _outside(values, low, high):
+        raise OutOfRange(what, bad[0], covered)
+
+
+def _date(time: float) -> str:
+    return str(np.datetime64("1970-01-01", "s") + np.timedelta64(round(time), "s"))[:10]

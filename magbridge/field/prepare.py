@@ -1,0 +1,229 @@
+"""Several surveys to one map: continued to one altitude, merged, masked, smoothed (section 4 of the paper).
+
+The continuation is harmonica's; the pictures show every step, because a map is looked at before it is used.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Sequence
+from math import isfinite
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from magbridge.errors import MissingExtra, OutOfRange
+from magbridge.field.earth import metres_per_degree
+from magbridge.field.grid import AnomalyGrid, filled
+from magbridge.files import atomic_path
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+__all__ = ["Step", "continue_upward", "draw_steps", "hanning", "merge", "prepare"]
+
+Array = NDArray[np.float64]
+
+HANNING = np.outer([1.0, 2.0, 1.0], [1.0, 2.0, 1.0]) / 16.0
+
+
+class Step(NamedTuple):
+    """A stage of the preparation and the grid that it left."""
+
+    title: str
+    grid: AnomalyGrid
+
+
+def prepare(
+    grids: Sequence[AnomalyGrid],
+    altitude: float | None = None,
+    passes: int = 20,
+    mask: ArrayLike | None = None,
+    spacing: float | None = None,
+) -> tuple[AnomalyGrid, list[Step]]:
+    """Return one map from several surveys, and each step on the way.
+
+    Parameters
+    ----------
+    grids : sequence of AnomalyGrid
+        At least one.
+    altitude : float, optional
+        m, to which every grid is continued upward; default the highest of the grids'.
+    passes : int, optional
+        Of the 3x3 Hanning kernel.
+    mask : array_like, (k, 2), optional
+        Longitude and latitude (deg) of a polygon; the map ends there.
+    spacing : float, optional
+        deg, of the map; default the finest of the grids'.
+
+    Raises
+    ------
+    OutOfRange
+        An altitude below a grid's: continuing downward invents what the survey did not see.
+    """
+    steps = [Step(f"as surveyed: {Path(grid.name).name}", grid) for grid in grids]
+    known = [grid.altitude for grid in grids if isfinite(grid.altitude)]
+    level = altitude if altitude is not None else max(known, default=float("nan"))
+    lifted = []
+    for grid in grids:
+        up = level - grid.altitude
+        if isfinite(up) and up != 0.0:
+            lifted.append(continue_upward(grid, up))
+            steps.append(Step(f"continued {up:+.0f} m: {Path(grid.name).name}", lifted[-1]))
+        else:
+            lifted.append(grid)
+    result = merge(lifted, spacing)
+    if len(grids) > 1:
+        steps.append(Step("merged", result))
+    if mask is not None:
+        result = _masked(result, np.asarray(mask, float))
+        steps.append(Step("masked", result))
+    if passes:
+        result = hanning(result, passes)
+        steps.append(Step(f"smoothed, {passes} passes", result))
+    return result, steps
+
+
+def continue_upward(grid: AnomalyGrid, height: float) -> AnomalyGrid:
+    """Return the grid as a survey `height` metres (>= 0) higher would have seen it; holes stay holes.
+
+    Notes
+    -----
+    ``F(k) -> F(k) exp(-|k| h)`` (Blakely 1995, eq. 12.8). The field is mirrored at its edges first, so that
+    the transform's wrap-around joins equal values.
+    """
+    if height < 0.0:
+        raise OutOfRange(
+            "altitude",
+            f"{grid.altitude + height:.0f} m",
+            f"{grid.name} was surveyed at {grid.altitude:.0f} m: a field can only be continued upward",
+        )
+    import xarray as xr  # noqa: PLC0415
+
+    upward_continuation = _harmonica()
+    ny, nx = grid.anomaly.shape
+    mirrored = np.pad(filled(grid.anomaly), ((0, ny), (0, nx)), mode="symmetric")
+    per_latitude, per_longitude = metres_per_degree(float(np.mean(grid.latitude)))
+    step_y, step_x = np.diff(grid.latitude[:2])[0], np.diff(grid.longitude[:2])[0]
+    plane = xr.DataArray(
+        mirrored,
+        {
+            "northing": np.arange(2 * ny) * step_y * per_latitude,
+            "easting": np.arange(2 * nx) * step_x * per_longitude,
+        },
+        ("northing", "easting"),
+    )
+    with warnings.catch_warnings():  # harmonica 0.7 on a newer xarray: about names, not numbers
+        warnings.simplefilter("ignore", FutureWarning)
+        raised = upward_continuation(plane, height).to_numpy()[:ny, :nx]
+    return _like(grid, np.where(np.isnan(grid.anomaly), np.nan, raised), altitude=grid.altitude + height)
+
+
+def _harmonica() -> Callable[[xr.DataArray, float], xr.DataArray]:
+    """Return the library's continuation; it pulls in numba, which takes seconds."""
+    try:
+        with warnings.catch_warnings():  # xrft's docstrings have stray backslashes
+            warnings.simplefilter("ignore")
+            from harmonica import upward_continuation  # noqa: PLC0415
+    except ImportError:
+        raise MissingExtra("harmonica", "grids") from None
+    continuation: Callable[[xr.DataArray, float], xr.DataArray] = upward_continuation
+    return continuation
+
+
+def merge(grids: Sequence[AnomalyGrid], spacing: float | None = None) -> AnomalyGrid:
+    """Return the mean of the grids wherever at least one of them is; on the finest of their spacings."""
+    first = grids[0]
+    if len(grids) == 1 and spacing is None:
+        return first
+    step = spacing or min(float(np.diff(axis[:2])[0]) for g in grids for axis in (g.longitude, g.latitude))
+    near = [(g, 360.0 * round((float(first.longitude[0]) - float(g.longitude[0])) / 360.0)) for g in grids]
+    longitude = _cover([g.longitude + turn for g, turn in near], step)
+    latitude = _cover([g.latitude for g in grids], step)
+    x, y = (axis.ravel() for axis in np.meshgrid(longitude, latitude))
+    shape = (latitude.size, longitude.size)
+    total, variance, count = np.zeros(shape), np.zeros(shape), np.zeros(shape)
+    for grid in grids:
+        local = grid.evaluate(x, y)
+        total += np.nan_to_num(local.anomaly).reshape(shape)
+        variance += np.nan_to_num(local.variance).reshape(shape)
+        count += np.isfinite(local.anomaly).reshape(shape)
+    with np.errstate(invalid="ignore"):
+        return AnomalyGrid(
+            longitude,
+            latitude,
+            total / np.where(count > 0, count, np.nan),
+            np.sqrt(variance) / count,
+            first.altitude,
+            " + ".join(Path(grid.name).name for grid in grids),
+        )
+
+
+def hanning(grid: AnomalyGrid, passes: int) -> AnomalyGrid:
+    """Return the grid after `passes` of the 3x3 Hanning kernel; at edges and holes over what there is."""
+    from scipy.ndimage import convolve  # noqa: PLC0415
+
+    present = np.isfinite(grid.anomaly)
+    share = convolve(present.astype(float), HANNING, mode="constant")
+    values = grid.anomaly
+    for _ in range(passes):
+        smooth = convolve(np.where(present, values, 0.0), HANNING, mode="constant")
+        values = np.where(present, smooth / np.where(present, share, 1.0), np.nan)
+    return _like(grid, values)
+
+
+def draw_steps(steps: Sequence[Step], path: str | Path) -> None:
+    """Draw every step on one page, one colour scale, to `path` (PNG, PDF, SVG)."""
+    from matplotlib.figure import Figure  # noqa: PLC0415  only drawing needs it
+
+    columns = min(3, len(steps))
+    rows = -(-len(steps) // columns)
+    figure = Figure(figsize=(5.2 * columns, 4.4 * rows), layout="constrained")
+    axes = np.atleast_1d(figure.subplots(rows, columns, sharex=True, sharey=True)).ravel()
+    values = np.concatenate([step.grid.anomaly[np.isfinite(step.grid.anomaly)] for step in steps])
+    low, high = np.percentile(values, [1, 99])
+    for step, axis in zip(steps, axes, strict=False):
+        grid = step.grid
+        image = axis.pcolormesh(
+            grid.longitude,
+            grid.latitude,
+            grid.anomaly,
+            vmin=low,
+            vmax=high,
+            cmap="RdYlBu_r",
+            shading="nearest",
+        )
+        axis.set_title(step.title, fontsize=10)
+        axis.set_aspect(1.0 / np.cos(np.radians(grid.latitude.mean())))
+        axis.ticklabel_format(useOffset=False)
+        axis.locator_params(axis="x", nbins=4)
+    for axis in axes[len(steps) :]:
+        axis.set_axis_off()
+    figure.colorbar(image, ax=axes, label="anomaly, nT", shrink=0.8)
+    figure.supxlabel("longitude, deg")
+    figure.supylabel("latitude, deg")
+    with atomic_path(path) as beside:
+        figure.savefig(beside, dpi=110)
+
+
+def _masked(grid: AnomalyGrid, polygon: Array) -> AnomalyGrid:
+    from matplotlib.path import Path as Polygon  # noqa: PLC0415
+
+    x, y = np.meshgrid(grid.longitude, grid.latitude)
+    inside = Polygon(polygon).contains_points(np.column_stack([x.ravel(), y.ravel()])).reshape(x.shape)
+    if not (inside & np.isfinite(grid.anomaly)).any():
+        raise OutOfRange("mask", f"{len(polygon)} corners", f"no node of {grid} lies inside")
+    return _like(grid, np.where(inside, grid.anomaly, np.nan))
+
+
+def _like(grid: AnomalyGrid, values: Array, altitude: float | None = None) -> AnomalyGrid:
+    level = grid.altitude if altitude is None else altitude
+    return AnomalyGrid(grid.longitude, grid.latitude, values, grid.sigma, level, grid.name)
+
+
+def _cover(axes: Sequence[Array], step: float) -> Array:
+    low, high = min(float(a[0]) for a in axes), max(float(a[-1]) for a in axes)
+    axis: Array = low + step * np.arange(int((high - low) / step + 1e-6) + 1, dtype=float)
+    return axis

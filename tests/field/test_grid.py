@@ -1,0 +1,154 @@
+"""The anomaly map: what a spline must do, beside scipy's own and beside finite differences."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.interpolate import RectBivariateSpline
+
+from magbridge.errors import FormatError, OutOfRange
+from magbridge.field.earth import metres_per_degree, offset, separation
+from magbridge.field.grid import AnomalyGrid
+
+LON, LAT = np.linspace(10.0, 10.5, 51), np.linspace(54.0, 54.4, 41)
+
+
+def hills(lon, lat):
+    return 40 * np.sin(lon * 40) * np.cos(lat * 35) + 5 * (lat - 54)
+
+
+@pytest.fixture(scope="module")
+def grid() -> AnomalyGrid:
+    return AnomalyGrid(LON, LAT, hills(*np.meshgrid(LON, LAT)), sigma=2.0)
+
+
+@pytest.fixture(scope="module")
+def places():
+    rng = np.random.default_rng(1)
+    return rng.uniform(10.0, 10.5, 300), rng.uniform(54.0, 54.4, 300)
+
+
+def test_passes_through_its_nodes(grid):
+    x, y = np.meshgrid(LON, LAT)
+    np.testing.assert_allclose(grid.at(x.ravel(), y.ravel()), hills(x, y).ravel(), atol=1e-9)
+
+
+def test_agrees_with_scipys_spline_inside(grid):
+    rng = np.random.default_rng(2)
+    x, y = rng.uniform(10.15, 10.35, 200), rng.uniform(54.15, 54.25, 200)
+    other = RectBivariateSpline(LAT, LON, grid.anomaly)
+    local = grid.evaluate(x, y)
+    per_lat, per_lon = metres_per_degree(y)
+    np.testing.assert_allclose(local.anomaly, other(y, x, grid=False), atol=2e-4)
+    np.testing.assert_allclose(local.north * per_lat, other(y, x, dx=1, grid=False), atol=0.1)
+    np.testing.assert_allclose(local.east * per_lon, other(y, x, dy=1, grid=False), atol=0.1)
+
+
+def test_gradient_and_hessian_are_derivatives(grid, places):
+    """Central differences on metres: 1e-2 m step on the gradient, whose error is then rounding."""
+    lon, lat = (p[5:50] * 0.9 + 0.1 * p.mean() for p in places)
+    local = grid.evaluate(lon, lat)
+    per_lat, per_lon = metres_per_degree(lat)
+    h = 0.5
+    for (dlon, dlat), slope, curve, mixed in (
+        ((0, h / per_lat), local.north, local.north_north, local.north_east),
+        ((h / per_lon, 0), local.east, local.north_east, local.east_east),
+    ):
+        ahead, behind = grid.evaluate(lon + dlon, lat + dlat), grid.evaluate(lon - dlon, lat - dlat)
+        np.testing.assert_allclose((ahead.anomaly - behind.anomaly) / (2 * h), slope, atol=1e-7)
+        np.testing.assert_allclose((ahead.north - behind.north) / (2 * h), curve, atol=2e-8)
+        np.testing.assert_allclose((ahead.east - behind.east) / (2 * h), mixed, atol=2e-8)
+
+
+def test_one_place_and_many_are_the_same(grid, places):
+    many = np.stack(grid.evaluate(*places), axis=1)
+    one = np.array([grid.look_up(lon, lat) for lon, lat in zip(*map(np.ndarray.tolist, places), strict=True)])
+    np.testing.assert_allclose(one, many, rtol=1e-10, atol=1e-13)
+
+
+@pytest.mark.parametrize("flip", [(1, -1), (-1, 1), (-1, -1)])
+def test_a_descending_axis_is_the_same_map(grid, places, flip):
+    y, x = flip
+    turned = AnomalyGrid(LON[::x], LAT[::y], grid.anomaly[::y, ::x], sigma=2.0)
+    np.testing.assert_allclose(turned.at(*places), grid.at(*places), atol=1e-10)
+
+
+@pytest.mark.parametrize("start", [179.8, -180.2, 359.9])
+def test_longitude_goes_round(grid, places, start):
+    """The same hills, laid over the antimeridian or Greenwich, whichever way the axis counts there."""
+    axis = LON - 10.0 + start
+    for stored in (axis, (axis + 180) % 360 - 180, axis % 360):
+        moved = AnomalyGrid(stored, LAT, grid.anomaly)
+        lon = places[0] - 10.0 + start
+        for asked in (lon, (lon + 180) % 360 - 180, lon % 360):
+            np.testing.assert_allclose(moved.at(asked, places[1]), grid.at(*places), atol=1e-6)
+            assert moved.look_up(float(asked[0]), float(places[1][0])).anomaly == pytest.approx(
+                grid.at(*places)[0], abs=1e-6
+            )
+
+
+def test_a_hole_is_a_hole_and_no_more(grid):
+    values = grid.anomaly.copy()
+    values[20, 25] = 1.70141e38
+    holed = AnomalyGrid(LON, LAT, values)
+    assert np.isnan(holed.look_up(10.245, 54.195).anomaly)
+    assert np.isnan(holed.evaluate(10.245, 54.195).anomaly).all()
+    far = holed.evaluate([10.1, 10.4], [54.1, 54.3]).anomaly
+    np.testing.assert_allclose(far, grid.evaluate([10.1, 10.4], [54.1, 54.3]).anomaly, atol=0.01)
+    assert np.isfinite(holed.look_up(10.265, 54.195).anomaly)
+
+
+def test_off_the_map_is_nan_or_refused(grid):
+    assert np.isnan(grid.evaluate([9.99, 10.1, np.nan], [54.1, 54.41, 54.1]).anomaly).all()
+    assert np.isnan(grid.look_up(9.99, 54.1).north)
+    assert np.isnan(grid.look_up(np.nan, 54.1).north)
+    with pytest.raises(OutOfRange, match=r"position = 54.41000 10.10000: grid \(latitude"):
+        grid.at([10.1, 10.1], [54.1, 54.41])
+
+
+def test_sigma_lies_between_its_nodes():
+    grid = AnomalyGrid(LON, LAT, np.zeros((41, 51)), sigma=np.meshgrid(np.arange(51.0), LAT)[0])
+    assert grid.look_up(10.105, 54.1).variance == pytest.approx((10**2 + 11**2) / 2)
+    assert grid.evaluate(10.105, 54.1).variance[0] == pytest.approx((10**2 + 11**2) / 2)
+
+
+def test_roughness_of_a_known_map():
+    """exp(-r²/2L²) by summing many waves with Gaussian wavenumbers: L comes back to 10 %."""
+    rng = np.random.default_rng(4)
+    lon, lat = np.linspace(0, 0.5, 250), np.linspace(0, 0.5, 250)
+    per_lat, per_lon = metres_per_degree(0.25)
+    x, y = np.meshgrid(lon * per_lon, lat * per_lat)
+    k, phase = rng.normal(size=(300, 2)) / 1500.0, rng.uniform(0, 2 * np.pi, 300)
+    a = 20 * np.sqrt(2 / 300) * sum(np.cos(kx * x + ky * y + p) for (kx, ky), p in zip(k, phase, strict=True))
+    grid = AnomalyGrid(lon, lat, a)
+    assert grid.rms == pytest.approx(20, rel=0.15)
+    assert grid.correlation_length == pytest.approx(1500, rel=0.1)
+    assert AnomalyGrid(lon, lat, np.zeros_like(a)).correlation_length == np.inf
+
+
+@pytest.mark.parametrize(
+    ("lon", "lat", "values", "message"),
+    [
+        (LON * 1e4, LAT, 0.0, "column 'longitude': expected degrees, found 105000: projected coordinates"),
+        (LON, LAT * 1e4, 0.0, "column 'latitude': expected degrees"),
+        (LON**8, LAT, 0.0, "expected degrees"),
+        (np.concatenate([LON[:25], LON[26:], [10.6]]), LAT, 0.0, "evenly spaced"),
+        (LON[:3], LAT, 0.0, "at least 4"),
+        (LON, LAT, 52_000.0, "median of 52000 nT: subtract the IGRF"),
+        (LON, LAT, np.nan, "nothing but holes"),
+    ],
+)
+def test_refuses_what_is_no_map(lon, lat, values, message):
+    with pytest.raises(FormatError, match=message):
+        AnomalyGrid(lon, lat, np.full((len(lat), len(lon)), values).astype(float))
+
+
+def test_refuses_another_shape():
+    with pytest.raises(FormatError, match="expected 41 rows of 51 values, found 51 x 41"):
+        AnomalyGrid(LON, LAT, np.zeros((51, 41)))
+
+
+def test_offset_and_separation_are_inverse():
+    there = offset(60.0, 179.9, 12_000.0, 15_000.0)
+    assert there[1] < -179
+    assert separation(60.0, 179.9, *there) == pytest.approx((12_000.0, 15_000.0), abs=1e-6)

@@ -1,0 +1,204 @@
+"""One map written in every format, by other programs where there is one, and read back; and what is none."""
+
+from __future__ import annotations
+
+import struct
+
+import numpy as np
+import pytest
+import xarray as xr
+from PIL import Image
+from PIL.TiffImagePlugin import ImageFileDirectory_v2
+
+from magbridge.errors import FormatError
+from magbridge.field.grid import AnomalyGrid
+from magbridge.field.read import read_grid
+
+LON, LAT = np.linspace(10.0, 10.5, 11), np.linspace(54.0, 54.4, 9)
+MAP = 30 * np.sin(np.meshgrid(LON, LAT)[0] * 9) + 100 * (np.meshgrid(LON, LAT)[1] - 54)
+
+
+def surfer_text(path):
+    head = f"DSAA\n{LON.size} {LAT.size}\n{LON[0]} {LON[-1]}\n{LAT[0]} {LAT[-1]}\n{MAP.min()} {MAP.max()}\n"
+    path.write_text(head + "\n".join(" ".join(f"{v:.9g}" for v in row) for row in MAP))
+
+
+def surfer_6(path):
+    head = struct.pack(
+        "<4s2h6d", b"DSBB", LON.size, LAT.size, LON[0], LON[-1], LAT[0], LAT[-1], MAP.min(), MAP.max()
+    )
+    path.write_bytes(head + MAP.astype("<f4").tobytes())
+
+
+def surfer_7(path):
+    step = LON[1] - LON[0], LAT[1] - LAT[0]
+    grid = struct.pack(
+        "<2i8d", LAT.size, LON.size, LON[0], LAT[0], *step, MAP.min(), MAP.max(), 0.0, 1.70141e38
+    )
+    data = MAP.astype("<f8").tobytes()
+    path.write_bytes(
+        b"DSRB"
+        + struct.pack("<2i", 4, 2)
+        + b"GRID"
+        + struct.pack("<i", len(grid))
+        + grid
+        + b"DATA"
+        + struct.pack("<i", len(data))
+        + data
+    )
+
+
+def esri(path):
+    head = f"ncols {LON.size}\nnrows {LAT.size}\nxllcenter {LON[0]}\nyllcenter {LAT[0]}\ncellsize 0.05\nNODATA_value -9999\n"
+    path.write_text(head + "\n".join(" ".join(f"{v:.9g}" for v in row) for row in MAP[::-1]))
+
+
+def esri_corner(path):
+    head = f"NCOLS {LON.size}\nNROWS {LAT.size}\nXLLCORNER {LON[0] - 0.025}\nYLLCORNER {LAT[0] - 0.025}\nCELLSIZE 0.05\n"
+    path.write_text(head + "\n".join(" ".join(f"{v:.9g}" for v in row) for row in MAP[::-1]))
+
+
+def table(path, header="longitude,latitude,anomaly\n", delimiter=",", scale=1.0):
+    x, y = np.meshgrid(LON, LAT)
+    rows = np.column_stack([x.ravel(), y.ravel(), MAP.ravel() * scale])
+    np.random.default_rng(0).shuffle(rows)
+    path.write_text(header + "\n".join(delimiter.join(f"{v:.9g}" for v in row) for row in rows))
+
+
+def geotiff(path):
+    tags = ImageFileDirectory_v2()
+    tags[33550] = (0.05, 0.05, 0.0)
+    tags[33922] = (0.0, 0.0, 0.0, LON[0] - 0.025, LAT[-1] + 0.025, 0.0)
+    tags[34735] = (1, 1, 0, 2, 1024, 0, 1, 2, 1025, 0, 1, 1)
+    for tag, kind in ((33550, 12), (33922, 12), (34735, 3)):
+        tags.tagtype[tag] = kind
+    Image.fromarray(MAP[::-1].astype(np.float32)).save(path, tiffinfo=tags)
+
+
+def cf(path, unit="nT", scale=1.0, names=("lat", "lon"), **attrs):
+    grid = xr.DataArray(MAP * scale, {names[0]: LAT, names[1]: LON}, names, attrs={"units": unit})
+    grid[names[1]].attrs = attrs
+    xr.Dataset({"tfa": grid, "survey_flag": ((), 1)}).to_netcdf(path)
+
+
+def gmt(path):
+    """GMT's own netCDF: x, y, z, rows ascending; long names, no standard names."""
+    cf(path, unit="", names=("y", "x"), long_name="longitude")
+
+
+def old_gmt(path):
+    xr.Dataset(
+        {
+            "x_range": ("side", [LON[0], LON[-1]]),
+            "y_range": ("side", [LAT[0], LAT[-1]]),
+            "dimension": ("side", [LON.size, LAT.size]),
+            "z": ("xysize", MAP[::-1].ravel(), {"node_offset": 0}),
+        }
+    ).to_netcdf(path, format="NETCDF3_CLASSIC")
+
+
+def folder(path):
+    path.mkdir()
+    for name, values in (("xx", LON[None]), ("yy", LAT[None]), ("alt", [[305.0]]), ("map", MAP)):
+        np.savetxt(path / f"{name}.csv", values, delimiter=",")
+
+
+@pytest.mark.parametrize(
+    ("name", "write"),
+    [
+        ("a.grd", surfer_text),
+        ("b.grd", surfer_6),
+        ("c.grd", surfer_7),
+        ("d.grd", old_gmt),
+        ("e.grd", gmt),
+        ("a.nc", cf),
+        ("a.asc", esri),
+        ("b.asc", esri_corner),
+        ("a.csv", table),
+        ("a.xyz", lambda path: table(path, "", " ")),
+        ("b.csv", lambda path: table(path, "lon;lat;mag [nT]\n", ";")),
+        ("c.csv", lambda path: table(path, "lon,lat,mag (uT)\n", scale=1e-3)),
+        ("b.nc", lambda path: cf(path, "T", 1e-9)),
+        ("a.tif", geotiff),
+        ("magnav", folder),
+    ],
+)
+def test_every_format_gives_the_same_map(tmp_path, name, write):
+    write(tmp_path / name)
+    grid = read_grid(tmp_path / name)
+    np.testing.assert_allclose(grid.longitude, LON, atol=1e-6)
+    np.testing.assert_allclose(grid.latitude, LAT, atol=1e-6)
+    np.testing.assert_allclose(grid.anomaly, MAP, atol=1e-4)
+
+
+def test_what_is_saved_comes_back(tmp_path):
+    holed = MAP.copy()
+    holed[2, 3] = np.nan
+    grid = AnomalyGrid(LON, LAT, holed, sigma=np.abs(MAP) / 10, altitude=90.0)
+    grid.save(tmp_path / "g.nc")
+    back = read_grid(tmp_path / "g.nc")
+    np.testing.assert_allclose(back.anomaly, holed, rtol=1e-6)
+    np.testing.assert_allclose(back.sigma, grid.sigma, rtol=1e-6)
+    assert back.altitude == 90.0
+    assert list(tmp_path.iterdir()) == [tmp_path / "g.nc"]
+
+
+def test_a_table_over_the_antimeridian(tmp_path):
+    x, y = np.meshgrid((LON + 169.75 + 180) % 360 - 180, LAT)
+    np.savetxt(tmp_path / "a.xyz", np.column_stack([x.ravel(), y.ravel(), MAP.ravel()]))
+    grid = read_grid(tmp_path / "a.xyz")
+    np.testing.assert_allclose(grid.anomaly, MAP, atol=1e-9)
+    assert grid.look_up(-179.9, 54.2).anomaly == pytest.approx(grid.look_up(180.1, 54.2).anomaly)
+
+
+def test_a_gap_in_a_table_is_a_hole(tmp_path):
+    x, y = np.meshgrid(LON, LAT)
+    rows = np.column_stack([x.ravel(), y.ravel(), MAP.ravel()])
+    np.savetxt(tmp_path / "a.xyz", np.delete(rows, 45, axis=0))
+    assert np.isnan(read_grid(tmp_path / "a.xyz").anomaly).sum() == 1
+
+
+def scattered(path):
+    np.savetxt(path, np.random.default_rng(0).uniform(10, 11, (50, 3)))
+
+
+@pytest.mark.parametrize(
+    ("name", "write", "message"),
+    [
+        ("none.nc", None, "no such file"),
+        ("a.png", lambda p: p.write_bytes(b"x"), "expected a grid: one of .nc"),
+        ("a.nc", lambda p: p.write_bytes(b"not netCDF"), "expected a netCDF grid"),
+        ("a.nc", lambda p: cf(p, "mGal"), "expected a magnetic field in nT, found the unit 'mGal'"),
+        ("a.nc", lambda p: cf(p, names=("northing", "easting")), "column 'northing': projected coordinates"),
+        ("a.nc", lambda p: cf(p, names=("y", "x"), units="m"), "column 'x': projected coordinates"),
+        ("a.grd", lambda p: p.write_bytes(b"DSBB" + bytes(20)), "expected a Surfer grid"),
+        ("a.grd", lambda p: p.write_text("DSAA 4 4 0 1 0 1 0 1 7 7 7"), "expected a Surfer grid"),
+        ("a.grd", lambda p: p.write_bytes(bytes(600)), "Geosoft"),
+        ("a.asc", lambda p: p.write_text("ncols 3\nnrows 2\n1 2 3"), "expected an ESRI ASCII grid"),
+        ("a.tif", lambda p: p.write_bytes(b"II*\0"), "expected a GeoTIFF"),
+        ("a.csv", lambda p: p.write_text("lon,lat,depth\n1,2,3\n"), "row 1: expected the columns"),
+        (
+            "a.csv",
+            lambda p: p.write_text("lon,lat,mag\n1,2,x\n"),
+            "row 2, column '3': expected numbers",
+        ),
+        ("a.xyz", scattered, "50 scattered points"),
+        ("dir", lambda p: p.mkdir(), "expected xx.csv"),
+    ],
+)
+def test_one_clear_line(tmp_path, name, write, message):
+    if write:
+        write(tmp_path / name)
+    with pytest.raises(FormatError, match=message) as caught:
+        read_grid(tmp_path / name)
+    assert "\n" not in str(caught.value)
+    assert str(tmp_path) in str(caught.value)
+
+
+@pytest.mark.real
+def test_magnavs_published_map_matches_its_own_flight(real_data):
+    """The example's compensated magnetometer against its map, at the true track: other programs made both."""
+    grid = read_grid(real_data / "magnav_example" / "map")
+    flight = np.genfromtxt(real_data / "magnav_example" / "xyz.csv", delimiter=",", names=True)
+    left = flight["mag_1_c"] - grid.at(flight["lon"], flight["lat"])
+    assert np.std(left) < 5.0 < 0.05 * np.std(flight["mag_1_c"])

@@ -1,0 +1,58 @@
+"""Equation 4: what the total field should be."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from magbridge.errors import FormatError, OutOfRange
+from magbridge.field.grid import AnomalyGrid
+from magbridge.field.igrf import total_field
+from magbridge.field.reference import positions, reference_field
+
+TIME = 1386201600.0 + np.arange(6.0)
+
+
+def deployment(**columns: list[float]) -> xr.Dataset:
+    return xr.Dataset({name: ("time", values) for name, values in columns.items()}, {"time": TIME})
+
+
+PLACE = {"latitude": [49.5] * 6, "longitude": [-57.9] * 6, "depth": list(np.arange(6.0) * 100)}
+
+
+def test_is_the_main_field_at_each_depth_plus_anomaly_plus_bias():
+    grid = AnomalyGrid(np.linspace(-58, -57.8, 9), np.linspace(49.4, 49.6, 9), np.full((9, 9), 33.0))
+    expected = total_field(-57.9, 49.5, PLACE["depth"], TIME) + 33.0 - 4.0
+    np.testing.assert_allclose(reference_field(deployment(**PLACE), grid, -4.0), expected, atol=1e-6)
+
+
+def test_a_given_reference_counts_where_it_is_given():
+    given = [50_000.0, np.nan, 50_002.0, np.nan, np.nan, np.nan]
+    field = reference_field(deployment(reference_field=given, **PLACE))
+    assert field[0] == 50_000.0
+    assert field[2] == 50_002.0
+    np.testing.assert_allclose(field[[1, 3]], total_field(-57.9, 49.5, [100.0, 300.0], TIME[0]), atol=1e-3)
+    alone = reference_field(deployment(reference_field=given))
+    assert np.isnan(alone).tolist() == np.isnan(given).tolist()
+
+
+def test_rows_without_a_position_get_one_from_their_neighbours():
+    gaps = deployment(
+        latitude=[np.nan, 49.0, np.nan, np.nan, 49.3, np.nan],
+        longitude=[np.nan, 179.9, np.nan, np.nan, -179.8, np.nan],
+    )
+    longitude, latitude, depth = positions(gaps)
+    np.testing.assert_allclose(latitude, [49.0, 49.0, 49.1, 49.2, 49.3, 49.3])
+    np.testing.assert_allclose(longitude, [179.9, 179.9, -180.0, -179.9, -179.8, -179.8])
+    assert not depth.any()
+
+
+def test_says_what_is_missing():
+    with pytest.raises(FormatError, match="expected latitude and longitude, or reference_field"):
+        reference_field(deployment(depth=[0.0] * 6))
+    elsewhere = AnomalyGrid(np.linspace(0, 1, 9), np.linspace(0, 1, 9), np.zeros((9, 9)))
+    with pytest.raises(OutOfRange, match="does not cover"):
+        reference_field(deployment(**PLACE), elsewhere)
+    with pytest.raises(OutOfRange, match="the IGRF covers"):
+        reference_field(deployment(**PLACE).assign_coords(time=TIME + 3e9))
