@@ -1,0 +1,325 @@
+"""Correct raw samples: one arithmetic for one sample and for a million, with the same bits.
+
+Notes
+-----
+With ``A, T`` at the sample's positions and V the covariance of the corrected vector::
+
+    d = H_r - T,  b = A d,  F = |b|,  u = b / F
+    V_ij = Q_ij . (d d^T) + L_ij . d + O_ij         (dA, dT and the sensor's noise carried through)
+    sigma_F^2 = u^T V u
+
+Every operation is elementwise IEEE arithmetic in one written order, on floats or on arrays, never a
+library's matrix product (whose order of summation depends on the shape and on the machine): so a
+sample corrected live, in a batch, or replayed on another computer gives identical bits.
+
+What a missing value gives: a NaN channel of the field or position makes total and vector NaN and
+the sigmas infinite, flagged ``gap`` or ``stale_telemetry``; the total is never a guess.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import inf, isnan, sqrt
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magbridge.calibration.kernel import Kernel
+from magbridge.calibration.model import Calibration
+from magbridge.calibration.terms import Step
+from magbridge.errors import CalibrationError
+from magbridge.records import Corrected, Quality
+
+__all__ = ["CorrectedArrays", "Corrector", "correct", "regressors"]
+
+FloatArray = NDArray[np.float64]
+CHUNK = 512  # samples whose table products stay in a core's cache
+MARGIN = 0.02  # of the half range: telemetry that shakes at its end is not extrapolated
+
+
+class CorrectedArrays(NamedTuple):
+    """Corrected samples as arrays: nT, and :class:`~magbridge.records.Quality` bits.
+
+    Attributes
+    ----------
+    total, sigma : (n,) arrays
+    vector, vector_sigma : (n, 3) arrays
+        Body axes; sensor axes where ``no_boresight`` is set.
+    quality : (n,) int array
+    """
+
+    total: FloatArray
+    sigma: FloatArray
+    vector: FloatArray
+    vector_sigma: FloatArray
+    quality: NDArray[np.int64]
+
+
+def _prepare(t: Sequence[Any]) -> tuple[Any, ...]:
+    """From the table's 69 sums to what a sample needs, at one set of positions.
+
+    ``L_ij,k = -(G_ik,j + G_jk,i)`` with ``G = S_aT A``, and ``O = A S_TT A``.
+    """
+    xx, yy, zz, xy, xz, yz = t[:6]
+    G = []
+    for s in range(45, 63, 3):
+        x, y, z = t[s : s + 3]
+        G.append((x * xx + y * xy + z * xz, x * xy + y * yy + z * yz, x * xz + y * yz + z * zz))
+    gxx, gyy, gzz, gxy, gxz, gyz = G
+    L = (
+        (-2.0 * gxx[0], -2.0 * gxy[0], -2.0 * gxz[0]),
+        (-2.0 * gxy[1], -2.0 * gyy[1], -2.0 * gyz[1]),
+        (-2.0 * gxz[2], -2.0 * gyz[2], -2.0 * gzz[2]),
+        (-(gxx[1] + gxy[0]), -(gxy[1] + gyy[0]), -(gxz[1] + gyz[0])),
+        (-(gxx[2] + gxz[0]), -(gxy[2] + gyz[0]), -(gxz[2] + gzz[0])),
+        (-(gxy[2] + gxz[1]), -(gyy[2] + gyz[1]), -(gyz[2] + gzz[1])),
+    )
+    a, b, c, d, e, f = t[63:69]  # S_TT: xx yy zz xy xz yz
+    px, py, pz = a * xx + d * xy + e * xz, d * xx + b * xy + f * xz, e * xx + f * xy + c * xz
+    qx, qy, qz = a * xy + d * yy + e * yz, d * xy + b * yy + f * yz, e * xy + f * yy + c * yz
+    rx, ry, rz = a * xz + d * yz + e * zz, d * xz + b * yz + f * zz, e * xz + f * yz + c * zz
+    O = (  # noqa: E741  (the notes' letter)
+        xx * px + xy * py + xz * pz,
+        xy * qx + yy * qy + yz * qz,
+        xz * rx + yz * ry + zz * rz,
+        xx * qx + xy * qy + xz * qz,
+        xx * rx + xy * ry + xz * rz,
+        xy * rx + yy * ry + yz * rz,
+    )
+    V = tuple((*t[9 + 6 * i : 15 + 6 * i], *L[i], O[i]) for i in range(6))
+    return (*t[:9], V)
+
+
+def _apply(
+    hx: Any, hy: Any, hz: Any, prepared: tuple[Any, ...], sight: tuple[float, ...] | None, root: Any
+) -> tuple[Any, ...]:
+    """One sample (or arrays of them): total, sigma, vector, sigmas of the vector."""
+    xx, yy, zz, xy, xz, yz, tx, ty, tz, V = prepared
+    dx, dy, dz = hx - tx, hy - ty, hz - tz
+    bx = xx * dx + xy * dy + xz * dz
+    by = xy * dx + yy * dy + yz * dz
+    bz = xz * dx + yz * dy + zz * dz
+    F = root(bx * bx + by * by + bz * bz)
+    over = 1.0 / (F + 1e-300)  # a vector of exactly nothing has no direction, and must not raise
+    ux, uy, uz = bx * over, by * over, bz * over
+    exx, eyy, ezz, exy, exz, eyz = dx * dx, dy * dy, dz * dz, dx * dy, dx * dz, dy * dz
+    vxx, vyy, vzz, vxy, vxz, vyz = [
+        q0 * exx + q1 * eyy + q2 * ezz + q3 * exy + q4 * exz + q5 * eyz + l0 * dx + l1 * dy + l2 * dz + o
+        for q0, q1, q2, q3, q4, q5, l0, l1, l2, o in V
+    ]
+    variance = (
+        ux * ux * vxx + uy * uy * vyy + uz * uz * vzz
+        + 2.0 * (ux * uy * vxy + ux * uz * vxz + uy * uz * vyz)
+    )  # fmt: skip
+    # abs: rounding may leave a variance of nothing at -1e-12
+    if sight is None:
+        return F, root(abs(variance)), bx, by, bz, root(abs(vxx)), root(abs(vyy)), root(abs(vzz))
+    return (F, root(abs(variance)), *_rotate(bx, by, bz, vxx, vyy, vzz, vxy, vxz, vyz, sight, root))
+
+
+def _rotate(
+    bx: Any, by: Any, bz: Any, vxx: Any, vyy: Any, vzz: Any, vxy: Any, vxz: Any, vyz: Any,
+    sight: tuple[float, ...], root: Any,
+) -> tuple[Any, ...]:  # fmt: skip
+    """Into body axes: ``b' = R b``, ``V' = R V R^T + [b'] Omega [b']^T``, Omega the boresight's own."""
+    oxx, oyy, ozz, oxy, oxz, oyz = sight[9:]
+    rows = (sight[0:3], sight[3:6], sight[6:9])
+    px, py, pz = [rx * bx + ry * by + rz * bz for rx, ry, rz in rows]
+    wx, wy, wz = [
+        rx * rx * vxx + ry * ry * vyy + rz * rz * vzz
+        + 2.0 * (rx * ry * vxy + rx * rz * vxz + ry * rz * vyz)
+        for rx, ry, rz in rows
+    ]  # fmt: skip
+    wx = wx + (pz * pz * oyy + py * py * ozz - 2.0 * py * pz * oyz)
+    wy = wy + (pz * pz * oxx + px * px * ozz - 2.0 * px * pz * oxz)
+    wz = wz + (py * py * oxx + px * px * oyy - 2.0 * px * py * oxy)
+    return px, py, pz, root(abs(wx)), root(abs(wy)), root(abs(wz))
+
+
+def _sight(calibration: Calibration) -> tuple[float, ...] | None:
+    """Boresight as 9 numbers of R, then 6 of its covariance."""
+    if calibration.boresight is None:
+        return None
+    O = calibration.boresight.covariance  # noqa: E741
+    return (
+        *calibration.boresight.matrix().ravel().tolist(),
+        O[0][0], O[1][1], O[2][2], O[0][1], O[0][2], O[1][2],
+    )  # fmt: skip
+
+
+class Corrector:
+    """Corrects sample after sample, as the bridge does.
+
+    Parameters
+    ----------
+    calibration : Calibration
+
+    Notes
+    -----
+    While positions and effects stand still, only the sample's own arithmetic is done.
+    """
+
+    def __init__(self, calibration: Calibration) -> None:
+        self.calibration = calibration
+        self._kernel = calibration.kernel
+        self._sight = _sight(calibration)
+        self._steps = [effect.begin(calibration) for effect in calibration.effects]
+        self._base = _base_flags(calibration)
+        self._ranges = _ranges(calibration)
+        self._wanted = len(calibration.channels)
+        self._last: list[float] = []
+        self._prepared: tuple[Any, ...] = ()
+        self._buffer = np.empty_like(self._kernel.table)
+
+    def step(
+        self, time_us: int, field: tuple[float, float, float], values: Sequence[float], quality: int = 0
+    ) -> Corrected:
+        """Correct one sample.
+
+        Parameters
+        ----------
+        time_us : int
+            µs since 1970 UTC.
+        field : tuple of 3 float
+            nT, raw, sensor axes.
+        values : sequence of float
+            ``calibration.channels``, in that order; NaN where unknown.
+        quality : int
+            Flags that the sample already carries.
+
+        Raises
+        ------
+        CalibrationError
+            Another number of values than the calibration's channels.
+        """
+        if len(values) != self._wanted:
+            raise CalibrationError(
+                f"expected {self._wanted} values ({', '.join(self.calibration.channels)}), "
+                f"found {len(values)}"
+            )
+        hx, hy, hz = field
+        regressors = self._kernel.powers(values, 1.0)
+        for effect in self._steps:
+            regressors += effect(time_us, hx, hy, hz, values)
+        if regressors != self._last:
+            self._last = regressors
+            self._prepared = self._stage(regressors)
+        F, sigma, x, y, z, sx, sy, sz = _apply(hx, hy, hz, self._prepared, self._sight, sqrt)
+        quality |= self._base
+        for value, (low, high) in zip(values, self._ranges, strict=False):
+            if not low <= value <= high:
+                quality |= Quality.STALE_TELEMETRY if isnan(value) else Quality.EXTRAPOLATED
+        if F - F != 0.0:  # NaN or infinite
+            quality |= int(hx + hy + hz - (hx + hy + hz) != 0.0) * Quality.GAP
+            F = x = y = z = np.nan
+            sigma = sx = sy = sz = inf
+        return Corrected(F, sigma, (x, y, z), (sx, sy, sz), int(quality))
+
+    def _stage(self, regressors: list[float]) -> tuple[Any, ...]:
+        phi = np.array(regressors)
+        psi = phi.take(self._kernel.first) * phi.take(self._kernel.second)
+        np.multiply(psi[:, None], self._kernel.table, out=self._buffer)
+        return _prepare(np.add.reduce(self._buffer, axis=0).tolist())
+
+
+def correct(
+    calibration: Calibration, field: FloatArray, channels: FloatArray, time: FloatArray
+) -> CorrectedArrays:
+    """Correct many samples; bit for bit what :class:`Corrector` gives one by one.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    field : (n, 3) array
+        nT, raw, sensor axes.
+    channels : (n, k) array
+        ``calibration.channels``, in that order; NaN where unknown.
+    time : (n,) array
+        s since 1970 UTC; effects follow it, so in order.
+
+    Returns
+    -------
+    CorrectedArrays
+    """
+    field = np.asarray(field, float)
+    n = len(field)
+    channels = np.asarray(channels, float).reshape(n, -1)
+    if channels.shape[1] != len(calibration.channels):
+        raise CalibrationError(
+            f"expected {len(calibration.channels)} channels ({', '.join(calibration.channels)}), "
+            f"found {channels.shape[1]}"
+        )
+    out = np.empty((8, n))
+    kernel, sight = calibration.kernel, _sight(calibration)
+    steps = [effect.begin(calibration) for effect in calibration.effects]
+    with np.errstate(all="ignore"):  # NaN in, NaN out: flagged below
+        for start in range(0, n, CHUNK):
+            part = slice(start, start + CHUNK)
+            phi = _regressors(kernel, steps, field[part], channels[part], time[part])
+            prepared = _stage_many(kernel, phi)
+            hx, hy, hz = field[part].T
+            out[:, part] = _apply(hx, hy, hz, prepared, sight, np.sqrt)
+        quality = np.full(n, _base_flags(calibration))
+        for value, (low, high) in zip(channels.T, _ranges(calibration), strict=False):
+            quality |= np.where((value < low) | (value > high), int(Quality.EXTRAPOLATED), 0)
+            quality |= np.where(np.isnan(value), int(Quality.STALE_TELEMETRY), 0)
+        lost = ~np.isfinite(out[0])
+        quality |= np.where(lost & ~np.isfinite(field.sum(axis=1)), int(Quality.GAP), 0)
+    out[np.ix_([0, 2, 3, 4], lost)] = np.nan
+    out[np.ix_([1, 5, 6, 7], lost)] = inf
+    return CorrectedArrays(out[0], out[1], out[2:5].T, out[5:8].T, quality)
+
+
+def _regressors(
+    kernel: Kernel, steps: list[Step], field: FloatArray, channels: FloatArray, time: FloatArray
+) -> FloatArray:
+    """(m, n): monomials vectorised, effects stepped through because they have a state."""
+    phi = kernel.powers(list(channels.T), np.ones(len(field)))
+    if steps:
+        times = np.rint(np.asarray(time) * 1e6).astype(np.int64).tolist()
+        samples = list(zip(times, *field.T.tolist(), channels.tolist(), strict=True))
+        for step in steps:
+            phi += list(np.array([step(*sample) for sample in samples]).T)
+    return np.stack(phi)
+
+
+def regressors(
+    calibration: Calibration, field: FloatArray, channels: FloatArray, time: FloatArray
+) -> FloatArray:
+    """(m, n) regressors of every sample, from a fresh state; arguments as for :func:`correct`."""
+    steps = [effect.begin(calibration) for effect in calibration.effects]
+    return _regressors(calibration.kernel, steps, field, channels.reshape(len(field), -1), time)
+
+
+def _stage_many(kernel: Kernel, phi: FloatArray) -> tuple[Any, ...]:
+    """:meth:`Corrector._stage` for (m, n) regressors, once for each run of equal ones."""
+    new = np.ones(phi.shape[1], bool)
+    new[1:] = (phi[:, 1:] != phi[:, :-1]).any(axis=0)
+    phi = phi[:, new]
+    table = kernel.table
+    sums = np.multiply.outer(table[0], phi[kernel.first[0]] * phi[kernel.second[0]])
+    product = np.empty_like(sums)
+    for q in range(1, len(table)):
+        psi = phi[kernel.first[q]] * phi[kernel.second[q]]
+        np.multiply(table[q][:, None], psi, out=product)
+        sums += product
+    prepared = _prepare(list(sums))
+    if new.all():
+        return prepared
+    if phi.shape[1] == 1:
+        return prepared
+    back = np.cumsum(new) - 1
+    return (*(row[back] for row in prepared[:9]), [[row[back] for row in entry] for entry in prepared[9]])
+
+
+def _base_flags(calibration: Calibration) -> int:
+    flags = Quality(0) if calibration.boresight else Quality.NO_BORESIGHT
+    return int(flags | Quality.UNCALIBRATED) if calibration.method == "none" else int(flags)
+
+
+def _ranges(calibration: Calibration) -> list[tuple[float, float]]:
+    return [
+        (parameter.low - MARGIN * parameter.scale, parameter.high + MARGIN * parameter.scale)
+        for parameter in calibration.parameters
+    ]

@@ -1,0 +1,215 @@
+"""From a deployment, or plain arrays, to what a fit compares."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from dataclasses import field as attribute
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magbridge.calibration.model import Parameter
+from magbridge.errors import CalibrationError
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+__all__ = ["Observations", "observations"]
+
+FloatArray = NDArray[np.float64]
+_PER_SAMPLE = ("field", "reference", "parameters", "runs", "time", "attitude", "reference_ned")
+
+
+@dataclass(frozen=True, eq=False)
+class Observations:
+    """Calibration data as arrays; rows that lack a value are dropped when it is made.
+
+    Attributes
+    ----------
+    field : (n, 3) array
+        nT, raw channels, sensor axes.
+    reference : (n,) array
+        nT, the true total field.
+    parameters : (n, k) array
+        Actuator positions; k may be 0.
+    names, units : tuple of str
+        Of the parameters.
+    runs : (n,) array
+        A label for each sample: dive, spiral, file. Left-out data are whole runs.
+    time : (n,) array
+        s since 1970 UTC; if not given, one sample a second.
+    attitude : (n, 3) array, optional
+        rad, roll, pitch, heading (true).
+    reference_ned : (n, 3) array, optional
+        nT, the true field vector, north-east-down.
+    sensor : str
+    inputs : dict
+        File name -> SHA-256.
+    model : str
+        What the reference is.
+    """
+
+    field: FloatArray
+    reference: FloatArray
+    parameters: FloatArray
+    names: tuple[str, ...] = ()
+    units: tuple[str, ...] = ()
+    runs: NDArray[np.generic] | None = None
+    time: FloatArray | None = None
+    attitude: FloatArray | None = None
+    reference_ned: FloatArray | None = None
+    sensor: str = ""
+    inputs: dict[str, str] = attribute(default_factory=dict)
+    model: str = ""
+
+    def __post_init__(self) -> None:
+        n = len(self.field)
+        put = object.__setattr__  # the one moment in which a frozen thing is made
+        parameters = np.asarray(self.parameters, float).reshape(n, -1)
+        k = parameters.shape[1]
+        put(self, "names", tuple(self.names) or tuple(f"p{i + 1}" for i in range(k)))
+        put(self, "units", tuple(self.units) or ("",) * k)
+        if len(self.names) != k or len(self.units) != k:
+            raise CalibrationError(
+                f"parameters: {k} columns, but {len(self.names)} names and {len(self.units)} units"
+            )
+        reference = np.broadcast_to(np.asarray(self.reference, float), n)
+        time = np.arange(n, dtype=float) if self.time is None else np.asarray(self.time, float)
+        runs = np.zeros(n, int) if self.runs is None else np.asarray(self.runs)
+        whole = np.isfinite(np.asarray(self.field, float)).all(axis=1) & np.isfinite(reference)
+        whole &= np.isfinite(parameters).all(axis=1) & np.isfinite(time)
+        _enough(n, whole, parameters, self.names, reference)
+        put(self, "field", np.asarray(self.field, float)[whole])
+        put(self, "reference", reference[whole])
+        put(self, "parameters", parameters[whole])
+        put(self, "runs", runs[whole])
+        put(self, "time", time[whole])
+        for name in ("attitude", "reference_ned"):
+            if getattr(self, name) is not None:
+                put(self, name, np.asarray(getattr(self, name), float)[whole])
+
+    def __len__(self) -> int:
+        return len(self.field)
+
+    def part(self, rows: NDArray[np.bool_]) -> Observations:
+        """Pick rows."""
+        picked = {name: getattr(self, name) for name in _PER_SAMPLE}
+        return replace(self, **{name: v if v is None else v[rows] for name, v in picked.items()})
+
+    @property
+    def follows(self) -> NDArray[np.bool_]:
+        """(n,) whether a sample comes one interval after the one before, in the same run."""
+        assert self.time is not None
+        assert self.runs is not None
+        follows = np.zeros(len(self), bool)
+        step = np.diff(self.time)
+        if step.size:
+            follows[1:] = (self.runs[1:] == self.runs[:-1]) & (step > 0) & (step < 1.5 * np.median(step))
+        return follows
+
+    def ranges(self) -> tuple[Parameter, ...]:
+        """Return the parameters with the range seen, scaled to [-1, 1]."""
+        found = []
+        for name, unit, column in zip(self.names, self.units, self.parameters.T, strict=True):
+            low, high = float(column.min()), float(column.max())
+            if not high - low > 1e-9 * max(abs(high), abs(low)):
+                raise CalibrationError(
+                    f"parameter {name!r} never moves (it is {low:g} throughout): leave it out, or add runs"
+                )
+            found.append(Parameter(name, unit, low, high, (low + high) / 2, (high - low) / 2))
+        return tuple(found)
+
+
+def _enough(
+    n: int, whole: NDArray[np.bool_], parameters: FloatArray, names: Sequence[str], reference: FloatArray
+) -> None:
+    """Refuse what cannot be fitted, saying which column is to blame."""
+    if whole.sum() >= 10:
+        if not (reference[whole] > 0).all():
+            raise CalibrationError("reference field: expected positive numbers (nT)")
+        return
+    reasons = [
+        f"{name!r} has {int(np.isfinite(column).sum())}"
+        for name, column in zip((*names, "reference field"), (*parameters.T, reference), strict=True)
+        if np.isfinite(column).sum() < 10
+    ]
+    because = f" ({', '.join(reasons)} numbers)" if reasons else ""
+    raise CalibrationError(
+        f"only {int(whole.sum())} of {n} samples have every value{because}: at least 10 needed"
+    )
+
+
+def observations(
+    ds: xr.Dataset,
+    parameters: Sequence[str],
+    *,
+    reference: Callable[[xr.Dataset], tuple[FloatArray, FloatArray | None, str]] | None = None,
+) -> Observations:
+    """Take a deployment's columns.
+
+    Parameters
+    ----------
+    ds : Dataset
+        A deployment (columns as in the contract).
+    parameters : sequence of str
+        Columns that move masses.
+    reference : callable, optional
+        ``ds -> (total (n,) nT, vector (n, 3) NED nT or None, name)``. If not given, or where the
+        deployment has it, the column ``reference_field`` counts.
+
+    Raises
+    ------
+    CalibrationError
+        A column is missing or does not hold numbers.
+    """
+    names = ("mag_x", "mag_y", "mag_z", *parameters)
+    columns = {name: _column(ds, name) for name in names}
+    vector: FloatArray | None = None
+    model = "reference_field"
+    if reference is not None:
+        total, vector, model = reference(ds)
+        if "reference_field" in ds:
+            own = _column(ds, "reference_field")
+            total = np.where(np.isfinite(own), own, total)
+    else:
+        total = _column(ds, "reference_field")
+    attitude = None
+    if all(name in ds for name in ("roll", "pitch", "heading")):
+        attitude = np.radians(np.stack([_column(ds, name) for name in ("roll", "pitch", "heading")], axis=1))
+    time = np.asarray(ds["time"].values, float)
+    return Observations(
+        field=np.stack([columns[name] for name in names[:3]], axis=1),
+        reference=total,
+        parameters=np.stack([columns[name] for name in parameters], axis=1)
+        if parameters
+        else np.empty((len(time), 0)),
+        names=tuple(parameters),
+        units=tuple(str(ds[name].attrs.get("units", "")) for name in parameters),
+        runs=_runs(ds, time),
+        time=time,
+        attitude=attitude,
+        reference_ned=vector,
+        sensor=str(ds.attrs.get("sensor", "")),
+        model=model,
+    )
+
+
+def _column(ds: xr.Dataset, name: str) -> FloatArray:
+    if name not in ds:
+        known = ", ".join(sorted(str(column) for column in ds.data_vars))
+        raise CalibrationError(f"column {name!r} is missing: the deployment has {known}")
+    values = np.asarray(ds[name].values)
+    if values.dtype.kind not in "fiub":
+        raise CalibrationError(f"column {name!r}: expected numbers, found {values.dtype}")
+    return values.astype(float)
+
+
+def _runs(ds: xr.Dataset, time: FloatArray) -> NDArray[np.generic]:
+    """Take the column ``run`` or ``dive``, or a new run after every gap of ten intervals."""
+    for name in ("run", "dive"):
+        if name in ds:
+            return np.asarray(ds[name].values)
+    step = np.diff(time, prepend=time[:1])
+    return np.cumsum(step > 10 * np.median(step[1:])) if len(time) > 1 else np.zeros(len(time), int)

@@ -1,0 +1,173 @@
+"""A moving dipole: permanent and induced moment on a mass that travels along a line.
+
+Notes
+-----
+A mass at ``r(p) = r_0 + t p``, seen from the sensor, with permanent moment m and susceptibility chi
+adds to the field at the sensor (r-hat the unit vector; Blakely 1996, eq. 4.14, with mu_0/4pi in m)::
+
+    G(r) = (3 r-hat r-hat^T - I) / |r|^3,   T += G(r) m,   H -> (I + chi G(r)) H
+
+so that to first order ``A += -chi G(r)``. What the second order leaves, ``(chi G)^2``, is constant but
+for the travel and goes into the polynomial beside. Moments are kept as the field they make at the
+sensor, in nT: ``m / |r_0|^3`` and ``chi F_0 / |r_0|^3``.
+
+Along a line short against the distance, G is a rapidly converging power series in p: the term *is*
+a polynomial (order :data:`ORDER`), and runs at a polynomial's cost.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+from numpy.polynomial import chebyshev
+from numpy.typing import NDArray
+
+from magbridge.calibration.terms import Expansion, Term
+from magbridge.errors import CalibrationError
+
+if TYPE_CHECKING:
+    from magbridge.calibration.model import Calibration
+
+__all__ = ["ORDER", "Dipole", "dipole_tensor", "expand_dipole"]
+
+FloatArray = NDArray[np.float64]
+Vector = tuple[float, float, float]
+
+ORDER = 8
+"""Travel of a fifth of the distance either way is then good to 1e-4 of the moment; a tenth to 1e-7."""
+
+SYMMETRIC = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+
+
+def dipole_tensor(r: FloatArray) -> FloatArray:
+    """``G(r)`` of dipoles at `r` from the sensor.
+
+    Parameters
+    ----------
+    r : (..., 3) array
+        m.
+
+    Returns
+    -------
+    (..., 3, 3) array
+        m^-3; times a moment (nT m³, with mu_0/4pi in it) it is the field at the sensor, nT.
+    """
+    distance = np.linalg.norm(r, axis=-1)[..., None, None]
+    unit = r[..., :, None] / distance
+    return np.asarray((3.0 * unit * np.swapaxes(unit, -1, -2) - np.eye(3)) / distance**3)
+
+
+def dipole_columns(r: FloatArray, moment: FloatArray, induced: float, r_0: float) -> FloatArray:
+    """Return what each of a dipole's seven numbers adds to the nine coefficients, with the dipole at `r`.
+
+    Parameters
+    ----------
+    r : (n, 3) array
+        m, where the mass is.
+    moment : (3,) array
+        nT at the sensor, as :class:`Dipole` keeps it; its size scales the three of the position.
+    induced : float
+        nT.
+    r_0 : float
+        m, the distance that moments are scaled with.
+
+    Returns
+    -------
+    (7, n, 9) array
+        moment x, y, z; induced; displacement x, y, z (nT per m).
+    """
+    columns = np.zeros((7, len(r), 9))
+
+    def put(rows: FloatArray, G: FloatArray, moments: FloatArray, chi: float) -> None:
+        rows[:, 6:] = G @ moments
+        rows[:, :6] = np.stack([-chi * G[:, i, j] for i, j in SYMMETRIC], axis=1)
+
+    G = dipole_tensor(r) * r_0**3
+    for k in range(3):
+        put(columns[k], G, np.eye(3)[k], 0.0)
+    put(columns[3], G, np.zeros(3), 1.0)
+    for k in range(3):  # a symmetric difference over 1e-5 of the distance is good to 1e-10
+        h = 1e-5 * r_0 * np.eye(3)[k]
+        slope = (dipole_tensor(r + h) - dipole_tensor(r - h)) * r_0**3 / (2e-5 * r_0)
+        put(columns[4 + k], slope, moment, induced)
+    return columns
+
+
+def expand_dipole(values: FloatArray, order: int) -> FloatArray:
+    """Values at the Chebyshev nodes of [-1, 1] -> power series coefficients.
+
+    Parameters
+    ----------
+    values : (..., n, s) array
+        At ``cos(pi (i + 1/2) / n)``, n > order.
+
+    Returns
+    -------
+    (..., order + 1, s) array
+    """
+    n = values.shape[-2]
+    nodes = chebyshev.chebpts1(n)
+    fit = np.linalg.pinv(chebyshev.chebvander(nodes, order))
+    powers = np.zeros((order + 1, order + 1))
+    for degree in range(order + 1):
+        powers[: degree + 1, degree] = chebyshev.cheb2poly(np.eye(order + 1)[degree])[: degree + 1]
+    return np.asarray((powers @ fit) @ values)
+
+
+class Dipole(Term, frozen=True, kw_only=True):
+    """One mass as a dipole; coefficients: moment (3), induced (1), displacement (3).
+
+    Attributes
+    ----------
+    parameter : str
+        Which parameter moves it.
+    at : tuple of 3 float
+        m, body frame from the sensor, where the mass is when the parameter is 0.
+    travel : tuple of 3 float
+        m per unit of the parameter.
+    at_sigma : float
+        m, 1-sigma of `at`: the prior of the displacement.
+    moment : tuple of 3 float
+        nT at the sensor: where the displacement's columns were linearised.
+    induced : float
+        nT, likewise.
+    """
+
+    kind: ClassVar[str] = "dipole"
+    parameter: str
+    at: Vector
+    travel: Vector
+    at_sigma: float = 0.0
+    moment: Vector = (0.0, 0.0, 0.0)
+    induced: float = 0.0
+
+    @property
+    def size(self) -> int:
+        """Moment, induced moment, displacement."""
+        return 7
+
+    def check(self, parameters: tuple[str, ...]) -> None:
+        """Require that the parameter exists and the mass is not in the sensor."""
+        if self.parameter not in parameters:
+            raise CalibrationError(f"dipole: parameter {self.parameter!r} is not one of {list(parameters)}")
+        if not np.linalg.norm(self.at) > 0.0:
+            raise CalibrationError("dipole: at: expected a place away from the sensor")
+
+    def expand(self, calibration: Calibration) -> Expansion:
+        """Give the dipole as a power series in its parameter, scaled as the calibration scales it."""
+        names = [parameter.name for parameter in calibration.parameters]
+        k = names.index(self.parameter)
+        parameter = calibration.parameters[k]
+        p = parameter.centre + parameter.scale * chebyshev.chebpts1(4 * ORDER)
+        r = np.array(self.at) + p[:, None] * np.array(self.travel)
+        if np.linalg.norm(r, axis=1).min() < 3.0 * parameter.scale * np.linalg.norm(self.travel):
+            raise CalibrationError(
+                f"dipole on {self.parameter!r}: passes the sensor within three half-travels; "
+                "no series stands for it there"
+            )
+        columns = dipole_columns(r, np.array(self.moment), self.induced, float(np.linalg.norm(self.at)))
+        exponents = tuple(
+            tuple(power if i == k else 0 for i in range(len(names))) for power in range(ORDER + 1)
+        )
+        return Expansion(exponents, expand_dipole(columns, ORDER))

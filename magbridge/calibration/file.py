@@ -1,0 +1,195 @@
+"""``cal.json``: a calibration on disk, checked when it is read.
+
+Every fault is one line that names the file and what was expected: a file that was cut short, comes
+from a newer magbridge, or was edited by hand and no longer holds together.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+from zlib import crc32
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from magbridge.calibration.model import Boresight, Calibration, Noise, Parameter, Reference, Run, Sensor
+from magbridge.calibration.terms import Effect, Term, term_class
+from magbridge.errors import CalibrationError, FormatError
+from magbridge.files import atomic_path
+
+__all__ = ["FORMAT", "calibration_id", "decode_calibration", "encode_calibration", "load", "save"]
+
+FloatArray = NDArray[np.float64]
+
+FORMAT = 1
+"""Version of the layout; a reader takes this one and all before it."""
+
+
+class _File(msgspec.Struct, forbid_unknown_fields=True):
+    """Layout of ``cal.json``; names are public."""
+
+    format: int
+    software: str
+    method: str
+    sensor: Sensor
+    parameters: tuple[Parameter, ...]
+    terms: list[dict[str, Any]]
+    effects: list[dict[str, Any]]
+    coefficients: list[float]
+    covariance: list[list[float]]
+    noise: Noise
+    reference: Reference
+    boresight: Boresight | None
+    runs: tuple[Run, ...]
+    inputs: dict[str, str]
+
+
+class _Version(msgspec.Struct):
+    format: int
+
+
+def encode_calibration(calibration: Calibration) -> bytes:
+    """Return `calibration` as JSON, one key a line."""
+    content = _File(
+        format=FORMAT,
+        software=calibration.software,
+        method=calibration.method,
+        sensor=calibration.sensor,
+        parameters=calibration.parameters,
+        terms=[_term_out(term) for term in calibration.terms],
+        effects=[_term_out(effect) for effect in calibration.effects],
+        coefficients=calibration.coefficients.tolist(),
+        covariance=calibration.covariance.tolist(),
+        noise=calibration.noise,
+        reference=calibration.reference,
+        boresight=calibration.boresight,
+        runs=calibration.runs,
+        inputs=calibration.inputs,
+    )
+    encode = msgspec.json.encode
+    lines = [encode(name) + b": " + encode(getattr(content, name)) for name in _File.__struct_fields__]
+    return b"{\n" + b",\n".join(lines) + b"\n}\n"
+
+
+def decode_calibration(data: bytes, file: str | Path = "cal.json") -> Calibration:
+    """Inverse of :func:`encode_calibration`.
+
+    Parameters
+    ----------
+    data : bytes
+    file : path
+        Named in errors.
+
+    Raises
+    ------
+    FormatError
+        Not JSON, a newer format, a key missing, unknown or of the wrong type.
+    CalibrationError
+        The numbers do not hold together.
+    """
+    try:
+        version = msgspec.json.decode(data, type=_Version).format
+        if version > FORMAT:
+            raise FormatError(
+                file, f"written by a newer magbridge (format {version}; this one reads up to {FORMAT})"
+            )
+        content = msgspec.json.decode(data, type=_File)
+        terms = tuple(_term_in(term, file) for term in content.terms)
+        effects = tuple(_term_in(effect, file) for effect in content.effects)
+    except msgspec.DecodeError as problem:
+        raise FormatError(file, f"not a calibration: {_plain(problem)}") from problem
+    try:
+        return _checked(content, terms, effects)
+    except CalibrationError as problem:
+        raise CalibrationError(f"{file}: {problem}") from problem
+
+
+def load(path: str | Path) -> Calibration:
+    """Read ``cal.json``; errors as :func:`decode_calibration`, or FormatError if it cannot be opened."""
+    try:
+        data = Path(path).read_bytes()
+    except OSError as problem:
+        raise FormatError(path, f"cannot be read: {problem.strerror}") from problem
+    return decode_calibration(data, path)
+
+
+def save(calibration: Calibration, path: str | Path) -> None:
+    """Write ``cal.json``: whole, or not at all."""
+    with atomic_path(path) as beside:
+        beside.write_bytes(encode_calibration(calibration))
+
+
+def calibration_id(calibration: Calibration) -> int:
+    """32 bits that name this calibration on the link: CRC-32 of its file."""
+    return crc32(encode_calibration(calibration))
+
+
+def _term_out(term: Term) -> dict[str, Any]:
+    return {"kind": term.kind, **msgspec.to_builtins(term)}
+
+
+def _term_in(raw: dict[str, Any], file: str | Path) -> Term:
+    settings = dict(raw)
+    kind = settings.pop("kind", None)
+    if not isinstance(kind, str):
+        raise FormatError(file, "a term without its kind")
+    try:
+        return msgspec.convert(settings, term_class(kind))
+    except CalibrationError as problem:
+        raise FormatError(file, str(problem)) from problem
+
+
+def _checked(content: _File, terms: tuple[Term, ...], effects: tuple[Term, ...]) -> Calibration:
+    """Build the calibration, refusing numbers that cannot belong together."""
+    coefficients = np.array(content.coefficients, float)
+    rows = {len(row) for row in content.covariance}
+    if rows != {coefficients.size}:
+        raise CalibrationError(f"covariance: expected {coefficients.size} x {coefficients.size} numbers")
+    covariance = np.array(content.covariance, float)
+    _check_covariance(covariance)
+    for parameter in content.parameters:
+        if not (parameter.scale > 0.0 and parameter.low <= parameter.high):
+            raise CalibrationError(f"parameter {parameter.name!r}: expected scale > 0 and low <= high")
+    if not content.reference.field > 0.0:
+        raise CalibrationError("reference: field: expected nT, > 0")
+    if not content.noise.sensor >= 0.0:
+        raise CalibrationError("noise: sensor: expected nT, >= 0")
+    if any(isinstance(term, Effect) for term in terms) or not all(isinstance(e, Effect) for e in effects):
+        raise CalibrationError(
+            "terms and effects: an effect stands among the terms or a term among the effects"
+        )
+    return Calibration(
+        parameters=content.parameters,
+        terms=terms,
+        effects=tuple(effect for effect in effects if isinstance(effect, Effect)),
+        coefficients=coefficients,
+        covariance=covariance,
+        noise=content.noise,
+        reference=content.reference,
+        sensor=content.sensor,
+        boresight=content.boresight,
+        runs=content.runs,
+        method=content.method,
+        inputs=content.inputs,
+        software=content.software,
+    )
+
+
+def _check_covariance(covariance: FloatArray) -> None:
+    """Symmetric and positive semidefinite, up to rounding."""
+    scale = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+    correlation = covariance / scale / scale[:, None]
+    if (np.diag(covariance) < 0.0).any() or np.abs(correlation).max(initial=0.0) > 1.0 + 1e-6:
+        raise CalibrationError("covariance: a variance is negative or a correlation above 1")
+    if not np.allclose(correlation, correlation.T, rtol=0.0, atol=1e-9):
+        raise CalibrationError("covariance: expected a symmetric matrix")
+    if np.linalg.eigvalsh(correlation)[0] < -1e-6 * len(correlation):
+        raise CalibrationError("covariance: expected a positive semidefinite matrix")
+
+
+def _plain(problem: msgspec.DecodeError) -> str:
+    """Put the path first in msgspec's message: ``noise.sensor: Expected `float`, got `str```."""
+    text, _, path = str(problem).partition(" - at ")
+    return f"{path.strip('`').removeprefix('$.')}: {text}" if path else text

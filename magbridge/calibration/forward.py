@@ -1,0 +1,59 @@
+"""The model forwards: from the true field to what the sensor reads.
+
+Notes
+-----
+``H_r = A^-1 R^T H + T``, the inverse of :mod:`.correct`. Effects that follow the reading itself are
+found by iterating; all others are exact at once.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magbridge.calibration.correct import regressors
+from magbridge.calibration.model import Calibration
+
+__all__ = ["coefficients_at", "forward"]
+
+FloatArray = NDArray[np.float64]
+
+
+def coefficients_at(
+    calibration: Calibration, field: FloatArray, channels: FloatArray, time: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return ``A`` (n, 3, 3) and ``T`` (n, 3) of every sample, effects included; arguments as for `correct`."""
+    phi = regressors(calibration, np.asarray(field, float), np.asarray(channels, float), time)
+    theta = phi.T @ calibration.kernel.weights
+    return theta[:, [0, 3, 4, 3, 1, 5, 4, 5, 2]].reshape(-1, 3, 3), theta[:, 6:]
+
+
+def forward(
+    calibration: Calibration, field_body: FloatArray, channels: FloatArray, time: FloatArray
+) -> FloatArray:
+    """Return what the sensor reads in a true field, without noise.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    field_body : (n, 3) array
+        nT, the true field in body axes (in the calibration's sensor axes if it has no boresight).
+    channels : (n, k) array
+        ``calibration.channels``, in that order.
+    time : (n,) array
+        s.
+
+    Returns
+    -------
+    (n, 3) array
+        nT, raw channels.
+    """
+    truth = np.asarray(field_body, float)
+    if calibration.boresight is not None:
+        truth = truth @ calibration.boresight.matrix()
+    reading = truth
+    # one pass settles everything that does not look at the reading; each further one gains two digits
+    for _ in range(6 if calibration.effects else 1):
+        A, T = coefficients_at(calibration, reading, channels, time)
+        reading = np.linalg.solve(A, truth[:, :, None])[:, :, 0] + T
+    return reading

@@ -1,0 +1,172 @@
+"""A calibration compiled into one table, so that a sample costs a few microseconds.
+
+Notes
+-----
+With regressors ``phi(x)`` (the monomials, and what effects add) the nine coefficients are
+``theta = phi^T W``, and their covariance is ``sum_mn phi_m phi_n C_mn``, a sum over the *products* of
+regressors. Many products coincide (``x^2 . x`` and ``x . x^2``): 28 remain of 55 for a cubic in two
+positions. So both are one sum over products ``psi``::
+
+    (theta, covariance of theta) = psi^T table
+
+For the covariance V of the corrected vector ``b = A d, d = H_r - T``, write ``db = dA d - A dT``: V is
+quadratic in d, and the table holds the covariance in just the combinations that V needs: 36 for the
+quadratic part Q, 18 for ``S_aT``, 6 for ``S_TT`` (with the sensor's own noise, which acts like T's).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magbridge.calibration.terms import Exponents
+
+if TYPE_CHECKING:
+    from magbridge.calibration.model import Calibration
+
+__all__ = ["Kernel", "compile_kernel"]
+
+FloatArray = NDArray[np.float64]
+
+PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+SLOT = ((0, 3, 4), (3, 1, 5), (4, 5, 2))
+"""Where ``A[i, k]`` stands among the nine."""
+
+
+@dataclass(frozen=True, eq=False)
+class Kernel:
+    """What :mod:`.correct` needs, and nothing else.
+
+    Attributes
+    ----------
+    centre, scale : tuple of float
+        Of each parameter.
+    parents : tuple of (int, int)
+        Monomial ``i + 1`` is monomial ``parents[i][0]`` times position ``parents[i][1]``.
+    monomials : int
+        How many; the remaining regressors belong to effects.
+    weights : (m, 9) array
+        W, with ``A`` itself (not ``a``) in the first six.
+    first, second : (q,) int arrays
+        Product q is ``phi[first] * phi[second]``; the first m products are the regressors.
+    table : (q, 69) array
+        nine coefficients, then 60 combinations of their covariance.
+    """
+
+    centre: tuple[float, ...]
+    scale: tuple[float, ...]
+    parents: tuple[tuple[int, int], ...]
+    monomials: int
+    weights: FloatArray
+    first: NDArray[np.intp]
+    second: NDArray[np.intp]
+    table: FloatArray
+
+    def powers(self, values: Sequence[Any], one: Any) -> list[Any]:
+        """Return the monomials, of floats or of arrays: the same multiplications in the same order."""
+        x = [
+            (value - centre) / scale
+            for value, centre, scale in zip(values, self.centre, self.scale, strict=False)
+        ]
+        phi = [one]
+        for parent, k in self.parents:
+            phi.append(phi[parent] * x[k])
+        return phi
+
+    def monomials_of(self, positions: FloatArray) -> FloatArray:
+        """(m, n) monomials of (n, k) positions."""
+        return np.stack(self.powers(list(positions.T), np.ones(len(positions))))
+
+
+def compile_kernel(calibration: Calibration) -> Kernel:
+    """Compile `calibration`; see the module's notes."""
+    expansions = [term.expand(calibration) for term in calibration.terms]  # type: ignore[attr-defined]
+    exponents = _closed({e for expansion in expansions for e in expansion.exponents}, calibration)
+    row = {exponent: i for i, exponent in enumerate(exponents)}
+    effects = [effect.columns(calibration.reference.field) for effect in calibration.effects]
+    m = len(exponents) + sum(columns.shape[1] for columns in effects)
+    P = np.zeros((calibration.coefficients.size, m, 9))
+    k, r = 0, len(exponents)
+    for expansion in expansions:
+        rows = [row[exponent] for exponent in expansion.exponents]
+        P[k : k + len(expansion.columns), rows] = expansion.columns
+        k += len(expansion.columns)
+    for columns in effects:
+        P[k : k + columns.shape[0], r : r + columns.shape[1]] = columns
+        k, r = k + columns.shape[0], r + columns.shape[1]
+    P[:, :, :6] /= calibration.reference.field
+    W = np.tensordot(calibration.coefficients, P, 1)
+    W[0, :3] += 1.0
+    first, second, table = _table(P, W, calibration, exponents)
+    return Kernel(
+        centre=tuple(parameter.centre for parameter in calibration.parameters),
+        scale=tuple(parameter.scale for parameter in calibration.parameters),
+        parents=tuple((row[_parent(e)[0]], _parent(e)[1]) for e in exponents[1:]),
+        monomials=len(exponents),
+        weights=W,
+        first=first,
+        second=second,
+        table=table,
+    )
+
+
+def _parent(exponent: Exponents) -> tuple[Exponents, int]:
+    """Return the monomial with one power less, and of which position."""
+    k = max(i for i, power in enumerate(exponent) if power)
+    return (*exponent[:k], exponent[k] - 1, *exponent[k + 1 :]), k
+
+
+def _closed(exponents: set[Exponents], calibration: Calibration) -> list[Exponents]:
+    """All `exponents` with all their parents, by degree: each can be made from one before it."""
+    todo = [*exponents, (0,) * len(calibration.parameters)]
+    closed: set[Exponents] = set()
+    while todo:
+        exponent = todo.pop()
+        if exponent not in closed:
+            closed.add(exponent)
+            if any(exponent):
+                todo.append(_parent(exponent)[0])
+    return sorted(closed, key=lambda e: (sum(e), [-power for power in e]))
+
+
+def _table(
+    P: FloatArray, W: FloatArray, calibration: Calibration, exponents: list[Exponents]
+) -> tuple[NDArray[np.intp], NDArray[np.intp], FloatArray]:
+    """Return the products of regressors and what each contributes."""
+    m = len(W)
+    flat = P.reshape(len(P), -1)
+    C = (flat.T @ calibration.covariance @ flat).reshape(m, 9, m, 9)
+
+    def key(i: int, j: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
+        powers = [np.array(exponents[r]) for r in (i, j) if r < len(exponents)]
+        return tuple(np.sum(powers, axis=0).astype(int)) if powers else (), tuple(
+            sorted(r for r in (i, j) if r >= len(exponents))
+        )
+
+    products: dict[tuple[tuple[int, ...], tuple[int, ...]], list[tuple[int, int]]] = {}
+    for i in range(m):
+        for j in range(i, m):
+            products.setdefault(key(i, j), []).append((i, j))
+    table = np.zeros((len(products), 69))
+    table[:m, :9] = W
+    for q, pairs in enumerate(products.values()):
+        S = np.sum([C[i, :, j] + (C[j, :, i] if i != j else 0.0) for i, j in pairs], axis=0)
+        if q == 0:  # the sensor's noise adds to what it reads just as T does
+            S[6:, 6:] += calibration.noise.sensor**2 * np.eye(3)
+        table[q, 9:] = _combinations(S)
+    first, second = np.array([pairs[0] for pairs in products.values()]).T
+    return first, second, table
+
+
+def _combinations(S: FloatArray) -> FloatArray:
+    """(60,): Q of V's six entries by the six products of d, then ``S_aT`` (6 x 3), then ``S_TT``."""
+    Q = [
+        S[SLOT[i][k], SLOT[j][l]] + (S[SLOT[i][l], SLOT[j][k]] if k != l else 0.0)
+        for i, j in PAIRS
+        for k, l in PAIRS  # noqa: E741  (the index of the equation)
+    ]
+    return np.array([*Q, *S[:6, 6:].ravel(), *(S[6 + i, 6 + j] for i, j in PAIRS)])

@@ -1,0 +1,213 @@
+"""The model: what a strapdown magnetometer among moving masses reads, and how to take it back.
+
+Notes
+-----
+The instrument reads ``H_r = D(p) H + T(p)``. Corrected is::
+
+    H_c = A(p) (H_r - T(p)),   |H_c| = H_e = |IGRF| + anomaly             (paper, eqs. 3, 4 and 7)
+
+The paper's eq. 2 puts the rotation M where it drops out of the magnitude, its eq. 3 puts it where
+the vector ends in the ellipsoid's own axes. We take ``A = M S^-1 M^T``, **symmetric**: the same
+ellipsoid, six numbers, and a vector that stays in sensor axes (see :mod:`.paper`). Each of the nine
+coefficients is a polynomial in the positions scaled to the range seen, ``x = (p - centre) / scale``.
+All are kept in nT: ``A = I + a / F_0``, with F_0 the field at calibration.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from magbridge.calibration.kernel import Kernel, compile_kernel
+from magbridge.calibration.terms import Effect, Polynomial, Term
+from magbridge.errors import CalibrationError
+
+__all__ = ["Boresight", "Calibration", "Noise", "Parameter", "Reference", "Run", "Sensor", "identity"]
+
+FloatArray = NDArray[np.float64]
+
+
+class Parameter(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A telemetry channel that moves a mass.
+
+    Attributes
+    ----------
+    name, unit : str
+        As in the deployment's columns.
+    low, high : float
+        The range that the calibration has seen.
+    centre, scale : float
+        ``x = (p - centre) / scale``.
+    """
+
+    name: str
+    unit: str
+    low: float
+    high: float
+    centre: float
+    scale: float
+
+
+class Sensor(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Which instrument was calibrated, and in which of its power cycles (None: unknown)."""
+
+    name: str = ""
+    power_cycle: int | None = None
+
+
+UNKNOWN = Sensor()
+
+
+class Noise(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Noise of the samples: 1-sigma of each channel (nT), of the reference (nT), memory.
+
+    `memory` is the correlation of a sample's noise with the next one's, `interval` s later.
+    """
+
+    sensor: float
+    reference: float = 0.0
+    memory: float = 0.0
+    interval: float = 0.0
+
+
+class Reference(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What the magnitude was compared with: F_0 (nT), which model, and the site bias found (nT)."""
+
+    field: float
+    model: str = ""
+    bias: float = 0.0
+    bias_sigma: float = 0.0
+
+
+class Boresight(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The rotation from corrected sensor axes to body axes that a scalar fit leaves free.
+
+    `rotation` is a rotation vector (rad), `covariance` that of a small further rotation in body
+    axes (rad²).
+    """
+
+    rotation: tuple[float, float, float]
+    covariance: tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
+
+    def matrix(self) -> FloatArray:
+        """(3, 3) rotation matrix: Rodrigues' formula."""
+        x, y, z = self.rotation
+        angle = float(np.sqrt(x * x + y * y + z * z))
+        K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+        return np.asarray(
+            np.eye(3) + np.sinc(angle / np.pi) * K + 0.5 * np.sinc(angle / (2 * np.pi)) ** 2 * K @ K
+        )
+
+
+class Run(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """One calibration run: how many samples, what is left (nT, in the sensor's own units), where."""
+
+    label: str
+    samples: int
+    rms: float
+    parameters: tuple[float, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """A calibration with its uncertainty. Nothing in it changes: a fit returns a new one.
+
+    Attributes
+    ----------
+    parameters : tuple of Parameter
+    terms, effects : tuple of Term, tuple of Effect
+        Coefficients stand in this order.
+    coefficients : (K,) array
+        nT (a dipole's displacement: m; an effect's: as its class says).
+    covariance : (K, K) array
+    noise, reference, sensor, boresight, runs
+        See their classes.
+    method : str
+        Which fit made it; ``"none"`` marks every sample as uncalibrated.
+    inputs : dict
+        File name -> SHA-256 of what it was made from.
+    software : str
+        Version that made it.
+    """
+
+    parameters: tuple[Parameter, ...]
+    terms: tuple[Term, ...]
+    coefficients: FloatArray
+    covariance: FloatArray
+    noise: Noise
+    reference: Reference
+    effects: tuple[Effect, ...] = ()
+    sensor: Sensor = UNKNOWN
+    boresight: Boresight | None = None
+    runs: tuple[Run, ...] = ()
+    method: str = ""
+    inputs: dict[str, str] = field(default_factory=dict)
+    software: str = ""
+
+    def __post_init__(self) -> None:
+        names = tuple(parameter.name for parameter in self.parameters)
+        for term in (*self.terms, *self.effects):
+            term.check(names)
+        size = sum(term.size for term in (*self.terms, *self.effects))
+        if self.coefficients.shape != (size,):
+            raise CalibrationError(
+                f"coefficients: expected {size}, one for each term's number, found {self.coefficients.size}"
+            )
+        if self.covariance.shape != (size, size):
+            raise CalibrationError(
+                f"covariance: expected {size} x {size}, found {' x '.join(map(str, self.covariance.shape))}"
+            )
+        for array in (self.coefficients, self.covariance):
+            array.setflags(write=False)
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """Telemetry that correcting needs, in order: the parameters, then what effects follow."""
+        names = [parameter.name for parameter in self.parameters]
+        for effect in self.effects:
+            names += [name for name in effect.channels() if name not in names]
+        return tuple(names)
+
+    @cached_property
+    def kernel(self) -> Kernel:
+        """The arithmetic of this calibration, made once."""
+        return compile_kernel(self)
+
+    def matrices(self, positions: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return ``A`` and ``T`` of the position terms.
+
+        Parameters
+        ----------
+        positions : (n, k) array
+            One column for each parameter, in its unit.
+
+        Returns
+        -------
+        A : (n, 3, 3) array
+        T : (n, 3) array
+            nT.
+        """
+        theta = self.kernel.monomials_of(positions).T @ self.kernel.weights[: self.kernel.monomials]
+        return theta[:, [0, 3, 4, 3, 1, 5, 4, 5, 2]].reshape(-1, 3, 3), theta[:, 6:]
+
+
+def identity(parameters: tuple[Parameter, ...] = (), field: float = 50_000.0) -> Calibration:
+    """Return the calibration that changes nothing and knows nothing: every sample is flagged."""
+    return Calibration(
+        parameters=parameters,
+        terms=(Polynomial(exponents=((0,) * len(parameters),)),),
+        coefficients=np.zeros(9),
+        covariance=np.diag(np.full(9, field**2)),
+        noise=Noise(0.0),
+        reference=Reference(field),
+        method="none",
+    )
+
+
+def with_boresight(calibration: Calibration, boresight: Boresight | None) -> Calibration:
+    """Return the same calibration with another boresight."""
+    return replace(calibration, boresight=boresight)

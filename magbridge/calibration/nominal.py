@@ -1,0 +1,140 @@
+"""The nominal fit: one ellipsoid for all samples, nine numbers (paper, section 2.1).
+
+Notes
+-----
+On a glider's narrow attitudes a free ellipsoid has a way out: ``A -> 0`` with ``T -> infinity`` sends every
+residual to zero. So scale and soft iron have a prior of physical width, residuals are reported in
+the sensor's own nT, and an answer that shrank all the same is refused.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magbridge.calibration.data import Observations
+from magbridge.calibration.residual import Samples
+from magbridge.calibration.solve import NoiseModel, Prior, covariance_of, estimate_noise, gauss_newton
+from magbridge.errors import CalibrationError
+
+__all__ = ["SCALE_SIGMA", "check_scales", "nominal", "nominal_samples"]
+
+FloatArray = NDArray[np.float64]
+
+SCALE_SIGMA = 0.03
+"""Prior 1-sigma by which scales differ from each other, and of soft iron, on a vehicle."""
+GAIN_SIGMA = 0.3
+"""Prior 1-sigma of the gain that the three axes share: instruments state theirs in rough units."""
+OFFSET_SIGMA = 0.6
+"""Prior 1-sigma of the hard iron, as a fraction of the field."""
+
+
+def nominal_samples(data: Observations) -> Samples:
+    """Take `data` with the constant monomial only."""
+    return Samples(
+        data.field, data.reference, np.ones((len(data), 1)), data.follows, float(data.reference.mean())
+    )
+
+
+def nominal(
+    data: Observations,
+    *,
+    axes_fixed: bool = False,
+    equal_xz: bool = False,
+    scale_sigma: float = SCALE_SIGMA,
+    gain_sigma: float = GAIN_SIGMA,
+) -> tuple[FloatArray, FloatArray, NoiseModel]:
+    """Fit one ellipsoid.
+
+    Parameters
+    ----------
+    data : Observations
+        Its parameters are not used.
+    axes_fixed : bool
+        ``M = I``: no rotation, as the paper does.
+    equal_xz : bool
+        ``S_x = S_z``, as the paper does.
+    scale_sigma, gain_sigma : float
+        Prior 1-sigma of soft iron, and of the gain common to all axes.
+
+    Returns
+    -------
+    coefficients : (9,) array
+        nT.
+    covariance : (9, 9) array
+        nT².
+    noise : NoiseModel
+
+    Raises
+    ------
+    CalibrationError
+        The fit collapsed or did not settle.
+    """
+    samples = nominal_samples(data)
+    E = np.eye(9)
+    if equal_xz:
+        E[2, 0] = 1.0
+    keep = [s for s in range(9) if not (axes_fixed and s in {3, 4, 5}) and not (equal_xz and s == 2)]
+    E = E[:, keep]
+    prior = Prior(np.zeros(len(keep)), _precision(E, scale_sigma, gain_sigma) / samples.unit**2, E)
+    best = None
+    for start in starts(samples):
+        z: FloatArray = np.linalg.lstsq(E, start, rcond=None)[0]
+        noise = NoiseModel(1e-3 * samples.unit)  # wide at first: far from the answer nothing is noise
+        for _ in range(4):
+            found = gauss_newton(samples, prior, noise, z)
+            z = found.z
+            noise = estimate_noise(samples, E @ z, len(keep))
+        value = found.normal.cost
+        if found.settled and (best is None or value < 0.999 * best[0]):
+            best = (value, found, noise)
+    if best is None:
+        raise CalibrationError("nominal: no start settled; are the samples those of one sensor?")
+    _, found, noise = best
+    covariance = E @ covariance_of(found.normal.hessian / noise.sigma**2 + prior.precision) @ E.T
+    coefficients = E @ found.z
+    check_scales(coefficients, samples.unit)
+    return coefficients, covariance, noise
+
+
+def _precision(E: FloatArray, scale_sigma: float, gain_sigma: float) -> FloatArray:
+    """Prior precision in units of the field, of the numbers that E leaves."""
+    covariance = np.diag(np.array([scale_sigma] * 6 + [OFFSET_SIGMA] * 3) ** 2)
+    covariance[:3, :3] += gain_sigma**2
+    return np.asarray(E.T @ np.linalg.inv(covariance) @ E)
+
+
+def starts(samples: Samples) -> list[FloatArray]:
+    """No iron at all; and the sphere that is nearest by linear least squares.
+
+    ``|h|^2 = 2 h^T T + (F^2 - |T|^2)`` is linear in T and one constant.
+    """
+    h = samples.field
+    design = np.column_stack([2.0 * h, np.full(len(h), samples.unit)])
+    scale = np.abs(design).max(axis=0) + 1e-300
+    right = (h * h).sum(axis=1) - samples.reference**2
+    # a hundredth of the field holds directions the samples never went to
+    damp = np.diag(np.full(4, 1e-2 * np.sqrt(len(h))))
+    solved = np.linalg.lstsq(np.vstack([design / scale, damp]), np.append(right, np.zeros(4)), rcond=None)[0]
+    sphere = np.concatenate([np.zeros(6), (solved / scale)[:3]])
+    return [np.zeros(9), sphere]
+
+
+def check_scales(coefficients: FloatArray, unit: float) -> None:
+    """Refuse a collapsed fit.
+
+    Raises
+    ------
+    CalibrationError
+        A scale of A outside 0.5 to 2, or a hard iron above twice the field.
+    """
+    a = coefficients[:6] / unit
+    A = a[[0, 3, 4, 3, 1, 5, 4, 5, 2]].reshape(3, 3) + np.eye(3)
+    scales = np.linalg.eigvalsh(A)
+    T = float(np.linalg.norm(coefficients[6:9]))
+    if scales[0] < 0.5 or scales[-1] > 2.0 or T / unit > 2.0:
+        listed = ", ".join(f"{value:.3g}" for value in scales)
+        raise CalibrationError(
+            f"the fit collapsed: scales {listed} (expected near 1), offset {T:.0f} nT in a field of "
+            f"{unit:.0f} nT; the attitudes are too few to tell scale from offset"
+        )

@@ -1,0 +1,39 @@
+"""The paper's view of a calibration: rotation M, scale S, translation T, and back.
+
+Notes
+-----
+The paper writes ``H_r = H_e^-1 S M H_c + T`` (eq. 2) and inverts it as ``H_c = H_e S^-1 M^-1 (H_r - T)``
+(eq. 3). With eq. 2's order M drops out of ``|H_c|``; with eq. 3's the vector ends in the ellipsoid's own
+axes. ``A = H_e M S^-1 M^T`` is the same ellipsoid and leaves the vector in sensor axes, so M are the
+ellipsoid's axes and S the lengths of its semi-axes (nT), for a field of H_e.
+"""
+
+from __future__ import annotations
+
+from itertools import permutations
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["from_paper", "to_paper"]
+
+FloatArray = NDArray[np.float64]
+
+
+def to_paper(A: FloatArray, field: float) -> tuple[FloatArray, FloatArray]:
+    """Rotation M (3, 3) and scale S (3,) of a symmetric positive ``A``; `field` is H_e, nT.
+
+    Axes are ordered and signed so that M is as near to I as can be.
+    """
+    values, axes = np.linalg.eigh(A)
+    order = max(permutations(range(3)), key=lambda p: sum(abs(axes[i, k]) for i, k in enumerate(p)))
+    axes, values = axes[:, order], values[list(order)]
+    axes = axes * np.where(np.diag(axes) < 0.0, -1.0, 1.0)
+    if np.linalg.det(axes) < 0.0:
+        axes[:, np.argmin(np.abs(np.diag(axes)))] *= -1.0
+    return axes, field / values
+
+
+def from_paper(M: FloatArray, S: FloatArray, field: float) -> FloatArray:
+    """Return ``A = H_e M S^-1 M^T`` (3, 3)."""
+    return np.asarray((M * (field / np.asarray(S))) @ np.asarray(M).T)

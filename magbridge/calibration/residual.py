@@ -1,0 +1,155 @@
+"""The scalar residual of a calibration, its analytic Jacobian, and their normal equations.
+
+Notes
+-----
+Noise sits in the reading, inside ``A(.)``: least squares on ``|A(H_r - T)| - H_e`` would shrink A and bias T.
+The errors-in-variables residual (Sampson's; Kukush, Markovsky & Van Huffel 2004) is in the sensor's
+own nanotesla::
+
+    d = H_r - T,  b = A d,  F = |b|,  u = b / F,  w = A u
+    e = (F - H_e) / s,   s^2 = kappa^2 + |w|^2          (kappa: noise of the reference over the sensor's)
+
+    de = (u^T dA d - w^T dT) / s - (e / s^2) w^T dw
+    w^T dw = w^T dA u + y^T dA d - y^T A dT,   y = (I - u u^T) A w / F
+
+Each coefficient is a polynomial, so a row of the Jacobian is ``phi (x) g`` with g the derivative by the
+nine. Noise with memory rho is whitened within a run: ``(e_i - rho e_(i-1)) / sqrt(1 - rho^2)``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["NormalEquations", "Samples", "normal_equations", "residuals"]
+
+FloatArray = NDArray[np.float64]
+CHUNK = 8192  # rows of the Jacobian at a time: bounded memory at any number of samples
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """What a fit compares.
+
+    Attributes
+    ----------
+    field : (n, 3) array
+        nT, raw.
+    reference : (n,) array
+        nT, H_e.
+    phi : (n, m) array
+        Monomials of the positions.
+    follows : (n,) bool array
+        The sample before it belongs to the same run and came one interval earlier.
+    unit : float
+        nT, F_0: ``A = I + a / F_0``.
+    kappa : float
+        Noise of the reference over the sensor's.
+    """
+
+    field: FloatArray
+    reference: FloatArray
+    phi: FloatArray
+    follows: NDArray[np.bool_]
+    unit: float
+    kappa: float = 0.0
+
+    def part(self, rows: slice | NDArray[np.bool_] | NDArray[np.intp]) -> Samples:
+        """Pick samples."""
+        return Samples(
+            self.field[rows], self.reference[rows], self.phi[rows], self.follows[rows], self.unit, self.kappa
+        )
+
+
+class NormalEquations(NamedTuple):
+    """``cost = sum weight e^2`` about a point: half its gradient, and Gauss-Newton's half Hessian."""
+
+    hessian: FloatArray
+    gradient: FloatArray
+    cost: float
+
+
+def residuals(samples: Samples, coefficients: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Residual e (n,) in sensor nT, and its derivative by the nine coefficients (n, 9).
+
+    Parameters
+    ----------
+    samples : Samples
+    coefficients : (9 m,) array
+        nT, monomial by monomial.
+    """
+    theta = samples.phi @ coefficients.reshape(-1, 9)
+    a = theta[:, :6] / samples.unit
+    A = a[:, [0, 3, 4, 3, 1, 5, 4, 5, 2]].reshape(-1, 3, 3) + np.eye(3)
+    d = samples.field - theta[:, 6:]
+    b = _times(A, d)
+    F = np.sqrt((b * b).sum(axis=1))
+    u = b / F[:, None]
+    w = _times(A, u)
+    s2 = samples.kappa**2 + (w * w).sum(axis=1)
+    s = np.sqrt(s2)
+    e = (F - samples.reference) / s
+    v = _times(A, w)
+    y = (v - u * (u * v).sum(axis=1)[:, None]) / F[:, None]
+    k = (e / s2)[:, None]
+    z = u / s[:, None] - k * y  # de = z^T dA d - (A z)^T dT - k w^T dA u
+    g = np.empty((len(e), 9))
+    for slot, (i, j) in enumerate(((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))):
+        g[:, slot] = z[:, i] * d[:, j] - k[:, 0] * w[:, i] * u[:, j]
+        if i != j:
+            g[:, slot] += z[:, j] * d[:, i] - k[:, 0] * w[:, j] * u[:, i]
+    g[:, :6] /= samples.unit
+    g[:, 6:] = -_times(A, z)
+    return e, g
+
+
+def _times(A: FloatArray, x: FloatArray) -> FloatArray:
+    """(n, 3, 3) times (n, 3)."""
+    return np.asarray(np.matmul(A, x[:, :, None])[:, :, 0])
+
+
+def normal_equations(
+    samples: Samples,
+    coefficients: FloatArray,
+    weight: FloatArray | None = None,
+    memory: float = 0.0,
+) -> NormalEquations:
+    """Sum up the normal equations of the whitened residual, in bounded memory.
+
+    Parameters
+    ----------
+    samples : Samples
+    coefficients : (9 m,) array
+    weight : (n,) array, optional
+        Of each whitened residual (robust fits); 1 if not given.
+    memory : float
+        rho, between neighbours in a run.
+    """
+    size = coefficients.size
+    hessian, gradient, cost = np.zeros((size, size)), np.zeros(size), 0.0
+    for start in range(0, len(samples.field), CHUNK):
+        first = max(start - 1, 0)  # one row of overlap: whitening looks back
+        part = samples.part(slice(first, start + CHUNK))
+        e, g = residuals(part, coefficients)
+        J = (part.phi[:, :, None] * g[:, None, :]).reshape(len(e), size)
+        if memory:
+            e, J = whiten(e, part.follows, memory), whiten(J, part.follows, memory)
+        e, J = e[start - first :], J[start - first :]
+        if weight is not None:
+            root = np.sqrt(weight[start : start + CHUNK])
+            e, J = e * root, J * root[:, None]
+        hessian += J.T @ J
+        gradient += J.T @ e
+        cost += float(e @ e)
+    return NormalEquations(hessian, gradient, cost)
+
+
+def whiten(values: FloatArray, follows: NDArray[np.bool_], memory: float) -> FloatArray:
+    """``(v_i - rho v_(i-1)) / sqrt(1 - rho^2)`` where a sample follows another; as it is elsewhere."""
+    white = values.copy()
+    mask = follows[1:]
+    white[1:][mask] = (values[1:][mask] - memory * values[:-1][mask]) / np.sqrt(1.0 - memory**2)
+    return white

@@ -1,0 +1,188 @@
+"""Damped Gauss-Newton on the scalar residual with a Gaussian prior, and robust noise.
+
+Notes
+-----
+Minimises over z, with coefficients ``c = E z``::
+
+    sum_i w_i e_i(c)^2 / (2 sigma^2) + (z - mu)^T P (z - mu) / 2
+
+Levenberg's damping keeps each step downhill; steps are small linear algebra, because the normal
+equations of all samples are summed up once per step.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve, solve_triangular
+from scipy.linalg.lapack import dpotrf
+
+from magbridge.calibration.residual import NormalEquations, Samples, normal_equations, residuals, whiten
+from magbridge.errors import CalibrationError
+
+__all__ = ["NoiseModel", "Prior", "Solution", "estimate_noise", "gauss_newton"]
+
+FloatArray = NDArray[np.float64]
+DEGREES = 5.0  # of freedom of the noise's tails where outliers are suspected
+
+
+@dataclass(frozen=True, eq=False)
+class Prior:
+    """Gaussian on z: mean (q,) and precision (q, q); E (K, q) or None for the identity."""
+
+    mean: FloatArray
+    precision: FloatArray
+    E: FloatArray | None = None
+
+    def coefficients(self, z: FloatArray) -> FloatArray:
+        """``c = E z``."""
+        return z if self.E is None else np.asarray(self.E @ z)
+
+    def reduce(self, normal: NormalEquations) -> NormalEquations:
+        """Return the normal equations in z."""
+        if self.E is None:
+            return normal
+        return NormalEquations(self.E.T @ normal.hessian @ self.E, self.E.T @ normal.gradient, normal.cost)
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseModel:
+    """Noise of the residuals: 1-sigma (sensor nT), memory, and a weight for each sample."""
+
+    sigma: float
+    memory: float = 0.0
+    weight: FloatArray | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """Where the solver ended: z, normal equations there (in z), and whether it settled."""
+
+    z: FloatArray
+    normal: NormalEquations
+    settled: bool
+    steps: int
+
+
+def gauss_newton(
+    samples: Samples,
+    prior: Prior,
+    noise: NoiseModel,
+    start: FloatArray,
+    *,
+    steps: int = 50,
+    tolerance: float = 1e-3,
+) -> Solution:
+    """Minimise from `start`.
+
+    Parameters
+    ----------
+    samples, prior, noise
+        See the module's notes.
+    start : (q,) array
+    steps : int
+        At most.
+    tolerance : float
+        Settled when the next step would gain less than this (in units of log likelihood).
+    """
+    z, damping = np.array(start, float), 0.0
+    normal = prior.reduce(normal_equations(samples, prior.coefficients(z), noise.weight, noise.memory))
+    value = _objective(normal, prior, noise, z)
+    for step in range(steps):
+        precision = normal.hessian / noise.sigma**2 + prior.precision
+        gradient = normal.gradient / noise.sigma**2 + prior.precision @ (z - prior.mean)
+        while True:
+            move = -_solve(precision, gradient, damping)
+            promise = -float(gradient @ move)
+            if promise < tolerance:
+                return Solution(z, normal, settled=True, steps=step)
+            tried = prior.reduce(
+                normal_equations(samples, prior.coefficients(z + move), noise.weight, noise.memory)
+            )
+            new = _objective(tried, prior, noise, z + move)
+            if new < value:
+                break
+            damping = max(10.0 * damping, 1e-6)
+            if damping > 1e6:
+                return Solution(z, normal, settled=False, steps=step)
+        damping = damping / 10.0 if damping > 1e-8 else 0.0
+        z, normal, value = z + move, tried, new
+    return Solution(z, normal, settled=False, steps=steps)
+
+
+def _objective(normal: NormalEquations, prior: Prior, noise: NoiseModel, z: FloatArray) -> float:
+    off = z - prior.mean
+    return 0.5 * normal.cost / noise.sigma**2 + 0.5 * float(off @ prior.precision @ off)
+
+
+def _solve(precision: FloatArray, gradient: FloatArray, damping: float) -> FloatArray:
+    """Newton's step with Levenberg-Marquardt damping, scaled by the diagonal."""
+    scale = np.sqrt(np.maximum(np.diag(precision), 1e-300))
+    scaled = precision / np.outer(scale, scale)
+    scaled[np.diag_indices_from(scaled)] += damping
+    factor, info = dpotrf(scaled)
+    if info:  # directions that neither data nor prior hold: stay there
+        values, vectors = np.linalg.eigh(scaled)
+        kept = values > 1e-11 * values[-1]
+        inner = vectors[:, kept] @ ((vectors[:, kept].T @ (gradient / scale)) / values[kept])
+        return np.asarray(inner / scale)
+    return np.asarray(cho_solve((factor, False), gradient / scale) / scale)
+
+
+def covariance_of(precision: FloatArray) -> FloatArray:
+    """Inverse of a positive definite precision, symmetric to the last bit."""
+    scale = np.sqrt(np.diag(precision))
+    try:
+        factor, lower = cho_factor(precision / np.outer(scale, scale), lower=True)
+    except np.linalg.LinAlgError as problem:
+        raise CalibrationError("the data and the prior leave a combination of coefficients free") from problem
+    root = solve_triangular(factor, np.eye(len(scale)), lower=lower) / scale
+    return np.asarray(root.T @ root)
+
+
+def estimate_noise(
+    samples: Samples, coefficients: FloatArray, free: float, *, robust: bool = True
+) -> NoiseModel:
+    """Noise model from the residuals of a fit.
+
+    Parameters
+    ----------
+    samples : Samples
+    coefficients : (9 m,) array
+    free : float
+        How many numbers the data determined.
+    robust : bool
+        Weigh samples as Student's t with :data:`DEGREES` of freedom does where the residuals have
+        outliers.
+
+    Returns
+    -------
+    NoiseModel
+    """
+    e, _ = residuals(samples, coefficients)
+    n = len(e)
+    scale = 1.4826 * float(np.median(np.abs(e))) or 1e-9
+    if not robust or not (np.abs(e) > 5.0 * scale).any():
+        memory = _memory(e, samples.follows)
+        white = whiten(e, samples.follows, memory)
+        return NoiseModel(float(np.sqrt((white @ white) / max(n - free, 1.0))), memory)
+    memory = _memory(np.clip(e, -3.0 * scale, 3.0 * scale), samples.follows)
+    white = whiten(e, samples.follows, memory)
+    sigma2 = (1.4826 * float(np.median(np.abs(white)))) ** 2
+    for _ in range(20):  # EM for the scale of a t distribution
+        weight = (DEGREES + 1.0) / (DEGREES + white * white / sigma2)
+        sigma2 = float((weight * white * white).sum()) / max(n - free, 1.0)
+    # expected information of t noise is (nu + 1) / (nu + 3) of its weights' sum
+    weight = (DEGREES + 1.0) / (DEGREES + white * white / sigma2)
+    return NoiseModel(float(np.sqrt(sigma2)), memory, weight)
+
+
+def _memory(e: FloatArray, follows: NDArray[np.bool_]) -> float:
+    """Correlation of neighbours; what is within its own error of 0 is 0."""
+    late, early = e[1:][follows[1:]], e[:-1][follows[1:]]
+    if len(late) < 30:
+        return 0.0
+    rho = float(late @ early / np.sqrt((late @ late) * (early @ early) + 1e-300))
+    return min(max(rho, 0.0), 0.99) if rho > 3.0 / np.sqrt(len(late)) else 0.0

@@ -1,0 +1,156 @@
+"""What a calibration is made of: terms, each adding to the nine coefficients of ``A`` and ``T``.
+
+A *position term* is a polynomial in the scaled actuator positions (:class:`Polynomial`, and
+:class:`~magbridge.calibration.dipole.Dipole`, which expands into one). An *effect* is anything
+else that moves the reading, with a state of its own where it needs one: see
+:mod:`magbridge.calibration.effects`. Adding a term is one class and one row in :data:`TERMS`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from importlib import import_module
+from importlib.metadata import entry_points
+from itertools import combinations_with_replacement
+from typing import TYPE_CHECKING, Any, ClassVar, cast
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from magbridge.errors import CalibrationError
+
+if TYPE_CHECKING:
+    from magbridge.calibration.model import Calibration
+
+__all__ = ["SLOTS", "TERMS", "Effect", "Expansion", "Polynomial", "Term", "full_order", "term_class"]
+
+FloatArray = NDArray[np.float64]
+Exponents = tuple[int, ...]
+Step = Callable[[int, float, float, float, Sequence[float]], tuple[float, ...]]
+"""One sample into an effect: time (µs), the raw channels (nT), the values -> its regressors."""
+
+SLOTS = ("a_xx", "a_yy", "a_zz", "a_xy", "a_xz", "a_yz", "t_x", "t_y", "t_z")
+"""Six of the symmetric ``A`` (as ``a = (A - I) F_0``, nT) and three of ``T`` (nT)."""
+
+TERMS: dict[str, str] = {
+    "polynomial": "magbridge.calibration.terms:Polynomial",
+    "dipole": "magbridge.calibration.dipole:Dipole",
+    "channel": "magbridge.calibration.effects:ChannelEffect",
+}
+"""Name in ``cal.json`` -> ``module:class``; others join by the entry point group ``magbridge.terms``."""
+
+
+class Expansion(msgspec.Struct, frozen=True):
+    """A position term as a polynomial: ``theta(x) = sum_k c_k sum_m x^m columns[k, m]``.
+
+    Attributes
+    ----------
+    exponents : tuple of tuple of int
+        m monomials; one exponent for each parameter.
+    columns : (K, m, 9) array
+        What one unit of coefficient k adds to the nine :data:`SLOTS`, nT.
+    """
+
+    exponents: tuple[Exponents, ...]
+    columns: FloatArray
+
+
+class Term(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Settings of a term; its coefficients stand in the calibration's vector."""
+
+    kind: ClassVar[str]
+
+    @property
+    def size(self) -> int:
+        """Number of coefficients."""
+        raise NotImplementedError
+
+    def check(self, parameters: tuple[str, ...]) -> None:
+        """Raise CalibrationError where the settings do not fit the calibration's parameters."""
+
+
+class Polynomial(Term, frozen=True, kw_only=True):
+    """Each of the nine coefficients a polynomial in the scaled positions (paper, eq. 8).
+
+    Coefficient ``9 m + s`` multiplies monomial m in slot s.
+
+    Attributes
+    ----------
+    exponents : tuple of tuple of int
+        The monomials; the constant one first.
+    """
+
+    kind: ClassVar[str] = "polynomial"
+    exponents: tuple[Exponents, ...]
+
+    @property
+    def size(self) -> int:
+        """Nine for each monomial."""
+        return 9 * len(self.exponents)
+
+    def check(self, parameters: tuple[str, ...]) -> None:
+        """One non-negative exponent for each parameter, no monomial twice."""
+        for exponent in self.exponents:
+            if len(exponent) != len(parameters) or min(exponent, default=0) < 0:
+                raise CalibrationError(
+                    f"exponents {list(exponent)}: expected {len(parameters)} non-negative numbers, "
+                    "one for each parameter"
+                )
+        if len(set(self.exponents)) != len(self.exponents):
+            raise CalibrationError("exponents: a monomial stands there twice")
+
+    def expand(self, calibration: Calibration) -> Expansion:  # noqa: ARG002  (a dipole needs it)
+        """Return the polynomial as itself."""
+        m = len(self.exponents)
+        return Expansion(self.exponents, np.eye(9 * m).reshape(9 * m, m, 9))
+
+
+class Effect(Term, frozen=True, kw_only=True):
+    """A term that follows something else than the positions: a temperature, a current, time.
+
+    It turns every sample into a few *regressors* (nT, or the unit of what it follows); `columns`
+    says what each coefficient does with them. One function steps it, live and in batch, so both
+    give the same bits. A NaN in its channel must not spoil its state: hold the last value.
+    """
+
+    def channels(self) -> tuple[str, ...]:
+        """Names of the telemetry that it needs; beyond the parameters, in the deployment's columns."""
+        return ()
+
+    def columns(self, field: float) -> FloatArray:
+        """(K, r, 9): what coefficient k makes of regressor r in each slot; `field` is F_0, nT."""
+        raise NotImplementedError
+
+    def begin(self, calibration: Calibration) -> Step:
+        """Return a fresh stepper, with a state as at switching on."""
+        raise NotImplementedError
+
+
+def full_order(parameters: int, order: int) -> tuple[Exponents, ...]:
+    """All monomials of total degree up to `order`, cross terms included, the constant first."""
+    return tuple(
+        tuple(picks.count(k) for k in range(parameters))
+        for degree in range(order + 1)
+        for picks in combinations_with_replacement(range(parameters), degree)
+    )
+
+
+def term_class(kind: str) -> type[Term]:
+    """Look a term's class up by its name in :data:`TERMS` or among the entry points.
+
+    Raises
+    ------
+    CalibrationError
+        Nobody offers that name.
+    """
+    found: Any
+    if kind in TERMS:
+        module, _, name = TERMS[kind].partition(":")
+        found = getattr(import_module(module), name)
+    else:
+        offers = [entry for entry in entry_points(group="magbridge.terms") if entry.name == kind]
+        if not offers:
+            raise CalibrationError(f"term {kind!r} is not known here: known are {', '.join(sorted(TERMS))}")
+        found = offers[0].load()
+    return cast("type[Term]", found)

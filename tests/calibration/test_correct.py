@@ -1,0 +1,206 @@
+"""Correcting: against a naive oracle, the same bits live and in batch, nothing silent."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from magbridge.calibration.correct import Corrector, correct
+from magbridge.calibration.dipole import Dipole
+from magbridge.calibration.effects import ChannelEffect
+from magbridge.calibration.forward import forward
+from magbridge.calibration.model import Boresight, Calibration, Noise, Parameter, Reference, identity
+from magbridge.calibration.terms import Effect, Polynomial, Term, full_order
+from magbridge.errors import CalibrationError
+from magbridge.records import Quality
+
+F_0 = 50_000.0
+
+
+def random_calibration(
+    seed: int, k: int = 2, order: int = 3, *, boresight: bool = False, extra: bool = False
+) -> Calibration:
+    rng = np.random.default_rng(seed)
+    terms: tuple[Term, ...] = (Polynomial(exponents=full_order(k, order)),)
+    effects: tuple[Effect, ...] = ()
+    if extra:
+        terms += (
+            Dipole(
+                parameter="p0",
+                at=(-0.4, 0.05, 0.1),
+                travel=(0.02, 0.0, 0.0),
+                moment=(900.0, -300.0, 50.0),
+                induced=40.0,
+            ),
+        )
+        effects = (ChannelEffect(cause="temperature_offset", channel="sensor_temperature", lag=60.0),)
+    size = sum(term.size for term in (*terms, *effects))
+    root = rng.normal(size=(size, size))
+    return Calibration(
+        parameters=tuple(Parameter(f"p{i}", "in", -1.0, 1.2, 0.1, 1.1) for i in range(k)),
+        terms=terms,
+        effects=effects,
+        coefficients=rng.normal(size=size) * 300.0 * (np.arange(size) < size - 10 * extra),
+        covariance=root @ root.T,
+        noise=Noise(1.5),
+        reference=Reference(F_0),
+        boresight=Boresight((0.01, -0.02, 0.3), tuple(map(tuple, (np.eye(3) * 1e-5).tolist())))
+        if boresight
+        else None,
+        method="auto",
+    )
+
+
+def random_samples(seed: int, n: int, channels: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    field = rng.normal(size=(n, 3))
+    field *= F_0 / np.linalg.norm(field, axis=1)[:, None]
+    return field, rng.uniform(-1.2, 1.4, size=(n, channels)), np.arange(n) * 4.0
+
+
+def naive(cal: Calibration, c: np.ndarray, h: np.ndarray, p: np.ndarray) -> np.ndarray:
+    """b = A (h - T), as the equation stands, one sample, polynomials only."""
+    x = np.array([(v - par.centre) / par.scale for v, par in zip(p, cal.parameters, strict=True)])
+    theta = sum(
+        np.prod(x ** np.array(e)) * c[9 * m : 9 * m + 9] for m, e in enumerate(cal.terms[0].exponents)
+    )
+    a = theta[:6] / F_0
+    A = np.eye(3) + np.array([[a[0], a[3], a[4]], [a[3], a[1], a[5]], [a[4], a[5], a[2]]])
+    return A @ (h - theta[6:])
+
+
+@pytest.mark.parametrize(("k", "order"), [(0, 0), (1, 3), (2, 3), (3, 2), (2, 5)])
+def test_agrees_with_the_equation_as_it_stands(k: int, order: int) -> None:
+    cal = random_calibration(1, k, order)
+    field, positions, time = random_samples(2, 5, k)
+    got = correct(cal, field, positions, time)
+    for i in range(5):
+        b = naive(cal, cal.coefficients, field[i], positions[i])
+        np.testing.assert_allclose(got.vector[i], b, rtol=1e-12)
+        np.testing.assert_allclose(got.total[i], np.linalg.norm(b), rtol=1e-12)
+
+
+def test_sigma_is_the_covariance_carried_through() -> None:
+    cal = random_calibration(3)
+    field, positions, time = random_samples(4, 4, 2)
+    got = correct(cal, field, positions, time)
+    for i in range(4):
+        J = np.array(
+            [
+                (
+                    naive(cal, cal.coefficients + 0.05 * e, field[i], positions[i])
+                    - naive(cal, cal.coefficients - 0.05 * e, field[i], positions[i])
+                ) / 0.1
+                for e in np.eye(cal.coefficients.size)
+            ]
+        ).T  # fmt: skip
+        A, _ = cal.matrices(positions[i : i + 1])
+        V = J @ cal.covariance @ J.T + cal.noise.sensor**2 * A[0] @ A[0].T
+        u = got.vector[i] / got.total[i]
+        np.testing.assert_allclose(got.sigma[i], np.sqrt(u @ V @ u), rtol=1e-5)
+        np.testing.assert_allclose(got.vector_sigma[i], np.sqrt(np.diag(V)), rtol=1e-5)
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    k=st.integers(0, 3),
+    order=st.integers(0, 3),
+    boresight=st.booleans(),
+    extra=st.booleans(),
+    n=st.integers(1, 700),
+    hold=st.integers(1, 50),
+)
+def test_one_by_one_and_all_at_once_give_the_same_bits(
+    seed: int, k: int, order: int, boresight: bool, extra: bool, n: int, hold: int
+) -> None:
+    cal = random_calibration(seed, max(k, 1) if extra else k, order, boresight=boresight, extra=extra)
+    field, channels, time = random_samples(seed + 1, n, len(cal.channels))
+    channels = np.repeat(channels[::hold], hold, axis=0)[:n]
+    rng = np.random.default_rng(seed)
+    field[rng.random(n) < 0.02] = np.nan
+    channels[rng.random(channels.shape) < 0.02] = np.nan
+    batch = correct(cal, field, channels, time)
+    live = Corrector(cal)
+    for i in range(n):
+        one = live.step(round(time[i] * 1e6), tuple(field[i].tolist()), channels[i].tolist())
+        many = (batch.total[i], batch.sigma[i], *batch.vector[i], *batch.vector_sigma[i], batch.quality[i])
+        np.testing.assert_array_equal(
+            (one.total_field, one.total_field_sigma, *one.field, *one.field_sigma, one.quality), many
+        )
+
+
+def test_what_is_missing_is_flagged_and_never_a_number() -> None:
+    cal = random_calibration(5)
+    live = Corrector(cal)
+    good = (20_000.0, 0.0, 45_000.0)
+    for field, values, flag in (
+        ((np.nan, 0.0, 1.0), (0.0, 0.0), Quality.GAP),
+        (good, (np.nan, 0.0), Quality.STALE_TELEMETRY),
+    ):
+        got = live.step(0, field, values)
+        assert np.isnan(got.total_field)
+        assert got.total_field_sigma == np.inf
+        assert got.quality & flag
+    assert live.step(0, good, (0.0, 0.0), Quality.MOVING).quality == Quality.MOVING | Quality.NO_BORESIGHT
+    assert live.step(0, (0.0, 0.0, 0.0), (0.0, 0.0)).total_field_sigma > 0.0
+
+
+def test_extrapolation_is_flagged_and_sigma_grows() -> None:
+    cal = random_calibration(6)
+    field = np.repeat([[20_000.0, 1000.0, 45_000.0]], 3, axis=0)
+    got = correct(cal, field, np.array([[0.1, 0.1], [1.9, 0.1], [2.9, 0.1]]), np.arange(3.0))
+    flagged = got.quality & Quality.EXTRAPOLATED
+    assert flagged.tolist() == [0, Quality.EXTRAPOLATED, Quality.EXTRAPOLATED]
+    assert got.sigma[0] < got.sigma[1] < got.sigma[2]
+
+
+def test_a_boresight_turns_the_vector_and_leaves_the_magnitude() -> None:
+    sighted = random_calibration(7, boresight=True)
+    blind = replace(sighted, boresight=None)
+    samples = random_samples(8, 50, 2)
+    got, raw = correct(sighted, *samples), correct(blind, *samples)
+    np.testing.assert_array_equal(got.total, raw.total)
+    np.testing.assert_allclose(got.vector, raw.vector @ sighted.boresight.matrix().T, rtol=1e-12)
+    assert (raw.quality & Quality.NO_BORESIGHT).all()
+    assert not (got.quality & Quality.NO_BORESIGHT).any()
+    assert (np.linalg.norm(got.vector_sigma, axis=1) > np.linalg.norm(raw.vector_sigma, axis=1)).all()
+
+
+def test_no_motion_no_actuator_correction_and_identity_changes_nothing() -> None:
+    field, _, time = random_samples(9, 20, 0)
+    got = correct(identity(), field, np.empty((20, 0)), time)
+    np.testing.assert_allclose(got.vector, field, rtol=1e-15)
+    assert (got.quality & Quality.UNCALIBRATED).all()
+
+
+@pytest.mark.parametrize("extra", [False, True])
+def test_forward_is_the_inverse(extra: bool) -> None:
+    cal = random_calibration(10, boresight=True, extra=extra)
+    truth, channels, time = random_samples(11, 60, len(cal.channels))
+    reading = forward(cal, truth, channels, time)
+    np.testing.assert_allclose(correct(cal, reading, channels, time).vector, truth, atol=1e-6)
+
+
+def test_wrong_number_of_channels_is_one_clear_line() -> None:
+    cal = random_calibration(12)
+    with pytest.raises(CalibrationError, match="expected 2 channels \\(p0, p1\\), found 1"):
+        correct(cal, np.zeros((1, 3)), np.zeros((1, 1)), np.zeros(1))
+    with pytest.raises(CalibrationError, match="expected 2 values"):
+        Corrector(cal).step(0, (0.0, 0.0, 0.0), (1.0,))
+
+
+def test_the_live_path_imports_no_heavy_packages() -> None:
+    heavy = "scipy", "xarray", "pandas", "matplotlib", "filterpy", "ppigrf"
+    code = (
+        "import sys, magbridge.calibration.correct, magbridge.calibration.file;"
+        f"print([m for m in {heavy!r} if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
