@@ -162,7 +162,7 @@ def fly(
         Of the wander.
     motion : Motion
     limits : mapping of Limit
-        For every moving mass; also where a mass that no leg has yet moved stands (mid-range).
+        For every moving mass. One that no leg moves stands in the middle of its way.
 
     Raises
     ------
@@ -193,7 +193,7 @@ def fly(
     north = np.cumsum(ahead * np.cos(np.radians(heading)) + motion.current[0]) * step
     east = np.cumsum(ahead * np.sin(np.radians(heading)) + motion.current[1]) * step
     latitude, longitude = from_local(north, east, start[1:])
-    names = dict.fromkeys(name for leg in legs for name in leg.parameters)
+    names = dict.fromkeys((*limits, *(name for leg in legs for name in leg.parameters)))
     return Track(
         start=start[0],
         step=step,
@@ -238,7 +238,7 @@ def _mass_motion(
             raise OutOfRange(
                 name, value, f"the vehicle allows {limit.low:g} to {limit.high:g} {limit.unit}".rstrip()
             )
-    position = wanted[0]
+    position = wanted[0] if wanted else (limit.low + limit.high) / 2
     begin: list[float] = []
     origin: list[float] = []
     target: list[float] = []

@@ -1,0 +1,65 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sitl.signals import autoregressive, first_order, first_order_at
+
+TAU = 1 / (2 * np.pi * 0.33)
+
+
+def test_a_step_rises_as_one_minus_e_to_the_t_over_tau() -> None:
+    # a step between two points is a ramp; a steep one must do
+    step = 1e-3
+    u = np.ones(5000)
+    y = first_order(u, step, TAU, start=0.0)
+    t = step * np.arange(5000)
+    np.testing.assert_allclose(y, 1 - np.exp(-t / TAU), atol=1e-12)
+
+
+def test_a_ramp_is_followed_one_time_constant_late_at_any_step() -> None:
+    for step in (0.01, 0.5, 4.0):
+        t = step * np.arange(round(40 / step))
+        y = first_order(t, step, TAU)
+        np.testing.assert_allclose(y, t - TAU * (1 - np.exp(-t / TAU)), atol=1e-9)
+
+
+def test_a_sine_at_the_corner_loses_three_decibels() -> None:
+    t = 0.01 * np.arange(6000)
+    y = first_order(np.sin(2 * np.pi * 0.33 * t), 0.01, TAU)
+    assert np.abs(y[3000:]).max() == pytest.approx(1 / np.sqrt(2), rel=1e-3)
+
+
+def test_between_points_is_what_a_finer_grid_gives() -> None:
+    rng = np.random.default_rng(0)
+    u = rng.normal(0, 1, 30)
+    fine = np.interp(0.01 * np.arange(1451), 0.5 * np.arange(30), u)
+    expected = first_order(fine, 0.01, TAU)
+    when = 0.01 * np.arange(1451)
+    np.testing.assert_allclose(
+        first_order_at(u, first_order(u, 0.5, TAU), 0.5, TAU, when), expected, atol=1e-9
+    )
+
+
+def test_it_is_causal() -> None:
+    u = np.zeros((50, 3))
+    later = u.copy()
+    later[25:] = 1.0
+    np.testing.assert_array_equal(first_order(u, 0.5, TAU)[:25], first_order(later, 0.5, TAU)[:25])
+
+
+def test_no_time_constant_no_lag() -> None:
+    u = np.random.default_rng(1).normal(0, 1, 20)
+    np.testing.assert_array_equal(first_order(u, 0.5, 0.0), u)
+    np.testing.assert_allclose(first_order_at(u, u, 0.5, 0.0, np.array([0.25])), [(u[0] + u[1]) / 2])
+
+
+@pytest.mark.parametrize("memory", [0.0, 3.0, 10.0])
+def test_noise_has_the_spread_and_memory_asked_for(memory: float) -> None:
+    noise = autoregressive(np.random.default_rng(2), (200_000, 2), 5.0, memory)
+    assert np.std(noise) == pytest.approx(5.0, rel=0.02)
+    expected = np.exp(-1 / memory) if memory else 0.0
+    assert np.corrcoef(noise[:-1, 0], noise[1:, 0])[0, 1] == pytest.approx(expected, abs=0.02)
+    assert np.std(autoregressive(np.random.default_rng(3), (2, 100_000), 5.0, memory)[0]) == pytest.approx(
+        5.0, rel=0.02
+    )

@@ -1,0 +1,91 @@
+from __future__ import annotations
+
+import choclo
+import numpy as np
+import pytest
+
+from sitl.world import Geology, Rock, Water, World, dipole_field, from_local, to_local
+
+MAIN = np.array([17000.0, -6000.0, 49600.0])
+WINTER = 1386763200.0  # s, 2013-12-11T12:00Z
+GEOLOGY = Geology(sources=60, extent=3000.0, rms=80.0)
+
+
+def draw_world(seed: int = 1) -> World:
+    return World.draw((49.52, -57.87), WINTER, GEOLOGY, Water(), np.random.default_rng(seed))
+
+
+def test_a_dipole_is_choclos_dipole() -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        r, m = rng.normal(0, 1, 3), rng.normal(0, 1, 3)
+        # choclo: east, north, up and tesla
+        enu = choclo.dipole.magnetic_field(r[1], r[0], -r[2], 0.0, 0.0, 0.0, m[1], m[0], -m[2])
+        expected = 1e9 * np.array([enu[1], enu[0], -enu[2]])
+        np.testing.assert_allclose(dipole_field(r, m), expected, rtol=1e-9)
+
+
+def test_on_its_axis_a_dipole_has_twice_the_field_of_its_equator() -> None:
+    m = np.array([0.0, 0.0, 3.0])
+    np.testing.assert_allclose(dipole_field(np.array([0.0, 0.0, 2.0]), m), 2 * 100.0 * m / 8)
+    np.testing.assert_allclose(dipole_field(np.array([0.0, 2.0, 0.0]), m), -100.0 * m / 8)
+
+
+def test_rock_is_the_sum_of_its_dipoles() -> None:
+    rock = Rock.draw(GEOLOGY, MAIN, np.random.default_rng(2))
+    points = np.random.default_rng(3).uniform([-2000, -2000, 0], [2000, 2000, 200], (50, 3))
+    one_by_one = sum(dipole_field(points - s, m) for s, m in zip(rock.position, rock.moment, strict=True))
+    np.testing.assert_allclose(rock.field(points, block=7), one_by_one, atol=1e-6)
+
+
+def test_rocks_field_has_neither_sources_nor_curl_where_the_vehicle_swims() -> None:
+    rock = Rock.draw(GEOLOGY, MAIN, np.random.default_rng(4))
+    place, h = np.array([120.0, -340.0, 90.0]), 0.5
+    gradient = np.column_stack(
+        [(rock.field(place[None] + h * e) - rock.field(place[None] - h * e))[0] / (2 * h) for e in np.eye(3)]
+    )
+    largest = np.abs(gradient).max()
+    assert abs(np.trace(gradient)) < 1e-5 * largest
+    assert np.abs(gradient - gradient.T).max() < 1e-5 * largest
+
+
+def test_rock_is_as_rough_as_asked_and_rougher_below() -> None:
+    rock = Rock.draw(GEOLOGY, MAIN, np.random.default_rng(5))
+    side = np.linspace(-1500, 1500, 40)
+
+    def anomaly(depth: float) -> float:
+        grid = np.stack(np.meshgrid(side, side, [depth]), axis=-1).reshape(-1, 3)
+        return float(np.std(rock.field(grid) @ MAIN / np.linalg.norm(MAIN)))
+
+    assert anomaly(0.0) == pytest.approx(80.0)
+    assert anomaly(150.0) > anomaly(0.0) > anomaly(-90.0)
+
+
+def test_upward_continuation_loses_the_fine_structure_first() -> None:
+    world = draw_world()
+    low, high = (world.anomaly_map(WINTER, altitude, 1500.0, 50.0).to_numpy() for altitude in (0.0, 300.0))
+    roughness = [np.std(np.diff(grid, axis=1)) / np.std(grid) for grid in (low, high)]
+    assert roughness[1] < 0.8 * roughness[0]
+    assert np.std(high) < np.std(low)
+
+
+def test_without_rock_there_is_only_the_main_field() -> None:
+    world = World.draw((49.52, -57.87), WINTER, Geology(sources=0), Water(), np.random.default_rng(0))
+    field = world.field(np.full(2, WINTER), np.array([49.52, 49.53]), np.full(2, -57.87), np.zeros(2))
+    assert 52_500 < np.linalg.norm(field[0]) < 53_200  # nT, ppigrf: 52 880
+    assert not np.any(world.anomaly_map(WINTER, 90.0, 500.0, 250.0))
+
+
+def test_local_metres_and_back_across_the_antimeridian() -> None:
+    origin = (-17.0, 179.99)
+    latitude, longitude = np.array([-17.01, -16.9]), np.array([-179.98, 179.9])
+    north, east = to_local(latitude, longitude, origin)
+    assert east[0] == pytest.approx(0.03 * 111_195 * np.cos(np.radians(17)), rel=1e-3)
+    back = from_local(north, east, origin)
+    np.testing.assert_allclose(back[0], latitude)
+    np.testing.assert_allclose((back[1] + 180) % 360 - 180, longitude)
+
+
+def test_water_has_two_layers() -> None:
+    water = Water(surface=1.0, deep=4.0, thermocline=50.0, thickness=10.0)
+    np.testing.assert_allclose(water.temperature(np.array([0.0, 50.0, 200.0])), [1.0, 2.5, 4.0], atol=1e-3)
