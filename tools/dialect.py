@@ -7,6 +7,7 @@ is a table, not the classes of mavgen: those take 0.4 s and 115 MB to import for
 from __future__ import annotations
 
 import argparse
+import re
 import sys
 from pathlib import Path
 from typing import Any
@@ -49,6 +50,10 @@ CODES = {
 }  # fmt: skip
 
 
+EXTENSIONS = {"TIMESYNC": ("B:target_system::", "B:target_component::")}
+"""Fields that upstream has added since the definitions in pymavlink; extensions leave the checksum as it is."""
+
+
 def collect(path: Path, seen: dict[Path, Any]) -> dict[Path, Any]:
     """Parse `path` and what it includes, each file once."""
     if path not in seen:
@@ -58,11 +63,20 @@ def collect(path: Path, seen: dict[Path, Any]) -> dict[Path, Any]:
     return seen
 
 
+def invalid(one: Any) -> str:
+    """Return the number that says 'not known', empty where there is none (or NaN, which says it itself)."""
+    text = one.invalid.strip("[]:,")
+    if match := re.fullmatch(r"(U?)INT(\d+)_(MAX|MIN)", text):
+        bits = int(match[2]) - (match[1] == "")
+        return str((1 << bits) - 1 if match[3] == "MAX" else -(1 << bits))
+    return text if re.fullmatch(r"-?\d+", text) else ""
+
+
 def field(one: Any) -> str:
-    """Return ``code:name:unit`` of a field, the code as in `struct`, with its count for an array."""
+    """Return ``code:name:unit:invalid`` of a field, the code as in `struct`, with its count for an array."""
     count = str(one.array_length) if one.array_length else ""
-    text = f"{count}{CODES[one.type]}:{one.name}:{one.units.strip('[]')}"
-    if text.count(":") != 2 or "," in text:
+    text = f"{count}{CODES[one.type]}:{one.name}:{one.units.strip('[]')}:{invalid(one)}"
+    if text.count(":") != 3 or "," in text:
         raise ValueError(f"a unit that the table cannot hold: {text}")
     return text
 
@@ -79,10 +93,11 @@ def render() -> str:
         "from enum import IntEnum",
         "",
         "MESSAGES: dict[int, tuple[str, int, str]] = {",
-        "    # id: (name, CRC_EXTRA, fields in the order of the wire as code:name:unit)",
+        "    # id: (name, CRC_EXTRA, fields in the order of the wire as code:name:unit:invalid)",
     ]
     lines += [
-        f'    {m.id}: ("{m.name}", {m.crc_extra}, "{",".join(map(field, m.ordered_fields))}"),'
+        f'    {m.id}: ("{m.name}", {m.crc_extra}, '
+        f'"{",".join((*map(field, m.ordered_fields), *EXTENSIONS.get(m.name, ())))}"),'
         for _, m in sorted(messages.items())
     ]
     lines.append("}")

@@ -32,12 +32,15 @@ class Field:
         Length of an array, 0 for a scalar.
     code : str
         As in :mod:`struct`; ``s`` is text, ``B`` with a count is bytes.
+    invalid : int or None
+        The value that says that the sender does not know; NaN says so in any float.
     """
 
-    __slots__ = ("code", "count", "name", "offset", "struct", "unit")
+    __slots__ = ("code", "count", "invalid", "name", "offset", "struct", "unit")
 
     def __init__(self, text: str, offset: int) -> None:
-        form, self.name, self.unit = text.split(":")
+        form, self.name, self.unit, invalid = text.split(":")
+        self.invalid = int(invalid) if invalid else None
         self.count, self.code = int(form[:-1] or 0), form[-1]
         self.offset = offset
         packed_as_bytes = self.code == "B" and self.count  # 253 integers a message would be slow
