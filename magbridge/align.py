@@ -174,7 +174,8 @@ class Aligner:
         field, first_us = self._common_time(reading, time_us)
         if self._is_gap(time_us) or missing:
             quality |= GAP
-        self._before = time_us, reading
+        if isfinite(sum(reading.field)):
+            self._before = time_us, reading
         if self.offset_suspect:
             quality |= OFFSET_SUSPECT
             variance += settings.turn_on_sigma**2

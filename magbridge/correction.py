@@ -1,0 +1,148 @@
+"""From readings and telemetry to corrected samples: what the live bridge and ``magbridge correct`` share.
+
+Alignment says what is known at a sample's time and how well; the calibration turns that into the field. What is
+not known exactly (a mass in motion, telemetry that never came) is carried into the sigma: the correction is
+evaluated at both ends of what the parameter may have been.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from math import hypot, isfinite, nan
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from magbridge.align import Aligner, Input, Sample
+from magbridge.calibration.correct import Corrector
+from magbridge.calibration.model import Calibration, identity
+from magbridge.config import Align
+from magbridge.records import Corrected, Reading
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+__all__ = ["TEMPERATURE", "Correction", "correct_rows"]
+
+TEMPERATURE = "sensor_temperature"
+"""The one channel that comes with the reading itself."""
+MAX_AGE = 30.0
+"""s after which telemetry is stale where nothing else is said."""
+
+
+class Correction:
+    """Corrects reading after reading.
+
+    Parameters
+    ----------
+    calibration : Calibration or None
+        Without one every sample passes unchanged, flagged ``uncalibrated``.
+    settings : Align
+    ages : mapping of str to float
+        s after which a parameter's telemetry is stale; 30 s where not given.
+    """
+
+    def __init__(
+        self, calibration: Calibration | None, settings: Align, ages: Mapping[str, float] | None = None
+    ) -> None:
+        calibration = calibration if calibration is not None else identity()
+        ranges = {parameter.name: (parameter.low, parameter.high) for parameter in calibration.parameters}
+        inputs = tuple(
+            Input(name, *ranges.get(name, (nan, nan)), max_age=(ages or {}).get(name, MAX_AGE))
+            for name in calibration.channels
+        )
+        self.aligner = Aligner(inputs, settings, calibration.sensor.power_cycle)
+        self.names = tuple(one.name for one in inputs)
+        self._wants_temperature = TEMPERATURE in self.names
+        self._corrector = Corrector(calibration)
+        # effects have a state that must see every sample once; what-ifs are asked of the positions alone
+        self._what_if = (
+            Corrector(replace(calibration, effects=())) if calibration.effects else self._corrector
+        )
+
+    def telemetry(self, name: str, time_us: int, value: float) -> None:
+        """Take a telemetry value; a name that the calibration does not need is ignored."""
+        self.aligner.telemetry(name, time_us, value)
+
+    def reading(
+        self, reading: Reading, time_us: int, *, restarted: bool = False, missing: int = 0
+    ) -> tuple[Sample, Corrected]:
+        """Align and correct one reading; arguments as :meth:`magbridge.align.Aligner.reading`."""
+        if self._wants_temperature:
+            self.aligner.telemetry(TEMPERATURE, time_us, reading.temperature)
+        sample = self.aligner.reading(reading, time_us, restarted=restarted, missing=missing)
+        corrected = self._corrector.step(sample.time_us, sample.field, sample.values, sample.quality)
+        if sample.sigma or sample.spans:
+            corrected = self._widen(sample, corrected)
+        return sample, corrected
+
+    def _widen(self, sample: Sample, corrected: Corrected) -> Corrected:
+        """Add to the sigmas what the flags say: ``sigma^2 + s^2 + sum ((F(hi) - F(lo)) / 2)^2``."""
+        count = len(self._what_if.calibration.channels)
+        extra = [sample.sigma]
+        for index, low, high in sample.spans:
+            if index >= count:
+                continue
+            ends = []
+            for value in (low, high):
+                values = (*sample.values[:index], value, *sample.values[index + 1 : count])
+                ends.append(self._what_if.step(sample.time_us, sample.field, values).total_field)
+            extra.append(0.5 * (ends[1] - ends[0]))
+        more = hypot(*extra)
+        x, y, z = corrected.field_sigma
+        return Corrected(
+            corrected.total_field,
+            hypot(corrected.total_field_sigma, more),
+            corrected.field,
+            (hypot(x, more), hypot(y, more), hypot(z, more)),
+            corrected.quality,
+        )
+
+
+def correct_rows(correction: Correction, deployment: xr.Dataset) -> xr.Dataset:
+    """Correct the rows of a deployment (a piece of one, in order), exactly as the bridge would live.
+
+    Parameters
+    ----------
+    correction : Correction
+        Its state goes on from piece to piece.
+    deployment : Dataset (time)
+        With ``mag_x mag_y mag_z``, and the parameters that the calibration needs.
+
+    Returns
+    -------
+    Dataset (time)
+        ``total_field total_field_sigma field_x field_y field_z quality``; ``time`` as in the input.
+    """
+    rows = [correction.reading(*row)[1] for row in _readings(correction, deployment)]
+    results = np.array(
+        [(row.total_field, row.total_field_sigma, *row.field, row.quality) for row in rows], dtype=float
+    ).reshape(-1, 6)
+    names = ("total_field", "total_field_sigma", "field_x", "field_y", "field_z", "quality")
+    return deployment[[]].assign(
+        {name: ("time", column) for name, column in zip(names, results.T, strict=True)}
+    )
+
+
+def _readings(correction: Correction, deployment: xr.Dataset) -> Iterator[tuple[Reading, int]]:
+    """Yield each row as a reading, after its telemetry has been told."""
+
+    def column(name: str) -> list[float]:
+        if name in deployment:
+            return list(deployment[name].to_numpy().astype(float).tolist())
+        return [nan] * deployment.sizes["time"]
+
+    times = np.asarray(deployment["time"].to_numpy(), float)
+    stamps = (np.rint(times * 1e6).astype(np.int64) & ~3).tolist()
+    delays = [np.nan_to_num(np.array(column(f"mag_time_{axis}")) - times).round(6).tolist() for axis in "xyz"]
+    telemetry = [(name, column(name)) for name in correction.names if name != TEMPERATURE]
+    cycles = column("power_cycle")
+    channels = zip(*(column(f"mag_{axis}") for axis in "xyz"), strict=True)
+    rows = zip(stamps, channels, zip(*delays, strict=True), column(TEMPERATURE), cycles, strict=True)
+    for row, (stamp, field, delay, temperature, cycle) in enumerate(rows):
+        for name, values in telemetry:
+            if isfinite(values[row]):  # a row that lacks a value is not news that it is lost
+                correction.telemetry(name, stamp, values[row])
+        power_cycle = int(cycle) if isfinite(cycle) else None
+        yield Reading(field, channel_delay=delay, temperature=temperature, power_cycle=power_cycle), stamp
