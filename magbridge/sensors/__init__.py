@@ -1,0 +1,109 @@
+"""Instruments: each driver a parser that never touches a port, all of them in one table.
+
+Other packages add their own by an entry point in the group ``magbridge.sensors`` whose name is the driver's
+and whose object is a class like :class:`Driver`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from importlib import import_module
+from pathlib import Path
+from typing import Any, ClassVar, Protocol
+
+from magbridge.config import convert
+from magbridge.errors import ConfigError
+from magbridge.records import Reading
+
+__all__ = ["DRIVERS", "Driver", "open_driver"]
+
+DRIVERS: dict[str, tuple[str, str]] = {
+    "ascii": ("magbridge.sensors.ascii", "Ascii"),
+    "digitizer": ("magbridge.sensors.digitizer", "Digitizer"),
+    "hmr2300": ("magbridge.sensors.hmr2300", "Hmr2300"),
+    "twinleaf": ("magbridge.sensors.twinleaf", "Twinleaf"),
+}
+"""Name: module and class; a module is imported when its driver is opened."""
+
+
+class Driver(Protocol):
+    """What every driver offers.
+
+    Whole chunk or byte by byte, :meth:`feed` gives the same readings and the same counts; whatever the bytes
+    are, they end up in a reading, in a message that is not a reading, in a counter, or, up to a bound, in the
+    remainder that waits for more.
+
+    Attributes
+    ----------
+    Options : type
+        A msgspec struct: the keys that ``[sensor.options]`` may have.
+    range_nt : float
+        nT, at which a channel saturates; infinite where unknown.
+    sequence_modulo : int
+        ``Reading.sequence`` wraps here; 0: never, or there is none.
+    time_modulo : float
+        s, at which ``Reading.device_time`` wraps; 0 where it does not.
+    period : float
+        s, nominal, between the readings of an instrument without a clock; 0 where unknown or irrelevant.
+    """
+
+    Options: ClassVar[Any]
+    range_nt: float
+    sequence_modulo: int
+    time_modulo: float
+    period: float
+
+    def __init__(self, options: Any) -> None: ...
+
+    @property
+    def bytes_skipped(self) -> int:
+        """Bytes that belonged to no valid frame (delimiters are not counted)."""
+        ...
+
+    @property
+    def frames_bad(self) -> int:
+        """Frames with a wrong length, checksum or content."""
+        ...
+
+    def start(self) -> tuple[bytes, ...]:
+        """Return what to send once the port is open: commands, at least 0.1 s apart, maybe none."""
+        ...
+
+    def feed(self, data: bytes) -> list[Reading]:
+        """Take bytes as they came; return the readings that they complete."""
+        ...
+
+
+def open_driver(name: str, options: Mapping[str, Any], source: str | Path = "bridge.toml") -> Driver:
+    """Return the driver called `name`, with its options checked.
+
+    Parameters
+    ----------
+    name : str
+        From :data:`DRIVERS`, or an entry point of the group ``magbridge.sensors``.
+    options : mapping
+        As they stand in ``[sensor.options]``.
+    source : path
+        The file they stand in, for the error.
+
+    Raises
+    ------
+    ConfigError
+        No such driver; an option that is unknown, missing, of the wrong type or out of range.
+    """
+    driver: type[Driver] = _find(name, source)
+    return driver(convert(dict(options), driver.Options, source, "sensor.options."))
+
+
+def _find(name: str, source: str | Path) -> Any:
+    if name in DRIVERS:
+        module, attribute = DRIVERS[name]
+        return getattr(import_module(module), attribute)
+    from importlib.metadata import entry_points  # noqa: PLC0415 - slow to import, and rarely needed
+
+    others = {entry.name: entry for entry in entry_points(group="magbridge.sensors")}
+    if name not in others:
+        raise ConfigError(
+            source, "sensor.driver", f"expected one of {', '.join(sorted({*DRIVERS, *others}))}"
+        )
+    return others[name].load()

@@ -1,0 +1,220 @@
+"""``ascii``: any line of text that holds three channels, described in the configuration.
+
+An APS 1540 in its autosend mode (gauss and degrees, separated by blanks)::
+
+    [sensor.options]
+    columns = ["x", "y", "z", "temperature"]
+    unit = "G"
+    range = 65000.0
+
+An FGsensors FGA logger (comma separated, ms since power-on in 32 bits, more columns than we need)::
+
+    [sensor.options]
+    separator = ","
+    columns = ["time", "x", "y", "z", "*"]
+    time_unit = "ms"
+    time_modulo = 4294967.296
+
+A sentence like NMEA's, ``$PMAG,1234.500,12345.6,-234.5,43210.9*5A``::
+
+    [sensor.options]
+    prefix = "$PMAG,"
+    separator = ","
+    columns = ["time", "x", "y", "z"]
+    checksum = "nmea"
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import reduce
+from math import inf, isfinite, nan
+from operator import itemgetter, xor
+from typing import Annotated, Any, ClassVar, Literal
+from zlib import crc32
+
+import msgspec
+from msgspec import Meta
+
+from magbridge.records import Reading
+from magbridge.sensors.framing import NT_PER_UNIT, Framer
+
+__all__ = ["CHECKSUMS", "Ascii", "AsciiOptions"]
+
+LIMIT = 512
+"""Longest line, in bytes."""
+ENCODING = "latin-1"
+SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6}
+Positive = Annotated[float, Meta(gt=0)]
+NotNegative = Annotated[float, Meta(ge=0)]
+
+CHECKSUMS: dict[str, tuple[int, Callable[[bytes], int]]] = {
+    "nmea": (2, lambda text: reduce(xor, text[1:], 0)),
+    "xor": (2, lambda text: reduce(xor, text, 0)),
+    "sum": (2, lambda text: sum(text) & 0xFF),
+    "crc32": (8, crc32),
+}
+"""Name: hexadecimal digits after the ``*``, and the function of all that stands before it.
+
+``nmea`` leaves out the first byte, the ``$``.
+"""
+
+
+def _finite(text: bytes) -> float:
+    number = float(text)
+    if not isfinite(number):
+        raise ValueError
+    return number
+
+
+KINDS: dict[str, Callable[[bytes], float]] = {
+    "time": _finite,
+    "temperature": float,
+    "supply": float,
+    "sequence": int,
+    "power_cycle": int,
+}
+"""Columns beside x, y and z, and how each is read."""
+
+
+class AsciiOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """``[sensor.options]`` of a line protocol.
+
+    Attributes
+    ----------
+    columns : list of str
+        What stands where: ``x y z`` (required), ``time temperature supply sequence power_cycle``; ``-`` for a
+        column to pass over; ``*`` at the end for any number of further ones.
+    separator : str
+        Between columns; empty for any number of blanks or tabs.
+    prefix : str
+        What every line begins with.
+    terminator : str
+        The last byte of a line; a carriage return before it is dropped.
+    unit : str
+        Of the channels: nT, uT, mT, T, pT, fT, G, mG, uG, or "counts".
+    scale : float
+        Factor on the channels, with its sign; for counts: nT per count.
+    range : float or None
+        nT at which a channel saturates.
+    checksum : str or None
+        From :data:`CHECKSUMS`: in hexadecimal after a ``*`` at the end of the line.
+    time_unit : {"s", "ms", "us"}
+        Of the column ``time``.
+    time_modulo : float
+        s, at which the device's time wraps; 0: never.
+    sequence_modulo : int
+        Where the column ``sequence`` wraps; 0: never.
+    rate : float
+        Lines per second of a device without a clock, to remove the jitter of their arrival; 0: it sends when
+        it likes, and each line is dated by its arrival.
+    start : list of str
+        Commands to send once the port is open.
+    """
+
+    columns: list[str] = msgspec.field(default_factory=lambda: ["x", "y", "z"])
+    separator: str = ""
+    prefix: str = ""
+    terminator: Literal["\n", "\r"] = "\n"
+    unit: Literal["nT", "uT", "mT", "T", "pT", "fT", "G", "mG", "uG", "counts"] = "nT"
+    scale: float = 1.0
+    range: Positive | None = None
+    checksum: Literal["nmea", "xor", "sum", "crc32"] | None = None
+    time_unit: Literal["s", "ms", "us"] = "s"
+    time_modulo: NotNegative = 0.0
+    sequence_modulo: Annotated[int, Meta(ge=0)] = 0
+    rate: NotNegative = 0.0
+    start: list[str] = msgspec.field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        named = self.columns[:-1] if self.columns[-1:] == ["*"] else self.columns
+        for name in named:
+            if name not in ("x", "y", "z", "-", *KINDS):
+                raise ValueError(f"columns: {name!r} is none of x y z {' '.join(KINDS)} -")
+            if name != "-" and named.count(name) > 1:
+                raise ValueError(f"columns: {name!r} stands there twice")
+        if not {"x", "y", "z"} <= set(named):
+            raise ValueError("columns: x, y and z must be among them")
+
+
+class Ascii:
+    """Parser of a line protocol."""
+
+    Options: ClassVar = AsciiOptions
+
+    def __init__(self, options: AsciiOptions) -> None:
+        self._options = options
+        columns = options.columns
+        self._more = columns[-1] == "*"
+        self._width = len(columns) - self._more
+        self._xyz = itemgetter(*(columns.index(axis) for axis in "xyz"))
+        self._others = [(name, at, KINDS[name]) for at, name in enumerate(columns) if name in KINDS]
+        self._prefix = options.prefix.encode(ENCODING)
+        self._separator = options.separator.encode(ENCODING) or None
+        self._counts = options.unit == "counts"
+        self._scale = options.scale * NT_PER_UNIT.get(options.unit, 1.0)
+        self._seconds = SECONDS[options.time_unit]
+        self.range_nt = options.range or inf
+        self.sequence_modulo = options.sequence_modulo
+        self.time_modulo = options.time_modulo
+        self.period = 1.0 / options.rate if options.rate else 0.0
+        self._framer = Framer(options.terminator.encode(), LIMIT)
+        self._skipped = 0
+        self.frames_bad = 0
+
+    @property
+    def bytes_skipped(self) -> int:
+        """Bytes that belonged to no valid line."""
+        return self._skipped + self._framer.skipped
+
+    def start(self) -> tuple[bytes, ...]:
+        """Return the configured commands."""
+        return tuple(command.encode(ENCODING) for command in self._options.start)
+
+    def feed(self, data: bytes) -> list[Reading]:
+        """Take bytes as they came; return the readings that they complete."""
+        readings = []
+        for line in self._framer.split(data):
+            try:
+                readings.append(self._reading(line))
+            except ValueError:
+                self._skipped += len(line)
+                self.frames_bad += line != b"\r"
+        return readings
+
+    def _reading(self, line: bytes) -> Reading:
+        """Return what a line says; raise ValueError where it does not say it."""
+        line = line.rstrip(b"\r")
+        if self._options.checksum:
+            line = _checked(line, self._options.checksum)
+        if not line.startswith(self._prefix) or b"_" in line:  # Python's numbers may hold underscores
+            raise ValueError
+        cells = line[len(self._prefix) :].split(self._separator)
+        if len(cells) != self._width and not (self._more and len(cells) > self._width):
+            raise ValueError
+        x, y, z = map(float, self._xyz(cells))
+        if not isfinite(x + y + z):
+            raise ValueError
+        others: dict[str, Any] = {name: kind(cells[at]) for name, at, kind in self._others}
+        scale, limit = self._scale, self.range_nt
+        field = (x * scale, y * scale, z * scale)
+        inside = -limit < field[0] < limit and -limit < field[1] < limit and -limit < field[2] < limit
+        return Reading(
+            field,
+            (int(x), int(y), int(z)) if self._counts else None,
+            others.get("sequence"),
+            others.get("time", nan) * self._seconds,
+            temperature=others.get("temperature", nan),
+            supply=others.get("supply", nan),
+            power_cycle=others.get("power_cycle"),
+            saturated=not inside,
+        )
+
+
+def _checked(line: bytes, checksum: str) -> bytes:
+    """Return the part of `line` before its checksum; raise ValueError where the checksum is wrong."""
+    digits, function = CHECKSUMS[checksum]
+    text, star, stated = line[: -digits - 1], line[-digits - 1 : -digits], line[-digits:]
+    if star != b"*" or int(stated, 16) != function(text):
+        raise ValueError
+    return text

@@ -1,0 +1,307 @@
+"""When a reading was taken, on the host's clock.
+
+A byte arrives after it was sent, never before: ``arrival = device time + offset + drift + delay``, ``delay >= 0``.
+Serial converters and schedulers make the delay anything from nothing to many ms, but now and then it is short.
+So the relation between the two clocks is the straight line that the points (device time, arrival - device time)
+lie above: each block of readings gives its lowest point, and a line is fitted to the lowest points of the last
+blocks. What is left is the shortest delay, a constant.
+
+An instrument without a clock is its own clock when it sends at a steady rate: reading n was taken at
+``n * period``, and the line's slope is the error of its nominal period.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import inf, isnan
+from typing import NamedTuple
+
+from magbridge.records import Reading
+from magbridge.sensors import Driver
+
+__all__ = ["DeviceClock", "Stamp"]
+
+BLOCK = 8
+"""Readings in the first blocks."""
+POINTS = 16
+"""Lowest points that the line is fitted to."""
+SPAN = 4.0
+"""s that a block grows to."""
+TOLERANCE = 20_000.0
+"""µs by which an arrival may contradict the line."""
+DELAY = 5_000.0
+"""µs, the mean delay before anything is known."""
+SIGMA_CLOCK, SIGMA_PERIOD = 1e3, 1e4
+"""µs/s (ppm): how wrong a clock's rate, or a nominal period, is before anything is known."""
+WANDER = 0.05
+"""Part of that which always remains: rates change with temperature."""
+BOUND = 5.0
+"""Widths of the prior that a rate may be off."""
+RESTART = 1e6
+"""µs by which an instrument's time that fell back may miss the host's, and still have wrapped."""
+HALF = 0.6
+"""Of a period: a delay that is longer is a missing reading."""
+KEEP_PHASE = 3
+"""Readings that may be missing before the instrument is no longer trusted to have kept its beat."""
+
+
+class Stamp(NamedTuple):
+    """When a reading was taken.
+
+    Attributes
+    ----------
+    time_us : int
+        µs since 1970 UTC, a multiple of 4, increasing unless `stepped`.
+    restarted : bool
+        The instrument's own clock began anew: it was powered on again.
+    stepped : bool
+        One of the two clocks was set; the relation between them is learned anew.
+    missing : int
+        Readings that are missing before this one.
+    """
+
+    time_us: int
+    restarted: bool = False
+    stepped: bool = False
+    missing: int = 0
+
+
+class _Floor:
+    """The straight line below the points (x, y): x in s, y in µs.
+
+    Notes
+    -----
+    With the lowest points (x_k, y_k) of the blocks, their mean (X, Y), and b_0 what was known of the slope::
+
+        b   = b_0 + sum (x_k - X) (y_k - Y - b_0 (x_k - X)) / S,   S = sum (x_k - X)^2 + (s / s_b)^2
+        s_b = s / sqrt(S)                                          afterwards
+
+    which is least squares with a Gaussian prior of width `s_b` on the slope; s, the scatter of the lowest points,
+    is the mean delay over the number of readings in a block, as it is for exponential delays.
+    """
+
+    def __init__(self, slope_sigma: float) -> None:
+        self._prior_sigma = slope_sigma
+        self.slope = 0.0
+        self.delay = DELAY
+        self.restart(0.0, 0.0)
+
+    def restart(self, x: float, y: float) -> None:
+        """Begin anew at a point; the slope is kept as what is known of it."""
+        self._prior = self.slope
+        self._sigma = self._prior_sigma
+        self._points: list[tuple[float, float]] = []
+        self._x, self._y = x, y
+        self._drop = 0.0
+        self._size = BLOCK
+        self._count = 0
+        self._began, self._least, self.lowest = x, inf, (x, y)
+
+    def at(self, x: float) -> float:
+        """Return the line at `x`, in µs."""
+        return self._y + self.slope * (x - self._x) + self._drop
+
+    @property
+    def scatter(self) -> float:
+        """How far the lowest points of blocks scatter, in µs."""
+        return self.delay / self._size + 1.0
+
+    def tolerance(self, x: float) -> float:
+        """Return by how much a point at `x` may reasonably contradict the line, in µs."""
+        return TOLERANCE + 3.0 * self._sigma * abs(x - self._x)
+
+    def add(self, x: float, y: float, limit: float) -> float:
+        """Take a point; where a whole block has lain more than `limit` above the line, return how far (else 0).
+
+        Such a block is not taken; `lowest` is its lowest point until the next one is added.
+        """
+        if not self._count:
+            self._began, self._least = x, inf
+        above = y - self.at(x)
+        self.delay += (max(above, 0.0) - self.delay) * 0.02
+        if above < self._least:
+            self._least, self.lowest = above, (x, y)
+            self._drop += min(above, 0.0)
+        self._count += 1
+        if self._count < self._size:
+            return 0.0
+        self._count = 0
+        if self._least > limit:
+            return self._least
+        self._points.append(self.lowest)
+        if len(self._points) == POINTS:
+            self._thin(x - self._began)
+        self._fit()
+        return 0.0
+
+    def _thin(self, duration: float) -> None:
+        """Make room: join blocks in pairs while they are short, else forget the oldest."""
+        if duration >= SPAN:
+            del self._points[0]
+            return
+        self._size *= 2
+        pairs = zip(self._points[::2], self._points[1::2], strict=True)
+        self._points = [min(pair, key=lambda point: point[1] - self.slope * point[0]) for pair in pairs]
+
+    def _fit(self) -> None:
+        points = self._points
+        n = len(points)
+        x = sum(point[0] for point in points) / n
+        y = sum(point[1] for point in points) / n
+        sxx = sum((point[0] - x) ** 2 for point in points)
+        sxy = sum((point[0] - x) * (point[1] - y) for point in points)
+        information = sxx + (self.scatter / self._prior_sigma) ** 2
+        slope = self._prior + (sxy - self._prior * sxx) / information
+        self.slope = max(-BOUND * self._prior_sigma, min(slope, BOUND * self._prior_sigma))
+        self._sigma = max(self.scatter / information**0.5, WANDER * self._prior_sigma)
+        self._x, self._y, self._drop = x, y, 0.0
+
+
+class DeviceClock:
+    """Host times of an instrument's readings.
+
+    Parameters
+    ----------
+    time_modulo : float
+        s, at which the instrument's time wraps; 0: never.
+    sequence_modulo : int
+        Where its count of readings wraps; 0: never.
+    period : float
+        s between the readings of an instrument without a clock; 0: not steady, and a reading is dated by its
+        arrival.
+    """
+
+    def __init__(self, *, time_modulo: float = 0.0, sequence_modulo: int = 0, period: float = 0.0) -> None:
+        self._time_modulo = time_modulo
+        self._sequence_modulo = sequence_modulo
+        self._period = period
+        self._floor = _Floor(SIGMA_PERIOD if period else SIGMA_CLOCK)
+        self._sequence: int | None = None
+        self._origin_us: int | None = None
+        self._zero = self._turned = self._device_time = 0.0
+        self._count = 0
+        self._arrival_us = self._out_us = 0
+
+    @classmethod
+    def of(cls, driver: Driver) -> DeviceClock:
+        """Return the clock that a driver's readings need."""
+        return cls(
+            time_modulo=driver.time_modulo, sequence_modulo=driver.sequence_modulo, period=driver.period
+        )
+
+    @property
+    def drift_ppm(self) -> float:
+        """How much faster the host's clock runs than the instrument's, in µs/s."""
+        return self._floor.slope
+
+    @property
+    def jitter_us(self) -> float:
+        """Mean delay of an arrival, in µs beyond the shortest."""
+        return self._floor.delay
+
+    def stamp(self, readings: Sequence[Reading], arrival_us: int) -> list[Stamp]:
+        """Return when each reading of a chunk was taken, the chunk having arrived at `arrival_us` (µs).
+
+        The last one was delayed the least; the others were already waiting.
+        """
+        last = len(readings) - 1
+        stamps = []
+        for index, reading in enumerate(readings):
+            waited = 0.0
+            if index < last:
+                waited = readings[last].device_time - reading.device_time
+                if isnan(waited):
+                    waited = (last - index) * self._period
+                elif not 0.0 <= waited < 60.0:  # a restart or a wrap between them
+                    waited = 0.0
+            stamps.append(self.update(reading.device_time, arrival_us - int(waited * 1e6), reading.sequence))
+        return stamps
+
+    def update(self, device_time: float, arrival_us: int, sequence: int | None = None) -> Stamp:
+        """Return when a reading was taken.
+
+        Parameters
+        ----------
+        device_time : float
+            s on the instrument's clock; NaN where it has none.
+        arrival_us : int
+            µs on the host's clock.
+        sequence : int or None
+            The instrument's count of readings.
+        """
+        missing = self._hole(sequence)
+        restarted = stepped = False
+        if self._origin_us is None:
+            self._begin(device_time, arrival_us)
+            time_us = float(arrival_us)
+        elif not isnan(device_time):
+            time_us, restarted, stepped = self._by_time(device_time, arrival_us, self._origin_us)
+        elif self._period:
+            time_us, stepped, unseen = self._by_count(arrival_us, self._origin_us, missing)
+            missing += unseen
+        else:
+            time_us = float(arrival_us)
+        self._arrival_us, self._device_time = arrival_us, device_time
+        out_us = int(time_us) & ~3
+        if out_us <= self._out_us and not stepped:
+            out_us = self._out_us + 4
+        self._out_us = out_us
+        return Stamp(out_us, restarted, stepped, 0 if restarted else missing)
+
+    def _hole(self, sequence: int | None) -> int:
+        """Return how many readings the count says are missing."""
+        last, self._sequence = self._sequence, sequence
+        if sequence is None or last is None:
+            return 0
+        hole = sequence - last - 1
+        if self._sequence_modulo:
+            hole %= self._sequence_modulo
+            if hole > self._sequence_modulo // 2:
+                return 0
+        return max(hole, 0)
+
+    def _begin(self, device_time: float, arrival_us: int) -> None:
+        """Learn the relation between the clocks anew, from this reading on."""
+        self._origin_us = arrival_us
+        self._zero, self._turned, self._count = device_time, 0.0, 0
+        self._floor.restart(0.0, 0.0)
+
+    def _by_time(self, device_time: float, arrival_us: int, origin_us: int) -> tuple[float, bool, bool]:
+        """Return the host time (µs), and whether the instrument was restarted, or a clock set."""
+        step = device_time - self._device_time
+        if self._time_modulo:
+            turns = round(((arrival_us - self._arrival_us) * 1e-6 - step) / self._time_modulo)
+            step += turns * self._time_modulo
+            self._turned += turns * self._time_modulo
+        floor = self._floor
+        x = device_time + self._turned - self._zero
+        y = arrival_us - origin_us - 1e6 * x
+        above = y - floor.at(x)
+        fell_back = device_time < 0.5 * self._device_time
+        restarted = fell_back and (step < 0.0 or abs(above) > RESTART)
+        if restarted or step < 0.0 or above < -floor.tolerance(x):
+            self._begin(device_time, arrival_us)
+            return float(arrival_us), restarted, not restarted
+        late = floor.add(x, y, floor.tolerance(x))
+        if late:
+            floor.restart(*floor.lowest)
+        return origin_us + 1e6 * x + floor.at(x), False, late > 0.0
+
+    def _by_count(self, arrival_us: int, origin_us: int, missing: int) -> tuple[float, bool, int]:
+        """Return the host time (µs), whether it stepped back, and how many readings are missing unseen."""
+        floor, period_us = self._floor, 1e6 * self._period
+        self._count += 1 + missing
+        x = self._count * self._period
+        y = arrival_us - origin_us - 1e6 * x
+        above = y - floor.at(x)
+        limit = max(HALF * period_us, TOLERANCE)
+        if -limit <= above <= limit + 10.0 * floor.delay:
+            above = floor.add(x, y, HALF * period_us + 20.0 * floor.scatter)
+        beats = round(above / period_us)
+        if beats:
+            self._count += beats
+            x += beats * self._period
+            y -= beats * period_us
+            if not 0 < beats <= KEEP_PHASE:
+                floor.restart(x, y)
+        return origin_us + 1e6 * x + floor.at(x), beats < 0, max(beats, 0)

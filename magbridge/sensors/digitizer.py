@@ -1,0 +1,159 @@
+"""``digitizer``: three fluxgate outputs, one 24-bit converter; our own frame, meant for small firmware.
+
+One frame is one reading of all three channels::
+
+    frame = COBS(message) 00        message = 36 bytes, little-endian, no padding
+
+====== ===== ============= =============================================================================
+offset type  name          meaning
+====== ===== ============= =============================================================================
+0      u8    kind          1: a reading. Other kinds are skipped unless their CRC is wrong.
+1      u8    length        bytes of the whole message with its CRC: 36. A later firmware may insert
+                           fields before the CRC and say a greater length, at most 253.
+2      u16   sequence      number of the reading since power-on, wraps at 65536
+4      u16   power_cycle   how often the instrument was powered on; kept in non-volatile memory
+6      u32   time_x        µs on the instrument's clock when channel x was sampled (the middle of the
+                           conversion), wraps at 2^32 (71.6 min)
+10     u32   time_y        the same for channel y
+14     u32   time_z        the same for channel z
+18     i16   temperature   0.01 degC at the fluxgate; -32768: not measured
+20     u16   supply        mV; 65535: not measured
+22     u8    flags         bits 0, 1, 2: the converter or its amplifier was overloaded on x, y, z
+23     i24   counts_x      two's complement; ±2^23 is ± reference voltage / gain
+26     i24   counts_y
+29     i24   counts_z
+32     u32   crc           CRC-32 (IEEE 802.3, reflected, as zlib and Ethernet) of bytes 0 to 31
+====== ===== ============= =============================================================================
+
+COBS (Cheshire & Baker 1999) removes the zeros from the message and makes it one byte longer, so a zero on the
+line is always the end of a frame, and a receiver that lost bytes is right again at the next one. On the line a
+reading takes 38 bytes: 0.25 Hz needs nothing, 100 Hz needs 38,400 bit/s. The first byte after power-on should
+be a zero.
+
+Worked example: reading 7 after the third power-on, x sampled at 1.000000 s, y 0.1 s and z 0.2 s later, 4.25 degC,
+3.712 V, counts 2796203, -1048576, 5592405. The message::
+
+    01 24 07 00 03 00 40 42 0F 00 E0 C8 10 00 80 4F 12 00 A9 01 80 0E 00 AB AA 2A 00 00 F0 55 55 55 CC 3B C2 3C
+
+and the frame is in :data:`EXAMPLE`. Counts become volts, ``V = counts / 2^23 * reference_voltage / gain``, and
+volts become ``B = V / sensitivity``.
+"""
+
+from __future__ import annotations
+
+from math import nan
+from struct import Struct
+from typing import Annotated, ClassVar
+from zlib import crc32
+
+import msgspec
+from msgspec import Meta
+
+from magbridge.records import Reading
+from magbridge.sensors.framing import CRC32_RESIDUE, Framer, cobs_decode
+
+__all__ = ["EXAMPLE", "Digitizer", "DigitizerOptions"]
+
+EXAMPLE = bytes.fromhex(
+    "04 01 24 07 02 03 04 40 42 0F 04 E0 C8 10 04 80 4F 12 05 A9 01 80 0E 04 AB AA 2A 01 09 F0 55 55 55 CC 3B C2 3C 00"
+)
+"""The worked example as it stands on the line, delimiter included."""
+
+READING = 1
+LENGTH = 36
+FULL_SCALE = 1 << 23
+WRAP_US = 1 << 32
+NO_TEMPERATURE = -32768
+NO_SUPPLY = 65535
+HEAD = Struct("<BBHHIIIhHB")
+Positive = Annotated[float, Meta(gt=0)]
+
+
+class DigitizerOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """``[sensor.options]`` of the digitizer.
+
+    Attributes
+    ----------
+    sensitivity : float
+        V/nT of the fluxgate's outputs, from its certificate (50 mV/µT is 5e-5).
+    reference_voltage : float
+        V at which the converter is at full scale.
+    gain : float
+        Of the amplifier between fluxgate and converter; below 1 for a divider.
+    full_scale : float or None
+        nT at which the fluxgate itself saturates, where that is before the converter.
+    """
+
+    sensitivity: Positive
+    reference_voltage: Positive = 2.5
+    gain: Positive = 1.0
+    full_scale: Positive | None = None
+
+    @property
+    def nt_per_count(self) -> float:
+        """Field of one count, in nT."""
+        return self.reference_voltage / self.gain / FULL_SCALE / self.sensitivity
+
+
+class Digitizer:
+    """Parser of the digitizer's frames."""
+
+    Options: ClassVar = DigitizerOptions
+    sequence_modulo = 1 << 16
+    time_modulo = WRAP_US * 1e-6
+    period = 0.0
+
+    def __init__(self, options: DigitizerOptions) -> None:
+        self._scale = options.nt_per_count
+        self._limit = FULL_SCALE - 1.0
+        if options.full_scale is not None:
+            self._limit = min(self._limit, options.full_scale / self._scale)
+        self.range_nt = self._limit * self._scale
+        self._framer = Framer(b"\0", 254)
+        self._skipped = 0
+        self.frames_bad = 0
+
+    @property
+    def bytes_skipped(self) -> int:
+        """Bytes that belonged to no valid frame."""
+        return self._skipped + self._framer.skipped
+
+    def start(self) -> tuple[bytes, ...]:
+        """Return no commands: the instrument sends by itself."""
+        return ()
+
+    def feed(self, data: bytes) -> list[Reading]:
+        """Take bytes as they came; return the readings that they complete."""
+        readings = []
+        for frame in self._framer.split(data):
+            message = cobs_decode(frame)
+            if len(message) < LENGTH or message[1] != len(message) or crc32(message) != CRC32_RESIDUE:
+                self.frames_bad += 1
+                self._skipped += len(frame)
+            elif message[0] == READING:
+                readings.append(self._reading(message))
+        return readings
+
+    def _reading(self, message: bytearray) -> Reading:
+        _, _, sequence, cycle, time_x, time_y, time_z, temperature, supply, flags = HEAD.unpack_from(message)
+        x = int.from_bytes(message[23:26], "little", signed=True)
+        y = int.from_bytes(message[26:29], "little", signed=True)
+        z = int.from_bytes(message[29:32], "little", signed=True)
+        scale, limit = self._scale, self._limit
+        inside = -limit < x < limit and -limit < y < limit and -limit < z < limit
+        return Reading(
+            (x * scale, y * scale, z * scale),
+            (x, y, z),
+            sequence,
+            time_x * 1e-6,
+            (0.0, _after(time_y, time_x), _after(time_z, time_x)),
+            nan if temperature == NO_TEMPERATURE else temperature * 0.01,
+            nan if supply == NO_SUPPLY else supply * 1e-3,
+            cycle,
+            not inside or flags & 7 != 0,
+        )
+
+
+def _after(time: int, start: int) -> float:
+    """Return `time` - `start` in s, both in µs on the wrapping clock, less than half a turn apart."""
+    return ((time - start + WRAP_US // 2) % WRAP_US - WRAP_US // 2) * 1e-6

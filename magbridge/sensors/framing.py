@@ -1,0 +1,94 @@
+"""What several protocols share: frames between delimiters, COBS, units."""
+
+from __future__ import annotations
+
+__all__ = ["CRC32_RESIDUE", "NT_PER_UNIT", "Framer", "cobs_decode", "cobs_encode"]
+
+NT_PER_UNIT = {
+    "fT": 1e-6,
+    "pT": 1e-3,
+    "nT": 1.0,
+    "uT": 1e3,
+    "µT": 1e3,
+    "mT": 1e6,
+    "T": 1e9,
+    "uG": 1e-1,
+    "mG": 1e2,
+    "G": 1e5,
+}
+"""nT in one unit of magnetic flux density."""
+
+CRC32_RESIDUE = 0x2144DF1C
+"""CRC-32 (IEEE 802.3) of any message followed by its own CRC-32 in little-endian order."""
+
+
+class Framer:
+    """Cuts a byte stream at a delimiter; what is longer than `limit` bytes is skipped, not kept.
+
+    Parameters
+    ----------
+    delimiter : bytes
+        One byte.
+    limit : int
+        Longest frame, without its delimiter.
+    """
+
+    __slots__ = ("_delimiter", "_limit", "_overlong", "_rest", "skipped")
+
+    def __init__(self, delimiter: bytes, limit: int) -> None:
+        self._delimiter = delimiter
+        self._limit = limit
+        self._rest = b""
+        self._overlong = False
+        self.skipped = 0
+
+    def split(self, data: bytes) -> list[bytes]:
+        """Take bytes; return the frames that they complete, empty ones left out."""
+        pieces = (self._rest + data).split(self._delimiter)
+        rest = pieces.pop()
+        if pieces and self._overlong:
+            self.skipped += len(pieces[0])
+            pieces[0] = b""
+            self._overlong = False
+        if self._overlong or len(rest) > self._limit:
+            self.skipped += len(rest)
+            self._overlong = True
+            rest = b""
+        self._rest = rest
+        frames = []
+        for piece in pieces:
+            if len(piece) > self._limit:
+                self.skipped += len(piece)
+            elif piece:
+                frames.append(piece)
+        return frames
+
+
+def cobs_encode(data: bytes) -> bytes:
+    """Return `data`, at most 253 bytes, without zeros and one byte longer (delimiter not included).
+
+    Notes
+    -----
+    Consistent Overhead Byte Stuffing (Cheshire & Baker 1999): a leading byte says how far it is to the first
+    zero, each zero is replaced by the distance to the next one, the last by the distance to the end. Up to
+    this length the code 255 ("no zero follows") is never needed.
+    """
+    stuffed = bytearray(b"\0" + data + b"\0")
+    at = 0
+    while (zero := stuffed.find(0, at + 1)) > 0:
+        stuffed[at] = zero - at
+        at = zero
+    return bytes(stuffed[:-1])
+
+
+def cobs_decode(frame: bytes) -> bytearray:
+    """Return the data of a frame of :func:`cobs_encode`; empty where it is not one."""
+    data = bytearray(frame)
+    at, end = 0, len(data)
+    while at < end:
+        step = data[at]
+        if not step:
+            return bytearray()
+        data[at] = 0
+        at += step
+    return data[1:] if at == end else bytearray()
