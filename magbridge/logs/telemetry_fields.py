@@ -1,0 +1,81 @@
+"""Which fields of which MAVLink messages become columns, and in what unit."""
+
+from __future__ import annotations
+
+from math import nan
+from typing import Any
+
+from magbridge.mavlink import spec
+from magbridge.mavlink.messages import split_index
+
+__all__ = ["TELEMETRY", "UNKNOWN_INT", "Value"]
+
+FIELDS: dict[str, dict[str, str]] = {
+    # message: {column: field}
+    "ATTITUDE": {"roll": "roll", "pitch": "pitch", "heading": "yaw"},
+    "GLOBAL_POSITION_INT": {"latitude": "lat", "longitude": "lon", "depth": "relative_alt"},
+    "SYS_STATUS": {"battery_current": "current_battery", "battery_voltage": "voltage_battery"},
+    "SCALED_PRESSURE": {"pressure": "press_abs", "pressure_temperature": "temperature"},
+    "SCALED_PRESSURE2": {"pressure2": "press_abs", "pressure2_temperature": "temperature"},
+    "SCALED_PRESSURE3": {"pressure3": "press_abs", "pressure3_temperature": "temperature"},
+    "SERVO_OUTPUT_RAW": {f"servo{k}": f"servo{k}_raw" for k in range(1, 17)},
+    "ESC_TELEMETRY_1_TO_4": {f"esc{k + 1}_current": f"current[{k}]" for k in range(4)},
+    "ESC_TELEMETRY_5_TO_8": {f"esc{k + 5}_current": f"current[{k}]" for k in range(4)},
+    "HIGHRES_IMU": {"imu_temperature": "temperature"},
+    "RAW_IMU": {"imu_temperature": "temperature", "mag1_x": "xmag", "mag1_y": "ymag", "mag1_z": "zmag"},
+    "SCALED_IMU2": {"mag2_x": "xmag", "mag2_y": "ymag", "mag2_z": "zmag"},
+    "SCALED_IMU3": {"mag3_x": "xmag", "mag3_y": "ymag", "mag3_z": "zmag"},
+}
+UNITS = {
+    # the dialect's: (ours, factor)
+    "rad": ("deg", 57.29577951308232),
+    "degE7": ("deg", 1e-7),
+    "gauss": ("nT", 1e5),
+    "mgauss": ("nT", 1e2),
+    "cA": ("A", 1e-2),
+    "mV": ("V", 1e-3),
+    "cdegC": ("degC", 1e-2),
+    "mm": ("m", 1e-3),
+}
+UNKNOWN_INT = 0x7FFFFFFF
+UNKNOWN: dict[str, tuple[int, ...]] = {
+    # what these fields hold when their sender does not know
+    "lat": (0, UNKNOWN_INT),
+    "lon": (0, UNKNOWN_INT),
+    "relative_alt": (UNKNOWN_INT,),
+    "current_battery": (-1,),
+    "voltage_battery": (0xFFFF,),
+    **{f"servo{k}_raw": (0,) for k in range(1, 17)},
+}
+
+
+class Value:
+    """How one column comes out of a message.
+
+    Attributes
+    ----------
+    column, unit : str
+    """
+
+    def __init__(self, column: str, message: str, field: str) -> None:
+        name, self._index = split_index(field)
+        self._field = spec(message).fields[name]
+        self._unknown = UNKNOWN.get(name, ())
+        self.column = column
+        self.unit, self._factor = UNITS.get(self._field.unit, (self._field.unit or "1", 1.0))
+        if name == "relative_alt":
+            self._factor = -self._factor  # depth
+
+    def get(self, payload: bytes) -> float:
+        """Return the value in `unit`; NaN where the sender does not know."""
+        value: Any = self._field.get(payload)
+        if self._index is not None:
+            value = value[self._index]
+        return nan if value in self._unknown else float(value * self._factor)
+
+
+TELEMETRY = {
+    spec(message).id: [Value(column, message, field) for column, field in columns.items()]
+    for message, columns in FIELDS.items()
+}
+"""Message id to the columns in it."""

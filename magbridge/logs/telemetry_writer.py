@@ -1,0 +1,154 @@
+"""A deployment as a MAVLink telemetry log: what a bridge and an autopilot would have said.
+
+A row becomes, all with its time: ``ATTITUDE`` (float32), ``GLOBAL_POSITION_INT`` (1e-7 deg, mm), a ``NAMED_VALUE_FLOAT``
+(float32) for every other column, ``MAG_RAW`` (float32 nT, µs) and, where the deployment is corrected, ``MAG_FIELD``. So a
+column comes back to 6e-8 of its value, time to 1 µs; a column of integers (counts times 100, say) comes back exactly.
+
+A name of more than ten letters is cut, made unique, and told in full by a ``MAG_COLUMN`` at the start, as
+are all units and the attributes that change what values mean.
+"""
+
+from __future__ import annotations
+
+from math import isnan, nan, radians
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from magbridge.columns import CHANNEL_TIMES, CHANNELS, CORRECTED
+from magbridge.logs.deployment import MEANING
+from magbridge.logs.telemetry_fields import UNKNOWN_INT
+from magbridge.mavlink import Codec, Spec, pack_record, spec
+from magbridge.records import Channel, Quality
+
+__all__ = ["FileWriter"]
+
+VEHICLE, AUTOPILOT, BRIDGE = 1, 1, 191
+ATTITUDE = ("roll", "pitch", "heading")
+POSITION = ("latitude", "longitude", "depth")
+SAMPLE = (*CHANNELS, "sensor_temperature", "sensor_supply", "power_cycle")
+STANDARD = {*ATTITUDE, *POSITION, *SAMPLE, *CHANNEL_TIMES, *CORRECTED}
+"""Columns that have a message of their own."""
+ATTITUDE_, POSITION_, NAMED_, RAW_, FIELD_ = (
+    spec(name) for name in ("ATTITUDE", "GLOBAL_POSITION_INT", "NAMED_VALUE_FLOAT", "MAG_RAW", "MAG_FIELD")
+)
+POWER_CYCLE = 8  # MAG_RAW_FLAGS_POWER_CYCLE
+UNKNOWN_HEADING = 0xFFFF
+
+Row = dict[str, float]
+
+
+class FileWriter:
+    """Writes deployments one after the other; the columns are those of the first."""
+
+    def __init__(self, path: Path) -> None:
+        self._file = path.open("wb")
+        self._autopilot = Codec(VEHICLE, AUTOPILOT)
+        self._bridge = Codec(VEHICLE, BRIDGE)
+        self._start_us = 0
+        self._named: list[tuple[str, bytes]] = []
+        self._sequence = 0
+
+    def append(self, dataset: xr.Dataset, *, first: bool) -> None:
+        """Write the rows, and before the first ones what the names stand for."""
+        columns = [str(name) for name in dataset.data_vars]
+        times = np.round(dataset["time"].values * 1e6).astype(np.int64).tolist()
+        if first:
+            self._start_us = times[0] if times else 0
+            self._declare(dataset)
+        say = [self._attitude] * any(name in columns for name in ATTITUDE)
+        say += [self._position] * any(name in columns for name in POSITION)
+        say += [self._telemetry, self._raw]
+        say += [self._field] * ("total_field" in columns)
+        values = [_single(name, dataset[name].values).tolist() for name in columns]
+        for time_us, *row in zip(times, *values, strict=True):
+            named = dict(zip(columns, row, strict=True))
+            for one in say:
+                one(time_us, named)
+
+    def close(self) -> None:
+        """Bring everything to the file."""
+        self._file.close()
+
+    def _declare(self, dataset: xr.Dataset) -> None:
+        said = [("", str(dataset.attrs[key]), key) for key in MEANING if key in dataset.attrs]
+        taken: set[str] = set()
+        for name in map(str, dataset.data_vars):
+            if name in STANDARD:
+                continue
+            short = _short(name, taken)
+            taken.add(short)
+            self._named.append((name, short.encode()))
+            unit = str(dataset[name].attrs.get("units", "1"))
+            if (short, unit) != (name, "1"):
+                said.append((short, unit, name))
+        for short, unit, name in said:
+            frame = self._bridge.pack("MAG_COLUMN", name=short, unit=unit, column=name)
+            self._file.write(pack_record(self._start_us, Channel.STATE, frame))
+
+    def _say(self, time_us: int, channel: Channel, codec: Codec, layout: Spec, *values: Any) -> None:
+        frame = codec.frame(layout, layout.struct.pack(*values))
+        self._file.write(pack_record(time_us, channel, frame))
+
+    def _boot_ms(self, time_us: int) -> int:
+        return (time_us - self._start_us) // 1000 & 0xFFFFFFFF
+
+    def _attitude(self, time_us: int, row: Row) -> None:
+        angles = [radians(row.get(name, nan)) for name in ATTITUDE]
+        self._say(time_us, Channel.LINK, self._autopilot, ATTITUDE_, self._boot_ms(time_us), *angles, nan, nan, nan)
+
+    def _position(self, time_us: int, row: Row) -> None:
+        # 0 is how autopilots say that they do not know
+        latitude, longitude = (_integer(row.get(name, nan) * 1e7) or 1 for name in POSITION[:2])
+        altitude = _integer(-row.get("depth", nan) * 1e3)
+        boot_ms = self._boot_ms(time_us)
+        fields = boot_ms, latitude, longitude, altitude, altitude, 0, 0, 0, UNKNOWN_HEADING
+        self._say(time_us, Channel.LINK, self._autopilot, POSITION_, *fields)
+
+    def _telemetry(self, time_us: int, row: Row) -> None:
+        boot_ms = self._boot_ms(time_us)
+        for name, short in self._named:
+            self._say(time_us, Channel.LINK, self._autopilot, NAMED_, boot_ms, row[name], short)
+
+    def _raw(self, time_us: int, row: Row) -> None:
+        x, y, z, temperature, supply, cycle = (row.get(name, nan) for name in SAMPLE)
+        delays = [_delay(row.get(name, nan), time_us) for name in CHANNEL_TIMES]
+        counted = not isnan(cycle)
+        fields = time_us, 0, x, y, z, 0, 0, 0, *delays, temperature, supply
+        power = (int(cycle) & 0xFFFF, 0, POWER_CYCLE) if counted else (0, 0, 0)
+        self._say(time_us, Channel.SENT, self._bridge, RAW_, *fields, *power)
+
+    def _field(self, time_us: int, row: Row) -> None:
+        total, sigma, x, y, z, anomaly, quality = (row.get(name, nan) for name in CORRECTED)
+        if isnan(total):
+            return
+        flags = int(Quality.UNCALIBRATED) if isnan(quality) else int(quality)
+        self._sequence += 1
+        fields = time_us, total, self._sequence, 0, sigma, x, y, z, nan, nan, nan, anomaly, nan, nan, flags, 0
+        self._say(time_us, Channel.SENT, self._bridge, FIELD_, *fields)
+
+
+def _short(name: str, taken: set[str]) -> str:
+    """Ten letters that no other column has."""
+    short = name.encode("ascii", "replace")[:10].decode() or "_"
+    return next(s for s in (short, *(f"{short[:6]}{k:04d}" for k in range(10_000))) if s not in taken)
+
+
+def _single(name: str, values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The values as float32 holds them, so that packing cannot overflow."""
+    if name in (*POSITION, *CHANNEL_TIMES, "total_field"):
+        return values
+    with np.errstate(over="ignore"):
+        return values.astype(np.float32).astype(np.float64)
+
+
+def _integer(value: float) -> int:
+    return round(value) if abs(value) < UNKNOWN_INT else UNKNOWN_INT
+
+
+def _delay(time: float, time_us: int) -> int:
+    delay = time * 1e6 - time_us
+    return round(delay) if abs(delay) < UNKNOWN_INT else 0
