@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from datetime import UTC, datetime
+
 import msgspec
 import numpy as np
 import xarray as xr
@@ -44,13 +47,14 @@ def simulate_like(log: xr.Dataset, scenario: Scenario, seed: int = 0) -> xr.Data
     FormatError
         The log lacks a column that the forward model needs, or one holds nothing.
     """
-    track, when = read_track(log, scenario)
+    twin = Twin.draw(scenario, seed)
+    track, when = read_track(log, scenario, twin.vehicle.channels)
     place = msgspec.structs.replace(
         scenario.world,
         latitude=float(np.median(track.latitude)),
         longitude=float(np.median(track.longitude)),
     )
-    start = msgspec.convert(track.start, type(scenario.start), strict=False)
+    start = datetime.fromtimestamp(track.start, UTC)
     twin = Twin.draw(msgspec.structs.replace(scenario, world=place, start=start), seed)
     measured = twin.measure(track, when)
     replaced = [name for name in log.data_vars if str(name).startswith(("mag_", "reference_field"))]
@@ -66,8 +70,8 @@ def simulate_like(log: xr.Dataset, scenario: Scenario, seed: int = 0) -> xr.Data
     return out
 
 
-def read_track(log: xr.Dataset, scenario: Scenario) -> tuple[Track, Array]:
-    """Return a log's track on a uniform grid, and the log's times in s after its start."""
+def read_track(log: xr.Dataset, scenario: Scenario, channels: Sequence[str]) -> tuple[Track, Array]:
+    """Return a log's track with these `channels` on a uniform grid, and the log's times in s after its start."""
     time = log["time"].to_numpy().astype(np.float64)
     if len(time) < 2:
         raise FormatError(_source(log), "at least two rows")
@@ -94,7 +98,6 @@ def read_track(log: xr.Dataset, scenario: Scenario) -> tuple[Track, Array]:
     if log.attrs.get("heading_reference") == "magnetic":
         field = igrf((longitude + 180) % 360 - 180, latitude, depth, time[0] + grid)
         heading = heading + np.degrees(np.arctan2(field[:, 1], field[:, 0]))
-    masses = scenario.vehicle.mass if scenario.vehicle else scenario.masses
     track = Track(
         start=float(time[0]),
         step=step,
@@ -104,7 +107,7 @@ def read_track(log: xr.Dataset, scenario: Scenario) -> tuple[Track, Array]:
         roll=column("roll"),
         pitch=column("pitch"),
         heading=heading,
-        parameters={name: column(name) for name in masses},
+        parameters={name: column(name) for name in channels},
         water=column("water_temperature") if "water_temperature" in log else None,
     )
     return track, when

@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Annotated, Literal
 
+import msgspec
 import numpy as np
 from msgspec import Meta
 
 from magbridge.config import NotNegative, Positive, Table
-from sitl.trajectory import Leg, Limit
+from sitl.platform import MOUNTINGS
 
-__all__ = ["TABLE_1", "CrissCross", "Legs", "Part", "Spirals"]
+__all__ = ["LIMITS", "TABLE_1", "CrissCross", "Leg", "Legs", "Limit", "Part", "Spirals"]
 
 TABLE_1: tuple[tuple[int, float, float, float], ...] = (
     (1, -14.0, 0.272, 0.226),
@@ -29,6 +30,46 @@ TABLE_1: tuple[tuple[int, float, float, float], ...] = (
 
 The ballast stands at -200 cm³ in a dive and at 200 cm³ in a climb.
 """
+
+
+class Limit(Table, frozen=True):
+    """``[limits.NAME]``: what the vehicle allows a moving mass: its ends (units) and speed (units/s)."""
+
+    low: float
+    high: float
+    rate: Positive
+    unit: str = ""
+
+
+LIMITS = {name: Limit(low=m.low, high=m.high, rate=m.rate, unit=m.unit) for name, m in MOUNTINGS.items()}
+
+
+class Leg(Table, frozen=True):
+    """One descent, ascent or level stretch with every commanded value held.
+
+    Attributes
+    ----------
+    duration : float
+        s.
+    pitch, roll : float
+        deg.
+    turn : float
+        deg/s, clockwise seen from above.
+    heading : float or None
+        deg at its start; None goes on from where the last leg ended.
+    parameters : dict of float
+        Positions of the moving masses; one that is not named stays where it is.
+    segment : str
+        Consecutive legs of one name are one segment of the deployment.
+    """
+
+    duration: Positive
+    pitch: Annotated[float, Meta(ge=-80, le=80)]
+    roll: Annotated[float, Meta(ge=-80, le=80)] = 0.0
+    turn: float = 0.0
+    heading: float | None = None
+    parameters: dict[str, float] = msgspec.field(default_factory=dict)
+    segment: str = "mission"
 
 
 class Spirals(Table, frozen=True, tag_field="kind", tag="spirals"):

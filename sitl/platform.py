@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from magbridge.calibration.forward import forward
+from magbridge.calibration.model import Calibration
 from magbridge.config import Table
 from sitl.world import MU_0_OVER_4_PI, dipole_field
 
-__all__ = ["MOUNTINGS", "Mass", "Mounting", "Vehicle", "draw_vehicle"]
+__all__ = ["MOUNTINGS", "Calibrated", "Mass", "Mounting", "Vehicle", "draw_vehicle"]
 
 Array = NDArray[np.float64]
 Vector = tuple[float, float, float]
@@ -108,19 +111,43 @@ class Vehicle(Table, frozen=True):
     soft_iron: Matrix = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
     mass: dict[str, Mass] = msgspec.field(default_factory=dict)
 
-    def field(self, ambient: Array, parameters: Mapping[str, Array]) -> Array:
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """What :meth:`field` must be told."""
+        return tuple(self.mass)
+
+    def field(self, ambient: Array, channels: Mapping[str, Array], time: Array | None = None) -> Array:  # noqa: ARG002
         """Return the field at the sensor, (n, 3) nT in body axes.
 
         Parameters
         ----------
         ambient : array (n, 3)
             nT, the Earth's field in body axes.
-        parameters : mapping of array (n,)
+        channels : mapping of array (n,)
             Where the masses are; every mass must be among them.
+        time : array (n,), optional
+            Iron does not mind.
         """
         fixed = ambient + np.asarray(self.hard_iron) + ambient @ np.asarray(self.soft_iron).T
-        moving = (mass.field(ambient, parameters[name]) for name, mass in self.mass.items())
+        moving = (mass.field(ambient, channels[name]) for name, mass in self.mass.items())
         return sum(moving, start=fixed)
+
+
+@dataclass(frozen=True)
+class Calibrated:
+    """A vehicle that a calibration describes: its own forward model instead of iron."""
+
+    calibration: Calibration
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """What :meth:`field` must be told: masses, and what the calibration's effects follow."""
+        return self.calibration.channels
+
+    def field(self, ambient: Array, channels: Mapping[str, Array], time: Array) -> Array:
+        """Return the field at the sensor as :meth:`Vehicle.field` does; `time` is in s since 1970."""
+        told = np.column_stack([channels[name] for name in self.channels]) if self.channels else None
+        return forward(self.calibration, ambient, np.empty((len(time), 0)) if told is None else told, time)
 
 
 def draw_vehicle(rng: np.random.Generator, masses: Sequence[str] = ("battpos", "ballast")) -> Vehicle:

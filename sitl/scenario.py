@@ -12,9 +12,9 @@ from msgspec import Meta
 from magbridge.config import NotNegative, Table, convert, load_toml
 from magbridge.errors import ConfigError
 from sitl.instrument import Instrument
-from sitl.mission import Part
+from sitl.mission import LIMITS, Limit, Part
 from sitl.platform import MOUNTINGS, Mass, Vehicle
-from sitl.trajectory import LIMITS, Limit, Motion
+from sitl.trajectory import Motion
 from sitl.world import Geology, Water
 
 __all__ = ["SCENARIOS", "Place", "Scenario", "Telemetry", "load"]
@@ -70,6 +70,8 @@ class Scenario(Table, frozen=True):
         Kinds of moving mass (keys of :data:`sitl.platform.MOUNTINGS`) of a vehicle that is drawn from the seed.
     vehicle : Vehicle or None
         A vehicle whose magnetism is given; nothing is drawn then.
+    calibration : str or None
+        A ``cal.json`` (relative to the scenario's file) that describes vehicle and instrument in the vehicle's stead.
     limits : dict of Limit
         The vehicle's limits where they differ from those of its kind of mass.
     world, motion, instrument, telemetry
@@ -82,6 +84,7 @@ class Scenario(Table, frozen=True):
     start: Annotated[datetime, Meta(tz=True)] = datetime(2013, 12, 11, 12, tzinfo=UTC)
     masses: tuple[str, ...] = ("battpos", "ballast")
     vehicle: Vehicle | None = None
+    calibration: str | None = None
     limits: dict[str, Limit] = msgspec.field(default_factory=dict)
     world: Place = Place()
     motion: Motion = Motion()
@@ -116,7 +119,12 @@ def load(path: str | Path) -> Scenario:
     for name in scenario.masses:
         if name not in MOUNTINGS:
             raise ConfigError(path, "masses", f"{name!r} is not one of {', '.join(MOUNTINGS)}")
-    return scenario
+    if scenario.calibration is None:
+        return scenario
+    calibration = path.parent / scenario.calibration
+    if not calibration.is_file():
+        raise ConfigError(path, "calibration", f"no such file: {calibration}")
+    return msgspec.structs.replace(scenario, calibration=str(calibration))
 
 
 def _check_entries(table: dict[str, Any], key: str, kind: type, path: Path, prefix: str = "") -> None:

@@ -4,62 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated
 
-import msgspec
 import numpy as np
-from msgspec import Meta
 from numpy.typing import NDArray
 
 from magbridge.config import NotNegative, Positive, Table
 from magbridge.errors import OutOfRange
-from sitl.platform import MOUNTINGS
+from sitl.mission import LIMITS, Leg, Limit
 from sitl.signals import autoregressive, first_order
 from sitl.world import from_local
 
-__all__ = ["Leg", "Limit", "Motion", "Track", "fly"]
+__all__ = ["Motion", "Track", "fly"]
 
 Array = NDArray[np.float64]
-
-
-class Limit(Table, frozen=True):
-    """``[limits.NAME]``: what the vehicle allows a moving mass: its ends (units) and speed (units/s)."""
-
-    low: float
-    high: float
-    rate: Positive
-    unit: str = ""
-
-
-LIMITS = {name: Limit(low=m.low, high=m.high, rate=m.rate, unit=m.unit) for name, m in MOUNTINGS.items()}
-
-
-class Leg(Table, frozen=True):
-    """One descent, ascent or level stretch with every commanded value held.
-
-    Attributes
-    ----------
-    duration : float
-        s.
-    pitch, roll : float
-        deg.
-    turn : float
-        deg/s, clockwise seen from above.
-    heading : float or None
-        deg at its start; None goes on from where the last leg ended.
-    parameters : dict of float
-        Positions of the moving masses; one that is not named stays where it is.
-    segment : str
-        Consecutive legs of one name are one segment of the deployment.
-    """
-
-    duration: Positive
-    pitch: Annotated[float, Meta(ge=-80, le=80)]
-    roll: Annotated[float, Meta(ge=-80, le=80)] = 0.0
-    turn: float = 0.0
-    heading: float | None = None
-    parameters: dict[str, float] = msgspec.field(default_factory=dict)
-    segment: str = "mission"
 
 
 class Motion(Table, frozen=True):
@@ -109,7 +66,9 @@ class Track:
     roll, pitch, heading : array (n,)
         deg; the heading runs on past 360 (so that it can be interpolated).
     parameters : dict of array (n,)
-        Positions of the moving masses.
+        Positions of the moving masses, and whatever else a log has that the vehicle's magnetism follows.
+    run : array (n,) or None
+        Number of the leg, from 1.
     segments : tuple of (name, first, last)
         s after the start.
     water : array (n,) or None
@@ -125,6 +84,7 @@ class Track:
     pitch: Array
     heading: Array
     parameters: dict[str, Array]
+    run: Array | None = None
     segments: tuple[tuple[str, float, float], ...] = ()
     water: Array | None = None
 
@@ -204,6 +164,7 @@ def fly(
         pitch=pitch,
         heading=heading,
         parameters={name: _mass_motion(name, legs, ends, t, leg_of, limits) for name in names},
+        run=1 + leg_of.astype(np.float64),
         segments=_segments(legs, ends),
     )
 

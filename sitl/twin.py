@@ -8,23 +8,24 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
-from scipy.interpolate import RegularGridInterpolator
 
+from magbridge.calibration.file import load as load_calibration
 from magbridge.errors import WrongUse
-from magbridge.field.igrf import igrf
+from magbridge.field.grid import AnomalyGrid
+from magbridge.field.igrf import total_field
+from sitl.columns import dataset
 from sitl.instrument import rotation
-from sitl.platform import MOUNTINGS, Vehicle, draw_vehicle
+from sitl.platform import Calibrated, Vehicle, draw_vehicle
 from sitl.scenario import Scenario
 from sitl.trajectory import Track, fly
 from sitl.world import World, from_local, to_local
 
-__all__ = ["Twin", "segments", "simulate"]
+__all__ = ["Twin", "simulate"]
 
 Array = NDArray[np.float64]
 
@@ -32,31 +33,6 @@ FINE_STEP = 0.5
 """s between the simulation's points: a spiral's arc departs from its chords by 0.1 nT."""
 FIELD_STEP = 4.0
 """s between evaluations of the Earth's field, which varies by less than 0.01 nT about a line meanwhile."""
-
-COLUMNS = {
-    "mag_x": ("nT", "raw magnetometer channel, forward"),
-    "mag_y": ("nT", "raw magnetometer channel, starboard"),
-    "mag_z": ("nT", "raw magnetometer channel, down"),
-    "mag_time_x": ("s", "time of the forward channel's sample"),
-    "mag_time_y": ("s", "time of the starboard channel's sample"),
-    "mag_time_z": ("s", "time of the downward channel's sample"),
-    "sensor_temperature": ("degC", "temperature at the fluxgate"),
-    "power_cycle": ("1", "times the instrument was powered on again"),
-    "roll": ("deg", "roll, starboard down"),
-    "pitch": ("deg", "pitch, nose up"),
-    "heading": ("deg", "heading, true"),
-    "latitude": ("deg", "latitude as the vehicle knows it"),
-    "longitude": ("deg", "longitude as the vehicle knows it"),
-    "depth": ("m", "depth"),
-    "reference_field": ("nT", "total field to calibrate against"),
-    "truth_total_field": ("nT", "true total field"),
-    "truth_field_x": ("nT", "true field, body forward"),
-    "truth_field_y": ("nT", "true field, body starboard"),
-    "truth_field_z": ("nT", "true field, body down"),
-    "truth_latitude": ("deg", "true latitude"),
-    "truth_longitude": ("deg", "true longitude"),
-}
-"""Unit and meaning of each column, telemetry of the moving masses aside."""
 
 
 @dataclass(frozen=True)
@@ -68,13 +44,13 @@ class Twin:
     scenario : Scenario
     seed : int
     world : World
-    vehicle : Vehicle
+    vehicle : Vehicle or Calibrated
     """
 
     scenario: Scenario
     seed: int
     world: World
-    vehicle: Vehicle
+    vehicle: Vehicle | Calibrated
 
     @classmethod
     def draw(cls, scenario: Scenario, seed: int) -> Twin:
@@ -91,7 +67,11 @@ class Twin:
             place.water,
             _stream(seed, 0),
         )
-        vehicle = scenario.vehicle or draw_vehicle(_stream(seed, 1), scenario.masses)
+        vehicle: Vehicle | Calibrated
+        if scenario.calibration is not None:
+            vehicle = Calibrated(load_calibration(scenario.calibration))
+        else:
+            vehicle = scenario.vehicle or draw_vehicle(_stream(seed, 1), scenario.masses)
         return cls(scenario, seed, world, vehicle)
 
     def fly(self) -> Track:
@@ -122,7 +102,9 @@ class Twin:
         instrument, reference = self.scenario.instrument, self.scenario.telemetry.reference
         earth = self._earth_field(track)
         attitude = rotation(track.roll, track.pitch, track.heading)
-        at_sensor = self.vehicle.field(attitude.apply(earth, inverse=True), track.parameters)
+        at_sensor = self.vehicle.field(
+            attitude.apply(earth, inverse=True), self._channels(track), track.start + track.elapsed
+        )
         water = self.world.water.temperature(track.depth) if track.water is None else track.water
         samples = instrument.measure(at_sensor, water, track.step, when, _stream(self.seed, 3))
 
@@ -141,13 +123,15 @@ class Twin:
             columns[f"truth_field_{axis}"] = field_body[:, k]
             if any(instrument.channel_delay):
                 columns[f"mag_time_{axis}"] = track.start + samples.times[:, k]
+        if track.run is not None:
+            columns["run"] = track.run[np.rint(when / track.step).astype(np.intp)]
         if reference == "true":
             columns["reference_field"] = columns["truth_total_field"]
         elif reference == "map":
             columns["reference_field"] = self._map_reference(columns, track.start + when)
-        return _dataset(track, when, columns, self.scenario.name)
+        return dataset(track, when, columns, self.scenario.name)
 
-    def anomaly_map(self) -> xr.DataArray:
+    def anomaly_map(self) -> AnomalyGrid:
         """Return the aeromagnetic map of the scenario's world: see :meth:`World.anomaly_map`."""
         geology, altitude = self.scenario.world.geology, self.scenario.telemetry.map_altitude
         return self.world.anomaly_map(
@@ -166,6 +150,16 @@ class Twin:
         grid = np.arange(len(track.depth))
         return np.column_stack([np.interp(grid, points, component) for component in field.T])
 
+    def _channels(self, track: Track) -> dict[str, Array]:
+        """Return what the vehicle's magnetism follows."""
+        known = track.at(track.elapsed)
+        for name in self.vehicle.channels:
+            if name not in known:
+                raise WrongUse(
+                    f"scenario {self.scenario.name!r}: nothing drives {name!r}; there are {', '.join(known)}"
+                )
+        return {name: known[name] for name in self.vehicle.channels}
+
     def _telemetry(self, true: dict[str, Array], when: Array) -> dict[str, Array]:
         """Return what the vehicle believes of attitude, position and masses."""
         settings, rng = self.scenario.telemetry, _stream(self.seed, 4)
@@ -182,15 +176,9 @@ class Twin:
 
     def _map_reference(self, columns: dict[str, Array], time: Array) -> Array:
         """Return the IGRF with the map's anomaly, nT, where the vehicle believes to be (eq. 4 of the paper)."""
-        grid = self.anomaly_map()
-        look_up = RegularGridInterpolator(
-            (grid["latitude"].to_numpy(), grid["longitude"].to_numpy()),
-            grid.to_numpy(),
-            bounds_error=False,
-        )
         latitude, longitude = columns["latitude"], columns["longitude"]
-        main = igrf(longitude, latitude, columns["depth"], time)
-        return np.asarray(np.linalg.norm(main, axis=1) + look_up((latitude, longitude)))
+        main = total_field(longitude, latitude, columns["depth"], time)
+        return main + self.anomaly_map().evaluate(longitude, latitude).anomaly
 
 
 def simulate(scenario: Scenario, seed: int = 0) -> xr.Dataset:
@@ -200,7 +188,7 @@ def simulate(scenario: Scenario, seed: int = 0) -> xr.Dataset:
     -------
     Dataset (time)
         Columns as in any deployment, ``truth_*`` beside them. ``attrs["segments"]`` lists the parts of the mission
-        (JSON: name, first and last time in s since 1970); :func:`segments` takes them apart.
+        (JSON: name, first and last time in s since 1970); :func:`sitl.segments` takes them apart.
     """
     twin = Twin.draw(scenario, seed)
     track = twin.fly()
@@ -208,30 +196,5 @@ def simulate(scenario: Scenario, seed: int = 0) -> xr.Dataset:
     return twin.measure(track, np.arange(0.0, last, 1 / scenario.instrument.rate))
 
 
-def segments(deployment: xr.Dataset) -> dict[str, xr.Dataset]:
-    """Return the parts of a simulated deployment's mission by name."""
-    return {
-        name: deployment.sel(time=slice(first, np.nextafter(last, first)))
-        for name, first, last in json.loads(deployment.attrs["segments"])
-    }
-
-
 def _stream(seed: int, which: int) -> np.random.Generator:
     return np.random.default_rng([seed, which])
-
-
-def _dataset(track: Track, when: Array, columns: dict[str, Array], name: str) -> xr.Dataset:
-    units = COLUMNS | {
-        parameter: (MOUNTINGS[parameter].unit if parameter in MOUNTINGS else "1", f"position of {parameter}")
-        for parameter in track.parameters
-    }
-    parts = [(part, track.start + first, track.start + last) for part, first, last in track.segments]
-    return xr.Dataset(
-        {
-            column: ("time", columns[column], dict(zip(("units", "long_name"), units[column], strict=True)))
-            for column in units
-            if column in columns
-        },
-        coords={"time": ("time", track.start + when, {"units": "s", "long_name": "time since 1970 UTC"})},
-        attrs={"source": f"simulated: {name}", "segments": json.dumps(parts)},
-    )

@@ -5,11 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import xarray as xr
 from numpy.typing import NDArray
 
 from magbridge.config import Table
-from magbridge.field.igrf import igrf
+from magbridge.field.earth import metres_per_degree
+from magbridge.field.grid import AnomalyGrid
+from magbridge.field.igrf import igrf, total_field
 
 __all__ = ["Geology", "Rock", "Water", "World", "dipole_field", "from_local", "to_local"]
 
@@ -17,8 +18,6 @@ Array = NDArray[np.float64]
 
 MU_0_OVER_4_PI = 100.0
 """nT m / A: µ0/4π = 1e-7 T m/A."""
-EARTH_RADIUS = 6_371_200.0
-"""m, the reference sphere of the IGRF."""
 
 
 def dipole_field(r: Array, m: Array) -> Array:
@@ -50,18 +49,14 @@ def dipole_field(r: Array, m: Array) -> Array:
 
 def to_local(latitude: Array, longitude: Array, origin: tuple[float, float]) -> tuple[Array, Array]:
     """Return metres (north, east) of `origin` (latitude, longitude in deg), on the plane that touches it."""
-    north = np.radians(latitude - origin[0]) * EARTH_RADIUS
-    east = (np.radians((longitude - origin[1] + 180) % 360 - 180) * EARTH_RADIUS) * np.cos(
-        np.radians(origin[0])
-    )
-    return north, east
+    north, east = metres_per_degree(origin[0])
+    return (latitude - origin[0]) * north, ((longitude - origin[1] + 180) % 360 - 180) * east
 
 
 def from_local(north: Array, east: Array, origin: tuple[float, float]) -> tuple[Array, Array]:
-    """Return latitude and longitude (deg); the inverse of :func:`to_local`."""
-    latitude = origin[0] + np.degrees(north / EARTH_RADIUS)
-    longitude = origin[1] + np.degrees(east / (EARTH_RADIUS * np.cos(np.radians(origin[0]))))
-    return latitude, longitude
+    """Return latitude and longitude (deg, -180 to 180); the inverse of :func:`to_local`."""
+    per_latitude, per_longitude = metres_per_degree(origin[0])
+    return origin[0] + north / per_latitude, (origin[1] + east / per_longitude + 180) % 360 - 180
 
 
 class Geology(Table, frozen=True):
@@ -189,29 +184,24 @@ class World:
 
     def anomaly_map(
         self, time: float, altitude: float = 90.0, extent: float = 8_000.0, spacing: float = 150.0
-    ) -> xr.DataArray:
-        """Return the map an aeromagnetic survey would have made, upward-continued to `altitude` (m).
+    ) -> AnomalyGrid:
+        """Return the map an aeromagnetic survey would have made, upward-continued to `altitude`.
 
         The same bodies seen from higher up, without the fine structure that a vehicle under water meets.
 
-        Returns
-        -------
-        DataArray (latitude, longitude)
-            nT, the total field less the main field's, as ``anomaly``.
+        Parameters
+        ----------
+        time : float
+            s since 1970, of the main field.
+        altitude, extent, spacing : float
+            m above the surface; half the side of the square; between nodes.
         """
         side = np.arange(-extent, extent + spacing / 2, spacing)
         latitude, longitude = from_local(side, side, self.origin)
         lat, lon = (a.ravel() for a in np.meshgrid(latitude, longitude, indexing="ij"))
-        high = np.full(lat.shape, -altitude)
-        main = igrf(lon, lat, high, np.full(lat.shape, time))
-        total = self.field(np.full(lat.shape, time), lat, lon, high)
-        anomaly = np.linalg.norm(total, axis=1) - np.linalg.norm(main, axis=1)
-        return xr.DataArray(
-            anomaly.reshape(len(side), len(side)),
-            coords={
-                "latitude": ("latitude", latitude, {"units": "degrees_north"}),
-                "longitude": ("longitude", longitude, {"units": "degrees_east"}),
-            },
-            name="anomaly",
-            attrs={"units": "nT", "long_name": "total-field anomaly", "altitude": altitude},
+        when, high = np.full(lat.shape, time), np.full(lat.shape, -altitude)
+        total = np.linalg.norm(self.field(when, lat, lon, high), axis=1)
+        anomaly = total - total_field(lon, lat, high, when)
+        return AnomalyGrid(
+            longitude, latitude, anomaly.reshape(len(side), -1), altitude=altitude, name="aeromagnetic map"
         )

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from magbridge.errors import OutOfRange
-from sitl.mission import TABLE_1, CrissCross, Legs, Spirals
-from sitl.trajectory import LIMITS, Leg, Motion, Track, fly
+from sitl.mission import LIMITS, TABLE_1, CrissCross, Leg, Legs, Spirals
+from sitl.trajectory import Motion, Track, fly
 from sitl.world import to_local
 
 START = (1386763200.0, 49.52, -57.87)

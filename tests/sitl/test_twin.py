@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import msgspec
@@ -7,14 +8,16 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from magbridge.calibration.file import save as save_calibration
+from magbridge.calibration.model import Parameter, identity
 from magbridge.errors import ConfigError, FormatError, WrongUse
 from magbridge.field.igrf import igrf
 from sitl import Scenario, Twin, load, segments, simulate, simulate_like
 from sitl.instrument import Instrument
-from sitl.mission import Legs, Spirals
+from sitl.mission import Leg, Legs, Spirals
 from sitl.platform import Vehicle
 from sitl.scenario import SCENARIOS
-from sitl.trajectory import Leg
+from sitl.trajectory import Motion
 from sitl.world import Geology
 
 PERFECT = Instrument(noise_sigma=0.0, corner=0.0)
@@ -115,8 +118,28 @@ def test_the_map_reference_is_the_igrf_and_a_map_without_fine_structure() -> Non
         igrf(*(deployment[name] for name in ("longitude", "latitude", "depth", "time"))), axis=1
     )
     anomaly = Twin.draw(scenario, 5).anomaly_map()
-    there = anomaly.interp(latitude=deployment["latitude"], longitude=deployment["longitude"])
+    there = anomaly.at(deployment["longitude"], deployment["latitude"])
     np.testing.assert_allclose(deployment["reference_field"] - main, there, atol=1e-6)
+
+
+def test_a_calibration_stands_in_for_vehicle_and_instrument(tmp_path: Path) -> None:
+    battery = Parameter("battpos", "in", -1.0, 1.0, 0.0, 1.0)
+    plain = identity((battery,), 53_000.0)
+    hard_iron = np.zeros(9)
+    hard_iron[6:] = 100.0, -200.0, 300.0
+    save_calibration(replace(plain, coefficients=hard_iron), tmp_path / "cal.json")
+    (tmp_path / "scene.toml").write_text("name = 'calibrated'\ncalibration = 'cal.json'\n")
+    scenario = msgspec.structs.replace(
+        load(tmp_path / "scene.toml"),
+        instrument=PERFECT,
+        mission=SHORT,
+        motion=Motion(wander=(0.0, 0.0, 0.0)),
+    )
+    deployment = simulate(scenario, 1)
+    truth = np.column_stack([deployment[f"truth_field_{axis}"] for axis in "xyz"])
+    np.testing.assert_allclose(
+        channels(deployment) - truth, np.tile(hard_iron[6:], (len(truth), 1)), atol=0.02
+    )
 
 
 def test_an_unknown_current_moves_the_truth_from_where_the_vehicle_believes_to_be() -> None:
@@ -144,6 +167,7 @@ def test_a_scenario_without_a_mission_wants_a_log() -> None:
         ("[limits.battpos]\nlow = 0.0", "limits.battpos.high: missing"),
         ("[[mission]]\nkind = 'waltz'", "mission[0].kind"),
         ("[[mission]]\nkind = 'spirals'\ntrial = 3", "mission[0].trial"),
+        ("calibration = 'nowhere.json'", "calibration: no such file"),
         ("start =", "not TOML"),
     ],
 )
