@@ -7,11 +7,13 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from typing import Annotated, Any
 
-from cyclopts import App, CycloptsError
+from cyclopts import App, CycloptsError, Parameter
 
 from magbridge import __version__
-from magbridge.errors import MagbridgeError
+from magbridge.errors import MagbridgeError, MissingExtra, WrongUse
+from magbridge.progress import track
 
 __all__ = ["app", "main"]
 
@@ -21,6 +23,8 @@ app = App(
     version=__version__,
     help_format="plaintext",
 )
+Output = Annotated[Path, Parameter(name=["--output", "-o"])]
+Json = Annotated[bool, Parameter(name="--json", negative="")]
 
 
 @app.command
@@ -32,9 +36,101 @@ def run(*, config: Path) -> None:
     config
         The bridge.toml.
     """
-    from magbridge.bridge.live import run as live
+    from magbridge.bridge.run import run as attach
 
-    live(config)
+    attach(config)
+
+
+@app.command
+def convert(*files: Path, output: Output, json: Json = False) -> None:
+    """Convert logs of any readable format to any writable one; several are joined in time.
+
+    Parameters
+    ----------
+    files
+        Logs.
+    output
+        The file to write; its suffix says the format: .csv .nc .parquet .tlog.
+    json
+        Print the result for machines.
+    """
+    from magbridge.logs import Writer, read_chunks
+
+    rows = 0
+    with Writer(output) as writer:
+        for part in track(read_chunks(_some(files)), "reading"):
+            writer.append(part)
+            rows += part.sizes["time"]
+            names = [str(name) for name in part.data_vars]
+    _tell({"file": str(output), "rows": rows, "columns": names}, f"{output}: {rows} rows", json)
+
+
+@app.command
+def simulate(
+    scenario: Path, *, output: Output, seed: int = 0, like: tuple[Path, ...] = (), json: Json = False
+) -> None:
+    """Simulate a deployment from the forward model.
+
+    Parameters
+    ----------
+    scenario
+        A scenario file, or the name of one that comes with magbridge: demo, bonne_bay, comet, seaglider.
+    output
+        The file to write.
+    seed
+        Draws everything that the scenario leaves open; the same seed gives the same deployment.
+    like
+        Logs whose attitude, position and masses drive the simulation instead of the scenario's mission.
+    json
+        Print the result for machines.
+    """
+    from magbridge.logs import read, write
+    from sitl import load, simulate_like
+    from sitl import simulate as simulate_scenario
+
+    chosen = load(scenario)
+    deployment = simulate_like(read(like), chosen, seed) if like else simulate_scenario(chosen, seed)
+    write(deployment, output)
+    rows = deployment.sizes["time"]
+    _tell({"file": str(output), "rows": rows, "seed": seed}, f"{output}: {rows} rows", json)
+
+
+@app.command
+def correct(file: Path, *more: Path, calibration: Path, output: Output, json: Json = False) -> None:
+    """Correct a log with a calibration, as the bridge would have done live.
+
+    Parameters
+    ----------
+    file
+        A log.
+    more
+        Further logs of the same deployment.
+    calibration
+        The cal.json.
+    output
+        The file to write: total field with its sigma, vector, anomaly and quality.
+    json
+        Print the result for machines.
+    """
+    from magbridge.calibration.file import load
+    from magbridge.columns import CHANNELS
+    from magbridge.config import Align
+    from magbridge.correction import Correction, correct_rows
+    from magbridge.logs import Writer, read_chunks
+    from magbridge.records import Quality
+
+    correction = Correction(load(calibration), Align())
+    rows = flagged = 0
+    with Writer(output) as writer:
+        for part in track(read_chunks((file, *more), required=CHANNELS), "correcting"):
+            corrected = correct_rows(correction, part)
+            writer.append(corrected)
+            rows += part.sizes["time"]
+            flagged += int(
+                (corrected["quality"].to_numpy().astype(int) & ~int(Quality.NO_BORESIGHT) != 0).sum()
+            )
+    summary = f"{output}: {rows} samples, {flagged} of them flagged"
+    _tell({"file": str(output), "rows": rows, "flagged": flagged}, summary, json)
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -42,16 +138,43 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         app(arguments, exit_on_error=False, print_error=False, result_action="return_value")
     except CycloptsError as error:
-        return complain(str(error), 2)
+        return _complain(str(error), 2)
     except MagbridgeError as error:
-        return complain(str(error), error.exit_code)
+        return _complain(str(error), error.exit_code)
+    except ImportError as error:
+        extra = EXTRAS.get((error.name or "").partition(".")[0])
+        if extra is None:
+            raise
+        return _complain(str(MissingExtra(str(error.name), extra)), 2)
     except BrokenPipeError:  # the reader of our output has gone, as `| head` does
         sys.stderr.close()
-        return 0
+    except KeyboardInterrupt:
+        return _complain("interrupted", 130)
     return 0
 
 
-def complain(sentence: str, code: int) -> int:
+EXTRAS = dict.fromkeys(
+    ("scipy", "xarray", "netCDF4", "matplotlib", "ppigrf", "filterpy", "rich", "pandas"), "analysis"
+) | dict.fromkeys(("harmonica", "verde"), "grids")
+"""Which extra brings a package."""
+
+
+def _some(files: tuple[Path, ...]) -> tuple[Path, ...]:
+    if not files:
+        raise WrongUse("expected at least one FILE")
+    return files
+
+
+def _tell(result: dict[str, Any], sentence: str, as_json: bool) -> None:
+    """Print the result, for people or for machines."""
+    if as_json:
+        import msgspec
+
+        sentence = msgspec.json.encode(result).decode()
+    print(sentence)
+
+
+def _complain(sentence: str, code: int) -> int:
     """Print one line to stderr and return `code`."""
     print("magbridge:", " ".join(sentence.split()), file=sys.stderr)
     return code

@@ -13,11 +13,14 @@ from math import hypot, isfinite, nan
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from magbridge.align import Aligner, Input, Sample
 from magbridge.calibration.correct import Corrector
 from magbridge.calibration.model import Calibration, identity
 from magbridge.config import Align
+from magbridge.field.igrf import total_field
+from magbridge.field.reference import positions
 from magbridge.records import Corrected, Reading
 
 if TYPE_CHECKING:
@@ -113,16 +116,30 @@ def correct_rows(correction: Correction, deployment: xr.Dataset) -> xr.Dataset:
     Returns
     -------
     Dataset (time)
-        ``total_field total_field_sigma field_x field_y field_z quality``; ``time`` as in the input.
+        ``total_field total_field_sigma field_x field_y field_z quality anomaly``; ``time`` as in the input.
+        The anomaly is the total field minus the IGRF, NaN where there is no position.
     """
     rows = [correction.reading(*row)[1] for row in _readings(correction, deployment)]
     results = np.array(
         [(row.total_field, row.total_field_sigma, *row.field, row.quality) for row in rows], dtype=float
     ).reshape(-1, 6)
     names = ("total_field", "total_field_sigma", "field_x", "field_y", "field_z", "quality")
-    return deployment[[]].assign(
-        {name: ("time", column) for name, column in zip(names, results.T, strict=True)}
-    )
+    columns = dict(zip(names, results.T, strict=True))
+    columns["anomaly"] = columns["total_field"] - _main_field(deployment)
+    return deployment[[]].assign({name: ("time", column) for name, column in columns.items()})
+
+
+def _main_field(deployment: xr.Dataset) -> NDArray[np.float64]:
+    """Return the IGRF's total field (nT) at every row; NaN where there is no position."""
+    if not {"latitude", "longitude"} <= set(deployment.variables):
+        return np.full(deployment.sizes["time"], nan)
+    longitude, latitude, depth = positions(deployment)
+    known = np.isfinite(longitude) & np.isfinite(latitude)
+    field = np.full(len(known), nan)
+    if known.any():
+        time = deployment["time"].to_numpy()
+        field[known] = total_field(longitude[known], latitude[known], depth[known], time[known])
+    return field
 
 
 def _readings(correction: Correction, deployment: xr.Dataset) -> Iterator[tuple[Reading, int]]:
