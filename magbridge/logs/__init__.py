@@ -20,7 +20,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack
-from functools import cache
+from functools import cache, partial
 from importlib import import_module
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -149,7 +149,7 @@ def read_chunks(paths: Paths, rows: int = 65536, *, required: Iterable[str] = ()
 
     sources = _paths(paths)
     required = tuple(required)
-    for dataset in merge([lambda n, path=path: _chunks(path, n) for path in sources], rows):
+    for dataset in merge([partial(_chunks, path) for path in sources], rows):
         _require(dataset, required)
         yield dataset
 

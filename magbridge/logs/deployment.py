@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from magbridge.columns import COLUMNS, factor
 from magbridge.errors import FormatError
 from magbridge.records import Quality
 
-__all__ = ["MEANING", "deployment", "increasing", "join", "same_columns"]
+__all__ = ["MEANING", "deployment", "increasing", "join", "same_columns", "sliced"]
 
 Floats = NDArray[np.float64]
 
@@ -58,12 +58,11 @@ def deployment(
             raise FormatError(file, f"expected {COLUMNS[name].unit}, not {unit}", column=name)
         array = np.asarray(values, dtype=np.float64)
         variables[name] = ("time", array if scale == 1.0 else array * scale, _describe(name, unit))
-    dataset = xr.Dataset(
+    return xr.Dataset(
         variables,
         coords={"time": ("time", np.asarray(time, dtype=np.float64), _describe("time", ""))},
         attrs={"source": Path(file).name, **(attrs or {})},
     )
-    return dataset
 
 
 def _describe(name: str, unit: str) -> dict[str, Any]:
@@ -77,6 +76,12 @@ def _describe(name: str, unit: str) -> dict[str, Any]:
             "flag_meanings": " ".join(str(flag.name).lower() for flag in Quality),
         }
     return described
+
+
+def sliced(dataset: xr.Dataset, rows: int) -> Iterator[xr.Dataset]:
+    """Yield a deployment that is already in memory in pieces of at most `rows` rows."""
+    for start in range(0, dataset.sizes["time"], rows):
+        yield dataset.isel(time=slice(start, start + rows))
 
 
 def increasing(file: str | Path, time: Floats, *, first_row: int = 1, after: float = -np.inf) -> None:

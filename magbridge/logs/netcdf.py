@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from magbridge.errors import FormatError, MissingExtra
 from magbridge.logs import seaglider
-from magbridge.logs.deployment import deployment, increasing
+from magbridge.logs.deployment import deployment, increasing, sliced
 
 try:
     import netCDF4
@@ -64,7 +64,7 @@ def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
         with netCDF4.Dataset(path) as file:
             file.set_auto_mask(False)  # its valid_min would turn a depth of -2 cm into nothing
             if seaglider.DIMENSION in file.dimensions:
-                yield seaglider.dive(path, file)
+                yield from sliced(seaglider.dive(path, file), rows)
             elif DIMENSION in file.dimensions:
                 yield from _chunks(path, file, rows)
             else:
@@ -109,7 +109,7 @@ def _epoch(path: Path, variable: Any) -> tuple[float, float]:
     """Seconds since 1970 at which the time variable is 0, and seconds in one of its units."""
     units = getattr(variable, "units", "")
     try:
-        zero, one = netCDF4.num2date([0, 1], units, only_use_cftime_datetimes=False)
+        zero, one = (netCDF4.num2date(k, units, only_use_cftime_datetimes=False) for k in (0, 1))
     except ValueError:
         raise FormatError(path, f"expected {EPOCH!r}, not {units!r}", column="TIME") from None
     return zero.replace(tzinfo=UTC).timestamp(), (one - zero).total_seconds()
@@ -137,15 +137,12 @@ class FileWriter:
         n = dataset.sizes["time"]
         for name, variable in self._variables.items():
             values = dataset[name].values
-            fill = variable.get_fill_value() if name in ATTRIBUTES else None
-            if fill is not None and fill == fill:
+            if (fill := ATTRIBUTES.get(name, {}).get("_FillValue")) is not None:
                 values = np.where(np.isnan(values), fill, values)
             variable[self._rows : self._rows + n] = values
         self._rows += n
-        if self._rows:
-            last = float(dataset["time"][-1]) if n else 0.0
-            if n:
-                self._file.time_coverage_end = _iso(last)
+        if n:
+            self._file.time_coverage_end = _iso(float(dataset["time"][-1]))
 
     def _define(self, dataset: xr.Dataset) -> None:
         file = self._file

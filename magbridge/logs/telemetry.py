@@ -71,7 +71,10 @@ def _raw(payload: bytes) -> Columns:
 
 def _field(payload: bytes) -> Columns:
     time_us, total, _, _, sigma, x, y, z, _, _, _, anomaly, _, _, flags, _ = _FIELD.unpack(payload)
-    return {"time": time_us / 1e6, **dict(zip(CORRECTED, (total, sigma, x, y, z, anomaly, flags), strict=True))}
+    return {
+        "time": time_us / 1e6,
+        **dict(zip(CORRECTED, (total, sigma, x, y, z, anomaly, flags), strict=True)),
+    }
 
 
 def _of(message: str) -> Callable[[bytes], Columns]:
@@ -166,7 +169,7 @@ class Survey:
         elif number in (START, BYTES):
             self.ours = True
         elif number in (RAW, FIELD):
-            for column in (_raw if number == RAW else _field)(message.payload):
+            for column in (_raw if number == RAW else _field)(message.payload).keys() - {"time"}:
                 known.setdefault(column, UNITS.get(column, ""))
         elif number in TELEMETRY:
             still = self._open.setdefault((number, system), list(TELEMETRY[number]))

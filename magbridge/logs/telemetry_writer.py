@@ -98,7 +98,9 @@ class FileWriter:
 
     def _attitude(self, time_us: int, row: Row) -> None:
         angles = [radians(row.get(name, nan)) for name in ATTITUDE]
-        self._say(time_us, Channel.LINK, self._autopilot, ATTITUDE_, self._boot_ms(time_us), *angles, nan, nan, nan)
+        self._say(
+            time_us, Channel.LINK, self._autopilot, ATTITUDE_, self._boot_ms(time_us), *angles, nan, nan, nan
+        )
 
     def _position(self, time_us: int, row: Row) -> None:
         # 0 is how autopilots say that they do not know
@@ -138,7 +140,7 @@ def _short(name: str, taken: set[str]) -> str:
 
 
 def _single(name: str, values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The values as float32 holds them, so that packing cannot overflow."""
+    """Round to what float32 holds, so that packing cannot overflow."""
     if name in (*POSITION, *CHANNEL_TIMES, "total_field"):
         return values
     with np.errstate(over="ignore"):

@@ -12,7 +12,7 @@ import csv
 import re
 from collections.abc import Iterator
 from itertools import islice
-from math import nan
+from math import isnan, nan
 from pathlib import Path
 from typing import TextIO
 
@@ -140,5 +140,5 @@ def _heading(column: xr.DataArray) -> str:
 
 def _texts(name: str, values: np.ndarray[tuple[int], np.dtype[np.float64]]) -> list[str]:
     if name == "quality":  # a row that was not corrected is never taken for a good one
-        return [Quality(int(v)).names() if v == v else "uncalibrated" for v in values.tolist()]
-    return ["" if v != v else repr(v) for v in values.tolist()]
+        return ["uncalibrated" if isnan(v) else Quality(int(v)).names() for v in values.tolist()]
+    return ["" if isnan(v) else repr(v) for v in values.tolist()]

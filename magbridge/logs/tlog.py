@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import os
 from collections import deque
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from struct import Struct
@@ -199,10 +200,8 @@ class TlogWriter:
 
     def _fail(self, error: OSError, time_us: int) -> None:
         if self._file >= 0:
-            try:
+            with suppress(OSError):  # the reader skips a torn record
                 os.ftruncate(self._file, self._size)
-            except OSError:
-                pass  # the reader skips a torn record
         self._end_file()
         self.failure, self._failed_us = error.strerror or str(error), time_us
 

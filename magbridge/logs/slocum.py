@@ -1,0 +1,137 @@
+"""Slocum gliders: ``.dbd .mbd .sbd`` (flight) and ``.ebd .nbd .tbd`` (science), also compressed (``.dcd`` ... ``.tcd``).
+
+A row is a cycle of the flight computer; what was not updated in a cycle lies linearly between its neighbours. The
+science file of the same name beside a flight file is joined to it, and the other way round: either name, or both,
+give the same deployment. The list of sensors is looked for in the file ``<crc>.cac`` beside the file.
+
+Angles become degrees; ``heading`` is what the compass says, magnetic. A Slocum logs no vector magnetometer of its own:
+there is no ``mag_x``, and the log serves to drive a simulated one, or beside the log of an instrument that rode along.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from magbridge.errors import FormatError, MissingExtra
+from magbridge.logs.deployment import deployment, increasing, sliced
+from magbridge.logs.resample import linear
+
+__all__ = ["chunks"]
+
+Floats = NDArray[np.float64]
+
+MAX_GAP = 300.0
+"""s between two updates of a sensor across which nothing is interpolated."""
+SCIENCE = {".dbd": ".ebd", ".mbd": ".nbd", ".sbd": ".tbd", ".dcd": ".ecd", ".mcd": ".ncd", ".scd": ".tcd"}
+SENSORS = {
+    # theirs: (ours, unit, factor)
+    "m_roll": ("roll", "deg", 180.0 / np.pi),
+    "m_pitch": ("pitch", "deg", 180.0 / np.pi),
+    "m_heading": ("heading", "deg", 180.0 / np.pi),
+    "m_lat": ("latitude", "deg", 1.0),
+    "m_lon": ("longitude", "deg", 1.0),
+    "m_depth": ("depth", "m", 1.0),
+    "m_battpos": ("battpos", "in", 1.0),
+    "m_ballast_pumped": ("ballast", "cc", 1.0),
+    "m_de_oil_vol": ("oil_volume", "cc", 1.0),
+    "m_fin": ("fin", "deg", 180.0 / np.pi),
+    "m_coulomb_current": ("coulomb_current", "A", 1.0),
+    "m_battery": ("battery_voltage", "V", 1.0),
+    "m_veh_temp": ("vehicle_temperature", "degC", 1.0),
+    "m_vacuum": ("vacuum", "inHg", 1.0),
+    "m_pressure": ("flight_pressure", "bar", 1.0),
+    "sci_water_temp": ("water_temperature", "degC", 1.0),
+    "sci_water_pressure": ("water_pressure", "bar", 1.0),
+}
+ANGLES = {"m_heading": 360.0}
+
+
+def _import() -> Any:
+    """Import dbdreader without letting it make a directory in the user's home."""
+    home = os.environ.get("HOME")
+    try:
+        with tempfile.TemporaryDirectory() as elsewhere:
+            os.environ["HOME"] = elsewhere
+            import dbdreader  # noqa: PLC0415 - under another HOME
+    except ImportError:
+        raise MissingExtra("dbdreader", "formats") from None
+    finally:
+        os.environ.pop("HOME", None)
+        if home is not None:
+            os.environ["HOME"] = home
+    logging.getLogger("dbdreader.py").setLevel(logging.ERROR)
+    return dbdreader
+
+
+dbdreader = _import()
+
+
+def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
+    """Yield the flight file, with its science file where there is one, in pieces of at most `rows` rows.
+
+    Raises
+    ------
+    FormatError
+        Not a Slocum file, no ``.cac`` for it, or no rows in it.
+    """
+    flight, science = _pair(path)
+    tracks = {**_read(flight), **_read(science)}
+    base = "m_present_time" if "m_present_time" in tracks else "sci_m_present_time"
+    if base not in tracks or not len(tracks[base][0]):
+        raise FormatError(path, "expected rows, there are none")
+    time = tracks[base][0]
+    time = time[np.diff(time, prepend=-np.inf) > 0]  # some files say their first cycle twice
+    increasing(path, time)
+    columns, units = {}, {}
+    for theirs, (ours, unit, factor) in SENSORS.items():
+        if theirs in tracks and len(tracks[theirs][0]):
+            when, what = tracks[theirs]
+            columns[ours] = linear(time, when, what * factor, MAX_GAP, ANGLES.get(theirs))
+            units[ours] = unit
+    dataset = deployment(path, time, columns, units, {"heading_reference": "magnetic"})
+    yield from sliced(dataset, rows)
+
+
+def _pair(path: Path) -> tuple[Path | None, Path | None]:
+    """Return the flight and the science file that belong together; None for one that is not there."""
+    suffixes = {**SCIENCE, **{science: flight for flight, science in SCIENCE.items()}}
+    suffix = path.suffix
+    other = suffixes[suffix.lower()]
+    partner = path.with_suffix(other.upper() if suffix.isupper() else other)
+    both = path, (partner if partner.is_file() else None)
+    return both if suffix.lower() in SCIENCE else both[::-1]
+
+
+def _read(path: Path | None) -> dict[str, tuple[Floats, Floats]]:
+    """Return time and values of every sensor that we know, as they were updated."""
+    if path is None:
+        return {}
+    with (
+        tempfile.TemporaryDirectory() as scratch
+    ):  # dbdreader writes the list of sensors where it looks for it
+        for cache in [*path.parent.glob("*.cac"), *path.parent.glob("*.CAC")]:
+            Path(scratch, cache.name.lower()).symlink_to(cache.resolve())
+        try:
+            file = dbdreader.DBD(str(path), cacheDir=scratch)
+            wanted = [name for name in (file.timeVariable, *SENSORS) if name in file.parameterNames]
+            tracks = file.get(*wanted)
+        except dbdreader.DbdError as error:
+            if error.value == dbdreader.DBD_ERROR_CACHE_NOT_FOUND:
+                cache_id = next(iter(error.data.missing_cache_files))
+                raise FormatError(
+                    path, f"expected {cache_id}.cac, the list of its sensors, beside it"
+                ) from None
+            raise FormatError(path, f"expected a Slocum file: {error}") from None
+        except (ValueError, KeyError, IndexError, UnicodeDecodeError, RuntimeError) as error:
+            raise FormatError(path, f"expected a whole Slocum file: {error}") from None
+    tracks = tracks if len(wanted) > 1 else [tracks]
+    return {name: (np.asarray(t), np.asarray(v)) for name, (t, v) in zip(wanted, tracks, strict=True)}
