@@ -24,6 +24,7 @@ INCLUDED = "all.xml"
 ENUMS: dict[str, tuple[str, ...]] = {
     "MAG_LOG_STATE": (),
     "MAG_NAVIGATION_STATE": (),
+    "MAG_PORT_NAME": (),
     "MAG_PORT_STATE": (),
     "MAG_QUALITY": (),
     "MAG_RAW_FLAGS": (),

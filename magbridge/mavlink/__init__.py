@@ -5,6 +5,7 @@ from __future__ import annotations
 from magbridge.mavlink.codec import Codec
 from magbridge.mavlink.messages import BAD_DATA, REFUSED, Message, Spec, spec
 from magbridge.mavlink.signing import Signing, load_key
+from magbridge.mavlink.tape import TapeReader, TapeWriter
 from magbridge.mavlink.tlog import LogReader, Record, pack_record
 
 __all__ = [
@@ -16,6 +17,8 @@ __all__ = [
     "Record",
     "Signing",
     "Spec",
+    "TapeReader",
+    "TapeWriter",
     "load_key",
     "pack_record",
     "spec",

@@ -41,6 +41,11 @@ class Codec:
         self._rest = b""
         self._looked = 0
 
+    @property
+    def pending(self) -> bytes:
+        """Bytes that came but are not yet in any message."""
+        return self._rest
+
     def parse(self, data: bytes) -> list[Message]:
         """Take bytes as they come; return the messages that are complete with them.
 

@@ -362,7 +362,7 @@ MESSAGES: dict[int, tuple[str, int, str]] = {
     60102: ("MAG_STATUS", 66, "Q:time_usec:us:,q:vehicle_clock_offset:us:,I:uptime:s:,I:calibration_id::,I:samples::,I:samples_lost::,I:sensor_bytes_skipped:bytes:,I:sensor_frames_bad::,I:link_frames::,I:link_frames_lost::,I:link_bytes_skipped:bytes:,I:link_refused::,I:log_records::,I:log_lost::,I:telemetry_stale::,f:sample_rate:Hz:,f:sensor_clock_drift:ppm:,f:vehicle_clock_sigma:s:,f:vehicle_clock_drift:ppm:,H:vehicle_reboots::,B:sensor_state::,B:autopilot_state::,B:log_state::"),
     60103: ("MAG_NAVIGATION", 253, "Q:time_usec:us:,i:lat:degE7:,i:lon:degE7:,f:covariance_nn:m^2:,f:covariance_ne:m^2:,f:covariance_ee:m^2:,f:innovation:nT:,f:innovation_variance:nT^2:,f:gate::,f:bias:nT:,f:bias_sigma:nT:,f:current_north:m/s:,f:current_east:m/s:,B:state::,B:accepted::"),
     60104: ("MAG_SENSOR_BYTES", 5, "B:sensor_id::,B:length:bytes:,253B:data::"),
-    60105: ("MAG_LINK_BYTES", 119, "B:length:bytes:,254B:data::"),
+    60105: ("MAG_LINK_BYTES", 14, "B:ahead::,B:length:bytes:,253B:data::"),
     60106: ("MAG_BRIDGE_START", 172, "Q:time_usec:us:,Q:signing_timestamp::,I:calibration_id::,8B:config_digest::,24s:version::,24s:driver::"),
     60107: ("MAG_CLOCK_STEP", 81, "Q:time_usec:us:,q:step:us:"),
     60108: ("MAG_PORT", 171, "Q:time_usec:us:,I:dropped:bytes:,B:port::,B:state::,80s:reason::"),
@@ -382,6 +382,12 @@ class MAG_NAVIGATION_STATE(IntEnum):
     TRACKING = 2
     DEAD_RECKONING = 3
     LOST = 4
+
+
+class MAG_PORT_NAME(IntEnum):
+    LINK = 1
+    SENSOR = 2
+    LOG = 3
 
 
 class MAG_PORT_STATE(IntEnum):

@@ -22,6 +22,8 @@ SIGNED = 1
 SIGNATURE = 13
 """bytes: link id, 6 of time stamp, 6 of hash."""
 NOT_A_FRAME, MORE = 0, -1
+LAST = 0xFFFF
+"""The last message id that a message outside the dialect may have."""
 HEADER_V2 = Struct("<BBBBBBBHB")
 HEADER_V1 = Struct("<BBBBBB")
 EXTRA = {number: bytes((extra,)) for number, (_, extra, _) in MESSAGES.items()}
@@ -30,8 +32,9 @@ EXTRA = {number: bytes((extra,)) for number, (_, extra, _) in MESSAGES.items()}
 def frame_end(data: bytes, start: int, stop: int, gap: int = 0, *, last: bool = False) -> int:
     """Return where the frame ends that begins at ``data[start]``.
 
-    The checksum of a message outside the dialect cannot be checked; it is believed when another frame begins
-    `gap` bytes after its end, or when it ends with the data.
+    The checksum of a message outside the dialect cannot be checked; it is believed when its header is plausible
+    and another frame begins `gap` bytes after its end, or when it ends with the data. A random header hardly
+    ever is plausible, so that garbage does not hold up what follows it.
 
     Parameters
     ----------
@@ -52,16 +55,17 @@ def frame_end(data: bytes, start: int, stop: int, gap: int = 0, *, last: bool = 
     available = stop - start
     head = 10 if data[start] == V2 else 6
     flags = data[start + 2] if head == 10 and available > 2 else 0
-    if flags > SIGNED:  # an incompatibility flag that we do not know: by the standard, not to be read
-        return NOT_A_FRAME
-    if available < head:
-        return MORE
+    # an incompatibility flag that we do not know: by the standard, not to be read
+    if flags > SIGNED or available < head:
+        return NOT_A_FRAME if flags > SIGNED else MORE
     number = data[start + 5] if head == 6 else int.from_bytes(data[start + 7 : start + 10], "little")
+    extra = EXTRA.get(number)
+    if extra is None and (head == 6 or data[start + 3] or number > LAST):
+        return NOT_A_FRAME
     checksum = start + head + data[start + 1]
     end = checksum + 2 + (SIGNATURE if flags else 0)
     if end > stop:
         return MORE
-    extra = EXTRA.get(number)
     if extra is not None:
         right = (
             mcrf4xx(extra, mcrf4xx(data[start + 1 : checksum])) == data[checksum] | data[checksum + 1] << 8

@@ -1,0 +1,58 @@
+"""STATUSTEXT: every change of state, once, in words."""
+
+from __future__ import annotations
+
+from magbridge.link.outbox import Outbox
+from magbridge.link.timers import Timers
+from magbridge.mavlink.dialect import MAV_SEVERITY
+
+__all__ = ["Announcer"]
+
+CHUNK = 50
+"""Characters in one STATUSTEXT."""
+PAUSE_US = 1_000_000
+"""us; a state that flaps is told once a second, and always its last word."""
+
+
+class Announcer:
+    """Says things, and changes of state only when they change."""
+
+    def __init__(self, outbox: Outbox, timers: Timers) -> None:
+        self._outbox, self._timers = outbox, timers
+        self._said: dict[str, tuple[str, int]] = {}
+        self._number = 0
+
+    def say(self, text: str, severity: MAV_SEVERITY = MAV_SEVERITY.INFO) -> None:
+        """Send `text`, in pieces where it is long; what is not ASCII becomes a question mark."""
+        data = text.encode("ascii", "replace")
+        pieces = [data[i : i + CHUNK] for i in range(0, len(data), CHUNK)]
+        if len(pieces) > 1:
+            self._number = self._number % 0xFFFF + 1
+            if len(pieces[-1]) == CHUNK:
+                pieces.append(b"")  # the receiver waits for a piece that is not full
+        for i, piece in enumerate(pieces):
+            self._outbox.send(
+                "STATUSTEXT",
+                severity=severity,
+                text=piece,
+                id=self._number if len(pieces) > 1 else 0,
+                chunk_seq=i,
+            )
+
+    def state(self, key: str, text: str, severity: MAV_SEVERITY = MAV_SEVERITY.INFO) -> None:
+        """Say that the state of `key` is now `text`, unless that was the last thing said of it."""
+        now_us = self._outbox.codec.now_us
+        said, when_us = self._said.get(key, ("", now_us - PAUSE_US))
+        timer = f"say {key}"
+        self._timers.cancel(timer)
+        if said == text:
+            return
+        if now_us - when_us < PAUSE_US:
+            self._timers.at(timer, when_us + PAUSE_US, lambda _: self.state(key, text, severity))
+            return
+        self._said[key] = text, now_us
+        self.say(text, severity)
+
+    def silently(self, key: str, text: str) -> None:
+        """Take `text` as what is known of `key`: the state to begin with is not news."""
+        self._said[key] = text, self._outbox.codec.now_us - PAUSE_US

@@ -1,0 +1,111 @@
+"""The autopilot's clock against ours, from TIMESYNC."""
+
+from __future__ import annotations
+
+from collections import deque
+from math import nan, sqrt
+
+__all__ = ["VehicleClock"]
+
+WINDOW = 32
+"""Exchanges that count."""
+JITTER_US = 200.0
+"""us that even the fastest exchange is uncertain by."""
+STEP_US = 1_000_000
+"""us; an exchange this far off, beyond its own round trip, says that the other clock was set."""
+SPAN_US = 10_000_000
+"""us of exchanges before a drift is believed."""
+PENDING = 8
+
+
+class VehicleClock:
+    """Estimates ``offset = vehicle clock - our clock`` and its drift.
+
+    Notes
+    -----
+    An exchange sent at ``ts``, answered with the vehicle's ``tc`` and received at ``tr`` gives
+    ``offset = tc - (ts + tr) / 2``, wrong by no more than half its round trip ``tr - ts``. What it is slower
+    than the fastest of late was spent waiting somewhere, nobody knows on which way, so each counts with the
+    weight ``1 / sigma^2``, ``sigma = JITTER + (rtt - min rtt) / 2``, in a straight line through the last
+    exchanges (Cristian, 1989, takes the fastest alone).
+    """
+
+    def __init__(self) -> None:
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything: the other clock began anew."""
+        self._asked: deque[int] = deque(maxlen=PENDING)
+        self._exchanges: deque[tuple[int, int, int]] = deque(maxlen=WINDOW)
+        self._base_us = self._middle_us = 0
+        self._offset, self._slope = 0.0, 0.0
+        self.sigma = nan
+
+    @property
+    def known(self) -> bool:
+        """There is an estimate."""
+        return bool(self._exchanges)
+
+    @property
+    def drift_ppm(self) -> float:
+        """How much faster than ours the vehicle's clock runs; NaN while unknown."""
+        return self._slope * 1e6 if self._slope else nan
+
+    def ask(self, now_us: int) -> int:
+        """Return the ``ts1`` (ns) of a request sent now."""
+        self._asked.append(now_us * 1000)
+        return now_us * 1000
+
+    def answer(self, tc1: int, ts1: int, now_us: int) -> None:
+        """Take an answer (ns) received at `now_us`; one to a request that is not ours is ignored."""
+        if ts1 not in self._asked:
+            return
+        self._asked.remove(ts1)
+        sent_us = ts1 // 1000
+        trip_us = now_us - sent_us
+        middle_us = sent_us + trip_us // 2
+        offset_us = tc1 // 1000 - middle_us
+        if self.known and abs(offset_us - self.offset_us(now_us)) > STEP_US + trip_us:
+            self.reset()
+        self._exchanges.append((middle_us, offset_us, trip_us))
+        self._fit()
+
+    def _fit(self) -> None:
+        fastest = min(trip for _, _, trip in self._exchanges)
+        self._middle_us, self._base_us, _ = self._exchanges[-1]
+        s = sx = sy = sxx = sxy = 0.0
+        for middle, offset, trip in self._exchanges:
+            x, y = float(middle - self._middle_us), float(offset - self._base_us)
+            weight = (JITTER_US + (trip - fastest) / 2) ** -2
+            s += weight
+            sx += weight * x
+            sy += weight * y
+            sxx += weight * x * x
+            sxy += weight * x * y
+        determinant = s * sxx - sx * sx
+        self._slope = 0.0
+        if self._middle_us - self._exchanges[0][0] >= SPAN_US and determinant > 0.0:
+            self._slope = (s * sxy - sx * sy) / determinant
+        self._offset = (sy - self._slope * sx) / s
+        self.sigma = sqrt(1.0 / s) * 1e-6
+
+    def offset_us(self, t_us: int) -> float:
+        """Return the vehicle's clock minus ours at `t_us` (ours), in us; 0 while unknown."""
+        return self._base_us + (self._offset + self._slope * (t_us - self._middle_us))
+
+    def ours(self, vehicle_us: int, t_us: int, wrap_us: int = 0) -> int:
+        """Return our time at which the vehicle's clock stood at `vehicle_us`; at most `t_us`.
+
+        Parameters
+        ----------
+        vehicle_us : int
+            A time in a message.
+        t_us : int
+            When the message came.
+        wrap_us : int
+            The time's field starts again from 0 after this long; 0 is never.
+        """
+        offset_us = round(self.offset_us(t_us))
+        if wrap_us:
+            vehicle_us += round((t_us + offset_us - vehicle_us) / wrap_us) * wrap_us
+        return min(vehicle_us - offset_us, t_us)

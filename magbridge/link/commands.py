@@ -1,0 +1,120 @@
+"""Commands to the bridge: which message, how often, and what it can do."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from math import isfinite
+
+from magbridge.link.outbox import Outbox
+from magbridge.mavlink import Message, spec
+from magbridge.mavlink.dialect import MAV_CMD, MAV_RESULT
+
+__all__ = ["Commands"]
+
+OURS = 60100
+"""The first message id of our dialect: what nobody else on the vehicle can mean."""
+AUTOPILOT_VERSION = spec("AUTOPILOT_VERSION").id
+Answer = Callable[[int], bool]
+
+
+class Commands:
+    """Answers COMMAND_LONG and COMMAND_INT.
+
+    What is addressed to component 0 means whoever can: the bridge then does what only it can do, and never
+    refuses, because a station takes the refusal for the autopilot's. Calibration of the autopilot's own compass
+    (DO_START_MAG_CAL and the like) is the autopilot's business.
+
+    Parameters
+    ----------
+    outbox : Outbox
+    messages : mapping of int to callable
+        What can be requested, by message id; called with the second parameter of the request, sends the
+        message, and returns False where there is nothing to send yet.
+    interval_us : callable
+        Interval of a message id in us: -1 off, 0 unknown; KeyError where it has none.
+    set_rate : callable
+        Takes a message id and a rate in Hz (-1 off, None for the default); returns whether it is allowed.
+        KeyError where the message has no rate.
+    """
+
+    def __init__(
+        self,
+        outbox: Outbox,
+        messages: Mapping[int, Answer],
+        interval_us: Callable[[int], int],
+        set_rate: Callable[[int, float | None], bool],
+    ) -> None:
+        self._outbox = outbox
+        self._messages, self._interval_us, self._set_rate = messages, interval_us, set_rate
+        self._commands = {
+            MAV_CMD.REQUEST_MESSAGE: self._request,
+            MAV_CMD.SET_MESSAGE_INTERVAL: self._set_interval,
+            MAV_CMD.GET_MESSAGE_INTERVAL: self._get_interval,
+            MAV_CMD.REQUEST_AUTOPILOT_CAPABILITIES: self._capabilities,
+        }
+
+    def handle(self, message: Message, system: int, component: int) -> None:
+        """Obey and acknowledge, if the command is meant for `component` of `system`."""
+        target = message["target_component"]
+        if message["target_system"] not in (0, system) or target not in (0, component):
+            return
+        number = message["command"]
+        values = [message["param1"], message["param2"]]
+        if target == 0 and not self._only_us(number, values[0]):
+            return
+        command = self._commands.get(number)
+        result = command(values) if command else MAV_RESULT.UNSUPPORTED
+        self._outbox.send(
+            "COMMAND_ACK",
+            command=number,
+            result=result,
+            progress=0xFF,  # not known
+            target_system=message.system,
+            target_component=message.component,
+        )
+
+    def _only_us(self, number: int, first: float) -> bool:
+        about_message = number in (
+            MAV_CMD.REQUEST_MESSAGE,
+            MAV_CMD.SET_MESSAGE_INTERVAL,
+            MAV_CMD.GET_MESSAGE_INTERVAL,
+        )
+        return about_message and first >= OURS and first in self._messages
+
+    def _request(self, values: list[float]) -> MAV_RESULT:
+        answer = self._messages.get(whole(values[0]))
+        if answer is None:
+            return MAV_RESULT.DENIED
+        return MAV_RESULT.ACCEPTED if answer(whole(values[1])) else MAV_RESULT.TEMPORARILY_REJECTED
+
+    def _set_interval(self, values: list[float]) -> MAV_RESULT:
+        interval = values[1]
+        if not isfinite(interval) or (interval < 0 and interval != -1):
+            return MAV_RESULT.DENIED
+        rate = None if interval == 0 else -1.0 if interval < 0 else 1e6 / interval
+        try:
+            allowed = self._set_rate(whole(values[0]), rate)
+        except KeyError:
+            allowed = False
+        return MAV_RESULT.ACCEPTED if allowed else MAV_RESULT.DENIED
+
+    def _get_interval(self, values: list[float]) -> MAV_RESULT:
+        number = whole(values[0])
+        try:
+            interval = self._interval_us(number)
+        except KeyError:
+            interval = 0
+        if not 0 <= number <= 0xFFFF:
+            return MAV_RESULT.DENIED
+        self._outbox.send("MESSAGE_INTERVAL", message_id=number, interval_us=interval)
+        return MAV_RESULT.ACCEPTED
+
+    def _capabilities(self, values: list[float]) -> MAV_RESULT:
+        if values[0] != 1:
+            return MAV_RESULT.DENIED
+        return self._request([AUTOPILOT_VERSION, 0.0])
+
+
+def whole(value: float) -> int:
+    """Return the integer that a float parameter means; -1, which is no message, where it is none."""
+    return int(value) if isfinite(value) else -1

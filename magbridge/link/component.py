@@ -1,0 +1,259 @@
+"""The bridge as a MAVLink component: what it answers, and what it says of its own accord."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from magbridge.config import Link
+from magbridge.errors import ConfigError
+from magbridge.link.announcer import Announcer
+from magbridge.link.commands import Commands
+from magbridge.link.outbox import Outbox
+from magbridge.link.parameter_service import ParameterService
+from magbridge.link.parameters import Parameters, Tunable, rate_name, rates
+from magbridge.link.publish import PUBLISHED, Publisher
+from magbridge.link.rates import Rate
+from magbridge.link.reports import Reports
+from magbridge.link.timers import Timers
+from magbridge.link.vehicle import Vehicle
+from magbridge.mavlink import Codec, Message, Signing, TapeWriter, spec
+from magbridge.mavlink.dialect import MAV_SEVERITY
+
+__all__ = ["LIMITS", "Component", "check_publish"]
+
+LIMITS = {
+    "HEARTBEAT": (0.2, 10.0),
+    "MAG_STATUS": (-1.0, 10.0),
+    "MAG_NAVIGATION": (-1.0, 1000.0),
+    **dict.fromkeys(PUBLISHED, (-1.0, 1000.0)),
+}
+"""The messages whose rate (Hz) can be set, and within which limits."""
+DEFAULTS = {"HEARTBEAT": 1.0, "MAG_STATUS": 1.0, "MAG_NAVIGATION": 0.0}
+BY_CLOCK = ("HEARTBEAT", "MAG_STATUS")
+"""Those that follow the clock and not the samples; a rate of 0 is off."""
+TIMESYNC_US = 1_000_000
+
+
+def check_publish(publish: Mapping[str, float], path: Path) -> None:
+    """Check ``[publish]``.
+
+    Raises
+    ------
+    ConfigError
+        A message that the bridge does not publish, or a rate out of range.
+    """
+    for name, rate in publish.items():
+        if name not in LIMITS:
+            raise ConfigError(path, f"publish.{name}", f"one of {', '.join(sorted(LIMITS))}")
+        low, high = LIMITS[name]
+        if not low <= rate <= high:
+            raise ConfigError(path, f"publish.{name}", f"a rate from {low:g} to {high:g} Hz, not {rate:g}")
+
+
+class Component:
+    """One MAVLink component, without port or clock: the same events give the same bytes.
+
+    Parameters
+    ----------
+    link : Link
+        ``[link]``: who we are, and whom we listen to.
+    publish : mapping of str to float
+        ``[publish]``: rates in Hz; a message that is not named is off.
+    tunables : iterable of Tunable
+        What else can be tuned: other rooms' rows.
+    start_us : int
+        Event time of the start, in us; a multiple of 4.
+    signing : Signing or None
+    calibration_id : int
+        First 4 bytes of the SHA-256 of the calibration's file; 0 is none.
+    version : str
+        Of the program, ``"0.1.0"``.
+    kept : mapping of str to float
+        Parameters that a station changed in an earlier run.
+    status : callable
+        Returns the fields of MAG_STATUS that the component cannot know itself (samples, log, sensor).
+
+    Attributes
+    ----------
+    outbox : Outbox
+        What is to be sent.
+    heard : list of bytes
+        Everything that came, as frames for the log (see `TapeReader`); the bridge empties it.
+    parameters, rates, announcer, vehicle, publisher
+        The services, for the rooms above.
+    """
+
+    def __init__(
+        self,
+        link: Link,
+        publish: Mapping[str, float],
+        tunables: Iterable[Tunable] = (),
+        *,
+        start_us: int,
+        signing: Signing | None = None,
+        calibration_id: int = 0,
+        version: str = "0.0.0",
+        kept: Mapping[str, float] | None = None,
+        status: Callable[[], Mapping[str, Any]] = dict,
+    ) -> None:
+        self._link = link
+        self.codec = Codec(link.system, link.component, signing)
+        self.codec.now_us = start_us
+        self._tape = TapeWriter(link.system, link.component)
+        self.outbox, self.timers = Outbox(self.codec), Timers()
+        self.heard: list[bytes] = []
+        self.announcer = Announcer(self.outbox, self.timers)
+        self.vehicle = Vehicle(link.system, link.component, link.autopilot, self.announcer, self.timers)
+        self.parameters = Parameters([*rates({**DEFAULTS, **publish}, LIMITS), *tunables])
+        for name in self.parameters.restore(kept or {}):
+            self.announcer.say(f"kept parameter {name} does not fit: default", MAV_SEVERITY.WARNING)
+        self.rates = {name: Rate(self.parameters[rate_name(name)]) for name in LIMITS}
+        self.publisher = Publisher(self.outbox, self.rates, calibration_id, start_us)
+        self._reports = Reports(self.outbox, self.vehicle, start_us, version, calibration_id, status)
+        self._service = ParameterService(
+            self.parameters, self.outbox, self.timers, self.announcer, self._changed
+        )
+        self._commands = Commands(self.outbox, self._requestable(), self._interval_us, self._set_rate)
+        self._handlers: dict[int, Callable[[Message], None]] = {
+            spec("PARAM_REQUEST_LIST").id: self._if_ours(self._service.list),
+            spec("PARAM_REQUEST_READ").id: self._if_ours(self._service.read),
+            spec("PARAM_SET").id: self._if_ours(self._service.write),
+            spec("COMMAND_LONG").id: self._command,
+            spec("COMMAND_INT").id: self._command,
+            spec("TIMESYNC").id: self._timesync,
+        }
+        self._reporters: dict[str, Callable[[], None]] = {
+            "HEARTBEAT": self._reports.heartbeat,
+            "MAG_STATUS": self._reports.status,
+        }
+        for name in BY_CLOCK:
+            self._start_timer(name, start_us)
+        self.timers.every("TIMESYNC", TIMESYNC_US, self._ask_time, start_us + TIMESYNC_US // 2)
+
+    @property
+    def next_deadline(self) -> int:
+        """Event time in us by which :meth:`advance` has something to do."""
+        return self.timers.next_deadline
+
+    def advance(self, t_us: int) -> None:
+        """Let time pass until `t_us`; everything sent carries the time at which it was due."""
+        self.timers.advance(t_us, self._begin)
+        self._begin(t_us)
+
+    def receive(self, data: bytes, t_us: int) -> list[Message]:
+        """Take bytes from the link; return the messages that are telemetry of our vehicle.
+
+        Requests are answered into the outbox. :meth:`advance` has been called for `t_us` before.
+        """
+        self._begin(t_us)
+        ours = []
+        messages = self.codec.parse(data)
+        self.heard += self._tape.frames(messages, self.codec.pending)
+        for message in messages:
+            if not message.known:
+                continue
+            handler = self._handlers.get(message.id)
+            if handler:
+                handler(message)
+            if self.vehicle.hear(message, t_us):
+                ours.append(message)
+        return ours
+
+    def _begin(self, t_us: int) -> None:
+        self.codec.now_us = t_us
+
+    def _for_us(self, message: Message) -> bool:
+        return message["target_system"] in (0, self._link.system) and message["target_component"] in (
+            0,
+            self._link.component,
+        )
+
+    def _if_ours(self, handler: Callable[[Message], None]) -> Callable[[Message], None]:
+        return lambda message: handler(message) if self._for_us(message) else None
+
+    def _command(self, message: Message) -> None:
+        self._commands.handle(message, self._link.system, self._link.component)
+
+    def _timesync(self, message: Message) -> None:
+        now_us = self.codec.now_us
+        if not self._for_us(message):
+            return
+        if message["tc1"] == 0:
+            self.outbox.send(
+                "TIMESYNC",
+                tc1=now_us * 1000,
+                ts1=message["ts1"],
+                target_system=message.system,
+                target_component=message.component,
+            )
+        elif (message.system, message.component) == (self._link.system, self._link.autopilot):
+            self.vehicle.clock.answer(message["tc1"], message["ts1"], now_us)
+
+    def _ask_time(self, t_us: int) -> None:
+        self.outbox.send(
+            "TIMESYNC",
+            ts1=self.vehicle.clock.ask(t_us),
+            target_system=self._link.system,
+            target_component=self._link.autopilot,
+        )
+
+    def _start_timer(self, name: str, first_us: int) -> None:
+        hertz = self.rates[name].hertz
+        if hertz > 0:
+            report = self._reporters[name]
+            self.timers.every(name, round(1e6 / hertz), lambda _: report(), first_us)
+        else:
+            self.timers.cancel(name)
+
+    def _changed(self, parameter: str) -> None:
+        """Obey a parameter that a station changed, where it is a rate."""
+        for name, rate in self.rates.items():
+            if rate_name(name) == parameter:
+                rate.set(self.parameters[parameter])
+                if name in BY_CLOCK:
+                    self._start_timer(name, self.codec.now_us)
+
+    def _requestable(self) -> dict[int, Callable[[int], bool]]:
+        """Return what REQUEST_MESSAGE can ask for; each says whether there was something to send."""
+
+        def always(report: Callable[[], None]) -> Callable[[int], bool]:
+            def answer(_: int) -> bool:
+                report()
+                return True
+
+            return answer
+
+        def sample(name: str) -> Callable[[int], bool]:
+            return lambda _: self.publisher.repeat(name)
+
+        return {
+            spec("HEARTBEAT").id: always(self._reports.heartbeat),
+            spec("MAG_STATUS").id: always(self._reports.status),
+            spec("AUTOPILOT_VERSION").id: always(self._reports.version),
+            **{spec(name).id: sample(name) for name in PUBLISHED},
+        }
+
+    def _interval_us(self, number: int) -> int:
+        hertz = self.rates[name_of(number)].hertz
+        if hertz == 0:
+            return self._reports.sample_interval_us()
+        return round(1e6 / hertz) if hertz > 0 else -1
+
+    def _set_rate(self, number: int, hertz: float | None) -> bool:
+        parameter = rate_name(name_of(number))
+        value = self.parameters.table[parameter].default if hertz is None else hertz
+        if not self.parameters.set(parameter, value):
+            return False
+        self._changed(parameter)
+        self._service.send(parameter)
+        return True
+
+
+def name_of(number: int) -> str:
+    """Return the name of a message whose rate can be set; KeyError where it has none."""
+    name = spec(number).name
+    if name not in LIMITS:
+        raise KeyError(name)
+    return name

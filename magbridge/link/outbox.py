@@ -1,0 +1,34 @@
+"""What is to be sent, with the event time that it belongs to."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from magbridge.mavlink import Codec
+
+__all__ = ["Outbox"]
+
+
+class Outbox:
+    """Packs what the services say; the bridge drains it.
+
+    Attributes
+    ----------
+    codec : Codec
+        Its ``now_us`` is the time of what is being handled.
+    frames : list of (int, bytes)
+        Event time in us, frame; in the order in which to send.
+    """
+
+    def __init__(self, codec: Codec) -> None:
+        self.codec = codec
+        self.frames: list[tuple[int, bytes]] = []
+
+    def send(self, name: str, /, **fields: Any) -> None:
+        """Pack a message by name; fields not named are zero."""
+        self.frames.append((self.codec.now_us, self.codec.pack(name, **fields)))
+
+    def drain(self) -> list[tuple[int, bytes]]:
+        """Return what waits, and forget it."""
+        frames, self.frames = self.frames, []
+        return frames

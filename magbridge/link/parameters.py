@@ -1,0 +1,143 @@
+"""What can be tuned while the bridge runs: a table, and its values."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from math import isfinite
+from struct import pack, unpack
+
+import msgspec
+
+from magbridge.config import Align, Telemetry
+
+__all__ = ["Parameters", "Tunable", "alignment", "rate_name", "rates", "telemetry_ages"]
+
+
+class Tunable(msgspec.Struct, frozen=True):
+    """One parameter.
+
+    Attributes
+    ----------
+    name : str
+        On the link, at most 16 characters.
+    key : str
+        In the configuration.
+    default, low, high : float
+        In `unit`; `low` and `high` are allowed.
+    doc : str
+        One line.
+    """
+
+    name: str
+    key: str
+    default: float
+    low: float
+    high: float
+    unit: str
+    doc: str
+
+
+def alignment(align: Align) -> list[Tunable]:
+    """Return the tunables of ``[align]``."""
+    rows = (
+        ("MB_FILT_DELAY", "filter_delay", 0, 60, "s", "delay of the anti-alias filter"),
+        ("MB_GAP_FACTOR", "gap_factor", 1.01, 1000, "", "sample periods without a sample that are a gap"),
+        ("MB_MOVING_RATE", "moving_rate", 1e-6, 10, "1/s", "change in fractions of the range that is motion"),
+        ("MB_SETTLE_TIME", "settle_time", 0, 3600, "s", "samples stay flagged after a motion"),
+        ("MB_STALE_GROW", "stale_growth", 0, 1e4, "nT/s", "growth of sigma with the age of stale telemetry"),
+        ("MB_TURNON_SIGMA", "turn_on_sigma", 0, 1e5, "nT", "how differently the offset settles at power-on"),
+    )
+    return [
+        Tunable(name, f"align.{key}", float(getattr(align, key)), low, high, unit, doc)
+        for name, key, low, high, unit, doc in rows
+    ]
+
+
+def telemetry_ages(telemetry: Mapping[str, Telemetry]) -> list[Tunable]:
+    """Return one tunable for the ``max_age`` of each telemetry parameter."""
+    rows: dict[str, Tunable] = {}
+    for number, (name, what) in enumerate(telemetry.items()):
+        short = f"MB_AGE_{name.upper()}"[:16]
+        if short in rows:
+            short = f"MB_AGE_{number}"
+        rows[short] = Tunable(
+            short, f"telemetry.{name}.max_age", what.max_age, 0.01, 1e6, "s", f"older {name} is stale"
+        )
+    return list(rows.values())
+
+
+def rate_name(message: str) -> str:
+    """Return the name of the parameter that holds the rate of `message`."""
+    return f"MB_R_{message.removeprefix('MAG_')}"[:16]
+
+
+def rates(defaults: Mapping[str, float], limits: Mapping[str, tuple[float, float]]) -> list[Tunable]:
+    """Return one tunable for the rate of each message of `limits`; one without a default is off."""
+    return [
+        Tunable(
+            rate_name(message),
+            f"publish.{message}",
+            defaults.get(message, -1.0),
+            low,
+            high,
+            "Hz",
+            f"rate of {message}; 0 with every sample, -1 off",
+        )
+        for message, (low, high) in limits.items()
+    ]
+
+
+def real32(value: float) -> float:
+    """Return `value` as it looks after a journey in a REAL32."""
+    return float(unpack("<f", pack("<f", value))[0])
+
+
+class Parameters:
+    """The values of a table of tunables.
+
+    A value that was never set is the default exactly, not its REAL32: so a bridge that nobody tunes computes
+    with the configuration's own numbers.
+
+    Attributes
+    ----------
+    table : dict of str to Tunable
+        By name, in order: the order gives the index on the link.
+    revision : int
+        Grows with every change.
+    """
+
+    def __init__(self, table: Iterable[Tunable]) -> None:
+        self.table = {row.name: row for row in table}
+        self.names = list(self.table)
+        self.revision = 0
+        self._values = {row.name: float(row.default) for row in self.table.values()}
+        self._names_of = {row.key: row.name for row in self.table.values()}
+
+    def __getitem__(self, name: str) -> float:
+        return self._values[name]
+
+    def of(self, key: str) -> float:
+        """Return the value that the configuration calls `key`."""
+        return self._values[self._names_of[key]]
+
+    def changed(self) -> dict[str, float]:
+        """Return the values that are no longer the defaults, by name: what has to be kept."""
+        return {name: value for name, value in self._values.items() if value != self.table[name].default}
+
+    def set(self, name: str, value: float) -> bool:
+        """Set a value; return False, and change nothing, when it is not finite or out of its range."""
+        row = self.table[name]
+        if not isfinite(value) or abs(value) > 1e38:
+            return False
+        short = real32(value)
+        if not real32(row.low) <= short <= real32(row.high):
+            return False
+        if short == real32(self._values[name]):
+            return True
+        self._values[name] = row.default if short == real32(row.default) else short
+        self.revision += 1
+        return True
+
+    def restore(self, values: Mapping[str, float]) -> list[str]:
+        """Set what was kept; return the names that no longer exist or fit."""
+        return [name for name, value in values.items() if name not in self.table or not self.set(name, value)]

@@ -1,0 +1,168 @@
+"""Samples as messages: our own dialect in full, and the standard messages that every station plots."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from math import isfinite, nan
+
+import msgspec
+
+from magbridge.link.outbox import Outbox
+from magbridge.link.rates import Rate
+from magbridge.mavlink import spec
+from magbridge.mavlink.dialect import MAG_RAW_FLAGS
+from magbridge.records import Corrected, Reading
+
+__all__ = ["PUBLISHED", "Publisher", "Sample"]
+
+RAW, FIELD, IMU = spec("MAG_RAW"), spec("MAG_FIELD"), spec("HIGHRES_IMU")
+NAMED, VECTOR = spec("NAMED_VALUE_FLOAT"), spec("DEBUG_VECT")
+MAGNETOMETER = 0x1C0
+"""HIGHRES_IMU.fields_updated: xmag, ymag, zmag."""
+GAUSS = 1e-5
+"""in 1 nT"""
+MASK = 0xFFFFFFFF
+SATURATED, COUNTS = int(MAG_RAW_FLAGS.SATURATED), int(MAG_RAW_FLAGS.COUNTS)
+SEQUENCE, POWER_CYCLE = int(MAG_RAW_FLAGS.SEQUENCE), int(MAG_RAW_FLAGS.POWER_CYCLE)
+NO_COUNTS = (0, 0, 0)
+
+
+class Sample(msgspec.Struct, frozen=True, gc=False):
+    """One sample, as the bridge hands it out.
+
+    Attributes
+    ----------
+    reading : Reading
+    reading_us : int
+        us, our time at the reading's ``device_time``.
+    corrected : Corrected
+    time_us : int
+        us, our time of the corrected sample.
+    telemetry_age : float
+        s, of the oldest parameter in the correction; NaN where none went in.
+    anomaly : float
+        nT above the main field; NaN where the position is not known.
+    """
+
+    reading: Reading
+    reading_us: int
+    corrected: Corrected
+    time_us: int
+    telemetry_age: float = nan
+    anomaly: float = nan
+
+
+class Publisher:
+    """Sends each sample as the messages that are due.
+
+    Parameters
+    ----------
+    outbox : Outbox
+    rates : mapping of str to Rate
+        By message name; those of `PUBLISHED` are used.
+    calibration_id : int
+        First 4 bytes of the SHA-256 of the calibration's file; 0 is none.
+    start_us : int
+        us, when the bridge started: NAMED_VALUE_FLOAT counts from there.
+    """
+
+    def __init__(
+        self, outbox: Outbox, rates: Mapping[str, Rate], calibration_id: int = 0, start_us: int = 0
+    ) -> None:
+        self._outbox, self._codec = outbox, outbox.codec
+        self._calibration_id, self._start_us = calibration_id, start_us
+        self._messages = [(rates[name], getattr(self, method)) for name, method in PUBLISHED.items()]
+        self.latest: Sample | None = None
+        self.samples = 0
+
+    def publish(self, sample: Sample) -> None:
+        """Send what is due of a sample; ``outbox.codec.now_us`` is the time of sending."""
+        self.latest = sample
+        self.samples += 1
+        now_us = self._codec.now_us
+        for rate, build in self._messages:
+            if rate.hertz == 0 or (rate.hertz > 0 and rate.due(sample.time_us)):
+                for frame in build(sample):
+                    self._outbox.frames.append((now_us, frame))
+
+    def repeat(self, name: str) -> bool:
+        """Send message `name` of the latest sample again; False where there is none yet."""
+        if self.latest is None:
+            return False
+        build: Callable[[Sample], tuple[bytes, ...]] = getattr(self, PUBLISHED[name])
+        self._outbox.frames += [(self._codec.now_us, frame) for frame in build(self.latest)]
+        return True
+
+    def _raw(self, sample: Sample) -> tuple[bytes]:
+        reading = sample.reading
+        flags = SATURATED if reading.saturated else 0
+        if reading.counts is not None:
+            flags |= COUNTS
+        if reading.sequence is not None:
+            flags |= SEQUENCE
+        if reading.power_cycle is not None:
+            flags |= POWER_CYCLE
+        x, y, z = reading.channel_delay
+        payload = RAW.struct.pack(
+            sample.reading_us,
+            (reading.sequence or 0) & MASK,
+            *reading.field,
+            *(reading.counts or NO_COUNTS),
+            round(x * 1e6),
+            round(y * 1e6),
+            round(z * 1e6),
+            reading.temperature,
+            reading.supply,
+            (reading.power_cycle or 0) & 0xFFFF,
+            0,
+            flags,
+        )
+        return (self._codec.frame(RAW, payload),)
+
+    def _field(self, sample: Sample) -> tuple[bytes]:
+        corrected = sample.corrected
+        payload = FIELD.struct.pack(
+            sample.time_us,
+            corrected.total_field,
+            self.samples & MASK,
+            self._calibration_id,
+            corrected.total_field_sigma,
+            *corrected.field,
+            *corrected.field_sigma,
+            sample.anomaly,
+            sample.telemetry_age,
+            (self._codec.now_us - sample.time_us) * 1e-6,
+            corrected.quality,
+            0,
+        )
+        return (self._codec.frame(FIELD, payload),)
+
+    def _imu(self, sample: Sample) -> tuple[bytes]:
+        x, y, z = sample.corrected.field
+        payload = IMU.struct.pack(
+            sample.time_us, 0, 0, 0, 0, 0, 0, x * GAUSS, y * GAUSS, z * GAUSS, 0, 0, 0, 0, MAGNETOMETER, 0
+        )
+        return (self._codec.frame(IMU, payload),)
+
+    def _named(self, sample: Sample) -> tuple[bytes, ...]:
+        corrected = sample.corrected
+        boot_ms = (sample.time_us - self._start_us) // 1000 & MASK
+        values = [(b"mag_total", corrected.total_field), (b"mag_sigma", corrected.total_field_sigma)]
+        if isfinite(sample.anomaly):
+            values.append((b"mag_anom", sample.anomaly))
+        pack = NAMED.struct.pack
+        return tuple(self._codec.frame(NAMED, pack(boot_ms, value, name)) for name, value in values)
+
+    def _vector(self, sample: Sample) -> tuple[bytes]:
+        payload = VECTOR.struct.pack(sample.time_us, *sample.corrected.field, b"mag_field")
+        return (self._codec.frame(VECTOR, payload),)
+
+
+PUBLISHED: dict[str, str] = {
+    "MAG_RAW": "_raw",
+    "MAG_FIELD": "_field",
+    "HIGHRES_IMU": "_imu",
+    "NAMED_VALUE_FLOAT": "_named",
+    "DEBUG_VECT": "_vector",
+}
+"""The messages that follow the samples, and which method of `Publisher` builds each."""

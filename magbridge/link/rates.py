@@ -1,0 +1,44 @@
+"""How often a message goes out."""
+
+from __future__ import annotations
+
+__all__ = ["Rate"]
+
+
+class Rate:
+    """Thins a stream of samples to a rate, in event time and without drift.
+
+    Parameters
+    ----------
+    hertz : float
+        1/s; 0 lets every sample through, a negative rate none.
+    """
+
+    __slots__ = ("_next_us", "_period_us", "hertz")
+
+    def __init__(self, hertz: float) -> None:
+        self.set(hertz)
+
+    def set(self, hertz: float) -> None:
+        """Change the rate; the next sample goes out."""
+        self.hertz = hertz
+        self._period_us = round(1e6 / hertz) if hertz > 0 else 0
+        self._next_us = 0
+
+    def due(self, t_us: int) -> bool:
+        """Say whether the sample at `t_us` goes out.
+
+        Slots lie a period apart and a sample may be a quarter of it early, so that a jittering stream at just
+        this rate passes whole. A pause, or a time far back, begins the slots anew.
+        """
+        if self.hertz <= 0:
+            return self.hertz == 0
+        ahead = self._next_us - t_us
+        if ahead * 4 > self._period_us:
+            if ahead <= 2 * self._period_us:
+                return False
+        elif ahead > -self._period_us:
+            self._next_us += self._period_us
+            return True
+        self._next_us = t_us + self._period_us
+        return True

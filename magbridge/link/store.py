@@ -1,0 +1,52 @@
+"""What outlives the process: parameters that a station changed, and the last signing time stamp."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import msgspec
+
+from magbridge.errors import FormatError
+from magbridge.files import atomic_path
+
+__all__ = ["Kept", "load", "save"]
+
+
+class Kept(msgspec.Struct, frozen=True):
+    """The contents of the file.
+
+    Attributes
+    ----------
+    parameters : dict of str to float
+        Values that are not the configuration's.
+    signing_timestamp : int
+        The last that was used (10 us since 2015-01-01).
+    """
+
+    parameters: dict[str, float] = {}
+    signing_timestamp: int = 0
+
+
+def load(path: str | Path) -> Kept:
+    """Read the file; one that does not exist yet keeps nothing.
+
+    Raises
+    ------
+    FormatError
+        It is not what :func:`save` wrote.
+    """
+    try:
+        return msgspec.json.decode(Path(path).read_bytes(), type=Kept)
+    except FileNotFoundError:
+        return Kept()
+    except msgspec.DecodeError as error:
+        raise FormatError(path, f"kept parameters as JSON: {error}") from error
+
+
+def save(path: str | Path, kept: Kept) -> None:
+    """Write the file, whole or not at all, and onto the disk: the next moment may be a power cut."""
+    with atomic_path(path) as beside, beside.open("wb") as file:
+        file.write(msgspec.json.format(msgspec.json.encode(kept), indent=2))
+        file.flush()
+        os.fsync(file.fileno())

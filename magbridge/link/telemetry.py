@@ -1,0 +1,141 @@
+"""Any field of any message as a parameter of the calibration."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from math import nan
+from pathlib import Path
+from typing import Any
+
+from magbridge.config import Telemetry
+from magbridge.errors import ConfigError
+from magbridge.link.clock import VehicleClock
+from magbridge.mavlink import Message, Spec, spec
+from magbridge.mavlink.messages import Field, split_index
+
+__all__ = ["TelemetryMap"]
+
+Value = tuple[str, float, int]
+YEAR_2001_US = 10**15
+"""us; a 64-bit time beyond it counts from 1970 and not from the boot."""
+
+
+class Extractor:
+    """Takes one parameter out of one kind of message."""
+
+    __slots__ = ("field", "index", "match", "name", "offset", "scale")
+
+    def __init__(self, name: str, what: Telemetry, layout: Spec, path: Path) -> None:
+        key = f"telemetry.{name}"
+        self.name, self.scale, self.offset = name, what.scale, what.offset
+        field_name, self.index = split_index(what.field)
+        self.field = find(layout, field_name, path, f"{key}.field")
+        count = self.field.count
+        if self.field.code == "s":
+            raise ConfigError(path, f"{key}.field", f"a number, but {layout.name}.{field_name} is text")
+        if (self.index is None) != (count == 0) or (count and not 0 <= (self.index or 0) < count):
+            wanted = (
+                f"{field_name}[0] to {field_name}[{count - 1}]" if count else f"{field_name} without an index"
+            )
+            raise ConfigError(path, f"{key}.field", f"{wanted}, not {what.field!r}")
+        self.match = [
+            (find(layout, one, path, f"{key}.match.{one}"), value) for one, value in what.match.items()
+        ]
+        for field, value in self.match:
+            if isinstance(value, str) != (field.code == "s"):
+                kind = "text" if field.code == "s" else "a number"
+                raise ConfigError(path, f"{key}.match.{field.name}", f"{kind}, not {value!r}")
+
+    def value(self, payload: bytes) -> float | None:
+        """Return the value, NaN where the sender does not know it, None where the message does not match."""
+        for field, wanted in self.match:
+            if field.get(payload) != wanted:
+                return None
+        raw = self.field.get(payload)
+        if self.index is not None:
+            raw = raw[self.index]
+        return nan if raw == self.field.invalid else self.scale * raw + self.offset
+
+
+def find(layout: Spec, name: str, path: Path, key: str) -> Field:
+    """Return the field `name` of a message, or say which there are."""
+    try:
+        return layout.fields[name]
+    except KeyError:
+        raise ConfigError(
+            path, key, f"{layout.name} has no field {name!r}; it has {', '.join(layout.fields)}"
+        ) from None
+
+
+class TelemetryMap:
+    """Takes the configured parameters out of messages, with the time at which they were true.
+
+    Parameters
+    ----------
+    telemetry : mapping of str to Telemetry
+        ``[telemetry.NAME]`` of the configuration.
+    autopilot : int
+        Component whose clock the ``VehicleClock`` knows.
+    path : Path
+        The configuration, for errors.
+
+    Raises
+    ------
+    ConfigError
+        A message or field that does not exist.
+    """
+
+    def __init__(
+        self, telemetry: Mapping[str, Telemetry], autopilot: int = 1, path: Path = Path("bridge.toml")
+    ) -> None:
+        self._autopilot = autopilot
+        self._by_id: dict[int, list[Extractor]] = {}
+        self._times: dict[int, Callable[[bytes], tuple[int, int]] | None] = {}
+        for name, what in telemetry.items():
+            try:
+                layout = spec(what.message)
+            except KeyError:
+                raise ConfigError(
+                    path, f"telemetry.{name}.message", f"{what.message!r} is no message of any dialect"
+                ) from None
+            self._by_id.setdefault(layout.id, []).append(Extractor(name, what, layout, path))
+            self._times[layout.id] = own_time(layout)
+
+    def values(self, message: Message, t_us: int, clock: VehicleClock) -> list[Value]:
+        """Return ``(name, value, time in us)`` of every parameter that `message`, come at `t_us`, carries.
+
+        The time is the message's own where it has one and the autopilot's clock is known, else `t_us`. A value
+        that the sender marks as not known is NaN.
+        """
+        extractors = self._by_id.get(message.id)
+        if extractors is None:
+            return []
+        found = []
+        when_us = 0
+        for one in extractors:
+            value = one.value(message.payload)
+            if value is not None:
+                when_us = when_us or self._time(message, t_us, clock)
+                found.append((one.name, value, when_us))
+        return found
+
+    def _time(self, message: Message, t_us: int, clock: VehicleClock) -> int:
+        read = self._times[message.id]
+        if read is None or message.component != self._autopilot or not clock.known:
+            return t_us
+        vehicle_us, wrap_us = read(message.payload)
+        if vehicle_us <= 0 or vehicle_us > YEAR_2001_US:  # not filled in, or another clock than TIMESYNC's
+            return t_us
+        return clock.ours(vehicle_us, t_us, wrap_us)
+
+
+def own_time(layout: Spec) -> Callable[[bytes], tuple[int, int]] | None:
+    """Return a function that reads a message's own time and after how many us it wraps; None where it has none."""
+    for name, unit_us in (("time_boot_ms", 1000), ("time_usec", 1)):
+        field = layout.fields.get(name)
+        if field is None:
+            continue
+        get: Callable[[bytes], Any] = field.get
+        wrap_us = unit_us << 32 if field.code == "I" else 0
+        return lambda payload: (get(payload) * unit_us, wrap_us)
+    return None

@@ -1,0 +1,136 @@
+"""The vehicle that the bridge is attached to: whether its autopilot is there, rebooted, or not alone."""
+
+from __future__ import annotations
+
+from magbridge.link.announcer import Announcer
+from magbridge.link.clock import VehicleClock
+from magbridge.link.timers import Timers
+from magbridge.mavlink import Message, spec
+from magbridge.mavlink.dialect import MAG_PORT_STATE, MAV_AUTOPILOT, MAV_SEVERITY, MAV_TYPE, MESSAGES
+
+__all__ = ["Vehicle"]
+
+HEARTBEAT = spec("HEARTBEAT").id
+ABSENT_US = 5_000_000
+"""us without a heartbeat after which the autopilot counts as gone."""
+BACK_MS = 1_000
+"""ms that ``time_boot_ms`` goes back before it is more than packets out of order."""
+BELIEVED = 3
+"""Messages in a row from the new boot clock before it is believed: one may be a straggler."""
+LEAP_MS = 10_000
+"""ms that it runs ahead of ours before it is another's."""
+TWICE, CHANGES_US = 5, 10_000_000
+"""So many changes between two boot clocks in so many us, and there are two autopilots."""
+BOOT_TIMES = {
+    number: spec(number).fields["time_boot_ms"]
+    for number, row in MESSAGES.items()
+    if ":time_boot_ms:ms" in row[2]
+}
+
+
+class Vehicle:
+    """Watches what the configured system says of itself.
+
+    Attributes
+    ----------
+    clock : VehicleClock
+        Reset when the autopilot reboots.
+    reboots, frames_lost : int
+        Times that the boot clock began anew; frames missing by the autopilot's sequence numbers.
+    others : dict of int to int
+        Frames from other vehicles, by system id.
+    """
+
+    def __init__(
+        self, system: int, component: int, autopilot: int, announcer: Announcer, timers: Timers
+    ) -> None:
+        self.system, self.component, self.autopilot = system, component, autopilot
+        self.clock = VehicleClock()
+        self.reboots = self.frames_lost = 0
+        self.others: dict[int, int] = {}
+        self.state = MAG_PORT_STATE.ABSENT
+        self._announcer, self._timers = announcer, timers
+        self._sequence: int | None = None
+        self._boot_ms = self._boot_us = 0
+        self._behind = 0
+        self._changes: list[int] = []
+
+    def hear(self, message: Message, t_us: int) -> bool:
+        """Take note of a message; return whether it is telemetry of our vehicle."""
+        if message.system != self.system:
+            self._stranger(message)
+            return False
+        if message.component == self.component:
+            self._announcer.state(
+                "twin",
+                f"another program speaks as {self.system}:{self.component}",
+                MAV_SEVERITY.WARNING,
+            )
+            return False
+        if message.component == self.autopilot:
+            self._count(message.sequence)
+            if message.id in BOOT_TIMES:
+                self._watch_boot(BOOT_TIMES[message.id].get(message.payload), t_us)
+            elif message.id == HEARTBEAT:
+                self._present(t_us)
+        return True
+
+    def _stranger(self, message: Message) -> None:
+        if message.id != HEARTBEAT and message.system not in self.others:
+            return
+        station = message.id == HEARTBEAT and (
+            message["type"] == MAV_TYPE.GCS or message["autopilot"] == MAV_AUTOPILOT.INVALID
+        )
+        if station:
+            return
+        self.others[message.system] = self.others.get(message.system, 0) + 1
+        self._announcer.state(
+            f"system {message.system}",
+            f"vehicle {message.system} is on the link too: ignored",
+            MAV_SEVERITY.NOTICE,
+        )
+
+    def _count(self, sequence: int) -> None:
+        if self._sequence is not None:
+            missing = (sequence - self._sequence - 1) % 256
+            # what seems to be more than half a turn missing is a packet out of order, or sent twice
+            self.frames_lost += missing if missing < 128 else 0
+        self._sequence = sequence
+
+    def _present(self, t_us: int) -> None:
+        who = f"autopilot {self.system}:{self.autopilot}"
+        if self.state != MAG_PORT_STATE.OK:
+            self._announcer.state("autopilot", f"{who} found", MAV_SEVERITY.INFO)
+        self.state = MAG_PORT_STATE.OK
+        self._timers.at("autopilot", t_us + ABSENT_US, lambda _: self._vanish(who))
+
+    def _vanish(self, who: str) -> None:
+        self.state = MAG_PORT_STATE.LOST
+        self._announcer.state("autopilot", f"{who} is silent", MAV_SEVERITY.WARNING)
+
+    def _watch_boot(self, boot_ms: int, t_us: int) -> None:
+        """Tell a reboot from stragglers, and from a second autopilot with its own boot clock."""
+        elapsed_ms = (t_us - self._boot_us) // 1000
+        # modulo 2^32 ms and signed, so that the wrap after 50 days is a step forward
+        ahead_ms = (boot_ms - self._boot_ms + (1 << 31)) % (1 << 32) - (1 << 31)
+        if self._boot_us and ahead_ms < -BACK_MS:
+            self._behind += 1
+            if self._behind < BELIEVED:
+                return
+            self._behind = 0
+            self.reboots += 1
+            self.clock.reset()
+            self._announcer.say(f"autopilot {self.system}:{self.autopilot} rebooted", MAV_SEVERITY.WARNING)
+        elif self._behind or (self._boot_us and ahead_ms > elapsed_ms + LEAP_MS):
+            self._behind = 0
+            self._change(t_us)
+        if ahead_ms > 0 or ahead_ms < -BACK_MS or not self._boot_us:
+            self._boot_ms, self._boot_us = boot_ms, t_us
+
+    def _change(self, t_us: int) -> None:
+        """Count how often the boot clock went back and forth."""
+        self._changes = [*(when for when in self._changes if t_us - when < CHANGES_US), t_us][-TWICE:]
+        if len(self._changes) == TWICE:
+            self._announcer.state(
+                "autopilots", f"two autopilots speak as {self.system}:{self.autopilot}", MAV_SEVERITY.WARNING
+            )

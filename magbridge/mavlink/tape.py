@@ -1,0 +1,67 @@
+"""Every byte of a link as frames in a log, and back again.
+
+A log must be readable by any MAVLink tool and still hold everything that came: frames go in as they are, bytes
+that belong to none wrapped in MAG_LINK_BYTES. Where the parser had to look at bytes beyond the frame that it
+gave out, to see that something before it was no frame, these go in as well, marked *ahead*: fed with them, a
+replay's parser comes to the same end at the same time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from magbridge.mavlink.codec import Codec
+from magbridge.mavlink.framing import message
+from magbridge.mavlink.messages import BAD_DATA, Message, spec
+
+__all__ = ["TapeReader", "TapeWriter"]
+
+WRAPPER = spec("MAG_LINK_BYTES")
+SIZE = WRAPPER.fields["data"].count
+
+
+class TapeWriter:
+    """Turns what a codec gave into frames for the log."""
+
+    def __init__(self, system: int, component: int) -> None:
+        self._codec = Codec(system, component)
+
+    def frames(self, messages: Iterable[Message], pending: bytes) -> list[bytes]:
+        """Return the frames to log for one call of :meth:`Codec.parse`, and what was pending after it."""
+        frames: list[bytes] = []
+        in_doubt = False
+        for one in messages:
+            if one.id in (BAD_DATA, WRAPPER.id):
+                frames += self._wrap(one.frame, ahead=0)
+            else:
+                frames.append(one.frame)
+            in_doubt |= one.id == BAD_DATA or not one.known
+        return frames + self._wrap(pending, ahead=1) if in_doubt else frames
+
+    def _wrap(self, data: bytes, ahead: int) -> list[bytes]:
+        pieces = [data[i : i + SIZE] for i in range(0, len(data), SIZE)]
+        return [
+            self._codec.pack(WRAPPER.name, ahead=ahead, length=len(piece), data=piece) for piece in pieces
+        ]
+
+
+class TapeReader:
+    """The inverse: feed it the frames of a log, and it returns the bytes that came at that moment."""
+
+    def __init__(self) -> None:
+        self._fed = 0  # bytes given out beyond the last record that was not ahead
+        self._seen = 0  # bytes of records ahead since then
+
+    def data(self, frame: bytes) -> bytes:
+        """Return the bytes that `frame` adds to the stream."""
+        one = message(frame)
+        wrapped = one.id == WRAPPER.id
+        data = one["data"][: one["length"]] if wrapped else frame
+        if wrapped and one["ahead"]:
+            new = data[max(self._fed - self._seen, 0) :]
+            self._seen += len(data)
+            self._fed = max(self._fed, self._seen)
+        else:
+            new = data[self._fed :]
+            self._fed, self._seen = max(self._fed - len(data), 0), 0
+        return new

@@ -1,0 +1,108 @@
+"""Commands, acknowledged to the asker."""
+
+from __future__ import annotations
+
+from math import inf, nan
+
+import pytest
+
+ACCEPTED, TEMPORARILY_REJECTED, DENIED, UNSUPPORTED = 0, 1, 2, 3
+FIELD, HEARTBEAT, STATUS, HIGHRES_IMU, VERSION = 60101, 0, 60102, 105, 148
+GET, SET, REQUEST, CAPABILITIES, START_MAG_CAL = 510, 511, 512, 520, 42424
+
+
+def result(link, messages):
+    (ack,) = link.only(messages, "COMMAND_ACK")
+    assert (ack.get_srcComponent(), ack.command) == (191, link.asked)
+    return ack.result
+
+
+def ask(link, number, *params, **options):
+    link.asked = number
+    return link.command(number, *params, **options)
+
+
+def test_request_message(link):
+    heard = ask(link, REQUEST, STATUS)
+    assert result(link, heard) == ACCEPTED
+    assert len(link.only(heard, "MAG_STATUS")) == 1
+    assert result(link, ask(link, REQUEST, FIELD)) == TEMPORARILY_REJECTED  # no sample yet
+    assert result(link, ask(link, REQUEST, 24)) == DENIED
+    assert result(link, ask(link, REQUEST, nan)) == DENIED
+    assert result(link, ask(link, REQUEST, inf)) == DENIED
+
+
+def test_version(link):
+    for number, param in ((REQUEST, VERSION), (CAPABILITIES, 1)):
+        heard = ask(link, number, param)
+        assert result(link, heard) == ACCEPTED
+        (version,) = link.only(heard, "AUTOPILOT_VERSION")
+        assert version.flight_sw_version == 0x010203FF
+        assert version.capabilities == 2 | 8 | 8192
+
+
+def test_intervals(link):
+    heard = ask(link, SET, HIGHRES_IMU, 100_000)
+    assert result(link, heard) == ACCEPTED
+    (value,) = link.only(heard, "PARAM_VALUE")  # a parameter changed: stations want to know
+    assert (value.param_id, value.param_value) == ("MB_R_HIGHRES_IMU", 10.0)
+    heard = ask(link, GET, HIGHRES_IMU)
+    assert link.only(heard, "MESSAGE_INTERVAL")[0].interval_us == 100_000
+    assert result(link, ask(link, SET, HIGHRES_IMU, -1)) == ACCEPTED
+    assert link.only(ask(link, GET, HIGHRES_IMU), "MESSAGE_INTERVAL")[0].interval_us == -1
+    assert result(link, ask(link, SET, HEARTBEAT, 200_000)) == ACCEPTED
+    assert len(link.only(link.to(10.05), "HEARTBEAT")) == pytest.approx(50, abs=1)
+    assert result(link, ask(link, SET, HEARTBEAT, 0)) == ACCEPTED
+    assert len(link.only(link.to(20.05), "HEARTBEAT")) == pytest.approx(10, abs=1)
+
+
+@pytest.mark.parametrize(
+    ("message", "interval"),
+    [
+        (HEARTBEAT, -1),
+        (HEARTBEAT, 1e9),
+        (FIELD, 10),
+        (FIELD, -2),
+        (FIELD, nan),
+        (24, 1000),
+        (-1, 0),
+        (1e30, 0),
+    ],
+)
+def test_intervals_that_are_refused(link, message, interval):
+    before = dict(link.component.parameters.changed())
+    assert result(link, ask(link, SET, message, interval)) == DENIED
+    assert link.component.parameters.changed() == before
+
+
+def test_interval_of_a_message_we_do_not_send(link):
+    assert link.only(ask(link, GET, 24), "MESSAGE_INTERVAL")[0].interval_us == 0
+    assert result(link, ask(link, GET, 70_000)) == DENIED
+
+
+def test_unknown_commands_are_unsupported_but_not_for_others(link):
+    assert result(link, ask(link, 400, 1)) == UNSUPPORTED
+    assert ask(link, 400, 1, target=(1, 1)) == []
+    assert ask(link, 400, 1, target=(2, 191)) == []
+
+
+def test_to_everybody_we_do_only_what_only_we_can(link):
+    assert ask(link, START_MAG_CAL, 1, target=(1, 0)) == []
+    assert ask(link, REQUEST, VERSION, target=(1, 0)) == []
+    assert ask(link, SET, HIGHRES_IMU, 1000, target=(0, 0)) == []
+    heard = ask(link, REQUEST, STATUS, target=(1, 0))
+    assert result(link, heard) == ACCEPTED
+    assert len(link.only(heard, "MAG_STATUS")) == 1
+
+
+def test_command_int(link):
+    link.asked = REQUEST
+    heard = link.say("command_int", 1, 191, 0, REQUEST, 0, 0, STATUS, 0, 0, 0, 0, 0, 0)
+    assert result(link, heard) == ACCEPTED
+
+
+def test_the_acknowledgement_is_addressed(link):
+    (ack,) = link.only(ask(link, 400), "COMMAND_ACK")
+    frame = next(frame for _, frame in reversed(link.sent) if frame[7] == 77)
+    assert ack.result == UNSUPPORTED
+    assert frame[10 + 8 : 10 + 10] == bytes((255, 190))  # target_system, target_component

@@ -1,0 +1,144 @@
+"""The component as a station sees it."""
+
+from __future__ import annotations
+
+import random
+from pathlib import Path
+
+import pytest
+
+from magbridge.errors import ConfigError
+from magbridge.link import check_publish
+from magbridge.mavlink import Codec, Signing, TapeReader
+from magbridge.mavlink.dialect import MAG_PORT_STATE
+
+START = 1_700_000_000_000_000
+NOW = START + 100_000
+
+
+def test_heartbeat_once_a_second_at_its_own_time(link):
+    link.to(10.05)
+    beats = [at for at, frame in link.sent if frame[7] == 0]
+    assert beats == [START + i * 1_000_000 for i in range(11)]
+    (beat,) = link.only(link.to(11.0), "HEARTBEAT")
+    assert (beat.type, beat.autopilot, beat.mavlink_version) == (18, 8, 3)
+    assert (beat.get_srcSystem(), beat.get_srcComponent()) == (1, 191)
+    assert beat.system_status == 5  # critical: no sensor
+
+
+def test_when_it_is_woken_does_not_matter(make_link):
+    lazy, eager = make_link(), make_link()
+    lazy.to(30)
+    for i in range(301):
+        eager.to(i / 10)
+    assert lazy.sent == eager.sent
+
+
+def test_next_deadline_is_when_something_is_sent(link):
+    for _ in range(20):
+        deadline = link.component.next_deadline
+        link.component.advance(deadline - 4)
+        assert not link.component.outbox.drain()
+        link.component.advance(deadline)
+        assert {at for at, _ in link.component.outbox.drain()} == {deadline}
+
+
+def test_status(make_link):
+    link = make_link(
+        calibration_id=7,
+        status=lambda: {"samples": 5, "sensor_state": MAG_PORT_STATE.OK, "log_records": (1 << 32) + 3},
+    )
+    link.to(0)
+    link.give(b"garbage" + link.autopilot.pack("HEARTBEAT", type=12, autopilot=3))
+    heard = link.to(3)
+    status = link.only(heard, "MAG_STATUS")[-1]
+    assert (status.samples, status.calibration_id, status.uptime, status.link_frames) == (5, 7, 3, 1)
+    assert (status.link_bytes_skipped, status.log_records) == (7, 3)
+    assert status.autopilot_state == MAG_PORT_STATE.OK
+    assert link.only(heard, "HEARTBEAT")[-1].system_status == 4
+
+
+def test_telemetry_only_of_our_vehicle(link):
+    link.fly("ATTITUDE", roll=0.5)
+    assert [message["roll"] for message in link.telemetry] == [0.5]
+    for codec in (Codec(2, 1), Codec(1, 191)):
+        link.give(codec.pack("ATTITUDE", roll=1))
+        assert link.telemetry == []
+
+
+def test_everything_heard_is_kept_for_the_log(link):
+    frame = link.autopilot.pack("ATTITUDE", roll=0.5)
+    inside = link.autopilot.pack("MAG_LINK_BYTES", length=1, data=b"x")
+    noise = bytes(range(250)) * 2
+    link.give(frame + noise + inside + frame)
+    assert link.component.heard[0] == link.component.heard[-1] == frame
+    kept = Codec(1, 1).parse(b"".join(link.component.heard[1:-1]) + frame)[:-1]
+    assert {message.name for message in kept} == {"MAG_LINK_BYTES"}
+    assert b"".join(message["data"][: message["length"]] for message in kept) == noise + inside
+
+
+def test_replaying_what_was_heard_gives_the_same_bytes(make_link):
+    """Garbage, requests, time synchronisation, all cut at random: the log's frames bring it all about again."""
+    rng = random.Random(5)
+    first, second, log = make_link(), make_link(), []
+    for i in range(400):
+        first.now += 4 * rng.randrange(20_000)
+        first.component.advance(first.now)
+        data = rng.choice(
+            [
+                rng.randbytes(rng.randrange(60)),
+                first.autopilot.pack("ATTITUDE", time_boot_ms=10 * i, roll=0.1 * i),
+                first.autopilot.pack("HEARTBEAT", type=12, autopilot=3),
+                Codec(255, 190).pack("PARAM_REQUEST_LIST", target_system=1, target_component=191),
+                Codec(255, 190).pack(
+                    "PARAM_SET", target_system=1, target_component=191, param_id="MB_GAP_FACTOR",
+                    param_value=rng.uniform(-1, 10), param_type=9,
+                ),
+            ]
+        )  # fmt: skip
+        first.component.receive(data, first.now)
+        log += [(first.now, frame) for frame in first.component.heard]
+        first.component.heard.clear()
+    first.to(40)
+    tape = TapeReader()
+    for at, frame in log:
+        second.component.advance(at)
+        second.component.receive(tape.data(frame), at)
+    second.to(40)
+    assert len(first.sent) > 200
+    assert second.sent == first.sent
+    assert first.component.codec.bytes_skipped == second.component.codec.bytes_skipped > 1000
+
+
+def test_timesync_is_answered_to_the_asker(link):
+    (answer,) = link.only(link.say("timesync", 0, 123456789), "TIMESYNC")
+    assert (answer.tc1, answer.ts1) == (NOW * 1000, 123456789)
+    mine = link.fly("TIMESYNC", ts1=5, target_system=1, target_component=158)
+    assert not link.only(mine, "TIMESYNC")
+
+
+def test_signed_both_ways(make_link):
+    key = bytes(range(32))
+    link = make_link(signing=Signing(key))
+    link.station.signing.secret_key = key
+    link.station.signing.sign_outgoing = True
+    link.station.signing.timestamp = (START - 1_420_070_400_000_000) // 10
+    link.to(0.1)
+    values = link.say("param_request_read", 1, 191, b"", 0)
+    assert [message.get_signed() for message in values] == [True]
+    link.fly("PARAM_REQUEST_READ", target_system=1, target_component=191, param_index=0)
+    assert link.component.codec.signing.refused == 1
+    (status,) = link.only(link.to(1), "MAG_STATUS")
+    assert status.link_refused == 1
+
+
+def test_publish_is_checked():
+    check_publish({"MAG_FIELD": 0, "NAMED_VALUE_FLOAT": 1, "DEBUG_VECT": -1}, Path("b.toml"))
+    for publish, complaint in (
+        ({"MAG_FILED": 0}, r"b.toml: publish.MAG_FILED: one of .*MAG_FIELD"),
+        ({"MAG_FIELD": 1e6}, r"publish.MAG_FIELD: a rate from -1 to 1000 Hz"),
+        ({"HEARTBEAT": -1}, r"publish.HEARTBEAT"),
+        ({"MAG_FIELD": float("nan")}, r"publish.MAG_FIELD"),
+    ):
+        with pytest.raises(ConfigError, match=complaint):
+            check_publish(publish, Path("b.toml"))

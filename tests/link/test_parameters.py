@@ -1,0 +1,140 @@
+"""Every tunable over the parameter protocol."""
+
+from __future__ import annotations
+
+from math import inf, nan
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from magbridge.config import Align, Telemetry
+from magbridge.errors import FormatError
+from magbridge.link import Parameters, alignment, telemetry_ages
+from magbridge.link.component import LIMITS
+from magbridge.link.parameters import rates, real32
+from magbridge.link.store import Kept, load, save
+
+
+def write(link, name, value, kind=9):
+    return link.say("param_set", 1, 191, name.encode(), value, kind)
+
+
+def test_list_comes_whole_and_paced(link):
+    assert not link.only(link.say("param_request_list", 1, 191), "PARAM_VALUE")
+    values = link.only(link.to(5), "PARAM_VALUE")
+    table = link.component.parameters.table
+    assert [value.param_id for value in values] == list(table)
+    assert [value.param_index for value in values] == list(range(len(table)))
+    assert {(value.param_count, value.param_type) for value in values} == {(len(table), 9)}
+    times = [at for at, frame in link.sent if frame[7] == 22]
+    assert min(b - a for a, b in zip(times, times[1:], strict=False)) == 20_000
+    assert len(link.only(link.to(6), "PARAM_VALUE")) == 0
+
+
+def test_names_and_ranges_are_sound(link):
+    for row in link.component.parameters.table.values():
+        assert row.name.startswith("MB_")
+        assert len(row.name) <= 16
+        assert row.low <= row.default <= row.high or row.default == -1
+        assert row.doc
+
+
+def test_read_by_name_and_index(link):
+    for request in ((b"MB_GAP_FACTOR", -1), (b"", link.component.parameters.names.index("MB_GAP_FACTOR"))):
+        (value,) = link.say("param_request_read", 1, 191, *request)
+        assert (value.param_id, value.param_value) == ("MB_GAP_FACTOR", 2.5)
+    for request in ((b"NO_SUCH", -1), (b"", 999), (b"", -2)):
+        assert link.say("param_request_read", 1, 191, *request) == []
+
+
+def test_not_ours(link):
+    assert link.say("param_request_read", 1, 1, b"MB_GAP_FACTOR", -1) == []
+    assert link.say("param_request_read", 2, 191, b"MB_GAP_FACTOR", -1) == []
+    assert link.say("param_request_read", 1, 0, b"", 0) == []  # an index means the autopilot's
+    assert link.say("param_set", 1, 0, b"NO_SUCH", 1.0, 9) == []
+
+
+def test_set(link):
+    before = link.component.parameters.revision
+    (value,) = write(link, "MB_GAP_FACTOR", 4.0)
+    assert value.param_value == 4.0
+    assert link.component.parameters.of("align.gap_factor") == 4.0
+    assert link.component.parameters.revision == before + 1
+    assert link.component.parameters.changed() == {"MB_GAP_FACTOR": 4.0}
+
+
+@pytest.mark.parametrize("value", [0.5, -1.0, 1e6, nan, inf, -inf, 3.4e38])
+def test_out_of_range_is_refused_and_said(link, value):
+    heard = write(link, "MB_GAP_FACTOR", value)
+    assert [v.param_value for v in link.only(heard, "PARAM_VALUE")] == [2.5]
+    text = "".join(link.texts(heard))
+    assert text.startswith("MB_GAP_FACTOR: ")
+    assert text.endswith("is not within 1.01 to 1000")
+    assert link.component.parameters.changed() == {}
+
+
+def test_only_real32(link):
+    heard = write(link, "MB_GAP_FACTOR", 4.0, kind=6)
+    assert link.texts(heard) == ["MB_GAP_FACTOR: only REAL32 is taken"]
+    assert link.only(heard, "PARAM_VALUE")[0].param_value == 2.5
+
+
+def test_a_rate_parameter_is_obeyed(link):
+    write(link, "MB_R_HEARTBEAT", 5.0)
+    assert len(link.only(link.to(10.05), "HEARTBEAT")) == pytest.approx(50, abs=1)
+    write(link, "MB_R_STATUS", -1.0)
+    assert not link.only(link.to(20), "MAG_STATUS")
+
+
+def test_kept_parameters_come_back(make_link):
+    link = make_link(kept={"MB_GAP_FACTOR": 3.5, "MB_R_MAG_RAW": 2.0, "GONE": 1.0})
+    assert link.component.parameters["MB_GAP_FACTOR"] == 3.5
+    assert any("GONE" in text for text in link.texts(link.hear()))
+
+
+ROWS = [
+    *rates({}, LIMITS),
+    *alignment(Align()),
+    *telemetry_ages({f"a_rather_long_name_{i}": Telemetry("ATTITUDE", "roll") for i in range(3)}),
+]
+
+
+def test_names_do_not_collide():
+    assert len(Parameters(ROWS).names) == len(ROWS)
+
+
+@given(st.sampled_from(ROWS), st.floats(width=32))
+def test_what_is_set_reads_back_or_nothing_changes(row, value):
+    parameters = Parameters(ROWS)
+    before = parameters[row.name]
+    if parameters.set(row.name, value):
+        assert real32(parameters[row.name]) == value
+        assert real32(row.low) <= value <= real32(row.high)
+        again = Parameters(ROWS)
+        assert again.restore(parameters.changed()) == []
+        assert again[row.name] == parameters[row.name]
+    else:
+        assert parameters[row.name] == before
+        assert parameters.revision == 0
+
+
+def test_a_default_read_and_written_back_stays_exact():
+    parameters = Parameters(ROWS)
+    exact = parameters["MB_MOVING_RATE"]
+    assert exact != real32(exact)
+    parameters.set("MB_MOVING_RATE", 0.25)
+    parameters.set("MB_MOVING_RATE", real32(exact))
+    assert parameters["MB_MOVING_RATE"] == exact
+
+
+def test_store(tmp_path):
+    path = tmp_path / "parameters.json"
+    assert load(path) == Kept()
+    kept = Kept({"MB_GAP_FACTOR": real32(0.1)}, 12345678901234)
+    save(path, kept)
+    assert load(path) == kept
+    assert [one.name for one in tmp_path.iterdir()] == ["parameters.json"]
+    path.write_text('{"parameters": {"a": "b"}}')
+    with pytest.raises(FormatError, match=r"parameters.json"):
+        load(path)
