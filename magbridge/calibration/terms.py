@@ -37,6 +37,13 @@ TERMS: dict[str, str] = {
     "polynomial": "magbridge.calibration.terms:Polynomial",
     "dipole": "magbridge.calibration.dipole:Dipole",
     "channel": "magbridge.calibration.effects:ChannelEffect",
+    "powers": "magbridge.calibration.followers:PowersEffect",
+    "monomial": "magbridge.calibration.followers:MonomialEffect",
+    "play": "magbridge.calibration.followers:PlayEffect",
+    "clock": "magbridge.calibration.followers:ClockEffect",
+    "time": "magbridge.calibration.instrument:TimeEffect",
+    "rate": "magbridge.calibration.instrument:RateEffect",
+    "response": "magbridge.calibration.instrument:ResponseEffect",
 }
 """Name in ``cal.json`` -> ``module:class``; others join by the entry point group ``magbridge.terms``."""
 

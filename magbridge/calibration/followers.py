@@ -1,0 +1,218 @@
+"""Effects that follow the telemetry of moving masses: more powers, backlash, a clock that is off."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import isnan
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magbridge.calibration.terms import Effect, Exponents, Step
+from magbridge.errors import CalibrationError
+
+if TYPE_CHECKING:
+    from magbridge.calibration.model import Calibration
+
+__all__ = ["ClockEffect", "MonomialEffect", "PlayEffect", "PowersEffect"]
+
+FloatArray = NDArray[np.float64]
+MAX_INTERVAL = 60_000_000
+"""µs; over a longer gap a rate of change means nothing."""
+
+
+def offsets(regressors: int) -> FloatArray:
+    """(3 r, r, 9): each regressor adds to T with three coefficients of its own, axis by axis."""
+    columns = np.zeros((3 * regressors, regressors, 9))
+    for r in range(regressors):
+        columns[3 * r : 3 * r + 3, r, 6:9] = np.eye(3)
+    return columns
+
+
+class PowersEffect(Effect, frozen=True, kw_only=True):
+    """A mass that another channel moves: ``T += sum_k c_k x^k``, ``x = (p - centre) / scale``.
+
+    A permanent moment on a mass at ``r(p)`` gives ``G(r(p)) m`` (see :mod:`.dipole`), a power series in p.
+
+    Attributes
+    ----------
+    cause, channel : str
+    centre, scale : float
+        In the channel's unit.
+    order : int
+        Highest power; three coefficients (nT) for each.
+    """
+
+    kind: ClassVar[str] = "powers"
+    cause: str
+    channel: str
+    centre: float
+    scale: float
+    order: int = 1
+
+    @property
+    def size(self) -> int:
+        """Three for each power."""
+        return 3 * self.order
+
+    def channels(self) -> tuple[str, ...]:
+        """Name the one that it follows."""
+        return (self.channel,)
+
+    def columns(self, field: float) -> FloatArray:  # noqa: ARG002  (others need it)
+        """Offsets."""
+        return offsets(self.order)
+
+    def begin(self, calibration: Calibration) -> Step:
+        """Return a stepper; a missing value leaves the last one standing."""
+        index, order = calibration.channels.index(self.channel), self.order
+        centre, scale, x = self.centre, self.scale, 0.0
+
+        def step(time_us: int, hx: float, hy: float, hz: float, values: Sequence[float]) -> tuple[float, ...]:  # noqa: ARG001
+            nonlocal x
+            if not isnan(values[index]):
+                x = (values[index] - centre) / scale
+            powers = [x]
+            for _ in range(order - 1):
+                powers.append(powers[-1] * x)
+            return tuple(powers)
+
+        return step
+
+
+class MonomialEffect(Effect, frozen=True, kw_only=True):
+    """A monomial of the calibration's own positions that its terms lack: ``T += c prod_k x_k^e_k``.
+
+    Attributes
+    ----------
+    cause : str
+    exponents : tuple of int
+        One for each parameter, of positions scaled as the calibration scales them.
+    """
+
+    kind: ClassVar[str] = "monomial"
+    cause: str
+    exponents: Exponents
+
+    @property
+    def size(self) -> int:
+        """One for each axis, nT."""
+        return 3
+
+    def check(self, parameters: tuple[str, ...]) -> None:
+        """Require one exponent for each parameter."""
+        if len(self.exponents) != len(parameters):
+            raise CalibrationError(f"monomial: expected {len(parameters)} exponents, one for each parameter")
+
+    def columns(self, field: float) -> FloatArray:  # noqa: ARG002  (others need it)
+        """Offsets."""
+        return offsets(1)
+
+    def begin(self, calibration: Calibration) -> Step:
+        """Return a stepper; it has no state."""
+        factors = [
+            (k, parameter.centre, parameter.scale)
+            for k, parameter in enumerate(calibration.parameters)
+            for _ in range(self.exponents[k])
+        ]
+
+        def step(time_us: int, hx: float, hy: float, hz: float, values: Sequence[float]) -> tuple[float]:  # noqa: ARG001
+            product = 1.0
+            for k, centre, scale in factors:
+                product *= (values[k] - centre) / scale
+            return (product,)
+
+        return step
+
+
+class PlayEffect(Effect, frozen=True, kw_only=True):
+    """Backlash or remanence: ``T += c (y - p) / width``, y the play operator of the channel p.
+
+    ``y = min(max(y, p - width / 2), p + width / 2)``: the last position drags behind by half the width, on the
+    side that the mass came from (Brokate & Sprekels 1996, *Hysteresis and Phase Transitions*, sec. 2.1).
+
+    Attributes
+    ----------
+    cause, channel : str
+    width : float
+        In the channel's unit.
+    """
+
+    kind: ClassVar[str] = "play"
+    cause: str
+    channel: str
+    width: float
+
+    @property
+    def size(self) -> int:
+        """One for each axis, nT from one side to the other."""
+        return 3
+
+    def channels(self) -> tuple[str, ...]:
+        """Name the one that it follows."""
+        return (self.channel,)
+
+    def columns(self, field: float) -> FloatArray:  # noqa: ARG002  (others need it)
+        """Offsets."""
+        return offsets(1)
+
+    def begin(self, calibration: Calibration) -> Step:
+        """Return a stepper that starts in the middle of its play."""
+        index, width = calibration.channels.index(self.channel), self.width
+        half, y, p, first = 0.5 * width, 0.0, 0.0, True
+
+        def step(time_us: int, hx: float, hy: float, hz: float, values: Sequence[float]) -> tuple[float]:  # noqa: ARG001
+            nonlocal y, p, first
+            if not isnan(values[index]):
+                p = values[index]
+                y = p if first else min(max(y, p - half), p + half)
+                first = False
+            return ((y - p) / width,)
+
+        return step
+
+
+class ClockEffect(Effect, frozen=True, kw_only=True):
+    """Telemetry that is late: ``theta += delay * dtheta/dp * dp/dt``, all nine coefficients at once.
+
+    One coefficient, s by which the telemetry lags behind the field's samples.
+
+    Attributes
+    ----------
+    cause : str
+    """
+
+    kind: ClassVar[str] = "clock"
+    cause: str = "clock_offset"
+
+    @property
+    def size(self) -> int:
+        """One delay."""
+        return 1
+
+    def columns(self, field: float) -> FloatArray:  # noqa: ARG002  (others need it)
+        """Nine regressors, the rates of the nine coefficients, under one coefficient."""
+        return np.eye(9)[None]
+
+    def begin(self, calibration: Calibration) -> Step:
+        """Return a stepper; rates are differences to the sample before."""
+        kernel, field = calibration.kernel, calibration.reference.field
+        W = kernel.weights[: kernel.monomials] * np.array([field] * 6 + [1.0] * 3)
+        last: list[float] = []
+        still = (0.0,) * 9
+        then = 0
+
+        def step(time_us: int, hx: float, hy: float, hz: float, values: Sequence[float]) -> tuple[float, ...]:  # noqa: ARG001
+            nonlocal last, then
+            now, before, apart = kernel.powers(values, 1.0), last, time_us - then
+            last, then = now, time_us
+            if now == before or not before or not 0 < apart < MAX_INTERVAL:
+                return still
+            rates = [(a - b) / (1e-6 * apart) for a, b in zip(now, before, strict=True)]
+            return tuple(
+                sum(rate * weight for rate, weight in zip(rates, column, strict=True))
+                for column in W.T.tolist()
+            )
+
+        return step

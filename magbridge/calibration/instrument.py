@@ -1,0 +1,186 @@
+"""Effects of the instrument itself: time, the rate of change of the reading, a response that bends."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import cos, pi, sin
+from typing import TYPE_CHECKING, ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magbridge.calibration.followers import MAX_INTERVAL, offsets
+from magbridge.calibration.terms import Effect, Step
+
+if TYPE_CHECKING:
+    from magbridge.calibration.model import Calibration
+
+__all__ = ["RateEffect", "ResponseEffect", "TimeEffect"]
+
+FloatArray = NDArray[np.float64]
+
+
+class TimeEffect(Effect, frozen=True, kw_only=True):
+    """An offset that follows time alone.
+
+    Attributes
+    ----------
+    cause : str
+    shape : {"step", "drift", "tone"}
+        ``H(t - t_0)``; ``(t - t_0) / period`` and its powers; ``cos`` and ``sin`` of ``2 pi (t - t_0) / period``.
+    start : float
+        t_0, s since 1970 UTC.
+    period : float
+        s.
+    order : int
+        Highest power of a drift.
+    """
+
+    kind: ClassVar[str] = "time"
+    cause: str
+    shape: Literal["step", "drift", "tone"]
+    start: float
+    period: float = 86_400.0
+    order: int = 1
+
+    @property
+    def regressors(self) -> int:
+        """How many functions of time."""
+        return {"step": 1, "drift": self.order, "tone": 2}[self.shape]
+
+    @property
+    def size(self) -> int:
+        """Three (nT) for each function of time."""
+        return 3 * self.regressors
+
+    def columns(self, field: float) -> FloatArray:  # noqa: ARG002  (others need it)
+        """Offsets."""
+        return offsets(self.regressors)
+
+    def begin(self, calibration: Calibration) -> Step:  # noqa: ARG002  (others need it)
+        """Return a stepper; it has no state."""
+        start, period, shape, order = round(self.start * 1e6), self.period * 1e6, self.shape, self.order
+
+        def step(time_us: int, hx: float, hy: float, hz: float, values: Sequence[float]) -> tuple[float, ...]:  # noqa: ARG001
+            if shape == "step":
+                return (1.0 if time_us >= start else 0.0,)
+            x = (time_us - start) / period
+            if shape == "tone":
+                return cos(2.0 * pi * x), sin(2.0 * pi * x)
+            powers = [x]
+            for _ in range(order - 1):
+                powers.append(powers[-1] * x)
+            return tuple(powers)
+
+        return step
+
+
+class RateEffect(Effect, frozen=True, kw_only=True):
+    """What follows the rate of change of the reading, ``dH_r/dt``.
+
+    Attributes
+    ----------
+    cause : str
+    on : {"lag", "skew", "eddy"}
+        ``lag``: an anti-alias filter's delay tau common to all channels, ``T = -tau dH/dt``: one coefficient.
+        ``skew``: y and z are sampled later than x by tau_i, ``T_i = tau_i dH_i/dt``: two.
+        ``eddy``: currents that a changing field drives, ``T_i = k_ij dH_j/dt``, i != j: six, in the order
+        xy, xz, yx, yz, zx, zy (Tolles & Lawson 1950, in the notation of Leliak 1961). All in s.
+
+    Notes
+    -----
+    Live there is no future, so the rate is the second-order backward difference of three samples.
+    """
+
+    kind: ClassVar[str] = "rate"
+    cause: str
+    on: Literal["lag", "skew", "eddy"]
+
+    @property
+    def size(self) -> int:
+        """How many times."""
+        return {"lag": 1, "skew": 2, "eddy": 6}[self.on]
+
+    def columns(self, field: float) -> FloatArray:  # noqa: ARG002  (others need it)
+        """Three regressors, the rates of the three channels (nT/s)."""
+        columns = np.zeros((self.size, 3, 9))
+        if self.on == "lag":
+            columns[0, :, 6:9] = -np.eye(3)
+        elif self.on == "skew":
+            columns[0, 1, 7] = columns[1, 2, 8] = 1.0
+        else:
+            pairs = [(i, j) for i in range(3) for j in range(3) if i != j]
+            for k, (i, j) in enumerate(pairs):
+                columns[k, j, 6 + i] = 1.0
+        return columns
+
+    def begin(self, calibration: Calibration) -> Step:  # noqa: ARG002  (others need it)
+        """Return a stepper; rates are zero until three samples have come without a gap."""
+        before: tuple[float, float, float] = (0.0, 0.0, 0.0)
+        slope: tuple[float, float, float] = (0.0, 0.0, 0.0)
+        then, apart_before, count = 0, 0.0, 0
+
+        def step(time_us: int, hx: float, hy: float, hz: float, values: Sequence[float]) -> tuple[float, ...]:  # noqa: ARG001
+            nonlocal before, slope, then, apart_before, count
+            if hx + hy + hz - (hx + hy + hz) != 0.0:  # NaN: as if the sample had not come
+                return 0.0, 0.0, 0.0
+            apart = 1e-6 * (time_us - then)
+            if count == 0 or not 0.0 < apart < 1e-6 * MAX_INTERVAL:
+                before, then, count = (hx, hy, hz), time_us, 1
+                return 0.0, 0.0, 0.0
+            now = ((hx - before[0]) / apart, (hy - before[1]) / apart, (hz - before[2]) / apart)
+            share = apart / (apart + apart_before) if count > 1 else 0.0
+            x, y, z = [a + (a - b) * share for a, b in zip(now, slope, strict=True)]
+            before, slope, then, apart_before, count = (hx, hy, hz), now, time_us, apart, 2
+            return x, y, z
+
+        return step
+
+
+class ResponseEffect(Effect, frozen=True, kw_only=True):
+    """A channel whose response bends: by a power of its reading, or beyond a knee.
+
+    Attributes
+    ----------
+    cause : str
+    power : int
+        ``T_i += c_i (H_i / unit)^power``: three coefficients, nT; 0 where the knee counts.
+    unit : float
+        nT.
+    axis : int
+        Which channel has the knee.
+    knee : float
+        nT, either sign; beyond it ``T += -c_1 - c_2 (H - knee) / unit``: two coefficients, nT.
+    """
+
+    kind: ClassVar[str] = "response"
+    cause: str
+    unit: float
+    power: int = 0
+    axis: int = 0
+    knee: float = 0.0
+
+    @property
+    def size(self) -> int:
+        """Three, or two beyond a knee."""
+        return 3 if self.power else 2
+
+    def columns(self, field: float) -> FloatArray:  # noqa: ARG002  (others need it)
+        """Offsets of each channel by its own regressor; of one by both."""
+        columns = np.zeros((self.size, self.size, 9))
+        for k in range(self.size):
+            columns[k, k, 6 + (k if self.power else self.axis)] = 1.0 if self.power else -1.0
+        return columns
+
+    def begin(self, calibration: Calibration) -> Step:  # noqa: ARG002  (others need it)
+        """Return a stepper; it has no state."""
+        power, unit, axis, knee = self.power, self.unit, self.axis, self.knee
+        sign = 1.0 if knee >= 0.0 else -1.0
+
+        def step(time_us: int, hx: float, hy: float, hz: float, values: Sequence[float]) -> tuple[float, ...]:  # noqa: ARG001
+            if power:
+                return tuple((h / unit) ** power for h in (hx, hy, hz))
+            over = sign * ((hx, hy, hz)[axis] - knee)
+            return (sign, sign * over / unit) if over >= 0.0 else (0.0, 0.0)
+
+        return step
