@@ -51,7 +51,7 @@ def deployment(
     """
     units = units or {}
     variables = {}
-    for name, values in columns.items():
+    for name, values in {"time": time, **columns}.items():
         unit = units.get(name, "")
         scale = factor(unit, name)
         if scale is None:
@@ -60,7 +60,7 @@ def deployment(
         variables[name] = ("time", array if scale == 1.0 else array * scale, _describe(name, unit))
     return xr.Dataset(
         variables,
-        coords={"time": ("time", np.asarray(time, dtype=np.float64), _describe("time", ""))},
+        coords={"time": variables.pop("time")},
         attrs={"source": Path(file).name, **(attrs or {})},
     )
 
@@ -84,13 +84,15 @@ def sliced(dataset: xr.Dataset, rows: int) -> Iterator[xr.Dataset]:
         yield dataset.isel(time=slice(start, start + rows))
 
 
-def increasing(file: str | Path, time: Floats, *, first_row: int = 1, after: float = -np.inf) -> None:
-    """Check that `time` is finite and increases, also against the last time before it.
+def increasing(
+    file: str | Path, time: Floats, rows: Sequence[int] | None = None, *, after: float = -np.inf
+) -> None:
+    """Check that `time` is finite and increases, also from `after`, the last one before it.
 
     Raises
     ------
     FormatError
-        Names the first row that does not fit, counted from `first_row`.
+        Names the first row that does not fit: its number in `rows`, or counted from 1.
     """
     steps = np.diff(time, prepend=after)
     wrong = np.flatnonzero(~(np.isfinite(time) & (steps > 0)))
@@ -99,7 +101,9 @@ def increasing(file: str | Path, time: Floats, *, first_row: int = 1, after: flo
     k = int(wrong[0])
     before = float(time[k - 1]) if k else after
     expected = f"expected a time after {before!r}" if np.isfinite(before) else "expected a finite time"
-    raise FormatError(file, f"{expected}, not {float(time[k])!r}", row=first_row + k, column="time")
+    raise FormatError(
+        file, f"{expected}, not {float(time[k])!r}", row=rows[k] if rows else k + 1, column="time"
+    )
 
 
 def same_columns(dataset: xr.Dataset, like: Mapping[str, Mapping[str, Any]]) -> xr.Dataset:

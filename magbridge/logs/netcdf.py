@@ -38,10 +38,10 @@ EPOCH = "seconds since 1970-01-01T00:00:00Z"
 NAMES = {"water_temperature": "TEMP", "water_pressure": "PRES"}
 """Columns whose name in OG1.0 is not simply ours in capitals."""
 ATTRIBUTES: dict[str, dict[str, Any]] = {
-    "time": {"standard_name": "time", "calendar": "gregorian", "units": EPOCH, "_FillValue": -1.0},
-    "latitude": {"standard_name": "latitude", "units": "degrees_north", "_FillValue": -9999.9},
-    "longitude": {"standard_name": "longitude", "units": "degrees_east", "_FillValue": -9999.9},
-    "depth": {"standard_name": "depth", "units": "m", "positive": "down", "_FillValue": -9999.9},
+    "time": {"standard_name": "time", "calendar": "gregorian", "units": EPOCH},
+    "latitude": {"standard_name": "latitude", "units": "degrees_north"},
+    "longitude": {"standard_name": "longitude", "units": "degrees_east"},
+    "depth": {"standard_name": "depth", "units": "m", "positive": "down"},
     "roll": {"standard_name": "platform_roll"},
     "pitch": {"standard_name": "platform_pitch"},
     "heading": {"standard_name": "platform_yaw"},
@@ -92,7 +92,7 @@ def _chunks(path: Path, file: Any, rows: int) -> Iterator[xr.Dataset]:
     for row in range(0, total, rows):
         columns = {name: _floats(variable, slice(row, row + rows)) for name, variable in variables.items()}
         time = columns.pop("time") * scale + start
-        increasing(path, time, first_row=row + 1, after=last)
+        increasing(path, time, range(row + 1, row + 1 + len(time)), after=last)
         last = float(time[-1])
         yield deployment(path, time, columns, units, attrs)
 
@@ -109,9 +109,10 @@ def _epoch(path: Path, variable: Any) -> tuple[float, float]:
     """Seconds since 1970 at which the time variable is 0, and seconds in one of its units."""
     units = getattr(variable, "units", "")
     try:
-        zero, one = (netCDF4.num2date(k, units, only_use_cftime_datetimes=False) for k in (0, 1))
+        dates: Any = netCDF4.num2date([0.0, 1.0], units, only_use_cftime_datetimes=False)
     except ValueError:
         raise FormatError(path, f"expected {EPOCH!r}, not {units!r}", column="TIME") from None
+    zero, one = dates
     return zero.replace(tzinfo=UTC).timestamp(), (one - zero).total_seconds()
 
 
@@ -136,10 +137,7 @@ class FileWriter:
             self._define(dataset)
         n = dataset.sizes["time"]
         for name, variable in self._variables.items():
-            values = dataset[name].values
-            if (fill := ATTRIBUTES.get(name, {}).get("_FillValue")) is not None:
-                values = np.where(np.isnan(values), fill, values)
-            variable[self._rows : self._rows + n] = values
+            variable[self._rows : self._rows + n] = dataset[name].values
         self._rows += n
         if n:
             self._file.time_coverage_end = _iso(float(dataset["time"][-1]))
@@ -173,7 +171,7 @@ class FileWriter:
                 capitals,
                 "f8",
                 (DIMENSION,),
-                fill_value=attrs.pop("_FillValue", np.nan),
+                fill_value=np.nan,
                 zlib=True,
                 complevel=1,
                 chunksizes=(CHUNK,),

@@ -51,7 +51,7 @@ def _chunks(path: Path, file: Any, rows: int) -> Iterator[xr.Dataset]:
     for batch in file.iter_batches(batch_size=min(rows, 1 << 20)):
         columns = {field.name: _floats(path, field, batch.column(k)) for k, field in enumerate(schema)}
         dataset = deployment(path, columns.pop("time"), columns, units, attrs)
-        increasing(path, dataset["time"].values, first_row=row, after=last)
+        increasing(path, dataset["time"].values, range(row, row + batch.num_rows), after=last)
         row, last = row + batch.num_rows, float(dataset["time"][-1])
         yield dataset
 

@@ -61,7 +61,8 @@ def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
         Not a ULog, or no ``sensor_mag`` in it.
     """
     try:
-        log = ULog(str(path), [*FIELDS, *OTHERS])
+        with path.open("rb") as file:
+            log = ULog(file, [*FIELDS, *OTHERS])
     except (ULogException, ValueError, KeyError, IndexError, TypeError) as error:
         raise FormatError(path, f"expected a PX4 log: {error}") from None
     topics: dict[str, dict[int, dict[str, Floats]]] = {}

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import islice
 from math import isnan, nan
 from pathlib import Path
@@ -65,30 +65,31 @@ def _chunks(path: Path, file: TextIO, rows: int) -> Iterator[xr.Dataset]:
     if "time" not in names:
         raise FormatError(path, "expected this column", row=row, column="time")
     reader, last, nothing = csv.reader(file), -np.inf, True
-    while block := [fields for fields in islice(reader, rows) if fields]:
-        first_row = row + reader.line_num - len(block) + 1
-        for k, fields in enumerate(block):
+    lines = ((row + reader.line_num, fields) for fields in reader if fields)
+    while block := list(islice(lines, rows)):
+        numbers, texts = zip(*block, strict=True)
+        for number, fields in block:
             if len(fields) != len(names):
-                raise FormatError(path, f"expected {len(names)} fields, not {len(fields)}", row=first_row + k)
+                raise FormatError(path, f"expected {len(names)} fields, not {len(fields)}", row=number)
         columns = {
-            name: np.array(_numbers(path, name, list(texts), first_row))
-            for name, texts in zip(names, zip(*block, strict=True), strict=True)
+            name: np.array(_numbers(path, name, column, numbers))
+            for name, column in zip(names, zip(*texts, strict=True), strict=True)
         }
         dataset = deployment(path, columns.pop("time"), columns, units, attrs)
-        increasing(path, dataset["time"].values, first_row=first_row, after=last)
+        increasing(path, dataset["time"].values, numbers, after=last)
         last, nothing = float(dataset["time"][-1]), False
         yield dataset
     if nothing:
         raise FormatError(path, "expected rows after the header", row=row + 1)
 
 
-def _numbers(path: Path, name: str, texts: list[str], first_row: int) -> list[float]:
+def _numbers(path: Path, name: str, texts: Sequence[str], rows: Sequence[int]) -> list[float]:
     number = _flags if name == "quality" else _float
     try:
         return [number(text) for text in texts]
     except ValueError:
         pass
-    for row, text in enumerate(texts, first_row):
+    for row, text in zip(rows, texts, strict=True):
         try:
             number(text)
         except ValueError as error:

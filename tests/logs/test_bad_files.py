@@ -1,0 +1,196 @@
+"""Each bad file is one line that says which file, which row, which column, and what was expected."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from magbridge import logs
+from magbridge.columns import CHANNELS
+from magbridge.errors import FormatError
+from magbridge.logs.deployment import deployment
+
+SUFFIXES = (".csv", ".nc", ".parquet", ".tlog", ".bin", ".ulg", ".dbd", ".tbd")
+BAD_CSV = {
+    "": "expected a log, the file is empty",
+    "\n1,2\n": "row 1: expected a header row, the file is empty",
+    "time,mag_x\n": "row 2: expected rows after the header",
+    "t,mag_x\n1,2\n": "row 1, column 'time': expected this column",
+    "time,,mag_x\n1,2,3\n": "row 1: expected a name of its own for column 2, not ''",
+    "time,mag_x,mag_x\n1,2,3\n": "row 1: expected a name of its own for column 3, not 'mag_x'",
+    "time,mag_x\n1,2\n2\n": "row 3: expected 2 fields, not 1",
+    "time,mag_x\n1,2\n2,3,4\n": "row 3: expected 2 fields, not 3",
+    "time,mag_x\n1,2\n2,north\n": "row 3, column 'mag_x': expected a number, not 'north'",
+    "time,mag_x\n1,2\n,3\n": "row 3, column 'time': expected a time after 1.0, not nan",
+    "time,mag_x\n2,2\n1,3\n": "row 3, column 'time': expected a time after 2.0, not 1.0",
+    "time,mag_x\n2,2\n2,3\n": "row 3, column 'time': expected a time after 2.0, not 2.0",
+    "time,mag_x\n2016-06-23,2\n": "row 2, column 'time': expected a number, not '2016-06-23'",
+    "time,mag_x [V]\n2,2\n": "column 'mag_x': expected nT, not V",
+    "time,quality\n2,splendid\n": "row 2, column 'quality': expected the names of flags, not 'splendid'",
+    "# heading_reference = magnetic\ntime,mag_x\n1,2\n\n2,x\n": "row 5, column 'mag_x': expected a number, not 'x'",
+}
+
+
+def one_line(error: FormatError, path: Path) -> str:
+    text = str(error)
+    assert text.startswith(f"{path}: ")
+    assert "\n" not in text
+    return text.removeprefix(f"{path}: ")
+
+
+@pytest.mark.parametrize("text", BAD_CSV)
+@pytest.mark.parametrize("rows", [1, 1000])
+def test_csv(text: str, rows: int, tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    path.write_text(text)
+    with pytest.raises(FormatError) as caught:
+        list(logs.read_chunks(path, rows))
+    assert one_line(caught.value, path) == BAD_CSV[text]
+    assert caught.value.exit_code == 1
+
+
+def test_csv_of_binary_data(tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    path.write_bytes(b"time,mag_x\n\xff\xfe\x00,1\n")
+    with pytest.raises(FormatError, match="expected text, not binary data"):
+        logs.read(path)
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+@pytest.mark.parametrize("content", [b"", b"no log at all\n" * 100, bytes(3000)])
+def test_anything_else_under_that_name(suffix: str, content: bytes, tmp_path: Path) -> None:
+    path = tmp_path / f"log{suffix}"
+    path.write_bytes(content)
+    with pytest.raises(FormatError) as caught:
+        logs.read(path)
+    assert "expected" in one_line(caught.value, path)
+
+
+@pytest.mark.parametrize(
+    ("make", "expected"),
+    [
+        (lambda path: path, "expected a file, there is none"),
+        (lambda path: path.mkdir(), "expected a file, not a directory"),
+    ],
+)
+def test_no_file(make: Callable[[Path], object], expected: str, tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    make(path)
+    for read in (logs.read, lambda path: list(logs.read_chunks(path))):
+        with pytest.raises(FormatError) as caught:
+            read(path)
+        assert one_line(caught.value, path) == expected
+
+
+def test_unknown_suffix(tmp_path: Path) -> None:
+    path = tmp_path / "log.xlsx"
+    path.write_text("x")
+    with pytest.raises(
+        FormatError, match=r"log.xlsx: expected a file name that ends in one of .*\.csv .*\.ulg"
+    ):
+        logs.read(path)
+    with pytest.raises(FormatError, match=r"ends in one of \.csv \.nc \.parquet \.tlog$"):
+        logs.Writer(tmp_path / "log.ulg")
+
+
+def test_unreadable_file(tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    path.symlink_to("/proc/self/mem")
+    with pytest.raises(FormatError, match=r"log.csv: "):
+        logs.read(path)
+
+
+def test_missing_channels_are_named(tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    path.write_text("time,mag_x,battpos\n1,2,3\n")
+    for read in (logs.read, lambda path, required: list(logs.read_chunks(path, required=required))):
+        with pytest.raises(
+            FormatError, match=r"log.csv: column 'mag_y': expected this column; there are: mag_x battpos"
+        ):
+            read(path, required=CHANNELS)
+
+
+@pytest.mark.parametrize("suffix", [".nc", ".parquet"])
+@pytest.mark.parametrize("kept", [0.1, 0.5, 0.9, 0.99])
+def test_truncated(suffix: str, kept: float, tmp_path: Path) -> None:
+    path = tmp_path / f"log{suffix}"
+    logs.write(
+        deployment("made", np.arange(1.0, 2000), {"mag_x": np.random.default_rng(0).normal(size=1999)}), path
+    )
+    data = path.read_bytes()
+    path.write_bytes(data[: int(kept * len(data))])
+    with pytest.raises(FormatError) as caught:
+        logs.read(path)
+    assert "expected a whole" in one_line(caught.value, path)
+
+
+@pytest.mark.parametrize("suffix", [".nc", ".parquet"])
+def test_time_goes_back(suffix: str, tmp_path: Path) -> None:
+    path = tmp_path / f"log{suffix}"
+    dataset = deployment("made", np.arange(1.0, 6), {"mag_x": np.zeros(5)})
+    logs.write(dataset, path)
+    if suffix == ".nc":
+        import netCDF4  # noqa: PLC0415 - not for the other format
+
+        with netCDF4.Dataset(path, "a") as file:
+            file["TIME"][3] = 2.5
+    else:
+        import pyarrow as pa  # noqa: PLC0415 - not for the other format
+        from pyarrow import parquet  # noqa: PLC0415
+
+        parquet.write_table(pa.table({"time": [1.0, 2.0, 3.0, 2.5, 5.0]}), path)
+    for rows in (1, 3, 1000):
+        with pytest.raises(FormatError) as caught:
+            list(logs.read_chunks(path, rows))
+        assert one_line(caught.value, path) == "row 4, column 'time': expected a time after 3.0, not 2.5"
+
+
+def test_netcdf_of_another_shape(tmp_path: Path) -> None:
+    netCDF4 = pytest.importorskip("netCDF4")
+    path = tmp_path / "log.nc"
+    with netCDF4.Dataset(path, "w") as file:
+        file.createDimension("obs", 3)
+    with pytest.raises(
+        FormatError, match=r"expected the dimension N_MEASUREMENTS \(OG1.0\) or a Seaglider's file"
+    ):
+        logs.read(path)
+    with netCDF4.Dataset(path, "w") as file:
+        file.createDimension("N_MEASUREMENTS", None)
+        file.createVariable("TIME", "f8", ("N_MEASUREMENTS",)).units = "fortnights since the flood"
+    with pytest.raises(FormatError, match="expected rows, there are none"):
+        logs.read(path)
+    with netCDF4.Dataset(path, "a") as file:
+        file["TIME"][:] = np.arange(3.0)
+    with pytest.raises(
+        FormatError, match=r"column 'TIME': expected 'seconds since.*, not 'fortnights since the flood'"
+    ):
+        logs.read(path)
+
+
+def test_parquet_of_text(tmp_path: Path) -> None:
+    pa = pytest.importorskip("pyarrow")
+    parquet = pytest.importorskip("pyarrow.parquet")
+    path = tmp_path / "log.parquet"
+    parquet.write_table(pa.table({"time": [1.0], "mag_x": ["north"]}), path)
+    with pytest.raises(FormatError, match="column 'mag_x': expected numbers, not string"):
+        logs.read(path)
+    parquet.write_table(pa.table({"mag_x": [1.0]}), path)
+    with pytest.raises(FormatError, match="column 'time': expected this column; there are: mag_x"):
+        logs.read(path)
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".tlog", ".bin", ".ulg"])
+@given(content=st.binary(min_size=1, max_size=400))
+@settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_any_bytes_are_a_deployment_or_one_line(suffix: str, content: bytes, tmp_path: Path) -> None:
+    path = tmp_path / f"log{suffix}"
+    path.write_bytes(content)
+    try:
+        logs.read(path)
+    except FormatError as error:
+        one_line(error, path)

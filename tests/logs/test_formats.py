@@ -1,0 +1,320 @@
+"""What is written comes back, whole or in pieces, from every format that can be written."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from magbridge import logs
+from magbridge.columns import COLUMNS
+from magbridge.logs.deployment import deployment
+
+EXACT = [".csv", ".nc", ".parquet"]
+WRITABLE = [*EXACT, ".tlog"]
+T0 = 1_466_705_388.010925
+UNITS = {
+    "battpos": "in",
+    "ballast": "cc",
+    "pump_current": "A",
+    "a_rather_long_name": "degC",
+    "BattPos": "in",
+    "ratio": "1",
+}
+
+known = st.lists(st.sampled_from([name for name in COLUMNS if name not in ("time", "quality")]), unique=True)
+others = st.dictionaries(
+    st.from_regex(r"[A-Za-z][A-Za-z0-9_.]{0,20}", fullmatch=True).filter(lambda name: name not in COLUMNS),
+    st.sampled_from(["A", "in", "1", "degC", "m/s"]),
+    max_size=4,
+)
+
+
+@st.composite
+def deployments(draw: st.DrawFn, width: int) -> xr.Dataset:
+    """Columns of the table and of any other name, NaN anywhere; µs that fit what a record can say."""
+    steps = draw(st.lists(st.integers(1, 10**8), min_size=1, max_size=12))
+    time = (1_700_000_000_000_000 + np.cumsum(steps)) / 1e6
+    units = draw(others)
+    value = st.floats(allow_nan=True, allow_infinity=False, width=width)
+    columns = {
+        name: np.array(draw(st.lists(value, min_size=len(time), max_size=len(time))), dtype=float)
+        for name in [*draw(known), *units]
+    }
+    flags = st.sampled_from([0, 1, 3, 128, 255])
+    columns["quality"] = np.array(draw(st.lists(flags, min_size=len(time), max_size=len(time))), dtype=float)
+    return deployment(
+        "made", time, columns, units, draw(st.sampled_from([{}, {"heading_reference": "magnetic"}]))
+    )
+
+
+def example(rows: int = 100, start: float = T0, seed: int = 0) -> xr.Dataset:
+    """Return a glider's telemetry, each value as a vehicle would have it."""
+    random = np.random.default_rng(seed)
+    time = np.round(start + 4.0 * np.arange(rows), 6)
+    columns = {f"mag_{axis}": random.normal(0, 30_000, rows) for axis in "xyz"}
+    columns |= {f"mag_time_{axis}": np.round(time + k * 0.01, 6) for k, axis in enumerate("xyz")}
+    columns |= {"roll": random.uniform(-40, 40, rows), "pitch": random.uniform(-30, 30, rows)}
+    columns |= {"heading": random.uniform(0, 360, rows), "latitude": random.uniform(-90, 90, rows)}
+    columns |= {"longitude": random.uniform(-180, 180, rows), "depth": random.uniform(0, 1000, rows)}
+    columns |= {"sensor_temperature": random.uniform(-2, 30, rows), "power_cycle": np.full(rows, 3.0)}
+    columns |= {
+        "total_field": random.normal(50_000, 100, rows),
+        "total_field_sigma": random.uniform(1, 9, rows),
+    }
+    columns |= {f"field_{axis}": random.normal(0, 30_000, rows) for axis in "xyz"}
+    columns |= {"anomaly": random.normal(0, 50, rows), "quality": random.integers(0, 256, rows).astype(float)}
+    columns |= {name: random.normal(0, 3, rows) for name in UNITS}
+    for name in ("battpos", "roll", "latitude", "sensor_temperature", "anomaly", "a_rather_long_name"):
+        columns[name][random.uniform(size=rows) < 0.2] = np.nan
+    return deployment("made", time, columns, UNITS, {"heading_reference": "magnetic"})
+
+
+def assert_same(back: xr.Dataset, dataset: xr.Dataset) -> None:
+    assert set(back.data_vars) == set(dataset.data_vars)
+    for name, column in dataset.variables.items():
+        np.testing.assert_array_equal(back[name].values, column.values, err_msg=str(name))
+        assert back[name].attrs == column.attrs
+    assert back.attrs.get("heading_reference") == dataset.attrs.get("heading_reference")
+
+
+TOLERANCES = {"latitude": 0.6e-7, "longitude": 0.6e-7, "depth": 0.6e-3, "heading": 5e-5, "total_field": 0.0}
+
+
+def assert_close(back: xr.Dataset, dataset: xr.Dataset) -> None:
+    """As :func:`assert_same`, to the precision of the messages: float32, 1e-7 deg, mm, µs."""
+    assert set(back.data_vars) == set(dataset.data_vars)
+    for name, column in dataset.variables.items():
+        atol = TOLERANCES.get(str(name), 0.6e-6 if "time" in str(name) else 1e-30)
+        rtol = 0.0 if name in TOLERANCES or "time" in str(name) else 1.3e-7
+        np.testing.assert_allclose(back[name].values, column.values, rtol, atol, err_msg=str(name))
+        assert back[name].attrs == column.attrs
+    assert back.attrs.get("heading_reference") == dataset.attrs.get("heading_reference")
+
+
+@pytest.mark.parametrize("suffix", EXACT)
+@given(dataset=deployments(width=64))
+@settings(max_examples=25, deadline=None)
+def test_comes_back_bit_for_bit(suffix: str, dataset: xr.Dataset) -> None:
+    with tempfile.TemporaryDirectory() as directory:
+        path = Path(directory, f"log{suffix}")
+        logs.write(dataset, path)
+        assert_same(logs.read(path), dataset)
+
+
+@pytest.mark.parametrize("suffix", WRITABLE)
+def test_example_comes_back(suffix: str, tmp_path: Path) -> None:
+    dataset = example()
+    logs.write(dataset, tmp_path / f"log{suffix}")
+    assert_close(logs.read(tmp_path / f"log{suffix}"), dataset)
+
+
+@given(dataset=deployments(width=32))
+@settings(max_examples=25, deadline=None)
+def test_any_numbers_pass_through_a_telemetry_log(dataset: xr.Dataset) -> None:
+    """Numbers that no vehicle has may come back as unknown, but nothing breaks and time stands."""
+    with tempfile.TemporaryDirectory() as directory:
+        path = Path(directory, "log.tlog")
+        logs.write(dataset, path)
+        back = logs.read(path)
+    np.testing.assert_allclose(back["time"], dataset["time"], rtol=0, atol=0.6e-6)
+    for name in set(dataset.data_vars) - set(COLUMNS):
+        np.testing.assert_array_equal(back[name], dataset[name], err_msg=name)
+        assert back[name].attrs == dataset[name].attrs
+
+
+@pytest.mark.parametrize("suffix", WRITABLE)
+def test_in_pieces_is_as_whole(suffix: str, tmp_path: Path) -> None:
+    dataset = example()
+    whole, pieces = tmp_path / f"whole{suffix}", tmp_path / f"pieces{suffix}"
+    logs.write(dataset, whole)
+    with logs.Writer(pieces) as writer:
+        for piece in logs.read_chunks(whole, 17):
+            assert piece.sizes["time"] <= 17
+            assert set(piece.data_vars) == set(dataset.data_vars)
+            writer.append(piece)
+    assert_close(logs.read(pieces), dataset)
+
+
+@pytest.mark.parametrize("suffix", WRITABLE)
+def test_a_later_piece_may_lack_a_column(suffix: str, tmp_path: Path) -> None:
+    first, second = example(5), example(5, start=T0 + 100)
+    with logs.Writer(tmp_path / f"log{suffix}") as writer:
+        writer.append(first)
+        writer.append(second.drop_vars(["battpos", "pitch"]))
+    back = logs.read(tmp_path / f"log{suffix}")
+    assert back.sizes["time"] == 10
+    assert np.isnan(back["battpos"][5:]).all()
+    assert np.isnan(back["pitch"][5:]).all()
+    assert not np.isnan(back["pitch"][:5]).all()
+
+
+def test_a_later_piece_brings_no_new_column(tmp_path: Path) -> None:
+    with logs.Writer(tmp_path / "log.csv") as writer:
+        writer.append(example(5).drop_vars("battpos"))
+        with pytest.raises(
+            ValueError, match=r"column 'battpos': expected only columns that the first rows had"
+        ):
+            writer.append(example(5, start=T0 + 100))
+
+
+@pytest.mark.parametrize("suffix", WRITABLE)
+def test_what_fails_leaves_the_old_file(suffix: str, tmp_path: Path) -> None:
+    path = tmp_path / f"log{suffix}"
+    path.write_text("old")
+    with pytest.raises(ValueError, match="expected a time after"), logs.Writer(path) as writer:  # noqa: PT012
+        writer.append(example(5))
+        writer.append(example(5))
+    assert path.read_text() == "old"
+    assert [p.name for p in tmp_path.iterdir()] == [path.name]
+
+
+def test_appending_backwards_is_refused(tmp_path: Path) -> None:
+    with logs.Writer(tmp_path / "log.csv") as writer:
+        writer.append(example(5))
+        with pytest.raises(ValueError, match=r"log.csv: row 1, column 'time': expected a time after"):
+            writer.append(example(5))
+
+
+def test_several_files_are_one_deployment(tmp_path: Path) -> None:
+    """Parts in any order and format, overlapping, each with a column of its own."""
+    whole = example(60)
+    whole["battpos"][:] = np.arange(60.0)
+    whole["ballast"][:] = -np.arange(60.0)
+    logs.write(whole.isel(time=slice(0, 25)).drop_vars("battpos"), tmp_path / "a.parquet")
+    logs.write(whole.isel(time=slice(20, 40)), tmp_path / "b.nc")
+    logs.write(whole.isel(time=slice(40, 60)).drop_vars("ballast"), tmp_path / "c.csv")
+    paths = [tmp_path / "c.csv", tmp_path / "a.parquet", tmp_path / "b.nc"]
+    back = logs.read(paths)
+    assert back.attrs["source"].split(", ")[0] == "c.csv"
+    assert back.attrs["duplicate_rows"] == 5
+    np.testing.assert_array_equal(back["time"], whole["time"])
+    np.testing.assert_array_equal(back["mag_x"], whole["mag_x"])
+    np.testing.assert_array_equal(back["battpos"], np.r_[np.full(20, np.nan), np.arange(20.0, 60.0)])
+    np.testing.assert_array_equal(back["ballast"], np.r_[-np.arange(40.0), np.full(20, np.nan)])
+    for rows in (1, 7, 1000):
+        pieces = list(logs.read_chunks(paths, rows))
+        for name in back.variables:
+            streamed = np.concatenate([piece[name].values for piece in pieces])
+            np.testing.assert_array_equal(streamed, back[name].values, err_msg=str(name))
+
+
+def test_heading_of_two_kinds_is_not_mixed(tmp_path: Path) -> None:
+    true = example(5)
+    del true.attrs["heading_reference"]
+    logs.write(true, tmp_path / "true.nc")
+    logs.write(example(5, start=T0 + 100), tmp_path / "magnetic.csv")
+    with pytest.raises(
+        ValueError, match=r"magnetic.csv: expected heading_reference true as before, not magnetic"
+    ):
+        logs.read([tmp_path / "true.nc", tmp_path / "magnetic.csv"])
+
+
+def test_units_of_two_kinds_are_not_mixed(tmp_path: Path) -> None:
+    for name, unit, start in (("a", "in", 0), ("b", "cm", 10)):
+        (tmp_path / f"{name}.csv").write_text(f"time,battpos [{unit}]\n{start},1\n")
+    with pytest.raises(
+        ValueError, match=r"b.csv: column 'battpos': expected in as in the files before, not cm"
+    ):
+        logs.read([tmp_path / "a.csv", tmp_path / "b.csv"])
+
+
+def test_a_units_we_know_is_converted(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text(
+        "time [ms],mag_x [uT],roll [rad],depth [metres]\n1500,50,3.141592653589793,7\n"
+    )
+    back = logs.read(tmp_path / "a.csv")
+    assert [back[name].item() for name in ("time", "mag_x", "roll", "depth")] == [1.5, 50_000, 180, 7]
+
+
+def test_columns_say_what_they_are(tmp_path: Path) -> None:
+    back = example(5)
+    assert back["mag_x"].attrs["units"] == "nT"
+    assert back["battpos"].attrs["units"] == "in"
+    assert all(column.dtype == np.float64 and column.attrs["long_name"] for column in back.variables.values())
+
+
+def test_csv_is_as_plain_as_can_be(tmp_path: Path) -> None:
+    dataset = deployment(
+        "made", [1.5, 2], {"mag_x": [1, np.nan], "battpos": [0.1, 2], "quality": [0, 3]}, {"battpos": "in"}
+    )
+    logs.write(dataset, tmp_path / "a.csv")
+    assert (tmp_path / "a.csv").read_text().splitlines() == [
+        "time,mag_x,battpos [in],quality",
+        "1.5,1.0,0.1,",
+        "2.0,,2.0,stale_telemetry extrapolated",
+    ]
+
+
+def test_netcdf_has_the_shape_of_og1(tmp_path: Path) -> None:
+    netCDF4 = pytest.importorskip("netCDF4")
+    logs.write(example(5), tmp_path / "a.nc")
+    with netCDF4.Dataset(tmp_path / "a.nc") as file:
+        assert file.dimensions["N_MEASUREMENTS"].isunlimited()
+        assert {"TIME", "LATITUDE", "LONGITUDE", "DEPTH", "MAG_X", "BATTPOS", "TRAJECTORY"} <= set(
+            file.variables
+        )
+        assert file["TIME"].units == "seconds since 1970-01-01T00:00:00Z"
+        assert file["TRAJECTORY"].cf_role == "trajectory_id"
+        assert file.featureType == "trajectory"
+        assert file.time_coverage_start == "20160623T180948"
+        assert file["LATITUDE"].standard_name == "latitude"
+
+
+def test_og1_file_of_someone_else(tmp_path: Path) -> None:
+    netCDF4 = pytest.importorskip("netCDF4")
+    with netCDF4.Dataset(tmp_path / "a.nc", "w") as file:
+        file.createDimension("N_MEASUREMENTS", 3)
+        for name, dtype, values, fill, attrs in (
+            ("TIME", "f8", [0, 60, 120], -1.0, {"units": "minutes since 2020-01-01"}),
+            ("LATITUDE", "f8", [50, -9999.9, 51], -9999.9, {"units": "degrees_north"}),
+            ("DEPTH", "f4", [-0.02, 5, 6], None, {"units": "metres", "valid_min": np.float32(0)}),
+            ("TEMP", "f4", [10, 11, 12], -9999.9, {"units": "Celsius"}),
+            ("PHASE", "i1", [1, 2, 2], 0, {}),
+        ):
+            file.createVariable(name, dtype, ("N_MEASUREMENTS",), fill_value=fill).setncatts(attrs)
+            file[name].set_auto_mask(False)
+            file[name][:] = np.array(values)
+        file.createVariable("DEPLOYMENT_TIME", "f8", ())[...] = 5
+    back = logs.read(tmp_path / "a.nc")
+    np.testing.assert_array_equal(back["time"], 1577836800 + np.array([0, 3600, 7200]))
+    np.testing.assert_array_equal(back["latitude"], [50, np.nan, 51])
+    np.testing.assert_allclose(back["depth"], [-0.02, 5, 6], rtol=1e-6)
+    assert back["water_temperature"].attrs["units"] == "Celsius"
+    assert "phase" in back
+    assert back["latitude"].attrs["units"] == "deg"
+
+
+def test_parquet_of_someone_else(tmp_path: Path) -> None:
+    pa = pytest.importorskip("pyarrow")
+    pq = pytest.importorskip("pyarrow.parquet")
+    stamps = pa.array([1_500_000, 2_500_000], pa.timestamp("us", tz="UTC"))
+    pq.write_table(
+        pa.table({"time": stamps, "mag_x": pa.array([1, None], pa.int32())}), tmp_path / "a.parquet"
+    )
+    back = logs.read(tmp_path / "a.parquet")
+    np.testing.assert_array_equal(back["time"], [1.5, 2.5])
+    np.testing.assert_array_equal(back["mag_x"], [1, np.nan])
+
+
+def test_streams_in_bounded_memory(tmp_path: Path) -> None:
+    """Eight times the rows, as much memory: pieces of one size, none kept."""
+    import tracemalloc  # noqa: PLC0415 - slows everything down while it is loaded
+
+    peaks = []
+    for pieces in (2, 16):
+        with logs.Writer(tmp_path / "in.nc") as writer:
+            for k in range(pieces):
+                writer.append(example(200, start=T0 + 1e4 * k))
+        tracemalloc.start()
+        with logs.Writer(tmp_path / "out.csv") as writer:
+            for piece in logs.read_chunks(tmp_path / "in.nc", 200):
+                writer.append(piece)
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert peaks[1] < 1.3 * peaks[0] + 200_000
