@@ -9,56 +9,48 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from magbridge.columns import COLUMNS, Column
 from sitl.platform import MOUNTINGS
 from sitl.trajectory import Track
 
-__all__ = ["COLUMNS", "dataset", "segments"]
+__all__ = ["dataset", "segments"]
 
 Array = NDArray[np.float64]
 
-COLUMNS = {
-    "mag_x": ("nT", "raw magnetometer channel, forward"),
-    "mag_y": ("nT", "raw magnetometer channel, starboard"),
-    "mag_z": ("nT", "raw magnetometer channel, down"),
-    "mag_time_x": ("s", "time of the forward channel's sample"),
-    "mag_time_y": ("s", "time of the starboard channel's sample"),
-    "mag_time_z": ("s", "time of the downward channel's sample"),
-    "sensor_temperature": ("degC", "temperature at the fluxgate"),
-    "power_cycle": ("1", "times the instrument was powered on again"),
-    "roll": ("deg", "roll, starboard down"),
-    "pitch": ("deg", "pitch, nose up"),
-    "heading": ("deg", "heading, true"),
-    "latitude": ("deg", "latitude as the vehicle knows it"),
-    "longitude": ("deg", "longitude as the vehicle knows it"),
-    "depth": ("m", "depth"),
-    "run": ("1", "number of the leg"),
-    "reference_field": ("nT", "total field to calibrate against"),
-    "truth_total_field": ("nT", "true total field"),
-    "truth_field_x": ("nT", "true field, body forward"),
-    "truth_field_y": ("nT", "true field, body starboard"),
-    "truth_field_z": ("nT", "true field, body down"),
-    "truth_latitude": ("deg", "true latitude"),
-    "truth_longitude": ("deg", "true longitude"),
+OWN = {
+    "power_cycle": Column("1", "times the instrument was powered on again"),
+    "run": Column("1", "number of the leg"),
+    "truth_total_field": Column("nT", "true total field"),
+    "truth_field_x": Column("nT", "true field, body forward"),
+    "truth_field_y": Column("nT", "true field, body starboard"),
+    "truth_field_z": Column("nT", "true field, body down"),
+    "truth_latitude": Column("deg", "true latitude"),
+    "truth_longitude": Column("deg", "true longitude"),
 }
-"""Unit and meaning of each column, telemetry of the moving masses aside."""
+"""Columns that a simulation adds to those of any deployment."""
 
 
-def dataset(track: Track, when: Array, columns: Mapping[str, Array], name: str) -> xr.Dataset:
+def dataset(track: Track, when: Array, columns: Mapping[str, Array], source: str) -> xr.Dataset:
     """Return `columns`, sampled at `when` (s after the track's start), as a deployment."""
-    units = COLUMNS | {
-        parameter: (MOUNTINGS[parameter].unit if parameter in MOUNTINGS else "1", f"position of {parameter}")
-        for parameter in track.parameters
-    }
+    known = dict(COLUMNS | OWN)
+    for name in track.parameters:
+        unit = MOUNTINGS[name].unit if name in MOUNTINGS else "1"
+        known |= {name: Column(unit, f"position of {name}")}
     parts = [(part, track.start + first, track.start + last) for part, first, last in track.segments]
     return xr.Dataset(
         {
-            column: ("time", columns[column], dict(zip(("units", "long_name"), units[column], strict=True)))
-            for column in units
+            column: ("time", columns[column], attributes(known[column]))
+            for column in known
             if column in columns
         },
-        coords={"time": ("time", track.start + when, {"units": "s", "long_name": "time since 1970 UTC"})},
-        attrs={"source": f"simulated: {name}", "segments": json.dumps(parts)},
+        coords={"time": ("time", track.start + when, attributes(COLUMNS["time"]))},
+        attrs={"source": f"simulated: {source}", "segments": json.dumps(parts)},
     )
+
+
+def attributes(column: Column) -> dict[str, str]:
+    """Return a column's unit and meaning as a variable's attributes."""
+    return {"units": column.unit, "long_name": column.long_name}
 
 
 def segments(deployment: xr.Dataset) -> dict[str, xr.Dataset]:

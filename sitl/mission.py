@@ -91,7 +91,7 @@ class Spirals(Table, frozen=True, tag_field="kind", tag="spirals"):
     trial: Literal[1, 2] = 1
     duration: Positive = 900.0
     turns: float = 4.0
-    roll: tuple[float, NotNegative] = (6.0, 0.7)
+    roll: tuple[float, NotNegative] = (6.0, 1.0)
     segment: str = "calibration"
 
     def legs(self, rng: np.random.Generator, limits: Mapping[str, Limit]) -> list[Leg]:

@@ -31,7 +31,7 @@ class Motion(Table, frozen=True):
     settle : float
         s of the first-order approach to a commanded attitude.
     wander : tuple of 3 float
-        deg, standard deviation of roll, pitch and heading about the command.
+        deg, standard deviation of roll, pitch and heading about the command; as a Slocum's log shows them.
     wander_memory : float
         s over which the wander's correlation falls.
     current : tuple of 2 float
@@ -43,8 +43,8 @@ class Motion(Table, frozen=True):
     speed: Positive = 0.35
     angle_of_attack: float = 3.0
     settle: NotNegative = 15.0
-    wander: tuple[float, float, float] = (0.5, 0.4, 1.0)
-    wander_memory: Positive = 60.0
+    wander: tuple[float, float, float] = (0.5, 1.2, 2.0)
+    wander_memory: Positive = 20.0
     current: tuple[float, float] = (0.0, 0.0)
     max_depth: Positive = 200.0
 

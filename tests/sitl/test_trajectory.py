@@ -83,7 +83,7 @@ def test_what_the_vehicle_cannot_do_is_refused(name: str, value: float) -> None:
 
 
 def test_the_vehicle_wanders_as_much_as_asked_without_jitter() -> None:
-    motion = Motion(wander=(0.5, 0.4, 1.0), settle=0.0)
+    motion = Motion(wander=(0.5, 0.4, 1.0), wander_memory=60.0, settle=0.0)
     track = fly_legs(Leg(duration=40_000, pitch=-26), motion=motion, step=1.0)
     assert np.std(track.roll) == pytest.approx(0.5, rel=0.15)
     assert np.std(np.diff(track.roll)) < 0.03 * 0.5 * 2

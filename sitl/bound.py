@@ -1,0 +1,141 @@
+"""How well any calibration could do: the Cramér-Rao bound of the vehicle's true model."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import msgspec
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from sitl.platform import Vehicle
+
+__all__ = ["information_bound", "oracle"]
+
+Array = NDArray[np.float64]
+
+UNKNOWN_IRON = 1e5
+"""nT, prior width of the hard iron: none to speak of."""
+UNKNOWN_SOFT_IRON = 1.0
+UNKNOWN_MOMENT = 100.0
+"""A m²."""
+UNKNOWN_VOLUME = 0.1
+"""m³."""
+
+
+def oracle(vehicle: Vehicle, deployment: xr.Dataset) -> Array:
+    """Return the total field (n,), nT, that a calibration which knows the vehicle makes of its readings.
+
+    Its error is the noise floor: what noise in the channels leaves in the magnitude. The instrument must have no
+    errors of its own but noise.
+    """
+    D, T = _response(vehicle, deployment)
+    raw = np.column_stack([deployment[f"mag_{axis}"] for axis in "xyz"])
+    return np.asarray(np.linalg.norm(np.linalg.solve(D, (raw - T)[..., None])[..., 0], axis=1))
+
+
+def information_bound(
+    vehicle: Vehicle,
+    calibration: xr.Dataset,
+    survey: xr.Dataset,
+    sigma: float,
+    memory: float = 0.0,
+    at_sigma: float = 0.05,
+) -> tuple[Array, Array]:
+    r"""Return the least standard deviation of the corrected total field that the calibration data allow.
+
+    Parameters
+    ----------
+    vehicle : Vehicle
+        The truth; dipoles with a permanent and a three-axis induced moment and a position each.
+    calibration, survey : Dataset (time)
+        Deployments of :func:`sitl.simulate`.
+    sigma, memory : float
+        nT of a channel's noise, and samples over which its correlation falls by e.
+    at_sigma : float
+        m, how well the masses' positions are known beforehand.
+
+    Returns
+    -------
+    bound : array (n,)
+        nT, at each sample of the survey, noise included.
+    floor : array (n,)
+        nT, the noise alone.
+
+    Notes
+    -----
+    The reading is :math:`\mathbf y = D(p) \mathbf B + \mathbf T(p) + \mathbf n`, and only :math:`|\mathbf B|` is
+    known. With :math:`\mathbf w = D^{-T} \mathbf B / |B|`, a change of the parameters θ and the noise change the
+    corrected magnitude by :math:`-\mathbf w^T (\partial \mathbf y / \partial θ) dθ + \mathbf w^T \mathbf n`. So with
+    g the first factor over :math:`σ |\mathbf w|`, whitened by the noise's memory, the information is
+    :math:`\sum \mathbf g \mathbf g^T` plus the prior's (Kay 1993, *Estimation Theory*, ch. 3 and 15).
+    """
+    g, floor = _sensitivity(vehicle, calibration, sigma)
+    g = g / floor[:, None]
+    if memory:
+        phi = np.exp(-1 / memory)
+        run = calibration["run"].to_numpy()
+        follows = np.diff(run, prepend=np.nan) == 0
+        before = np.roll(g, 1, axis=0)
+        g = np.where(follows[:, None], (g - phi * before) / np.sqrt(1 - phi**2), g)
+    widths = [*[UNKNOWN_SOFT_IRON] * 9, *[UNKNOWN_IRON] * 3]
+    for _ in vehicle.mass:
+        widths += [*[UNKNOWN_MOMENT] * 3, *[UNKNOWN_VOLUME] * 3, *[at_sigma] * 3]
+    scale = np.array(widths)
+    g = g * scale  # θ in units of its prior: the information matrix is then well scaled
+    covariance = np.linalg.inv(g.T @ g + np.eye(len(scale)))
+    h, survey_floor = _sensitivity(vehicle, survey, sigma)
+    h = h * scale
+    return np.sqrt(np.einsum("ni,ij,nj->n", h, covariance, h) + survey_floor**2), survey_floor
+
+
+def _sensitivity(vehicle: Vehicle, deployment: xr.Dataset, sigma: float) -> tuple[Array, Array]:
+    """Return what each parameter does to the corrected magnitude (n, k), nT a unit, and the noise's share (n,)."""
+    ambient = np.column_stack([deployment[f"truth_field_{axis}"] for axis in "xyz"])
+    channels = {name: deployment[name].to_numpy() for name in vehicle.channels}
+    D, _ = _response(vehicle, deployment)
+    u = ambient / np.linalg.norm(ambient, axis=1, keepdims=True)
+    w = np.linalg.solve(np.swapaxes(D, 1, 2), u[..., None])[..., 0]
+    columns = []
+    for up, down, step in _neighbours(vehicle):
+        change = (up.field(ambient, channels) - down.field(ambient, channels)) / (2 * step)
+        columns.append(-np.sum(w * change, axis=1))
+    return np.column_stack(columns), sigma * np.linalg.norm(w, axis=1)
+
+
+def _response(vehicle: Vehicle, deployment: xr.Dataset) -> tuple[Array, Array]:
+    """Return D (n, 3, 3) and T (n, 3): the reading is affine in the ambient field."""
+    channels = {name: deployment[name].to_numpy() for name in vehicle.channels}
+    n, unit = deployment.sizes["time"], 1e4
+    T = vehicle.field(np.zeros((n, 3)), channels)
+    D = np.stack(
+        [(vehicle.field(np.tile(unit * e, (n, 1)), channels) - T) / unit for e in np.eye(3)], axis=-1
+    )
+    return D, T
+
+
+def _neighbours(vehicle: Vehicle) -> Iterator[tuple[Vehicle, Vehicle, float]]:
+    """Yield the vehicle with one number a step up, a step down, and the step; in the order of the prior's widths."""
+
+    def vary(struct: Any, name: str, step: float) -> Iterator[tuple[Any, Any, float]]:
+        value = np.asarray(getattr(struct, name), dtype=np.float64)
+        for k in range(value.size):
+            moved = []
+            for sign in (1, -1):
+                other = value.copy()
+                other.flat[k] += sign * step
+                moved.append(msgspec.structs.replace(struct, **{name: other.tolist()}))
+            yield moved[0], moved[1], step
+
+    yield from vary(vehicle, "soft_iron", 1e-4)
+    yield from vary(vehicle, "hard_iron", 1.0)
+    for name, mass in vehicle.mass.items():
+        for field, step in (("moment", 1e-3), ("volume", 1e-5), ("at", 1e-5)):
+            for up, down, width in vary(mass, field, step):
+                yield (
+                    msgspec.structs.replace(vehicle, mass=vehicle.mass | {name: up}),
+                    msgspec.structs.replace(vehicle, mass=vehicle.mass | {name: down}),
+                    width,
+                )

@@ -1,0 +1,60 @@
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+import pytest
+import xarray as xr
+
+from sitl import Twin, load, segments, simulate
+from sitl.bound import information_bound, oracle
+from sitl.mission import CrissCross, Spirals
+from sitl.platform import Vehicle
+
+SCENARIO = msgspec.structs.replace(
+    load("random_glider"), mission=(Spirals(duration=200.0), CrissCross(hours=1.0, duration=450.0))
+)
+
+
+@pytest.fixture(scope="module")
+def flight() -> tuple[Twin, xr.Dataset, xr.Dataset]:
+    parts = segments(simulate(SCENARIO, 1))
+    return Twin.draw(SCENARIO, 1), parts["calibration"], parts["survey"]
+
+
+def rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def test_who_knows_the_vehicle_is_left_with_the_noise(flight: tuple[Twin, xr.Dataset, xr.Dataset]) -> None:
+    twin, calibration, survey = flight
+    error = oracle(twin.vehicle, survey) - survey["truth_total_field"].to_numpy()
+    _, floor = information_bound(twin.vehicle, calibration, survey, sigma=1.0)
+    assert rms(error) == pytest.approx(rms(floor), rel=0.06)
+
+
+def test_no_calibration_beats_the_noise_and_more_knowledge_helps(
+    flight: tuple[Twin, xr.Dataset, xr.Dataset],
+) -> None:
+    twin, calibration, survey = flight
+    bound, floor = information_bound(twin.vehicle, calibration, survey, 1.0)
+    assert np.all(bound > floor)
+    vague, _ = information_bound(twin.vehicle, calibration, survey, 1.0, at_sigma=0.5)
+    assert np.all(vague >= bound - 1e-9)
+    fewer, _ = information_bound(twin.vehicle, calibration.isel(time=slice(0, None, 2)), survey, 1.0)
+    assert np.all(fewer >= bound - 1e-9)
+
+
+def test_with_only_the_hard_iron_unknown_the_bound_is_three_sines(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A bare vehicle: the information about the hard iron is the sum of the field's directions, over the variance."""
+    monkeypatch.setattr("sitl.bound.UNKNOWN_SOFT_IRON", 1e-12)
+    scenario = msgspec.structs.replace(SCENARIO, vehicle=Vehicle())
+    parts = segments(simulate(scenario, 1))
+    u, v = (
+        np.column_stack([parts[name][f"truth_field_{axis}"] for axis in "xyz"])
+        for name in ("calibration", "survey")
+    )
+    u, v = (field / np.linalg.norm(field, axis=1, keepdims=True) for field in (u, v))
+    bound, floor = information_bound(Vehicle(), parts["calibration"], parts["survey"], sigma=5.0)
+    expected = 25.0 * (1 + np.einsum("ni,ij,nj->n", v, np.linalg.inv(u.T @ u), v))
+    np.testing.assert_allclose(floor, 5.0)
+    np.testing.assert_allclose(bound**2, expected, rtol=1e-6)
