@@ -67,7 +67,7 @@ class Component:
         Event time of the start, in us; a multiple of 4.
     signing : Signing or None
     calibration_id : int
-        First 4 bytes of the SHA-256 of the calibration's file; 0 is none.
+        CRC-32 of the calibration's file; 0 is none.
     version : str
         Of the program, ``"0.1.0"``.
     kept : mapping of str to float

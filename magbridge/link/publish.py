@@ -61,7 +61,7 @@ class Publisher:
     rates : mapping of str to Rate
         By message name; those of `PUBLISHED` are used.
     calibration_id : int
-        First 4 bytes of the SHA-256 of the calibration's file; 0 is none.
+        CRC-32 of the calibration's file; 0 is none.
     start_us : int
         us, when the bridge started: NAMED_VALUE_FLOAT counts from there.
     """
@@ -72,6 +72,8 @@ class Publisher:
         self._outbox, self._codec = outbox, outbox.codec
         self._calibration_id, self._start_us = calibration_id, start_us
         self._messages = [(rates[name], getattr(self, method)) for name, method in PUBLISHED.items()]
+        self.utc_offset_us = 0
+        """us that the host's clock was set by since the start: added to every UNIX time that is sent."""
         self.latest: Sample | None = None
         self.samples = 0
 
@@ -104,7 +106,7 @@ class Publisher:
             flags |= POWER_CYCLE
         x, y, z = reading.channel_delay
         payload = RAW.struct.pack(
-            sample.reading_us,
+            sample.reading_us + self.utc_offset_us,
             (reading.sequence or 0) & MASK,
             *reading.field,
             *(reading.counts or NO_COUNTS),
@@ -122,7 +124,7 @@ class Publisher:
     def _field(self, sample: Sample) -> tuple[bytes]:
         corrected = sample.corrected
         payload = FIELD.struct.pack(
-            sample.time_us,
+            sample.time_us + self.utc_offset_us,
             corrected.total_field,
             self.samples & MASK,
             self._calibration_id,
@@ -140,7 +142,22 @@ class Publisher:
     def _imu(self, sample: Sample) -> tuple[bytes]:
         x, y, z = sample.corrected.field
         payload = IMU.struct.pack(
-            sample.time_us, 0, 0, 0, 0, 0, 0, x * GAUSS, y * GAUSS, z * GAUSS, 0, 0, 0, 0, MAGNETOMETER, 0
+            sample.time_us + self.utc_offset_us,
+            0,
+            0,
+            0,
+            0,
+            0,
+            0,
+            x * GAUSS,
+            y * GAUSS,
+            z * GAUSS,
+            0,
+            0,
+            0,
+            0,
+            MAGNETOMETER,
+            0,
         )
         return (self._codec.frame(IMU, payload),)
 
@@ -154,7 +171,9 @@ class Publisher:
         return tuple(self._codec.frame(NAMED, pack(boot_ms, value, name)) for name, value in values)
 
     def _vector(self, sample: Sample) -> tuple[bytes]:
-        payload = VECTOR.struct.pack(sample.time_us, *sample.corrected.field, b"mag_field")
+        payload = VECTOR.struct.pack(
+            sample.time_us + self.utc_offset_us, *sample.corrected.field, b"mag_field"
+        )
         return (self._codec.frame(VECTOR, payload),)
 
 

@@ -49,7 +49,7 @@ class Line:
         assert self.station.total_receive_errors == 0
         return heard
 
-    def say(self, name: str, *args, **fields):
+    def say(self, name: str, /, *args, **fields):
         """Send a message of the station; return what it hears back."""
         message = getattr(self.peer, f"MAVLink_{name.lower()}_message")(*args, **fields)
         return self.give(message.pack(self.station))

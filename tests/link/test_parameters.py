@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from math import inf, nan
 
 import pytest
@@ -28,7 +29,7 @@ def test_list_comes_whole_and_paced(link):
     assert [value.param_index for value in values] == list(range(len(table)))
     assert {(value.param_count, value.param_type) for value in values} == {(len(table), 9)}
     times = [at for at, frame in link.sent if frame[7] == 22]
-    assert min(b - a for a, b in zip(times, times[1:], strict=False)) == 20_000
+    assert min(b - a for a, b in itertools.pairwise(times)) == 20_000
     assert len(link.only(link.to(6), "PARAM_VALUE")) == 0
 
 

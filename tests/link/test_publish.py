@@ -1,0 +1,114 @@
+"""Samples as a station sees them."""
+
+from __future__ import annotations
+
+from math import nan
+
+import pytest
+
+from magbridge.link import Sample
+from magbridge.records import Corrected, Quality, Reading
+
+START = 1_700_000_000_000_000
+ALL = {"MAG_RAW": 0.0, "MAG_FIELD": 0.0, "HIGHRES_IMU": 0.0, "NAMED_VALUE_FLOAT": 0.0, "DEBUG_VECT": 0.0}
+READING = Reading(
+    (12345.678, -23456.5, 43210.25),
+    counts=(1000, -2000, 8_000_000),
+    sequence=70_000,
+    channel_delay=(0.0, 0.01, 0.02),
+    temperature=12.5,
+    power_cycle=3,
+    saturated=True,
+)
+CORRECTED = Corrected(
+    50_123.456789, 1.5, (20_000.0, -1000.0, 45_000.0), (1.0, 2.0, 3.0), int(Quality.MOVING | Quality.GAP)
+)
+
+
+def sample(t_us=START, **fields):
+    return Sample(READING, t_us + 4000, CORRECTED, t_us, **fields)
+
+
+def publish(link, one):
+    link.component.publisher.publish(one)
+    return link.hear()
+
+
+@pytest.fixture
+def line(make_link):
+    line = make_link(publish=ALL, calibration_id=0xDEADBEEF)
+    line.to(0.1)
+    return line
+
+
+def test_raw(line):
+    (raw,) = line.only(publish(line, sample()), "MAG_RAW")
+    assert raw.time_usec == START + 4000
+    assert (raw.x, raw.y, raw.z) == pytest.approx(READING.field, abs=0.002)
+    assert (raw.count_x, raw.count_y, raw.count_z) == READING.counts
+    assert (raw.delay_x, raw.delay_y, raw.delay_z) == (0, 10_000, 20_000)
+    assert (raw.temperature, raw.power_cycle, raw.sequence) == (12.5, 3, 70_000)
+    assert raw.supply != raw.supply  # NaN: not known
+    assert raw.flags == 1 | 2 | 4 | 8
+
+
+def test_raw_of_an_instrument_that_says_little(line):
+    plain = Sample(Reading((1.0, 2.0, 3.0)), START, CORRECTED, START)
+    (raw,) = line.only(publish(line, plain), "MAG_RAW")
+    assert raw.flags == 0
+    assert (raw.count_x, raw.sequence, raw.power_cycle) == (0, 0, 0)
+
+
+def test_field(line):
+    (field,) = line.only(publish(line, sample(telemetry_age=0.25, anomaly=-12.5)), "MAG_FIELD")
+    assert field.total_field == CORRECTED.total_field  # double: not rounded
+    assert (field.x, field.y, field.z) == CORRECTED.field
+    assert (field.sigma_x, field.sigma_y, field.sigma_z) == CORRECTED.field_sigma
+    assert (field.flags, field.calibration_id, field.sequence) == (CORRECTED.quality, 0xDEADBEEF, 1)
+    assert (field.telemetry_age, field.anomaly, field.total_field_sigma) == (0.25, -12.5, 1.5)
+    assert field.latency == pytest.approx(0.1)
+
+
+def test_standard_messages(line):
+    heard = publish(line, sample())
+    (imu,) = line.only(heard, "HIGHRES_IMU")
+    assert (imu.xmag, imu.ymag, imu.zmag) == pytest.approx((0.2, -0.01, 0.45), rel=1e-6)
+    assert (imu.fields_updated, imu.time_usec, imu.xacc) == (0x1C0, START, 0)
+    (vector,) = line.only(heard, "DEBUG_VECT")
+    assert (vector.name, vector.x, vector.y, vector.z) == ("mag_field", *CORRECTED.field)
+    named = line.only(heard, "NAMED_VALUE_FLOAT")
+    assert {one.name: one.value for one in named} == pytest.approx(
+        {"mag_total": 50_123.456789, "mag_sigma": 1.5}
+    )
+    named = line.only(publish(line, sample(START + 2_500_000, anomaly=-3.0)), "NAMED_VALUE_FLOAT")
+    assert {one.name for one in named} == {"mag_total", "mag_sigma", "mag_anom"}
+    assert {one.time_boot_ms for one in named} == {2500}
+
+
+def test_rates(make_link):
+    line = make_link(publish={"MAG_FIELD": 0.0, "HIGHRES_IMU": 3.0})
+    heard = []
+    for i in range(1000):  # 10 Hz
+        heard += publish(line, sample(START + i * 100_000))
+    assert len(line.only(heard, "MAG_FIELD")) == 1000
+    assert len(line.only(heard, "HIGHRES_IMU")) == pytest.approx(300, abs=1)
+    assert len(heard) == pytest.approx(1300, abs=1)
+    line.command(511, 105, -1)
+    line.command(511, 60101, 1_000_000)
+    heard = []
+    for i in range(1000, 2000):
+        heard += publish(line, sample(START + i * 100_000))
+    assert {one.get_type() for one in heard} == {"MAG_FIELD"}
+    assert len(heard) == pytest.approx(100, abs=1)
+
+
+def test_the_latest_sample_on_request(line):
+    publish(line, sample())
+    heard = line.command(512, 105)
+    assert [one.get_type() for one in heard] == ["HIGHRES_IMU", "COMMAND_ACK"]
+
+
+def test_nan_is_published_as_nan(line):
+    one = Sample(Reading((nan, 1.0, 2.0)), START, Corrected(nan, nan, (nan,) * 3, (nan,) * 3, 16), START)
+    (field,) = line.only(publish(line, one), "MAG_FIELD")
+    assert field.total_field != field.total_field

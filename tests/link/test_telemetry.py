@@ -1,0 +1,139 @@
+"""Any field of any message becomes a parameter."""
+
+from __future__ import annotations
+
+import time
+from math import isnan
+from pathlib import Path
+
+import pytest
+
+from magbridge.config import Telemetry
+from magbridge.errors import ConfigError
+from magbridge.link import TelemetryMap
+from magbridge.link.clock import VehicleClock
+from magbridge.mavlink import Codec, LogReader
+from magbridge.mavlink.dialect import MESSAGES
+from magbridge.mavlink.messages import spec
+
+NOW = 1_700_000_000_000_000
+
+
+def values(telemetry, message_name, clock=None, component=1, /, **fields):
+    (message,) = Codec(1, 191).parse(Codec(1, component).pack(message_name, **fields))
+    return TelemetryMap(telemetry).values(message, NOW, clock or VehicleClock())
+
+
+def test_scale_offset_and_match():
+    telemetry = {
+        "battpos": Telemetry("NAMED_VALUE_FLOAT", "value", match={"name": "battpos"}, scale=2.0, offset=1.0),
+        "fin": Telemetry("NAMED_VALUE_FLOAT", "value", match={"name": "fin"}),
+        "copy": Telemetry("NAMED_VALUE_FLOAT", "value"),
+    }
+    got = values(telemetry, "NAMED_VALUE_FLOAT", name="battpos", value=0.5)
+    assert got == [("battpos", 2.0, NOW), ("copy", 0.5, NOW)]
+    assert values(telemetry, "ATTITUDE", roll=1) == []
+
+
+def test_arrays_and_numeric_match():
+    telemetry = {
+        "ballast": Telemetry("ACTUATOR_OUTPUT_STATUS", "actuator[2]"),
+        "cell": Telemetry("BATTERY_STATUS", "voltages[1]", match={"id": 1}, scale=1e-3),
+        "cov": Telemetry("GPS_STATUS", "satellite_snr[3]"),
+    }
+    assert values(telemetry, "ACTUATOR_OUTPUT_STATUS", actuator=[*range(32)]) == [("ballast", 2.0, NOW)]
+    cells = [4100, 4200, *[65535] * 8]
+    assert values(telemetry, "BATTERY_STATUS", voltages=cells, id=1) == [("cell", 4.2, NOW)]
+    assert values(telemetry, "BATTERY_STATUS", voltages=cells, id=0) == []
+    assert values(telemetry, "GPS_STATUS", satellite_snr=bytes(range(20))) == [("cov", 3, NOW)]
+
+
+def test_not_known_is_nan():
+    telemetry = {"i": Telemetry("SYS_STATUS", "current_battery", scale=0.01)}
+    (one,) = values(telemetry, "SYS_STATUS", current_battery=-1)
+    assert isnan(one[1])
+    assert values(telemetry, "SYS_STATUS", current_battery=150)[0][1] == 1.5
+
+
+def known_clock(offset_us):
+    clock = VehicleClock()
+    clock.answer((NOW + offset_us) * 1000, clock.ask(NOW), NOW)
+    return clock
+
+
+def test_the_messages_own_time():
+    telemetry = {"roll": Telemetry("ATTITUDE", "roll"), "servo": Telemetry("SERVO_OUTPUT_RAW", "servo1_raw")}
+    clock = known_clock(-NOW + 3_600_000_000 * 5)  # the autopilot runs for 5 h
+    boot_ms = 3_600_000 * 5
+    (one,) = values(telemetry, "ATTITUDE", clock, time_boot_ms=boot_ms - 250, roll=1)
+    assert one == ("roll", 1.0, NOW - 250_000)
+    (one,) = values(telemetry, "ATTITUDE", clock, time_boot_ms=boot_ms + 250, roll=1)
+    assert one[2] == NOW  # not in the future
+    (one,) = values(telemetry, "ATTITUDE", clock, 158, time_boot_ms=boot_ms - 250, roll=1)
+    assert one[2] == NOW  # another clock
+    (one,) = values(telemetry, "ATTITUDE", clock, time_boot_ms=0, roll=1)
+    assert one[2] == NOW  # not filled in
+    micros = (boot_ms * 1000 - 100_000) % (1 << 32)  # wraps every 71 minutes
+    (one,) = values(telemetry, "SERVO_OUTPUT_RAW", clock, time_usec=micros, servo1_raw=1500)
+    assert one == ("servo", 1500.0, NOW - 100_000)
+
+
+@pytest.mark.parametrize(
+    ("what", "complaint"),
+    [
+        (Telemetry("NO_SUCH", "x"), r"b.toml: telemetry.p.message: 'NO_SUCH' is no message"),
+        (
+            Telemetry("ATTITUDE", "rol"),
+            r"telemetry.p.field: ATTITUDE has no field 'rol'; it has time_boot_ms, roll",
+        ),
+        (Telemetry("ATTITUDE", "roll[0]"), r"telemetry.p.field: roll without an index, not 'roll\[0\]'"),
+        (Telemetry("ACTUATOR_OUTPUT_STATUS", "actuator"), r"actuator\[0\] to actuator\[31\], not 'actuator'"),
+        (Telemetry("ACTUATOR_OUTPUT_STATUS", "actuator[32]"), r"actuator\[0\] to actuator\[31\]"),
+        (Telemetry("ATTITUDE", "roll-pitch"), r"has no field 'roll-pitch'"),
+        (Telemetry("STATUSTEXT", "text"), r"a number, but STATUSTEXT.text is text"),
+        (
+            Telemetry("NAMED_VALUE_FLOAT", "value", match={"nam": "a"}),
+            r"telemetry.p.match.nam: .* no field 'nam'",
+        ),
+        (Telemetry("NAMED_VALUE_FLOAT", "value", match={"name": 3}), r"telemetry.p.match.name: text, not 3"),
+        (Telemetry("BATTERY_STATUS", "id", match={"id": "a"}), r"telemetry.p.match.id: a number, not 'a'"),
+    ],
+)
+def test_mistakes_are_one_clear_line(what, complaint):
+    with pytest.raises(ConfigError, match=complaint):
+        TelemetryMap({"p": what}, path=Path("b.toml"))
+
+
+def test_every_numeric_field_of_every_message_maps():
+    for number in MESSAGES:
+        layout = spec(number)
+        telemetry = {
+            name: Telemetry(layout.name, f"{name}[{field.count - 1}]" if field.count else name)
+            for name, field in layout.fields.items()
+            if field.code != "s"
+        }
+        got = values(telemetry, layout.name)
+        assert [name for name, _, _ in got] == list(telemetry)
+        assert all(isinstance(value, (int, float)) for _, value, _ in got)
+
+
+@pytest.mark.real
+def test_measured_telemetry(real_data):
+    wanted = {
+        "roll": Telemetry("ATTITUDE", "roll"),
+        "current": Telemetry("SYS_STATUS", "current_battery", scale=0.01, unit="A"),
+        "thruster": Telemetry("SERVO_OUTPUT_RAW", "servo3_raw"),
+        "mag_x": Telemetry("RAW_IMU", "xmag"),
+    }
+    telemetry, clock, got = TelemetryMap(wanted), VehicleClock(), {name: [] for name in wanted}
+    with (real_data / "ardusub" / "small.tlog").open("rb") as file:
+        records = [(one.time_us, one.message) for one in LogReader(file)]
+    begin = time.process_time()
+    for at, message in records:
+        for name, value, _ in telemetry.values(message, at, clock):
+            got[name].append(value)
+    assert (time.process_time() - begin) / len(records) < 10e-6
+    assert len(got["roll"]) > 5000 * 0.9
+    assert max(map(abs, got["roll"])) < 3.2
+    assert 0 < sum(got["current"]) / len(got["current"]) < 50
+    assert all(1000 <= one <= 2000 for one in got["thruster"])

@@ -1,0 +1,126 @@
+"""Rates, timers and announcements in event time."""
+
+from __future__ import annotations
+
+import random
+
+import pytest
+
+from magbridge.link.announcer import Announcer
+from magbridge.link.outbox import Outbox
+from magbridge.link.rates import Rate
+from magbridge.link.timers import FOREVER, Timers
+from magbridge.mavlink import Codec
+
+START = 1_700_000_000_000_000
+
+
+def passed(rate: Rate, times) -> list[int]:
+    return [t for t in times if rate.due(t)]
+
+
+@pytest.mark.parametrize("hertz", [1, 3, 7, 9.9, 10])
+def test_thinned_without_drift(hertz):
+    times = [START + 100_000 * i for i in range(10_000)]  # 10 Hz, 1000 s
+    assert len(passed(Rate(hertz), times)) == pytest.approx(1000 * hertz, abs=1)
+
+
+def test_a_jittering_stream_at_just_the_rate_passes_whole():
+    rng = random.Random(2)
+    times = [START + 100_000 * i + rng.randrange(-20_000, 20_000) for i in range(1000)]
+    assert len(passed(Rate(10), times)) == pytest.approx(1000, abs=2)
+
+
+def test_all_none_and_too_fast():
+    times = [START + 10_000 * i for i in range(100)]
+    assert passed(Rate(0), times) == times
+    assert passed(Rate(-1), times) == []
+    assert passed(Rate(1000), times) == times
+
+
+def test_pauses_and_steps_back_begin_anew():
+    rate = Rate(1)
+    assert passed(rate, [START, START + 500_000, START + 1_000_000]) == [START, START + 1_000_000]
+    assert passed(rate, [START + 3600_000_000, START + 3600_500_000]) == [START + 3600_000_000]
+    assert passed(rate, [START + 100_000, START + 200_000, START + 1_100_000]) == [
+        START + 100_000,
+        START + 1_100_000,
+    ]
+    rate.set(2)
+    assert rate.due(START + 1_100_000)
+
+
+def test_timers_fire_in_order_at_their_own_times():
+    timers, fired, begun = Timers(), [], []
+    timers.every("a", 300, lambda t: fired.append(("a", t)), 0)
+    timers.every("b", 500, lambda t: fired.append(("b", t)), 100)
+    timers.at("c", 600, lambda t: timers.at("d", t + 1, lambda t: fired.append(("d", t))))
+    timers.advance(1000, begun.append)
+    assert fired == [("a", 0), ("b", 100), ("a", 300), ("a", 600), ("b", 600), ("d", 601), ("a", 900)]
+    assert begun == [0, 100, 300, 600, 600, 600, 601, 900]
+    assert timers.next_deadline == 1100
+    for name in ("a", "b", "never"):
+        timers.cancel(name)
+    assert timers.next_deadline == FOREVER
+
+
+class Talker:
+    def __init__(self, peer) -> None:
+        self.codec = Codec(1, 191)
+        self.outbox, self.timers = Outbox(self.codec), Timers()
+        self.announcer = Announcer(self.outbox, self.timers)
+        self.station = peer.MAVLink(None)
+        self.codec.now_us = START
+
+    def at(self, seconds: float) -> list:
+        def begin(t: int) -> None:
+            self.codec.now_us = t
+
+        self.timers.advance(START + round(seconds * 1e6), begin)
+        begin(START + round(seconds * 1e6))
+        return [m for _, frame in self.outbox.drain() for m in self.station.parse_buffer(frame)]
+
+
+@pytest.fixture
+def talker(peer):
+    return Talker(peer)
+
+
+def test_short_text(talker):
+    talker.announcer.say("sensor found")
+    (message,) = talker.at(0)
+    assert (message.text, message.id, message.severity) == ("sensor found", 0, 6)
+
+
+@pytest.mark.parametrize("length", [50, 51, 99, 100, 150, 151])
+def test_long_text_in_pieces(talker, length):
+    text = "".join(chr(97 + i % 26) for i in range(length))
+    for _ in range(2):
+        talker.announcer.say(text)
+        messages = talker.at(0)
+        assert "".join(message.text for message in messages) == text
+        if length > 50:
+            assert len({message.id for message in messages}) == 1
+            assert messages[0].id > 0
+            assert [message.chunk_seq for message in messages] == list(range(len(messages)))
+            assert len(messages[-1].text) < 50  # else the receiver waits for more
+    talker.announcer.say("5 µT")
+    assert talker.at(0)[0].text == "5 ?T"
+
+
+def test_only_changes_are_said(talker):
+    for second, state in enumerate(("ok", "ok", "lost", "lost", "ok")):
+        talker.at(second * 2)
+        talker.announcer.state("sensor", state)
+        talker.announcer.state("log", "ok")
+    assert [m.text for m in talker.at(20)] == ["ok"]
+
+
+def test_what_flaps_is_said_once_a_second_and_its_last_word_always(talker):
+    said = []
+    for i in range(201):  # 100 Hz for 2 s, ends on "up"
+        said += talker.at(i / 100)
+        talker.announcer.state("link", "up" if i % 2 == 0 else "down")
+    said += talker.at(10)
+    assert 2 <= len(said) <= 4
+    assert said[-1].text == "up"

@@ -1,0 +1,157 @@
+"""The autopilot comes, goes, reboots, and may not be alone; its clock."""
+
+from __future__ import annotations
+
+import random
+from math import isnan
+
+import pytest
+
+from magbridge.link.clock import VehicleClock
+from magbridge.mavlink import Codec
+
+START = 1_700_000_000_000_000
+
+
+def test_found_vanished_found(link):
+    beat = {"type": 12, "autopilot": 3}
+    assert link.texts(link.fly("HEARTBEAT", **beat)) == ["autopilot 1:1 found"]
+    assert link.texts(link.to(4)) == []
+    assert link.texts(link.fly("HEARTBEAT", **beat)) == []
+    assert link.texts(link.to(8.9)) == []
+    assert link.texts(link.to(9.1)) == ["autopilot 1:1 is silent"]
+    assert link.texts(link.to(60)) == []
+    assert link.texts(link.fly("HEARTBEAT", **beat)) == ["autopilot 1:1 found"]
+
+
+def boots(link, codec, times):
+    said = []
+    for i, boot_ms in enumerate(times):
+        said += link.texts(link.to(1 + i * 0.1))
+        said += link.texts(link.give(codec.pack("ATTITUDE", time_boot_ms=boot_ms)))
+    return said
+
+
+def test_reboot(link):
+    times = [*range(100_000, 101_000, 100), *range(500, 1500, 100)]
+    assert boots(link, link.autopilot, times) == ["autopilot 1:1 rebooted"]
+    assert link.component.vehicle.reboots == 1
+
+
+def test_stragglers_duplicates_and_the_wrap_are_no_reboot(link):
+    end = (1 << 32) - 1000
+    times = [end, end + 100, end + 100, end - 20_000, end + 200, end - 100, end + 300, *range(0, 1000, 100)]
+    assert boots(link, link.autopilot, times) == []
+    assert link.component.vehicle.reboots == 0
+
+
+def test_two_autopilots_with_one_address(link):
+    times = [boot for i in range(20) for boot in (500_000 + 200 * i, 3_000 + 200 * i)]
+    said = boots(link, link.autopilot, times)
+    assert said[0] == "two autopilots speak as 1:1"
+    assert link.component.vehicle.reboots == 0
+
+
+def test_two_autopilots_in_bursts(link):
+    times = [
+        boot + 100 * i
+        for i in range(12)
+        for boot in (500_000, 500_010, 500_020, 500_030, 3_000, 3_010, 3_020, 3_030)
+    ]
+    assert "two autopilots speak as 1:1" in boots(link, link.autopilot, times)
+
+
+def test_a_second_vehicle_is_told_once_and_ignored(link):
+    other = Codec(2, 1)
+    said = []
+    for i in range(5):
+        link.to(1 + i)
+        said += link.texts(link.give(other.pack("HEARTBEAT", type=12, autopilot=3)))
+        link.give(other.pack("ATTITUDE", roll=1))
+        assert link.telemetry == []
+    assert said == ["vehicle 2 is on the link too: ignored"]
+    assert link.component.vehicle.others == {2: 10}
+
+
+def test_a_ground_station_is_no_vehicle(link):
+    assert link.texts(link.say("heartbeat", 6, 8, 0, 0, 0, 3)) == []
+    assert link.component.vehicle.others == {}
+
+
+def test_another_program_with_our_address(link):
+    twin = Codec(1, 191)
+    said = [
+        text for _ in range(5) for text in link.texts(link.give(twin.pack("HEARTBEAT", type=18, autopilot=8)))
+    ]
+    assert said == ["another program speaks as 1:191"]
+
+
+def test_lost_frames_are_counted(link):
+    frames = [link.autopilot.pack("ATTITUDE", time_boot_ms=i) for i in range(600)]
+    link.give(b"".join(frames[:100] + frames[107:400] + frames[400:410] + frames[405:600]))
+    assert link.component.vehicle.frames_lost == 7
+
+
+def exchange(clock, rng, now_us, offset_us, slow=300.0, drift_ppm=0.0):
+    """One request and its answer over a link that delays each way by a random time."""
+    there, back = (slow + rng.expovariate(1 / 2000) for _ in range(2))
+    asked = clock.ask(now_us)
+    vehicle_us = now_us + there + offset_us + drift_ppm * 1e-6 * (now_us - START)
+    clock.answer(round(vehicle_us * 1000), asked, round(now_us + there + back))
+
+
+@pytest.mark.parametrize("drift_ppm", [0.0, 40.0, -100.0])
+def test_offset_through_jitter(drift_ppm):
+    rng, clock, offset = random.Random(4), VehicleClock(), -START + 5_000_000
+    errors = []
+    for i in range(300):
+        now = START + i * 1_000_000
+        exchange(clock, rng, now, offset, drift_ppm=drift_ppm)
+        if i >= 10:
+            errors.append(clock.offset_us(now) - offset - drift_ppm * i)
+    errors.sort(key=abs)
+    assert abs(errors[len(errors) // 2]) < 300  # us; a single exchange is wrong by 1400 (median)
+    assert abs(errors[-1]) < 3000
+    assert abs(clock.drift_ppm - drift_ppm) < 30
+    assert clock.sigma < 1e-3
+
+
+def test_foreign_and_old_answers_are_ignored():
+    clock = VehicleClock()
+    clock.ask(START)
+    clock.answer(5, 77, START + 10)
+    assert not clock.known
+    assert isnan(clock.sigma)
+    for i in range(20):
+        clock.ask(START + i)
+    clock.answer(5, START * 1000, START + 100)
+    assert not clock.known
+
+
+def test_a_step_of_the_vehicles_clock_begins_anew():
+    rng, clock = random.Random(4), VehicleClock()
+    for i in range(30):
+        exchange(clock, rng, START + i * 1_000_000, -START)
+    exchange(clock, rng, START + 31_000_000, 0)
+    assert abs(clock.offset_us(START + 31_000_000)) < 10_000
+
+
+def test_vehicle_times_are_unwrapped_and_never_in_the_future():
+    rng, clock = random.Random(4), VehicleClock()
+    boot = START - 3 * (1 << 32) - 1_000_000  # 3.6 h before
+    for i in range(30):
+        exchange(clock, rng, START + i * 1_000_000, -boot)
+    now = START + 31_000_000
+    for age in (0, 1000, 2_000_000):
+        field = (now - age - boot) % (1 << 32)
+        assert clock.ours(field, now, 1 << 32) == pytest.approx(now - age, abs=2000)
+    assert clock.ours(now - boot + 1_000_000, now) == now
+
+
+def test_reboot_resets_the_clock(link):
+    for i in range(5):
+        for message in link.only(link.to(1 + i), "TIMESYNC"):
+            link.fly("TIMESYNC", ts1=message.ts1, tc1=(50 + i) * 10**9)
+    assert link.component.vehicle.clock.known
+    boots(link, link.autopilot, [100_000, 100, 200, 300])
+    assert not link.component.vehicle.clock.known
