@@ -9,6 +9,7 @@ is corrected for it, and the telemetry is looked up at that time.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Mapping
 from math import inf, isfinite
 from typing import NamedTuple
 
@@ -101,6 +102,12 @@ class Track:
         if elapsed >= 1.0:
             self.anchor = time_us, value
 
+    def stale(self, time_us: int) -> bool:
+        """Say whether the value is not known, or older than it may be, at `time_us`."""
+        if self.lacking or not self.history:
+            return True
+        return time_us - self.history[-1][0] > self.input.max_age * 1e6
+
     def moving(self, time_us: int, settle_time: float) -> bool:
         """Say whether it moved up to its latest value, or less than `settle_time` s before `time_us`."""
         return self.moved_us == self.history[-1][0] or time_us - self.moved_us <= settle_time * 1e6
@@ -130,7 +137,6 @@ class Aligner:
     inputs : sequence of Input
         What the calibration needs, in its order.
     settings : Align
-        May be replaced at any time.
     power_cycle : int or None
         The instrument's power-on counter when it was calibrated, where known.
     """
@@ -143,6 +149,12 @@ class Aligner:
         self.offset_suspect = False
         self._before: tuple[int, Reading] | None = None
         self._period_us = 0.0
+
+    def tune(self, settings: Align, ages: Mapping[str, float]) -> None:
+        """Replace the settings, and the ages (s) after which telemetry is stale, by name."""
+        self.settings = settings
+        for name, track in self.by_name.items():
+            track.input = track.input._replace(max_age=ages.get(name, track.input.max_age))
 
     def telemetry(self, name: str, time_us: int, value: float) -> None:
         """Take a telemetry value; a name that the calibration does not need is ignored."""

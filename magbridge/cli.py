@@ -85,8 +85,9 @@ def simulate(
         Print the result for machines.
     """
     from magbridge.logs import read, write
-    from sitl import load, simulate_like
-    from sitl import simulate as simulate_scenario
+    from sitl.like import simulate_like
+    from sitl.scenario import load
+    from sitl.twin import simulate as simulate_scenario
 
     chosen = load(scenario)
     deployment = simulate_like(read(like), chosen, seed) if like else simulate_scenario(chosen, seed)

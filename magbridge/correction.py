@@ -64,7 +64,7 @@ class Correction:
             Corrector(replace(calibration, effects=())) if calibration.effects else self._corrector
         )
 
-    def telemetry(self, name: str, time_us: int, value: float) -> None:
+    def telemetry(self, name: str, value: float, time_us: int) -> None:
         """Take a telemetry value; a name that the calibration does not need is ignored."""
         self.aligner.telemetry(name, time_us, value)
 
@@ -160,6 +160,6 @@ def _readings(correction: Correction, deployment: xr.Dataset) -> Iterator[tuple[
     for row, (stamp, field, delay, temperature, cycle) in enumerate(rows):
         for name, values in telemetry:
             if isfinite(values[row]):  # a row that lacks a value is not news that it is lost
-                correction.telemetry(name, stamp, values[row])
+                correction.telemetry(name, values[row], stamp)
         power_cycle = int(cycle) if isfinite(cycle) else None
         yield Reading(field, channel_delay=delay, temperature=temperature, power_cycle=power_cycle), stamp

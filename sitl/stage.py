@@ -17,7 +17,10 @@ import tty
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
+import msgspec
+
 from magbridge.bridge.events import Event
+from magbridge.bridge.pipeline import Start
 from magbridge.errors import PortError
 from magbridge.records import Channel
 from sitl.timetable import Entry, pace
@@ -59,7 +62,7 @@ class Stage:
             "--timetable", str(times_out),
             *(("--log", str(log)) if log else ()),
         ]  # fmt: skip
-        self._bridge = subprocess.Popen(command, pass_fds=(times_out,), stderr=subprocess.PIPE)
+        self._bridge = subprocess.Popen(command, pass_fds=(times_out,), stderr=subprocess.PIPE)  # noqa: S603 - our own
         os.close(times_out)
         try:
             self._link, _ = server.accept()
@@ -82,8 +85,16 @@ class Stage:
         lines = self._bridge.communicate()[1].decode(errors="replace").strip().splitlines()
         return lines[-1] if lines else ""
 
-    def play(self, events: Iterable[Event], speed: float = float("inf")) -> None:
+    def play(self, start: Start, events: Iterable[Event], speed: float = float("inf")) -> None:
         """Play events in order, and wait until the bridge has dealt with all of them.
+
+        Parameters
+        ----------
+        start : Start
+            The bridge's own.
+        events : iterable of Event
+        speed : float
+            How many times faster than they happened.
 
         Raises
         ------
@@ -91,6 +102,8 @@ class Stage:
             The bridge ended before its time; tells its last words.
         """
         times = self._buffers[Channel.STATE]
+        begin = msgspec.json.encode(start)
+        times += Entry.pack(start.time_us | Channel.STATE, len(begin)) + begin
         pending = 0
         try:
             for wait, event in pace(events, speed):

@@ -8,10 +8,9 @@ those times for its clock; everything behind its ports is the same code as at se
 
 from __future__ import annotations
 
-import os
 import struct
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 
 from magbridge.bridge.events import Event
 from magbridge.records import Channel
@@ -22,8 +21,11 @@ Entry = struct.Struct("<QI")
 """Stamp (µs, channel in the low two bits) and number of bytes; a ``STATE`` entry is followed by its bytes."""
 
 
-def read_entries(descriptor: int) -> Iterator[tuple[int, Channel, int, bytes]]:
-    """Read a timetable from a pipe: time in µs, channel, number of bytes, and the bytes of a ``STATE`` entry."""
+def read_entries(read: Callable[[], bytes]) -> Iterator[tuple[int, Channel, int, bytes]]:
+    """Take apart a timetable: time in µs, channel, number of bytes, and the bytes of a ``STATE`` entry.
+
+    `read` returns more of it, and nothing at its end.
+    """
     buffer = bytearray()
     channels = tuple(Channel)
     while True:
@@ -39,7 +41,7 @@ def read_entries(descriptor: int) -> Iterator[tuple[int, Channel, int, bytes]]:
             position += inline
             yield stamp & ~3, channel, size, data
         del buffer[:position]
-        chunk = os.read(descriptor, 65536)
+        chunk = read()
         if not chunk:
             return
         buffer += chunk

@@ -1,6 +1,6 @@
 """The forward model: a scenario and a seed make a deployment.
 
->>> from sitl import load, simulate
+>>> from sitl.scenario import load
 >>> deployment = simulate(load("demo"), seed=1)
 >>> sorted(deployment.sizes)
 ['time']

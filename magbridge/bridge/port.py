@@ -46,6 +46,10 @@ class Port:
         """Send `data` whole or drop it; raises :class:`PortError` when the port is gone."""
         raise NotImplementedError
 
+    def write_all(self, data: bytes) -> None:
+        """Send `data` whole, waiting for a slow reader; for a replay, which has no deadline."""
+        self.write(data)
+
     def close(self) -> None:
         """Close it; harmless when it is closed."""
         raise NotImplementedError

@@ -148,6 +148,13 @@ class _Stream(Port):
         except OSError as error:
             raise self.lost(error.strerror) from error
 
+    def write_all(self, data: bytes) -> None:
+        """Send `data` whole, waiting for a slow reader."""
+        assert self._connection is not None
+        self._connection.setblocking(True)
+        self._connection.sendall(data)
+        self._connection.setblocking(False)
+
     def adopt(self, connection: socket.socket) -> None:
         """Make `connection` the one to use."""
         connection.setblocking(False)

@@ -1,0 +1,65 @@
+"""Everything that came and went, as records for the log: a replay needs nothing else."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from magbridge.mavlink import Codec, spec
+from magbridge.records import Channel
+
+__all__ = ["Journal"]
+
+BYTES = spec("MAG_SENSOR_BYTES")
+SIZE = BYTES.fields["data"].count
+
+
+class Journal:
+    """Collects records until :meth:`drain`.
+
+    Attributes
+    ----------
+    active : bool
+        When not, nothing is collected, and counting nothing costs nothing.
+    count : int
+        Records collected since the start.
+    """
+
+    def __init__(self, system: int, component: int, *, active: bool) -> None:
+        self.active = active
+        self.count = 0
+        self._records: list[tuple[int, Channel, bytes]] = []
+        self._scribe = Codec(system, component)
+
+    def sent(self, frames: Iterable[tuple[int, bytes]]) -> None:
+        """Take what went out over the link: event time in µs, frame."""
+        if self.active:
+            self._records += [(time_us, Channel.SENT, frame) for time_us, frame in frames]
+
+    def link(self, time_us: int, frames: Iterable[bytes]) -> None:
+        """Take what came over the link."""
+        if self.active:
+            self._records += [(time_us, Channel.LINK, frame) for frame in frames]
+
+    def sensor(self, time_us: int, data: bytes) -> None:
+        """Take bytes as they came from the sensor."""
+        if not self.active:
+            return
+        for begin in range(0, len(data), SIZE):
+            piece = data[begin : begin + SIZE]
+            frame = self._scribe.frame(BYTES, BYTES.struct.pack(0, len(piece), piece))
+            self._records.append((time_us, Channel.SENSOR, frame))
+
+    def state(self, time_us: int, frame: bytes) -> None:
+        """Take a frame that says what changed at the edge."""
+        if self.active:
+            self._records.append((time_us, Channel.STATE, frame))
+
+    def note(self, time_us: int, name: str, **fields: object) -> None:
+        """Write a state record of our own."""
+        self.state(time_us, self._scribe.pack(name, **fields))
+
+    def drain(self) -> list[tuple[int, Channel, bytes]]:
+        """Return what was collected, in order (event time in µs, channel, frame), and forget it."""
+        records, self._records = self._records, []
+        self.count += len(records)
+        return records

@@ -1,0 +1,129 @@
+"""The live edge: two ports and the one clock, turned into events.
+
+One thread reads, corrects and sends. A second opens ports that are down, so that an open that takes its time
+never holds up the other line.
+"""
+
+from __future__ import annotations
+
+import os
+import queue
+import select
+import threading
+import time
+from collections.abc import Callable, Iterator
+
+from magbridge.bridge import states
+from magbridge.bridge.events import Clock, Event
+from magbridge.bridge.port import Port
+from magbridge.errors import PortError
+from magbridge.records import Channel
+
+__all__ = ["LiveEdge"]
+
+RETRY = 0.25
+"""s between attempts to open a port that is down."""
+LOOK_US = 1_000_000
+"""µs between looks at the host's clock."""
+
+
+class LiveEdge:
+    """Turns what happens on the ports into events, in the order in which it happens.
+
+    Parameters
+    ----------
+    ports : dict of Channel to Port
+        The sensor's and the link's; opened here.
+    clock : Clock
+    """
+
+    def __init__(self, ports: dict[Channel, Port], clock: Clock) -> None:
+        self._ports = ports
+        self._clock = clock
+        self._changes: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+        self._woken, self._waker = os.pipe()
+        self._stopping = False
+        self._opener = threading.Thread(target=self._keep_open, name="port opener", daemon=True)
+        self._opener.start()
+
+    def events(self, deadline: Callable[[], int]) -> Iterator[Event]:
+        """Yield events until :meth:`stop`, and an empty one whenever `deadline` (µs) has passed."""
+        look_us = self._clock.now_us() + LOOK_US
+        while not self._stopping:
+            wait = (min(deadline(), look_us) - self._clock.now_us()) * 1e-6
+            lines = {fd: channel for channel, port in self._ports.items() for fd in port.fds()}
+            try:
+                ready = select.select([*lines, self._woken], [], [], max(wait, 0.0))[0]
+            except (OSError, ValueError):  # a descriptor was closed between asking for it and waiting
+                continue
+            now_us = self._clock.now_us()
+            for fd in ready:
+                if fd == self._woken:
+                    os.read(fd, 4096)
+                elif data := self._read(lines[fd]):
+                    yield Event(now_us, lines[fd], data)
+            while not self._changes.empty():
+                yield Event(now_us, Channel.STATE, self._changes.get())
+            if now_us >= look_us:
+                look_us = now_us + LOOK_US
+                if step_us := self._clock.step_us():
+                    yield Event(now_us, Channel.STATE, states.clock_step(now_us, step_us))
+            if now_us >= deadline():
+                yield Event(now_us, Channel.STATE, b"")
+
+    def send(self, channel: Channel, data: bytes) -> None:
+        """Send to a port; what a port that is down does not take is lost."""
+        port = self._ports[channel]
+        if not port.up:
+            port.dropped += len(data)
+            return
+        try:
+            port.write(data)
+        except PortError as error:
+            self._lost(channel, error)
+
+    def tell(self, state: bytes) -> None:
+        """Add a state frame to the events; from any thread."""
+        self._changes.put(state)
+        os.write(self._waker, b"!")
+
+    def stop(self) -> None:
+        """End :meth:`events` at the next turn; from any thread or signal handler."""
+        self._stopping = True
+        os.write(self._waker, b"!")
+
+    def close(self) -> None:
+        """Close the ports."""
+        self._stopping = True
+        self._opener.join()
+        for port in self._ports.values():
+            port.close()
+        os.close(self._woken)
+        os.close(self._waker)
+
+    def _read(self, channel: Channel) -> bytes:
+        try:
+            return self._ports[channel].read()
+        except PortError as error:
+            self._lost(channel, error)
+            return b""
+
+    def _lost(self, channel: Channel, error: PortError) -> None:
+        self.tell(states.port(channel, self._ports[channel], error.reason))
+
+    def _keep_open(self) -> None:
+        """Open whatever is down, again and again; tell of each change once."""
+        told: dict[Channel, str] = {}
+        while not self._stopping:
+            for channel, port in self._ports.items():
+                if port.up:
+                    continue
+                try:
+                    port.open()
+                    reason = ""
+                except PortError as error:
+                    reason = error.reason
+                if not reason or told.get(channel) != reason:
+                    self.tell(states.port(channel, port, reason))
+                told[channel] = reason
+            time.sleep(RETRY)

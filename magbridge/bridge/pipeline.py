@@ -1,0 +1,298 @@
+"""The bridge without its ports: events in, frames out. The same events always give the same bytes."""
+
+from __future__ import annotations
+
+from collections import deque
+from math import nan
+
+import msgspec
+
+import magbridge
+from magbridge.bridge.events import Event
+from magbridge.bridge.journal import Journal
+from magbridge.bridge.position import Position
+from magbridge.bridge.sensor_line import SensorLine
+from magbridge.calibration.file import calibration_id
+from magbridge.calibration.model import Calibration
+from magbridge.config import Align, Config
+from magbridge.correction import TEMPERATURE, Correction
+from magbridge.errors import ConfigError
+from magbridge.link.component import Component, check_publish
+from magbridge.link.parameters import alignment, telemetry_ages
+from magbridge.link.publish import Sample
+from magbridge.link.telemetry import TelemetryMap
+from magbridge.mavlink import Codec, Signing, spec
+from magbridge.mavlink.dialect import (
+    MAG_LOG_STATE,
+    MAG_PORT_NAME,
+    MAG_PORT_STATE,
+    MAV_PARAM_TYPE,
+    MAV_SEVERITY,
+)
+from magbridge.records import Channel, Quality, Reading
+from magbridge.sensors import open_driver
+from magbridge.sensors.clock import DeviceClock, Stamp
+
+__all__ = ["Pipeline", "Start"]
+
+LATELY = 64
+"""Samples over which the sample rate is told."""
+DOUBTS = int(Quality.STALE_TELEMETRY | Quality.SATURATED | Quality.UNCALIBRATED | Quality.OFFSET_SUSPECT)
+"""Flags whose coming and going is told; the others come and go with every manoeuvre."""
+CLOCK_STEP, PORT = spec("MAG_CLOCK_STEP").id, spec("MAG_PORT").id
+
+
+class Start(msgspec.Struct, frozen=True):
+    """All that a run depends on beside its configuration, its calibration and its events.
+
+    Attributes
+    ----------
+    time_us : int
+        µs since 1970 UTC, a multiple of 4.
+    parameters : dict of str to float
+        Values that a station set in earlier runs.
+    signing_timestamp : int
+        The last one that was used.
+    """
+
+    time_us: int
+    parameters: dict[str, float] = {}
+    signing_timestamp: int = 0
+
+
+class Pipeline:
+    """Sensor bytes, link bytes and changes of state in; MAVLink frames and sensor commands out.
+
+    Parameters
+    ----------
+    config : Config
+    calibration : Calibration or None
+    start : Start
+    key : bytes or None
+        The signing key.
+
+    Attributes
+    ----------
+    component : Component
+        The MAVLink side.
+    journal : Journal
+        Everything that came and went since it was last drained: the log.
+    sensor : SensorLine
+        Holds the commands that are to be sent to the sensor.
+
+    Raises
+    ------
+    ConfigError
+        A driver, an option, a message, a field or a rate that does not exist; a calibration that needs a
+        parameter which ``[telemetry]`` does not provide, or in another unit.
+    """
+
+    def __init__(
+        self, config: Config, calibration: Calibration | None, start: Start, key: bytes | None = None
+    ) -> None:
+        self._config = config
+        self._driver = open_driver(config.sensor.driver, config.sensor.options, config.path)
+        self._clock = DeviceClock.of(self._driver)
+        self._telemetry = TelemetryMap(config.telemetry, config.link.autopilot, config.path)
+        foreign = calibration is not None and calibration.sensor.name not in ("", config.sensor.driver)
+        check_publish(config.publish, config.path)
+        if calibration is not None:
+            check(calibration, config)
+        used = None if foreign else calibration
+        self._correction = Correction(used, config.align)
+        self._calibration_id = calibration_id(used) if used else 0
+        self.signing = Signing(key, start.signing_timestamp) if key else None
+        self.component = Component(
+            config.link,
+            config.publish,
+            [*alignment(config.align), *telemetry_ages(config.telemetry)],
+            start_us=start.time_us,
+            signing=self.signing,
+            calibration_id=self._calibration_id,
+            version=magbridge.__version__,
+            kept=start.parameters,
+            status=self._status,
+        )
+        self.sensor = SensorLine(
+            config.sensor.driver,
+            self._driver.start,
+            round(config.sensor.timeout * 1e6),
+            self.component.announcer,
+            self.component.timers,
+            start.time_us,
+        )
+        self.journal = Journal(config.link.system, config.link.component, active=config.log is not None)
+        self._position = Position()
+        self._samples = self._lost = self._quality = self._log_lost = 0
+        self._times: deque[int] = deque(maxlen=LATELY)
+        self._log_state = MAG_LOG_STATE.OFF
+        self._tune()
+        self._begin(start, used, foreign=foreign)
+
+    @property
+    def deadline(self) -> int:
+        """µs since 1970 UTC: feed something by then, if only time."""
+        return self.component.next_deadline
+
+    def feed(self, event: Event) -> list[tuple[int, bytes]]:
+        """Take an event; return what is to be sent over the link: event time in µs, frame."""
+        component = self.component
+        component.advance(event.time_us)
+        due = component.outbox.drain()
+        self.journal.sent(due)
+        if event.channel is Channel.SENSOR:
+            self.journal.sensor(event.time_us, event.data)
+            self._hear_sensor(event)
+        elif event.channel is Channel.LINK:
+            self._hear_link(event)
+        elif event.data:
+            self.journal.state(event.time_us, event.data)
+            self._hear_state(event)
+        answers = component.outbox.drain()
+        self.journal.sent(answers)
+        return due + answers
+
+    def _hear_sensor(self, event: Event) -> None:
+        readings = self._driver.feed(event.data)
+        if not readings:
+            return
+        self.sensor.spoke(event.time_us)
+        for reading, stamp in zip(readings, self._clock.stamp(readings, event.time_us), strict=True):
+            self._sample(reading, stamp)
+
+    def _sample(self, reading: Reading, stamp: Stamp) -> None:
+        self._samples += 1
+        self._lost += stamp.missing
+        self._times.append(stamp.time_us)
+        sample, corrected = self._correction.reading(
+            reading, stamp.time_us, restarted=stamp.restarted, missing=stamp.missing
+        )
+        if (corrected.quality ^ self._quality) & DOUBTS:
+            self._tell_doubts(corrected.quality & DOUBTS)
+        anomaly = corrected.total_field - self._position.main_field(sample.time_us)
+        self.component.publisher.publish(
+            Sample(reading, stamp.time_us, corrected, sample.time_us, sample.age, anomaly)
+        )
+
+    def _hear_link(self, event: Event) -> None:
+        component = self.component
+        for message in component.receive(event.data, event.time_us):
+            for value in self._telemetry.values(message, event.time_us, component.vehicle.clock):
+                self._correction.telemetry(*value)
+            if message.id == Position.MESSAGE:
+                self._position.update(message, event.time_us)
+        self.journal.link(event.time_us, component.heard)
+        component.heard.clear()
+        if component.parameters.revision != self._revision:
+            self._tune()
+
+    def _hear_state(self, event: Event) -> None:
+        """Take note of a change at the edge: a port, or the host's clock."""
+        for message in Codec(0, 0).parse(event.data):
+            if message.id == CLOCK_STEP:
+                self.component.publisher.utc_offset_us += message["step"]
+                step = f"clock was set by {message['step'] * 1e-6:+.3f} s"
+                self.component.announcer.say(step, MAV_SEVERITY.NOTICE)
+            elif message.id == PORT:
+                well = message["state"] == MAG_PORT_STATE.OK
+                self._hear_port(message["port"], well, message["reason"], message["dropped"], event.time_us)
+
+    def _hear_port(self, port: int, well: bool, reason: str, dropped: int, time_us: int) -> None:
+        severity = MAV_SEVERITY.INFO if well else MAV_SEVERITY.ERROR
+        if port == MAG_PORT_NAME.SENSOR:
+            self.sensor.opened(time_us) if well else self.sensor.lost(reason)
+        elif port == MAG_PORT_NAME.LOG:
+            self._log_state = MAG_LOG_STATE.OK if well else MAG_LOG_STATE.FAILED
+            self._log_lost = dropped
+            self.component.announcer.state("log", f"log: {reason or 'being written'}", severity)
+        else:
+            self.component.announcer.state("link", f"link: {reason or 'open'}", severity)
+
+    def _tune(self) -> None:
+        """Obey the parameters."""
+        parameters = self.component.parameters
+        self._revision = parameters.revision
+        settings = {name: parameters.of(f"align.{name}") for name in Align.__struct_fields__}
+        ages = {name: parameters.of(f"telemetry.{name}.max_age") for name in self._config.telemetry}
+        self._correction.aligner.tune(Align(**settings), ages)
+
+    def _tell_doubts(self, doubts: int) -> None:
+        names = Quality(doubts).names().replace("_", " ")
+        severity = MAV_SEVERITY.WARNING if names else MAV_SEVERITY.INFO
+        self.component.announcer.state("quality", f"field: {names or 'good'}", severity)
+        self._quality = doubts
+
+    def _begin(self, start: Start, calibration: Calibration | None, *, foreign: bool) -> None:
+        """Write down what a replay needs, and say with what the bridge works."""
+        self.journal.note(
+            start.time_us,
+            "MAG_BRIDGE_START",
+            time_usec=start.time_us,
+            signing_timestamp=start.signing_timestamp,
+            calibration_id=self._calibration_id,
+            config_digest=bytes.fromhex(self._config.digest),
+            version=magbridge.__version__,
+            driver=self._config.sensor.driver,
+        )
+        for name, value in start.parameters.items():
+            self.journal.note(
+                start.time_us,
+                "PARAM_VALUE",
+                param_id=name,
+                param_value=value,
+                param_type=MAV_PARAM_TYPE.REAL32,
+            )
+        say = self.component.announcer.say
+        if foreign:
+            say(f"calibration is not of a {self._config.sensor.driver}: not used", MAV_SEVERITY.ERROR)
+        elif calibration is None:
+            say("no calibration: raw field", MAV_SEVERITY.WARNING)
+        else:
+            say(f"calibration {self._calibration_id:08x}, {calibration.method}")
+
+    def _status(self) -> dict[str, object]:
+        """Return what MAG_STATUS says of the sensor, the samples and the log."""
+        times, now_us = self._times, self.component.codec.now_us
+        span_us = times[-1] - times[0] if len(times) > 1 else 0
+        tracks = self._correction.aligner.by_name
+        stale = sum(
+            1 << bit
+            for bit, name in enumerate(self._config.telemetry)
+            if bit < 32 and name in tracks and tracks[name].stale(now_us)
+        )
+        return {
+            "samples": self._samples,
+            "samples_lost": self._lost,
+            "sensor_bytes_skipped": self._driver.bytes_skipped,
+            "sensor_frames_bad": self._driver.frames_bad,
+            "sensor_state": self.sensor.state,
+            "sensor_clock_drift": -self._clock.drift_ppm,
+            "sample_rate": (len(times) - 1) * 1e6 / span_us if span_us > 0 else nan,
+            "telemetry_stale": stale,
+            "log_records": self.journal.count & 0xFFFFFFFF,
+            "log_lost": self._log_lost,
+            "log_state": self._log_state,
+        }
+
+
+def check(calibration: Calibration, config: Config) -> None:
+    """Check that the link will provide what the calibration needs.
+
+    Raises
+    ------
+    ConfigError
+        A parameter that ``[telemetry]`` lacks, or that comes in another unit.
+    """
+    units = {parameter.name: parameter.unit for parameter in calibration.parameters}
+    for name in calibration.channels:
+        if name == TEMPERATURE:
+            continue
+        if name not in config.telemetry:
+            raise ConfigError(
+                config.path, f"telemetry.{name}", "missing: the calibration needs this parameter"
+            )
+        unit = config.telemetry[name].unit
+        if units.get(name) and unit and unit != units[name]:
+            raise ConfigError(
+                config.path, f"telemetry.{name}.unit", f"the calibration is in {units[name]}, not in {unit}"
+            )

@@ -1,0 +1,56 @@
+"""Where the vehicle says it is, and what the Earth's main field is there."""
+
+from __future__ import annotations
+
+from math import nan
+
+from magbridge.errors import MagbridgeError
+from magbridge.mavlink import Message, spec
+
+__all__ = ["Position"]
+
+POSITION = spec("GLOBAL_POSITION_INT")
+MAX_AGE_US = 60_000_000
+"""µs: a glider makes 20 m in a minute, over which the main field changes by less than 0.1 nT."""
+AGAIN_US = 1_000_000
+"""µs for which a value of the main field serves."""
+
+
+class Position:
+    """The vehicle's last position; the field model is loaded when the first one comes."""
+
+    MESSAGE = POSITION.id
+
+    def __init__(self) -> None:
+        self._where: tuple[float, float, float] | None = None
+        self._when_us = self._evaluated_us = 0
+        self._field = nan
+        self._model: object = None
+
+    def update(self, message: Message, time_us: int) -> None:
+        """Take a GLOBAL_POSITION_INT."""
+        latitude, longitude, altitude = message["lat"] * 1e-7, message["lon"] * 1e-7, message["alt"] * 1e-3
+        if latitude or longitude:  # 0, 0 is what an autopilot says that does not know
+            self._where = latitude, longitude, -altitude
+            self._when_us, self._evaluated_us = time_us, 0
+
+    def main_field(self, time_us: int) -> float:
+        """Return the IGRF's total field in nT; NaN where the position is not known, or no model covers it."""
+        if self._where is None or abs(time_us - self._when_us) > MAX_AGE_US:
+            return nan
+        if abs(time_us - self._evaluated_us) > AGAIN_US:
+            self._evaluated_us = time_us
+            self._field = self._evaluate(time_us)
+        return self._field
+
+    def _evaluate(self, time_us: int) -> float:
+        assert self._where is not None
+        try:
+            from magbridge.field.nearby import NearbyField  # noqa: PLC0415 - the field model is optional live
+
+            if self._model is None:
+                self._model = NearbyField()
+            assert isinstance(self._model, NearbyField)
+            return self._model.at(*self._where, time_us * 1e-6)[0]
+        except (ImportError, MagbridgeError):
+            return nan

@@ -1,0 +1,177 @@
+"""Run a bridge: set the pipeline up, feed it from an edge, send and log what it says."""
+
+from __future__ import annotations
+
+import gc
+import signal
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Protocol
+
+from magbridge.bridge import states
+from magbridge.bridge.events import Clock, Event
+from magbridge.bridge.live import LiveEdge
+from magbridge.bridge.pipeline import Pipeline, Start
+from magbridge.bridge.serial_port import SerialPort
+from magbridge.bridge.sockets import open_link
+from magbridge.calibration import file as calibration_file
+from magbridge.config import Config, load
+from magbridge.errors import PortError
+from magbridge.link import store
+from magbridge.logs.tlog import TlogWriter
+from magbridge.mavlink import load_key
+from magbridge.records import Channel
+
+__all__ = ["Edge", "drive", "run", "set_up"]
+
+KEEP_US = 60_000_000
+"""µs between two savings of the signing time stamp; after a crash a minute is added to it."""
+LOG_LOOK_US = 1_000_000
+"""µs between looks at how the log is."""
+
+
+class Edge(Protocol):
+    """Where events come from, and where bytes go."""
+
+    def events(self, deadline: Callable[[], int]) -> Iterator[Event]:
+        """Yield events in order; one, if only an empty one, by `deadline` (µs)."""
+        ...
+
+    def send(self, channel: Channel, data: bytes) -> None:
+        """Send to the link or to the sensor."""
+        ...
+
+
+def set_up(config: Config, start: Start) -> Pipeline:
+    """Return the pipeline that a configuration describes.
+
+    Raises
+    ------
+    ConfigError, FormatError, CalibrationError
+        The configuration, or a file that it names, does not say what it should.
+    """
+    calibration = None
+    if config.calibration is not None:
+        calibration = calibration_file.load(config.resolve(config.calibration.file))
+    key = load_key(config.resolve(config.link.signing_key)) if config.link.signing_key else None
+    return Pipeline(config, calibration, start, key)
+
+
+def drive(pipeline: Pipeline, edge: Edge, log: TlogWriter | None, after: Callable[[int], None]) -> None:
+    """Feed the pipeline until the edge ends; call ``after(time_us)`` when each event is dealt with."""
+    for event in edge.events(lambda: pipeline.deadline):
+        sent = pipeline.feed(event)
+        if sent:
+            edge.send(Channel.LINK, b"".join([frame for _, frame in sent]))
+        if pipeline.sensor.to_send:
+            edge.send(Channel.SENSOR, b"".join(pipeline.sensor.to_send))
+            pipeline.sensor.to_send.clear()
+        records = pipeline.journal.drain()
+        if log is not None:
+            for record in records:
+                log.write(*record)
+        after(event.time_us)
+
+
+def run(path: Path) -> None:
+    """Attach to the sensor and the link that a ``bridge.toml`` names, until stopped by a signal.
+
+    Raises
+    ------
+    ConfigError, FormatError, CalibrationError
+        As :func:`set_up`; nothing was opened then.
+    """
+    config = load(path)
+    keeper = Keeper(config)
+    clock = Clock()
+    pipeline = set_up(config, keeper.start(clock.now_us()))
+    sensor = SerialPort(config.sensor.port, config.sensor.baudrate)
+    link = open_link(config.link.url, config.link.baudrate, str(config.path))
+    edge = LiveEdge({Channel.SENSOR: sensor, Channel.LINK: link}, clock)
+    log = _open_log(config, edge)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: edge.stop())
+    gc.collect()
+    gc.freeze()  # what is here now stays: the collector need not look at it again
+    watch = LogWatch(log, edge)
+
+    def after(time_us: int) -> None:
+        keeper.look(pipeline, time_us)
+        watch.look(time_us)
+
+    try:
+        drive(pipeline, edge, log, after)
+    finally:
+        edge.close()
+        keeper.save(pipeline)
+        if log is not None:
+            log.close()
+
+
+def _open_log(config: Config, edge: LiveEdge) -> TlogWriter | None:
+    """Open the log; a folder that cannot be made is told over the link, and does not stop the bridge."""
+    if config.log is None:
+        return None
+    directory = config.resolve(config.log.directory)
+    try:
+        log = TlogWriter(directory, max_size=config.log.max_size, max_age=config.log.max_age)
+    except PortError as error:
+        edge.tell(states.log_state(error.reason, 0))
+        return None
+    edge.tell(states.log_state("", 0))
+    return log
+
+
+class LogWatch:
+    """Tells the pipeline when the log fails and when it is well again."""
+
+    def __init__(self, log: TlogWriter | None, edge: LiveEdge) -> None:
+        self._log, self._edge = log, edge
+        self._told = ""
+        self._look_us = 0
+
+    def look(self, time_us: int) -> None:
+        """Look, once a second."""
+        if self._log is None or time_us < self._look_us:
+            return
+        self._look_us = time_us + LOG_LOOK_US
+        if self._log.failure != self._told:
+            self._told = self._log.failure
+            self._edge.tell(states.log_state(self._told, self._log.lost))
+
+
+class Keeper:
+    """Keeps what must outlive the process: parameters set over the link, the signing time stamp."""
+
+    MARGIN = KEEP_US // 10
+    """Added to the kept time stamp (units of 10 µs), because it may be as old as that."""
+
+    def __init__(self, config: Config) -> None:
+        self._path = config.resolve(config.link.parameters)
+        self._kept = store.load(self._path)
+        self._signs = config.link.signing_key is not None
+        self._saved_us = 0
+
+    def start(self, time_us: int) -> Start:
+        """Return the start of a run at `time_us`."""
+        stamp = self._kept.signing_timestamp
+        return Start(time_us, self._kept.parameters, stamp + self.MARGIN if stamp else 0)
+
+    def look(self, pipeline: Pipeline, time_us: int) -> None:
+        """Save what changed; the time stamp now and then."""
+        changed = pipeline.component.parameters.changed() != self._kept.parameters
+        if changed or (self._signs and time_us - self._saved_us > KEEP_US):
+            self._saved_us = time_us
+            self.save(pipeline)
+
+    def save(self, pipeline: Pipeline) -> None:
+        """Write the file, if there is anything to keep; a disk that is full keeps the old one."""
+        stamp = pipeline.signing.last if pipeline.signing else 0
+        kept = store.Kept(pipeline.component.parameters.changed(), stamp)
+        if kept == self._kept:
+            return
+        self._kept = kept
+        try:
+            store.save(self._path, kept)
+        except OSError as error:
+            pipeline.component.announcer.say(f"parameters not kept: {error.strerror}")

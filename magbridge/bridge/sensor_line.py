@@ -1,0 +1,89 @@
+"""The sensor's line: does it speak, and what must it be told."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from magbridge.link.announcer import Announcer
+from magbridge.link.timers import Timers
+from magbridge.mavlink.dialect import MAG_PORT_STATE, MAV_SEVERITY
+
+__all__ = ["SensorLine"]
+
+COMMAND_GAP_US = 100_000
+"""µs between two commands to a sensor."""
+LOOK_US = 1_000_000
+"""µs between looks at whether the sensor still speaks."""
+
+
+class SensorLine:
+    """Watches the line, and sends the start-up commands whenever the sensor may have lost them.
+
+    Parameters
+    ----------
+    name : str
+        What the sensor is called when its state is told.
+    commands : callable
+        Returns the commands that start it.
+    timeout_us : int
+        µs without a reading after which it counts as silent.
+    announcer, timers
+        The link's.
+    start_us : int
+        µs since 1970 UTC.
+
+    Attributes
+    ----------
+    state : MAG_PORT_STATE
+    to_send : list of bytes
+        Commands that are due; whoever feeds the pipeline sends and empties them.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        commands: Callable[[], tuple[bytes, ...]],
+        timeout_us: int,
+        announcer: Announcer,
+        timers: Timers,
+        start_us: int,
+    ) -> None:
+        self._name, self._commands, self._timeout_us = name, commands, timeout_us
+        self._announcer, self._timers = announcer, timers
+        self.state = MAG_PORT_STATE.ABSENT
+        self.to_send: list[bytes] = []
+        self._heard_us = start_us
+        timers.every("sensor", LOOK_US, self._look, start_us + LOOK_US)
+
+    def spoke(self, time_us: int) -> None:
+        """Take note of a reading."""
+        self._heard_us = time_us
+        if self.state != MAG_PORT_STATE.OK:
+            self.state = MAG_PORT_STATE.OK
+            self._announcer.state("sensor", f"{self._name} speaks")
+
+    def opened(self, time_us: int) -> None:
+        """Take note that the port opened: it is silent until the sensor speaks."""
+        self._silent(time_us)
+
+    def lost(self, reason: str) -> None:
+        """Take note that the port is gone."""
+        self.state = MAG_PORT_STATE.LOST
+        self._timers.cancel("command")
+        self._announcer.state("sensor", f"{self._name} lost: {reason}", MAV_SEVERITY.ERROR)
+
+    def _look(self, time_us: int) -> None:
+        if time_us - self._heard_us < self._timeout_us or self.state == MAG_PORT_STATE.LOST:
+            return
+        self._announcer.state("sensor", f"{self._name} is silent", MAV_SEVERITY.ERROR)
+        self._silent(time_us)
+
+    def _silent(self, time_us: int) -> None:
+        """Begin to tell the sensor what it must know; it may have been without power."""
+        self.state, self._heard_us = MAG_PORT_STATE.SILENT, time_us
+        self._command(time_us, self._commands())
+
+    def _command(self, time_us: int, commands: tuple[bytes, ...]) -> None:
+        if commands:
+            self.to_send.append(commands[0])
+            self._timers.at("command", time_us + COMMAND_GAP_US, lambda t: self._command(t, commands[1:]))

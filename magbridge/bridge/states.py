@@ -1,0 +1,36 @@
+"""What changes at the edge, as frames of our own dialect: they go into the log, and a replay feeds them back."""
+
+from __future__ import annotations
+
+from magbridge.bridge.port import Port
+from magbridge.mavlink.codec import Codec
+from magbridge.mavlink.dialect import MAG_PORT_NAME, MAG_PORT_STATE
+from magbridge.records import Channel
+
+__all__ = ["clock_step", "log_state", "opened", "port"]
+
+
+def _frame(name: str, **fields: object) -> bytes:
+    return Codec(0, 0).pack(name, **fields)
+
+
+def clock_step(time_us: int, step_us: int) -> bytes:
+    """Return the frame that says that the host's clock was set by `step_us` µs."""
+    return _frame("MAG_CLOCK_STEP", time_usec=time_us + step_us, step=step_us)
+
+
+def port(channel: Channel, what: Port, reason: str) -> bytes:
+    """Return the frame that says that a port opened (no `reason`) or why it is not open."""
+    state = MAG_PORT_STATE.LOST if reason else MAG_PORT_STATE.OK
+    return _frame("MAG_PORT", port=int(channel), state=int(state), dropped=what.dropped, reason=reason)
+
+
+def opened(name: MAG_PORT_NAME) -> bytes:
+    """Return the frame that says that a port opened, where there is none to ask: in a replay."""
+    return _frame("MAG_PORT", port=int(name), state=int(MAG_PORT_STATE.OK))
+
+
+def log_state(reason: str, lost: int) -> bytes:
+    """Return the frame that says that the log is being written (no `reason`) or why not, and records lost."""
+    state = MAG_PORT_STATE.LOST if reason else MAG_PORT_STATE.OK
+    return _frame("MAG_PORT", port=int(MAG_PORT_NAME.LOG), state=int(state), dropped=lost, reason=reason)

@@ -1,0 +1,92 @@
+"""An emulated autopilot: says over MAVLink what a deployment's telemetry says.
+
+System 1, component 1. Once a second a heartbeat; with every row of the deployment the messages from which the
+bridge's configuration takes its parameters, the attitude and the position.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from math import isfinite, nan, radians
+from typing import Any
+
+from magbridge.config import Config, Telemetry
+from magbridge.mavlink.codec import Codec
+from magbridge.mavlink.messages import spec, split_index
+
+__all__ = ["Autopilot"]
+
+HEARTBEAT_US = 1_000_000
+SUBMARINE, GENERIC, ACTIVE = 12, 0, 4
+"""MAV_TYPE, MAV_AUTOPILOT and MAV_STATE of its heartbeat."""
+
+
+class Autopilot:
+    """Turns rows of a deployment into MAVLink frames.
+
+    Parameters
+    ----------
+    config : Config
+        The bridge's: whose telemetry is emulated, under which system id.
+    boot_us : int
+        µs since 1970 UTC at which the vehicle booted.
+    """
+
+    def __init__(self, config: Config, boot_us: int) -> None:
+        self._codec = Codec(config.link.system, config.link.autopilot)
+        self._telemetry = config.telemetry
+        self._boot_us = boot_us
+        self._next_heartbeat_us = boot_us
+
+    def heartbeats(self, until_us: int) -> list[tuple[int, bytes]]:
+        """Return the heartbeats due up to `until_us`, with their times."""
+        due = []
+        while self._next_heartbeat_us <= until_us:
+            frame = self._codec.pack(
+                "HEARTBEAT", type=SUBMARINE, autopilot=GENERIC, system_status=ACTIVE, mavlink_version=3
+            )
+            due.append((self._next_heartbeat_us, frame))
+            self._next_heartbeat_us += HEARTBEAT_US
+        return due
+
+    def row(self, time_us: int, row: Mapping[str, float]) -> list[bytes]:
+        """Return the frames that tell one row: columns by their contract names, NaN where lacking."""
+        boot_ms = (time_us - self._boot_us) // 1000
+        frames = [
+            self._parameter(telemetry, row[name], boot_ms)
+            for name, telemetry in self._telemetry.items()
+            if isfinite(row.get(name, nan))
+        ]
+        attitude = [row.get(name, nan) for name in ("roll", "pitch", "heading")]
+        if all(map(isfinite, attitude)):
+            roll, pitch, yaw = map(radians, attitude)
+            frames.append(self._codec.pack("ATTITUDE", time_boot_ms=boot_ms, roll=roll, pitch=pitch, yaw=yaw))
+        latitude, longitude = row.get("latitude", nan), row.get("longitude", nan)
+        if isfinite(latitude) and isfinite(longitude):
+            depth = row.get("depth", nan)
+            frames.append(
+                self._codec.pack(
+                    "GLOBAL_POSITION_INT",
+                    time_boot_ms=boot_ms,
+                    lat=round(latitude * 1e7),
+                    lon=round(longitude * 1e7),
+                    alt=round(-1e3 * depth) if isfinite(depth) else 0,
+                )
+            )
+        return frames
+
+    def _parameter(self, telemetry: Telemetry, value: float, boot_ms: int) -> bytes:
+        """Return the message from which the bridge will read `value`: the inverse of its mapping."""
+        name, index = split_index(telemetry.field)
+        field = spec(telemetry.message).fields[name]
+        number: Any = (value - telemetry.offset) / telemetry.scale
+        if field.code not in "fd":
+            number = round(number)
+        fields: dict[str, Any] = dict(telemetry.match)
+        if "time_boot_ms" in spec(telemetry.message).fields:
+            fields["time_boot_ms"] = boot_ms
+        if index is not None:
+            values = [0] * field.count
+            values[index] = number
+            number = bytes(values) if field.code == "B" else values
+        return self._codec.pack(telemetry.message, **{**fields, name: number})

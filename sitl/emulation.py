@@ -1,0 +1,115 @@
+"""What two devices would have sent in a deployment: the events that a replay of it plays.
+
+The emulated fluxgate takes its readings at the deployment's times and sends each when its last channel is
+sampled; the emulated autopilot tells each row's telemetry just before.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import pairwise
+from math import isfinite, nan
+
+import numpy as np
+import xarray as xr
+
+from magbridge.bridge import states
+from magbridge.bridge.events import Event
+from magbridge.config import Config
+from magbridge.mavlink.dialect import MAG_PORT_NAME
+from magbridge.records import Channel, Reading
+from magbridge.sensors import open_driver
+from sitl.autopilot import Autopilot
+from sitl.fluxgate import Encoder, open_encoder
+
+__all__ = ["emulate", "start_us"]
+
+LEAD_US = 2_000_000
+"""µs before the first row at which the bridge starts."""
+TELEMETRY_LEAD_US = 1_000
+"""µs by which a row's telemetry comes before its reading."""
+LINE_DELAY_US = 2_000
+"""µs from a reading's last sample to its last byte."""
+
+
+def start_us(deployment: xr.Dataset) -> int:
+    """Return when the bridge starts, in µs since 1970 UTC: a little before the first row."""
+    return _stamp(float(deployment["time"][0])) - LEAD_US
+
+
+def emulate(deployment: xr.Dataset, config: Config) -> Iterator[Event]:
+    """Yield the events of a deployment, in order of time.
+
+    Parameters
+    ----------
+    deployment : Dataset (time)
+        With ``mag_x mag_y mag_z``, and whatever telemetry it has.
+    config : Config
+        Of the bridge: which instrument is emulated, and in which messages the telemetry is told.
+
+    Raises
+    ------
+    ConfigError
+        The instrument cannot be emulated.
+    """
+    begin_us = start_us(deployment)
+    autopilot = Autopilot(config, begin_us)
+    times = deployment["time"].to_numpy().astype(float)
+    fluxgate = open_encoder(config.sensor.driver, config.sensor.options, _rate(times), config.path)
+    answers = b"".join(fluxgate.feed(command) for command in _commands(config))
+    for port in (MAG_PORT_NAME.SENSOR, MAG_PORT_NAME.LINK):
+        yield Event(begin_us, Channel.STATE, states.opened(port))
+    if answers:
+        yield Event(begin_us, Channel.SENSOR, answers)
+    last_us = begin_us
+    for time_us, row in _rows(deployment):
+        told_us = max(last_us, time_us - TELEMETRY_LEAD_US & ~3)
+        for beat_us, frame in autopilot.heartbeats(told_us):
+            yield Event(max(last_us, beat_us), Channel.LINK, frame)
+        frames = autopilot.row(time_us, row)
+        if frames:
+            yield Event(told_us, Channel.LINK, b"".join(frames))
+        last_us = told_us
+        data, delay_us = _reading(fluxgate, (time_us - begin_us) * 1e-6, row, time_us)
+        if data:
+            last_us = max(told_us, time_us + delay_us + LINE_DELAY_US & ~3)
+            yield Event(last_us, Channel.SENSOR, data)
+
+
+def _commands(config: Config) -> tuple[bytes, ...]:
+    """Return what the bridge's driver tells the sensor at the start."""
+    return open_driver(config.sensor.driver, config.sensor.options, config.path).start()
+
+
+def _rows(deployment: xr.Dataset) -> Iterator[tuple[int, dict[str, float]]]:
+    """Yield each row as a dict, with its time in µs."""
+    names = ["time", *(str(name) for name in deployment.data_vars)]
+    columns = [deployment[name].to_numpy().astype(float).tolist() for name in names]
+    for values in zip(*columns, strict=True):
+        row = dict(zip(names, values, strict=True))
+        yield _stamp(row["time"]), row
+
+
+def _reading(fluxgate: Encoder, device_time: float, row: dict[str, float], time_us: int) -> tuple[bytes, int]:
+    """Return the bytes of a row's reading, and the µs until its last channel is sampled."""
+    x, y, z = row["mag_x"], row["mag_y"], row["mag_z"]
+    if not isfinite(x + y + z):
+        return b"", 0
+    dx, dy, dz = (
+        delay if isfinite(delay := row.get(f"mag_time_{axis}", nan) - time_us * 1e-6) else 0.0
+        for axis in "xyz"
+    )
+    delays = (max(dx, 0.0), max(dy, 0.0), max(dz, 0.0))
+    temperature = row.get("sensor_temperature", nan)
+    reading = Reading((x, y, z), device_time=device_time, channel_delay=delays, temperature=temperature)
+    data = fluxgate.encode(reading)
+    return data, round(max(delays) * 1e6)
+
+
+def _stamp(time: float) -> int:
+    return round(time * 1e6) & ~3
+
+
+def _rate(times: np.ndarray[tuple[int], np.dtype[np.float64]]) -> float:
+    steps = [later - earlier for earlier, later in pairwise(times[:1000].tolist())]
+    return 1.0 / float(np.median(steps)) if steps else 1.0

@@ -1,0 +1,112 @@
+"""The process in which a bridge plays under replay: its real ports, and the timetable's clock.
+
+Run by :class:`sitl.stage.Stage`; not a command of its own.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import select
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import msgspec
+
+from magbridge.bridge.events import Event
+from magbridge.bridge.pipeline import Start
+from magbridge.bridge.port import Port
+from magbridge.bridge.run import drive, set_up
+from magbridge.bridge.serial_port import SerialPort
+from magbridge.bridge.sockets import open_link
+from magbridge.config import load
+from magbridge.errors import MagbridgeError
+from magbridge.logs.tlog import TlogWriter
+from magbridge.records import Channel
+from sitl.timetable import read_entries
+
+__all__ = ["ScriptedEdge"]
+
+BATCH = 8192
+"""Bytes to the autopilot that may wait for company."""
+
+
+class ScriptedEdge:
+    """Reads real ports in the order, and at the times, that a timetable says."""
+
+    def __init__(self, ports: dict[Channel, Port], timetable: int) -> None:
+        self._ports = ports
+        self._timetable = timetable
+        self._entries = read_entries(self._wait_for_times)
+        self._unread = {channel: bytearray() for channel in ports}
+        self._unsent = bytearray()
+
+    def start(self) -> Start:
+        """Return the start that the timetable begins with."""
+        _, _, _, data = next(self._entries)
+        return msgspec.json.decode(data, type=Start)
+
+    def events(self, _deadline: Callable[[], int]) -> Iterator[Event]:
+        """Yield the events of the timetable; the bytes come through the ports."""
+        for time_us, channel, size, data in self._entries:
+            yield Event(time_us, channel, data if channel is Channel.STATE else self._take(channel, size))
+        self.flush()
+
+    def _wait_for_times(self) -> bytes:
+        self.flush()  # whoever paces the replay wants to see what was published before the next event
+        return os.read(self._timetable, 65536)
+
+    def _take(self, channel: Channel, size: int) -> bytes:
+        """Return exactly `size` bytes of a port, waiting for them."""
+        unread = self._unread[channel]
+        while len(unread) < size:
+            port = self._ports[channel]
+            if select.select(port.fds(), [], [], 10.0)[0]:
+                unread += port.read()
+        data = bytes(unread[:size])
+        del unread[:size]
+        return data
+
+    def send(self, channel: Channel, data: bytes) -> None:
+        """Send to the autopilot; what a sensor under replay is told, it was told when the log was made."""
+        if channel is Channel.SENSOR:
+            return
+        self._unsent += data
+        if len(self._unsent) >= BATCH:
+            self.flush()
+
+    def flush(self) -> None:
+        """Send what is waiting, whole."""
+        self._ports[Channel.LINK].write_all(bytes(self._unsent))
+        self._unsent.clear()
+
+
+def main() -> int:
+    """Play the bridge on the ports given."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("config", type=Path)
+    parser.add_argument("--sensor", required=True)
+    parser.add_argument("--link", required=True)
+    parser.add_argument("--timetable", type=int, required=True)
+    parser.add_argument("--log", type=Path)
+    chosen = parser.parse_args()
+    try:
+        config = load(chosen.config)
+        sensor, link = SerialPort(chosen.sensor, config.sensor.baudrate), open_link(chosen.link, 0)
+        sensor.open()
+        link.open()
+        edge = ScriptedEdge({Channel.SENSOR: sensor, Channel.LINK: link}, chosen.timetable)
+        pipeline = set_up(config, edge.start())
+        log = TlogWriter(chosen.log) if chosen.log else None
+        drive(pipeline, edge, log, lambda _: None)
+        if log is not None:
+            log.close(timeout=60.0)
+    except MagbridgeError as error:
+        print(error, file=sys.stderr)
+        return error.exit_code
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
