@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import re
 from itertools import pairwise
+from operator import sub
 from struct import Struct
 from typing import Annotated, ClassVar, Literal
 
@@ -29,6 +30,8 @@ RETURN = 0x0D
 COUNTS = Struct(">hhh")
 CONFIRM = 4
 """Frames in a row that must end in a carriage return before an alignment is believed."""
+LEAP = 1000
+"""Counts by which a first frame may differ from the second in any case."""
 WINDOW = SIZE * CONFIRM + SIZE - 1
 """Bytes in which every one of the seven alignments has that many frames."""
 NUMBER = rb"([ +-][\d ]{2}[, ][\d ]{2}\d)"
@@ -104,8 +107,7 @@ class Hmr2300:
             if not self._aligned:
                 if end - at < WINDOW:
                     break
-                offset = _alignment(buffer, at)
-                self._aligned = offset < SIZE
+                offset, self._aligned = _alignment(buffer, at)
                 self._skipped += offset
                 at += offset
             elif end - at < SIZE:
@@ -137,18 +139,19 @@ def _reading(x: int, y: int, z: int) -> Reading:
     return Reading(field, (x, y, z), saturated=not inside)
 
 
-def _alignment(buffer: bytes, at: int) -> int:
-    """Return how many bytes after `at` the first frame begins; `SIZE` where none can be seen in the window."""
-    best, least = SIZE, 0
+def _alignment(buffer: bytes, at: int) -> tuple[int, bool]:
+    """Return how many bytes after `at` the first frame begins, and whether one was found in the window at all.
+
+    The end of a reply to a command looks like a frame, just before the first real one; it is left out.
+    """
+    best, least, found = SIZE, 0, False
     for offset in range(SIZE):
         starts = range(at + offset, at + offset + SIZE * CONFIRM, SIZE)
         if all(buffer[start + SIZE - 1] == RETURN for start in starts):
             frames = [COUNTS.unpack_from(buffer, start) for start in starts]
-            variation = sum(
-                abs(now - then)
-                for before, after in pairwise(frames)
-                for then, now in zip(before, after, strict=True)
-            )
-            if best == SIZE or variation < least:
-                best, least = offset, variation
-    return best
+            steps = [sum(map(abs, map(sub, after, before))) for before, after in pairwise(frames)]
+            variation = sum(steps[1:])
+            if not found or variation < least:
+                leap = steps[0] > 10 * variation + LEAP
+                best, least, found = offset + SIZE * leap, variation, True
+    return best, found

@@ -50,6 +50,7 @@ FORMATS = {
 
 HEADER = Struct("<BBH")
 RPC_HEAD = Struct("<HH")
+FLOAT = Struct("<f")
 TIMEBASE_HEAD = Struct("<HBBQIIIf")
 """Number, source, epoch, start, numerator and denominator of the period in µs, flags, stability."""
 SOURCE_HEAD = Struct("<HHIIiHHB")

@@ -31,7 +31,7 @@ class TwinleafOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
 
     Attributes
     ----------
-    columns : list of 3 str
+    columns : tuple of 3 str
         The three channels, as the device calls them.
     temperature : str
         The column with the temperature in degC, if there is one.
@@ -43,9 +43,7 @@ class TwinleafOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
         nT at which a channel saturates.
     """
 
-    columns: Annotated[list[str], Meta(min_length=3, max_length=3)] = msgspec.field(
-        default_factory=lambda: ["vector.x", "vector.y", "vector.z"]
-    )
+    columns: tuple[str, str, str] = ("vector.x", "vector.y", "vector.z")
     temperature: str = ""
     unit: str | None = None
     route: Annotated[str, Meta(pattern=r"^/?(\d+(/\d+)*/?)?$")] = "/"
@@ -194,6 +192,8 @@ class Twinleaf:
         row = self._rows[number]
         if row is None:
             return []
+        if len(payload) < 4:
+            raise ValueError
         first = int.from_bytes(payload[:4], "little")
         if number == 0:
             stream = self._streams[0]

@@ -1,0 +1,52 @@
+"""Emulated instruments: the inverse of each driver, in the instrument's own bytes.
+
+An encoder quantises and saturates as the instrument does, counts its readings, and answers what the driver
+sends, so that a program behind a pty cannot tell it from the real one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from magbridge.config import convert
+from magbridge.errors import ConfigError
+from sitl.fluxgate.ascii import AsciiEncoder
+from sitl.fluxgate.digitizer import DigitizerEncoder
+from sitl.fluxgate.encoder import Encoder
+from sitl.fluxgate.hmr2300 import Hmr2300Encoder
+from sitl.fluxgate.twinleaf import TwinleafEncoder
+
+__all__ = ["ENCODERS", "Encoder", "open_encoder"]
+
+ENCODERS: dict[str, type[Encoder]] = {
+    "ascii": AsciiEncoder,
+    "digitizer": DigitizerEncoder,
+    "hmr2300": Hmr2300Encoder,
+    "twinleaf": TwinleafEncoder,
+}
+"""Driver's name: the emulated instrument."""
+
+
+def open_encoder(
+    name: str, options: Mapping[str, Any], rate: float = 1.0, source: str | Path = "bridge.toml"
+) -> Encoder:
+    """Return the emulated instrument that the driver called `name` reads.
+
+    Parameters
+    ----------
+    name, options, source
+        As for :func:`magbridge.sensors.open_driver`.
+    rate : float
+        Hz, for an instrument that dates a reading by its number.
+
+    Raises
+    ------
+    ConfigError
+        No such instrument, or a wrong option.
+    """
+    if name not in ENCODERS:
+        raise ConfigError(source, "sensor.driver", f"can emulate {', '.join(ENCODERS)}")
+    encoder = ENCODERS[name]
+    return encoder(convert(dict(options), encoder.Options, source, "sensor.options."), rate)

@@ -1,0 +1,60 @@
+"""What every emulated instrument offers."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import Any, ClassVar
+
+from magbridge.records import Reading
+
+__all__ = ["Encoder", "clip"]
+
+
+class Encoder(ABC):
+    """An instrument, switched on.
+
+    Parameters
+    ----------
+    options
+        Of the driver that reads it.
+    rate : float
+        Hz, for an instrument that dates a reading by its number.
+
+    Attributes
+    ----------
+    streaming : bool
+        Whether it sends readings now; some wait for a command.
+    power_cycle : int
+        How often it was switched on.
+    """
+
+    Options: ClassVar[Any]
+    streaming = True
+
+    def __init__(self, options: Any, rate: float = 1.0) -> None:
+        self.options = options
+        self.rate = rate
+        self.power_cycle = 0
+        self.power_on()
+
+    def power_on(self) -> None:
+        """Be switched off and on again: count that, and readings from 0."""
+        self.power_cycle += 1
+        self.sequence = 0
+
+    @abstractmethod
+    def encode(self, reading: Reading) -> bytes:
+        """Return what it sends for one reading; nothing where it is not streaming.
+
+        Of `reading` it takes the field (nT, finite), `device_time` (s on its own clock, which begins at power-on),
+        `channel_delay`, `temperature` and `supply`, as far as it has them; it counts for itself.
+        """
+
+    def feed(self, data: bytes) -> bytes:  # noqa: ARG002 - most do not listen
+        """Take what was sent to it; return its answers."""
+        return b""
+
+
+def clip(value: float, limit: float) -> float:
+    """Return `value`, at most `limit` either side of zero."""
+    return max(-limit, min(value, limit))

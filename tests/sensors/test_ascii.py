@@ -1,0 +1,131 @@
+"""Line protocols as the configuration describes them."""
+
+from __future__ import annotations
+
+from functools import reduce
+from math import inf
+from operator import xor
+from typing import Any
+from zlib import crc32
+
+import pytest
+
+from magbridge.records import Reading
+from magbridge.sensors import open_driver
+
+
+def read(text: str, **options: Any) -> list[Reading]:
+    return open_driver("ascii", options).feed(text.encode())
+
+
+def test_aps_1540() -> None:
+    text = " 0.21345 -0.04521  0.48766  21.45\r\n"
+    (reading,) = read(text, columns=["x", "y", "z", "temperature"], unit="G", range=65_000.0)
+    assert reading.field == pytest.approx((21_345.0, -4_521.0, 48_766.0))
+    assert reading.temperature == 21.45
+    assert (reading.counts, reading.sequence, reading.saturated) == (None, None, False)
+
+
+def test_fgsensors_logger_with_its_header_line() -> None:
+    driver = open_driver(
+        "ascii",
+        {
+            "separator": ",",
+            "columns": ["time", "x", "y", "z", "*"],
+            "time_unit": "ms",
+            "time_modulo": 4294967.296,
+        },
+    )
+    header = b"Timestamp_ms,B1x_nT,B1y_nT,B1z_nT,B1v_nT,Lat_deg\r\n"
+    (reading,) = driver.feed(header + b"123456,24312.5,-1823.1,44521.8,50234.6,46.05\r\n")
+    assert reading.field == (24312.5, -1823.1, 44521.8)
+    assert reading.device_time == pytest.approx(123.456)
+    assert driver.time_modulo == 4294967.296
+    assert (driver.frames_bad, driver.bytes_skipped) == (1, len(header) - 1)
+
+
+@pytest.mark.parametrize(
+    ("checksum", "digits"),
+    [
+        ("nmea", lambda text: f"{reduce(xor, text[1:]):02X}"),
+        ("xor", lambda text: f"{reduce(xor, text):02x}"),
+        ("sum", lambda text: f"{sum(text) % 256:02X}"),
+        ("crc32", lambda text: f"{crc32(text):08X}"),
+    ],
+)
+def test_checksums(checksum: str, digits: Any) -> None:
+    driver = open_driver("ascii", {"prefix": "$M,", "separator": ",", "checksum": checksum})
+    text = b"$M,1.5,-2.5,3"
+    line = text + b"*" + digits(text).encode()
+    assert driver.feed(line + b"\r\n")[0].field == (1.5, -2.5, 3.0)
+    wrong = [line.replace(b"1.5", b"1.6"), text, text + b"*", line[:-1], line[:-1] + b"g", b"*"]
+    assert driver.feed(b"\n".join(wrong) + b"\n") == []
+    assert driver.frames_bad == len(wrong)
+
+
+def test_a_known_nmea_sentence() -> None:
+    # the textbook example of the checksum
+    text = "$GPGLL,5300.97914,N,00259.98174,E,125926,A*28\n"
+    (reading,) = read(
+        text, prefix="$GPGLL,", separator=",", columns=["x", "-", "y", "-", "z", "-"], checksum="nmea"
+    )
+    assert reading.field == (5300.97914, 259.98174, 125926.0)
+
+
+def test_counts_sequence_and_supply() -> None:
+    driver = open_driver(
+        "ascii",
+        {
+            "columns": ["sequence", "x", "y", "z", "supply", "power_cycle"],
+            "unit": "counts",
+            "scale": -2.0,
+            "range": 100.0,
+            "sequence_modulo": 256,
+            "rate": 10.0,
+            "start": ["*99C\r"],
+        },
+    )
+    (reading,) = driver.feed(b"255 10 -20 50 11.5 3\n")
+    assert reading.counts == (10, -20, 50)
+    assert reading.field == (-20.0, 40.0, -100.0)
+    assert (reading.sequence, reading.supply, reading.power_cycle, reading.saturated) == (255, 11.5, 3, True)
+    assert (driver.sequence_modulo, driver.period, driver.range_nt) == (256, 0.1, 100.0)
+    assert driver.start() == (b"*99C\r",)
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "1 2",
+        "1 2 3 4",
+        "1 2 x",
+        "nan 2 3",
+        "1 2 inf",
+        "1 2 3_0",
+        "1,2,3",
+        "1 2 1e999",
+        "\x00 1 2 3",
+        "1 2 \xff",
+    ],
+)
+def test_a_line_that_says_something_else_is_bad(line: str) -> None:
+    driver = open_driver("ascii", {})
+    assert driver.feed(line.encode("latin-1") + b"\n") == []
+    assert driver.frames_bad == 1
+    assert driver.bytes_skipped == len(line.encode("latin-1"))
+
+
+def test_a_time_that_is_no_number_is_bad() -> None:
+    assert read("inf 1 2 3\nnan 1 2 3\n", columns=["time", "x", "y", "z"]) == []
+
+
+def test_other_ends_of_line_and_separators() -> None:
+    assert [r.field for r in read("1;2;3\r4;5;6\r", separator=";", terminator="\r")] == [(1, 2, 3), (4, 5, 6)]
+    assert [r.field for r in read("1\t 2   3\r\n\r\n\n", separator="")] == [(1, 2, 3)]
+    assert open_driver("ascii", {}).range_nt == inf
+
+
+def test_an_overlong_line_is_skipped() -> None:
+    driver = open_driver("ascii", {})
+    assert [r.field for r in driver.feed(b"1 2 " + b"3" * 1000 + b"\n1 2 3\n")] == [(1, 2, 3)]
+    assert driver.bytes_skipped == 1004

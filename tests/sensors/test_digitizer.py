@@ -1,0 +1,90 @@
+"""The digitizer's frame, byte for byte as its description says."""
+
+from __future__ import annotations
+
+from math import isnan
+from zlib import crc32
+
+import pytest
+
+from magbridge.records import Reading
+from magbridge.sensors import digitizer, open_driver
+from magbridge.sensors.digitizer import EXAMPLE
+from magbridge.sensors.framing import cobs_encode
+
+MESSAGE = bytes.fromhex("01240700030040420F00E0C81000804F1200A901800E00ABAA2A0000F0555555")
+OPTIONS = {"sensitivity": 5e-5}
+
+
+def framed(message: bytes) -> bytes:
+    return cobs_encode(message + crc32(message).to_bytes(4, "little")) + b"\0"
+
+
+def read(*frames: bytes, **options: float) -> list[Reading]:
+    return open_driver("digitizer", OPTIONS | options).feed(b"".join(frames))
+
+
+def test_the_worked_example() -> None:
+    assert framed(MESSAGE) == EXAMPLE
+    assert MESSAGE.hex(" ").upper() in str(digitizer.__doc__)
+    (reading,) = read(EXAMPLE)
+    assert reading.counts == (2796203, -1048576, 5592405)
+    # 2796203 / 2^23 * 2.5 V / 5e-5 V/nT
+    assert reading.field == pytest.approx((16666.668653, -6250.0, 33333.331347), abs=1e-6)
+    assert (reading.sequence, reading.power_cycle, reading.saturated) == (7, 3, False)
+    assert reading.device_time == pytest.approx(1.0)
+    assert reading.channel_delay == pytest.approx((0.0, 0.1, 0.2))
+    assert (reading.temperature, reading.supply) == pytest.approx((4.25, 3.712))
+
+
+def test_gain_and_reference_scale_the_field() -> None:
+    (plain,), (other,) = read(EXAMPLE), read(EXAMPLE, reference_voltage=5.0, gain=4.0)
+    assert other.field == pytest.approx([value / 2 for value in plain.field])
+    assert other.counts == plain.counts
+
+
+def test_every_damaged_bit_is_seen() -> None:
+    driver = open_driver("digitizer", OPTIONS)
+    for bit in range(8 * (len(EXAMPLE) - 1)):
+        frame = bytearray(EXAMPLE)
+        frame[bit // 8] ^= 1 << bit % 8
+        assert driver.feed(bytes(frame)) == []
+    assert driver.frames_bad >= 8 * (len(EXAMPLE) - 1)
+    assert len(driver.feed(EXAMPLE)) == 1
+
+
+def test_channels_sampled_across_the_wrap_of_the_clock() -> None:
+    times = (2**32 - 50_000).to_bytes(4, "little") + (50_000).to_bytes(4, "little")
+    (reading,) = read(framed(MESSAGE[:6] + times + (2**32 - 60_000).to_bytes(4, "little") + MESSAGE[18:]))
+    assert reading.channel_delay == pytest.approx((0.0, 0.1, -0.01))
+
+
+@pytest.mark.parametrize("counts", ["FFFF7F", "000080"])
+def test_the_ends_of_the_converter_saturate(counts: str) -> None:
+    (reading,) = read(framed(MESSAGE[:-3] + bytes.fromhex(counts)))
+    assert reading.saturated
+
+
+def test_overload_and_the_fluxgate_s_own_range_saturate() -> None:
+    assert read(framed(MESSAGE[:22] + b"\x02" + MESSAGE[23:]))[0].saturated
+    assert read(EXAMPLE, full_scale=33_000.0)[0].saturated
+    driver = open_driver("digitizer", OPTIONS | {"full_scale": 40_000.0})
+    assert driver.range_nt == pytest.approx(40_000.0)
+    assert not driver.feed(EXAMPLE)[0].saturated
+
+
+def test_unknown_temperature_and_supply_are_nan() -> None:
+    (reading,) = read(framed(MESSAGE[:18] + bytes.fromhex("0080FFFF") + MESSAGE[22:]))
+    assert isnan(reading.temperature)
+    assert isnan(reading.supply)
+
+
+def test_later_firmware_may_say_more() -> None:
+    longer = bytes([1, 40]) + MESSAGE[2:] + b"more"
+    status = bytes([2, 12]) + b"status"
+    driver = open_driver("digitizer", OPTIONS)
+    (reading,) = driver.feed(framed(longer) + framed(status + bytes(24))[:-1] + b"\0")
+    assert reading.sequence == 7
+    assert driver.frames_bad == 1  # the status says 12 bytes and has 36
+    assert driver.feed(framed(bytes([2, 36]) + bytes(30))) == []
+    assert driver.frames_bad == 1

@@ -1,0 +1,197 @@
+"""What holds for every driver: any bytes in any chunks, and what its encoder sends."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Iterator
+from math import isfinite, nan
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from magbridge.errors import ConfigError
+from magbridge.records import Reading
+from magbridge.sensors import DRIVERS, Driver, open_driver
+from sitl.fluxgate import Encoder, open_encoder
+
+CASES: dict[str, tuple[str, dict[str, Any]]] = {
+    "digitizer": ("digitizer", {"sensitivity": 5e-5}),
+    "hmr2300 binary": ("hmr2300", {"output": "binary"}),
+    "hmr2300 ascii": ("hmr2300", {"output": "ascii"}),
+    "twinleaf 2": ("twinleaf", {"temperature": "therm"}),
+    "twinleaf 1": ("twinleaf", {"route": "/0/2"}),
+    "ascii blanks": ("ascii", {"columns": ["x", "y", "z", "temperature"], "unit": "G", "range": 65_000.0}),
+    "ascii nmea": (
+        "ascii",
+        {
+            "prefix": "$PMAG,",
+            "separator": ",",
+            "columns": ["time", "sequence", "x", "y", "z"],
+            "checksum": "nmea",
+        },
+    ),
+}
+FIELDS = st.tuples(*[st.floats(-150_000, 150_000)] * 3)
+
+
+def instrument(case: str) -> tuple[Driver, Encoder]:
+    name, options = CASES[case]
+    encoder = open_encoder(name, options, rate=10.0)
+    if case == "twinleaf 1":
+        encoder.generation = 1  # type: ignore[attr-defined]
+    driver = open_driver(name, options)
+    for command in driver.start():
+        driver.feed(encoder.feed(command))
+    return driver, encoder
+
+
+def fed(driver: Driver, chunks: Iterator[bytes]) -> tuple[list[bytes], int, int]:
+    """Readings (packed, so that NaN equals NaN) and counters."""
+    readings = [reading for chunk in chunks for reading in driver.feed(chunk)]
+    return [msgspec.msgpack.encode(reading) for reading in readings], driver.bytes_skipped, driver.frames_bad
+
+
+def stream(encoder: Encoder, fields: list[tuple[float, float, float]]) -> list[bytes]:
+    return [encoder.encode(Reading(field, device_time=0.1 * k)) for k, field in enumerate(fields)]
+
+
+@st.composite
+def damaged(draw: st.DrawFn, case: str) -> list[bytes]:
+    """Frames with garbage between, bytes lost and bytes changed; cut into chunks."""
+    _, encoder = instrument(case)
+    parts = []
+    for frame in stream(encoder, draw(st.lists(FIELDS, max_size=12))):
+        match draw(st.integers(0, 5)):
+            case 0:
+                parts.append(draw(st.binary(max_size=40)))
+            case 1:
+                at = draw(st.integers(0, len(frame) - 1))
+                parts.append(frame[:at] + frame[at + 1 :])
+                continue
+            case 2:
+                at = draw(st.integers(0, len(frame) - 1))
+                parts.append(frame[:at] + bytes([draw(st.integers(0, 255))]) + frame[at + 1 :])
+                continue
+        parts.append(frame)
+    data = b"".join(parts)
+    cuts = sorted(draw(st.lists(st.integers(0, len(data)), max_size=8)))
+    return [data[a:b] for a, b in zip([0, *cuts], [*cuts, len(data)], strict=True)]
+
+
+@pytest.mark.parametrize("case", CASES)
+@given(data=st.data())
+@settings(max_examples=60)
+def test_whole_or_in_pieces_is_the_same(case: str, data: st.DataObject) -> None:
+    chunks = data.draw(damaged(case))
+    whole = b"".join(chunks)
+    expected = fed(instrument(case)[0], iter([whole]))
+    assert fed(instrument(case)[0], iter(chunks)) == expected
+    assert fed(instrument(case)[0], (whole[k : k + 1] for k in range(len(whole)))) == expected
+
+
+@pytest.mark.parametrize("case", CASES)
+@given(chunks=st.lists(st.binary(max_size=200), max_size=10))
+@settings(max_examples=60)
+def test_any_bytes_give_readings_or_counted_loss(case: str, chunks: list[bytes]) -> None:
+    driver, _ = instrument(case)
+    skipped = driver.bytes_skipped
+    readings = [reading for chunk in chunks for reading in driver.feed(chunk)]
+    assert all(isfinite(value) for reading in readings for value in reading.field)
+    assert 0 <= driver.bytes_skipped - skipped <= sum(map(len, chunks))
+
+
+@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("byte", [b"\x00", b"\x0d", b"\x0a", b"\xc0", b"\xdb", b"1", b"\xff"])
+def test_memory_is_bounded(case: str, byte: bytes) -> None:
+    driver, _ = instrument(case)
+    before = driver.bytes_skipped
+    for _ in range(20):
+        driver.feed(byte * 10_000)
+    kept = [value for value in vars(driver).values() if isinstance(value, bytes)]
+    kept += [value._rest for value in vars(driver).values() if hasattr(value, "_rest")]
+    assert sum(map(len, kept)) < 2000
+    assert driver.bytes_skipped <= before + 200_000
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_garbage_costs_a_few_readings_at_most(case: str) -> None:
+    driver, encoder = instrument(case)
+    fields = [(20_000.0 + 37 * k, -3000.0 + 11 * k, 41_000.0 - 23 * k) for k in range(40)]
+    frames = stream(encoder, fields)
+    got = [driver.feed(frame) for frame in frames[:20]]
+    driver.feed(bytes(range(256)) * 3)
+    got += [driver.feed(frame) for frame in frames[20:]]
+    right = [reading for readings in got for reading in readings if reading.field[2] < 42_000]
+    assert len(right) >= 38
+    for reading in right[-10:]:
+        nearest = min(fields, key=lambda field: abs(field[0] - reading.field[0]))
+        assert reading.field == pytest.approx(nearest, abs=4)
+    assert driver.bytes_skipped > 0
+
+
+@pytest.mark.parametrize("name", DRIVERS)
+def test_the_table_keeps_its_word(name: str) -> None:
+    driver = open_driver(name, {"sensitivity": 5e-5} if name == "digitizer" else {})
+    assert driver.feed(b"") == []
+    assert driver.bytes_skipped == driver.frames_bad == 0
+    assert driver.range_nt > 0
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "line"),
+    [
+        ("fluxgate", {}, "sensor.driver: expected one of ascii, digitizer, hmr2300, twinleaf"),
+        ("digitizer", {}, "sensor.options.sensitivity: missing key"),
+        ("digitizer", {"sensitivity": 0.0}, "sensor.options.sensitivity: expected `float` > 0.0"),
+        ("hmr2300", {"rate": 21}, "sensor.options.rate: invalid enum value 21"),
+        ("hmr2300", {"speed": 21}, "sensor.options.speed: unknown key"),
+        ("twinleaf", {"columns": ["x"]}, "sensor.options.columns: expected `array` of length 3"),
+        ("twinleaf", {"unit": "ell"}, "sensor.options: unit: expected one of"),
+        ("ascii", {"columns": ["x", "y"]}, "sensor.options: columns: x, y and z must be among them"),
+        ("ascii", {"columns": ["x", "y", "z", "q"]}, "sensor.options: columns: 'q' is none of x y z"),
+        ("ascii", {"columns": ["x", "y", "z", "z"]}, "sensor.options: columns: 'z' stands there twice"),
+        ("ascii", {"checksum": "crc8"}, "sensor.options.checksum: invalid enum value 'crc8'"),
+    ],
+)
+def test_wrong_options_name_the_key(name: str, options: dict[str, Any], line: str) -> None:
+    with pytest.raises(ConfigError) as error:
+        open_driver(name, options, source="my.toml")
+    assert str(error.value).startswith(f"my.toml: {line}")
+    assert "\n" not in str(error.value)
+
+
+def test_other_packages_can_add_a_driver(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    info = tmp_path / "other-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: other\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text("[magbridge.sensors]\nother = other_sensor:Other\n")
+    (tmp_path / "other_sensor.py").write_text(
+        "from magbridge.sensors.ascii import Ascii\nclass Other(Ascii):\n    pass\n"
+    )
+    monkeypatch.syspath_prepend(str(tmp_path))
+    (reading,) = open_driver("other", {"unit": "uT"}).feed(b"1 2 3\n")
+    assert reading.field == (1000.0, 2000.0, 3000.0)
+
+
+def test_opening_a_driver_imports_that_one_and_nothing_heavy() -> None:
+    code = (
+        "import sys; from magbridge.sensors import open_driver; open_driver('hmr2300', {});"
+        "print(*(m for m in sys.modules if m.split('.')[0] in {'scipy', 'xarray', 'numpy', 'pymavlink'}"
+        " or m.startswith('magbridge.sensors.')))"
+    )
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert set(out.split()) == {"magbridge.sensors.hmr2300", "magbridge.sensors.framing"}
+
+
+def test_nan_is_only_for_what_is_not_known() -> None:
+    driver, encoder = instrument("digitizer")
+    (reading,) = driver.feed(
+        encoder.encode(Reading((1.0, 2.0, 3.0), device_time=1.0, temperature=nan, supply=3.3))
+    )
+    assert reading.temperature != reading.temperature
+    assert reading.supply == pytest.approx(3.3)
