@@ -1,1 +1,30 @@
 """The other end of every line: a simulated world, and emulated devices that speak real protocols."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from sitl.columns import segments
+    from sitl.like import simulate_like
+    from sitl.scenario import Scenario, load
+    from sitl.twin import Twin, simulate
+
+__all__ = ["Scenario", "Twin", "load", "segments", "simulate", "simulate_like"]
+
+# loaded when first asked for: an emulated device needs neither scipy nor xarray
+_HOMES = {
+    "Scenario": "sitl.scenario",
+    "Twin": "sitl.twin",
+    "load": "sitl.scenario",
+    "segments": "sitl.columns",
+    "simulate": "sitl.twin",
+    "simulate_like": "sitl.like",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name in _HOMES:
+        return getattr(import_module(_HOMES[name]), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
