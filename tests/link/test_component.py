@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import random
+from math import inf, nan
 from pathlib import Path
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
+from magbridge.config import Align, Link
 from magbridge.errors import ConfigError
-from magbridge.link import check_publish
-from magbridge.mavlink import Codec, Signing, TapeReader
+from magbridge.link import Component, alignment, check_publish
+from magbridge.mavlink import Codec, Signing, TapeReader, spec
 from magbridge.mavlink.dialect import MAG_PORT_STATE
 
 START = 1_700_000_000_000_000
@@ -142,3 +146,46 @@ def test_publish_is_checked():
     ):
         with pytest.raises(ConfigError, match=complaint):
             check_publish(publish, Path("b.toml"))
+
+
+SPECIAL = [nan, inf, -inf, 0.0, -0.0, -1.0, 1e38, 3.4e38, 1e-40, 1e9, 60101.0, 511.5]
+VALUES = {
+    "f": st.one_of(st.sampled_from(SPECIAL), st.floats(width=32)),
+    "d": st.floats(),
+    **{code: st.integers(-(1 << bits - 1), (1 << bits - 1) - 1) for code, bits in zip("bhiq", (8, 16, 32, 64), strict=True)},
+    **{code: st.integers(0, (1 << bits) - 1) for code, bits in zip("BHIQ", (8, 16, 32, 64), strict=True)},
+}  # fmt: skip
+ANSWERED = [
+    "COMMAND_INT", "COMMAND_LONG", "HEARTBEAT", "PARAM_REQUEST_LIST", "PARAM_REQUEST_READ", "PARAM_SET",
+    "SYSTEM_TIME", "TIMESYNC",
+]  # fmt: skip
+COMMANDS = [510, 511, 512, 519, 520, 42424]
+
+
+@st.composite
+def message(draw):
+    """Bytes of a message that the component reacts to, with any values in it."""
+    layout = spec(draw(st.sampled_from(ANSWERED)))
+    fields = {name: draw(VALUES[field.code]) for name, field in layout.fields.items() if field.code != "s"}
+    fields["target_system"], fields["target_component"] = 1, draw(st.sampled_from([0, 191]))
+    if "param_id" in layout.fields:
+        fields["param_id"] = draw(st.sampled_from(["MB_R_HEARTBEAT", "MB_GAP_FACTOR", b"\xff" * 16]))
+    if "command" in layout.fields:
+        fields["command"] = draw(st.sampled_from(COMMANDS))
+    known = {name: value for name, value in fields.items() if name in layout.fields}
+    return Codec(*draw(st.sampled_from([(1, 1), (1, 191), (255, 190), (2, 1)]))).pack(layout.name, **known)
+
+
+@given(st.lists(st.one_of(message(), st.binary(max_size=30)), max_size=15))
+def test_whatever_is_said_it_goes_on(chunks):
+    component = Component(Link("u"), {"HIGHRES_IMU": 1.0}, alignment(Align()), start_us=START)
+    for i, chunk in enumerate(chunks):
+        now = START + i * 300_000
+        component.advance(now)
+        component.receive(chunk, now)
+        assert len(component.outbox.drain()) < 50  # nothing that is said makes it talk without end
+    component.advance(START + 10_000_000)
+    rows = component.parameters.table.values()
+    assert all(row.low <= component.parameters[row.name] <= row.high * 1.0001 for row in rows)
+    beats = [1 for _, frame in component.outbox.drain() if frame[7:10] == b"\0\0\0"]
+    assert len(beats) >= 1

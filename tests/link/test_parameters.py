@@ -89,8 +89,9 @@ def test_a_rate_parameter_is_obeyed(link):
 
 
 def test_kept_parameters_come_back(make_link):
-    link = make_link(kept={"MB_GAP_FACTOR": 3.5, "MB_R_MAG_RAW": 2.0, "GONE": 1.0})
+    link = make_link(kept={"MB_GAP_FACTOR": 3.5, "MB_R_RAW": 2.0, "GONE": 1.0})
     assert link.component.parameters["MB_GAP_FACTOR"] == 3.5
+    assert link.component.rates["MAG_RAW"].hertz == 2.0
     assert any("GONE" in text for text in link.texts(link.hear()))
 
 
