@@ -39,7 +39,7 @@ LATELY = 64
 """Samples over which the sample rate is told."""
 DOUBTS = int(Quality.STALE_TELEMETRY | Quality.SATURATED | Quality.UNCALIBRATED | Quality.OFFSET_SUSPECT)
 """Flags whose coming and going is told; the others come and go with every manoeuvre."""
-CLOCK_STEP, PORT = spec("MAG_CLOCK_STEP").id, spec("MAG_PORT").id
+CLOCK_STEP, NOTICE, PORT = (spec(name).id for name in ("MAG_CLOCK_STEP", "STATUSTEXT", "MAG_PORT"))
 
 
 class Start(msgspec.Struct, frozen=True):
@@ -193,6 +193,8 @@ class Pipeline:
                 self.component.publisher.utc_offset_us += message["step"]
                 step = f"clock was set by {message['step'] * 1e-6:+.3f} s"
                 self.component.announcer.say(step, MAV_SEVERITY.NOTICE)
+            elif message.id == NOTICE:
+                self.component.announcer.say(message["text"], MAV_SEVERITY(message["severity"]))
             elif message.id == PORT:
                 well = message["state"] == MAG_PORT_STATE.OK
                 self._hear_port(message["port"], well, message["reason"], message["dropped"], event.time_us)

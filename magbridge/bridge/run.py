@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import signal
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Protocol
@@ -26,6 +27,8 @@ __all__ = ["Edge", "drive", "run", "set_up"]
 
 KEEP_US = 60_000_000
 """µs between two savings of the signing time stamp; after a crash a minute is added to it."""
+SWITCH = 0.0005
+"""s after which the log's thread must let the bridge go on; Python's 5 ms would be seen in the latency."""
 LOG_LOOK_US = 1_000_000
 """µs between looks at how the log is."""
 
@@ -88,9 +91,11 @@ def run(path: Path) -> None:
     sensor = SerialPort(config.sensor.port, config.sensor.baudrate)
     link = open_link(config.link.url, config.link.baudrate, str(config.path))
     edge = LiveEdge({Channel.SENSOR: sensor, Channel.LINK: link}, clock)
+    keeper.attach(edge)
     log = _open_log(config, edge)
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: edge.stop())
+    sys.setswitchinterval(SWITCH)
     gc.collect()
     gc.freeze()  # what is here now stays: the collector need not look at it again
     watch = LogWatch(log, edge)
@@ -102,8 +107,8 @@ def run(path: Path) -> None:
     try:
         drive(pipeline, edge, log, after)
     finally:
-        edge.close()
         keeper.save(pipeline)
+        edge.close()
         if log is not None:
             log.close()
 
@@ -147,10 +152,15 @@ class Keeper:
     """Added to the kept time stamp (units of 10 µs), because it may be as old as that."""
 
     def __init__(self, config: Config) -> None:
+        self._tell: Callable[[bytes], None] = lambda _: None
         self._path = config.resolve(config.link.parameters)
         self._kept = store.load(self._path)
         self._signs = config.link.signing_key is not None
         self._saved_us = 0
+
+    def attach(self, edge: LiveEdge) -> None:
+        """Tell `edge` when something cannot be kept."""
+        self._tell = edge.tell
 
     def start(self, time_us: int) -> Start:
         """Return the start of a run at `time_us`."""
@@ -174,4 +184,4 @@ class Keeper:
         try:
             store.save(self._path, kept)
         except OSError as error:
-            pipeline.component.announcer.say(f"parameters not kept: {error.strerror}")
+            self._tell(states.notice(f"parameters not kept: {error.strerror or error}"))

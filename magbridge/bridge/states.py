@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from magbridge.bridge.port import Port
 from magbridge.mavlink.codec import Codec
-from magbridge.mavlink.dialect import MAG_PORT_NAME, MAG_PORT_STATE
+from magbridge.mavlink.dialect import MAG_PORT_NAME, MAG_PORT_STATE, MAV_SEVERITY
 from magbridge.records import Channel
 
-__all__ = ["clock_step", "log_state", "opened", "port"]
+__all__ = ["clock_step", "log_state", "notice", "opened", "port"]
 
 
 def _frame(name: str, **fields: object) -> bytes:
@@ -17,6 +17,11 @@ def _frame(name: str, **fields: object) -> bytes:
 def clock_step(time_us: int, step_us: int) -> bytes:
     """Return the frame that says that the host's clock was set by `step_us` µs."""
     return _frame("MAG_CLOCK_STEP", time_usec=time_us + step_us, step=step_us)
+
+
+def notice(text: str) -> bytes:
+    """Return the frame of a warning that the bridge is to pass on, at most 50 characters."""
+    return _frame("STATUSTEXT", severity=int(MAV_SEVERITY.WARNING), text=text)
 
 
 def port(channel: Channel, what: Port, reason: str) -> bytes:

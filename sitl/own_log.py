@@ -1,0 +1,107 @@
+"""A bridge's own log as the script of a replay, and what it must publish again, bit for bit."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import groupby
+from pathlib import Path
+
+from magbridge.bridge.events import Event
+from magbridge.bridge.pipeline import Start
+from magbridge.errors import FormatError
+from magbridge.mavlink import LogReader, Record, TapeReader, spec
+from magbridge.records import Channel
+
+__all__ = ["Recorded", "is_own_log"]
+
+BEGIN, PARAMETER = spec("MAG_BRIDGE_START").id, spec("PARAM_VALUE").id
+
+
+def is_own_log(path: Path) -> bool:
+    """Say whether a file is the beginning of a bridge's own log."""
+    if path.suffix.lower() != ".tlog":
+        return False
+    with path.open("rb") as file:
+        first = next(iter(LogReader(file)), None)
+    return first is not None and first.channel == Channel.STATE and first.message.id == BEGIN
+
+
+class Recorded:
+    """The log of one run of a bridge, in one file or in the several that it was rotated into.
+
+    Parameters
+    ----------
+    paths : sequence of path
+        In order.
+
+    Attributes
+    ----------
+    start : Start
+        What the run started from.
+    config_digest : str
+        Of the configuration that it ran with.
+    published : bytearray
+        What it published, as far as :meth:`events` has come.
+
+    Raises
+    ------
+    FormatError
+        The first file does not begin with the start of a bridge.
+    """
+
+    def __init__(self, paths: Sequence[Path]) -> None:
+        self._paths = paths
+        self.published = bytearray()
+        self.messages = 0
+        self.damages = 0
+        records = self._records()
+        first = next(records, None)
+        if first is None or first.message.id != BEGIN:
+            raise FormatError(paths[0], "expected the log of a bridge, from its start")
+        parameters: dict[str, float] = {}
+        for record in records:
+            if record.channel != Channel.STATE or record.message.id != PARAMETER:
+                break
+            parameters[record.message["param_id"]] = record.message["param_value"]
+        self.config_digest = first.message["config_digest"].hex()
+        self.start = Start(first.time_us, parameters, first.message["signing_timestamp"])
+
+    def _records(self) -> Iterator[Record]:
+        for path in self._paths:
+            with path.open("rb") as file:
+                reader = LogReader(file)
+                yield from reader
+                self.damages += reader.damages
+
+    def events(self) -> Iterator[Event]:
+        """Yield what came in; what went out is kept in `published`."""
+        tape = TapeReader()
+        time_us = self.start.time_us
+        inputs = (record for record in self._records() if not self._went_out(record))
+        for (time_us, channel), group in groupby(inputs, lambda record: (record.time_us, record.channel)):
+            if channel == Channel.STATE:
+                for record in group:
+                    if record.message.id not in (BEGIN, PARAMETER):
+                        yield Event(time_us, Channel.STATE, record.frame)
+            elif channel == Channel.SENSOR:
+                yield Event(time_us, Channel.SENSOR, _sensor_bytes(group))
+            elif data := b"".join(tape.data(record.frame) for record in group):
+                yield Event(time_us, Channel.LINK, data)
+        # timers that fired after the last input
+        yield Event(max(time_us, self._last_us), Channel.STATE, b"")
+
+    _last_us = 0
+
+    def _went_out(self, record: Record) -> bool:
+        self._last_us = record.time_us
+        if record.channel != Channel.SENT:
+            return False
+        self.published += record.frame
+        self.messages += 1
+        return True
+
+
+def _sensor_bytes(records: Iterable[Record]) -> bytes:
+    """Return bytes that came at one time, which the log may hold in pieces."""
+    messages = (record.message for record in records)
+    return b"".join(message["data"][: message["length"]] for message in messages)
