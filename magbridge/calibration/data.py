@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from dataclasses import field as attribute
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -95,8 +95,9 @@ class Observations:
 
     def part(self, rows: NDArray[np.bool_]) -> Observations:
         """Pick rows."""
-        picked = {name: getattr(self, name) for name in _PER_SAMPLE}
-        return replace(self, **{name: v if v is None else v[rows] for name, v in picked.items()})
+        columns = ((name, getattr(self, name)) for name in _PER_SAMPLE)
+        picked: dict[str, Any] = {name: None if v is None else v[rows] for name, v in columns}
+        return replace(self, **picked)
 
     @property
     def follows(self) -> NDArray[np.bool_]:

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 import magbridge
 from magbridge.calibration.data import Observations
 from magbridge.calibration.model import Calibration, Noise, Parameter, Reference, Run, Sensor
+from magbridge.calibration.noise import NoiseModel
 from magbridge.calibration.residual import Samples, residuals
-from magbridge.calibration.solve import NoiseModel
 from magbridge.calibration.terms import Polynomial
 from magbridge.errors import CalibrationError
 
@@ -23,6 +23,7 @@ __all__ = ["METHODS", "Fit", "fit"]
 FloatArray = NDArray[np.float64]
 
 METHODS: dict[str, str] = {
+    "auto": "magbridge.calibration.auto:fit_auto",
     "nominal": "magbridge.calibration.fit:fit_nominal",
 }
 """Name -> ``module:function``, each ``(observations, order, **options) -> Fit``."""

@@ -13,18 +13,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magbridge.calibration.data import Observations
-from magbridge.calibration.residual import Samples
-from magbridge.calibration.solve import NoiseModel, Prior, covariance_of, estimate_noise, gauss_newton
+from magbridge.calibration.noise import NoiseModel, estimate_noise
+from magbridge.calibration.residual import Samples, residuals
+from magbridge.calibration.solve import Prior, covariance_of, gauss_newton
 from magbridge.errors import CalibrationError
 
 __all__ = ["SCALE_SIGMA", "check_scales", "nominal", "nominal_samples"]
 
 FloatArray = NDArray[np.float64]
 
-SCALE_SIGMA = 0.03
+SCALE_SIGMA = 0.015
 """Prior 1-sigma by which scales differ from each other, and of soft iron, on a vehicle."""
-GAIN_SIGMA = 0.3
-"""Prior 1-sigma of the gain that the three axes share: instruments state theirs in rough units."""
+GAIN_SIGMA = 0.02
+"""Prior 1-sigma of the gain that the three axes share: data of all attitudes overrule it."""
 OFFSET_SIGMA = 0.6
 """Prior 1-sigma of the hard iron, as a fraction of the field."""
 
@@ -79,12 +80,12 @@ def nominal(
     prior = Prior(np.zeros(len(keep)), _precision(E, scale_sigma, gain_sigma) / samples.unit**2, E)
     best = None
     for start in starts(samples):
-        z: FloatArray = np.linalg.lstsq(E, start, rcond=None)[0]
+        z = np.asarray(np.linalg.lstsq(E, start, rcond=None)[0], float)
         noise = NoiseModel(1e-3 * samples.unit)  # wide at first: far from the answer nothing is noise
         for _ in range(4):
             found = gauss_newton(samples, prior, noise, z)
             z = found.z
-            noise = estimate_noise(samples, E @ z, len(keep))
+            noise = estimate_noise(residuals(samples, E @ z)[0], samples.follows, len(keep))
         value = found.normal.cost
         if found.settled and (best is None or value < 0.999 * best[0]):
             best = (value, found, noise)

@@ -1,4 +1,4 @@
-"""Damped Gauss-Newton on the scalar residual with a Gaussian prior, and robust noise.
+"""Damped Gauss-Newton on the scalar residual with a Gaussian prior.
 
 Notes
 -----
@@ -19,13 +19,13 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 from scipy.linalg.lapack import dpotrf
 
-from magbridge.calibration.residual import NormalEquations, Samples, normal_equations, residuals, whiten
+from magbridge.calibration.noise import NoiseModel
+from magbridge.calibration.residual import NormalEquations, Samples, normal_equations
 from magbridge.errors import CalibrationError
 
-__all__ = ["NoiseModel", "Prior", "Solution", "estimate_noise", "gauss_newton"]
+__all__ = ["Prior", "Solution", "covariance_of", "gauss_newton"]
 
 FloatArray = NDArray[np.float64]
-DEGREES = 5.0  # of freedom of the noise's tails where outliers are suspected
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,15 +45,6 @@ class Prior:
         if self.E is None:
             return normal
         return NormalEquations(self.E.T @ normal.hessian @ self.E, self.E.T @ normal.gradient, normal.cost)
-
-
-@dataclass(frozen=True, eq=False)
-class NoiseModel:
-    """Noise of the residuals: 1-sigma (sensor nT), memory, and a weight for each sample."""
-
-    sigma: float
-    memory: float = 0.0
-    weight: FloatArray | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,49 +131,3 @@ def covariance_of(precision: FloatArray) -> FloatArray:
         raise CalibrationError("the data and the prior leave a combination of coefficients free") from problem
     root = solve_triangular(factor, np.eye(len(scale)), lower=lower) / scale
     return np.asarray(root.T @ root)
-
-
-def estimate_noise(
-    samples: Samples, coefficients: FloatArray, free: float, *, robust: bool = True
-) -> NoiseModel:
-    """Noise model from the residuals of a fit.
-
-    Parameters
-    ----------
-    samples : Samples
-    coefficients : (9 m,) array
-    free : float
-        How many numbers the data determined.
-    robust : bool
-        Weigh samples as Student's t with :data:`DEGREES` of freedom does where the residuals have
-        outliers.
-
-    Returns
-    -------
-    NoiseModel
-    """
-    e, _ = residuals(samples, coefficients)
-    n = len(e)
-    scale = 1.4826 * float(np.median(np.abs(e))) or 1e-9
-    if not robust or not (np.abs(e) > 5.0 * scale).any():
-        memory = _memory(e, samples.follows)
-        white = whiten(e, samples.follows, memory)
-        return NoiseModel(float(np.sqrt((white @ white) / max(n - free, 1.0))), memory)
-    memory = _memory(np.clip(e, -3.0 * scale, 3.0 * scale), samples.follows)
-    white = whiten(e, samples.follows, memory)
-    sigma2 = (1.4826 * float(np.median(np.abs(white)))) ** 2
-    for _ in range(20):  # EM for the scale of a t distribution
-        weight = (DEGREES + 1.0) / (DEGREES + white * white / sigma2)
-        sigma2 = float((weight * white * white).sum()) / max(n - free, 1.0)
-    # expected information of t noise is (nu + 1) / (nu + 3) of its weights' sum
-    weight = (DEGREES + 1.0) / (DEGREES + white * white / sigma2)
-    return NoiseModel(float(np.sqrt(sigma2)), memory, weight)
-
-
-def _memory(e: FloatArray, follows: NDArray[np.bool_]) -> float:
-    """Correlation of neighbours; what is within its own error of 0 is 0."""
-    late, early = e[1:][follows[1:]], e[:-1][follows[1:]]
-    if len(late) < 30:
-        return 0.0
-    rho = float(late @ early / np.sqrt((late @ late) * (early @ early) + 1e-300))
-    return min(max(rho, 0.0), 0.99) if rho > 3.0 / np.sqrt(len(late)) else 0.0

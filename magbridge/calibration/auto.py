@@ -1,0 +1,130 @@
+"""The default fit: errors in variables, physical priors whose widths the evidence chooses.
+
+Notes
+-----
+Each start climbs alternately: coefficients by Gauss-Newton at fixed widths, then widths and noise by
+the evidence of the quadratic that it leaves, then memory and outliers of the residuals. The start
+whose evidence is largest wins, and must be a maximum; the answer must not have collapsed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magbridge.calibration.data import Observations
+from magbridge.calibration.evidence import Quadratic, Widths, maximise
+from magbridge.calibration.fit import Fit, assemble
+from magbridge.calibration.noise import OUTLIER, NoiseModel, estimate_noise
+from magbridge.calibration.nominal import check_scales, starts
+from magbridge.calibration.prior import Structure, free_structure
+from magbridge.calibration.residual import Samples, residuals
+from magbridge.calibration.solve import Prior, Solution, covariance_of, gauss_newton
+from magbridge.calibration.terms import Exponents, full_order
+from magbridge.errors import CalibrationError
+
+__all__ = ["fit_auto", "polynomial_samples"]
+
+FloatArray = NDArray[np.float64]
+
+ROUNDS = 12  # of coefficients, widths, noise; four or five usually settle
+FIRST_NOISE = 1e-4  # of the field: wide against a sensor's noise, so that no early step is too sure
+
+
+def polynomial_samples(data: Observations, exponents: tuple[Exponents, ...], kappa: float = 0.0) -> Samples:
+    """Take `data` with the monomials of its scaled positions."""
+    ranges = data.ranges()
+    x = (data.parameters - [p.centre for p in ranges]) / [p.scale for p in ranges]
+    phi = np.stack([np.prod(x ** np.array(powers), axis=1) for powers in exponents], axis=1)
+    return Samples(data.field, data.reference, phi, data.follows, float(data.reference.mean()), kappa)
+
+
+@dataclass(frozen=True, eq=False)
+class _Answer:
+    solution: Solution
+    widths: Widths
+    noise: NoiseModel
+    structure: Structure
+    score: float
+
+
+def fit_auto(data: Observations, order: int = 3) -> Fit:
+    """Fit polynomials of all orders up to `order` with physical priors; see the module's notes.
+
+    Raises
+    ------
+    CalibrationError
+        No start reached a maximum, or the best one collapsed.
+    """
+    ranges = data.ranges()
+    exponents = full_order(len(ranges), order)
+    samples = polynomial_samples(data, exponents)
+    structure = free_structure(exponents, data.names, samples.unit)
+    best = _best(samples, structure)
+    prior = _prior(best.structure, best.widths.eta)
+    precision = best.solution.normal.hessian / best.noise.sigma**2 + prior.precision
+    coefficients = prior.coefficients(best.solution.z)
+    check_scales(coefficients, samples.unit)
+    E = best.structure.E
+    return assemble(
+        data, samples, ranges, exponents, coefficients, E @ covariance_of(precision) @ E.T, best.noise, "auto",
+        details={
+            "log_evidence": best.score,
+            "determined": best.widths.determined,
+            "outliers": best.noise.rejected,
+            "widths_nT": dict(zip(structure.names, np.exp(best.widths.eta).tolist(), strict=True)),
+        },
+    )  # fmt: skip
+
+
+def _best(samples: Samples, structure: Structure) -> _Answer:
+    """The answer with the largest evidence among several starts."""
+    size = samples.phi.shape[1] * 9
+    answers = []
+    for start in starts(samples):
+        for shift in (0.0, 1.5):
+            coefficients = np.zeros(size)
+            coefficients[:9] = start
+            answer = _climb(samples, structure, coefficients, structure.centre + shift * structure.spread)
+            answers.append(answer)
+    sound = [answer for answer in answers if answer.solution.settled and answer.widths.maximum]
+    if not sound:
+        raise CalibrationError(
+            "auto: no start reached a maximum of the evidence; the data contradict themselves"
+        )
+    return max(sound, key=lambda answer: answer.score)
+
+
+def _climb(samples: Samples, structure: Structure, coefficients: FloatArray, eta: FloatArray) -> _Answer:
+    """Alternate coefficients, widths and noise until the evidence stands still."""
+    noise = NoiseModel(FIRST_NOISE * samples.unit)
+    z = np.asarray(np.linalg.lstsq(structure.E, coefficients, rcond=None)[0], float)
+    score = -np.inf
+    for step in range(ROUNDS):
+        solution = gauss_newton(samples, _prior(structure, eta), noise, z)
+        kept = len(samples.field) - noise.rejected
+        quadratic = Quadratic.about(solution.z, structure.mean, solution.normal, kept)
+        widths = maximise(quadratic, structure, eta, noise.sigma)
+        eta, z = widths.eta, structure.mean + widths.mean
+        last, score = score, _score(widths, noise, samples)
+        noise = replace(noise, sigma=widths.sigma)
+        if step > 1 and abs(score - last) < 1e-2 and solution.steps <= 1:
+            break
+        if step < ROUNDS - 3:  # then let the noise's shape be, so that the rest can settle
+            e, _ = residuals(samples, structure.E @ z)
+            shape = estimate_noise(e, samples.follows, widths.determined)
+            noise = replace(shape, sigma=widths.sigma)
+    return _Answer(solution, widths, noise, structure, score)
+
+
+def _score(widths: Widths, noise: NoiseModel, samples: Samples) -> float:
+    """Log evidence of all samples: an outlier counts as one just at the limit, whitening by its Jacobian."""
+    outlier = np.log(widths.sigma) + 0.5 * OUTLIER**2
+    whitening = 0.5 * samples.follows.sum() * np.log(1.0 - noise.memory**2)
+    return float(widths.log_evidence - noise.rejected * outlier - whitening)
+
+
+def _prior(structure: Structure, eta: FloatArray) -> Prior:
+    return Prior(structure.mean, np.diag(structure.widths(eta) ** -2.0), structure.E)

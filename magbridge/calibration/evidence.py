@@ -1,0 +1,112 @@
+"""The marginal likelihood of the prior's widths, its gradient, and where it is largest.
+
+Notes
+-----
+About the best coefficients the log likelihood is quadratic in z: ``-(c_0 - 2 b.z + z^T H z) / 2 sigma^2``.
+With a Gaussian prior of widths ``w = exp(constant + design . eta)`` the evidence is known in closed form.
+With ``W = diag(w)``, ``M = I + W H W / sigma^2`` and ``y = M^-1 W b / sigma^2`` (so the posterior mean is ``W y``)::
+
+    log Z = -n log sigma - c_0 / 2 sigma^2 + y.(W b) / 2 sigma^2 - log|M| / 2 + log p(eta)
+    d log Z / d log w_i = y_i^2 + (M^-1)_ii - 1                                     (MacKay 1992)
+    d log Z / d log sigma = -n + cost(W y) / sigma^2 + q - tr M^-1
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
+from scipy.optimize import minimize
+
+from magbridge.calibration.prior import Structure
+from magbridge.calibration.residual import NormalEquations
+
+__all__ = ["Quadratic", "Widths", "evidence", "maximise"]
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Quadratic:
+    """``cost(z) = c_0 - 2 b.y + y^T H y`` with ``y = z - mean``, of n samples."""
+
+    H: FloatArray
+    b: FloatArray
+    c_0: float
+    n: float
+
+    @classmethod
+    def about(cls, z: FloatArray, mean: FloatArray, normal: NormalEquations, n: float) -> Quadratic:
+        """The quadratic whose value, gradient and Hessian at `z` are `normal`'s."""
+        y = z - mean
+        H, g = normal.hessian, normal.gradient
+        return cls(H, H @ y - g, float(normal.cost - 2.0 * g @ y + y @ H @ y), n)
+
+
+@dataclass(frozen=True, eq=False)
+class Widths:
+    """Where the evidence is largest: eta, the noise (sensor nT), log Z, and whether it is a maximum."""
+
+    eta: FloatArray
+    sigma: float
+    log_evidence: float
+    maximum: bool
+    determined: float
+    """How many numbers the data, not the prior, determined: ``q - tr M^-1``."""
+    mean: FloatArray
+    """Posterior mean of ``z`` about the structure's own."""
+
+
+def evidence(
+    quadratic: Quadratic, structure: Structure, eta: FloatArray, log_sigma: float
+) -> tuple[float, FloatArray, FloatArray, float]:
+    """Log evidence, its gradient by (eta, log sigma), the posterior mean, and how much is determined."""
+    w = structure.widths(eta)
+    s2 = np.exp(2.0 * log_sigma)
+    M = (w[:, None] * quadratic.H * w) / s2
+    M[np.diag_indices_from(M)] += 1.0
+    factor, info = dpotrf(M, overwrite_a=True)
+    if info:
+        return -np.inf, np.zeros(len(eta) + 1), np.zeros(len(w)), 0.0
+    Wb = w * quadratic.b / s2
+    y = dpotrs(factor, Wb)[0]
+    off = (eta - structure.centre) / structure.spread
+    value = (
+        -quadratic.n * log_sigma
+        - 0.5 * quadratic.c_0 / s2
+        + 0.5 * Wb @ y
+        - np.log(np.diag(factor)).sum()
+        - 0.5 * off @ off
+    )
+    inverse = np.diag(dpotri(factor, overwrite_c=True)[0])
+    z = w * y
+    cost = quadratic.c_0 - 2.0 * quadratic.b @ z + z @ quadratic.H @ z
+    determined = float(len(w) - inverse.sum())
+    by_eta = structure.design.T @ (y * y + inverse - 1.0) - off / structure.spread
+    return float(value), np.append(by_eta, -quadratic.n + cost / s2 + determined), z, determined
+
+
+def maximise(quadratic: Quadratic, structure: Structure, eta: FloatArray, sigma: float) -> Widths:
+    """Climb from `eta` and `sigma` to where the evidence is largest.
+
+    The answer is checked: no slope is left, and the surface bends down in every direction.
+    """
+
+    def downhill(x: FloatArray) -> tuple[float, FloatArray]:
+        value, slope, *_ = evidence(quadratic, structure, x[:-1], x[-1])
+        return (-value, -slope) if np.isfinite(value) else (1e300, -slope)
+
+    found = minimize(
+        downhill,
+        np.append(eta, np.log(sigma)),
+        jac=True,
+        method="BFGS",
+        options={"gtol": 1e-2, "maxiter": 200},
+    )
+    x = found.x
+    value, slope, z, determined = evidence(quadratic, structure, x[:-1], x[-1])
+    bend = np.array([(downhill(x + h)[1] - downhill(x - h)[1]) / 2e-3 for h in 1e-3 * np.eye(len(x))])
+    maximum = bool(np.abs(slope).max() < 0.1 and np.linalg.eigvalsh(bend + bend.T)[0] > 0.0)
+    return Widths(x[:-1], float(np.exp(x[-1])), value, maximum, determined, z)
