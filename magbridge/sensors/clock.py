@@ -31,6 +31,8 @@ TOLERANCE = 20_000.0
 """µs by which an arrival may contradict the line."""
 DELAY = 5_000.0
 """µs, the mean delay before anything is known."""
+STALL = 100_000.0
+"""µs, a delay that tells nothing of the usual ones any more."""
 SIGMA_CLOCK, SIGMA_PERIOD = 1e3, 1e4
 """µs/s (ppm): how wrong a clock's rate, or a nominal period, is before anything is known."""
 WANDER = 0.05
@@ -118,7 +120,7 @@ class _Floor:
         if not self._count:
             self._began, self._least = x, inf
         above = y - self.at(x)
-        self.delay += (max(above, 0.0) - self.delay) * 0.02
+        self.delay += (max(0.0, min(above, STALL)) - self.delay) * 0.02
         if above < self._least:
             self._least, self.lowest = above, (x, y)
             self._drop += min(above, 0.0)
@@ -231,10 +233,12 @@ class DeviceClock:
         """
         missing = self._hole(sequence)
         restarted = stepped = False
-        if self._origin_us is None:
+        timed = not isnan(device_time)
+        if self._origin_us is None or timed == isnan(self._device_time):
+            stepped = self._origin_us is not None
             self._begin(device_time, arrival_us)
             time_us = float(arrival_us)
-        elif not isnan(device_time):
+        elif timed:
             time_us, restarted, stepped = self._by_time(device_time, arrival_us, self._origin_us)
         elif self._period:
             time_us, stepped, unseen = self._by_count(arrival_us, self._origin_us, missing)

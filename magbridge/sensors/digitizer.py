@@ -105,9 +105,9 @@ class Digitizer:
 
     def __init__(self, options: DigitizerOptions) -> None:
         self._scale = options.nt_per_count
-        self._limit = FULL_SCALE - 1.0
+        self._limit = FULL_SCALE - 1
         if options.full_scale is not None:
-            self._limit = min(self._limit, options.full_scale / self._scale)
+            self._limit = min(self._limit, int(options.full_scale / self._scale))
         self.range_nt = self._limit * self._scale
         self._framer = Framer(b"\0", 254)
         self._skipped = 0

@@ -30,8 +30,7 @@ RETURN = 0x0D
 COUNTS = Struct(">hhh")
 CONFIRM = 4
 """Frames in a row that must end in a carriage return before an alignment is believed."""
-LEAP = 1000
-"""Counts by which a first frame may differ from the second in any case."""
+TEXT = bytes(range(0x20, 0x7F)) + b"\r\n"
 WINDOW = SIZE * CONFIRM + SIZE - 1
 """Bytes in which every one of the seven alignments has that many frames."""
 NUMBER = rb"([ +-][\d ]{2}[, ][\d ]{2}\d)"
@@ -142,16 +141,18 @@ def _reading(x: int, y: int, z: int) -> Reading:
 def _alignment(buffer: bytes, at: int) -> tuple[int, bool]:
     """Return how many bytes after `at` the first frame begins, and whether one was found in the window at all.
 
-    The end of a reply to a command looks like a frame, just before the first real one; it is left out.
+    The end of a reply to a command looks like a frame, just before the first real one; what is all text is left
+    out.
     """
     best, least, found = SIZE, 0, False
     for offset in range(SIZE):
         starts = range(at + offset, at + offset + SIZE * CONFIRM, SIZE)
         if all(buffer[start + SIZE - 1] == RETURN for start in starts):
             frames = [COUNTS.unpack_from(buffer, start) for start in starts]
-            steps = [sum(map(abs, map(sub, after, before))) for before, after in pairwise(frames)]
-            variation = sum(steps[1:])
+            # the first step would be from text to numbers, should the first frame be text
+            variation = sum(sum(map(abs, map(sub, after, before))) for before, after in pairwise(frames[1:]))
             if not found or variation < least:
-                leap = steps[0] > 10 * variation + LEAP
-                best, least, found = offset + SIZE * leap, variation, True
+                best, least, found = offset, variation, True
+    if found and not buffer[at + best : at + best + SIZE].translate(None, TEXT):
+        best += SIZE
     return best, found

@@ -192,21 +192,11 @@ class Twinleaf:
         row = self._rows[number]
         if row is None:
             return []
-        if len(payload) < 4:
-            raise ValueError
-        first = int.from_bytes(payload[:4], "little")
-        if number == 0:
-            stream = self._streams[0]
-            first = self._unwrap(0, first, WRAP_1)
-            begin, zero, period = 0, 0, self._timebases[stream.timebase] * stream.period
-        else:
-            segment = self._segments.get((number, first >> 24))
-            if segment is None:
-                self._skipped += len(payload)
-                return []
-            first = self._unwrap(first >> 24, first % WRAP_2, WRAP_2)
-            begin, period = segment.start, segment.decimation / segment.rate
-            zero = segment.start * segment.rate // segment.decimation
+        timing = self._timing(number, payload)
+        if timing is None:
+            self._skipped += len(payload)
+            return []
+        first, begin, zero, period = timing
         count, rest = divmod(len(payload) - 4, row.size)
         if rest:
             if len(payload) - 4 not in row.sizes:
@@ -229,6 +219,21 @@ class Twinleaf:
                 )
             )
         return readings
+
+    def _timing(self, number: int, payload: bytes) -> tuple[int, int, int, float] | None:
+        """Return a packet's first sample number, and of its segment the start (s), its number and period (s)."""
+        if len(payload) < 4:
+            raise ValueError
+        first = int.from_bytes(payload[:4], "little")
+        if number == 0:
+            stream = self._streams[0]
+            return self._unwrap(0, first, WRAP_1), 0, 0, self._timebases[stream.timebase] * stream.period
+        segment = self._segments.get((number, first >> 24))
+        if segment is None:
+            return None
+        zero = segment.start * segment.rate // segment.decimation
+        first = self._unwrap(first >> 24, first % WRAP_2, WRAP_2)
+        return first, segment.start, zero, segment.decimation / segment.rate
 
     def _unwrap(self, key: int, number: int, wrap: int) -> int:
         """Return the sample number with the turns it has made in its segment."""

@@ -1,0 +1,247 @@
+"""The device clock against injected truth: drift, jitter, wraps, restarts, steps, losses."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from math import nan
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from magbridge.records import Reading
+from magbridge.sensors import open_driver
+from magbridge.sensors.clock import DeviceClock, Stamp
+
+EPOCH = 1_700_000_000_000_000
+Array = NDArray[np.float64]
+
+
+def arrivals(true: Array, jitter: float, seed: int = 1) -> Array:
+    """s; the delay is exponential with mean `jitter`, and bytes do not overtake each other."""
+    random = np.random.default_rng(seed)
+    arrived: Array = np.maximum.accumulate(true + random.exponential(jitter, true.size))
+    return arrived
+
+
+def stamps(
+    clock: DeviceClock, device: Array, arrived: Array, sequence: list[int] | None = None
+) -> list[Stamp]:
+    times = (arrived * 1e6).astype(int) + EPOCH
+    numbers = sequence or [None] * device.size
+    return [clock.update(d, a, s) for d, a, s in zip(device.tolist(), times.tolist(), numbers, strict=True)]
+
+
+def error_us(made: list[Stamp], true: Array) -> Array:
+    error: Array = np.array([stamp.time_us - EPOCH for stamp in made]) - true * 1e6
+    return error
+
+
+def flags(made: list[Stamp]) -> tuple[int, int, int]:
+    return sum(s.restarted for s in made), sum(s.stepped for s in made), sum(s.missing for s in made)
+
+
+# The shortest delay in a block of n readings is jitter / n on average; that is the bias that remains, and its
+# scatter is as large. Bounds are five times that.
+@pytest.mark.parametrize(
+    ("rate", "duration", "bound"), [(0.25, 14_400, 5_000), (10.0, 1_200, 800), (100.0, 300, 150)]
+)
+@pytest.mark.parametrize("drift_ppm", [50.0, -50.0, 2_000.0])
+def test_drift_is_learned_and_jitter_removed(
+    rate: float, duration: float, bound: float, drift_ppm: float
+) -> None:
+    true = np.arange(0.0, duration, 1.0 / rate)
+    clock = DeviceClock()
+    made = stamps(clock, true / (1.0 + drift_ppm * 1e-6) + 77.7, arrivals(true, 5e-3))
+    settled = error_us(made, true)[true.size // 4 :]
+    assert np.abs(settled).max() < bound
+    assert settled.std() < bound / 5
+    assert clock.drift_ppm == pytest.approx(drift_ppm, abs=5.0)
+    assert clock.jitter_us == pytest.approx(5_000, rel=0.6)
+    assert flags(made) == (0, 0, 0)
+
+
+def test_even_at_first_no_error_exceeds_the_arrival_s() -> None:
+    true = np.arange(0.0, 20.0, 0.01)
+    arrived = arrivals(true, 5e-3)
+    made = stamps(DeviceClock(), true * (1 - 50e-6), arrived)
+    assert np.abs(error_us(made, true)).max() <= (arrived - true).max() * 1e6 + 4
+    assert np.abs(error_us(made, true)[500:]).max() < 400  # after 5 s
+
+
+def test_a_clock_that_wraps() -> None:
+    modulo = 2**32 * 1e-6
+    true = np.arange(0.0, 10_000.0, 1.0)
+    true = np.delete(true, slice(3_000, 9_500))  # silent for longer than a turn
+    made = stamps(
+        DeviceClock(time_modulo=modulo), (true * (1 - 50e-6) + 4_000) % modulo, arrivals(true, 5e-3)
+    )
+    assert flags(made) == (0, 0, 0)
+    assert np.abs(error_us(made, true)[200:]).max() < 20_000
+
+
+@pytest.mark.parametrize("modulo", [0.0, 2**32 * 1e-6])
+@pytest.mark.parametrize("uptime", [3.0, 600.0, 3_900.0])
+def test_a_power_cycle(modulo: float, uptime: float) -> None:
+    before = np.arange(0.0, 60.0, 0.1)
+    after = 62.5 + np.arange(0.0, 60.0, 0.1)
+    device = np.concatenate([before + uptime, after - 62.5 + 0.3]) * (1 - 50e-6)
+    true = np.concatenate([before, after])
+    made = stamps(DeviceClock(time_modulo=modulo), device, arrivals(true, 5e-3), [*range(600), *range(600)])
+    assert [k for k, stamp in enumerate(made) if stamp.restarted] == [600]
+    assert flags(made)[1:] == (0, 0)
+    error = error_us(made, true)
+    assert np.abs(error[600:620]).max() < 40_000
+    assert np.abs(error[700:]).max() < 2_000
+
+
+@pytest.mark.parametrize("step", [3_600.0, 2.0, -2.0, -3_600.0])
+def test_the_host_s_clock_is_set(step: float) -> None:
+    true = np.arange(0.0, 240.0, 0.1)
+    host = true + np.where(true < 120.0, 0.0, step)
+    made = stamps(DeviceClock(), true * (1 + 50e-6), arrivals(true, 5e-3) + host - true)
+    (found,) = [k for k, stamp in enumerate(made) if stamp.stepped]
+    # back is impossible, and seen at once; forward may be a long delay, until all of two blocks are late
+    assert 1200 <= found <= (1200 if step < 0 else 1200 + 2 * 64)
+    assert flags(made)[0] == 0
+    error = error_us(made, host)
+    assert np.abs(error[300:1200]).max() < 2_000
+    assert np.abs(error[found + 50 :]).max() < 3_000
+    # until then the readings keep the old time, without a jump between them
+    assert np.abs((error + (host - true) * 1e6)[1200:found]).max(initial=0) < 2_000
+
+
+def test_the_instrument_s_clock_is_set_forward() -> None:
+    true = np.arange(0.0, 100.0, 0.1)
+    made = stamps(DeviceClock(), true + np.where(true < 50.0, 0.0, 1.7e9), arrivals(true, 5e-3))
+    assert [k for k, stamp in enumerate(made) if stamp.stepped] == [500]
+    assert flags(made)[0] == 0
+
+
+def test_a_stalled_host_changes_nothing() -> None:
+    true = np.arange(0.0, 200.0, 0.01)
+    arrived = arrivals(true, 2e-3)
+    arrived[(true > 100.0) & (arrived < 101.5)] = 101.5
+    made = stamps(DeviceClock(), true, arrived)
+    assert flags(made) == (0, 0, 0)
+    assert np.abs(error_us(made, true)[5_000:]).max() < 150
+
+
+def test_unplugged_for_an_hour() -> None:
+    true = np.concatenate([np.arange(0.0, 300.0, 0.1), 3_900 + np.arange(0.0, 100.0, 0.1)])
+    made = stamps(DeviceClock(), true * (1 - 50e-6), arrivals(true, 5e-3))
+    assert flags(made) == (0, 0, 0)
+    assert np.abs(error_us(made, true)[3_000:]).max() < 5_000
+
+
+# -- without a clock -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("rate", "error_of_period"), [(0.25, 1e-4), (10.0, 0.01), (20.0, -0.02), (154.0, 0.005)]
+)
+def test_a_steady_beat_is_a_clock(rate: float, error_of_period: float) -> None:
+    true = np.arange(0.0, max(120.0, 400 / rate), 1.0 / rate)
+    clock = DeviceClock(period=(1.0 + error_of_period) / rate)
+    made = stamps(clock, np.full(true.size, nan), arrivals(true, 2e-3))
+    assert flags(made) == (0, 0, 0)
+    settled = error_us(made, true)[true.size // 3 :]
+    assert np.abs(settled).max() < 3_000
+    assert settled.std() < 600
+    expected = (1.0 / (1.0 + error_of_period) - 1.0) * 1e6
+    assert clock.drift_ppm == pytest.approx(expected, abs=10)
+
+
+@pytest.mark.parametrize(("rate", "jitter"), [(0.25, 5e-3), (10.0, 1e-3), (154.0, 1e-3)])
+def test_unseen_losses_are_counted(rate: float, jitter: float) -> None:
+    true = np.arange(30_000 if rate > 1 else 1_000) / rate
+    lost = [int(true.size * part) for part in (0.4, 0.6, 0.8)]
+    true = np.delete(true, lost)
+    made = stamps(DeviceClock(period=1.0 / rate), np.full(true.size, nan), arrivals(true, jitter))
+    assert flags(made) == (0, 0, 3)
+    error = error_us(made, true)[true.size // 3 :]
+    assert np.abs(error).max() < 1.05e6 / rate + 5_000  # at worst a period late, until the block ends
+    assert np.median(np.abs(error)) < 3_000
+
+
+def test_a_pause_without_a_clock() -> None:
+    true = np.concatenate([np.arange(0.0, 60.0, 0.1), 75.03 + np.arange(0.0, 60.0, 0.1)])
+    made = stamps(DeviceClock(period=0.1), np.full(true.size, nan), arrivals(true, 2e-3))
+    assert made[600].missing in (150, 151)
+    assert flags(made) == (0, 0, made[600].missing)
+    assert np.abs(error_us(made, true)[600:]).max() < 15_000
+
+
+def test_an_irregular_instrument_is_dated_by_arrival() -> None:
+    clock = DeviceClock()
+    assert [clock.update(nan, EPOCH + t).time_us - EPOCH for t in (0, 70_003, 70_003, 90_000)] == [
+        0,
+        70_000,
+        70_004,
+        90_000,
+    ]
+
+
+# -- sequence, chunks, records ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("modulo", "numbers", "missing"), [
+    (0, [1, 2, 5, 6], [0, 0, 2, 0]),
+    (256, [254, 255, 0, 3], [0, 0, 0, 2]),
+    (256, [7, 7, 6, 7], [0, 0, 0, 0]),
+])  # fmt: skip
+def test_holes_in_the_sequence(modulo: int, numbers: list[int], missing: list[int]) -> None:
+    clock = DeviceClock(sequence_modulo=modulo)
+    assert [clock.update(k, EPOCH + k * 1_000_000, n).missing for k, n in enumerate(numbers)] == missing
+
+
+@pytest.mark.parametrize("device", [True, False])
+def test_readings_of_one_chunk_are_as_good_as_one_by_one(device: bool) -> None:
+    true = np.arange(0.0, 60.0, 0.1)
+    clock = DeviceClock(period=0.0 if device else 0.1)
+    made: list[Stamp] = []
+    for start in range(0, 600, 10):
+        chunk = true[start : start + 10]
+        readings = [Reading((0.0, 0.0, 0.0), device_time=float(t) if device else nan) for t in chunk]
+        made += clock.stamp(readings, EPOCH + int(chunk[-1] * 1e6) + 2_000)
+    assert flags(made) == (0, 0, 0)
+    assert np.abs(error_us(made, true) - 2_000).max() < 10
+
+
+def test_the_clock_of_a_driver() -> None:
+    clock = DeviceClock.of(open_driver("hmr2300", {"rate": 10}))
+    assert [clock.update(nan, EPOCH + k * 100_000 + 7_000 * (k % 2)).time_us - EPOCH for k in range(4)] == [
+        0,
+        100_000,
+        200_000,
+        300_000,
+    ]
+
+
+EVENTS: Any = st.tuples(
+    st.one_of(st.just(nan), st.floats(0, 5_000), st.floats(-1e9, 1e10)),
+    st.integers(-(10**7), 10**8),
+    st.one_of(st.none(), st.integers(0, 65_535)),
+)
+
+
+@given(st.lists(EVENTS, max_size=60), st.sampled_from([0.0, 4294.967296]), st.sampled_from([0.0, 0.1]))
+@settings(max_examples=100)
+def test_anything_gives_a_time_that_increases_unless_stepped(
+    events: list[tuple[float, int, int | None]], modulo: float, period: float
+) -> None:
+    made, clocks = (
+        [],
+        [DeviceClock(time_modulo=modulo, sequence_modulo=65_536, period=period) for _ in range(2)],
+    )
+    arrival = EPOCH
+    for device_time, wait, sequence in events:
+        arrival += wait
+        first, second = (clock.update(device_time, arrival, sequence) for clock in clocks)
+        assert first == second
+        made.append(first)
+    assert all(stamp.time_us % 4 == 0 and stamp.missing >= 0 for stamp in made)
+    assert all(b.stepped or b.time_us > a.time_us for a, b in pairwise(made))

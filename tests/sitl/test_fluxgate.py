@@ -1,0 +1,174 @@
+"""An encoder is the inverse of its driver, within what the instrument resolves."""
+
+from __future__ import annotations
+
+from math import isnan, nan
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from magbridge.errors import ConfigError
+from magbridge.records import Reading
+from magbridge.sensors import DRIVERS, Driver, open_driver
+from sitl.fluxgate import ENCODERS, Encoder, open_encoder
+
+GAUSS = 100_000.0
+LINE = ["time", "x", "y", "z", "temperature", "supply", "sequence", "power_cycle"]
+NMEA: dict[str, Any] = {
+    "columns": LINE,
+    "separator": ",",
+    "prefix": "$PMAG,",
+    "checksum": "nmea",
+    "sequence_modulo": 256,
+}
+CASES: dict[str, tuple[str, dict[str, Any], int, float]] = {
+    # driver, options, generation, largest error of quantisation in nT
+    "digitizer": ("digitizer", {"sensitivity": 5e-5}, 0, 2.5 / 2**23 / 5e-5 / 2),
+    "digitizer, gain 4": ("digitizer", {"sensitivity": 2e-5, "gain": 4.0}, 0, 2.5 / 4 / 2**23 / 2e-5 / 2),
+    "hmr2300 binary": ("hmr2300", {"output": "binary"}, 0, GAUSS / 15_000 / 2),
+    "hmr2300 ascii": ("hmr2300", {"output": "ascii", "device": 12}, 0, GAUSS / 15_000 / 2),
+    "twinleaf 2": ("twinleaf", {"temperature": "therm"}, 2, 0.004),  # float32
+    "twinleaf 2 behind a hub, µT": ("twinleaf", {"route": "/0/2", "unit": "uT"}, 2, 0.004),
+    "twinleaf 1": ("twinleaf", {"temperature": "therm"}, 1, 0.004),
+    "ascii nmea": ("ascii", NMEA, 0, 1e-6),
+    "ascii gauss": ("ascii", {"columns": ["x", "y", "z", "-", "*"], "unit": "G"}, 0, 1e-6),
+    "ascii counts": ("ascii", {"unit": "counts", "scale": 0.5, "terminator": "\r"}, 0, 0.25),
+}  # fmt: skip
+HAS_TIME = ("digitizer", "twinleaf", "ascii nmea")
+HAS_TEMPERATURE = ("digitizer", "twinleaf 2", "twinleaf 1", "ascii nmea")
+RANGE = {"hmr2300": 200_000.0, "twinleaf": 100_000.0, "digitizer": 31_000.0, "ascii": 1e6}
+
+
+def pair(case: str) -> tuple[Driver, Encoder]:
+    """A driver and its instrument, started."""
+    name, options, generation, _ = CASES[case]
+    driver, encoder = open_driver(name, options), open_encoder(name, options, rate=20.0)
+    if generation:
+        encoder.generation = generation  # type: ignore[attr-defined]
+    for command in driver.start():
+        assert driver.feed(encoder.feed(command)) == []
+    assert encoder.streaming
+    return driver, encoder
+
+
+def through(driver: Driver, encoder: Encoder, sent: list[Reading]) -> list[Reading]:
+    return driver.feed(b"".join(encoder.encode(reading) for reading in sent))
+
+
+def test_every_driver_has_its_instrument() -> None:
+    assert list(ENCODERS) == list(DRIVERS)
+
+
+@pytest.mark.parametrize("case", CASES)
+@given(data=st.data())
+@settings(max_examples=30)
+def test_round_trip(case: str, data: st.DataObject) -> None:
+    name, _, _, quantum = CASES[case]
+    limit = 0.99 * RANGE[name]
+    fields = data.draw(st.lists(st.tuples(*[st.floats(-limit, limit)] * 3), min_size=8, max_size=8))
+    sent = [
+        Reading(field, device_time=0.05 * k, temperature=4.0 + k, supply=3.3)
+        for k, field in enumerate(fields)
+    ]
+    driver, encoder = pair(case)
+    got = through(driver, encoder, sent)
+    assert len(got) == len(sent)
+    for there, here in zip(sent, got, strict=True):
+        assert here.field == pytest.approx(there.field, abs=quantum * 1.001 + 1e-6, rel=0)
+        assert not here.saturated
+        if case.startswith(HAS_TIME):
+            assert here.device_time == pytest.approx(there.device_time, abs=1e-6)
+        if case in HAS_TEMPERATURE:
+            assert here.temperature == pytest.approx(there.temperature, abs=0.005)
+    if got[0].sequence is not None:
+        assert [reading.sequence for reading in got] == list(range(8))
+    assert driver.frames_bad == 0
+
+
+@pytest.mark.parametrize("case", ["digitizer", "hmr2300 binary", "hmr2300 ascii", "twinleaf 2"])
+def test_a_field_beyond_the_range_saturates(case: str) -> None:
+    driver, encoder = pair(case)
+    fields = [(1000.0 + k, 2000.0, -300_000.0 if k == 7 else 100.0) for k in range(12)]
+    got = through(driver, encoder, [Reading(field, device_time=0.05 * k) for k, field in enumerate(fields)])
+    assert [k for k, reading in enumerate(got) if reading.saturated] == [7]
+    assert got[7].field[2] == pytest.approx(-driver.range_nt, rel=1e-5)
+
+
+def test_the_fluxgate_saturates_before_the_converter() -> None:
+    options = {"sensitivity": 2e-5, "full_scale": 70_000.0}
+    (reading,) = open_driver("digitizer", options).feed(
+        open_encoder("digitizer", options).encode(Reading((1.0, 90_000.0, 3.0), device_time=0.0))
+    )
+    assert reading.saturated
+    assert reading.field[1] == pytest.approx(70_000.0, abs=0.02)
+
+
+def test_digitizer_channel_times_wrap_and_unknowns() -> None:
+    driver, encoder = pair("digitizer")
+    start = 2**32 * 1e-6 - 0.1
+    (reading,) = through(
+        driver, encoder, [Reading((1.0, 2.0, 3.0), device_time=start, channel_delay=(0.0, 0.2, 0.4))]
+    )
+    assert reading.device_time == pytest.approx(start)
+    assert reading.channel_delay == pytest.approx((0.0, 0.2, 0.4), abs=1e-6)
+    assert isnan(reading.temperature)
+    assert isnan(reading.supply)
+    (reading,) = through(
+        driver, encoder, [Reading((1.0, 2.0, 3.0), device_time=start + 0.3, temperature=nan)]
+    )
+    assert reading.device_time == pytest.approx(0.2, abs=1e-6)
+
+
+@pytest.mark.parametrize("case", ["digitizer", "twinleaf 2", "twinleaf 1", "ascii nmea"])
+def test_a_power_cycle_shows(case: str) -> None:
+    driver, encoder = pair(case)
+    one = Reading((1.0, 2.0, 3.0), device_time=0.0)
+    (before,) = through(driver, encoder, [one])
+    encoder.power_on()
+    (after,) = through(driver, encoder, [one])
+    assert None not in (before.power_cycle, after.power_cycle)
+    assert after.power_cycle != before.power_cycle
+    assert after.sequence == 0
+
+
+def test_hmr2300_obeys_only_when_asked_properly() -> None:
+    encoder = open_encoder("hmr2300", {})
+    one = Reading((GAUSS / 2, 0.0, -GAUSS), device_time=0.0)
+    assert not encoder.streaming
+    assert encoder.encode(one) == b""
+    assert encoder.feed(b"*99P\r") == b"  7,500        0  -15,000  \r"
+    assert encoder.feed(b"*99B\r") == b"WE_OFF\r"
+    assert encoder.feed(b"*99W") + encoder.feed(b"E\r*99b\r") == b"OK\rBINARY ON\r"
+    assert encoder.feed(b"hello\r*99QQ\r") == b"Re-enter\rRe-enter\r"
+    assert encoder.feed(b"*99WE\r*99R=100\r*99C\r") == b"OK\rOK\r"
+    assert encoder.encode(one) == bytes.fromhex("1D4C 0000 C568 0D")
+    assert encoder.feed(b"\x1b") == b""
+    assert encoder.encode(one) == b""
+
+
+def test_twinleaf_says_no_to_other_requests() -> None:
+    encoder, other = open_encoder("twinleaf", {}), open_encoder("twinleaf", {"route": "/3"})
+    (start,) = open_driver("twinleaf", {}).start()
+    assert other.feed(start + b"garbage\xc0\xc0") == b""
+    answers = encoder.feed(start)
+    assert b"\x04\x00\x04\x00\x01\x00\x02\x00" in answers  # RPC error, request 1 (data.send_all): not found
+    assert b"vector.x" in answers
+
+
+def test_wrong_options_name_the_key() -> None:
+    with pytest.raises(
+        ConfigError, match=r"my.toml: sensor.driver: can emulate ascii, digitizer, hmr2300, twinleaf"
+    ):
+        open_encoder("compass", {}, source="my.toml")
+    with pytest.raises(ConfigError, match=r"bridge.toml: sensor.options.sensitivity: missing key"):
+        open_encoder("digitizer", {})
+
+
+@given(st.lists(st.binary(max_size=50), max_size=10), st.sampled_from(sorted(CASES)))
+@settings(max_examples=100)
+def test_an_instrument_survives_any_commands(chunks: list[bytes], case: str) -> None:
+    _, encoder = pair(case)
+    for chunk in chunks:
+        encoder.feed(chunk)
