@@ -85,7 +85,7 @@ def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
         No magnetometer in it.
     """
     tables, skipped = _tables(path.read_bytes())
-    if "MAG" not in tables:
+    if not {"TimeUS", "MagX", "MagY", "MagZ"} <= tables.get("MAG", {}).keys():
         raise FormatError(path, "expected an ArduPilot log with MAG records")
     offset = _utc_offset(tables)
     mags = _instances(tables, "MAG", offset)
@@ -103,9 +103,10 @@ def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
         for number, (when, table) in _instances(tables, record, offset).items():
             for column, field, unit, factor in fields:
                 name = column.replace("#", str(number + 1) if number else "")
-                if field in table and name not in columns and np.any(table[field]):
-                    columns[name] = latest(time, when, table[field] * factor, MAX_AGE)
-                    units[name] = unit
+                if field not in table or name in columns or (record == "RCOU" and not np.any(table[field])):
+                    continue  # an output that is always 0 does not exist
+                columns[name] = latest(time, when, table[field] * factor, MAX_AGE)
+                units[name] = unit
     attrs: dict[str, Any] = {"bytes_skipped": skipped}
     if not offset:
         attrs["time_reference"] = "boot"

@@ -13,6 +13,7 @@ PX4 user guide, "ULog File Format", https://docs.px4.io/main/en/dev_log/ulog_fil
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +50,13 @@ FIELDS: dict[str, tuple[tuple[str, str, str, float], ...]] = {
     "actuator_outputs": tuple((f"servo{k + 1}", f"output[{k}]", "us", 1.0) for k in range(16)),
     "esc_status": tuple((f"esc{k + 1}_current", f"esc[{k}].esc_current", "A", 1.0) for k in range(8)),
 }
+NEEDED = {
+    "sensor_mag": {"timestamp", "x", "y", "z"},
+    "vehicle_attitude": {"timestamp", "q[0]", "q[1]", "q[2]", "q[3]"},
+    "debug_key_value": {"timestamp", "value", "key[0]"},
+}
+UNUSED = ("servo", "esc")
+"""Outputs of which a log has as many as there could be; those that are always 0 do not exist."""
 OTHERS = ("sensor_mag", "vehicle_attitude", "vehicle_gps_position", "sensor_gps", "debug_key_value")
 
 
@@ -61,14 +69,15 @@ def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
         Not a ULog, or no ``sensor_mag`` in it.
     """
     try:
-        with path.open("rb") as file:
+        with path.open("rb") as file, redirect_stdout(None):  # pyulog prints what it finds damaged
             log = ULog(file, [*FIELDS, *OTHERS])
     except (ULogException, ValueError, KeyError, IndexError, TypeError) as error:
         raise FormatError(path, f"expected a PX4 log: {error}") from None
     topics: dict[str, dict[int, dict[str, Floats]]] = {}
     for one in log.data_list:
         fields = {name: values.astype(np.float64) for name, values in one.data.items()}
-        topics.setdefault(one.name, {})[one.multi_id] = fields
+        if NEEDED.get(one.name, {"timestamp"}) <= fields.keys():
+            topics.setdefault(one.name, {})[one.multi_id] = fields
     mags = topics.get("sensor_mag")
     if not mags:
         raise FormatError(path, "expected a PX4 log with sensor_mag")
@@ -88,7 +97,7 @@ def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
                 "nT",
             )
     for column, unit, when, values in _telemetry(topics, offset):
-        if column not in columns and np.any(values):
+        if column not in columns and (np.any(values) or not column.startswith(UNUSED)):
             columns[column], units[column] = latest(time, when, values, MAX_AGE), unit
     attrs: dict[str, Any] = {"dropouts": len(log.dropouts)}
     if not offset:

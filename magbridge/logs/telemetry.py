@@ -187,8 +187,8 @@ class Rows:
         self.source_id = spec(survey.source).id.to_bytes(3, "little")
         self._source, self._make = spec(survey.source).id, SOURCES[survey.source]
         columns = ["time", *(f"mag_{axis}" for axis in "xyz" if "IMU" in survey.source)]
-        own = f"mag{survey.source[-1]}_" if survey.source[-1].isdigit() else "mag1_"
-        columns += [name for name in survey.columns if not ("IMU" in survey.source and name.startswith(own))]
+        own = {value.column for value in TELEMETRY.get(self._source, []) if value.column.startswith("mag")}
+        columns += [name for name in survey.columns if name not in own]
         self._slot = {name: k for k, name in enumerate(columns)}
         self._values = [nan] * len(columns)
         self._stamps = [NEVER] * len(columns)

@@ -1,0 +1,199 @@
+"""``.BIN`` and ``.ulg``, built here byte by byte as their formats say; nothing of them is kept."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from struct import pack
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from magbridge import logs
+from magbridge.errors import FormatError
+from magbridge.logs import ardupilot
+
+KINDS = {
+    # name: (type, letters, struct, fields)
+    "MAG": (100, "QBhhhhhhhhhBI", "<QB9hBI", "TimeUS,I,MagX,MagY,MagZ,OfsX,OfsY,OfsZ,MOX,MOY,MOZ,Health,S"),
+    "ATT": (101, "QccccCCCCB", "<Q4h4HB", "TimeUS,DesRoll,Roll,DesPitch,Pitch,DesYaw,Yaw,ErrRP,ErrYaw,AEKF"),
+    "GPS": (102, "QBIHBcLL", "<QBIHBhii", "TimeUS,Status,GMS,GWk,NSats,HDop,Lat,Lng"),
+    "BAT": (103, "QBff", "<QBff", "TimeUS,Instance,Volt,Curr"),
+    "MSG": (104, "QZ", "<Q64s", "TimeUS,Message"),
+}
+SIZES = {
+    name: len(pack(form, *([0] * 13)[: len(letters)])) if name != "MSG" else 72
+    for name, (_, letters, form, _) in KINDS.items()
+}
+UTC = 1_700_000_000
+
+
+def fmt(number: int, size: int, name: str, letters: str, fields: str) -> bytes:
+    return b"\xa3\x95\x80" + pack(
+        "<BB4s16s64s", number, size, name.encode(), letters.encode(), fields.encode()
+    )
+
+
+def bin_log(*, gps: bool = True) -> bytes:
+    data = fmt(128, 89, "FMT", "BBnNZ", "Type,Length,Name,Format,Columns")
+    for name, (number, letters, _, fields) in KINDS.items():
+        data += fmt(number, SIZES[name] + 3, name, letters, fields)
+
+    def say(name: str, *values: object) -> bytes:
+        number, _, form, _ = KINDS[name]
+        return b"\xa3\x95" + bytes([number]) + pack(form, *values)
+
+    gps_s = UTC + 18 - 315_964_800  # GPS time of the boot
+    for k in range(20):
+        us = k * 100_000
+        if k == 5:
+            data += say("ATT", us, 0, 1234, 0, -500, 0, 27_000, 0, 0, 3)
+            data += say("BAT", us, 0, 16.0, 1.5) + say("BAT", us, 1, 12.0, 0.5) + say("MSG", us, b"hello")
+        if k == 7 and gps:
+            t = gps_s + us * 1e-6
+            data += say(
+                "GPS", us, 3, round(t % 604_800 * 1000), int(t // 604_800), 9, 100, 450_000_000, -630_000_000
+            )
+        for instance in (0, 1):
+            data += say("MAG", us + instance, instance, 100 + k + 7, 20, -300, 7, 0, 0, 0, 0, 50, 1, 0)
+    return data
+
+
+def test_bin(tmp_path: Path) -> None:
+    path = tmp_path / "log.BIN"
+    path.write_bytes(bin_log())
+    back = logs.read(path)
+    np.testing.assert_allclose(back["time"], UTC + 0.1 * np.arange(20), rtol=0, atol=1e-6)
+    np.testing.assert_array_equal(back["mag_x"], 100.0 * (100 + np.arange(20)))  # the offset is off again
+    np.testing.assert_array_equal(back["mag_z"], np.full(20, -35_000.0))  # and the motor compensation
+    np.testing.assert_array_equal(back["mag2_x"][1:], back["mag_x"][:-1])
+    assert np.isnan(back["roll"][:5]).all()
+    np.testing.assert_allclose(back["roll"][5:], 12.34)
+    np.testing.assert_allclose(back["pitch"][5:], -5)
+    np.testing.assert_allclose(back["heading"][5:], 270)
+    np.testing.assert_allclose(back["battery_current"][5:], 1.5)
+    np.testing.assert_allclose(back["battery2_current"][5:], 0.5)
+    np.testing.assert_allclose(back["latitude"][7:], 45)
+    assert back.attrs["bytes_skipped"] == 0
+    assert "time_reference" not in back.attrs
+
+
+def test_bin_without_gps_counts_from_the_boot(tmp_path: Path) -> None:
+    path = tmp_path / "log.bin"
+    path.write_bytes(bin_log(gps=False))
+    back = logs.read(path)
+    np.testing.assert_allclose(back["time"], 0.1 * np.arange(20), rtol=0, atol=1e-9)
+    assert back.attrs["time_reference"] == "boot"
+
+
+def test_damaged_bin_is_read_to_its_end(tmp_path: Path) -> None:
+    data = bytearray(bin_log())
+    at = data.index(b"\xa3\x95d", len(data) // 2)  # there is no checksum: what is hit inside stays a record
+    data[at : at + 40] = b"garbage " * 5
+    path = tmp_path / "log.bin"
+    path.write_bytes(bytes(data[:-4]))
+    back = logs.read(path)
+    assert back.sizes["time"] == 19
+    assert back["mag_x"][-1] == 100 * (100 + 19)
+    assert back.attrs["bytes_skipped"] > 40
+
+
+@given(at=st.integers(0, 10**6), junk=st.binary(max_size=40), cut=st.integers(0, 60))
+@settings(max_examples=100, deadline=None)
+def test_bin_with_anything_in_it(at: int, junk: bytes, cut: int) -> None:
+    """Whatever stands between or instead of records, only columns of numbers come out."""
+    data = bin_log()
+    at %= len(data)
+    tables, skipped = ardupilot._tables(data[:at] + junk + data[at + cut :])
+    assert 0 <= skipped <= len(data) + len(junk)
+    assert all(values.dtype == np.float64 for table in tables.values() for values in table.values())
+
+
+# ULog: 16 bytes of head, then messages of a 16-bit size, a letter and that many bytes
+
+TOPICS = {
+    # name: (id, definition, struct)
+    "sensor_mag": (
+        0,
+        "uint64_t timestamp;uint64_t timestamp_sample;float x;float y;float z;float temperature;",
+        "<QQ4f",
+    ),
+    "vehicle_attitude": (1, "uint64_t timestamp;float[4] q;", "<Q4f"),
+    "battery_status": (2, "uint64_t timestamp;float voltage_v;float current_a;", "<Qff"),
+    "sensor_gps": (3, "uint64_t timestamp;uint64_t time_utc_usec;", "<QQ"),
+    "debug_key_value": (4, "uint64_t timestamp;float value;char[10] key;uint8_t[2] _padding0;", "<Qf10s"),
+}
+
+
+def ulog() -> bytes:
+    def message(kind: str, body: bytes) -> bytes:
+        return pack("<HB", len(body), ord(kind)) + body
+
+    data = b"ULog\x01\x12\x35\x01" + pack("<Q", 0) + message("B", bytes(40))
+    for name, (_, definition, _) in TOPICS.items():
+        data += message("F", f"{name}:{definition}".encode())
+    for name, (number, _, _) in TOPICS.items():
+        data += message("A", pack("<BH", 0, number) + name.encode())
+
+    def say(name: str, *values: object) -> bytes:
+        number, _, form = TOPICS[name]
+        return message("D", pack("<H", number) + pack(form, *values))
+
+    for k in range(20):
+        us = 1_000_000 + k * 100_000
+        if k == 3:
+            half = np.radians(-90) / 2  # heading 270
+            data += say("vehicle_attitude", us, np.cos(half), 0, 0, np.sin(half))
+            data += say("battery_status", us, 16, 2.5)
+            data += say("sensor_gps", us, UTC * 1_000_000 + us)
+        data += say("debug_key_value", us, k, b"battpos")
+        data += say("sensor_mag", us + 20, us, 0.2 + k / 100, 0.1, -0.4, 25)
+    return data
+
+
+def test_ulg(tmp_path: Path) -> None:
+    pytest.importorskip("pyulog")
+    path = tmp_path / "log.ulg"
+    path.write_bytes(ulog())
+    back = logs.read(path)
+    np.testing.assert_allclose(back["time"], UTC + 1 + 0.1 * np.arange(20), rtol=0, atol=1e-6)
+    np.testing.assert_allclose(back["mag_x"], 1e5 * (0.2 + np.arange(20) / 100), rtol=1e-6)
+    np.testing.assert_allclose(back["mag_z"], -40_000, rtol=1e-6)
+    assert np.isnan(back["heading"][:3]).all()
+    np.testing.assert_allclose(back["heading"][3:], 270, rtol=1e-6)
+    np.testing.assert_allclose(back["battery_current"][3:], 2.5)
+    np.testing.assert_array_equal(back["battpos"], np.arange(20))
+    assert "time_reference" not in back.attrs
+
+
+@pytest.mark.parametrize("kept", [0.9, 0.999])
+def test_truncated_ulg_is_read_to_its_end(
+    kept: float, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("pyulog")
+    path = tmp_path / "log.ulg"
+    data = ulog()
+    path.write_bytes(data[: int(kept * len(data))])
+    assert 15 <= logs.read(path).sizes["time"] < 20
+    assert capsys.readouterr().out == ""
+
+
+def test_ulg_cut_in_its_definitions(tmp_path: Path) -> None:
+    pytest.importorskip("pyulog")
+    path = tmp_path / "log.ulg"
+    path.write_bytes(ulog()[:300])
+    with pytest.raises(FormatError, match=r"log\.ulg: expected a PX4 log"):
+        logs.read(path)
+
+
+def test_quaternion_of_known_attitudes() -> None:
+    pytest.importorskip("pyulog")
+    from magbridge.logs.px4 import _angles  # noqa: PLC0415 - needs pyulog
+
+    rotation = pytest.importorskip("scipy.spatial.transform").Rotation
+    angles = np.random.default_rng(0).uniform([-180, -89, 0], [180, 89, 360], (50, 3))
+    x, y, z, w = rotation.from_euler("ZYX", angles[:, ::-1], degrees=True).as_quat().T
+    np.testing.assert_allclose(
+        np.transpose(_angles({"q[0]": w, "q[1]": x, "q[2]": y, "q[3]": z})), angles, atol=1e-9
+    )

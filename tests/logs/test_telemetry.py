@@ -1,0 +1,230 @@
+"""Logs of live links: what a row holds of what was said around it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from magbridge import logs
+from magbridge.errors import FormatError
+from magbridge.logs.tlog import TlogWriter
+from magbridge.mavlink import Codec, pack_record
+from magbridge.records import Channel, Quality
+
+T0 = 1_700_000_000_000_000  # µs
+S = 1_000_000
+
+
+class Log:
+    """A log in the making; times in s after its start."""
+
+    def __init__(self) -> None:
+        self.data = b""
+        self.codecs: dict[tuple[int, int], Codec] = {}
+
+    def say(
+        self, t: float, message: str, /, *, by: tuple[int, int] = (1, 1), channel: int = 0, **fields: Any
+    ) -> None:
+        frame = self.codecs.setdefault(by, Codec(*by)).pack(message, **fields)
+        self.data += pack_record(T0 + round(t * S), channel, frame)
+
+    def mag(self, t: float, x: int, **fields: Any) -> None:
+        self.say(t, "RAW_IMU", xmag=x, ymag=10, zmag=-20, temperature=2550, **fields)
+
+    def read(self, tmp_path: Path) -> Any:
+        path = tmp_path / "log.tlog"
+        path.write_bytes(self.data)
+        return logs.read(path)
+
+
+def test_a_row_holds_what_was_known_then(tmp_path: Path) -> None:
+    log = Log()
+    log.mag(0, 1)
+    log.say(1, "ATTITUDE", roll=0.1, pitch=-0.2, yaw=-np.pi / 2)
+    log.say(1.5, "NAMED_VALUE_FLOAT", name="battpos", value=0.5)
+    log.mag(2, 2)
+    log.say(3, "NAMED_VALUE_FLOAT", name="battpos", value=0.75)
+    log.say(3, "NAMED_VALUE_FLOAT", name="ballast", value=200)
+    log.say(3, "GLOBAL_POSITION_INT", lat=450_000_000, lon=-630_000_000, relative_alt=-12_000)
+    log.say(3, "SYS_STATUS", current_battery=123, voltage_battery=0xFFFF)
+    log.mag(4, 3)
+    log.mag(31, 4)
+    log.mag(33.5, 5)
+    back = log.read(tmp_path)
+    np.testing.assert_allclose(back["time"] - T0 / S, [0, 2, 4, 31, 33.5], atol=1e-6)
+    np.testing.assert_array_equal(back["mag_x"], [100, 200, 300, 400, 500])
+    np.testing.assert_array_equal(back["mag_z"], np.full(5, -2000))
+    nan = np.nan
+    np.testing.assert_allclose(back["roll"], np.degrees([nan, 0.1, 0.1, 0.1, nan]), rtol=1e-6)
+    np.testing.assert_allclose(back["heading"], [nan, 270, 270, 270, nan], rtol=1e-6)
+    np.testing.assert_array_equal(back["battpos"], [nan, 0.5, 0.75, 0.75, nan])
+    np.testing.assert_array_equal(back["ballast"], [nan, nan, 200, 200, nan])
+    np.testing.assert_allclose(back["latitude"], [nan, nan, 45, 45, nan])
+    np.testing.assert_allclose(back["depth"], [nan, nan, 12, 12, nan])
+    np.testing.assert_allclose(back["battery_current"], [nan, nan, 1.23, 1.23, nan])
+    np.testing.assert_allclose(back["imu_temperature"], 25.5)
+    assert back["battery_current"].attrs["units"] == "A"
+    assert "battery_voltage" not in back  # never known
+    assert "mag1_x" not in back  # that is mag_x
+    assert back.attrs["bytes_skipped"] == back.attrs["damages"] == back.attrs["rows_dropped"] == 0
+
+
+def test_only_the_vehicle_with_the_magnetometer_speaks(tmp_path: Path) -> None:
+    log = Log()
+    log.say(0, "ATTITUDE", roll=0.1)
+    log.say(0, "NAMED_VALUE_FLOAT", name="battpos", value=1)
+    for by in ((2, 1), (255, 190)):
+        log.say(1, "ATTITUDE", by=by, roll=9)
+        log.say(1, "NAMED_VALUE_FLOAT", by=by, name="battpos", value=9)
+        log.say(1, "NAMED_VALUE_FLOAT", by=by, name="other", value=9)
+    log.mag(2, 1)
+    log.mag(3, 2)
+    log.mag(3.5, 7, by=(2, 1))
+    back = log.read(tmp_path)
+    np.testing.assert_array_equal(back["mag_x"], [100, 200])
+    np.testing.assert_array_equal(back["battpos"], [1, 1])
+    np.testing.assert_allclose(back["roll"], np.degrees(0.1), rtol=1e-6)
+    assert "other" not in back
+
+
+def test_the_best_magnetometer_makes_the_rows(tmp_path: Path) -> None:
+    log = Log()
+    for k in range(3):
+        log.say(k, "SCALED_IMU2", xmag=5)
+        log.mag(k + 0.1, 7)
+        log.say(k + 0.2, "HIGHRES_IMU", xmag=0.5, ymag=0.25, zmag=-0.125)
+    back = log.read(tmp_path)
+    np.testing.assert_array_equal(back["mag_x"], [50_000] * 3)
+    np.testing.assert_array_equal(back["mag1_x"], [700] * 3)
+    np.testing.assert_array_equal(back["mag2_x"], [500] * 3)
+
+
+def test_without_a_magnetometer_attitude_makes_the_rows(tmp_path: Path) -> None:
+    log = Log()
+    for k in range(3):
+        log.say(k, "NAMED_VALUE_FLOAT", name="battpos", value=k)
+        log.say(k, "ATTITUDE", roll=0.1 * k)
+    back = log.read(tmp_path)
+    assert "mag_x" not in back
+    np.testing.assert_array_equal(back["battpos"], [0, 1, 2])
+    np.testing.assert_allclose(back["roll"], np.degrees([0, 0.1, 0.2]), rtol=1e-6)
+
+
+def test_a_bridges_own_log(tmp_path: Path) -> None:
+    """Its own reports are no telemetry, the correction stands in the row of its reading."""
+    log, ours = Log(), (1, 191)
+    log.say(0, "MAG_BRIDGE_START", by=ours, channel=Channel.STATE)
+    for k in range(3):
+        time_us = T0 + k * S
+        log.say(k, "NAMED_VALUE_FLOAT", channel=Channel.LINK, name="battpos", value=k)
+        log.mag(k, 9, channel=Channel.LINK)
+        log.say(k, "MAG_SENSOR_BYTES", by=ours, channel=Channel.SENSOR, length=1, data=b"x")
+        raw = {"x": 1.5, "y": 2.5, "z": k, "delay_y": 10, "delay_z": 20, "temperature": 4, "supply": np.nan}
+        log.say(
+            k, "MAG_RAW", by=ours, channel=Channel.SENT, time_usec=time_us - 7, power_cycle=2, flags=8, **raw
+        )
+        if k != 1:
+            field = {"total_field": 50_000.125 + k, "total_field_sigma": 2, "x": 1, "anomaly": np.nan}
+            flags = int(Quality.GAP)
+            log.say(
+                k, "MAG_FIELD", by=ours, channel=Channel.SENT, time_usec=time_us - 7, flags=flags, **field
+            )
+        log.say(k, "NAMED_VALUE_FLOAT", by=ours, channel=Channel.SENT, name="mag", value=50_000)
+        log.say(k, "HIGHRES_IMU", by=ours, channel=Channel.SENT, xmag=0.5)
+    back = log.read(tmp_path)
+    np.testing.assert_allclose(back["time"], (T0 - 7) / S + np.arange(3.0), rtol=0, atol=1e-6)
+    np.testing.assert_allclose(back["mag_time_z"] - back["time"], 20e-6, rtol=0, atol=0.5e-6)
+    np.testing.assert_array_equal(back["mag_z"], [0, 1, 2])
+    np.testing.assert_array_equal(back["battpos"], [0, 1, 2])
+    np.testing.assert_array_equal(back["power_cycle"], [2, 2, 2])
+    np.testing.assert_array_equal(back["sensor_temperature"], [4, 4, 4])
+    np.testing.assert_array_equal(back["total_field"], [50_000.125, np.nan, 50_002.125])
+    np.testing.assert_array_equal(back["quality"], [128, np.nan, 128])
+    assert not {"mag", "sensor_supply", "imu_temperature"} & set(back.data_vars) - {"imu_temperature"}
+
+
+def test_a_bridges_log_without_readings_gives_no_compass_instead(tmp_path: Path) -> None:
+    log = Log()
+    log.say(0, "MAG_BRIDGE_START", by=(1, 191), channel=Channel.STATE)
+    log.mag(1, 9, channel=Channel.LINK)
+    with pytest.raises(FormatError, match=r"log\.tlog: expected MAVLink records with one of MAG_RAW"):
+        log.read(tmp_path)
+
+
+def test_damage_is_passed_over_and_counted(tmp_path: Path) -> None:
+    log = Log()
+    ends = []
+    for k in range(50):
+        log.mag(k, k)
+        ends.append(len(log.data))
+    whole = log.data
+    torn = bytearray(whole)
+    torn[ends[9] + 20] ^= 0x40  # in record 10
+    del torn[ends[29] : ends[29] + 7]  # the head of record 30
+    log.data = bytes(torn[:-5])  # and the tail of the last
+    back = log.read(tmp_path)
+    np.testing.assert_array_equal(back["mag_x"], [100 * k for k in range(50) if k not in (10, 30, 49)])
+    assert back.attrs["damages"] == 3
+    assert back.attrs["bytes_skipped"] == len(log.data) - 47 * ends[0]
+    pieces = list(logs.read_chunks(tmp_path / "log.tlog", 7))
+    assert sum(piece.attrs["damages"] for piece in pieces) == 3
+
+
+def test_time_that_goes_back_drops_the_row(tmp_path: Path) -> None:
+    log = Log()
+    for t in (0, 1, 0.5, 1, 2):
+        log.mag(t, round(10 * t))
+    back = log.read(tmp_path)
+    np.testing.assert_array_equal(back["mag_x"], [0, 1000, 2000])
+    assert back.attrs["rows_dropped"] == 2
+
+
+def test_a_live_log_is_read_back(tmp_path: Path) -> None:
+    codec = Codec(1, 191)
+    with TlogWriter(tmp_path, max_size=0.01) as log:
+        for k in range(500):
+            frame = codec.pack("MAG_RAW", time_usec=T0 + k * S + 1, x=k, temperature=np.nan, supply=np.nan)
+            log.write(T0 + k * S, Channel.SENT, frame)
+    files = sorted(tmp_path.iterdir())
+    assert len(files) > 2
+    with files[-1].open("ab") as file:
+        file.write(pack_record(T0 + 500 * S, 0, frame)[:-3])  # torn by a power cut
+    back = logs.read(files)
+    np.testing.assert_array_equal(back["mag_x"], np.arange(500.0))
+    np.testing.assert_allclose(back["time"], T0 / S + 1e-6 + np.arange(500.0), rtol=0, atol=0.5e-6)
+    assert back.attrs["damages"] == 1
+
+
+def test_names_longer_than_ten_letters(tmp_path: Path) -> None:
+    """Cut for the message, whole again in the deployment; any MAVLink tool plots the short one."""
+    from magbridge.logs.deployment import deployment  # noqa: PLC0415 - only here
+
+    columns = {
+        name: [float(k)] for k, name in enumerate(("water_temperature", "water_temperatures", "water_temp"))
+    }
+    logs.write(deployment("made", [1.0], columns, {"water_temp": "degC"}), tmp_path / "log.tlog")
+    back = logs.read(tmp_path / "log.tlog")
+    assert {name: back[name].item() for name in back.data_vars} == {
+        name: column[0] for name, column in columns.items()
+    }
+    assert back["water_temp"].attrs["units"] == "degC"
+
+
+def test_any_mavlink_tool_reads_what_we_write(tmp_path: Path) -> None:
+    mavutil = pytest.importorskip("pymavlink.mavutil")
+    from magbridge.logs.deployment import deployment  # noqa: PLC0415 - only here
+
+    dataset = deployment(
+        "made", [1.0, 2.0], {"mag_x": [5, 6], "roll": [90, 0], "battpos": [0.5, 1]}, {"battpos": "in"}
+    )
+    logs.write(dataset, tmp_path / "log.tlog")
+    log = mavutil.mavlink_connection(str(tmp_path / "log.tlog"))
+    seen = list(iter(log.recv_match, None))
+    log.close()
+    rolls = [message.roll for message in seen if message.get_type() == "ATTITUDE"]
+    assert rolls == pytest.approx([np.pi / 2, 0])
+    assert [message.value for message in seen if message.get_type() == "NAMED_VALUE_FLOAT"] == [0.5, 1]
+    assert not [message for message in seen if message.get_type() == "BAD_DATA"]
