@@ -112,17 +112,16 @@ class _Floor:
         """Return by how much a point at `x` may reasonably contradict the line, in µs."""
         return TOLERANCE + 3.0 * self._sigma * abs(x - self._x)
 
-    def add(self, x: float, y: float, limit: float) -> float:
-        """Take a point; where a whole block has lain more than `limit` above the line, return how far (else 0).
+    def add(self, x: float, y: float, above: float, limit: float) -> float:
+        """Take a point, `above` the line; where a whole block was more than `limit` above, return how far (else 0).
 
         Such a block is not taken; `lowest` is its lowest point until the next one is added.
         """
         if not self._count:
             self._began, self._least = x, inf
-        above = y - self.at(x)
         self.delay += (max(0.0, min(above, STALL)) - self.delay) * 0.02
         if above < self._least:
-            self._least, self.lowest = above, (x, y)
+            self._least, self.lowest = max(above, 0.0), (x, y)
             self._drop += min(above, 0.0)
         self._count += 1
         if self._count < self._size:
@@ -207,6 +206,8 @@ class DeviceClock:
         The last one was delayed the least; the others were already waiting.
         """
         last = len(readings) - 1
+        if not last:
+            return [self.update(readings[0].device_time, arrival_us, readings[0].sequence)]
         stamps = []
         for index, reading in enumerate(readings):
             waited = 0.0
@@ -283,10 +284,11 @@ class DeviceClock:
         above = y - floor.at(x)
         fell_back = device_time < 0.5 * self._device_time
         restarted = fell_back and (step < 0.0 or abs(above) > RESTART)
-        if restarted or step < 0.0 or above < -floor.tolerance(x):
+        tolerance = floor.tolerance(x)
+        if restarted or step < 0.0 or above < -tolerance:
             self._begin(device_time, arrival_us)
             return float(arrival_us), restarted, not restarted
-        late = floor.add(x, y, floor.tolerance(x))
+        late = floor.add(x, y, above, tolerance)
         if late:
             floor.restart(*floor.lowest)
         return origin_us + 1e6 * x + floor.at(x), False, late > 0.0
@@ -300,7 +302,7 @@ class DeviceClock:
         above = y - floor.at(x)
         limit = max(HALF * period_us, TOLERANCE)
         if -limit <= above <= limit + 10.0 * floor.delay:
-            above = floor.add(x, y, HALF * period_us + 20.0 * floor.scatter)
+            above = floor.add(x, y, above, HALF * period_us + 20.0 * floor.scatter)
         beats = round(above / period_us)
         if beats:
             self._count += beats
