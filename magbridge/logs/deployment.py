@@ -20,6 +20,8 @@ Floats = NDArray[np.float64]
 
 MEANING = {"heading_reference": "true", "time_reference": "utc"}
 """Attributes that change what values mean, and what holds where they are absent."""
+COUNTERS = ("bytes_skipped", "damages", "dropouts", "duplicate_rows", "rows_dropped")
+"""Attributes that add up."""
 
 
 def deployment(
@@ -28,6 +30,7 @@ def deployment(
     columns: Mapping[str, ArrayLike],
     units: Mapping[str, str] | None = None,
     attrs: Mapping[str, Any] | None = None,
+    long_names: Mapping[str, str] | None = None,
 ) -> xr.Dataset:
     """Return the columns as a deployment, in the units of :data:`magbridge.columns.COLUMNS`.
 
@@ -43,13 +46,15 @@ def deployment(
         Declared unit of a column; one that the table knows is converted to the table's.
     attrs : mapping, optional
         Attributes of the whole, as ``heading_reference``.
+    long_names : mapping of str to str, optional
+        What columns mean that the table does not know.
 
     Raises
     ------
     FormatError
         A declared unit that does not fit the column.
     """
-    units = units or {}
+    units, long_names = units or {}, long_names or {}
     variables = {}
     for name, values in {"time": time, **columns}.items():
         unit = units.get(name, "")
@@ -57,7 +62,11 @@ def deployment(
         if scale is None:
             raise FormatError(file, f"expected {COLUMNS[name].unit}, not {unit}", column=name)
         array = np.asarray(values, dtype=np.float64)
-        variables[name] = ("time", array if scale == 1.0 else array * scale, _describe(name, unit))
+        variables[name] = (
+            "time",
+            array if scale == 1.0 else array * scale,
+            _describe(name, unit, long_names.get(name)),
+        )
     return xr.Dataset(
         variables,
         coords={"time": variables.pop("time")},
@@ -65,10 +74,10 @@ def deployment(
     )
 
 
-def _describe(name: str, unit: str) -> dict[str, Any]:
+def _describe(name: str, unit: str, long_name: str | None) -> dict[str, Any]:
     known = COLUMNS.get(name)
     if known is None:
-        return {"units": unit or "1", "long_name": name.replace("_", " ")}
+        return {"units": unit or "1", "long_name": long_name or name.replace("_", " ")}
     described: dict[str, Any] = {"units": known.unit, "long_name": known.long_name}
     if name == "quality":
         described |= {
@@ -182,8 +191,8 @@ def _join_attrs(all_attrs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     for attrs in all_attrs:
         sources += [name for name in str(attrs.get("source", "")).split(", ") if name not in sources]
         for key, value in attrs.items():
-            if isinstance(value, int) and key in joined:
-                joined[key] += value  # a counter
+            if key in COUNTERS and key in joined:
+                joined[key] += value
             else:
                 joined.setdefault(key, value)
     return joined | {"source": ", ".join(sources)}

@@ -87,6 +87,7 @@ def _chunks(path: Path, file: Any, rows: int) -> Iterator[xr.Dataset]:
         raise FormatError(path, "expected rows, there are none")
     start, scale = _epoch(path, variables["time"])
     units = {name: getattr(variable, "units", "1") for name, variable in variables.items() if name != "time"}
+    meanings = {name: str(getattr(variable, "long_name", "")) for name, variable in variables.items()}
     attrs = {key: _plain(value) for key, value in file.__dict__.items() if key not in GENERATED}
     last = -np.inf
     for row in range(0, total, rows):
@@ -94,7 +95,7 @@ def _chunks(path: Path, file: Any, rows: int) -> Iterator[xr.Dataset]:
         time = columns.pop("time") * scale + start
         increasing(path, time, range(row + 1, row + 1 + len(time)), after=last)
         last = float(time[-1])
-        yield deployment(path, time, columns, units, attrs)
+        yield deployment(path, time, columns, units, attrs, meanings)
 
 
 def _floats(variable: Any, rows: slice) -> NDArray[np.float64]:

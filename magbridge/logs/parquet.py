@@ -42,6 +42,7 @@ def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
 def _chunks(path: Path, file: Any, rows: int) -> Iterator[xr.Dataset]:
     schema = file.schema_arrow
     units = {field.name: _text(field.metadata, b"units") for field in schema}
+    meanings = {field.name: _text(field.metadata, b"long_name") for field in schema}
     attrs = json.loads(_text(schema.metadata, b"magbridge") or "{}")
     if "time" not in schema.names:
         raise FormatError(path, f"expected this column; there are: {' '.join(schema.names)}", column="time")
@@ -50,7 +51,7 @@ def _chunks(path: Path, file: Any, rows: int) -> Iterator[xr.Dataset]:
     row, last = 1, -np.inf
     for batch in file.iter_batches(batch_size=min(rows, 1 << 20)):
         columns = {field.name: _floats(path, field, batch.column(k)) for k, field in enumerate(schema)}
-        dataset = deployment(path, columns.pop("time"), columns, units, attrs)
+        dataset = deployment(path, columns.pop("time"), columns, units, attrs, meanings)
         increasing(path, dataset["time"].values, range(row, row + batch.num_rows), after=last)
         row, last = row + batch.num_rows, float(dataset["time"][-1])
         yield dataset

@@ -141,24 +141,27 @@ class TlogWriter:
         self._end_file()
 
     def _drain(self) -> None:
-        group: list[bytes] = []
-        size = 0
-        for record in [self._queue.popleft() for _ in range(len(self._queue))]:
-            self._taken += len(record)
+        records = [self._queue.popleft() for _ in range(len(self._queue))]
+        size = sum(map(len, records))
+        self._taken += size
+        if self._fits(size, STAMP.unpack_from(records[-1])[0]):
+            self._put_down(records)
+            return
+        for record in records:
             time_us = STAMP.unpack_from(record)[0]
-            if self._file >= 0 and (
-                self._size + size + len(record) > self._max_size
-                or time_us - self._start_us > self._max_age_us
-            ):
-                self._put_down(group)
+            if not self._fits(len(record), time_us):
                 self._end_file()
-                group, size = [], 0
-            if self._file < 0 and not self._begin_file(time_us):
+            if self._file >= 0 or self._begin_file(time_us):
+                self._put_down([record])
+            else:
                 self._dropped += 1
-                continue
-            group.append(record)
-            size += len(record)
-        self._put_down(group)
+
+    def _fits(self, size: int, time_us: int) -> bool:
+        return (
+            self._file >= 0
+            and self._size + size <= self._max_size
+            and time_us - self._start_us <= self._max_age_us
+        )
 
     def _begin_file(self, time_us: int) -> bool:
         if self.failure and 0 <= time_us - self._failed_us < RETRY_US:
@@ -180,8 +183,6 @@ class TlogWriter:
 
     def _put_down(self, group: list[bytes]) -> None:
         """Write whole records; when that fails, leave none half-written."""
-        if not group:
-            return
         data = memoryview(b"".join(group))
         time_us = STAMP.unpack_from(group[-1])[0]
         try:

@@ -239,6 +239,17 @@ def test_columns_say_what_they_are(tmp_path: Path) -> None:
     assert all(column.dtype == np.float64 and column.attrs["long_name"] for column in back.variables.values())
 
 
+@pytest.mark.parametrize("suffix", [".nc", ".parquet"])
+def test_meaning_and_attributes_are_kept(suffix: str, tmp_path: Path) -> None:
+    dataset = deployment(
+        "made", [1.0], {"run": [3]}, attrs={"segments": "[]", "seed": 5}, long_names={"run": "the leg"}
+    )
+    logs.write(dataset, tmp_path / f"log{suffix}")
+    back = logs.read(tmp_path / f"log{suffix}")
+    assert back["run"].attrs["long_name"] == "the leg"
+    assert back.attrs == dataset.attrs
+
+
 def test_csv_is_as_plain_as_can_be(tmp_path: Path) -> None:
     dataset = deployment(
         "made", [1.5, 2], {"mag_x": [1, np.nan], "battpos": [0.1, 2], "quality": [0, 3]}, {"battpos": "in"}
