@@ -153,13 +153,13 @@ class Calibrated:
 def draw_vehicle(rng: np.random.Generator, masses: Sequence[str] = ("battpos", "ballast")) -> Vehicle:
     """Draw a vehicle with these moving masses (keys of :data:`MOUNTINGS`).
 
-    The sizes are those of a small glider. Fixed iron: 1,500 nT and 1.5 % an axis. A mass: 2 A m² an axis left by
-    handling (ten kilograms of alkaline cells hold a kilogram or two of steel, 2e-4 m³, at some 10 kA/m), and an
+    The sizes are those of a small glider. Fixed iron: 1,500 nT and 1 % an axis. A mass: 3 A m² an axis left by
+    handling (ten kilograms of alkaline cells hold two or three kilograms of steel, 3e-4 m³, at some 10 kA/m), and an
     apparent susceptibility times volume of 2 litres along its length, half that across (cans with a demagnetising
     factor near 0.1). It stands within centimetres of where its kind usually stands. A nominal calibration of such
     a vehicle over the spirals of the paper's Table 1 leaves about 150 nT, as the paper's did.
     """
-    iron = rng.normal(0, 0.015, (3, 3))
+    iron = rng.normal(0, 0.01, (3, 3))
     return Vehicle(
         hard_iron=_vector(rng.normal(0, 1500, 3)),
         soft_iron=(_vector(iron[0]), _vector(iron[1]), _vector(iron[2])),
@@ -171,7 +171,7 @@ def _draw_mass(rng: np.random.Generator, mounting: Mounting) -> Mass:
     return Mass(
         at=_vector(np.asarray(mounting.at) + rng.normal(0, [0.06, 0.03, 0.03])),
         travel=mounting.travel,
-        moment=_vector(rng.normal(0, 2, 3)),
+        moment=_vector(rng.normal(0, 3, 3)),
         volume=_vector(np.array([2e-3, 1e-3, 1e-3]) * np.exp(rng.normal(0, 0.3, 3))),
     )
 

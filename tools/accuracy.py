@@ -1,0 +1,320 @@
+"""How well each calibration does out of sample, over random simulated gliders, beside what is possible at all.
+
+Each glider has dipoles of its own, flies the paper's Table 1, is calibrated, and flies a survey on another day with
+other roll and pitch. Printed for each method: the survey's RMS error over its noise floor (the error of a calibration
+that knows the vehicle), as median, 95th percentile and worst of the gliders, the RMS in nT on calibration and survey,
+and whether the predicted sigma is right. Samples while a mass is on its way are left out.
+
+    python tools/accuracy.py --seeds 40 --out accuracy/
+    python tools/accuracy.py --peers .venv-peers/bin/python        # see tools/peers.py
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterable, Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from itertools import product
+from multiprocessing import get_context
+from pathlib import Path
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+import xarray as xr
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+from scipy.optimize import least_squares
+
+from magbridge.calibration.correct import correct
+from magbridge.calibration.data import observations
+from magbridge.calibration.fit import fit
+from magbridge.errors import CalibrationError
+from magbridge.field.igrf import igrf
+from sitl import Twin, load, segments, simulate
+from sitl.bound import information_bound, oracle
+from sitl.instrument import rotation
+from sitl.platform import Vehicle
+
+NOISES = {"1 nT white": (1.0, 0.0), "5 nT AR(1)": (5.0, 10.0)}
+"""nT of a channel, and samples over which its correlation falls by e."""
+MASSES = {1: ("battpos",), 2: ("battpos", "ballast"), 3: ("battpos", "ballast", "rollpos")}
+TAPE = 0.05
+"""m, how well someone measures where the masses sit."""
+
+
+class Case(NamedTuple):
+    """One glider under one noise."""
+
+    seed: int
+    noise: str
+    masses: int
+    methods: tuple[str, ...]
+    peers: str
+
+
+class Row(NamedTuple):
+    """What one method did on one glider; RMS in nT, `sigma` the standardised survey error's deviation."""
+
+    noise: str
+    masses: int
+    method: str
+    seed: int
+    calibration: float
+    survey: float
+    floor: float
+    sigma: float
+    failed: str = ""
+
+
+def run(case: Case) -> list[Row]:
+    """Simulate, calibrate by every method, and score on the survey."""
+    scenario = load("random_glider")
+    noise, memory = NOISES[case.noise]
+    names = MASSES[case.masses]
+    scenario = msgspec.structs.replace(
+        scenario,
+        masses=names,
+        instrument=msgspec.structs.replace(scenario.instrument, noise_sigma=noise, noise_memory=memory),
+    )
+    vehicle = Twin.draw(scenario, case.seed).vehicle
+    assert isinstance(vehicle, Vehicle)
+    parts = {name: at_rest(part, names) for name, part in segments(simulate(scenario, case.seed)).items()}
+    runs, survey = parts["calibration"], parts["survey"]
+    floor = rms(oracle(vehicle, survey) - total(survey))
+    rows = []
+
+    def add(method: str, before: float, after: float, sigma: float = np.nan, failed: str = "") -> None:
+        rows.append(Row(case.noise, case.masses, method, case.seed, before, after, floor, sigma, failed))
+
+    for method in case.methods:
+        try:
+            error, sigma, residual = calibrate(method, vehicle, runs, survey, names, case.seed)
+        except CalibrationError as error:
+            add(method, np.nan, np.nan, failed=str(error))
+            continue
+        add(method, residual, rms(error), float(np.std(error / sigma)))
+    for at_sigma, name in ((0.5, "bound"), (TAPE, "bound, positions to 5 cm")):
+        bound, noise_alone = information_bound(vehicle, runs, survey, noise, memory, at_sigma)
+        add(name, rms(noise_alone), rms(bound) / rms(noise_alone) * floor)
+    for name, (A, T, failed) in strangers(runs, case.peers):
+        add(name, rms(left(A, T, runs)), rms(left(A, T, survey)), failed=failed)
+    return rows
+
+
+def calibrate(
+    method: str, vehicle: Vehicle, runs: xr.Dataset, survey: xr.Dataset, names: tuple[str, ...], seed: int
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return the survey's error and predicted sigma (n,), and the RMS on the calibration runs, nT."""
+    used = () if method == "nominal" else names
+    options = {}
+    if method == "nominal":
+        options = {"axes_fixed": True, "equal_xz": True}  # as the paper does
+    elif method == "auto, positions to 5 cm":
+        options = {"vehicle": tape(vehicle, seed)}
+    fitted = fit(observations(runs, used), method.partition(",")[0], **options).calibration
+    left_over = []
+    for part in (runs, survey):
+        channels = (
+            np.column_stack([part[name] for name in used]) if used else np.empty((part.sizes["time"], 0))
+        )
+        corrected = correct(fitted, raw(part), channels, part["time"].to_numpy())
+        left_over.append((corrected.total - total(part), corrected.sigma))
+    return *left_over[1], rms(left_over[0][0])
+
+
+def tape(vehicle: Vehicle, seed: int) -> dict[str, dict[str, object]]:
+    """Return the masses' positions as someone measures them; the tables of a ``vehicle.toml``."""
+    rng = np.random.default_rng([seed, 99])
+    return {
+        name: {
+            "at": (np.array(mass.at) + rng.normal(0, TAPE, 3)).tolist(),
+            "at_sigma": TAPE,
+            "travel": list(mass.travel),
+        }
+        for name, mass in vehicle.mass.items()
+    }
+
+
+def strangers(runs: xr.Dataset, peers: str) -> Iterator[tuple[str, tuple[np.ndarray, np.ndarray, str]]]:
+    """Yield public methods' answers: corrected is ``A (raw - T)``."""
+    yield "scipy ellipsoid", (*ellipsoid(runs), "")
+    if not peers:
+        return
+    attitude = rotation(*(runs[name].to_numpy() for name in ("roll", "pitch", "heading")))
+    time = runs["time"].to_numpy()
+    turned = (attitude[:-1].inv() * attitude[1:]).as_rotvec() / np.diff(time)[:, None]
+    place = [runs[name].to_numpy()[:1] for name in ("longitude", "latitude", "depth", "time")]
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "runs.npz"
+        np.savez(
+            file,
+            field=raw(runs),
+            reference=total(runs),
+            attitude=np.column_stack([runs[name] for name in ("roll", "pitch", "heading")]),
+            rates=np.vstack([turned, turned[-1:]]),
+            reference_ned=igrf(*place)[0],
+            time=time,
+        )
+        command = [peers, str(Path(__file__).with_name("peers.py")), str(file)]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise SystemExit(f"{peers}: {done.stderr.strip().splitlines()[-1]}")
+    for name, answer in json.loads(done.stdout).items():
+        failed = answer.get("failed", "")
+        nothing = np.full((3, 3), np.nan), np.full(3, np.nan)
+        yield name, (*(nothing if failed else (np.array(answer["A"]), np.array(answer["T"]))), failed)
+
+
+def ellipsoid(runs: xr.Dataset) -> tuple[np.ndarray, np.ndarray]:
+    """Fit a free ellipsoid, nine numbers, by scipy from the identity."""
+    upper = np.triu_indices(3)
+    size = float(np.mean(total(runs)))
+
+    def unpack(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        A = np.zeros((3, 3))
+        A[upper] = x[:6]
+        return A + np.triu(A, 1).T, size * x[6:]
+
+    start = np.concatenate([np.eye(3)[upper], np.zeros(3)])
+    found = least_squares(lambda x: left(*unpack(x), runs) / size, start, method="lm", xtol=1e-12, ftol=1e-12)
+    return unpack(found.x)
+
+
+def at_rest(part: xr.Dataset, names: Iterable[str]) -> xr.Dataset:
+    """Return the samples about which no mass is on its way."""
+    still = np.ones(part.sizes["time"], bool)
+    for name in names:
+        moved = np.abs(np.diff(part[name])) > 1e-9
+        still[:-1] &= ~moved
+        still[1:] &= ~moved
+    return part.isel(time=still)
+
+
+def raw(part: xr.Dataset) -> np.ndarray:
+    return np.column_stack([part[f"mag_{axis}"] for axis in "xyz"])
+
+
+def total(part: xr.Dataset) -> np.ndarray:
+    return part["truth_total_field"].to_numpy()
+
+
+def left(A: np.ndarray, T: np.ndarray, part: xr.Dataset) -> np.ndarray:
+    return np.linalg.norm((raw(part) - T) @ A.T, axis=1) - total(part)
+
+
+def rms(error: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(error**2)))
+
+
+def show(rows: list[Row], console: Console) -> None:
+    """Print a table for each noise and number of masses."""
+    for noise, masses in dict.fromkeys((row.noise, row.masses) for row in rows):
+        chosen = [row for row in rows if (row.noise, row.masses) == (noise, masses)]
+        gliders = len({row.seed for row in chosen})
+        table = Table(
+            title=f"{noise}, {masses} moving mass{'es' * (masses > 1)}, {gliders} gliders",
+            title_justify="left",
+        )
+        for heading in (
+            "",
+            "over the floor: median",
+            "95 %",
+            "worst",
+            "runs nT",
+            "survey nT",
+            "sigma: median",
+            "0.8 to 1.25",
+        ):
+            table.add_column(heading, justify="left" if not heading else "right")
+        for method in dict.fromkeys(row.method for row in chosen):
+            mine = [row for row in chosen if row.method == method]
+            good = [row for row in mine if np.isfinite(row.survey)]
+            if not good:
+                table.add_row(method, f"failed: {mine[0].failed}")
+                continue
+            ratio = np.array([row.survey / row.floor for row in good])
+            sigma = np.array([row.sigma for row in good])
+            known = np.isfinite(sigma).any()
+            table.add_row(
+                method
+                + (f" ({len(mine) - len(good)} of {len(mine)} failed)" if len(good) < len(mine) else ""),
+                *(
+                    f"{value:.3f}" if value < 10 else f"{value:,.0f}"
+                    for value in (*np.quantile(ratio, [0.5, 0.95]), ratio.max())
+                ),
+                *(
+                    f"{np.median([getattr(row, name) for row in good]):,.2f}"
+                    for name in ("calibration", "survey")
+                ),
+                f"{np.median(sigma):.2f}" if known else "",
+                f"{np.mean((sigma > 0.8) & (sigma < 1.25)):.0%}" if known else "",
+            )
+        console.print(table)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--seeds", type=int, default=40, help="gliders")
+    parser.add_argument("--masses", type=int, nargs="+", default=[2, 1, 3], choices=sorted(MASSES))
+    parser.add_argument("--noise", nargs="+", default=list(NOISES), choices=list(NOISES))
+    parser.add_argument(
+        "--methods", nargs="+", default=["nominal", "cubic", "auto", "auto, positions to 5 cm"]
+    )
+    parser.add_argument(
+        "--peers",
+        default=os.environ.get("MAGBRIDGE_PEERS", ""),
+        help="interpreter that has magyc and MAVProxy",
+    )
+    parser.add_argument(
+        "--peer-seeds", type=int, default=10, help="gliders that the peers are given, two masses (11 s each)"
+    )
+    parser.add_argument("--jobs", type=int, default=2, choices=(1, 2), help="processes")
+    parser.add_argument("--out", type=Path, help="folder for accuracy.csv and accuracy.txt")
+    chosen = parser.parse_args()
+    console = Console(width=150, record=True)
+    if not chosen.peers:
+        console.print(
+            "magyc and MAVProxy's magfit are left out: no --peers interpreter (tools/peers.py says how)"
+        )
+    cases = [
+        Case(
+            seed,
+            noise,
+            masses,
+            tuple(chosen.methods),
+            chosen.peers * (masses == 2 and seed < chosen.peer_seeds),
+        )
+        for masses, noise, seed in product(chosen.masses, chosen.noise, range(chosen.seeds))
+    ]
+    rows: list[Row] = []
+    os.environ |= {
+        "OMP_NUM_THREADS": "1",
+        "OPENBLAS_NUM_THREADS": "1",
+    }  # a process a core, for those spawned below
+    with ProcessPoolExecutor(chosen.jobs, mp_context=get_context("spawn")) as pool:
+        waiting = [pool.submit(run, case) for case in cases]
+        for done in track(as_completed(waiting), "gliders", len(waiting), console=Console(stderr=True)):
+            rows += done.result()
+    order = {(case.masses, case.noise): k for k, case in enumerate(cases)}
+    rows.sort(key=lambda row: (order[row.masses, row.noise], row.seed))
+    show(rows, console)
+    if chosen.out:
+        chosen.out.mkdir(parents=True, exist_ok=True)
+        (chosen.out / "accuracy.txt").write_text(console.export_text())
+        with (chosen.out / "accuracy.csv").open("w", newline="") as file:
+            writer = csv.writer(file)
+            writer.writerows([Row._fields, *rows])
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,133 @@
+"""Public magnetometer calibrations on a glider's data: run by tools/accuracy.py in an interpreter that has them.
+
+magyc (PyPI) needs numpy < 2 and gtsam, MAVProxy a desktop; neither belongs into magbridge's environment. So::
+
+    python -m venv .venv-peers
+    .venv-peers/bin/pip install magyc MAVProxy pymavlink
+    python tools/accuracy.py --peers .venv-peers/bin/python
+
+In: an ``.npz`` with raw ``field`` (n, 3) nT, ``reference`` (n,) nT, ``attitude`` (n, 3) deg roll, pitch, heading,
+``rates`` (n, 3) rad/s (both exact, better than any vehicle knows them), ``reference_ned`` (3,) nT, ``time`` (n,) s.
+Out, on stdout: JSON, for each method ``{"A": 3x3, "T": 3}`` such that the corrected field is ``A (field - T)``, or
+``{"failed": reason}``.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import sys
+import types
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+NT_PER_MILLIGAUSS = 100.0
+MAGFIT_SAMPLES = 250
+"""magfit sums in Python; it is given every n-th sample, as its own 'Reduce' does."""
+
+
+def magfit(data: dict[str, np.ndarray]) -> np.ndarray:
+    """MAVProxy's magfit: offsets, scale, diagonals, off-diagonals against the attitude and the Earth's field."""
+    # it imports a desktop toolkit for its window; the fit itself does not use it
+    desktop = types.SimpleNamespace(Dialog=object, Panel=object, Frame=object)
+    for name in ("wx_loader", "wx_processguard", "grapher", "multiproc_util"):
+        stand_in: Any = types.ModuleType(name)
+        stand_in.wx, stand_in.MPDataLogChildTask = desktop, object
+        sys.modules[f"MAVProxy.modules.lib.{name}"] = stand_in
+    from MAVProxy.modules.lib import magfit as peer  # noqa: PLC0415  once its desktop is stood in for
+    from pymavlink.rotmat import Vector3  # noqa: PLC0415
+
+    rows = slice(None, None, max(1, len(data["field"]) // MAGFIT_SAMPLES))
+    north, east, _ = data["reference_ned"]
+    peer.earth_field = Vector3(*(data["reference_ned"] / NT_PER_MILLIGAUSS))
+    peer.declination = float(np.degrees(np.arctan2(east, north)))
+    peer.margs = {
+        "OffsetMax": 1500.0, "ScaleMin": 0.8, "ScaleMax": 1.2, "Elliptical": True, "DiagonalMin": 0.8,
+        "DiagonalMax": 1.2, "OffDiagMin": -0.2, "OffDiagMax": 0.2, "CMOT": False, "CMOT NoChange": False,
+    }  # fmt: skip
+    peer.data = [
+        (
+            types.SimpleNamespace(MagX=x, MagY=y, MagZ=z),
+            types.SimpleNamespace(Roll=roll, Pitch=pitch, Yaw=yaw),
+            None,
+        )
+        for (x, y, z), (roll, pitch, yaw) in zip(
+            (data["field"][rows] / NT_PER_MILLIGAUSS).tolist(), data["attitude"][rows].tolist(), strict=True
+        )
+    ]
+    found = peer.fit_WWW()
+    bare = [
+        peer.correct(types.SimpleNamespace(MagX=x, MagY=y, MagZ=z), None, found)
+        for x, y, z in (data["field"] / NT_PER_MILLIGAUSS).tolist()
+    ]
+    return np.array([[v.x, v.y, v.z] for v in bare]) * NT_PER_MILLIGAUSS
+
+
+def _magyc(name: str) -> Callable[[dict[str, np.ndarray]], np.ndarray]:
+    def run(data: dict[str, np.ndarray]) -> np.ndarray:
+        import magyc  # noqa: PLC0415  so that one peer may be missing
+
+        gauss = data["field"] * 1e-5
+        method = getattr(magyc, name)
+        if name.startswith("twostep"):
+            found = method(gauss, data["reference_ned"] * 1e-5)
+        elif name == "magfactor3":
+            north, east, _ = data["reference_ned"]
+            west = -float(np.degrees(np.arctan2(east, north)))  # the sign it expects: the other is far worse
+            found = method(gauss, np.radians(data["attitude"]), west, data["reference_ned"] * 1e-5)
+        elif name.startswith("ellipsoid"):
+            found = method(gauss)
+        else:
+            found = method(gauss, data["rates"], data["time"] - data["time"][0])
+        corrected = next(
+            np.asarray(part) for part in found[1:] if np.shape(part) in {gauss.shape, gauss.T.shape}
+        )
+        return np.asarray(corrected.T if corrected.shape[0] == 3 else corrected) * 1e5
+
+    return run
+
+
+METHODS: dict[str, Callable[[dict[str, np.ndarray]], np.ndarray]] = {
+    "MAVProxy magfit": magfit,
+    "magyc magfactor3": _magyc("magfactor3"),
+    "magyc twostep_hi": _magyc("twostep_hi"),
+    "magyc twostep_hsi": _magyc("twostep_hsi"),
+    "magyc ellipsoid_fit": _magyc("ellipsoid_fit"),
+    "magyc magyc_ls": _magyc("magyc_ls"),
+    "magyc magyc_nls": _magyc("magyc_nls"),
+    "magyc magyc_bfg": _magyc("magyc_bfg"),
+}
+"""Each takes the data and returns the corrected field (n, 3), nT."""
+
+
+def main() -> None:
+    data = dict(np.load(sys.argv[1]))
+    results: dict[str, Any] = {}
+    raw, reference = data["field"], data["reference"]
+    design = np.column_stack([raw, np.ones(len(raw))])
+    warnings.simplefilter("ignore")
+    for name, method in METHODS.items():
+        try:
+            with contextlib.redirect_stdout(sys.stderr):
+                corrected = method(data)
+            if not np.isfinite(corrected).all():
+                raise ValueError("its answer is not finite")  # noqa: TRY301
+        # whatever a stranger's code raises is its result here
+        except (Exception, SystemExit) as error:  # noqa: BLE001
+            results[name] = {"failed": f"{type(error).__name__}: {error}".splitlines()[0][:120]}
+            continue
+        affine = np.linalg.lstsq(design, corrected, rcond=None)[0]
+        A, b = affine[:3].T, affine[3]
+        size = np.linalg.norm(raw @ A.T + b, axis=1)
+        A, b = (
+            part * (size @ reference) / (size @ size) for part in (A, b)
+        )  # most know no scale: give them the best
+        results[name] = {"A": A.tolist(), "T": (-np.linalg.pinv(A) @ b).tolist()}
+    json.dump(results, sys.stdout)
+
+
+if __name__ == "__main__":
+    main()
