@@ -148,7 +148,7 @@ class Aligner:
         self.power_cycle = power_cycle
         self.offset_suspect = False
         self._before: tuple[int, Reading] | None = None
-        self._period_us = 0.0
+        self._period_us, self._step_us = 0.0, 0
 
     def tune(self, settings: Align, ages: Mapping[str, float]) -> None:
         """Replace the settings, and the ages (s) after which telemetry is stale, by name."""
@@ -239,11 +239,16 @@ class Aligner:
         return (x, y, z), first_us
 
     def _is_gap(self, time_us: int) -> bool:
-        """Say whether samples are missing before `time_us`; learns the period from steps that are not gaps."""
+        """Say whether samples are missing before `time_us`.
+
+        A step counts as one when it is long against the usual period and against the step before it: an
+        instrument that is told to sample less often is flagged once, not for ever.
+        """
         if self._before is None:
             return False
-        step = time_us - self._before[0]
-        if self._period_us and step > self.settings.gap_factor * self._period_us:
+        step, before = time_us - self._before[0], self._step_us
+        self._step_us = step
+        if self._period_us and step > self.settings.gap_factor * max(self._period_us, before):
             return True
         self._period_us += (step - self._period_us) * (0.1 if self._period_us else 1.0)
         return False

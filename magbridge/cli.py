@@ -6,13 +6,14 @@ Exit codes: 0 done, 1 the data do not allow it, 2 wrong use. What is wrong goes 
 from __future__ import annotations
 
 import sys
+from math import inf, nan
 from pathlib import Path
 from typing import Annotated, Any
 
 from cyclopts import App, CycloptsError, Parameter
 
 from magbridge import __version__
-from magbridge.errors import MagbridgeError, MissingExtra, WrongUse
+from magbridge.errors import DataError, MagbridgeError, MissingExtra, WrongUse
 from magbridge.progress import track
 
 __all__ = ["app", "main"]
@@ -39,6 +40,41 @@ def run(*, config: Path) -> None:
     from magbridge.bridge.run import run as attach
 
     attach(config)
+
+
+@app.command
+def replay(
+    *files: Path,
+    config: Path | None = None,
+    speed: str = "max",
+    log: Path | None = None,
+    json: Json = False,
+) -> None:
+    """Replay logs through the unmodified bridge: real bytes through a pty, real MAVLink through a socket.
+
+    A bridge's own log is published again bit for bit. Any other log is spoken by an emulated fluxgate and an
+    emulated autopilot, and the corrected field is compared with the reference field.
+
+    Parameters
+    ----------
+    files
+        The log, or the files of it in order.
+    config
+        The bridge.toml; without one a nominal calibration is fitted on all files but the last.
+    speed
+        Times real time, or max: as fast as it goes.
+    log
+        A folder for the bridge's own log of the replay.
+    json
+        Print the result for machines.
+    """
+    from sitl.replay import replay as play
+    from sitl.replay import tell
+
+    result = play(_some(files), config, _speed(speed), log)
+    _tell(result, tell(result), json)
+    if not all(run["identical"] for run in result.get("runs", ())):
+        raise DataError("what was published is not what the log holds")
 
 
 @app.command
@@ -164,6 +200,16 @@ def _some(files: tuple[Path, ...]) -> tuple[Path, ...]:
     if not files:
         raise WrongUse("expected at least one FILE")
     return files
+
+
+def _speed(text: str) -> float:
+    try:
+        speed = inf if text == "max" else float(text)
+    except ValueError:
+        speed = nan
+    if not speed > 0.0:
+        raise WrongUse(f"--speed {text}: expected a positive number, or max")
+    return speed
 
 
 def _tell(result: dict[str, Any], sentence: str, as_json: bool) -> None:

@@ -12,7 +12,7 @@ from magbridge.errors import FormatError
 from magbridge.mavlink import LogReader, Record, TapeReader, spec
 from magbridge.records import Channel
 
-__all__ = ["Recorded", "is_own_log"]
+__all__ = ["Recorded", "is_own_log", "runs"]
 
 BEGIN, PARAMETER = spec("MAG_BRIDGE_START").id, spec("PARAM_VALUE").id
 
@@ -24,6 +24,16 @@ def is_own_log(path: Path) -> bool:
     with path.open("rb") as file:
         first = next(iter(LogReader(file)), None)
     return first is not None and first.channel == Channel.STATE and first.message.id == BEGIN
+
+
+def runs(paths: Sequence[Path]) -> list[list[Path]]:
+    """Group files, in order, by the run that they belong to: each begins with the start of a bridge."""
+    grouped: list[list[Path]] = []
+    for path in paths:
+        if is_own_log(path) or not grouped:
+            grouped.append([])
+        grouped[-1].append(path)
+    return grouped
 
 
 class Recorded:

@@ -135,6 +135,13 @@ def test_gap_and_missing_readings() -> None:
     assert "gap" in flags(aligner.reading(reading(), START + 32 * SECOND, missing=1))
 
 
+def test_a_slower_sampling_rate_is_one_gap_and_then_the_new_period() -> None:
+    aligner = Aligner((), Align())
+    times = [0, 5, 10, 15, 45, 75, 105, 110, 115]
+    gaps = ["gap" in flags(aligner.reading(reading(), START + t * SECOND)) for t in times]
+    assert gaps == [False] * 4 + [True] + [False] * 4
+
+
 def test_a_power_cycle_makes_the_offset_suspect_for_good() -> None:
     aligner = Aligner((), Align(turn_on_sigma=20.0), power_cycle=7)
     assert flags(aligner.reading(reading(power_cycle=7), START)) == set()

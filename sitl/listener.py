@@ -1,0 +1,71 @@
+"""A ground station's ear: takes the bridge's stream apart as it comes."""
+
+from __future__ import annotations
+
+from array import array
+from collections import Counter
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magbridge.mavlink import Codec, spec
+from magbridge.records import Quality
+
+__all__ = ["Listener"]
+
+FIELD, TEXT = spec("MAG_FIELD"), spec("STATUSTEXT")
+COLUMNS = {
+    "time": "time_usec",
+    "total_field": "total_field",
+    "sigma": "total_field_sigma",
+    "field_x": "x",
+    "field_y": "y",
+    "field_z": "z",
+    "quality": "flags",
+}
+"""What is kept of every MAG_FIELD, by the message's names."""
+
+
+class Listener:
+    """Counts messages, and keeps the corrected field and what was said.
+
+    Attributes
+    ----------
+    counts : Counter
+        Messages by name.
+    said : list of str
+        The STATUSTEXTs, in order.
+    """
+
+    def __init__(self) -> None:
+        self.said: list[str] = []
+        self._counts: Counter[int] = Counter()
+        self._codec = Codec(255, 190)
+        self._fields = [FIELD.fields[name] for name in COLUMNS.values()]
+        self._values = array("d")
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Messages by name."""
+        return {spec(number).name: count for number, count in self._counts.items()}
+
+    def hear(self, data: bytes) -> None:
+        """Take bytes as they come."""
+        for message in self._codec.parse(data):
+            self._counts[message.id] += 1
+            if message.id == FIELD.id:
+                self._values.extend(field.get(message.payload) for field in self._fields)
+            elif message.id == TEXT.id:
+                self.said.append(message["text"])
+
+    def field(self) -> dict[str, NDArray[np.float64]]:
+        """Return the corrected field, (n,) each: ``time`` in s since 1970 UTC, the rest in nT, ``quality``."""
+        table = np.array(self._values).reshape(-1, len(COLUMNS))
+        columns = dict(zip(COLUMNS, table.T, strict=True))
+        return {**columns, "time": columns["time"] * 1e-6}
+
+    def flags(self) -> dict[str, int]:
+        """Return how many samples carried each flag, by its public name."""
+        quality = self.field()["quality"].astype(int)
+        counts = {flag.names(): int((quality & flag != 0).sum()) for flag in Quality}
+        return {name: count for name, count in counts.items() if count}

@@ -1,0 +1,175 @@
+"""What a replay needs when all there is is a log: a configuration, and a calibration fitted on part of it.
+
+Of several files (or, of one, of its three thirds) the last is left out of the fit: its error is the one that
+tells something.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from magbridge.calibration.data import observations
+from magbridge.calibration.file import save
+from magbridge.calibration.fit import fit
+from magbridge.columns import CHANNELS, COLUMNS
+from magbridge.errors import CalibrationError, FormatError
+from magbridge.field.reference import reference_field
+from magbridge.logs import read
+from sitl.like import simulate_like
+from sitl.scenario import load
+
+__all__ = ["Part", "Rehearsal", "prepare"]
+
+FULL_SCALE = 100_000.0
+"""nT that the emulated fluxgate can read."""
+SENSITIVITY = 5e-5
+"""V/nT of the emulated fluxgate."""
+NAME = 10
+"""Characters of a NAMED_VALUE_FLOAT's name."""
+
+
+class Part(NamedTuple):
+    """A part of the deployment: a file, or a third of the only one.
+
+    Attributes
+    ----------
+    name : str
+    begin, end : float
+        s since 1970 UTC.
+    """
+
+    name: str
+    begin: float
+    end: float
+
+
+class Rehearsal(NamedTuple):
+    """What is ready to be replayed.
+
+    Attributes
+    ----------
+    config : Path
+        A ``bridge.toml``.
+    deployment : Dataset (time)
+    parts : list of Part
+        The last is the one that the calibration has not seen.
+    calibration : str
+        How it was made, or why there is none.
+    simulated : bool
+        The log has no magnetometer: its field is simulated, its telemetry real.
+    """
+
+    config: Path
+    deployment: xr.Dataset
+    parts: list[Part]
+    calibration: str
+    simulated: bool
+
+
+def prepare(files: Sequence[Path], folder: Path) -> Rehearsal:
+    """Read logs, fit a nominal calibration on all but the last part, and write the bridge's files to `folder`.
+
+    Raises
+    ------
+    FormatError
+        A file cannot be read, or says neither a magnetic field nor what is needed to simulate one.
+    """
+    deployment = read(files)
+    simulated = not set(CHANNELS) <= set(deployment)
+    if simulated:
+        deployment = simulate_like(deployment, load("comet"))
+    parts = _parts(files, deployment)
+    summary = _calibrate(deployment, parts, folder / "cal.json")
+    config = folder / "bridge.toml"
+    config.write_text(_toml(deployment, calibrated=summary.startswith("nominal")), encoding="utf-8")
+    return Rehearsal(config, deployment, parts, summary, simulated)
+
+
+def _parts(files: Sequence[Path], deployment: xr.Dataset) -> list[Part]:
+    """Return the time spans of the files (those of one stem are one part), or the thirds of one file."""
+    time = deployment["time"].to_numpy()
+    stems = list(dict.fromkeys(file.stem for file in files))
+    if len(stems) == 1:
+        edges = np.linspace(time[0], time[-1], 4)
+        names = ("first third", "second third", "last third")
+        return [Part(*part) for part in zip(names, edges[:-1].tolist(), edges[1:].tolist(), strict=True)]
+    spans: list[Part] = []
+    few = deployment.sizes["time"] / len(stems) / 10
+    for stem in stems:
+        own = read([file for file in files if file.stem == stem])["time"].to_numpy()
+        if spans and len(own) < few:  # a file of a few rows at the surface tells nothing alone
+            spans[-1] = spans[-1]._replace(end=float(own[-1]))
+        else:
+            spans.append(Part(stem, float(own[0]), float(own[-1])))
+    return sorted(spans, key=lambda part: part.begin)
+
+
+def rows_of(part: Part, time: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return which times belong to a part."""
+    return (time >= part.begin) & (time <= part.end)
+
+
+def _calibrate(deployment: xr.Dataset, parts: Sequence[Part], path: Path) -> str:
+    """Fit the nominal calibration on all but the last part; return how, or why there is none."""
+    held_out = rows_of(parts[-1], deployment["time"].to_numpy())
+    try:
+        data = observations(
+            deployment.isel(time=~held_out), (), reference=lambda ds: (reference_field(ds), None, "IGRF")
+        )
+        found = fit(data, "nominal")
+    except (CalibrationError, FormatError) as error:
+        return f"none: {error}"
+    save(found.calibration, path)
+    return f"nominal, fitted on {parts[0].name} to {parts[-2].name}: {found.rms:.1f} nT RMS there"
+
+
+def _toml(deployment: xr.Dataset, *, calibrated: bool) -> str:
+    """Return a ``bridge.toml`` for an emulated digitizer, and every telemetry channel as a parameter."""
+    lines = [
+        "[sensor]",
+        'driver = "digitizer"',
+        'port = "/dev/null"  # the replay puts its own pty here',
+        "[sensor.options]",
+        f"sensitivity = {SENSITIVITY}",
+        f"reference_voltage = {SENSITIVITY * FULL_SCALE}",
+        "[link]",
+        'url = "udpout:127.0.0.1:14550"  # and its own socket here',
+        "[publish]",
+        "MAG_RAW = 0",
+        "MAG_FIELD = 0",
+        "HIGHRES_IMU = 0",
+    ]
+    if calibrated:
+        lines += ["[calibration]", 'file = "cal.json"']
+    for name, short in _names(str(name) for name in deployment.data_vars).items():
+        unit = str(deployment[name].attrs.get("units", "")).replace('"', "")
+        lines += [
+            f'[telemetry."{name}"]',
+            'message = "NAMED_VALUE_FLOAT"',
+            f'match = {{name = "{short}"}}',
+            'field = "value"',
+            f'unit = "{unit}"',
+        ]
+    return "\n".join(lines) + "\n"
+
+
+def _names(columns: Iterable[str]) -> dict[str, str]:
+    """Return a name of at most ten letters for every telemetry column."""
+    short: dict[str, str] = {}
+    for name in columns:
+        if name in COLUMNS or name.startswith(("truth_", "mag")) or not re.fullmatch(r"\w+", name, re.ASCII):
+            continue
+        candidate = name[:NAME]
+        for number in range(1, 100):
+            if candidate not in short.values():
+                break
+            candidate = f"{name[: NAME - len(str(number))]}{number}"
+        short[name] = candidate
+    return short

@@ -1,0 +1,211 @@
+"""Replay a log through the real bridge: real bytes through a pty, real MAVLink through a socket."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Sequence
+from math import inf
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from magbridge.bridge.pipeline import Start
+from magbridge.config import load
+from magbridge.errors import DataError, WrongUse
+from magbridge.field.reference import reference_field
+from magbridge.logs import read
+from sitl.emulation import emulate, start_us
+from sitl.listener import Listener
+from sitl.own_log import Recorded, is_own_log, runs
+from sitl.rehearsal import Part, prepare, rows_of
+from sitl.stage import Stage
+
+__all__ = ["replay", "tell"]
+
+Result = dict[str, Any]
+UNKNOWN = 50_000.0
+"""nT, about the whole field: a sigma beyond it says that nothing is known."""
+Floats = NDArray[np.float64]
+
+
+def replay(
+    files: Sequence[Path], config: Path | None = None, speed: float = inf, log: Path | None = None
+) -> Result:
+    """Replay `files` through the bridge; return what came of it, as the command prints it.
+
+    Parameters
+    ----------
+    files : sequence of path
+        A bridge's own log (all its files, in order), which is published again bit for bit; or any other logs,
+        whose magnetometer and telemetry two emulated devices speak.
+    config : path, optional
+        The ``bridge.toml``; without one, a nominal calibration is fitted on all but the last file.
+    speed : float
+        Times real time; ``inf`` is as fast as it goes.
+    log : path, optional
+        Folder for the bridge's log of the replay.
+
+    Raises
+    ------
+    WrongUse
+        A bridge's own log without its configuration, or a log of a bridge together with other logs.
+    """
+    if is_own_log(files[0]):
+        if config is None:
+            raise WrongUse(f"{files[0]} is a bridge's own log: name its configuration with --config")
+        return {"runs": [_again(run, config, speed, log) for run in runs(files)]}
+    if config is not None:
+        deployment = read(files)
+        times = deployment["time"].to_numpy()
+        parts = [Part("all", float(times[0]), float(times[-1]))]
+        return _play(deployment, config, parts, speed, log)
+    with tempfile.TemporaryDirectory() as folder:
+        rehearsal = prepare(files, Path(folder))
+        result = _play(rehearsal.deployment, rehearsal.config, rehearsal.parts, speed, log)
+    result |= {"calibration": rehearsal.calibration, "simulated_field": rehearsal.simulated}
+    result["parts"][-1]["held_out"] = rehearsal.calibration.startswith("nominal")
+    return result
+
+
+def _again(files: Sequence[Path], config: Path, speed: float, log: Path | None) -> Result:
+    """Replay a bridge's own log, and compare what is published with what was."""
+    recorded = Recorded(files)
+    published = bytearray()
+    stage = Stage(config, published.extend, log)
+    begun = time.monotonic()
+    stage.play(recorded.start, recorded.events(), speed)
+    return {
+        "files": [str(file) for file in files],
+        "messages": recorded.messages,
+        "bytes": len(recorded.published),
+        "identical": bool(published == recorded.published),
+        "first_difference": _first_difference(published, recorded.published),
+        "same_config": load(config).digest == recorded.config_digest,
+        "damages": recorded.damages,
+        "seconds": time.monotonic() - begun,
+    }
+
+
+def _first_difference(one: bytearray, other: bytearray) -> int | None:
+    """Return the first byte at which two streams differ; None where they do not."""
+    if one == other:
+        return None
+    size = min(len(one), len(other))
+    different = np.flatnonzero(np.frombuffer(one[:size], np.uint8) != np.frombuffer(other[:size], np.uint8))
+    return int(different[0]) if len(different) else size
+
+
+def _play(
+    deployment: xr.Dataset, config: Path, parts: Sequence[Part], speed: float, log: Path | None
+) -> Result:
+    """Replay a deployment that two emulated devices speak, and compare the field with the reference."""
+    listener = Listener()
+    stage = Stage(config, listener.hear, log)
+    begun = time.monotonic()
+    stage.play(Start(start_us(deployment)), emulate(deployment, load(config)), speed)
+    seconds = time.monotonic() - begun
+    field = listener.field()
+    times = deployment["time"].to_numpy()
+    raw = np.sqrt(sum(deployment[f"mag_{axis}"].to_numpy() ** 2 for axis in "xyz"))
+    reference = _reference(deployment)
+    nearest = _nearest(times, field["time"])
+    told = []
+    for part in parts:
+        rows = rows_of(part, times[nearest])
+        error = field["total_field"][rows] - reference[nearest][rows]
+        known = np.isfinite(error)
+        told.append(
+            {
+                "name": part.name,
+                "samples": int(rows.sum()),
+                "raw_rms_nT": _rms((raw - reference)[nearest][rows]),
+                "corrected_rms_nT": _rms(error),
+                "corrected_mean_nT": float(error[known].mean()) if known.any() else None,
+                "sigma_nT": _rms(field["sigma"][rows]),
+                "held_out": False,
+            }
+        )
+    return {
+        "samples": len(field["time"]),
+        "rows": len(times),
+        "messages": dict(sorted(listener.counts.items())),
+        "flags": listener.flags(),
+        "said": listener.said,
+        "span_s": float(times[-1] - times[0]),
+        "seconds": seconds,
+        "parts": told,
+        "skipped": {
+            name: int(deployment.attrs[name])
+            for name in ("bytes_skipped", "damages", "rows_dropped", "duplicate_rows")
+            if name in deployment.attrs
+        },
+    }
+
+
+def _nearest(times: Floats, wanted: Floats) -> NDArray[np.intp]:
+    """Return the index of the row (in order of time) nearest to each wanted time."""
+    after = np.clip(np.searchsorted(times, wanted), 1, max(len(times) - 1, 1))
+    return after - (wanted - times[after - 1] < times[after % len(times)] - wanted)
+
+
+def _reference(deployment: xr.Dataset) -> Floats:
+    """Return the true total field in nT; NaN where nothing tells it."""
+    try:
+        return reference_field(deployment)
+    except DataError:
+        return np.full(deployment.sizes["time"], np.nan)
+
+
+def _rms(values: Floats) -> float | None:
+    """Return the root mean square of the finite values; None where there are none."""
+    values = values[np.isfinite(values)]
+    return float(np.sqrt(np.mean(values**2))) if len(values) else None
+
+
+def tell(result: Result) -> str:
+    """Return a replay's result for people to read."""
+    if "runs" in result:
+        return "\n".join(_tell_again(run) for run in result["runs"])
+    first = (
+        f"{result['samples']} samples, {result['span_s'] / 3600:.1f} h, through a pty and a socket in "
+        f"{result['seconds']:.1f} s: {result['span_s'] / result['seconds']:,.0f} times real time"
+    )
+    lines = [first]
+    if result["skipped"]:
+        skipped = ", ".join(f"{name.replace('_', ' ')} {count}" for name, count in result["skipped"].items())
+        lines.append(f"in the log: {skipped}")
+    if result.get("simulated_field"):
+        lines.append("the log has no magnetometer: real telemetry, simulated field")
+    if "calibration" in result:
+        lines.append(f"calibration: {result['calibration']}")
+    lines.append(
+        f"flags: {', '.join(f'{name} {count}' for name, count in result['flags'].items()) or 'none'}"
+    )
+    lines.append("")
+    lines.append(
+        f"{'against the reference field, nT RMS':36} {'samples':>8} {'raw':>9} {'corrected':>10} {'sigma':>7}"
+    )
+    for part in result["parts"]:
+        name = part["name"] + (" (held out)" if part["held_out"] else "")
+        numbers = [part["raw_rms_nT"], part["corrected_rms_nT"], part["sigma_nT"]]
+        cells = ["-" if number is None or number > UNKNOWN else f"{number:.1f}" for number in numbers]
+        lines.append(f"{name:36} {part['samples']:8d} {cells[0]:>9} {cells[1]:>10} {cells[2]:>7}")
+    return "\n".join(lines)
+
+
+def _tell_again(result: Result) -> str:
+    if result["identical"]:
+        verdict = "published again, bit for bit"
+    else:
+        verdict = f"published, but not the same: the first difference is at byte {result['first_difference']}"
+    size = f"{result['messages']} messages ({result['bytes']} bytes)"
+    lines = [f"{result['files'][0]}: {size} {verdict}, in {result['seconds']:.1f} s"]
+    if not result["same_config"]:
+        lines.append("the configuration is not the one that the log was made with")
+    if result["damages"]:
+        lines.append(f"{result['damages']} damaged places in the log were passed over")
+    return "\n".join(lines)
