@@ -9,14 +9,16 @@ whose evidence is largest wins, and must be a maximum; the answer must not have 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from magbridge.calibration.data import Observations
-from magbridge.calibration.evidence import Quadratic, Widths, maximise
+from magbridge.calibration.evidence import Quadratic, Widths, is_maximum, maximise
 from magbridge.calibration.fit import Fit, assemble
+from magbridge.calibration.geometry import Mounting, mounted_structure
 from magbridge.calibration.noise import OUTLIER, NoiseModel, estimate_noise
 from magbridge.calibration.nominal import check_scales, starts
 from magbridge.calibration.prior import Structure, free_structure
@@ -47,11 +49,20 @@ class _Answer:
     widths: Widths
     noise: NoiseModel
     structure: Structure
+    quadratic: Quadratic
     score: float
 
 
-def fit_auto(data: Observations, order: int = 3) -> Fit:
+def fit_auto(data: Observations, order: int = 3, *, vehicle: Mapping[str, Mounting] | None = None) -> Fit:
     """Fit polynomials of all orders up to `order` with physical priors; see the module's notes.
+
+    Parameters
+    ----------
+    data : Observations
+    order : int
+        Highest total degree.
+    vehicle : mapping of Mounting, optional
+        Where masses sit, by parameter: the prior of their coefficients is then that of dipoles there.
 
     Raises
     ------
@@ -62,6 +73,8 @@ def fit_auto(data: Observations, order: int = 3) -> Fit:
     exponents = full_order(len(ranges), order)
     samples = polynomial_samples(data, exponents)
     structure = free_structure(exponents, data.names, samples.unit)
+    if vehicle:
+        structure = mounted_structure(structure, exponents, ranges, vehicle)
     best = _best(samples, structure)
     prior = _prior(best.structure, best.widths.eta)
     precision = best.solution.normal.hessian / best.noise.sigma**2 + prior.precision
@@ -80,7 +93,7 @@ def fit_auto(data: Observations, order: int = 3) -> Fit:
 
 
 def _best(samples: Samples, structure: Structure) -> _Answer:
-    """The answer with the largest evidence among several starts."""
+    """Return the answer with the largest evidence among several starts."""
     size = samples.phi.shape[1] * 9
     answers = []
     for start in starts(samples):
@@ -89,34 +102,34 @@ def _best(samples: Samples, structure: Structure) -> _Answer:
             coefficients[:9] = start
             answer = _climb(samples, structure, coefficients, structure.centre + shift * structure.spread)
             answers.append(answer)
-    sound = [answer for answer in answers if answer.solution.settled and answer.widths.maximum]
-    if not sound:
-        raise CalibrationError(
-            "auto: no start reached a maximum of the evidence; the data contradict themselves"
-        )
-    return max(sound, key=lambda answer: answer.score)
+    for answer in sorted(answers, key=lambda answer: -answer.score):
+        if answer.solution.settled and is_maximum(answer.quadratic, answer.structure, answer.widths):
+            return answer
+    raise CalibrationError("auto: no start reached a maximum of the evidence; the data contradict themselves")
 
 
 def _climb(samples: Samples, structure: Structure, coefficients: FloatArray, eta: FloatArray) -> _Answer:
     """Alternate coefficients, widths and noise until the evidence stands still."""
     noise = NoiseModel(FIRST_NOISE * samples.unit)
-    z = np.asarray(np.linalg.lstsq(structure.E, coefficients, rcond=None)[0], float)
+    z = structure.E.T @ coefficients
     score = -np.inf
     for step in range(ROUNDS):
+        if structure.renew is not None and step:
+            structure, z = structure.renew(z)
         solution = gauss_newton(samples, _prior(structure, eta), noise, z)
         kept = len(samples.field) - noise.rejected
-        quadratic = Quadratic.about(solution.z, structure.mean, solution.normal, kept)
+        quadratic = Quadratic.about(solution.z, solution.normal, kept)
         widths = maximise(quadratic, structure, eta, noise.sigma)
-        eta, z = widths.eta, structure.mean + widths.mean
+        eta, z = widths.eta, widths.mean
         last, score = score, _score(widths, noise, samples)
         noise = replace(noise, sigma=widths.sigma)
         if step > 1 and abs(score - last) < 1e-2 and solution.steps <= 1:
             break
         if step < ROUNDS - 3:  # then let the noise's shape be, so that the rest can settle
-            e, _ = residuals(samples, structure.E @ z)
+            e, _ = residuals(samples, structure.coefficients(z))
             shape = estimate_noise(e, samples.follows, widths.determined)
             noise = replace(shape, sigma=widths.sigma)
-    return _Answer(solution, widths, noise, structure, score)
+    return _Answer(solution, widths, noise, structure, quadratic, score)
 
 
 def _score(widths: Widths, noise: NoiseModel, samples: Samples) -> float:
@@ -127,4 +140,4 @@ def _score(widths: Widths, noise: NoiseModel, samples: Samples) -> float:
 
 
 def _prior(structure: Structure, eta: FloatArray) -> Prior:
-    return Prior(structure.mean, np.diag(structure.widths(eta) ** -2.0), structure.E)
+    return Prior(np.diag(structure.widths(eta) ** -2.0), structure.E, structure.offset)

@@ -2,12 +2,12 @@
 
 Notes
 -----
-A mass at ``r(p) = r_0 + t p``, seen from the sensor, with permanent moment m and susceptibility chi
-adds to the field at the sensor (r-hat the unit vector; Blakely 1996, eq. 4.14, with mu_0/4pi in m)::
+A mass at ``r(p) = r_0 + t p``, seen from the sensor, with permanent moment m and susceptibilities chi
+along the body's axes adds to the field at the sensor (r-hat the unit vector; Blakely 1996, eq. 4.14, with mu_0/4pi in m)::
 
-    G(r) = (3 r-hat r-hat^T - I) / |r|^3,   T += G(r) m,   H -> (I + chi G(r)) H
+    G(r) = (3 r-hat r-hat^T - I) / |r|^3,   T += G(r) m,   H -> (I + G(r) chi) H
 
-so that to first order ``A += -chi G(r)``. What the second order leaves, ``(chi G)^2``, is constant but
+so that to first order ``A -= G(r) chi``, symmetric part. What the second order leaves, ``(G chi)^2``, is constant but
 for the travel and goes into the polynomial beside. Moments are kept as the field they make at the
 sensor, in nT: ``m / |r_0|^3`` and ``chi F_0 / |r_0|^3``.
 
@@ -58,39 +58,38 @@ def dipole_tensor(r: FloatArray) -> FloatArray:
     return np.asarray((3.0 * unit * np.swapaxes(unit, -1, -2) - np.eye(3)) / distance**3)
 
 
-def dipole_columns(r: FloatArray, moment: FloatArray, induced: float, r_0: float) -> FloatArray:
-    """Return what each of a dipole's seven numbers adds to the nine coefficients, with the dipole at `r`.
+def dipole_columns(r: FloatArray, moment: FloatArray, induced: FloatArray, r_0: float) -> FloatArray:
+    """Return what each of a dipole's nine numbers adds to the nine coefficients, with the dipole at `r`.
 
     Parameters
     ----------
     r : (n, 3) array
         m, where the mass is.
-    moment : (3,) array
-        nT at the sensor, as :class:`Dipole` keeps it; its size scales the three of the position.
-    induced : float
-        nT.
+    moment, induced : (3,) arrays
+        nT at the sensor, as :class:`Dipole` keeps them; their size scales the three of the position.
     r_0 : float
         m, the distance that moments are scaled with.
 
     Returns
     -------
-    (7, n, 9) array
-        moment x, y, z; induced; displacement x, y, z (nT per m).
+    (9, n, 9) array
+        moment x, y, z; induced x, y, z; displacement x, y, z (nT per m).
     """
-    columns = np.zeros((7, len(r), 9))
+    columns = np.zeros((9, len(r), 9))
 
-    def put(rows: FloatArray, G: FloatArray, moments: FloatArray, chi: float) -> None:
+    def put(rows: FloatArray, G: FloatArray, moments: FloatArray, chi: FloatArray) -> None:
         rows[:, 6:] = G @ moments
-        rows[:, :6] = np.stack([-chi * G[:, i, j] for i, j in SYMMETRIC], axis=1)
+        pulled = G * chi  # G diag(chi); of an unsymmetric A only the symmetric part shows in the magnitude
+        rows[:, :6] = np.stack([-0.5 * (pulled[:, i, j] + pulled[:, j, i]) for i, j in SYMMETRIC], axis=1)
 
     G = dipole_tensor(r) * r_0**3
-    for k in range(3):
-        put(columns[k], G, np.eye(3)[k], 0.0)
-    put(columns[3], G, np.zeros(3), 1.0)
-    for k in range(3):  # a symmetric difference over 1e-5 of the distance is good to 1e-10
-        h = 1e-5 * r_0 * np.eye(3)[k]
+    nothing = np.zeros(3)
+    for k, axis in enumerate(np.eye(3)):
+        put(columns[k], G, axis, nothing)
+        put(columns[3 + k], G, nothing, axis)
+        h = 1e-5 * r_0 * axis  # a symmetric difference over 1e-5 of the distance is good to 1e-10
         slope = (dipole_tensor(r + h) - dipole_tensor(r - h)) * r_0**3 / (2e-5 * r_0)
-        put(columns[4 + k], slope, moment, induced)
+        put(columns[6 + k], slope, moment, induced)
     return columns
 
 
@@ -116,7 +115,7 @@ def expand_dipole(values: FloatArray, order: int) -> FloatArray:
 
 
 class Dipole(Term, frozen=True, kw_only=True):
-    """One mass as a dipole; coefficients: moment (3), induced (1), displacement (3).
+    """One mass as a dipole; coefficients: moment (3), induced (3), displacement (3).
 
     Attributes
     ----------
@@ -130,7 +129,7 @@ class Dipole(Term, frozen=True, kw_only=True):
         m, 1-sigma of `at`: the prior of the displacement.
     moment : tuple of 3 float
         nT at the sensor: where the displacement's columns were linearised.
-    induced : float
+    induced : tuple of 3 float
         nT, likewise.
     """
 
@@ -140,12 +139,12 @@ class Dipole(Term, frozen=True, kw_only=True):
     travel: Vector
     at_sigma: float = 0.0
     moment: Vector = (0.0, 0.0, 0.0)
-    induced: float = 0.0
+    induced: Vector = (0.0, 0.0, 0.0)
 
     @property
     def size(self) -> int:
         """Moment, induced moment, displacement."""
-        return 7
+        return 9
 
     def check(self, parameters: tuple[str, ...]) -> None:
         """Require that the parameter exists and the mass is not in the sensor."""
@@ -166,7 +165,8 @@ class Dipole(Term, frozen=True, kw_only=True):
                 f"dipole on {self.parameter!r}: passes the sensor within three half-travels; "
                 "no series stands for it there"
             )
-        columns = dipole_columns(r, np.array(self.moment), self.induced, float(np.linalg.norm(self.at)))
+        r_0 = float(np.linalg.norm(self.at))
+        columns = dipole_columns(r, np.array(self.moment), np.array(self.induced), r_0)
         exponents = tuple(
             tuple(power if i == k else 0 for i in range(len(names))) for power in range(ORDER + 1)
         )

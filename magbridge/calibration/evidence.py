@@ -23,14 +23,14 @@ from scipy.optimize import minimize
 from magbridge.calibration.prior import Structure
 from magbridge.calibration.residual import NormalEquations
 
-__all__ = ["Quadratic", "Widths", "evidence", "maximise"]
+__all__ = ["Quadratic", "Widths", "evidence", "is_maximum", "maximise"]
 
 FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
 class Quadratic:
-    """``cost(z) = c_0 - 2 b.y + y^T H y`` with ``y = z - mean``, of n samples."""
+    """``cost(z) = c_0 - 2 b.z + z^T H z``, of n samples."""
 
     H: FloatArray
     b: FloatArray
@@ -38,25 +38,23 @@ class Quadratic:
     n: float
 
     @classmethod
-    def about(cls, z: FloatArray, mean: FloatArray, normal: NormalEquations, n: float) -> Quadratic:
-        """The quadratic whose value, gradient and Hessian at `z` are `normal`'s."""
-        y = z - mean
+    def about(cls, z: FloatArray, normal: NormalEquations, n: float) -> Quadratic:
+        """Return the quadratic whose value, gradient and Hessian at `z` are `normal`'s."""
         H, g = normal.hessian, normal.gradient
-        return cls(H, H @ y - g, float(normal.cost - 2.0 * g @ y + y @ H @ y), n)
+        return cls(H, H @ z - g, float(normal.cost - 2.0 * g @ z + z @ H @ z), n)
 
 
 @dataclass(frozen=True, eq=False)
 class Widths:
-    """Where the evidence is largest: eta, the noise (sensor nT), log Z, and whether it is a maximum."""
+    """Where the evidence is largest: eta, the noise (sensor nT), log Z."""
 
     eta: FloatArray
     sigma: float
     log_evidence: float
-    maximum: bool
     determined: float
     """How many numbers the data, not the prior, determined: ``q - tr M^-1``."""
     mean: FloatArray
-    """Posterior mean of ``z`` about the structure's own."""
+    """Posterior mean of z."""
 
 
 def evidence(
@@ -66,7 +64,7 @@ def evidence(
     w = structure.widths(eta)
     s2 = np.exp(2.0 * log_sigma)
     M = (w[:, None] * quadratic.H * w) / s2
-    M[np.diag_indices_from(M)] += 1.0
+    M.flat[:: len(w) + 1] += 1.0
     factor, info = dpotrf(M, overwrite_a=True)
     if info:
         return -np.inf, np.zeros(len(eta) + 1), np.zeros(len(w)), 0.0
@@ -89,10 +87,7 @@ def evidence(
 
 
 def maximise(quadratic: Quadratic, structure: Structure, eta: FloatArray, sigma: float) -> Widths:
-    """Climb from `eta` and `sigma` to where the evidence is largest.
-
-    The answer is checked: no slope is left, and the surface bends down in every direction.
-    """
+    """Climb from `eta` and `sigma` to where the evidence is largest."""
 
     def downhill(x: FloatArray) -> tuple[float, FloatArray]:
         value, slope, *_ = evidence(quadratic, structure, x[:-1], x[-1])
@@ -106,7 +101,16 @@ def maximise(quadratic: Quadratic, structure: Structure, eta: FloatArray, sigma:
         options={"gtol": 1e-2, "maxiter": 200},
     )
     x = found.x
-    value, slope, z, determined = evidence(quadratic, structure, x[:-1], x[-1])
-    bend = np.array([(downhill(x + h)[1] - downhill(x - h)[1]) / 2e-3 for h in 1e-3 * np.eye(len(x))])
-    maximum = bool(np.abs(slope).max() < 0.1 and np.linalg.eigvalsh(bend + bend.T)[0] > 0.0)
-    return Widths(x[:-1], float(np.exp(x[-1])), value, maximum, determined, z)
+    value, _, z, determined = evidence(quadratic, structure, x[:-1], x[-1])
+    return Widths(x[:-1], float(np.exp(x[-1])), value, determined, z)
+
+
+def is_maximum(quadratic: Quadratic, structure: Structure, widths: Widths) -> bool:
+    """Check that no slope is left at `widths`, and that the surface bends down in every direction."""
+    x = np.append(widths.eta, np.log(widths.sigma))
+
+    def slope(at: FloatArray) -> FloatArray:
+        return evidence(quadratic, structure, at[:-1], at[-1])[1]
+
+    bend = np.array([(slope(x + h) - slope(x - h)) / 2e-3 for h in 1e-3 * np.eye(len(x))])
+    return bool(np.abs(slope(x)).max() < 0.1 and np.linalg.eigvalsh(bend + bend.T)[-1] < 0.0)

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 import magbridge
 from magbridge.calibration.data import Observations
@@ -77,7 +78,9 @@ def fit(data: Observations, method: str = "auto", order: int = 3, **options: Any
         raise CalibrationError(f"method {method!r} is not known: one of {', '.join(METHODS)}")
     module, _, name = METHODS[method].partition(":")
     chosen: Callable[..., Fit] = getattr(import_module(module), name)
-    return chosen(data, order, **options)
+    # one thread: matrices this small only wait for each other, and sums keep one order on any machine
+    with threadpool_limits(1, "blas"):
+        return chosen(data, order, **options)
 
 
 def fit_nominal(data: Observations, order: int = 0, **options: Any) -> Fit:  # noqa: ARG001  (one ellipsoid has none)

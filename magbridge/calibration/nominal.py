@@ -77,7 +77,7 @@ def nominal(
         E[2, 0] = 1.0
     keep = [s for s in range(9) if not (axes_fixed and s in {3, 4, 5}) and not (equal_xz and s == 2)]
     E = E[:, keep]
-    prior = Prior(np.zeros(len(keep)), _precision(E, scale_sigma, gain_sigma) / samples.unit**2, E)
+    prior = Prior(_precision(E, scale_sigma, gain_sigma) / samples.unit**2, E)
     best = None
     for start in starts(samples):
         z = np.asarray(np.linalg.lstsq(E, start, rcond=None)[0], float)

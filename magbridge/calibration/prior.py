@@ -16,6 +16,7 @@ its values maximise the evidence (:mod:`.evidence`), so data that want another s
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -41,28 +42,34 @@ class Structure:
     Attributes
     ----------
     E : (K, q) array
-        ``c = E z``.
-    mean : (q,) array
-        Expected z.
+        ``c = E z + offset``; z is expected about 0.
+    offset : (K,) array
     constant, design : (q,) array, (q, h) array
         Log widths of z are ``constant + design @ eta``.
     centre, spread : (h,) arrays
         Prior of eta.
     names : tuple of str
         Of eta's numbers: what ``exp(eta)`` is the width of.
+    renew : callable, optional
+        ``z -> (Structure, z)``: the structure linearised anew at z, and the same place in it.
     """
 
     E: FloatArray
-    mean: FloatArray
+    offset: FloatArray
     constant: FloatArray
     design: FloatArray
     centre: FloatArray
     spread: FloatArray
     names: tuple[str, ...]
+    renew: Callable[[FloatArray], tuple[Structure, FloatArray]] | None = None
 
     def widths(self, eta: FloatArray) -> FloatArray:
         """(q,) prior 1-sigma of z."""
         return np.asarray(np.exp(self.constant + self.design @ eta))
+
+    def coefficients(self, z: FloatArray) -> FloatArray:
+        """``c = E z + offset``."""
+        return np.asarray(self.E @ z + self.offset)
 
 
 def gain_rotation() -> FloatArray:
@@ -99,7 +106,7 @@ def free_structure(exponents: tuple[Exponents, ...], names: tuple[str, ...], uni
     E[:3, :3] = gain_rotation()
     return Structure(
         E=E,
-        mean=np.zeros(len(E)),
+        offset=np.zeros(len(E)),
         constant=constant.ravel(),
         design=design.reshape(len(E), -1),
         centre=np.array(centre),

@@ -2,9 +2,9 @@
 
 Notes
 -----
-Minimises over z, with coefficients ``c = E z``::
+Minimises over z, with coefficients ``c = E z + offset``::
 
-    sum_i w_i e_i(c)^2 / (2 sigma^2) + (z - mu)^T P (z - mu) / 2
+    sum_i w_i e_i(c)^2 / (2 sigma^2) + z^T P z / 2
 
 Levenberg's damping keeps each step downhill; steps are small linear algebra, because the normal
 equations of all samples are summed up once per step.
@@ -30,20 +30,18 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """Gaussian on z: mean (q,) and precision (q, q); E (K, q) or None for the identity."""
+    """Gaussian on z about 0: precision (q, q); and ``c = E z + offset``, E (K, q)."""
 
-    mean: FloatArray
     precision: FloatArray
-    E: FloatArray | None = None
+    E: FloatArray
+    offset: FloatArray | float = 0.0
 
     def coefficients(self, z: FloatArray) -> FloatArray:
-        """``c = E z``."""
-        return z if self.E is None else np.asarray(self.E @ z)
+        """``c = E z + offset``."""
+        return np.asarray(self.E @ z + self.offset)
 
     def reduce(self, normal: NormalEquations) -> NormalEquations:
         """Return the normal equations in z."""
-        if self.E is None:
-            return normal
         return NormalEquations(self.E.T @ normal.hessian @ self.E, self.E.T @ normal.gradient, normal.cost)
 
 
@@ -83,7 +81,7 @@ def gauss_newton(
     value = _objective(normal, prior, noise, z)
     for step in range(steps):
         precision = normal.hessian / noise.sigma**2 + prior.precision
-        gradient = normal.gradient / noise.sigma**2 + prior.precision @ (z - prior.mean)
+        gradient = normal.gradient / noise.sigma**2 + prior.precision @ z
         while True:
             move = -_solve(precision, gradient, damping)
             promise = -float(gradient @ move)
@@ -104,8 +102,7 @@ def gauss_newton(
 
 
 def _objective(normal: NormalEquations, prior: Prior, noise: NoiseModel, z: FloatArray) -> float:
-    off = z - prior.mean
-    return 0.5 * normal.cost / noise.sigma**2 + 0.5 * float(off @ prior.precision @ off)
+    return 0.5 * normal.cost / noise.sigma**2 + 0.5 * float(z @ prior.precision @ z)
 
 
 def _solve(precision: FloatArray, gradient: FloatArray, damping: float) -> FloatArray:

@@ -36,7 +36,7 @@ def random_calibration(
                 at=(-0.4, 0.05, 0.1),
                 travel=(0.02, 0.0, 0.0),
                 moment=(900.0, -300.0, 50.0),
-                induced=40.0,
+                induced=(40.0, 20.0, 20.0),
             ),
         )
         effects = (ChannelEffect(cause="temperature_offset", channel="sensor_temperature", lag=60.0),)
