@@ -5,11 +5,10 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from sitl import Twin, load, segments, simulate
 from sitl.bound import information_bound, oracle
 from sitl.mission import CrissCross, Spirals
 from sitl.platform import Vehicle
-from sitl.scenario import load
-from sitl.twin import Twin, segments, simulate
 
 SCENARIO = msgspec.structs.replace(
     load("random_glider"), mission=(Spirals(duration=200.0), CrissCross(hours=1.0, duration=450.0))

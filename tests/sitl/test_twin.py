@@ -12,13 +12,12 @@ from magbridge.calibration.file import save as save_calibration
 from magbridge.calibration.model import Parameter, identity
 from magbridge.errors import ConfigError, FormatError, WrongUse
 from magbridge.field.igrf import igrf
+from sitl import Scenario, Twin, load, segments, simulate, simulate_like
 from sitl.instrument import Instrument
-from sitl.like import simulate_like
 from sitl.mission import Leg, Legs, Spirals
 from sitl.platform import Vehicle
-from sitl.scenario import SCENARIOS, Scenario, load
+from sitl.scenario import SCENARIOS
 from sitl.trajectory import Motion
-from sitl.twin import Twin, segments, simulate
 from sitl.world import Geology
 
 PERFECT = Instrument(noise_sigma=0.0, corner=0.0)
