@@ -1,0 +1,4 @@
+"""Doubt: what the forward model gets wrong, which physical cause it has, and what mending it gains.
+
+:func:`~magbridge.diagnose.run.diagnose` is the door; :data:`~magbridge.diagnose.causes.CAUSES` the table of causes.
+"""

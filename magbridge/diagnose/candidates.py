@@ -1,0 +1,106 @@
+"""What a cause puts forward: an effect with its nonlinear parameters set, its columns, its plausible size."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magbridge.calibration.terms import Effect
+from magbridge.diagnose.problem import Columns, Problem, effect_columns, history
+
+__all__ = ["Candidate", "of_effect", "of_reference"]
+
+FloatArray = NDArray[np.float64]
+AXES = ("x", "y", "z")
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """One hypothesis.
+
+    Attributes
+    ----------
+    cause : str
+        As in ``findings.json``.
+    channel : str or None
+        Telemetry that it follows.
+    columns : Columns
+        Derivatives of the residual by its coefficients, each in units of its width.
+    width : (k,) array
+        Plausible size (1-sigma) of each coefficient, in its unit.
+    names, units : tuple of str
+        Of the coefficients.
+    effect : Effect or None
+        What it adds to the calibration; None where it is the reference that is wrong.
+    shape : dict
+        Nonlinear parameters: name -> (value, unit).
+    again : callable or None
+        Shape's values -> the same candidate with those: for profiling.
+    trials : float
+        Independent hypotheses that stand behind this one (frequencies searched).
+    """
+
+    cause: str
+    channel: str | None
+    columns: Columns
+    width: FloatArray
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    effect: Effect | None = None
+    shape: dict[str, tuple[float, str]] = field(default_factory=dict)
+    again: Callable[..., Candidate] | None = None
+    trials: float = 1.0
+
+    @property
+    def size(self) -> int:
+        """Free numbers."""
+        return len(self.width)
+
+
+def of_effect(
+    problem: Problem,
+    effect: Effect,
+    width: float | FloatArray,
+    unit: str,
+    *,
+    channel: str | None = None,
+    names: tuple[str, ...] = (),
+    phi: FloatArray | Callable[[slice], FloatArray] | None = None,
+    **more: Any,
+) -> Candidate:
+    """Make a candidate of an effect; its regressors are stepped through where `phi` does not give them."""
+    if phi is None:
+        phi = history(problem.survey, problem.calibration, effect)
+    widths = np.broadcast_to(np.asarray(width, float), effect.size)
+    bare = effect_columns(problem, effect, phi)
+    cause: str = effect.cause  # type: ignore[attr-defined]
+    if not names:
+        powers = effect.size // 3
+        names = tuple(axis + (str(power + 1) if powers > 1 else "") for power in range(powers) for axis in AXES)
+    return Candidate(
+        cause, channel, lambda rows: bare(rows) * widths, widths, names, (unit,) * effect.size, effect, **more
+    )  # fmt: skip
+
+
+def of_reference(
+    problem: Problem,
+    cause: str,
+    basis: Callable[[slice], FloatArray],
+    width: FloatArray,
+    names: tuple[str, ...],
+    **more: Any,
+) -> Candidate:
+    """Make a candidate of an error in the reference: ``H_e + sum_k b_k basis_k(t)``, nT."""
+    return Candidate(
+        cause,
+        None,
+        lambda rows: -problem.gain[rows, None] * basis(rows) * width,
+        width,
+        names,
+        ("nT",) * len(width),
+        **more,
+    )

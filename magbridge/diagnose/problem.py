@@ -1,0 +1,211 @@
+r"""The comparison as a linear problem: residuals of a calibration, and how every coefficient moves them.
+
+Notes
+-----
+With the scalar residual e of :mod:`magbridge.calibration.residual` and its derivative g by the nine
+coefficients at every sample, a term or an effect that adds ``sum_rs phi_r C_krs`` to slot s moves it by
+
+.. math:: \partial e_t / \partial c_k = \sum_{rs} \phi_r(t)\, C_{krs}\, g_s(t)
+
+so every cause passes through the forward model by the one rule. The calibration stays free, with its posterior
+as prior: ``c = c_0 + L z``, ``z ~ N(m, 1)``, where L holds only the directions that these data can see.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magbridge.calibration.correct import regressors
+from magbridge.calibration.model import Calibration
+from magbridge.calibration.residual import Samples, residuals, whiten
+from magbridge.calibration.terms import Effect
+from magbridge.diagnose.survey import Survey
+
+__all__ = ["Columns", "Problem", "add_effects", "effect_columns", "history", "pose"]
+
+FloatArray = NDArray[np.float64]
+Columns = Callable[[slice], FloatArray]
+"""Rows -> (m, k) derivatives of the residual by k coefficients."""
+
+CHUNK = 8192
+SEEN = 0.01
+"""Share of a prior's information that data must add for its direction to be kept."""
+BROADEST = 1e-4
+"""Precision, of the posterior's, below which a direction that only the given logs determined is not let."""
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """What a search works on.
+
+    Attributes
+    ----------
+    survey : Survey
+    calibration : Calibration
+    residual : (n,) array
+        e, nT of the sensor.
+    slopes : (n, 9) array
+        g.
+    gain : (n,) array
+        1/s: what one nT of error in the reference does to e.
+    free : (n, q) array
+        ``de/dz``.
+    directions : (K, q) array
+        L.
+    centre : (q,) array
+        m, prior mean of z.
+    """
+
+    survey: Survey
+    calibration: Calibration
+    residual: FloatArray
+    slopes: FloatArray
+    gain: FloatArray
+    free: FloatArray
+    directions: FloatArray
+    centre: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.residual)
+
+
+def add_effects(calibration: Calibration, effects: tuple[Effect, ...]) -> Calibration:
+    """Return the calibration with `effects` at zero, perfectly known."""
+    extra = sum(effect.size for effect in effects)
+    size = calibration.coefficients.size
+    covariance = np.zeros((size + extra, size + extra))
+    covariance[:size, :size] = calibration.covariance
+    return replace(
+        calibration,
+        effects=(*calibration.effects, *effects),
+        coefficients=np.append(calibration.coefficients, np.zeros(extra)),
+        covariance=covariance,
+    )
+
+
+def history(survey: Survey, calibration: Calibration, effect: Effect) -> FloatArray:
+    """(r, n) regressors of one effect along the survey, stepped as the bridge would."""
+    probe = add_effects(replace(calibration, effects=(), coefficients=calibration.coefficients[: _terms(calibration)],
+                                covariance=calibration.covariance[: _terms(calibration), : _terms(calibration)]), (effect,))
+    step = effect.begin(probe)
+    channels = survey.values(probe.channels)
+    times = np.rint(survey.time * 1e6).astype(np.int64).tolist()
+    rows = zip(times, *survey.field.T.tolist(), channels.tolist(), strict=True)
+    return np.array([step(*row) for row in rows]).T
+
+
+def effect_columns(problem: Problem, effect: Effect, phi: FloatArray | Callable[[slice], FloatArray]) -> Columns:
+    """Return the derivative by an effect's coefficients, from its regressors (r, n) or a function of the rows."""
+    tensor = effect.columns(problem.calibration.reference.field)
+    slots = np.flatnonzero(np.abs(tensor).sum(axis=(0, 1)))
+    tensor = tensor[:, :, slots]
+
+    def columns(rows: slice) -> FloatArray:
+        part = phi(rows) if callable(phi) else phi[:, rows]
+        return np.asarray(np.einsum("rt,ts,krs->tk", part, problem.slopes[rows][:, slots], tensor, optimize=True))
+
+    return columns
+
+
+def samples_of(survey: Survey, calibration: Calibration) -> tuple[Samples, FloatArray]:
+    """Return the residual's samples, with effects among the regressors, and its coefficients (9 m,)."""
+    phi = regressors(calibration, survey.field, survey.values(calibration.channels), survey.time)
+    unit = calibration.reference.field
+    W = calibration.kernel.weights.copy()
+    W[0, :3] -= 1.0
+    W[:, :6] *= unit
+    noise = calibration.noise
+    kappa = noise.reference / noise.sensor if noise.sensor > 0.0 else 0.0
+    return Samples(survey.field, survey.reference, phi.T, survey.follows, unit, kappa), W.ravel()
+
+
+def pose(survey: Survey, calibration: Calibration) -> Problem:
+    """Linearise the comparison about `calibration`."""
+    samples, coefficients = samples_of(survey, calibration)
+    n = len(survey)
+    e, g, gain = np.empty(n), np.empty((n, 9)), np.empty(n)
+    for start in range(0, n, CHUNK):
+        rows = slice(start, start + CHUNK)
+        part = samples.part(rows)
+        e[rows], g[rows] = residuals(part, coefficients)
+        above, _ = residuals(replace(part, reference=part.reference + 1.0), coefficients)
+        gain[rows] = e[rows] - above
+    L, centre = _prior(survey, calibration, samples, e, g)
+    free = _free(calibration, samples, g, L)
+    values, vectors = np.linalg.eigh(free.T @ free / _level(calibration, e) ** 2)
+    keep = values > SEEN
+    V = vectors[:, keep]
+    return Problem(survey, calibration, e, g, gain, free @ V, L @ V, V.T @ centre)
+
+
+def _level(calibration: Calibration, e: FloatArray) -> float:
+    return calibration.noise.sensor or 1.4826 * float(np.median(np.abs(e))) or 1.0
+
+
+def _terms(calibration: Calibration) -> int:
+    return sum(term.size for term in calibration.terms)
+
+
+def _free(calibration: Calibration, samples: Samples, g: FloatArray, L: FloatArray) -> FloatArray:
+    """(n, q): derivatives by the calibration's own coefficients, times L, in bounded memory."""
+    tensor = _tensor(calibration)
+    M = np.tensordot(L.T, tensor, 1).reshape(L.shape[1], -1).T
+    out = np.empty((len(g), L.shape[1]))
+    for start in range(0, len(g), CHUNK):
+        rows = slice(start, start + CHUNK)
+        outer = samples.phi[rows, :, None] * g[rows, None, :]
+        out[rows] = outer.reshape(len(outer), -1) @ M
+    return out
+
+
+def _tensor(calibration: Calibration) -> FloatArray:
+    """(K, m, 9): what each coefficient makes of each regressor, in each slot."""
+    kernel = calibration.kernel
+    exponents = [(0,) * len(calibration.parameters)]
+    for parent, k in kernel.parents:
+        e = exponents[parent]
+        exponents.append((*e[:k], e[k] + 1, *e[k + 1 :]))
+    tensor = np.zeros((calibration.coefficients.size, len(kernel.weights), 9))
+    row, k = {exponent: i for i, exponent in enumerate(exponents)}, 0
+    for term in calibration.terms:
+        expansion = term.expand(calibration)  # type: ignore[attr-defined]
+        tensor[k : k + term.size, [row[e] for e in expansion.exponents]] = expansion.columns
+        k += term.size
+    r = len(exponents)
+    for effect in calibration.effects:
+        columns = effect.columns(calibration.reference.field)
+        tensor[k : k + effect.size, r : r + columns.shape[1]] = columns
+        k, r = k + effect.size, r + columns.shape[1]
+    return tensor
+
+
+def _prior(
+    survey: Survey, calibration: Calibration, samples: Samples, e: FloatArray, g: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return L and m. What the calibration learned from samples that are here again is taken out of its posterior.
+
+    In the posterior's own units, ``P_0 = 1 - H`` with H the information of those samples, and since the gradient
+    vanished at c_0, ``P_0 m = L^T J^T W e``.
+    """
+    scale = np.sqrt(np.maximum(np.diag(calibration.covariance), 0.0)) + 1e-12
+    values, vectors = np.linalg.eigh(calibration.covariance / np.outer(scale, scale))
+    kept = values > 1e-12 * values[-1]
+    L = scale[:, None] * vectors[:, kept] * np.sqrt(values[kept])
+    centre = np.zeros(L.shape[1])
+    learned = np.flatnonzero(survey.learned)
+    if not learned.size:
+        return L, centre
+    J = _free(calibration, samples.part(learned), g[learned], L)
+    noise, follows = calibration.noise, survey.follows[learned]
+    white = np.column_stack([J, e[learned]])
+    white = whiten(white, follows, noise.memory) / _level(calibration, e)
+    A, y = white[:, :-1], white[:, -1]
+    values, vectors = np.linalg.eigh(np.eye(len(centre)) - A.T @ A)
+    held = values > 0.1  # elsewhere those samples were all there was, and they speak for themselves
+    centre = np.where(held, vectors.T @ (A.T @ y), 0.0) / np.where(held, values, 1.0)
+    values = np.maximum(values, BROADEST)
+    return L @ (vectors / np.sqrt(values)), centre * np.sqrt(values)
