@@ -181,7 +181,7 @@ def observations(
         attitude = np.radians(np.stack([_column(ds, name) for name in ("roll", "pitch", "heading")], axis=1))
     time = np.asarray(ds["time"].values, float)
     return Observations(
-        field=np.stack([columns[name] for name in names[:3]], axis=1),
+        field=np.stack([_at_common_time(ds, axis, columns[f"mag_{axis}"]) for axis in "xyz"], axis=1),
         reference=total,
         parameters=np.stack([columns[name] for name in parameters], axis=1)
         if parameters
@@ -195,6 +195,22 @@ def observations(
         sensor=str(ds.attrs.get("sensor", "")),
         model=model,
     )
+
+
+def _at_common_time(ds: xr.Dataset, axis: str, values: FloatArray) -> FloatArray:
+    """Interpolate a channel of a multiplexed converter to the row's time, as :mod:`magbridge.align` does live.
+
+    In a spiral a delay of 0.3 s is a rotation of a degree, always the same way: left in, it would be
+    calibrated into the coefficients, and stay there when the vehicle flies straight.
+    """
+    if f"mag_time_{axis}" not in ds:
+        return values
+    time, sampled = np.asarray(ds["time"].values, float), _column(ds, f"mag_time_{axis}")
+    known = np.isfinite(sampled) & np.isfinite(values)
+    if not known.any():
+        return values
+    common = np.interp(time, sampled[known], values[known])
+    return np.where(known, common, np.nan)
 
 
 def _column(ds: xr.Dataset, name: str) -> FloatArray:
