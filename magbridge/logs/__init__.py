@@ -147,9 +147,9 @@ def read_chunks(paths: Paths, rows: int = 65536, *, required: Iterable[str] = ()
     """
     from magbridge.logs.merge import merge  # noqa: PLC0415 - xarray is for ashore
 
-    sources = _paths(paths)
+    sources = [partial(_chunks, path) for path in _paths(paths)]
     required = tuple(required)
-    for dataset in merge([partial(_chunks, path) for path in sources], rows):
+    for dataset in sources[0](rows) if len(sources) == 1 else merge(sources, rows):
         _require(dataset, required)
         yield dataset
 

@@ -2,13 +2,26 @@
 
 from __future__ import annotations
 
-from math import nan
+from collections.abc import Callable
+from math import isnan, nan
 from typing import Any
 
+from magbridge.columns import CHANNEL_TIMES, CORRECTED
 from magbridge.mavlink import spec
 from magbridge.mavlink.messages import split_index
 
-__all__ = ["TELEMETRY", "UNKNOWN_INT", "Value"]
+__all__ = [
+    "COUNTED_POWER_CYCLES",
+    "SOURCES",
+    "TELEMETRY",
+    "UNKNOWN_INT",
+    "Columns",
+    "Value",
+    "correction",
+    "sample",
+]
+
+Columns = dict[str, float]
 
 FIELDS: dict[str, dict[str, str]] = {
     # message: {column: field}
@@ -79,3 +92,51 @@ TELEMETRY = {
     for message, columns in FIELDS.items()
 }
 """Message id to the columns in it."""
+
+SAMPLE, CORRECTION = spec("MAG_RAW").struct, spec("MAG_FIELD").struct
+COUNTED_POWER_CYCLES = 8  # MAG_RAW_FLAGS_POWER_CYCLE
+
+
+def sample(payload: bytes) -> Columns:
+    """Return what a ``MAG_RAW`` tells: its time, and the columns that it knows."""
+    time_us, _, x, y, z, _, _, _, *delays, temperature, supply, cycle, _, flags = SAMPLE.unpack(payload)
+    row = {"time": time_us / 1e6}
+    if not (isnan(x) and isnan(y) and isnan(z)):
+        row |= {"mag_x": x, "mag_y": y, "mag_z": z}
+    if any(delays):
+        row |= {name: (time_us + delay) / 1e6 for name, delay in zip(CHANNEL_TIMES, delays, strict=True)}
+    if not isnan(temperature):
+        row["sensor_temperature"] = temperature
+    if not isnan(supply):
+        row["sensor_supply"] = supply
+    if flags & COUNTED_POWER_CYCLES:
+        row["power_cycle"] = cycle
+    return row
+
+
+def correction(payload: bytes) -> Columns:
+    """Return what a ``MAG_FIELD`` tells: its time, and the columns of a corrected sample."""
+    time_us, total, _, _, sigma, x, y, z, _, _, _, anomaly, _, _, flags, _ = CORRECTION.unpack(payload)
+    return {
+        "time": time_us / 1e6,
+        **dict(zip(CORRECTED, (total, sigma, x, y, z, anomaly, flags), strict=True)),
+    }
+
+
+def _of(message: str) -> Callable[[bytes], Columns]:
+    values = [Value(f"mag_{axis}", message, f"{axis}mag") for axis in "xyz"]
+    return lambda payload: {value.column: value.get(payload) for value in values}
+
+
+SOURCES: dict[str, Callable[[bytes], Columns]] = {
+    "MAG_RAW": sample,
+    "MAG_FIELD": correction,
+    "HIGHRES_IMU": _of("HIGHRES_IMU"),
+    "RAW_IMU": _of("RAW_IMU"),
+    "SCALED_IMU": _of("SCALED_IMU"),
+    "SCALED_IMU2": _of("SCALED_IMU2"),
+    "SCALED_IMU3": _of("SCALED_IMU3"),
+    "ATTITUDE": lambda _: {},
+    "GLOBAL_POSITION_INT": lambda _: {},
+}
+"""What makes a row, the best first, and the columns that come with it."""

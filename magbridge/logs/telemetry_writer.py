@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from magbridge.columns import CHANNEL_TIMES, CHANNELS, CORRECTED
 from magbridge.logs.deployment import MEANING
-from magbridge.logs.telemetry_fields import UNKNOWN_INT
+from magbridge.logs.telemetry_fields import COUNTED_POWER_CYCLES, UNKNOWN_INT
 from magbridge.mavlink import Codec, Spec, pack_record, spec
 from magbridge.records import Channel, Quality
 
@@ -35,7 +35,6 @@ STANDARD = {*ATTITUDE, *POSITION, *SAMPLE, *CHANNEL_TIMES, *CORRECTED}
 ATTITUDE_, POSITION_, NAMED_, RAW_, FIELD_ = (
     spec(name) for name in ("ATTITUDE", "GLOBAL_POSITION_INT", "NAMED_VALUE_FLOAT", "MAG_RAW", "MAG_FIELD")
 )
-POWER_CYCLE = 8  # MAG_RAW_FLAGS_POWER_CYCLE
 UNKNOWN_HEADING = 0xFFFF
 
 Row = dict[str, float]
@@ -120,7 +119,7 @@ class FileWriter:
         delays = [_delay(row.get(name, nan), time_us) for name in CHANNEL_TIMES]
         counted = not isnan(cycle)
         fields = time_us, 0, x, y, z, 0, 0, 0, *delays, temperature, supply
-        power = (int(cycle) & 0xFFFF, 0, POWER_CYCLE) if counted else (0, 0, 0)
+        power = (int(cycle) & 0xFFFF, 0, COUNTED_POWER_CYCLES) if counted else (0, 0, 0)
         self._say(time_us, Channel.SENT, self._bridge, RAW_, *fields, *power)
 
     def _field(self, time_us: int, row: Row) -> None:

@@ -173,6 +173,23 @@ def test_damage_is_passed_over_and_counted(tmp_path: Path) -> None:
     assert sum(piece.attrs["damages"] for piece in pieces) == 3
 
 
+def test_version_1_frames(tmp_path: Path) -> None:
+    v1 = pytest.importorskip("pymavlink.dialects.v10.common")
+    mav = v1.MAVLink(None, srcSystem=1, srcComponent=1)
+    log = Log()
+    for k in range(4):
+        for message in (
+            v1.MAVLink_named_value_float_message(0, b"battpos", k),
+            v1.MAVLink_named_value_float_message(0, b"ballast", -k),
+            v1.MAVLink_raw_imu_message(0, 0, 0, 0, 0, 0, 0, k, 2, 3),
+        ):
+            log.data += pack_record(T0 + k * S, 0, message.pack(mav))
+    back = log.read(tmp_path)
+    np.testing.assert_array_equal(back["battpos"], [0, 1, 2, 3])
+    np.testing.assert_array_equal(back["ballast"], [0, -1, -2, -3])
+    np.testing.assert_array_equal(back["mag_x"], [0, 100, 200, 300])
+
+
 def test_time_that_goes_back_drops_the_row(tmp_path: Path) -> None:
     log = Log()
     for t in (0, 1, 0.5, 1, 2):
