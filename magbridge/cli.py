@@ -29,6 +29,29 @@ Json = Annotated[bool, Parameter(name="--json", negative="")]
 
 
 @app.command
+def demo(*, out: Path = Path("demo"), seed: int = 1, json: Json = False) -> None:
+    """Do the main job end to end on a simulated glider: no hardware, no network, under a minute.
+
+    Simulates a small deployment, fits a calibration to its spirals, replays the survey through a pty and a
+    socket into the bridge, listens as a ground station would, and draws raw, corrected and true field.
+
+    Parameters
+    ----------
+    out
+        The folder for what it makes.
+    seed
+        Another glider.
+    json
+        Print the result for machines.
+    """
+    from sitl.demo import demo as show
+    from sitl.demo import tell
+
+    result = show(out, seed, say=lambda text: print(text, file=sys.stderr))
+    _tell(result, tell(result), json)
+
+
+@app.command
 def run(*, config: Path) -> None:
     """Attach to the sensor and the autopilot link, and publish the corrected field until stopped.
 

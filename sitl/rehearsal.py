@@ -25,12 +25,14 @@ from magbridge.logs import read
 from sitl.like import simulate_like
 from sitl.scenario import load
 
-__all__ = ["Part", "Rehearsal", "prepare"]
+__all__ = ["Part", "Rehearsal", "bridge_toml", "prepare", "rows_of"]
 
 FULL_SCALE = 100_000.0
 """nT that the emulated fluxgate can read."""
 SENSITIVITY = 5e-5
 """V/nT of the emulated fluxgate."""
+SETTLE_TIME = 4.0
+"""s after a movement: eight time constants of the paper's anti-alias filter."""
 NAME = 10
 """Characters of a NAMED_VALUE_FLOAT's name."""
 
@@ -88,7 +90,8 @@ def prepare(files: Sequence[Path], folder: Path) -> Rehearsal:
     parts = _parts(files, deployment)
     summary = _calibrate(deployment, parts, folder / "cal.json")
     config = folder / "bridge.toml"
-    config.write_text(_toml(deployment, calibrated=summary.startswith("nominal")), encoding="utf-8")
+    text = bridge_toml(deployment, telemetry_of(deployment), calibrated=summary.startswith("nominal"))
+    config.write_text(text, encoding="utf-8")
     return Rehearsal(config, deployment, parts, summary, simulated)
 
 
@@ -130,12 +133,12 @@ def _calibrate(deployment: xr.Dataset, parts: Sequence[Part], path: Path) -> str
     return f"nominal, fitted on {parts[0].name} to {parts[-2].name}: {found.rms:.1f} nT RMS there"
 
 
-def _toml(deployment: xr.Dataset, *, calibrated: bool) -> str:
-    """Return a ``bridge.toml`` for an emulated digitizer, and every telemetry channel as a parameter."""
+def bridge_toml(deployment: xr.Dataset, names: Iterable[str], *, calibrated: bool, log: str = "") -> str:
+    """Return a ``bridge.toml`` for an emulated digitizer, with the columns `names` as parameters."""
     lines = [
         "[sensor]",
         'driver = "digitizer"',
-        'port = "/dev/null"  # the replay puts its own pty here',
+        'port = "/dev/null"  # a replay puts its own pty here',
         "[sensor.options]",
         f"sensitivity = {SENSITIVITY}",
         f"reference_voltage = {SENSITIVITY * FULL_SCALE}",
@@ -148,7 +151,10 @@ def _toml(deployment: xr.Dataset, *, calibrated: bool) -> str:
     ]
     if calibrated:
         lines += ["[calibration]", 'file = "cal.json"']
-    for name, short in _names(str(name) for name in deployment.data_vars).items():
+        lines += ["[align]", f"settle_time = {SETTLE_TIME}"]
+    if log:
+        lines += ["[log]", f'directory = "{log}"']
+    for name, short in short_names(names).items():
         unit = str(deployment[name].attrs.get("units", "")).replace('"', "")
         lines += [
             f'[telemetry."{name}"]',
@@ -160,16 +166,26 @@ def _toml(deployment: xr.Dataset, *, calibrated: bool) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _names(columns: Iterable[str]) -> dict[str, str]:
-    """Return a name of at most ten letters for every telemetry column."""
+def telemetry_of(deployment: xr.Dataset) -> list[str]:
+    """Return the columns that are telemetry: not the contract's own, and nameable in a ``bridge.toml``."""
+    names = (str(name) for name in deployment.data_vars)
+    return [
+        name
+        for name in names
+        if name not in COLUMNS
+        and not name.startswith(("truth_", "mag"))
+        and re.fullmatch(r"\w+", name, re.ASCII)
+    ]
+
+
+def short_names(names: Iterable[str]) -> dict[str, str]:
+    """Return a different name of at most ten letters for each."""
     short: dict[str, str] = {}
-    for name in columns:
-        if name in COLUMNS or name.startswith(("truth_", "mag")) or not re.fullmatch(r"\w+", name, re.ASCII):
-            continue
+    for name in names:
         candidate = name[:NAME]
-        for number in range(1, 100):
-            if candidate not in short.values():
-                break
+        number = 0
+        while candidate in short.values():
+            number += 1
             candidate = f"{name[: NAME - len(str(number))]}{number}"
         short[name] = candidate
     return short

@@ -1,0 +1,127 @@
+"""The main job end to end on a simulated glider: simulate, fit, replay through the bridge, listen, compare."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from math import inf
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from magbridge.bridge.pipeline import Start
+from magbridge.calibration.correct import correct
+from magbridge.calibration.data import observations
+from magbridge.calibration.file import save
+from magbridge.calibration.fit import Fit, fit
+from magbridge.config import load as load_config
+from magbridge.logs import write
+from magbridge.records import Quality
+from sitl.columns import segments
+from sitl.emulation import emulate, start_us
+from sitl.listener import Listener
+from sitl.rehearsal import bridge_toml
+from sitl.scenario import load
+from sitl.stage import Stage
+from sitl.twin import simulate
+
+__all__ = ["demo", "tell"]
+
+PARAMETERS = ("battpos", "ballast")
+Floats = NDArray[np.float64]
+
+
+def demo(folder: Path, seed: int = 1, say: Callable[[str], None] = print) -> dict[str, Any]:
+    """Run the demonstration; leave the deployment, the calibration, the log and a picture in `folder`.
+
+    Returns
+    -------
+    dict
+        Errors over the survey in nT, counts of samples, names of the files made.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    begun = time.monotonic()
+
+    def step(text: str) -> None:
+        say(f"{time.monotonic() - begun:5.1f} s  {text}")
+
+    step("simulating a glider with a moving battery and a ballast pump: calibration spirals, then a survey")
+    deployment = simulate(load("demo"), seed)
+    write(deployment, folder / "deployment.nc")
+    parts = segments(deployment)
+    training, survey = parts["calibration"], parts["survey"]
+
+    step(f"fitting the calibration to {training.sizes['time']} samples of the spirals")
+    nominal = fit(observations(training, ()), "nominal")
+    found = fit(observations(training, PARAMETERS), "auto")
+    save(found.calibration, folder / "cal.json")
+    config = folder / "bridge.toml"
+    config.write_text(bridge_toml(deployment, PARAMETERS, calibrated=True, log="logs"), encoding="utf-8")
+
+    step("replaying the survey: the fluxgate through a pty, the autopilot through a socket, into the bridge")
+    listener = Listener()
+    stage = Stage(config, listener.hear, folder / "logs")
+    stage.play(Start(start_us(survey)), emulate(survey, load_config(config)), inf)
+    step(f"heard {sum(listener.counts.values())} messages as a ground station would")
+
+    heard = _align(listener.field(), survey)
+    result = _compare(survey, nominal, heard)
+    picture = folder / "demo.png"
+    from sitl.demo_picture import draw  # noqa: PLC0415 - matplotlib takes a second, and comes last
+
+    draw(survey, _nominal_field(survey, nominal), heard, picture)
+    step(f"drew {picture}")
+    files = [str(folder / name) for name in ("deployment.nc", "cal.json", "bridge.toml", "logs", "demo.png")]
+    return {**result, "calibration_rms_nT": found.rms, "said": listener.said, "files": files}
+
+
+def _align(field: dict[str, Floats], survey: xr.Dataset) -> xr.Dataset:
+    """Return what was heard, on the times at which it was measured, with the truth at those times."""
+    when = field.pop("time")
+    times = survey["time"].to_numpy()
+    truth = np.interp(when, times, survey["truth_total_field"].to_numpy())
+    columns = {**field, "truth": truth}
+    return xr.Dataset({name: ("time", column) for name, column in columns.items()}, coords={"time": when})
+
+
+def _nominal_field(survey: xr.Dataset, nominal: Fit) -> Floats:
+    channels = np.stack([survey[f"mag_{axis}"].to_numpy() for axis in "xyz"], axis=1)
+    empty = np.empty((len(channels), 0))
+    return correct(nominal.calibration, channels, empty, survey["time"].to_numpy()).total
+
+
+def _compare(survey: xr.Dataset, nominal: Fit, heard: xr.Dataset) -> dict[str, Any]:
+    truth = survey["truth_total_field"].to_numpy()
+    raw = np.sqrt(sum(survey[f"mag_{axis}"].to_numpy() ** 2 for axis in "xyz"))
+    error = (heard["total_field"] - heard["truth"]).to_numpy()
+    good = (heard["quality"].to_numpy().astype(int) & ~int(Quality.NO_BORESIGHT)) == 0
+    return {
+        "samples": heard.sizes["time"],
+        "raw_rms_nT": _rms(raw - truth),
+        "nominal_rms_nT": _rms(_nominal_field(survey, nominal) - truth),
+        "corrected_rms_nT": _rms(error),
+        "unflagged_rms_nT": _rms(error[good]),
+        "unflagged_sigma_nT": _rms(heard["sigma"].to_numpy()[good]),
+        "flagged": int((~good).sum()),
+    }
+
+
+def _rms(error: Floats) -> float:
+    return float(np.sqrt(np.mean(error**2)))
+
+
+def tell(result: dict[str, Any]) -> str:
+    """Return the demonstration's result for people to read."""
+    rows = [
+        ("raw, as the fluxgate reads it", result["raw_rms_nT"]),
+        ("one ellipsoid for all positions (nominal)", result["nominal_rms_nT"]),
+        ("magbridge, as received over MAVLink", result["corrected_rms_nT"]),
+        (f"  without the {result['flagged']} samples it flags", result["unflagged_rms_nT"]),
+        ("  the 1-sigma it claims for those", result["unflagged_sigma_nT"]),
+    ]
+    table = [f"  {name:44}{value:10.2f} nT" for name, value in rows]
+    head = f"\nerror of the total field over the survey, RMS of {result['samples']} samples:"
+    return "\n".join([head, *table, "", "  " + "\n  ".join(result["files"])])

@@ -1,0 +1,109 @@
+"""The demonstration's picture: what the fluxgate reads, what the bridge publishes, what is true."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from magbridge.files import atomic_path
+from magbridge.records import Quality
+
+mpl.use("agg")
+import matplotlib.pyplot as plt
+from matplotlib.axes import Axes
+
+__all__ = ["draw"]
+
+Floats = NDArray[np.float64]
+RAW, NOMINAL, CORRECTED, TRUE, FLAGGED = "#b0b0b0", "#d1793b", "#1f6fb4", "#111111", "#c0392b"
+
+
+def draw(survey: xr.Dataset, nominal: Floats, heard: xr.Dataset, path: Path) -> None:
+    """Draw the survey: masses, raw and true field, corrected and true field, errors."""
+    hours = _hours(survey["time"], survey)
+    received = _hours(heard["time"], survey)
+    truth = survey["truth_total_field"].to_numpy()
+    raw = np.sqrt(sum(survey[f"mag_{axis}"].to_numpy() ** 2 for axis in "xyz"))
+    style: dict[Any, Any] = {
+        "font.size": 9,
+        "axes.spines.top": False,
+        "axes.spines.right": False,
+        "axes.titlelocation": "left",
+    }
+    with mpl.rc_context(style):
+        figure, panels = plt.subplots(
+            4, 1, figsize=(10, 10), sharex=True, height_ratios=(1, 1.4, 1.6, 1.6), layout="constrained"
+        )
+        _masses(panels[0], hours, survey)
+        _levels(
+            panels[1], "What the fluxgate reads", (hours, raw, RAW, "raw |H|"), (hours, truth, TRUE, "true")
+        )
+        total, sigma = heard["total_field"].to_numpy(), heard["sigma"].to_numpy()
+        panels[2].fill_between(
+            received,
+            total - 2 * sigma,
+            total + 2 * sigma,
+            color=CORRECTED,
+            alpha=0.2,
+            lw=0,
+            label="its 2 sigma",
+        )
+        _levels(
+            panels[2],
+            "What a ground station receives",
+            (received, total, CORRECTED, "corrected"),
+            (hours, truth, TRUE, "true"),
+        )
+        _errors(panels[3], hours, nominal - truth, received, heard)
+        panels[-1].set_xlabel("hours since the survey began")
+        with atomic_path(path) as beside:
+            figure.savefig(beside, dpi=130)
+        plt.close(figure)
+
+
+def _hours(time: xr.DataArray, survey: xr.Dataset) -> Floats:
+    return (time.to_numpy() - float(survey["time"][0])) / 3600.0
+
+
+def _masses(axes: Axes, hours: Floats, survey: xr.Dataset) -> None:
+    axes.set_title("What moves: battery and ballast")
+    axes.spines["right"].set_visible(True)
+    axes.step(hours, survey["battpos"].to_numpy(), color="#5b8a3c", lw=1)
+    axes.set_ylabel("battery, in", color="#5b8a3c")
+    other = axes.twinx()
+    other.step(hours, survey["ballast"].to_numpy(), color="#8a3c6e", lw=1)
+    other.set_ylabel("ballast, cm³", color="#8a3c6e")
+
+
+def _levels(axes: Axes, title: str, *lines: tuple[Floats, Floats, str, str]) -> None:
+    axes.set_title(title)
+    for x, y, colour, label in lines:
+        axes.plot(x, y, color=colour, lw=1.0 if colour == TRUE else 1.4, label=label)
+    axes.set_ylabel("total field, nT")
+    axes.ticklabel_format(axis="y", useOffset=False)
+    axes.legend(loc="upper right", frameon=False, ncols=3)
+    axes.margins(y=0.15)
+
+
+def _errors(axes: Axes, hours: Floats, nominal: Floats, received: Floats, heard: xr.Dataset) -> None:
+    error = (heard["total_field"] - heard["truth"]).to_numpy()
+    flagged = (heard["quality"].to_numpy().astype(int) & ~int(Quality.NO_BORESIGHT)) != 0
+    good = _rms(error[~flagged])
+    axes.set_title("Error")
+    axes.plot(hours, nominal, color=NOMINAL, lw=1, label=f"one ellipsoid: {_rms(nominal):.0f} nT RMS")
+    axes.plot(received, error, color=CORRECTED, lw=1, label=f"magbridge: {good:.1f} nT RMS where not flagged")
+    axes.plot(received[flagged], error[flagged], ".", color=FLAGGED, ms=4, label="flagged: a mass in motion")
+    axes.axhline(0.0, color=TRUE, lw=0.6)
+    axes.set_yscale("symlog", linthresh=10.0)
+    axes.set_ylim(-3e3, 3e3)
+    axes.set_ylabel("nT (linear within ±10)")
+    axes.legend(loc="upper right", frameon=False, ncols=3)
+
+
+def _rms(error: Floats) -> float:
+    return float(np.sqrt(np.mean(error**2)))
