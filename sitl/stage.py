@@ -145,3 +145,5 @@ class Stage:
         self._link.close()
         os.close(self._master)
         os.close(self._slave)
+        if self._bridge.stderr is not None:
+            self._bridge.stderr.close()

@@ -60,7 +60,7 @@ class LiveEdge:
             for fd in ready:
                 if fd == self._woken:
                     os.read(fd, 4096)
-                elif data := self._read(lines[fd]):
+                elif data := self._read(lines[fd], fd):
                     yield Event(now_us, lines[fd], data)
             while not self._changes.empty():
                 yield Event(now_us, Channel.STATE, self._changes.get())
@@ -101,9 +101,12 @@ class LiveEdge:
         os.close(self._woken)
         os.close(self._waker)
 
-    def _read(self, channel: Channel) -> bytes:
+    def _read(self, channel: Channel, fd: int) -> bytes:
+        port = self._ports[channel]
+        if fd not in port.fds():  # it was lost in sending, since the wait
+            return b""
         try:
-            return self._ports[channel].read()
+            return port.read()
         except PortError as error:
             self._lost(channel, error)
             return b""

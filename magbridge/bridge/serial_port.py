@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import glob
 import os
 import threading
@@ -45,7 +46,7 @@ class SerialPort(Port):
                 )  # two programs on one line lose bytes to each other
                 opened.open()
             except (serial.SerialException, OSError, ValueError) as error:
-                reason = error.strerror if isinstance(error, OSError) and error.strerror else error
+                reason = _reason(error)
                 continue
             try:
                 self._fd = opened.fileno()
@@ -91,6 +92,14 @@ class SerialPort(Port):
         if self._serial is not None:
             self._serial.close()
         self._serial, self._fd, self._pump = None, -1, None
+
+
+def _reason(error: Exception) -> str:
+    """Return why a port did not open, short enough for a STATUSTEXT: pyserial's own words repeat its name."""
+    number = error.errno if isinstance(error, OSError) else None
+    if number == errno.EAGAIN:
+        return "in use by another program"
+    return os.strerror(number) if number else str(error)
 
 
 class _Pump:

@@ -17,6 +17,9 @@ BACK_MS = 1_000
 """ms that ``time_boot_ms`` goes back before it is more than packets out of order."""
 BELIEVED = 3
 """Messages in a row from the new boot clock before it is believed: one may be a straggler."""
+WINDOW = 64
+"""Frames by which one may come late and still be told from one that was lost."""
+ALL = (1 << WINDOW) - 1
 LEAP_MS = 10_000
 """ms that it runs ahead of ours before it is another's."""
 TWICE, CHANGES_US = 5, 10_000_000
@@ -51,6 +54,7 @@ class Vehicle:
         self.state = MAG_PORT_STATE.ABSENT
         self._announcer, self._timers = announcer, timers
         self._sequence: int | None = None
+        self._seen = ALL  # bit k: the frame k before the latest has come
         self._boot_ms = self._boot_us = 0
         self._behind = 0
         self._changes: list[int] = []
@@ -91,10 +95,17 @@ class Vehicle:
         )
 
     def _count(self, sequence: int) -> None:
-        if self._sequence is not None:
-            missing = (sequence - self._sequence - 1) % 256
-            # what seems to be more than half a turn missing is a packet out of order, or sent twice
-            self.frames_lost += missing if missing < 128 else 0
+        """Count what is missing; a packet that comes late, out of order, is not, and one sent twice is nothing."""
+        if self._sequence is None:
+            self._sequence = sequence
+        ahead = (sequence - self._sequence + 128) % 256 - 128
+        if -WINDOW < ahead <= 0:
+            self.frames_lost -= not self._seen >> -ahead & 1
+            self._seen |= 1 << -ahead
+            return
+        # far behind: the sender began anew
+        self.frames_lost += max(ahead - 1, 0)
+        self._seen = (self._seen << ahead | 1) & (1 << WINDOW) - 1 if ahead > 0 else ALL
         self._sequence = sequence
 
     def _present(self, t_us: int) -> None:

@@ -92,6 +92,13 @@ def test_lost_frames_are_counted(link):
     assert link.component.vehicle.frames_lost == 7
 
 
+def test_late_frames_are_not_lost(link):
+    frames = [link.autopilot.pack("ATTITUDE", time_boot_ms=i) for i in range(400)]
+    order = [four + i for four in range(0, 400, 4) for i in (2, 0, 3, 1)]
+    link.give(b"".join(frames[i] for i in order if i not in (0, 1, 101, 203)))
+    assert link.component.vehicle.frames_lost == 2
+
+
 def exchange(clock, rng, now_us, offset_us, slow=300.0, drift_ppm=0.0):
     """One request and its answer over a link that delays each way by a random time."""
     there, back = (slow + rng.expovariate(1 / 2000) for _ in range(2))

@@ -1,0 +1,47 @@
+"""What the fault tests share: bridges on the bench, and the table of what was measured."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from rig import Rig
+
+ROWS: list[tuple[str, str, str, str]] = []
+
+
+@pytest.fixture(scope="module")
+def table() -> Iterator[Callable[[str, str, str, str], None]]:
+    """Take rows of the table of faults; MAGBRIDGE_FAULTS names the file that it is written to."""
+
+    def row(fault: str, meanwhile: str, well: str, lost: str) -> None:
+        ROWS.append((fault, meanwhile, well, lost))
+
+    yield row
+    if path := os.environ.get("MAGBRIDGE_FAULTS"):
+        head = (
+            "fault",
+            "what the bridge publishes meanwhile",
+            "well again after",
+            "what is lost, and where it is counted",
+        )
+        lines = [head, ("---",) * 4, *ROWS]
+        Path(path).write_text("".join(f"| {' | '.join(line)} |\n" for line in lines), encoding="utf-8")
+
+
+@pytest.fixture
+def make_rig(tmp_path: Path) -> Iterator[Callable[..., Rig]]:
+    """Make bridges that end with the test."""
+    made: list[Rig] = []
+
+    def make(*arguments: object, **settings: object) -> Rig:
+        folder = tmp_path / f"rig{len(made)}"
+        folder.mkdir()
+        made.append(Rig(folder, *arguments, **settings))
+        return made[-1]
+
+    yield make
+    for rig in made:
+        rig.close()

@@ -1,0 +1,417 @@
+"""What goes wrong at sea, one fault after the other, to one bridge that must live through all of them.
+
+Every test waits until all is well, does the damage, and says what was published meanwhile, how long it took and
+what was lost. In the end the log of it all is replayed.
+"""
+
+from __future__ import annotations
+
+import socket
+import time
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import pytest
+from rig import TELEMETRY_HZ, Rig
+
+from magbridge.mavlink import Codec
+
+Row = Callable[[str, str, str, str], None]
+NOISE = np.random.default_rng(1).integers(0, 256, 4000, dtype=np.uint8).tobytes()
+REAL32 = 9
+SILENT, LOST, ABSENT_S = 2, 3, 5.0
+
+
+@pytest.fixture(scope="module")
+def rig(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rig]:
+    made = Rig(tmp_path_factory.mktemp("rig"))
+    made.start()
+    yield made
+    made.close()
+
+
+def seconds(value: float) -> str:
+    return f"{value:.2f} s"
+
+
+def test_sensor_unplugged_in_the_middle_of_a_frame(rig: Rig, table: Row) -> None:
+    rig.until_well()
+    before, mark = rig.fresh_status(), rig.mark
+    sent = rig.fluxgate.encoder.sequence
+    rig.fluxgate.unplug(after=17)
+    away = time.monotonic()
+    rig.until_status(lambda status: status["sensor_state"] == LOST)
+    told = rig.until_said("digitizer lost", mark)
+    beat = rig.of("HEARTBEAT", mark)[-1]
+    assert beat["system_status"] == 5  # critical
+    rig.run(0.3)
+    rig.fluxgate.plug()
+    gone, back = time.monotonic() - away, rig.until_well()
+    rig.until_said("digitizer speaks", mark)
+    after = rig.fresh_status()
+    assert rig.flags(mark) == "gap"
+    lost = after["samples_lost"] - before["samples_lost"]
+    assert lost == pytest.approx(gone * 50, abs=30)
+    assert after["sensor_bytes_skipped"] - before["sensor_bytes_skipped"] >= 17
+    came = after["samples"] - before["samples"]
+    assert came + lost == pytest.approx(rig.fluxgate.encoder.sequence - sent, abs=10)
+    table(
+        "sensor unplugged in the middle of a frame, plugged in again",
+        "heartbeat critical, `sensor_state` lost, STATUSTEXT with the reason; first sample back: `gap`",
+        seconds(back),
+        f"the readings meanwhile and one frame: `samples_lost` {lost}, `sensor_bytes_skipped`",
+    )
+    assert told < 1.5
+    assert back < 2.0
+
+
+def test_sensor_silent(rig: Rig, table: Row) -> None:
+    rig.until_well()
+    before, mark = rig.fresh_status(), rig.mark
+    rig.fluxgate.speaks = False
+    rig.until_status(lambda status: status["sensor_state"] == SILENT)
+    noticed = rig.until_said("digitizer is silent", mark)
+    rig.fluxgate.speaks = True
+    back = rig.until_well()
+    lost = rig.fresh_status()["samples_lost"] - before["samples_lost"]
+    assert rig.flags(mark) == "gap"
+    assert lost > 20
+    table(
+        "sensor silent on an open line",
+        "heartbeat critical, `sensor_state` silent and STATUSTEXT after `sensor.timeout`; start-up commands again, every `timeout`",
+        seconds(back),
+        f"what it did not send: `samples_lost` {lost}",
+    )
+    assert noticed < 2.0
+    assert back < 1.0
+
+
+def test_garbage_from_the_sensor(rig: Rig, table: Row) -> None:
+    rig.until_well()
+    before, mark = rig.fresh_status(), rig.mark
+    rig.fluxgate.write(NOISE[:3000])
+    back = rig.until_well()
+    after = rig.until_status(lambda status: status["sensor_bytes_skipped"] > before["sensor_bytes_skipped"])
+    skipped = after["sensor_bytes_skipped"] - before["sensor_bytes_skipped"]
+    bad = after["sensor_frames_bad"] - before["sensor_frames_bad"]
+    lost = after["samples_lost"] - before["samples_lost"]
+    assert 2900 < skipped <= 3000 + 38
+    assert lost <= 1
+    assert set(rig.flags(mark).split()) <= {"gap"}
+    table(
+        "3,000 bytes of noise from the sensor",
+        f"`{rig.flags(mark) or 'no flag'}` on the sample after it",
+        seconds(back),
+        f"the frame that the noise ran into: `samples_lost` {lost}, `sensor_frames_bad` {bad}, `sensor_bytes_skipped` {skipped}",
+    )
+    assert back < 0.5
+
+
+def test_garbage_from_the_link(rig: Rig, table: Row) -> None:
+    rig.until_well()
+    before, mark = rig.fresh_status(), rig.mark
+    half = rig.autopilot.telemetry()[:20]
+    for piece in (NOISE[:1500], half, b"\xfd", b"\xfe" * 300, NOISE[1500:3000]):
+        rig.autopilot.send(piece)
+    back = rig.until_well()
+    after = rig.until_status(
+        lambda status: status["link_bytes_skipped"] >= before["link_bytes_skipped"] + 3200
+    )
+    skipped = after["link_bytes_skipped"] - before["link_bytes_skipped"]
+    lost = after["link_frames_lost"] - before["link_frames_lost"]
+    rig.autopilot.say("PARAM_REQUEST_READ", target_system=1, target_component=191, param_index=0)
+    rig.until(lambda: rig.of("PARAM_VALUE", mark))
+    assert rig.flags(mark) == ""
+    table(
+        "3,300 bytes of noise and half frames from the link",
+        "nothing: the field goes on, without a flag",
+        seconds(back),
+        f"no frame beside the half one: `link_frames_lost` {lost}, `link_bytes_skipped` {skipped}",
+    )
+    assert lost <= 2
+
+
+@pytest.mark.parametrize("how", ["frozen", "gone"])
+def test_telemetry_stale(rig: Rig, table: Row, how: str) -> None:
+    rig.until_well()
+    mark = rig.mark
+    sigma = rig.of("MAG_FIELD")[-1]["total_field_sigma"]
+    if how == "frozen":  # the same message, with the same time, again and again
+        frozen = rig.autopilot.telemetry()
+        rig.autopilot.retell = lambda _: [frozen]
+    else:
+        rig.autopilot.tells = False
+    noticed = rig.until(lambda: "stale_telemetry" in rig.flags(mark))
+    rig.run(0.5)
+    status = rig.fresh_status()
+    assert status["telemetry_stale"] == 1
+    doubtful = rig.of("MAG_FIELD")[-1]
+    assert doubtful["total_field_sigma"] > sigma
+    assert doubtful["telemetry_age"] > 0.5
+    rig.autopilot.retell, rig.autopilot.tells = lambda frame: [frame], True
+    back = rig.until_well()
+    rig.until_said("field: good", mark)
+    assert 0.4 < noticed < 1.5
+    assert rig.flags(mark) in ("stale_telemetry", "stale_telemetry moving")
+    table(
+        f"telemetry {'frozen: the same message again and again' if how == 'frozen' else 'stops, while the autopilot goes on'}",
+        f"after `max_age` (0.5 s; seen after {noticed:.2f} s) `stale_telemetry`, sigma grows, `telemetry_age`, its bit in `telemetry_stale`, STATUSTEXT",
+        seconds(back),
+        "nothing",
+    )
+    assert back < 1.0
+
+
+def test_telemetry_duplicated(rig: Rig, table: Row) -> None:
+    rig.until_well()
+    before, mark = rig.fresh_status(), rig.mark
+    rig.autopilot.retell = lambda frame: [frame] * 3
+    rig.run(0.7)
+    rig.autopilot.retell = lambda frame: [frame]
+    rig.run(0.2)
+    after = rig.fresh_status()
+    assert rig.flags(mark) == ""
+    assert after["link_frames_lost"] == before["link_frames_lost"]
+    table("telemetry, every message three times", "nothing: the copies are passed over", "at once", "nothing")
+
+
+def test_telemetry_out_of_order(rig: Rig, table: Row) -> None:
+    rig.until_well()
+    before, mark = rig.fresh_status(), rig.mark
+    kept: list[bytes] = []
+
+    def shuffle(frame: bytes) -> list[bytes]:
+        kept.append(frame)
+        if len(kept) < 4:
+            return []
+        frames, kept[:] = [kept[i] for i in (2, 0, 3, 1)], []
+        return frames
+
+    rig.autopilot.retell = shuffle
+    rig.run(16 / TELEMETRY_HZ)
+    rig.autopilot.retell = lambda frame: [frame]
+    rig.run(0.2)
+    after = rig.fresh_status()
+    lost = after["link_frames_lost"] - before["link_frames_lost"]
+    assert rig.flags(mark) == ""
+    assert after["vehicle_reboots"] == before["vehicle_reboots"]
+    assert not any("two autopilots" in line for line in rig.said(mark))
+    table(
+        "telemetry out of order, four messages shuffled",
+        "nothing: what is older than what is known is passed over",
+        "at once",
+        f"the older values; `link_frames_lost` {lost}, though none was: it counts by the order of arrival",
+    )
+
+
+def test_second_system_on_the_link(rig: Rig, table: Row) -> None:
+    rig.until_well()
+    mark = rig.mark
+    other = Codec(2, 1)
+    shouted = []
+
+    def join(frame: bytes) -> list[bytes]:
+        fields = {"value": -900.0, "name": "battpos", "time_boot_ms": 7}
+        shouted.append(0)
+        return [
+            frame,
+            other.pack("NAMED_VALUE_FLOAT", **fields),
+            other.pack("HEARTBEAT", type=12, autopilot=3),
+            other.pack("PARAM_SET", target_system=2, target_component=191, param_id="MB_GAP_FACTOR", param_value=9, param_type=REAL32),
+        ]  # fmt: skip
+
+    rig.autopilot.retell = join
+    told = rig.until_said("vehicle 2 is on the link too: ignored", mark)
+    rig.run(0.5)
+    rig.autopilot.retell = lambda frame: [frame]
+    assert rig.flags(mark) == ""
+    assert not rig.of("PARAM_VALUE", mark)
+    fields = np.array([message["total_field"] for message in rig.of("MAG_FIELD", mark)])
+    assert np.ptp(fields) < 1.0
+    assert len([line for line in rig.said(mark) if "vehicle 2" in line]) == 1
+    assert shouted
+    table(
+        "a second vehicle on the link, with the same names in its telemetry",
+        f"STATUSTEXT once (after {told:.2f} s); nothing of it is taken",
+        "at once",
+        "nothing",
+    )
+
+
+def test_two_autopilots_answer(rig: Rig, table: Row) -> None:
+    rig.until_well()
+    mark = rig.mark
+    other, count = Codec(1, 1), 0
+
+    def both(frame: bytes) -> list[bytes]:
+        nonlocal count
+        count += 1
+        # another vehicle, on for a day
+        return [frame, other.pack("SYS_STATUS"), other.pack("ATTITUDE", time_boot_ms=86_400_000 + 50 * count)]
+
+    rig.autopilot.retell = both
+    told = rig.until_said("two autopilots speak as 1:1", mark)
+    rig.autopilot.retell = lambda frame: [frame]
+    back = rig.until_well()
+    table(
+        "two programs answer as the autopilot (1:1)",
+        f"STATUSTEXT after {told:.2f} s; flags: {rig.flags(mark) or 'none'}",
+        seconds(back),
+        "nothing; `link_frames_lost` grows, because their numbers interleave",
+    )
+    assert back < 6.0
+
+
+def test_another_bridge_answers(rig: Rig, table: Row) -> None:
+    rig.until_well()
+    mark = rig.mark
+    rig.autopilot.send(Codec(1, 191).pack("HEARTBEAT", type=18, autopilot=8))
+    told = rig.until_said("another program speaks as 1:191", mark)
+    back = rig.until_well()
+    assert rig.flags(mark) == ""
+    table(
+        "another program speaks as the bridge itself (1:191)",
+        f"STATUSTEXT after {told:.2f} s; what it says is not taken for telemetry",
+        "at once",
+        "nothing",
+    )
+    assert back < 0.5
+
+
+def test_second_bridge_on_the_same_sensor(rig: Rig, table: Row) -> None:
+    rig.until_well()
+    before, mark = rig.fresh_status(), rig.mark
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sink:
+        sink.bind(("127.0.0.1", 0))
+        sink.setblocking(False)
+        second = rig.folder / "second"
+        second.mkdir()
+        config = second / "bridge.toml"
+        text = rig.settings(f"udpout:127.0.0.1:{sink.getsockname()[1]}").replace(
+            '"cal.json"', '"../cal.json"'
+        )
+        config.write_text(text)
+        ear, told = Codec(0, 0), []
+
+        def refused() -> bool:
+            try:
+                for message in ear.parse(sink.recv(65536)):
+                    if message.name == "STATUSTEXT":
+                        told.append(message["text"])
+            except BlockingIOError:
+                pass
+            return any("digitizer lost" in text for text in told)
+
+        other = rig.spawn(config)
+        try:
+            rig.until(refused)
+        finally:
+            other.terminate()
+            rig.until(lambda: other.poll() is not None)
+    assert other.returncode == 0
+    after = rig.fresh_status()
+    assert after["samples_lost"] == before["samples_lost"]
+    assert after["sensor_bytes_skipped"] == before["sensor_bytes_skipped"]
+    assert rig.flags(mark) == ""
+    reason = next(text for text in told if "digitizer lost" in text)
+    table(
+        "a second `magbridge run` on the same serial port",
+        f'the first: nothing. The second: heartbeat critical, STATUSTEXT "{reason}"; it waits for the port',
+        "at once; the second as soon as the first ends",
+        "nothing",
+    )
+
+
+def test_parameter_out_of_range(rig: Rig, table: Row) -> None:
+    rig.until_well()
+    mark = rig.mark
+    for value in (0.5, float("nan"), float("inf"), -1.0):
+        rig.autopilot.say(
+            "PARAM_SET", target_system=1, target_component=191, param_id="MB_GAP_FACTOR", param_value=value, param_type=REAL32,
+        )  # fmt: skip
+    rig.until_said("MB_GAP_FACTOR: 0.5 is not within 1.01 to 1000", mark)
+    rig.until(lambda: len(rig.of("PARAM_VALUE", mark)) == 4)
+    assert {message["param_value"] for message in rig.of("PARAM_VALUE", mark)} == {2.5}
+    assert rig.flags(mark) == ""
+    assert not (rig.folder / "parameters.json").exists()
+    table(
+        "a parameter write out of range (also NaN, infinite)",
+        "PARAM_VALUE with the value that still holds, STATUSTEXT with the limits",
+        "at once",
+        "the write: refused",
+    )
+
+
+def test_autopilot_reboots(rig: Rig, table: Row) -> None:
+    rig.until_well()
+    before, mark = rig.fresh_status(), rig.mark
+    rig.autopilot.reboot()
+    rig.until_said("autopilot 1:1 rebooted", mark)
+    back = rig.until_well()
+    after = rig.fresh_status()
+    assert after["vehicle_reboots"] == before["vehicle_reboots"] + 1
+    assert rig.flags(mark) in ("", "stale_telemetry")
+    table(
+        "autopilot reboots: its clock begins anew",
+        f"STATUSTEXT, `vehicle_reboots`; flags: {rig.flags(mark) or 'none'}",
+        seconds(back),
+        "nothing",
+    )
+    assert back < 2.0
+
+
+def test_udp_peer_gone_and_back(rig: Rig, table: Row) -> None:
+    rig.until_well()
+    mark = rig.mark
+    last = rig.of("MAG_FIELD")[-1]["sequence"]
+    samples = rig.fresh_status()["samples"]
+    rig.autopilot.down()
+    rig.run(ABSENT_S + 0.7)
+    rig.autopilot.up()
+    back = rig.until_well()
+    rig.until_said("autopilot 1:1 found", mark)
+    first = next(message for message in rig.of("MAG_FIELD", mark) if message["sequence"] > last + 50)
+    after = rig.fresh_status()
+    lost = first["sequence"] - last - 1
+    assert after["samples"] - samples > lost  # the bridge went on measuring
+    assert after["samples_lost"] == rig.until_status(lambda _: True)["samples_lost"]
+    table(
+        "autopilot link down (UDP: the port closes), up again after 5.7 s",
+        'nothing can be heard; into the log, `stale_telemetry` after `max_age`, "autopilot 1:1 is silent" after 5 s',
+        seconds(back),
+        f"messages to the autopilot, seen by MAG_FIELD's `sequence` ({lost} here); the log has them all",
+    )
+    assert back < 1.5
+
+
+def test_sensor_back_under_another_name_and_powered_anew(rig: Rig, table: Row) -> None:
+    rig.until_well()
+    mark = rig.mark
+    rig.fluxgate.unplug()
+    rig.until_status(lambda status: status["sensor_state"] == LOST)
+    rig.fluxgate.plug("ttyUSB1", powered_anew=True)
+    rig.normal = 32  # offset_suspect: until it is calibrated again
+    back = rig.until_well()
+    rig.until_said("offset suspect", mark)
+    sigma = rig.of("MAG_FIELD")[-1]["total_field_sigma"]
+    assert sigma > 20
+    table(
+        "sensor unplugged, back under another name, powered on anew",
+        f"as above; then `offset_suspect` with sigma {sigma:.0f} nT (`turn_on_sigma`) until the next start: its offset may have settled elsewhere",
+        seconds(back),
+        "the readings meanwhile; how many, the sensor no longer knows: its numbers began anew",
+    )
+    assert back < 2.0
+
+
+def test_all_of_it_again_from_the_log(rig: Rig) -> None:
+    """The replay publishes the same bytes, and what the autopilot heard stands among them, in order."""
+    assert rig.stop() == 0
+    recorded, published = rig.replay()
+    assert recorded.damages == 0
+    assert published == recorded.published
+    at = 0
+    for _, message in rig.heard:
+        at = published.find(message.frame, at)
+        assert at >= 0, message.fields
+        at += len(message.frame)

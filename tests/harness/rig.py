@@ -1,0 +1,445 @@
+"""A bridge on the bench: the real ``magbridge run`` in a process of its own, between a fluxgate and an autopilot.
+
+The fluxgate speaks into a pty, the autopilot on a UDP or TCP socket. Both are played by whoever calls
+:meth:`Rig.until`: nothing happens in the background, so a test says in plain order what goes wrong when.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import pty
+import socket
+import subprocess
+import sys
+import termios
+import time
+import tty
+from array import array
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from magbridge.calibration.file import save
+from magbridge.calibration.model import Boresight, Calibration, Noise, Parameter, Reference, Sensor
+from magbridge.calibration.terms import Polynomial
+from magbridge.config import load
+from magbridge.mavlink import Codec, Message, Signing
+from magbridge.records import Quality, Reading
+from sitl.fluxgate import open_encoder
+from sitl.own_log import Recorded
+from sitl.stage import Stage
+
+SENSOR_HZ, TELEMETRY_HZ, BEAT_HZ = 50, 20, 2
+TRUTH = (20_000.0, 1_000.0, 40_000.0)
+"""nT, what the fluxgate stands in."""
+TURN = 0.002
+"""s between two looks at everything."""
+
+CONFIG = """\
+[sensor]
+driver = "digitizer"
+port = "{port}"
+timeout = 0.5
+[sensor.options]
+sensitivity = 5e-5
+reference_voltage = 5.0
+[link]
+url = "{url}"
+{signing}
+[telemetry.battpos]
+message = "NAMED_VALUE_FLOAT"
+match = {{name = "battpos"}}
+field = "value"
+unit = "in"
+max_age = 0.5
+[calibration]
+file = "cal.json"
+[publish]
+MAG_FIELD = 0
+MAG_RAW = 10
+HIGHRES_IMU = 10
+NAMED_VALUE_FLOAT = 10
+MAG_STATUS = 10
+HEARTBEAT = 5
+[log]
+directory = "logs"
+"""
+
+
+class Heard(NamedTuple):
+    """A message of the bridge, and when it came (s, monotonic)."""
+
+    when: float
+    message: Message
+
+
+class Fluxgate:
+    """A digitizer on a pty, found under a name that can change as those of USB adapters do."""
+
+    def __init__(self, folder: Path, options: dict[str, object]) -> None:
+        self.folder = folder
+        self.encoder = open_encoder("digitizer", options)
+        self.speaks = True
+        self._master = self._slave = -1
+        self._name = folder
+        self._on = time.monotonic()
+        self._sent = 0
+
+    def plug(self, name: str = "ttyUSB0", *, powered_anew: bool = False) -> None:
+        """Plug it in."""
+        self._master, self._slave = pty.openpty()
+        tty.setraw(self._slave)
+        os.set_blocking(self._master, False)
+        self._name = self.folder / name
+        self._name.symlink_to(os.ttyname(self._slave))
+        if powered_anew:
+            self.encoder.power_on()
+            self._on, self._sent = time.monotonic(), 0
+
+    def unplug(self, *, after: int = 0) -> None:
+        """Pull it out, `after` so many bytes of a frame."""
+        self.write(self._frame()[:after])
+        deadline = time.monotonic() + 5.0
+        time.sleep(
+            0.05 if after else 0.0
+        )  # a pty hands on in its own time, and FIONREAD does not see what it holds
+        while after and array("i", fcntl.ioctl(self._slave, termios.FIONREAD, bytes(4)))[0]:
+            assert time.monotonic() < deadline, "nobody reads the line"
+            time.sleep(TURN)
+        self._name.unlink()
+        os.close(self._slave)
+        os.close(self._master)
+        self._master = -1
+
+    def write(self, data: bytes) -> None:
+        """Put bytes on the line; nobody may be there to read them."""
+        if self._master >= 0:
+            with suppress(BlockingIOError):
+                os.write(self._master, data)
+
+    def turn(self) -> None:
+        """Send the readings that are due; they are taken whether anybody listens or not."""
+        due = int((time.monotonic() - self._on) * SENSOR_HZ)
+        while self._sent < due:
+            frame = self._frame()
+            if self.speaks:
+                self.write(frame)
+
+    def _frame(self) -> bytes:
+        self._sent += 1
+        reading = Reading(TRUTH, device_time=self._sent / SENSOR_HZ, temperature=4.0, supply=3.7)
+        return self.encoder.encode(reading)
+
+
+class Autopilot:
+    """System 1, component 1, at the far end of the link."""
+
+    def __init__(self, url: str, codec: Codec) -> None:
+        self.codec = codec
+        self.tells = True
+        """Whether it sends telemetry."""
+        self.retell: Callable[[bytes], list[bytes]] = lambda frame: [frame]
+        """What the link makes of a telemetry frame."""
+        self.bytes_heard = 0
+        self._kind, _, address = url.partition(":")
+        self.address = ("127.0.0.1", int(address.rpartition(":")[2]))
+        self._ear = Codec(0, 0)
+        self._booted = self._beat = self._told = time.monotonic()
+        self._boot_ms = 5000
+        self._listener: socket.socket | None = None
+        self._line: socket.socket | None = None
+        self._peer: tuple[str, int] | None = None
+
+    def up(self) -> None:
+        """Open its end of the link."""
+        if self._kind == "tcp":
+            self._listener = socket.create_server(self.address)
+            self._listener.setblocking(False)
+            return
+        self._line = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._line.setblocking(False)
+        self._line.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
+        if self._kind == "udpout":
+            self._line.bind(self.address)
+        else:
+            self._peer = self.address
+
+    def down(self) -> None:
+        """Close its end of the link."""
+        for one in (self._line, self._listener):
+            if one is not None:
+                one.close()
+        self._line = self._listener = None
+
+    def reboot(self) -> None:
+        """Begin its clock anew."""
+        self._booted, self._boot_ms = time.monotonic(), 0
+
+    @property
+    def boot_us(self) -> int:
+        """Its own clock."""
+        return self._boot_ms * 1000 + int((time.monotonic() - self._booted) * 1e6)
+
+    def send(self, data: bytes) -> None:
+        """Put bytes on the link."""
+        if self._line is None:
+            return
+        with suppress(BlockingIOError, ConnectionRefusedError, BrokenPipeError, ConnectionResetError):
+            if self._kind == "tcp":
+                self._line.sendall(data)
+            elif self._peer is not None:
+                self._line.sendto(data, self._peer)
+
+    def pack(self, name: str, /, **fields: object) -> bytes:
+        """Return a frame, signed as of now where it signs."""
+        self.codec.now_us = time.time_ns() // 1000
+        return self.codec.pack(name, **fields)
+
+    def say(self, name: str, /, **fields: object) -> None:
+        """Send a message."""
+        self.send(self.pack(name, **fields))
+
+    def telemetry(self, value: float = 0.5, *, behind_us: int = 0) -> bytes:
+        """Return a frame of telemetry."""
+        return self.pack(
+            "NAMED_VALUE_FLOAT", time_boot_ms=(self.boot_us - behind_us) // 1000, value=value, name="battpos"
+        )
+
+    def turn(self) -> Iterator[Message]:
+        """Say what is due; yield what has come."""
+        now = time.monotonic()
+        if self._listener is not None and self._line is None:
+            with suppress(BlockingIOError):
+                self._line = self._listener.accept()[0]
+                self._line.setblocking(False)
+        if now >= self._beat:
+            self._beat = now + 1 / BEAT_HZ
+            self.say("HEARTBEAT", type=12, autopilot=3, system_status=4, mavlink_version=3)
+        if self.tells and now >= self._told:
+            self._told = now + 1 / TELEMETRY_HZ
+            for frame in self.retell(self.telemetry()):
+                self.send(frame)
+        for message in self._hear():
+            if message.known and message.name == "TIMESYNC" and message["tc1"] == 0:
+                self.say("TIMESYNC", tc1=self.boot_us * 1000, ts1=message["ts1"])
+            yield message
+
+    def _hear(self) -> Iterator[Message]:
+        while self._line is not None:
+            try:
+                data, peer = self._line.recvfrom(65536)
+            except BlockingIOError:
+                return
+            except OSError:
+                data = b""
+            if not data:
+                if self._kind == "tcp":
+                    self._line.close()
+                    self._line = None
+                return
+            self._peer = peer or self._peer
+            self.bytes_heard += len(data)
+            yield from self._ear.parse(data)
+
+
+class Rig:
+    """A bridge, its sensor and its autopilot.
+
+    Parameters
+    ----------
+    folder : Path
+        Empty; holds the configuration, the log and the sensor's device.
+    link : str
+        ``udpout``, ``udpin`` or ``tcp``.
+    key : bytes or None
+        The signing key.
+    stepped : bool
+        The bridge sees a clock that :meth:`step` sets.
+    more : str
+        Further lines of the configuration.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        link: str = "udpout",
+        *,
+        key: bytes | None = None,
+        stepped: bool = False,
+        more: str = "",
+    ) -> None:
+        self.folder, self.normal = folder, 0
+        self.heard: list[Heard] = []
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            probe.bind(("127.0.0.1", 0))
+            self.url = f"{link}:127.0.0.1:{probe.getsockname()[1]}"
+        (folder / "dev").mkdir()
+        self.config = folder / "bridge.toml"
+        self.config.write_text(self.settings(self.url, key is not None) + more)
+        save(calibration(), folder / "cal.json")
+        if key is not None:
+            (folder / "key.bin").write_bytes(key)
+        self.offset = folder / "offset"
+        self.offset.write_text("0")
+        clock = [sys.executable, str(Path(__file__).with_name("stepped.py")), str(self.offset)]
+        self._launch = clock if stepped else [str(Path(sys.executable).with_name("magbridge"))]
+        options = load(self.config).sensor.options
+        self.fluxgate = Fluxgate(folder / "dev", options)
+        self.autopilot = Autopilot(self.url, Codec(1, 1, Signing(key) if key else None))
+        self.process: subprocess.Popen[bytes] | None = None
+
+    def settings(self, url: str, signs: bool = False) -> str:
+        """Return a configuration."""
+        signing = 'signing_key = "key.bin"' if signs else ""
+        return CONFIG.format(port=self.folder / "dev" / "ttyUSB*", url=url, signing=signing)
+
+    def start(self) -> float:
+        """Plug everything in and start the bridge; return the s until all is well."""
+        if not list(self.fluxgate.folder.iterdir()):
+            self.fluxgate.plug()
+        self.autopilot.up()
+        return self.again()
+
+    def again(self) -> float:
+        """Start the bridge; return the s until all is well."""
+        begun, self.process = time.monotonic(), self.spawn(self.config)
+        self.until_well()
+        return time.monotonic() - begun
+
+    def spawn(self, config: Path) -> subprocess.Popen[bytes]:
+        """Start a bridge."""
+        return subprocess.Popen([*self._launch, "run", "--config", str(config)])
+
+    def stop(self) -> int:
+        """End the bridge as a user would; return its exit code."""
+        assert self.process is not None
+        self.process.terminate()
+        return self.process.wait(10)
+
+    def close(self) -> None:
+        """End everything, in whatever state it is."""
+        if self.process is not None and self.process.poll() is None:
+            self.process.kill()
+            self.process.wait()
+        self.autopilot.down()
+
+    def step(self, seconds: float) -> None:
+        """Set the clock that the bridge sees."""
+        beside = self.offset.with_suffix(".new")
+        beside.write_text(str(int(self.offset.read_text()) + round(seconds * 1e6)))
+        beside.replace(self.offset)
+
+    @property
+    def mark(self) -> int:
+        """Here, in the stream of what is heard."""
+        return len(self.heard)
+
+    def until(self, condition: Callable[[], object], timeout: float = 15.0) -> float:
+        """Play sensor and autopilot until `condition` holds; return the s that it took."""
+        begun = time.monotonic()
+        while not condition():
+            if time.monotonic() > begun + timeout:
+                told = "; ".join(self.said())[-1500:]
+                raise AssertionError(f"not within {timeout} s; said: {told}; {self.status}")
+            self.fluxgate.turn()
+            now = time.monotonic()
+            self.heard += [Heard(now, message) for message in self.autopilot.turn()]
+            time.sleep(TURN)
+        return time.monotonic() - begun
+
+    def run(self, seconds: float) -> None:
+        """Let time pass."""
+        end = time.monotonic() + seconds
+        self.until(lambda: time.monotonic() >= end, seconds + 5)
+
+    def until_well(self) -> float:
+        """Wait for a run of good samples, a sensor and an autopilot; return the s to the first of them."""
+        begun, mark = time.monotonic(), self.mark
+
+        def well() -> bool:
+            flags = [message["flags"] for message in self.of("MAG_FIELD", mark)]
+            state = self.of("MAG_STATUS", mark)
+            return (
+                len(flags) > 5
+                and set(flags[-5:]) <= {self.normal}
+                and bool(state)
+                and state[-1]["sensor_state"] == state[-1]["autopilot_state"] == 1
+            )
+
+        self.until(well)
+        fields = [one for one in self.heard[mark:] if one.message.name == "MAG_FIELD"]
+        good = len(fields)
+        while good and fields[good - 1].message["flags"] == self.normal:
+            good -= 1
+        return fields[good].when - begun
+
+    def until_status(self, condition: Callable[[Message], object], timeout: float = 15.0) -> Message:
+        """Wait for a MAG_STATUS from now on for which `condition` holds; return it."""
+        mark = self.mark
+        self.until(lambda: any(map(condition, self.of("MAG_STATUS", mark))), timeout)
+        return next(status for status in self.of("MAG_STATUS", mark) if condition(status))
+
+    def until_said(self, text: str, mark: int, timeout: float = 15.0) -> float:
+        """Wait until a STATUSTEXT since `mark` contains `text`; return the s that it took."""
+        return self.until(lambda: any(text in line for line in self.said(mark)), timeout)
+
+    def of(self, name: str, mark: int = 0) -> list[Message]:
+        """Return the messages of one kind heard since `mark`."""
+        return [message for _, message in self.heard[mark:] if message.name == name]
+
+    def said(self, mark: int = 0) -> list[str]:
+        """Return the STATUSTEXTs since `mark`, put together again."""
+        lines: list[str] = []
+        for message in self.of("STATUSTEXT", mark):
+            if message["chunk_seq"] and lines:
+                lines[-1] += message["text"]
+            else:
+                lines.append(message["text"])
+        return lines
+
+    def flags(self, mark: int) -> str:
+        """Return the names of all flags published since `mark`."""
+        seen = 0
+        for message in self.of("MAG_FIELD", mark):
+            seen |= message["flags"]
+        return Quality(seen & ~self.normal).names()
+
+    @property
+    def status(self) -> dict[str, object]:
+        """The latest MAG_STATUS, fresh."""
+        found = self.of("MAG_STATUS")
+        return found[-1].fields if found else {}
+
+    def fresh_status(self) -> dict[str, object]:
+        """Wait for the next MAG_STATUS."""
+        return self.until_status(lambda _: True).fields
+
+    @property
+    def logs(self) -> list[Path]:
+        """The log's files, in order."""
+        return sorted((self.folder / "logs").glob("*.tlog"))
+
+    def replay(self, files: list[Path] | None = None) -> tuple[Recorded, bytes]:
+        """Replay the log through another bridge: what was recorded, and what is published now."""
+        recorded, published = Recorded(files or self.logs), bytearray()
+        Stage(self.config, published.extend).play(recorded.start, recorded.events())
+        return recorded, bytes(published)
+
+
+def calibration() -> Calibration:
+    """A calibration with one moving mass, which changes nothing at its centre."""
+    return Calibration(
+        parameters=(Parameter("battpos", "in", -1.0, 2.0, 0.5, 1.5),),
+        terms=(Polynomial(exponents=((0,), (1,))),),
+        coefficients=np.array([0.0] * 15 + [30.0, -20.0, 10.0]),
+        covariance=np.eye(18),
+        noise=Noise(1.0),
+        reference=Reference(float(np.linalg.norm(TRUTH))),
+        sensor=Sensor("digitizer"),
+        boresight=Boresight((0.0, 0.0, 0.0), ((1e-6, 0.0, 0.0), (0.0, 1e-6, 0.0), (0.0, 0.0, 1e-6))),
+        method="made for a test",
+    )
