@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,7 +54,9 @@ class _Answer:
     score: float
 
 
-def fit_auto(data: Observations, order: int = 3, *, vehicle: Mapping[str, Mounting] | None = None) -> Fit:
+def fit_auto(
+    data: Observations, order: int = 3, *, vehicle: Mapping[str, Mounting | Mapping[str, Any]] | None = None
+) -> Fit:
     """Fit polynomials of all orders up to `order` with physical priors; see the module's notes.
 
     Parameters
@@ -61,7 +64,7 @@ def fit_auto(data: Observations, order: int = 3, *, vehicle: Mapping[str, Mounti
     data : Observations
     order : int
         Highest total degree.
-    vehicle : mapping of Mounting, optional
+    vehicle : mapping of Mounting (or of its fields), optional
         Where masses sit, by parameter: the prior of their coefficients is then that of dipoles there.
 
     Raises

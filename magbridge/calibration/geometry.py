@@ -15,7 +15,7 @@ import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
@@ -108,7 +108,7 @@ def mounted_structure(
     free: Structure,
     exponents: tuple[Exponents, ...],
     parameters: tuple[Parameter, ...],
-    vehicle: Mapping[str, Mounting],
+    vehicle: Mapping[str, Mounting | Mapping[str, Any]],
 ) -> Structure:
     """Add dipoles where `vehicle` has masses to the free polynomials.
 
@@ -119,7 +119,8 @@ def mounted_structure(
     """
     names = [parameter.name for parameter in parameters]
     masses = []
-    for name, mounting in vehicle.items():
+    for name, found in vehicle.items():
+        mounting = found if isinstance(found, Mounting) else msgspec.convert(found, Mounting)
         if name not in names:
             raise CalibrationError(f"vehicle: mass {name!r}: the fit's parameters are {', '.join(names)}")
         k = names.index(name)
