@@ -64,13 +64,15 @@ class Autopilot:
         latitude, longitude = row.get("latitude", nan), row.get("longitude", nan)
         if isfinite(latitude) and isfinite(longitude):
             depth = row.get("depth", nan)
+            altitude = round(-1e3 * depth) if isfinite(depth) else 0
             frames.append(
                 self._codec.pack(
                     "GLOBAL_POSITION_INT",
                     time_boot_ms=boot_ms,
                     lat=round(latitude * 1e7),
                     lon=round(longitude * 1e7),
-                    alt=round(-1e3 * depth) if isfinite(depth) else 0,
+                    alt=altitude,
+                    relative_alt=altitude,
                 )
             )
         return frames
