@@ -6,11 +6,13 @@ Exit codes: 0 done, 1 the data do not allow it, 2 wrong use. What is wrong goes 
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
+from hashlib import sha256
 from math import inf, nan
 from pathlib import Path
 from typing import Annotated, Any
 
-from cyclopts import App, CycloptsError, Parameter
+from cyclopts import App, CycloptsError, Parameter, validators
 
 from magbridge import __version__
 from magbridge.errors import DataError, MagbridgeError, MissingExtra, WrongUse
@@ -153,6 +155,119 @@ def simulate(
     write(deployment, output)
     rows = deployment.sizes["time"]
     _tell({"file": str(output), "rows": rows, "seed": seed}, f"{output}: {rows} rows", json)
+
+
+@app.command
+def calibrate(
+    *files: Path,
+    output: Output,
+    parameter: tuple[str, ...] = (),
+    order: Annotated[int, Parameter(validator=validators.Number(gte=1, lte=6))] = 3,
+    method: str = "auto",
+    vehicle: Path | None = None,
+    grid: Path | None = None,
+    strict: bool = False,
+    json: Json = False,
+) -> None:
+    """Fit a calibration to logs of calibration runs.
+
+    Parameters
+    ----------
+    files
+        Logs.
+    output
+        The cal.json to write.
+    parameter
+        A column that moves a mass; once for each.
+    order
+        Highest total degree of the polynomials in the parameters.
+    method
+        auto, or what it is compared with: nominal, cubic, runs, horizontal.
+    vehicle
+        A vehicle.toml that says where the moving masses sit, seen from the sensor.
+    grid
+        An anomaly grid, added to the IGRF.
+    strict
+        Exit with 1 when the data leave something untold.
+    json
+        Print the result for machines.
+    """
+    from magbridge.calibration.data import observations
+    from magbridge.calibration.file import save
+    from magbridge.calibration.fit import fit
+    from magbridge.calibration.geometry import read_vehicle
+    from magbridge.columns import CHANNELS
+    from magbridge.field.declination import with_true_heading
+    from magbridge.field.read import read_grid
+    from magbridge.field.reference import earth_field
+    from magbridge.logs import read
+
+    anomalies = read_grid(grid) if grid else None
+    deployment = with_true_heading(read(_some(files), required=(*CHANNELS, *parameter)))
+    data = observations(deployment, parameter, reference=lambda ds: earth_field(ds, anomalies))
+    data = replace(data, inputs={file.name: sha256(file.read_bytes()).hexdigest() for file in files})
+    options = {"vehicle": read_vehicle(vehicle)} if vehicle else {}
+    found = fit(data, method, order, **options)
+    save(found.calibration, output)
+    for warning in found.warnings:
+        _complain(warning, 0)
+    result = {
+        "file": str(output),
+        "method": method,
+        "samples": len(data),
+        "rms_nT": found.rms,
+        "noise_nT": found.calibration.noise.sensor,
+        "warnings": found.warnings,
+    }
+    summary = f"{output}: {method}, {len(data)} samples, {found.rms:.2f} nT RMS in the sensor's own units"
+    _tell(result, summary, json)
+    if strict and found.warnings:
+        raise DataError(f"{len(found.warnings)} things that the data cannot tell, and --strict")
+
+
+@app.command
+def map(  # noqa: A001 - the command's name
+    *grids: Path,
+    output: Output,
+    altitude: float | None = None,
+    passes: Annotated[int, Parameter(validator=validators.Number(gte=0))] = 20,
+    mask: Path | None = None,
+    spacing: float | None = None,
+    picture: Path | None = None,
+    json: Json = False,
+) -> None:
+    """Make one anomaly map from the grids of several surveys: continue upward, merge, mask, smooth.
+
+    Parameters
+    ----------
+    grids
+        Grids: netCDF, Surfer, ESRI ASCII, GeoTIFF, XYZ.
+    output
+        The map to write, netCDF.
+    altitude
+        m to which every grid is continued upward; the highest of theirs if not given.
+    passes
+        How often the 3x3 Hanning kernel is applied.
+    mask
+        A CSV of longitude,latitude (deg): the polygon at which the map ends.
+    spacing
+        deg; the finest of the grids' if not given.
+    picture
+        A PNG with every step.
+    json
+        Print the result for machines.
+    """
+    from magbridge.field.prepare import draw_steps, prepare
+    from magbridge.field.read import read_grid, read_polygon
+
+    polygon = read_polygon(mask) if mask else None
+    result, steps = prepare([read_grid(path) for path in _some(grids)], altitude, passes, polygon, spacing)
+    result.save(output)
+    if picture:
+        draw_steps(steps, picture)
+    titles = [step.title for step in steps]
+    facts = {"file": str(output), "steps": titles, "rms_nT": result.rms}
+    _tell(facts, f"{output}: {', '.join(titles)}", json)
 
 
 @app.command

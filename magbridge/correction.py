@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from magbridge.align import Aligner, Input, Sample
 from magbridge.calibration.correct import Corrector
 from magbridge.calibration.model import Calibration, identity
+from magbridge.columns import COLUMNS
 from magbridge.config import Align
 from magbridge.field.igrf import total_field
 from magbridge.field.reference import positions
@@ -119,6 +120,8 @@ def correct_rows(correction: Correction, deployment: xr.Dataset) -> xr.Dataset:
         ``total_field total_field_sigma field_x field_y field_z quality anomaly``; ``time`` as in the input.
         The anomaly is the total field minus the IGRF, NaN where there is no position.
     """
+    import xarray as xr  # noqa: PLC0415 - the live path runs without it
+
     rows = [correction.reading(*row)[1] for row in _readings(correction, deployment)]
     results = np.array(
         [(row.total_field, row.total_field_sigma, *row.field, row.quality) for row in rows], dtype=float
@@ -126,7 +129,14 @@ def correct_rows(correction: Correction, deployment: xr.Dataset) -> xr.Dataset:
     names = ("total_field", "total_field_sigma", "field_x", "field_y", "field_z", "quality")
     columns = dict(zip(names, results.T, strict=True))
     columns["anomaly"] = columns["total_field"] - _main_field(deployment)
-    return deployment[[]].assign({name: ("time", column) for name, column in columns.items()})
+    return xr.Dataset(
+        {
+            name: ("time", column, {"units": COLUMNS[name].unit, "long_name": COLUMNS[name].long_name})
+            for name, column in columns.items()
+        },
+        coords={"time": deployment["time"]},
+        attrs={"source": deployment.attrs.get("source", "")},
+    )
 
 
 def _main_field(deployment: xr.Dataset) -> NDArray[np.float64]:

@@ -100,7 +100,7 @@ def _errors(axes: Axes, hours: Floats, nominal: Floats, received: Floats, heard:
     axes.plot(received[flagged], error[flagged], ".", color=FLAGGED, ms=4, label="flagged: a mass in motion")
     axes.axhline(0.0, color=TRUE, lw=0.6)
     axes.set_yscale("symlog", linthresh=10.0)
-    axes.set_ylim(-3e3, 3e3)
+    axes.set_ylim(-3e3, 1.5e4)
     axes.set_ylabel("nT (linear within ±10)")
     axes.legend(loc="upper right", frameon=False, ncols=3)
 

@@ -67,6 +67,25 @@ def read_grid(path: str | Path, *, variable: str | None = None, unit: str | None
     return AnomalyGrid(longitude, latitude, values * scale, name=str(path), **options)
 
 
+def read_polygon(path: str | Path) -> Array:
+    """Read a polygon: a text file with longitude and latitude (deg) in each row, (k, 2), k at least 3.
+
+    Raises
+    ------
+    FormatError
+        It cannot be read, or says something else.
+    """
+    try:
+        polygon = np.loadtxt(path, delimiter=",", ndmin=2)
+    except OSError as error:
+        raise FormatError(path, f"cannot be read: {error.strerror or error}") from error
+    except ValueError as error:
+        raise FormatError(path, f"expected longitude,latitude in every row: {error}") from error
+    if polygon.shape[1:] != (2,) or len(polygon) < 3 or not np.isfinite(polygon).all():
+        raise FormatError(path, "expected longitude,latitude (deg) in at least three rows")
+    return polygon
+
+
 def _scale(path: Path, unit: str | None) -> float:
     if unit is None or not unit.strip():
         return 1.0

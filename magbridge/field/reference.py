@@ -9,12 +9,12 @@ from numpy.typing import NDArray
 
 from magbridge.errors import FormatError
 from magbridge.field.grid import AnomalyGrid
-from magbridge.field.igrf import total_field
+from magbridge.field.igrf import igrf, total_field
 
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["positions", "reference_field"]
+__all__ = ["earth_field", "positions", "reference_field"]
 
 Array = NDArray[np.float64]
 
@@ -73,6 +73,31 @@ def reference_field(deployment: xr.Dataset, grid: AnomalyGrid | None = None, sit
     if grid is not None:
         reference[unknown] += grid.at(longitude[unknown], latitude[unknown])
     return reference
+
+
+def earth_field(deployment: xr.Dataset, grid: AnomalyGrid | None = None) -> tuple[Array, Array | None, str]:
+    """Return what a calibration is fitted against: total field, vector, and what they are.
+
+    Returns
+    -------
+    total : (n,) array
+        nT, :func:`reference_field`.
+    vector : (n, 3) array or None
+        nT, north-east-down: the IGRF's direction with the length of `total`; None without positions.
+    name : str
+    """
+    total = reference_field(deployment, grid)
+    if not {"latitude", "longitude"} <= set(deployment.variables):
+        return total, None, "reference_field"
+    longitude, latitude, depth = positions(deployment)
+    known = np.isfinite(longitude) & np.isfinite(latitude)
+    vector = np.full((total.size, 3), np.nan)
+    if known.any():
+        field = igrf(longitude[known], latitude[known], depth[known], deployment["time"].to_numpy()[known])
+        vector[known] = field * (total[known] / np.linalg.norm(field, axis=1))[:, None]
+    given = "reference_field" in deployment
+    name = " + ".join(["reference_field" if given else "IGRF", *([grid.name] if grid is not None else [])])
+    return total, vector, name
 
 
 def positions(deployment: xr.Dataset) -> tuple[Array, Array, Array]:

@@ -1,0 +1,40 @@
+"""Magnetic headings made true."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from magbridge.field.igrf import igrf
+from magbridge.field.reference import positions
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+__all__ = ["with_true_heading"]
+
+
+def with_true_heading(deployment: xr.Dataset) -> xr.Dataset:
+    """Return the deployment with ``heading`` counted from true north.
+
+    Notes
+    -----
+    A deployment whose attribute ``heading_reference`` is ``"magnetic"`` gets the IGRF's declination at its
+    position added, ``D = atan2(B_east, B_north)``; any other comes back as it is. Without a position a magnetic
+    heading becomes NaN: it is not known against true north.
+    """
+    if deployment.attrs.get("heading_reference") != "magnetic" or "heading" not in deployment:
+        return deployment
+    declination = np.full(deployment.sizes["time"], np.nan)
+    if {"latitude", "longitude"} <= set(deployment.variables):
+        longitude, latitude, depth = positions(deployment)
+        known = np.isfinite(longitude) & np.isfinite(latitude)
+        if known.any():
+            time = deployment["time"].to_numpy()
+            field = igrf(longitude[known], latitude[known], depth[known], time[known])
+            declination[known] = np.degrees(np.arctan2(field[:, 1], field[:, 0]))
+    heading = (deployment["heading"].to_numpy() + declination) % 360.0
+    out = deployment.assign(heading=("time", heading, deployment["heading"].attrs))
+    out.attrs["heading_reference"] = "true"
+    return out
