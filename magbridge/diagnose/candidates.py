@@ -29,7 +29,7 @@ class Candidate:
     channel : str or None
         Telemetry that it follows.
     columns : Columns
-        Derivatives of the residual by its coefficients, each in units of its width.
+        What its coefficients leave in the residual, each in units of its width.
     width : (k,) array
         Plausible size (1-sigma) of each coefficient, in its unit.
     names, units : tuple of str
@@ -94,11 +94,11 @@ def of_reference(
     names: tuple[str, ...],
     **more: Any,
 ) -> Candidate:
-    """Make a candidate of an error in the reference: ``H_e + sum_k b_k basis_k(t)``, nT."""
+    """Make a candidate of an error in the reference: the field is ``H_e + sum_k b_k basis_k(t)``, nT."""
     return Candidate(
         cause,
         None,
-        lambda rows: -problem.gain[rows, None] * basis(rows) * width,
+        lambda rows: problem.gain[rows, None] * basis(rows) * width,
         width,
         names,
         ("nT",) * len(width),

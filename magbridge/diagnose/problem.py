@@ -1,4 +1,4 @@
-r"""The comparison as a linear problem: residuals of a calibration, and how every coefficient moves them.
+r"""The comparison as a linear problem: residuals of a calibration, and what every coefficient would have left in them.
 
 Notes
 -----
@@ -7,7 +7,8 @@ coefficients at every sample, a term or an effect that adds ``sum_rs phi_r C_krs
 
 .. math:: \partial e_t / \partial c_k = \sum_{rs} \phi_r(t)\, C_{krs}\, g_s(t)
 
-so every cause passes through the forward model by the one rule. The calibration stays free, with its posterior
+and a coefficient that is really there, but not in the calibration, leaves minus that in the residual. So every cause
+passes through the forward model by the one rule. The calibration stays free, with its posterior
 as prior: ``c = c_0 + L z``, ``z ~ N(m, 1)``, where L holds only the directions that these data can see.
 """
 
@@ -25,11 +26,11 @@ from magbridge.calibration.residual import Samples, residuals, whiten
 from magbridge.calibration.terms import Effect
 from magbridge.diagnose.survey import Survey
 
-__all__ = ["Columns", "Problem", "add_effects", "effect_columns", "history", "pose"]
+__all__ = ["Columns", "Problem", "add_effects", "derivatives", "effect_columns", "history", "pose", "samples_of"]
 
 FloatArray = NDArray[np.float64]
 Columns = Callable[[slice], FloatArray]
-"""Rows -> (m, k) derivatives of the residual by k coefficients."""
+"""Rows -> (m, k): what one unit of each of k coefficients leaves in the residual."""
 
 CHUNK = 8192
 SEEN = 0.01
@@ -53,11 +54,13 @@ class Problem:
     gain : (n,) array
         1/s: what one nT of error in the reference does to e.
     free : (n, q) array
-        ``de/dz``.
+        ``-de/dz``.
     directions : (K, q) array
         L.
     centre : (q,) array
         m, prior mean of z.
+    unseen : (K, K) array
+        nT², covariance in the directions that these data cannot see.
     """
 
     survey: Survey
@@ -68,6 +71,7 @@ class Problem:
     free: FloatArray
     directions: FloatArray
     centre: FloatArray
+    unseen: FloatArray
 
     def __len__(self) -> int:
         return len(self.residual)
@@ -99,14 +103,14 @@ def history(survey: Survey, calibration: Calibration, effect: Effect) -> FloatAr
 
 
 def effect_columns(problem: Problem, effect: Effect, phi: FloatArray | Callable[[slice], FloatArray]) -> Columns:
-    """Return the derivative by an effect's coefficients, from its regressors (r, n) or a function of the rows."""
+    """Return what an effect's coefficients leave, from its regressors (r, n) or a function of the rows."""
     tensor = effect.columns(problem.calibration.reference.field)
     slots = np.flatnonzero(np.abs(tensor).sum(axis=(0, 1)))
     tensor = tensor[:, :, slots]
 
     def columns(rows: slice) -> FloatArray:
         part = phi(rows) if callable(phi) else phi[:, rows]
-        return np.asarray(np.einsum("rt,ts,krs->tk", part, problem.slopes[rows][:, slots], tensor, optimize=True))
+        return np.asarray(np.einsum("rt,ts,krs->tk", part, problem.slopes[rows][:, slots], -tensor, optimize=True))
 
     return columns
 
@@ -135,11 +139,11 @@ def pose(survey: Survey, calibration: Calibration) -> Problem:
         above, _ = residuals(replace(part, reference=part.reference + 1.0), coefficients)
         gain[rows] = e[rows] - above
     L, centre = _prior(survey, calibration, samples, e, g)
-    free = _free(calibration, samples, g, L)
+    free = -derivatives(calibration, samples, g, L)
     values, vectors = np.linalg.eigh(free.T @ free / _level(calibration, e) ** 2)
     keep = values > SEEN
-    V = vectors[:, keep]
-    return Problem(survey, calibration, e, g, gain, free @ V, L @ V, V.T @ centre)
+    V, rest = vectors[:, keep], L @ vectors[:, ~keep]
+    return Problem(survey, calibration, e, g, gain, free @ V, L @ V, V.T @ centre, rest @ rest.T)
 
 
 def _level(calibration: Calibration, e: FloatArray) -> float:
@@ -150,8 +154,8 @@ def _terms(calibration: Calibration) -> int:
     return sum(term.size for term in calibration.terms)
 
 
-def _free(calibration: Calibration, samples: Samples, g: FloatArray, L: FloatArray) -> FloatArray:
-    """(n, q): derivatives by the calibration's own coefficients, times L, in bounded memory."""
+def derivatives(calibration: Calibration, samples: Samples, g: FloatArray, L: FloatArray) -> FloatArray:
+    """(n, q): derivatives of the residual by all the calibration's coefficients, times L (K, q), in bounded memory."""
     tensor = _tensor(calibration)
     M = np.tensordot(L.T, tensor, 1).reshape(L.shape[1], -1).T
     out = np.empty((len(g), L.shape[1]))
@@ -199,7 +203,7 @@ def _prior(
     learned = np.flatnonzero(survey.learned)
     if not learned.size:
         return L, centre
-    J = _free(calibration, samples.part(learned), g[learned], L)
+    J = derivatives(calibration, samples.part(learned), g[learned], L)
     noise, follows = calibration.noise, survey.follows[learned]
     white = np.column_stack([J, e[learned]])
     white = whiten(white, follows, noise.memory) / _level(calibration, e)

@@ -28,7 +28,7 @@ from magbridge.diagnose.joint import Information, Joint, fit_joint, information
 from magbridge.diagnose.noise import memory_order
 from magbridge.diagnose.problem import Problem
 
-__all__ = ["Hypothesis", "Outcome", "score", "search"]
+__all__ = ["LEVEL", "ODDS", "Hypothesis", "Outcome", "score", "search", "slices", "trials"]
 
 FloatArray = NDArray[np.float64]
 
@@ -71,8 +71,11 @@ class Hypothesis:
 
     @property
     def signal_to_noise(self) -> float:
-        """Whitened norm of what is the effect's own: the ratio less what noise alone gives."""
-        return float(np.sqrt(max(self.ratio - self.candidate.size, 0.0)))
+        """Whitened norm of what is the effect's own under the noise that is left, less what noise alone gives."""
+        assert self.fit is not None
+        k = self.candidate.size
+        b, own = self.fit.coefficients[-k:], self.fit.covariance[-k:, -k:]
+        return float(np.sqrt(max(b @ np.linalg.solve(own, b) - k, 0.0)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,7 +130,8 @@ def score(info: Information, at: slice) -> Score:
     return Score(ratio, int(seen.sum()), 0.5 * float(b @ estimate) + occam, occam, estimate, root)
 
 
-def _slices(candidates: Sequence[Candidate]) -> list[slice]:
+def slices(candidates: Sequence[Candidate]) -> list[slice]:
+    """Where each candidate's columns stand."""
     ends = np.cumsum([candidate.size for candidate in candidates])
     return [slice(int(end) - candidate.size, int(end)) for end, candidate in zip(ends, candidates, strict=True)]
 
@@ -158,7 +162,7 @@ class _Search:
 
     def __init__(self, problem: Problem, candidates: Sequence[Candidate], order: int, causes: int) -> None:
         self.problem, self.candidates, self.order, self.causes = problem, list(candidates), order, causes
-        self.at = _slices(self.candidates)
+        self.at = slices(self.candidates)
         self.trials: dict[str, float] = {}
 
     def fit(self, model: Sequence[Candidate], start: FloatArray | None = None, rounds: int = 6) -> Joint:
@@ -329,7 +333,10 @@ def _remove(
         p_value = min(1.0, state.trials.get(own.cause, 1.0) * state.causes * float(chi2.sf(ratio, own.size)))
         if p_value < LEVEL:
             change = 0.5 * (ratio - chosen[k].ratio)
-            chosen[k] = replace(chosen[k], ratio=ratio, p_value=p_value, evidence=chosen[k].evidence + change)
+            evidence = chosen[k].evidence + change
+            chosen[k] = replace(
+                chosen[k], ratio=ratio, p_value=p_value, evidence=evidence, fit=state.fit([*others, own])
+            )
             k += 1
             continue
         chosen, model, base, k = chosen[:k] + chosen[k + 1 :], others, without, 0

@@ -1,0 +1,94 @@
+"""From a finding to a calibration: the found effects as terms, with the calibration's own numbers refitted."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+import magbridge
+from magbridge.calibration.instrument import RateEffect
+from magbridge.calibration.model import Calibration
+from magbridge.calibration.residual import residuals
+from magbridge.diagnose.candidates import Candidate
+from magbridge.diagnose.joint import Joint, fit_joint
+from magbridge.diagnose.problem import Columns, Problem, derivatives, samples_of
+
+__all__ = ["extend", "settle"]
+
+FloatArray = NDArray[np.float64]
+
+
+def extend(problem: Problem, model: Sequence[Candidate], fit: Joint) -> Calibration:
+    """Return the calibration with the effects of `model` as terms, at `fit`.
+
+    An error of the reference is no property of the vehicle: of those only a constant bias is kept, as the
+    reference's. All covariances are those of the joint posterior.
+    """
+    calibration, q = problem.calibration, len(problem.centre)
+    widths = np.concatenate([np.empty(0), *(candidate.width for candidate in model)])
+    kept = np.concatenate([np.empty(0, bool), *(np.full(c.size, c.effect is not None) for c in model)])
+    b = fit.coefficients * widths
+    K, k = calibration.coefficients.size, int(kept.sum())
+    M = np.zeros((K + k, q + len(b)))
+    M[:K, :q] = problem.directions
+    M[K:, q:] = np.diag(widths)[kept]
+    covariance = M @ fit.covariance @ M.T
+    covariance[:K, :K] += problem.unseen
+    reference, at = calibration.reference, 0
+    for candidate in model:
+        if candidate.cause == "reference_bias":
+            sigma = float(np.sqrt(fit.covariance[q + at, q + at]) * widths[at])
+            reference = msgspec.structs.replace(reference, bias=reference.bias + float(b[at]), bias_sigma=sigma)
+        at += candidate.size
+    noise = msgspec.structs.replace(calibration.noise, sensor=min(calibration.noise.sensor, level(fit)) or level(fit))
+    return replace(
+        calibration,
+        effects=(*calibration.effects, *(c.effect for c in model if c.effect is not None)),
+        coefficients=np.append(calibration.coefficients + problem.directions @ fit.z, b[kept]),
+        covariance=0.5 * (covariance + covariance.T),
+        reference=reference,
+        noise=noise,
+        software=f"magbridge {magbridge.__version__}",
+    )
+
+
+def level(fit: Joint) -> float:
+    """Return the 1-sigma of what is left, nT: that of the bulk, not of outliers."""
+    return 1.4826 * float(np.median(np.abs(fit.left - np.median(fit.left))))
+
+
+def settle(problem: Problem, model: Sequence[Candidate], fit: Joint, order: int) -> tuple[Problem, list[Columns], Joint]:
+    """Linearise anew about the extended calibration, where a large effect has bent the magnitude, and fit once more.
+
+    Rates of change keep the columns of the search: a live effect's backward differences hold the sample's own noise.
+    """
+    columns = [candidate.columns for candidate in model]
+    if not model or any(isinstance(c.effect, RateEffect) for c in model):
+        return problem, columns, fit
+    extended = extend(problem, model, fit)
+    samples, coefficients = samples_of(problem.survey, extended)
+    e, g = residuals(samples, coefficients)
+    K = problem.calibration.coefficients.size
+    selector = np.eye(extended.coefficients.size)
+    L = np.vstack([problem.directions, np.zeros((len(selector) - K, len(problem.centre)))])
+    own = -derivatives(extended, samples, g, np.hstack([L, selector[:, K:]]))
+    free, effects, at = own[:, : len(problem.centre)], own[:, len(problem.centre) :], 0
+    blocks = []
+    for candidate in model:
+        if candidate.effect is None:
+            blocks.append(candidate.columns(slice(0, len(problem))))
+        else:
+            blocks.append(effects[:, at : at + candidate.size] * candidate.width)
+            at += candidate.size
+    X = np.hstack([free, *blocks])
+    # what the residual would be at the first point, were it linear about this one; the reference was not mended in it
+    c = np.append(fit.z, fit.coefficients)
+    own_part = np.concatenate([np.ones(len(fit.z), bool), *(np.full(m.size, m.effect is not None) for m in model)])
+    again = replace(problem, residual=e + X[:, own_part] @ c[own_part], free=free, slopes=g)
+    columns = [lambda rows, block=block: block[rows] for block in blocks]
+    return again, columns, fit_joint(again, columns, order, c)
+

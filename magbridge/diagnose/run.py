@@ -1,0 +1,217 @@
+"""The whole of a diagnosis: compare, search, extend, measure the gain, write it down."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magbridge.calibration.file import save
+from magbridge.calibration.model import Calibration
+from magbridge.diagnose.candidates import Candidate
+from magbridge.diagnose.causes import CAUSES, Cause
+from magbridge.diagnose.extend import extend, settle
+from magbridge.diagnose.findings import findings_json
+from magbridge.diagnose.gain import Gain, held_out, paired
+from magbridge.diagnose.isolability import Isolability, isolability
+from magbridge.diagnose.joint import Joint, information
+from magbridge.diagnose.problem import Problem, pose
+from magbridge.diagnose.search import ODDS, Hypothesis, Outcome, search, slices, trials
+from magbridge.diagnose.survey import take
+from magbridge.diagnose.unexplained import Leftover, Outliers, leftover, outliers
+from magbridge.errors import DataError
+from magbridge.field.grid import AnomalyGrid
+from magbridge.files import atomic_path
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+__all__ = ["Diagnosis", "diagnose"]
+
+FloatArray = NDArray[np.float64]
+
+SHARE = 0.5
+"""Of a named cause's signal-to-noise: when more than this stays unexplained, the name does not fit."""
+REMAINDER = 0.25
+"""Less than this is what an idealised regressor leaves, and not worth a word."""
+
+
+@dataclass(frozen=True, eq=False)
+class Diagnosis:
+    """Everything that was found out.
+
+    Attributes
+    ----------
+    problem : Problem
+    outcome : Outcome
+    named : tuple of Hypothesis
+        The causes that stand; their rivals in `rivals`.
+    rivals : tuple of tuple of Hypothesis
+    wrong : Outliers or None
+        Isolated wrong samples.
+    unexplained : Leftover or None
+    calibration : Calibration
+        Extended.
+    fit : Joint
+        At the extended calibration.
+    before, after : (n,) array
+        nT, residuals with the calibration as it was, and extended, held out.
+    total : Gain
+    gains : tuple of Gain
+        Of each named cause beside the others.
+    isolability : Isolability
+    verdict : str
+    """
+
+    problem: Problem
+    outcome: Outcome
+    named: tuple[Hypothesis, ...]
+    rivals: tuple[tuple[Hypothesis, ...], ...]
+    wrong: Outliers | None
+    unexplained: Leftover | None
+    calibration: Calibration
+    fit: Joint
+    before: FloatArray
+    after: FloatArray
+    total: Gain
+    gains: tuple[Gain, ...]
+    isolability: Isolability
+    verdict: str
+
+
+def diagnose(
+    datasets: Sequence[xr.Dataset],
+    calibration: Calibration,
+    out_dir: str | os.PathLike[str] | None = None,
+    *,
+    learned_from: Sequence[xr.Dataset] = (),
+    grid: AnomalyGrid | None = None,
+    causes: Mapping[str, Cause] = CAUSES,
+    progress: Callable[[str], None] = lambda step: None,
+) -> Diagnosis:
+    """Find what the forward model gets wrong in these deployments.
+
+    Parameters
+    ----------
+    datasets : sequence of Dataset
+        Deployments that the calibration has not seen.
+    calibration : Calibration
+    out_dir : path, optional
+        Where ``findings.json``, ``calibration.json`` and ``report.html`` go; nothing is written if not given.
+    learned_from : sequence of Dataset, optional
+        The logs that the calibration was made from: what changed since then is seen against them.
+    grid : AnomalyGrid, optional
+        Added to the main field where a log has no ``reference_field``.
+    causes : mapping, optional
+        The table of causes.
+    progress : callable, optional
+        Told each step's name.
+
+    Raises
+    ------
+    DataError
+        The data do not allow it: one line that says which column is missing or too short.
+    """
+    progress("reading")
+    survey = take(datasets, calibration, learned_from, grid)
+    problem = pose(survey, calibration)
+    progress("preparing causes")
+    candidates = {name: cause.candidates(problem) for name, cause in causes.items()}
+    untestable = {name: causes[name].needs for name, made in candidates.items() if not made}
+    if len(untestable) == len(causes):
+        needs = "; ".join(sorted(set(untestable.values())))
+        raise DataError(f"{survey.source}: nothing can be tested here; it would take {needs}")
+    flat = [candidate for made in candidates.values() for candidate in made]
+    progress("searching")
+    outcome = search(problem, flat, len(causes))
+    progress("what is left")
+    wrong = outliers(outcome.fit, len(causes))
+    tones = None if "interference_tone" in causes else CAUSES["interference_tone"].candidates(problem)
+    named, rivals, fit, rest = _accept(problem, outcome, tones[0] if tones else None)
+    model = [h.candidate for h in named]
+    progress("extending the calibration")
+    settled, columns, fit = settle(problem, model, fit, outcome.order)
+    extended = extend(settled, model, fit) if model else calibration
+    progress("measuring the gain")
+    counts = ~survey.learned
+    if wrong is not None:
+        counts = counts.copy()
+        counts[wrong.rows] = False
+    before = problem.residual
+    after = held_out(settled, columns, fit) if model else before
+    gains = []
+    for k in range(len(model)):
+        others = [candidate.columns for i, candidate in enumerate(model) if i != k]
+        # the others, the calibration and the noise are fitted anew; only the cause is missing
+        without = held_out(problem, others, _without(fit, model, k))
+        gains.append(paired(without, after, survey.dive, counts))
+    diagnosis = Diagnosis(
+        problem=problem, outcome=outcome, named=named, rivals=rivals, wrong=wrong, unexplained=rest,
+        calibration=extended, fit=fit, before=before, after=after,
+        total=paired(before, after, survey.dive, counts if counts.any() else ~counts), gains=tuple(gains),
+        isolability=_isolability(problem, outcome, flat, causes, untestable),
+        verdict=_verdict(named, wrong, rest),
+    )  # fmt: skip
+    if out_dir is not None:
+        progress("writing the report")
+        write(diagnosis, out_dir, causes)
+    return diagnosis
+
+
+def write(diagnosis: Diagnosis, out_dir: str | os.PathLike[str], causes: Mapping[str, Cause] = CAUSES) -> None:
+    """Write ``findings.json``, ``calibration.json`` and ``report.html``, each whole or not at all."""
+    from magbridge.diagnose.report import report_html  # noqa: PLC0415  (matplotlib only where a report is wanted)
+
+    folder = Path(out_dir)
+    folder.mkdir(parents=True, exist_ok=True)
+    save(diagnosis.calibration, folder / "calibration.json")
+    with atomic_path(folder / "findings.json") as beside:
+        beside.write_bytes(findings_json(diagnosis, causes))
+    with atomic_path(folder / "report.html") as beside:
+        beside.write_text(report_html(diagnosis, causes), encoding="utf-8")
+
+
+def _accept(
+    problem: Problem, outcome: Outcome, tone: Candidate | None
+) -> tuple[tuple[Hypothesis, ...], tuple[tuple[Hypothesis, ...], ...], Joint, Leftover | None]:
+    """Keep the names that fit: not one beside which as much again stays unexplained, or that a free curve beats."""
+    model = [h.candidate for h in outcome.chosen]
+    rest = leftover(problem, model, outcome.fit, outcome.order, tone)
+    if not model:
+        return (), (), outcome.null, rest
+    loudest = max(h.signal_to_noise for h in outcome.chosen)
+    if rest is not None and rest.signal_to_noise < REMAINDER * loudest:
+        rest = None
+    free = leftover(problem, [], outcome.null, outcome.order, tone) if rest is not None or len(model) == 1 else None
+    beaten = free is not None and free.evidence > sum(h.evidence for h in outcome.chosen) + ODDS
+    if (rest is not None and rest.signal_to_noise > SHARE * loudest) or beaten:
+        return (), (), outcome.null, free or rest
+    return outcome.chosen, outcome.rivals, outcome.fit, rest
+
+
+def _without(fit: Joint, model: Sequence[Candidate], k: int) -> Joint:
+    """Return the fit with the k-th effect's coefficients taken out."""
+    start = sum(candidate.size for candidate in model[:k])
+    kept = np.delete(fit.coefficients, np.arange(start, start + model[k].size))
+    return Joint(fit.log_likelihood, fit.z, kept, fit.covariance, fit.noise, fit.left)
+
+
+def _isolability(
+    problem: Problem, outcome: Outcome, candidates: list[Candidate], causes: Mapping[str, Cause], untestable: dict[str, str]
+) -> Isolability:
+    """Of the search's own columns, under the noise that is left: what it could have seen."""
+    fit = outcome.fit
+    base = Joint(0.0, problem.centre, np.empty(0), np.empty((0, 0)), fit.noise, fit.left)
+    info = information(problem, fit.noise, base, [], [c.columns for c in candidates])
+    return isolability(candidates, info, trials(info, candidates, slices(candidates)), len(causes), untestable)
+
+
+def _verdict(named: Sequence[Hypothesis], wrong: Outliers | None, rest: Leftover | None) -> str:
+    if named or wrong:
+        return "partly_explained" if rest else "explained"
+    return "unexplained" if rest else "nothing_found"
