@@ -8,7 +8,6 @@ evaluated at both ends of what the parameter may have been.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
 from math import hypot, isfinite, nan
 from typing import TYPE_CHECKING
 
@@ -60,10 +59,7 @@ class Correction:
         self.names = tuple(one.name for one in inputs)
         self._wants_temperature = TEMPERATURE in self.names
         self._corrector = Corrector(calibration)
-        # effects have a state that must see every sample once; what-ifs are asked of the positions alone
-        self._what_if = (
-            Corrector(replace(calibration, effects=())) if calibration.effects else self._corrector
-        )
+        self._positions = len(calibration.parameters)
 
     def telemetry(self, name: str, value: float, time_us: int) -> None:
         """Take a telemetry value; a name that the calibration does not need is ignored."""
@@ -83,16 +79,14 @@ class Correction:
 
     def _widen(self, sample: Sample, corrected: Corrected) -> Corrected:
         """Add to the sigmas what the flags say: ``sigma^2 + s^2 + sum ((F(hi) - F(lo)) / 2)^2``."""
-        count = len(self._what_if.calibration.channels)
+        total_at, field = self._corrector.total_at, sample.field
+        positions = sample.values[: self._positions]
         extra = [sample.sigma]
         for index, low, high in sample.spans:
-            if index >= count:
-                continue
-            ends = []
-            for value in (low, high):
-                values = (*sample.values[:index], value, *sample.values[index + 1 : count])
-                ends.append(self._what_if.step(sample.time_us, sample.field, values).total_field)
-            extra.append(0.5 * (ends[1] - ends[0]))
+            if index < self._positions:
+                before, after = positions[:index], positions[index + 1 :]
+                change = total_at(field, (*before, high, *after)) - total_at(field, (*before, low, *after))
+                extra.append(0.5 * change)
         more = hypot(*extra)
         x, y, z = corrected.field_sigma
         return Corrected(

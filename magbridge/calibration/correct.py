@@ -35,6 +35,7 @@ __all__ = ["CorrectedArrays", "Corrector", "correct", "regressors"]
 
 FloatArray = NDArray[np.float64]
 CHUNK = 512  # samples whose table products stay in a core's cache
+ASKED = 16  # positions whose coefficients are remembered for what-ifs
 MARGIN = 0.02  # of the half range: telemetry that shakes at its end is not extrapolated
 
 
@@ -171,6 +172,7 @@ class Corrector:
         self._last: list[float] = []
         self._prepared: tuple[Any, ...] = ()
         self._buffer = np.empty_like(self._kernel.table)
+        self._asked: dict[tuple[float, ...], list[float]] = {}
 
     def step(
         self, time_us: int, field: tuple[float, float, float], values: Sequence[float], quality: int = 0
@@ -215,6 +217,31 @@ class Corrector:
             F = x = y = z = np.nan
             sigma = sx = sy = sz = inf
         return Corrected(F, sigma, (x, y, z), (sx, sy, sz), int(quality))
+
+    def total_at(self, field: tuple[float, float, float], positions: tuple[float, ...]) -> float:
+        """Return the total field (nT) that `field` would mean at other positions; effects are left aside.
+
+        Parameters
+        ----------
+        field : tuple of 3 float
+            nT, raw, sensor axes.
+        positions : tuple of float
+            Of the calibration's parameters, in that order.
+        """
+        coefficients = self._asked.get(positions)
+        if coefficients is None:
+            if len(self._asked) == ASKED:
+                self._asked.clear()
+            kernel = self._kernel
+            phi = np.array(kernel.powers(positions, 1.0))
+            terms = phi[:, None] * kernel.weights[: kernel.monomials]
+            coefficients = self._asked[positions] = np.add.reduce(terms, axis=0).tolist()
+        xx, yy, zz, xy, xz, yz, tx, ty, tz = coefficients
+        dx, dy, dz = field[0] - tx, field[1] - ty, field[2] - tz
+        bx = xx * dx + xy * dy + xz * dz
+        by = xy * dx + yy * dy + yz * dz
+        bz = xz * dx + yz * dy + zz * dz
+        return sqrt(bx * bx + by * by + bz * bz)
 
     def _stage(self, regressors: list[float]) -> tuple[Any, ...]:
         phi = np.array(regressors)

@@ -204,3 +204,13 @@ def test_the_live_path_imports_no_heavy_packages() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+def test_what_if_at_other_positions_is_the_total_there() -> None:
+    cal = random_calibration(3, boresight=True)
+    field, positions, _ = random_samples(4, 40, 2)
+    corrector = Corrector(cal)
+    for h, p in zip(field.tolist(), positions.tolist(), strict=True):
+        told = corrector.step(0, tuple(h), p).total_field
+        assert corrector.total_at(tuple(h), tuple(p)) == pytest.approx(told, rel=1e-14)
+        assert corrector.total_at(tuple(h), tuple(p)) == corrector.total_at(tuple(h), tuple(p))
