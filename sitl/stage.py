@@ -76,8 +76,11 @@ class Stage:
         self._buffers = {Channel.SENSOR: bytearray(), Channel.LINK: bytearray(), Channel.STATE: bytearray()}
 
     def _listen(self) -> None:
-        while data := self._link.recv(65536):
-            self._listener(data)
+        try:
+            while data := self._link.recv(65536):
+                self._listener(data)
+        except ConnectionResetError:
+            return  # the bridge ended before its time; whoever plays to it tells why
 
     def _last_words(self) -> str:
         """Return the bridge's last line on stderr, after it has ended."""
@@ -124,7 +127,7 @@ class Stage:
                 raise PortError(
                     "replay", self._last_words() or f"the bridge ended with {self._bridge.returncode}"
                 )
-        except BrokenPipeError as error:
+        except (BrokenPipeError, ConnectionResetError) as error:
             raise PortError("replay", self._last_words() or "the bridge ended") from error
         finally:
             self._ear.join(timeout=10.0)

@@ -1,0 +1,156 @@
+"""Replays: real bytes through a real pty and a real socket, into the real bridge."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from magbridge.errors import FormatError, PortError, WrongUse
+from magbridge.logs import write
+from sitl import load, segments, simulate
+from sitl.demo import demo
+from sitl.own_log import Recorded, is_own_log
+from sitl.rehearsal import bridge_toml, short_names
+from sitl.replay import replay, tell
+
+
+@pytest.fixture(scope="module")
+def survey(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The first ten minutes of a simulated survey."""
+    deployment = segments(simulate(load("demo"), 3))["survey"].isel(time=slice(0, 150))
+    path = tmp_path_factory.mktemp("survey") / "survey.nc"
+    write(deployment, path)
+    return path
+
+
+def config(folder: Path, driver: str = "digitizer", options: str = "") -> Path:
+    path = folder / "bridge.toml"
+    text = bridge_toml({}, (), calibrated=False, log="logs")  # type: ignore[arg-type]
+    if driver != "digitizer":
+        begin, end = text.index("[sensor.options]"), text.index("[link]")
+        text = text[:begin] + f"[sensor.options]\n{options}\n" + text[end:]
+    path.write_text(text.replace('driver = "digitizer"', f'driver = "{driver}"'))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("driver", "options", "step"),
+    [
+        ("digitizer", "", 0.02),
+        ("hmr2300", "", 6.7),
+        ("twinleaf", "", 0.01),
+        ("ascii", 'columns = ["time", "x", "y", "z"]', 0.001),
+    ],
+)
+def test_every_instrument_s_protocol_arrives_whole(
+    survey: Path, tmp_path: Path, driver: str, options: str, step: float
+) -> None:
+    """What a ground station hears of the raw field is what was measured, to the instrument's own step."""
+    result = replay([survey], config(tmp_path, driver, options))
+    assert result["samples"] == result["rows"] == 150
+    part = result["parts"][0]
+    assert part["corrected_rms_nT"] == pytest.approx(part["raw_rms_nT"], abs=30 * step + 15)
+    assert set(result["flags"]) <= {"uncalibrated", "no_boresight", "gap"}
+    assert any("speaks" in text for text in result["said"])
+
+
+def test_a_log_of_a_replay_is_replayed_bit_for_bit(survey: Path, tmp_path: Path) -> None:
+    path = config(tmp_path)
+    replay([survey], path, log=tmp_path / "logs")
+    (log,) = sorted((tmp_path / "logs").glob("*.tlog"))
+    assert is_own_log(log)
+    assert not is_own_log(survey)
+    (run,) = replay([log], path, log=tmp_path / "again")["runs"]
+    assert run["identical"]
+    assert run["same_config"]
+    assert run["messages"] > 450
+    # and its own log is the same file
+    (again,) = sorted((tmp_path / "again").glob("*.tlog"))
+    first, second = Recorded([log]), Recorded([again])
+    assert [event for event in first.events() if event.data] == [
+        event for event in second.events() if event.data
+    ]
+    assert first.published == second.published
+
+
+def test_another_configuration_is_told_apart(survey: Path, tmp_path: Path) -> None:
+    path = config(tmp_path)
+    replay([survey], path, log=tmp_path / "logs")
+    path.write_text(path.read_text().replace("HIGHRES_IMU = 0", "HIGHRES_IMU = -1"))
+    result = replay(sorted((tmp_path / "logs").glob("*.tlog")), path)
+    (run,) = result["runs"]
+    assert not run["identical"]
+    assert not run["same_config"]
+    assert "not the same" in tell(result)
+
+
+def test_speed_is_kept(survey: Path, tmp_path: Path) -> None:
+    """Ten minutes at 300 times real time take at least two seconds."""
+    result = replay([survey], config(tmp_path), speed=300.0)
+    assert 1.9 < result["seconds"] < 10.0
+
+
+def test_a_bridge_s_own_log_needs_its_configuration(survey: Path, tmp_path: Path) -> None:
+    replay([survey], config(tmp_path), log=tmp_path / "logs")
+    with pytest.raises(WrongUse, match="--config"):
+        replay(sorted((tmp_path / "logs").glob("*.tlog")))
+
+
+def test_a_log_that_does_not_begin_a_run_is_refused(survey: Path, tmp_path: Path) -> None:
+    replay([survey], config(tmp_path), log=tmp_path / "logs")
+    (log,) = (tmp_path / "logs").glob("*.tlog")
+    tail = tmp_path / "tail.tlog"
+    tail.write_bytes(log.read_bytes()[2000:])
+    with pytest.raises(FormatError, match=r"tail\.tlog: expected the log of a bridge, from its start"):
+        Recorded([tail])
+
+
+def test_a_bridge_that_cannot_start_says_why(survey: Path, tmp_path: Path) -> None:
+    path = config(tmp_path)
+    path.write_text(path.read_text().replace("MAG_RAW = 0", "MAG_RAW = 0\nNO_SUCH = 1"))
+    with pytest.raises(PortError, match=r"publish\.NO_SUCH"):
+        replay([survey], path)
+
+
+def test_short_names_differ() -> None:
+    names = short_names(["pitch_current_a", "pitch_current_b", "roll"])
+    assert list(names.values()) == ["pitch_curr", "pitch_cur1", "roll"]
+
+
+def test_the_demonstration_shows_what_calibration_is_worth(tmp_path: Path) -> None:
+    said: list[str] = []
+    result = demo(tmp_path / "demo", seed=2, say=said.append)
+    assert result["raw_rms_nT"] > 10 * result["nominal_rms_nT"] / 3
+    assert result["unflagged_rms_nT"] < 5.0 < 100.0 < result["nominal_rms_nT"]
+    assert result["unflagged_rms_nT"] < 2 * result["unflagged_sigma_nT"]
+    assert all(Path(file).exists() for file in result["files"])
+    assert len(said) == 5
+
+
+@pytest.mark.real
+def test_measured_counts_and_moving_masses_go_through(real_data: Path) -> None:
+    """Seaglider 167: the dive that was left out of the fit is right to about one count (100 nT)."""
+    result = replay(sorted((real_data / "seaglider_sg167").glob("*.nc")))
+    last = result["parts"][-1]
+    assert last["held_out"]
+    assert result["samples"] == result["rows"] == 6740
+    assert 50.0 < last["corrected_rms_nT"] < 110.0 < 1000.0 < last["raw_rms_nT"]
+    assert np.isclose(last["sigma_nT"], last["corrected_rms_nT"], rtol=0.4)
+
+
+@pytest.mark.real
+def test_a_damaged_log_is_read_to_its_end(real_data: Path) -> None:
+    result = replay([real_data / "ardusub" / "damaged.tlog"])
+    assert result["samples"] == 627
+    assert result["skipped"]["damages"] > 1000
+    assert "uncalibrated" in result["flags"]
+
+
+@pytest.mark.real
+def test_real_telemetry_with_a_simulated_field(real_data: Path) -> None:
+    pytest.importorskip("dbdreader", reason="Slocum logs need the extra 'formats'")
+    result = replay(sorted((real_data / "slocum_comet").glob("*-00[0-2].[de]bd")))
+    assert result["simulated_field"]
+    assert result["parts"][-1]["corrected_rms_nT"] < 0.1 * result["parts"][-1]["raw_rms_nT"]

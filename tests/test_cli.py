@@ -1,0 +1,120 @@
+"""The command line: exit codes, one clear line for bad input, nothing half-written."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from magbridge.calibration.file import load as load_calibration
+from magbridge.cli import main
+from magbridge.config import Align
+from magbridge.correction import Correction, correct_rows
+from magbridge.logs import read, write
+from sitl import load, simulate
+
+
+@pytest.fixture(scope="module")
+def deployment(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("deployment") / "deployment.csv"
+    write(simulate(load("demo"), 5), path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def calibration(deployment: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("calibration") / "cal.json"
+    assert main(["calibrate", str(deployment), "--method", "nominal", "-o", str(path)]) == 0
+    return path
+
+
+def complaint(capsys: pytest.CaptureFixture[str], *arguments: object, code: int) -> str:
+    """Run a command that must fail; return its one line."""
+    assert main([str(argument) for argument in arguments]) == code
+    captured = capsys.readouterr()
+    assert captured.err.count("\n") == 1, captured.err
+    assert captured.err.startswith("magbridge: ")
+    assert "Traceback" not in captured.err
+    return captured.err.removeprefix("magbridge: ").rstrip()
+
+
+def test_convert_there_and_back_keeps_every_number(deployment: Path, tmp_path: Path) -> None:
+    assert main(["convert", str(deployment), "-o", str(tmp_path / "a.nc")]) == 0
+    assert main(["convert", str(tmp_path / "a.nc"), "-o", str(tmp_path / "b.csv")]) == 0
+    before, after = read(deployment), read(tmp_path / "b.csv")
+    assert set(before) == set(after)
+    for name in before:
+        np.testing.assert_array_equal(before[name], after[name], err_msg=str(name))
+
+
+def test_correct_writes_what_the_contract_names(
+    deployment: Path, calibration: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "corrected.nc"
+    arguments = ["correct", str(deployment), "--calibration", str(calibration), "-o", str(out), "--json"]
+    assert main(arguments) == 0
+    told = json.loads(capsys.readouterr().out)
+    corrected = read(out)
+    assert told["rows"] == corrected.sizes["time"] == 3600
+    names = {"total_field", "total_field_sigma", "field_x", "field_y", "field_z", "anomaly", "quality"}
+    assert set(corrected) == names
+    truth = read(deployment)
+    np.testing.assert_array_equal(corrected["time"], truth["time"])
+    error = (corrected["total_field"] - truth["truth_total_field"]).to_numpy()
+    assert np.sqrt(np.mean(error**2)) < 1000.0
+
+
+def test_correct_gives_the_same_in_pieces(deployment: Path, calibration: Path, tmp_path: Path) -> None:
+    """A month is corrected in pieces: the state goes on from one to the next."""
+    rows = read(deployment)
+    whole = correct_rows(Correction(load_calibration(calibration), Align()), rows)
+    pieces = Correction(load_calibration(calibration), Align())
+    parts = [correct_rows(pieces, rows.isel(time=slice(k, k + 701))) for k in range(0, 3600, 701)]
+    for name in whole:
+        if name == "anomaly":
+            continue  # positions between known ones are found piece by piece
+        np.testing.assert_array_equal(whole[name], np.concatenate([part[name] for part in parts]))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "words"),
+    [
+        (["convert", "-o", "x.csv"], 2, "expected at least one FILE"),
+        (["convert", "none.csv", "-o", "x.csv"], 1, "none.csv: expected a file"),
+        (["convert", "{d}", "-o", "x.foo"], 1, "x.foo: expected a file name that ends in one of"),
+        (["convert", "{d}"], 2, "--output"),
+        (["fly"], 2, "fly"),
+        (["replay", "{d}", "--speed", "fast"], 2, "--speed fast: expected a positive number"),
+        (["replay", "{d}", "--speed", "-1"], 2, "expected a positive number"),
+        (["run", "--config", "none.toml"], 2, "none.toml: No such file"),
+        (["simulate", "none", "-o", "x.csv"], 2, "none.toml: No such file"),
+        (["correct", "{d}", "--calibration", "none.json", "-o", "x.csv"], 1, "none.json: cannot be read"),
+        (["correct", "{d}", "--calibration", "{d}", "-o", "x.csv"], 1, "not a calibration"),
+        (["calibrate", "{d}", "--parameter", "nose", "-o", "x.json"], 1, "column 'nose'"),
+        (["calibrate", "{d}", "--method", "magic", "-o", "x.json"], 1, "'magic' is not known"),
+        (["calibrate", "{d}", "--order", "0", "-o", "x.json"], 2, "order"),
+        (["map", "none.nc", "-o", "x.nc"], 1, "none.nc"),
+    ],
+)
+def test_bad_input_gets_one_line_and_leaves_nothing(
+    deployment: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    arguments: list[str],
+    code: int,
+    words: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    line = complaint(capsys, *(argument.format(d=deployment) for argument in arguments), code=code)
+    assert words in line
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_help_names_every_command(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--help"]) == 0
+    text = capsys.readouterr().out
+    for command in ("demo", "run", "replay", "simulate", "convert", "calibrate", "correct", "map"):
+        assert command in text
