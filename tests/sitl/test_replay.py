@@ -122,8 +122,8 @@ def test_short_names_differ() -> None:
 def test_the_demonstration_shows_what_calibration_is_worth(tmp_path: Path) -> None:
     said: list[str] = []
     result = demo(tmp_path / "demo", seed=2, say=said.append)
-    assert result["raw_rms_nT"] > 10 * result["nominal_rms_nT"] / 3
-    assert result["unflagged_rms_nT"] < 5.0 < 100.0 < result["nominal_rms_nT"]
+    assert result["raw_rms_nT"] > 1000.0 > result["nominal_rms_nT"] > 5 * result["unflagged_rms_nT"]
+    assert result["unflagged_rms_nT"] < 5.0
     assert result["unflagged_rms_nT"] < 2 * result["unflagged_sigma_nT"]
     assert all(Path(file).exists() for file in result["files"])
     assert len(said) == 5
