@@ -84,7 +84,7 @@ class Codec:
     def frame(self, layout: Spec, payload: bytes) -> bytes:
         """Return the frame of a packed payload (``layout.struct.pack(...)``): the cheapest way to send."""
         frame = join(
-            layout.id, payload, self.sequence, self.system, self.component, signed=self.signing is not None
+            layout, payload, self.sequence, self.system, self.component, signed=self.signing is not None
         )
         self.sequence = self.sequence + 1 & 0xFF
         return self.signing.sign(frame, self.now_us) if self.signing else frame

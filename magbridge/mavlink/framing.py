@@ -12,7 +12,7 @@ from struct import Struct
 from fastcrc.crc16 import mcrf4xx
 
 from magbridge.mavlink.dialect import MESSAGES
-from magbridge.mavlink.messages import Message, spec
+from magbridge.mavlink.messages import Message, Spec, spec
 
 __all__ = ["MAGIC", "MORE", "NOT_A_FRAME", "frame_end", "join", "message"]
 
@@ -26,6 +26,8 @@ LAST = 0xFFFF
 """The last message id that a message outside the dialect may have."""
 HEADER_V2 = Struct("<BBBBBBBHB")
 HEADER_V1 = Struct("<BBBBBB")
+HEADER_OUT = Struct("<BBBBBB3s")
+"""Version 2 without its magic byte, which the checksum leaves out."""
 EXTRA = {number: bytes((extra,)) for number, (_, extra, _) in MESSAGES.items()}
 
 
@@ -67,9 +69,7 @@ def frame_end(data: bytes, start: int, stop: int, gap: int = 0, *, last: bool = 
     if end > stop:
         return MORE
     if extra is not None:
-        right = (
-            mcrf4xx(extra, mcrf4xx(data[start + 1 : checksum])) == data[checksum] | data[checksum + 1] << 8
-        )
+        right = mcrf4xx(data[start + 1 : checksum] + extra) == data[checksum] | data[checksum + 1] << 8
         return end if right else NOT_A_FRAME
     if end + gap >= stop:
         return end if last else MORE
@@ -92,13 +92,9 @@ def message(frame: bytes) -> Message:
 
 
 def join(
-    number: int, payload: bytes, sequence: int, system: int, component: int, *, signed: bool = False
+    layout: Spec, payload: bytes, sequence: int, system: int, component: int, *, signed: bool = False
 ) -> bytes:
     """Make a version 2 frame, without the signature that `signed` announces."""
     payload = payload.rstrip(b"\0") or b"\0"
-    header = HEADER_V2.pack(
-        V2, len(payload), signed, 0, sequence, system, component, number & 0xFFFF, number >> 16
-    )
-    body = header + payload
-    crc = mcrf4xx(EXTRA[number], mcrf4xx(body[1:]))
-    return body + crc.to_bytes(2, "little")
+    body = HEADER_OUT.pack(len(payload), signed, 0, sequence, system, component, layout.number) + payload
+    return b"\xfd" + body + mcrf4xx(body + layout.extra).to_bytes(2, "little")

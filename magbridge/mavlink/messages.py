@@ -67,6 +67,8 @@ class Spec:
     ----------
     id : int
     name : str
+    number : bytes
+        The id as it stands on the wire.
     extra : bytes
         The byte that the checksum is closed with: two dialects that differ do not understand each other.
     size : int
@@ -80,7 +82,7 @@ class Spec:
     def __init__(self, number: int) -> None:
         self.id = number
         self.name, extra, text = MESSAGES[number]
-        self.extra = bytes((extra,))
+        self.number, self.extra = number.to_bytes(3, "little"), bytes((extra,))
         self.fields: dict[str, Field] = {}
         offset, form = 0, "<"
         for part in text.split(","):
