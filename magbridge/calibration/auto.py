@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from magbridge.calibration.data import Observations
+from magbridge.calibration.data import Observations, polynomial_samples
 from magbridge.calibration.evidence import Quadratic, Widths, is_maximum, maximise
 from magbridge.calibration.fit import Fit, assemble
 from magbridge.calibration.geometry import Mounting, mounted_structure
@@ -25,23 +25,15 @@ from magbridge.calibration.nominal import check_scales, starts
 from magbridge.calibration.prior import Structure, free_structure
 from magbridge.calibration.residual import Samples, residuals
 from magbridge.calibration.solve import Prior, Solution, covariance_of, gauss_newton
-from magbridge.calibration.terms import Exponents, full_order
+from magbridge.calibration.terms import full_order
 from magbridge.errors import CalibrationError
 
-__all__ = ["fit_auto", "polynomial_samples"]
+__all__ = ["fit_auto"]
 
 FloatArray = NDArray[np.float64]
 
 ROUNDS = 12  # of coefficients, widths, noise; four or five usually settle
 FIRST_NOISE = 1e-4  # of the field: wide against a sensor's noise, so that no early step is too sure
-
-
-def polynomial_samples(data: Observations, exponents: tuple[Exponents, ...], kappa: float = 0.0) -> Samples:
-    """Take `data` with the monomials of its scaled positions."""
-    ranges = data.ranges()
-    x = (data.parameters - [p.centre for p in ranges]) / [p.scale for p in ranges]
-    phi = np.stack([np.prod(x ** np.array(powers), axis=1) for powers in exponents], axis=1)
-    return Samples(data.field, data.reference, phi, data.follows, float(data.reference.mean()), kappa)
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +74,7 @@ def fit_auto(
     prior = _prior(best.structure, best.widths.eta)
     precision = best.solution.normal.hessian / best.noise.sigma**2 + prior.precision
     coefficients = prior.coefficients(best.solution.z)
-    check_scales(coefficients, samples.unit)
+    check_scales(samples, coefficients)
     E = best.structure.E
     return assemble(
         data, samples, ranges, exponents, coefficients, E @ covariance_of(precision) @ E.T, best.noise, "auto",

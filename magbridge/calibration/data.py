@@ -11,12 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magbridge.calibration.model import Parameter
+from magbridge.calibration.residual import Samples
+from magbridge.calibration.terms import Exponents
 from magbridge.errors import CalibrationError
 
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["Observations", "observations"]
+__all__ = ["Observations", "observations", "polynomial_samples"]
 
 FloatArray = NDArray[np.float64]
 _PER_SAMPLE = ("field", "reference", "parameters", "runs", "time", "attitude", "reference_ned")
@@ -140,6 +142,14 @@ def _enough(
     raise CalibrationError(
         f"only {int(whole.sum())} of {n} samples have every value{because}: at least 10 needed"
     )
+
+
+def polynomial_samples(data: Observations, exponents: tuple[Exponents, ...], kappa: float = 0.0) -> Samples:
+    """Take `data` with the monomials of its scaled positions."""
+    ranges = data.ranges()
+    x = (data.parameters - [p.centre for p in ranges]) / [p.scale for p in ranges]
+    phi = np.stack([np.prod(x ** np.array(powers), axis=1) for powers in exponents], axis=1)
+    return Samples(data.field, data.reference, phi, data.follows, float(data.reference.mean()), kappa)
 
 
 def observations(

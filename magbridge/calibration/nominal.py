@@ -9,6 +9,8 @@ the sensor's own nT, and an answer that shrank all the same is refused.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -26,7 +28,7 @@ SCALE_SIGMA = 0.015
 """Prior 1-sigma by which scales differ from each other, and of soft iron, on a vehicle."""
 GAIN_SIGMA = 0.02
 """Prior 1-sigma of the gain that the three axes share: data of all attitudes overrule it."""
-OFFSET_SIGMA = 0.6
+HARD_IRON_SIGMA = 0.6
 """Prior 1-sigma of the hard iron, as a fraction of the field."""
 
 
@@ -85,22 +87,27 @@ def nominal(
         for _ in range(4):
             found = gauss_newton(samples, prior, noise, z)
             z = found.z
+            # the moving masses are still in the residual: no noise to whiten, only fewer witnesses
             noise = estimate_noise(residuals(samples, E @ z)[0], samples.follows, len(keep))
+            memory, noise = noise.memory, replace(noise, memory=0.0)
         value = found.normal.cost
         if found.settled and (best is None or value < 0.999 * best[0]):
-            best = (value, found, noise)
+            best = (value, found, noise, memory)
     if best is None:
         raise CalibrationError("nominal: no start settled; are the samples those of one sensor?")
-    _, found, noise = best
-    covariance = E @ covariance_of(found.normal.hessian / noise.sigma**2 + prior.precision) @ E.T
+    _, found, noise, memory = best
+    noise = replace(noise, memory=memory)
+    witnesses = (1.0 - memory) / (1.0 + memory)
+    precision = found.normal.hessian * witnesses / noise.sigma**2 + prior.precision
+    covariance = E @ covariance_of(precision) @ E.T
     coefficients = E @ found.z
-    check_scales(coefficients, samples.unit)
+    check_scales(samples, coefficients)
     return coefficients, covariance, noise
 
 
 def _precision(E: FloatArray, scale_sigma: float, gain_sigma: float) -> FloatArray:
     """Prior precision in units of the field, of the numbers that E leaves."""
-    covariance = np.diag(np.array([scale_sigma] * 6 + [OFFSET_SIGMA] * 3) ** 2)
+    covariance = np.diag(np.array([scale_sigma] * 6 + [HARD_IRON_SIGMA] * 3) ** 2)
     covariance[:3, :3] += gain_sigma**2
     return np.asarray(E.T @ np.linalg.inv(covariance) @ E)
 
@@ -121,21 +128,24 @@ def starts(samples: Samples) -> list[FloatArray]:
     return [np.zeros(9), sphere]
 
 
-def check_scales(coefficients: FloatArray, unit: float) -> None:
+def check_scales(samples: Samples, coefficients: FloatArray) -> None:
     """Refuse a collapsed fit.
 
     Raises
     ------
     CalibrationError
-        A scale of A outside 0.5 to 2, or a hard iron above twice the field.
+        Where the samples are, a scale of A outside 0.5 to 2, or a T above twice the field.
     """
-    a = coefficients[:6] / unit
-    A = a[[0, 3, 4, 3, 1, 5, 4, 5, 2]].reshape(3, 3) + np.eye(3)
-    scales = np.linalg.eigvalsh(A)
-    T = float(np.linalg.norm(coefficients[6:9]))
-    if scales[0] < 0.5 or scales[-1] > 2.0 or T / unit > 2.0:
-        listed = ", ".join(f"{value:.3g}" for value in scales)
+    seen = samples.phi[:: max(len(samples.phi) // 1000, 1)]
+    theta = seen @ coefficients.reshape(seen.shape[1], 9)
+    A = theta[:, [0, 3, 4, 3, 1, 5, 4, 5, 2]].reshape(-1, 3, 3) / samples.unit + np.eye(3)
+    scales, T = np.linalg.eigvalsh(A), np.linalg.norm(theta[:, 6:], axis=1)
+    worst = int(
+        np.argmax(np.maximum(np.abs(np.log2(np.maximum(scales, 1e-3))).max(axis=1), T / (2.0 * samples.unit)))
+    )
+    if scales[worst, 0] < 0.5 or scales[worst, 2] > 2.0 or T[worst] / samples.unit > 2.0:
+        listed = ", ".join(f"{value:.3g}" for value in scales[worst])
         raise CalibrationError(
-            f"the fit collapsed: scales {listed} (expected near 1), offset {T:.0f} nT in a field of "
-            f"{unit:.0f} nT; the attitudes are too few to tell scale from offset"
+            f"the fit collapsed: scales {listed} (expected near 1), offset {T[worst]:.0f} nT in a field of "
+            f"{samples.unit:.0f} nT; the attitudes are too few to tell scale from offset"
         )
