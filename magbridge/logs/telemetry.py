@@ -9,14 +9,14 @@ them; every other column is the last value that this vehicle said before it (NaN
   its own offsets already in them; time is the record's stamp. Further magnetometers become ``mag1_x`` ... ``mag3_z``.
 - Without any of these, ``ATTITUDE`` or position makes the rows, and there is no ``mag_x``.
 
-Telemetry is what :data:`~magbridge.logs.telemetry_fields.TELEMETRY` lists, and every ``NAMED_VALUE_FLOAT`` by its name. What is damaged is passed over
+Telemetry is what the log itself declares by ``MAG_COLUMN`` (a bridge's own, one from :mod:`magbridge.logs`), what :data:`~magbridge.logs.telemetry_fields.TELEMETRY` lists, and every ``NAMED_VALUE_FLOAT`` by its name. What is damaged is passed over
 and counted in the attributes ``bytes_skipped`` and ``damages``, a row whose time does not increase in
 ``rows_dropped``.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from math import inf, isnan, nan
 from pathlib import Path
 
@@ -73,11 +73,22 @@ class Rows:
         self._slot = {name: k for k, name in enumerate(columns)}
         self._values = [nan] * len(columns)
         self._stamps = [NEVER] * len(columns)
-        self._named = {letters: self._slot[column] for letters, column in survey.named.items()}
-        self._tables = {
-            number: [(self._slot[value.column], value.get) for value in values if value.column in self._slot]
+        self._named = {
+            letters: [(self._slot[column], scale, offset) for column, scale, offset in columns]
+            for letters, columns in survey.named.items()
+        }
+        said = {column for columns in survey.named.values() for column, _, _ in columns}
+        said |= {one.column for one in survey.declared}
+        self._tables: dict[int, list[tuple[int, Callable[[bytes], float | None]]]] = {
+            number: [
+                (self._slot[value.column], value.get)
+                for value in values
+                if value.column in self._slot and value.column not in said
+            ]
             for number, values in TELEMETRY.items()
         }
+        for one in survey.declared:
+            self._tables.setdefault(one.message, []).append((self._slot[one.column], one.get))
         self._last = -inf
         self._dropped = self._skipped = self._damages = 0
 
@@ -90,9 +101,11 @@ class Rows:
         if not (self._survey.ours and record.channel == Channel.SENT):
             if number == NAMED.id:
                 _, value, letters = NAMED.struct.unpack(payload)
-                self._note(record.time_us, self._named[letters], value)
+                for slot, scale, offset in self._named.get(letters, ()):
+                    self._note(record.time_us, slot, value * scale + offset)
             for slot, get in self._tables.get(number, ()):
-                self._note(record.time_us, slot, get(payload))
+                if (known := get(payload)) is not None:
+                    self._note(record.time_us, slot, known)
         if number == self._source and message.component == self._survey.component:
             self._row(record.time_us, self._make(payload))
         elif number == FIELD and self.rows:

@@ -7,7 +7,7 @@ from math import isnan, nan
 from typing import Any
 
 from magbridge.columns import CHANNEL_TIMES, CORRECTED
-from magbridge.mavlink import spec
+from magbridge.mavlink import Message, spec
 from magbridge.mavlink.messages import split_index
 
 __all__ = [
@@ -16,6 +16,7 @@ __all__ = [
     "TELEMETRY",
     "UNKNOWN_INT",
     "Columns",
+    "Declared",
     "Value",
     "correction",
     "sample",
@@ -52,12 +53,10 @@ UNITS = {
 }
 UNKNOWN_INT = 0x7FFFFFFF
 UNKNOWN: dict[str, tuple[int, ...]] = {
-    # what these fields hold when their sender does not know
+    # what these fields hold when their sender does not know, and the dialect does not say so
     "lat": (0, UNKNOWN_INT),
     "lon": (0, UNKNOWN_INT),
     "relative_alt": (UNKNOWN_INT,),
-    "current_battery": (-1,),
-    "voltage_battery": (0xFFFF,),
     **{f"servo{k}_raw": (0,) for k in range(1, 17)},
 }
 
@@ -84,7 +83,41 @@ class Value:
         value: Any = self._field.get(payload)
         if self._index is not None:
             value = value[self._index]
-        return nan if value in self._unknown else float(value * self._factor)
+        unknown = value == self._field.invalid or value in self._unknown
+        return nan if unknown else float(value * self._factor)
+
+
+class Declared:
+    """A column that the log itself declares, by a ``MAG_COLUMN``.
+
+    Attributes
+    ----------
+    column, unit : str
+    message : int
+        Id of the message that it stands in.
+    scale, offset : float
+        To the column's unit.
+    match : dict of str to str
+        What other fields must be.
+    """
+
+    def __init__(self, said: Message) -> None:
+        self.column, self.unit = said["column"], said["unit"] or "1"
+        self.scale, self.offset = said["scale"], said["offset"]
+        self.message = spec(said["message"]).id
+        name, self._index = split_index(said["field"])
+        self._field = spec(self.message).fields[name]
+        self.match = dict(part.split("=", 1) for part in said["match"].split(",") if part)
+        self._others = [(spec(self.message).fields[name], text) for name, text in self.match.items()]
+
+    def get(self, payload: bytes) -> float | None:
+        """Return the value in `unit`; None where the message is about something else."""
+        if any(str(field.get(payload)) != text for field, text in self._others):
+            return None
+        value: Any = self._field.get(payload)
+        if self._index is not None:
+            value = value[self._index]
+        return nan if value == self._field.invalid else float(value * self.scale + self.offset)
 
 
 TELEMETRY = {

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections import Counter
+from contextlib import suppress
 from functools import lru_cache
 from math import isnan
 from pathlib import Path
 from typing import Any
 
 from magbridge.errors import FormatError
-from magbridge.logs.telemetry_fields import SOURCES, TELEMETRY, Value, correction, sample
+from magbridge.logs.telemetry_fields import SOURCES, TELEMETRY, Declared, Value, correction, sample
 from magbridge.mavlink import LogReader, Message, spec
 from magbridge.records import Channel
 
@@ -34,8 +35,10 @@ class Survey:
         Its sender.
     columns : dict of str to str
         Column to unit, each known at least once.
-    named : dict of bytes to str
-        ``NAMED_VALUE_FLOAT.name`` to column.
+    named : dict of bytes to list of (str, float, float)
+        ``NAMED_VALUE_FLOAT.name`` to columns, each with scale and offset.
+    declared : list of Declared
+        Columns that the log itself says stand in other messages.
     attrs : dict
         What the log says of itself.
     ours : bool
@@ -48,7 +51,7 @@ class Survey:
         self._senders: dict[int, Counter[tuple[int, int]]] = {}
         self._known: dict[int, dict[str, str]] = {}
         self._named: dict[int, dict[bytes, str]] = {}
-        self._full: dict[str, tuple[str, str]] = {}
+        self._declared: dict[str, Declared] = {}
         self._open: dict[tuple[int, int], list[Value]] = {}
         self._read(path)
         for self.source in SOURCES:
@@ -57,13 +60,25 @@ class Survey:
                 continue  # the autopilot's compass is no stand-in for the instrument
             (self.system, self.component), _ = senders.most_common(1)[0]
             self.columns = self._known.get(self.system, {})
-            self.named = {}
-            for letters, name in self._named.get(self.system, {}).items():
-                column, unit = self._full.get(name, (name, "1"))
-                self.columns.setdefault(column, unit)
-                self.named[letters] = column
+            self._name()
             return
         raise FormatError(path, f"expected MAVLink records with one of {' '.join(SOURCES)}")
+
+    def _name(self) -> None:
+        """Give every ``NAMED_VALUE_FLOAT`` of the vehicle its column, or those that the log declares."""
+        self.named: dict[bytes, list[tuple[str, float, float]]] = {}
+        self.declared: list[Declared] = []
+        for one in self._declared.values():
+            self.columns[one.column] = one.unit
+            if one.message != NAMED.id or one.match.keys() != {"name"}:
+                self.declared.append(one)
+            else:
+                letters = one.match["name"].encode().ljust(10, b"\0")
+                self.named.setdefault(letters, []).append((one.column, one.scale, one.offset))
+        for letters, name in self._named.get(self.system, {}).items():
+            if letters not in self.named:
+                self.named[letters] = [(name, 1.0, 0.0)]
+                self.columns.setdefault(name, "1")
 
     def _read(self, path: Path) -> None:
         """Look at every record, but take apart only those that may tell something new."""
@@ -94,10 +109,11 @@ class Survey:
             letters = NAMED.struct.unpack(message.payload)[-1]
             self._named.setdefault(system, {})[letters] = message["name"]
         elif number == COLUMN:
-            if message["name"]:
-                self._full[message["name"]] = message["column"], message["unit"]
-            else:
+            if not message["message"]:
                 self.attrs[message["column"]] = message["unit"]
+            else:
+                with suppress(KeyError, ValueError):  # of a dialect that we do not know
+                    self._declared[message["column"]] = Declared(message)
             return False
         elif number in (START, BYTES):
             self.ours = True

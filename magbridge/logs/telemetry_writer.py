@@ -36,6 +36,7 @@ ATTITUDE_, POSITION_, NAMED_, RAW_, FIELD_ = (
     spec(name) for name in ("ATTITUDE", "GLOBAL_POSITION_INT", "NAMED_VALUE_FLOAT", "MAG_RAW", "MAG_FIELD")
 )
 UNKNOWN_HEADING = 0xFFFF
+NAMED_VALUE = {"message": "NAMED_VALUE_FLOAT", "field": "value", "scale": 1.0, "offset": 0.0}
 
 Row = dict[str, float]
 
@@ -73,7 +74,9 @@ class FileWriter:
         self._file.close()
 
     def _declare(self, dataset: xr.Dataset) -> None:
-        said = [("", str(dataset.attrs[key]), key) for key in MEANING if key in dataset.attrs]
+        said: list[dict[str, Any]] = [
+            {"column": key, "unit": str(dataset.attrs[key])} for key in MEANING if key in dataset.attrs
+        ]
         taken: set[str] = set()
         for name in map(str, dataset.data_vars):
             if name in STANDARD:
@@ -83,9 +86,9 @@ class FileWriter:
             self._named.append((name, short.encode()))
             unit = str(dataset[name].attrs.get("units", "1"))
             if (short, unit) != (name, "1"):
-                said.append((short, unit, name))
-        for short, unit, name in said:
-            frame = self._bridge.pack("MAG_COLUMN", name=short, unit=unit, column=name)
+                said.append({"column": name, "unit": unit, "match": f"name={short}"} | NAMED_VALUE)
+        for one in said:
+            frame = self._bridge.pack("MAG_COLUMN", **one)
             self._file.write(pack_record(self._start_us, Channel.STATE, frame))
 
     def _say(self, time_us: int, channel: Channel, codec: Codec, layout: Spec, *values: Any) -> None:

@@ -366,7 +366,7 @@ MESSAGES: dict[int, tuple[str, int, str]] = {
     60106: ("MAG_BRIDGE_START", 172, "Q:time_usec:us:,Q:signing_timestamp::,I:calibration_id::,8B:config_digest::,24s:version::,24s:driver::"),
     60107: ("MAG_CLOCK_STEP", 81, "Q:time_usec:us:,q:step:us:"),
     60108: ("MAG_PORT", 171, "Q:time_usec:us:,I:dropped:bytes:,B:port::,B:state::,80s:reason::"),
-    60109: ("MAG_COLUMN", 123, "10s:name::,16s:unit::,64s:column::"),
+    60109: ("MAG_COLUMN", 112, "d:scale::,d:offset::,16s:unit::,44s:message::,40s:field::,64s:match::,64s:column::"),
 }
 
 

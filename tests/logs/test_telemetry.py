@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from magbridge import logs
+from magbridge.config import Telemetry
 from magbridge.errors import FormatError
-from magbridge.logs.tlog import TlogWriter
+from magbridge.logs.tlog import TlogWriter, declarations
 from magbridge.mavlink import Codec, pack_record
 from magbridge.records import Channel, Quality
 
@@ -154,6 +155,37 @@ def test_a_bridges_log_without_readings_gives_no_compass_instead(tmp_path: Path)
         log.read(tmp_path)
 
 
+def test_the_log_says_what_its_parameters_are(tmp_path: Path) -> None:
+    """As a bridge does of its ``[telemetry]``: any field of any message, scaled, under its own name."""
+    log = Log()
+    name = {"message": "NAMED_VALUE_FLOAT", "field": "value", "match": "name=batt"}
+    array = {"message": "DEBUG_FLOAT_ARRAY", "field": "data[3]", "match": "name=masses,array_id=7"}
+    servo = {"message": "SERVO_OUTPUT_RAW", "field": "servo2_raw"}
+    log.say(0, "MAG_COLUMN", column="battery_position", unit="in", scale=0.5, offset=1, **name)
+    log.say(0, "MAG_COLUMN", column="ballast", unit="cc", scale=2, **array)
+    log.say(0, "MAG_COLUMN", column="servo2", unit="deg", scale=0.1, offset=-150, **servo)
+    log.say(0, "MAG_COLUMN", column="other", unit="1", scale=1, message="NOT_YET_INVENTED", field="x")
+    log.say(0, "MAG_COLUMN", column="heading_reference", unit="magnetic")
+    for k in range(3):
+        log.say(k, "NAMED_VALUE_FLOAT", name="batt", value=k)
+        log.say(k, "DEBUG_FLOAT_ARRAY", name="masses", array_id=7, data=[0, 0, 0, k, *[0] * 54])
+        log.say(k, "DEBUG_FLOAT_ARRAY", name="masses", array_id=8, data=[9] * 58)
+        log.say(k, "SERVO_OUTPUT_RAW", servo1_raw=1500, servo2_raw=1600 + k)
+        log.mag(k, k)
+    back = log.read(tmp_path)
+    np.testing.assert_array_equal(back["battery_position"], [1, 1.5, 2])
+    np.testing.assert_array_equal(back["ballast"], [0, 2, 4])
+    np.testing.assert_allclose(back["servo2"], [10, 10.1, 10.2])
+    np.testing.assert_array_equal(back["servo1"], [1500] * 3)
+    assert [back[name].attrs["units"] for name in ("battery_position", "ballast", "servo2")] == [
+        "in",
+        "cc",
+        "deg",
+    ]
+    assert back.attrs["heading_reference"] == "magnetic"
+    assert not {"batt", "other"} & set(back.data_vars)
+
+
 def test_damage_is_passed_over_and_counted(tmp_path: Path) -> None:
     log = Log()
     ends = []
@@ -213,6 +245,28 @@ def test_a_live_log_is_read_back(tmp_path: Path) -> None:
     np.testing.assert_array_equal(back["mag_x"], np.arange(500.0))
     np.testing.assert_allclose(back["time"], T0 / S + 1e-6 + np.arange(500.0), rtol=0, atol=0.5e-6)
     assert back.attrs["damages"] == 1
+
+
+def test_every_file_of_a_live_log_says_what_its_parameters_are(tmp_path: Path) -> None:
+    servo = Telemetry(
+        message="SERVO_OUTPUT_RAW",
+        field="servo2_raw",
+        match={"port": 0},
+        scale=0.1,
+        offset=-150.0,
+        unit="deg",
+    )
+    codec = Codec(1, 1)
+    with TlogWriter(tmp_path, max_size=0.01, head=declarations(1, 191, {"servo2": servo})) as log:
+        for k in range(500):
+            log.write(T0 + k * S, Channel.LINK, codec.pack("SERVO_OUTPUT_RAW", servo2_raw=1600))
+            log.write(T0 + k * S, Channel.LINK, codec.pack("RAW_IMU", xmag=1))
+    files = sorted(tmp_path.iterdir())
+    assert len(files) > 2
+    for path in files:
+        back = logs.read(path)
+        np.testing.assert_allclose(back["servo2"][1:], 10)
+        assert back["servo2"].attrs["units"] == "deg"
 
 
 def test_names_longer_than_ten_letters(tmp_path: Path) -> None:
