@@ -14,7 +14,7 @@ from magbridge.records import Channel
 
 __all__ = ["Recorded", "is_own_log", "runs"]
 
-BEGIN, PARAMETER = spec("MAG_BRIDGE_START").id, spec("PARAM_VALUE").id
+BEGIN, PARAMETER, COLUMN = (spec(name).id for name in ("MAG_BRIDGE_START", "PARAM_VALUE", "MAG_COLUMN"))
 
 
 def is_own_log(path: Path) -> bool:
@@ -70,6 +70,8 @@ class Recorded:
             raise FormatError(paths[0], "expected the log of a bridge, from its start")
         parameters: dict[str, float] = {}
         for record in records:
+            if record.channel == Channel.STATE and record.message.id == COLUMN:
+                continue  # stands in every file, for readers
             if record.channel != Channel.STATE or record.message.id != PARAMETER:
                 break
             parameters[record.message["param_id"]] = record.message["param_value"]
@@ -91,7 +93,7 @@ class Recorded:
         for (time_us, channel), group in groupby(inputs, lambda record: (record.time_us, record.channel)):
             if channel == Channel.STATE:
                 for record in group:
-                    if record.message.id not in (BEGIN, PARAMETER):
+                    if record.message.id not in (BEGIN, PARAMETER, COLUMN):
                         yield Event(time_us, Channel.STATE, record.frame)
             elif channel == Channel.SENSOR:
                 yield Event(time_us, Channel.SENSOR, _sensor_bytes(group))

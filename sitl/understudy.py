@@ -22,7 +22,7 @@ from magbridge.bridge.serial_port import SerialPort
 from magbridge.bridge.sockets import open_link
 from magbridge.config import load
 from magbridge.errors import MagbridgeError
-from magbridge.logs.tlog import TlogWriter
+from magbridge.logs.tlog import TlogWriter, declarations
 from magbridge.records import Channel
 from sitl.timetable import read_entries
 
@@ -98,7 +98,8 @@ def main() -> int:
         link.open()
         edge = ScriptedEdge({Channel.SENSOR: sensor, Channel.LINK: link}, chosen.timetable)
         pipeline = set_up(config, edge.start())
-        log = TlogWriter(chosen.log) if chosen.log else None
+        head = declarations(config.link.system, config.link.component, config.telemetry)
+        log = TlogWriter(chosen.log, head=head) if chosen.log else None
         drive(pipeline, edge, log, lambda _: None)
         if log is not None:
             log.close(timeout=60.0)
