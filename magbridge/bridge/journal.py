@@ -32,13 +32,11 @@ class Journal:
 
     def sent(self, frames: Iterable[tuple[int, bytes]]) -> None:
         """Take what went out over the link: event time in µs, frame."""
-        if self.active:
-            self._records += [(time_us, Channel.SENT, frame) for time_us, frame in frames]
+        self._add([(time_us, Channel.SENT, frame) for time_us, frame in frames])
 
     def link(self, time_us: int, frames: Iterable[bytes]) -> None:
         """Take what came over the link."""
-        if self.active:
-            self._records += [(time_us, Channel.LINK, frame) for frame in frames]
+        self._add([(time_us, Channel.LINK, frame) for frame in frames])
 
     def sensor(self, time_us: int, data: bytes) -> None:
         """Take bytes as they came from the sensor."""
@@ -47,12 +45,11 @@ class Journal:
         for begin in range(0, len(data), SIZE):
             piece = data[begin : begin + SIZE]
             frame = self._scribe.frame(BYTES, BYTES.struct.pack(0, len(piece), piece))
-            self._records.append((time_us, Channel.SENSOR, frame))
+            self._add([(time_us, Channel.SENSOR, frame)])
 
     def state(self, time_us: int, frame: bytes) -> None:
         """Take a frame that says what changed at the edge."""
-        if self.active:
-            self._records.append((time_us, Channel.STATE, frame))
+        self._add([(time_us, Channel.STATE, frame)])
 
     def note(self, time_us: int, name: str, **fields: object) -> None:
         """Write a state record of our own."""
@@ -61,5 +58,9 @@ class Journal:
     def drain(self) -> list[tuple[int, Channel, bytes]]:
         """Return what was collected, in order (event time in µs, channel, frame), and forget it."""
         records, self._records = self._records, []
-        self.count += len(records)
         return records
+
+    def _add(self, records: list[tuple[int, Channel, bytes]]) -> None:
+        if self.active:
+            self._records += records
+            self.count += len(records)

@@ -271,7 +271,10 @@ class Pipeline:
             "sensor_clock_drift": -self._clock.drift_ppm,
             "sample_rate": (len(times) - 1) * 1e6 / span_us if span_us > 0 else nan,
             "telemetry_stale": stale,
-            "log_records": self.journal.count & 0xFFFFFFFF,
+            # with what waits to be sent: in a replay several timers may fire before it is drained
+            "log_records": self.journal.count + len(self.component.outbox.frames)
+            if self.journal.active
+            else 0,
             "log_lost": self._log_lost,
             "log_state": self._log_state,
         }

@@ -19,7 +19,7 @@ from magbridge.calibration import file as calibration_file
 from magbridge.config import Config, load
 from magbridge.errors import PortError
 from magbridge.link import store
-from magbridge.logs.tlog import TlogWriter
+from magbridge.logs.tlog import TlogWriter, declarations
 from magbridge.mavlink import load_key
 from magbridge.records import Channel
 
@@ -119,7 +119,8 @@ def _open_log(config: Config, edge: LiveEdge) -> TlogWriter | None:
         return None
     directory = config.resolve(config.log.directory)
     try:
-        log = TlogWriter(directory, max_size=config.log.max_size, max_age=config.log.max_age)
+        head = declarations(config.link.system, config.link.component, config.telemetry)
+        log = TlogWriter(directory, max_size=config.log.max_size, max_age=config.log.max_age, head=head)
     except PortError as error:
         edge.tell(states.log_state(error.reason, 0))
         return None
@@ -128,11 +129,11 @@ def _open_log(config: Config, edge: LiveEdge) -> TlogWriter | None:
 
 
 class LogWatch:
-    """Tells the pipeline when the log fails and when it is well again."""
+    """Tells the pipeline when the log fails and is well again, and what it lost."""
 
     def __init__(self, log: TlogWriter | None, edge: LiveEdge) -> None:
         self._log, self._edge = log, edge
-        self._told = ""
+        self._told = ("", 0)
         self._look_us = 0
 
     def look(self, time_us: int) -> None:
@@ -140,9 +141,10 @@ class LogWatch:
         if self._log is None or time_us < self._look_us:
             return
         self._look_us = time_us + LOG_LOOK_US
-        if self._log.failure != self._told:
-            self._told = self._log.failure
-            self._edge.tell(states.log_state(self._told, self._log.lost))
+        state = self._log.failure, self._log.lost
+        if state != self._told:
+            self._told = state
+            self._edge.tell(states.log_state(*state))
 
 
 class Keeper:
@@ -156,7 +158,7 @@ class Keeper:
         self._path = config.resolve(config.link.parameters)
         self._kept = store.load(self._path)
         self._signs = config.link.signing_key is not None
-        self._saved_us = 0
+        self._saved_us = self._retry_us = self._revision = 0
 
     def attach(self, edge: LiveEdge) -> None:
         """Tell `edge` when something cannot be kept."""
@@ -169,19 +171,24 @@ class Keeper:
 
     def look(self, pipeline: Pipeline, time_us: int) -> None:
         """Save what changed; the time stamp now and then."""
-        changed = pipeline.component.parameters.changed() != self._kept.parameters
-        if changed or (self._signs and time_us - self._saved_us > KEEP_US):
-            self._saved_us = time_us
-            self.save(pipeline)
+        revision = pipeline.component.parameters.revision
+        due = self._signs and time_us - self._saved_us > KEEP_US
+        if time_us < self._retry_us or (revision == self._revision and not due):
+            return
+        self._revision, self._saved_us = revision, time_us
+        if not self.save(pipeline):
+            self._revision, self._retry_us = -1, time_us + KEEP_US
 
-    def save(self, pipeline: Pipeline) -> None:
-        """Write the file, if there is anything to keep; a disk that is full keeps the old one."""
+    def save(self, pipeline: Pipeline) -> bool:
+        """Write the file, if there is anything to keep; a disk that is full keeps the old one: False."""
         stamp = pipeline.signing.last if pipeline.signing else 0
         kept = store.Kept(pipeline.component.parameters.changed(), stamp)
         if kept == self._kept:
-            return
-        self._kept = kept
+            return True
         try:
             store.save(self._path, kept)
         except OSError as error:
             self._tell(states.notice(f"parameters not kept: {error.strerror or error}"))
+            return False
+        self._kept = kept
+        return True

@@ -1,0 +1,292 @@
+"""Faults that need a bridge of their own: another link, another clock, a key, a disk, an end without warning."""
+
+from __future__ import annotations
+
+import os
+import resource
+import subprocess
+import time
+from itertools import zip_longest
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from rig import Rig
+
+from magbridge.mavlink import Codec, LogReader, Signing
+from magbridge.records import Channel
+
+Row = Callable[[str, str, str, str], None]
+MakeRig = Callable[..., Rig]
+KEY = bytes(range(32))
+LOG_OK, LOG_FAILED = 1, 2
+
+
+def replays(rig: Rig) -> None:
+    """Stop the bridge; its log, replayed, publishes the same bytes."""
+    assert rig.stop() == 0
+    recorded, published = rig.replay()
+    assert recorded.damages == 0
+    assert recorded.messages > 50
+    assert first_difference(published, recorded.published) is None
+
+
+def first_difference(one: bytes, other: bytes) -> tuple[object, object] | None:
+    """Return the first two messages in which two streams differ."""
+    pairs = zip_longest(Codec(0, 0).parse(bytes(one)), Codec(0, 0).parse(bytes(other)))
+    return next((pair for pair in pairs if pair[0] != pair[1]), None)
+
+
+def test_neither_sensor_nor_autopilot_at_the_start(make_rig: MakeRig, table: Row) -> None:
+    rig = make_rig("tcp")
+    rig.process = rig.spawn(rig.config)
+    rig.until(lambda: rig.logs and rig.logs[0].stat().st_size > 500)
+    rig.run(0.5)
+    assert rig.process.poll() is None
+    rig.fluxgate.plug()
+    rig.autopilot.up()
+    back = rig.until_well()
+    table(
+        "started with neither sensor nor autopilot there",
+        "`sensor_state` absent, then lost, with the reason; it waits for both",
+        f"{back:.2f} s after both came",
+        "nothing",
+    )
+    assert back < 3.0
+    replays(rig)
+
+
+def test_tcp_server_gone_and_back(make_rig: MakeRig, table: Row) -> None:
+    rig = make_rig("tcp")
+    rig.start()
+    rig.run(0.3)
+    last, mark = rig.of("MAG_FIELD")[-1]["sequence"], rig.mark
+    rig.autopilot.down()
+    rig.run(1.2)
+    assert rig.process is not None
+    assert rig.process.poll() is None
+    rig.autopilot.up()
+    back = rig.until_well()
+    rig.until_said("link: open", mark)
+    sequences = [message["sequence"] for message in rig.of("MAG_FIELD", mark)]
+    lost = next(number for number in sequences if number > last + 20) - last - 1
+    assert sequences == sorted(sequences)
+    table(
+        "autopilot link down (TCP: the server goes), up again after 1.2 s",
+        '"link: closed by the other end" into the log, then over the link "link: open"; `stale_telemetry` meanwhile',
+        f"{back:.2f} s",
+        f"messages to the autopilot, seen by MAG_FIELD's `sequence` ({lost} here); the log has them all",
+    )
+    assert back < 2.0
+    replays(rig)
+
+
+def test_host_clock_set_forward_and_back(make_rig: MakeRig, table: Row) -> None:
+    rig = make_rig(stepped=True)
+    rig.start()
+    mark = rig.mark
+    for step in (3600.0, -7200.0):
+        before = rig.of("MAG_FIELD")[-1]
+        seen = rig.mark
+        rig.step(step)
+        noticed = rig.until_said(f"clock was set by {step:+.3f} s", seen)
+        rig.run(0.2)
+        after = rig.of("MAG_FIELD")[-1]
+        elapsed = (after["time_usec"] - before["time_usec"]) * 1e-6
+        samples = (after["sequence"] - before["sequence"]) / 50
+        assert elapsed == pytest.approx(step + samples, abs=0.1)
+        assert noticed < 2.5
+    assert rig.flags(mark) == ""
+    assert rig.status["samples_lost"] == 0
+    (log,) = rig.logs
+    with log.open("rb") as file:
+        times = [record.time_us for record in LogReader(file)]
+    assert times == sorted(times)
+    table(
+        "host clock set 1 h forward, then 2 h back",
+        "STATUSTEXT within 1 s; from then on the published UNIX times follow; no flag, because no interval is measured with that clock",
+        "at once",
+        "nothing; between the step and the STATUSTEXT samples carry the old UNIX time",
+    )
+    replays(rig)
+
+
+def test_forged_signed_packets(make_rig: MakeRig, table: Row) -> None:
+    rig = make_rig(key=KEY)
+    rig.start()
+    before, mark = rig.fresh_status(), rig.mark
+    genuine = rig.autopilot.telemetry()
+    rig.autopilot.send(genuine)
+    future = ((1 << 48) - 1).to_bytes(6, "little")
+    thief = Codec(1, 1, Signing(bytes(32)))
+    thief.now_us = time.time_ns() // 1000 + 10**15
+    wrong = [
+        genuine[:-12] + future + genuine[-6:],  # a genuine one with another time stamp
+        thief.pack("NAMED_VALUE_FLOAT", value=-9.0, name="battpos"),  # signed with another key, in the future
+        Codec(1, 1).pack("NAMED_VALUE_FLOAT", value=-9.0, name="battpos"),  # not signed
+        genuine,  # sent again
+    ]
+    for frame in wrong:
+        rig.autopilot.send(frame)
+    rig.until_status(lambda status: status["link_refused"] == before["link_refused"] + len(wrong))
+    rig.run(0.8)  # beyond max_age: only later genuine telemetry keeps the field good
+    rig.autopilot.say("PARAM_REQUEST_READ", target_system=1, target_component=191, param_index=0)
+    rig.until(lambda: rig.of("PARAM_VALUE", mark))
+    assert rig.flags(mark) == ""
+    assert all(message.frame[2] & 1 for _, message in rig.heard)
+    table(
+        "forged packets: a time stamp far in the future, another key, no signature, a genuine one sent again",
+        "nothing; the genuine ones that follow are taken",
+        "at once",
+        f"the forged ones: `link_refused` {len(wrong)}",
+    )
+    replays(rig)
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A file system of 128 kB."""
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    try:
+        subprocess.run(
+            ["mount", "-t", "tmpfs", "-o", "size=128k", "tmpfs", str(disk)], check=True, capture_output=True
+        )
+    except (OSError, subprocess.CalledProcessError):
+        pytest.skip("a small disk needs the right to mount one")
+    yield disk
+    subprocess.run(["umount", "-l", str(disk)], check=True)
+
+
+def fills_and_empties(
+    rig: Rig, fill: Callable[[], object], empty: Callable[[], object]
+) -> tuple[str, str, str]:
+    """Fill the disk, then make room; return what was said, how long until it was well, what was lost."""
+    rig.start()
+    mark = rig.mark
+    fill()
+    rig.until_status(lambda status: status["log_state"] == LOG_FAILED)
+    rig.until(lambda: any(line.startswith("log: ") for line in rig.said(mark)))
+    rig.autopilot.say(
+        "PARAM_SET",
+        target_system=1,
+        target_component=191,
+        param_id="MB_GAP_FACTOR",
+        param_value=3.0,
+        param_type=9,
+    )
+    rig.until(lambda: rig.of("PARAM_VALUE", mark))
+    lost = rig.until_status(lambda status: status["log_lost"] > 0)["log_lost"]
+    rig.until_status(lambda status: status["log_lost"] > lost)
+    empty()
+    mended = rig.until(lambda: rig.status["log_state"] == LOG_OK)
+    rig.until_said("log: being written", mark)
+    assert rig.flags(mark) == ""
+    fields = [message["sequence"] for message in rig.of("MAG_FIELD")]
+    assert fields == list(range(fields[0], fields[0] + len(fields)))
+    lost = rig.fresh_status()["log_lost"]
+    assert rig.stop() == 0
+    for path in rig.logs:
+        with path.open("rb") as file:
+            reader = LogReader(file)
+            assert sum(1 for _ in reader) > 0, path
+            assert reader.damages == 0
+    said = next(line for line in rig.said(mark) if line.startswith("log: ") and "written" not in line)
+    return said, f"{mended:.1f} s", f"{lost} records"
+
+
+def test_log_reaches_a_limit(make_rig: MakeRig) -> None:
+    """A limit of the file's size is what any user can set; the write fails half-way, as on a full disk."""
+    rig = make_rig()
+
+    def limit(size: int) -> None:
+        assert rig.process is not None
+        resource.prlimit(rig.process.pid, resource.RLIMIT_FSIZE, (size, resource.RLIM_INFINITY))
+
+    said, _, _ = fills_and_empties(
+        rig, lambda: limit(rig.logs[-1].stat().st_size + 1000), lambda: limit(resource.RLIM_INFINITY)
+    )
+    assert said == "log: File too large"
+
+
+def test_disk_full(make_rig: MakeRig, small_disk: Path, table: Row) -> None:
+    rig = make_rig()
+    rig.config.write_text(rig.config.read_text().replace('"logs"', f'"{small_disk}"'))
+    (rig.folder / "logs").symlink_to(small_disk)
+    ballast = small_disk / "ballast"
+
+    def fill() -> None:
+        with ballast.open("wb", buffering=0) as file:
+            try:
+                while file.write(bytes(4096)):
+                    pass
+            except OSError:
+                return
+
+    said, mended, lost = fills_and_empties(rig, fill, ballast.unlink)
+    assert said == "log: No space left on device"
+    table(
+        "disk full, then room again",
+        f'the field goes on, no flag; STATUSTEXT "{said}", `log_state` failed',
+        f"{mended}, in a new file",
+        f"the log meanwhile: `log_lost` {lost}; what was written before reads to its end",
+    )
+
+
+def test_killed_without_warning(make_rig: MakeRig, table: Row) -> None:
+    rig = make_rig()
+    rig.start()
+    mark = rig.mark
+    rig.autopilot.say(
+        "PARAM_SET",
+        target_system=1,
+        target_component=191,
+        param_id="MB_GAP_FACTOR",
+        param_value=3.0,
+        param_type=9,
+    )
+    rig.until(lambda: rig.of("PARAM_VALUE", mark))
+    rig.run(1.0)
+    assert rig.process is not None
+    rig.process.kill()
+    rig.process.wait()
+    rig.run(0.1)
+    (log,) = rig.logs
+    recorded, published = rig.replay()
+    assert recorded.damages <= 1
+    assert published.startswith(recorded.published)
+    heard = [message.frame for _, message in rig.heard]
+    missing = [frame for frame in heard[-200:] if frame not in recorded.published]
+    assert len(missing) <= 20, "more than the last event"
+    assert missing == heard[len(heard) - len(missing) :]
+    with log.open("rb") as file:
+        channels = {record.channel for record in LogReader(file)}
+    assert channels == set(Channel)
+
+    mark = rig.mark
+    back = rig.again()
+    assert len(rig.logs) == 2
+    rig.autopilot.say(
+        "PARAM_REQUEST_READ", target_system=1, target_component=191, param_id="MB_GAP_FACTOR", param_index=-1
+    )
+    rig.until(lambda: rig.of("PARAM_VALUE", mark))
+    assert rig.of("PARAM_VALUE", mark)[-1]["param_value"] == 3.0
+    table(
+        "`kill -9`, started again",
+        "nothing; then as at every start. Parameters set over the link hold",
+        f"{back:.1f} s after the start",
+        f"of the log the last {len(missing)} messages; the rest reads, and replays to the same bytes",
+    )
+    rig.stop()
+    recorded, published = rig.replay([rig.logs[1]])
+    assert published == recorded.published
+
+
+def test_stops_when_told(make_rig: MakeRig) -> None:
+    rig = make_rig("udpin")
+    rig.start()
+    assert rig.process is not None
+    begun = time.monotonic()
+    os.kill(rig.process.pid, 2)
+    assert rig.process.wait(5) == 0
+    assert time.monotonic() - begun < 2.0
