@@ -36,6 +36,8 @@ __all__ = ["CorrectedArrays", "Corrector", "correct", "regressors"]
 FloatArray = NDArray[np.float64]
 CHUNK = 512  # samples whose table products stay in a core's cache
 ASKED = 16  # positions whose coefficients are remembered for what-ifs
+GAP, STALE_TELEMETRY = int(Quality.GAP), int(Quality.STALE_TELEMETRY)
+EXTRAPOLATED = int(Quality.EXTRAPOLATED)
 MARGIN = 0.02  # of the half range: telemetry that shakes at its end is not extrapolated
 
 
@@ -169,6 +171,8 @@ class Corrector:
         self._base = _base_flags(calibration)
         self._ranges = _ranges(calibration)
         self._wanted = len(calibration.channels)
+        self._values: tuple[float, ...] | None = None
+        self._flags = self._base
         self._last: list[float] = []
         self._prepared: tuple[Any, ...] = ()
         self._buffer = np.empty_like(self._kernel.table)
@@ -201,22 +205,29 @@ class Corrector:
                 f"found {len(values)}"
             )
         hx, hy, hz = field
-        regressors = self._kernel.powers(values, 1.0)
-        for effect in self._steps:
-            regressors += effect(time_us, hx, hy, hz, values)
-        if regressors != self._last:
-            self._last = regressors
-            self._prepared = self._stage(regressors)
+        values = tuple(values)
+        if values != self._values or self._steps:
+            self._values, self._flags = values, self._flags_of(values)
+            regressors = self._kernel.powers(values, 1.0)
+            for effect in self._steps:
+                regressors += effect(time_us, hx, hy, hz, values)
+            if regressors != self._last:
+                self._last = regressors
+                self._prepared = self._stage(regressors)
         F, sigma, x, y, z, sx, sy, sz = _apply(hx, hy, hz, self._prepared, self._sight, sqrt)
-        quality |= self._base
-        for value, (low, high) in zip(values, self._ranges, strict=False):
-            if not low <= value <= high:
-                quality |= Quality.STALE_TELEMETRY if isnan(value) else Quality.EXTRAPOLATED
+        quality |= self._flags
         if F - F != 0.0:  # NaN or infinite
-            quality |= int(hx + hy + hz - (hx + hy + hz) != 0.0) * Quality.GAP
+            quality |= GAP if hx + hy + hz - (hx + hy + hz) != 0.0 else 0
             F = x = y = z = np.nan
             sigma = sx = sy = sz = inf
-        return Corrected(F, sigma, (x, y, z), (sx, sy, sz), int(quality))
+        return Corrected(F, sigma, (x, y, z), (sx, sy, sz), quality)
+
+    def _flags_of(self, values: tuple[float, ...]) -> int:
+        flags = self._base
+        for value, (low, high) in zip(values, self._ranges, strict=False):
+            if not low <= value <= high:
+                flags |= STALE_TELEMETRY if isnan(value) else EXTRAPOLATED
+        return flags
 
     def total_at(self, field: tuple[float, float, float], positions: tuple[float, ...]) -> float:
         """Return the total field (nT) that `field` would mean at other positions; effects are left aside.
@@ -289,10 +300,10 @@ def correct(
             out[:, part] = _apply(hx, hy, hz, prepared, sight, np.sqrt)
         quality = np.full(n, _base_flags(calibration))
         for value, (low, high) in zip(channels.T, _ranges(calibration), strict=False):
-            quality |= np.where((value < low) | (value > high), int(Quality.EXTRAPOLATED), 0)
-            quality |= np.where(np.isnan(value), int(Quality.STALE_TELEMETRY), 0)
+            quality |= np.where((value < low) | (value > high), EXTRAPOLATED, 0)
+            quality |= np.where(np.isnan(value), STALE_TELEMETRY, 0)
         lost = ~np.isfinite(out[0])
-        quality |= np.where(lost & ~np.isfinite(field.sum(axis=1)), int(Quality.GAP), 0)
+        quality |= np.where(lost & ~np.isfinite(field.sum(axis=1)), GAP, 0)
     out[np.ix_([0, 2, 3, 4], lost)] = np.nan
     out[np.ix_([1, 5, 6, 7], lost)] = inf
     return CorrectedArrays(out[0], out[1], out[2:5].T, out[5:8].T, quality)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
 from typing import Any
 
@@ -12,8 +12,10 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 import magbridge
+from magbridge.calibration.boresight import find_boresight
 from magbridge.calibration.data import Observations
-from magbridge.calibration.model import Calibration, Noise, Parameter, Reference, Run, Sensor
+from magbridge.calibration.identify import expected_ratio, warnings_for
+from magbridge.calibration.model import Calibration, Noise, Parameter, Reference, Run, Sensor, with_boresight
 from magbridge.calibration.noise import NoiseModel
 from magbridge.calibration.residual import Samples, residuals
 from magbridge.calibration.terms import Polynomial
@@ -32,6 +34,9 @@ METHODS: dict[str, str] = {
 }
 """Name -> ``module:function``, each ``(observations, order, **options) -> Fit``."""
 
+ONE_ATTITUDE = 5.0  # deg from the mean direction
+UNSUPPORTED = 5.0  # times the noise is more than a calibration may leave
+
 
 @dataclass(frozen=True, eq=False)
 class Fit:
@@ -45,13 +50,16 @@ class Fit:
     warnings : tuple of str
         What the data could not tell, in a pilot's words.
     details : dict
-        Numbers of the method: evidence, rank, widths.
+        Numbers of the method: evidence, widths, what was determined.
+    supported : bool
+        The data hold the fit: what it leaves open is small against the noise (``--strict``).
     """
 
     calibration: Calibration
     residual: FloatArray
     warnings: tuple[str, ...]
     details: dict[str, Any]
+    supported: bool = True
 
     @property
     def rms(self) -> float:
@@ -83,7 +91,46 @@ def fit(data: Observations, method: str = "auto", order: int = 3, **options: Any
     chosen: Callable[..., Fit] = getattr(import_module(module), name)
     # one thread: matrices this small only wait for each other, and sums keep one order on any machine
     with threadpool_limits(1, "blas"):
-        return chosen(data, order, **options)
+        _refuse_one_attitude(data)
+        return _judged(chosen(data, order, **options), data)
+
+
+def _refuse_one_attitude(data: Observations) -> None:
+    """Refuse samples that all point the same way: nothing in them turns the sensor's errors."""
+    unit = data.field / np.linalg.norm(data.field, axis=1)[:, None]
+    middle = unit.mean(axis=0)
+    off = np.degrees(np.arccos(np.clip(unit @ middle / np.linalg.norm(middle), -1.0, 1.0)))
+    if np.quantile(off, 0.95) < ONE_ATTITUDE:
+        raise CalibrationError(
+            f"all samples stand within {np.quantile(off, 0.95):.1f} degrees of one attitude: "
+            "fly turns (full circles, dives and climbs)"
+        )
+
+
+def _judged(found: Fit, data: Observations) -> Fit:
+    """Add the boresight, and say what the data could not tell."""
+    calibration = found.calibration
+    if calibration.boresight is None:
+        calibration = with_boresight(calibration, find_boresight(calibration, data))
+    ratio = expected_ratio(calibration, data)
+    warnings = [*found.warnings, *warnings_for(calibration, data)]
+    outliers = found.details.get("outliers", 0)
+    if outliers > 0.02 * len(data):
+        warnings.append(f"{outliers} of {len(data)} samples are outliers and took no part")
+    if ratio > UNSUPPORTED:
+        warnings.insert(
+            0,
+            f"the data do not support this fit: near these runs, rolled 10 degrees further, "
+            f"expect {ratio * calibration.noise.sensor:.0f} nT of error",
+        )
+    details = {**found.details, "expected_over_noise": ratio}
+    return replace(
+        found,
+        calibration=calibration,
+        warnings=tuple(warnings),
+        details=details,
+        supported=ratio <= UNSUPPORTED,
+    )
 
 
 def fit_nominal(data: Observations, order: int = 0, **options: Any) -> Fit:  # noqa: ARG001  (one ellipsoid has none)
