@@ -117,12 +117,13 @@ class Track:
 
         Between two values it is interpolated (age 0); after the last it is held.
         """
-        after_us, after = 0, 0.0
-        for then_us, value in reversed(self.history):
+        history = self.history
+        after_us, after = history[-1]
+        if after_us <= time_us:
+            before = history[-2][1] if len(history) > 1 else after
+            return after, (time_us - after_us) * 1e-6, before
+        for then_us, value in reversed(history):
             if then_us <= time_us:
-                if not after_us:
-                    before = self.history[-2][1] if len(self.history) > 1 else value
-                    return value, (time_us - then_us) * 1e-6, before
                 weight = (time_us - then_us) / (after_us - then_us)
                 return value + weight * (after - value), 0.0, value
             after_us, after = then_us, value
@@ -221,22 +222,23 @@ class Aligner:
 
     def _common_time(self, reading: Reading, time_us: int) -> tuple[Vector, int]:
         """Interpolate the channels to the earliest one's time: field in nT and that time in µs."""
-        delays = reading.channel_delay
-        earliest = min(delays)
+        x_late, y_late, z_late = reading.channel_delay
+        earliest = min(x_late, y_late, z_late)
         first_us = time_us + round(earliest * 1e6)
-        if self._before is None or (delays[0] == delays[1] == delays[2]):
+        if self._before is None or x_late == y_late == z_late:
             return reading.field, first_us
         before_us, before = self._before
         step = (time_us - before_us) * 1e-6
         if step <= 0.0:
             return reading.field, first_us
-        x, y, z = (
-            now - (now - then) * (delay - earliest) / (step + delay - then_delay)
-            for now, then, delay, then_delay in zip(
-                reading.field, before.field, delays, before.channel_delay, strict=True
-            )
-        )
-        return (x, y, z), first_us
+        x, y, z = reading.field
+        x_then, y_then, z_then = before.field
+        x_was, y_was, z_was = before.channel_delay
+        return (
+            x - (x - x_then) * (x_late - earliest) / (step + x_late - x_was),
+            y - (y - y_then) * (y_late - earliest) / (step + y_late - y_was),
+            z - (z - z_then) * (z_late - earliest) / (step + z_late - z_was),
+        ), first_us
 
     def _is_gap(self, time_us: int) -> bool:
         """Say whether samples are missing before `time_us`.
