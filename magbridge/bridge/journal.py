@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from struct import Struct
 
 from magbridge.mavlink import Codec, spec
 from magbridge.records import Channel
 
 __all__ = ["Journal"]
 
-BYTES = spec("MAG_SENSOR_BYTES")
+BYTES, RAW = spec("MAG_SENSOR_BYTES"), spec("MAG_RAW")
+HEAD = Struct("<BB")
+"""Its fields before the data: sensor_id, length."""
 SIZE = BYTES.fields["data"].count
+SENT, LINK, SENSOR, STATE = Channel
 
 
 class Journal:
@@ -32,11 +36,11 @@ class Journal:
 
     def sent(self, frames: Iterable[tuple[int, bytes]]) -> None:
         """Take what went out over the link: event time in µs, frame."""
-        self._add([(time_us, Channel.SENT, frame) for time_us, frame in frames])
+        self._add([(time_us, SENT, frame) for time_us, frame in frames])
 
     def link(self, time_us: int, frames: Iterable[bytes]) -> None:
         """Take what came over the link."""
-        self._add([(time_us, Channel.LINK, frame) for frame in frames])
+        self._add([(time_us, LINK, frame) for frame in frames])
 
     def sensor(self, time_us: int, data: bytes) -> None:
         """Take bytes as they came from the sensor."""
@@ -44,12 +48,16 @@ class Journal:
             return
         for begin in range(0, len(data), SIZE):
             piece = data[begin : begin + SIZE]
-            frame = self._scribe.frame(BYTES, BYTES.struct.pack(0, len(piece), piece))
-            self._add([(time_us, Channel.SENSOR, frame)])
+            frame = self._scribe.frame(BYTES, HEAD.pack(0, len(piece)) + piece)
+            self._add([(time_us, SENSOR, frame)])
 
     def state(self, time_us: int, frame: bytes) -> None:
         """Take a frame that says what changed at the edge."""
-        self._add([(time_us, Channel.STATE, frame)])
+        self._add([(time_us, STATE, frame)])
+
+    def raw(self, time_us: int, payload: bytes) -> None:
+        """Write a MAG_RAW that is not published: without it, nothing could be calibrated from the log."""
+        self._add([(time_us, STATE, self._scribe.frame(RAW, payload))])
 
     def note(self, time_us: int, name: str, **fields: object) -> None:
         """Write a state record of our own."""

@@ -70,9 +70,8 @@ def drive(pipeline: Pipeline, edge: Edge, log: TlogWriter | None, after: Callabl
             edge.send(Channel.SENSOR, b"".join(pipeline.sensor.to_send))
             pipeline.sensor.to_send.clear()
         records = pipeline.journal.drain()
-        if log is not None:
-            for record in records:
-                log.write(*record)
+        if log is not None and records:
+            log.extend(records)
         after(event.time_us)
 
 

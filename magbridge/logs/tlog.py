@@ -3,7 +3,7 @@
 A record is an 8-byte big-endian stamp and a MAVLink frame. The stamp is the event's time in µs since 1970 UTC, a
 multiple of 4, plus the :class:`~magbridge.records.Channel` in its low two bits.
 
-The live thread only appends to a queue (about 0.3 µs); a thread of its own writes whole records. The first
+The live thread only appends to a queue (about 0.3 µs an event); a thread of its own writes whole records. The first
 record after a pause is written at once, those that follow within `WINDOW` together: after ``kill -9`` the
 file holds everything but the last group and reads to its end. A disk that stalls fills the queue, a disk that is
 full stops the log; either way records are dropped and counted, and the live thread never waits.
@@ -29,12 +29,15 @@ from magbridge.records import Channel
 
 __all__ = ["STAMP", "TlogWriter", "declarations"]
 
+Record = tuple[int, int, bytes]
+"""µs of the event, channel, frame."""
+
 STAMP = Struct(">Q")
 WINDOW = 0.005
 """s between two writes: up to 200 events a second each is written at once, and ``kill -9`` costs at most the last
 one; above that, those of 5 ms. In latency and processor time, 5 ms could not be told from 50 at 1,000 Hz."""
-QUEUE = 8_000_000
-"""bytes that wait for a stalled disk before records are dropped."""
+QUEUE = 100_000
+"""Records (some 10 MB) that wait for a stalled disk before they are dropped."""
 RETRY_US = 2_000_000
 """µs of the events' time after which a log that failed is tried again, in a new file."""
 SYNC_US = 5_000_000
@@ -87,7 +90,7 @@ class TlogWriter:
         self._head = tuple(head)
         self.records, self.failure = 0, ""
         # of the live thread
-        self._queue: deque[bytes] = deque()
+        self._queue: deque[Sequence[Record]] = deque()
         self._put = self._refused = 0
         self._idle, self._wake, self._closing = True, Event(), Event()
         # of the writing thread
@@ -115,12 +118,15 @@ class TlogWriter:
         frame : bytes
             One whole MAVLink frame.
         """
+        self.extend([(time_us, channel, frame)])
+
+    def extend(self, records: Sequence[Record]) -> None:
+        """Log the frames of an event, as :meth:`write` does; the list is the log's from now on."""
         if self._put - self._taken > QUEUE:
-            self._refused += 1
+            self._refused += len(records)
             return
-        record = STAMP.pack(time_us | channel) + frame
-        self._put += len(record)
-        self._queue.append(record)
+        self._put += len(records)
+        self._queue.append(records)
         if self._idle:
             self._idle = False
             self._wake.set()
@@ -154,18 +160,20 @@ class TlogWriter:
         self._end_file()
 
     def _drain(self) -> None:
-        records = [self._queue.popleft() for _ in range(len(self._queue))]
-        size = sum(map(len, records))
-        self._taken += size
-        if self._fits(size, STAMP.unpack_from(records[-1])[0]):
-            self._put_down(records)
+        records: list[Record] = []
+        for _ in range(len(self._queue)):
+            records += self._queue.popleft()
+        self._taken += len(records)
+        data = _packed(records)
+        if self._fits(len(data), records[-1][0]):
+            self._put_down(data, records)
             return
         for record in records:
-            time_us = STAMP.unpack_from(record)[0]
-            if not self._fits(len(record), time_us):
+            data = _packed([record])
+            if not self._fits(len(data), record[0]):
                 self._end_file()
-            if self._file >= 0 or self._begin_file(time_us):
-                self._put_down([record])
+            if self._file >= 0 or self._begin_file(record[0]):
+                self._put_down(data, [record])
             else:
                 self._dropped += 1
 
@@ -194,25 +202,24 @@ class TlogWriter:
         self._size, self._start_us, self._synced_us = 0, time_us, time_us
         return True
 
-    def _put_down(self, group: list[bytes]) -> None:
+    def _put_down(self, data: bytes, records: list[Record]) -> None:
         """Write whole records; when that fails, leave none half-written."""
         if not self._size:
-            stamp = STAMP.pack(STAMP.unpack_from(group[0])[0] & ~3 | Channel.STATE)
-            group = [group[0], *(stamp + frame for frame in self._head), *group[1:]]
-        data = memoryview(b"".join(group))
-        time_us = STAMP.unpack_from(group[-1])[0]
+            first, *others = records
+            data = _packed([first, *((first[0], Channel.STATE, frame) for frame in self._head), *others])
+        rest, time_us = memoryview(data), records[-1][0]
         try:
-            while data:
-                data = data[os.write(self._file, data) :]
+            while rest:
+                rest = rest[os.write(self._file, rest) :]
             if not 0 <= time_us - self._synced_us < SYNC_US:
                 os.fdatasync(self._file)
                 self._synced_us = time_us
         except OSError as error:
-            self._dropped += len(group)
+            self._dropped += len(records)
             self._fail(error, time_us)
             return
-        self._size += sum(map(len, group))
-        self.records += len(group)
+        self._size += len(data)
+        self.records += len(records)
         self.failure = ""
 
     def _fail(self, error: OSError, time_us: int) -> None:
@@ -231,6 +238,12 @@ class TlogWriter:
                 os.close(file)
             except OSError as error:  # a network disk reports here what it could not write
                 self.failure = error.strerror or str(error)
+
+
+def _packed(records: Sequence[Record]) -> bytes:
+    stamp = STAMP.pack
+    parts = [part for time_us, channel, frame in records for part in (stamp(time_us | channel), frame)]
+    return b"".join(parts)
 
 
 def declarations(system: int, component: int, telemetry: Mapping[str, Telemetry]) -> list[bytes]:

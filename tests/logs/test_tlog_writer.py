@@ -123,13 +123,13 @@ def test_stalled_disk_drops_and_counts_and_never_blocks(
 ) -> None:
     """The file is a pipe that nobody empties: its writes block like those to a disk that hangs."""
     inlet, outlet = os.pipe()
-    monkeypatch.setattr(tlog, "QUEUE", 100_000)
+    monkeypatch.setattr(tlog, "QUEUE", 3_000)
     monkeypatch.setattr(os, "open", lambda *_: outlet)
     log = TlogWriter(tmp_path)
     log.write(T0, 0, FRAME)
     time.sleep(0.1)
     monkeypatch.undo()
-    monkeypatch.setattr(tlog, "QUEUE", 100_000)
+    monkeypatch.setattr(tlog, "QUEUE", 3_000)
     slowest = 0.0
     for k in range(20_000):
         begin = time.perf_counter()
