@@ -295,9 +295,8 @@ def test_second_bridge_on_the_same_sensor(rig: Rig, table: Row) -> None:
 
         def refused() -> bool:
             try:
-                for message in ear.parse(sink.recv(65536)):
-                    if message.name == "STATUSTEXT":
-                        told.append(message["text"])
+                heard = ear.parse(sink.recv(65536))
+                told.extend(message["text"] for message in heard if message.name == "STATUSTEXT")
             except BlockingIOError:
                 pass
             return any("digitizer lost" in text for text in told)
