@@ -15,6 +15,8 @@ from magbridge.records import Channel
 __all__ = ["Recorded", "is_own_log", "runs"]
 
 BEGIN, PARAMETER, COLUMN = (spec(name).id for name in ("MAG_BRIDGE_START", "PARAM_VALUE", "MAG_COLUMN"))
+NOT_EVENTS = (BEGIN, PARAMETER, COLUMN, spec("MAG_RAW").id)
+"""State records that a bridge writes for whoever reads the log, not for its replay."""
 
 
 def is_own_log(path: Path) -> bool:
@@ -93,7 +95,7 @@ class Recorded:
         for (time_us, channel), group in groupby(inputs, lambda record: (record.time_us, record.channel)):
             if channel == Channel.STATE:
                 for record in group:
-                    if record.message.id not in (BEGIN, PARAMETER, COLUMN):
+                    if record.message.id not in NOT_EVENTS:
                         yield Event(time_us, Channel.STATE, record.frame)
             elif channel == Channel.SENSOR:
                 yield Event(time_us, Channel.SENSOR, _sensor_bytes(group))

@@ -20,7 +20,7 @@ from magbridge.bridge.port import Port
 from magbridge.bridge.run import drive, set_up
 from magbridge.bridge.serial_port import SerialPort
 from magbridge.bridge.sockets import open_link
-from magbridge.config import load
+from magbridge.config import Log, load
 from magbridge.errors import MagbridgeError
 from magbridge.logs.tlog import TlogWriter, declarations
 from magbridge.records import Channel
@@ -93,6 +93,8 @@ def main() -> int:
     chosen = parser.parse_args()
     try:
         config = load(chosen.config)
+        if chosen.log and config.log is None:
+            config = msgspec.structs.replace(config, log=Log(directory=str(chosen.log)))
         sensor, link = SerialPort(chosen.sensor, config.sensor.baudrate), open_link(chosen.link, 0)
         sensor.open()
         link.open()

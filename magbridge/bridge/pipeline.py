@@ -122,6 +122,7 @@ class Pipeline:
             start.time_us,
         )
         self.journal = Journal(config.link.system, config.link.component, active=config.log is not None)
+        self._raw_rate = self.component.rates["MAG_RAW"]
         self._position = Position()
         self._samples = self._lost = self._quality = self._log_lost = 0
         self._times: deque[int] = deque(maxlen=LATELY)
@@ -170,9 +171,11 @@ class Pipeline:
         if (corrected.quality ^ self._quality) & DOUBTS:
             self._tell_doubts(corrected.quality & DOUBTS)
         anomaly = corrected.total_field - self._position.main_field(sample.time_us)
-        self.component.publisher.publish(
-            Sample(reading, stamp.time_us, corrected, sample.time_us, sample.age, anomaly)
-        )
+        publisher = self.component.publisher
+        out = Sample(reading, stamp.time_us, corrected, sample.time_us, sample.age, anomaly)
+        publisher.publish(out)
+        if self.journal.active and self._raw_rate.hertz != 0:
+            self.journal.raw(self.component.codec.now_us, publisher.raw_payload(out))
 
     def _hear_link(self, event: Event) -> None:
         component = self.component

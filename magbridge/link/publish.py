@@ -96,6 +96,10 @@ class Publisher:
         return True
 
     def _raw(self, sample: Sample) -> tuple[bytes]:
+        return (self._codec.frame(RAW, self.raw_payload(sample)),)
+
+    def raw_payload(self, sample: Sample) -> bytes:
+        """Return the payload of a sample's MAG_RAW."""
         reading = sample.reading
         flags = SATURATED if reading.saturated else 0
         if reading.counts is not None:
@@ -105,7 +109,7 @@ class Publisher:
         if reading.power_cycle is not None:
             flags |= POWER_CYCLE
         x, y, z = reading.channel_delay
-        payload = RAW.struct.pack(
+        return RAW.struct.pack(
             sample.reading_us + self.utc_offset_us,
             (reading.sequence or 0) & MASK,
             *reading.field,
@@ -119,7 +123,6 @@ class Publisher:
             0,
             flags,
         )
-        return (self._codec.frame(RAW, payload),)
 
     def _field(self, sample: Sample) -> tuple[bytes]:
         corrected = sample.corrected

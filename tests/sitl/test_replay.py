@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from magbridge.errors import FormatError, PortError, WrongUse
-from magbridge.logs import write
+from magbridge.logs import read, write
 from sitl import load, segments, simulate
 from sitl.demo import demo
 from sitl.own_log import Recorded, is_own_log
@@ -154,3 +154,15 @@ def test_real_telemetry_with_a_simulated_field(real_data: Path) -> None:
     result = replay(sorted((real_data / "slocum_comet").glob("*-00[0-2].[de]bd")))
     assert result["simulated_field"]
     assert result["parts"][-1]["corrected_rms_nT"] < 0.1 * result["parts"][-1]["raw_rms_nT"]
+
+
+def test_a_log_can_be_calibrated_from_whatever_was_published(survey: Path, tmp_path: Path) -> None:
+    """Raw readings stand in the log even where MAG_RAW is switched off, and a replay of it is the same."""
+    path = config(tmp_path)
+    path.write_text(path.read_text().replace("MAG_RAW = 0", "MAG_RAW = -1"))
+    replay([survey], path, log=tmp_path / "logs")
+    logs = sorted((tmp_path / "logs").glob("*.tlog"))
+    raw, truth = read(logs), read(survey)
+    assert raw.sizes["time"] == 150
+    np.testing.assert_allclose(raw["mag_x"], truth["mag_x"], atol=0.02)
+    assert replay(logs, path)["runs"][0]["identical"]
