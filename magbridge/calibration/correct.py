@@ -175,6 +175,7 @@ class Corrector:
         self._flags = self._base
         self._last: list[float] = []
         self._prepared: tuple[Any, ...] = ()
+        self._pairs = list(zip(self._kernel.first.tolist(), self._kernel.second.tolist(), strict=True))
         self._buffer = np.empty_like(self._kernel.table)
         self._asked: dict[tuple[float, ...], list[float]] = {}
 
@@ -255,8 +256,7 @@ class Corrector:
         return sqrt(bx * bx + by * by + bz * bz)
 
     def _stage(self, regressors: list[float]) -> tuple[Any, ...]:
-        phi = np.array(regressors)
-        psi = phi.take(self._kernel.first) * phi.take(self._kernel.second)
+        psi = np.array([regressors[i] * regressors[j] for i, j in self._pairs])
         np.multiply(psi[:, None], self._kernel.table, out=self._buffer)
         return _prepare(np.add.reduce(self._buffer, axis=0).tolist())
 
