@@ -120,13 +120,13 @@ def soaked(surface: Array, step: float, lag: float) -> Array:
 def heat_offset(scene: Scene, size: float, rng: Generator) -> None:
     """An offset that follows the core's temperature; size in nT/degC."""
     core = soaked(scene.logged["sensor_temperature"][0], scene.track.step, float(rng.uniform(300, 4000)))
-    scene.field = scene.field + size * _direction(rng) * (core - core[0] + rng.normal())[:, None]
+    scene.field = scene.field + size * _direction(rng) * (core - core[0] + 0.5 * rng.normal())[:, None]
 
 
 def heat_scale(scene: Scene, size: float, rng: Generator) -> None:
     """Copper in the coils: gains follow the core's temperature; size in 1/degC, times 5e4."""
     core = soaked(scene.logged["sensor_temperature"][0], scene.track.step, float(rng.uniform(300, 4000)))
-    gains = 1.0 + size / 5e4 * np.abs(rng.normal(1.0, 0.4, 3)) * (core - core[0] + rng.normal())[:, None]
+    gains = 1.0 + size / 5e4 * np.abs(rng.normal(1.0, 0.4, 3)) * (core - core[0] + 0.5 * rng.normal())[:, None]
     scene.field = scene.field * gains
 
 
@@ -195,8 +195,14 @@ def preisach(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def ring(scene: Scene, size: float, rng: Generator) -> None:
-    """A conducting ring with resistance and inductance (a few tenths of a second); size in s of field's change."""
-    normal, place = _direction(rng), _direction(rng)
+    """A conducting ring with inductance, where its own field stands across its axis; size in s times the field's change.
+
+    A dipole n seen from p is ``3 p (p . n) - n``: at the magic angle, ``(p . n)^2 = 1/3``, it has nothing along n.
+    """
+    normal = np.eye(3)[rng.integers(3)] + 0.05 * rng.normal(size=3)
+    normal /= np.linalg.norm(normal)
+    side = np.cross(normal, _direction(rng))
+    place = normal / np.sqrt(3.0) + side / np.linalg.norm(side) * np.sqrt(2.0 / 3.0)
     flux = first_order(scene.field @ normal, scene.track.step, float(rng.uniform(0.05, 0.3)))
     shape = 3 * place * (place @ normal) - normal
     scene.field = scene.field - size * shape * np.gradient(flux, scene.track.step)[:, None]

@@ -83,7 +83,7 @@ class RateEffect(Effect, frozen=True, kw_only=True):
     cause : str
     on : {"lag", "skew", "eddy"}
         ``lag``: an anti-alias filter's delay tau common to all channels, ``T = -tau dH/dt``: one coefficient.
-        ``skew``: y and z are sampled later than x by tau_i, ``T_i = tau_i dH_i/dt``: two.
+        ``skew``: each channel is sampled tau_i later than the log says, ``T_i = tau_i dH_i/dt``: three.
         ``eddy``: currents that a changing field drives, ``T_i = k_ij dH_j/dt``, i != j: six, in the order
         xy, xz, yx, yz, zx, zy (Tolles & Lawson 1950, in the notation of Leliak 1961). All in s.
 
@@ -99,7 +99,7 @@ class RateEffect(Effect, frozen=True, kw_only=True):
     @property
     def size(self) -> int:
         """How many times."""
-        return {"lag": 1, "skew": 2, "eddy": 6}[self.on]
+        return {"lag": 1, "skew": 3, "eddy": 6}[self.on]
 
     def columns(self, field: float) -> FloatArray:  # noqa: ARG002  (others need it)
         """Three regressors, the rates of the three channels (nT/s)."""
@@ -107,7 +107,8 @@ class RateEffect(Effect, frozen=True, kw_only=True):
         if self.on == "lag":
             columns[0, :, 6:9] = -np.eye(3)
         elif self.on == "skew":
-            columns[0, 1, 7] = columns[1, 2, 8] = 1.0
+            for k in range(3):
+                columns[k, k, 6 + k] = 1.0
         else:
             pairs = [(i, j) for i in range(3) for j in range(3) if i != j]
             for k, (i, j) in enumerate(pairs):

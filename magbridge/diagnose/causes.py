@@ -228,7 +228,7 @@ def eddy_current(problem: Problem) -> list[Candidate]:
 def channel_skew(problem: Problem) -> list[Candidate]:
     """One digitiser takes the channels in turn: ``T_i += tau_i dH_i/dt`` (paper, section 3)."""
     effect = RateEffect(cause="channel_skew", on="skew")
-    return [of_effect(problem, effect, 0.5, "s", names=("y", "z"), phi=_rates(problem))]
+    return [of_effect(problem, effect, 0.5, "s", phi=_rates(problem))]
 
 
 def filter_lag(problem: Problem) -> list[Candidate]:

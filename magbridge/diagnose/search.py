@@ -2,8 +2,10 @@ r"""The search: which causes the data speak for, one after the other, with look-
 
 Notes
 -----
-*Score.* For a candidate with projected information S and score b (:mod:`.joint`), ``b^T S^-1 b`` is what its
-likelihood ratio would be; ``b^T (S + 1)^-1 b / 2 - log|S + 1| / 2`` its log evidence, in units of its prior width.
+*Score.* For a candidate with projected information S and score b (:mod:`.joint`), ``R = b^T S^-1 b`` is what its
+likelihood ratio would be. Nobody knows beforehand how large an effect is, so its k coefficients have Zellner's prior
+``N(0, g S^-1)`` with the g that the data like best: log evidence ``(R - k)/2 - (k/2) log(R/k)``, 0 below ``R = k``
+(Liang et al. 2008, JASA 103:410, sec. 2.4). It asks the same price of every cause, whatever its unit.
 The noise under which both are taken may have swallowed the effect, so candidates are scored twice: under the
 noise of the model so far, and under the noise that is left when every cause may take what it can.
 
@@ -28,7 +30,7 @@ from magbridge.diagnose.joint import Information, Joint, fit_joint, information
 from magbridge.diagnose.noise import memory_order
 from magbridge.diagnose.problem import Problem
 
-__all__ = ["LEVEL", "ODDS", "Hypothesis", "Outcome", "score", "search", "slices", "trials"]
+__all__ = ["LEVEL", "ODDS", "Hypothesis", "Outcome", "score", "search", "slices", "trials", "weigh"]
 
 FloatArray = NDArray[np.float64]
 
@@ -41,6 +43,8 @@ SHORT_LIST = 10
 """Causes that are fitted jointly in a round."""
 IDEAL = 0.15
 """How far from the truth an idealised regressor may be: what is left of a large effect is not another cause."""
+IMPLAUSIBLE = 30.0
+"""Times the plausible size, 1-sigma of what is believed at all."""
 SHARPEN = 4
 """Halvings of a nonlinear parameter's bracket."""
 MOST = 5
@@ -111,7 +115,6 @@ class Score:
     ratio: float
     freedom: int
     evidence: float
-    occam: float
     estimate: FloatArray
     root: FloatArray
 
@@ -122,12 +125,18 @@ def score(info: Information, at: slice) -> Score:
     values, vectors = np.linalg.eigh(S)
     seen = values > 1e-3  # of the prior's own information: less is invisible
     if not seen.any():
-        return Score(0.0, 0, 0.0, 0.0, np.zeros(len(b)), np.zeros((len(b), 0)))
+        return Score(0.0, 0, 0.0, np.zeros(len(b)), np.zeros((len(b), 0)))
     root = vectors[:, seen] / np.sqrt(values[seen])
     ratio = float(np.sum((root.T @ b) ** 2))
-    occam = -0.5 * float(np.log1p(np.maximum(values, 0.0)).sum())
     estimate = vectors[:, seen] @ ((vectors[:, seen].T @ b) / (values[seen] + 1.0))
-    return Score(ratio, int(seen.sum()), 0.5 * float(b @ estimate) + occam, occam, estimate, root)
+    return Score(ratio, int(seen.sum()), weigh(ratio, int(seen.sum())), estimate, root)
+
+
+def weigh(ratio: float, freedom: int) -> float:
+    """Log evidence of a likelihood ratio that took so many free numbers."""
+    if ratio <= freedom or not freedom:
+        return 0.0
+    return 0.5 * (ratio - freedom) - 0.5 * freedom * float(np.log(ratio / freedom))
 
 
 def slices(candidates: Sequence[Candidate]) -> list[slice]:
@@ -227,7 +236,8 @@ class _Search:
             tests = self.trials.get(candidate.cause, 1.0) * self.causes
             p_value = min(1.0, tests * float(chi2.sf(ratio, max(s.freedom, 1))))
             b = fit.coefficients[-candidate.size :]
-            evidence = 0.5 * ratio + s.occam - 0.5 * min(float(b @ b), 50.0) + average
+            # beyond many times its plausible size a cause is none
+            evidence = weigh(ratio, s.freedom) + average - 0.5 * float(np.sum((b / IMPLAUSIBLE) ** 2))
             if candidate.trials > 1.0:
                 evidence -= float(np.log(candidate.trials))
             found.append(Hypothesis(candidate, ratio, evidence, p_value, fit))

@@ -14,7 +14,7 @@ from magbridge.diagnose.candidates import Candidate
 from magbridge.diagnose.joint import Joint, fit_joint, information
 from magbridge.diagnose.noise import TAILS
 from magbridge.diagnose.problem import Columns, Problem
-from magbridge.diagnose.search import LEVEL, score
+from magbridge.diagnose.search import LEVEL, score, weigh
 
 __all__ = ["Leftover", "Outliers", "kinds", "leftover", "outliers"]
 
@@ -99,12 +99,12 @@ def leftover(
         s = score(info, slice(0, size))
         start = np.concatenate([fit.z, fit.coefficients, s.estimate])
         joint = fit_joint(problem, [*columns, flexible], order, start, ridge=1.0, rounds=4)
-        found.append(_judge(kind, joint, fit, s.occam, s.freedom, size, trials * 4))
+        found.append(_judge(kind, joint, fit, s.freedom, size, trials * 4))
     if tone is not None:
         info = information(problem, fit.noise, fit, columns, [tone.columns])
         s = score(info, slice(0, tone.size))
         joint = fit_joint(problem, [*columns, tone.columns], order, np.concatenate([fit.z, fit.coefficients, s.estimate]))
-        judged = _judge("tone", joint, fit, s.occam, s.freedom, tone.size, tone.trials * 4)
+        judged = _judge("tone", joint, fit, s.freedom, tone.size, tone.trials * 4)
         found.append(judged._replace(period_s=tone.shape["period"][0], evidence=judged.evidence - np.log(tone.trials)))
     sure = [entry for entry in found if entry.p_value < LEVEL]
     if not sure:
@@ -115,11 +115,11 @@ def leftover(
     return best._replace(best_channel=_goes_with(problem, fit))
 
 
-def _judge(kind: str, joint: Joint, base: Joint, occam: float, freedom: int, size: int, trials: float) -> Leftover:
+def _judge(kind: str, joint: Joint, base: Joint, freedom: int, size: int, trials: float) -> Leftover:
     b = joint.coefficients[-size:]
     ratio = max(0.0, 2.0 * (joint.log_likelihood - base.log_likelihood))
     p_value = min(1.0, trials * float(chi2.sf(ratio, max(freedom, 1))))
-    evidence = 0.5 * ratio + occam - 0.5 * float(b @ b)
+    evidence = weigh(ratio, max(freedom, 1))
     own = np.linalg.inv(joint.covariance[-size:, -size:])
     # of the flexible fit's own numbers, those that the data determine
     return Leftover(kind, float(np.sqrt(max(b @ own @ b - freedom, 0.0))), p_value, evidence, None, None)
