@@ -26,6 +26,8 @@ from magbridge.calibration.residual import NormalEquations
 __all__ = ["Quadratic", "Widths", "evidence", "is_maximum", "maximise"]
 
 FloatArray = NDArray[np.float64]
+FARTHEST = 10.0  # sigmas of the prior of eta: nothing physical lies beyond, and exp must not overflow
+SIGMA_STEP = 0.1  # a step in log sigma as large as one prior sigma in eta
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,19 +90,18 @@ def evidence(
 
 def maximise(quadratic: Quadratic, structure: Structure, eta: FloatArray, sigma: float) -> Widths:
     """Climb from `eta` and `sigma` to where the evidence is largest."""
+    middle = np.append(structure.centre, np.log(sigma))
+    scale = np.append(structure.spread, SIGMA_STEP)
 
     def downhill(x: FloatArray) -> tuple[float, FloatArray]:
-        value, slope, *_ = evidence(quadratic, structure, x[:-1], x[-1])
-        return (-value, -slope) if np.isfinite(value) else (1e300, -slope)
+        if np.abs(x[:-1]).max() > FARTHEST:
+            return 1e300, 0.0 * x
+        at = middle + scale * x
+        value, slope, *_ = evidence(quadratic, structure, at[:-1], at[-1])
+        return (-value if np.isfinite(value) else 1e300), -slope * scale
 
-    found = minimize(
-        downhill,
-        np.append(eta, np.log(sigma)),
-        jac=True,
-        method="BFGS",
-        options={"gtol": 1e-2, "maxiter": 200},
-    )
-    x = found.x
+    start = np.append((eta - structure.centre) / structure.spread, 0.0)
+    x = middle + scale * minimize(downhill, start, jac=True, method="BFGS", options={"gtol": 1e-2}).x
     value, _, z, determined = evidence(quadratic, structure, x[:-1], x[-1])
     return Widths(x[:-1], float(np.exp(x[-1])), value, determined, z)
 

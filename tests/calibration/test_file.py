@@ -1,0 +1,158 @@
+"""cal.json: what is written is read, and what does not hold together is one clear line."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from magbridge.calibration.correct import correct
+from magbridge.calibration.dipole import Dipole
+from magbridge.calibration.effects import ChannelEffect
+from magbridge.calibration.file import (
+    FORMAT,
+    calibration_id,
+    decode_calibration,
+    encode_calibration,
+    load,
+    save,
+)
+from magbridge.calibration.model import Boresight, Calibration, Noise, Parameter, Reference, Run, Sensor
+from magbridge.calibration.paper import from_paper, to_paper
+from magbridge.calibration.terms import Polynomial, full_order
+from magbridge.errors import CalibrationError, FormatError
+
+
+@pytest.fixture
+def cal() -> Calibration:
+    rng = np.random.default_rng(1)
+    root = rng.normal(size=(39, 39))
+    return Calibration(
+        parameters=(Parameter("battpos", "in", -0.4, 0.5, 0.05, 0.45),),
+        terms=(
+            Polynomial(exponents=full_order(1, 2)),
+            Dipole(parameter="battpos", at=(-0.5, 0.0, 0.05), travel=(0.0254, 0.0, 0.0), at_sigma=0.05),
+        ),
+        effects=(ChannelEffect(cause="temperature_offset", channel="sensor_temperature", lag=600.0),),
+        coefficients=rng.normal(size=39) * 100,
+        covariance=root @ root.T,
+        noise=Noise(1.0, 0.0, 0.3, 4.0),
+        reference=Reference(51_000.0, "IGRF"),
+        sensor=Sensor("digitizer", 3),
+        boresight=Boresight((0.0, 0.1, 0.2), ((1e-4, 0.0, 0.0), (0.0, 1e-4, 0.0), (0.0, 0.0, 1e-4))),
+        runs=(Run("1", 225, 1.1, (0.3,)),),
+        method="auto",
+        inputs={"a.csv": "00"},
+        software="magbridge 0.1.0",
+    )
+
+
+def test_round_trip_corrects_with_the_same_bits(cal: Calibration, tmp_path: Path) -> None:
+    path = tmp_path / "cal.json"
+    save(cal, path)
+    back = load(path)
+    assert encode_calibration(back) == encode_calibration(cal)
+    assert calibration_id(back) == calibration_id(cal)
+    rng = np.random.default_rng(2)
+    samples = rng.normal(size=(30, 3)) * 3e4, rng.uniform(-0.4, 0.5, (30, 2)), np.arange(30.0)
+    for got, want in zip(correct(back, *samples), correct(cal, *samples), strict=True):
+        np.testing.assert_array_equal(got, want)
+
+
+def test_the_contract_s_keys_are_there(cal: Calibration) -> None:
+    content = json.loads(encode_calibration(cal))
+    assert content["format"] == FORMAT
+    assert {
+        "sensor", "parameters", "terms", "coefficients", "covariance", "noise", "reference", "boresight",
+        "runs", "inputs", "software", "effects",
+    } <= content.keys()  # fmt: skip
+    assert content["parameters"][0].keys() == {"name", "unit", "low", "high", "centre", "scale"}
+
+
+def test_another_calibration_has_another_id(cal: Calibration) -> None:
+    moved = cal.coefficients.copy()
+    moved[0] += 1e-9
+    assert calibration_id(replace(cal, coefficients=moved)) != calibration_id(cal)
+
+
+def test_every_cut_is_refused_in_one_line(cal: Calibration) -> None:
+    data = encode_calibration(cal)
+    for cut in range(0, len(data) - 3, 997):
+        with pytest.raises(FormatError) as refused:
+            decode_calibration(data[:cut], "cal.json")
+        assert str(refused.value).startswith("cal.json: ")
+        assert "\n" not in str(refused.value)
+
+
+def edit(change: Callable[[dict[str, Any]], None], cal: Calibration) -> bytes:
+    content = json.loads(encode_calibration(cal))
+    change(content)
+    return json.dumps(content).encode()
+
+
+def _drop_row(c: dict[str, Any]) -> None:
+    c["covariance"].pop()
+
+
+EDITS: dict[str, tuple[Callable[[dict[str, Any]], Any], type[Exception], str]] = {
+    "newer": (lambda c: c.update(format=FORMAT + 1), FormatError, "newer magbridge"),
+    "unknown key": (lambda c: c.update(colour="red"), FormatError, "colour"),
+    "wrong type": (lambda c: c["noise"].update(sensor="low"), FormatError, "noise.sensor: Expected `float`"),
+    "missing": (lambda c: c.pop("reference"), FormatError, "reference"),
+    "unknown term": (lambda c: c["terms"][0].update(kind="warp"), FormatError, "term 'warp' is not known"),
+    "no kind": (lambda c: c["terms"][0].pop("kind"), FormatError, "without its kind"),
+    "a coefficient less": (lambda c: c["coefficients"].pop(), CalibrationError, "covariance: expected 38 x 38"),
+    "a row less": (_drop_row, CalibrationError, "covariance: expected 39"),
+    "negative variance": (
+        lambda c: c["covariance"][0].__setitem__(0, -1.0), CalibrationError, "a variance is negative"),
+    "not symmetric": (
+        lambda c: c["covariance"][0].__setitem__(1, c["covariance"][0][1] + 0.5), CalibrationError, "symmetric"),
+    "no field": (lambda c: c["reference"].update(field=0.0), CalibrationError, "reference: field"),
+    "no scale": (lambda c: c["parameters"][0].update(scale=0.0), CalibrationError, "scale > 0"),
+    "another parameter": (lambda c: c["parameters"][0].update(name="fin"), CalibrationError, "'battpos' is not one of"),
+    "exponents": (
+        lambda c: c["terms"][0].update(exponents=[[0, 0], [1, 0], [2, 0]]), CalibrationError, "one for each parameter"),
+    "an effect among terms": (
+        lambda c: c["terms"].append(c["effects"].pop()), CalibrationError, "terms and effects"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", EDITS)
+def test_edited_by_hand(name: str, cal: Calibration) -> None:
+    change, error, match = EDITS[name]
+    with pytest.raises(error, match=match) as refused:
+        decode_calibration(edit(change, cal), "cal.json")
+    assert str(refused.value).startswith("cal.json: ")
+    assert "\n" not in str(refused.value)
+
+
+def test_not_positive_semidefinite(cal: Calibration) -> None:
+    def change(content: dict[str, Any]) -> None:
+        n = len(content["covariance"])
+        content["covariance"] = (np.full((n, n), -0.9) + 1.9 * np.eye(n)).tolist()
+
+    with pytest.raises(CalibrationError, match="positive semidefinite"):
+        decode_calibration(edit(change, cal))
+
+
+def test_a_file_that_is_not_there(tmp_path: Path) -> None:
+    with pytest.raises(FormatError, match="cannot be read: No such file"):
+        load(tmp_path / "none.json")
+
+
+def test_the_paper_s_view_converts_both_ways() -> None:
+    rng = np.random.default_rng(3)
+    root = np.eye(3) + 0.05 * rng.normal(size=(3, 3))
+    A = root @ root.T
+    M, S = to_paper(A, 50_000.0)
+    np.testing.assert_allclose(M @ M.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(M) > 0.0
+    np.testing.assert_allclose(from_paper(M, S, 50_000.0), A, rtol=1e-12)
+    # S are semi-axes: a reading at the end of one has the field's magnitude
+    assert np.linalg.norm(A @ (M[:, 0] * S[0])) == pytest.approx(50_000.0)
+    np.testing.assert_allclose(to_paper(np.diag([1.1, 0.9, 1.0]), 1.0)[0], np.eye(3), atol=1e-12)

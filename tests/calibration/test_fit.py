@@ -1,0 +1,262 @@
+"""Fits: derivatives, recovery, out of sample near the noise floor, and honest about it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+from magbridge.calibration.correct import correct
+from magbridge.calibration.data import Observations, polynomial_samples
+from magbridge.calibration.evidence import Quadratic, evidence
+from magbridge.calibration.fit import METHODS, fit
+from magbridge.calibration.model import Calibration
+from magbridge.calibration.nominal import nominal, nominal_samples
+from magbridge.calibration.prior import free_structure
+from magbridge.calibration.residual import Samples, normal_equations, residuals
+from magbridge.calibration.terms import full_order
+from magbridge.errors import CalibrationError
+
+Gliders = Callable[..., Any]
+
+
+def survey_error(calibration: Calibration, glider: Any) -> tuple[float, float]:
+    """RMS over the noise floor on the survey, and deviation of the standardised error."""
+    k = len(calibration.parameters)
+    noisy, quiet = (
+        correct(calibration, field, glider.survey.parameters[:, :k], glider.survey.time)
+        for field in (glider.survey.field, glider.quiet)
+    )
+    error = noisy.total - glider.survey.reference
+    return float(np.sqrt(np.mean(error**2)) / np.std(noisy.total - quiet.total)), float(
+        np.std(error / noisy.sigma)
+    )
+
+
+def rms_on_survey(calibration: Calibration, glider: Any) -> float:
+    k = len(calibration.parameters)
+    total = correct(
+        calibration, glider.survey.field, glider.survey.parameters[:, :k], glider.survey.time
+    ).total
+    return float(np.sqrt(np.mean((total - glider.survey.reference) ** 2)))
+
+
+@pytest.fixture
+def some_samples() -> Samples:
+    rng = np.random.default_rng(1)
+    n = 60
+    return Samples(
+        rng.normal(size=(n, 3)) * 3e4,
+        np.full(n, 5e4),
+        rng.normal(size=(n, 3)),
+        np.arange(n) % 7 > 0,
+        5e4,
+        0.5,
+    )
+
+
+def test_jacobian_is_the_derivative(some_samples: Samples) -> None:
+    c = np.random.default_rng(2).normal(size=27) * 2000.0
+    _, g = residuals(some_samples, c)
+    J = (some_samples.phi[:, :, None] * g[:, None, :]).reshape(len(g), -1)
+    numeric = np.array(
+        [(residuals(some_samples, c + h)[0] - residuals(some_samples, c - h)[0]) / 2 for h in np.eye(27)]
+    ).T
+    np.testing.assert_allclose(J, numeric, atol=1e-6 * np.abs(J).max())
+
+
+@pytest.mark.parametrize("memory", [0.0, 0.7])
+def test_normal_equations_in_pieces_are_those_of_all(
+    some_samples: Samples, memory: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    c = np.random.default_rng(3).normal(size=27) * 500.0
+    whole = normal_equations(some_samples, c, None, memory)
+    monkeypatch.setattr("magbridge.calibration.residual.CHUNK", 11)
+    pieces = normal_equations(some_samples, c, None, memory)
+    np.testing.assert_allclose(pieces.hessian, whole.hessian, rtol=1e-10, atol=1e-12)
+    np.testing.assert_allclose(pieces.gradient, whole.gradient, rtol=1e-10, atol=1e-8)
+
+
+def test_evidence_has_the_slope_it_says(glider: Gliders) -> None:
+    exponents = full_order(2, 2)
+    samples = polynomial_samples(glider(0).runs, exponents)
+    structure = free_structure(exponents, ("a", "b"), samples.unit)
+    normal = normal_equations(samples, np.zeros(54))
+    quadratic = Quadratic.about(np.zeros(54), normal, 2250.0)
+    x = np.append(structure.centre, np.log(30.0))
+    _, slope, *_ = evidence(quadratic, structure, x[:-1], x[-1])
+    numeric = [
+        (
+            evidence(quadratic, structure, up[:-1], up[-1])[0]
+            - evidence(quadratic, structure, dn[:-1], dn[-1])[0]
+        )
+        / 2e-4
+        for up, dn in ((x + h, x - h) for h in 1e-4 * np.eye(len(x)))
+    ]
+    np.testing.assert_allclose(slope, numeric, rtol=1e-4, atol=1e-3)
+
+
+def test_errors_in_variables_take_the_bias_away() -> None:
+    """Plain least squares shrinks A and biases T (many deviations); the residual used here does not."""
+    rng = np.random.default_rng(4)
+    off = []
+    for _ in range(12):
+        n, dip, roll = 2000, np.radians(70), np.radians(2)
+        heading, pitch = rng.uniform(0, 2 * np.pi, n), np.radians(26) * rng.choice([-1, 1], n)
+        h, z = np.cos(dip), np.sin(dip)
+        x = h * np.cos(pitch) * np.cos(heading) - z * np.sin(pitch)
+        level = h * np.sin(pitch) * np.cos(heading) + z * np.cos(pitch)
+        y = -h * np.sin(heading) * np.cos(roll) + level * np.sin(roll)
+        w = h * np.sin(heading) * np.sin(roll) + level * np.cos(roll)
+        field = 5e4 * np.column_stack([x, y, w]) + [300.0, -200.0, 500.0] + rng.normal(0, 5, (n, 3))
+        data = Observations(field, np.full(n, 5e4), np.empty((n, 0)))
+        coefficients, covariance, _ = nominal(data, scale_sigma=1e-3, gain_sigma=0.02)
+        off.append((coefficients[8] - 500.0) / np.sqrt(covariance[8, 8]))
+    assert abs(np.mean(off)) < 3.0 / np.sqrt(len(off)) + 0.3
+    assert np.std(off) < 1.6
+
+
+@pytest.mark.parametrize(
+    ("masses", "noise", "memory", "geometry"),
+    [
+        (2, 1.0, 0.0, False),
+        (2, 1.0, 0.0, True),
+        (1, 1.0, 0.0, False),
+        (3, 1.0, 0.0, False),
+        (2, 5.0, 10.0, False),
+    ],
+)
+def test_auto_is_near_the_noise_floor_out_of_sample(
+    glider: Gliders, masses: int, noise: float, memory: float, geometry: bool
+) -> None:
+    ratios, spreads = [], []
+    for seed in range(6):
+        one = glider(seed, masses, noise, memory)
+        rng = np.random.default_rng(seed)
+        vehicle = {
+            name: {
+                "at": (np.array(mass.at) + rng.normal(0, 0.05, 3)).tolist(),
+                "at_sigma": 0.05,
+                "travel": list(mass.travel),
+            }
+            for name, mass in one.vehicle.mass.items()
+        }
+        found = fit(one.runs, **({"vehicle": vehicle} if geometry else {}))
+        ratio, spread = survey_error(found.calibration, one)
+        ratios.append(ratio)
+        spreads.append(spread)
+    assert np.median(ratios) < 1.10
+    assert max(ratios) < 1.5
+    assert 0.8 < np.median(spreads) < 1.25
+
+
+def test_the_paper_s_signature(glider: Gliders) -> None:
+    """Cubic looks as good as auto on its runs, and is several times worse on the survey; nominal is far off."""
+    one = glider(0)
+    by = {method: fit(one.runs, method) for method in ("nominal", "cubic", "auto")}
+    assert by["cubic"].rms < 1.1
+    assert by["auto"].rms < 1.1
+    assert by["nominal"].rms > 30.0
+    assert rms_on_survey(by["auto"].calibration, one) < 1.3
+    assert rms_on_survey(by["cubic"].calibration, one) > 2.0
+    assert rms_on_survey(by["nominal"].calibration, one) > 20.0
+
+
+def test_fits_are_deterministic(glider: Gliders) -> None:
+    first, second = (fit(glider(1).runs).calibration for _ in range(2))
+    np.testing.assert_array_equal(first.coefficients, second.coefficients)
+    np.testing.assert_array_equal(first.covariance, second.covariance)
+
+
+def test_outliers_take_no_part(glider: Gliders) -> None:
+    one = glider(2)
+    rng = np.random.default_rng(0)
+    hit = rng.random(len(one.runs)) < 0.03
+    field = one.runs.field + np.where(hit[:, None], rng.normal(0, 2000, (len(hit), 3)), 0.0)
+    found = fit(replace(one.runs, field=field))
+    assert found.details["outliers"] > 0.8 * hit.sum()
+    assert survey_error(found.calibration, one)[0] < 1.3
+    assert any("outliers" in text for text in found.warnings)
+
+
+def test_without_moving_masses_nothing_moves(glider: Gliders) -> None:
+    """A parameter that carries no iron gets no correction."""
+    one = glider(3, 0)
+    rng = np.random.default_rng(1)
+    moved = rng.uniform(-1, 1, 10)[np.asarray(one.runs.runs)][:, None]
+    data = replace(one.runs, parameters=moved, names=("nothing",), units=("",))
+    calibration = fit(data).calibration
+    b = np.tile(one.runs.field[:1], (3, 1))
+    total = correct(calibration, b, np.array([[-1.0], [0.0], [1.0]]), np.zeros(3)).total
+    assert np.ptp(total) < 2.0
+
+
+@pytest.mark.parametrize("method", sorted(METHODS))
+def test_every_method_fills_the_calibration(glider: Gliders, method: str) -> None:
+    found = fit(glider(2).runs, method)
+    calibration = found.calibration
+    assert calibration.method == method
+    assert calibration.boresight is not None
+    assert [run.samples for run in calibration.runs] == [225] * 10
+    assert calibration.software.startswith("magbridge")
+    assert np.linalg.eigvalsh(calibration.covariance)[0] > -1e-6 * np.diag(calibration.covariance).max()
+
+
+def test_auto_is_twenty_times_faster_than_finite_differences(glider: Gliders) -> None:
+    runs = glider(4).runs
+    samples = polynomial_samples(runs, full_order(2, 3))
+    start = time.process_time()
+    fit(runs)
+    ours = time.process_time() - start
+    start = time.process_time()
+    # three of its Jacobians; a whole run takes dozens
+    least_squares(lambda c: residuals(samples, c)[0], np.zeros(90), max_nfev=3, x_scale=1000.0)
+    assert ours < 3.0 * (time.process_time() - start)
+
+
+def test_bad_data_is_one_clear_line(glider: Gliders) -> None:
+    runs = glider(0).runs
+    k = len(runs)
+
+    def refused(match: str, method: str = "auto", **changes: Any) -> None:
+        with pytest.raises(CalibrationError, match=match):
+            fit(replace(runs, **changes), method)
+
+    refused("never moves", parameters=np.column_stack([runs.parameters[:, 0], np.full(k, 200.0)]))
+    refused("only 0 of 2250 samples have every value", field=np.full((k, 3), np.nan))
+    refused(r"'ballast' has 0", parameters=np.column_stack([runs.parameters[:, 0], np.full(k, np.nan)]))
+    refused(
+        "within .* degrees of one attitude",
+        field=np.tile(runs.field[:1], (k, 1)) + np.random.default_rng(0).normal(0, 1, (k, 3)),
+    )
+    refused("not known", "magic")
+    refused("expected positive", reference=np.zeros(k))
+    with pytest.raises(CalibrationError, match="only 5 of 5"):
+        runs.part(np.arange(k) < 5)
+    with pytest.raises(CalibrationError, match="horizontal: needs roll"):
+        fit(replace(runs, attitude=None), "horizontal")
+
+
+def test_a_collapsed_fit_is_refused() -> None:
+    """One circle at one pitch: nothing holds A and T apart, and a free fit runs away."""
+    rng = np.random.default_rng(5)
+    heading = rng.uniform(0, 2 * np.pi, 400)
+    field = 5e4 * np.column_stack([0.35 * np.cos(heading), 0.35 * np.sin(heading), np.full(400, 0.93)])
+    data = Observations(
+        field * [3.0, 3.0, 3.0] + rng.normal(0, 1, (400, 3)), np.full(400, 5e4), np.empty((400, 0))
+    )
+    with pytest.raises(CalibrationError, match="collapsed"):
+        fit(data, "nominal", gain_sigma=1.0)
+
+
+def test_nominal_constraints(glider: Gliders) -> None:
+    coefficients, covariance, _ = nominal(glider(0).runs, axes_fixed=True, equal_xz=True)
+    assert coefficients[0] == coefficients[2]
+    assert not coefficients[3:6].any()
+    assert not covariance[3:6].any()
+    assert nominal_samples(glider(0).runs).phi.shape[1] == 1
