@@ -173,7 +173,7 @@ class AnomalyGrid:
         s, t = u - j, v - i
         across, along = _weights(s), _weights(t)
         window = np.lib.stride_tricks.sliding_window_view(self._coefficients, (4, 4))
-        f = np.einsum("nai,nij,nbj->nab", along, window[i, j], across, optimize=True)
+        f = along @ window[i, j] @ across.transpose(0, 2, 1)
         variance = (1 - t) * ((1 - s) * self._variance[i, j] + s * self._variance[i, j + 1]) + t * (
             (1 - s) * self._variance[i + 1, j] + s * self._variance[i + 1, j + 1]
         )

@@ -1,0 +1,74 @@
+"""The main field near one place, for a filter that asks at every sample: a quadratic, renewed as one moves.
+
+The IGRF's shortest wave is 3,000 km, so over some tens of kilometres and a dive a quadratic is exact to a
+thousandth of a nanotesla, at a hundredth of the cost of the series.
+"""
+
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magbridge.field.earth import offset, separation
+from magbridge.field.igrf import coverage, total_field
+
+__all__ = ["NearbyField"]
+
+Array = NDArray[np.float64]
+
+REACH = 20_000.0  # m, from the middle to the edge
+DEEP = 2_000.0  # m, depth up to which it is fitted
+LONG = 20 * 86_400.0  # s, before and after
+
+
+class NearbyField:
+    """Total main field around a moving place; :meth:`at` renews the fit when one has left it."""
+
+    def __init__(self) -> None:
+        self._middle = (np.nan, np.nan, np.nan)  # latitude, longitude, time
+        self._c = [0.0] * 11
+
+    def at(self, latitude: float, longitude: float, depth: float, time: float) -> tuple[float, float, float]:
+        """Return the total field (nT) and its slopes north and east (nT/m).
+
+        Parameters
+        ----------
+        latitude, longitude : float
+            deg.
+        depth : float
+            m below the surface.
+        time : float
+            s since 1970 UTC.
+
+        Raises
+        ------
+        OutOfRange
+            As :func:`~magbridge.field.igrf.total_field`.
+        """
+        north, east = separation(self._middle[0], self._middle[1], latitude, longitude)
+        later = time - self._middle[2]
+        if not (abs(north) < REACH and abs(east) < REACH and abs(later) < LONG):
+            self._fit(latitude, longitude, time)
+            north = east = later = 0.0
+        n, e, d, t = north / REACH, east / REACH, depth / DEEP, later / LONG
+        c0, cn, ce, cd, ct, cnn, cee, cdd, cne, cnd, ced = self._c
+        field = (
+            c0 + n * (cn + n * cnn + e * cne + d * cnd) + e * (ce + e * cee + d * ced) + d * (cd + d * cdd)
+        )
+        slope_north = cn + 2.0 * n * cnn + e * cne + d * cnd
+        slope_east = ce + 2.0 * e * cee + n * cne + d * ced
+        return field + t * ct, slope_north / REACH, slope_east / REACH
+
+    def _fit(self, latitude: float, longitude: float, time: float) -> None:
+        """Fit the eleven coefficients to the series on 81 nodes."""
+        nodes = np.array(list(product((-1.0, 0.0, 1.0), repeat=4)))
+        n, e, d, t = nodes.T
+        places = np.array([offset(latitude, longitude, a * REACH, b * REACH) for a, b in nodes[:, :2]])
+        times = np.clip(time + t * LONG, *coverage()) if coverage()[0] <= time <= coverage()[1] else time
+        field = total_field(places[:, 1], np.clip(places[:, 0], -90.0, 90.0), d * DEEP, times)
+        later = (times - time) / LONG
+        design = np.stack([n**0, n, e, d, later, n * n, e * e, d * d, n * e, n * d, e * d], axis=1)
+        self._c = np.linalg.lstsq(design, field, rcond=None)[0].tolist()
+        self._middle = (latitude, longitude, time)

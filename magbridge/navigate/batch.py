@@ -1,0 +1,260 @@
+"""A whole log against a map: the navigator over every row, a backward pass, and what there is to say about it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from filterpy.kalman import rts_smoother
+from numpy.typing import NDArray
+
+from magbridge.errors import FormatError
+from magbridge.field.earth import metres_per_degree, offset
+from magbridge.field.grid import AnomalyGrid
+from magbridge.navigate.judge import judge
+from magbridge.navigate.model import Options
+from magbridge.navigate.navigator import UNUSABLE, Navigator, Record
+
+__all__ = ["MOTIONS", "navigate"]
+
+Array = NDArray[np.float64]
+Floats = NDArray[np.floating[Any]]
+
+MOTIONS: dict[str, dict[str, str]] = {
+    "velocity": {"velocity_north": "velocity_north", "velocity_east": "velocity_east"},
+    "speed": {"water_speed": "speed", "heading": "heading"},
+    "local": {"local_north": "north", "local_east": "east"},
+    "inertial": {"dr_latitude": "dr_latitude", "dr_longitude": "dr_longitude"},
+    "glide": {"depth": "depth", "pitch": "pitch", "heading": "heading"},
+    "position": {"latitude": "dr_latitude", "longitude": "dr_longitude"},
+}
+"""How a log tells motion, best first: its columns, and what the dead reckoning calls them."""
+
+YARDSTICKS = (
+    ("truth_latitude", "truth_longitude"),
+    ("gps_latitude", "gps_longitude"),
+    ("latitude", "longitude"),
+)
+
+UNITS = {
+    "latitude": "deg", "longitude": "deg", "smoothed_latitude": "deg", "smoothed_longitude": "deg",
+    "covariance_nn": "m2", "covariance_ne": "m2", "covariance_ee": "m2",
+    "innovation": "nT", "innovation_variance": "nT2", "anomaly": "nT", "map_anomaly": "nT",
+    "bias": "nT", "bias_sigma": "nT", "map_error": "nT", "current_north": "m s-1", "current_east": "m s-1",
+    "north": "m", "east": "m", "smoothed_sigma_north": "m", "smoothed_sigma_east": "m",
+    "error_north": "m", "error_east": "m", "smoothed_error_north": "m", "smoothed_error_east": "m",
+}  # fmt: skip
+
+
+def navigate(
+    deployment: xr.Dataset,
+    grid: AnomalyGrid,
+    options: Options | None = None,
+    *,
+    motion: str | None = None,
+    start: tuple[float, float] | None = None,
+    fixes: bool = False,
+    progress: Callable[[int], object] | None = None,
+) -> xr.Dataset:
+    """Return the track that the field and the map give.
+
+    Parameters
+    ----------
+    deployment : Dataset
+        On ``time``, with ``total_field`` (nT), ``total_field_sigma`` if known (else 1 nT), and the columns of one of
+        :data:`MOTIONS`.
+    grid : AnomalyGrid
+    options : Options, optional
+    motion : str, optional
+        Key of :data:`MOTIONS`; default the first that the log has.
+    start : (latitude, longitude), optional
+        deg; default the log's first position.
+    fixes : bool, optional
+        Take in ``gps_latitude gps_longitude`` all along; default only the first, the others are the yardstick.
+    progress : callable, optional
+        Called with the number of rows done.
+
+    Returns
+    -------
+    Dataset
+        On ``time`` of the updates: every field of :class:`~magbridge.navigate.navigator.Record`,
+        ``smoothed_*`` from the backward pass, ``error_*`` where the log has a better position. Attributes:
+        ``findings``, sentences one a line; ``motion``; ``yardstick``.
+
+    Raises
+    ------
+    FormatError
+        No total field, no motion, no start, time that does not increase, or nothing left of it.
+    OutOfRange
+        A date that the IGRF does not cover.
+    """
+    source = str(deployment.attrs.get("source", "deployment"))
+    options = options or Options()
+    time, field, sigma = _samples(deployment, source)
+    motion = motion or _motion(deployment, source)
+    navigator = Navigator(grid, options)
+    latitude, longitude = start if start is not None else _first_position(deployment, source)
+    moves = _columns(deployment, MOTIONS[motion] | {"depth": "depth"}, source)
+    surfaced = _columns(deployment, {"gps_latitude": "a", "gps_longitude": "o"}, source) if fixes else {}
+    records: list[Record] = []
+    states: list[tuple[Array, Array, Array, Array, int]] = []
+
+    def keep(record: Record | None) -> None:
+        if record is not None:
+            records.append(record)
+            states.append((navigator.x, navigator.P, *navigator.moved, len(navigator.jumps)))
+
+    time_us = np.round(time * 1e6).astype(np.int64)
+    navigator.fix(int(time_us[0]) - 1, latitude, longitude)
+    rows = {name: values.tolist() for name, values in moves.items()}
+    places = zip(surfaced["a"].tolist(), surfaced["o"].tolist(), strict=True) if surfaced else None
+    for i, (t, f, s) in enumerate(zip(time_us.tolist(), field.tolist(), sigma.tolist(), strict=True)):
+        navigator.telemetry(t, **{name: values[i] for name, values in rows.items()})
+        if places is not None:
+            keep(navigator.fix(t, *next(places)))
+        keep(navigator.measure(t, f, s))
+        if progress is not None and i % 1000 == 0:
+            progress(i)
+    keep(navigator.finish())
+    if not records:
+        raise FormatError(source, "expected samples of the total field at known times: none was usable")
+    result = _dataset(records, _smooth(states))
+    result.attrs = {"source": source, "map": grid.name, "motion": motion}
+    result = _with_errors(result, deployment, motion)
+    findings = judge(result, grid, options, navigator.jumps, _yardstick(deployment, motion))
+    return result.assign_attrs(findings="\n".join(findings))
+
+
+def _samples(deployment: xr.Dataset, source: str) -> tuple[Floats, Floats, Floats]:
+    """Return time, total field and its sigma; NaN where a sample must not be used."""
+    if "total_field" not in deployment:
+        raise FormatError(source, "expected total_field: correct the log with a calibration first")
+    time = deployment["time"].to_numpy().astype(float)
+    if (backward := np.flatnonzero(~(np.diff(time) > 0.0))).size:
+        raise FormatError(source, "expected increasing time", row=int(backward[0]) + 2, column="time")
+    field = deployment["total_field"].to_numpy().astype(float)
+    sigma = (
+        deployment["total_field_sigma"].to_numpy().astype(float)
+        if "total_field_sigma" in deployment
+        else np.ones(time.size)
+    )
+    if "quality" in deployment:
+        quality = np.nan_to_num(deployment["quality"].to_numpy().astype(float)).astype(int)
+        field = np.where(quality & UNUSABLE, np.nan, field)
+    return time, field, sigma
+
+
+def _motion(deployment: xr.Dataset, source: str) -> str:
+    for name, columns in MOTIONS.items():
+        if all(column in deployment and deployment[column].notnull().any() for column in columns):
+            return name
+    raise FormatError(
+        source, "expected a motion: " + ", or ".join(" ".join(columns) for columns in MOTIONS.values())
+    )
+
+
+def _columns(deployment: xr.Dataset, names: Mapping[str, str], source: str) -> dict[str, Floats]:
+    missing = [name for name in names if name not in deployment and name != "depth"]
+    if missing:
+        raise FormatError(source, f"expected the column {missing[0]!r}")
+    return {
+        name: deployment[column].to_numpy().astype(float)
+        for column, name in names.items()
+        if column in deployment
+    }
+
+
+def _first_position(deployment: xr.Dataset, source: str) -> tuple[float, float]:
+    for pair in (*YARDSTICKS[1:], ("dr_latitude", "dr_longitude")):
+        if all(name in deployment for name in pair):
+            known = deployment[list(pair)].to_dataframe().dropna()
+            if len(known):
+                return float(known.iloc[0][pair[0]]), float(known.iloc[0][pair[1]])
+    raise FormatError(source, "expected a position to start from: latitude and longitude")
+
+
+def _yardstick(deployment: xr.Dataset, motion: str) -> xr.Dataset | None:
+    """Return the best position that the estimate has not used, with the field there; None if there is none."""
+    for pair in YARDSTICKS:
+        used = pair[0] in MOTIONS[motion]
+        if not used and all(name in deployment for name in pair):
+            wanted = [*pair, "total_field", *(["depth"] if "depth" in deployment else [])]
+            known = deployment[wanted].rename(dict(zip(pair, ("latitude", "longitude"), strict=True)))
+            known = known.dropna("time", subset=["latitude", "longitude"])
+            if known.sizes["time"]:
+                return known.assign_attrs(yardstick=pair[0].removesuffix("latitude") or "log")
+    return None
+
+
+def _smooth(states: list[tuple[Array, Array, Array, Array, int]]) -> tuple[Array, Array]:
+    """Return smoothed means (n, 6) and covariances (n, 6, 6), pass by pass between jumps."""
+    x, P, F, Q = (np.stack([state[k] for state in states]) for k in range(4))
+    jumps = np.array([state[4] for state in states])
+    for piece in np.split(np.arange(jumps.size), np.flatnonzero(np.diff(jumps)) + 1):
+        ahead = piece[1:].tolist() + piece[-1:].tolist()  # filterpy's F[k] leads from k to k + 1
+        x[piece], P[piece], _, _ = rts_smoother(x[piece], P[piece], F[ahead], Q[ahead] + 1e-12 * np.eye(6))
+    return x, P
+
+
+def _dataset(records: list[Record], smoothed: tuple[Array, Array]) -> xr.Dataset:
+    columns: dict[str, Any] = {
+        name: np.array([getattr(record, name) for record in records], float)
+        for name in Record.__struct_fields__
+        if name not in ("time_us", "gate")
+    }
+    x, P = smoothed
+    moved = x[:, :2] - np.stack([columns["north"], columns["east"]], axis=1)
+    places = [
+        offset(latitude, longitude, *shift)
+        for latitude, longitude, shift in zip(
+            columns["latitude"].tolist(), columns["longitude"].tolist(), moved.tolist(), strict=True
+        )
+    ]
+    columns["smoothed_latitude"], columns["smoothed_longitude"] = np.array(places).T
+    columns["smoothed_sigma_north"], columns["smoothed_sigma_east"] = np.sqrt([P[:, 0, 0], P[:, 1, 1]])
+    time = np.array([record.time_us for record in records]) * 1e-6
+    return xr.Dataset(
+        {name: ("time", values, _attrs(name)) for name, values in columns.items()},
+        {"time": ("time", time, {"units": "s", "long_name": "seconds since 1970-01-01 UTC"})},
+    )
+
+
+def _attrs(name: str) -> dict[str, str]:
+    return {"units": UNITS.get(name, "1"), "long_name": name.replace("_", " ")}
+
+
+def _with_errors(result: xr.Dataset, deployment: xr.Dataset, motion: str) -> xr.Dataset:
+    """Add metres from the yardstick to the track, where there is one within the log's own spacing."""
+    truth = _yardstick(deployment, motion)
+    if truth is None:
+        return result
+    time = result["time"].to_numpy()
+    known = truth["time"].to_numpy()
+    spacing = max(60.0, 2.0 * float(np.median(np.diff(known)))) if known.size > 1 else 60.0
+    nearest = np.abs(known[np.clip(np.searchsorted(known, time), 0, known.size - 1)] - time)
+    before = np.abs(known[np.clip(np.searchsorted(known, time) - 1, 0, known.size - 1)] - time)
+    near = np.minimum(nearest, before) <= spacing
+    latitude = np.interp(time, known, truth["latitude"].to_numpy())
+    longitude = np.interp(time, known, np.unwrap(truth["longitude"].to_numpy(), period=360.0))
+    added = {}
+    for prefix in ("", "smoothed_"):
+        north, east = _separations(
+            latitude,
+            longitude,
+            result[f"{prefix}latitude"].to_numpy(),
+            result[f"{prefix}longitude"].to_numpy(),
+        )
+        added[f"{prefix}error_north"] = np.where(near, north, np.nan)
+        added[f"{prefix}error_east"] = np.where(near, east, np.nan)
+    named = {name: ("time", values, _attrs(name)) for name, values in added.items()}
+    return result.assign(named).assign_attrs(yardstick=truth.attrs["yardstick"])
+
+
+def _separations(
+    latitude: Floats, longitude: Floats, to_latitude: Floats, to_longitude: Floats
+) -> tuple[Floats, Floats]:
+    per_latitude, per_longitude = metres_per_degree(np.asarray(latitude, np.float64))
+    turn = (to_longitude - longitude + 180.0) % 360.0 - 180.0
+    return (to_latitude - latitude) * per_latitude, turn * per_longitude

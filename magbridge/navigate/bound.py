@@ -1,0 +1,116 @@
+"""What a map is worth before the dive: the best that any estimator could do along a track."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from magbridge.errors import OutOfRange
+from magbridge.field.earth import metres_per_degree, separation
+from magbridge.field.grid import AnomalyGrid
+from magbridge.field.igrf import total_field
+from magbridge.navigate.model import Options, block_length, measurement_row, prior, transition
+
+__all__ = ["Bound", "position_bound"]
+
+Array = NDArray[np.float64]
+
+STEP = 0.005  # deg, over which the main field's slope is taken
+
+
+class Bound(NamedTuple):
+    """Along the track: time s, position deg, smallest covariance (n, 6, 6), and 1-sigma of the position, m.
+
+    ``sigma`` is ``sqrt(P_nn + P_ee)``, what an error's root mean square is compared with; ``unaided`` is the
+    same for dead reckoning alone.
+    """
+
+    time: Array
+    latitude: Array
+    longitude: Array
+    covariance: Array
+    sigma: Array
+    unaided: Array
+
+
+def position_bound(
+    grid: AnomalyGrid,
+    time: ArrayLike,
+    latitude: ArrayLike,
+    longitude: ArrayLike,
+    options: Options | None = None,
+    sigma: float = 1.0,
+    depth: float = 0.0,
+    every: float = 4.0,
+) -> Bound:
+    """Return the posterior Cramér-Rao bound of the position along a track.
+
+    Parameters
+    ----------
+    grid : AnomalyGrid
+    time : array_like, (n,)
+        s since 1970 UTC, increasing: the planned track's corners are enough.
+    latitude, longitude : array_like, (n,)
+        deg.
+    options : Options, optional
+        How well everything is known.
+    sigma : float, optional
+        nT, of one sample.
+    depth : float, optional
+        m.
+    every : float, optional
+        s between samples.
+
+    Returns
+    -------
+    Bound
+        At the times of the filter's updates.
+
+    Raises
+    ------
+    OutOfRange
+        A track in which time does not increase.
+
+    Notes
+    -----
+    Tichavský, Muravchik & Nehorai 1998, eq. 21; with linear motion and the map's slope at the true position
+    it is the covariance of a Kalman filter that knows where to linearise,
+    ``J_k+1 = (Q + F J_k^-1 F')^-1 + H' R^-1 H``. Off the map nothing is learnt.
+    """
+    o = options or Options()
+    corners = np.asarray(time, float)
+    if corners.size < 2 or (np.diff(corners) <= 0.0).any():
+        raise OutOfRange("time", "the track's", "it must increase from corner to corner")
+    lat, lon = np.asarray(latitude, float), np.unwrap(np.asarray(longitude, float), period=360.0)
+    legs = [separation(*a, *b) for a, b in pairwise(zip(lat, lon, strict=True))]
+    along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.array(legs).T))])
+    speed = along[-1] / (corners[-1] - corners[0])
+    interval = max(every, min(o.interval, block_length(grid) / max(speed, 1e-9)))
+    at = np.arange(corners[0] + 0.5 * interval, corners[-1], interval)
+    lat, lon = np.interp(at, corners, lat), np.interp(at, corners, lon)
+    metres = np.diff(np.interp(at, corners, along), prepend=0.0)
+    local = grid.evaluate(lon, lat)
+    main = total_field(lon, lat, depth, at)
+    per_latitude, per_longitude = metres_per_degree(lat)
+    slope_north = (total_field(lon, lat + STEP, depth, at) - main) / (STEP * per_latitude)
+    slope_east = (total_field(lon + STEP, lat, depth, at) - main) / (STEP * per_longitude)
+
+    variance = sigma**2 * every / interval
+    _, P = prior(o)
+    alone = P
+    covariance = np.empty((at.size, 6, 6))
+    unaided = np.empty(at.size)
+    previous = corners[0]
+    for i, now in enumerate(at):
+        F, Q = transition(o, now - previous, float(metres[i]))
+        P, alone, previous = F @ P @ F.T + Q, F @ alone @ F.T + Q, now
+        if np.isfinite(local.anomaly[i]):
+            row = measurement_row(local.north[i] + slope_north[i], local.east[i] + slope_east[i])
+            gain = P @ row.T
+            P = P - gain @ gain.T / float((row @ gain)[0, 0] + variance + local.variance[i])
+        covariance[i], unaided[i] = P, np.sqrt(alone[0, 0] + alone[1, 1])
+    reached = np.sqrt(covariance[:, 0, 0] + covariance[:, 1, 1])
+    return Bound(at, lat, (lon + 180.0) % 360.0 - 180.0, covariance, reached, unaided)

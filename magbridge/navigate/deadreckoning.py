@@ -1,0 +1,109 @@
+"""Where the vehicle would be if it knew its own motion: position from heading, speed and depth, or from others."""
+
+from __future__ import annotations
+
+from math import cos, hypot, isfinite, nan, radians, sin, tan
+
+from magbridge.field.earth import offset, separation
+
+__all__ = ["DeadReckoning"]
+
+GLIDE = 8.0  # deg, of pitch; a glider flatter than that is turning between dive and climb
+DEPTH_BASE = 10.0  # s, over which the depth's rate is taken
+FASTEST = 3.0  # m/s, through the water; beyond, a depth that jumped was taken for a dive
+LONGEST = 3600.0  # s without telemetry, after which nobody knows where the vehicle went
+
+
+class DeadReckoning:
+    """A position carried along by telemetry; each kind of telemetry as good as a vehicle has it.
+
+    Attributes
+    ----------
+    latitude, longitude : float
+        deg; NaN before :meth:`place`.
+    depth : float
+        m.
+    travelled : float
+        m through the water since the start.
+    """
+
+    def __init__(self) -> None:
+        self.latitude = self.longitude = nan
+        self.depth, self.travelled = 0.0, 0.0
+        self._time = nan
+        self._velocity = (0.0, 0.0)
+        self._heading = self._pitch = self._speed = nan
+        self._dive = (nan, nan)  # time and depth from which the depth's rate counts
+        self._rate = nan
+        self._local: tuple[float, float] | None = None
+        self._carrier: tuple[float, float] | None = None
+
+    def place(self, latitude: float, longitude: float) -> None:
+        """Start, or start again, at a position."""
+        self.latitude, self.longitude = latitude, longitude
+
+    def advance(self, time: float) -> None:
+        """Move along the last known velocity up to `time` (s)."""
+        elapsed = time - self._time
+        if elapsed <= 0.0:
+            return
+        if isfinite(elapsed) and elapsed < LONGEST:
+            self._move(self._velocity[0] * elapsed, self._velocity[1] * elapsed)
+        self._time = time
+
+    def telemetry(self, time: float, values: dict[str, float]) -> None:
+        """Take in what is known at `time` (s).
+
+        Parameters
+        ----------
+        values : dict
+            Any of ``depth`` m, ``heading`` deg true, ``pitch`` deg, ``speed`` m/s through the water;
+            ``velocity_north velocity_east`` m/s; ``north east`` m, a local position of which only the changes
+            count; ``dr_latitude dr_longitude`` deg, a dead-reckoned position of which only the changes count.
+            NaN is nothing. The depth's rate and the pitch stand in for a glider's speed.
+        """
+        self.advance(time)
+        values = {name: value for name, value in values.items() if isfinite(value)}
+        if "depth" in values:
+            self.depth = values["depth"]
+            self._sink(time)
+        self._heading = values.get("heading", self._heading)
+        self._pitch = values.get("pitch", self._pitch)
+        self._speed = values.get("speed", self._speed)
+        if "north" in values and "east" in values:
+            here = values["north"], values["east"]
+            if self._local is not None:
+                self._move(here[0] - self._local[0], here[1] - self._local[1])
+            self._local, self._velocity = here, (0.0, 0.0)
+        elif "dr_latitude" in values and "dr_longitude" in values:
+            there = values["dr_latitude"], values["dr_longitude"]
+            if self._carrier is not None:
+                self._move(*separation(*self._carrier, *there))
+            self._carrier, self._velocity = there, (0.0, 0.0)
+        elif "velocity_north" in values and "velocity_east" in values:
+            self._velocity = values["velocity_north"], values["velocity_east"]
+        elif self._local is None and self._carrier is None and isfinite(self._heading):
+            speed = self._speed if isfinite(self._speed) else self._glide()
+            if isfinite(speed):
+                along = radians(self._heading)
+                self._velocity = speed * cos(along), speed * sin(along)
+
+    def _sink(self, time: float) -> None:
+        since, depth = self._dive
+        if not isfinite(since):
+            self._dive = time, self.depth
+        elif time - since >= DEPTH_BASE:
+            self._rate = (self.depth - depth) / (time - since)
+            self._dive = time, self.depth
+
+    def _glide(self) -> float:
+        """Return a glider's speed over ground from its sink rate and pitch; the last one through a turn."""
+        if not isfinite(self._pitch) or abs(self._pitch) < GLIDE:
+            return nan
+        speed = abs(self._rate / tan(radians(self._pitch)))
+        return min(speed, FASTEST)
+
+    def _move(self, north: float, east: float) -> None:
+        self.travelled += hypot(north, east)
+        if isfinite(self.latitude):
+            self.latitude, self.longitude = offset(self.latitude, self.longitude, north, east)

@@ -1,0 +1,176 @@
+"""What to tell a user who sees only the result: was the map left, flat, wrong; was the filter ever lost."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import hypot, sqrt
+from typing import Any, NamedTuple
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from magbridge.field.earth import metres_per_degree
+from magbridge.field.grid import AnomalyGrid
+from magbridge.field.igrf import total_field
+from magbridge.navigate.model import Options
+from magbridge.navigate.navigator import Jump, State
+
+__all__ = ["Shift", "best_shift", "judge"]
+
+Array = NDArray[np.floating[Any]]
+
+SPARSE = 40  # positions, below which a map's place cannot be judged
+SEARCH = 1_500.0  # m, how far a map may have been put wrong
+LATTICE = 31  # shifts on each axis
+DOUBLE = 2.0  # of what bias and map error allow: a scatter beyond is another field
+BETTER = 0.6  # of the scatter at the map's own place: what a shift must reach to be believed
+LEVEL = 4.0  # sigma of the calibration's bias: beyond, it is not the calibration
+EXPLAINED = 0.5  # of the field's variance along the track, below which the map does not describe it
+
+
+def judge(
+    result: xr.Dataset,
+    grid: AnomalyGrid,
+    options: Options,
+    jumps: Sequence[Jump],
+    yardstick: xr.Dataset | None,
+) -> list[str]:
+    """Return the findings, one sentence each; empty when there is nothing to remark.
+
+    Parameters
+    ----------
+    result : Dataset
+        The records, as :func:`~magbridge.navigate.batch.navigate` has them.
+    grid, options
+        What it was made with.
+    jumps : sequence of Jump
+    yardstick : Dataset or None
+        ``latitude longitude total_field`` at known positions.
+    """
+    hours = (result["time"].to_numpy() - float(result["time"][0])) / 3600.0
+    state = result["state"].to_numpy().astype(int)
+    off = np.isnan(result["map_anomaly"].to_numpy())
+    findings = []
+    if off.any():
+        findings.append(
+            f"off the map for {100.0 * off.mean():.0f} % of the track, first after {hours[off][0]:.1f} h:"
+            " dead reckoning there"
+        )
+    silent = (state == State.DEAD_RECKONING) & ~off
+    if silent.mean() > 0.5:
+        findings.append(
+            f"the field says nothing for {100.0 * silent.mean():.0f} % of the track: the map is flat there"
+            f" ({grid.rms:.1f} nT rms) against what the calibration leaves ({options.bias_sigma:.1f} nT)"
+        )
+    findings += _told_by_jumps(jumps, float(result["time"][0]))
+    if (lost := (state == State.LOST)).any():
+        findings.append(
+            f"lost for {100.0 * lost.mean():.0f} % of the track, first after {hours[lost][0]:.1f} h"
+        )
+    findings += _told_by_level(result, options)
+    if yardstick is not None:
+        findings += _told_by_positions(grid, yardstick, options)
+    if state[-1] == State.SEARCHING:
+        findings.append("several positions still explain the field at the end of the log")
+    return findings
+
+
+def _told_by_jumps(jumps: Sequence[Jump], start: float) -> list[str]:
+    return [
+        f"after {(jump.time_us * 1e-6 - start) / 3600.0:.1f} h {jump.cause}:"
+        f" moved {hypot(jump.north, jump.east):.0f} m ({_compass(jump.north, jump.east)})"
+        + (
+            f", {hypot(jump.north, jump.east) / jump.allowed:.0f} times what dead reckoning allows:"
+            " the start or the map is in the wrong place (datum?)"
+            if hypot(jump.north, jump.east) > 3.0 * jump.allowed
+            else ""
+        )
+        for jump in jumps
+    ]
+
+
+def _told_by_level(result: xr.Dataset, options: Options) -> list[str]:
+    """Report the bias at the end, if no calibration would leave it."""
+    tracked = result.where(result["state"] == State.TRACKING, drop=True)
+    if not tracked.sizes["time"]:
+        return []
+    last = tracked.isel(time=slice(-max(1, tracked.sizes["time"] // 4), None))
+    bias, sigma = float(last["bias"].mean()), float(last["bias_sigma"].mean())
+    if abs(bias) < LEVEL * max(options.bias_sigma, sigma):
+        return []
+    said = (
+        f"the measured level is {bias:+.0f} nT from the map's, where the calibration leaves"
+        f" {options.bias_sigma:.1f} nT: the map's main field may be of another epoch, or its altitude another"
+    )
+    return [said]
+
+
+class Shift(NamedTuple):
+    """Metres (north, east) by which a map fits best, scatter (nT) there and at the map's own place."""
+
+    north: float
+    east: float
+    there: float
+    here: float
+
+
+def best_shift(grid: AnomalyGrid, latitude: Array, longitude: Array, anomaly: Array) -> Shift:
+    """Return by how much the map must be moved to describe an anomaly measured at known positions.
+
+    Parameters
+    ----------
+    latitude, longitude : array, (n,)
+        deg.
+    anomaly : array, (n,)
+        nT; a constant is taken out.
+    """
+    shifts = np.linspace(-SEARCH, SEARCH, LATTICE)
+    per_latitude, per_longitude = metres_per_degree(float(np.mean(latitude)))
+    best = (0.0, 0.0, np.inf)
+    origin = np.inf
+    for north in shifts:
+        for east in shifts:
+            seen = grid.evaluate(longitude - east / per_longitude, latitude - north / per_latitude).anomaly
+            left = anomaly - seen
+            if np.isfinite(left).mean() < 0.8:
+                continue
+            scatter = float(np.nanstd(left))
+            if north == 0.0 and east == 0.0:
+                origin = scatter
+            if scatter < best[2]:
+                best = (float(north), float(east), scatter)
+    return Shift(*best, origin)
+
+
+def _told_by_positions(grid: AnomalyGrid, yardstick: xr.Dataset, options: Options) -> list[str]:
+    """Compare the map with the field at known positions: its place, and whether it is this field's map."""
+    latitude, longitude = yardstick["latitude"].to_numpy(), yardstick["longitude"].to_numpy()
+    depth = yardstick["depth"].fillna(0.0).to_numpy() if "depth" in yardstick else 0.0
+    time = yardstick["time"].to_numpy()
+    measured = yardstick["total_field"].to_numpy() - total_field(longitude, latitude, depth, time)
+    known = np.isfinite(measured + grid.evaluate(longitude, latitude).anomaly)
+    if known.sum() < SPARSE:
+        return []
+    thin = np.flatnonzero(known)[:: max(1, int(known.sum()) // 400)]
+    measured, latitude, longitude = measured[thin], latitude[thin], longitude[thin]
+    north, east, there, here = best_shift(grid, latitude, longitude, measured)
+    step = 2.0 * SEARCH / (LATTICE - 1)
+    findings = []
+    expected = DOUBLE * hypot(options.bias_sigma, options.map_sigma)
+    if there < min(BETTER * here, expected) and hypot(north, east) > step:
+        findings.append(
+            f"at the known positions the map fits best when moved {hypot(north, east):.0f} m"
+            f" ({_compass(north, east)}): {there:.1f} nT instead of {here:.1f} nT; another datum?"
+        )
+    elif here > max(sqrt(1.0 - EXPLAINED) * float(np.std(measured)), expected):
+        findings.append(
+            f"at the known positions the map leaves {here:.1f} nT of the field's {np.std(measured):.1f} nT:"
+            " it does not describe this field"
+        )
+    return findings
+
+
+def _compass(north: float, east: float) -> str:
+    points = ("N", "NE", "E", "SE", "S", "SW", "W", "NW")
+    return points[round(float(np.degrees(np.arctan2(east, north))) / 45.0) % 8]

@@ -1,0 +1,161 @@
+"""What the filters estimate, how it moves, and what a block of samples says about it.
+
+The state is what dead reckoning and the instruments do not know, so that it moves linearly whatever the
+vehicle does, and one model serves every estimator, the smoother and the bound:
+
+==  =========================================  =====================================================
+0   north, m                                   of the true position from the dead-reckoned one
+1   east, m
+2   current north, m/s                         what carries the dead reckoning off; slow Gauss-Markov
+3   current east, m/s
+4   calibration bias, nT                       Gauss-Markov in time
+5   map error, nT                              Gauss-Markov in the distance travelled
+==  =========================================  =====================================================
+"""
+
+from __future__ import annotations
+
+from math import exp
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from magbridge.field.grid import AnomalyGrid
+
+__all__ = ["Block", "Options", "block_length", "measurement_row", "prior", "resolution", "transition"]
+
+Array = NDArray[np.float64]
+
+N_STATES = 6
+FINE = 0.35  # of the spread that one measurement allows: errors of neighbours follow each other and add up
+
+
+class Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """How well things are known beforehand; all 1-sigma.
+
+    Attributes
+    ----------
+    start_sigma : float
+        m, of the first position, each axis.
+    current_sigma, current_time : float
+        m/s and s: the current, and how long it lasts.
+    drift : float
+        m/sqrt(s), random walk of the dead reckoning.
+    bias_sigma, bias_time : float
+        nT and s: what the calibration leaves, and how long it lasts.
+    map_sigma, map_length : float
+        nT and m: the map's error, and how far it reaches. An independent error of each cell is the grid's own.
+    noise : float or None
+        nT, the part of a sample's sigma that is white; the rest does not average out. None: all of it.
+    gate : float
+        Largest innovation squared over its variance that is taken in.
+    interval : float
+        s, samples within are averaged to one update; sooner if the vehicle has moved 2 % of the map's
+        correlation length.
+    vouch_sigma : float
+        m, no fix is vouched for that is worse.
+    doubt : float
+        Odds at which another hypothesis ends the filter's trust in itself.
+    """
+
+    start_sigma: float = 50.0
+    current_sigma: float = 0.1
+    current_time: float = 21_600.0
+    drift: float = 0.2
+    bias_sigma: float = 5.0
+    bias_time: float = 21_600.0
+    map_sigma: float = 2.0
+    map_length: float = 1_000.0
+    noise: float | None = None
+    gate: float = 16.0
+    interval: float = 20.0
+    vouch_sigma: float = 500.0
+    doubt: float = 2_000.0
+
+
+class Block(NamedTuple):
+    """Samples close enough together to be one measurement.
+
+    Attributes
+    ----------
+    time_us : int
+        µs, their mean time.
+    latitude, longitude : float
+        deg, dead-reckoned, their mean.
+    anomaly : float
+        nT, total field minus the main field at the dead-reckoned position.
+    variance : float
+        nT², of that mean.
+    slope_north, slope_east : float
+        nT/m, of the main field.
+    """
+
+    time_us: int
+    latitude: float
+    longitude: float
+    anomaly: float
+    variance: float
+    slope_north: float
+    slope_east: float
+
+
+def prior(options: Options, position_sigma: float | None = None) -> tuple[Array, Array]:
+    """Return mean (6,) and covariance (6, 6) before anything was measured."""
+    o = options
+    sigma = o.start_sigma if position_sigma is None else position_sigma
+    sigmas = [sigma, sigma, o.current_sigma, o.current_sigma, o.bias_sigma, o.map_sigma]
+    return np.zeros(N_STATES), np.diag(np.square(sigmas))
+
+
+def transition(options: Options, seconds: float, metres: float) -> tuple[Array, Array]:
+    """Return F and Q (6, 6) over a time and a distance through the water.
+
+    Notes
+    -----
+    A Gauss-Markov state keeps ``a = exp(-Δ/τ)`` of itself and gains the variance ``σ²(1 - a²)``. The current
+    is carried into the position to second order in Δ/τ.
+    """
+    o = options
+    f, q = np.eye(N_STATES), np.zeros((N_STATES, N_STATES))
+    kept = exp(-seconds / o.current_time)
+    gained = o.current_sigma**2 * (1.0 - kept * kept)
+    for p, c in ((0, 2), (1, 3)):
+        f[p, c], f[c, c] = seconds * (1.0 + kept) / 2.0, kept
+        q[p, p] = o.drift**2 * seconds + gained * seconds * seconds / 3.0
+        q[p, c] = q[c, p] = gained * seconds / 2.0
+        q[c, c] = gained
+    for i, sigma, decay in (
+        (4, o.bias_sigma, seconds / o.bias_time),
+        (5, o.map_sigma, metres / o.map_length),
+    ):
+        f[i, i] = exp(-decay)
+        q[i, i] = sigma**2 * (1.0 - f[i, i] ** 2)
+    return f, q
+
+
+def measurement_row(north: float, east: float) -> Array:
+    """Return H (1, 6): the field's slope at the position, and both biases in full."""
+    return np.array([[north, east, 0.0, 0.0, 1.0, 1.0]])
+
+
+def block_length(grid: AnomalyGrid) -> float:
+    """Return the distance over which a map is as good as straight: m, 2 % of its correlation length."""
+    return 0.02 * grid.correlation_length
+
+
+def resolution(grid: AnomalyGrid, variance: float) -> float:
+    """Return the position spread, m, within which the map is straight to the noise of one measurement.
+
+    Notes
+    -----
+    A spread s sees the curvature k as an error of variance ``(k s²)²/2``. With ``k = √3 σ/L²``, the rms
+    second derivative of a map of scatter σ and covariance ``exp(-r²/2L²)``, that stays below the noise while
+    ``s² < √2 r/k``; and never more than a quarter of L, beyond which no Taylor series holds.
+    """
+    length = grid.correlation_length
+    if not np.isfinite(length) or grid.rms == 0.0:
+        return float("inf")
+    curvature = 3.0**0.5 * grid.rms / length**2
+    return float(min(0.25 * length, FINE * (2.0 * variance) ** 0.25 / curvature**0.5))

@@ -1,0 +1,107 @@
+"""One hypothesis: filterpy's extended Kalman filter, wrapped once with its shapes fixed."""
+
+from __future__ import annotations
+
+from math import isnan, log, nan, pi
+from typing import NamedTuple
+
+import numpy as np
+from filterpy.kalman import ExtendedKalmanFilter
+from numpy.typing import NDArray
+
+from magbridge.field.earth import metres_per_degree
+from magbridge.field.grid import AnomalyGrid
+from magbridge.navigate.model import N_STATES, Block, measurement_row
+
+__all__ = ["Innovation", "Tracker"]
+
+Array = NDArray[np.float64]
+
+
+class Innovation(NamedTuple):
+    """What a measurement said: ``value`` nT (or m), its ``variance``, its log-likelihood, whether taken in."""
+
+    value: float
+    variance: float
+    log_likelihood: float
+    accepted: bool
+    anomaly: float = nan  # nT, the map under the position
+
+
+class Tracker:
+    """Extended Kalman filter on the six states of :mod:`~magbridge.navigate.model`.
+
+    ``x`` is (6,), because filterpy's default (6, 1) broadcasts a scalar innovation to (6, 6) without a word.
+    filterpy's update is Joseph's form: the covariance stays symmetric and positive.
+    """
+
+    def __init__(self, grid: AnomalyGrid, x: Array, P: Array, gate: float) -> None:
+        self._grid, self._gate = grid, gate
+        self._filter = ExtendedKalmanFilter(dim_x=N_STATES, dim_z=1)
+        self._filter.x, self._filter.P = x.copy(), P.copy()
+
+    @property
+    def x(self) -> Array:
+        """State, (6,)."""
+        x: Array = self._filter.x
+        return x
+
+    @property
+    def P(self) -> Array:  # noqa: N802  the name every filter gives it
+        """Covariance, (6, 6)."""
+        covariance: Array = self._filter.P
+        return covariance
+
+    def predict(self, F: Array, Q: Array) -> None:
+        """Move on by one transition."""
+        self._filter.F, self._filter.Q = F, Q
+        self._filter.predict()
+
+    def update(self, block: Block) -> Innovation | None:
+        """Take in one measurement of the field; None off the map, where there is nothing to compare with.
+
+        Notes
+        -----
+        ``h = a(p) + ∇F·δ + b + m + tr(C P)/2`` and ``R = r + map variance + tr((C P)²)/2``, with C the map's
+        Hessian and P the position's covariance: mean and variance, to second order, of the map under the
+        spread (the second-order filter of Bar-Shalom et al. 2001, sec. 10.3).
+        """
+        north, east = float(self.x[0]), float(self.x[1])
+        per_latitude, per_longitude = metres_per_degree(block.latitude)
+        local = self._grid.look_up(
+            block.longitude + east / per_longitude, block.latitude + north / per_latitude
+        )
+        if isnan(local.anomaly):
+            return None
+        (pnn, pne), (_, pee) = self.P[:2, :2].tolist()
+        a, b = (
+            local.north_north * pnn + local.north_east * pne,
+            local.north_north * pne + local.north_east * pee,
+        )
+        c, d = local.north_east * pnn + local.east_east * pne, local.north_east * pne + local.east_east * pee
+        slopes = local.north + block.slope_north, local.east + block.slope_east
+        expected = local.anomaly + block.slope_north * north + block.slope_east * east + 0.5 * (a + d)
+        variance = block.variance + local.variance + 0.5 * (a * a + 2.0 * b * c + d * d)
+        row = measurement_row(*slopes)
+        innovation = self._observe(block.anomaly, expected + float(self.x[4] + self.x[5]), row, variance)
+        return innovation._replace(anomaly=local.anomaly)
+
+    def update_position(self, north: float, east: float, sigma: float) -> None:
+        """Take in a fix from elsewhere, m from the dead-reckoned position."""
+        for axis, value in enumerate((north, east)):
+            row = np.zeros((1, N_STATES))
+            row[0, axis] = 1.0
+            self._observe(value, float(self.x[axis]), row, sigma * sigma, gated=False)
+
+    def _observe(
+        self, value: float, expected: float, row: Array, variance: float, *, gated: bool = True
+    ) -> Innovation:
+        y = value - expected
+        s = float((row @ self.P @ row.T)[0, 0]) + variance
+        accepted = not gated or y * y <= self._gate * s
+        if accepted:
+            self._filter.update(
+                np.array([value]), lambda _: row, lambda _: np.array([expected]), np.array([[variance]])
+            )
+        likelihood = -0.5 * (min(y * y / s, self._gate) + log(2.0 * pi * s))
+        return Innovation(y, s, likelihood, accepted)

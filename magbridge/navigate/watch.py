@@ -1,0 +1,175 @@
+"""Whether the filter should still be believed: it is compared with the other things that could be true.
+
+A filter on the wrong hill is content: its innovations fit, because it has moved to where they do. What shows
+it is that another explanation predicts the same measurements better. Two are kept beside it: *elsewhere*, a bank
+of hypotheses around it that has forgotten where it came from, and *nowhere*, a field that has the map's
+roughness and nothing else to do with it.
+
+The odds of each against the filter, product of predictive likelihoods, are a martingale as long as the filter
+is right, so they ever exceed c with a probability of at most 1/c (Ville 1939): the threshold is the false-alarm rate.
+"""
+
+from __future__ import annotations
+
+from enum import Enum
+from math import exp, log, pi
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magbridge.field.earth import wrap
+from magbridge.field.grid import AnomalyGrid
+from magbridge.navigate.bank import Bank, widest
+from magbridge.navigate.model import Block, Options, block_length, transition
+
+__all__ = ["Unmapped", "Verdict", "Watch"]
+
+Array = NDArray[np.float64]
+
+AGREES = 9.0  # squared distance in sigma, within which two estimates are the same place
+ELSEWHERE = 16.0  # squared distance beyond which they are not
+PATIENCE_US = 45_000_000  # µs of blocks that the rivals take in as one,
+STRIDES = 3.0  # or so many times the distance after which the filter makes a block
+
+
+class Verdict(Enum):
+    """What the comparison says."""
+
+    OPEN = "not yet decided"
+    HOLDS = "the filter holds"
+    ELSEWHERE = "another place explains the field better"
+    NOWHERE = "the map does not explain the field"
+
+
+class Unmapped:
+    """The field as a Gauss-Markov process with the map's scatter and correlation length: no map at all.
+
+    One state beside the noise, and the calibration's bias in its variance.
+    """
+
+    def __init__(self, grid: AnomalyGrid, options: Options) -> None:
+        self._length = grid.correlation_length
+        self._mean = float(np.nanmean(grid.anomaly))
+        self._variance = float(np.nanvar(grid.anomaly)) + options.bias_sigma**2
+        self._x, self._p = 0.0, self._variance
+
+    def update(self, block: Block, metres: float) -> float:
+        """Return the log-likelihood of a measurement `metres` after the one before, and take it in."""
+        kept = exp(-metres / self._length)
+        self._x *= kept
+        self._p = kept * kept * self._p + (1.0 - kept * kept) * self._variance
+        y, s = block.anomaly - self._mean - self._x, self._p + block.variance
+        gain = self._p / s
+        self._x += gain * y
+        self._p *= 1.0 - gain
+        return -0.5 * (y * y / s + log(2.0 * pi * s))
+
+
+class Watch:
+    """The filter's rival since the filter was last confirmed, and the filter's own second at equal terms.
+
+    Both take in the blocks together, several to one, because a bank costs more than a filter and a rival can
+    wait a minute: *here* begins where the filter was, *elsewhere* anywhere around it.
+
+    Parameters
+    ----------
+    grid, options
+        As the filter's.
+    x, P : ndarray, (6,), (6, 6)
+        The filter's estimate now.
+    time_us : int
+        µs, its time.
+    reach : float
+        m, 1-sigma of where else the vehicle might be.
+    resolution : float
+        m, of the banks.
+    """
+
+    def __init__(
+        self,
+        grid: AnomalyGrid,
+        options: Options,
+        x: Array,
+        P: Array,
+        time_us: int,
+        reach: float,
+        resolution: float,
+    ) -> None:
+        wide = P.copy()
+        wide[:2, :2] += reach**2 * np.eye(2)
+        for state, sigma in ((2, options.current_sigma), (3, options.current_sigma), (4, options.bias_sigma)):
+            wide[state, state] = max(wide[state, state], sigma**2)
+        self._options, self._time_us = options, time_us
+        self._threshold = log(options.doubt)
+        self._waiting: list[Block] = []
+        self._metres, self._step = 0.0, STRIDES * block_length(grid)
+        self.here = Bank(grid, x, P, resolution, options.gate)
+        self.elsewhere = Bank(grid, x, wide, resolution, options.gate)
+        self.odds = 0.0
+        """Natural logarithm of the odds of *elsewhere* against *here*."""
+
+    def step(self, block: Block, metres: float, x: Array, P: Array) -> Verdict:
+        """Take in a block `metres` after the one before, and the filter's estimate after it."""
+        self._waiting.append(block)
+        self._metres += metres
+        first = self._waiting[0]
+        if block.time_us - first.time_us < PATIENCE_US and self._metres < self._step:
+            return Verdict.OPEN
+        together = average(self._waiting)
+        F, Q = transition(self._options, (together.time_us - self._time_us) * 1e-6, self._metres)
+        self._time_us, self._metres = together.time_us, 0.0
+        self._waiting.clear()
+        self.here.predict(F, Q)
+        self.elsewhere.predict(F, Q)
+        self.odds += self.elsewhere.update(together)[2] - self.here.update(together)[2]
+        return self._compare(x, P)
+
+    def surrender(self, time_us: int) -> Bank:
+        """Return *elsewhere*, moved on to `time_us`, to be the filter from now on."""
+        self.elsewhere.predict(*transition(self._options, (time_us - self._time_us) * 1e-6, 0.0))
+        return self.elsewhere
+
+    def _compare(self, x: Array, P: Array) -> Verdict:
+        there, spread = self.elsewhere.moments()
+        if self.odds > self._threshold and distance(there - x, P) > ELSEWHERE:
+            return Verdict.ELSEWHERE
+        if widest(spread) > 1.5 * max(self.elsewhere.resolution, widest(P)):
+            return Verdict.OPEN
+        if distance(there - x, spread + P) < AGREES:
+            return Verdict.HOLDS
+        here, narrow = self.here.moments()  # where the filter would be, were it not for its one straight line
+        return Verdict.ELSEWHERE if distance(there - here, spread + narrow) < AGREES else Verdict.OPEN
+
+
+def distance(apart: Array, P: Array) -> float:
+    """Return the squared distance of two positions in units of a covariance."""
+    return float(apart[:2] @ np.linalg.solve(P[:2, :2], apart[:2]))
+
+
+def average(blocks: list[Block]) -> Block:
+    """Return several blocks as one: their mean, by weight of their precision."""
+    first = blocks[0]
+    precision = np.array([1.0 / b.variance for b in blocks])
+    columns = np.array(
+        [
+            (
+                b.time_us - first.time_us,
+                b.latitude,
+                wrap(b.longitude - first.longitude),
+                b.anomaly,
+                b.slope_north,
+                b.slope_east,
+            )
+            for b in blocks
+        ]
+    )
+    time, latitude, longitude, anomaly, north, east = (precision @ columns / precision.sum()).tolist()
+    return Block(
+        first.time_us + round(time),
+        latitude,
+        wrap(first.longitude + longitude),
+        anomaly,
+        1.0 / float(precision.sum()),
+        north,
+        east,
+    )
