@@ -226,6 +226,42 @@ def calibrate(
 
 
 @app.command
+def plan(
+    *,
+    calibration: Path,
+    mission: Path,
+    runs: Annotated[int, Parameter(validator=validators.Number(gte=1))] = 10,
+    roll: float = 10.0,
+    json: Json = False,
+) -> None:
+    """Tell which calibration runs to fly next: those after which the mission's worst error is smallest.
+
+    Parameters
+    ----------
+    calibration
+        What is known so far.
+    mission
+        A log or a simulated deployment that flies as the mission will: attitude, position, moving masses.
+    runs
+        How many spirals.
+    roll
+        deg that the vehicle can bank in a spiral, either way.
+    json
+        Print the result for machines.
+    """
+    from magbridge.calibration.file import load
+    from magbridge.calibration.flight_plan import facts, flight_plan, tell
+    from magbridge.field.declination import with_true_heading
+    from magbridge.field.reference import earth_field
+    from magbridge.logs import read
+
+    deployment = with_true_heading(read(mission))
+    known = load(calibration)
+    found = flight_plan(known, deployment, earth_field(deployment)[1], runs=runs, roll=roll)
+    _tell(facts(found, known), tell(found, known), json)
+
+
+@app.command
 def map(  # noqa: A001 - the command's name
     *grids: Path,
     output: Output,
