@@ -1,0 +1,68 @@
+"""A ground station on MAVSDK; tells what it finds as lines of JSON. Arguments: URL of the link, our XML."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import sys
+import threading
+import time
+from pathlib import Path
+
+from mavsdk import ComponentType, Configuration, Mavsdk
+from mavsdk.plugins.mavlink_direct import MavlinkDirect
+from mavsdk.plugins.param import Param, ParamError, ProtocolVersion
+
+url, xml = sys.argv[1], Path(sys.argv[2])
+BRIDGE = 191
+
+
+def tell(name: str, what: object) -> None:
+    print(json.dumps({name: what}), flush=True)
+
+
+station = Mavsdk(Configuration.create_with_component_type(ComponentType.GROUND_STATION))
+result = station.add_any_connection(url)
+systems = []
+while not systems or BRIDGE not in systems[0].component_ids():
+    systems = station.get_systems()
+    time.sleep(0.05)
+system = systems[0]
+tell(
+    "found",
+    {
+        "system": system.get_system_id(),
+        "components": system.component_ids(),
+        "autopilot": system.has_autopilot(),
+    },
+)
+
+direct = MavlinkDirect(system)
+direct.load_custom_xml(xml.read_text())
+heard, ready = {}, threading.Event()
+
+
+def hear(message: object, _: object) -> None:
+    heard[message.message_name] = json.loads(message.fields_json)
+    if {"MAG_FIELD", "MAG_RAW", "MAG_STATUS"} <= heard.keys():
+        ready.set()
+
+
+for name in ("MAG_FIELD", "MAG_RAW", "MAG_STATUS"):
+    direct.subscribe_message(name, hear)
+ready.wait(20)
+tell("heard", heard)
+
+param = Param(system)
+with contextlib.suppress(ParamError):  # MAVSDK 4.1.0 says "unknown" when it has selected it
+    param.select_component(BRIDGE, ProtocolVersion.V1)
+tell("parameters", {one.name: one.value for one in param.get_all_params().float_params})
+param.set_param_float("MB_GAP_FACTOR", 4.0)
+tell("read back", param.get_param_float("MB_GAP_FACTOR"))
+try:
+    param.set_param_float("MB_GAP_FACTOR", 0.5)
+    tell("refused", None)
+except ParamError as error:
+    tell("refused", str(error))
+tell("kept", param.get_param_float("MB_GAP_FACTOR"))
+sys.stdin.read()
