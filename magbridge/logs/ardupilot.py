@@ -1,4 +1,4 @@
-"""ArduPilot's own logs (``.BIN``): records that describe themselves.
+"""ArduPilot's own logs (``.BIN``), through pymavlink.
 
 A row is a sample of the first magnetometer that the log has; every other column is the last value before it. The log
 holds the field after the autopilot's offsets and motor compensation; both are in it too and are taken off again, so
@@ -9,38 +9,30 @@ Time is UTC once the log has a GPS fix; a log without one counts from the boot, 
 
 References
 ----------
-ArduPilot, libraries/AP_Logger/LogStructure.h: the head (0xA3 0x95, type), FMT and the format letters.
+ArduPilot, "Onboard Message Log Messages", https://ardupilot.org/copter/docs/logmessages.html
 """
 
 from __future__ import annotations
 
+import struct
+from array import array
 from collections.abc import Iterator
+from contextlib import redirect_stderr, redirect_stdout, suppress
 from pathlib import Path
-from struct import Struct
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from magbridge.errors import FormatError
+from magbridge.errors import FormatError, MissingExtra
 from magbridge.logs.deployment import deployment, increasing, sliced
 from magbridge.logs.resample import latest
 
 __all__ = ["chunks"]
 
 Floats = NDArray[np.float64]
-Table = NDArray[np.void]
 
-HEAD = b"\xa3\x95"
-FMT = 0x80
-FMT_BODY = Struct("<BB4s16s64s")
-LETTERS = {
-    "a": "V64", "b": "i1", "B": "u1", "h": "i2", "H": "u2", "i": "i4", "I": "u4", "f": "f4", "d": "f8", "g": "f2",
-    "n": "S4", "N": "S16", "Z": "S64", "c": "i2", "C": "u2", "e": "i4", "E": "u4", "L": "i4", "M": "u1", "q": "i8",
-    "Q": "u8",
-}  # fmt: skip
-SCALES = {"c": 0.01, "C": 0.01, "e": 0.01, "E": 0.01, "L": 1e-7}
 NT_PER_MG = 100.0
 MAX_AGE = 30.0
 """s; an older value is not carried to a row."""
@@ -67,13 +59,15 @@ LEAP = ((1_483_228_800, 18), (1_435_708_800, 17), (1_341_100_800, 16), (0, 15))
 """From this UTC on, by so many s GPS time is ahead."""
 
 
-class Format(NamedTuple):
-    """One kind of record."""
-
-    name: str
-    size: int
-    dtype: np.dtype[np.void]
-    scales: dict[str, float]
+KINDS = {f"{name}{k}" for name in ("MAG", *FIELDS) for k in ("", "2", "3")}
+COLUMNS = {
+    *("TimeUS", "GWk", "GMS", "Status", *INSTANCE),
+    *(f"{what}{axis}" for what in ("Mag", "Ofs", "MO") for axis in "XYZ"),
+    *(field for fields in FIELDS.values() for _, field, _, _ in fields),
+}
+NUMBERS = (int, float)
+DAMAGE = (AttributeError, LookupError, RecursionError, TypeError, ValueError, struct.error)
+"""What pymavlink raises where a record, or the one that describes it, is not what it should be."""
 
 
 def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
@@ -84,11 +78,12 @@ def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
     FormatError
         No magnetometer in it.
     """
-    tables, skipped = _tables(path.read_bytes())
-    if not {"TimeUS", "MagX", "MagY", "MagZ"} <= tables.get("MAG", {}).keys():
-        raise FormatError(path, "expected an ArduPilot log with MAG records")
+    tables, skipped = _tables(path)
     offset = _utc_offset(tables)
-    mags = _instances(tables, "MAG", offset)
+    found = _instances(tables, "MAG", offset)
+    mags = {number: one for number, one in found.items() if {"MagX", "MagY", "MagZ"} <= one[1].keys()}
+    if not mags:
+        raise FormatError(path, "expected an ArduPilot log with MAG records")
     first = min(mags)
     time, mag = mags.pop(first)
     keep = np.diff(time, prepend=-np.inf) > 0
@@ -133,7 +128,7 @@ def _instances(
         which = next(
             (table[field] for field in INSTANCE if field in table), np.full(len(table["TimeUS"]), number)
         )
-        for k in np.unique(which):
+        for k in np.unique(which[np.isfinite(which)]):
             fields = {field: values[which == k] for field, values in table.items()}
             found[int(k)] = fields["TimeUS"] * 1e-6 + offset, fields
     return found
@@ -149,53 +144,45 @@ def _utc_offset(tables: dict[str, dict[str, Floats]]) -> float:
         return 0.0
     k = fixes[0]
     utc = EPOCH_GPS + gps["GWk"][k] * WEEK + gps["GMS"][k] * 1e-3
-    leap = next(seconds for since, seconds in LEAP if utc - seconds >= since)
+    leap = next((seconds for since, seconds in LEAP if utc - seconds >= since), 0)
     return float(utc - leap - gps["TimeUS"][k] * 1e-6)
 
 
-def _tables(data: bytes) -> tuple[dict[str, dict[str, Floats]], int]:
-    """Return every kind of record that we use as columns, and the bytes that belonged to none."""
-    wanted = {f"{name}{k}" for name in ("MAG", *FIELDS) for k in ("", "2", "3")}
-    formats: dict[int, Format] = {}
-    bodies: dict[int, list[bytes]] = {}
-    at = skipped = 0
-    while at + 3 <= len(data):
-        kind = data[at + 2]
-        size = FMT_BODY.size + 3 if kind == FMT else formats[kind].size if kind in formats else 0
-        if data[at : at + 2] != HEAD or not size or at + size > len(data):
-            following = data.find(HEAD, at + 1)
-            following = len(data) if following < 0 else following
-            skipped += following - at
-            at = following
-            continue
-        body = data[at + 3 : at + size]
-        if kind == FMT:
-            if one := _format(body):
-                formats[body[0]] = one
-        elif formats[kind].name in wanted:
-            bodies.setdefault(kind, []).append(body)
-        at += size
-    skipped += len(data) - at
-    return {formats[kind].name: _columns(formats[kind], found) for kind, found in bodies.items()}, skipped
+def _tables(path: Path) -> tuple[dict[str, dict[str, Floats]], int]:
+    """Return every kind of record that we use as columns, and the bytes that belonged to no record."""
+    try:
+        from pymavlink.DFReader import DFReader_binary  # noqa: PLC0415 - a slow import
+    except ImportError:
+        raise MissingExtra("pymavlink", "analysis") from None
 
+    class Reader(DFReader_binary):  # type: ignore[misc]  # pymavlink is untyped
+        """Record by record: the index stops at the first unknown one, and may not come back from damage."""
 
-def _format(body: bytes) -> Format | None:
-    """Return what a FMT record says of another kind; None where that cannot be."""
-    _, size, *texts = FMT_BODY.unpack(body)
-    name, letters, fields = (text.rstrip(b"\0").decode("ascii", "replace") for text in texts)
-    names = fields.split(",") if fields else []
-    codes = [LETTERS.get(letter) for letter in letters]
-    if len(names) != len(codes) or len(set(names)) != len(names) or None in codes or "" in names:
-        return None
-    dtype = np.dtype(list(zip(names, codes, strict=True)))
-    scales = {field: SCALES[letter] for field, letter in zip(names, letters, strict=True) if letter in SCALES}
-    return Format(name, size, dtype, scales) if dtype.itemsize == size - 3 else None
+        def init_arrays(self, progress_callback: object = None) -> None:
+            pass
 
+        init_arrays_fast = init_clock = init_arrays
 
-def _columns(one: Format, bodies: list[bytes]) -> dict[str, Floats]:
-    table = np.frombuffer(b"".join(bodies), dtype=one.dtype)
+    tables: dict[str, dict[str, array[float]]] = {}
+    with redirect_stdout(None), redirect_stderr(None), Reader(str(path)) as log:
+        skipped = log.data_len
+        while (at := log.offset) < log.data_len - 2:
+            with suppress(*DAMAGE):
+                if record := log.recv_msg():
+                    skipped -= record.fmt.len
+                    if record.fmt.name in KINDS:
+                        _add(tables.setdefault(record.fmt.name, {}), record)
+            log.offset = max(log.offset, at + 3)  # a damaged description may say that a record has no length
     return {
-        field: table[field].astype(np.float64) * one.scales.get(field, 1.0)
-        for field in one.dtype.names or ()
-        if one.dtype[field].kind in "iuf"
-    }
+        name: {field: np.array(table[field]) for field in table} for name, table in tables.items()
+    }, skipped
+
+
+def _add(table: dict[str, array[float]], record: Any) -> None:
+    """Append the numbers of a record; one that has not the fields of those before it is damage."""
+    kinds = zip(record.fmt.columns, record.fmt.msg_types, strict=False)
+    row = {name: float(getattr(record, name)) for name, kind in kinds if name in COLUMNS and kind in NUMBERS}
+    if not table:
+        table.update((name, array("d")) for name in row)
+    for column, value in zip(table.values(), [row[name] for name in table], strict=True):
+        column.append(value)

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 from struct import pack
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from magbridge import logs
 from magbridge.errors import FormatError
-from magbridge.logs import ardupilot
 
 KINDS = {
     # name: (type, letters, struct, fields)
@@ -100,14 +100,35 @@ def test_damaged_bin_is_read_to_its_end(tmp_path: Path) -> None:
 
 
 @given(at=st.integers(0, 10**6), junk=st.binary(max_size=40), cut=st.integers(0, 60))
-@settings(max_examples=100, deadline=None)
-def test_bin_with_anything_in_it(at: int, junk: bytes, cut: int) -> None:
-    """Whatever stands between or instead of records, only columns of numbers come out."""
+@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_bin_with_anything_in_it(
+    at: int, junk: bytes, cut: int, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Whatever stands between or instead of records, only a deployment comes out, or one line."""
     data = bin_log()
     at %= len(data)
-    tables, skipped = ardupilot._tables(data[:at] + junk + data[at + cut :])
-    assert 0 <= skipped <= len(data) + len(junk)
-    assert all(values.dtype == np.float64 for table in tables.values() for values in table.values())
+    path = tmp_path / "log.bin"
+    path.write_bytes(data[:at] + junk + data[at + cut :])
+    with suppress(FormatError):
+        assert 0 <= logs.read(path).attrs["bytes_skipped"] <= len(data) + len(junk)
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize(
+    "described",
+    [
+        fmt(7, 0, "NONE", "", ""),  # a record without a length: a reader may stay there for ever
+        fmt(7, 9, "BAD", "Q", "TimeUS"),  # one whose length is not its fields'
+        fmt(7, 14, "FMTU", "QBN", "TimeUS,FmtType,UnitIds"),
+        fmt(7, 0, "", "xyz", ",,"),
+    ],
+)
+def test_bin_with_damaged_descriptions(described: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "log.bin"
+    path.write_bytes(described + b"\xa3\x95\x07damage" * 5000 + bin_log())
+    back = logs.read(path)
+    assert back.sizes["time"] == 20
+    assert back.attrs["bytes_skipped"] >= 5000
 
 
 # ULog: 16 bytes of head, then messages of a 16-bit size, a letter and that many bytes

@@ -42,6 +42,7 @@ def test_slocum_leaves_the_home_alone(tmp_path: Path) -> None:
         (".ulg", "pyulog", "formats"),
         (".dbd", "dbdreader", "formats"),
         (".nc", "netCDF4", "analysis"),
+        (".bin", "pymavlink", "analysis"),
     ],
 )
 def test_a_missing_extra_is_named(suffix: str, package: str, extra: str, tmp_path: Path) -> None:
