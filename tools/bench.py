@@ -1,0 +1,109 @@
+"""How fast it is, each figure beside its floor in the same run.
+
+    python tools/bench.py                       everything: some minutes
+    python tools/bench.py processor start       some of it
+    python tools/bench.py --json                for machines, with details
+
+Repetitions of the thing and of its floor alternate, and medians are told, so that a busy machine slows both alike.
+Processor time and ratios hold on a busy machine; latencies do not: the load average is told with them, and the
+floor's own tail says how far to believe them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import sys
+import tempfile
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from benchmarks.row import Row
+from rich.console import Console
+from rich.table import Table
+
+__all__ = ["BENCHMARKS"]
+
+BENCHMARKS: dict[str, tuple[str, int]] = {
+    "processor": ("benchmarks.processor:processor", 15),
+    "latency": ("benchmarks.latency:latency", 5),
+    "replay": ("benchmarks.replay:replay", 5),
+    "start": ("benchmarks.start:start", 5),
+}
+"""Name to ``module:function`` and number of repetitions; the function takes a folder and that number."""
+
+
+def measure(name: str, factor: float) -> dict[str, Any]:
+    """Run one benchmark; return its rows, and the load before and after."""
+    place, repetitions = BENCHMARKS[name]
+    module, _, function = place.partition(":")
+    before = os.getloadavg()[0]
+    with tempfile.TemporaryDirectory() as folder:
+        rows: list[Row] = getattr(import_module(module), function)(
+            Path(folder), max(1, round(repetitions * factor))
+        )
+    return {"name": name, "load": (before, os.getloadavg()[0]), "rows": rows}
+
+
+def show(results: list[dict[str, Any]]) -> Table:
+    """Return the table for people."""
+    table = Table(
+        title=f"{platform.processor() or platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}"
+    )
+    for heading, justify in (
+        ("what", "left"), ("measured", "right"), ("floor", "right"), ("ratio", "right"), ("asked", "right"), ("", "left"),
+    ):  # fmt: skip
+        table.add_column(heading, justify=justify)  # type: ignore[arg-type]
+    for result in results:
+        for row in result["rows"]:
+            asked = f"<= {row.most:g}" if row.most is not None else f">= {row.least:g}" if row.least else ""
+            table.add_row(
+                row.what,
+                f"{row.value:.3g} {row.unit}",
+                f"{row.floor:.3g} {row.unit} ({row.floor_is})" if row.floor is not None else "",
+                f"{row.ratio:.2f}" if row.ratio is not None else "",
+                asked,
+                {True: "holds", False: "FALLS SHORT", None: ""}[row.holds],
+            )
+        table.add_row(
+            f"[dim]load average {result['load'][0]:.1f} to {result['load'][1]:.1f}", end_section=True
+        )
+    return table
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("names", nargs="*", metavar="NAME", help=", ".join(BENCHMARKS))
+    parser.add_argument("--json", action="store_true")
+    parser.add_argument("--factor", type=float, default=1.0, help="so many times the repetitions")
+    chosen = parser.parse_args()
+    if unknown := set(chosen.names) - set(BENCHMARKS):
+        parser.error(f"no benchmark {', '.join(sorted(unknown))}; there are {', '.join(BENCHMARKS)}")
+    results = []
+    for name in chosen.names or BENCHMARKS:
+        print(f"{name} ...", file=sys.stderr)
+        results.append(measure(name, chosen.factor))
+    if chosen.json:
+        told = [
+            {
+                **result,
+                "rows": [
+                    {**row._asdict(), "detail": dict(row.detail), "holds": row.holds}
+                    for row in result["rows"]
+                ],
+            }
+            for result in results
+        ]
+        print(json.dumps(told, indent=1))
+    else:
+        Console(width=None if sys.stdout.isatty() else 160).print(show(results))
+    return int(any(row.holds is False for result in results for row in result["rows"]))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,214 @@
+"""From the last byte of a frame into the pty to the datagram out, of the real ``magbridge run``.
+
+One thread of this process is the fluxgate, the autopilot and the station: it writes a frame, and then asks the
+socket again and again until the next thing is due, so that what is measured is the bridge and not a wake-up of
+ours. The floor is measured in the same way: a process that sends whatever it reads.
+"""
+
+from __future__ import annotations
+
+import os
+import pty
+import re
+import socket
+import subprocess
+import sys
+import time
+import tty
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from statistics import median
+from typing import NamedTuple
+
+import numpy as np
+from benchmarks.row import Row
+from benchmarks.workload import OPTIONS, TELEMETRY_HZ, Feed, write_config
+
+from magbridge.mavlink import Codec, spec
+from magbridge.sensors import open_driver
+
+__all__ = ["latency", "started"]
+
+ECHO = Path(__file__).with_name("echo.py")
+RATES = (100, 1000)
+SECONDS = 5.0
+"""Of one repetition."""
+GRACE = 1.0
+"""s in which the last samples may still come."""
+WARM_UP = 0.5
+"""s at the beginning that do not count: caches, the first IGRF."""
+RAW, FIELD = spec("MAG_RAW").id, spec("MAG_FIELD").id
+BIN = Path(sys.executable).parent
+
+
+class Sent(NamedTuple):
+    """One repetition."""
+
+    latency: np.ndarray
+    """ms of each frame; NaN where it was lost."""
+    cpu: float
+    """s of processor time, of all threads, kernel included."""
+    resident: float
+    """MB"""
+
+
+class Stage(NamedTuple):
+    """A process on a pty and a socket."""
+
+    process: subprocess.Popen[bytes]
+    master: int
+    link: socket.socket
+    peer: tuple[str, int]
+    seconds: float
+    """From its start to its first datagram."""
+    first: bytes
+    """That datagram."""
+
+    def write(self, frame: bytes) -> None:
+        """Let the fluxgate send `frame`."""
+        os.write(self.master, frame)
+
+
+@contextmanager
+def started(command: Callable[[str, int], list[str]]) -> Iterator[Stage]:
+    """Start a process between a new pty and a new socket; `command` takes the tty's name and the port."""
+    master, slave = pty.openpty()
+    tty.setraw(slave)
+    link = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    link.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 22)
+    link.bind(("127.0.0.1", 0))
+    link.settimeout(30.0)
+    line = command(os.ttyname(slave), link.getsockname()[1])
+    begun = time.perf_counter()
+    process = subprocess.Popen(line)
+    try:
+        first, peer = link.recvfrom(65536)
+        link.setblocking(False)
+        yield Stage(process, master, link, peer, time.perf_counter() - begun, first)
+    finally:
+        process.terminate()
+        process.wait(10.0)
+        link.close()
+        os.close(master)
+        os.close(slave)
+
+
+def bridge_command(folder: Path) -> Callable[[str, int], list[str]]:
+    """Return what starts the bridge of the workload."""
+
+    def command(device: str, port: int) -> list[str]:
+        config = write_config(folder, device, f"udpout:127.0.0.1:{port}")
+        return [str(BIN / "magbridge"), "run", "--config", str(config)]
+
+    return command
+
+
+def latency(folder: Path, repetitions: int) -> list[Row]:
+    """Measure bridge and echo in turn, at each rate."""
+    rows = []
+    for hertz in RATES:
+        bridge, echo = [], []
+        with (
+            started(bridge_command(folder)) as live,
+            started(lambda device, port: [sys.executable, str(ECHO), device, str(port)]) as bare,
+        ):
+            feed, other = Feed(), Feed()
+            for _ in range(repetitions):
+                bridge.append(_play(live, feed, hertz, _sequences_of_messages()))
+                echo.append(_play(bare, other, hertz, _sequences_of_frames()))
+        rows += _rows(hertz, bridge, echo)
+    return rows
+
+
+def _rows(hertz: int, bridge: list[Sent], echo: list[Sent]) -> list[Row]:
+    def quantile(runs: list[Sent], q: float) -> float:
+        return median([float(np.nanpercentile(run.latency, q)) for run in runs])
+
+    detail = {
+        "best": [min(float(np.nanpercentile(run.latency, q)) for run in bridge) for q in (50.0, 99.0)],
+        "samples": sum(len(run.latency) for run in bridge),
+    }
+    rows = [
+        Row(f"latency at {hertz:,} Hz, {name}", quantile(bridge, q), "ms", quantile(echo, q), "echo", most=most,
+            detail=detail)
+        for name, q, most in (("p50", 50.0, 0.5), ("p99", 99.0, 2.0))
+    ]  # fmt: skip
+    lost = sum(int(np.isnan(run.latency).sum()) for run in bridge)
+    samples = hertz * SECONDS
+    rows.append(Row(f"lost at {hertz:,} Hz, of {detail['samples']:,}", lost, "samples", most=0))
+    cpu = [median([run.cpu for run in runs]) / samples * 1e6 for runs in (bridge, echo)]
+    rows.append(Row(f"processor time at {hertz:,} Hz, kernel and log included", cpu[0], "us", cpu[1], "echo"))
+    rows.append(Row(f"resident after {hertz:,} Hz", bridge[-1].resident, "MB", most=90.0))
+    return rows
+
+
+def _play(stage: Stage, feed: Feed, hertz: int, sequences: Callable[[bytes], list[int]]) -> Sent:
+    """Send readings and telemetry for a while; match what comes back by sequence number."""
+    clock, send, recv = time.perf_counter, stage.link.sendto, stage.link.recv
+    heard: list[tuple[float, bytes]] = []
+    written: dict[int, float] = {}
+    driver = open_driver("digitizer", OPTIONS)
+
+    def listen(until: float) -> None:
+        while (now := clock()) < until:
+            try:
+                heard.append((now, recv(65536)))
+            except BlockingIOError:
+                continue
+
+    cpu = processor_time(stage.process.pid)
+    begun = clock() + 0.01
+    messages, every = 0, hertz // TELEMETRY_HZ
+    for sample in range(round(hertz * SECONDS)):
+        frame = feed.reading(hertz)
+        sequence = driver.feed(frame)[0].sequence
+        due = begun + sample / hertz
+        if sample % every == every // 2:
+            listen(due - 0.5 / hertz)
+            send(feed.message(time.time_ns() // 1000), stage.peer)
+            messages += 1
+            if messages % TELEMETRY_HZ == 0:
+                send(feed.heartbeat(), stage.peer)
+        listen(due)
+        written[sequence or 0] = clock()
+        stage.write(frame)
+    listen(clock() + GRACE)
+    cpu = processor_time(stage.process.pid) - cpu
+    came: dict[int, float] = {}
+    for when, data in heard:
+        for sequence in sequences(data):
+            came.setdefault(sequence, when)
+    late = [1e3 * (came.get(sequence, np.nan) - when) for sequence, when in written.items()]
+    return Sent(np.array(late[round(WARM_UP * hertz) :]), cpu, resident(stage.process.pid)["VmRSS"])
+
+
+def _sequences_of_messages() -> Callable[[bytes], list[int]]:
+    codec = Codec(255, 190)
+
+    def sequences(data: bytes) -> list[int]:
+        messages = codec.parse(data)
+        raw = [message["sequence"] for message in messages if message.id == RAW]
+        # a raw reading that came without its corrected field is not what was asked for
+        return raw if any(message.id == FIELD for message in messages) else []
+
+    return sequences
+
+
+def _sequences_of_frames() -> Callable[[bytes], list[int]]:
+    driver = open_driver("digitizer", OPTIONS)
+    return lambda data: [reading.sequence or 0 for reading in driver.feed(data)]
+
+
+def processor_time(pid: int) -> float:
+    """Return the processor time of a process so far, in s, all threads, kernel included."""
+    tasks = Path(f"/proc/{pid}/task").iterdir()
+    return sum(int((task / "schedstat").read_text().split()[0]) for task in tasks) * 1e-9
+
+
+def resident(pid: int) -> dict[str, float]:
+    """Return VmRSS and VmHWM of a process, in MB."""
+    text = Path(f"/proc/{pid}/status").read_text()
+    return {
+        name: int(kilobytes) / 1024.0 for name, kilobytes in re.findall(r"(VmRSS|VmHWM):\s+(\d+) kB", text)
+    }

@@ -1,0 +1,74 @@
+"""The floor: the same MAVLink messages, decoded and encoded by the classes that pymavlink makes of our XML."""
+
+from __future__ import annotations
+
+import importlib.util
+import shutil
+import tempfile
+from collections.abc import Iterable
+from contextlib import redirect_stdout
+from functools import cache
+from io import StringIO
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pymavlink
+from pymavlink.generator import mavgen
+
+import magbridge.mavlink
+
+__all__ = ["Peer"]
+
+
+@cache
+def classes() -> ModuleType:
+    """Return the module that mavgen writes for our dialect."""
+    with tempfile.TemporaryDirectory() as name, redirect_stdout(StringIO()):
+        folder = Path(name)
+        shutil.copy(Path(magbridge.mavlink.__file__).with_name("magbridge.xml"), folder)
+        for included in ("common", "standard", "minimal"):
+            shutil.copy(Path(pymavlink.__file__).parent / "dialects" / "v20" / f"{included}.xml", folder)
+        options = mavgen.Opts(str(folder / "peer"), wire_protocol="2.0", language="Python3")
+        if not mavgen.mavgen(options, [str(folder / "magbridge.xml")]):
+            raise RuntimeError("mavgen refused magbridge.xml")
+        place = importlib.util.spec_from_file_location("peer", folder / "peer.py")
+        if place is None or place.loader is None:
+            raise ImportError("peer.py")
+        module = importlib.util.module_from_spec(place)
+        place.loader.exec_module(module)
+    return module
+
+
+class Peer:
+    """pymavlink's codec, given the bytes that the bridge is given and the messages that it publishes."""
+
+    def __init__(self) -> None:
+        self._in = classes().MAVLink(None)
+        self._in.robust_parsing = True
+        self._out = classes().MAVLink(None, srcSystem=1, srcComponent=191)
+
+    def decode(self, pieces: Iterable[bytes]) -> int:
+        """Decode bytes as they come; return how many messages they were."""
+        return sum(len(self._in.parse_buffer(piece) or ()) for piece in pieces)
+
+    def arguments(self, published: bytes) -> list[tuple[type, tuple[Any, ...]]]:
+        """Return class and arguments of every message of a stream: what :meth:`encode` is to make it from."""
+        reader = classes().MAVLink(None)
+        messages = reader.parse_buffer(published) or []
+        return [(type(one), tuple(self._argument(one, name) for name in one.fieldnames)) for one in messages]
+
+    def sensor_bytes(self, data: bytes) -> tuple[type, tuple[Any, ...]]:
+        """Return class and arguments of the message in which the log keeps a sensor's bytes."""
+        kind = classes().MAVLink_mag_sensor_bytes_message
+        return kind, (0, len(data), list(data.ljust(253, b"\0")))
+
+    @staticmethod
+    def _argument(message: Any, name: str) -> Any:
+        value = getattr(message, name)
+        return value.encode() if isinstance(value, str) else value
+
+    def encode(self, messages: Iterable[tuple[type, tuple[Any, ...]]]) -> int:
+        """Make and pack messages; return the bytes."""
+        out = self._out
+        return sum(len(kind(*arguments).pack(out)) for kind, arguments in messages)

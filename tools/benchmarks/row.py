@@ -1,0 +1,47 @@
+"""One line of the table."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+__all__ = ["Row"]
+
+
+class Row(NamedTuple):
+    """What was measured, beside its floor in the same run and what was asked.
+
+    Attributes
+    ----------
+    what : str
+    value : float
+    unit : str
+    floor : float or None
+        The same thing done bare, in the same unit; `floor_is` says how.
+    ratio : float or None
+        The figure that `most` or `least` is about, where it is not `value` itself: the median over the
+        repetitions of value by floor.
+    most, least : float or None
+        What was asked.
+    detail : mapping
+        For ``--json``.
+    """
+
+    what: str
+    value: float
+    unit: str
+    floor: float | None = None
+    floor_is: str = ""
+    ratio: float | None = None
+    most: float | None = None
+    least: float | None = None
+    detail: Mapping[str, Any] = MappingProxyType({})
+
+    @property
+    def holds(self) -> bool | None:
+        """Whether it is as asked; None where nothing was."""
+        judged = self.value if self.ratio is None else self.ratio
+        if self.most is not None:
+            return judged <= self.most
+        return judged >= self.least if self.least is not None else None

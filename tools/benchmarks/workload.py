@@ -1,0 +1,144 @@
+"""What the bridge is given in every benchmark: one configuration, one calibration, one stream of events."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import count
+from math import cos, sin
+from pathlib import Path
+
+import numpy as np
+
+from magbridge.bridge.events import Event
+from magbridge.calibration.file import save
+from magbridge.calibration.model import Boresight, Calibration, Noise, Parameter, Reference
+from magbridge.calibration.terms import Polynomial, full_order
+from magbridge.mavlink import Codec
+from magbridge.records import Channel, Reading
+from sitl.fluxgate import Encoder, open_encoder
+
+__all__ = ["BEGIN_US", "CONFIG", "Feed", "calibration", "write_config"]
+
+BEGIN_US = 1_750_000_000_000_000
+TELEMETRY_HZ = 20
+TELEMETRY = ("battpos",) * 8 + ("ballast",) * 8 + ("ATTITUDE",) * 3 + ("GLOBAL_POSITION_INT",)
+"""Messages of one second, beside the autopilot's heartbeat."""
+OPTIONS = {"sensitivity": 5e-5, "reference_voltage": 5.0}
+CONFIG = """
+[sensor]
+driver = "digitizer"
+port = "{port}"
+[sensor.options]
+sensitivity = 5e-5
+reference_voltage = 5.0
+[link]
+url = "{url}"
+[calibration]
+file = "cal.json"
+[telemetry.battpos]
+message = "NAMED_VALUE_FLOAT"
+match = {{name = "battpos"}}
+field = "value"
+unit = "in"
+[telemetry.ballast]
+message = "NAMED_VALUE_FLOAT"
+match = {{name = "ballast"}}
+field = "value"
+unit = "cm3"
+[publish]
+MAG_RAW = 0
+MAG_FIELD = 0
+HIGHRES_IMU = 0
+NAMED_VALUE_FLOAT = 1
+[log]
+directory = "logs"
+"""
+
+
+def calibration() -> Calibration:
+    """Return a full cubic in two masses: 90 coefficients with a full covariance."""
+    random = np.random.default_rng(1)
+    terms = (Polynomial(exponents=full_order(2, 3)),)
+    size = terms[0].size
+    root = random.normal(size=(size, size))
+    small = (np.eye(3) * 1e-6).tolist()
+    return Calibration(
+        parameters=(
+            Parameter("battpos", "in", -1.0, 1.0, 0.0, 1.0),
+            Parameter("ballast", "cm3", 0.0, 400.0, 200.0, 200.0),
+        ),
+        terms=terms,
+        coefficients=random.normal(size=size) * 100.0,
+        covariance=root @ root.T / size,
+        noise=Noise(1.0),
+        reference=Reference(50_000.0),
+        boresight=Boresight((0.01, -0.02, 0.03), (tuple(small[0]), tuple(small[1]), tuple(small[2]))),
+        method="auto",
+    )
+
+
+def write_config(folder: Path, port: str = "/dev/null", url: str = "udpout:127.0.0.1:14550") -> Path:
+    """Write ``bridge.toml`` and ``cal.json`` to `folder`; return the first."""
+    save(calibration(), folder / "cal.json")
+    path = folder / "bridge.toml"
+    path.write_text(CONFIG.format(port=port, url=url), encoding="utf-8")
+    return path
+
+
+class Feed:
+    """The bytes of a digitizer and of an autopilot, second after second.
+
+    Parameters
+    ----------
+    moving : bool
+        The masses never rest; else they rest nine seconds of ten, and their telemetry trembles in its last digit.
+    """
+
+    def __init__(self, *, moving: bool = False) -> None:
+        self._moving = moving
+        self._autopilot = Codec(1, 1)
+        self._fluxgate: Encoder = open_encoder("digitizer", OPTIONS)
+        self._messages = count()
+        self._samples = count()
+
+    def events(self, seconds: int, hertz: int, begin_us: int) -> Iterator[Event]:
+        """Yield a time's events: `hertz` readings and 20 messages a second, and the heartbeat."""
+        for second in range(seconds):
+            start_us = begin_us + second * 1_000_000
+            due = [(start_us, Channel.LINK, -1)]
+            due += [
+                (start_us + i * 1_000_000 // TELEMETRY_HZ + 500, Channel.LINK, i) for i in range(TELEMETRY_HZ)
+            ]
+            due += [(start_us + i * 1_000_000 // hertz + 3000, Channel.SENSOR, i) for i in range(hertz)]
+            for time_us, channel, index in sorted(due):
+                data = self.reading(hertz) if channel is Channel.SENSOR else self.message(time_us)
+                yield Event(time_us & ~3, channel, self.heartbeat() if index < 0 else data)
+
+    def reading(self, hertz: int) -> bytes:
+        """Return the next frame of the digitizer."""
+        t = next(self._samples) / hertz
+        field = (30_000.0 * sin(0.1 * t), 30_000.0 * cos(0.1 * t), 40_000.0 + 10.0 * sin(t))
+        delay = 0.1 / hertz
+        return self._fluxgate.encode(
+            Reading(field, device_time=t, channel_delay=(0.0, delay, 2 * delay), temperature=12.5, supply=3.7)
+        )
+
+    def heartbeat(self) -> bytes:
+        """Return the autopilot's heartbeat."""
+        return self._autopilot.pack("HEARTBEAT", type=12, autopilot=0, system_status=4, mavlink_version=3)
+
+    def message(self, time_us: int) -> bytes:
+        """Return the next telemetry message."""
+        number = next(self._messages)
+        name = TELEMETRY[number * 7 % TELEMETRY_HZ]
+        boot_ms = (time_us - BEGIN_US) // 1000 % (1 << 32)
+        t = number / TELEMETRY_HZ
+        if name == "ATTITUDE":
+            return self._autopilot.pack(name, time_boot_ms=boot_ms, roll=0.1 * sin(t), pitch=-0.3, yaw=1.0)
+        if name == "GLOBAL_POSITION_INT":
+            return self._autopilot.pack(
+                name, time_boot_ms=boot_ms, lat=495_000_000 + number, lon=-578_000_000, alt=-50_000
+            )
+        travel = sin(t) if self._moving or t % 10.0 > 9.0 else 0.3 + 1e-4 * (number % 3)
+        value = travel if name == "battpos" else 200.0 + 150.0 * travel
+        return self._autopilot.pack("NAMED_VALUE_FLOAT", time_boot_ms=boot_ms, value=value, name=name)
