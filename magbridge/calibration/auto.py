@@ -2,8 +2,9 @@
 
 Notes
 -----
-Each start climbs alternately: coefficients by Gauss-Newton at fixed widths, then widths and noise by
-the evidence of the quadratic that it leaves, then memory and outliers of the residuals. The start
+Each start first comes near with the noise as large as its residuals; then it climbs alternately:
+coefficients by Gauss-Newton at fixed widths, widths and noise by the evidence of the quadratic that
+it leaves, outliers and (at last) memory of the residuals. The start
 whose evidence is largest wins, and must be a maximum; the answer must not have collapsed.
 """
 
@@ -32,8 +33,7 @@ __all__ = ["fit_auto"]
 
 FloatArray = NDArray[np.float64]
 
-ROUNDS = 12  # of coefficients, widths, noise; four or five usually settle
-FIRST_NOISE = 1e-4  # of the field: wide against a sensor's noise, so that no early step is too sure
+ROUNDS = 16  # of coefficients, widths, noise; five or six usually settle
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,9 +105,8 @@ def _best(samples: Samples, structure: Structure) -> _Answer:
 
 def _climb(samples: Samples, structure: Structure, coefficients: FloatArray, eta: FloatArray) -> _Answer:
     """Alternate coefficients, widths and noise until the evidence stands still."""
-    noise = NoiseModel(FIRST_NOISE * samples.unit)
-    z = structure.E.T @ coefficients
-    score = -np.inf
+    z, noise = _approach(samples, _prior(structure, eta), structure.E.T @ coefficients)
+    score, white = -np.inf, True
     for step in range(ROUNDS):
         if structure.renew is not None and step:
             structure, z = structure.renew(z)
@@ -115,16 +114,31 @@ def _climb(samples: Samples, structure: Structure, coefficients: FloatArray, eta
         kept = len(samples.field) - noise.rejected
         quadratic = Quadratic.about(solution.z, solution.normal, kept)
         widths = maximise(quadratic, structure, eta, noise.sigma)
-        eta, z = widths.eta, widths.mean
+        eta, z = widths.eta, solution.z
         last, score = score, _score(widths, noise, samples)
         noise = replace(noise, sigma=widths.sigma)
-        if step > 1 and abs(score - last) < 1e-2 and solution.steps <= 1:
+        still = step > 0 and abs(score - last) < 1e-2 and solution.steps <= 1
+        if still and not white:
             break
-        if step < ROUNDS - 3:  # then let the noise's shape be, so that the rest can settle
+        # what a wrong model leaves looks like noise with a long memory: not before the model has settled
+        white = white and not still and step < ROUNDS // 2
+        if step < ROUNDS - 4:  # then let the noise's shape be, so that the rest can settle
             e, _ = residuals(samples, structure.coefficients(z))
-            shape = estimate_noise(e, samples.follows, widths.determined)
+            shape = estimate_noise(e, samples.follows & (not white), widths.determined)
             noise = replace(shape, sigma=widths.sigma)
     return _Answer(solution, widths, noise, structure, quadratic, score)
+
+
+def _approach(samples: Samples, prior: Prior, z: FloatArray) -> tuple[FloatArray, NoiseModel]:
+    """Come near the answer: noise as large as the residuals' bulk, smaller with each step."""
+    apart = np.zeros(len(samples.field), bool)
+    noise = estimate_noise(residuals(samples, prior.coefficients(z))[0], apart, 0.0)
+    for _ in range(ROUNDS):
+        z = gauss_newton(samples, prior, noise, z, steps=5, tolerance=0.1).z
+        last, noise = noise, estimate_noise(residuals(samples, prior.coefficients(z))[0], apart, 0.0)
+        if noise.sigma > 0.8 * last.sigma:
+            break
+    return z, noise
 
 
 def _score(widths: Widths, noise: NoiseModel, samples: Samples) -> float:

@@ -145,7 +145,7 @@ def _checked(content: _File, terms: tuple[Term, ...], effects: tuple[Term, ...])
     """Build the calibration, refusing numbers that cannot belong together."""
     coefficients = np.array(content.coefficients, float)
     rows = {len(row) for row in content.covariance}
-    if rows != {coefficients.size}:
+    if rows != {coefficients.size} or len(content.covariance) != coefficients.size:
         raise CalibrationError(f"covariance: expected {coefficients.size} x {coefficients.size} numbers")
     covariance = np.array(content.covariance, float)
     _check_covariance(covariance)

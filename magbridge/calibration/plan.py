@@ -20,6 +20,7 @@ from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 from magbridge.calibration.boresight import field_body
 from magbridge.calibration.data import Observations
@@ -207,7 +208,7 @@ def plan(
     *,
     runs: int = 10,
     samples: int = 225,
-    levels: int = 5,
+    levels: int = 7,
 ) -> Plan:
     """Choose the runs to fly next.
 
@@ -230,6 +231,19 @@ def plan(
     CalibrationError
         The limits leave nothing to fly.
     """
+    with threadpool_limits(1, "blas"):  # matrices this small only wait for each other
+        return _plan(calibration, mission, field_ned, limits, runs, samples, levels)
+
+
+def _plan(
+    calibration: Calibration,
+    mission: Mission,
+    field_ned: FloatArray,
+    limits: Limits,
+    runs: int,
+    samples: int,
+    levels: int,
+) -> Plan:
     design = _Design(calibration, mission, field_ned, samples)
     candidates = list(_candidates(limits, calibration.parameters, levels))
     if not candidates:

@@ -105,7 +105,7 @@ def test_errors_in_variables_take_the_bias_away() -> None:
     """Plain least squares shrinks A and biases T (many deviations); the residual used here does not."""
     rng = np.random.default_rng(4)
     off = []
-    for _ in range(12):
+    for _ in range(10):
         n, dip, roll = 2000, np.radians(70), np.radians(2)
         heading, pitch = rng.uniform(0, 2 * np.pi, n), np.radians(26) * rng.choice([-1, 1], n)
         h, z = np.cos(dip), np.sin(dip)
@@ -135,7 +135,7 @@ def test_auto_is_near_the_noise_floor_out_of_sample(
     glider: Gliders, masses: int, noise: float, memory: float, geometry: bool
 ) -> None:
     ratios, spreads = [], []
-    for seed in range(6):
+    for seed in range(4):
         one = glider(seed, masses, noise, memory)
         rng = np.random.default_rng(seed)
         vehicle = {
