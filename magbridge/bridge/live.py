@@ -57,13 +57,13 @@ class LiveEdge:
             except (OSError, ValueError):  # a descriptor was closed between asking for it and waiting
                 continue
             now_us = self._clock.now_us()
-            for fd in ready:
-                if fd == self._woken:
-                    os.read(fd, 4096)
-                elif data := self._read(lines[fd], fd):
-                    yield Event(now_us, lines[fd], data)
-            while not self._changes.empty():
+            if self._woken in ready:
+                os.read(self._woken, 4096)
+            while not self._changes.empty():  # that a port opened comes before what it says
                 yield Event(now_us, Channel.STATE, self._changes.get())
+            for fd in ready:
+                if fd != self._woken and (data := self._read(lines[fd], fd)):
+                    yield Event(now_us, lines[fd], data)
             if now_us >= look_us:
                 look_us = now_us + LOOK_US
                 if step_us := self._clock.step_us():

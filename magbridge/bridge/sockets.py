@@ -246,8 +246,8 @@ class TcpServer(_Stream):
 
 
 def _address(text: str) -> tuple[str, int]:
-    host, _, port = text.rpartition(":")
-    if not port.isdigit() or int(port) > 65535:
+    host, colon, port = text.rpartition(":")
+    if not colon or not port.isdigit() or int(port) > 65535:
         raise ValueError("expected HOST:PORT")
     return host.removeprefix("//"), int(port)
 

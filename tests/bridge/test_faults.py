@@ -12,7 +12,8 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
-from rig import TELEMETRY_HZ, Rig
+from devices import TELEMETRY_HZ
+from rig import Rig
 
 from magbridge.mavlink import Codec
 

@@ -6,38 +6,25 @@ The fluxgate speaks into a pty, the autopilot on a UDP or TCP socket. Both are p
 
 from __future__ import annotations
 
-import fcntl
-import os
-import pty
 import socket
 import subprocess
 import sys
-import termios
 import time
-import tty
-from array import array
-from collections.abc import Callable, Iterator
-from contextlib import suppress
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from devices import TRUTH, TURN, Autopilot, Fluxgate
 
 from magbridge.calibration.file import save
 from magbridge.calibration.model import Boresight, Calibration, Noise, Parameter, Reference, Sensor
 from magbridge.calibration.terms import Polynomial
 from magbridge.config import load
 from magbridge.mavlink import Codec, Message, Signing
-from magbridge.records import Quality, Reading
-from sitl.fluxgate import open_encoder
+from magbridge.records import Quality
 from sitl.own_log import Recorded
 from sitl.stage import Stage
-
-SENSOR_HZ, TELEMETRY_HZ, BEAT_HZ = 50, 20, 2
-TRUTH = (20_000.0, 1_000.0, 40_000.0)
-"""nT, what the fluxgate stands in."""
-TURN = 0.002
-"""s between two looks at everything."""
 
 CONFIG = """\
 [sensor]
@@ -75,175 +62,6 @@ class Heard(NamedTuple):
 
     when: float
     message: Message
-
-
-class Fluxgate:
-    """A digitizer on a pty, found under a name that can change as those of USB adapters do."""
-
-    def __init__(self, folder: Path, options: dict[str, object]) -> None:
-        self.folder = folder
-        self.encoder = open_encoder("digitizer", options)
-        self.speaks = True
-        self._master = self._slave = -1
-        self._name = folder
-        self._on = time.monotonic()
-        self._sent = 0
-
-    def plug(self, name: str = "ttyUSB0", *, powered_anew: bool = False) -> None:
-        """Plug it in."""
-        self._master, self._slave = pty.openpty()
-        tty.setraw(self._slave)
-        os.set_blocking(self._master, False)
-        self._name = self.folder / name
-        self._name.symlink_to(os.ttyname(self._slave))
-        if powered_anew:
-            self.encoder.power_on()
-            self._on, self._sent = time.monotonic(), 0
-
-    def unplug(self, *, after: int = 0) -> None:
-        """Pull it out, `after` so many bytes of a frame."""
-        self.write(self._frame()[:after])
-        deadline = time.monotonic() + 5.0
-        time.sleep(
-            0.05 if after else 0.0
-        )  # a pty hands on in its own time, and FIONREAD does not see what it holds
-        while after and array("i", fcntl.ioctl(self._slave, termios.FIONREAD, bytes(4)))[0]:
-            assert time.monotonic() < deadline, "nobody reads the line"
-            time.sleep(TURN)
-        self._name.unlink()
-        os.close(self._slave)
-        os.close(self._master)
-        self._master = -1
-
-    def write(self, data: bytes) -> None:
-        """Put bytes on the line; nobody may be there to read them."""
-        if self._master >= 0:
-            with suppress(BlockingIOError):
-                os.write(self._master, data)
-
-    def turn(self) -> None:
-        """Send the readings that are due; they are taken whether anybody listens or not."""
-        due = int((time.monotonic() - self._on) * SENSOR_HZ)
-        while self._sent < due:
-            frame = self._frame()
-            if self.speaks:
-                self.write(frame)
-
-    def _frame(self) -> bytes:
-        self._sent += 1
-        reading = Reading(TRUTH, device_time=self._sent / SENSOR_HZ, temperature=4.0, supply=3.7)
-        return self.encoder.encode(reading)
-
-
-class Autopilot:
-    """System 1, component 1, at the far end of the link."""
-
-    def __init__(self, url: str, codec: Codec) -> None:
-        self.codec = codec
-        self.tells = True
-        """Whether it sends telemetry."""
-        self.retell: Callable[[bytes], list[bytes]] = lambda frame: [frame]
-        """What the link makes of a telemetry frame."""
-        self.bytes_heard = 0
-        self._kind, _, address = url.partition(":")
-        self.address = ("127.0.0.1", int(address.rpartition(":")[2]))
-        self._ear = Codec(0, 0)
-        self._booted = self._beat = self._told = time.monotonic()
-        self._boot_ms = 5000
-        self._listener: socket.socket | None = None
-        self._line: socket.socket | None = None
-        self._peer: tuple[str, int] | None = None
-
-    def up(self) -> None:
-        """Open its end of the link."""
-        if self._kind == "tcp":
-            self._listener = socket.create_server(self.address)
-            self._listener.setblocking(False)
-            return
-        self._line = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._line.setblocking(False)
-        self._line.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
-        if self._kind == "udpout":
-            self._line.bind(self.address)
-        else:
-            self._peer = self.address
-
-    def down(self) -> None:
-        """Close its end of the link."""
-        for one in (self._line, self._listener):
-            if one is not None:
-                one.close()
-        self._line = self._listener = None
-
-    def reboot(self) -> None:
-        """Begin its clock anew."""
-        self._booted, self._boot_ms = time.monotonic(), 0
-
-    @property
-    def boot_us(self) -> int:
-        """Its own clock."""
-        return self._boot_ms * 1000 + int((time.monotonic() - self._booted) * 1e6)
-
-    def send(self, data: bytes) -> None:
-        """Put bytes on the link."""
-        if self._line is None:
-            return
-        with suppress(BlockingIOError, ConnectionRefusedError, BrokenPipeError, ConnectionResetError):
-            if self._kind == "tcp":
-                self._line.sendall(data)
-            elif self._peer is not None:
-                self._line.sendto(data, self._peer)
-
-    def pack(self, name: str, /, **fields: object) -> bytes:
-        """Return a frame, signed as of now where it signs."""
-        self.codec.now_us = time.time_ns() // 1000
-        return self.codec.pack(name, **fields)
-
-    def say(self, name: str, /, **fields: object) -> None:
-        """Send a message."""
-        self.send(self.pack(name, **fields))
-
-    def telemetry(self, value: float = 0.5, *, behind_us: int = 0) -> bytes:
-        """Return a frame of telemetry."""
-        return self.pack(
-            "NAMED_VALUE_FLOAT", time_boot_ms=(self.boot_us - behind_us) // 1000, value=value, name="battpos"
-        )
-
-    def turn(self) -> Iterator[Message]:
-        """Say what is due; yield what has come."""
-        now = time.monotonic()
-        if self._listener is not None and self._line is None:
-            with suppress(BlockingIOError):
-                self._line = self._listener.accept()[0]
-                self._line.setblocking(False)
-        if now >= self._beat:
-            self._beat = now + 1 / BEAT_HZ
-            self.say("HEARTBEAT", type=12, autopilot=3, system_status=4, mavlink_version=3)
-        if self.tells and now >= self._told:
-            self._told = now + 1 / TELEMETRY_HZ
-            for frame in self.retell(self.telemetry()):
-                self.send(frame)
-        for message in self._hear():
-            if message.known and message.name == "TIMESYNC" and message["tc1"] == 0:
-                self.say("TIMESYNC", tc1=self.boot_us * 1000, ts1=message["ts1"])
-            yield message
-
-    def _hear(self) -> Iterator[Message]:
-        while self._line is not None:
-            try:
-                data, peer = self._line.recvfrom(65536)
-            except BlockingIOError:
-                return
-            except OSError:
-                data = b""
-            if not data:
-                if self._kind == "tcp":
-                    self._line.close()
-                    self._line = None
-                return
-            self._peer = peer or self._peer
-            self.bytes_heard += len(data)
-            yield from self._ear.parse(data)
 
 
 class Rig:

@@ -10,8 +10,9 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
+from devices import TRUTH
 from pymavlink import mavutil
-from rig import TRUTH, Rig
+from rig import Rig
 
 from magbridge.mavlink import LogReader
 from magbridge.records import Channel

@@ -1,0 +1,97 @@
+"""A link's ports by themselves: what a slow, a rude or an absent reader does to them."""
+
+from __future__ import annotations
+
+import select
+import socket
+import time
+
+import pytest
+
+from magbridge.bridge.sockets import PENDING, TcpServer, open_link
+from magbridge.errors import ConfigError, PortError
+
+FRAME = bytes(range(200)) * 5
+
+
+def drained(reader: socket.socket, size: int) -> bytes:
+    """Read at least `size` bytes."""
+    data = b""
+    reader.settimeout(10)
+    while len(data) < size:
+        data += reader.recv(1 << 20)
+    return data
+
+
+def test_a_slow_reader_loses_whole_messages_and_stalls_nobody() -> None:
+    with socket.socket() as server:
+        server.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        server.bind(("127.0.0.1", 0))
+        server.listen()
+        port = open_link(f"tcp:127.0.0.1:{server.getsockname()[1]}", 0)
+        port.open()
+        reader, _ = server.accept()
+        count, slowest = 0, 0.0
+        while port.dropped < 10 * len(FRAME):
+            begun = time.monotonic()
+            port.write(FRAME)
+            slowest = max(slowest, time.monotonic() - begun)
+            count += 1
+            assert count * len(FRAME) < 64 << 20
+        taken = count * len(FRAME) - port.dropped
+        assert taken > PENDING
+        assert slowest < 0.5
+        received = b""
+        while len(received) < taken:
+            received += drained(reader, 1)
+            port.write(b"")  # time goes on: what waited is sent
+        assert received == FRAME * (taken // len(FRAME))
+        port.close()
+        reader.close()
+
+
+def test_a_server_takes_the_next_client() -> None:
+    port = open_link("tcpin:127.0.0.1:0", 0)
+    assert isinstance(port, TcpServer)
+    port.open()
+    with socket.socket(fileno=socket.dup(port.fds()[0])) as listener:
+        address = listener.getsockname()
+    port.write(b"nobody hears this")
+    assert port.dropped == 17
+    for word in (b"first", b"second"):
+        with socket.create_connection(address) as client:
+            client.sendall(word)
+            heard = b""
+            while heard != word:
+                assert select.select(port.fds(), [], [], 5)[0]
+                heard += port.read()
+            port.write(b"answer")
+            assert drained(client, 6) == b"answer"
+        assert port.up
+    port.close()
+    assert not port.up
+
+
+def test_a_udp_peer_that_is_not_there_is_no_fault() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as gone:
+        gone.bind(("127.0.0.1", 0))
+        port = open_link(f"udpout:127.0.0.1:{gone.getsockname()[1]}", 0)
+    port.open()
+    for _ in range(20):
+        port.write(b"x")
+    assert port.dropped > 0
+    assert port.read() == b""
+    assert port.up
+    port.close()
+
+
+@pytest.mark.parametrize("url", ["udpin:14550", "tcp:host:http", "tcp:host:70000"])
+def test_an_address_that_is_none(url: str) -> None:
+    with pytest.raises(ConfigError, match="HOST:PORT"):
+        open_link(url, 0)
+
+
+def test_a_port_that_cannot_be_opened_says_why(tmp_path) -> None:
+    for name in (str(tmp_path / "ttyUSB*"), str(tmp_path / "ttyUSB0")):
+        with pytest.raises(PortError, match=r"[Nn]o such (device|file)"):
+            open_link(name, 9600).open()
