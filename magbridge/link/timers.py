@@ -18,35 +18,44 @@ class Timers:
 
     def __init__(self) -> None:
         self._timers: dict[str, tuple[int, int, Callable[[int], None]]] = {}
+        self._next = ""
         self.next_deadline = FOREVER
 
     def every(self, name: str, period_us: int, action: Callable[[int], None], first_us: int) -> None:
         """Call ``action(deadline)`` at `first_us` and every `period_us` (a multiple of 4) from there."""
-        self._timers[name] = (first_us, max(period_us & ~3, 4), action)
-        self._sort()
+        self._set(name, (first_us, max(period_us & ~3, 4), action))
 
     def at(self, name: str, time_us: int, action: Callable[[int], None]) -> None:
         """Call ``action(time_us)`` once."""
-        self._timers[name] = (time_us, 0, action)
-        self._sort()
+        self._set(name, (time_us, 0, action))
 
     def cancel(self, name: str) -> None:
         """Forget a timer, if there is one."""
-        self._timers.pop(name, None)
-        self._sort()
+        if self._timers.pop(name, None) and name == self._next:
+            self._sort()
 
     def advance(self, t_us: int, begin: Callable[[int], None]) -> None:
         """Fire all that are due up to `t_us`, with ``begin(deadline)`` before each."""
         while self.next_deadline <= t_us:
-            name = min(self._timers, key=lambda one: self._timers[one][0])
+            name = self._next
             deadline, period, action = self._timers[name]
             if period:
                 self._timers[name] = (deadline + period, period, action)
             else:
                 del self._timers[name]
+            self._sort()
             begin(deadline)
             action(deadline)
+
+    def _set(self, name: str, timer: tuple[int, int, Callable[[int], None]]) -> None:
+        self._timers[name] = timer
+        if name == self._next or timer[0] <= self.next_deadline:
             self._sort()
 
     def _sort(self) -> None:
-        self.next_deadline = min((one[0] for one in self._timers.values()), default=FOREVER)
+        """Find which is next; of two at one time the one that was set first."""
+        self._next = min(self._timers, key=self._deadline, default="")
+        self.next_deadline = self._deadline(self._next) if self._next else FOREVER
+
+    def _deadline(self, name: str) -> int:
+        return self._timers[name][0]

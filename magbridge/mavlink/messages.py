@@ -108,16 +108,22 @@ class Spec:
         struct.error
             A value does not fit its field.
         """
-        if unknown := fields.keys() - self.fields.keys():
-            raise KeyError(f"{self.name} has no field {', '.join(sorted(unknown))}")
+        given = self.defaults | fields  # in the order of the wire
+        if len(given) != len(self.fields):
+            raise KeyError(f"{self.name} has no field {', '.join(sorted(given.keys() - self.fields.keys()))}")
+        if not self.uneven:
+            return self.struct.pack(*given.values())
+        for field in self.uneven:
+            given[field.name] = field.put(given[field.name])
         values: list[Any] = []
-        for name, field in self.fields.items():
-            value = field.put(fields.get(name, self.defaults[name]))
-            if isinstance(value, tuple):
-                values += value
-            else:
-                values.append(value)
+        for value in given.values():
+            values += value if isinstance(value, tuple) else (value,)
         return self.struct.pack(*values)
+
+    @cached_property
+    def uneven(self) -> list[Field]:
+        """The fields that are not one number: texts and arrays."""
+        return [field for field in self.fields.values() if field.count or field.code == "s"]
 
 
 @cache
