@@ -1,0 +1,121 @@
+"""The twin of the Bonne Bay trials: flown, calibrated before and after the survey, and scored as the paper does."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from magbridge.calibration.correct import correct
+from magbridge.calibration.data import observations
+from magbridge.calibration.fit import fit
+from magbridge.columns import CHANNEL_TIMES, CHANNELS
+from magbridge.errors import CalibrationError
+from magbridge.field.grid import AnomalyGrid
+from sitl.columns import segments
+from sitl.scenario import load
+from sitl.twin import Twin
+
+__all__ = ["METHODS", "PAPER", "TRIALS", "Trials", "fly"]
+
+Array = NDArray[np.float64]
+
+MASSES = ("battpos", "ballast")
+METHODS: dict[str, dict[str, Any]] = {
+    "nominal": {"axes_fixed": True, "equal_xz": True},
+    "cubic": {},
+    "auto": {},
+}
+"""The paper's two, with its constraints, and ours."""
+TRIALS = ("trial 1", "trial 2")
+PAPER = {
+    ("trial 1", "nominal"): (153, 207),
+    ("trial 2", "nominal"): (145, 136),
+    ("trial 1", "cubic"): (29, 124),
+    ("trial 2", "cubic"): (17, 69),
+}
+"""nT RMS on the calibration runs and on the survey (section 4 and Table 2)."""
+
+
+@dataclass(frozen=True)
+class Trials:
+    """A simulated deployment, and what each method made of it.
+
+    Attributes
+    ----------
+    parts : dict of Dataset
+        Trial 1, survey, trial 2.
+    corrected : dict of array (n,)
+        By (part, trial of the coefficients, method), nT.
+    failed : dict of str
+        Why, by (trial, method).
+    anomaly : AnomalyGrid
+        The map that the fit was given.
+    """
+
+    parts: dict[str, xr.Dataset]
+    corrected: dict[tuple[str, str, str], Array]
+    failed: dict[tuple[str, str], str]
+    anomaly: AnomalyGrid
+
+    def error(self, part: str, trial: str, method: str, against: str = "reference_field") -> Array:
+        """Return what `method` with the coefficients of `trial` leaves on a part, (n,) nT; NaN where it failed."""
+        known = self.parts[part][against].to_numpy()
+        found: Array = self.corrected.get((part, trial, method), np.full(known.shape, np.nan))
+        return np.asarray(found - known)
+
+    def rms(self, part: str, trial: str, method: str, against: str = "reference_field") -> float:
+        """Return the RMS of :meth:`error`, nT."""
+        return float(np.sqrt(np.mean(self.error(part, trial, method, against) ** 2)))
+
+
+def fly(seed: int, methods: Sequence[str] = tuple(METHODS)) -> Trials:
+    """Simulate the deployment and calibrate it both times with each of the methods."""
+    twin = Twin.draw(load("bonne_bay"), seed)
+    track = twin.fly()
+    instrument = twin.scenario.instrument
+    when = np.arange(0.0, track.elapsed[-1] - max(instrument.channel_delay), 1 / instrument.rate)
+    parts = segments(resting(one_time_base(twin.measure(track, when))))
+    corrected, failed = {}, {}
+    for trial, method in product(TRIALS, methods):
+        used = () if method == "nominal" else MASSES
+        try:
+            found = fit(observations(parts[trial], used), method, **METHODS[method]).calibration
+        except CalibrationError as error:
+            failed[trial, method] = str(error)
+            continue
+        for part in (trial, "survey"):
+            ds = parts[part]
+            raw, masses = columns(ds, CHANNELS), columns(ds, used)
+            corrected[part, trial, method] = correct(found, raw, masses, ds["time"].to_numpy()).total
+    return Trials(parts, corrected, failed, twin.anomaly_map())
+
+
+def columns(deployment: xr.Dataset, names: Sequence[str]) -> Array:
+    """Return columns side by side, (n, k)."""
+    out = np.empty((deployment.sizes["time"], len(names)))
+    for k, name in enumerate(names):
+        out[:, k] = deployment[name]
+    return out
+
+
+def one_time_base(deployment: xr.Dataset) -> xr.Dataset:
+    """Interpolate the channels to the time of their row, as the paper does."""
+    time = deployment["time"].to_numpy()
+    moved = {n: ("time", np.interp(time, deployment[f"mag_time_{n[-1]}"], deployment[n])) for n in CHANNELS}
+    return deployment.assign(moved).drop_vars(CHANNEL_TIMES)
+
+
+def resting(deployment: xr.Dataset) -> xr.Dataset:
+    """Leave out the samples about which a mass is on its way."""
+    moving = np.zeros(deployment.sizes["time"], bool)
+    for name in MASSES:
+        step = np.abs(np.diff(deployment[name])) > 1e-9
+        moving[:-1] |= step
+        moving[1:] |= step
+    return deployment.isel(time=~moving)
