@@ -23,7 +23,7 @@ __all__ = ["LiveEdge"]
 
 RETRY = 0.25
 """s between attempts to open a port that is down."""
-LOOK_US = 1_000_000
+LOOK_US = 100_000
 """µs between looks at the host's clock."""
 
 

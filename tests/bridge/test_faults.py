@@ -195,13 +195,14 @@ def test_telemetry_out_of_order(rig: Rig, table: Row) -> None:
     after = rig.fresh_status()
     lost = after["link_frames_lost"] - before["link_frames_lost"]
     assert rig.flags(mark) == ""
+    assert lost < 4  # those that were kept back in the end
     assert after["vehicle_reboots"] == before["vehicle_reboots"]
     assert not any("two autopilots" in line for line in rig.said(mark))
     table(
         "telemetry out of order, four messages shuffled",
         "nothing: what is older than what is known is passed over",
         "at once",
-        f"the older values; `link_frames_lost` {lost}, though none was: it counts by the order of arrival",
+        "the values that came too late; what only came late does not count as lost",
     )
 
 
@@ -397,7 +398,7 @@ def test_sensor_back_under_another_name_and_powered_anew(rig: Rig, table: Row) -
     assert sigma > 20
     table(
         "sensor unplugged, back under another name, powered on anew",
-        f"as above; then `offset_suspect` with sigma {sigma:.0f} nT (`turn_on_sigma`) until the next start: its offset may have settled elsewhere",
+        f"as above; then `offset_suspect` with sigma {sigma:.0f} nT (`turn_on_sigma`) for the rest of the run: its offset may have settled elsewhere",
         seconds(back),
         "the readings meanwhile; how many, the sensor no longer knows: its numbers began anew",
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import resource
+import signal
 import subprocess
 import time
 from collections.abc import Callable, Iterator
@@ -96,7 +97,7 @@ def test_host_clock_set_forward_and_back(make_rig: MakeRig, table: Row) -> None:
         elapsed = (after["time_usec"] - before["time_usec"]) * 1e-6
         samples = (after["sequence"] - before["sequence"]) / 50
         assert elapsed == pytest.approx(step + samples, abs=0.1)
-        assert noticed < 2.5
+        assert noticed < 1.5
     assert rig.flags(mark) == ""
     assert rig.status["samples_lost"] == 0
     (log,) = rig.logs
@@ -105,7 +106,7 @@ def test_host_clock_set_forward_and_back(make_rig: MakeRig, table: Row) -> None:
     assert times == sorted(times)
     table(
         "host clock set 1 h forward, then 2 h back",
-        "STATUSTEXT within 1 s; from then on the published UNIX times follow; no flag, because no interval is measured with that clock",
+        f"STATUSTEXT ({noticed:.2f} s after the step); from then on the published UNIX times follow; no flag, because no interval is measured with that clock",
         "at once",
         "nothing; between the step and the STATUSTEXT samples carry the old UNIX time",
     )
@@ -208,6 +209,8 @@ def test_log_reaches_a_limit(make_rig: MakeRig) -> None:
         rig, lambda: limit(rig.logs[-1].stat().st_size + 1000), lambda: limit(resource.RLIM_INFINITY)
     )
     assert said == "log: File too large"
+    recorded, published = rig.replay(rig.logs[:1])
+    assert first_difference(published[: len(recorded.published)], recorded.published) is None
 
 
 def test_disk_full(make_rig: MakeRig, small_disk: Path, table: Row) -> None:
@@ -276,18 +279,20 @@ def test_killed_without_warning(make_rig: MakeRig, table: Row) -> None:
         "`kill -9`, started again",
         "nothing; then as at every start. Parameters set over the link hold",
         f"{back:.1f} s after the start",
-        f"of the log the last {len(missing)} messages; the rest reads, and replays to the same bytes",
+        f"of the log at most the last event: {len(missing)} messages here; the rest reads, and replays to the same bytes",
     )
-    rig.stop()
-    recorded, published = rig.replay([rig.logs[1]])
-    assert published == recorded.published
 
 
-def test_stops_when_told(make_rig: MakeRig) -> None:
-    rig = make_rig("udpin")
+def test_stopped_by_hand_with_a_log_in_many_files(make_rig: MakeRig) -> None:
+    rig = make_rig("udpin", more="max_size = 0.02\n")
     rig.start()
+    rig.until(lambda: len(rig.logs) >= 3)
     assert rig.process is not None
     begun = time.monotonic()
-    os.kill(rig.process.pid, 2)
+    os.kill(rig.process.pid, signal.SIGINT)
     assert rig.process.wait(5) == 0
     assert time.monotonic() - begun < 2.0
+    assert all(path.stat().st_size <= 20_000 for path in rig.logs)
+    recorded, published = rig.replay()
+    assert recorded.damages == 0
+    assert first_difference(published, recorded.published) is None
