@@ -8,6 +8,7 @@ from typing import Any
 
 from magbridge.link.outbox import Outbox
 from magbridge.link.vehicle import Vehicle
+from magbridge.mavlink import spec
 from magbridge.mavlink.dialect import (
     MAG_PORT_STATE,
     MAV_AUTOPILOT,
@@ -19,7 +20,10 @@ from magbridge.mavlink.dialect import (
 __all__ = ["Reports"]
 
 MASK = 0xFFFFFFFF
+COUNTERS = [field.name for field in spec("MAG_STATUS").fields.values() if field.code == "I"]
 UNKNOWN = float("nan")
+NOTHING = {**dict.fromkeys(COUNTERS, 0), "sample_rate": UNKNOWN, "sensor_clock_drift": UNKNOWN}
+"""What MAG_STATUS says where nobody above knows."""
 OFFICIAL = 255
 """FIRMWARE_VERSION_TYPE_OFFICIAL"""
 CAPABILITIES = (
@@ -71,9 +75,8 @@ class Reports:
     def status(self) -> None:
         """Send MAG_STATUS."""
         codec, vehicle, clock = self._outbox.codec, self._vehicle, self._vehicle.clock
-        fields = {
-            "sample_rate": UNKNOWN,
-            "sensor_clock_drift": UNKNOWN,
+        fields: dict[str, Any] = {
+            **NOTHING,
             "calibration_id": self._calibration_id,
             **self._status(),
             "uptime": (codec.now_us - self._start_us) // 1_000_000,
@@ -86,11 +89,13 @@ class Reports:
             "vehicle_clock_drift": clock.drift_ppm,
             "vehicle_clock_sigma": clock.sigma,
         }
+        for name in COUNTERS:
+            fields[name] &= MASK
         self._outbox.send(
             "MAG_STATUS",
             time_usec=codec.now_us,
             vehicle_clock_offset=round(clock.offset_us(codec.now_us)),
-            **{name: value & MASK if isinstance(value, int) else value for name, value in fields.items()},
+            **fields,
         )
 
     def version(self) -> None:

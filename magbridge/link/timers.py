@@ -17,45 +17,44 @@ class Timers:
     """
 
     def __init__(self) -> None:
-        self._timers: dict[str, tuple[int, int, Callable[[int], None]]] = {}
+        self._deadlines: dict[str, int] = {}
+        self._what: dict[str, tuple[int, Callable[[int], None]]] = {}  # period and action
         self._next = ""
         self.next_deadline = FOREVER
 
     def every(self, name: str, period_us: int, action: Callable[[int], None], first_us: int) -> None:
         """Call ``action(deadline)`` at `first_us` and every `period_us` (a multiple of 4) from there."""
-        self._set(name, (first_us, max(period_us & ~3, 4), action))
+        self._set(name, first_us, max(period_us & ~3, 4), action)
 
     def at(self, name: str, time_us: int, action: Callable[[int], None]) -> None:
         """Call ``action(time_us)`` once."""
-        self._set(name, (time_us, 0, action))
+        self._set(name, time_us, 0, action)
 
     def cancel(self, name: str) -> None:
         """Forget a timer, if there is one."""
-        if self._timers.pop(name, None) and name == self._next:
+        self._deadlines.pop(name, None)
+        if name == self._next:
             self._sort()
 
     def advance(self, t_us: int, begin: Callable[[int], None]) -> None:
         """Fire all that are due up to `t_us`, with ``begin(deadline)`` before each."""
         while self.next_deadline <= t_us:
-            name = self._next
-            deadline, period, action = self._timers[name]
+            name, deadline = self._next, self.next_deadline
+            period, action = self._what[name]
             if period:
-                self._timers[name] = (deadline + period, period, action)
+                self._deadlines[name] = deadline + period
             else:
-                del self._timers[name]
+                del self._deadlines[name]
             self._sort()
             begin(deadline)
             action(deadline)
 
-    def _set(self, name: str, timer: tuple[int, int, Callable[[int], None]]) -> None:
-        self._timers[name] = timer
-        if name == self._next or timer[0] <= self.next_deadline:
+    def _set(self, name: str, deadline: int, period: int, action: Callable[[int], None]) -> None:
+        self._deadlines[name], self._what[name] = deadline, (period, action)
+        if name == self._next or deadline <= self.next_deadline:
             self._sort()
 
     def _sort(self) -> None:
         """Find which is next; of two at one time the one that was set first."""
-        self._next = min(self._timers, key=self._deadline, default="")
-        self.next_deadline = self._deadline(self._next) if self._next else FOREVER
-
-    def _deadline(self, name: str) -> int:
-        return self._timers[name][0]
+        self._next = min(self._deadlines, key=self._deadlines.__getitem__, default="")
+        self.next_deadline = self._deadlines.get(self._next, FOREVER)

@@ -59,11 +59,12 @@ class Codec:
         while begin < len(data):
             stop = min(len(data), begin + WINDOW)
             match = MAGIC.search(data, at, stop)
-            end = frame_end(data, match.start(), stop) if match else MORE
-            if match and end > 0:
-                if begin < match.start():
-                    found.append(self._skip(data[begin : match.start()]))
-                found.append(self._accept(message(data[match.start() : end])))
+            start = match.start() if match else stop
+            end = frame_end(data, start, stop) if match else MORE
+            if end > 0:
+                if begin < start:
+                    found.append(self._skip(data[begin:start]))
+                found.append(self._accept(message(data[start:end])))
                 begin = at = end
             elif match and end != MORE:
                 at = match.end()
@@ -71,7 +72,7 @@ class Codec:
                 found.append(self._skip(data[begin:stop]))
                 begin = at = stop
             else:
-                at = match.start() if match else stop
+                at = start
                 break
         self._rest, self._looked = data[begin:], at - begin
         return found
