@@ -1,105 +1,17 @@
-"""The command line: one thin function a command; the help is its docstring.
-
-Exit codes: 0 done, 1 the data do not allow it, 2 wrong use. What is wrong goes to stderr as one line.
-"""
+"""Commands ashore: convert, simulate, calibrate, plan, map, correct."""
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
 from hashlib import sha256
-from math import inf, nan
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
-from cyclopts import App, CycloptsError, Parameter, validators
+from cyclopts import Parameter, validators
 
-from magbridge import __version__
-from magbridge.errors import DataError, MagbridgeError, MissingExtra, WrongUse
+from magbridge.cli.common import Json, Output, app, complain, some, tell
+from magbridge.errors import DataError
 from magbridge.progress import track
-
-__all__ = ["app", "main"]
-
-app = App(
-    name="magbridge",
-    help="A magnetometer bridge for vehicles whose own iron moves.",
-    version=__version__,
-    help_format="plaintext",
-)
-Output = Annotated[Path, Parameter(name=["--output", "-o"])]
-Json = Annotated[bool, Parameter(name="--json", negative="")]
-
-
-@app.command
-def demo(*, out: Path = Path("demo"), seed: int = 1, json: Json = False) -> None:
-    """Do the main job end to end on a simulated glider: no hardware, no network, under a minute.
-
-    Simulates a small deployment, fits a calibration to its spirals, replays the survey through a pty and a
-    socket into the bridge, listens as a ground station would, and draws raw, corrected and true field.
-
-    Parameters
-    ----------
-    out
-        The folder for what it makes.
-    seed
-        Another glider.
-    json
-        Print the result for machines.
-    """
-    from sitl.demo import demo as show
-    from sitl.demo import tell
-
-    result = show(out, seed, say=lambda text: print(text, file=sys.stderr))
-    _tell(result, tell(result), json)
-
-
-@app.command
-def run(*, config: Path) -> None:
-    """Attach to the sensor and the autopilot link, and publish the corrected field until stopped.
-
-    Parameters
-    ----------
-    config
-        The bridge.toml.
-    """
-    from magbridge.bridge.run import run as attach
-
-    attach(config)
-
-
-@app.command
-def replay(
-    *files: Path,
-    config: Path | None = None,
-    speed: str = "max",
-    log: Path | None = None,
-    json: Json = False,
-) -> None:
-    """Replay logs through the unmodified bridge: real bytes through a pty, real MAVLink through a socket.
-
-    A bridge's own log is published again bit for bit. Any other log is spoken by an emulated fluxgate and an
-    emulated autopilot, and the corrected field is compared with the reference field.
-
-    Parameters
-    ----------
-    files
-        The log, or the files of it in order.
-    config
-        The bridge.toml; without one a nominal calibration is fitted on all files but the last.
-    speed
-        Times real time, or max: as fast as it goes.
-    log
-        A folder for the bridge's own log of the replay.
-    json
-        Print the result for machines.
-    """
-    from sitl.replay import replay as play
-    from sitl.replay import tell
-
-    result = play(_some(files), config, _speed(speed), log)
-    _tell(result, tell(result), json)
-    if not all(run["identical"] for run in result.get("runs", ())):
-        raise DataError("what was published is not what the log holds")
 
 
 @app.command
@@ -119,11 +31,11 @@ def convert(*files: Path, output: Output, json: Json = False) -> None:
 
     rows = 0
     with Writer(output) as writer:
-        for part in track(read_chunks(_some(files)), "reading"):
+        for part in track(read_chunks(some(files)), "reading"):
             writer.append(part)
             rows += part.sizes["time"]
             names = [str(name) for name in part.data_vars]
-    _tell({"file": str(output), "rows": rows, "columns": names}, f"{output}: {rows} rows", json)
+    tell({"file": str(output), "rows": rows, "columns": names}, f"{output}: {rows} rows", json)
 
 
 @app.command
@@ -154,7 +66,7 @@ def simulate(
     deployment = simulate_like(read(like), chosen, seed) if like else simulate_scenario(chosen, seed)
     write(deployment, output)
     rows = deployment.sizes["time"]
-    _tell({"file": str(output), "rows": rows, "seed": seed}, f"{output}: {rows} rows", json)
+    tell({"file": str(output), "rows": rows, "seed": seed}, f"{output}: {rows} rows", json)
 
 
 @app.command
@@ -203,14 +115,14 @@ def calibrate(
     from magbridge.logs import read
 
     anomalies = read_grid(grid) if grid else None
-    deployment = with_true_heading(read(_some(files), required=(*CHANNELS, *parameter)))
+    deployment = with_true_heading(read(some(files), required=(*CHANNELS, *parameter)))
     data = observations(deployment, parameter, reference=lambda ds: earth_field(ds, anomalies))
     data = replace(data, inputs={file.name: sha256(file.read_bytes()).hexdigest() for file in files})
     options = {"vehicle": read_vehicle(vehicle)} if vehicle else {}
     found = fit(data, method, order, **options)
     save(found.calibration, output)
     for warning in found.warnings:
-        _complain(warning, 0)
+        complain(warning, 0)
     result = {
         "file": str(output),
         "method": method,
@@ -220,7 +132,7 @@ def calibrate(
         "warnings": found.warnings,
     }
     summary = f"{output}: {method}, {len(data)} samples, {found.rms:.2f} nT RMS in the sensor's own units"
-    _tell(result, summary, json)
+    tell(result, summary, json)
     if strict and found.warnings:
         raise DataError(f"{len(found.warnings)} things that the data cannot tell, and --strict")
 
@@ -249,16 +161,16 @@ def plan(
     json
         Print the result for machines.
     """
+    from magbridge.calibration import flight_plan
     from magbridge.calibration.file import load
-    from magbridge.calibration.flight_plan import facts, flight_plan, tell
     from magbridge.field.declination import with_true_heading
     from magbridge.field.reference import earth_field
     from magbridge.logs import read
 
     deployment = with_true_heading(read(mission))
     known = load(calibration)
-    found = flight_plan(known, deployment, earth_field(deployment)[1], runs=runs, roll=roll)
-    _tell(facts(found, known), tell(found, known), json)
+    found = flight_plan.flight_plan(known, deployment, earth_field(deployment)[1], runs=runs, roll=roll)
+    tell(flight_plan.facts(found, known), flight_plan.tell(found, known), json)
 
 
 @app.command
@@ -297,13 +209,13 @@ def map(  # noqa: A001 - the command's name
     from magbridge.field.read import read_grid, read_polygon
 
     polygon = read_polygon(mask) if mask else None
-    result, steps = prepare([read_grid(path) for path in _some(grids)], altitude, passes, polygon, spacing)
+    result, steps = prepare([read_grid(path) for path in some(grids)], altitude, passes, polygon, spacing)
     result.save(output)
     if picture:
         draw_steps(steps, picture)
     titles = [step.title for step in steps]
     facts = {"file": str(output), "steps": titles, "rms_nT": result.rms}
-    _tell(facts, f"{output}: {', '.join(titles)}", json)
+    tell(facts, f"{output}: {', '.join(titles)}", json)
 
 
 @app.command
@@ -341,65 +253,4 @@ def correct(file: Path, *more: Path, calibration: Path, output: Output, json: Js
                 (corrected["quality"].to_numpy().astype(int) & ~int(Quality.NO_BORESIGHT) != 0).sum()
             )
     summary = f"{output}: {rows} samples, {flagged} of them flagged"
-    _tell({"file": str(output), "rows": rows, "flagged": flagged}, summary, json)
-
-
-def main(arguments: list[str] | None = None) -> int:
-    """Run a command; return its exit code."""
-    try:
-        app(arguments, exit_on_error=False, print_error=False, result_action="return_value")
-    except CycloptsError as error:
-        return _complain(str(error), 2)
-    except MagbridgeError as error:
-        return _complain(str(error), error.exit_code)
-    except ImportError as error:
-        extra = EXTRAS.get((error.name or "").partition(".")[0])
-        if extra is None:
-            raise
-        return _complain(str(MissingExtra(str(error.name), extra)), 2)
-    except BrokenPipeError:  # the reader of our output has gone, as `| head` does
-        sys.stderr.close()
-    except KeyboardInterrupt:
-        return _complain("interrupted", 130)
-    return 0
-
-
-EXTRAS = dict.fromkeys(
-    ("scipy", "xarray", "netCDF4", "matplotlib", "ppigrf", "filterpy", "rich", "pandas"), "analysis"
-) | dict.fromkeys(("harmonica", "verde"), "grids")
-"""Which extra brings a package."""
-
-
-def _some(files: tuple[Path, ...]) -> tuple[Path, ...]:
-    if not files:
-        raise WrongUse("expected at least one FILE")
-    return files
-
-
-def _speed(text: str) -> float:
-    try:
-        speed = inf if text == "max" else float(text)
-    except ValueError:
-        speed = nan
-    if not speed > 0.0:
-        raise WrongUse(f"--speed {text}: expected a positive number, or max")
-    return speed
-
-
-def _tell(result: dict[str, Any], sentence: str, as_json: bool) -> None:
-    """Print the result, for people or for machines."""
-    if as_json:
-        import msgspec
-
-        sentence = msgspec.json.encode(result).decode()
-    print(sentence)
-
-
-def _complain(sentence: str, code: int) -> int:
-    """Print one line to stderr and return `code`."""
-    print("magbridge:", " ".join(sentence.split()), file=sys.stderr)
-    return code
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+    tell({"file": str(output), "rows": rows, "flagged": flagged}, summary, json)

@@ -1,0 +1,46 @@
+"""The command line: one thin function a command; the help is its docstring.
+
+Exit codes: 0 done, 1 the data do not allow it, 2 wrong use. What is wrong goes to stderr as one line.
+"""
+
+from __future__ import annotations
+
+import sys
+
+from cyclopts import CycloptsError
+
+from magbridge.cli import ashore, doubt, onboard
+from magbridge.cli.common import app, complain
+from magbridge.errors import MagbridgeError, MissingExtra
+
+__all__ = ["app", "ashore", "doubt", "main", "onboard"]
+
+EXTRAS = {
+    **dict.fromkeys(
+        ("scipy", "xarray", "netCDF4", "matplotlib", "ppigrf", "filterpy", "rich", "pandas", "pymavlink"),
+        "analysis",
+    ),
+    **dict.fromkeys(("harmonica", "verde"), "grids"),
+    "nicegui": "monitor",
+}
+"""Which extra brings a package."""
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run a command; return its exit code."""
+    try:
+        app(arguments, exit_on_error=False, print_error=False, result_action="return_value")
+    except CycloptsError as error:
+        return complain(str(error), 2)
+    except MagbridgeError as error:
+        return complain(str(error), error.exit_code)
+    except ImportError as error:
+        extra = EXTRAS.get((error.name or "").partition(".")[0])
+        if extra is None:
+            raise
+        return complain(str(MissingExtra(str(error.name), extra)), 2)
+    except BrokenPipeError:  # the reader of our output has gone, as `| head` does
+        sys.stderr.close()
+    except KeyboardInterrupt:
+        return complain("interrupted", 130)
+    return 0

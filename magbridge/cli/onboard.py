@@ -1,0 +1,91 @@
+"""Commands on the vehicle, and those that show what happens there: demo, run, replay."""
+
+from __future__ import annotations
+
+import sys
+from math import inf, nan
+from pathlib import Path
+
+from magbridge.cli.common import Json, app, some, tell
+from magbridge.errors import DataError, WrongUse
+
+
+@app.command
+def demo(*, out: Path = Path("demo"), seed: int = 1, json: Json = False) -> None:
+    """Do the main job end to end on a simulated glider: no hardware, no network, under a minute.
+
+    Simulates a small deployment, fits a calibration to its spirals, replays the survey through a pty and a
+    socket into the bridge, listens as a ground station would, and draws raw, corrected and true field.
+
+    Parameters
+    ----------
+    out
+        The folder for what it makes.
+    seed
+        Another glider.
+    json
+        Print the result for machines.
+    """
+    from sitl import demo as demonstration
+
+    result = demonstration.demo(out, seed, say=lambda text: print(text, file=sys.stderr))
+    tell(result, demonstration.tell(result), json)
+
+
+@app.command
+def run(*, config: Path) -> None:
+    """Attach to the sensor and the autopilot link, and publish the corrected field until stopped.
+
+    Parameters
+    ----------
+    config
+        The bridge.toml.
+    """
+    from magbridge.bridge.run import run as attach
+
+    attach(config)
+
+
+@app.command
+def replay(
+    *files: Path,
+    config: Path | None = None,
+    speed: str = "max",
+    log: Path | None = None,
+    json: Json = False,
+) -> None:
+    """Replay logs through the unmodified bridge: real bytes through a pty, real MAVLink through a socket.
+
+    A bridge's own log is published again bit for bit. Any other log is spoken by an emulated fluxgate and an
+    emulated autopilot, and the corrected field is compared with the reference field.
+
+    Parameters
+    ----------
+    files
+        The log, or the files of it in order.
+    config
+        The bridge.toml; without one a nominal calibration is fitted on all files but the last.
+    speed
+        Times real time, or max: as fast as it goes.
+    log
+        A folder for the bridge's own log of the replay.
+    json
+        Print the result for machines.
+    """
+    from sitl import replay as replaying
+
+    result = replaying.replay(some(files), config, speed_of(speed), log)
+    tell(result, replaying.tell(result), json)
+    if not all(run["identical"] for run in result.get("runs", ())):
+        raise DataError("what was published is not what the log holds")
+
+
+def speed_of(text: str) -> float:
+    """Return a speed: times real time, or ``max``."""
+    try:
+        speed = inf if text == "max" else float(text)
+    except ValueError:
+        speed = nan
+    if not speed > 0.0:
+        raise WrongUse(f"--speed {text}: expected a positive number, or max")
+    return speed
