@@ -12,7 +12,7 @@ from msgspec import Meta
 from magbridge.config import NotNegative, Positive, Table
 from sitl.platform import MOUNTINGS
 
-__all__ = ["LIMITS", "TABLE_1", "CrissCross", "Leg", "Legs", "Limit", "Part", "Spirals"]
+__all__ = ["LIMITS", "TABLE_1", "CrissCross", "Leg", "Legs", "Limit", "Part", "Run", "Spirals"]
 
 TABLE_1: tuple[tuple[int, float, float, float], ...] = (
     (1, -14.0, 0.272, 0.226),
@@ -72,13 +72,26 @@ class Leg(Table, frozen=True):
     segment: str = "mission"
 
 
+class Run(Table, frozen=True):
+    """One calibration run, as a planner asks for it: deg, and positions of the moving masses.
+
+    Without a `roll` the spiral banks as the vehicle's spirals do.
+    """
+
+    pitch: Annotated[float, Meta(ge=-80, le=80)]
+    roll: Annotated[float, Meta(ge=-80, le=80)] | None = None
+    parameters: dict[str, float] = msgspec.field(default_factory=dict)
+
+
 class Spirals(Table, frozen=True, tag_field="kind", tag="spirals"):
-    """The calibration runs of Table 1: ten spirals, clockwise, each with battery and ballast at rest.
+    """Calibration runs: spirals, clockwise, each a descent or an ascent with every mass at rest.
 
     Attributes
     ----------
     trial : int
-        1 or 2, which of the table's two columns.
+        1 or 2, which of the columns of :data:`TABLE_1` is flown.
+    runs : tuple of Run
+        Flown instead of the table.
     duration : float
         s of one descent or ascent; the paper's pair took about 30 minutes.
     turns : float
@@ -89,25 +102,27 @@ class Spirals(Table, frozen=True, tag_field="kind", tag="spirals"):
     """
 
     trial: Literal[1, 2] = 1
+    runs: tuple[Run, ...] = ()
     duration: Positive = 900.0
     turns: float = 4.0
     roll: tuple[float, NotNegative] = (6.0, 1.0)
     segment: str = "calibration"
 
     def legs(self, rng: np.random.Generator, limits: Mapping[str, Limit]) -> list[Leg]:
-        """Return the ten legs; masses that the table does not know are drawn anew for each."""
-        return [
-            Leg(
+        """Return a leg for each run; masses that a run does not name are drawn anew for each."""
+        legs = []
+        for run in self.runs or _table_1(self.trial):
+            bank = float(rng.normal(*self.roll))
+            leg = Leg(
                 duration=self.duration,
-                pitch=pitch,
-                roll=float(rng.normal(*self.roll)),
+                pitch=run.pitch,
+                roll=bank if run.roll is None else run.roll,
                 turn=360 * self.turns / self.duration,
-                parameters=others(rng, limits)
-                | {"battpos": battery[self.trial - 1], "ballast": float(np.copysign(200, pitch))},
+                parameters=others(rng, limits) | run.parameters,
                 segment=self.segment,
             )
-            for _, pitch, *battery in TABLE_1
-        ]
+            legs.append(leg)
+        return legs
 
 
 class CrissCross(Table, frozen=True, tag_field="kind", tag="criss_cross"):
@@ -179,6 +194,15 @@ class Legs(Table, frozen=True, tag_field="kind", tag="legs"):
 
 
 Part = Spirals | CrissCross | Legs
+
+
+def _table_1(trial: int) -> tuple[Run, ...]:
+    return tuple(
+        Run(
+            pitch=pitch, parameters={"battpos": battery[trial - 1], "ballast": float(np.copysign(200, pitch))}
+        )
+        for _, pitch, *battery in TABLE_1
+    )
 
 
 def others(rng: np.random.Generator, limits: Mapping[str, Limit]) -> dict[str, float]:

@@ -128,7 +128,7 @@ def draw(flight: Trials, folder: Path) -> Iterator[Path]:
 def _figure_2(flight: Trials) -> Figure:
     figure, axes = plt.subplots(figsize=(6.6, 5.6))
     grid, survey = flight.anomaly, flight.parts["survey"]
-    scale = float(np.abs(grid.anomaly).max())
+    scale = float(np.quantile(np.abs(grid.anomaly), 0.98))
     shade = axes.pcolormesh(
         grid.longitude, grid.latitude, grid.anomaly, cmap="RdBu_r", vmin=-scale, vmax=scale, shading="gouraud"
     )

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from magbridge.errors import OutOfRange
-from sitl.mission import LIMITS, TABLE_1, CrissCross, Leg, Legs, Spirals
+from sitl.mission import LIMITS, TABLE_1, CrissCross, Leg, Legs, Run, Spirals
 from sitl.trajectory import Motion, Track, fly
 from sitl.world import to_local
 
@@ -116,6 +116,15 @@ def test_other_masses_are_moved_too() -> None:
     legs = Spirals().legs(np.random.default_rng(3), limits)
     assert len({leg.parameters["rollpos"] for leg in legs}) == 10
     assert all(-3 <= leg.parameters["rollpos"] <= 3 for leg in legs)
+
+
+def test_a_planners_runs_are_flown_in_place_of_the_table() -> None:
+    wanted = (Run(pitch=-20, roll=-8, parameters={"battpos": 0.1, "ballast": 120}), Run(pitch=20))
+    banked, free = Spirals(runs=wanted, turns=2, duration=600).legs(np.random.default_rng(0), GLIDER)
+    assert (banked.pitch, banked.roll, banked.turn) == (-20, -8, 1.2)
+    assert banked.parameters == {"battpos": 0.1, "ballast": 120}
+    assert 2 < free.roll < 10
+    assert not free.parameters
 
 
 def test_a_planners_list_is_flown_as_it_is() -> None:
