@@ -25,6 +25,7 @@ class SerialPort(Port):
         self._serial: Any = None
         self._fd = -1
         self._pump: _Pump | None = None
+        self._begun = bytearray()
 
     @property
     def up(self) -> bool:
@@ -74,12 +75,20 @@ class SerialPort(Port):
         return data
 
     def write(self, data: bytes) -> None:
-        """Write what the line's buffer takes; drop and count the rest."""
+        """Write what the line's buffer takes; what was begun is ended before anything else goes out.
+
+        So a line that is too slow loses whole messages, counted, and never the half of one.
+        """
         try:
             if self._pump is not None:
                 self._serial.write(data)
+                return
+            if self._begun:
+                del self._begun[: os.write(self._fd, self._begun)]
+            if self._begun:
+                self.dropped += len(data)
             else:
-                self.dropped += len(data) - os.write(self._fd, data)
+                self._begun += data[os.write(self._fd, data) :]
         except BlockingIOError:
             self.dropped += len(data)
         except (serial.SerialException, OSError) as error:
@@ -92,6 +101,7 @@ class SerialPort(Port):
         if self._serial is not None:
             self._serial.close()
         self._serial, self._fd, self._pump = None, -1, None
+        self._begun.clear()
 
 
 def _reason(error: Exception) -> str:

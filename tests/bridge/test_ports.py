@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import os
+import pty
 import select
 import socket
 import time
+import tty
 
 import pytest
 
@@ -48,6 +51,28 @@ def test_a_slow_reader_loses_whole_messages_and_stalls_nobody() -> None:
         assert received == FRAME * (taken // len(FRAME))
         port.close()
         reader.close()
+
+
+def test_a_slow_line_loses_whole_messages() -> None:
+    master, slave = pty.openpty()
+    tty.setraw(slave)
+    port = open_link(f"serial:{os.ttyname(slave)}", 57600)
+    port.open()
+    frames = [bytes((i,)) * 700 for i in range(100)]
+    received = b""
+    for frame in frames:
+        port.write(frame)
+        if port.dropped > 3000 and len(received) < 20_000:
+            received += os.read(master, 500)
+    while port.dropped + len(received) < 70_000 or len(received) % 700:
+        received += os.read(master, 65536)
+        port.write(b"")
+    port.close()
+    os.close(master)
+    os.close(slave)
+    assert 0 < port.dropped < 70_000
+    pieces = [received[i : i + 700] for i in range(0, len(received), 700)]
+    assert all(piece in frames for piece in pieces)
 
 
 def test_a_server_takes_the_next_client() -> None:
