@@ -31,6 +31,15 @@ def table() -> Iterator[Callable[[str, str, str, str], None]]:
         Path(path).write_text("".join(f"| {' | '.join(line)} |\n" for line in lines), encoding="utf-8")
 
 
+@pytest.fixture(scope="module")
+def rig(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rig]:
+    """One bridge for all tests of a module."""
+    made = Rig(tmp_path_factory.mktemp("rig"))
+    made.start()
+    yield made
+    made.close()
+
+
 @pytest.fixture
 def make_rig(tmp_path: Path) -> Iterator[Callable[..., Rig]]:
     """Make bridges that end with the test."""

@@ -1,0 +1,158 @@
+"""What goes wrong on the sensor's line, one fault after the other, to one bridge that must live through all of them.
+
+Every test waits until all is well, does the damage, and says what was published meanwhile, how long it took and
+what was lost. In the end the log of it all is replayed.
+"""
+
+from __future__ import annotations
+
+import socket
+import time
+
+import pytest
+from checks import NOISE, Row, replays, seconds
+from rig import Rig
+
+from magbridge.mavlink import Codec
+
+SILENT, LOST = 2, 3
+
+
+def test_sensor_unplugged_in_the_middle_of_a_frame(rig: Rig, table: Row) -> None:
+    rig.until_well()
+    before, mark = rig.fresh_status(), rig.mark
+    sent = rig.fluxgate.encoder.sequence
+    rig.fluxgate.unplug(after=17)
+    away = time.monotonic()
+    rig.until_status(lambda status: status["sensor_state"] == LOST)
+    told = rig.until_said("digitizer lost", mark)
+    beat = rig.of("HEARTBEAT", mark)[-1]
+    assert beat["system_status"] == 5  # critical
+    rig.run(0.3)
+    rig.fluxgate.plug()
+    gone, back = time.monotonic() - away, rig.until_well()
+    rig.until_said("digitizer speaks", mark)
+    after = rig.fresh_status()
+    assert rig.flags(mark) == "gap"
+    lost = after["samples_lost"] - before["samples_lost"]
+    assert lost == pytest.approx(gone * 50, abs=30)
+    assert after["sensor_bytes_skipped"] - before["sensor_bytes_skipped"] >= 17
+    came = after["samples"] - before["samples"]
+    assert came + lost == pytest.approx(rig.fluxgate.encoder.sequence - sent, abs=10)
+    table(
+        "sensor unplugged in the middle of a frame, plugged in again",
+        "heartbeat critical, `sensor_state` lost, STATUSTEXT with the reason; first sample back: `gap`",
+        seconds(back),
+        f"the readings meanwhile and one frame: `samples_lost` {lost}, `sensor_bytes_skipped`",
+    )
+    assert told < 1.5
+    assert back < 2.0
+
+
+def test_sensor_silent(rig: Rig, table: Row) -> None:
+    rig.until_well()
+    before, mark = rig.fresh_status(), rig.mark
+    rig.fluxgate.speaks = False
+    rig.until_status(lambda status: status["sensor_state"] == SILENT)
+    noticed = rig.until_said("digitizer is silent", mark)
+    rig.fluxgate.speaks = True
+    back = rig.until_well()
+    lost = rig.fresh_status()["samples_lost"] - before["samples_lost"]
+    assert rig.flags(mark) == "gap"
+    assert lost > 20
+    table(
+        "sensor silent on an open line",
+        "heartbeat critical, `sensor_state` silent and STATUSTEXT after `sensor.timeout`; start-up commands again, every `timeout`",
+        seconds(back),
+        f"what it did not send: `samples_lost` {lost}",
+    )
+    assert noticed < 2.0
+    assert back < 1.0
+
+
+def test_garbage_from_the_sensor(rig: Rig, table: Row) -> None:
+    rig.until_well()
+    before, mark = rig.fresh_status(), rig.mark
+    rig.fluxgate.write(NOISE[:3000])
+    back = rig.until_well()
+    after = rig.until_status(lambda status: status["sensor_bytes_skipped"] > before["sensor_bytes_skipped"])
+    skipped = after["sensor_bytes_skipped"] - before["sensor_bytes_skipped"]
+    bad = after["sensor_frames_bad"] - before["sensor_frames_bad"]
+    lost = after["samples_lost"] - before["samples_lost"]
+    assert 2900 < skipped <= 3000 + 38
+    assert lost <= 1
+    assert set(rig.flags(mark).split()) <= {"gap"}
+    table(
+        "3,000 bytes of noise from the sensor",
+        f"`{rig.flags(mark) or 'no flag'}` on the sample after it",
+        seconds(back),
+        f"the frame that the noise ran into: `samples_lost` {lost}, `sensor_frames_bad` {bad}, `sensor_bytes_skipped` {skipped}",
+    )
+    assert back < 0.5
+
+
+def test_second_bridge_on_the_same_sensor(rig: Rig, table: Row) -> None:
+    rig.until_well()
+    before, mark = rig.fresh_status(), rig.mark
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sink:
+        sink.bind(("127.0.0.1", 0))
+        sink.setblocking(False)
+        second = rig.folder / "second"
+        second.mkdir()
+        config = second / "bridge.toml"
+        text = rig.settings(f"udpout:127.0.0.1:{sink.getsockname()[1]}").replace(
+            '"cal.json"', '"../cal.json"'
+        )
+        config.write_text(text)
+        ear, told = Codec(0, 0), []
+
+        def refused() -> bool:
+            try:
+                heard = ear.parse(sink.recv(65536))
+                told.extend(message["text"] for message in heard if message.name == "STATUSTEXT")
+            except BlockingIOError:
+                pass
+            return any("digitizer lost" in text for text in told)
+
+        other = rig.spawn(config)
+        try:
+            rig.until(refused)
+        finally:
+            other.terminate()
+            rig.until(lambda: other.poll() is not None)
+    assert other.returncode == 0
+    after = rig.fresh_status()
+    assert after["samples_lost"] == before["samples_lost"]
+    assert after["sensor_bytes_skipped"] == before["sensor_bytes_skipped"]
+    assert rig.flags(mark) == ""
+    reason = next(text for text in told if "digitizer lost" in text)
+    table(
+        "a second `magbridge run` on the same serial port",
+        f'the first: nothing. The second: heartbeat critical, STATUSTEXT "{reason}"; it waits for the port',
+        "at once; the second as soon as the first ends",
+        "nothing",
+    )
+
+
+def test_sensor_back_under_another_name_and_powered_anew(rig: Rig, table: Row) -> None:
+    rig.until_well()
+    mark = rig.mark
+    rig.fluxgate.unplug()
+    rig.until_status(lambda status: status["sensor_state"] == LOST)
+    rig.fluxgate.plug("ttyUSB1", powered_anew=True)
+    rig.normal = 32  # offset_suspect: until it is calibrated again
+    back = rig.until_well()
+    rig.until_said("offset suspect", mark)
+    sigma = rig.of("MAG_FIELD")[-1]["total_field_sigma"]
+    assert sigma > 20
+    table(
+        "sensor unplugged, back under another name, powered on anew",
+        f"as above; then `offset_suspect` with sigma {sigma:.0f} nT (`turn_on_sigma`) for the rest of the run: its offset may have settled elsewhere",
+        seconds(back),
+        "the readings meanwhile; how many, the sensor no longer knows: its numbers began anew",
+    )
+    assert back < 2.0
+
+
+def test_all_of_it_again_from_the_log(rig: Rig) -> None:
+    replays(rig)

@@ -1,0 +1,41 @@
+"""What the tests of faults check and tell alike."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import zip_longest
+
+import numpy as np
+from rig import Rig
+
+from magbridge.mavlink import Codec
+
+Row = Callable[[str, str, str, str], None]
+"""Takes a row of the table of faults."""
+NOISE = np.random.default_rng(1).integers(0, 256, 4000, dtype=np.uint8).tobytes()
+
+
+def seconds(value: float) -> str:
+    """Return a time as the table tells it."""
+    return f"{value:.2f} s"
+
+
+def replays(rig: Rig) -> None:
+    """Stop the bridge; its log, replayed, publishes the same bytes, and what was heard stands in it in order."""
+    assert rig.stop() == 0
+    recorded, published = rig.replay()
+    assert recorded.damages == 0
+    assert recorded.messages > 20
+    assert first_difference(published, recorded.published) is None
+    at = 0
+    for _, message in rig.heard:
+        at = published.find(message.frame, at)
+        assert at >= 0, message.fields
+        at += len(message.frame)
+
+
+def first_difference(one: bytes, other: bytes) -> tuple[object, object] | None:
+    """Return the first two messages in which two streams differ."""
+    pairs = zip_longest(*(Codec(0, 0).parse(bytes(stream)) for stream in (one, other)))
+    different = ((this and this.fields, that and that.fields) for this, that in pairs if this != that)
+    return next(different, None)
