@@ -10,7 +10,7 @@ import time
 from pathlib import Path
 from statistics import median
 
-from benchmarks.latency import BIN, bridge_command, resident, started
+from benchmarks.latency import BIN, bridge_command, processor_time, resident, started
 from benchmarks.row import Row
 from benchmarks.workload import Feed, write_config
 
@@ -27,7 +27,7 @@ HERTZ = 100
 
 def start(folder: Path, repetitions: int) -> list[Row]:
     """Start the bridge again and again, beside an interpreter that only imports what any bridge needs."""
-    bridge, bare = [], []
+    bridge, bare, used = [], [], []
     memory: dict[str, float] = {}
     for _ in range(repetitions):
         with started(bridge_command(folder)) as live:
@@ -35,6 +35,7 @@ def start(folder: Path, repetitions: int) -> list[Row]:
             if "HEARTBEAT" not in names:
                 raise RuntimeError(f"the first datagram was {names}")
             bridge.append(live.seconds)
+            used.append(processor_time(live.process.pid))
             feed = Feed()
             for _ in range(round(SETTLE * HERTZ)):
                 live.link.sendto(feed.message(time.time_ns() // 1000), live.peer)
@@ -48,6 +49,7 @@ def start(folder: Path, repetitions: int) -> list[Row]:
     return [
         Row("magbridge run to the first heartbeat", median(bridge), "s", median(bare), FLOOR, most=0.8,
             detail={"best": min(bridge)}),
+        Row("processor time of that", median(used), "s"),
         Row("resident, calibrating, logging and with a position", memory["VmRSS"], "MB", most=90.0),
         Row("resident, at most", memory["VmHWM"], "MB", most=90.0, detail={"imported": imported}),
     ]  # fmt: skip
