@@ -35,12 +35,16 @@ def test_neither_sensor_nor_autopilot_at_the_start(make_rig: MakeRig, table: Row
     back = rig.until_well()
     table(
         "started with neither sensor nor autopilot there",
-        "`sensor_state` absent, then lost, with the reason; it waits for both",
+        "into the log: both lines lost, with the reasons; it tries to open them every 0.25 s",
         f"{back:.2f} s after both came",
         "nothing",
     )
     assert back < 3.0
     replays(rig)
+    (log,) = rig.logs
+    with log.open("rb") as file:
+        said = [record.message["text"] for record in LogReader(file) if record.message.name == "STATUSTEXT"]
+    assert {"digitizer lost: no such device", "link: Connection refused"} <= set(said)
 
 
 def test_tcp_server_gone_and_back(make_rig: MakeRig, table: Row) -> None:

@@ -129,7 +129,7 @@ def test_second_bridge_on_the_same_sensor(rig: Rig, table: Row) -> None:
     table(
         "a second `magbridge run` on the same serial port",
         f'the first: nothing. The second: heartbeat critical, STATUSTEXT "{reason}"; it waits for the port',
-        "at once; the second as soon as the first ends",
+        "at once; the second tries again every 0.25 s",
         "nothing",
     )
 
