@@ -148,7 +148,7 @@ def test_second_system_on_the_link(rig: Rig, table: Row) -> None:
 
 def test_two_autopilots_answer(rig: Rig, table: Row) -> None:
     rig.until_well()
-    before, mark = rig.fresh_status(), rig.mark
+    mark = rig.mark
     other, count = Codec(1, 1), 0
 
     def both(frame: bytes) -> list[bytes]:
@@ -161,12 +161,11 @@ def test_two_autopilots_answer(rig: Rig, table: Row) -> None:
     told = rig.until_said("two autopilots speak as 1:1", mark)
     rig.autopilot.retell = lambda frame: [frame]
     back = rig.until_well()
-    assert rig.fresh_status()["link_frames_lost"] > before["link_frames_lost"]
     table(
         "two programs answer as the autopilot (1:1)",
         f"STATUSTEXT after {told:.2f} s; flags: {rig.flags(mark) or 'none'}",
         seconds(back),
-        "nothing; `link_frames_lost` grows, because their numbers interleave",
+        "nothing; `link_frames_lost` says little while their numbers interleave",
     )
     assert back < 6.0
 
