@@ -1,10 +1,13 @@
-"""Commands on the vehicle, and those that show what happens there: demo, run, replay."""
+"""Commands on the vehicle, and those that show what happens there: demo, run, replay, monitor."""
 
 from __future__ import annotations
 
 import sys
 from math import inf, nan
 from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter, validators
 
 from magbridge.cli.common import Json, app, some, tell
 from magbridge.errors import DataError, WrongUse
@@ -78,6 +81,35 @@ def replay(
     tell(result, replaying.tell(result), json)
     if not all(run["identical"] for run in result.get("runs", ())):
         raise DataError("what was published is not what the log holds")
+
+
+@app.command
+def monitor(
+    link: str = "udpin:0.0.0.0:14550",
+    *,
+    host: str = "127.0.0.1",
+    port: Annotated[int, Parameter(validator=validators.Number(gte=1, lte=65535))] = 8080,
+    baudrate: Annotated[int, Parameter(validator=validators.Number(gt=0))] = 57600,
+    show: Annotated[bool, Parameter(negative="")] = False,
+) -> None:
+    """Serve the ground station's page: what a bridge measures and says, as it comes over MAVLink.
+
+    Parameters
+    ----------
+    link
+        Where the bridge is heard: udpin:HOST:PORT, udpout, tcp, tcpin, or a serial device.
+    host
+        The address at which the page is served; others than this machine see it at 0.0.0.0.
+    port
+        Its port.
+    baudrate
+        Of a serial device.
+    show
+        Open the page in a browser.
+    """
+    from magbridge.monitor.page import serve
+
+    serve(link, baudrate, host, port, show=show)
 
 
 def speed_of(text: str) -> float:

@@ -1,0 +1,57 @@
+"""The link on a thread of its own: what comes goes to the state, what the state asks goes out."""
+
+from __future__ import annotations
+
+import select
+import time
+from threading import Lock, Thread
+
+from magbridge.bridge.port import Port
+from magbridge.errors import PortError
+from magbridge.mavlink import Codec
+from magbridge.monitor.state import State
+
+__all__ = ["Ear"]
+
+
+class Ear:
+    """Listens to `port`, as ground station 255:190, until the process ends.
+
+    Attributes
+    ----------
+    state : State
+        To be used with `lock` held.
+    trouble : str
+        Why the port is not open; empty while it is.
+    """
+
+    def __init__(self, port: Port) -> None:
+        self.port, self.state, self.lock, self.trouble = port, State(), Lock(), ""
+        self._codec = Codec(255, 190)
+
+    def start(self) -> None:
+        """Open the port and begin; raises :class:`PortError`."""
+        self.port.open()
+        Thread(target=self._listen, name="link", daemon=True).start()
+
+    def _listen(self) -> None:
+        while True:
+            try:
+                if not self.port.up:
+                    self.port.open()
+                self._turn()
+                self.trouble = ""
+            except PortError as error:
+                self.trouble = error.reason
+                time.sleep(1.0)
+
+    def _turn(self) -> None:
+        ready, _, _ = select.select(self.port.fds(), [], [], 0.1)
+        heard = self._codec.parse(self.port.read()) if ready else []
+        now = time.time()
+        with self.lock:
+            for message in heard:
+                self.state.hear(message, now)
+            requests = self.state.due(now)
+        for name, fields in requests:
+            self.port.write(self._codec.pack(name, **fields))

@@ -1,0 +1,236 @@
+"""The page itself."""
+
+from __future__ import annotations
+
+import socket
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from copy import deepcopy
+from functools import partial
+from math import nan
+from typing import Any
+
+from nicegui import ui
+
+from magbridge.bridge.sockets import open_link
+from magbridge.config import Align
+from magbridge.errors import PortError
+from magbridge.link import alignment
+from magbridge.mavlink.dialect import MAV_SEVERITY
+from magbridge.monitor.ear import Ear
+from magbridge.monitor.state import Point
+from magbridge.monitor.words import FLAGS, ago, health, measured, silence
+
+__all__ = ["serve"]
+
+BREAK = 10.0
+"""s without a sample that interrupt the curve."""
+TUNABLES = {one.name: one for one in alignment(Align())}
+"""What every bridge has: a PARAM_VALUE tells neither unit nor range."""
+INK, BLUE, GREEN, AMBER, RED = "#1e293b", "#1d4ed8", "#15803d", "#b45309", "#b91c1c"
+LINE = {"type": "line", "symbol": "none", "animation": False, "color": BLUE}
+BAND = {**LINE, "stack": "band", "lineStyle": {"opacity": 0}}
+CHART: dict[str, Any] = {
+    "useUTC": True,
+    "grid": {"left": 70, "right": 16, "top": 12, "bottom": 28},
+    "xAxis": {"type": "time"},
+    "yAxis": {"type": "value", "scale": True},
+    "series": [BAND, {**BAND, "areaStyle": {"opacity": 0.2}}, {**LINE, "lineStyle": {"width": 1.5}}],
+}
+GRID = "w-full grid gap-4 grid-cols-1 lg:grid-cols-"
+
+
+def serve(link: str, baudrate: int, host: str, port: int, *, show: bool) -> None:
+    """Listen to `link` and serve the page until interrupted.
+
+    Raises
+    ------
+    ConfigError, PortError
+        `link` is no address, or it or the page's own port cannot be opened.
+    """
+    ear = Ear(open_link(link, baudrate, "magbridge monitor"))
+    try:
+        socket.create_server((host, port)).close()  # the web server itself would only log it
+    except OSError as error:
+        raise PortError(f"{host}:{port}", error.strerror or str(error)) from error
+    ear.start()
+    print(f"listening on {link}; the page is http://{host}:{port}", file=sys.stderr)
+    options: dict[str, Any] = {"title": "magbridge", "favicon": "🧲", "show_welcome_message": False}
+    ui.run(partial(Page, ear), host=host, port=port, show=show, reload=False, **options)
+
+
+class Page:
+    """One browser's view of what the ear has heard."""
+
+    def __init__(self, ear: Ear) -> None:
+        self._ear, self._state = ear, ear.state
+        self._shown: dict[str, Any] = {}
+        self._inputs: dict[str, ui.number] = {}
+        ui.query("body").classes("bg-slate-100").style(f"color: {INK}")
+        with ui.header().classes("items-center gap-4 px-6 py-2 bg-slate-800"):
+            ui.label("magbridge").classes("text-lg font-semibold")
+            self._from = ui.label().classes("text-sm text-slate-300")
+            ui.space()
+            self._stream = ui.label().classes("text-sm px-3 py-1 rounded-full")
+        facts = list(health(self._state))
+        with ui.column().classes("w-full max-w-screen-2xl mx-auto gap-4") as self._body:
+            with ui.element().classes(f"{GRID}[18rem_1fr]"):
+                with _card("Field, nT ± 2σ"):
+                    self._measured = [_quantity(name) for name in measured(self._state)]
+                with _card("Total field, nT ± 2σ, of the last ten minutes, UTC"):
+                    self._chart = ui.echart(deepcopy(CHART)).classes("w-full h-72")
+            with ui.element().classes(f"{GRID}3"):
+                with _card("Flags"):
+                    self._flags = ui.column().classes("gap-2")
+                with _card("Bridge"):
+                    self._health = [_fact(name) for name in facts[:8]]
+                with _card("Losses"):
+                    self._health += [_fact(name) for name in facts[8:]]
+            with ui.element().classes(f"{GRID}2"):
+                with _card("Messages, UTC"):
+                    self._texts = ui.column().classes("w-full h-60 gap-1 overflow-auto flex-nowrap")
+                with _card("Parameters (Enter sets one)"):
+                    self._parameters = ui.element().classes(
+                        "w-full h-60 grid grid-cols-3 gap-x-4 overflow-auto"
+                    )
+        self._refresh()
+        ui.timer(0.5, self._refresh)
+
+    def _refresh(self) -> None:
+        now = time.time()
+        with self._ear.lock:
+            self._tell_stream(self._ear.trouble or silence(self._state, now))
+            self._tell_figures()
+            self._tell_flags(now)
+            self._tell_texts()
+            self._tell_parameters()
+            self._draw()
+
+    def _tell_stream(self, trouble: str) -> None:
+        who = "vehicle {}, component {}".format(*self._state.bridge) if self._state.bridge else ""
+        self._from.set_text(f"{self._ear.port.name} \N{EN SPACE} {who}")
+        self._stream.set_text(trouble or "live")
+        self._stream.style(f"background: {RED if trouble else GREEN}")
+        self._body.style(f"opacity: {0.45 if trouble else 1}")
+
+    def _tell_figures(self) -> None:
+        for labels, texts in zip(self._measured, measured(self._state).values(), strict=True):
+            for label, text in zip(labels, texts, strict=True):
+                label.set_text(text)
+        for label, (text, well) in zip(self._health, health(self._state).values(), strict=True):
+            label.set_text(text if self._state.status else "–")
+            label.style(f"color: {INK if well or not self._state.status else RED}")
+
+    def _tell_flags(self, now: float) -> None:
+        flags = {name: f"since {_clock(t)}, {ago(now - t)}" for name, (t, _) in self._state.flags.items()}
+        if not self._new("flags", flags or bool(self._state.field), self._flags):
+            return
+        with self._flags:
+            if self._state.field and not flags:
+                ui.label("None").style(f"color: {GREEN}")
+            for name, since in flags.items():
+                color = AMBER if name == "no_boresight" else RED
+                with ui.column().classes("gap-0 border-l-4 pl-3").style(f"border-color: {color}"):
+                    ui.label(FLAGS[name]).classes("leading-tight")
+                    ui.label(f"{name}, {since}").classes("text-xs text-slate-500")
+
+    def _tell_texts(self) -> None:
+        if not self._new("texts", list(self._state.texts), self._texts):
+            return
+        with self._texts:
+            for when, severity, text in self._state.texts:
+                color = (
+                    RED
+                    if severity <= MAV_SEVERITY.ERROR
+                    else AMBER
+                    if severity <= MAV_SEVERITY.WARNING
+                    else INK
+                )
+                with ui.row().classes("w-full gap-3 text-sm flex-nowrap items-baseline"):
+                    ui.label(_clock(when)).classes("text-slate-500 tabular-nums")
+                    word = MAV_SEVERITY(severity & 7).name.lower()
+                    ui.label(word).classes("w-20 shrink-0").style(f"color: {color}")
+                    ui.label(text)
+
+    def _tell_parameters(self) -> None:
+        known = self._state.parameters
+        if self._new("names", sorted(known), self._parameters):
+            with self._parameters:
+                self._inputs = {name: self._input(name) for name in sorted(known)}
+        for name, one in known.items():
+            if self._new(name, (one.value, one.error, one.asked)):
+                box = self._inputs[name]
+                if one.asked is None:
+                    box.set_value(float(f"{one.value:.7g}"))
+                box.props["error"], box.props["error-message"] = bool(one.error), one.error
+                box.update()
+
+    def _input(self, name: str) -> ui.number:
+        self._shown.pop(name, None)
+        box = ui.number(name).props("dense stack-label").on("keydown.enter", partial(self._set, name))
+        if known := TUNABLES.get(name):
+            box.tooltip(f"{known.doc}; {known.low:g} to {known.high:g} {known.unit}")
+            box.props(f'suffix="{known.unit}"')
+        return box
+
+    def _set(self, name: str) -> None:
+        with self._ear.lock:
+            if name in self._state.parameters:
+                value = self._inputs[name].value
+                self._state.set(name, nan if value is None else value)
+
+    def _draw(self) -> None:
+        trace = self._state.trace
+        if trace and self._new("trace", trace[-1].time):
+            curves = zip(*_curves(list(trace)), strict=True)
+            for series, data in zip(self._chart.options["series"], curves, strict=True):
+                series["data"] = data
+            self._chart.update()
+
+    def _new(self, key: str, value: Any, box: ui.element | None = None) -> bool:
+        """Return whether `value` is not what this browser shows already; empty the `box` that showed it."""
+        new = key not in self._shown or bool(self._shown[key] != value)
+        self._shown[key] = value
+        if new and box is not None:
+            box.clear()
+        return new
+
+
+def _curves(trace: list[Point]) -> Iterator[list[tuple[float, float]]]:
+    """Yield (ms, nT) of the band's lower edge, of its width and of the mean; NaN where the curve is interrupted."""
+    last = trace[0].time
+    for point in trace:
+        ms = 1e3 * point.time
+        if point.time - last > BREAK:
+            yield [(ms - 1.0, nan)] * 3
+        last = point.time
+        yield [(ms, point.low), (ms, point.high - point.low), (ms, point.sum / point.count)]
+
+
+@contextmanager
+def _card(title: str) -> Iterator[None]:
+    with ui.card().classes("w-full gap-2 p-4 shadow-sm rounded-lg"):
+        ui.label(title).classes("text-sm font-semibold text-slate-500")
+        yield
+
+
+def _quantity(name: str) -> tuple[ui.label, ui.label]:
+    with ui.column().classes("gap-0"):
+        ui.label(name).classes("text-xs text-slate-500")
+        with ui.row().classes("items-baseline gap-2"):
+            size = "text-3xl" if name == "Total field" else "text-xl"
+            return ui.label().classes(f"{size} tabular-nums"), ui.label().classes(
+                "text-slate-500 tabular-nums"
+            )
+
+
+def _fact(name: str) -> ui.label:
+    with ui.row().classes("w-full justify-between text-sm"):
+        ui.label(name).classes("text-slate-600")
+        return ui.label().classes("font-medium tabular-nums")
+
+
+def _clock(when: float) -> str:
+    return time.strftime("%H:%M:%S", time.gmtime(when))

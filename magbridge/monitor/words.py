@@ -1,0 +1,85 @@
+"""The state in words and figures, as the page shows them."""
+
+from __future__ import annotations
+
+from math import isfinite, nan
+
+from magbridge.mavlink.dialect import MAG_LOG_STATE, MAG_PORT_STATE
+from magbridge.monitor.state import State
+
+__all__ = ["FLAGS", "ago", "health", "measured", "silence"]
+
+SILENT = 3.0
+"""s; a bridge speaks every second."""
+FLAGS = {
+    "stale_telemetry": "A parameter of the calibration is old, missing or NaN",
+    "extrapolated": "A parameter is outside the range that the calibration has seen",
+    "moving": "A mass is moving",
+    "saturated": "A channel is at the end of its range",
+    "uncalibrated": "No calibration, or not one of this sensor",
+    "offset_suspect": "The sensor was powered on anew since its calibration",
+    "no_boresight": "The vector is in sensor axes; its magnitude is right",
+    "gap": "Samples are missing",
+}
+LOSSES = {
+    "Samples lost at the sensor": "samples_lost",
+    "Bad frames from the sensor": "sensor_frames_bad",
+    "Bytes skipped from the sensor": "sensor_bytes_skipped",
+    "Frames lost from the autopilot": "link_frames_lost",
+    "Bytes skipped from the link": "link_bytes_skipped",
+    "Frames with a wrong signature": "link_refused",
+    "Records lost by the log": "log_lost",
+}
+
+
+def ago(seconds: float) -> str:
+    """Return a duration in the unit that suits it."""
+    unit, size = next(((u, s) for u, s in (("h", 3600), ("min", 60)) if seconds >= 2 * s), ("s", 1))
+    return f"{max(seconds, 0.0) / size:.0f} {unit}"
+
+
+def silence(state: State, now: float) -> str:
+    """Return what is wrong with the stream; nothing while it flows."""
+    for what, when in (("nothing", state.heard), ("no field", state.sampled)):
+        if now - when > SILENT:
+            return f"{what} heard for {ago(now - when)}" if isfinite(when) else f"{what} heard yet"
+    return ""
+
+
+def measured(state: State) -> dict[str, tuple[str, str]]:
+    """Return the field in nT: of each quantity its value and its 2-sigma."""
+    get = state.field.get
+    shown = {"Total field": _number(get("total_field", nan), ".2f", 2 * get("total_field_sigma", nan))}
+    shown["Anomaly"] = _number(get("anomaly", nan), "+.2f")
+    for name, axis in {"Forward": "x", "Starboard": "y", "Down": "z"}.items():
+        shown[name] = _number(get(axis, nan), ".1f", 2 * get(f"sigma_{axis}", nan))
+    return shown
+
+
+def health(state: State) -> dict[str, tuple[str, bool]]:
+    """Return how the bridge is: of each thing a word, and whether it is well."""
+    field, get = state.field.get, state.status.get
+    sensor, autopilot = (MAG_PORT_STATE(get(f"{line}_state", 0)) for line in ("sensor", "autopilot"))
+    log = MAG_LOG_STATE(get("log_state", 0))
+    told = {name: get(counter, 0) for name, counter in LOSSES.items()}
+    return {
+        "Sensor": (sensor.name.lower(), sensor == MAG_PORT_STATE.OK),
+        "Autopilot": (autopilot.name.lower(), autopilot == MAG_PORT_STATE.OK),
+        "Log": (log.name.lower(), log != MAG_LOG_STATE.FAILED),
+        "Sample rate": (_number(get("sample_rate", nan), ".2f", unit="Hz")[0], True),
+        "Latency": (_number(1e3 * field("latency", nan), ".1f", unit="ms")[0], True),
+        "Age of the telemetry": (
+            _number(field("telemetry_age", nan), ".1f", unit="s")[0],
+            "stale_telemetry" not in state.flags,
+        ),
+        "Calibration": (f"{field('calibration_id', 0):08x}".replace("0" * 8, "none"), True),
+        "Uptime": (ago(get("uptime", 0)), True),
+        "Messages lost on the way here": (f"{state.lost} of {state.lost + state.received}", not state.lost),
+        **{name: (str(count), not count) for name, count in told.items()},
+    }
+
+
+def _number(value: float, form: str, two_sigma: float = nan, unit: str = "") -> tuple[str, str]:
+    """Return a value with its unit, thousands apart, and its 2-sigma; a dash and nothing where not known."""
+    text = f"{value:{form.replace('.', ',.')}} {unit}".replace(",", "\N{NARROW NO-BREAK SPACE}").rstrip()
+    return text if isfinite(value) else "–", f"± {two_sigma:{form}}" if isfinite(two_sigma) else ""

@@ -1,0 +1,113 @@
+"""The page as a browser gets it, from the command itself, fed with real datagrams."""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from urllib.error import URLError
+from urllib.request import urlopen
+
+import pytest
+
+from magbridge.cli import main
+from magbridge.mavlink import Codec
+
+pytest.importorskip("nicegui")
+
+
+def free(kind: socket.SocketKind) -> int:
+    with socket.socket(socket.AF_INET, kind) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+@pytest.fixture
+def page() -> Iterator[tuple[str, tuple[str, int]]]:
+    link, port = free(socket.SOCK_DGRAM), free(socket.SOCK_STREAM)
+    command = [
+        sys.executable,
+        "-m",
+        "magbridge.cli",
+        "monitor",
+        f"udpin:127.0.0.1:{link}",
+        "--port",
+        str(port),
+    ]
+    alone = {
+        name: value for name, value in os.environ.items() if "PYTEST" not in name
+    }  # NiceGUI looks at them
+    with subprocess.Popen(command, stderr=subprocess.PIPE, env=alone) as process:
+        assert process.stderr
+        assert b"the page is" in process.stderr.readline()
+        yield f"http://127.0.0.1:{port}/", ("127.0.0.1", link)
+        process.terminate()
+
+
+def get(url: str) -> str:
+    for _ in range(150):
+        try:
+            with urlopen(url, timeout=20) as answer:
+                return str(answer.read().decode())
+        except URLError:
+            time.sleep(0.2)
+    raise TimeoutError(url)
+
+
+def test_page(page: tuple[str, tuple[str, int]]) -> None:
+    url, link = page
+    assert "nothing heard yet" in get(url)
+    bridge = Codec(1, 191)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        sender.settimeout(10)
+        sender.sendto(
+            bridge.pack(
+                "MAG_FIELD", total_field=52_134.268, total_field_sigma=0.6, time_usec=10**15, flags=4
+            ),
+            link,
+        )
+        heard = Codec(1, 191).parse(sender.recv(4096))
+        assert heard[0].name in {"HEARTBEAT", "PARAM_REQUEST_LIST"}
+        assert (heard[0].system, heard[0].component) == (255, 190)
+        for name, fields in (
+            ("MAG_STATUS", {"sensor_state": 3, "uptime": 9}),
+            ("STATUSTEXT", {"severity": 3, "text": "sensor lost: unplugged"}),
+            ("PARAM_VALUE", {"param_id": "MB_SETTLE_TIME", "param_value": 5.0, "param_count": 1}),
+        ):
+            sender.sendto(bridge.pack(name, **fields), link)
+    time.sleep(0.5)
+    html = get(url)
+    for text in ("52\u202f134.27", "± 1.20", "A mass is moving", "sensor lost: unplugged", "MB_SETTLE_TIME"):
+        assert text in html, text
+    assert "vehicle 1, component 191" in html
+    assert 'src="http' not in html  # it must show without a network
+    assert 'href="http' not in html
+
+
+def test_bad_input_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = str(taken.getsockname()[1])
+        for arguments, code, expected in (
+            (["udpin:nowhere"], 2, "expected HOST:PORT"),
+            (["/dev/nowhere"], 1, "/dev/nowhere: "),
+            (["udpin:127.0.0.1:0", "--port", port], 1, f"127.0.0.1:{port}: Address already in use"),
+            (["--port", "99999"], 2, "99999"),
+        ):
+            assert main(["monitor", *arguments]) == code
+            line = capsys.readouterr().err
+            assert line.count("\n") == 1
+            assert expected in line
+
+
+def test_a_missing_extra_is_named(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "nicegui", None)
+    monkeypatch.delitem(sys.modules, "magbridge.monitor.page", raising=False)
+    assert main(["monitor"]) == 2
+    assert (
+        capsys.readouterr().err == "magbridge: nicegui is not installed: pip install 'magbridge[monitor]'\n"
+    )

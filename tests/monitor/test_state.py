@@ -1,0 +1,178 @@
+"""What the page knows, from frames as a bridge sends them."""
+
+from __future__ import annotations
+
+from math import inf, nan
+
+import pytest
+
+from magbridge.config import Align, Link
+from magbridge.link import Component, alignment
+from magbridge.mavlink import Codec
+from magbridge.monitor.state import State
+from magbridge.monitor.words import ago, health, measured, silence
+from magbridge.records import Quality
+
+NOW = 1_700_000_000.0
+
+
+class Air:
+    """A bridge's codec and a station's ear."""
+
+    def __init__(self) -> None:
+        self.state, self.bridge, self.codec = State(), Codec(1, 191), Codec(255, 190)
+
+    def say(self, now: float, name: str, /, **fields: object) -> None:
+        self.give(self.bridge.pack(name, **fields), now)
+
+    def give(self, data: bytes, now: float) -> None:
+        for message in self.codec.parse(data):
+            self.state.hear(message, now)
+
+    def field(self, now: float, total: float = 52_000.0, flags: int = 0, **fields: object) -> None:
+        fields = {"total_field_sigma": 1.0, "time_usec": round(now * 1e6), "anomaly": nan, **fields}
+        self.say(now, "MAG_FIELD", total_field=total, flags=flags, **fields)
+
+
+@pytest.fixture
+def air() -> Air:
+    return Air()
+
+
+def test_silence_is_told(air: Air) -> None:
+    assert silence(air.state, NOW) == "nothing heard yet"
+    assert air.state.heard == -inf
+    air.say(NOW, "MAG_STATUS", uptime=5)
+    assert silence(air.state, NOW) == "no field heard yet"
+    air.field(NOW)
+    assert silence(air.state, NOW + 3) == ""
+    assert silence(air.state, NOW + 12) == "nothing heard for 12 s"
+    air.say(NOW + 12, "MAG_STATUS", uptime=17)
+    assert silence(air.state, NOW + 13) == "no field heard for 13 s"
+    assert [ago(s) for s in (-1, 0, 119, 121, 7200)] == ["0 s", "0 s", "119 s", "2 min", "2 h"]
+
+
+def test_figures(air: Air) -> None:
+    assert {value for value, _ in measured(air.state).values()} == {"–"}
+    air.field(NOW, 52_134.268, x=-4_203.04, sigma_x=1.1, y=nan, latency=0.0042, calibration_id=0xBEEF)
+    shown = measured(air.state)
+    assert shown["Total field"] == ("52\u202f134.27", "± 2.00")
+    assert shown["Forward"] == ("-4\u202f203.0", "± 2.2")
+    assert shown["Anomaly"][0] == shown["Starboard"][0] == "–"
+    air.say(NOW, "MAG_STATUS", sensor_state=3, autopilot_state=1, log_state=2, samples_lost=7, uptime=4)
+    told = health(air.state)
+    assert told["Sensor"] == ("lost", False)
+    assert told["Autopilot"] == ("ok", True)
+    assert told["Log"] == ("failed", False)
+    assert told["Latency"] == ("4.2 ms", True)
+    assert told["Calibration"] == ("0000beef", True)
+    assert told["Samples lost at the sensor"] == ("7", False)
+
+
+def test_only_the_first_bridge_is_heard(air: Air) -> None:
+    air.give(Codec(1, 1).pack("STATUSTEXT", text="autopilot", severity=4), NOW)
+    assert air.state.bridge is None
+    air.field(NOW, 50_000)
+    air.give(Codec(2, 191).pack("MAG_FIELD", total_field=1.0), NOW)
+    air.give(b"\xfd noise \xfe", NOW)
+    assert air.state.bridge == (1, 191)
+    assert air.state.field["total_field"] == 50_000
+    assert not air.state.texts
+
+
+def test_messages_lost_on_the_way_are_counted(air: Air) -> None:
+    frames = [air.bridge.pack("MAG_STATUS", uptime=k) for k in range(600)]
+    late = frames.pop(310)
+    frames.insert(312, late)
+    for frame in (frame for k, frame in enumerate(frames) if k not in {0, 40, 255, 256, 257}):
+        air.give(frame, NOW)
+    assert air.state.received == 595
+    assert air.state.lost == 4 + 1 + 2  # a late one is a gap before it, and one after it
+
+
+def test_flags_stand_since_they_came(air: Air) -> None:
+    for k in range(10):
+        air.field(NOW + k, flags=Quality.NO_BORESIGHT | (Quality.MOVING if k in {4, 5, 7} else 0))
+    assert air.state.flags == {"no_boresight": (NOW, NOW + 9), "moving": (NOW + 4, NOW + 7)}
+    air.field(NOW + 11)
+    assert set(air.state.flags) == {"no_boresight"}
+    air.field(NOW + 20)
+    assert not air.state.flags
+
+
+def test_trace_is_the_outline_of_the_last_ten_minutes(air: Air) -> None:
+    for k in range(7000):
+        air.field(
+            NOW + k / 10, 52_000.0 + (50 if k == 5005 else 0), total_field_sigma=3.0 if k == 5007 else 1.0
+        )
+    trace = air.state.trace
+    assert len(trace) == 601
+    assert {point.count for point in trace} == {10}
+    spike = next(point for point in trace if point.time == NOW + 500)
+    assert (spike.sum / spike.count, spike.low, spike.high) == pytest.approx((52_005, 51_994, 52_052))
+    air.field(NOW + 701, nan)
+    assert len(trace) == 601
+    air.field(NOW - 60)  # its clock was set back
+    assert [point.time for point in trace] == [NOW - 60]
+
+
+def test_a_long_text_is_put_together(air: Air) -> None:
+    air.field(NOW)
+    for piece, text in enumerate(("a" * 50, "b" * 50, "c")):
+        air.say(NOW + piece, "STATUSTEXT", severity=4, text=text, id=9, chunk_seq=piece)
+    air.say(NOW + 3, "STATUSTEXT", severity=6, text="short")
+    assert [said.text for said in air.state.texts] == ["short", "a" * 50 + "b" * 50 + "c"]
+    assert air.state.texts[1].time == NOW + 2
+
+
+def test_parameters_with_a_real_bridge(air: Air) -> None:
+    """Fetched also where some are lost on the way; set; refused with the bridge's own words."""
+    bridge = Component(Link("udpout:h:1"), {}, alignment(Align()), start_us=round(NOW * 1e6))
+    lose = {"MB_SETTLE_TIME", "MB_GAP_FACTOR"}
+    clock = [NOW]
+
+    def run(seconds: float, answers: bool = True) -> None:
+        end = clock[0] + seconds
+        while clock[0] < end:
+            clock[0] += 0.1
+            us = round(clock[0] * 1e6)
+            for name, fields in air.state.due(clock[0]):
+                if answers:
+                    bridge.receive(air.codec.pack(name, **fields), us)
+            bridge.advance(us)
+            for _, frame in bridge.outbox.drain():
+                name = next(iter(Codec(0, 0).parse(frame)))
+                if name.name == "PARAM_VALUE" and name["param_id"] in lose:
+                    lose.remove(name["param_id"])
+                    continue
+                air.give(frame, clock[0])
+
+    run(8)
+    assert not lose
+    assert set(air.state.parameters) == set(bridge.parameters.names)
+    settle = air.state.parameters["MB_SETTLE_TIME"]
+    assert settle.value == pytest.approx(bridge.parameters["MB_SETTLE_TIME"])
+
+    air.state.set("MB_SETTLE_TIME", 7.3)
+    run(1)
+    assert bridge.parameters["MB_SETTLE_TIME"] == pytest.approx(7.3)
+    assert (settle.value, settle.asked, settle.error) == (pytest.approx(7.3), None, "")
+
+    air.state.set("MB_SETTLE_TIME", -1)
+    run(1)
+    assert settle.error == "-1 is not within 0 to 3600 s"
+    assert (settle.value, settle.asked) == (pytest.approx(7.3), None)
+
+    air.state.set("MB_SETTLE_TIME", 1e39)
+    assert settle.error == "expected a number"
+
+    air.state.set("MB_SETTLE_TIME", 8)
+    run(4, answers=False)
+    assert (settle.error, settle.asked) == ("no answer yet", 8)
+    run(2)
+    assert (settle.error, settle.value) == ("", 8)
+
+    air.say(clock[0], "MAG_STATUS", uptime=0)
+    assert not air.state.parameters  # another run: asked again
+    run(4)
+    assert len(air.state.parameters) == len(bridge.parameters.names)
