@@ -9,7 +9,8 @@ of random numbers that draw its direction, place and time; sizes are proportiona
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from dataclasses import field as attribute
 
 import msgspec
 import numpy as np
@@ -61,13 +62,13 @@ class Scene:
     water: Array
     instrument: Instrument
     late: float = 0.0
-    logged: dict[str, tuple[Array, str]] = field(default_factory=dict)
-    reference: Array = field(default_factory=lambda: np.zeros(1))
-    bend: list[Callable[[Array], Array]] = field(default_factory=list)
+    logged: dict[str, tuple[Array, str]] = attribute(default_factory=dict)
+    reference: Array = attribute(default_factory=lambda: np.zeros(1))
+    bend: list[Callable[[Array], Array]] = attribute(default_factory=list)
 
     @property
     def t(self) -> Array:
-        """s after the start, (n,)."""
+        """S after the start, (n,)."""
         return self.track.elapsed
 
 
@@ -98,7 +99,9 @@ def furnish(scene: Scene, rng: Generator) -> None:
     scene.logged["amps_b"] = (motor + 0.005 * rng.normal(size=n), "A")
     fin = np.round(first_order(autoregressive(rng, (n,), 12.0, 240.0 / step), step, 5.0), 1)
     scene.logged["p17"] = (fin, "deg")
-    day = 0.8 * np.sin(2 * np.pi * t / 86400.0 + rng.uniform(0, 6.28)) + autoregressive(rng, (n,), 0.25, 4000.0 / step)
+    day = 0.8 * np.sin(2 * np.pi * t / 86400.0 + rng.uniform(0, 6.28)) + autoregressive(
+        rng, (n,), 0.25, 4000.0 / step
+    )
     scene.water = scene.water + day
     scene.logged["sensor_temperature"] = (first_order(scene.water, step, 300.0), "degC")
     scene.logged["water_temperature"] = (scene.water, "degC")
@@ -126,7 +129,9 @@ def heat_offset(scene: Scene, size: float, rng: Generator) -> None:
 def heat_scale(scene: Scene, size: float, rng: Generator) -> None:
     """Copper in the coils: gains follow the core's temperature; size in 1/degC, times 5e4."""
     core = soaked(scene.logged["sensor_temperature"][0], scene.track.step, float(rng.uniform(300, 4000)))
-    gains = 1.0 + size / 5e4 * np.abs(rng.normal(1.0, 0.4, 3)) * (core - core[0] + 0.5 * rng.normal())[:, None]
+    gains = (
+        1.0 + size / 5e4 * np.abs(rng.normal(1.0, 0.4, 3)) * (core - core[0] + 0.5 * rng.normal())[:, None]
+    )
     scene.field = scene.field * gains
 
 
@@ -140,7 +145,10 @@ def jump(scene: Scene, size: float, rng: Generator) -> None:
 def creep(scene: Scene, size: float, rng: Generator) -> None:
     """Stress relaxes logarithmically (magnetic viscosity: Street & Woolley 1949); size in nT over the log."""
     tau = rng.uniform(0.3, 1.5) * scene.t[-1]
-    scene.field = scene.field + size * _direction(rng) * (np.log1p(scene.t / tau) / np.log1p(scene.t[-1] / tau))[:, None]
+    scene.field = (
+        scene.field
+        + size * _direction(rng) * (np.log1p(scene.t / tau) / np.log1p(scene.t[-1] / tau))[:, None]
+    )
 
 
 def wires(scene: Scene, size: float, rng: Generator) -> None:
@@ -228,7 +236,9 @@ def late_stamps(scene: Scene, size: float, rng: Generator) -> None:  # noqa: ARG
 def core(scene: Scene, size: float, rng: Generator) -> None:
     """The feedback's finite gain lets the core's curve through; size in nT at 50,000 nT."""
     a, b = rng.normal(0, 1, 3), rng.normal(0, 1, 3)
-    scene.bend.append(lambda H: H - size * (a * (H / 5e4) ** 2 + b * np.tan(np.clip(H / 5e4, -1.2, 1.2)) / 1.5574))
+    scene.bend.append(
+        lambda H: H - size * (a * (H / 5e4) ** 2 + b * np.tan(np.clip(H / 5e4, -1.2, 1.2)) / 1.5574)
+    )
 
 
 def rail(scene: Scene, size: float, rng: Generator) -> None:  # noqa: ARG001  (the rail is where it is)
@@ -272,7 +282,9 @@ def bad_map(scene: Scene, size: float, rng: Generator) -> None:
     for _ in range(3):
         k = rng.integers(len(north))
         far = (north - north[k]) ** 2 + (east - east[k]) ** 2
-        scene.reference = scene.reference + size * rng.normal() * np.exp(-0.5 * far / (width * rng.uniform(0.5, 1.0)) ** 2)
+        scene.reference = scene.reference + size * rng.normal() * np.exp(
+            -0.5 * far / (width * rng.uniform(0.5, 1.0)) ** 2
+        )
 
 
 def wrong_level(scene: Scene, size: float, rng: Generator) -> None:
@@ -295,7 +307,9 @@ def bit_flips(scene: Scene, size: float, rng: Generator) -> None:
     def bend(H: Array) -> Array:
         rows = rng.choice(len(H) // 4, 12, replace=False) * 4
         out = H.copy()
-        out[rows, rng.integers(0, 3, 12)] += size * rng.choice([-1.0, 1.0], 12) * 2.0 ** rng.integers(0, 3, 12)
+        out[rows, rng.integers(0, 3, 12)] += (
+            size * rng.choice([-1.0, 1.0], 12) * 2.0 ** rng.integers(0, 3, 12)
+        )
         return out
 
     scene.bend.append(bend)
@@ -396,7 +410,11 @@ def disturb(twin: Twin, hidden: tuple[Hidden, ...], track: Track, when: Array, s
     out = replace(twin, scenario=msgspec.structs.replace(twin.scenario, instrument=tap)).measure(track, when)
     scene = scenes[0]
     # the truth is larger than the reference by so much
-    out["reference_field"] = ("time", out["reference_field"].to_numpy() - scene.reference, out["reference_field"].attrs)
+    out["reference_field"] = (
+        "time",
+        out["reference_field"].to_numpy() - scene.reference,
+        out["reference_field"].attrs,
+    )
     seen = np.clip(when - scene.late, 0.0, None)
     logged = dict(scene.logged)
     if scene.late:

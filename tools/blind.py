@@ -55,7 +55,9 @@ def vehicle(seed: int) -> tuple[Twin, Track, Array, Calibration]:
         base,
         instrument=replace(instrument, noise_sigma=0.0),
         world=replace(base.world, water=water),
-        mission=(CrissCross(hours=HOURS, roll=(0.0, 4.0), pitch=(24.0, 3.0), battery_spread=0.12, duration=700.0),),
+        mission=(
+            CrissCross(hours=HOURS, roll=(0.0, 4.0), pitch=(24.0, 3.0), battery_spread=0.12, duration=700.0),
+        ),
     )
     twin = Twin.draw(quiet, seed)
     track = twin.fly()
@@ -160,7 +162,13 @@ def plan(cases: int) -> list[dict[str, Any]]:
         made.append({"names": (), "wanted": 0.0, "noise": NOISES[k % len(NOISES)]})
     for k in range(cases // 2):
         sizes = (8.0, 8.0, 4.0, 8.0, 25.0, 8.0, 3.0, 100.0, 8.0, 5.5)
-        made.append({"names": (names[k % len(names)],), "wanted": sizes[k // len(names) % len(sizes)], "noise": NOISES[int(rng.integers(2))]})
+        made.append(
+            {
+                "names": (names[k % len(names)],),
+                "wanted": sizes[k // len(names) % len(sizes)],
+                "noise": NOISES[int(rng.integers(2))],
+            }
+        )
     for k in range(cases // 8):
         name = names[k % (len(names) - 1)]
         if k % 3 == 2:
@@ -201,26 +209,58 @@ def lines(rows: list[dict[str, Any]]) -> list[str]:
     nulls = [r for r in rows if not r["names"]]
     add("false alarm on nulls", "at most 1 %", share(nulls, lambda r: r["verdict"] != "nothing_found"))
     for noise in NOISES:
-        add(f"... {noise}", "", share([r for r in nulls if r["noise"] == noise], lambda r: r["verdict"] != "nothing_found"))
+        add(
+            f"... {noise}",
+            "",
+            share([r for r in nulls if r["noise"] == noise], lambda r: r["verdict"] != "nothing_found"),
+        )
     single = [r for r in rows if len(r["names"]) == 1 and not r["without"] and r["names"][0] in EFFECTS]
     for size in sorted({r["wanted"] for r in single}):
-        add(f"detection at S/N {size:g}", "95 % at 8", share([r for r in single if r["wanted"] == size], lambda r: r["verdict"] != "nothing_found"))
+        add(
+            f"detection at S/N {size:g}",
+            "95 % at 8",
+            share([r for r in single if r["wanted"] == size], lambda r: r["verdict"] != "nothing_found"),
+        )
     loud = [r for r in single if r["wanted"] == 8.0]
     add("S/N 8: named alone and right", "90 % where theory allows", share(loud, right_alone))
     add("S/N 8: the set holds the truth", "97 %", share(loud, lambda r: r["names"][0] in sets_of(r)))
     named = [len(sets_of(r)) for r in loud if r["found"]]
-    out.append(f"| S/N 8: mean size of the set | 1.5 where separable | {np.mean(named) if named else 0:.2f} | {len(named)} |")
+    out.append(
+        f"| S/N 8: mean size of the set | 1.5 where separable | {np.mean(named) if named else 0:.2f} | {len(named)} |"
+    )
     unknown = [r for r in rows if r["without"] or (r["names"] and r["names"][0] in FOREIGN)]
-    add("unknown at S/N 10: 'unexplained'", "90 %", share(unknown, lambda r: r["verdict"] in ("unexplained", "partly_explained")))
+    add(
+        "unknown at S/N 10: 'unexplained'",
+        "90 %",
+        share(unknown, lambda r: r["verdict"] in ("unexplained", "partly_explained")),
+    )
     add("unknown at S/N 10: a wrong name", "at most 5 %", share(unknown, lambda r: bool(r["found"])))
     pairs = [r for r in rows if len(r["names"]) == 2]
     add("two at S/N 10: both in the sets", "80 %", share(pairs, lambda r: set(r["names"]) <= sets_of(r)))
-    out += ["", "| hidden (S/N 8) | cases | found | named alone, right | in the set | else |", "|---|---|---|---|---|---|"]
+    out += [
+        "",
+        "| hidden (S/N 8) | cases | found | named alone, right | in the set | else |",
+        "|---|---|---|---|---|---|",
+    ]
     for name in EFFECTS:
         own = [r for r in loud if r["names"] == [name]]
-        other = sorted({c for r in own for c in causes_of(r) - {name}} | {r["unexplained"]["kind"] for r in own if r["unexplained"]})
-        found, alone, inside = (share(own, good)[0] for good in (lambda r: r["verdict"] != "nothing_found", right_alone, lambda r, name=name: name in sets_of(r)))
-        out.append(f"| {name} | {len(own)} | {found:.0%} | {alone:.0%} | {inside:.0%} | {', '.join(other)} |" if own else f"| {name} | 0 | | | | |")
+        other = sorted(
+            {c for r in own for c in causes_of(r) - {name}}
+            | {r["unexplained"]["kind"] for r in own if r["unexplained"]}
+        )
+        found, alone, inside = (
+            share(own, good)[0]
+            for good in (
+                lambda r: r["verdict"] != "nothing_found",
+                right_alone,
+                lambda r, name=name: name in sets_of(r),
+            )
+        )
+        out.append(
+            f"| {name} | {len(own)} | {found:.0%} | {alone:.0%} | {inside:.0%} | {', '.join(other)} |"
+            if own
+            else f"| {name} | 0 | | | | |"
+        )
     return out
 
 
@@ -234,7 +274,13 @@ def plot(rows: list[dict[str, Any]], path: Path) -> None:
     names = [name for name in EFFECTS if name != "outliers"]
     measured = np.zeros((len(names), len(names)))
     for r in rows:
-        if len(r["names"]) == 1 and r["wanted"] == 8.0 and r["names"][0] in names and r["found"] and r["found"][0][0] in names:
+        if (
+            len(r["names"]) == 1
+            and r["wanted"] == 8.0
+            and r["names"][0] in names
+            and r["found"]
+            and r["found"][0][0] in names
+        ):
             measured[names.index(r["names"][0]), names.index(r["found"][0][0])] += 1.0
     measured /= np.maximum(measured.sum(axis=1, keepdims=True), 1.0)
     twin, track, when, calibration = vehicle(0)
@@ -244,7 +290,9 @@ def plot(rows: list[dict[str, Any]], path: Path) -> None:
     predicted = confusion(report.correlation[np.ix_(first, first)], 8.0)
     labels = [listed[k] for k in first]
     figure = Figure(figsize=(15, 7.5), layout="constrained")
-    for axis, matrix, ticks, title in zip(figure.subplots(1, 2), (predicted, measured), (labels, names), ("predicted", "measured"), strict=True):
+    for axis, matrix, ticks, title in zip(
+        figure.subplots(1, 2), (predicted, measured), (labels, names), ("predicted", "measured"), strict=True
+    ):
         axis.imshow(matrix, cmap="Blues", vmin=0.0, vmax=1.0)
         axis.set_xticks(range(len(ticks)), ticks, rotation=90)
         axis.set_yticks(range(len(ticks)), ticks)
@@ -256,16 +304,24 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--cases", type=int, default=400)
     parser.add_argument("--out", type=Path, default=Path("study"))
-    parser.add_argument("--scheduler", default="", help="address of a dask scheduler; a local cluster if not given")
+    parser.add_argument(
+        "--scheduler", default="", help="address of a dask scheduler; a local cluster if not given"
+    )
     parser.add_argument("--workers", type=int, default=2)
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
     log = options.out / "cases.jsonl"
-    done = {row["number"]: row for row in map(json.loads, log.read_text().splitlines())} if log.exists() else {}
+    done = (
+        {row["number"]: row for row in map(json.loads, log.read_text().splitlines())} if log.exists() else {}
+    )
     todo = [entry for entry in plan(options.cases) if entry["number"] not in done]
     print(f"{len(done)} cases done, {len(todo)} to do")
     if todo:
-        cluster = None if options.scheduler else LocalCluster(n_workers=options.workers, threads_per_worker=1, dashboard_address=None)
+        cluster = (
+            None
+            if options.scheduler
+            else LocalCluster(n_workers=options.workers, threads_per_worker=1, dashboard_address=None)
+        )
         with Client(options.scheduler or cluster) as client, log.open("a") as file:
             client.run(sys.path.insert, 0, str(Path(__file__).parent))
             futures = client.map(run_case, todo, pure=False)

@@ -80,7 +80,9 @@ def of_effect(
     cause: str = effect.cause  # type: ignore[attr-defined]
     if not names:
         powers = effect.size // 3
-        names = tuple(axis + (str(power + 1) if powers > 1 else "") for power in range(powers) for axis in AXES)
+        names = tuple(
+            axis + (str(power + 1) if powers > 1 else "") for power in range(powers) for axis in AXES
+        )
     return Candidate(
         cause, channel, lambda rows: bare(rows) * widths, widths, names, (unit,) * effect.size, effect, **more
     )  # fmt: skip

@@ -25,7 +25,7 @@ __all__ = ["CAUSES", "Cause"]
 
 FloatArray = NDArray[np.float64]
 
-LAGS = (0.0, 600.0, 1800.0, 5400.0, 16200.0, 43200.0)
+LAGS = (0.0, 900.0, 3600.0, 12000.0, 40000.0)
 ONSETS = 40
 
 
@@ -47,9 +47,9 @@ class Cause(NamedTuple):
     separated_by: str
 
 
-def _channels(problem: Problem, kind: str, *, parameters: bool = False) -> list[str]:
+def _channels(problem: Problem, kind: str) -> list[str]:
     own = {parameter.name for parameter in problem.calibration.parameters}
-    return [name for name, c in problem.survey.channels.items() if kind in c.kinds and (parameters or name not in own)]
+    return [name for name, c in problem.survey.channels.items() if kind in c.kinds and name not in own]
 
 
 def _range(problem: Problem, name: str) -> tuple[float, float]:
@@ -63,7 +63,7 @@ def _origins(problem: Problem, name: str) -> list[float]:
     middle = float(np.mean(problem.survey.channels[name].values))
     if problem.survey.learned.any():  # then the data hold the calibration's own values of it
         return [middle]
-    return [middle, low, high, 2 * low - high, 2 * high - low]
+    return [middle, 2 * low - high, 2 * high - low]
 
 
 def _thermal(problem: Problem, on: Literal["offset", "scale"]) -> list[Candidate]:
@@ -83,7 +83,14 @@ def _thermal(problem: Problem, on: Literal["offset", "scale"]) -> list[Candidate
             shape = {"origin": (origin, "degC"), "lag": (lag, "s")}
             phi = lagged(lag)
             return of_effect(
-                problem, effect, 5.0, unit, channel=name, shape=shape, again=again, phi=lambda rows: phi[:, rows] - origin
+                problem,
+                effect,
+                5.0,
+                unit,
+                channel=name,
+                shape=shape,
+                again=again,
+                phi=lambda rows: phi[:, rows] - origin,
             )
 
         lags = [lag for lag in LAGS if lag <= longest]
@@ -127,7 +134,9 @@ def offset_drift(problem: Problem) -> list[Candidate]:
     made = []
     for order, start in ((1, t[0]), (1, 0.5 * (t[0] + t[-1])), (2, t[0])):
         effect = TimeEffect(cause="offset_drift", shape="drift", start=float(start), period=span, order=order)
-        phi = lambda rows, order=order, start=start: np.stack([((t[rows] - start) / span) ** (k + 1) for k in range(order)])  # noqa: E731
+        phi = lambda rows, order=order, start=start: np.stack(
+            [((t[rows] - start) / span) ** (k + 1) for k in range(order)]
+        )  # noqa: E731
         made.append(of_effect(problem, effect, 50.0, f"nT in {span / 3600:.3g} h", phi=phi))
     return made
 
@@ -162,9 +171,19 @@ def unmodelled_actuator(problem: Problem) -> list[Candidate]:
         scale = 0.5 * (high - low)
         centres = [0.5 * (low + high)] if problem.survey.learned.any() else [0.5 * (low + high), low, high]
         for order, centre in product((1, 2, 3), centres):
-            effect = PowersEffect(cause="unmodelled_actuator", channel=name, centre=centre, scale=scale, order=order)
+            effect = PowersEffect(
+                cause="unmodelled_actuator", channel=name, centre=centre, scale=scale, order=order
+            )
             width = np.repeat(100.0 * 0.3 ** np.arange(order), 3)
-            made.append(of_effect(problem, effect, width, f"nT per {scale:.3g} {problem.survey.channels[name].unit}", channel=name))
+            made.append(
+                of_effect(
+                    problem,
+                    effect,
+                    width,
+                    f"nT per {scale:.3g} {problem.survey.channels[name].unit}",
+                    channel=name,
+                )
+            )
     return made
 
 
@@ -192,15 +211,18 @@ def actuator_order(problem: Problem) -> list[Candidate]:
 def hysteresis(problem: Problem) -> list[Candidate]:
     """Backlash of the drive, or steel remagnetised by its own motion: ``T += b (y - p) / width``, y the play of p."""
     made = []
-    for name in _channels(problem, "position", parameters=True):
+    # only of masses that are modelled: a wide play of another is that other itself
+    for name in (parameter.name for parameter in problem.calibration.parameters):
         low, high = _range(problem, name)
 
         def again(width: float, name: str = name) -> Candidate:
             effect = PlayEffect(cause="hysteresis", channel=name, width=width)
             unit = problem.survey.channels[name].unit
-            return of_effect(problem, effect, 50.0, "nT", channel=name, shape={"width": (width, unit)}, again=again)
+            return of_effect(
+                problem, effect, 50.0, "nT", channel=name, shape={"width": (width, unit)}, again=again
+            )
 
-        made += [again(share * (high - low)) for share in (0.05, 0.15, 0.4, 0.9)]
+        made += [again(share * (high - low)) for share in (0.05, 0.15, 0.3, 0.5)]
     return made
 
 
@@ -262,7 +284,9 @@ def nonlinearity(problem: Problem) -> list[Candidate]:
     for power in (2, 3):
         effect = ResponseEffect(cause="nonlinearity", unit=unit, power=power)
         phi = lambda rows, power=power: (H[rows].T / unit) ** power  # noqa: E731
-        made.append(of_effect(problem, effect, 50.0, f"nT at {unit:.0f} nT", phi=phi, shape={"power": (power, "1")}))
+        made.append(
+            of_effect(problem, effect, 50.0, f"nT at {unit:.0f} nT", phi=phi, shape={"power": (power, "1")})
+        )
     return made
 
 
@@ -300,16 +324,17 @@ def diurnal_variation(problem: Problem) -> list[Candidate]:
     t = problem.survey.time
     span = float(t[-1] - t[0])
     harmonics = [h for h in (1, 2, 3) if 86400.0 / h < 4.0 * span]
-    if not harmonics:
-        return []
+    made = []
+    for some in (harmonics[k:] for k in range(len(harmonics))):
 
-    def basis(rows: slice) -> FloatArray:
-        angle = 2.0 * np.pi * t[rows, None] / 86400.0 * np.array(harmonics)
-        return np.hstack([np.cos(angle), np.sin(angle)])
+        def basis(rows: slice, some: list[int] = some) -> FloatArray:
+            angle = 2.0 * np.pi * t[rows, None] / 86400.0 * np.array(some)
+            return np.hstack([np.cos(angle), np.sin(angle)])
 
-    names = tuple(f"{f} {24 // h} h" for f in ("cos", "sin") for h in harmonics)
-    width = np.tile(20.0 / np.array(harmonics), 2)
-    return [of_reference(problem, "diurnal_variation", basis, width, names)]
+        names = tuple(f"{f} {24 // h} h" for f in ("cos", "sin") for h in some)
+        width = np.tile(20.0 / np.array(some), 2)
+        made.append(of_reference(problem, "diurnal_variation", basis, width, names))
+    return made
 
 
 def map_error(problem: Problem) -> list[Candidate]:
@@ -323,10 +348,12 @@ def map_error(problem: Problem) -> list[Candidate]:
     u = (place - low) / max(float(size.max()), 1.0)
     made = []
     for highest in (1, 2, 3):
-        waves = [(i, j) for i in range(highest + 1) for j in range(highest + 1) if 0 < i + j]
+        waves = [(i, j) for i in range(highest + 1) for j in range(highest + 1) if i + j > 0]
 
         def basis(rows: slice, waves: list[tuple[int, int]] = waves) -> FloatArray:
-            return np.stack([np.cos(np.pi * i * u[rows, 0]) * np.cos(np.pi * j * u[rows, 1]) for i, j in waves], axis=1)
+            return np.stack(
+                [np.cos(np.pi * i * u[rows, 0]) * np.cos(np.pi * j * u[rows, 1]) for i, j in waves], axis=1
+            )
 
         width = np.array([40.0 / (i + j) for i, j in waves])
         names = tuple(f"north {i} east {j}" for i, j in waves)
@@ -336,7 +363,7 @@ def map_error(problem: Problem) -> list[Candidate]:
 
 def reference_bias(problem: Problem) -> list[Candidate]:
     """The reference is off by a constant: the main-field model at this site, some tens of nT."""
-    ones = ~problem.survey.learned[:, None] * 1.0
+    ones = (~problem.survey.learned[:, None]).astype(np.float64)
     return [of_reference(problem, "reference_bias", lambda rows: ones[rows], np.array([30.0]), ("bias",))]
 
 
@@ -392,7 +419,7 @@ CAUSES: dict[str, Cause] = {
     "current_field": Cause(current_field, "a current", "run the motor with its mass held, and hold the motor with its mass moved"),
     "unmodelled_actuator": Cause(unmodelled_actuator, "the position of something that moves", "move it at one attitude"),
     "actuator_order": Cause(actuator_order, "a calibration with parameters", "move one mass in small steps over its whole range at one attitude"),
-    "hysteresis": Cause(hysteresis, "the position of something that moves", "approach one position from both sides"),
+    "hysteresis": Cause(hysteresis, "a calibration with parameters", "approach one position from both sides"),
     "eddy_current": Cause(eddy_current, "turns", "reverse the turn"),
     "channel_skew": Cause(channel_skew, "turns", "reverse the turn; roll about the axis that all channels share"),
     "filter_lag": Cause(filter_lag, "masses that move while sampled", "the filter's corner is known: switch it, or move an actuator by a step"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import msgspec
 import numpy as np
@@ -18,6 +19,9 @@ from magbridge.diagnose.joint import Joint, fit_joint
 from magbridge.diagnose.problem import Columns, Problem, derivatives, samples_of
 
 __all__ = ["extend", "settle"]
+
+STEPS = 4
+"""Linearisations at most; a second one is rarely needed."""
 
 FloatArray = NDArray[np.float64]
 
@@ -42,9 +46,13 @@ def extend(problem: Problem, model: Sequence[Candidate], fit: Joint) -> Calibrat
     for candidate in model:
         if candidate.cause == "reference_bias":
             sigma = float(np.sqrt(fit.covariance[q + at, q + at]) * widths[at])
-            reference = msgspec.structs.replace(reference, bias=reference.bias + float(b[at]), bias_sigma=sigma)
+            reference = msgspec.structs.replace(
+                reference, bias=reference.bias + float(b[at]), bias_sigma=sigma
+            )
         at += candidate.size
-    noise = msgspec.structs.replace(calibration.noise, sensor=min(calibration.noise.sensor, level(fit)) or level(fit))
+    noise = msgspec.structs.replace(
+        calibration.noise, sensor=min(calibration.noise.sensor, level(fit)) or level(fit)
+    )
     return replace(
         calibration,
         effects=(*calibration.effects, *(c.effect for c in model if c.effect is not None)),
@@ -61,14 +69,29 @@ def level(fit: Joint) -> float:
     return 1.4826 * float(np.median(np.abs(fit.left - np.median(fit.left))))
 
 
-def settle(problem: Problem, model: Sequence[Candidate], fit: Joint, order: int) -> tuple[Problem, list[Columns], Joint]:
-    """Linearise anew about the extended calibration, where a large effect has bent the magnitude, and fit once more.
+def settle(
+    problem: Problem, model: Sequence[Candidate], fit: Joint, order: int
+) -> tuple[Problem, list[Columns], Joint]:
+    """Linearise anew about the extended calibration, where a large effect has bent the magnitude, and fit again.
 
     Rates of change keep the columns of the search: a live effect's backward differences hold the sample's own noise.
     """
     columns = [candidate.columns for candidate in model]
     if not model or any(isinstance(c.effect, RateEffect) for c in model):
         return problem, columns, fit
+    settled = problem
+    for _ in range(STEPS):
+        before = fit
+        settled, columns, fit = _again(settled, model, fit, order)
+        if abs(fit.log_likelihood - before.log_likelihood) < 0.5:
+            break
+    return settled, columns, fit
+
+
+def _again(
+    problem: Problem, model: Sequence[Candidate], fit: Joint, order: int
+) -> tuple[Problem, list[Columns], Joint]:
+    """One step of Gauss and Newton on the whole model."""
     extended = extend(problem, model, fit)
     samples, coefficients = samples_of(problem.survey, extended)
     e, g = residuals(samples, coefficients)
@@ -87,8 +110,13 @@ def settle(problem: Problem, model: Sequence[Candidate], fit: Joint, order: int)
     X = np.hstack([free, *blocks])
     # what the residual would be at the first point, were it linear about this one; the reference was not mended in it
     c = np.append(fit.z, fit.coefficients)
-    own_part = np.concatenate([np.ones(len(fit.z), bool), *(np.full(m.size, m.effect is not None) for m in model)])
+    own_part = np.concatenate(
+        [np.ones(len(fit.z), bool), *(np.full(m.size, m.effect is not None) for m in model)]
+    )
     again = replace(problem, residual=e + X[:, own_part] @ c[own_part], free=free, slopes=g)
-    columns = [lambda rows, block=block: block[rows] for block in blocks]
+    columns: list[Columns] = [partial(_rows, block) for block in blocks]
     return again, columns, fit_joint(again, columns, order, c)
 
+
+def _rows(block: FloatArray, rows: slice) -> FloatArray:
+    return block[rows]

@@ -54,7 +54,7 @@ def _scale(diagnosis: Diagnosis) -> float:
 
 
 def measured(diagnosis: Diagnosis) -> str:
-    """Total field measured and simulated, and their difference before and after, over time."""
+    """Draw the total field measured and simulated, and their difference before and after, over time."""
     hours, survey, part = _hours(diagnosis), diagnosis.problem.survey, _thin(len(diagnosis.problem))
     figure, axes = _figure(10, 5.2, 2, 1, sharex=True, height_ratios=[1, 1.5])
     top, low = axes[:, 0]
@@ -63,7 +63,9 @@ def measured(diagnosis: Diagnosis) -> str:
     top.plot(hours[part], survey.reference[part], color=INK, linewidth=1.0, label="simulated (reference)")
     top.set_ylabel("total field (nT)", fontsize=9)
     low.plot(hours[part], diagnosis.before[part], ".", color=BEFORE, markersize=2, label="before")
-    low.plot(hours[part], diagnosis.after[part], ".", color=AFTER, markersize=2, label="after, dives left out")
+    low.plot(
+        hours[part], diagnosis.after[part], ".", color=AFTER, markersize=2, label="after, dives left out"
+    )
     for start in survey.time[np.flatnonzero(np.diff(survey.dive)) + 1]:
         low.axvline((start - survey.time[0]) / 3600.0, color=FAINT, linewidth=0.4)
     scale = _scale(diagnosis)
@@ -76,7 +78,7 @@ def measured(diagnosis: Diagnosis) -> str:
 
 
 def spectrum(diagnosis: Diagnosis) -> str:
-    """Spectral density of the difference, before and after, with the noise model's."""
+    """Draw the spectral density of the difference, before and after, with the noise model's."""
     survey = diagnosis.problem.survey
     interval = float(np.median(np.diff(survey.time)))
     figure, axes = _figure(5.6, 3.6)
@@ -86,7 +88,10 @@ def spectrum(diagnosis: Diagnosis) -> str:
         edges = np.unique(np.geomspace(1, len(frequency), 60).astype(int))
         where = [slice(a, b) for a, b in zip(edges[:-1], edges[1:], strict=True)]
         axis.loglog(
-            [frequency[w].mean() for w in where], [np.sqrt(power[w].mean()) for w in where], color=colour, label=label
+            [frequency[w].mean() for w in where],
+            [np.sqrt(power[w].mean()) for w in where],
+            color=colour,
+            label=label,
         )
     noise = diagnosis.fit.noise
     frequency = np.geomspace(1.0 / float(np.ptp(survey.time)), 0.5 / interval, 200)
@@ -103,7 +108,7 @@ def spectrum(diagnosis: Diagnosis) -> str:
 
 
 def channels(diagnosis: Diagnosis) -> str:
-    """The difference against each channel: means over twenty bins with their scatter."""
+    """Draw the difference against each channel: means over twenty bins with their scatter."""
     survey = diagnosis.problem.survey
     shown = {name: (channel.values, channel.unit) for name, channel in survey.channels.items()}
     if survey.attitude is not None:
@@ -133,7 +138,7 @@ def channels(diagnosis: Diagnosis) -> str:
 
 
 def track(diagnosis: Diagnosis) -> str | None:
-    """The difference along the track, before and after."""
+    """Draw the difference along the track, before and after."""
     place = diagnosis.problem.survey.place
     if place is None or np.ptp(place, axis=0).max() < 1.0:
         return None
@@ -141,9 +146,17 @@ def track(diagnosis: Diagnosis) -> str | None:
     figure, axes = _figure(10, 3.8, 1, 2, sharex=True, sharey=True)
     limit = float(np.quantile(np.abs(diagnosis.before), 0.98)) + 1e-9
     dots = None
-    for axis, values, title in zip(axes[0], (diagnosis.before, diagnosis.after), ("before", "after"), strict=True):
+    for axis, values, title in zip(
+        axes[0], (diagnosis.before, diagnosis.after), ("before", "after"), strict=True
+    ):
         dots = axis.scatter(
-            place[part, 1] / 1e3, place[part, 0] / 1e3, c=values[part], s=5, cmap="RdBu_r", vmin=-limit, vmax=limit
+            place[part, 1] / 1e3,
+            place[part, 0] / 1e3,
+            c=values[part],
+            s=5,
+            cmap="RdBu_r",
+            vmin=-limit,
+            vmax=limit,
         )
         axis.set_aspect("equal", adjustable="box")
         axis.set_title(title, fontsize=9)
@@ -155,7 +168,7 @@ def track(diagnosis: Diagnosis) -> str | None:
 
 
 def terms(diagnosis: Diagnosis) -> str | None:
-    """What each found cause adds to the total field, over time."""
+    """Draw what each found cause adds to the total field, over time."""
     if not diagnosis.named:
         return None
     hours, part = _hours(diagnosis), _thin(len(diagnosis.problem))
@@ -175,21 +188,23 @@ def terms(diagnosis: Diagnosis) -> str | None:
 
 
 def evidence(diagnosis: Diagnosis) -> str:
-    """How strongly the data speak for each cause alone."""
+    """Draw how strongly the data speak for each cause alone."""
     tested = diagnosis.outcome.tested
     order = sorted(tested, key=lambda name: tested[name][1])
     figure, axes = _figure(5.6, 0.6 + 0.24 * max(len(order), 1))
     axis = axes[0, 0]
     named = {h.candidate.cause for h in diagnosis.named}
     axis.barh(
-        order, [np.sqrt(tested[name][1]) for name in order], color=[AFTER if name in named else FAINT for name in order]
+        order,
+        [np.sqrt(tested[name][1]) for name in order],
+        color=[AFTER if name in named else FAINT for name in order],
     )
     axis.set_xlabel("root of the likelihood ratio, alone, noise fitted anew", fontsize=8)
     return _png(figure)
 
 
 def likeness(diagnosis: Diagnosis) -> str:
-    """Which causes look alike in this log, whatever it shows."""
+    """Draw which causes look alike in this log, whatever it shows."""
     visible, R = diagnosis.isolability.visible, diagnosis.isolability.correlation
     names = [v.cause + (f" · {v.channel}" if v.channel else "") for v in visible]
     size = 2.6 + 0.21 * len(names)

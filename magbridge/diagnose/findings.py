@@ -32,7 +32,7 @@ def findings(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> dict[str, Any
                 "channel": candidate.channel,
                 "signal_to_noise": _round(hypothesis.signal_to_noise),
                 "p_value": _round(hypothesis.p_value),
-                "alternatives": alternatives(hypothesis, rivals),
+                "alternatives": alternatives(rivals),
                 "separated_by": causes[candidate.cause].separated_by if rivals else None,
                 "parameters": parameters(diagnosis, hypothesis, at),
                 "gain": _gain(gain),
@@ -64,9 +64,8 @@ def findings_json(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> bytes:
     return msgspec.json.format(msgspec.json.encode(findings(diagnosis, causes)), indent=2) + b"\n"
 
 
-def alternatives(own: Hypothesis, rivals: tuple[Hypothesis, ...]) -> list[dict[str, Any]]:
+def alternatives(rivals: tuple[Hypothesis, ...]) -> list[dict[str, Any]]:
     """List the others within 20:1, the likeliest first."""
-    del own
     return [{"cause": h.candidate.cause, "channel": h.candidate.channel} for h in rivals]
 
 
@@ -80,7 +79,9 @@ def parameters(diagnosis: Diagnosis, hypothesis: Hypothesis, at: int) -> dict[st
         name: {"value": _round(v), "sigma": _round(s), "unit": unit}
         for name, v, s, unit in zip(candidate.names, value, sigma, candidate.units, strict=True)
     }
-    shape = {name: {"value": float(v), "sigma": None, "unit": unit} for name, (v, unit) in candidate.shape.items()}
+    shape = {
+        name: {"value": float(v), "sigma": None, "unit": unit} for name, (v, unit) in candidate.shape.items()
+    }
     return linear | shape
 
 

@@ -19,6 +19,7 @@ least squares of
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -89,8 +90,8 @@ class Noise:
         out = values[skip:].copy()
         past = self.past[rows]
         for k, a in enumerate(self.memory, start=1):
-            shifted = values[skip - k : len(values) - k] if skip >= k else np.roll(values, k, axis=0)[skip:]
-            out -= a * np.where(past[:, None], shifted, 0.0)
+            late = max(k - skip, 0)  # the first rows of all have no past
+            out[late:] -= (a * past[late:])[:, None] * values[skip + late - k : len(values) - k]
         factor = np.sqrt(self.kappa) * np.where(past, 1.0, self.share) / self.scale[rows]
         out *= factor[:, None]
         return out
@@ -105,7 +106,9 @@ def _past(follows: BoolArray, p: int) -> BoolArray:
     """Whether the p samples before are there, without a gap."""
     broken = np.flatnonzero(~follows)
     since = np.arange(len(follows)) - broken[np.searchsorted(broken, np.arange(len(follows)), "right") - 1]
-    return np.asarray(since >= p) if broken.size and not follows[0] else np.asarray(np.arange(len(follows)) >= p)
+    return (
+        np.asarray(since >= p) if broken.size and not follows[0] else np.asarray(np.arange(len(follows)) >= p)
+    )
 
 
 def memory_order(residual: FloatArray, follows: BoolArray) -> int:
@@ -129,7 +132,7 @@ FEW = 20
 
 
 def fit_noise(
-    residual: FloatArray, follows: BoolArray, order: int, *, blocks: bool | None = None, rounds: int = 4
+    residual: FloatArray, follows: BoolArray, order: int, *, blocks: bool | None = None, rounds: int = 3
 ) -> Noise:
     """Fit the noise model.
 
@@ -151,19 +154,30 @@ def fit_noise(
     block = np.minimum(np.arange(n) // BLOCK, max(n // BLOCK - 1, 0))
     weight, nu = np.ones(n), 1e6
     scale = np.full(n, 1.4826 * np.median(np.abs(residual)) + 1e-12)
-    lags = np.stack([residual[rows - k] for k in range(1, order + 1)], axis=1) if order else np.empty((rows.size, 0))
+    lags = (
+        np.stack([residual[rows - k] for k in range(1, order + 1)], axis=1)
+        if order
+        else np.empty((rows.size, 0))
+    )
     memory, share, v = np.zeros(order), 1.0, residual
+    tails: Sequence[float] = TAILS
     for _ in range(rounds):
         root = np.sqrt(weight[rows]) / scale[rows]
         if order and rows.size > 2 * order:
             memory = _stable(np.linalg.lstsq(lags * root[:, None], residual[rows] * root, rcond=None)[0])
         v = residual.copy()
         v[rows] -= lags @ memory
-        share = min(1.0, float(np.sqrt(np.median(v[rows] ** 2) / (np.median(residual**2) + 1e-300)))) if order else 1.0
+        share = (
+            min(1.0, float(np.sqrt(np.median(v[rows] ** 2) / (np.median(residual**2) + 1e-300))))
+            if order
+            else 1.0
+        )
         v[~past] *= share
         if blocks is None:
             blocks = _uneven(v, block)
-        nu, scale = _tails(v, block if blocks else np.zeros(n, np.int64), scale)
+        nu, scale = _tails(v, block if blocks else np.zeros(n, np.int64), scale, tails)
+        near = TAILS.index(nu)
+        tails = TAILS[max(near - 1, 0) : near + 2]
         weight = (nu + 1.0) / (nu + (v / scale) ** 2)
     x = v / scale
     log_likelihood = float(np.sum(_log_t(x, nu) - np.log(scale)) + np.log(share) * np.sum(~past))
@@ -195,22 +209,28 @@ def _uneven(v: FloatArray, block: NDArray[np.int64]) -> bool:
     mean = np.bincount(block, clipped) / count
     expected = clipped.var() / count
     chi2 = float(np.sum((mean - clipped.mean()) ** 2 / expected))
-    return chi2 > count.size + 4.0 * np.sqrt(2.0 * count.size)
+    return bool(chi2 > count.size + 4.0 * np.sqrt(2.0 * count.size))
 
 
-def _tails(v: FloatArray, block: NDArray[np.int64], start: FloatArray) -> tuple[float, FloatArray]:
+def _tails(
+    v: FloatArray, block: NDArray[np.int64], start: FloatArray, tails: Sequence[float]
+) -> tuple[float, FloatArray]:
     """Find the best tails and the level of each block, drawn towards the common one by as much as ten samples."""
     count = np.bincount(block)
     best: tuple[float, float, FloatArray] = (-np.inf, 1e6, start)
     common = float(np.median(np.abs(v))) * 1.4826 + 1e-12
-    for nu in TAILS:
+    for nu in tails:
         level = np.full(count.size, common)
         whole = common
         for _ in range(6 if nu < 1e5 else 2):
             x = v / level[block]
             weighted = np.bincount(block, (nu + 1.0) / (nu + x * x) * v * v)
             whole = float(np.sqrt(weighted.sum() / len(v))) + 1e-12
-            level = np.sqrt((weighted + 10.0 * whole**2) / (count + 10.0)) if count.size > 1 else np.array([whole])
+            level = (
+                np.sqrt((weighted + 10.0 * whole**2) / (count + 10.0))
+                if count.size > 1
+                else np.array([whole])
+            )
         scale = level[block]
         value = float(np.sum(_log_t(v / scale, nu) - np.log(scale)))
         if value > best[0] + 1e-9:

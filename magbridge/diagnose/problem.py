@@ -26,7 +26,16 @@ from magbridge.calibration.residual import Samples, residuals, whiten
 from magbridge.calibration.terms import Effect
 from magbridge.diagnose.survey import Survey
 
-__all__ = ["Columns", "Problem", "add_effects", "derivatives", "effect_columns", "history", "pose", "samples_of"]
+__all__ = [
+    "Columns",
+    "Problem",
+    "add_effects",
+    "derivatives",
+    "effect_columns",
+    "history",
+    "pose",
+    "samples_of",
+]
 
 FloatArray = NDArray[np.float64]
 Columns = Callable[[slice], FloatArray]
@@ -35,7 +44,7 @@ Columns = Callable[[slice], FloatArray]
 CHUNK = 8192
 SEEN = 0.01
 """Share of a prior's information that data must add for its direction to be kept."""
-BROADEST = 1e-4
+BROADEST = 1e-2
 """Precision, of the posterior's, below which a direction that only the given logs determined is not let."""
 
 
@@ -93,8 +102,15 @@ def add_effects(calibration: Calibration, effects: tuple[Effect, ...]) -> Calibr
 
 def history(survey: Survey, calibration: Calibration, effect: Effect) -> FloatArray:
     """(r, n) regressors of one effect along the survey, stepped as the bridge would."""
-    probe = add_effects(replace(calibration, effects=(), coefficients=calibration.coefficients[: _terms(calibration)],
-                                covariance=calibration.covariance[: _terms(calibration), : _terms(calibration)]), (effect,))
+    probe = add_effects(
+        replace(
+            calibration,
+            effects=(),
+            coefficients=calibration.coefficients[: _terms(calibration)],
+            covariance=calibration.covariance[: _terms(calibration), : _terms(calibration)],
+        ),
+        (effect,),
+    )
     step = effect.begin(probe)
     channels = survey.values(probe.channels)
     times = np.rint(survey.time * 1e6).astype(np.int64).tolist()
@@ -102,7 +118,9 @@ def history(survey: Survey, calibration: Calibration, effect: Effect) -> FloatAr
     return np.array([step(*row) for row in rows]).T
 
 
-def effect_columns(problem: Problem, effect: Effect, phi: FloatArray | Callable[[slice], FloatArray]) -> Columns:
+def effect_columns(
+    problem: Problem, effect: Effect, phi: FloatArray | Callable[[slice], FloatArray]
+) -> Columns:
     """Return what an effect's coefficients leave, from its regressors (r, n) or a function of the rows."""
     tensor = effect.columns(problem.calibration.reference.field)
     slots = np.flatnonzero(np.abs(tensor).sum(axis=(0, 1)))
@@ -110,7 +128,8 @@ def effect_columns(problem: Problem, effect: Effect, phi: FloatArray | Callable[
 
     def columns(rows: slice) -> FloatArray:
         part = phi(rows) if callable(phi) else phi[:, rows]
-        return np.asarray(np.einsum("rt,ts,krs->tk", part, problem.slopes[rows][:, slots], -tensor, optimize=True))
+        slopes = problem.slopes[rows][:, slots]
+        return np.asarray(-sum((phi_r[:, None] * slopes) @ tensor[:, r].T for r, phi_r in enumerate(part)))
 
     return columns
 

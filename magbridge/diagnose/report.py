@@ -33,7 +33,9 @@ td.n{text-align:right;font-variant-numeric:tabular-nums}.verdict{font-size:1.1re
 def report_html(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> str:
     """Return the page."""
     survey = diagnosis.problem.survey
-    first, last = (datetime.fromtimestamp(float(t), UTC).strftime("%Y-%m-%d %H:%M") for t in survey.time[[0, -1]])
+    first, last = (
+        datetime.fromtimestamp(float(t), UTC).strftime("%Y-%m-%d %H:%M") for t in survey.time[[0, -1]]
+    )
     body = [
         f"<h1>Diagnosis of {escape(survey.source)}</h1>",
         f'<p class="faint">{first} to {last} UTC · {len(survey)} samples in {np.unique(survey.dive).size} dives · '
@@ -73,7 +75,9 @@ def _figure(png: str | None, caption: str) -> str:
 
 def _name(hypothesis: Hypothesis) -> str:
     channel = hypothesis.candidate.channel
-    return f"<b>{hypothesis.candidate.cause.replace('_', ' ')}</b>" + (f" ({escape(channel)})" if channel else "")
+    return f"<b>{hypothesis.candidate.cause.replace('_', ' ')}</b>" + (
+        f" ({escape(channel)})" if channel else ""
+    )
 
 
 def _verdict(diagnosis: Diagnosis) -> str:
@@ -106,9 +110,10 @@ def _found(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> list[str]:
             for name, value in parameters(diagnosis, hypothesis, at).items()
         )
         at += candidate.size
-        others = alternatives(hypothesis, rivals)
+        others = alternatives(rivals)
         listed = ", ".join(
-            o["cause"].replace("_", " ") + (f" ({escape(o['channel'])})" if o["channel"] else "") for o in others
+            o["cause"].replace("_", " ") + (f" ({escape(o['channel'])})" if o["channel"] else "")
+            for o in others
         )
         doubt = (
             f"<p>The data cannot tell it from {listed} (odds below 20:1). What would: {escape(causes[candidate.cause].separated_by)}.</p>"
@@ -163,14 +168,20 @@ def _isolability(diagnosis: Diagnosis) -> list[str]:
         for v in report.visible
     )
     pairs = "".join(
-        f'<tr><td>{escape(a)}</td><td>{escape(b)}</td><td class="n">{rho:.3f}</td></tr>' for a, b, rho in report.pairs[:20]
+        f'<tr><td>{escape(a)}</td><td>{escape(b)}</td><td class="n">{rho:.3f}</td></tr>'
+        for a, b, rho in report.pairs[:20]
     )
-    missing = "; ".join(f"{name.replace('_', ' ')}: {escape(needs)}" for name, needs in report.untestable.items())
+    missing = "; ".join(
+        f"{name.replace('_', ' ')}: {escape(needs)}" for name, needs in report.untestable.items()
+    )
     return [
         '<p class="faint">From telemetry, attitude and noise alone: the size of each effect that would be found in 95 of 100 '
         "deployments like this one, and which causes look alike in it.</p>",
         f"<table><tr><th>cause</th><th>50 % at S/N</th><th>95 % at S/N</th><th>seen from</th></tr>{rows}</table>",
         f"<h3>Look alike</h3><table>{pairs}</table>" if pairs else "",
         f"<p>Not testable here, and what it would take: {missing}.</p>" if missing else "",
-        _figure(figures.likeness(diagnosis), "How alike the signatures of two causes are in this log, calibration free."),
+        _figure(
+            figures.likeness(diagnosis),
+            "How alike the signatures of two causes are in this log, calibration free.",
+        ),
     ]

@@ -163,7 +163,9 @@ def diagnose(
     return diagnosis
 
 
-def write(diagnosis: Diagnosis, out_dir: str | os.PathLike[str], causes: Mapping[str, Cause] = CAUSES) -> None:
+def write(
+    diagnosis: Diagnosis, out_dir: str | os.PathLike[str], causes: Mapping[str, Cause] = CAUSES
+) -> None:
     """Write ``findings.json``, ``calibration.json`` and ``report.html``, each whole or not at all."""
     from magbridge.diagnose.report import report_html  # noqa: PLC0415  (matplotlib only where a report is wanted)
 
@@ -187,7 +189,11 @@ def _accept(
     loudest = max(h.signal_to_noise for h in outcome.chosen)
     if rest is not None and rest.signal_to_noise < REMAINDER * loudest:
         rest = None
-    free = leftover(problem, [], outcome.null, outcome.order, tone) if rest is not None or len(model) == 1 else None
+    free = (
+        leftover(problem, [], outcome.null, outcome.order, tone)
+        if rest is not None or len(model) == 1
+        else None
+    )
     beaten = free is not None and free.evidence > sum(h.evidence for h in outcome.chosen) + ODDS
     if (rest is not None and rest.signal_to_noise > SHARE * loudest) or beaten:
         return (), (), outcome.null, free or rest
@@ -202,13 +208,19 @@ def _without(fit: Joint, model: Sequence[Candidate], k: int) -> Joint:
 
 
 def _isolability(
-    problem: Problem, outcome: Outcome, candidates: list[Candidate], causes: Mapping[str, Cause], untestable: dict[str, str]
+    problem: Problem,
+    outcome: Outcome,
+    candidates: list[Candidate],
+    causes: Mapping[str, Cause],
+    untestable: dict[str, str],
 ) -> Isolability:
     """Of the search's own columns, under the noise that is left: what it could have seen."""
     fit = outcome.fit
     base = Joint(0.0, problem.centre, np.empty(0), np.empty((0, 0)), fit.noise, fit.left)
     info = information(problem, fit.noise, base, [], [c.columns for c in candidates])
-    return isolability(candidates, info, trials(info, candidates, slices(candidates)), len(causes), untestable)
+    return isolability(
+        candidates, info, trials(info, candidates, slices(candidates)), len(causes), untestable
+    )
 
 
 def _verdict(named: Sequence[Hypothesis], wrong: Outliers | None, rest: Leftover | None) -> str:

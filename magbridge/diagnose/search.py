@@ -39,7 +39,7 @@ LEVEL = 0.01
 ODDS = np.log(20.0)
 """Log evidence by which a cause must win to be named alone."""
 SIMULATIONS = 400
-SHORT_LIST = 10
+SHORT_LIST = 9
 """Causes that are fitted jointly in a round."""
 IDEAL = 0.15
 """How far from the truth an idealised regressor may be: what is left of a large effect is not another cause."""
@@ -47,6 +47,8 @@ IMPLAUSIBLE = 30.0
 """Times the plausible size, 1-sigma of what is believed at all."""
 SHARPEN = 4
 """Halvings of a nonlinear parameter's bracket."""
+STARTS = 3
+"""Causes that a chain of several may begin with."""
 MOST = 5
 """Causes in one log."""
 
@@ -64,22 +66,25 @@ class Hypothesis:
         Log Bayes factor against the model so far.
     p_value : float
         Look-elsewhere and number of causes included.
-    fit : Joint or None
+    fit : Joint
+    price : float
+        Log evidence, below 0, that its nonlinear parameters cost: 0 would be had they been known.
     """
 
     candidate: Candidate
     ratio: float
     evidence: float
     p_value: float
-    fit: Joint | None = None
+    fit: Joint
+    price: float = 0.0
 
     @property
     def signal_to_noise(self) -> float:
         """Whitened norm of what is the effect's own under the noise that is left, less what noise alone gives."""
-        assert self.fit is not None
         k = self.candidate.size
         b, own = self.fit.coefficients[-k:], self.fit.covariance[-k:, -k:]
-        return float(np.sqrt(max(b @ np.linalg.solve(own, b) - k, 0.0)))
+        power = float(b @ np.linalg.solve(own, b)) - k
+        return float(np.sqrt(power)) if power > 0.0 else 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,11 +147,13 @@ def weigh(ratio: float, freedom: int) -> float:
 def slices(candidates: Sequence[Candidate]) -> list[slice]:
     """Where each candidate's columns stand."""
     ends = np.cumsum([candidate.size for candidate in candidates])
-    return [slice(int(end) - candidate.size, int(end)) for end, candidate in zip(ends, candidates, strict=True)]
+    return [
+        slice(int(end) - candidate.size, int(end)) for end, candidate in zip(ends, candidates, strict=True)
+    ]
 
 
 def trials(info: Information, candidates: Sequence[Candidate], at: Sequence[slice]) -> dict[str, float]:
-    """Number of independent hypotheses behind each cause."""
+    """Return the number of independent hypotheses behind each cause."""
     rng = np.random.default_rng(20131211)  # the same answer every time
     found = {}
     for cause in dict.fromkeys(candidate.cause for candidate in candidates):
@@ -174,7 +181,7 @@ class _Search:
         self.at = slices(self.candidates)
         self.trials: dict[str, float] = {}
 
-    def fit(self, model: Sequence[Candidate], start: FloatArray | None = None, rounds: int = 6) -> Joint:
+    def fit(self, model: Sequence[Candidate], start: FloatArray | None = None, rounds: int = 4) -> Joint:
         return fit_joint(self.problem, [c.columns for c in model], self.order, start, rounds=rounds)
 
     def round(self, model: list[Candidate], base: Joint) -> list[Hypothesis]:
@@ -195,7 +202,9 @@ class _Search:
                 top = int(np.argmax(evidences))
                 # the grid's average, as against its best: what the nonlinear parameters cost
                 average = float(np.log(np.mean(np.exp(evidences - evidences[top]))))
-                best.setdefault(group, []).append((evidences[top], average, members[top], scores[members[top]]))
+                best.setdefault(group, []).append(
+                    (evidences[top], average, members[top], scores[members[top]])
+                )
         listed = sorted(best.items(), key=lambda item: -max(entry[0] for entry in item[1]))
         found = [self._joint(model, base, entries) for _, entries in listed[:SHORT_LIST]]
         return sorted(found, key=lambda h: -h.evidence)
@@ -221,7 +230,9 @@ class _Search:
             rounds=2,
         )
         columns = [c.columns for c in model]
-        return information(self.problem, everything.noise, base, columns, [c.columns for c in self.candidates])
+        return information(
+            self.problem, everything.noise, base, columns, [c.columns for c in self.candidates]
+        )
 
     def _joint(
         self, model: list[Candidate], base: Joint, entries: list[tuple[float, float, int, Score]]
@@ -240,11 +251,11 @@ class _Search:
             evidence = weigh(ratio, s.freedom) + average - 0.5 * float(np.sum((b / IMPLAUSIBLE) ** 2))
             if candidate.trials > 1.0:
                 evidence -= float(np.log(candidate.trials))
-            found.append(Hypothesis(candidate, ratio, evidence, p_value, fit))
+            found.append(Hypothesis(candidate, ratio, evidence, p_value, fit, average))
         return max(found, key=lambda h: h.evidence)
 
     def place_of(self, model: list[Candidate], k: int) -> list[Hypothesis]:
-        """What could stand where the k-th of `model` stands."""
+        """Return what could stand where the k-th of `model` stands."""
         others = model[:k] + model[k + 1 :]
         return self.round(others, self.fit(others))
 
@@ -255,7 +266,9 @@ class _Search:
         if again is None:
             return best
         for position, name in enumerate(best.candidate.shape):
-            grid = sorted({c.shape[name][0] for c in self.candidates if (c.cause, c.channel) == _key(best.candidate)})
+            grid = sorted(
+                {c.shape[name][0] for c in self.candidates if (c.cause, c.channel) == _key(best.candidate)}
+            )
             here = best.candidate.shape[name][0]
             low = max((v for v in grid if v < here), default=here - 0.5 * (grid[-1] - grid[0]))
             high = min((v for v in grid if v > here), default=here + 0.5 * (grid[-1] - grid[0]))
@@ -267,14 +280,20 @@ class _Search:
                     values = [v for v, _ in best.candidate.shape.values()]
                     values[position] = low + share * (high - low)
                     candidate = again(*values)
-                    start = np.concatenate([base.z, base.coefficients, best.fit.coefficients[-candidate.size :]])  # type: ignore[union-attr]
+                    start = np.concatenate(
+                        [base.z, base.coefficients, best.fit.coefficients[-candidate.size :]]
+                    )
                     fit = self.fit([*model, candidate], start, rounds=2)
                     gain = 2.0 * (fit.log_likelihood - base.log_likelihood) - best.ratio
                     tried.append((gain, values[position], candidate, fit))
                 gain, value, candidate, fit = max(tried, key=lambda entry: entry[0])
                 if gain > 0.0:
                     best = replace(
-                        best, candidate=candidate, fit=fit, ratio=best.ratio + gain, evidence=best.evidence + 0.5 * gain
+                        best,
+                        candidate=candidate,
+                        fit=fit,
+                        ratio=best.ratio + gain,
+                        evidence=best.evidence + 0.5 * gain,
                     )
                 quarter = 0.25 * (high - low)
                 low, high = max(low, value - quarter), min(high, value + quarter)
@@ -282,7 +301,7 @@ class _Search:
 
     @property
     def span(self) -> float:
-        """s."""
+        """S."""
         return float(np.ptp(self.problem.survey.time))
 
 
@@ -304,30 +323,54 @@ def search(problem: Problem, candidates: Sequence[Candidate], causes: int) -> Ou
     rough = fit_joint(problem, [], 1, rounds=2)
     order = memory_order(rough.left, problem.survey.follows)
     state = _Search(problem, candidates, order, causes)
-    null = base = state.fit([])
+    null = state.fit([])
+    first = state.round([], null) if candidates else []
+    tested: dict[str, tuple[float, float]] = {}
+    for h in first:
+        if h.p_value <= tested.get(h.candidate.cause, (np.inf, 0.0))[0]:
+            tested[h.candidate.cause] = (h.p_value, h.ratio)
+    chosen, model, base = _chain(state, null, first)
+    if (
+        len(chosen) > 1
+    ):  # the first step may have gone astray where several causes act: begin with others, too
+        kinds = {h.candidate.cause: h for h in reversed(first) if h.p_value < LEVEL}
+        others = [h for cause, h in kinds.items() if cause != first[0].candidate.cause]
+        others = sorted(others, key=lambda h: -h.evidence)[: STARTS - 1]
+        chains = [(chosen, model, base), *(_chain(state, null, [h]) for h in others)]
+        chosen, model, base = max(
+            chains,
+            key=lambda chain: weigh(
+                2.0 * (chain[2].log_likelihood - null.log_likelihood), sum(c.size for c in chain[1])
+            ),
+        )
+    rivals = []
+    for k, own in enumerate(chosen):
+        others = [h for h in state.place_of(model, k) if _key(h.candidate) != _key(own.candidate)]
+        # a rival has the benefit of the doubt about its nonlinear parameters
+        rivals.append(
+            tuple(h for h in others if h.evidence - h.price > own.evidence - ODDS and h.p_value < LEVEL)
+        )
+    return Outcome(tuple(chosen), tuple(rivals), null, base, order, tested)
+
+
+def _chain(
+    state: _Search, null: Joint, first: list[Hypothesis]
+) -> tuple[list[Hypothesis], list[Candidate], Joint]:
+    """Add cause after cause while one passes the test, beginning with the best of `first`; drop what became needless."""
     chosen: list[Hypothesis] = []
     model: list[Candidate] = []
-    tested: dict[str, tuple[float, float]] = {}
-    while len(chosen) < MOST and candidates:
-        found = state.round(model, base)
-        for h in found:
-            if not chosen and h.p_value <= tested.get(h.candidate.cause, (np.inf, 0.0))[0]:
-                tested[h.candidate.cause] = (h.p_value, h.ratio)
+    base, found = null, first
+    while len(chosen) < MOST:
         sure = [h for h in found if h.p_value < LEVEL]
         loudest = max((h.signal_to_noise for h in chosen), default=0.0)
         if not sure or sure[0].signal_to_noise < IDEAL * loudest:
             break
         best = state.sharpen(model, sure[0], base)
-        assert best.fit is not None
         chosen.append(best)
         model.append(best.candidate)
         base = best.fit
-    chosen, model, base = _remove(state, chosen, model, base)
-    rivals = []
-    for k, own in enumerate(chosen):
-        others = [h for h in state.place_of(model, k) if _key(h.candidate) != _key(own.candidate)]
-        rivals.append(tuple(h for h in others if h.evidence > own.evidence - ODDS))
-    return Outcome(tuple(chosen), tuple(rivals), null, base, order, tested)
+        found = state.round(model, base) if len(chosen) < MOST else []
+    return _remove(state, chosen, model, base)
 
 
 def _remove(

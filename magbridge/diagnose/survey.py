@@ -95,7 +95,9 @@ class Survey:
         """(n, k) channels, in this order."""
         missing = [name for name in names if name not in self.channels]
         if missing:
-            raise DataError(f"{self.source}: the calibration needs the column {missing[0]!r}, which is missing")
+            raise DataError(
+                f"{self.source}: the calibration needs the column {missing[0]!r}, which is missing"
+            )
         return (
             np.stack([self.channels[name].values for name in names], axis=1)
             if names
@@ -126,16 +128,24 @@ def take(
     DataError
         A column is missing, or too few samples have all they need: one line that says which.
     """
-    parts = [_columns(ds, calibration, grid, learned) for learned, group in ((False, datasets), (True, learned_from)) for ds in group]
+    parts = [
+        _columns(ds, calibration, grid, learned)
+        for learned, group in ((False, datasets), (True, learned_from))
+        for ds in group
+    ]
     names = {name for part in parts for name in part}
     sizes = [part["time"].size for part in parts]
     table = {
-        name: np.concatenate([part.get(name, np.full(n, np.nan)) for part, n in zip(parts, sizes, strict=True)])
+        name: np.concatenate(
+            [part.get(name, np.full(n, np.nan)) for part, n in zip(parts, sizes, strict=True)]
+        )
         for name in names
     }
     order = np.argsort(table["time"], kind="stable")
     table = {name: column[order] for name, column in table.items()}
-    source = ", ".join(dict.fromkeys(str(ds.attrs.get("source", "deployment")) for ds in (*datasets, *learned_from)))
+    source = ", ".join(
+        dict.fromkeys(str(ds.attrs.get("source", "deployment")) for ds in (*datasets, *learned_from))
+    )
     parameters = [parameter.name for parameter in calibration.parameters]
     needed = [*(f"mag_{axis}" for axis in "xyz"), "reference_field", *parameters]
     whole = np.all([np.isfinite(table[name]) for name in needed], axis=0)
@@ -146,16 +156,24 @@ def take(
             f"(column {worst!r} has {int(np.isfinite(table[worst]).sum())} numbers)"
         )
     table = {name: column[whole] for name, column in table.items()}
-    units = {str(k): str(v.attrs.get("units", "")) for ds in (*datasets, *learned_from) for k, v in ds.data_vars.items()}
+    units = {
+        str(k): str(v.attrs.get("units", ""))
+        for ds in (*datasets, *learned_from)
+        for k, v in ds.data_vars.items()
+    }
     return _assemble(table, units, source)
 
 
-def _columns(ds: xr.Dataset, calibration: Calibration, grid: AnomalyGrid | None, learned: bool) -> dict[str, FloatArray]:
+def _columns(
+    ds: xr.Dataset, calibration: Calibration, grid: AnomalyGrid | None, learned: bool
+) -> dict[str, FloatArray]:
     """Return every column that counts; the channels at the row's time, the reference from wherever it is."""
     source = str(ds.attrs.get("source", "deployment"))
     for name in ("mag_x", "mag_y", "mag_z", *(parameter.name for parameter in calibration.parameters)):
         if name not in ds:
-            raise DataError(f"{source}: column {name!r} is missing; there are {', '.join(map(str, ds.data_vars))}")
+            raise DataError(
+                f"{source}: column {name!r} is missing; there are {', '.join(map(str, ds.data_vars))}"
+            )
     time = ds["time"].to_numpy().astype(float)
     table = {
         str(name): column.to_numpy().astype(float)
@@ -196,7 +214,11 @@ def _assemble(table: dict[str, FloatArray], units: dict[str, str], source: str) 
     if {"latitude", "longitude"} <= set(table):
         middle = np.median(table["latitude"])
         north = np.radians(table["latitude"] - middle) * 6.3712e6
-        east = np.radians(table["longitude"] - np.median(table["longitude"])) * 6.3712e6 * np.cos(np.radians(middle))
+        east = (
+            np.radians(table["longitude"] - np.median(table["longitude"]))
+            * 6.3712e6
+            * np.cos(np.radians(middle))
+        )
         place = np.stack([north, east], axis=1)
     attitude = None
     if {"roll", "pitch", "heading"} <= set(table):
@@ -227,14 +249,14 @@ def _kinds(name: str, unit: str) -> tuple[str, ...]:
 
 
 def _held(values: FloatArray) -> FloatArray:
-    """The last value known, and the first one before it."""
+    """Return the last value known, and the first one before it."""
     known = np.flatnonzero(np.isfinite(values))
     last = np.maximum.accumulate(np.where(np.isfinite(values), np.arange(len(values)), known[0]))
     return np.asarray(values[np.maximum(last, known[0])])
 
 
 def _dives(table: dict[str, FloatArray], follows: NDArray[np.bool_], interval: float) -> NDArray[np.int64]:
-    """Number the dives: as the log does, or from surface to surface, or pieces of an eighth of the log."""
+    """Count the dives: as the log does, or from surface to surface, or pieces of an eighth of the log."""
     for name in ("dive", "run"):
         if name in table and np.unique(table[name]).size > 3:
             return np.unique(table[name], return_inverse=True)[1].astype(np.int64)

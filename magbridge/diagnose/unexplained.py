@@ -53,7 +53,7 @@ class Outliers(NamedTuple):
     p_value: float
 
 
-def kinds(problem: Problem) -> dict[str, tuple[Columns, float, float]]:
+def kinds(problem: Problem) -> dict[str, tuple[Columns, int, float]]:
     """Flexible descriptions: kind -> (columns in units of a width, number of columns, hypotheses behind it)."""
     t = problem.survey.time
     n = len(t)
@@ -64,7 +64,9 @@ def kinds(problem: Problem) -> dict[str, tuple[Columns, float, float]]:
         """Each function of time along each axis of the body."""
 
         def columns(rows: slice) -> FloatArray:
-            return np.asarray((basis[rows, :, None] * body[rows, None, :]).reshape(basis[rows].shape[0], -1) * width)
+            return np.asarray(
+                (basis[rows, :, None] * body[rows, None, :]).reshape(basis[rows].shape[0], -1) * width
+            )
 
         return columns
 
@@ -99,13 +101,17 @@ def leftover(
         s = score(info, slice(0, size))
         start = np.concatenate([fit.z, fit.coefficients, s.estimate])
         joint = fit_joint(problem, [*columns, flexible], order, start, ridge=1.0, rounds=4)
-        found.append(_judge(kind, joint, fit, s.freedom, size, trials * 4))
+        found.append(_judge(kind, joint, fit, s.freedom, size, 4.0 * trials))
     if tone is not None:
         info = information(problem, fit.noise, fit, columns, [tone.columns])
         s = score(info, slice(0, tone.size))
-        joint = fit_joint(problem, [*columns, tone.columns], order, np.concatenate([fit.z, fit.coefficients, s.estimate]))
+        joint = fit_joint(
+            problem, [*columns, tone.columns], order, np.concatenate([fit.z, fit.coefficients, s.estimate])
+        )
         judged = _judge("tone", joint, fit, s.freedom, tone.size, tone.trials * 4)
-        found.append(judged._replace(period_s=tone.shape["period"][0], evidence=judged.evidence - np.log(tone.trials)))
+        found.append(
+            judged._replace(period_s=tone.shape["period"][0], evidence=judged.evidence - np.log(tone.trials))
+        )
     sure = [entry for entry in found if entry.p_value < LEVEL]
     if not sure:
         return None
@@ -115,26 +121,28 @@ def leftover(
     return best._replace(best_channel=_goes_with(problem, fit))
 
 
-def _judge(kind: str, joint: Joint, base: Joint, freedom: int, size: int, trials: float) -> Leftover:
+def _judge(kind: str, joint: Joint, base: Joint, freedom: int, size: int, hypotheses: float) -> Leftover:
     b = joint.coefficients[-size:]
     ratio = max(0.0, 2.0 * (joint.log_likelihood - base.log_likelihood))
-    p_value = min(1.0, trials * float(chi2.sf(ratio, max(freedom, 1))))
+    p_value = min(1.0, hypotheses * float(chi2.sf(ratio, max(freedom, 1))))
     evidence = weigh(ratio, max(freedom, 1))
     own = np.linalg.inv(joint.covariance[-size:, -size:])
     # of the flexible fit's own numbers, those that the data determine
-    return Leftover(kind, float(np.sqrt(max(b @ own @ b - freedom, 0.0))), p_value, evidence, None, None)
+    power = max(float(b @ own @ b) - freedom, 0.0)
+    return Leftover(kind, power**0.5, p_value, evidence, None, None)
 
 
 def _steps(problem: Problem, fit: Joint) -> str:
     """Tell one disturbance that comes and goes from a state that switches again and again."""
     n = len(problem)
-    level = np.array([part.mean() for part in np.array_split(fit.left, min(64, max(n // 30, 2)))])
+    parts = np.arange(n) * min(64, max(n // 30, 2)) // n
+    level: FloatArray = np.bincount(parts, fit.left) / np.bincount(parts)
     high = level > 0.5 * (level.max() + level.min())
     return "switching" if np.count_nonzero(np.diff(high.astype(int))) > 4 else "transient"
 
 
 def _goes_with(problem: Problem, fit: Joint) -> str | None:
-    """The channel of which a curve through ten bins explains most of what is left."""
+    """Return the channel of which a curve through ten bins explains most of what is left."""
     best: tuple[float, str | None] = (0.02, None)
     total = float(fit.left @ fit.left)
     for name, channel in problem.survey.channels.items():
@@ -170,7 +178,11 @@ def outliers(fit: Joint, causes: int) -> Outliers | None:
 
 def _mixture(v: FloatArray, nu: float, eps: float) -> tuple[float, FloatArray]:
     """Log likelihood of the mixture after expectation maximisation, and each sample's chance to be wrong."""
-    s, wide, member = 1.4826 * float(np.median(np.abs(v))), 3.0 * float(np.abs(v).max()) / 3.0, np.zeros(len(v))
+    s, wide, member = (
+        1.4826 * float(np.median(np.abs(v))),
+        3.0 * float(np.abs(v).max()) / 3.0,
+        np.zeros(len(v)),
+    )
     value = -np.inf
     for _ in range(25):
         x = v / s

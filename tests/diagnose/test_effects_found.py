@@ -1,0 +1,140 @@
+"""The effects that a diagnosis adds: live and in batch the same bits, and the derivative that the search uses."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from magbridge.calibration.correct import Corrector, correct
+from magbridge.calibration.effects import ChannelEffect
+from magbridge.calibration.file import decode_calibration, encode_calibration
+from magbridge.calibration.followers import ClockEffect, MonomialEffect, PlayEffect, PowersEffect
+from magbridge.calibration.instrument import RateEffect, ResponseEffect, TimeEffect
+from magbridge.calibration.model import Calibration, Noise, Parameter, Reference
+from magbridge.calibration.residual import residuals
+from magbridge.calibration.terms import Effect, Polynomial
+from magbridge.diagnose.problem import add_effects, effect_columns, history, pose, samples_of
+from magbridge.diagnose.survey import Channel, Survey
+
+FIELD = 50_000.0
+T0 = 1.7e9
+EFFECTS: list[Effect] = [
+    ChannelEffect(cause="temperature_offset", channel="heat", origin=3.0, lag=200.0),
+    ChannelEffect(cause="temperature_scale", channel="heat", origin=3.0, lag=50.0, on="scale"),
+    PowersEffect(cause="unmodelled_actuator", channel="heat", centre=3.0, scale=2.0, order=3),
+    MonomialEffect(cause="actuator_order", exponents=(4,)),
+    PlayEffect(cause="hysteresis", channel="p", width=0.3),
+    ClockEffect(),
+    TimeEffect(cause="offset_step", shape="step", start=T0 + 200.0),
+    TimeEffect(cause="offset_drift", shape="drift", start=T0, period=500.0, order=2),
+    TimeEffect(cause="interference_tone", shape="tone", start=T0, period=17.3),
+    RateEffect(cause="filter_lag", on="lag"),
+    RateEffect(cause="channel_skew", on="skew"),
+    RateEffect(cause="eddy_current", on="eddy"),
+    ResponseEffect(cause="nonlinearity", unit=FIELD, power=3),
+    ResponseEffect(cause="saturation", unit=FIELD, axis=2, knee=35_000.0),
+]
+
+
+@pytest.fixture(scope="module")
+def survey() -> Survey:
+    rng = np.random.default_rng(5)
+    n = 300
+    t = T0 + 4.0 * np.arange(n)
+    d = rng.normal(size=(n, 3)).cumsum(axis=0) * 0.1 + [0.3, 0.1, 0.9]
+    field = FIELD * d / np.linalg.norm(d, axis=1)[:, None] + [300.0, -200.0, 500.0]
+    p = np.sin(np.arange(n) / 20.0)
+    heat = 3.0 + rng.normal(size=n).cumsum() * 0.1
+    follows = np.append(False, np.ones(n - 1, bool))
+    return Survey(
+        time=t, field=field, reference=np.full(n, FIELD), still=(), follows=follows, dive=np.arange(n) // 50, place=None,
+        channels={"p": Channel(p, "in", ("position",)), "heat": Channel(heat, "degC", ("temperature",))},
+        attitude=None, learned=np.zeros(n, bool), cycles=np.empty(0), source="made",
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def calibration() -> Calibration:
+    rng = np.random.default_rng(6)
+    coefficients = rng.normal(0, 100.0, 27)
+    coefficients[6:9] = [300.0, -200.0, 500.0]
+    return Calibration(
+        parameters=(Parameter("p", "in", -1.0, 1.0, 0.0, 1.0),),
+        terms=(Polynomial(exponents=((0,), (1,), (2,))),),
+        coefficients=coefficients,
+        covariance=np.diag(np.full(27, 4.0)),
+        noise=Noise(1.0),
+        reference=Reference(FIELD),
+        method="made",
+    )
+
+
+def with_values(calibration: Calibration, effect: Effect, values: np.ndarray) -> Calibration:
+    extended = add_effects(calibration, (effect,))
+    return replace(extended, coefficients=np.append(calibration.coefficients, values))
+
+
+def sizes(effect: Effect) -> np.ndarray:
+    unit = 0.1 if isinstance(effect, (RateEffect, ClockEffect)) else 5.0
+    return unit * np.random.default_rng(7).normal(size=effect.size)
+
+
+@pytest.mark.parametrize("effect", EFFECTS, ids=lambda e: e.cause)
+def test_live_and_batch_give_the_same_bits_and_survive_the_file(
+    effect: Effect, survey: Survey, calibration: Calibration
+) -> None:
+    extended = decode_calibration(encode_calibration(with_values(calibration, effect, sizes(effect))))
+    channels = survey.values(extended.channels)
+    channels[40:50] = np.nan
+    field = survey.field.copy()
+    field[100, 1] = np.nan
+    batch = correct(extended, field, channels, survey.time)
+    live = Corrector(extended)
+    for i, t in enumerate(survey.time):
+        one = live.step(round(t * 1e6), tuple(field[i].tolist()), channels[i].tolist())
+        np.testing.assert_array_equal(one.total_field, batch.total[i])
+        np.testing.assert_array_equal(one.total_field_sigma, batch.sigma[i])
+    assert np.isfinite(batch.total).sum() > 200
+
+
+@pytest.mark.parametrize("effect", EFFECTS, ids=lambda e: e.cause)
+def test_the_search_uses_the_models_own_derivative(
+    effect: Effect, survey: Survey, calibration: Calibration
+) -> None:
+    """What a coefficient leaves in the residual, against a difference of the whole model."""
+    problem = pose(survey, calibration)
+    columns = effect_columns(problem, effect, history(survey, calibration, effect))(slice(0, len(survey)))
+    for k in range(effect.size):
+        step = np.zeros(effect.size)
+        step[k] = 1e-3
+        above, below = (
+            residuals(*samples_of(survey, with_values(calibration, effect, s * step)))[0] for s in (1.0, -1.0)
+        )
+        # a coefficient that the calibration has already taken off is missing in the residual
+        np.testing.assert_allclose(
+            -(above - below) / 2e-3, columns[:, k], rtol=1e-4, atol=1e-5 + 1e-4 * np.abs(columns).max()
+        )
+
+
+def test_the_calibrations_own_columns_are_derivatives_too(survey: Survey, calibration: Calibration) -> None:
+    problem = pose(survey, calibration)
+    for k in range(problem.free.shape[1]):
+
+        def moved(s: float, k: int = k) -> np.ndarray:
+            c = replace(calibration, coefficients=calibration.coefficients + s * problem.directions[:, k])
+            return residuals(*samples_of(survey, c))[0]
+
+        difference = (moved(1e-3) - moved(-1e-3)) / 2e-3
+        np.testing.assert_allclose(-difference, problem.free[:, k], atol=1e-5 * np.abs(problem.free).max())
+
+
+def test_play_remembers_the_side(survey: Survey, calibration: Calibration) -> None:
+    effect = PlayEffect(cause="hysteresis", channel="p", width=0.4)
+    phi = history(survey, calibration, effect)[0]
+    p = survey.channels["p"].values
+    rising = np.gradient(p) > 0.01
+    steady = np.arange(len(p)) > 100
+    assert phi[rising & steady & (np.abs(p) < 0.3)] == pytest.approx(-0.5)
+    assert phi[~rising & steady & (np.abs(p) < 0.3)] == pytest.approx(0.5)

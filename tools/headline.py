@@ -1,0 +1,79 @@
+"""The paper's own mystery: calibrated at -10 degC after launch, surveyed at +2 degC. What does ``diagnose`` make of it?
+
+    python tools/headline.py --seeds 3
+
+Prints, beside the paper, the twin's survey error before and after, against the field that was really there. Nothing
+tells the detector that it is a temperature.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "2")
+
+import msgspec
+import numpy as np
+import xarray as xr
+
+from magbridge.calibration.correct import correct
+from magbridge.calibration.data import observations
+from magbridge.calibration.fit import fit
+from magbridge.calibration.model import Calibration
+from magbridge.diagnose.run import diagnose
+from sitl.bonne_bay import MASSES, PAPER, columns, one_time_base, resting
+from sitl.columns import segments
+from sitl.scenario import load
+from sitl.twin import Twin
+
+
+def fly(seed: int, reference: str) -> dict[str, xr.Dataset]:
+    """The twin's three parts, on one time base, masses at rest."""
+    scenario = load("bonne_bay")
+    telemetry = msgspec.structs.replace(scenario.telemetry, reference=reference)
+    twin = Twin.draw(msgspec.structs.replace(scenario, telemetry=telemetry), seed)
+    track = twin.fly()
+    instrument = scenario.instrument
+    when = np.arange(0.0, track.elapsed[-1] - max(instrument.channel_delay), 1 / instrument.rate)
+    return segments(resting(one_time_base(twin.measure(track, when))))
+
+
+def rms(calibration: Calibration, ds: xr.Dataset, against: str = "truth_total_field") -> float:
+    """Error of the corrected total field, nT."""
+    total = correct(
+        calibration,
+        columns(ds, ("mag_x", "mag_y", "mag_z")),
+        columns(ds, calibration.channels),
+        ds["time"].to_numpy(),
+    ).total
+    return float(np.sqrt(np.mean((total - ds[against].to_numpy()) ** 2)))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seeds", type=int, default=3)
+    options = parser.parse_args()
+    paper = PAPER["trial 1", "cubic"][1]
+    print(
+        "| world | reference | paper | twin before | twin after | noise floor | found |\n|---|---|---|---|---|---|---|"
+    )
+    for reference in ("true", "map"):
+        for seed in range(21, 21 + options.seeds):
+            parts = fly(seed, reference)
+            calibration = fit(observations(parts["trial 1"], MASSES), "auto").calibration
+            found = diagnose([parts["survey"]], calibration, learned_from=[parts["trial 1"]])
+            named = ", ".join(
+                f"{h.candidate.cause} ({h.candidate.channel})" if h.candidate.channel else h.candidate.cause
+                for h in found.named
+            )
+            floor = load("bonne_bay").instrument.noise_sigma
+            print(
+                f"| {seed} | {reference} | {paper} nT | {rms(calibration, parts['survey']):.1f} nT | "
+                f"{rms(found.calibration, parts['survey']):.1f} nT | {floor:.1f} nT | {found.verdict}: {named or '-'} |",
+                flush=True,
+            )
+
+
+if __name__ == "__main__":
+    main()
