@@ -22,6 +22,7 @@ __all__ = [
     "Config",
     "Link",
     "Log",
+    "Navigation",
     "Sensor",
     "Telemetry",
     "convert",
@@ -143,6 +144,25 @@ class Align(Table, frozen=True):
     turn_on_sigma: NotNegative = 20.0
 
 
+class Navigation(Table, frozen=True):
+    """``[navigation]``: the corrected field against an anomaly map.
+
+    Attributes
+    ----------
+    map : str
+        The anomaly grid.
+    fix : str
+        In which message a fix goes to the autopilot: ``EXTERNAL_POSITION_ESTIMATE`` or ``ODOMETRY`` (ArduPilot),
+        ``GLOBAL_POSITION_SENSOR`` or ``ODOMETRY`` (PX4).
+    options : dict
+        How well things are known beforehand: :class:`magbridge.navigate.Options`.
+    """
+
+    map: str
+    fix: str
+    options: dict[str, Any] = msgspec.field(default_factory=dict)
+
+
 class Log(Table, frozen=True):
     """``[log]``: where the telemetry log goes, and when a new file begins."""
 
@@ -163,6 +183,7 @@ class Config(Table, frozen=True):
     align: Align = Align()
     publish: dict[str, float] = msgspec.field(default_factory=lambda: {"MAG_FIELD": 0.0})
     log: Log | None = None
+    navigation: Navigation | None = None
     path: Path = Path("bridge.toml")
     digest: str = ""
 
@@ -196,9 +217,10 @@ def load(path: str | Path) -> Config:
     named = {
         "calibration.file": config.calibration.file if config.calibration else None,
         "link.signing_key": config.link.signing_key,
+        "navigation.map": config.navigation.map if config.navigation else None,
     }
     for key, name in named.items():
-        if name is not None and not config.resolve(name).is_file():
+        if name is not None and not config.resolve(name).exists():
             raise ConfigError(path, key, f"no such file: {config.resolve(name)}")
     return config
 

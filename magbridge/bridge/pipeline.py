@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from math import nan
+from typing import TYPE_CHECKING
 
 import msgspec
 
@@ -32,6 +33,9 @@ from magbridge.mavlink.dialect import (
 from magbridge.records import Channel, Quality, Reading
 from magbridge.sensors import open_driver
 from magbridge.sensors.clock import DeviceClock, Stamp
+
+if TYPE_CHECKING:
+    from magbridge.bridge.navigation import Navigation  # it brings filterpy, which few vehicles carry
 
 __all__ = ["Pipeline", "Start"]
 
@@ -79,6 +83,8 @@ class Pipeline:
         Everything that came and went since it was last drained: the log.
     sensor : SensorLine
         Holds the commands that are to be sent to the sensor.
+    navigation : Navigation or None
+        Set before the first event, where the vehicle is to find its way by the field.
 
     Raises
     ------
@@ -122,6 +128,7 @@ class Pipeline:
             start.time_us,
         )
         self.journal = Journal(config.link.system, config.link.component, active=config.log is not None)
+        self.navigation: Navigation | None = None
         self._raw_rate = self.component.rates["MAG_RAW"]
         self._position = Position()
         self._samples = self._lost = self._quality = self._log_lost = 0
@@ -171,6 +178,8 @@ class Pipeline:
         if (corrected.quality ^ self._quality) & DOUBTS:
             self._tell_doubts(corrected.quality & DOUBTS)
         anomaly = corrected.total_field - self._position.main_field(sample.time_us)
+        if self.navigation is not None:
+            self.navigation.sample(sample.time_us, corrected)
         publisher = self.component.publisher
         out = Sample(reading, stamp.time_us, corrected, sample.time_us, sample.age, anomaly)
         publisher.publish(out)
@@ -184,6 +193,8 @@ class Pipeline:
                 self._correction.telemetry(*value)
             if message.id == Position.MESSAGE:
                 self._position.update(message, event.time_us)
+            if self.navigation is not None:
+                self.navigation.hear(message, event.time_us)
         self.journal.link(event.time_us, component.heard)
         component.heard.clear()
         if component.parameters.revision != self._revision:

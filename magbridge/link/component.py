@@ -133,6 +133,11 @@ class Component:
         self.timers.every("TIMESYNC", TIMESYNC_US, self._ask_time, start_us + TIMESYNC_US // 2)
 
     @property
+    def peer(self) -> tuple[int, int]:
+        """System and component of the autopilot."""
+        return self._link.system, self._link.autopilot
+
+    @property
     def next_deadline(self) -> int:
         """Event time in us by which :meth:`advance` has something to do."""
         return self.timers.next_deadline

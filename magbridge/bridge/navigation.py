@@ -1,0 +1,164 @@
+"""The navigator on the link: dead reckoning from the vehicle's telemetry in, fixes out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from math import degrees, nan
+
+from magbridge.config import Config, convert
+from magbridge.errors import ConfigError
+from magbridge.field.earth import separation
+from magbridge.field.grid import AnomalyGrid
+from magbridge.field.read import read_grid
+from magbridge.link.component import Component
+from magbridge.link.fixes import FIXES, Fix
+from magbridge.link.rates import Rate
+from magbridge.mavlink import Message, spec
+from magbridge.mavlink.dialect import MAV_SEVERITY
+from magbridge.navigate import Navigator, Options, Record, State
+from magbridge.records import Corrected
+
+__all__ = ["Navigation", "open_navigation"]
+
+FIX_3D = 3
+"""GPS_RAW_INT.fix_type from which a position counts."""
+UNKNOWN_SPEED = 0.0
+"""VFR_HUD.airspeed of a vehicle that has no log for its speed through the water."""
+WORDS = {
+    State.OFF: "waits for a first position",
+    State.SEARCHING: "searches",
+    State.TRACKING: "tracks",
+    State.DEAD_RECKONING: "dead reckoning: the field says nothing here",
+    State.LOST: "lost: the field and the map disagree",
+}
+
+
+class Navigation:
+    """Feeds the navigator, and sends what it finds.
+
+    Parameters
+    ----------
+    grid : AnomalyGrid
+    options : Options
+    fix : str
+        Key of :data:`~magbridge.link.fixes.FIXES`.
+    component : Component
+    """
+
+    def __init__(self, grid: AnomalyGrid, options: Options, fix: str, component: Component) -> None:
+        self.navigator = Navigator(grid, options)
+        self._send_fix = FIXES[fix]
+        self._component = component
+        self._rate: Rate = component.rates["MAG_NAVIGATION"]
+        self._origin: tuple[float, float] | None = None
+        self._state = State.OFF
+        self._handlers: dict[int, Callable[[Message, int], Record | None]] = {
+            spec("ATTITUDE").id: self._attitude,
+            spec("GPS_RAW_INT").id: self._gps,
+            spec("GLOBAL_POSITION_INT").id: self._depth,
+            spec("LOCAL_POSITION_NED").id: self._local,
+            spec("ODOMETRY").id: self._local,
+            spec("VFR_HUD").id: self._speed,
+        }
+
+    def hear(self, message: Message, time_us: int) -> None:
+        """Take what a message says of the vehicle's motion, or of its position at the surface."""
+        handler = self._handlers.get(message.id)
+        if handler is not None:
+            self._tell(handler(message, time_us))
+
+    def sample(self, time_us: int, corrected: Corrected) -> None:
+        """Take a corrected sample."""
+        self._tell(self.navigator.sample(time_us, corrected))
+
+    def _attitude(self, message: Message, time_us: int) -> None:
+        self.navigator.telemetry(
+            time_us, heading=degrees(message["yaw"]) % 360.0, pitch=degrees(message["pitch"])
+        )
+
+    def _depth(self, message: Message, time_us: int) -> None:
+        # its position is the autopilot's own estimate, which our fixes go into: only the depth counts
+        self.navigator.telemetry(time_us, depth=-1e-3 * message["alt"])
+
+    def _local(self, message: Message, time_us: int) -> None:
+        self.navigator.telemetry(time_us, north=message["x"], east=message["y"], depth=message["z"])
+
+    def _speed(self, message: Message, time_us: int) -> None:
+        speed = message["airspeed"]
+        self.navigator.telemetry(time_us, speed=speed if speed > UNKNOWN_SPEED else nan)
+
+    def _gps(self, message: Message, time_us: int) -> Record | None:
+        if message["fix_type"] < FIX_3D:
+            return None
+        latitude, longitude = message["lat"] * 1e-7, message["lon"] * 1e-7
+        if self._origin is None:
+            self._origin = latitude, longitude
+        accuracy = message["h_acc"] * 1e-3
+        return self.navigator.fix(time_us, latitude, longitude, accuracy if accuracy > 0.0 else None)
+
+    def _tell(self, record: Record | None) -> None:
+        """Send an update, and as a fix what the filter vouches for."""
+        if record is None:
+            return
+        component = self._component
+        if record.state is not self._state:
+            self._state = record.state
+            severity = MAV_SEVERITY.WARNING if record.state is State.LOST else MAV_SEVERITY.INFO
+            component.announcer.state("navigation", f"navigation: {WORDS[record.state]}", severity)
+        offset_us = component.publisher.utc_offset_us
+        if self._rate.due(record.time_us):
+            component.outbox.send(
+                "MAG_NAVIGATION",
+                time_usec=record.time_us + offset_us,
+                lat=round(record.latitude * 1e7),
+                lon=round(record.longitude * 1e7),
+                covariance_nn=record.covariance_nn,
+                covariance_ne=record.covariance_ne,
+                covariance_ee=record.covariance_ee,
+                innovation=record.innovation,
+                innovation_variance=record.innovation_variance,
+                gate=record.gate,
+                bias=record.bias,
+                bias_sigma=record.bias_sigma,
+                current_north=record.current_north,
+                current_east=record.current_east,
+                state=int(record.state),
+                accepted=int(record.accepted),
+            )
+        if record.vouched:
+            self._send_fix(component.outbox, self._fix(record, offset_us), *component.peer)
+
+    def _fix(self, record: Record, offset_us: int) -> Fix:
+        origin = self._origin or (record.latitude, record.longitude)
+        north, east = separation(*origin, record.latitude, record.longitude)
+        return Fix(
+            time_us=record.time_us + offset_us,
+            age=(self._component.codec.now_us - record.time_us) * 1e-6,
+            latitude=record.latitude,
+            longitude=record.longitude,
+            covariance_nn=record.covariance_nn,
+            covariance_ne=record.covariance_ne,
+            covariance_ee=record.covariance_ee,
+            north=north,
+            east=east,
+            resets=len(self.navigator.jumps),
+        )
+
+
+def open_navigation(config: Config, component: Component) -> Navigation | None:
+    """Return the navigation that a configuration asks for.
+
+    Raises
+    ------
+    ConfigError
+        A fix message or an option that does not exist.
+    FormatError, OutOfRange
+        The map cannot be read.
+    """
+    wanted = config.navigation
+    if wanted is None:
+        return None
+    if wanted.fix not in FIXES:
+        raise ConfigError(config.path, "navigation.fix", f"expected one of {', '.join(FIXES)}")
+    options = convert(wanted.options, Options, config.path, "navigation.options.")
+    return Navigation(read_grid(config.resolve(wanted.map)), options, wanted.fix, component)
