@@ -24,7 +24,7 @@ from magbridge.calibration.geometry import Mounting, mounted_structure
 from magbridge.calibration.noise import OUTLIER, NoiseModel, estimate_noise
 from magbridge.calibration.nominal import check_scales, starts
 from magbridge.calibration.prior import Structure, free_structure
-from magbridge.calibration.residual import Samples, residuals
+from magbridge.calibration.residual import Samples, residuals_of
 from magbridge.calibration.solve import Prior, Solution, covariance_of, gauss_newton
 from magbridge.calibration.terms import full_order
 from magbridge.errors import CalibrationError
@@ -33,6 +33,7 @@ __all__ = ["fit_auto"]
 
 FloatArray = NDArray[np.float64]
 
+ENOUGH, BLOCK = 6000, 50  # samples that choose the start, in blocks of neighbours
 ROUNDS = 16  # of coefficients, widths, noise; five or six usually settle
 
 
@@ -89,24 +90,43 @@ def fit_auto(
 
 def _best(samples: Samples, structure: Structure) -> _Answer:
     """Return the answer with the largest evidence among several starts."""
-    size = samples.phi.shape[1] * 9
+    few = _thinned(samples)
     answers = []
-    for start in starts(samples):
-        for shift in (0.0, 1.5):
-            coefficients = np.zeros(size)
-            coefficients[:9] = start
-            answer = _climb(samples, structure, coefficients, structure.centre + shift * structure.spread)
-            answers.append(answer)
+    for start in starts(few):
+        z = structure.E[:9].T @ start
+        answers += [
+            _climb(few, structure, z, structure.centre + shift * structure.spread) for shift in (0.0, 1.5)
+        ]
     for answer in sorted(answers, key=lambda answer: -answer.score):
-        if answer.solution.settled and is_maximum(answer.quadratic, answer.structure, answer.widths):
-            return answer
+        last = answer
+        if few is not samples:
+            noise = NoiseModel(answer.noise.sigma, answer.noise.memory)
+            last = _climb(samples, answer.structure, answer.solution.z, answer.widths.eta, noise)
+        if last.solution.settled and is_maximum(last.quadratic, last.structure, last.widths):
+            return last
     raise CalibrationError("auto: no start reached a maximum of the evidence; the data contradict themselves")
 
 
-def _climb(samples: Samples, structure: Structure, coefficients: FloatArray, eta: FloatArray) -> _Answer:
-    """Alternate coefficients, widths and noise until the evidence stands still."""
-    z, noise = _approach(samples, _prior(structure, eta), structure.E.T @ coefficients)
-    score, white = -np.inf, True
+def _thinned(samples: Samples) -> Samples:
+    """Take blocks of neighbours evenly over all samples: enough to choose a start by."""
+    blocks = len(samples.field) // BLOCK
+    if len(samples.field) <= ENOUGH:
+        return samples
+    rows = (
+        np.linspace(0, blocks - 1, ENOUGH // BLOCK).astype(int)[:, None] * BLOCK + np.arange(BLOCK)
+    ).ravel()
+    part = samples.part(rows)
+    part.follows[::BLOCK] = False
+    return part
+
+
+def _climb(
+    samples: Samples, structure: Structure, z: FloatArray, eta: FloatArray, noise: NoiseModel | None = None
+) -> _Answer:
+    """Alternate coefficients, widths and noise until the evidence stands still; `noise` if z is near it."""
+    score, white = -np.inf, noise is None
+    if noise is None:
+        z, noise = _approach(samples, _prior(structure, eta), z)
     for step in range(ROUNDS):
         if structure.renew is not None and step:
             structure, z = structure.renew(z)
@@ -123,7 +143,7 @@ def _climb(samples: Samples, structure: Structure, coefficients: FloatArray, eta
         # what a wrong model leaves looks like noise with a long memory: not before the model has settled
         white = white and not still and step < ROUNDS // 2
         if step < ROUNDS - 4:  # then let the noise's shape be, so that the rest can settle
-            e, _ = residuals(samples, structure.coefficients(z))
+            e = residuals_of(samples, structure.coefficients(z))
             shape = estimate_noise(e, samples.follows & (not white), widths.determined)
             noise = replace(shape, sigma=widths.sigma)
     return _Answer(solution, widths, noise, structure, quadratic, score)
@@ -132,10 +152,10 @@ def _climb(samples: Samples, structure: Structure, coefficients: FloatArray, eta
 def _approach(samples: Samples, prior: Prior, z: FloatArray) -> tuple[FloatArray, NoiseModel]:
     """Come near the answer: noise as large as the residuals' bulk, smaller with each step."""
     apart = np.zeros(len(samples.field), bool)
-    noise = estimate_noise(residuals(samples, prior.coefficients(z))[0], apart, 0.0)
+    noise = estimate_noise(residuals_of(samples, prior.coefficients(z)), apart, 0.0)
     for _ in range(ROUNDS):
         z = gauss_newton(samples, prior, noise, z, steps=5, tolerance=0.1).z
-        last, noise = noise, estimate_noise(residuals(samples, prior.coefficients(z))[0], apart, 0.0)
+        last, noise = noise, estimate_noise(residuals_of(samples, prior.coefficients(z)), apart, 0.0)
         if noise.sigma > 0.8 * last.sigma:
             break
     return z, noise

@@ -64,7 +64,8 @@ def find_boresight(calibration: Calibration, data: Observations) -> Boresight | 
     rotation, _ = Rotation.align_vectors(v, b)
     score = np.cross(v, rotation.apply(b) - v)
     information = np.sum(v * v) * np.eye(3) - v.T @ v
-    between = np.stack([score[part.runs == label].sum(axis=0) for label in np.unique(part.runs)])
+    _, which = np.unique(part.runs, return_inverse=True)
+    between = np.stack([np.bincount(which, column) for column in score.T], axis=1)
     runs = len(between)
     inverse = np.linalg.inv(information)
     spread = between.T @ between * (runs / max(runs - 1, 1))

@@ -14,7 +14,7 @@ from magbridge.calibration.data import Observations, polynomial_samples
 from magbridge.calibration.fit import Fit, assemble
 from magbridge.calibration.noise import NoiseModel, estimate_noise
 from magbridge.calibration.nominal import check_scales, nominal
-from magbridge.calibration.residual import residuals
+from magbridge.calibration.residual import residuals_of
 from magbridge.calibration.solve import Prior, covariance_of, gauss_newton
 from magbridge.calibration.terms import full_order
 from magbridge.errors import CalibrationError
@@ -42,12 +42,12 @@ def fit_cubic(data: Observations, order: int = 3) -> Fit:
     start = np.zeros(9 * len(exponents))
     start[:9] = _start(data)
     prior = Prior(np.eye(len(start)) / ANYTHING**2, np.eye(len(start)))
-    noise = NoiseModel(float(np.std(residuals(samples, start)[0])) or 1e-9)
+    noise = NoiseModel(float(np.std(residuals_of(samples, start))) or 1e-9)
     for _ in range(2):  # once far from the answer, once with the noise found there
         found = gauss_newton(samples, prior, noise, start, steps=200)
         start = found.z
         free = min(float(len(start)), len(data) / 2)
-        noise = NoiseModel(estimate_noise(residuals(samples, start)[0], samples.follows, free).sigma)
+        noise = NoiseModel(estimate_noise(residuals_of(samples, start), samples.follows, free).sigma)
     check_scales(samples, start)
     covariance = covariance_of(found.normal.hessian / noise.sigma**2 + prior.precision)
     plain = polynomial_samples(data, exponents)

@@ -27,6 +27,7 @@ __all__ = ["Quadratic", "Widths", "evidence", "is_maximum", "maximise"]
 
 FloatArray = NDArray[np.float64]
 FARTHEST = 10.0  # sigmas of the prior of eta: nothing physical lies beyond, and exp must not overflow
+STILL = 0.01  # of log evidence: two answers that differ by less are one
 SIGMA_STEP = 0.1  # a step in log sigma as large as one prior sigma in eta
 
 
@@ -107,11 +108,14 @@ def maximise(quadratic: Quadratic, structure: Structure, eta: FloatArray, sigma:
 
 
 def is_maximum(quadratic: Quadratic, structure: Structure, widths: Widths) -> bool:
-    """Check that no slope is left at `widths`, and that the surface bends down in every direction."""
+    """Check that the surface bends down in every direction, and that a Newton step would gain nothing."""
     x = np.append(widths.eta, np.log(widths.sigma))
+    scale = np.append(structure.spread, SIGMA_STEP)
 
     def slope(at: FloatArray) -> FloatArray:
-        return evidence(quadratic, structure, at[:-1], at[-1])[1]
+        return np.asarray(evidence(quadratic, structure, at[:-1], at[-1])[1] * scale)
 
-    bend = np.array([(slope(x + h) - slope(x - h)) / 2e-3 for h in 1e-3 * np.eye(len(x))])
-    return bool(np.abs(slope(x)).max() < 0.1 and np.linalg.eigvalsh(bend + bend.T)[-1] < 0.0)
+    bend = np.array([(slope(x + h) - slope(x - h)) / 2e-3 for h in 1e-3 * np.diag(scale)])
+    values, vectors = np.linalg.eigh(-0.5 * (bend + bend.T))
+    gain = 0.5 * np.sum((vectors.T @ slope(x)) ** 2 / np.maximum(values, 1e-300))
+    return bool(values[0] > 0.0 and gain < STILL)

@@ -17,7 +17,7 @@ from magbridge.calibration.data import Observations
 from magbridge.calibration.identify import expected_ratio, warnings_for
 from magbridge.calibration.model import Calibration, Noise, Parameter, Reference, Run, Sensor, with_boresight
 from magbridge.calibration.noise import NoiseModel
-from magbridge.calibration.residual import Samples, residuals
+from magbridge.calibration.residual import Samples, residuals_of
 from magbridge.calibration.terms import Polynomial
 from magbridge.errors import CalibrationError
 
@@ -154,17 +154,21 @@ def assemble(
     details: dict[str, Any] | None = None,
 ) -> Fit:
     """Put a fit's numbers into a calibration with its run table."""
-    e, _ = residuals(samples, coefficients)
+    e = residuals_of(samples, coefficients)
     assert data.runs is not None
     assert data.time is not None
+    labels, which = np.unique(data.runs, return_inverse=True)
+    count = np.bincount(which)
+    squares = np.bincount(which, e * e)
+    places = [np.bincount(which, column) / count for column in data.parameters.T]
     table = tuple(
         Run(
-            label=str(label),
-            samples=int((data.runs == label).sum()),
-            rms=float(np.sqrt(np.mean(e[data.runs == label] ** 2))),
-            parameters=tuple(data.parameters[data.runs == label].mean(axis=0).tolist()),
+            str(label),
+            int(count[r]),
+            float(np.sqrt(squares[r] / count[r])),
+            tuple(float(p[r]) for p in places),
         )
-        for label in np.unique(data.runs)
+        for r, label in enumerate(labels)
     )
     steps = np.diff(data.time)
     calibration = Calibration(

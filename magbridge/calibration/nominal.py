@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from magbridge.calibration.data import Observations
 from magbridge.calibration.noise import NoiseModel, estimate_noise
-from magbridge.calibration.residual import Samples, residuals
+from magbridge.calibration.residual import Samples, residuals_of
 from magbridge.calibration.solve import Prior, covariance_of, gauss_newton
 from magbridge.errors import CalibrationError
 
@@ -88,7 +88,7 @@ def nominal(
             found = gauss_newton(samples, prior, noise, z)
             z = found.z
             # the moving masses are still in the residual: no noise to whiten, only fewer witnesses
-            noise = estimate_noise(residuals(samples, E @ z)[0], samples.follows, len(keep))
+            noise = estimate_noise(residuals_of(samples, E @ z), samples.follows, len(keep))
             memory, noise = noise.memory, replace(noise, memory=0.0)
         value = found.normal.cost
         if found.settled and (best is None or value < 0.999 * best[0]):

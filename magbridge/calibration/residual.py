@@ -24,7 +24,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["NormalEquations", "Samples", "normal_equations", "residuals"]
+__all__ = ["NormalEquations", "Samples", "normal_equations", "residuals", "residuals_of", "whiten"]
 
 FloatArray = NDArray[np.float64]
 CHUNK = 8192  # rows of the Jacobian at a time: bounded memory at any number of samples
@@ -104,6 +104,15 @@ def residuals(samples: Samples, coefficients: FloatArray) -> tuple[FloatArray, F
     g[:, :6] /= samples.unit
     g[:, 6:] = -_times(A, z)
     return e, g
+
+
+def residuals_of(samples: Samples, coefficients: FloatArray) -> FloatArray:
+    """Residual e (n,) alone, in bounded memory; arguments as for :func:`residuals`."""
+    pieces = [
+        residuals(samples.part(slice(start, start + CHUNK)), coefficients)[0]
+        for start in range(0, len(samples.field), CHUNK)
+    ]
+    return np.concatenate(pieces)
 
 
 def _times(A: FloatArray, x: FloatArray) -> FloatArray:
