@@ -26,7 +26,7 @@ from magbridge.monitor.words import FLAGS, ago, health, measured, silence
 __all__ = ["serve"]
 
 BREAK = 10.0
-"""s without a sample that interrupt the curve."""
+"""s without a sample that interrupt the curve, unless the one before was as late."""
 TUNABLES = {one.name: one for one in alignment(Align())}
 """What every bridge has: a PARAM_VALUE tells neither unit nor range."""
 INK, BLUE, GREEN, AMBER, RED = "#1e293b", "#1d4ed8", "#15803d", "#b45309", "#b91c1c"
@@ -200,12 +200,12 @@ class Page:
 
 def _curves(trace: list[Point]) -> Iterator[list[tuple[float, float]]]:
     """Yield (ms, nT) of the band's lower edge, of its width and of the mean; NaN where the curve is interrupted."""
-    last = trace[0].time
+    last, usual = trace[0].time, 0.0
     for point in trace:
-        ms = 1e3 * point.time
-        if point.time - last > BREAK:
+        ms, gap = 1e3 * point.time, point.time - last
+        if gap > max(BREAK, 3 * usual):
             yield [(ms - 1.0, nan)] * 3
-        last = point.time
+        last, usual = point.time, gap
         yield [(ms, point.low), (ms, point.high - point.low), (ms, point.sum / point.count)]
 
 

@@ -63,6 +63,8 @@ class State:
         Its system and component.
     heard, sampled : float
         When its last message and its last MAG_FIELD came; -inf before the first.
+    interval : float
+        s between its last two MAG_FIELDs; 0 before the second.
     received, lost : int
         Its messages, and those missing by its own numbering.
     field, status : dict
@@ -79,6 +81,7 @@ class State:
     def __init__(self) -> None:
         self.bridge: tuple[int, int] | None = None
         self.heard = self.sampled = -inf
+        self.interval = 0.0
         self.received = self.lost = 0
         self.field: dict[str, Any] = {}
         self.status: dict[str, Any] = {}
@@ -140,6 +143,7 @@ class State:
             one.error = "expected a number"
 
     def _field(self, message: Message, now: float) -> None:
+        self.interval = now - self.sampled if self.field else 0.0
         self.field, self.sampled = message.fields, now
         for name in Quality(self.field["flags"]).names().split():
             self.flags[name] = self.flags.get(name, (now, now))[0], now

@@ -9,8 +9,8 @@ from magbridge.monitor.state import State
 
 __all__ = ["FLAGS", "ago", "health", "measured", "silence"]
 
-SILENT = 3.0
-"""s; a bridge speaks every second."""
+SILENT, SLOW = 3.0, 30.0
+"""s; a bridge speaks every second, a slow sensor less often: three of its intervals, but no more than `SLOW`."""
 FLAGS = {
     "stale_telemetry": "A parameter of the calibration is old, missing or NaN",
     "extrapolated": "A parameter is outside the range that the calibration has seen",
@@ -40,8 +40,9 @@ def ago(seconds: float) -> str:
 
 def silence(state: State, now: float) -> str:
     """Return what is wrong with the stream; nothing while it flows."""
-    for what, when in (("nothing", state.heard), ("no field", state.sampled)):
-        if now - when > SILENT:
+    slow = max(SILENT, min(3 * state.interval, SLOW))
+    for what, when, limit in (("nothing", state.heard, SILENT), ("no field", state.sampled, slow)):
+        if now - when > limit:
             return f"{what} heard for {ago(now - when)}" if isfinite(when) else f"{what} heard yet"
     return ""
 

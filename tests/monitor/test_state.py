@@ -52,6 +52,15 @@ def test_silence_is_told(air: Air) -> None:
     assert [ago(s) for s in (-1, 0, 119, 121, 7200)] == ["0 s", "0 s", "119 s", "2 min", "2 h"]
 
 
+def test_a_slow_sensor_is_not_silent(air: Air) -> None:
+    for k in range(0, 40, 4):
+        air.field(NOW + k)
+        air.say(NOW + k + 3.9, "MAG_STATUS", uptime=k)
+        assert silence(air.state, NOW + k + 3.9) == ("" if k else "no field heard for 4 s")
+    air.say(NOW + 49, "MAG_STATUS", uptime=50)
+    assert silence(air.state, NOW + 49) == "no field heard for 13 s"
+
+
 def test_figures(air: Air) -> None:
     assert {value for value, _ in measured(air.state).values()} == {"–"}
     air.field(NOW, 52_134.268, x=-4_203.04, sigma_x=1.1, y=nan, latency=0.0042, calibration_id=0xBEEF)
