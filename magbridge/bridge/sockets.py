@@ -44,7 +44,6 @@ class UdpPort(Port):
         opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
         try:
             if self._listen:
-                opened.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
                 opened.bind(self._address)
             else:
                 opened.connect(self._address)
