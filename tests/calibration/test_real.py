@@ -1,0 +1,44 @@
+"""Measured data: a Seaglider's own magnetometer, one dive left out at a time."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from magbridge.calibration.data import observations
+from magbridge.calibration.validate import leave_runs_out
+from magbridge.errors import CalibrationError
+from magbridge.field.declination import with_true_heading
+from magbridge.field.reference import earth_field
+from magbridge.logs import read
+
+COUNT = 100.0  # nT: the sensor's quantisation
+
+
+@pytest.mark.real
+def test_seaglider_dives_left_out(real_data: Path) -> None:
+    """Nominal stands at the sensor's quantisation; the moving masses take a few per cent more."""
+    deployment = with_true_heading(read(sorted((real_data / "seaglider_sg167").glob("*.nc"))))
+    nominal = leave_runs_out(observations(deployment, [], reference=earth_field), "nominal")
+    moving = leave_runs_out(observations(deployment, ["vbdCC"], reference=earth_field), "auto", 1)
+    assert len(nominal.by_run()) == 5
+    assert nominal.rms / COUNT == pytest.approx(0.96, abs=0.03)
+    assert 0.85 < moving.rms / nominal.rms < 1.0
+    assert 0.8 < np.nanstd(moving.standardised) < 1.35
+
+
+def test_two_runs_at_least(glider) -> None:  # type: ignore[no-untyped-def]
+    runs = glider(0, 2).runs
+    with pytest.raises(CalibrationError, match="leaving runs out: found 1"):
+        leave_runs_out(runs.part(np.asarray(runs.runs) == 0), "nominal")
+
+
+def test_left_out_runs_are_near_the_floor(glider) -> None:  # type: ignore[no-untyped-def]
+    """Leaving out inner runs (the outermost would be extrapolation) costs a little; sigma knows how much."""
+    runs = glider(0, 1).runs
+    found = leave_runs_out(runs.part(np.asarray(runs.runs) < 4), "auto", 1)
+    inner = np.asarray(found.runs) < 4
+    assert np.isfinite(found.error[inner]).all()
+    assert np.nanmedian(np.abs(found.standardised)) < 1.5
