@@ -118,6 +118,7 @@ class Pipeline:
             version=magbridge.__version__,
             kept=start.parameters,
             status=self._status,
+            speaking=lambda: self.sensor.state == MAG_PORT_STATE.OK,
         )
         self.sensor = SensorLine(
             config.sensor.driver,

@@ -74,6 +74,8 @@ class Component:
         Parameters that a station changed in an earlier run.
     status : callable
         Returns the fields of MAG_STATUS that the component cannot know itself (samples, log, sensor).
+    speaking : callable
+        Says whether the sensor speaks: the heartbeat is critical where it does not.
 
     Attributes
     ----------
@@ -97,6 +99,7 @@ class Component:
         version: str = "0.0.0",
         kept: Mapping[str, float] | None = None,
         status: Callable[[], Mapping[str, Any]] = dict,
+        speaking: Callable[[], bool] = bool,
     ) -> None:
         self._link = link
         self.codec = Codec(link.system, link.component, signing)
@@ -111,7 +114,9 @@ class Component:
             self.announcer.say(f"kept parameter {name} does not fit: default", MAV_SEVERITY.WARNING)
         self.rates = {name: Rate(self.parameters[rate_name(name)]) for name in LIMITS}
         self.publisher = Publisher(self.outbox, self.rates, calibration_id, start_us)
-        self._reports = Reports(self.outbox, self.vehicle, start_us, version, calibration_id, status)
+        self._reports = Reports(
+            self.outbox, self.vehicle, start_us, version, calibration_id, status, speaking
+        )
         self._service = ParameterService(
             self.parameters, self.outbox, self.timers, self.announcer, self._changed
         )

@@ -10,7 +10,6 @@ from magbridge.link.outbox import Outbox
 from magbridge.link.vehicle import Vehicle
 from magbridge.mavlink import spec
 from magbridge.mavlink.dialect import (
-    MAG_PORT_STATE,
     MAV_AUTOPILOT,
     MAV_PROTOCOL_CAPABILITY,
     MAV_STATE,
@@ -47,6 +46,8 @@ class Reports:
     calibration_id : int
     status : callable
         Returns fields of MAG_STATUS: what the rooms above know.
+    speaking : callable
+        Says whether the sensor speaks.
     """
 
     def __init__(
@@ -57,18 +58,19 @@ class Reports:
         version: str,
         calibration_id: int,
         status: Callable[[], Mapping[str, Any]],
+        speaking: Callable[[], bool],
     ) -> None:
         self._outbox, self._vehicle, self._status = outbox, vehicle, status
+        self._speaking = speaking
         self._start_us, self._version, self._calibration_id = start_us, version, calibration_id
 
     def heartbeat(self) -> None:
         """Send HEARTBEAT: active while the sensor speaks, else critical."""
-        speaking = self._status().get("sensor_state") == MAG_PORT_STATE.OK
         self._outbox.send(
             "HEARTBEAT",
             type=MAV_TYPE.ONBOARD_CONTROLLER,
             autopilot=MAV_AUTOPILOT.INVALID,
-            system_status=MAV_STATE.ACTIVE if speaking else MAV_STATE.CRITICAL,
+            system_status=MAV_STATE.ACTIVE if self._speaking() else MAV_STATE.CRITICAL,
             mavlink_version=3,
         )
 

@@ -51,6 +51,7 @@ def test_status(make_link):
     link = make_link(
         calibration_id=7,
         status=lambda: {"samples": 5, "sensor_state": MAG_PORT_STATE.OK, "log_records": (1 << 32) + 3},
+        speaking=lambda: True,
     )
     link.to(0)
     link.give(b"garbage" + link.autopilot.pack("HEARTBEAT", type=12, autopilot=3))
