@@ -22,6 +22,7 @@ import msgspec
 import numpy as np
 import xarray as xr
 from distributed import Client, LocalCluster, as_completed
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from magbridge.calibration.correct import regressors
@@ -29,6 +30,10 @@ from magbridge.calibration.data import observations
 from magbridge.calibration.fit import fit
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.residual import Samples, residuals
+from magbridge.diagnose.causes import CAUSES
+from magbridge.diagnose.findings import findings
+from magbridge.diagnose.isolability import confusion
+from magbridge.diagnose.run import diagnose
 from sitl import Twin, load, simulate
 from sitl.inject import EFFECTS, FOREIGN, Hidden, disturb
 from sitl.mission import CrissCross, Spirals
@@ -133,10 +138,6 @@ def hide(name: str, wanted: float, seed: int, number: int, noise: str) -> tuple[
 
 def case(number: int, names: tuple[str, ...], wanted: float, noise: str, without: str = "") -> dict[str, Any]:
     """One case: hide, diagnose, and say what came out."""
-    from magbridge.diagnose.causes import CAUSES
-    from magbridge.diagnose.findings import findings
-    from magbridge.diagnose.run import diagnose
-
     began = time.process_time()
     seed = number % VEHICLES
     twin, track, when, calibration = vehicle(seed)
@@ -157,9 +158,9 @@ def plan(cases: int) -> list[dict[str, Any]]:
     """The study: nulls of every noise; each cause over sizes; without its function; pairs; foreign effects."""
     rng = np.random.default_rng(20131212)
     names = list(EFFECTS)
-    made: list[dict[str, Any]] = []
-    for k in range(cases // 4):
-        made.append({"names": (), "wanted": 0.0, "noise": NOISES[k % len(NOISES)]})
+    made: list[dict[str, Any]] = [
+        {"names": (), "wanted": 0.0, "noise": NOISES[k % len(NOISES)]} for k in range(cases // 4)
+    ]
     for k in range(cases // 2):
         sizes = (8.0, 8.0, 4.0, 8.0, 25.0, 8.0, 3.0, 100.0, 8.0, 5.5)
         made.append(
@@ -266,11 +267,6 @@ def lines(rows: list[dict[str, Any]]) -> list[str]:
 
 def plot(rows: list[dict[str, Any]], path: Path) -> None:
     """The measured confusion matrix beside the one that theory predicts for the first vehicle's log."""
-    from matplotlib.figure import Figure
-
-    from magbridge.diagnose.isolability import confusion
-    from magbridge.diagnose.run import diagnose
-
     names = [name for name in EFFECTS if name != "outliers"]
     measured = np.zeros((len(names), len(names)))
     for r in rows:

@@ -1,4 +1,4 @@
-"""The paper's own mystery: calibrated at -10 degC after launch, surveyed at +2 degC. What does ``diagnose`` make of it?
+"""The paper's own mystery: calibrated at -10 degC after launch, surveyed at +2 degC, and what ``diagnose`` says.
 
     python tools/headline.py --seeds 3
 

@@ -134,9 +134,10 @@ def offset_drift(problem: Problem) -> list[Candidate]:
     made = []
     for order, start in ((1, t[0]), (1, 0.5 * (t[0] + t[-1])), (2, t[0])):
         effect = TimeEffect(cause="offset_drift", shape="drift", start=float(start), period=span, order=order)
-        phi = lambda rows, order=order, start=start: np.stack(
-            [((t[rows] - start) / span) ** (k + 1) for k in range(order)]
-        )  # noqa: E731
+
+        def phi(rows: slice, order: int = order, start: float = float(start)) -> FloatArray:
+            return np.stack([((t[rows] - start) / span) ** (k + 1) for k in range(order)])
+
         made.append(of_effect(problem, effect, 50.0, f"nT in {span / 3600:.3g} h", phi=phi))
     return made
 

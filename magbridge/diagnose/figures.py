@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from base64 import b64encode
 from io import BytesIO
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -86,7 +87,7 @@ def spectrum(diagnosis: Diagnosis) -> str:
     for values, colour, label in ((diagnosis.before, BEFORE, "before"), (diagnosis.after, AFTER, "after")):
         frequency, power = periodogram(values, 1.0 / interval, detrend="constant")
         edges = np.unique(np.geomspace(1, len(frequency), 60).astype(int))
-        where = [slice(a, b) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+        where = [slice(a, b) for a, b in pairwise(edges)]
         axis.loglog(
             [frequency[w].mean() for w in where],
             [np.sqrt(power[w].mean()) for w in where],

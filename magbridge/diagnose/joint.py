@@ -59,7 +59,6 @@ def fit_joint(
     blocks: bool | None = None,
     ridge: float = 1e-6,
     rounds: int = 5,
-    rows: NDArray[np.bool_] | None = None,
 ) -> Joint:
     """Maximise the joint likelihood of calibration, effects and noise.
 
@@ -77,8 +76,6 @@ def fit_joint(
         Prior precision of the effects; the default only keeps what is invisible from running away.
     rounds : int
         At most.
-    rows : (n,) bool array, optional
-        Which samples count; all if not given.
     """
     q, n = problem.free.shape[1], len(problem)
     whole = slice(0, n)
@@ -86,25 +83,45 @@ def fit_joint(
     k = X.shape[1] - q
     prior = np.append(np.ones(q), np.full(k, ridge))
     centre = np.append(problem.centre, np.zeros(k))
-    c = centre.copy() if start is None else start.copy()
-    left, noise, P = problem.residual - X @ c, None, np.diag(prior)
     follows = problem.survey.follows
-    before = -np.inf
-    for _ in range(rounds):
-        noise = fit_noise(left, follows, order, blocks=blocks)
-        value = noise.log_likelihood - 0.5 * float(prior[:q] @ (c[:q] - centre[:q]) ** 2)
-        if abs(value - before) < 0.02:
-            break
-        before = value
-        A, y = noise.filter(X), noise.response(left)
-        if rows is not None:
-            A, y = A[rows], y[rows]
-        P = A.T @ A + np.diag(prior)
-        c = c + np.linalg.solve(P, A.T @ y - prior * (c - centre))
+
+    def at(c: FloatArray) -> tuple[float, FloatArray, Noise]:
         left = problem.residual - X @ c
-    assert noise is not None
-    value = noise.log_likelihood - 0.5 * float(prior[:q] @ (c[:q] - centre[:q]) ** 2)
-    return Joint(value, c[:q], c[q:], np.linalg.inv(P), noise, left)
+        noise = fit_noise(left, follows, order, blocks=blocks)
+        return noise.log_likelihood - 0.5 * float(prior @ (c - centre) ** 2), left, noise
+
+    # noise with a long memory swallows what is slow, and least squares then never asks for it again: so it is
+    # asked once as if the noise had none
+    first = centre if start is None else start
+    found = [(c, *at(c)) for c in (first, _plain(X, problem.residual, prior, centre))]
+    c, value, left, noise = max(found, key=lambda entry: entry[1])
+    for _ in range(rounds):
+        A, y = noise.filter(X), noise.response(left)
+        moved = c + np.linalg.solve(A.T @ A + np.diag(prior), A.T @ y - prior * (c - centre))
+        tried = at(moved)
+        gained = tried[0] - value
+        if gained > 0.0:
+            c, (value, left, noise) = moved, tried
+        if gained < 0.02:
+            break
+    A = noise.filter(X)
+    covariance: FloatArray = np.asarray(np.linalg.inv(A.T @ A + np.diag(prior)), float)
+    value += 0.5 * float(prior[q:] @ c[q:] ** 2)  # the ridge is no prior
+    return Joint(value, c[:q], c[q:], covariance, noise, left)
+
+
+def _plain(X: FloatArray, residual: FloatArray, prior: FloatArray, centre: FloatArray) -> FloatArray:
+    """Least squares as if the noise were white, outliers cut off."""
+    level = 1.4826 * float(np.median(np.abs(residual - np.median(residual)))) + 1e-12
+    c = centre
+    for _ in range(2):
+        left = residual - X @ c
+        cut = np.clip(left, *(np.median(left) + np.array([-8.0, 8.0]) * level)) if c is not centre else left
+        c = c + np.linalg.solve(
+            X.T @ X / level**2 + np.diag(prior), X.T @ cut / level**2 - prior * (c - centre)
+        )
+        level = 1.4826 * float(np.median(np.abs(residual - X @ c))) + 1e-12
+    return c
 
 
 @dataclass(frozen=True, eq=False)

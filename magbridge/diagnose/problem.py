@@ -44,7 +44,7 @@ Columns = Callable[[slice], FloatArray]
 CHUNK = 8192
 SEEN = 0.01
 """Share of a prior's information that data must add for its direction to be kept."""
-BROADEST = 1e-2
+BROADEST = 1e-3
 """Precision, of the posterior's, below which a direction that only the given logs determined is not let."""
 
 

@@ -38,9 +38,9 @@ def report_html(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> str:
     )
     body = [
         f"<h1>Diagnosis of {escape(survey.source)}</h1>",
-        f'<p class="faint">{first} to {last} UTC · {len(survey)} samples in {np.unique(survey.dive).size} dives · '
+        (f'<p class="faint">{first} to {last} UTC · {len(survey)} samples in {np.unique(survey.dive).size} dives · '
         f"calibration: {escape(diagnosis.problem.calibration.method or 'unnamed')}, "
-        f"{diagnosis.problem.calibration.coefficients.size} coefficients</p>",
+        f"{diagnosis.problem.calibration.coefficients.size} coefficients</p>"),
         f'<p class="verdict">{_verdict(diagnosis)}</p>',
         "<h2>Measured against simulated</h2>",
         _figure(figures.measured(diagnosis), "The total field as measured and corrected by the calibration, and as the "
@@ -123,9 +123,11 @@ def _found(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> list[str]:
         parts += [
             f"<h3>{_name(hypothesis)}</h3>",
             f'<p class="faint">{escape((getdoc(causes[candidate.cause].candidates) or "").splitlines()[0])}</p>',
-            f"<p>Signal-to-noise {hypothesis.signal_to_noise:.1f} with the calibration refitted; chance of a false alarm among "
-            f"all that was tried {hypothesis.p_value:.1g}. Leaving it out multiplies the held-out RMS by {1 / max(gain.ratio, 1e-9):.2f} "
-            f"(95 %: {1 / max(gain.interval[1], 1e-9):.2f} to {1 / max(gain.interval[0], 1e-9):.2f}).</p>",
+            (
+                f"<p>Signal-to-noise {hypothesis.signal_to_noise:.1f} with the calibration refitted; chance of a false alarm among "
+                f"all that was tried {hypothesis.p_value:.1g}. Leaving it out multiplies the held-out RMS by {1 / max(gain.ratio, 1e-9):.2f} "
+                f"(95 %: {1 / max(gain.interval[1], 1e-9):.2f} to {1 / max(gain.interval[0], 1e-9):.2f}).</p>"
+            ),
             f"<table>{rows}</table>",
             doubt,
         ]
@@ -175,8 +177,10 @@ def _isolability(diagnosis: Diagnosis) -> list[str]:
         f"{name.replace('_', ' ')}: {escape(needs)}" for name, needs in report.untestable.items()
     )
     return [
-        '<p class="faint">From telemetry, attitude and noise alone: the size of each effect that would be found in 95 of 100 '
-        "deployments like this one, and which causes look alike in it.</p>",
+        (
+            '<p class="faint">From telemetry, attitude and noise alone: the size of each effect that would be found in 95 of 100 '
+            "deployments like this one, and which causes look alike in it.</p>"
+        ),
         f"<table><tr><th>cause</th><th>50 % at S/N</th><th>95 % at S/N</th><th>seen from</th></tr>{rows}</table>",
         f"<h3>Look alike</h3><table>{pairs}</table>" if pairs else "",
         f"<p>Not testable here, and what it would take: {missing}.</p>" if missing else "",

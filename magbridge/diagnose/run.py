@@ -92,7 +92,7 @@ def diagnose(
     learned_from: Sequence[xr.Dataset] = (),
     grid: AnomalyGrid | None = None,
     causes: Mapping[str, Cause] = CAUSES,
-    progress: Callable[[str], None] = lambda step: None,
+    progress: Callable[[str], object] = str,
 ) -> Diagnosis:
     """Find what the forward model gets wrong in these deployments.
 

@@ -230,7 +230,7 @@ def _assemble(table: dict[str, FloatArray], units: dict[str, str], source: str) 
         channels=channels,
         still=tuple(still),
         follows=follows,
-        dive=_dives(table, follows, interval),
+        dive=_dives(table, follows),
         place=place,
         attitude=attitude,
         learned=table["learned"] > 0.5,
@@ -255,7 +255,7 @@ def _held(values: FloatArray) -> FloatArray:
     return np.asarray(values[np.maximum(last, known[0])])
 
 
-def _dives(table: dict[str, FloatArray], follows: NDArray[np.bool_], interval: float) -> NDArray[np.int64]:
+def _dives(table: dict[str, FloatArray], follows: NDArray[np.bool_]) -> NDArray[np.int64]:
     """Count the dives: as the log does, or from surface to surface, or pieces of an eighth of the log."""
     for name in ("dive", "run"):
         if name in table and np.unique(table[name]).size > 3:

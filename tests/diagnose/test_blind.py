@@ -95,7 +95,7 @@ def study() -> ModuleType:
     return module
 
 
-@pytest.mark.parametrize("name", [name for name in CAUSES])
+@pytest.mark.parametrize("name", list(CAUSES))
 def test_a_hidden_effect_is_found_and_named(name: str) -> None:
     row = study().case(12 + 6 * list(CAUSES).index(name), (name,), 20.0, "white")
     assert row["verdict"] != "nothing_found"
@@ -125,7 +125,7 @@ def test_what_no_cause_explains_is_called_unexplained() -> None:
 
 @pytest.fixture(scope="module")
 def warm() -> tuple[xr.Dataset, object]:
-    twin, track, when, calibration = study().vehicle(0)
+    calibration = study().vehicle(0)[3]
     _, ds = study().hide("current_field", 60.0, 0, 24, "white")
     return study().add_noise(ds, "white", 1.0, 24), calibration
 
