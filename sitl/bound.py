@@ -10,19 +10,11 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from sitl.platform import Vehicle
+from sitl.platform import HARD_IRON, MOMENT, SOFT_IRON, VOLUME_SPREAD, Vehicle
 
 __all__ = ["information_bound", "oracle"]
 
 Array = NDArray[np.float64]
-
-UNKNOWN_IRON = 1e5
-"""nT, prior width of the hard iron: none to speak of."""
-UNKNOWN_SOFT_IRON = 1.0
-UNKNOWN_MOMENT = 100.0
-"""A m²."""
-UNKNOWN_VOLUME = 0.1
-"""m³."""
 
 
 def oracle(vehicle: Vehicle, deployment: xr.Dataset) -> Array:
@@ -49,7 +41,8 @@ def information_bound(
     Parameters
     ----------
     vehicle : Vehicle
-        The truth; dipoles with a permanent and a three-axis induced moment and a position each.
+        The truth: dipoles with a permanent and a three-axis induced moment and a position each. Known of it
+        beforehand are the sizes that such vehicles are drawn with.
     calibration, survey : Dataset (time)
         Deployments of :func:`sitl.simulate`.
     sigma, memory : float
@@ -80,9 +73,9 @@ def information_bound(
         follows = np.diff(run, prepend=np.nan) == 0
         before = np.roll(g, 1, axis=0)
         g = np.where(follows[:, None], (g - phi * before) / np.sqrt(1 - phi**2), g)
-    widths = [*[UNKNOWN_SOFT_IRON] * 9, *[UNKNOWN_IRON] * 3]
-    for _ in vehicle.mass:
-        widths += [*[UNKNOWN_MOMENT] * 3, *[UNKNOWN_VOLUME] * 3, *[at_sigma] * 3]
+    widths = [*[SOFT_IRON] * 9, *[HARD_IRON] * 3]
+    for mass in vehicle.mass.values():
+        widths += [*[MOMENT] * 3, *(VOLUME_SPREAD * volume for volume in mass.volume), *[at_sigma] * 3]
     scale = np.array(widths)
     g = g * scale  # θ in units of its prior: the information matrix is then well scaled
     covariance = np.linalg.inv(g.T @ g + np.eye(len(scale)))

@@ -51,6 +51,16 @@ MOUNTINGS: dict[str, Mounting] = {
 }
 
 
+HARD_IRON, SOFT_IRON = 1500.0, 0.01
+"""nT, and nT a nT: 1-sigma an axis of a drawn vehicle's fixed iron."""
+MOMENT = 3.0
+"""A m², 1-sigma an axis of a drawn mass."""
+VOLUME, VOLUME_SPREAD = (2e-3, 1e-3, 1e-3), 0.3
+"""m³, apparent susceptibility times volume along each axis, and the spread of its logarithm."""
+PLACE_SPREAD = (0.06, 0.03, 0.03)
+"""m, 1-sigma of where a drawn mass stands about :data:`MOUNTINGS`."""
+
+
 class Mass(Table, frozen=True):
     """``[vehicle.mass.NAME]``: a mass that the parameter NAME moves.
 
@@ -159,9 +169,9 @@ def draw_vehicle(rng: np.random.Generator, masses: Sequence[str] = ("battpos", "
     factor near 0.1). It stands within centimetres of where its kind usually stands. A nominal calibration of such
     a vehicle over the spirals of the paper's Table 1 leaves about 150 nT, as the paper's did.
     """
-    iron = rng.normal(0, 0.01, (3, 3))
+    iron = rng.normal(0, SOFT_IRON, (3, 3))
     return Vehicle(
-        hard_iron=_vector(rng.normal(0, 1500, 3)),
+        hard_iron=_vector(rng.normal(0, HARD_IRON, 3)),
         soft_iron=(_vector(iron[0]), _vector(iron[1]), _vector(iron[2])),
         mass={name: _draw_mass(rng, MOUNTINGS[name]) for name in masses},
     )
@@ -169,10 +179,10 @@ def draw_vehicle(rng: np.random.Generator, masses: Sequence[str] = ("battpos", "
 
 def _draw_mass(rng: np.random.Generator, mounting: Mounting) -> Mass:
     return Mass(
-        at=_vector(np.asarray(mounting.at) + rng.normal(0, [0.06, 0.03, 0.03])),
+        at=_vector(np.asarray(mounting.at) + rng.normal(0, PLACE_SPREAD)),
         travel=mounting.travel,
-        moment=_vector(rng.normal(0, 3, 3)),
-        volume=_vector(np.array([2e-3, 1e-3, 1e-3]) * np.exp(rng.normal(0, 0.3, 3))),
+        moment=_vector(rng.normal(0, MOMENT, 3)),
+        volume=_vector(np.array(VOLUME) * np.exp(rng.normal(0, VOLUME_SPREAD, 3))),
     )
 
 

@@ -303,8 +303,13 @@ def main() -> None:
     }  # a process a core, for those spawned below
     with ProcessPoolExecutor(chosen.jobs, mp_context=get_context("spawn")) as pool:
         waiting = [pool.submit(run, case) for case in cases]
-        for done in track(as_completed(waiting), "gliders", len(waiting), console=Console(stderr=True)):
+        progress = Console(stderr=True)
+        for count, done in enumerate(
+            track(as_completed(waiting), "gliders", len(waiting), console=progress), 1
+        ):
             rows += done.result()
+            if not progress.is_terminal and count % 10 == 0:
+                print(f"{count} of {len(waiting)}", file=sys.stderr, flush=True)
     order = {(case.masses, case.noise): k for k, case in enumerate(cases)}
     rows.sort(key=lambda row: (order[row.masses, row.noise], row.seed))
     show(rows, console)
