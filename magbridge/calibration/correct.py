@@ -8,9 +8,9 @@ With ``A, T`` at the sample's positions and V the covariance of the corrected ve
     V_ij = Q_ij . (d d^T) + L_ij . d + O_ij         (dA, dT and the sensor's noise carried through)
     sigma_F^2 = u^T V u
 
-Every operation is elementwise IEEE arithmetic in one written order, on floats or on arrays, never a
-library's matrix product (whose order of summation depends on the shape and on the machine): so a
-sample corrected live, in a batch, or replayed on another computer gives identical bits.
+Every operation is elementwise IEEE arithmetic in one written order, on floats or on arrays, but for the
+products of :class:`~magbridge.calibration.kernel.Kernel`, which are exact in any order: so a sample
+corrected live, in a batch, or replayed on another computer gives identical bits.
 
 What a missing value gives: a NaN channel of the field or position makes total and vector NaN and
 the sigmas infinite, flagged ``gap`` or ``stale_telemetry``; the total is never a guess.
@@ -34,7 +34,7 @@ from magbridge.records import Corrected, Quality
 __all__ = ["CorrectedArrays", "Corrector", "correct", "regressors"]
 
 FloatArray = NDArray[np.float64]
-CHUNK = 512  # samples whose table products stay in a core's cache
+CHUNK = 4096  # samples: enough to outweigh a call, few enough for a core's cache
 ASKED = 16  # positions whose coefficients are remembered for what-ifs
 GAP, STALE_TELEMETRY = int(Quality.GAP), int(Quality.STALE_TELEMETRY)
 EXTRAPOLATED = int(Quality.EXTRAPOLATED)
@@ -175,8 +175,6 @@ class Corrector:
         self._flags = self._base
         self._last: list[float] = []
         self._prepared: tuple[Any, ...] = ()
-        self._pairs = list(zip(self._kernel.first.tolist(), self._kernel.second.tolist(), strict=True))
-        self._buffer = np.empty_like(self._kernel.table)
         self._asked: dict[tuple[float, ...], list[float]] = {}
 
     def step(
@@ -214,7 +212,7 @@ class Corrector:
                 regressors += effect(time_us, hx, hy, hz, values)
             if regressors != self._last:
                 self._last = regressors
-                self._prepared = self._stage(regressors)
+                self._prepared = _prepare(self._kernel.sums_of_one(regressors))
         F, sigma, x, y, z, sx, sy, sz = _apply(hx, hy, hz, self._prepared, self._sight, sqrt)
         quality |= self._flags
         if F - F != 0.0:  # NaN or infinite
@@ -254,11 +252,6 @@ class Corrector:
         by = xy * dx + yy * dy + yz * dz
         bz = xz * dx + yz * dy + zz * dz
         return sqrt(bx * bx + by * by + bz * bz)
-
-    def _stage(self, regressors: list[float]) -> tuple[Any, ...]:
-        psi = np.array([regressors[i] * regressors[j] for i, j in self._pairs])
-        np.multiply(psi[:, None], self._kernel.table, out=self._buffer)
-        return _prepare(np.add.reduce(self._buffer, axis=0).tolist())
 
 
 def correct(
@@ -331,22 +324,13 @@ def regressors(
 
 
 def _stage_many(kernel: Kernel, phi: FloatArray) -> tuple[Any, ...]:
-    """:meth:`Corrector._stage` for (m, n) regressors, once for each run of equal ones."""
+    """Prepare (m, n) regressors; where most stand still, once for each run of equal ones."""
     new = np.ones(phi.shape[1], bool)
     new[1:] = (phi[:, 1:] != phi[:, :-1]).any(axis=0)
+    if 2 * np.count_nonzero(new) > len(new):
+        return _prepare(list(kernel.sums(phi)))
     phi = phi[:, new]
-    table = kernel.table
-    sums = np.multiply.outer(table[0], phi[kernel.first[0]] * phi[kernel.second[0]])
-    product = np.empty_like(sums)
-    for q in range(1, len(table)):
-        psi = phi[kernel.first[q]] * phi[kernel.second[q]]
-        np.multiply(table[q][:, None], psi, out=product)
-        sums += product
-    prepared = _prepare(list(sums))
-    if new.all():
-        return prepared
-    if phi.shape[1] == 1:
-        return prepared
+    prepared = _prepare(list(kernel.sums(phi)))
     back = np.cumsum(new) - 1
     return (*(row[back] for row in prepared[:9]), [[row[back] for row in entry] for entry in prepared[9]])
 

@@ -67,7 +67,9 @@ class Fit:
         return float(np.sqrt(np.mean(self.residual**2)))
 
 
-def fit(data: Observations, method: str = "auto", order: int = 3, **options: Any) -> Fit:
+def fit(
+    data: Observations, method: str = "auto", order: int = 3, *, site_bias: float = 0.0, **options: Any
+) -> Fit:
     """Fit a calibration to `data`.
 
     Parameters
@@ -77,6 +79,9 @@ def fit(data: Observations, method: str = "auto", order: int = 3, **options: Any
         One of :data:`METHODS`.
     order : int
         Highest total degree of the polynomials.
+    site_bias : float
+        nT, 1-sigma of what the reference may be wrong by all over the site. No scalar fit at one site
+        can tell it from the gain: it goes into the covariance.
     **options
         The method's own.
 
@@ -92,7 +97,38 @@ def fit(data: Observations, method: str = "auto", order: int = 3, **options: Any
     # one thread: matrices this small only wait for each other, and sums keep one order on any machine
     with threadpool_limits(1, "blas"):
         _refuse_one_attitude(data)
-        return _judged(chosen(data, order, **options), data)
+        data, doubled = _without_doubles(data)
+        found = _biased(chosen(data, order, **options), site_bias)
+        return _judged(found, data, doubled)
+
+
+def _without_doubles(data: Observations) -> tuple[Observations, tuple[str, ...]]:
+    """Count samples once that stand there twice: a run given in two files."""
+    assert data.time is not None
+    order = np.argsort(data.time, kind="stable")
+    time, field = data.time[order], data.field[order]
+    same = np.zeros(len(data), bool)
+    same[order[1:]] = (time[1:] == time[:-1]) & (field[1:] == field[:-1]).all(axis=1)
+    if not same.any():
+        return data, ()
+    return data.part(~same), (f"{int(same.sum())} samples stand in the data twice: they were counted once",)
+
+
+def _biased(found: Fit, sigma: float) -> Fit:
+    """Carry an unknown bias of the reference into the covariance: ``dA = A dF / F`` for all positions alike."""
+    calibration = found.calibration
+    field = calibration.reference.field
+    v = calibration.coefficients.reshape(-1, 9) / field
+    v[0, :3] += 1.0
+    v[:, 6:] = 0.0
+    return replace(
+        found,
+        calibration=replace(
+            calibration,
+            covariance=calibration.covariance + sigma**2 * np.outer(v, v),
+            reference=Reference(field, calibration.reference.model, 0.0, sigma),
+        ),
+    )
 
 
 def _refuse_one_attitude(data: Observations) -> None:
@@ -107,13 +143,13 @@ def _refuse_one_attitude(data: Observations) -> None:
         )
 
 
-def _judged(found: Fit, data: Observations) -> Fit:
+def _judged(found: Fit, data: Observations, doubled: tuple[str, ...]) -> Fit:
     """Add the boresight, and say what the data could not tell."""
     calibration = found.calibration
     if calibration.boresight is None:
         calibration = with_boresight(calibration, find_boresight(calibration, data))
     ratio = expected_ratio(calibration, data)
-    warnings = [*found.warnings, *warnings_for(calibration, data)]
+    warnings = [*doubled, *found.warnings, *warnings_for(calibration, data)]
     outliers = found.details.get("outliers", 0)
     if outliers > 0.02 * len(data):
         warnings.append(f"{outliers} of {len(data)} samples are outliers and took no part")

@@ -7,7 +7,13 @@ With regressors ``phi(x)`` (the monomials, and what effects add) the nine coeffi
 regressors. Many products coincide (``x^2 . x`` and ``x . x^2``): 28 remain of 55 for a cubic in two
 positions. So both are one sum over products ``psi``::
 
-    (theta, covariance of theta) = psi^T table
+    (theta, covariance of theta) = table psi
+
+A matrix product rounds in an order that depends on its shape and on the machine. So psi and table are
+split into a coarse and a fine part of 21 bits each: products of parts and their sums then fit a
+double *exactly*, in whatever order (Ozaki et al. 2012, Numer. Algorithms 59:95), and one sample live
+gives the same bits as a million in a batch, here and on any other computer. What the split leaves
+out is 2e-13 of the largest: 1e-8 nT.
 
 For the covariance V of the corrected vector ``b = A d, d = H_r - T``, write ``db = dA d - A dT``: V is
 quadratic in d, and the table holds the covariance in just the combinations that V needs: 36 for the
@@ -18,6 +24,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from math import frexp, ldexp
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -31,6 +39,13 @@ if TYPE_CHECKING:
 __all__ = ["Kernel", "compile_kernel"]
 
 FloatArray = NDArray[np.float64]
+
+BITS = 21
+COARSE, FINE = 1.5 * 2.0 ** (52 - BITS), 1.5 * 2.0 ** (52 - 2 * BITS)
+"""Adding and taking away rounds to a multiple of 2^-21, of 2^-42."""
+EXPONENT = 3
+"""psi is kept below 2^3, by a power of two where positions lie far outside the range seen: then
+2^24 . 2^21 . 256 products still fit 53 bits."""
 
 PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 SLOT = ((0, 3, 4), (3, 1, 5), (4, 5, 2))
@@ -53,8 +68,8 @@ class Kernel:
         W, with ``A`` itself (not ``a``) in the first six.
     first, second : (q,) int arrays
         Product q is ``phi[first] * phi[second]``; the first m products are the regressors.
-    table : (q, 69) array
-        nine coefficients, then 60 combinations of their covariance.
+    coarse, fine : (69, q) arrays
+        The table in two parts: nine coefficients, then 60 combinations of their covariance.
     """
 
     centre: tuple[float, ...]
@@ -64,7 +79,45 @@ class Kernel:
     weights: FloatArray
     first: NDArray[np.intp]
     second: NDArray[np.intp]
-    table: FloatArray
+    coarse: FloatArray
+    fine: FloatArray
+
+    def sums(self, phi: FloatArray) -> FloatArray:
+        """Return ``table psi`` (69, n) of many samples' regressors (m, n)."""
+        psi = phi[self.first] * phi[self.second]
+        largest = np.abs(phi).max(axis=0)
+        scale = np.ldexp(1.0, np.minimum(EXPONENT - np.frexp(largest * largest)[1], 0))
+        psi *= scale
+        coarse = (psi + COARSE) - COARSE
+        fine = (psi - coarse + FINE) - FINE
+        found = self.coarse @ coarse + (self.fine @ coarse + self.coarse @ fine)
+        found /= scale
+        return np.asarray(found)
+
+    def sums_of_one(self, phi: list[float]) -> list[float]:
+        """Return the same 69 sums of one sample's regressors: one product, so that it is quick."""
+        largest = max(*phi, -min(phi))
+        scale = ldexp(1.0, min(EXPONENT - frexp(largest * largest)[1], 0))
+        psi = np.array([phi[i] * phi[j] * scale for i, j in self.pairs])
+        parts = np.empty((len(psi), 2))
+        coarse = np.add(psi, COARSE, out=parts[:, 0])
+        coarse -= COARSE
+        fine = np.subtract(psi, coarse, out=parts[:, 1])
+        fine += FINE
+        fine -= FINE
+        found = self.both @ parts
+        sums: list[float] = ((found[:69, 0] + (found[69:, 0] + found[:69, 1])) / scale).tolist()
+        return sums
+
+    @cached_property
+    def pairs(self) -> list[tuple[int, int]]:
+        """`first` and `second` as numbers that Python multiplies by at once."""
+        return list(zip(self.first.tolist(), self.second.tolist(), strict=True))
+
+    @cached_property
+    def both(self) -> FloatArray:
+        """(138, q) `coarse` above `fine`."""
+        return np.concatenate([self.coarse, self.fine])
 
     def powers(self, values: Sequence[Any], one: Any) -> list[Any]:
         """Return the monomials, of floats or of arrays: the same multiplications in the same order."""
@@ -102,6 +155,9 @@ def compile_kernel(calibration: Calibration) -> Kernel:
     W = np.tensordot(calibration.coefficients, P, 1)
     W[0, :3] += 1.0
     first, second, table = _table(P, W, calibration, exponents)
+    size = 2.0 ** np.frexp(np.abs(table).max(axis=0))[1]  # a power of two above each column
+    coarse = ((table / size + COARSE) - COARSE).T * size[:, None]
+    fine = ((table / size - coarse.T / size + FINE) - FINE).T * size[:, None]
     return Kernel(
         centre=tuple(parameter.centre for parameter in calibration.parameters),
         scale=tuple(parameter.scale for parameter in calibration.parameters),
@@ -110,7 +166,8 @@ def compile_kernel(calibration: Calibration) -> Kernel:
         weights=W,
         first=first,
         second=second,
-        table=table,
+        coarse=coarse,
+        fine=fine,
     )
 
 

@@ -260,3 +260,23 @@ def test_nominal_constraints(glider: Gliders) -> None:
     assert not coefficients[3:6].any()
     assert not covariance[3:6].any()
     assert nominal_samples(glider(0).runs).phi.shape[1] == 1
+
+
+def test_runs_given_twice_count_once(glider: Gliders) -> None:
+    runs = glider(1, 2).runs
+    twice = {name: np.concatenate([getattr(runs, name)] * 2) for name in (
+        "field", "reference", "parameters", "runs", "time", "attitude", "reference_ned")}  # fmt: skip
+    found = fit(replace(runs, **twice), "nominal")
+    assert "2250 samples stand in the data twice" in found.warnings[0]
+    np.testing.assert_array_equal(
+        found.calibration.coefficients, fit(runs, "nominal").calibration.coefficients
+    )
+
+
+def test_a_site_bias_is_in_every_sigma(glider: Gliders) -> None:
+    """What the reference may be wrong by, the corrected field may be wrong by, and nothing else changes."""
+    runs = glider(1, 2).runs
+    without, with_bias = (fit(runs, site_bias=bias).calibration for bias in (0.0, 30.0))
+    before, after = (correct(c, runs.field, runs.parameters, runs.time) for c in (without, with_bias))
+    np.testing.assert_array_equal(before.total, after.total)
+    np.testing.assert_allclose(np.sqrt(after.sigma**2 - before.sigma**2), 30.0, rtol=0.01)
