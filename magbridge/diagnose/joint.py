@@ -32,7 +32,7 @@ class Joint:
     Attributes
     ----------
     log_likelihood : float
-        Of the noise model, with the calibration's prior.
+        Of the noise model, with the prior of the calibration and of the effects.
     z : (q,) array
     coefficients : (k,) array
         Of the effects, in units of their prior width.
@@ -57,7 +57,7 @@ def fit_joint(
     start: FloatArray | None = None,
     *,
     blocks: bool | None = None,
-    ridge: float = 1e-6,
+    ridge: float = 1e-2,
     rounds: int = 5,
 ) -> Joint:
     """Maximise the joint likelihood of calibration, effects and noise.
@@ -73,7 +73,7 @@ def fit_joint(
     blocks : bool, optional
         See :func:`~magbridge.diagnose.noise.fit_noise`.
     ridge : float
-        Prior precision of the effects; the default only keeps what is invisible from running away.
+        Prior precision of the effects, in units of their widths: ten times a plausible size is hardly believed.
     rounds : int
         At most.
     """
@@ -106,7 +106,6 @@ def fit_joint(
             break
     A = noise.filter(X)
     covariance: FloatArray = np.asarray(np.linalg.inv(A.T @ A + np.diag(prior)), float)
-    value += 0.5 * float(prior[q:] @ c[q:] ** 2)  # the ridge is no prior
     return Joint(value, c[:q], c[q:], covariance, noise, left)
 
 

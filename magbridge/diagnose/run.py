@@ -37,6 +37,8 @@ FloatArray = NDArray[np.float64]
 
 SHARE = 0.5
 """Of a named cause's signal-to-noise: when more than this stays unexplained, the name does not fit."""
+WORSE = 1.1
+"""Ratio of held-out RMS above which the extended calibration is not believed."""
 REMAINDER = 0.25
 """Less than this is what an idealised regressor leaves, and not worth a word."""
 
@@ -144,6 +146,10 @@ def diagnose(
         counts[wrong.rows] = False
     before = problem.residual
     after = held_out(settled, columns, fit) if model else before
+    if paired(before, after, survey.dive, counts if counts.any() else ~counts).ratio > WORSE:
+        # names that make the dives worse that they never saw are no explanation
+        named, rivals, model, fit, after, extended = (), (), [], outcome.null, before, calibration
+        rest = leftover(problem, [], outcome.null, outcome.order, tones[0] if tones else None)
     gains = []
     for k in range(len(model)):
         others = [candidate.columns for i, candidate in enumerate(model) if i != k]

@@ -43,8 +43,6 @@ SHORT_LIST = 9
 """Causes that are fitted jointly in a round."""
 IDEAL = 0.15
 """How far from the truth an idealised regressor may be: what is left of a large effect is not another cause."""
-IMPLAUSIBLE = 30.0
-"""Times the plausible size, 1-sigma of what is believed at all."""
 SHARPEN = 4
 """Halvings of a nonlinear parameter's bracket."""
 STARTS = 3
@@ -246,9 +244,7 @@ class _Search:
             ratio = max(0.0, 2.0 * (fit.log_likelihood - base.log_likelihood))
             tests = self.trials.get(candidate.cause, 1.0) * self.causes
             p_value = min(1.0, tests * float(chi2.sf(ratio, max(s.freedom, 1))))
-            b = fit.coefficients[-candidate.size :]
-            # beyond many times its plausible size a cause is none
-            evidence = weigh(ratio, s.freedom) + average - 0.5 * float(np.sum((b / IMPLAUSIBLE) ** 2))
+            evidence = weigh(ratio, s.freedom) + average
             if candidate.trials > 1.0:
                 evidence -= float(np.log(candidate.trials))
             found.append(Hypothesis(candidate, ratio, evidence, p_value, fit, average))
