@@ -194,7 +194,7 @@ def actuator_order(problem: Problem) -> list[Candidate]:
     k = len(calibration.parameters)
     if not k:
         return []
-    present = {e for term in calibration.terms for e in term.expand(calibration).exponents}  # type: ignore[attr-defined]
+    present = {e for term in calibration.terms for e in term.expand(calibration).exponents}
     highest = max(sum(e) for e in present)
     made = []
     for exponents in full_order(k, min(highest + 1, 5)):

@@ -71,6 +71,11 @@ class Noise:
         """Fisher information of a location, against a Gaussian's of the same scale."""
         return (self.nu + 1.0) / (self.nu + 3.0)
 
+    @property
+    def independent(self) -> float:
+        """How many independent samples say as much of a constant: ``n (1 - sum a)^2 / f^2``."""
+        return float(len(self.scale) * (1.0 - self.memory.sum()) ** 2 / max(self.share, 1e-6) ** 2)
+
     def filter(self, values: FloatArray, start: int = 0, skip: int = 0) -> FloatArray:
         """Whiten columns for least squares.
 

@@ -195,7 +195,7 @@ def _tensor(calibration: Calibration) -> FloatArray:
     tensor = np.zeros((calibration.coefficients.size, len(kernel.weights), 9))
     row, k = {exponent: i for i, exponent in enumerate(exponents)}, 0
     for term in calibration.terms:
-        expansion = term.expand(calibration)  # type: ignore[attr-defined]
+        expansion = term.expand(calibration)
         tensor[k : k + term.size, [row[e] for e in expansion.exponents]] = expansion.columns
         k += term.size
     r = len(exponents)
