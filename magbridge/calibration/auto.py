@@ -6,6 +6,9 @@ Each start first comes near with the noise as large as its residuals; then it cl
 coefficients by Gauss-Newton at fixed widths, widths and noise by the evidence of the quadratic that
 it leaves, outliers and (at last) memory of the residuals. The start
 whose evidence is largest wins, and must be a maximum; the answer must not have collapsed.
+
+Leaving one run out at a time chooses no better widths (survey at 1.045 of the noise floor against the
+evidence's 1.036, median of 8 gliders), for hundreds of fits where the evidence needs a few.
 """
 
 from __future__ import annotations

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
 
-from magbridge.calibration.terms import Expansion, Term
+from magbridge.calibration.terms import Expansion, PositionTerm
 from magbridge.errors import CalibrationError
 
 if TYPE_CHECKING:
@@ -114,7 +114,7 @@ def expand_dipole(values: FloatArray, order: int) -> FloatArray:
     return np.asarray((powers @ fit) @ values)
 
 
-class Dipole(Term, frozen=True, kw_only=True):
+class Dipole(PositionTerm, frozen=True, kw_only=True):
     """One mass as a dipole; coefficients: moment (3), induced (3), displacement (3).
 
     Attributes

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magbridge.calibration.model import Boresight, Calibration, Noise, Parameter, Reference, Run, Sensor
-from magbridge.calibration.terms import Effect, Term, term_class
+from magbridge.calibration.terms import Effect, PositionTerm, Term, term_class
 from magbridge.errors import CalibrationError, FormatError
 from magbridge.files import atomic_path
 
@@ -156,14 +156,16 @@ def _checked(content: _File, terms: tuple[Term, ...], effects: tuple[Term, ...])
         raise CalibrationError("reference: field: expected nT, > 0")
     if not content.noise.sensor >= 0.0:
         raise CalibrationError("noise: sensor: expected nT, >= 0")
-    if any(isinstance(term, Effect) for term in terms) or not all(isinstance(e, Effect) for e in effects):
+    positions = tuple(term for term in terms if isinstance(term, PositionTerm))
+    others = tuple(effect for effect in effects if isinstance(effect, Effect))
+    if len(positions) < len(terms) or len(others) < len(effects):
         raise CalibrationError(
             "terms and effects: an effect stands among the terms or a term among the effects"
         )
     return Calibration(
         parameters=content.parameters,
-        terms=terms,
-        effects=tuple(effect for effect in effects if isinstance(effect, Effect)),
+        terms=positions,
+        effects=others,
         coefficients=coefficients,
         covariance=covariance,
         noise=content.noise,
@@ -180,7 +182,8 @@ def _checked(content: _File, terms: tuple[Term, ...], effects: tuple[Term, ...])
 def _check_covariance(covariance: FloatArray) -> None:
     """Symmetric and positive semidefinite, up to rounding."""
     scale = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
-    correlation = covariance / scale / scale[:, None]
+    with np.errstate(over="ignore"):  # a covariance without a variance: refused below
+        correlation = covariance / scale / scale[:, None]
     if (np.diag(covariance) < 0.0).any() or np.abs(correlation).max(initial=0.0) > 1.0 + 1e-6:
         raise CalibrationError("covariance: a variance is negative or a correlation above 1")
     if not np.allclose(correlation, correlation.T, rtol=0.0, atol=1e-9):

@@ -14,10 +14,10 @@ from threadpoolctl import threadpool_limits
 import magbridge
 from magbridge.calibration.boresight import find_boresight
 from magbridge.calibration.data import Observations
-from magbridge.calibration.identify import expected_ratio, warnings_for
+from magbridge.calibration.identify import combinations, expected_ratio, warnings_for
 from magbridge.calibration.model import Calibration, Noise, Parameter, Reference, Run, Sensor, with_boresight
 from magbridge.calibration.noise import NoiseModel
-from magbridge.calibration.residual import Samples, residuals_of
+from magbridge.calibration.residual import Samples, residuals_of, scales_and_offsets
 from magbridge.calibration.terms import Polynomial
 from magbridge.errors import CalibrationError
 
@@ -50,7 +50,10 @@ class Fit:
     warnings : tuple of str
         What the data could not tell, in a pilot's words.
     details : dict
-        Numbers of the method: evidence, widths, what was determined.
+        Numbers of the method: evidence, widths, what was determined; rank and how well each estimable
+        combination is known from the data alone (nT).
+    samples : Samples
+        What was compared, for a closer look (:mod:`.identify`).
     supported : bool
         The data hold the fit: what it leaves open is small against the noise (``--strict``).
     """
@@ -59,7 +62,17 @@ class Fit:
     residual: FloatArray
     warnings: tuple[str, ...]
     details: dict[str, Any]
+    samples: Samples
     supported: bool = True
+
+    @property
+    def scales(self) -> tuple[float, float]:
+        """Smallest and largest scale of A where the samples are: what the residual was bought with."""
+        step = max(len(self.samples.phi) // 1000, 1)
+        scales, _ = scales_and_offsets(
+            self.samples.part(slice(None, None, step)), self.calibration.coefficients
+        )
+        return float(scales.min()), float(scales.max())
 
     @property
     def rms(self) -> float:
@@ -159,7 +172,13 @@ def _judged(found: Fit, data: Observations, doubled: tuple[str, ...]) -> Fit:
             f"the data do not support this fit: near these runs, rolled 10 degrees further, "
             f"expect {ratio * calibration.noise.sensor:.0f} nT of error",
         )
-    details = {**found.details, "expected_over_noise": ratio}
+    seen = combinations(found.samples, calibration.coefficients, max(calibration.noise.sensor, 1e-9))
+    details = {
+        **found.details,
+        "expected_over_noise": ratio,
+        "rank": seen.rank,
+        "combinations_nT": seen.sigma.tolist(),
+    }
     return replace(
         found,
         calibration=calibration,
@@ -225,4 +244,4 @@ def assemble(
         inputs=dict(data.inputs),
         software=f"magbridge {magbridge.__version__}",
     )
-    return Fit(calibration, e, warnings, details or {})
+    return Fit(calibration, e, warnings, details or {}, samples)

@@ -17,7 +17,7 @@ from magbridge.calibration.terms import Polynomial
 __all__ = ["Combinations", "combinations", "expected_ratio", "warnings_for"]
 
 FloatArray = NDArray[np.float64]
-ROWS = 20_000  # of the Jacobian: more do not change its rank
+ROWS = 5_000  # of the Jacobian: more do not change its rank
 RANK_TOLERANCE = 1e-9  # of the largest singular value
 
 

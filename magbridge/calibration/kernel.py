@@ -137,7 +137,7 @@ class Kernel:
 
 def compile_kernel(calibration: Calibration) -> Kernel:
     """Compile `calibration`; see the module's notes."""
-    expansions = [term.expand(calibration) for term in calibration.terms]  # type: ignore[attr-defined]
+    expansions = [term.expand(calibration) for term in calibration.terms]
     exponents = _closed({e for expansion in expansions for e in expansion.exponents}, calibration)
     row = {exponent: i for i, exponent in enumerate(exponents)}
     effects = [effect.columns(calibration.reference.field) for effect in calibration.effects]

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magbridge.calibration.kernel import Kernel, compile_kernel
-from magbridge.calibration.terms import Effect, Polynomial, Term
+from magbridge.calibration.terms import Effect, Polynomial, PositionTerm
 from magbridge.errors import CalibrationError
 
 __all__ = ["Boresight", "Calibration", "Noise", "Parameter", "Reference", "Run", "Sensor", "identity"]
@@ -119,7 +119,7 @@ class Calibration:
     Attributes
     ----------
     parameters : tuple of Parameter
-    terms, effects : tuple of Term, tuple of Effect
+    terms, effects : tuple of PositionTerm, tuple of Effect
         Coefficients stand in this order.
     coefficients : (K,) array
         nT (a dipole's displacement: m; an effect's: as its class says).
@@ -135,7 +135,7 @@ class Calibration:
     """
 
     parameters: tuple[Parameter, ...]
-    terms: tuple[Term, ...]
+    terms: tuple[PositionTerm, ...]
     coefficients: FloatArray
     covariance: FloatArray
     noise: Noise

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from magbridge.calibration.data import Observations
 from magbridge.calibration.noise import NoiseModel, estimate_noise
-from magbridge.calibration.residual import Samples, residuals_of
+from magbridge.calibration.residual import Samples, residuals_of, scales_and_offsets
 from magbridge.calibration.solve import Prior, covariance_of, gauss_newton
 from magbridge.errors import CalibrationError
 
@@ -136,10 +136,8 @@ def check_scales(samples: Samples, coefficients: FloatArray) -> None:
     CalibrationError
         Where the samples are, a scale of A outside 0.5 to 2, or a T above twice the field.
     """
-    seen = samples.phi[:: max(len(samples.phi) // 1000, 1)]
-    theta = seen @ coefficients.reshape(seen.shape[1], 9)
-    A = theta[:, [0, 3, 4, 3, 1, 5, 4, 5, 2]].reshape(-1, 3, 3) / samples.unit + np.eye(3)
-    scales, T = np.linalg.eigvalsh(A), np.linalg.norm(theta[:, 6:], axis=1)
+    seen = samples.part(slice(None, None, max(len(samples.phi) // 1000, 1)))
+    scales, T = scales_and_offsets(seen, coefficients)
     worst = int(
         np.argmax(np.maximum(np.abs(np.log2(np.maximum(scales, 1e-3))).max(axis=1), T / (2.0 * samples.unit)))
     )

@@ -24,7 +24,15 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["NormalEquations", "Samples", "normal_equations", "residuals", "residuals_of", "whiten"]
+__all__ = [
+    "NormalEquations",
+    "Samples",
+    "normal_equations",
+    "residuals",
+    "residuals_of",
+    "scales_and_offsets",
+    "whiten",
+]
 
 FloatArray = NDArray[np.float64]
 CHUNK = 8192  # rows of the Jacobian at a time: bounded memory at any number of samples
@@ -113,6 +121,13 @@ def residuals_of(samples: Samples, coefficients: FloatArray) -> FloatArray:
         for start in range(0, len(samples.field), CHUNK)
     ]
     return np.concatenate(pieces)
+
+
+def scales_and_offsets(samples: Samples, coefficients: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Eigenvalues of A (n, 3) and size of T (n,), nT, at every sample."""
+    theta = samples.phi @ coefficients.reshape(-1, 9)
+    A = theta[:, [0, 3, 4, 3, 1, 5, 4, 5, 2]].reshape(-1, 3, 3) / samples.unit + np.eye(3)
+    return np.asarray(np.linalg.eigvalsh(A)), np.asarray(np.linalg.norm(theta[:, 6:], axis=1))
 
 
 def _times(A: FloatArray, x: FloatArray) -> FloatArray:

@@ -23,12 +23,24 @@ from magbridge.errors import CalibrationError
 if TYPE_CHECKING:
     from magbridge.calibration.model import Calibration
 
-__all__ = ["SLOTS", "TERMS", "Effect", "Expansion", "Polynomial", "Term", "full_order", "term_class"]
+__all__ = [
+    "SLOTS",
+    "TERMS",
+    "Effect",
+    "Expansion",
+    "Polynomial",
+    "PositionTerm",
+    "Term",
+    "full_order",
+    "term_class",
+]
 
 FloatArray = NDArray[np.float64]
 Exponents = tuple[int, ...]
 Step = Callable[[int, float, float, float, Sequence[float]], tuple[float, ...]]
 """One sample into an effect: time (µs), the raw channels (nT), the values -> its regressors."""
+
+HIGHEST = 30  # total degree: beyond, powers are noise
 
 SLOTS = ("a_xx", "a_yy", "a_zz", "a_xy", "a_xz", "a_yz", "t_x", "t_y", "t_z")
 """Six of the symmetric ``A`` (as ``a = (A - I) F_0``, nT) and three of ``T`` (nT)."""
@@ -77,7 +89,15 @@ class Term(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
         """Raise CalibrationError where the settings do not fit the calibration's parameters."""
 
 
-class Polynomial(Term, frozen=True, kw_only=True):
+class PositionTerm(Term, frozen=True, kw_only=True):
+    """A term that depends on the positions alone: a polynomial in them, or as good as one."""
+
+    def expand(self, calibration: Calibration) -> Expansion:
+        """Return the term as a polynomial in the positions as `calibration` scales them."""
+        raise NotImplementedError
+
+
+class Polynomial(PositionTerm, frozen=True, kw_only=True):
     """Each of the nine coefficients a polynomial in the scaled positions (paper, eq. 8).
 
     Coefficient ``9 m + s`` multiplies monomial m in slot s.
@@ -97,17 +117,17 @@ class Polynomial(Term, frozen=True, kw_only=True):
         return 9 * len(self.exponents)
 
     def check(self, parameters: tuple[str, ...]) -> None:
-        """One non-negative exponent for each parameter, no monomial twice."""
+        """One exponent of 0 to 30 for each parameter, no monomial twice."""
         for exponent in self.exponents:
-            if len(exponent) != len(parameters) or min(exponent, default=0) < 0:
+            if len(exponent) != len(parameters) or min(exponent, default=0) < 0 or sum(exponent) > HIGHEST:
                 raise CalibrationError(
-                    f"exponents {list(exponent)}: expected {len(parameters)} non-negative numbers, "
-                    "one for each parameter"
+                    f"exponents {list(exponent)}: expected {len(parameters)} numbers >= 0, one for each "
+                    f"parameter, of {HIGHEST} in all at most"
                 )
         if len(set(self.exponents)) != len(self.exponents):
             raise CalibrationError("exponents: a monomial stands there twice")
 
-    def expand(self, calibration: Calibration) -> Expansion:  # noqa: ARG002  (a dipole needs it)
+    def expand(self, calibration: Calibration) -> Expansion:  # noqa: ARG002  (a dipole needs the scale)
         """Return the polynomial as itself."""
         m = len(self.exponents)
         return Expansion(self.exponents, np.eye(9 * m).reshape(9 * m, m, 9))

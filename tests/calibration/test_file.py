@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 from magbridge.calibration.correct import correct
 from magbridge.calibration.dipole import Dipole
@@ -138,6 +140,38 @@ def test_not_positive_semidefinite(cal: Calibration) -> None:
 
     with pytest.raises(CalibrationError, match="positive semidefinite"):
         decode_calibration(edit(change, cal))
+
+
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_any_edit_is_read_or_refused_in_one_line(data: st.DataObject, cal: Calibration) -> None:
+    """Whatever a hand puts in place of a value: a calibration, or one of the two errors."""
+    content = json.loads(encode_calibration(cal))
+    place: Any = content
+    while isinstance(place, (dict, list)) and place:
+        keys = sorted(place) if isinstance(place, dict) else list(range(len(place)))
+        key = data.draw(st.sampled_from(keys))
+        if not isinstance(place[key], (dict, list)) or data.draw(st.booleans()):
+            place[key] = data.draw(
+                st.none() | st.booleans() | st.floats(allow_nan=False, allow_infinity=False) | st.text(max_size=3)
+                | st.integers(-(2**70), 2**70) | st.lists(st.integers(-5, 99), max_size=3)
+            )  # fmt: skip
+            break
+        place = place[key]
+    try:
+        read = decode_calibration(json.dumps(content).encode(), "cal.json")
+    except (FormatError, CalibrationError) as refused:
+        told = str(refused)
+    else:
+        told = f"cal.json: {read.method}"
+    assert told.startswith("cal.json: ")
+    assert "\n" not in told or told == f"cal.json: {content['method']}"
+
+
+@given(noise=st.binary(max_size=60))
+def test_any_bytes_are_refused(noise: bytes) -> None:
+    with pytest.raises(FormatError):
+        decode_calibration(noise)
 
 
 def test_a_file_that_is_not_there(tmp_path: Path) -> None:

@@ -254,6 +254,14 @@ def test_a_collapsed_fit_is_refused() -> None:
         fit(data, "nominal", gain_sigma=1.0)
 
 
+def test_without_parameters_auto_is_one_ellipsoid(glider: Gliders) -> None:
+    found = fit(glider(0, 0).runs)
+    assert found.calibration.coefficients.shape == (9,)
+    assert survey_error(found.calibration, glider(0, 0))[0] < 1.1
+    smallest, largest = found.scales
+    assert 0.9 < smallest < largest < 1.1
+
+
 def test_nominal_constraints(glider: Gliders) -> None:
     coefficients, covariance, _ = nominal(glider(0).runs, axes_fixed=True, equal_xz=True)
     assert coefficients[0] == coefficients[2]
