@@ -243,3 +243,16 @@ def test_a_seagliders_own_attitude_explains_its_magnetometer(real_data: Path) ->
     assert np.std(measured[known] @ matrix - truth[known]) < 400
     np.testing.assert_allclose(matrix[:3], np.eye(3), atol=0.06)
     assert np.isfinite(simulated["reference_field"]).all()
+
+
+@pytest.mark.real
+def test_a_slocums_telemetry_drives_a_glider_that_it_never_was(real_data: Path) -> None:
+    logs = pytest.importorskip("magbridge.logs")
+    pytest.importorskip("dbdreader")
+    log = logs.read(sorted((real_data / "slocum_comet").glob("*.[de]bd")))
+    simulated = simulate_like(log, load("comet"), 1)
+    np.testing.assert_array_equal(simulated["battpos"], log["battpos"])
+    for name in ("mag_x", "mag_y", "mag_z", "truth_total_field", "reference_field"):
+        assert np.isfinite(simulated[name]).all()
+    raw = np.linalg.norm(channels(simulated), axis=1)
+    assert 100 < np.std(raw - simulated["truth_total_field"]) < 5000  # its iron, turned by its attitudes
