@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from cyclopts import Parameter, validators
 
@@ -118,7 +118,7 @@ def calibrate(
     deployment = with_true_heading(read(some(files), required=(*CHANNELS, *parameter)))
     data = observations(deployment, parameter, reference=lambda ds: earth_field(ds, anomalies))
     data = replace(data, inputs={file.name: sha256(file.read_bytes()).hexdigest() for file in files})
-    options = {"vehicle": read_vehicle(vehicle)} if vehicle else {}
+    options: dict[str, Any] = {"vehicle": read_vehicle(vehicle)} if vehicle else {}
     found = fit(data, method, order, **options)
     save(found.calibration, output)
     for warning in found.warnings:
