@@ -78,6 +78,7 @@ def calibrate(
     method: str = "auto",
     vehicle: Path | None = None,
     grid: Path | None = None,
+    site_bias: Annotated[float, Parameter(validator=validators.Number(gte=0))] = 0.0,
     strict: bool = False,
     json: Json = False,
 ) -> None:
@@ -99,6 +100,8 @@ def calibrate(
         A vehicle.toml that says where the moving masses sit, seen from the sensor.
     grid
         An anomaly grid, added to the IGRF.
+    site_bias
+        nT, 1-sigma of what the reference may be wrong by all over the site.
     strict
         Exit with 1 when the data leave something untold.
     json
@@ -119,7 +122,7 @@ def calibrate(
     data = observations(deployment, parameter, reference=lambda ds: earth_field(ds, anomalies))
     data = replace(data, inputs={file.name: sha256(file.read_bytes()).hexdigest() for file in files})
     options: dict[str, Any] = {"vehicle": read_vehicle(vehicle)} if vehicle else {}
-    found = fit(data, method, order, **options)
+    found = fit(data, method, order, site_bias=site_bias, **options)
     save(found.calibration, output)
     for warning in found.warnings:
         complain(warning, 0)
@@ -128,10 +131,15 @@ def calibrate(
         "method": method,
         "samples": len(data),
         "rms_nT": found.rms,
+        "scales": found.scales,
         "noise_nT": found.calibration.noise.sensor,
         "warnings": found.warnings,
     }
-    summary = f"{output}: {method}, {len(data)} samples, {found.rms:.2f} nT RMS in the sensor's own units"
+    low, high = found.scales
+    left = f"{found.rms:.2f} nT RMS in the sensor's own units"
+    summary = (
+        f"{output}: {method}, {len(data)} samples, {left}, bought with scales of {low:.3f} to {high:.3f}"
+    )
     tell(result, summary, json)
     if strict and found.warnings:
         raise DataError(f"{len(found.warnings)} things that the data cannot tell, and --strict")
