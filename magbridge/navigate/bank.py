@@ -188,11 +188,12 @@ class Bank:
     def _merge(self) -> None:
         """Make one of those that have come to the same cell of the position, of the same mean and covariance."""
         cell = np.floor(self.x[:, :2] / (CELL * self.resolution))
-        _, group = np.unique(cell, axis=0, return_inverse=True)
+        group = np.unique(cell, axis=0, return_inverse=True)[1].ravel()
         n = int(group.max()) + 1
         if n == len(self):
             return
-        w = np.bincount(group, self.w, n)
+        w = np.zeros(n)
+        np.add.at(w, group, self.w)
         share = (self.w / w[group])[:, None]
         x = np.zeros((n, self.x.shape[1]))
         np.add.at(x, group, share * self.x)

@@ -40,7 +40,9 @@ UNINFORMED = 0.8  # of what dead reckoning alone would have: the field has said 
 REACH = 300.0  # m, the least that the watch looks around
 JOIN, SPLIT = 1.2, 1.5  # of the map's resolution: below one hypothesis will do, above it will not
 LEVEL_LASTS = 10.0  # times as long as a calibration's bias
-HOPELESS = 4  # searches that end nowhere, before the spread is no longer widened
+DOUBTFUL = 1.0  # log odds: another place explains the field better, if not yet beyond doubt
+SPREADS = (2.0, 4.0, 2.0, 8.0)  # times its reach, of the searches after each other
+DOUBTED = 2  # searches in vain, after which the map's level is doubted too
 
 
 class State(IntEnum):
@@ -294,39 +296,39 @@ class Navigator:
             s.slope_east / n,
         )
 
-    def _predict(self, time_us: int) -> float:
-        """Move every estimate on to `time_us`; return the metres travelled."""
+    def _predict(self, time_us: int) -> tuple[float, float]:
+        """Move every estimate on to `time_us`; return the seconds and metres that it took."""
         seconds, metres = (time_us - self._time_us) * 1e-6, self._reckoning.travelled - self._travelled
         self._time_us, self._travelled = time_us, self._reckoning.travelled
         F, Q = transition(self.options, seconds, metres)
         self._alone = F[:4, :4] @ self._alone @ F[:4, :4].T + Q[:4, :4]
-        before = (np.eye(6), np.zeros((6, 6))) if self._reported else self.moved
-        self.moved = F @ before[0], F @ before[1] @ F.T + Q
+        self.moved = (F, Q) if self._reported else (F @ self.moved[0], F @ self.moved[1] @ F.T + Q)
         self._reported = False
         if self._filter is None:
             self.x, self.P = F @ self.x, F @ self.P @ F.T + Q
         else:
             self._filter.predict(F, Q)
-        return metres
+        return seconds, metres
 
     def _update(self, s: Sums) -> Record:
         block = self._block(s)
-        metres = self._predict(block.time_us)
+        seconds, metres = self._predict(block.time_us)
         if self._filter is None:
             self._resolution = resolution(self.grid, block.variance)
             self._filter = self._estimator(self.x, self.P)
         innovation, variance, likelihood, accepted, anomaly = self._take_in(block)
         self._estimate()
         if isfinite(anomaly):
-            self._judge(block, metres, likelihood)
+            self._judge(block, seconds, metres, likelihood)
         self._choose(isfinite(anomaly))
         self._reported = True
         latitude, longitude = offset(block.latitude, block.longitude, float(self.x[0]), float(self.x[1]))
         (nn, ne), (_, ee) = self.P[:2, :2].tolist()
+        odds = self._watch.odds if self._watch else 0.0
         return Record(
             block.time_us,
             self.state,
-            self.state is State.TRACKING and sqrt(max(nn, ee)) < self.options.vouch_sigma,
+            self.state is State.TRACKING and odds < DOUBTFUL and widest(self.P) < self.options.vouch_sigma,
             latitude,
             longitude,
             nn,
@@ -346,7 +348,7 @@ class Navigator:
             float(self.x[0]),
             float(self.x[1]),
             len(self._filter) if isinstance(self._filter, Bank) else 1,
-            self._watch.odds if self._watch else 0.0,
+            odds,
         )
 
     def _take_in(self, block: Block) -> tuple[float, float, float, bool, float]:
@@ -388,30 +390,21 @@ class Navigator:
         self.jumps.append(Jump(self._time_us, north, east, widest(self._alone), cause))
         self._watch = None
 
-    def _judge(self, block: Block, metres: float, likelihood: float) -> None:
+    def _judge(self, block: Block, seconds: float, metres: float, likelihood: float) -> None:
         """Compare the filter with its rivals; leave it where one of them has won."""
         self._nowhere = max(
-            self._nowhere + self._unmapped.update(block, metres) - likelihood, -log(self.options.doubt)
+            self._nowhere + self._unmapped.update(block, seconds, metres) - likelihood,
+            -log(self.options.doubt),
         )
         if self._nowhere > log(self.options.doubt):
-            self._nowhere = 0.0
-            self._unmapped = Unmapped(self.grid, self.options)
-            self._lost = True
-            self._searches = min(self._searches + 1, HOPELESS)
-            if self.options.bias_sigma < self.grid.rms:  # the map's level may be that of another epoch
-                self.options = replace(
-                    self.options, bias_sigma=self.grid.rms, bias_time=LEVEL_LASTS * self.options.bias_time
-                )
-            x, P = prior(self.options)
-            P[:4, :4] = self._alone
-            P[:2, :2] += (self._reach() * self._searches) ** 2 * np.eye(2)
-            self._begin(x, P, Verdict.NOWHERE.value)
+            self._search_anew()
             return
-        if not self._compact():
+        if not self._compact(widest(self.P)):
             return
         if self._watch is None:
+            reach = self._reach() * (2.0 if self._lost else 1.0)
             self._watch = Watch(
-                self.grid, self.options, self.x, self.P, block.time_us, self._reach(), self._resolution
+                self.grid, self.options, self.x, self.P, block.time_us, reach, self._resolution
             )
             return
         verdict = self._watch.step(block, metres, self.x, self.P)
@@ -421,14 +414,26 @@ class Navigator:
             self._estimate()
         elif verdict is Verdict.HOLDS:
             self._watch = None
-            if self._nowhere <= -log(
-                self.options.doubt
-            ):  # and the map describes the field, which a lost filter must show
+            if self._nowhere < -0.5 * log(self.options.doubt):  # and the map does describe the field
                 self._lost, self._searches = False, 0
 
-    def _compact(self) -> bool:
-        """Return whether the position is one place, seen on the scale of the map."""
-        return widest(self.P) <= max(SPLIT * self._resolution, 0.25 * self.grid.correlation_length)
+    def _search_anew(self) -> None:
+        """Look around, further, and then for a map of another level."""
+        self._nowhere, self._lost = 0.0, True
+        if self._searches == DOUBTED and self.options.bias_sigma < self.grid.rms:
+            self.options = replace(
+                self.options, bias_sigma=self.grid.rms, bias_time=LEVEL_LASTS * self.options.bias_time
+            )
+        self._unmapped = Unmapped(self.grid, self.options)
+        x, P = prior(self.options)
+        P[:4, :4] = self._alone
+        P[:2, :2] += (self._reach() * SPREADS[self._searches % len(SPREADS)]) ** 2 * np.eye(2)
+        self._searches += 1
+        self._begin(x, P, Verdict.NOWHERE.value)
+
+    def _compact(self, width: float) -> bool:
+        """Return whether a position of this spread is one place, seen on the scale of the map."""
+        return width <= max(SPLIT * self._resolution, 0.25 * self.grid.correlation_length)
 
     def _reach(self) -> float:
         """Return how far around itself the filter is doubted: m."""
@@ -447,7 +452,7 @@ class Navigator:
             )
         if self._lost:
             self.state = State.LOST
-        elif not self._compact():
+        elif not self._compact(width):
             self.state = State.SEARCHING
         elif not on_the_map or width > UNINFORMED * widest(self._alone):
             self.state = State.DEAD_RECKONING

@@ -2,8 +2,8 @@
 
 A filter on the wrong hill is content: its innovations fit, because it has moved to where they do. What shows
 it is that another explanation predicts the same measurements better. Two are kept beside it: *elsewhere*, a bank
-of hypotheses around it that has forgotten where it came from, and *nowhere*, a field that has the map's
-roughness and nothing else to do with it.
+of hypotheses around it that has forgotten where it came from, and *nowhere*, a field as rough as the map and
+with nothing else to do with it.
 
 The odds of each against the filter, product of predictive likelihoods, are a martingale as long as the filter
 is right, so they ever exceed c with a probability of at most 1/c (Ville 1939): the threshold is the false-alarm rate.
@@ -12,7 +12,7 @@ is right, so they ever exceed c with a probability of at most 1/c (Ville 1939): 
 from __future__ import annotations
 
 from enum import Enum
-from math import exp, log, pi
+from math import exp, expm1, log, pi, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,26 +42,45 @@ class Verdict(Enum):
 
 
 class Unmapped:
-    """The field as a Gauss-Markov process with the map's scatter and correlation length: no map at all.
+    """The field as a smooth random function of the distance, with the map's scatter and correlation length.
 
-    One state beside the noise, and the calibration's bias in its variance.
+    What a measurement would look like if the map had nothing to say: Matérn's process of smoothness 3/2, two
+    states (value nT, slope nT/m), to which the bias and the map's error are added as what they add to each step.
+
+    Notes
+    -----
+    ``F = exp(-λd) [[1 + λd, d], [-λ²d, 1 - λd]]``, ``λ = √3/L``, stationary covariance ``diag(σ², λ²σ²)``
+    (Hartikainen & Särkkä 2010, sec. 4).
     """
 
     def __init__(self, grid: AnomalyGrid, options: Options) -> None:
-        self._length = grid.correlation_length
+        self._options = options
+        self._rate = sqrt(3.0) / grid.correlation_length
         self._mean = float(np.nanmean(grid.anomaly))
-        self._variance = float(np.nanvar(grid.anomaly)) + options.bias_sigma**2
-        self._x, self._p = 0.0, self._variance
+        self._value = float(np.nanvar(grid.anomaly)) + options.bias_sigma**2 + options.map_sigma**2
+        self._slope = self._rate**2 * float(np.nanvar(grid.anomaly))
+        self._x = 0.0, 0.0
+        self._p = self._value, 0.0, self._slope
 
-    def update(self, block: Block, metres: float) -> float:
-        """Return the log-likelihood of a measurement `metres` after the one before, and take it in."""
-        kept = exp(-metres / self._length)
-        self._x *= kept
-        self._p = kept * kept * self._p + (1.0 - kept * kept) * self._variance
-        y, s = block.anomaly - self._mean - self._x, self._p + block.variance
-        gain = self._p / s
-        self._x += gain * y
-        self._p *= 1.0 - gain
+    def update(self, block: Block, seconds: float, metres: float) -> float:
+        """Return the log-likelihood of a measurement so long after the one before, and take it in."""
+        o, rate = self._options, self._rate
+        kept = exp(-rate * metres)
+        a, b = kept * (1.0 + rate * metres), kept * metres
+        c, d = -kept * rate * rate * metres, kept * (1.0 - rate * metres)
+        value, slope = a * self._x[0] + b * self._x[1], c * self._x[0] + d * self._x[1]
+        p, q, r = self._p
+        v, w = self._value, self._slope
+        wander = o.map_sigma**2 * -expm1(-2.0 * metres / o.map_length)
+        wander += o.bias_sigma**2 * -expm1(-2.0 * seconds / o.bias_time)
+        p, q, r = (
+            a * a * (p - v) + 2.0 * a * b * q + b * b * (r - w) + v + wander,
+            a * c * (p - v) + (a * d + b * c) * q + b * d * (r - w),
+            c * c * (p - v) + 2.0 * c * d * q + d * d * (r - w) + w,
+        )
+        y, s = block.anomaly - self._mean - value, p + block.variance
+        self._x = value + p / s * y, slope + q / s * y
+        self._p = p - p * p / s, q - p * q / s, r - q * q / s
         return -0.5 * (y * y / s + log(2.0 * pi * s))
 
 
