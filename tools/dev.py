@@ -56,7 +56,7 @@ def main() -> None:
         run(BIN / "magbridge", "demo", *arguments)
     elif what == "test":
         install("dev")
-        run(BIN / "python", "-m", "pytest", *arguments)
+        run(BIN / "python", "-m", "pytest", "-n", "2", "--dist", "loadfile", *arguments)
     elif what == "check":
         install("dev")
         for command in CHECKS:
