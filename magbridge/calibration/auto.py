@@ -133,7 +133,8 @@ def _climb(
     for step in range(ROUNDS):
         if structure.renew is not None and step:
             structure, z = structure.renew(z)
-        solution = gauss_newton(samples, _prior(structure, eta), noise, z)
+        # the first widths are a guess, and not worth settling at
+        solution = gauss_newton(samples, _prior(structure, eta), noise, z, steps=50 if step else 3)
         kept = len(samples.field) - noise.rejected
         quadratic = Quadratic.about(solution.z, solution.normal, kept)
         widths = maximise(quadratic, structure, eta, noise.sigma)
@@ -157,7 +158,7 @@ def _approach(samples: Samples, prior: Prior, z: FloatArray) -> tuple[FloatArray
     apart = np.zeros(len(samples.field), bool)
     noise = estimate_noise(residuals_of(samples, prior.coefficients(z)), apart, 0.0)
     for _ in range(ROUNDS):
-        z = gauss_newton(samples, prior, noise, z, steps=5, tolerance=0.1).z
+        z = gauss_newton(samples, prior, noise, z, steps=1, tolerance=0.1).z
         last, noise = noise, estimate_noise(residuals_of(samples, prior.coefficients(z)), apart, 0.0)
         if noise.sigma > 0.8 * last.sigma:
             break

@@ -94,6 +94,7 @@ def nominal(
         if found.settled and (best is None or value < 0.999 * best[0]):
             best = (value, found, noise, memory)
     if best is None:
+        check_scales(samples, E @ z)  # on its way to collapse it never settles
         raise CalibrationError("nominal: no start settled; are the samples those of one sensor?")
     _, found, noise, memory = best
     noise = replace(noise, memory=memory)

@@ -6,8 +6,8 @@ Minimises over z, with coefficients ``c = E z + offset``::
 
     sum_i w_i e_i(c)^2 / (2 sigma^2) + z^T P z / 2
 
-Levenberg's damping keeps each step downhill; steps are small linear algebra, because the normal
-equations of all samples are summed up once per step.
+Each step is Gauss-Newton's, shortened until it goes downhill. It is small linear algebra, because the
+normal equations of all samples are summed up once per step.
 """
 
 from __future__ import annotations
@@ -76,28 +76,31 @@ def gauss_newton(
     tolerance : float
         Settled when the next step would gain less than this (in units of log likelihood).
     """
-    z, damping = np.array(start, float), 0.0
-    normal = prior.reduce(normal_equations(samples, prior.coefficients(z), noise.weight, noise.memory))
+    z = np.array(start, float)
+
+    def normal_at(z: FloatArray) -> NormalEquations:
+        return prior.reduce(normal_equations(samples, prior.coefficients(z), noise.weight, noise.memory))
+
+    normal = normal_at(z)
     value = _objective(normal, prior, noise, z)
     for step in range(steps):
         precision = normal.hessian / noise.sigma**2 + prior.precision
         gradient = normal.gradient / noise.sigma**2 + prior.precision @ z
+        move = -_solve(precision, gradient)
+        promise = -float(gradient @ move)
+        if promise < tolerance:
+            return Solution(z, normal, settled=True, steps=step)
+        part = 1.0
         while True:
-            move = -_solve(precision, gradient, damping)
-            promise = -float(gradient @ move)
-            if promise < tolerance:
-                return Solution(z, normal, settled=True, steps=step)
-            tried = prior.reduce(
-                normal_equations(samples, prior.coefficients(z + move), noise.weight, noise.memory)
-            )
-            new = _objective(tried, prior, noise, z + move)
+            tried = normal_at(z + part * move)
+            new = _objective(tried, prior, noise, z + part * move)
             if new < value:
                 break
-            damping = max(10.0 * damping, 1e-6)
-            if damping > 1e6:
+            # the parabola through value, slope and new has its minimum at
+            part *= max(0.5 * part * promise / (new - value + part * promise), 0.1)
+            if part < 1e-6:
                 return Solution(z, normal, settled=False, steps=step)
-        damping = damping / 10.0 if damping > 1e-8 else 0.0
-        z, normal, value = z + move, tried, new
+        z, normal, value = z + part * move, tried, new
     return Solution(z, normal, settled=False, steps=steps)
 
 
@@ -105,11 +108,10 @@ def _objective(normal: NormalEquations, prior: Prior, noise: NoiseModel, z: Floa
     return 0.5 * normal.cost / noise.sigma**2 + 0.5 * float(z @ prior.precision @ z)
 
 
-def _solve(precision: FloatArray, gradient: FloatArray, damping: float) -> FloatArray:
-    """Newton's step with Levenberg-Marquardt damping, scaled by the diagonal."""
+def _solve(precision: FloatArray, gradient: FloatArray) -> FloatArray:
+    """Newton's step, scaled by the diagonal."""
     scale = np.sqrt(np.maximum(np.diag(precision), 1e-300))
     scaled = precision / np.outer(scale, scale)
-    scaled[np.diag_indices_from(scaled)] += damping
     factor, info = dpotrf(scaled)
     if info:  # directions that neither data nor prior hold: stay there
         values, vectors = np.linalg.eigh(scaled)
