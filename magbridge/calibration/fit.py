@@ -29,7 +29,7 @@ METHODS: dict[str, str] = {
     "auto": "magbridge.calibration.auto:fit_auto",
     "nominal": "magbridge.calibration.fit:fit_nominal",
     "cubic": "magbridge.calibration.cubic:fit_cubic",
-    "per_run": "magbridge.calibration.per_run:fit_per_run",
+    "runs": "magbridge.calibration.per_run:fit_per_run",
     "horizontal": "magbridge.calibration.horizontal:fit_horizontal",
 }
 """Name -> ``module:function``, each ``(observations, order, **options) -> Fit``."""

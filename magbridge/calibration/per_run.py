@@ -62,9 +62,9 @@ def fit_per_run(data: Observations, order: int = 3) -> Fit:
         precision += np.kron(np.outer(typical, typical), Lambda)
         right += np.kron(typical, Lambda @ prior.coefficients(z))
     if runs <= order:
-        raise CalibrationError(f"per_run: {runs} runs of {FEWEST} samples; order {order} needs {order + 1}")
+        raise CalibrationError(f"runs: {runs} runs of {FEWEST} samples; order {order} needs {order + 1}")
     covariance = covariance_of(precision)
     coefficients = covariance @ right
     check_scales(samples, coefficients)
     left = estimate_noise(residuals_of(samples, coefficients), samples.follows, 0.0)
-    return assemble(data, samples, ranges, exponents, coefficients, covariance, left, "per_run")
+    return assemble(data, samples, ranges, exponents, coefficients, covariance, left, "runs")
