@@ -26,6 +26,7 @@ T = TypeVar("T", float, Array)
 
 EVEN = 1e-3  # of a step: what rounded coordinates may deviate from an even spacing
 HOLE = 9.9e4  # nT: beyond any anomaly; 99999 and 1.7e38 are how formats without NaN write a hole
+FLAT = 1e-6  # nT: what rounding leaves of a plane
 NOT_AN_ANOMALY = 15_000.0  # nT: a median this large is the whole field, not what is left of it
 PAD = 16  # nodes: an influence of a cubic spline's end that far in is 1e-9
 
@@ -227,7 +228,7 @@ class AnomalyGrid:
         north, east = np.gradient(self.anomaly, self._dy * per_latitude, self._dx * per_longitude)
         flat = north - np.nanmean(north), east - np.nanmean(east)
         slope = sqrt(float(np.nanmean(flat[0] ** 2 + flat[1] ** 2)))
-        return sqrt(2.0) * self.rms / slope if slope > 0.0 else inf
+        return sqrt(2.0) * self.rms / slope if self.rms > FLAT else inf
 
     def save(self, path: str | Path) -> None:
         """Write the grid as CF netCDF, which :func:`~magbridge.field.read.read_grid` and GMT read."""

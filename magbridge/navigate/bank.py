@@ -25,13 +25,13 @@ MOST = 2_000  # hypotheses
 AT_FIRST = 20_000  # of them, until the first measurement has thinned them out
 CELL = 0.8  # of the resolution, within which two hypotheses are one
 SPACING = 1.2  # of two neighbours, in their own sigma: their sum is flat to 1 %
-EDGE = 3.2  # sigma, as far as a start is covered
+EDGE = 3.5  # sigma, as far as a start is covered
 FADED = 1e-7  # of the largest weight
 MERGE_EVERY = 4  # updates
-# One Gaussian as three narrower ones of the same mean and variance (DeMars et al. 2013, table 1).
+# One Gaussian as three narrower ones (DeMars et al. 2013, table 1), their variance such that the sum keeps its own.
 THREE = np.array([-1.0575154615, 0.0, 1.0575154615])
 THREE_WEIGHT = np.array([0.2252246249, 0.5495507502, 0.2252246249])
-THREE_VARIANCE = 0.6715662887**2
+THREE_VARIANCE = 1.0 - float(THREE_WEIGHT @ THREE**2)
 
 
 class Bank:
@@ -124,11 +124,12 @@ class Bank:
 
     def update_position(self, north: float, east: float, sigma: float) -> None:
         """Take in a fix from elsewhere, m from the dead-reckoned position."""
-        nowhere = np.zeros(len(self), bool)
         for axis, value in enumerate((north, east)):
             row = np.zeros_like(self.x)
             row[:, axis] = 1.0
-            self._observe(value - self.x[:, axis], row, np.full(len(self), sigma * sigma), nowhere)
+            self._observe(
+                value - self.x[:, axis], row, np.full(len(self), sigma * sigma), np.zeros(len(self), bool)
+            )
 
     def _observe(
         self, y: Array, row: Array, variance: Array, off: NDArray[np.bool_]
@@ -174,7 +175,7 @@ class Bank:
         self.w, self.x, self.P = self.w[keep] / self.w[keep].sum(), self.x[keep], self.P[keep]
 
     def _split(self, wide: NDArray[np.bool_]) -> None:
-        """Split along the widest axis of each position: the same mixture to fourth moments."""
+        """Split along the widest axis of each position: the same mean and covariance."""
         w, x, P = self.w[wide], self.x[wide], self.P[wide]
         values, axes = np.linalg.eigh(P[:, :2, :2])
         value, axis = values[:, 1], axes[:, :, 1]

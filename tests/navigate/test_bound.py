@@ -1,0 +1,55 @@
+"""The posterior Cramér-Rao bound, where it is known in closed form."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from magbridge.errors import OutOfRange
+from magbridge.field.grid import AnomalyGrid
+from magbridge.navigate import Options, position_bound
+from magbridge.navigate.draw import draw_bound
+
+TRACK = ([1.4e9, 1.4e9 + 7200, 1.4e9 + 14400], [49.48, 49.5, 49.5], [-57.95, -57.9, -57.85])
+STILL = Options(start_sigma=100.0, current_sigma=1e-9, drift=1e-9, bias_sigma=1e-9, map_sigma=1e-9)
+
+
+def slope(grid: AnomalyGrid, per_degree: float) -> AnomalyGrid:
+    x, _ = np.meshgrid(grid.longitude, grid.latitude)
+    return AnomalyGrid(grid.longitude, grid.latitude, (x + 57.9) * per_degree)
+
+
+def test_on_a_plane_it_is_the_line_fit(grid):
+    """Along a slope g, N samples of sigma: 1/var = 1/start² + N g²/sigma²; across it stays at its start.
+
+    The main field's own slope, 4 nT/km, adds to the plane's 100 nT/km: 6 %.
+    """
+    g = 0.1
+    bound = position_bound(slope(grid, g * 72_400.0), *TRACK, STILL, sigma=5.0, every=4.0)
+    along, across = np.sqrt(np.linalg.eigvalsh(bound.covariance[-1, :2, :2]))
+    expected = 1 / np.sqrt(1 / 100.0**2 + 3600 * g**2 / 25.0)
+    assert along == pytest.approx(expected, rel=0.06)
+    assert across == pytest.approx(100.0, rel=0.01)
+
+
+def test_a_map_helps_and_noise_hurts(grid, options):
+    good = position_bound(grid, *TRACK, options, 1.0)
+    poor = position_bound(grid, *TRACK, options, 10.0)
+    assert good.sigma[-1] < poor.sigma[-1] < poor.unaided[-1]
+    assert (good.sigma <= good.unaided + 1e-9).all()
+
+
+def test_off_the_map_it_is_dead_reckoning(grid, options):
+    moved = AnomalyGrid(grid.longitude + 10.0, grid.latitude, grid.anomaly)
+    bound = position_bound(moved, *TRACK, options)
+    np.testing.assert_allclose(bound.sigma, bound.unaided)
+
+
+def test_time_must_increase(grid):
+    with pytest.raises(OutOfRange, match="must increase"):
+        position_bound(grid, TRACK[0][::-1], *TRACK[1:])
+
+
+def test_its_picture(grid, options, tmp_path):
+    draw_bound(position_bound(grid, *TRACK, options), grid, tmp_path / "bound.png")
+    assert (tmp_path / "bound.png").stat().st_size > 20_000

@@ -1,0 +1,48 @@
+"""The motion of the states, and how fine a map must be cut."""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+import pytest
+
+from magbridge.field.grid import AnomalyGrid
+from magbridge.navigate.model import Options, block_length, prior, resolution, transition
+
+
+def test_many_short_steps_are_one_long_step():
+    options = Options()
+    f, q = np.eye(6), np.zeros((6, 6))
+    for _ in range(100):
+        step_f, step_q = transition(options, 3.0, 1.0)
+        f, q = step_f @ f, step_f @ q @ step_f.T + step_q
+    long_f, long_q = transition(options, 300.0, 100.0)
+    np.testing.assert_allclose(f, long_f, rtol=1e-3, atol=1e-9)
+    np.testing.assert_allclose(q, long_q, rtol=0.01, atol=1e-9)
+
+
+def test_gauss_markov_states_keep_their_variance():
+    options = Options()
+    _, P = prior(options)
+    f, q = transition(options, 600.0, 200.0)
+    np.testing.assert_allclose((f @ P @ f.T + q)[2:, 2:], P[2:, 2:], rtol=1e-12)
+
+
+def test_no_time_is_no_motion():
+    f, q = transition(Options(), 0.0, 0.0)
+    np.testing.assert_array_equal(f, np.eye(6))
+    np.testing.assert_array_equal(q, np.zeros((6, 6)))
+
+
+def test_resolution_follows_the_map(grid):
+    fine, coarse = resolution(grid, 0.1), resolution(grid, 10.0)
+    assert 0 < fine < coarse <= 0.25 * grid.correlation_length
+    flat = AnomalyGrid(grid.longitude, grid.latitude, np.zeros_like(grid.anomaly))
+    assert resolution(flat, 1.0) == np.inf
+    assert block_length(flat) == np.inf
+
+
+def test_options_refuse_what_they_do_not_know():
+    with pytest.raises(msgspec.ValidationError, match="unknown field `gait`"):
+        msgspec.convert({"gait": 1.0}, Options)
+    assert msgspec.convert({"gate": 9.0}, Options).gate == 9.0

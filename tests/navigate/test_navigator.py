@@ -1,0 +1,170 @@
+"""The navigator as a user has it: it finds the vehicle, says when it has not, and does the same again in replay."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from magbridge.field.earth import offset
+from magbridge.field.grid import AnomalyGrid
+from magbridge.field.igrf import total_field
+from magbridge.navigate import Navigator, Options, State
+from magbridge.records import Corrected, Quality
+
+PLACE = (49.5, -57.9)
+START_US = 1_386_201_600_000_000
+
+
+def feed(navigator: Navigator, ds, rows=slice(None)):
+    """Run a voyage through the navigator; return records and errors (m)."""
+    records, errors = [], []
+    time_us = np.round(ds["time"].to_numpy()[rows] * 1e6).astype(int).tolist()
+    heading, field, north, east = (
+        ds[name].to_numpy()[rows].tolist() for name in ("heading", "total_field", "away_north", "away_east")
+    )
+    for i, t in enumerate(time_us):
+        navigator.telemetry(t - 4_000_000, heading=heading[i], speed=0.35, depth=30.0)
+        record = navigator.measure(t, field[i], 1.0)
+        if record is not None:
+            records.append(record)
+            errors.append(np.hypot(record.north - north[i], record.east - east[i]))
+    return records, np.array(errors)
+
+
+@pytest.fixture(scope="module")
+def ds(study, grid, options):
+    return study.voyage(grid, options, 11, hours=3.0)
+
+
+@pytest.fixture(scope="module")
+def voyage(grid, options, ds):
+    navigator = Navigator(grid, options)
+    navigator.fix(START_US, *PLACE)
+    return feed(navigator, ds)
+
+
+def test_five_lines(grid):
+    nav = Navigator(grid, Options(start_sigma=100.0, interval=4.0))
+    nav.fix(START_US, *PLACE)
+    nav.telemetry(START_US, heading=90.0, speed=0.35, depth=40.0)
+    corrected = Corrected(52_300.0, 1.0, (0.0, 0.0, 0.0), (1.0, 1.0, 1.0), 0)
+    record = nav.sample(START_US + 4_000_000, corrected) or nav.sample(START_US + 8_000_000, corrected)
+    assert record is not None
+    assert record.latitude == pytest.approx(PLACE[0], abs=0.01)
+
+
+def test_it_holds_the_position(voyage):
+    records, error = voyage
+    half = error.size // 2
+    assert np.sqrt(np.mean(error[half:] ** 2)) < 150.0
+    assert sum(r.state is State.TRACKING for r in records) > 0.7 * len(records)
+    sigma = np.array([np.sqrt(r.covariance_nn + r.covariance_ee) for r in records])
+    assert np.mean(error < 3 * sigma) > 0.95
+    z = np.array([r.innovation**2 / r.innovation_variance for r in records])
+    assert 0.7 < z.mean() < 1.3
+
+
+def test_a_replay_gives_the_same_bits(grid, options, ds, voyage):
+    again = Navigator(grid, options)
+    again.fix(START_US, *PLACE)
+    assert (
+        feed(again, ds, slice(0, 900))[0]
+        == voyage[0][: len(feed(_fresh(grid, options), ds, slice(0, 900))[0])]
+    )
+
+
+def _fresh(grid, options):
+    navigator = Navigator(grid, options)
+    navigator.fix(START_US, *PLACE)
+    return navigator
+
+
+def test_a_wide_start_is_found(study, grid, options):
+    wide = study.with_options(options, start_sigma=1500.0)
+    run = study.sail(study.voyage(grid, wide, 4, hours=4.0), grid, wide)
+    assert run.error[0] > 300.0
+    assert run.drms < 200.0
+    assert run.state[0] == State.SEARCHING or run.state[0] == State.DEAD_RECKONING
+    assert run.state[-1] == State.TRACKING
+    assert not run.flagged
+
+
+def test_carried_off_it_says_that_it_is_lost_and_finds_itself_again(study):
+    hours_vouched, hours_lost = study.carried(study.Map(30, 1500), 3)
+    assert 0.0 < hours_lost < 2.0
+    assert hours_vouched < 0.5
+
+
+def test_samples_that_cannot_be_used(grid, options):
+    nav = _fresh(grid, options)
+    nav.telemetry(START_US, heading=0.0, speed=0.35)
+    bad = Corrected(9e4, 1.0, (0.0, 0.0, 0.0), (1.0, 1.0, 1.0), int(Quality.SATURATED))
+    nan = Corrected(np.nan, 1.0, (0.0, 0.0, 0.0), (1.0, 1.0, 1.0), 0)
+    for k in range(1, 20):
+        assert nav.sample(START_US + k * 4_000_000, bad) is None
+        assert nav.sample(START_US + k * 4_000_000, nan) is None
+    assert nav.finish() is None
+    nav.measure(START_US + 100_000_000, 52_300.0, 1.0)
+    nav.measure(START_US + 96_000_000, 52_300.0, 1.0)
+    assert nav.dropped == 1
+
+
+def test_nothing_before_a_start(grid):
+    nav = Navigator(grid)
+    assert nav.state is State.OFF
+    nav.telemetry(START_US, heading=0.0, speed=0.35)
+    nav.fix(START_US, np.nan, 1.0)
+    assert nav.measure(START_US + 4_000_000, 52_300.0, 1.0) is None
+    assert nav.state is State.OFF
+
+
+def test_a_fix_is_taken_in_and_a_contradiction_believed(grid, options, ds):
+    nav = _fresh(grid, options)
+    records, _ = feed(nav, ds, slice(0, 600))
+    t = records[-1].time_us + 30_000_000
+    near = offset(records[-1].latitude, records[-1].longitude, 20.0, 0.0)
+    nav.fix(t, *near, 5.0)
+    assert np.sqrt(nav.P[0, 0]) < 6.0
+    assert not nav.jumps
+    far = offset(*near, 3000.0, -2000.0)
+    nav.fix(t + 1_000_000, *far, 5.0)
+    assert nav.jumps[0].cause == "a fix contradicts the filter"
+    assert (nav.jumps[0].north, nav.jumps[0].east) == pytest.approx((3000.0, -2000.0), abs=30.0)
+
+
+def test_off_the_map_it_reckons(study, grid, options, ds):
+    small = AnomalyGrid(grid.longitude[:70], grid.latitude, grid.anomaly[:, :70])
+    nav = _fresh(small, options)
+    records, _ = feed(nav, ds, slice(0, 200))
+    assert np.isnan(small.look_up(PLACE[1], PLACE[0]).anomaly)
+    assert {r.state for r in records} <= {State.DEAD_RECKONING, State.SEARCHING}
+    assert not any(r.vouched for r in records)
+    assert nav.P[0, 0] > options.start_sigma**2
+
+
+def test_a_flat_map_says_nothing(grid, options, ds):
+    flat = AnomalyGrid(grid.longitude, grid.latitude, np.zeros_like(grid.anomaly))
+    records, _ = feed(
+        _fresh(flat, options), ds.assign(total_field=ds["total_field"] * 0 + 52_300.0), slice(0, 300)
+    )
+    assert not any(r.vouched for r in records)
+
+
+def test_across_the_antimeridian(study, options):
+    """The same map and voyage moved to 180 degrees: the field differs by the main field only."""
+    grid = study.synthetic(study.Map(30, 1500), 3)
+    moved = AnomalyGrid(grid.longitude - PLACE[1] + 180.0, grid.latitude, grid.anomaly)
+    nav = Navigator(moved, study.with_options(options, start_sigma=20.0))
+    nav.fix(START_US, PLACE[0], 179.9999)
+    records = []
+    where = (PLACE[0], 179.9999)
+    nav.telemetry(START_US, heading=90.0, speed=1.0, depth=0.0)
+    for k in range(1, 300):
+        where = offset(*where, 0.0, 4.0)
+        t = START_US + 4_000_000 * k
+        z = float(total_field(where[1], where[0], 0.0, t * 1e-6)[0] + moved.at(where[1], where[0])[0])
+        if record := nav.measure(t, z, 1.0):
+            records.append(record)
+    assert records[-1].longitude < -179.9
+    assert abs(records[-1].east) < 60.0
+    assert all(np.isfinite(r.map_anomaly) for r in records)

@@ -1,0 +1,173 @@
+"""One filter and many: against the equations written out, against each other, against brute force."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from magbridge.field.earth import metres_per_degree
+from magbridge.field.grid import AnomalyGrid
+from magbridge.navigate.bank import Bank, widest
+from magbridge.navigate.model import Block, Options, prior, transition
+from magbridge.navigate.tracker import Tracker
+
+PLACE = (49.5, -57.9)
+
+
+def block(anomaly: float, variance: float = 1.0) -> Block:
+    return Block(0, *PLACE, anomaly, variance, 0.0, 0.0)
+
+
+def around(grid: AnomalyGrid, north, east):
+    per_lat, per_lon = metres_per_degree(PLACE[0])
+    return grid.evaluate(PLACE[1] + np.asarray(east) / per_lon, PLACE[0] + np.asarray(north) / per_lat)
+
+
+@pytest.fixture
+def correlated() -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(0)
+    x, P = prior(Options(start_sigma=60.0))
+    root = np.linalg.cholesky(P) @ (np.eye(6) + 0.2 * rng.normal(size=(6, 6)))
+    return x + 0.3 * np.sqrt(np.diag(P)) * rng.normal(size=6), root @ root.T
+
+
+def test_the_tracker_is_the_second_order_filter(grid, correlated):
+    """The textbook equations, with the whole covariance, in the plainest code."""
+    x, P = correlated
+    tracker = Tracker(grid, x, P, gate=25.0)
+    local = around(grid, x[0], x[1])
+    hessian = np.array(
+        [
+            [local.north_north[0], local.north_east[0]],
+            [local.north_east[0], local.east_east[0]],
+        ]
+    )
+    h = np.array([local.north[0], local.east[0], 0, 0, 1, 1])
+    curve = hessian @ P[:2, :2]
+    expected = local.anomaly[0] + 0.5 * np.trace(curve) + x[4] + x[5]
+    s = h @ P @ h + 1.0 + 0.5 * np.trace(curve @ curve)
+    z = expected + 2.0
+    gain = P @ h / s
+    seen = tracker.update(block(z))
+    np.testing.assert_allclose(tracker.x, x + gain * 2.0, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(tracker.P, P - np.outer(gain, gain) * s, rtol=1e-6, atol=1e-6)
+    assert seen is not None
+    assert seen.value == pytest.approx(2.0, abs=1e-9)
+    assert seen.variance == pytest.approx(s)
+    assert seen.accepted
+
+
+def test_shapes_stay_fixed_and_the_covariance_stays_one(grid, correlated):
+    tracker = Tracker(grid, *correlated, gate=1e9)
+    moved = transition(Options(), 20.0, 7.0)
+    rng = np.random.default_rng(1)
+    for _ in range(500):
+        tracker.predict(*moved)
+        tracker.update(block(float(rng.normal(scale=30.0)), 1e-4))
+        assert tracker.x.shape == (6,)
+        assert tracker.P.shape == (6, 6)
+    np.testing.assert_allclose(tracker.P, tracker.P.T, rtol=1e-9, atol=1e-12)
+    assert np.linalg.eigvalsh(tracker.P).min() > 0
+
+
+def test_the_gate_keeps_an_outlier_out(grid, correlated):
+    tracker = Tracker(grid, *correlated, gate=16.0)
+    before = tracker.x.copy()
+    seen = tracker.update(block(5_000.0))
+    assert seen is not None
+    assert not seen.accepted
+    np.testing.assert_array_equal(tracker.x, before)
+
+
+def test_off_the_map_nothing_is_compared(grid, correlated):
+    x, P = correlated
+    assert Tracker(grid, x + 1e6 * np.eye(6)[0], P, 16.0).update(block(0.0)) is None
+
+
+def test_a_bank_of_one_is_the_tracker(grid, correlated):
+    tracker, bank = Tracker(grid, *correlated, gate=16.0), Bank(grid, *correlated, resolution=1e4, gate=16.0)
+    moved = transition(Options(), 20.0, 7.0)
+    rng = np.random.default_rng(2)
+    for _ in range(50):
+        z = float(around(grid, 0.0, 0.0).anomaly[0] + rng.normal())
+        tracker.predict(*moved)
+        bank.predict(*moved)
+        one, many = tracker.update(block(z)), bank.update(block(z))
+        assert one is not None
+        assert many == pytest.approx((one.value, one.variance, one.log_likelihood), rel=1e-9)
+    assert len(bank) == 1
+    np.testing.assert_allclose(bank.x[0], tracker.x, rtol=1e-7, atol=1e-9)
+    np.testing.assert_allclose(bank.P[0], tracker.P, rtol=1e-6, atol=1e-9)
+    tracker.update_position(30.0, -20.0, 10.0)
+    bank.update_position(30.0, -20.0, 10.0)
+    np.testing.assert_allclose(bank.x[0], tracker.x, rtol=1e-7, atol=1e-9)
+
+
+def test_a_cut_gaussian_is_still_that_gaussian(grid, correlated):
+    """1 %: what a lattice of 1.2 sigma spacing loses; 3 % for the tails beyond 3.5 sigma."""
+    x, P = correlated
+    bank = Bank(grid, x, P, resolution=15.0, gate=16.0)
+    assert 20 < len(bank) < 800
+    mean, covariance = bank.moments()
+    scale = np.sqrt(np.diag(P))
+    np.testing.assert_allclose(mean / scale, x / scale, atol=0.01)
+    np.testing.assert_allclose(covariance / np.outer(scale, scale), P / np.outer(scale, scale), atol=0.03)
+    assert widest(bank.P[0]) == pytest.approx(15.0, rel=1e-6)
+    assert np.linalg.eigvalsh(bank.P).min() > 0
+
+
+def test_splitting_and_merging_keep_mean_and_covariance(grid, correlated):
+    bank = Bank(grid, *correlated, resolution=30.0, gate=16.0)
+    before = bank.moments()
+    bank._split(np.ones(len(bank), bool))
+    for now, then in zip(bank.moments(), before, strict=True):
+        np.testing.assert_allclose(now, then, rtol=1e-6, atol=1e-6)
+    many = len(bank)
+    bank._merge()
+    assert len(bank) < many
+    assert bank.w.sum() == pytest.approx(1.0)
+    for now, then in zip(bank.moments(), before, strict=True):
+        np.testing.assert_allclose(now, then, rtol=1e-6, atol=1e-6)
+
+
+def test_the_bank_is_bayes_on_a_wide_start(grid):
+    """A million points of the prior, weighted by the likelihood, against the bank: mean, spread and evidence.
+
+    Points need no line through the map: what is left is the bank's own. Two measurements 900 m apart; tolerance
+    3 % of the posterior's spread, and 3 % of the evidence.
+    """
+    x, P = prior(Options(start_sigma=600.0, bias_sigma=2.0, map_sigma=0.5))
+    rng = np.random.default_rng(3)
+    points = rng.normal(size=(1_000_000, 6)) * np.sqrt(np.diag(P))
+    bank = Bank(grid, x, P, resolution=40.0, gate=1e9)
+    truth = np.array([250.0, -420.0])
+    log_w = np.zeros(len(points))
+    evidence = 0.0
+    for shift in ((0.0, 0.0), (900.0, 0.0)):
+        z = float(around(grid, truth[0] + shift[0], truth[1] + shift[1]).anomaly[0])
+        per_lat, per_lon = metres_per_degree(PLACE[0])
+        there = Block(0, PLACE[0] + shift[0] / per_lat, PLACE[1] + shift[1] / per_lon, z, 4.0, 0.0, 0.0)
+        evidence += bank.update(there)[2]
+        field = around(grid, points[:, 0] + shift[0], points[:, 1] + shift[1]).anomaly
+        log_w += -0.5 * ((z - field - points[:, 4] - points[:, 5]) ** 2 / 4.0 + np.log(2 * np.pi * 4.0))
+    w = np.exp(log_w - log_w.max())
+    mean = w @ points[:, :2] / w.sum()
+    d = points[:, :2] - mean
+    covariance = (w[:, None] * d).T @ d / w.sum()
+    found, spread = bank.moments()
+    scale = np.sqrt(np.diag(covariance))
+    np.testing.assert_allclose(found[:2] / scale, mean / scale, atol=0.03)
+    np.testing.assert_allclose(
+        spread[:2, :2] / np.outer(scale, scale), covariance / np.outer(scale, scale), atol=0.05
+    )
+    assert evidence == pytest.approx(np.log(w.mean()) + log_w.max(), abs=0.03)
+
+
+def test_hypotheses_off_the_map_stay_in_the_running(grid):
+    """A vehicle at the edge: those outside expect anything, so they neither win nor vanish at once."""
+    x, P = prior(Options(start_sigma=800.0))
+    bank = Bank(grid, x + 16_000.0 * np.eye(6)[0], P, resolution=200.0, gate=16.0)
+    bank.update(block(float(np.nanmean(grid.anomaly))))
+    off = np.isnan(around(grid, bank.x[:, 0], bank.x[:, 1]).anomaly)
+    assert 0.02 < bank.w[off].sum() < 0.98
+    assert np.isfinite(bank.moments()[1]).all()
