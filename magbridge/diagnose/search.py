@@ -41,8 +41,11 @@ ODDS = np.log(20.0)
 SIMULATIONS = 400
 SHORT_LIST = 9
 """Causes that are fitted jointly in a round."""
-IDEAL = 0.15
-"""How far from the truth an idealised regressor may be: what is left of a large effect is not another cause."""
+IDEAL = 0.2
+"""How far from the truth an idealised regressor may be: what is left of a large effect is not another cause.
+
+The price: a second cause of less than a fifth of the strongest one's signal-to-noise is not named beside it.
+"""
 SHARPEN = 4
 """Halvings of a nonlinear parameter's bracket."""
 STARTS = 3

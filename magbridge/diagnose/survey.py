@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magbridge.calibration.model import Calibration
+from magbridge.config import Align
 from magbridge.errors import DataError
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.reference import positions, reference_field
@@ -180,15 +181,36 @@ def _columns(
         for name, column in ds.data_vars.items()
         if column.dtype.kind in "fiub" and not str(name).startswith("truth_")
     }
+    in_turn = False
     for axis in "xyz":  # a converter that takes the channels in turn says when it took each
         own = table.pop(f"mag_time_{axis}", None)
         if own is not None and np.isfinite(own).all() and not np.array_equal(own, time):
             table[f"mag_{axis}"] = np.interp(time, own, table[f"mag_{axis}"], left=np.nan)
+            in_turn = True
     table |= {"time": time, "learned": np.full(time.size, float(learned))}
+    if in_turn:
+        for axis in "xyz":
+            table[f"mag_{axis}"][_moving(table, calibration)] = np.nan
     table["reference_field"] = reference_field(ds, grid, calibration.reference.bias)
     if {"latitude", "longitude"} <= set(table):
         table["longitude"], table["latitude"], _ = positions(ds)
     return table
+
+
+def _moving(table: dict[str, FloatArray], calibration: Calibration) -> NDArray[np.bool_]:
+    """Say about which samples a mass is on its way, by the bridge's own criterion.
+
+    There each channel saw another vehicle, and no vector is common to them. A converter that takes all three at once
+    keeps such samples: only they tell a clock that is off.
+    """
+    moving = np.zeros(table["time"].size, bool)
+    elapsed = np.maximum(np.diff(table["time"]), 1.0)
+    for parameter in calibration.parameters:
+        fastest = Align().moving_rate * (parameter.high - parameter.low)
+        step = np.abs(np.diff(table[parameter.name])) > fastest * elapsed
+        moving[1:] |= step
+        moving[:-1] |= step  # the later channels of this sample were taken when it had begun
+    return moving
 
 
 def _assemble(table: dict[str, FloatArray], units: dict[str, str], source: str) -> Survey:
