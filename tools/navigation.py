@@ -30,7 +30,8 @@ from magbridge.field.grid import AnomalyGrid
 from magbridge.field.igrf import total_field
 from magbridge.navigate.bound import position_bound
 from magbridge.navigate.model import Options
-from magbridge.navigate.navigator import Navigator, State
+from magbridge.navigate.navigator import Navigator
+from magbridge.navigate.record import State
 
 Array = NDArray[np.float64]
 

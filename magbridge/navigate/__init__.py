@@ -2,6 +2,7 @@
 
 from magbridge.navigate.bound import Bound, position_bound
 from magbridge.navigate.model import Options
-from magbridge.navigate.navigator import Navigator, Record, State
+from magbridge.navigate.navigator import Navigator
+from magbridge.navigate.record import Record, State
 
 __all__ = ["Bound", "Navigator", "Options", "Record", "State", "position_bound"]

@@ -15,7 +15,8 @@ from magbridge.field.earth import metres_per_degree, offset
 from magbridge.field.grid import AnomalyGrid
 from magbridge.navigate.judge import judge
 from magbridge.navigate.model import Options
-from magbridge.navigate.navigator import UNUSABLE, Navigator, Record
+from magbridge.navigate.navigator import UNUSABLE, Navigator
+from magbridge.navigate.record import Record
 
 __all__ = ["MOTIONS", "navigate"]
 
@@ -79,7 +80,7 @@ def navigate(
     Returns
     -------
     Dataset
-        On ``time`` of the updates: every field of :class:`~magbridge.navigate.navigator.Record`,
+        On ``time`` of the updates: every field of :class:`~magbridge.navigate.record.Record`,
         ``smoothed_*`` from the backward pass, ``error_*`` where the log has a better position. Attributes:
         ``findings``, sentences one a line; ``motion``; ``yardstick``.
 

@@ -14,7 +14,7 @@ from magbridge.field.earth import metres_per_degree
 from magbridge.field.grid import AnomalyGrid
 from magbridge.files import atomic_path
 from magbridge.navigate.bound import Bound
-from magbridge.navigate.navigator import State
+from magbridge.navigate.record import State
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

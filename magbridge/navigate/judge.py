@@ -14,7 +14,7 @@ from magbridge.field.earth import metres_per_degree
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.igrf import total_field
 from magbridge.navigate.model import Options
-from magbridge.navigate.navigator import Jump, State
+from magbridge.navigate.record import Jump, State
 
 __all__ = ["Shift", "best_shift", "judge"]
 
@@ -155,8 +155,14 @@ def _told_by_positions(grid: AnomalyGrid, yardstick: xr.Dataset, options: Option
     thin = np.flatnonzero(known)[:: max(1, int(known.sum()) // 400)]
     measured, latitude, longitude = measured[thin], latitude[thin], longitude[thin]
     north, east, there, here = best_shift(grid, latitude, longitude, measured)
+    level = float(np.mean(measured - grid.evaluate(longitude, latitude).anomaly))
     step = 2.0 * SEARCH / (LATTICE - 1)
     findings = []
+    if abs(level) > LEVEL * options.bias_sigma + here:
+        findings.append(
+            f"at the known positions the field is {abs(level):.0f} nT {'above' if level > 0 else 'below'} the map's"
+            " level: its main field may be of another epoch, or its altitude another"
+        )
     expected = DOUBLE * hypot(options.bias_sigma, options.map_sigma)
     if there < min(BETTER * here, expected) and hypot(north, east) > step:
         findings.append(

@@ -11,26 +11,24 @@ Pure in event time, with nothing random in it: a replay gives the same bits. ::
 
 from __future__ import annotations
 
-from enum import IntEnum
 from math import inf, isfinite, log, nan, sqrt
-from typing import NamedTuple
 
-import msgspec
 import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from magbridge.field.earth import offset, separation, wrap
+from magbridge.field.earth import offset, separation
 from magbridge.field.grid import AnomalyGrid
-from magbridge.field.nearby import NearbyField
 from magbridge.navigate.bank import Bank, widest
+from magbridge.navigate.collect import Collector
 from magbridge.navigate.deadreckoning import DeadReckoning
 from magbridge.navigate.model import Block, Options, block_length, prior, resolution, transition
+from magbridge.navigate.record import Jump, Record, State
 from magbridge.navigate.tracker import Tracker
 from magbridge.navigate.watch import Unmapped, Verdict, Watch, distance
 from magbridge.records import Corrected, Quality
 
-__all__ = ["Navigator", "Record", "State"]
+__all__ = ["UNUSABLE", "Navigator"]
 
 Array = NDArray[np.float64]
 
@@ -43,110 +41,6 @@ LEVEL_LASTS = 10.0  # times as long as a calibration's bias
 DOUBTFUL = 1.0  # log odds: another place explains the field better, if not yet beyond doubt
 SPREADS = (2.0, 4.0, 2.0, 8.0)  # times its reach, of the searches after each other
 DOUBTED = 2  # searches in vain, after which the map's level is doubted too
-
-
-class State(IntEnum):
-    """What the filter says of itself; the values are those of the link."""
-
-    OFF = 0
-    """No start yet."""
-    SEARCHING = 1
-    """Several hypotheses."""
-    TRACKING = 2
-    """One hypothesis holds."""
-    DEAD_RECKONING = 3
-    """Off the map, or the field says nothing here."""
-    LOST = 4
-    """The field and the map disagree, or agree better elsewhere."""
-
-
-class Record(msgspec.Struct, frozen=True, gc=False):
-    """One update.
-
-    Attributes
-    ----------
-    time_us : int
-        µs since 1970 UTC, at which the rest holds: the mean time of the samples that went in.
-    state : State
-    vouched : bool
-        The filter stands by this position: it may be sent as a fix.
-    latitude, longitude : float
-        deg.
-    covariance_nn, covariance_ne, covariance_ee : float
-        m², of the position.
-    innovation, innovation_variance : float
-        nT, nT²; measured minus expected anomaly; NaN off the map.
-    gate : float
-        Largest innovation squared over variance that is taken in.
-    accepted : bool
-        The measurement was taken in.
-    anomaly : float
-        nT, measured: total field minus main field at the dead-reckoned position.
-    map_anomaly : float
-        nT, of the map at the position; NaN off the map.
-    bias, bias_sigma : float
-        nT, of the calibration.
-    map_error : float
-        nT.
-    current_north, current_east : float
-        m/s.
-    north, east : float
-        m, from the dead-reckoned position.
-    hypotheses : int
-    odds : float
-        Natural logarithm of the odds of another place against this one.
-    """
-
-    time_us: int
-    state: State
-    vouched: bool
-    latitude: float
-    longitude: float
-    covariance_nn: float
-    covariance_ne: float
-    covariance_ee: float
-    innovation: float
-    innovation_variance: float
-    gate: float
-    accepted: bool
-    anomaly: float
-    map_anomaly: float
-    bias: float
-    bias_sigma: float
-    map_error: float
-    current_north: float
-    current_east: float
-    north: float
-    east: float
-    hypotheses: int
-    odds: float
-
-
-class Jump(NamedTuple):
-    """The estimate began anew: µs, metres from where it was, 1-sigma that dead reckoning alone allowed, why."""
-
-    time_us: int
-    north: float
-    east: float
-    allowed: float
-    cause: str
-
-
-class Sums(NamedTuple):
-    """What the samples of the block so far add up to, relative to the first of them."""
-
-    start_us: int
-    latitude: float
-    longitude: float
-    travelled: float
-    n: int = 0
-    time: int = 0
-    d_latitude: float = 0.0
-    d_longitude: float = 0.0
-    anomaly: float = 0.0
-    variance: float = 0.0
-    slope_north: float = 0.0
-    slope_east: float = 0.0
 
 
 class Navigator:
@@ -178,9 +72,8 @@ class Navigator:
         self._reported = False
         self.jumps: list[Jump] = []
         self.dropped = 0
-        self._reckoning, self._main_field = DeadReckoning(), NearbyField()
-        self._step = min(block_length(grid), 1e6)
-        self._sums: Sums | None = None
+        self._reckoning = DeadReckoning()
+        self._collector = Collector(self.options.interval, block_length(grid), self.options.noise)
         self._time_us, self._latest_us, self._travelled = 0, 0, 0.0
         self._filter: Tracker | Bank | None = None
         self._watch: Watch | None = None
@@ -209,6 +102,7 @@ class Navigator:
         self._reckoning.advance(time_us * 1e-6)
         if self._filter is None:
             self._reckoning.place(latitude, longitude)
+            self._collector.flush()  # of samples that were taken at another place
             self._time_us = time_us
             self.x, self.P = prior(self.options, sigma)
             self._alone = self.P[:4, :4].copy()
@@ -252,49 +146,15 @@ class Navigator:
         self._latest_us = time_us
         where = self._reckoning
         where.advance(time_us * 1e-6)
-        s = self._sums or Sums(time_us, where.latitude, where.longitude, where.travelled)
-        main, slope_north, slope_east = self._main_field.at(
-            where.latitude, where.longitude, where.depth, time_us * 1e-6
-        )
-        self._sums = Sums(
-            s.start_us,
-            s.latitude,
-            s.longitude,
-            s.travelled,
-            s.n + 1,
-            s.time + time_us - s.start_us,
-            s.d_latitude + where.latitude - s.latitude,
-            s.d_longitude + wrap(where.longitude - s.longitude),
-            s.anomaly + total_field - main,
-            s.variance + sigma * sigma,
-            s.slope_north + slope_north,
-            s.slope_east + slope_east,
-        )
-        full = (
-            time_us - s.start_us >= self.options.interval * 1e6 or where.travelled - s.travelled >= self._step
-        )
-        return self.finish() if full else None
+        block = self._collector.add(time_us, where, total_field, sigma)
+        return None if block is None else self._update(block)
 
     def finish(self) -> Record | None:
         """Return the update of the samples that wait for more to join them; None if none wait."""
-        s, self._sums = self._sums, None
-        return None if s is None else self._update(s)
+        block = self._collector.flush()
+        return None if block is None else self._update(block)
 
     # ---- one update ----------------------------------------------------------------------------------
-
-    def _block(self, s: Sums) -> Block:
-        n, o = s.n, self.options
-        variance = s.variance / n
-        white = variance if o.noise is None else min(o.noise**2, variance)
-        return Block(
-            s.start_us + s.time // n,
-            s.latitude + s.d_latitude / n,
-            wrap(s.longitude + s.d_longitude / n),
-            s.anomaly / n,
-            white / n + (variance - white),
-            s.slope_north / n,
-            s.slope_east / n,
-        )
 
     def _predict(self, time_us: int) -> tuple[float, float]:
         """Move every estimate on to `time_us`; return the seconds and metres that it took."""
@@ -310,8 +170,7 @@ class Navigator:
             self._filter.predict(F, Q)
         return seconds, metres
 
-    def _update(self, s: Sums) -> Record:
-        block = self._block(s)
+    def _update(self, block: Block) -> Record:
         seconds, metres = self._predict(block.time_us)
         if self._filter is None:
             self._resolution = resolution(self.grid, block.variance)
@@ -355,9 +214,9 @@ class Navigator:
         """Return innovation, its variance, log-likelihood, whether it was taken in, and the map's anomaly."""
         if isinstance(self._filter, Tracker):
             seen = self._filter.update(block)
-            return (seen.value, seen.variance, seen.log_likelihood, seen.accepted, seen.anomaly) if seen else (
-                nan, nan, 0.0, False, nan
-            )  # fmt: skip
+            if seen is None:
+                return nan, nan, 0.0, False, nan
+            return seen.value, seen.variance, seen.log_likelihood, seen.accepted, seen.anomaly
         assert self._filter is not None
         innovation, variance, likelihood = self._filter.update(block)
         best = self._filter.x[int(self._filter.w.argmax())]
@@ -446,10 +305,8 @@ class Navigator:
         if isinstance(self._filter, Bank) and width < JOIN * self._resolution:
             self._filter = Tracker(self.grid, self.x, self.P, self.options.gate)
         elif isinstance(self._filter, Tracker) and width > SPLIT * self._resolution:
-            self._filter, self._watch = (
-                Bank(self.grid, self.x, self.P, self._resolution, self.options.gate),
-                None,
-            )
+            self._filter = Bank(self.grid, self.x, self.P, self._resolution, self.options.gate)
+            self._watch = None
         if self._lost:
             self.state = State.LOST
         elif not self._compact(width):

@@ -1,0 +1,97 @@
+"""What the navigator says: its state, one record for each update, and where it had to begin anew."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from typing import NamedTuple
+
+import msgspec
+
+__all__ = ["Jump", "Record", "State"]
+
+
+class State(IntEnum):
+    """What the filter says of itself; the values are those of the link."""
+
+    OFF = 0
+    """No start yet."""
+    SEARCHING = 1
+    """Several hypotheses."""
+    TRACKING = 2
+    """One hypothesis holds."""
+    DEAD_RECKONING = 3
+    """Off the map, or the field says nothing here."""
+    LOST = 4
+    """The field and the map disagree, or agree better elsewhere."""
+
+
+class Record(msgspec.Struct, frozen=True, gc=False):
+    """One update.
+
+    Attributes
+    ----------
+    time_us : int
+        µs since 1970 UTC, at which the rest holds: the mean time of the samples that went in.
+    state : State
+    vouched : bool
+        The filter stands by this position: it may be sent as a fix.
+    latitude, longitude : float
+        deg.
+    covariance_nn, covariance_ne, covariance_ee : float
+        m², of the position.
+    innovation, innovation_variance : float
+        nT, nT²; measured minus expected anomaly; NaN off the map.
+    gate : float
+        Largest innovation squared over variance that is taken in.
+    accepted : bool
+        The measurement was taken in.
+    anomaly : float
+        nT, measured: total field minus main field at the dead-reckoned position.
+    map_anomaly : float
+        nT, of the map at the position; NaN off the map.
+    bias, bias_sigma : float
+        nT, of the calibration.
+    map_error : float
+        nT.
+    current_north, current_east : float
+        m/s.
+    north, east : float
+        m, from the dead-reckoned position.
+    hypotheses : int
+    odds : float
+        Natural logarithm of the odds of another place against this one.
+    """
+
+    time_us: int
+    state: State
+    vouched: bool
+    latitude: float
+    longitude: float
+    covariance_nn: float
+    covariance_ne: float
+    covariance_ee: float
+    innovation: float
+    innovation_variance: float
+    gate: float
+    accepted: bool
+    anomaly: float
+    map_anomaly: float
+    bias: float
+    bias_sigma: float
+    map_error: float
+    current_north: float
+    current_east: float
+    north: float
+    east: float
+    hypotheses: int
+    odds: float
+
+
+class Jump(NamedTuple):
+    """The estimate began anew: µs, metres from where it was, 1-sigma that dead reckoning alone allowed, why."""
+
+    time_us: int
+    north: float
+    east: float
+    allowed: float
+    cause: str
