@@ -2,15 +2,7 @@
 
 Notes
 -----
-With ``A, T`` at the sample's positions and V the covariance of the corrected vector::
-
-    d = H_r - T,  b = A d,  F = |b|,  u = b / F
-    V_ij = Q_ij . (d d^T) + L_ij . d + O_ij         (dA, dT and the sensor's noise carried through)
-    sigma_F^2 = u^T V u
-
-Every operation is elementwise IEEE arithmetic in one written order, on floats or on arrays, but for the
-products of :class:`~magbridge.calibration.kernel.Kernel`, which are exact in any order: so a sample
-corrected live, in a batch, or replayed on another computer gives identical bits.
+The equations stand in :mod:`.arithmetic`, and are the same code for one sample and for many.
 
 What a missing value gives: a NaN channel of the field or position makes total and vector NaN and
 the sigmas infinite, flagged ``gap`` or ``stale_telemetry``; the total is never a guess.
@@ -25,6 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from magbridge.calibration.arithmetic import apply, prepare
 from magbridge.calibration.kernel import Kernel
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.terms import Step
@@ -57,87 +50,6 @@ class CorrectedArrays(NamedTuple):
     vector: FloatArray
     vector_sigma: FloatArray
     quality: NDArray[np.int64]
-
-
-def _prepare(t: Sequence[Any]) -> tuple[Any, ...]:
-    """From the table's 69 sums to what a sample needs, at one set of positions.
-
-    ``L_ij,k = -(G_ik,j + G_jk,i)`` with ``G = S_aT A``, and ``O = A S_TT A``.
-    """
-    xx, yy, zz, xy, xz, yz = t[:6]
-    G = []
-    for s in range(45, 63, 3):
-        x, y, z = t[s : s + 3]
-        G.append((x * xx + y * xy + z * xz, x * xy + y * yy + z * yz, x * xz + y * yz + z * zz))
-    gxx, gyy, gzz, gxy, gxz, gyz = G
-    L = (
-        (-2.0 * gxx[0], -2.0 * gxy[0], -2.0 * gxz[0]),
-        (-2.0 * gxy[1], -2.0 * gyy[1], -2.0 * gyz[1]),
-        (-2.0 * gxz[2], -2.0 * gyz[2], -2.0 * gzz[2]),
-        (-(gxx[1] + gxy[0]), -(gxy[1] + gyy[0]), -(gxz[1] + gyz[0])),
-        (-(gxx[2] + gxz[0]), -(gxy[2] + gyz[0]), -(gxz[2] + gzz[0])),
-        (-(gxy[2] + gxz[1]), -(gyy[2] + gyz[1]), -(gyz[2] + gzz[1])),
-    )
-    a, b, c, d, e, f = t[63:69]  # S_TT: xx yy zz xy xz yz
-    px, py, pz = a * xx + d * xy + e * xz, d * xx + b * xy + f * xz, e * xx + f * xy + c * xz
-    qx, qy, qz = a * xy + d * yy + e * yz, d * xy + b * yy + f * yz, e * xy + f * yy + c * yz
-    rx, ry, rz = a * xz + d * yz + e * zz, d * xz + b * yz + f * zz, e * xz + f * yz + c * zz
-    O = (  # noqa: E741  (the notes' letter)
-        xx * px + xy * py + xz * pz,
-        xy * qx + yy * qy + yz * qz,
-        xz * rx + yz * ry + zz * rz,
-        xx * qx + xy * qy + xz * qz,
-        xx * rx + xy * ry + xz * rz,
-        xy * rx + yy * ry + yz * rz,
-    )
-    V = tuple((*t[9 + 6 * i : 15 + 6 * i], *L[i], O[i]) for i in range(6))
-    return (*t[:9], V)
-
-
-def _apply(
-    hx: Any, hy: Any, hz: Any, prepared: tuple[Any, ...], sight: tuple[float, ...] | None, root: Any
-) -> tuple[Any, ...]:
-    """One sample (or arrays of them): total, sigma, vector, sigmas of the vector."""
-    xx, yy, zz, xy, xz, yz, tx, ty, tz, V = prepared
-    dx, dy, dz = hx - tx, hy - ty, hz - tz
-    bx = xx * dx + xy * dy + xz * dz
-    by = xy * dx + yy * dy + yz * dz
-    bz = xz * dx + yz * dy + zz * dz
-    F = root(bx * bx + by * by + bz * bz)
-    over = 1.0 / (F + 1e-300)  # a vector of exactly nothing has no direction, and must not raise
-    ux, uy, uz = bx * over, by * over, bz * over
-    exx, eyy, ezz, exy, exz, eyz = dx * dx, dy * dy, dz * dz, dx * dy, dx * dz, dy * dz
-    vxx, vyy, vzz, vxy, vxz, vyz = [
-        q0 * exx + q1 * eyy + q2 * ezz + q3 * exy + q4 * exz + q5 * eyz + l0 * dx + l1 * dy + l2 * dz + o
-        for q0, q1, q2, q3, q4, q5, l0, l1, l2, o in V
-    ]
-    variance = (
-        ux * ux * vxx + uy * uy * vyy + uz * uz * vzz
-        + 2.0 * (ux * uy * vxy + ux * uz * vxz + uy * uz * vyz)
-    )  # fmt: skip
-    # abs: rounding may leave a variance of nothing at -1e-12
-    if sight is None:
-        return F, root(abs(variance)), bx, by, bz, root(abs(vxx)), root(abs(vyy)), root(abs(vzz))
-    return (F, root(abs(variance)), *_rotate(bx, by, bz, vxx, vyy, vzz, vxy, vxz, vyz, sight, root))
-
-
-def _rotate(
-    bx: Any, by: Any, bz: Any, vxx: Any, vyy: Any, vzz: Any, vxy: Any, vxz: Any, vyz: Any,
-    sight: tuple[float, ...], root: Any,
-) -> tuple[Any, ...]:  # fmt: skip
-    """Into body axes: ``b' = R b``, ``V' = R V R^T + [b'] Omega [b']^T``, Omega the boresight's own."""
-    oxx, oyy, ozz, oxy, oxz, oyz = sight[9:]
-    rows = (sight[0:3], sight[3:6], sight[6:9])
-    px, py, pz = [rx * bx + ry * by + rz * bz for rx, ry, rz in rows]
-    wx, wy, wz = [
-        rx * rx * vxx + ry * ry * vyy + rz * rz * vzz
-        + 2.0 * (rx * ry * vxy + rx * rz * vxz + ry * rz * vyz)
-        for rx, ry, rz in rows
-    ]  # fmt: skip
-    wx = wx + (pz * pz * oyy + py * py * ozz - 2.0 * py * pz * oyz)
-    wy = wy + (pz * pz * oxx + px * px * ozz - 2.0 * px * pz * oxz)
-    wz = wz + (py * py * oxx + px * px * oyy - 2.0 * px * py * oxy)
-    return px, py, pz, root(abs(wx)), root(abs(wy)), root(abs(wz))
 
 
 def _sight(calibration: Calibration) -> tuple[float, ...] | None:
@@ -212,8 +124,8 @@ class Corrector:
                 regressors += effect(time_us, hx, hy, hz, values)
             if regressors != self._last:
                 self._last = regressors
-                self._prepared = _prepare(self._kernel.sums_of_one(regressors))
-        F, sigma, x, y, z, sx, sy, sz = _apply(hx, hy, hz, self._prepared, self._sight, sqrt)
+                self._prepared = prepare(self._kernel.sums_of_one(regressors))
+        F, sigma, x, y, z, sx, sy, sz = apply(hx, hy, hz, self._prepared, self._sight, sqrt)
         quality |= self._flags
         if F - F != 0.0:  # NaN or infinite
             quality |= GAP if hx + hy + hz - (hx + hy + hz) != 0.0 else 0
@@ -290,7 +202,7 @@ def correct(
             phi = _regressors(kernel, steps, field[part], channels[part], time[part])
             prepared = _stage_many(kernel, phi)
             hx, hy, hz = field[part].T
-            out[:, part] = _apply(hx, hy, hz, prepared, sight, np.sqrt)
+            out[:, part] = apply(hx, hy, hz, prepared, sight, np.sqrt)
         quality = np.full(n, _base_flags(calibration))
         for value, (low, high) in zip(channels.T, _ranges(calibration), strict=False):
             quality |= np.where((value < low) | (value > high), EXTRAPOLATED, 0)
@@ -328,9 +240,9 @@ def _stage_many(kernel: Kernel, phi: FloatArray) -> tuple[Any, ...]:
     new = np.ones(phi.shape[1], bool)
     new[1:] = (phi[:, 1:] != phi[:, :-1]).any(axis=0)
     if 2 * np.count_nonzero(new) > len(new):
-        return _prepare(list(kernel.sums(phi)))
+        return prepare(list(kernel.sums(phi)))
     phi = phi[:, new]
-    prepared = _prepare(list(kernel.sums(phi)))
+    prepared = prepare(list(kernel.sums(phi)))
     back = np.cumsum(new) - 1
     return (*(row[back] for row in prepared[:9]), [[row[back] for row in entry] for entry in prepared[9]])
 
