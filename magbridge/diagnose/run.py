@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from magbridge.calibration.file import save
 from magbridge.calibration.model import Calibration
+from magbridge.calibration.residual import residuals
 from magbridge.diagnose.candidates import Candidate
 from magbridge.diagnose.causes import CAUSES, Cause
 from magbridge.diagnose.extend import extend, settle
@@ -20,9 +21,9 @@ from magbridge.diagnose.findings import findings_json
 from magbridge.diagnose.gain import Gain, held_out, paired
 from magbridge.diagnose.isolability import Isolability, isolability
 from magbridge.diagnose.joint import Joint, information
-from magbridge.diagnose.problem import Problem, pose
+from magbridge.diagnose.problem import Problem, pose, samples_of
 from magbridge.diagnose.search import ODDS, Hypothesis, Outcome, search, slices, trials
-from magbridge.diagnose.survey import take
+from magbridge.diagnose.survey import Survey, take
 from magbridge.diagnose.unexplained import Leftover, Outliers, leftover, outliers
 from magbridge.errors import DataError
 from magbridge.field.grid import AnomalyGrid
@@ -39,6 +40,8 @@ SHARE = 0.5
 """Of a named cause's signal-to-noise: when more than this stays unexplained, the name does not fit."""
 WORSE = 1.1
 """Ratio of held-out RMS above which the extended calibration is not believed."""
+SPOILT = 2.0
+"""Ratio of RMS above which a calibration is not handed out: alike effects can cancel in the fit and not in use."""
 REMAINDER = 0.25
 """Less than this is what an idealised regressor leaves, and not worth a word."""
 
@@ -146,7 +149,8 @@ def diagnose(
         counts[wrong.rows] = False
     before = problem.residual
     after = held_out(settled, columns, fit) if model else before
-    if paired(before, after, survey.dive, counts if counts.any() else ~counts).ratio > WORSE:
+    held = paired(before, after, survey.dive, counts if counts.any() else ~counts).ratio
+    if held > WORSE or (model and _spoils(survey, problem, extended, counts if counts.any() else ~counts)):
         # names that make the dives worse that they never saw are no explanation
         named, rivals, model, fit, after, extended = (), (), [], outcome.null, before, calibration
         rest = leftover(problem, [], outcome.null, outcome.order, tones[0] if tones else None)
@@ -204,6 +208,12 @@ def _accept(
     if (rest is not None and rest.signal_to_noise > SHARE * loudest) or beaten:
         return (), (), outcome.null, free or rest
     return outcome.chosen, outcome.rivals, outcome.fit, rest
+
+
+def _spoils(survey: Survey, problem: Problem, extended: Calibration, counts: NDArray[np.bool_]) -> bool:
+    """Say whether the extended calibration itself, not linearised and without the map's part, is off by far more."""
+    e, _ = residuals(*samples_of(survey, extended))
+    return float(np.mean(e[counts] ** 2)) > SPOILT**2 * float(np.mean(problem.residual[counts] ** 2))
 
 
 def _without(fit: Joint, model: Sequence[Candidate], k: int) -> Joint:

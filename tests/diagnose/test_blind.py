@@ -83,21 +83,27 @@ ALIKE = {
 }
 
 
+LONGER = {"temperature_offset", "actuator_order", "saturation", "map_error"}
+"""Seen in two hours, but not told from others; three do."""
+
+
 @cache
-def study() -> ModuleType:
+def study(hours: float = 2.0) -> ModuleType:
     path = Path(__file__).parents[2] / "tools" / "blind.py"
     spec = importlib.util.spec_from_file_location("blind", path)
     assert spec is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules["blind"] = module
     spec.loader.exec_module(module)  # type: ignore[union-attr]
-    module.HOURS = 3.0  # quicker than the study's
+    module.HOURS = hours  # quicker than the study's
     return module
 
 
 @pytest.mark.parametrize("name", list(CAUSES))
 def test_a_hidden_effect_is_found_and_named(name: str) -> None:
-    row = study().case(12 + 6 * list(CAUSES).index(name), (name,), 20.0, "white")
+    row = study(3.0 if name in LONGER else 2.0).case(
+        12 + 6 * list(CAUSES).index(name), (name,), 20.0, "white"
+    )
     assert row["verdict"] != "nothing_found"
     named = {found[0] for found in row["found"]} | {other for found in row["found"] for other in found[3]}
     assert named & ({name} | ALIKE.get(name, set())), row
@@ -119,7 +125,7 @@ def test_two_at_once() -> None:
 
 
 def test_what_no_cause_explains_is_called_unexplained() -> None:
-    row = study().case(24, ("relay",), 40.0, "white")
+    row = study(3.0).case(24, ("relay",), 40.0, "white")
     assert row["unexplained"] is not None
 
 
@@ -130,10 +136,17 @@ def warm() -> tuple[xr.Dataset, object]:
     return study().add_noise(ds, "white", 1.0, 24), calibration
 
 
-def test_what_is_written(warm: tuple[xr.Dataset, object], tmp_path: Path) -> None:
-    """The contract's three files; the calibration is an ordinary one, and mends what it says it mends."""
+@pytest.fixture(scope="module")
+def written(warm: tuple[xr.Dataset, object], tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """The folder of a diagnosis and the channel that it names."""
     ds, calibration = warm
-    diagnose([ds], calibration, tmp_path / "out")
+    out = tmp_path_factory.mktemp("diagnosis")
+    return out, diagnose([ds], calibration, out / "out").named[0].candidate.channel
+
+
+def test_what_is_written(warm: tuple[xr.Dataset, object], written: tuple[Path, str]) -> None:
+    """The contract's three files; the calibration is an ordinary one, and mends what it says it mends."""
+    ds, tmp_path = warm[0], written[0]
     found = json.loads((tmp_path / "out" / "findings.json").read_text())
     assert found["verdict"] == "explained"
     assert set(found) == {"verdict", "rms_before_nT", "rms_after_nT", "gain", "findings", "unexplained"}
@@ -150,10 +163,9 @@ def test_what_is_written(warm: tuple[xr.Dataset, object], tmp_path: Path) -> Non
     assert "http" not in page.replace("http-equiv", "")
 
 
-def test_a_channels_name_does_not_decide(warm: tuple[xr.Dataset, object]) -> None:
+def test_a_channels_name_does_not_decide(warm: tuple[xr.Dataset, object], written: tuple[Path, str]) -> None:
     ds, calibration = warm
-    channel = diagnose([ds], calibration).named[0].candidate.channel
-    renamed = ds.rename({channel: "zz"})
+    renamed = ds.rename({written[1]: "zz"})
     assert diagnose([renamed], calibration).named[0].candidate.channel == "zz"
 
 
