@@ -160,7 +160,7 @@ def _figure_3(flight: Trials) -> Figure:
             hours, np.sqrt(sum(part[n] ** 2 for n in CHANNELS)) / 1e3, ".", markersize=1.2, color="#777777"
         )
         raw_panel.set_title(f"Trial {trial[-1]}: raw")
-        panel.set_title("corrected, nominal")
+        panel.set_title("corrected")
         panel.plot(
             hours,
             flight.corrected[trial, trial, "nominal"],
