@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import sys
-from importlib.util import module_from_spec, spec_from_file_location
+from collections.abc import Iterator
+from importlib import import_module
 from pathlib import Path
 from types import ModuleType
 
@@ -14,14 +15,12 @@ from magbridge.navigate.model import Options
 
 
 @pytest.fixture(scope="session")
-def study() -> ModuleType:
-    spec = spec_from_file_location("navigation", Path(__file__).parents[2] / "tools" / "navigation.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = module_from_spec(spec)
-    sys.modules["navigation"] = module  # dataclasses look their module up
-    spec.loader.exec_module(module)
-    return module
+def study() -> Iterator[ModuleType]:
+    """tools/navigation.py, with tools/voyages.py beside it."""
+    tools = str(Path(__file__).parents[2] / "tools")
+    sys.path.insert(0, tools)
+    yield import_module("navigation")
+    sys.path.remove(tools)
 
 
 @pytest.fixture(scope="session")
