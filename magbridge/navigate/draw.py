@@ -40,7 +40,7 @@ def draw_navigation(result: xr.Dataset, grid: AnomalyGrid, path: str | Path) -> 
     )
     axis.plot(hours, result["map_anomaly"], color="C3", lw=1, label="map under the track")
     axis.set_ylabel("anomaly, nT")
-    axis.legend(fontsize=8)
+    axis.legend(loc="upper right", fontsize=8)
 
     axis = panels["innovation"]
     spread = 2.0 * np.sqrt(result["innovation_variance"])
@@ -49,7 +49,7 @@ def draw_navigation(result: xr.Dataset, grid: AnomalyGrid, path: str | Path) -> 
     axis.plot(hours[taken], result["innovation"][taken], ".", ms=2, color="C0", label="taken in")
     axis.plot(hours[~taken], result["innovation"][~taken], "x", ms=4, color="C3", label="beyond the gate")
     axis.set_ylabel("innovation, nT")
-    axis.legend(fontsize=8, ncols=3)
+    axis.legend(loc="upper right", fontsize=8, ncols=3)
 
     axis = panels["sigma"]
     sigma = np.sqrt(result["covariance_nn"] + result["covariance_ee"])
@@ -63,7 +63,7 @@ def draw_navigation(result: xr.Dataset, grid: AnomalyGrid, path: str | Path) -> 
     axis.set_ylabel("position, m")
     axis.set_xlabel("hours")
     _shade(axis, hours, result["state"].to_numpy())
-    axis.legend(fontsize=8)
+    axis.legend(loc="upper right", fontsize=8)
     _save(figure, path)
 
 
@@ -126,7 +126,7 @@ def _tracks(axis: Axes, result: xr.Dataset) -> None:
             lw=1,
             label=f"yardstick ({result.attrs['yardstick'].rstrip('_')})",
         )
-    axis.legend(fontsize=8)
+    axis.legend(loc="upper right", fontsize=8)
 
 
 def _shade(axis: Axes, hours: Any, state: Any) -> None:
