@@ -32,6 +32,8 @@ BENCHMARKS: dict[str, tuple[str, int]] = {
     "latency": ("benchmarks.latency:latency", 5),
     "replay": ("benchmarks.replay:replay", 5),
     "start": ("benchmarks.start:start", 5),
+    "fitting": ("benchmarks.calibration:fitting", 3),
+    "correcting": ("benchmarks.calibration:correcting", 5),
 }
 """Name to ``module:function`` and number of repetitions; the function takes a folder and that number."""
 

@@ -84,15 +84,22 @@ class Kernel:
 
     def sums(self, phi: FloatArray) -> FloatArray:
         """Return ``table psi`` (69, n) of many samples' regressors (m, n)."""
-        psi = phi[self.first] * phi[self.second]
-        largest = np.abs(phi).max(axis=0)
-        scale = np.ldexp(1.0, np.minimum(EXPONENT - np.frexp(largest * largest)[1], 0))
-        psi *= scale
-        coarse = (psi + COARSE) - COARSE
-        fine = (psi - coarse + FINE) - FINE
-        found = self.coarse @ coarse + (self.fine @ coarse + self.coarse @ fine)
-        found /= scale
-        return np.asarray(found)
+        psi = np.empty((len(self.pairs), phi.shape[1]))
+        for row, (i, j) in zip(psi, self.pairs, strict=True):
+            np.multiply(phi[i], phi[j], out=row)
+        largest = max(float(phi.max()), -float(phi.min()))
+        scale = None if largest * largest < 2.0**EXPONENT else _scales(phi)
+        if scale is not None:
+            psi *= scale
+        coarse = psi + COARSE
+        coarse -= COARSE
+        fine = np.subtract(psi, coarse, out=psi)
+        fine += FINE
+        fine -= FINE
+        found = self.fine @ coarse
+        found += self.coarse @ fine
+        found += self.coarse @ coarse
+        return np.asarray(found if scale is None else found / scale)
 
     def sums_of_one(self, phi: list[float]) -> list[float]:
         """Return the same 69 sums of one sample's regressors: one product, so that it is quick."""
@@ -106,7 +113,7 @@ class Kernel:
         fine += FINE
         fine -= FINE
         found = self.both @ parts
-        sums: list[float] = ((found[:69, 0] + (found[69:, 0] + found[:69, 1])) / scale).tolist()
+        sums: list[float] = ((found[69:, 0] + found[:69, 1] + found[:69, 0]) / scale).tolist()
         return sums
 
     @cached_property
@@ -133,6 +140,12 @@ class Kernel:
     def monomials_of(self, positions: FloatArray) -> FloatArray:
         """(m, n) monomials of (n, k) positions."""
         return np.stack(self.powers(list(positions.T), np.ones(len(positions))))
+
+
+def _scales(phi: FloatArray) -> FloatArray:
+    """(n,) power of two by which the products of each sample are made small enough, 1 for most."""
+    largest = np.abs(phi).max(axis=0)
+    return np.asarray(np.ldexp(1.0, np.minimum(EXPONENT - np.frexp(largest * largest)[1], 0)))
 
 
 def compile_kernel(calibration: Calibration) -> Kernel:

@@ -1,0 +1,167 @@
+"""Fitting and correcting: beside scipy with finite differences, and beside the bare matrix product."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from statistics import median
+
+import msgspec
+import numpy as np
+from benchmarks.row import Row
+from scipy.optimize import least_squares
+from threadpoolctl import threadpool_limits
+
+from magbridge.calibration.correct import CHUNK, Corrector, correct
+from magbridge.calibration.data import Observations, observations, polynomial_samples
+from magbridge.calibration.fit import fit
+from magbridge.calibration.residual import residuals_of
+from magbridge.calibration.terms import full_order
+from sitl import load, segments, simulate
+
+__all__ = ["correcting", "fitting"]
+
+NAMES = ("battpos", "ballast")
+LARGE = (100_000, 1_000_000)
+
+IN_ANOTHER = """
+import json, resource, sys, time
+from benchmarks.calibration import many
+from magbridge.calibration.fit import fit
+data = many(int(sys.argv[1]))
+begun = time.process_time()
+fit(data)
+used = time.process_time() - begun
+print(json.dumps([used, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3]))
+"""
+
+
+def fitting(folder: Path, repetitions: int) -> list[Row]:  # noqa: ARG001  (the others write there)
+    """Time `auto` on a glider's calibration runs, and on very many samples."""
+    data = table_1()
+    samples = polynomial_samples(data, full_order(2, 3))
+    ours, theirs = [], []
+    fit(data)
+    with threadpool_limits(1):
+        for _ in range(repetitions):
+            ours.append(processor_time(lambda: fit(data)))
+            theirs.append(
+                processor_time(
+                    lambda: least_squares(lambda c: residuals_of(samples, c), np.zeros(90), method="lm")
+                )
+            )
+    place = str(Path(__file__).parents[1])
+    large = []
+    for count in LARGE:
+        command = [sys.executable, "-c", IN_ANOTHER, str(count)]
+        done = subprocess.run(command, cwd=place, capture_output=True, text=True, check=True)
+        large.append(json.loads(done.stdout))
+    (few, _), (all_, memory) = large
+    return [
+        Row(f"auto, {len(data)} samples, 2 masses, one core", median(ours), "s", most=1.0),
+        Row("the same by scipy, finite differences, no hyperparameters", median(theirs), "s", median(ours), "auto",
+            ratio=median(b / a for a, b in zip(ours, theirs, strict=True)), least=20.0),
+        Row(f"auto, {LARGE[1]:,} samples", all_, "s", few * LARGE[1] / LARGE[0], f"{LARGE[1] // LARGE[0]} times {LARGE[0]:,}"),
+        Row("memory of that", memory, "MB", most=1000.0),
+    ]  # fmt: skip
+
+
+def correcting(folder: Path, repetitions: int) -> list[Row]:  # noqa: ARG001
+    """Time `correct` where every sample has other positions, where they stand still, and one by one."""
+    data = table_1()
+    calibration = fit(data).calibration
+    kernel = calibration.kernel
+    rng = np.random.default_rng(1)
+    n = 200_000
+    field = data.field[rng.integers(0, len(data), n)]
+    moving = rng.uniform(data.parameters.min(axis=0), data.parameters.max(axis=0), (n, 2))
+    still = np.repeat(moving[::200], 200, axis=0)
+    when = np.arange(n) * 4.0
+    phi = np.ascontiguousarray(kernel.monomials_of(moving).T)
+    table = np.ascontiguousarray((kernel.coarse + kernel.fine).T)
+    values = moving[:2000].tolist()
+    readings = [(x, y, z) for x, y, z in field[:2000].tolist()]
+
+    def product(piece: int) -> None:
+        for start in range(0, n, piece):
+            part = phi[start : start + piece]
+            (part[:, kernel.first] * part[:, kernel.second]) @ table
+
+    def live(held: bool) -> None:
+        corrector = Corrector(calibration)
+        for reading, value in zip(readings, [values[0]] * len(values) if held else values, strict=True):
+            corrector.step(0, reading, value)
+
+    found: dict[str, list[float]] = {
+        "bare": [],
+        "pieces": [],
+        "moving": [],
+        "still": [],
+        "live": [],
+        "live held": [],
+    }
+    with threadpool_limits(1):
+        for _ in range(repetitions):
+            found["bare"].append(1e6 * processor_time(lambda: product(n)) / n)
+            found["pieces"].append(1e6 * processor_time(lambda: product(CHUNK)) / n)
+            found["moving"].append(
+                1e6 * processor_time(lambda: correct(calibration, field, moving, when)) / n
+            )
+            found["still"].append(1e6 * processor_time(lambda: correct(calibration, field, still, when)) / n)
+            found["live"].append(1e6 * processor_time(lambda: live(held=False)) / len(values))
+            found["live held"].append(1e6 * processor_time(lambda: live(held=True)) / len(values))
+    floor = (
+        f"{table.shape[0]} products of monomials @ {table.shape[0]} x {table.shape[1]} table, on whole arrays"
+    )
+    return [
+        Row("correct, sigmas and all, positions new with every sample", median(found["moving"]), "us",
+            median(found["bare"]), floor, least=0.5,
+            ratio=median(b / a for a, b in zip(found["moving"], found["bare"], strict=True))),
+        Row(
+            "the same, the product in pieces that stay in the cache",
+            median(found["moving"]),
+            "us",
+            median(found["pieces"]),
+            "as above, in pieces",
+            ratio=median(b / a for a, b in zip(found["moving"], found["pieces"], strict=True)),
+        ),
+        Row("correct, positions held", median(found["still"]), "us"),
+        Row("one sample live, positions held", median(found["live held"]), "us"),
+        Row("one sample live, positions new", median(found["live"]), "us"),
+    ]  # fmt: skip
+
+
+def table_1(noise: float = 1.0) -> Observations:
+    """Return a random glider's runs of the paper's Table 1; `noise` in nT."""
+    scenario = load("random_glider")
+    instrument = msgspec.structs.replace(scenario.instrument, noise_sigma=noise)
+    deployment = simulate(msgspec.structs.replace(scenario, instrument=instrument), 1)
+    return observations(segments(deployment)["calibration"], NAMES)
+
+
+def many(count: int) -> Observations:
+    """Return so many samples: the same runs again and again, each time with noise of their own."""
+    runs = table_1(0.0)
+    rng = np.random.default_rng(2)
+    pick = np.arange(count) % len(runs)
+    assert runs.runs is not None
+    return Observations(
+        field=runs.field[pick] + rng.normal(0.0, 1.0, (count, 3)),
+        reference=runs.reference[pick],
+        parameters=runs.parameters[pick],
+        names=runs.names,
+        units=runs.units,
+        runs=runs.runs[pick].astype(int) + 10 * (np.arange(count) // len(runs)),
+        time=np.arange(count) * 4.0,
+    )
+
+
+def processor_time(work: Callable[[], object]) -> float:
+    """Return the s of processor time that `work` takes."""
+    begun = time.process_time()
+    work()
+    return time.process_time() - begun
