@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from magbridge.errors import FormatError
 from magbridge.field.earth import metres_per_degree, offset
 from magbridge.field.grid import AnomalyGrid
+from magbridge.navigate.deadreckoning import GLIDE
 from magbridge.navigate.judge import judge
 from magbridge.navigate.model import Options
 from magbridge.navigate.navigator import UNUSABLE, Navigator
@@ -149,11 +150,21 @@ def _samples(deployment: xr.Dataset, source: str) -> tuple[Floats, Floats, Float
 
 def _motion(deployment: xr.Dataset, source: str) -> str:
     for name, columns in MOTIONS.items():
-        if all(column in deployment and deployment[column].notnull().any() for column in columns):
+        there = all(column in deployment and deployment[column].notnull().any() for column in columns)
+        if there and (name != "glide" or _glides(deployment)):
             return name
     raise FormatError(
         source, "expected a motion: " + ", or ".join(" ".join(columns) for columns in MOTIONS.values())
     )
+
+
+def _glides(deployment: xr.Dataset) -> bool:
+    """Return whether the vehicle sinks nose down and rises nose up, as only a glider must."""
+    known = deployment[["depth", "pitch"]].dropna("time", how="any")
+    rate = np.gradient(known["depth"].to_numpy().astype(float)) if known.sizes["time"] > 2 else np.zeros(0)
+    steep = np.abs(known["pitch"].to_numpy()[: rate.size]) > GLIDE
+    agree = rate[steep] * known["pitch"].to_numpy()[: rate.size][steep] < 0.0
+    return steep.mean() > 0.5 and bool(agree.mean() > 0.8) if steep.size else False
 
 
 def _columns(deployment: xr.Dataset, names: Mapping[str, str], source: str) -> dict[str, Floats]:

@@ -23,6 +23,7 @@ Array = NDArray[np.floating[Any]]
 SPARSE = 40  # positions, below which a map's place cannot be judged
 SEARCH = 1_500.0  # m, how far a map may have been put wrong
 LATTICE = 31  # shifts on each axis
+FLAT = 3.0  # times what is known of the field: a map with less relief has nothing to say
 DOUBLE = 2.0  # of what bias and map error allow: a scatter beyond is another field
 BETTER = 0.6  # of the scatter at the map's own place: what a shift must reach to be believed
 LEVEL = 4.0  # sigma of the calibration's bias: beyond, it is not the calibration
@@ -59,9 +60,14 @@ def judge(
         )
     silent = (state == State.DEAD_RECKONING) & ~off
     if silent.mean() > 0.5:
+        known = hypot(options.bias_sigma, options.map_sigma)
         findings.append(
-            f"the field says nothing for {100.0 * silent.mean():.0f} % of the track: the map is flat there"
-            f" ({grid.rms:.1f} nT rms) against what the calibration leaves ({options.bias_sigma:.1f} nT)"
+            f"the field says nothing for {100.0 * silent.mean():.0f} % of the track: "
+            + (
+                f"the map is flat there ({grid.rms:.1f} nT rms, where calibration and map are known to {known:.1f} nT)"
+                if grid.rms < FLAT * known
+                else f"dead reckoning is as good as this map can be ({_sigma(result, silent):.0f} m)"
+            )
         )
     findings += _told_by_jumps(jumps, float(result["time"][0]))
     if (lost := (state == State.LOST)).any():
@@ -74,6 +80,10 @@ def judge(
     if state[-1] == State.SEARCHING:
         findings.append("several positions still explain the field at the end of the log")
     return findings
+
+
+def _sigma(result: xr.Dataset, rows: NDArray[np.bool_]) -> float:
+    return float(np.sqrt(np.median((result["covariance_nn"] + result["covariance_ee"]).to_numpy()[rows])))
 
 
 def _told_by_jumps(jumps: Sequence[Jump], start: float) -> list[str]:
