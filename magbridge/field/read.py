@@ -7,6 +7,7 @@ reads a file stands in one table, by suffix, and GRD files, of which four kinds 
 from __future__ import annotations
 
 import re
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -186,7 +187,7 @@ Surfer = tuple[int, int, tuple[float, float], tuple[float, float], Array]
 
 
 def _surfer_text(path: Path) -> Surfer:
-    words = path.read_text().split()
+    words = path.read_text(errors="replace").split()
     nx, ny = int(words[1]), int(words[2])
     limits = [float(word) for word in words[3:9]]
     return nx, ny, (limits[0], limits[1]), (limits[2], limits[3]), np.array(words[9:], float)
@@ -232,7 +233,7 @@ def _geosoft(path: Path) -> Parts:
 
 def _ascii(path: Path) -> Parts:
     """ESRI ASCII: ``ncols``, ``nrows``, a corner or centre, ``cellsize``, then rows from the north."""
-    words = path.read_text().split()
+    words = path.read_text(errors="replace").split()
     head: dict[str, float] = {}
     try:
         while words[2 * len(head)][0].isalpha():
@@ -252,7 +253,7 @@ def _ascii(path: Path) -> Parts:
 
 def _table(path: Path) -> Parts:
     """Longitude, latitude, anomaly in columns, with or without a header; any order of rows; gaps are holes."""
-    with path.open() as file:
+    with path.open(errors="replace") as file:
         first = file.readline()
     delimiter = next((mark for mark in ",;" if mark in first), None)
     words = [word.strip() for word in first.strip().lstrip("#").lower().split(delimiter)]
@@ -271,13 +272,19 @@ def _table(path: Path) -> Parts:
         stated = re.search(r"[\[(]([^\])]+)", words[columns[2]])
         unit = stated.group(1) if stated else None
     try:
-        table = np.loadtxt(path, delimiter=delimiter, skiprows=int(header), usecols=columns, ndmin=2)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # of a file without rows, which is seen below
+            table = np.loadtxt(
+                path, delimiter=delimiter, skiprows=int(header), usecols=columns, ndmin=2, encoding="latin-1"
+            )
     except ValueError as error:
         place = re.search(
             r"at row (\d+), column (\d+)", str(error)
         )  # numpy counts rows from 0 below the header
         line, number = (int(place[1]) + 1 + header, place[2]) if place else (None, None)
         raise FormatError(path, "expected numbers", row=line, column=number) from error
+    if not np.isfinite(table[:, :2]).all() or not len(table):
+        raise FormatError(path, "expected rows of longitude, latitude, anomaly")
     x, column = _levels(table[:, 0])
     y, row = _levels(table[:, 1])
     if x.size * y.size > 4 * len(table):

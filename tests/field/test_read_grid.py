@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import struct
+from contextlib import suppress
 
 import numpy as np
 import pytest
 import xarray as xr
+from hypothesis import given
+from hypothesis import strategies as st
 from PIL import Image
 from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
@@ -193,6 +196,23 @@ def test_one_clear_line(tmp_path, name, write, message):
         read_grid(tmp_path / name)
     assert "\n" not in str(caught.value)
     assert str(tmp_path) in str(caught.value)
+
+
+WORDS = b"DSAA DSBB DSRB GRID DATA ncols nrows xllcorner yllcenter cellsize lon lat mag 1 -9 nan inf 1e400 , ; ( ["
+
+
+@given(
+    suffix=st.sampled_from([".grd", ".asc", ".csv", ".xyz", ".tif"]),
+    raw=st.one_of(
+        st.binary(max_size=300),
+        st.lists(st.sampled_from([*WORDS.split(), b"\n"]), max_size=40).map(b" ".join),
+    ),
+)
+def test_whatever_a_file_holds_the_answer_is_a_grid_or_one_line(tmp_path_factory, suffix, raw):
+    path = tmp_path_factory.mktemp("any") / f"a{suffix}"
+    path.write_bytes(raw)
+    with suppress(FormatError):
+        assert read_grid(path).anomaly.size >= 16
 
 
 @pytest.mark.real
