@@ -6,6 +6,8 @@ Writing never blocks: what a slow reader does not take is dropped and counted.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+
 from magbridge.errors import PortError
 
 __all__ = ["CHUNK", "Port"]
@@ -14,7 +16,7 @@ CHUNK = 65536
 """Bytes read at once."""
 
 
-class Port:
+class Port(ABC):
     """What the bridge asks of a port."""
 
     def __init__(self, name: str) -> None:
@@ -23,36 +25,36 @@ class Port:
         """Bytes that could not be written."""
 
     @property
+    @abstractmethod
     def up(self) -> bool:
         """Whether bytes can come and go."""
-        raise NotImplementedError
 
+    @abstractmethod
     def open(self) -> None:
         """Open it; raises :class:`PortError`."""
-        raise NotImplementedError
 
+    @abstractmethod
     def fds(self) -> list[int]:
         """Return the file descriptors to wait for."""
-        raise NotImplementedError
 
+    @abstractmethod
     def read(self) -> bytes:
         """Return what has come, when a descriptor is ready; raises :class:`PortError` when the port is gone.
 
         A serial line that is ready and yet has nothing is one that hung up, so do not ask when none is ready.
         """
-        raise NotImplementedError
 
+    @abstractmethod
     def write(self, data: bytes) -> None:
         """Send `data` whole or drop it; raises :class:`PortError` when the port is gone."""
-        raise NotImplementedError
 
     def write_all(self, data: bytes) -> None:
         """Send `data` whole, waiting for a slow reader; for a replay, which has no deadline."""
         self.write(data)
 
+    @abstractmethod
     def close(self) -> None:
         """Close it; harmless when it is closed."""
-        raise NotImplementedError
 
     def lost(self, reason: object) -> PortError:
         """Close the port and return the error to raise."""
