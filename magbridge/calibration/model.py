@@ -26,7 +26,17 @@ from magbridge.calibration.kernel import Kernel, compile_kernel
 from magbridge.calibration.terms import Effect, Polynomial, PositionTerm
 from magbridge.errors import CalibrationError
 
-__all__ = ["Boresight", "Calibration", "Noise", "Parameter", "Reference", "Run", "Sensor", "identity"]
+__all__ = [
+    "Boresight",
+    "Calibration",
+    "Noise",
+    "Parameter",
+    "Reference",
+    "Run",
+    "Sensor",
+    "identity",
+    "with_boresight",
+]
 
 FloatArray = NDArray[np.float64]
 
