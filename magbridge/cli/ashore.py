@@ -103,7 +103,7 @@ def calibrate(
     site_bias
         nT, 1-sigma of what the reference may be wrong by all over the site.
     strict
-        Exit with 1 when the data leave something untold.
+        Exit with 1 when the data do not support the fit.
     json
         Print the result for machines.
     """
@@ -131,6 +131,7 @@ def calibrate(
         "method": method,
         "samples": len(data),
         "rms_nT": found.rms,
+        "supported": found.supported,
         "scales": found.scales,
         "noise_nT": found.calibration.noise.sensor,
         "warnings": found.warnings,
@@ -141,8 +142,8 @@ def calibrate(
         f"{output}: {method}, {len(data)} samples, {left}, bought with scales of {low:.3f} to {high:.3f}"
     )
     tell(result, summary, json)
-    if strict and found.warnings:
-        raise DataError(f"{len(found.warnings)} things that the data cannot tell, and --strict")
+    if strict and not found.supported:
+        raise DataError("the data do not support this fit, and --strict: see the warnings")
 
 
 @app.command
