@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from magbridge.calibration.correct import regressors
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.residual import Samples, residuals, whiten
-from magbridge.calibration.terms import Effect
+from magbridge.calibration.terms import Effect, Polynomial
 from magbridge.diagnose.survey import Survey
 
 __all__ = [
@@ -32,6 +32,7 @@ __all__ = [
     "add_effects",
     "derivatives",
     "effect_columns",
+    "floor",
     "history",
     "pose",
     "samples_of",
@@ -46,6 +47,8 @@ SEEN = 0.01
 """Share of a prior's information that data must add for its direction to be kept."""
 BROADEST = 1e-3
 """Precision, of the posterior's, below which a direction that only the given logs determined is not let."""
+STABLE = 1e-5
+"""Of the field: no fluxgate's scale, axes and offset hold better than ten parts per million from one day to another."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,7 +160,7 @@ def pose(survey: Survey, calibration: Calibration) -> Problem:
         e[rows], g[rows] = residuals(part, coefficients)
         above, _ = residuals(replace(part, reference=part.reference + 1.0), coefficients)
         gain[rows] = e[rows] - above
-    L, centre = _prior(survey, calibration, samples, e, g)
+    L, centre = _loosened(calibration, *_prior(survey, calibration, samples, e, g))
     free = -derivatives(calibration, samples, g, L)
     values, vectors = np.linalg.eigh(free.T @ free / _level(calibration, e) ** 2)
     keep = values > SEEN
@@ -206,6 +209,38 @@ def _tensor(calibration: Calibration) -> FloatArray:
     return tensor
 
 
+def floor(calibration: Calibration) -> FloatArray:
+    """(K, K) covariance, nT²: what the nine constants may have changed by since the calibration.
+
+    Its posterior knows only the noise of its samples, and a few thousand of them make that a hundredth of it. What
+    the runs' turns did to the filtered channels, and what nobody holds constant, is more.
+    """
+    spread, k = np.zeros(calibration.coefficients.size), 0
+    for term in calibration.terms:
+        if isinstance(term, Polynomial) and (0,) * len(calibration.parameters) in term.exponents:
+            first = k + 9 * term.exponents.index((0,) * len(calibration.parameters))
+            spread[first : first + 9] = STABLE * calibration.reference.field
+        k += term.size
+    return np.diag(spread**2)
+
+
+def _loosened(
+    calibration: Calibration, L: FloatArray, centre: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return L and m with :func:`floor` added."""
+    mean = L @ centre
+    broad = _factor(L @ L.T + floor(calibration))
+    return broad, np.linalg.lstsq(broad, mean, rcond=None)[0]
+
+
+def _factor(covariance: FloatArray) -> FloatArray:
+    """L with ``L L^T`` the covariance, of as many columns as it has rank."""
+    scale = np.sqrt(np.maximum(np.diag(covariance), 0.0)) + 1e-12
+    values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
+    kept = values > 1e-12 * values[-1]
+    return scale[:, None] * vectors[:, kept] * np.sqrt(values[kept])
+
+
 def _prior(
     survey: Survey, calibration: Calibration, samples: Samples, e: FloatArray, g: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
@@ -214,10 +249,7 @@ def _prior(
     In the posterior's own units, ``P_0 = 1 - H`` with H the information of those samples, and since the gradient
     vanished at c_0, ``P_0 m = L^T J^T W e``.
     """
-    scale = np.sqrt(np.maximum(np.diag(calibration.covariance), 0.0)) + 1e-12
-    values, vectors = np.linalg.eigh(calibration.covariance / np.outer(scale, scale))
-    kept = values > 1e-12 * values[-1]
-    L = scale[:, None] * vectors[:, kept] * np.sqrt(values[kept])
+    L = _factor(calibration.covariance)
     centre = np.zeros(L.shape[1])
     learned = np.flatnonzero(survey.learned)
     if not learned.size:
