@@ -173,20 +173,28 @@ class AnomalyGrid:
         inside &= self._whole[i, j]
         s, t = u - j, v - i
         across, along = _weights(s), _weights(t)
-        window = np.lib.stride_tricks.sliding_window_view(self._coefficients, (4, 4))
-        f = along @ window[i, j] @ across.transpose(0, 2, 1)
-        variance = (1 - t) * ((1 - s) * self._variance[i, j] + s * self._variance[i, j + 1]) + t * (
-            (1 - s) * self._variance[i + 1, j] + s * self._variance[i + 1, j + 1]
-        )
+        wide = self._coefficients.shape[1]
+        patch = self._coefficients.ravel()[
+            (wide * i + j) + (wide * np.arange(4)[:, None] + np.arange(4))[..., None]
+        ]
+        lines = (across[:, None] * patch).sum(
+            axis=2
+        )  # (3, 4, n): each row of the patch at s, with its slopes
+        if self._even_sigma:
+            variance = np.full(s.shape, self._variance[0, 0])
+        else:
+            variance = (1 - t) * ((1 - s) * self._variance[i, j] + s * self._variance[i, j + 1]) + t * (
+                (1 - s) * self._variance[i + 1, j] + s * self._variance[i + 1, j + 1]
+            )
         per_degree = metres_per_degree(np.where(inside, lat, 0.0))
         north, east = 1.0 / (per_degree[0] * self._dy), 1.0 / (per_degree[1] * self._dx)
         parts = (
-            f[:, 0, 0],
-            f[:, 1, 0] * north,
-            f[:, 0, 1] * east,
-            f[:, 2, 0] * north * north,
-            f[:, 1, 1] * north * east,
-            f[:, 0, 2] * east * east,
+            (along[0] * lines[0]).sum(axis=0),
+            (along[1] * lines[0]).sum(axis=0) * north,
+            (along[0] * lines[1]).sum(axis=0) * east,
+            (along[2] * lines[0]).sum(axis=0) * north * north,
+            (along[1] * lines[1]).sum(axis=0) * north * east,
+            (along[0] * lines[2]).sum(axis=0) * east * east,
             variance,
         )
         return Local(*(np.where(inside, part, nan) for part in parts))
@@ -298,6 +306,6 @@ def _axis(values: ArrayLike, name: str, what: str) -> tuple[Array, bool]:
 
 
 def _weights(t: Array) -> Array:
-    powers = np.stack([np.ones_like(t), t, t * t, t * t * t])
-    weights: Array = (WEIGHTS @ powers).T.reshape(-1, 3, 4)
+    """Return value, slope and curvature weights of four nodes, (3, 4, n): n last, along which memory runs."""
+    weights: Array = (WEIGHTS @ np.stack([np.ones_like(t), t, t * t, t * t * t])).reshape(3, 4, -1)
     return weights

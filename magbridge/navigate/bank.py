@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from magbridge.field.earth import metres_per_degree
 from magbridge.field.grid import AnomalyGrid
-from magbridge.navigate.model import Block
+from magbridge.navigate.model import N_STATES, Block
 
 __all__ = ["Bank"]
 
@@ -36,6 +36,9 @@ THREE_VARIANCE = 1.0 - float(THREE_WEIGHT @ THREE**2)
 
 class Bank:
     """A Gaussian mixture on the six states, each part linearised by itself.
+
+    Hypotheses come last in every array, weights ``w`` (n,), states ``x`` (6, n) and covariances ``P`` (6, 6, n):
+    each operation then runs along memory, three times as fast as on n small matrices.
 
     Parameters
     ----------
@@ -74,7 +77,7 @@ class Bank:
             * np.sqrt(np.prod(np.maximum(values, self.resolution**2)))
         )
         self.resolution = max(self.resolution, float(np.sqrt(area / AT_FIRST)))
-        part, w, shifts = P.copy(), np.ones(1), np.zeros((1, x.size))
+        part, w, shifts = P.copy(), np.ones(1), np.zeros((x.size, 1))
         for value, axis in zip(values, axes.T, strict=True):
             left = value - self.resolution**2
             if left <= 0.0:
@@ -83,30 +86,31 @@ class Bank:
             s = np.linspace(-EDGE, EDGE, n)
             g = P[:, :2] @ axis / value
             w = np.outer(w, np.exp(-0.5 * s * s)).ravel()
-            shifts = (shifts[:, None, :] + (s * np.sqrt(left))[:, None] * g).reshape(-1, x.size)
+            shifts = (shifts[:, :, None] + np.outer(g, s * np.sqrt(left))[:, None, :]).reshape(x.size, -1)
             part -= np.outer(g, g) * left
         keep = w > np.exp(-0.5 * EDGE**2)
-        w, shifts = w[keep], shifts[keep]
-        return w / w.sum(), x + shifts, np.broadcast_to(part, (w.size, *part.shape)).copy()
+        w, shifts = w[keep], shifts[:, keep]
+        return w / w.sum(), x[:, None] + shifts, np.repeat(part[:, :, None], w.size, axis=2)
 
     def predict(self, F: Array, Q: Array) -> None:
         """Move every hypothesis on by one transition."""
-        self.x = self.x @ F.T
-        self.P = F @ self.P @ F.T + Q
+        self.x = F @ self.x
+        half = (F @ self.P.reshape(N_STATES, -1)).reshape(self.P.shape)
+        self.P = F @ half + Q[:, :, None]
 
     def update(self, block: Block) -> tuple[float, float, float]:
         """Take in one measurement; return its innovation (nT), its variance and its log-likelihood.
 
         A hypothesis off the map expects the map's mean and scatter, and learns nothing.
         """
-        north, east = self.x[:, 0], self.x[:, 1]
+        north, east = self.x[:2]
         per_latitude, per_longitude = metres_per_degree(block.latitude)
         local = self._grid.evaluate(
             block.longitude + east / per_longitude, block.latitude + north / per_latitude
         )
         off = np.isnan(local.anomaly)
         anomaly, gn, ge, hnn, hne, hee, v = (np.where(off, 0.0, part) for part in local)
-        pnn, pne, pee = self.P[:, 0, 0], self.P[:, 0, 1], self.P[:, 1, 1]
+        pnn, pne, pee = self.P[0, 0], self.P[0, 1], self.P[1, 1]
         a, b, c, d = (
             hnn * pnn + hne * pne,
             hnn * pne + hne * pee,
@@ -115,35 +119,30 @@ class Bank:
         )
         anomaly += block.slope_north * north + block.slope_east * east + 0.5 * (a + d)
         v = v + block.variance + 0.5 * (a * a + 2.0 * b * c + d * d)
-        row = np.zeros_like(self.x)
-        row[:, 0], row[:, 1] = gn + block.slope_north, ge + block.slope_east
-        row[:, 4:] = 1.0
-        row[off, :2] = 0.0
+        slopes = np.where(off, 0.0, (gn + block.slope_north, ge + block.slope_east))
+        gain = slopes[0] * self.P[0] + slopes[1] * self.P[1] + self.P[4] + self.P[5]
+        s = slopes[0] * gain[0] + slopes[1] * gain[1] + gain[4] + gain[5]
         anomaly[off], v[off] = self._elsewhere[0], block.variance + self._elsewhere[1]
-        return self._observe(block.anomaly - anomaly - self.x[:, 4] - self.x[:, 5], row, v, off)
+        return self._observe(block.anomaly - anomaly - self.x[4] - self.x[5], gain, s + v, off)
 
     def update_position(self, north: float, east: float, sigma: float) -> None:
         """Take in a fix from elsewhere, m from the dead-reckoned position."""
         for axis, value in enumerate((north, east)):
-            row = np.zeros_like(self.x)
-            row[:, axis] = 1.0
+            gain = self.P[axis]
             self._observe(
-                value - self.x[:, axis], row, np.full(len(self), sigma * sigma), np.zeros(len(self), bool)
+                value - self.x[axis], gain, gain[axis] + sigma * sigma, np.zeros(len(self), dtype=bool)
             )
 
-    def _observe(
-        self, y: Array, row: Array, variance: Array, off: NDArray[np.bool_]
-    ) -> tuple[float, float, float]:
-        gain = (self.P @ row[:, :, None])[:, :, 0]
-        s = np.einsum("ki,ki->k", gain, row) + variance
+    def _observe(self, y: Array, gain: Array, s: Array, off: NDArray[np.bool_]) -> tuple[float, float, float]:
+        """Take in innovations (n,) of variances (n,), with ``P H'`` (6, n); return as :meth:`update`."""
         z2 = y * y / s
         likelihood = -0.5 * (np.minimum(z2, self._gate) + np.log(s) + log(2.0 * pi))
         mean = float(self.w @ y)
         spread = float(self.w @ (s + (y - mean) ** 2))
-        learn = ((z2 <= self._gate) & ~off)[:, None]
-        gain = np.where(learn, gain, 0.0)
-        self.x = self.x + gain * (y / s)[:, None]
-        self.P = self.P - gain[:, :, None] * (gain / s[:, None])[:, None, :]
+        gain = np.where((z2 <= self._gate) & ~off, gain, 0.0)
+        scaled = gain / s
+        self.x = self.x + scaled * y
+        self.P = self.P - gain[:, None] * scaled
         top = float(likelihood.max())
         w = self.w * np.exp(likelihood - top)
         total = float(w.sum())
@@ -154,7 +153,10 @@ class Bank:
 
     def moments(self) -> tuple[Array, Array]:
         """Return mean (6,) and covariance (6, 6) of the whole mixture."""
-        return _moments(self.w, self.x, self.P)
+        mean: Array = self.x @ self.w / self.w.sum()
+        d = self.x - mean[:, None]
+        covariance: Array = (self.P @ self.w + (self.w * d) @ d.T) / self.w.sum()
+        return mean, covariance
 
     def _tidy(self) -> None:
         """Drop what has faded, split what has grown too wide, and now and then merge what has met."""
@@ -165,42 +167,41 @@ class Bank:
             self._take(np.sort(np.argsort(-self.w, kind="stable")[:MOST]))
         if self._updates % MERGE_EVERY == 0 and len(self) > 1:
             self._merge()
-        pnn, pne, pee = self.P[:, 0, 0], self.P[:, 0, 1], self.P[:, 1, 1]
+        pnn, pne, pee = self.P[0, 0], self.P[0, 1], self.P[1, 1]
         largest = 0.5 * (pnn + pee) + np.hypot(0.5 * (pnn - pee), pne)
         wide = (largest > (1.5 * self.resolution) ** 2) & (self.w > 1e-4)
         if wide.any() and len(self) + 2 * int(wide.sum()) <= 2 * MOST:
             self._split(wide)
 
     def _take(self, keep: NDArray[np.bool_]) -> None:
-        self.w, self.x, self.P = self.w[keep] / self.w[keep].sum(), self.x[keep], self.P[keep]
+        w = self.w[keep]
+        self.w, self.x, self.P = w / w.sum(), self.x[:, keep], self.P[:, :, keep]
 
     def _split(self, wide: NDArray[np.bool_]) -> None:
         """Split along the widest axis of each position: the same mean and covariance."""
-        w, x, P = self.w[wide], self.x[wide], self.P[wide]
-        values, axes = np.linalg.eigh(P[:, :2, :2])
-        value, axis = values[:, 1], axes[:, :, 1]
-        g = (P[:, :, :2] @ axis[:, :, None])[:, :, 0] / np.sqrt(value)[:, None]
-        narrow = P - (1.0 - THREE_VARIANCE) * g[:, :, None] * g[:, None, :]
-        parts_x = [self.x[~wide]] + [x + shift * g for shift in THREE]
+        w, x, P = self.w[wide], self.x[:, wide], self.P[:, :, wide]
+        values, axes = np.linalg.eigh(np.moveaxis(P[:2, :2], 2, 0))
+        axis = axes[:, :, 1].T
+        g = (P[:, 0] * axis[0] + P[:, 1] * axis[1]) / np.sqrt(values[:, 1])
+        narrow = P - (1.0 - THREE_VARIANCE) * g[:, None] * g
         self.w = np.concatenate([self.w[~wide]] + [w * share for share in THREE_WEIGHT])
-        self.x = np.concatenate(parts_x)
-        self.P = np.concatenate([self.P[~wide]] + [narrow] * 3)
+        self.x = np.concatenate([self.x[:, ~wide]] + [x + shift * g for shift in THREE], axis=1)
+        self.P = np.concatenate([self.P[:, :, ~wide]] + [narrow] * 3, axis=2)
 
     def _merge(self) -> None:
         """Make one of those that have come to the same cell of the position, of the same mean and covariance."""
-        cell = np.floor(self.x[:, :2] / (CELL * self.resolution))
-        group = np.unique(cell, axis=0, return_inverse=True)[1].ravel()
-        n = int(group.max()) + 1
-        if n == len(self):
+        cell = np.floor(self.x[:2] / (CELL * self.resolution)).astype(np.int64)
+        order = np.lexsort(cell)
+        cell = cell[:, order]
+        first = np.flatnonzero(np.append(True, (np.diff(cell) != 0).any(axis=0)))
+        if first.size == len(self):
             return
-        w = np.zeros(n)
-        np.add.at(w, group, self.w)
-        share = (self.w / w[group])[:, None]
-        x = np.zeros((n, self.x.shape[1]))
-        np.add.at(x, group, share * self.x)
-        d = self.x - x[group]
-        P = np.zeros((n, *self.P.shape[1:]))
-        np.add.at(P, group, share[:, :, None] * (self.P + d[:, :, None] * d[:, None, :]))
+        sizes = np.diff(np.append(first, len(self)))
+        w = np.add.reduceat(self.w[order], first)
+        share = self.w[order] / np.repeat(w, sizes)
+        x = np.add.reduceat(share * self.x[:, order], first, axis=1)
+        d = self.x[:, order] - np.repeat(x, sizes, axis=1)
+        P = np.add.reduceat(share * (self.P[:, :, order] + d[:, None] * d), first, axis=2)
         self.w, self.x, self.P = w, x, P
 
 
@@ -208,11 +209,3 @@ def widest(P: Array) -> float:
     """Return the largest 1-sigma of the position, m."""
     (a, b), (_, c) = P[:2, :2].tolist()
     return sqrt(0.5 * (a + c) + hypot(0.5 * (a - c), b))
-
-
-def _moments(w: Array, x: Array, P: Array) -> tuple[Array, Array]:
-    w = w / w.sum()
-    mean = w @ x
-    d = x - mean
-    covariance: Array = np.einsum("k,kij->ij", w, P) + np.einsum("k,ki,kj->ij", w, d, d)
-    return mean, covariance

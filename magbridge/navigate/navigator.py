@@ -219,7 +219,7 @@ class Navigator:
             return seen.value, seen.variance, seen.log_likelihood, seen.accepted, seen.anomaly
         assert self._filter is not None
         innovation, variance, likelihood = self._filter.update(block)
-        best = self._filter.x[int(self._filter.w.argmax())]
+        best = self._filter.x[:, int(self._filter.w.argmax())]
         latitude, longitude = offset(block.latitude, block.longitude, float(best[0]), float(best[1]))
         anomaly = self.grid.look_up(longitude, latitude).anomaly
         accepted = innovation**2 <= self.options.gate * variance

@@ -96,11 +96,11 @@ def test_a_bank_of_one_is_the_tracker(grid, correlated):
         assert one is not None
         assert many == pytest.approx((one.value, one.variance, one.log_likelihood), rel=1e-9)
     assert len(bank) == 1
-    np.testing.assert_allclose(bank.x[0], tracker.x, rtol=1e-7, atol=1e-9)
-    np.testing.assert_allclose(bank.P[0], tracker.P, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(bank.x[:, 0], tracker.x, rtol=1e-7, atol=1e-9)
+    np.testing.assert_allclose(bank.P[:, :, 0], tracker.P, rtol=1e-6, atol=1e-9)
     tracker.update_position(30.0, -20.0, 10.0)
     bank.update_position(30.0, -20.0, 10.0)
-    np.testing.assert_allclose(bank.x[0], tracker.x, rtol=1e-7, atol=1e-9)
+    np.testing.assert_allclose(bank.x[:, 0], tracker.x, rtol=1e-7, atol=1e-9)
 
 
 def test_a_cut_gaussian_is_still_that_gaussian(grid, correlated):
@@ -112,8 +112,8 @@ def test_a_cut_gaussian_is_still_that_gaussian(grid, correlated):
     scale = np.sqrt(np.diag(P))
     np.testing.assert_allclose(mean / scale, x / scale, atol=0.01)
     np.testing.assert_allclose(covariance / np.outer(scale, scale), P / np.outer(scale, scale), atol=0.03)
-    assert widest(bank.P[0]) == pytest.approx(15.0, rel=1e-6)
-    assert np.linalg.eigvalsh(bank.P).min() > 0
+    assert widest(bank.P[:, :, 0]) == pytest.approx(15.0, rel=1e-6)
+    assert np.linalg.eigvalsh(np.moveaxis(bank.P, 2, 0)).min() > 0
 
 
 def test_splitting_and_merging_keep_mean_and_covariance(grid, correlated):
@@ -168,6 +168,6 @@ def test_hypotheses_off_the_map_stay_in_the_running(grid):
     x, P = prior(Options(start_sigma=800.0))
     bank = Bank(grid, x + 16_000.0 * np.eye(6)[0], P, resolution=200.0, gate=16.0)
     bank.update(block(float(np.nanmean(grid.anomaly))))
-    off = np.isnan(around(grid, bank.x[:, 0], bank.x[:, 1]).anomaly)
+    off = np.isnan(around(grid, bank.x[0], bank.x[1]).anomaly)
     assert 0.02 < bank.w[off].sum() < 0.98
     assert np.isfinite(bank.moments()[1]).all()
