@@ -224,13 +224,11 @@ def floor(calibration: Calibration) -> FloatArray:
     return np.diag(spread**2)
 
 
-def _loosened(
-    calibration: Calibration, L: FloatArray, centre: FloatArray
-) -> tuple[FloatArray, FloatArray]:
+def _loosened(calibration: Calibration, L: FloatArray, centre: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return L and m with :func:`floor` added."""
     mean = L @ centre
     broad = _factor(L @ L.T + floor(calibration))
-    return broad, np.linalg.lstsq(broad, mean, rcond=None)[0]
+    return broad, np.asarray(np.linalg.lstsq(broad, mean, rcond=None)[0], float)
 
 
 def _factor(covariance: FloatArray) -> FloatArray:
@@ -238,7 +236,7 @@ def _factor(covariance: FloatArray) -> FloatArray:
     scale = np.sqrt(np.maximum(np.diag(covariance), 0.0)) + 1e-12
     values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
     kept = values > 1e-12 * values[-1]
-    return scale[:, None] * vectors[:, kept] * np.sqrt(values[kept])
+    return np.asarray(scale[:, None] * vectors[:, kept] * np.sqrt(values[kept]))
 
 
 def _prior(

@@ -1,0 +1,67 @@
+"""The causes: one small function each, with its physics, equation and source, and one row in a table.
+
+Each takes the problem and returns candidates over a grid of its nonlinear parameters. Widths are plausible sizes
+(1-sigma of a Gaussian prior): they set Occam's factor, not what can be found.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+from magbridge.diagnose.candidates import Candidate
+from magbridge.diagnose.causes.clock import interference_tone, offset_drift, offset_step
+from magbridge.diagnose.causes.masses import actuator_order, hysteresis, unmodelled_actuator
+from magbridge.diagnose.causes.reference import diurnal_variation, map_error, reference_bias
+from magbridge.diagnose.causes.response import nonlinearity, saturation
+from magbridge.diagnose.causes.telemetry import (
+    current_field,
+    pressure_offset,
+    temperature_offset,
+    temperature_scale,
+)
+from magbridge.diagnose.causes.timing import channel_skew, clock_offset, eddy_current, filter_lag
+from magbridge.diagnose.problem import Problem
+
+__all__ = ["CAUSES", "Cause"]
+
+
+class Cause(NamedTuple):
+    """A row of the table.
+
+    Attributes
+    ----------
+    candidates : callable
+        ``Problem -> list of Candidate``.
+    needs : str
+        What a log must have for it to be tested at all.
+    separated_by : str
+        The manoeuvre that tells it from what it hides behind.
+    """
+
+    candidates: Callable[[Problem], list[Candidate]]
+    needs: str
+    separated_by: str
+
+
+CAUSES: dict[str, Cause] = {
+    "temperature_offset": Cause(temperature_offset, "a temperature that varies", "dive and climb through one depth with a thermal lag between; or hold one depth for an hour after launch"),
+    "temperature_scale": Cause(temperature_scale, "a temperature that varies", "roll about the field at two temperatures: a scale follows the channel's reading, an offset does not"),
+    "offset_step": Cause(offset_step, "time", "log the power-cycle counter; fly one attitude before and after"),
+    "offset_drift": Cause(offset_drift, "time", "return to one place and attitude hours later"),
+    "current_field": Cause(current_field, "a current", "run the motor with its mass held, and hold the motor with its mass moved"),
+    "unmodelled_actuator": Cause(unmodelled_actuator, "the position of something that moves", "move it at one attitude"),
+    "actuator_order": Cause(actuator_order, "a calibration with parameters", "move one mass in small steps over its whole range at one attitude"),
+    "hysteresis": Cause(hysteresis, "a calibration with parameters", "approach one position from both sides"),
+    "eddy_current": Cause(eddy_current, "turns", "reverse the turn"),
+    "channel_skew": Cause(channel_skew, "turns", "reverse the turn; roll about the axis that all channels share"),
+    "filter_lag": Cause(filter_lag, "masses that move while sampled", "the filter's corner is known: switch it, or move an actuator by a step"),
+    "clock_offset": Cause(clock_offset, "a calibration with parameters, which move while sampled", "move an actuator at constant attitude"),
+    "nonlinearity": Cause(nonlinearity, "attitudes that take a channel over its range", "turn every channel through the whole field"),
+    "saturation": Cause(saturation, "a channel near its end", "turn the channel away from the field: only near full scale does it stay"),
+    "pressure_offset": Cause(pressure_offset, "depth or pressure that varies", "hold one depth for an hour: temperature settles, pressure stays"),
+    "diurnal_variation": Cause(diurnal_variation, "at least six hours", "a base station ashore"),
+    "map_error": Cause(map_error, "positions over some hundred metres", "cross the track: a map's error is the same on every pass"),
+    "reference_bias": Cause(reference_bias, "a reference", "calibrate and survey at one place; a proton magnetometer beside"),
+    "interference_tone": Cause(interference_tone, "even sampling", "change the sampling rate: an alias moves"),
+}  # fmt: skip

@@ -1,0 +1,90 @@
+"""What follows time alone: steps, drifts, tones."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magbridge.calibration.instrument import TimeEffect
+from magbridge.diagnose.candidates import AXES, Candidate, of_effect
+from magbridge.diagnose.problem import Problem
+
+__all__ = ["interference_tone", "offset_drift", "offset_step"]
+
+FloatArray = NDArray[np.float64]
+
+ONSETS = 40
+
+
+def offset_step(problem: Problem) -> list[Candidate]:
+    """The offset jumps: a power cycle settles it anew, a shock or a magnet remagnetises: ``T += b H(t - t_0)``."""
+    survey = problem.survey
+    t = survey.time
+    fresh = t[~survey.learned]
+    onsets = np.quantile(fresh, np.linspace(0.02, 0.98, ONSETS)) if fresh.size else t[:0]
+
+    def again(onset: float) -> Candidate:
+        effect = TimeEffect(cause="offset_step", shape="step", start=onset)
+        phi = lambda rows: (t[rows] >= onset)[None].astype(float)  # noqa: E731  (a regressor is one line)
+        return of_effect(problem, effect, 100.0, "nT", shape={"onset": (onset, "s")}, again=again, phi=phi)
+
+    return [again(float(onset)) for onset in np.unique([fresh.min() - 1.0, *onsets, *survey.cycles])]
+
+
+def offset_drift(problem: Problem) -> list[Candidate]:
+    """The offset creeps with ageing and relaxing stress: ``T += b_1 x + b_2 x^2``, ``x = (t - t_0) / duration``."""
+    t = problem.survey.time
+    span = float(t[-1] - t[0])
+    made = []
+    for order, start in ((1, t[0]), (1, 0.5 * (t[0] + t[-1])), (2, t[0])):
+        effect = TimeEffect(cause="offset_drift", shape="drift", start=float(start), period=span, order=order)
+
+        def phi(rows: slice, order: int = order, start: float = float(start)) -> FloatArray:
+            return np.stack([((t[rows] - start) / span) ** (k + 1) for k in range(order)])
+
+        made.append(of_effect(problem, effect, 50.0, f"nT in {span / 3600:.3g} h", phi=phi))
+    return made
+
+
+def interference_tone(problem: Problem) -> list[Candidate]:
+    """Machinery at a fixed frequency, seen through the sampling: ``T += b cos + c sin (2 pi t / period)``.
+
+    Frequencies are those where the differenced residual, seen through each channel's projection, has its highest peaks.
+    """
+    survey = problem.survey
+    t = survey.time
+    interval = float(np.median(np.diff(t)))
+    slots = np.rint((t - t[0]) / interval).astype(np.int64)
+    if slots[-1] > 8 * len(t):
+        return []
+    flat = np.append(0.0, np.diff(problem.residual) * survey.follows[1:])
+    size = 1 << int(np.ceil(np.log2(slots[-1] + 1)) + 1)
+    power = np.zeros(size // 2 + 1)
+    for axis in range(3):
+        series = np.bincount(slots, flat * problem.slopes[:, 6 + axis], minlength=size)
+        power += np.abs(np.fft.rfft(series)) ** 2
+    frequency = np.fft.rfftfreq(size, interval)
+    smooth = np.convolve(power, np.ones(201) / 201, mode="same") + 1e-300
+    ratio = np.where(frequency * float(np.ptp(t)) > 20.0, power / smooth, 0.0)
+    made: list[Candidate] = []
+
+    def again(period: float) -> Candidate:
+        effect = TimeEffect(cause="interference_tone", shape="tone", start=float(t[0]), period=period)
+
+        def phi(rows: slice) -> FloatArray:
+            angle = 2.0 * np.pi * (t[rows] - t[0]) / period
+            return np.stack([np.cos(angle), np.sin(angle)])
+
+        names = tuple(f"{f} {axis}" for f in ("cos", "sin") for axis in AXES)
+        return of_effect(
+            problem, effect, 10.0, "nT", names=names, phi=phi, shape={"period": (period, "s")}, again=again,
+            trials=0.5 * len(t),
+        )  # fmt: skip
+
+    for _ in range(5):
+        peak = int(np.argmax(ratio))
+        if ratio[peak] <= 0.0:
+            break
+        made.append(again(1.0 / frequency[peak]))
+        ratio[max(peak - 4, 0) : peak + 5] = 0.0
+    return made

@@ -1,0 +1,58 @@
+"""The channel's own response: it bends, it clips."""
+
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magbridge.calibration.instrument import ResponseEffect
+from magbridge.diagnose.candidates import AXES, Candidate, of_effect
+from magbridge.diagnose.problem import Problem
+
+__all__ = ["nonlinearity", "saturation"]
+
+FloatArray = NDArray[np.float64]
+
+
+def nonlinearity(problem: Problem) -> list[Candidate]:
+    """The response bends: ``T_i += b_i (H_i / H_0)^p``, p = 2 (an even harmonic's leak) or 3 (a saturating core)."""
+    unit, H = problem.calibration.reference.field, problem.survey.field
+    made = []
+    for power in (2, 3):
+        effect = ResponseEffect(cause="nonlinearity", unit=unit, power=power)
+        phi = lambda rows, power=power: (H[rows].T / unit) ** power  # noqa: E731
+        made.append(
+            of_effect(problem, effect, 50.0, f"nT at {unit:.0f} nT", phi=phi, shape={"power": (power, "1")})
+        )
+    return made
+
+
+def saturation(problem: Problem) -> list[Candidate]:
+    """A channel compresses or clips near its end: ``T_i -= b_1 + b_2 (H_i - knee) / H_0`` beyond the knee."""
+    unit, H = problem.calibration.reference.field, problem.survey.field
+    made = []
+    for axis, sign in product(range(3), (1.0, -1.0)):
+        reading = sign * H[:, axis]
+        if reading.max() < 0.2 * unit:  # nowhere near any end
+            continue
+        for share in (0.7, 0.85, 0.95, 0.99):
+            knee = sign * float(np.quantile(reading, share))
+
+            def again(knee: float, axis: int = axis) -> Candidate:
+                effect = ResponseEffect(cause="saturation", unit=unit, axis=axis, knee=knee)
+                way = 1.0 if knee >= 0.0 else -1.0
+
+                def phi(rows: slice) -> FloatArray:
+                    over = way * (H[rows, axis] - knee)
+                    return np.stack([way * (over >= 0), way * np.maximum(over, 0.0) / unit])
+
+                names = (f"{AXES[axis]} beyond", f"{AXES[axis]} slope")
+                return of_effect(
+                    problem, effect, np.array([100.0, 0.1 * unit]), "nT", names=names, phi=phi,
+                    shape={"knee": (knee, "nT")}, again=again,
+                )  # fmt: skip
+
+            made.append(again(knee))
+    return made

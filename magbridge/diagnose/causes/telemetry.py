@@ -1,0 +1,97 @@
+"""What follows a telemetry channel: temperatures, currents, pressures."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magbridge.calibration.effects import ChannelEffect
+from magbridge.diagnose.candidates import Candidate, of_effect
+from magbridge.diagnose.causes.channels import channels_of, extent
+from magbridge.diagnose.problem import Problem, history
+
+__all__ = ["current_field", "pressure_offset", "temperature_offset", "temperature_scale"]
+
+FloatArray = NDArray[np.float64]
+
+LAGS = (0.0, 900.0, 3600.0, 12000.0, 40000.0)
+
+
+def _origins(problem: Problem, name: str) -> list[float]:
+    """Where the channel may have stood when the vehicle was calibrated."""
+    low, high = extent(problem, name)
+    middle = float(np.mean(problem.survey.channels[name].values))
+    if problem.survey.learned.any():  # then the data hold the calibration's own values of it
+        return [middle]
+    return [middle, 2 * low - high, 2 * high - low]
+
+
+def _thermal(problem: Problem, on: Literal["offset", "scale"]) -> list[Candidate]:
+    found = []
+    field, longest = problem.calibration.reference.field, 2.0 * float(np.ptp(problem.survey.time))
+    unit = "nT/degC" if on == "offset" else f"nT/degC at {field:.0f} nT"
+    for name in channels_of(problem, "temperature"):
+
+        @cache
+        def lagged(lag: float, name: str = name) -> FloatArray:
+            effect = ChannelEffect(cause="", channel=name, lag=lag)
+            return history(problem.survey, problem.calibration, effect)
+
+        def again(origin: float, lag: float, name: str = name, lagged: Any = lagged) -> Candidate:
+            lag = max(lag, 0.0)
+            effect = ChannelEffect(cause=f"temperature_{on}", channel=name, origin=origin, lag=lag, on=on)
+            shape = {"origin": (origin, "degC"), "lag": (lag, "s")}
+            phi = lagged(lag)
+            return of_effect(
+                problem,
+                effect,
+                5.0,
+                unit,
+                channel=name,
+                shape=shape,
+                again=again,
+                phi=lambda rows: phi[:, rows] - origin,
+            )
+
+        lags = [lag for lag in LAGS if lag <= longest]
+        found += [again(origin, lag) for origin in _origins(problem, name) for lag in lags]
+    return found
+
+
+def temperature_offset(problem: Problem) -> list[Candidate]:
+    """Core and electronics have an offset that follows temperature: ``T += b (theta_lag - theta_0)``.
+
+    ``dtheta_lag/dt = (theta - theta_lag) / lag``. Typically 0.1 nT/degC for a good fluxgate, several for a low-power
+    one (Primdahl 1979, J. Phys. E 12:241). Separated from depth by the thermal hysteresis of dive and climb.
+    """
+    return _thermal(problem, "offset")
+
+
+def temperature_scale(problem: Problem) -> list[Candidate]:
+    """Coil constant and resistances follow temperature: ``A += diag(b) (theta_lag - theta_0)``, 10-100 ppm/degC."""
+    return _thermal(problem, "scale")
+
+
+def current_field(problem: Problem) -> list[Candidate]:
+    """A current loop is a fixed source: ``T += b I(t)`` (Biot and Savart), zero when the current is."""
+    made = []
+    for name in channels_of(problem, "current"):
+        low, high = extent(problem, name)
+        effect = ChannelEffect(cause="current_field", channel=name)
+        unit = f"nT/{problem.survey.channels[name].unit or '1'}"
+        made.append(of_effect(problem, effect, 100.0 / max(abs(low), abs(high)), unit, channel=name))
+    return made
+
+
+def pressure_offset(problem: Problem) -> list[Candidate]:
+    """Pressure strains the hull and its magnetisation follows (Villari effect), and the sensor's mount: ``T += b p``."""
+    made = []
+    for name in channels_of(problem, "pressure"):
+        low, high = extent(problem, name)
+        effect = ChannelEffect(cause="pressure_offset", channel=name)
+        unit = f"nT/{problem.survey.channels[name].unit or '1'}"
+        made.append(of_effect(problem, effect, 50.0 / max(abs(low), abs(high)), unit, channel=name))
+    return made
