@@ -1,0 +1,109 @@
+"""What an effect may change: the simulation between the vehicle and its log."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from dataclasses import field as attribute
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from sitl.instrument import Instrument
+from sitl.signals import autoregressive, first_order
+from sitl.trajectory import Track
+
+__all__ = ["Effect", "Generator", "Hidden", "Scene", "direction", "furnish"]
+
+Array = NDArray[np.float64]
+Generator = np.random.Generator
+
+
+@dataclass
+class Scene:
+    """What an effect may change, on the simulation's fine grid of n points; m rows are logged.
+
+    Attributes
+    ----------
+    track : Track
+    when : array (m,)
+        s after the start, of the rows.
+    field : array (n, 3)
+        nT at the sensor, body axes.
+    earth : array (n, 3)
+        nT NED that the reference does not know of.
+    water : array (n,)
+        degC.
+    instrument : Instrument
+    reference : array (m,)
+        nT by which the reference is too small.
+    late : float
+        s by which the telemetry's stamps are behind.
+    logged : dict of (array (n,), unit)
+        Further telemetry.
+    bend : list of callable
+        What happens to the channels (m, 3) after the analogue chain.
+    truth : dict
+        Numbers that a perfect diagnosis would print, by the name it would print them under.
+    """
+
+    track: Track
+    when: Array
+    field: Array
+    earth: Array
+    water: Array
+    instrument: Instrument
+    reference: Array
+    late: float = 0.0
+    logged: dict[str, tuple[Array, str]] = attribute(default_factory=dict)
+    bend: list[Callable[[Array], Array]] = attribute(default_factory=list)
+    truth: dict[str, float] = attribute(default_factory=dict)
+
+    @property
+    def t(self) -> Array:
+        """S after the start, (n,)."""
+        return self.track.elapsed
+
+    def add(self, shape: Array, vector: Array) -> None:
+        """Add ``shape(t) vector`` to the field at the sensor; `vector` (3,) in body axes is what is to be found."""
+        self.field = self.field + shape[:, None] * vector
+        self.truth |= dict(zip("xyz", (self.instrument.matrix() @ vector).tolist(), strict=True))
+
+
+Effect = Callable[[Scene, float, Generator], None]
+
+
+class Hidden(msgspec.Struct, frozen=True):
+    """One hidden effect: its name in :data:`EFFECTS` or :data:`FOREIGN`, its size, and the seed of all else."""
+
+    name: str
+    size: float
+    seed: int
+
+
+def direction(rng: Generator) -> Array:
+    """Draw a unit vector."""
+    d = rng.normal(size=3)
+    return np.asarray(d / np.linalg.norm(d))
+
+
+def furnish(scene: Scene, rng: Generator) -> None:
+    """Log what any vehicle logs, whether it matters or not: two motors' currents, a fin, three temperatures."""
+    n, t, step = len(scene.t), scene.t, scene.track.step
+    moving = np.abs(np.gradient(scene.track.parameters["ballast"], step)) > 1.0
+    duty = (autoregressive(rng, (n,), 1.0, 400.0 / step) > 0.8) & ~moving
+    pump = 2.5 * first_order(moving.astype(float), step, 3.0) + 0.02 * rng.normal(size=n)
+    motor = 0.8 * first_order(duty.astype(float), step, 8.0) * (1.0 + 0.1 * np.sin(t / 700.0))
+    scene.logged["amps_a"] = (pump, "A")
+    scene.logged["amps_b"] = (motor + 0.005 * rng.normal(size=n), "A")
+    fin = np.round(first_order(autoregressive(rng, (n,), 12.0, 240.0 / step), step, 5.0), 1)
+    scene.logged["p17"] = (fin, "deg")
+    day = 0.8 * np.sin(2 * np.pi * t / 86400.0 + rng.uniform(0, 6.28)) + autoregressive(
+        rng, (n,), 0.25, 4000.0 / step
+    )
+    scene.water = scene.water + day
+    scene.logged["sensor_temperature"] = (first_order(scene.water, step, 300.0), "degC")
+    scene.logged["water_temperature"] = (scene.water, "degC")
+    bay = first_order(scene.water, step, 20_000.0) + first_order(0.6 * pump, step, 5000.0)
+    scene.logged["bay_temperature"] = (bay, "degC")

@@ -1,0 +1,114 @@
+"""What goes wrong inside the instrument: heat, shocks, age, its converter, its filter, its clock, its range."""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from sitl.inject.scene import Generator, Scene, direction
+from sitl.signals import first_order
+
+Array = NDArray[np.float64]
+
+CALIBRATED_AT = 4.5
+"""degC, about which the instrument's temperature stood when it was calibrated."""
+
+
+def soaked(surface: Array, step: float, lag: float) -> Array:
+    """Temperature in the middle of a slab whose faces follow `surface`: the series of Carslaw & Jaeger 1959, sec. 3.4.
+
+    ``lag`` is the slowest mode's time constant, s.
+    """
+    modes = range(8)
+    weights = np.array([4.0 * (-1) ** k / (np.pi * (2 * k + 1)) for k in modes])
+    parts = [first_order(surface, step, lag / (2 * k + 1) ** 2) for k in modes]
+    return np.asarray((weights / weights.sum()) @ np.array(parts))
+
+
+def _warmer(scene: Scene, rng: Generator) -> Array:
+    """By how much the core is warmer than when it was calibrated, degC."""
+    core = soaked(scene.logged["sensor_temperature"][0], scene.track.step, float(rng.uniform(300, 4000)))
+    return core - CALIBRATED_AT - 0.5 * rng.normal()
+
+
+def heat_offset(scene: Scene, size: float, rng: Generator) -> None:
+    """An offset that follows the core's temperature; size in nT/degC."""
+    scene.add(_warmer(scene, rng), size * direction(rng))
+
+
+def heat_scale(scene: Scene, size: float, rng: Generator) -> None:
+    """Copper in the coils: gains follow the core's temperature; size in 1/degC, times 5e4."""
+    gains = 1.0 + size / 5e4 * np.abs(rng.normal(1.0, 0.4, 3)) * _warmer(scene, rng)[:, None]
+    scene.field = scene.field * gains
+
+
+def jump(scene: Scene, size: float, rng: Generator) -> None:
+    """A shock: the offset jumps and settles within a minute; size in nT."""
+    t0 = rng.uniform(0.15, 0.85) * scene.t[-1]
+    settled = np.where(scene.t > t0, 1.0 - 0.15 * np.exp(-np.maximum(scene.t - t0, 0.0) / 20.0), 0.0)
+    scene.add(settled, size * direction(rng))
+
+
+def creep(scene: Scene, size: float, rng: Generator) -> None:
+    """Stress relaxes logarithmically (magnetic viscosity: Street & Woolley 1949); size in nT over the log."""
+    tau = rng.uniform(0.3, 1.5) * scene.t[-1]
+    crept = np.log1p(scene.t / tau) / np.log1p(scene.t[-1] / tau)
+    scene.field = scene.field + size * direction(rng) * crept[:, None]
+
+
+def multiplexed(scene: Scene, size: float, rng: Generator) -> None:
+    """The converter takes the channels in turn, and nobody says so; size in s between channels."""
+    order = rng.choice([-1.0, 1.0])
+    delays = (0.0, size, 2 * size) if order > 0 else (2 * size, size, 0.0)
+    scene.instrument = msgspec.structs.replace(scene.instrument, channel_delay=delays)
+    scene.truth |= dict(zip("xyz", delays, strict=True))
+
+
+def anti_alias(scene: Scene, size: float, rng: Generator) -> None:  # noqa: ARG001  (a filter has no direction)
+    """A slow RC before the converter; size its time constant in s."""
+    scene.instrument = msgspec.structs.replace(scene.instrument, corner=1.0 / (2 * np.pi * max(size, 1e-6)))
+    scene.truth["delay"] = size
+
+
+def late_stamps(scene: Scene, size: float, rng: Generator) -> None:  # noqa: ARG001  (a clock has no direction)
+    """The telemetry's clock is behind; size in s."""
+    scene.late = size
+    scene.truth["delay"] = size
+
+
+def core(scene: Scene, size: float, rng: Generator) -> None:
+    """The feedback's finite gain lets the core's curve through; size in nT at 50,000 nT."""
+    a, b = rng.normal(0, 1, 3), rng.normal(0, 1, 3)
+    scene.bend.append(
+        lambda H: H - size * (a * (H / 5e4) ** 2 + b * np.tan(np.clip(H / 5e4, -1.2, 1.2)) / 1.5574)
+    )
+
+
+def rail(scene: Scene, size: float, rng: Generator) -> None:  # noqa: ARG001  (the rail is where it is)
+    """An amplifier compresses softly towards its rail; size in nT lost at the largest reading."""
+
+    def bend(H: Array) -> Array:
+        axis = int(np.argmax(np.abs(H).max(axis=0)))
+        h = np.abs(H[:, axis])
+        top = float(h.max())
+        knee = top - 0.25 * float(np.ptp(h))
+        out = H.copy()
+        out[:, axis] -= np.sign(H[:, axis]) * size * (np.maximum(h - knee, 0.0) / (top - knee)) ** 1.5
+        return out
+
+    scene.bend.append(bend)
+
+
+def bit_flips(scene: Scene, size: float, rng: Generator) -> None:
+    """A bus drops bits now and then: a dozen samples are off by about `size` nT, on any channel."""
+
+    def bend(H: Array) -> Array:
+        rows = rng.choice(len(H) // 4, 12, replace=False) * 4
+        out = H.copy()
+        out[rows, rng.integers(0, 3, 12)] += (
+            size * rng.choice([-1.0, 1.0], 12) * 2.0 ** rng.integers(0, 3, 12)
+        )
+        return out
+
+    scene.bend.append(bend)

@@ -1,0 +1,1 @@
+"""What ``tools/blind.py`` runs: the stage, the cases, the theory beside them, the tables and figures."""

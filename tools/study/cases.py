@@ -1,0 +1,185 @@
+"""The cases: what is hidden in each part of the study, and what a diagnosis makes of it."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from magbridge.calibration.correct import correct
+from magbridge.calibration.model import Calibration
+from magbridge.diagnose.causes import CAUSES
+from magbridge.diagnose.findings import findings
+from magbridge.diagnose.run import Diagnosis, diagnose
+from sitl.inject import EFFECTS, FOREIGN, Hidden, disturb
+from study.stage import NOISES, Stage, add_noise, again, hide, signature, stage_of
+from study.theory import ideal
+
+Row = dict[str, Any]
+Array = NDArray[np.float64]
+NAMES = tuple(EFFECTS)
+KNOWN = tuple(CAUSES)
+"""Causes with a function of their own in the table; outliers are found by the noise model."""
+LADDER = (4.0, 3.0, 5.0, 2.0, 6.0)
+LOUD = (25.0, 100.0, 15.0, 50.0)
+LASTING = (
+    "temperature_offset", "temperature_scale", "current_field", "unmodelled_actuator", "actuator_order", "hysteresis",
+    "eddy_current", "channel_skew", "filter_lag", "clock_offset", "nonlinearity", "pressure_offset", "reference_bias",
+)  # fmt: skip
+"""What is the same on another deployment: the rest has its moment or its place, or its range in one log."""
+
+
+DELAYS = ("filter_lag", "clock_offset")
+"""In a uniform field these two are one: what is left of a late field is the masses that moved meanwhile."""
+
+
+class Part(NamedTuple):
+    """A part of the study: its share of the cases, and its k-th case."""
+
+    share: float
+    entry: Callable[[int], Row]
+
+
+def _null(k: int) -> Row:
+    return {"names": (), "wanted": 0.0, "noise": NOISES[k % len(NOISES)]}
+
+
+def _named(k: int) -> Row:
+    return {"names": (NAMES[k % len(NAMES)],), "wanted": 8.0, "noise": ("white", "ar")[k // len(NAMES) % 2]}
+
+
+def _ladder(k: int) -> Row:
+    return _named(k) | {"wanted": LADDER[k // len(NAMES) % len(LADDER)]}
+
+
+def _loud(k: int) -> Row:
+    return _named(k) | {"wanted": LOUD[k // len(NAMES) % len(LOUD)]}
+
+
+def _unknown(k: int) -> Row:
+    names = (*KNOWN, *FOREIGN)
+    name = names[k % len(names)]
+    return {"names": (name,), "wanted": 10.0, "noise": "white", "without": name if name in CAUSES else ""}
+
+
+def _pair(k: int) -> Row:
+    a, b = np.random.default_rng([20131212, k]).choice(len(KNOWN), 2, replace=False)
+    return {"names": (KNOWN[int(a)], KNOWN[int(b)]), "wanted": 10.0, "noise": ("white", "ar")[k % 2]}
+
+
+def _gain(k: int) -> Row:
+    return {"names": (LASTING[k % len(LASTING)],), "wanted": 20.0, "noise": "white"}
+
+
+PARTS: dict[str, Part] = {
+    "null": Part(0.25, _null),
+    "named": Part(0.25, _named),
+    "ladder": Part(0.22, _ladder),
+    "loud": Part(0.08, _loud),
+    "unknown": Part(0.08, _unknown),
+    "pair": Part(0.06, _pair),
+    "gain": Part(0.06, _gain),
+}
+
+
+def plan(cases: int, parts: tuple[str, ...] = tuple(PARTS)) -> list[Row]:
+    """The study's entries, every part's evenly among the others'; a longer study holds the shorter one."""
+    made = []
+    for place, (name, part) in enumerate(PARTS.items()):
+        count = round(cases * part.share) if name in parts else 0
+        made += [
+            ((k + 0.5) / part.share, part.entry(k) | {"part": name, "number": 100_000 * place + k})
+            for k in range(count)
+        ]
+    return [entry for _, entry in sorted(made, key=lambda item: item[0])]
+
+
+def case(entry: Row) -> Row:
+    """Hide, diagnose, and say what came out, with what theory says of it."""
+    began = time.process_time()
+    number, noise, names, without = entry["number"], entry["noise"], entry["names"], entry.get("without", "")
+    stage = stage_of(number, noise)
+    twin, track, when, calibration, _ = stage
+    hidden = tuple(
+        hide(name, entry["wanted"], stage, number + 7919 * k, number, noise) for k, name in enumerate(names)
+    )
+    whole = disturb(twin, hidden, track, when, number)
+    ds = add_noise(whole, noise, number)
+    table = {name: cause for name, cause in CAUSES.items() if name != without}
+    result = diagnose([ds], calibration, causes=table)
+    found = findings(result, table)
+    row = entry | {
+        "sizes": [h.size for h in hidden], "verdict": found["verdict"], "unexplained": found["unexplained"],
+        "found": [[f["cause"], f["channel"], f["signal_to_noise"], [a["cause"] for a in f["alternatives"]]] for f in found["findings"]],
+        "half": _half(result, names),
+        "scores": _scores(found, names, whole),
+        "theory": [_theory(one, stage, ds, noise, number, without) for one in hidden] if entry["part"] in ("named", "unknown", "pair") else [],
+    }  # fmt: skip
+    if entry["part"] == "gain":
+        row["gain"] = _gained(hidden[0], stage, ds, result, number)
+    return row | {"seconds": time.process_time() - began}
+
+
+def _half(result: Diagnosis, names: tuple[str, ...]) -> list[float] | None:
+    """Signal-to-noise at which theory expects half of, and 95 % of, such effects to be found."""
+    own = [(v.half, v.sure) for v in result.isolability.visible if names == (v.cause,)]
+    return list(min(own)) if own else None
+
+
+def _scores(found: Row, names: tuple[str, ...], whole: xr.Dataset) -> list[float]:
+    """(value - truth) / sigma of every parameter that physics knows, towards larger sizes, if the cause is named."""
+    truth = json.loads(whole.attrs["truth"])
+    own = [f["parameters"] for f in found["findings"] if names == (f["cause"],)]
+    if len(own) != 1:
+        return []
+    return [
+        float(np.sign(truth[name]) * (p["value"] - truth[name]) / p["sigma"])
+        for name, p in own[0].items()
+        if name in truth and p["sigma"]
+    ]
+
+
+def _theory(
+    one: Hidden, stage: Stage, ds: xr.Dataset, noise: str, number: int, without: str
+) -> dict[str, Any] | None:
+    if one.name == "outliers":  # nothing else comes one by one
+        return None
+    twin, track, when, calibration, prior = stage
+    clean = disturb(twin, (), track, when, number)
+
+    def seen(hidden: Hidden) -> tuple[Array, Array]:
+        return signature(disturb(twin, (hidden,), track, when, number), clean, calibration, noise)
+
+    table = {name: cause for name, cause in CAUSES.items() if name != without}
+    # the table's rates are differences: the delays' own signatures are more alike than those
+    others = {
+        name: seen(Hidden(name, 0.1, number))[0]
+        for name in DELAYS
+        if one.name in DELAYS and name not in (one.name, without)
+    }
+    return ideal(one.name, *seen(one), ds, calibration, prior, table, noise, others)
+
+
+def _gained(hidden: Hidden, stage: Stage, ds: xr.Dataset, result: Diagnosis, number: int) -> dict[str, float]:
+    """Mean square error (nT²) on another deployment: as calibrated, extended, and extended by who knows the cause."""
+    oracle = diagnose([ds], stage.calibration, causes={hidden.name: CAUSES[hidden.name]})
+    twin, track, when, calibration, _ = again(stage)
+    other = add_noise(disturb(twin, (hidden,), track, when, number + 1), "white", number + 1)
+    before, after, best = (_error(other, c) for c in (calibration, result.calibration, oracle.calibration))
+    whole = np.isfinite(before) & np.isfinite(after) & np.isfinite(best)
+    return {
+        name: float(np.mean(e[whole] ** 2))
+        for name, e in (("before", before), ("after", after), ("oracle", best))
+    }
+
+
+def _error(ds: xr.Dataset, calibration: Calibration) -> Array:
+    H = np.column_stack([ds[f"mag_{axis}"] for axis in "xyz"])
+    p = np.column_stack([ds[name] for name in calibration.channels])
+    reference = ds["reference_field"].to_numpy() + calibration.reference.bias
+    return np.asarray(correct(calibration, H, p, ds["time"].to_numpy()).total - reference)

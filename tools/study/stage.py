@@ -1,0 +1,175 @@
+"""Vehicles with their calibrations, deployments with their noise, and effects of a wanted size hidden in them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from magbridge.calibration.correct import regressors
+from magbridge.calibration.data import observations
+from magbridge.calibration.fit import fit
+from magbridge.calibration.model import Calibration
+from magbridge.calibration.residual import Samples, residuals
+from magbridge.diagnose.problem import floor
+from sitl import Twin, load, simulate
+from sitl.inject import Hidden, disturb
+from sitl.mission import CrissCross, Spirals
+from sitl.signals import first_order
+from sitl.trajectory import Track
+from sitl.world import Water
+
+Array = NDArray[np.float64]
+HOURS = 6.0
+"""Length of a deployment; the tests' are shorter."""
+VEHICLES = 24
+INERTIA = 3.0
+"""s, twice, with which the attitude follows what :mod:`sitl.trajectory` draws."""
+MEMORY = 0.8
+"""Correlation of neighbours in noise with a memory."""
+NOISES = ("white", "ar", "heavy", "uneven", "half", "map")
+"""White; with a memory; heavy-tailed; louder at times; half as loud again as calibrated; over rock that is rough."""
+
+
+class Stage(NamedTuple):
+    """A vehicle with its calibration, and a deployment's track with the times of its rows.
+
+    `prior` (K, K) is what the calibration's coefficients are allowed: its covariance, and what no instrument holds.
+    """
+
+    twin: Twin
+    track: Track
+    when: Array
+    calibration: Calibration
+    prior: Array
+
+
+@lru_cache(maxsize=VEHICLES)
+def vehicle(seed: int, rms: float = 60.0) -> Stage:
+    """Draw a vehicle, calibrate it on a log of its own, and fly its survey; `rms` (nT) is that of the rock's field."""
+    swap = msgspec.structs.replace
+    base = load("demo")
+    instrument = swap(base.instrument, corner=0.0, channel_delay=(0.0, 0.0, 0.0), noise_sigma=1.0)
+    water = Water(surface=6.0, deep=2.5, thermocline=50.0, thickness=30.0)
+    world = swap(base.world, water=water, geology=swap(base.world.geology, rms=rms))
+    base = swap(base, instrument=instrument, world=world, motion=swap(base.motion, settle=40.0))
+    spirals = simulate(swap(base, mission=(Spirals(),)), seed)
+    calibration = fit(observations(spirals, ["battpos", "ballast"]), "auto").calibration
+    survey = CrissCross(hours=HOURS, roll=(0.0, 4.0), pitch=(24.0, 3.0), battery_spread=0.12, duration=700.0)
+    quiet = swap(base, instrument=swap(instrument, noise_sigma=0.0), mission=(survey,))
+    return _flown(Twin.draw(quiet, seed), calibration)
+
+
+def again(stage: Stage) -> Stage:
+    """Another deployment of the same vehicle in the same waters."""
+    return _flown(replace(stage.twin, seed=stage.twin.seed + 1000), stage.calibration)
+
+
+def _flown(twin: Twin, calibration: Calibration) -> Stage:
+    track = twin.fly()
+    # a hull has inertia: without it the attitude has no rate, and a delay of a millisecond is a noise of its own
+    smooth = {
+        name: first_order(first_order(getattr(track, name), track.step, INERTIA), track.step, INERTIA)
+        for name in ("roll", "pitch", "heading")
+    }
+    track = replace(track, **smooth)
+    when = np.arange(0.0, track.elapsed[-1] - 30.0, 1 / twin.scenario.instrument.rate)
+    return Stage(twin, track, when, calibration, calibration.covariance + floor(calibration))
+
+
+def stage_of(number: int, noise: str) -> Stage:
+    """The stage of a case."""
+    return vehicle(number % VEHICLES, 300.0) if noise == "map" else vehicle(number % VEHICLES)
+
+
+def statistics(noise: str) -> tuple[float, float]:
+    """Correlation of neighbours, and 1-sigma (nT)."""
+    return (MEMORY if noise == "ar" else 0.0), (1.5 if noise == "half" else 1.0)
+
+
+def add_noise(ds: xr.Dataset, kind: str, seed: int) -> xr.Dataset:
+    """Add noise of unit variance, or what its `kind` says, to each channel."""
+    rng = np.random.default_rng([seed, 99])
+    n = ds.sizes["time"]
+    noise = rng.standard_normal((n, 3))
+    if kind == "heavy":
+        noise = rng.standard_t(4.0, (n, 3)) / np.sqrt(2.0)
+    if kind == "ar":
+        noise[1:] *= np.sqrt(1 - MEMORY**2)
+        for i in range(1, n):
+            noise[i] += MEMORY * noise[i - 1]
+    if kind == "uneven":
+        noise *= np.repeat(np.exp(rng.normal(0, 0.5, n // 300 + 1)), 300)[:n, None]
+    out = ds.copy()
+    for k, axis in enumerate("xyz"):
+        out[f"mag_{axis}"] = out[f"mag_{axis}"] + statistics(kind)[1] * noise[:, k]
+    return out
+
+
+def compare(ds: xr.Dataset, calibration: Calibration) -> tuple[Array, Array]:
+    """Residual (n,) and its derivative by the calibration's coefficients (n, K)."""
+    H = np.column_stack([ds[f"mag_{axis}"] for axis in "xyz"])
+    p = np.column_stack([ds[name] for name in calibration.channels])
+    phi = regressors(calibration, H, p, ds["time"].to_numpy()).T
+    W = calibration.kernel.weights.copy()
+    W[0, :3] -= 1.0
+    W[:, :6] *= calibration.reference.field
+    samples = Samples(
+        H, ds["reference_field"].to_numpy(), phi, np.ones(len(H), bool), calibration.reference.field
+    )
+    e, g = residuals(samples, W.ravel())
+    return e, (phi[:, :, None] * g[:, None, :]).reshape(len(e), -1)
+
+
+def whiten(x: Array, noise: str) -> Array:
+    """Innovations in units of their 1-sigma, by the true noise; the first row has no past and is left out."""
+    rho, sigma = statistics(noise)
+    return np.asarray((x[1:] - rho * x[:-1]) / (sigma * np.sqrt(1 - rho**2)))
+
+
+def project(X: Array, A: Array, covariance: Array) -> Array:
+    """Take out of the columns X what a calibration (columns A, prior `covariance`) that is fitted with them absorbs.
+
+    The inner product of the result with X is Fisher's information with the calibration free; Woodbury's identity
+    needs no inverse of the prior.
+    """
+    inner = np.eye(len(covariance)) + (A.T @ A) @ covariance
+    return np.asarray(X - A @ (covariance @ np.linalg.solve(inner, A.T @ X)))
+
+
+def signature(ds: xr.Dataset, clean: xr.Dataset, calibration: Calibration, noise: str) -> tuple[Array, Array]:
+    """What is hidden, and the calibration's columns, both whitened by the true noise."""
+    e, A = compare(clean, calibration)
+    return whiten(compare(ds, calibration)[0] - e, noise), whiten(A, noise)
+
+
+def size_of(name: str, d: Array, A: Array, covariance: Array) -> float:
+    """Signal-to-noise of a signature: the norm of what the free calibration leaves of it.
+
+    Outliers come one by one, each at a moment that nobody knows: theirs is that of the largest.
+    """
+    left = project(d[:, None], A, covariance)[:, 0]
+    if name == "outliers":
+        return float(np.abs(left).max())
+    return float(np.sqrt(max(d @ left, 0.0)))
+
+
+def hide(name: str, wanted: float, stage: Stage, seed: int, number: int, noise: str) -> Hidden:
+    """Find the size at which the effect has the signal-to-noise that is wanted."""
+    twin, track, when, calibration, prior = stage
+    clean = disturb(twin, (), track, when, number)
+    e, J = compare(clean, calibration)
+    A, size = whiten(J, noise), 1.0
+    for _ in range(6):
+        ds = disturb(twin, (Hidden(name, size, seed),), track, when, number)
+        d = whiten(compare(ds, calibration)[0] - e, noise)
+        found = size_of(name, d, A, prior)
+        if abs(found / wanted - 1.0) < 0.02:
+            break
+        size *= wanted / max(found, 1e-9)
+    return Hidden(name, size, seed)

@@ -1,0 +1,228 @@
+"""The study's figures against their targets, each with its count and a 95 % interval."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from scipy.optimize import minimize_scalar
+from scipy.stats import binomtest, norm
+
+from sitl.inject import EFFECTS
+from study.cases import LADDER
+from study.stage import NOISES
+
+Row = dict[str, Any]
+ALLOWED = 0.95
+"""Theory's chance to name the truth alone, from which on a detector is held to it."""
+APART = 6.0
+"""Signal-to-noise left by the best imitation, from which on a thing is like nothing else (95 % of 6 free numbers)."""
+
+
+def share(rows: Sequence[Row], good: Callable[[Row], bool]) -> str:
+    """Percentage of the rows that are good, with its 95 % interval (Clopper and Pearson 1934) | count."""
+    n = len(rows)
+    if not n:
+        return "not run | 0"
+    k = sum(map(good, rows))
+    low, high = binomtest(k, n).proportion_ci()
+    return f"{100 * k / n:.1f} % ({100 * low:.1f}-{100 * high:.1f}) | {k}/{n}"
+
+
+def found(row: Row) -> bool:
+    return bool(row["verdict"] != "nothing_found")
+
+
+def causes_of(row: Row) -> set[str]:
+    return {entry[0] for entry in row["found"]}
+
+
+def sets_of(row: Row) -> set[str]:
+    return causes_of(row).union(*(entry[3] for entry in row["found"]))
+
+
+def right_alone(row: Row) -> bool:
+    """One cause found, the truth, and no other beside it."""
+    return sets_of(row) == set(row["names"])
+
+
+def holds(row: Row) -> bool:
+    return set(row["names"]) <= sets_of(row)
+
+
+def allowed(row: Row) -> bool:
+    """Theory can name what is hidden alone."""
+    return all(t is None or t["alone"] >= ALLOWED for t in row["theory"])
+
+
+def unlike(row: Row) -> bool:
+    """No cause of the table imitates what is hidden."""
+    return all(t is not None and t["unlike"] >= APART for t in row["theory"])
+
+
+def _mean_set(rows: Sequence[Row]) -> str:
+    sizes = [len(sets_of(r)) for r in rows if r["found"]]
+    return f"{np.mean(sizes):.2f} | {len(sizes)}" if sizes else "not run | 0"
+
+
+def efficiency(rows: Sequence[Row]) -> tuple[float, float, float] | None:
+    """By how much the point of half detection is off theory's: factor with its 68 % interval.
+
+    Detection at signal-to-noise a is ``Phi((a / f - half) / width)``, f by maximum likelihood; `half`
+    and the width are theory's of each case.
+    """
+    rows = [r for r in rows if r["half"]]
+    if len(rows) < 8:
+        return None
+    a, y = np.array([r["wanted"] for r in rows]), np.array([found(r) for r in rows])
+    half, sure = np.array([r["half"] for r in rows]).T
+    width = (sure - half) / 1.645
+
+    def cost(log_f: float) -> float:
+        p = np.clip(norm.cdf((a / np.exp(log_f) - half) / width), 1e-6, 1 - 1e-6)
+        return -float(np.sum(np.where(y, np.log(p), np.log1p(-p))))
+
+    best = minimize_scalar(cost, bounds=(-1.0, 1.2), method="bounded")
+    grid = np.linspace(-1.0, 1.2, 441)
+    inside = grid[np.array([cost(g) for g in grid]) < best.fun + 0.5]
+    return float(np.exp(best.x)), float(np.exp(inside.min())), float(np.exp(inside.max()))
+
+
+def lines(rows: Sequence[Row]) -> list[str]:
+    """Return the tables."""
+    part = {name: [r for r in rows if r["part"] == name] for name in {r["part"] for r in rows}}
+    out = ["| figure | target | measured (95 % interval) | cases |", "|---|---|---|---|"]
+
+    def add(figure: str, target: str, measured: str) -> None:
+        out.append(f"| {figure} | {target} | {measured} |")
+
+    nulls = part.get("null", [])
+    add("false alarm on nulls", "at most 1 %", share(nulls, found))
+    for noise in NOISES:
+        add(f"... {noise}", "", share([r for r in nulls if r["noise"] == noise], found))
+    _detection(add, part)
+    loud = part.get("named", [])
+    clear, other = [r for r in loud if allowed(r)], [r for r in loud if not allowed(r)]
+    add("S/N 8: named alone and right, where theory allows 95 %", "at least 90 %", share(clear, right_alone))
+    add("... elsewhere the set holds the truth", "at least 97 %", share(other, holds))
+    add("... mean size of the set where separable", "at most 1.5", _mean_set(clear))
+    sizes = [r["theory"][0]["size"] for r in other if r["theory"][0]]
+    add("... elsewhere", f"theory {np.mean(sizes) if sizes else np.nan:.2f}", _mean_set(other))
+    _parameters(add, [r for r in rows if r["wanted"] >= 8.0 and len(r["names"]) == 1])
+    _gains(add, part.get("gain", []))
+    unknown = part.get("unknown", [])
+    apart = [r for r in unknown if unlike(r)]
+    for label, chosen in (("that nothing else imitates", apart), ("whatever is left in the table", unknown)):
+        add(
+            f"unknown at S/N 10, {label}: 'unexplained'",
+            "at least 90 %",
+            share(chosen, lambda r: r["unexplained"] is not None),
+        )
+        add("... a wrong name", "at most 5 %", share(chosen, lambda r: bool(r["found"])))
+    pairs = part.get("pair", [])
+    apart = [r for r in pairs if allowed(r)]
+    for label, chosen in (("each nameable alone", apart), ("any two", pairs)):
+        add(
+            f"two at S/N 10, {label}: both named",
+            "at least 80 %",
+            share(chosen, lambda r: set(r["names"]) <= causes_of(r)),
+        )
+        add("... both in the sets", "", share(chosen, holds))
+    return [*out, "", *_by_cause(part)]  # fmt: skip
+
+
+def _detection(add: Callable[[str, str, str], None], part: dict[str, list[Row]]) -> None:
+    for size in sorted(LADDER):
+        own = [r for r in part.get("ladder", []) if r["wanted"] == size]
+        add(f"detection at S/N {size:g}", "", share(own, found))
+    add("detection at S/N 8", "at least 95 %", share(part.get("named", []), found))
+    loud = part.get("loud", []) + part.get("gain", [])
+    add("detection at S/N 15 to 100", "no loss", share(loud, found))
+    known = part.get("ladder", []) + part.get("named", [])
+    off = efficiency(known)
+    if off:
+        add(
+            "point of half detection, against theory's", "within 15 %",
+            f"{100 * (off[0] - 1):+.0f} % ({100 * (off[1] - 1):+.0f} to {100 * (off[2] - 1):+.0f}, 68 %) | {len(known)}",
+        )  # fmt: skip
+
+
+def _parameters(add: Callable[[str, str, str], None], rows: Sequence[Row]) -> None:
+    z = np.array([x for r in rows for x in r["scores"]])
+    if not z.size:
+        add("parameters", "bias under 0.2 sigma", "not run | 0")
+        return
+    add(
+        "parameters: median bias", "under 0.2 sigma",
+        f"{np.median(z):+.2f} sigma (mean {z.mean():+.2f}) | {z.size} of {sum(bool(r['scores']) for r in rows)} cases",
+    )  # fmt: skip
+    inside = np.abs(z) < 1.96
+    low, high = binomtest(int(inside.sum()), z.size).proportion_ci()
+    add(
+        "... 95 % intervals cover",
+        "92-97 %",
+        f"{100 * inside.mean():.1f} % ({100 * low:.1f}-{100 * high:.1f}) | {z.size}",
+    )
+
+
+def gained(rows: Sequence[Row]) -> float:
+    """Share of the oracle's gain, in mean square on another deployment."""
+    best = sum(r["gain"]["before"] - r["gain"]["oracle"] for r in rows)
+    return sum(r["gain"]["before"] - r["gain"]["after"] for r in rows) / best if best > 0.0 else np.nan
+
+
+def _gains(add: Callable[[str, str, str], None], rows: Sequence[Row]) -> None:
+    if not rows:
+        add("gain on another deployment, of an oracle's", "at least 80 %", "not run | 0")
+        return
+    rng = np.random.default_rng(1)
+    drawn = [gained([rows[k] for k in rng.integers(0, len(rows), len(rows))]) for _ in range(1000)]
+    low, high = np.nanquantile(drawn, [0.025, 0.975])
+    add(
+        "gain on another deployment, of an oracle's (S/N 20)", "at least 80 %",
+        f"{100 * gained(rows):.0f} % ({100 * low:.0f}-{100 * high:.0f}) | {len(rows)}",
+    )  # fmt: skip
+
+
+def _by_cause(part: dict[str, list[Row]]) -> list[str]:
+    """One line a cause."""
+    out = [
+        "| hidden | found at 8 | half point, theory's / measured | alone at 8 (theory's) | in the set (theory's) | set size (theory's) | loud: found, in the set | parameters: bias, cover, n | gain of oracle's | named or called instead |",
+        "|---|---|---|---|---|---|---|---|---|---|",
+    ]
+    for name in EFFECTS:
+        own = {key: [r for r in rows if r["names"] in ((name,), [name])] for key, rows in part.items()}
+        named, loud = own.get("named", []), own.get("loud", []) + own.get("gain", [])
+        known = [r["theory"][0] for r in named if r["theory"] and r["theory"][0]]
+        theory = {
+            key: f"{np.mean([t[key] for t in known]):.2f}" if known else "-"
+            for key in ("alone", "inside", "size")
+        }
+        z = np.array([x for key in ("named", "loud", "gain") for r in own.get(key, []) for x in r["scores"]])
+        off = efficiency(own.get("ladder", []) + named)
+        half = [r["half"][0] for r in named if r["half"]]
+        halves = (
+            f"{np.mean(half):.1f} / {np.mean(half) * off[0]:.1f} ({100 * (off[0] - 1):+.0f} %)"
+            if half and off
+            else "-"
+        )
+        else_ = sorted(
+            {c for r in named for c in causes_of(r) - {name}}
+            | {r["unexplained"]["kind"] for r in named if r["unexplained"]}
+        )
+        gain = own.get("gain", [])
+        cells = [
+            f"{_of(named, found)}", halves, f"{_of(named, right_alone)} ({theory['alone']})",
+            f"{_of(named, holds)} ({theory['inside']})",
+            f"{np.mean([len(sets_of(r)) for r in named if r['found']] or [0.0]):.1f} ({theory['size']})",
+            f"{_of(loud, found)}, {_of(loud, holds)}",
+            f"{np.median(z):+.2f}, {100 * np.mean(np.abs(z) < 1.96):.0f} %, {z.size}" if z.size else "-",
+            f"{100 * gained(gain):.0f} %" if gain else "-", ", ".join(else_),
+        ]  # fmt: skip
+        out.append(f"| {name} | " + " | ".join(cells) + " |")
+    return out
+
+
+def _of(rows: Sequence[Row], good: Callable[[Row], bool]) -> str:
+    return f"{sum(map(good, rows))}/{len(rows)}"

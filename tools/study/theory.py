@@ -1,0 +1,142 @@
+r"""What a detector could do at best that knows the noise and the true shape of what is hidden.
+
+Notes
+-----
+Let d be the hidden signature and X a rival's columns, whitened, with the calibration projected out. Scores of all
+columns are then ``N(X^T d, X^T X)``, whatever the data were: so the ideal detector's answers are drawn from that
+distribution without a deployment. It weighs the truth, a single column d with as many free numbers as the cause has in
+the table, against every other cause of the table by the same evidence that the real one uses, and names all within 20:1.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from magbridge.calibration.model import Calibration
+from magbridge.diagnose.causes import Cause
+from magbridge.diagnose.problem import pose
+from magbridge.diagnose.survey import take
+from study.stage import project, whiten
+
+Array = NDArray[np.float64]
+DRAWS = 200
+ODDS = float(np.log(20.0))
+
+
+def ideal(
+    name: str,
+    d: Array,
+    A: Array,
+    ds: xr.Dataset,
+    calibration: Calibration,
+    prior: Array,
+    causes: Mapping[str, Cause],
+    noise: str,
+    others: Mapping[str, Array],
+) -> dict[str, Any]:
+    """Chances of an ideal detector.
+
+    Parameters
+    ----------
+    name : str
+        The true cause.
+    d, A : array (n,), (n, K)
+        Its signature, and the calibration's columns, whitened.
+    ds : Dataset
+        The deployment that is diagnosed.
+    calibration : Calibration
+    prior : array (K, K)
+        What its coefficients are allowed.
+    causes : mapping
+        The table of causes.
+    noise : str
+    others : mapping of array (n,)
+        Whitened true signatures of other causes, beside what the table makes of them.
+
+    Returns
+    -------
+    dict
+        ``alone``: chance to name the truth alone; ``inside``: that the set holds it; ``size``: the set's mean size;
+        ``first``: cause -> chance to be named first; ``unlike``: signal-to-noise that the best imitation leaves, and
+        ``mimic``: whose that is.
+    """
+    problem = pose(take([ds], calibration), calibration)
+    candidates = [c for cause in causes.values() for c in cause.candidates(problem)]
+    ends = np.cumsum([c.size for c in candidates])
+    X = whiten(np.hstack([c.columns(slice(0, len(problem))) for c in candidates]), noise)
+    X = np.column_stack([X, *others.values(), d])
+    S = X.T @ project(X, A, prior)
+    values, vectors = np.linalg.eigh(0.5 * (S + S.T))
+    rng = np.random.default_rng(20131212)
+    spread = rng.standard_normal((len(S), DRAWS)) * np.sqrt(np.maximum(values, 0.0))[:, None]
+    scores = S[:, -1:] + vectors @ spread
+    groups: dict[
+        tuple[str, str | None], list[tuple[Array, float]]
+    ] = {}  # evidence, and what a long search costs
+    nearest = (0.0, "")
+    freedom = {name: (0.0, 1)}
+    spans = [
+        (c.cause, c.channel, slice(end - c.size, end), float(np.log(c.trials)))
+        for c, end in zip(candidates, ends.tolist(), strict=True)
+    ]
+    spans += [(cause, "", slice(k, k + 1), 0.0) for k, cause in enumerate(others, len(S) - 1 - len(others))]
+    for cause, channel, own, price in spans:
+        root = _root(S[own, own])
+        explained = float(np.sum((root.T @ S[own, -1]) ** 2))
+        if cause == name:
+            freedom[name] = max(freedom[name], (explained, root.shape[1]))
+        elif explained > nearest[0]:
+            nearest = (explained, cause)
+        ratio = np.sum((root.T @ scores[own]) ** 2, axis=0)
+        groups.setdefault((cause, channel), []).append((weigh(ratio, root.shape[1]), price))
+    k = freedom[name][1]
+    # its k - 1 other numbers fit nothing but noise
+    truth = scores[-1] ** 2 / S[-1, -1] + 2.0 * rng.standard_gamma(0.5 * (k - 1), DRAWS)
+    evidence = _by_cause(groups, name, weigh(truth, k))
+    names = list(evidence)
+    table = np.array([evidence[cause] for cause in names])
+    inside = table > table.max(axis=0) - ODDS
+    first = np.argmax(table, axis=0)
+    me = names.index(name)
+    return {
+        "alone": float(np.mean((first == me) & (inside.sum(axis=0) == 1))),
+        "inside": float(np.mean(inside[me])),
+        "size": float(np.mean(inside.sum(axis=0))),
+        "first": {cause: float(np.mean(first == j)) for j, cause in enumerate(names) if (first == j).any()},
+        "unlike": float(np.sqrt(max(S[-1, -1] - nearest[0], 0.0))),
+        "mimic": nearest[1],
+    }
+
+
+def weigh(ratio: Array, freedom: int) -> Array:
+    """Log evidence of likelihood ratios that took so many free numbers (Liang et al. 2008, sec. 2.4)."""
+    if not freedom:
+        return np.zeros_like(ratio)
+    more = np.maximum(ratio, freedom)
+    return np.asarray(0.5 * (more - freedom) - 0.5 * freedom * np.log(more / freedom))
+
+
+def _root(S: Array) -> Array:
+    """Return R (k, f) with ``R R^T`` the inverse of S in the directions that the data see."""
+    values, vectors = np.linalg.eigh(S)
+    seen = values > 1e-3
+    return np.asarray(vectors[:, seen] / np.sqrt(values[seen]))
+
+
+def _by_cause(
+    groups: Mapping[tuple[str, str | None], list[tuple[Array, float]]], name: str, truth: Array
+) -> dict[str, Array]:
+    """Each cause's evidence, averaged over its grid, of its best channel; the truth pays for its grid as the others do."""
+    found: dict[str, Array] = {}
+    for (cause, _), members in groups.items():
+        table = np.array([evidence for evidence, _ in members])
+        top = table.max(axis=0)
+        price = np.log(np.mean(np.exp(table - top), axis=0)) - members[0][1]
+        own = (truth if cause == name else top) + price
+        found[cause] = np.maximum(found.get(cause, own), own)
+    return found if name in found else found | {name: truth}
