@@ -20,7 +20,7 @@ def soaked(surface: Array, step: float, lag: float) -> Array:
 
     ``lag`` is the slowest mode's time constant, s.
     """
-    modes = range(8)
+    modes = range(40)
     weights = np.array([4.0 * (-1) ** k / (np.pi * (2 * k + 1)) for k in modes])
     parts = [first_order(surface, step, lag / (2 * k + 1) ** 2) for k in modes]
     return np.asarray((weights / weights.sum()) @ np.array(parts))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -17,7 +18,7 @@ from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.findings import findings
 from magbridge.diagnose.run import Diagnosis, diagnose
 from sitl.inject import EFFECTS, FOREIGN, Hidden, disturb
-from study.stage import NOISES, Stage, add_noise, again, hide, signature, stage_of
+from study.stage import NOISES, Found, Stall, add_noise, again, stage_of
 from study.theory import ideal
 
 Row = dict[str, Any]
@@ -103,26 +104,23 @@ def case(entry: Row) -> Row:
     """Hide, diagnose, and say what came out, with what theory says of it."""
     began = time.process_time()
     number, noise, names, without = entry["number"], entry["noise"], entry["names"], entry.get("without", "")
-    stage = stage_of(number, noise)
-    twin, track, when, calibration, _ = stage
-    hidden = tuple(
-        hide(name, entry["wanted"], stage, number + 7919 * k, number, noise) for k, name in enumerate(names)
-    )
-    whole = disturb(twin, hidden, track, when, number)
+    stall = Stall.of(stage_of(number, noise), number, noise)
+    hidden = [stall.hide(name, entry["wanted"], number + 7919 * k) for k, name in enumerate(names)]
+    whole = hidden[0].ds if len(hidden) == 1 else stall.measure(*(one.hidden for one in hidden))
     ds = add_noise(whole, noise, number)
     table = {name: cause for name, cause in CAUSES.items() if name != without}
-    result = diagnose([ds], calibration, causes=table)
+    result = diagnose([ds], stall.stage.calibration, causes=table)
     found = findings(result, table)
     row = entry | {
-        "sizes": [h.size for h in hidden], "verdict": found["verdict"], "unexplained": found["unexplained"],
+        "sizes": [one.hidden.size for one in hidden], "verdict": found["verdict"], "unexplained": found["unexplained"],
         "found": [[f["cause"], f["channel"], f["signal_to_noise"], [a["cause"] for a in f["alternatives"]]] for f in found["findings"]],
         "half": _half(result, names),
         "scores": _scores(found, names, whole),
-        "theory": [_theory(one, stage, ds, noise, number, without) for one in hidden] if entry["part"] in ("named", "unknown", "pair") else [],
+        "theory": [_theory(one, stall, ds, without) for one in hidden] if entry["part"] in ("named", "unknown", "pair") else [],
     }  # fmt: skip
     if entry["part"] == "gain":
-        row["gain"] = _gained(hidden[0], stage, ds, result, number)
-    return row | {"seconds": time.process_time() - began}
+        row["gain"] = _gained(hidden[0].hidden, stall, ds, result)
+    return row | {"seconds": time.process_time() - began, "worker": os.getpid()}
 
 
 def _half(result: Diagnosis, names: tuple[str, ...]) -> list[float] | None:
@@ -144,32 +142,27 @@ def _scores(found: Row, names: tuple[str, ...], whole: xr.Dataset) -> list[float
     ]
 
 
-def _theory(
-    one: Hidden, stage: Stage, ds: xr.Dataset, noise: str, number: int, without: str
-) -> dict[str, Any] | None:
-    if one.name == "outliers":  # nothing else comes one by one
+def _theory(one: Found, stall: Stall, ds: xr.Dataset, without: str) -> dict[str, Any] | None:
+    name = one.hidden.name
+    if name == "outliers":  # nothing else comes one by one
         return None
-    twin, track, when, calibration, prior = stage
-    clean = disturb(twin, (), track, when, number)
-
-    def seen(hidden: Hidden) -> tuple[Array, Array]:
-        return signature(disturb(twin, (hidden,), track, when, number), clean, calibration, noise)
-
-    table = {name: cause for name, cause in CAUSES.items() if name != without}
+    table = {key: cause for key, cause in CAUSES.items() if key != without}
     # the table's rates are differences: the delays' own signatures are more alike than those
     others = {
-        name: seen(Hidden(name, 0.1, number))[0]
-        for name in DELAYS
-        if one.name in DELAYS and name not in (one.name, without)
+        other: stall.show(Hidden(other, 0.1, stall.number)).signature
+        for other in DELAYS
+        if name in DELAYS and other not in (name, without)
     }
-    return ideal(one.name, *seen(one), ds, calibration, prior, table, noise, others)
+    return ideal(one, stall, ds, table, others)
 
 
-def _gained(hidden: Hidden, stage: Stage, ds: xr.Dataset, result: Diagnosis, number: int) -> dict[str, float]:
+def _gained(hidden: Hidden, stall: Stall, ds: xr.Dataset, result: Diagnosis) -> dict[str, float]:
     """Mean square error (nT²) on another deployment: as calibrated, extended, and extended by who knows the cause."""
-    oracle = diagnose([ds], stage.calibration, causes={hidden.name: CAUSES[hidden.name]})
-    twin, track, when, calibration, _ = again(stage)
-    other = add_noise(disturb(twin, (hidden,), track, when, number + 1), "white", number + 1)
+    calibration = stall.stage.calibration
+    oracle = diagnose([ds], calibration, causes={hidden.name: CAUSES[hidden.name]})
+    there = again(stall.stage)
+    other = disturb(there.twin, (hidden,), there.track, there.when, stall.number + 1)
+    other = add_noise(other, "white", stall.number + 1)
     before, after, best = (_error(other, c) for c in (calibration, result.calibration, oracle.calibration))
     whole = np.isfinite(before) & np.isfinite(after) & np.isfinite(best)
     return {

@@ -142,12 +142,6 @@ def project(X: Array, A: Array, covariance: Array) -> Array:
     return np.asarray(X - A @ (covariance @ np.linalg.solve(inner, A.T @ X)))
 
 
-def signature(ds: xr.Dataset, clean: xr.Dataset, calibration: Calibration, noise: str) -> tuple[Array, Array]:
-    """What is hidden, and the calibration's columns, both whitened by the true noise."""
-    e, A = compare(clean, calibration)
-    return whiten(compare(ds, calibration)[0] - e, noise), whiten(A, noise)
-
-
 def size_of(name: str, d: Array, A: Array, covariance: Array) -> float:
     """Signal-to-noise of a signature: the norm of what the free calibration leaves of it.
 
@@ -159,17 +153,49 @@ def size_of(name: str, d: Array, A: Array, covariance: Array) -> float:
     return float(np.sqrt(max(d @ left, 0.0)))
 
 
-def hide(name: str, wanted: float, stage: Stage, seed: int, number: int, noise: str) -> Hidden:
-    """Find the size at which the effect has the signal-to-noise that is wanted."""
-    twin, track, when, calibration, prior = stage
-    clean = disturb(twin, (), track, when, number)
-    e, J = compare(clean, calibration)
-    A, size = whiten(J, noise), 1.0
-    for _ in range(6):
-        ds = disturb(twin, (Hidden(name, size, seed),), track, when, number)
-        d = whiten(compare(ds, calibration)[0] - e, noise)
-        found = size_of(name, d, A, prior)
-        if abs(found / wanted - 1.0) < 0.02:
-            break
-        size *= wanted / max(found, 1e-9)
-    return Hidden(name, size, seed)
+class Found(NamedTuple):
+    """An effect of the size that was wanted: what it is, what it leaves in the residual (whitened), the log with it."""
+
+    hidden: Hidden
+    signature: Array
+    ds: xr.Dataset
+
+
+class Stall(NamedTuple):
+    """What all sizes share: the log without any effect, its residual, and the calibration's columns, whitened."""
+
+    stage: Stage
+    number: int
+    noise: str
+    clean: xr.Dataset
+    residual: Array
+    columns: Array
+
+    @classmethod
+    def of(cls, stage: Stage, number: int, noise: str) -> Stall:
+        """Set up; `number` draws what the vehicle logs beside."""
+        clean = disturb(stage.twin, (), stage.track, stage.when, number)
+        e, J = compare(clean, stage.calibration)
+        return cls(stage, number, noise, clean, e, whiten(J, noise))
+
+    def measure(self, *hidden: Hidden) -> xr.Dataset:
+        """The log with effects, before its noise."""
+        return disturb(self.stage.twin, hidden, self.stage.track, self.stage.when, self.number)
+
+    def show(self, hidden: Hidden) -> Found:
+        """What an effect does here."""
+        ds = self.measure(hidden)
+        d = whiten(compare(ds, self.stage.calibration)[0] - self.residual, self.noise)
+        return Found(hidden, d, ds)
+
+    def hide(self, name: str, wanted: float, seed: int) -> Found:
+        """Find the size at which the effect has the signal-to-noise that is wanted."""
+        size, made = 1.0, None
+        for _ in range(6):
+            made = self.show(Hidden(name, size, seed))
+            found = size_of(name, made.signature, self.columns, self.stage.prior)
+            if abs(found / wanted - 1.0) < 0.02:
+                break
+            size *= wanted / max(found, 1e-9)
+        assert made is not None
+        return made

@@ -17,11 +17,10 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from magbridge.calibration.model import Calibration
 from magbridge.diagnose.causes import Cause
 from magbridge.diagnose.problem import pose
 from magbridge.diagnose.survey import take
-from study.stage import project, whiten
+from study.stage import Found, Stall, project, whiten
 
 Array = NDArray[np.float64]
 DRAWS = 200
@@ -29,32 +28,20 @@ ODDS = float(np.log(20.0))
 
 
 def ideal(
-    name: str,
-    d: Array,
-    A: Array,
-    ds: xr.Dataset,
-    calibration: Calibration,
-    prior: Array,
-    causes: Mapping[str, Cause],
-    noise: str,
-    others: Mapping[str, Array],
+    one: Found, stall: Stall, ds: xr.Dataset, causes: Mapping[str, Cause], others: Mapping[str, Array]
 ) -> dict[str, Any]:
     """Chances of an ideal detector.
 
     Parameters
     ----------
-    name : str
-        The true cause.
-    d, A : array (n,), (n, K)
-        Its signature, and the calibration's columns, whitened.
+    one : Found
+        What is hidden.
+    stall : Stall
+        Where.
     ds : Dataset
         The deployment that is diagnosed.
-    calibration : Calibration
-    prior : array (K, K)
-        What its coefficients are allowed.
     causes : mapping
         The table of causes.
-    noise : str
     others : mapping of array (n,)
         Whitened true signatures of other causes, beside what the table makes of them.
 
@@ -62,15 +49,16 @@ def ideal(
     -------
     dict
         ``alone``: chance to name the truth alone; ``inside``: that the set holds it; ``size``: the set's mean size;
-        ``first``: cause -> chance to be named first; ``unlike``: signal-to-noise that the best imitation leaves, and
-        ``mimic``: whose that is.
+        ``beside``: cause -> chance to be in the set; ``first``: to be named first; ``unlike``: signal-to-noise that the
+        best imitation leaves, and ``mimic``: whose that is.
     """
+    name, calibration = one.hidden.name, stall.stage.calibration
     problem = pose(take([ds], calibration), calibration)
     candidates = [c for cause in causes.values() for c in cause.candidates(problem)]
     ends = np.cumsum([c.size for c in candidates])
-    X = whiten(np.hstack([c.columns(slice(0, len(problem))) for c in candidates]), noise)
-    X = np.column_stack([X, *others.values(), d])
-    S = X.T @ project(X, A, prior)
+    X = whiten(np.hstack([c.columns(slice(0, len(problem))) for c in candidates]), stall.noise)
+    X = np.column_stack([X, *others.values(), one.signature])
+    S = X.T @ project(X, stall.columns, stall.stage.prior)
     values, vectors = np.linalg.eigh(0.5 * (S + S.T))
     rng = np.random.default_rng(20131212)
     spread = rng.standard_normal((len(S), DRAWS)) * np.sqrt(np.maximum(values, 0.0))[:, None]
@@ -107,6 +95,7 @@ def ideal(
         "alone": float(np.mean((first == me) & (inside.sum(axis=0) == 1))),
         "inside": float(np.mean(inside[me])),
         "size": float(np.mean(inside.sum(axis=0))),
+        "beside": {cause: float(np.mean(inside[j])) for j, cause in enumerate(names) if inside[j].any()},
         "first": {cause: float(np.mean(first == j)) for j, cause in enumerate(names) if (first == j).any()},
         "unlike": float(np.sqrt(max(S[-1, -1] - nearest[0], 0.0))),
         "mimic": nearest[1],
