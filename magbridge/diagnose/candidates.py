@@ -1,9 +1,9 @@
-"""What a cause puts forward: an effect with its nonlinear parameters set, its columns, its plausible size."""
+"""What a cause puts forward: effects with their nonlinear parameters set, their columns, their plausible size."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from magbridge.calibration.terms import Effect
 from magbridge.diagnose.problem import Columns, Problem, effect_columns, history
 
-__all__ = ["Candidate", "of_effect", "of_reference"]
+__all__ = ["AXES", "Candidate", "of_effect", "of_reference"]
 
 FloatArray = NDArray[np.float64]
 AXES = ("x", "y", "z")
@@ -34,14 +34,16 @@ class Candidate:
         Plausible size (1-sigma) of each coefficient, in its unit.
     names, units : tuple of str
         Of the coefficients.
-    effect : Effect or None
-        What it adds to the calibration; None where it is the reference that is wrong.
+    effects : tuple of Effect
+        What it adds to the calibration; none where it is the reference that is wrong.
     shape : dict
         Nonlinear parameters: name -> (value, unit).
     again : callable or None
         Shape's values -> the same candidate with those: for profiling.
     trials : float
         Independent hypotheses that stand behind this one (frequencies searched).
+    positive : bool
+        Its coefficients cannot be negative.
     """
 
     cause: str
@@ -50,15 +52,33 @@ class Candidate:
     width: FloatArray
     names: tuple[str, ...]
     units: tuple[str, ...]
-    effect: Effect | None = None
+    effects: tuple[Effect, ...] = ()
     shape: dict[str, tuple[float, str]] = field(default_factory=dict)
     again: Callable[..., Candidate] | None = None
     trials: float = 1.0
+    positive: bool = False
 
     @property
     def size(self) -> int:
         """Free numbers."""
         return len(self.width)
+
+    def with_(self, other: Candidate) -> Candidate:
+        """Return both as one: a cause that takes more than one regressor to describe."""
+        parts = (self, other)
+        taken = self.names + tuple(self.shape)
+        number = 2 + sum(name.startswith(f"{other.names[0]} (") for name in taken)
+        mark = "" if set(taken).isdisjoint(other.names) else f" ({number})"
+        return replace(
+            self,
+            columns=lambda rows: np.hstack([part.columns(rows) for part in parts]),
+            width=np.concatenate([part.width for part in parts]),
+            names=self.names + tuple(name + mark for name in other.names),
+            units=self.units + other.units,
+            effects=self.effects + other.effects,
+            shape=self.shape | {name + mark: value for name, value in other.shape.items()},
+            again=None,
+        )
 
 
 def of_effect(
@@ -84,7 +104,7 @@ def of_effect(
             axis + (str(power + 1) if powers > 1 else "") for power in range(powers) for axis in AXES
         )
     return Candidate(
-        cause, channel, lambda rows: bare(rows) * widths, widths, names, (unit,) * effect.size, effect, **more
+        cause, channel, lambda rows: bare(rows) * widths, widths, names, (unit,) * effect.size, (effect,), **more
     )  # fmt: skip
 
 

@@ -34,7 +34,7 @@ def extend(problem: Problem, model: Sequence[Candidate], fit: Joint) -> Calibrat
     """
     calibration, q = problem.calibration, len(problem.centre)
     widths = np.concatenate([np.empty(0), *(candidate.width for candidate in model)])
-    kept = np.concatenate([np.empty(0, bool), *(np.full(c.size, c.effect is not None) for c in model)])
+    kept = np.concatenate([np.empty(0, bool), *(np.full(c.size, bool(c.effects)) for c in model)])
     b = fit.coefficients * widths
     K, k = calibration.coefficients.size, int(kept.sum())
     M = np.zeros((K + k, q + len(b)))
@@ -55,7 +55,7 @@ def extend(problem: Problem, model: Sequence[Candidate], fit: Joint) -> Calibrat
     )
     return replace(
         calibration,
-        effects=(*calibration.effects, *(c.effect for c in model if c.effect is not None)),
+        effects=(*calibration.effects, *(effect for c in model for effect in c.effects)),
         coefficients=np.append(calibration.coefficients + problem.directions @ fit.z, b[kept]),
         covariance=0.5 * (covariance + covariance.T),
         reference=reference,
@@ -77,7 +77,7 @@ def settle(
     Rates of change keep the columns of the search: a live effect's backward differences hold the sample's own noise.
     """
     columns = [candidate.columns for candidate in model]
-    if not model or any(isinstance(c.effect, RateEffect) for c in model):
+    if not model or any(isinstance(effect, RateEffect) for c in model for effect in c.effects):
         return problem, columns, fit
     settled = problem
     for _ in range(STEPS):
@@ -102,7 +102,7 @@ def _again(
     free, effects, at = own[:, : len(problem.centre)], own[:, len(problem.centre) :], 0
     blocks = []
     for candidate in model:
-        if candidate.effect is None:
+        if not candidate.effects:
             blocks.append(candidate.columns(slice(0, len(problem))))
         else:
             blocks.append(effects[:, at : at + candidate.size] * candidate.width)
@@ -110,9 +110,7 @@ def _again(
     X = np.hstack([free, *blocks])
     # what the residual would be at the first point, were it linear about this one; the reference was not mended in it
     c = np.append(fit.z, fit.coefficients)
-    own_part = np.concatenate(
-        [np.ones(len(fit.z), bool), *(np.full(m.size, m.effect is not None) for m in model)]
-    )
+    own_part = np.concatenate([np.ones(len(fit.z), bool), *(np.full(m.size, bool(m.effects)) for m in model)])
     again = replace(problem, residual=e + X[:, own_part] @ c[own_part], free=free, slopes=g)
     columns: list[Columns] = [partial(_rows, block) for block in blocks]
     return again, columns, fit_joint(again, columns, order, c)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import numpy as np
 
-from magbridge.diagnose.search import Hypothesis
+from magbridge.diagnose.search import Hypothesis, Rival
 
 if TYPE_CHECKING:
     from magbridge.diagnose.causes import Cause
@@ -33,6 +33,7 @@ def findings(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> dict[str, Any
                 "signal_to_noise": _round(hypothesis.signal_to_noise),
                 "p_value": _round(hypothesis.p_value),
                 "alternatives": alternatives(rivals),
+                "isolability": _round(told(diagnosis, hypothesis)),
                 "separated_by": causes[candidate.cause].separated_by if rivals else None,
                 "parameters": parameters(diagnosis, hypothesis, at),
                 "gain": _gain(gain),
@@ -64,9 +65,9 @@ def findings_json(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> bytes:
     return msgspec.json.format(msgspec.json.encode(findings(diagnosis, causes)), indent=2) + b"\n"
 
 
-def alternatives(rivals: tuple[Hypothesis, ...]) -> list[dict[str, Any]]:
+def alternatives(rivals: tuple[Rival, ...]) -> list[dict[str, Any]]:
     """List the others within 20:1, the likeliest first."""
-    return [{"cause": h.candidate.cause, "channel": h.candidate.channel} for h in rivals]
+    return [{"cause": rival.cause, "channel": rival.channel} for rival in rivals]
 
 
 def parameters(diagnosis: Diagnosis, hypothesis: Hypothesis, at: int) -> dict[str, dict[str, Any]]:
@@ -83,6 +84,18 @@ def parameters(diagnosis: Diagnosis, hypothesis: Hypothesis, at: int) -> dict[st
         name: {"value": float(v), "sigma": None, "unit": unit} for name, (v, unit) in candidate.shape.items()
     }
     return linear | shape
+
+
+def told(diagnosis: Diagnosis, hypothesis: Hypothesis) -> float:
+    """Theory's chance that this cause, of this size and direction, is named alone in this log."""
+    info, chosen = diagnosis.outcome.info, diagnosis.outcome.chosen
+    k = next(i for i, one in enumerate(chosen) if one.candidate is hypothesis.candidate)
+    first = len(info.score) - sum(one.candidate.size for one in chosen[k:])
+    own = np.arange(first, first + hypothesis.candidate.size)
+    b = hypothesis.fit.coefficients[-hypothesis.candidate.size :]
+    return diagnosis.isolability.telling.chance(
+        hypothesis.candidate.cause, own, b, hypothesis.signal_to_noise
+    )
 
 
 def _wrong(diagnosis: Diagnosis) -> dict[str, Any]:

@@ -20,7 +20,8 @@ from scipy.stats import chi2, ncx2, norm
 
 from magbridge.diagnose.candidates import Candidate
 from magbridge.diagnose.joint import Information
-from magbridge.diagnose.search import LEVEL, score, slices
+from magbridge.diagnose.telling import Telling
+from magbridge.diagnose.weigh import LEVEL, score, slices
 
 __all__ = ["Isolability", "Visible", "confusion", "isolability", "threshold"]
 
@@ -67,12 +68,19 @@ class Isolability:
         Cause -> what a log would need for it.
     correlation : (m, m) array
         Between the causes of `visible`.
+    telling : Telling
+        The chance of each cause to be named alone.
     """
 
     visible: tuple[Visible, ...]
     pairs: tuple[tuple[str, str, float], ...]
     untestable: dict[str, str]
     correlation: FloatArray
+    telling: Telling
+
+    def alone(self, cause: str, signal_to_noise: float) -> float:
+        """Chance that `cause`, at this signal-to-noise, is named and nothing beside it."""
+        return self.telling.alone(cause, signal_to_noise)
 
 
 def threshold(freedom: int, hypotheses: float, chance: float) -> float:
@@ -120,7 +128,13 @@ def isolability(
         for j in range(i)
         if R[i, j] > CONFOUNDED and visible[i].cause != visible[j].cause
     ]
-    return Isolability(tuple(visible), tuple(sorted(pairs, key=lambda p: -p[2])), dict(untestable), R)
+    return Isolability(
+        tuple(visible),
+        tuple(sorted(pairs, key=lambda p: -p[2])),
+        dict(untestable),
+        R,
+        Telling(candidates, info, trials, causes),
+    )
 
 
 def _alike(info: Information, a: slice, b: slice) -> float:

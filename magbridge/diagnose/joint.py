@@ -54,8 +54,8 @@ def fit_joint(
     problem: Problem,
     columns: Sequence[Columns],
     order: int,
-    start: FloatArray | None = None,
-    *,
+    *starts: FloatArray,
+    like: Joint | None = None,
     blocks: bool | None = None,
     ridge: float = 1e-2,
     rounds: int = 5,
@@ -69,7 +69,10 @@ def fit_joint(
         The effects'.
     order : int
         Of the noise's memory.
-    start : (q + k,) array, optional
+    *starts : (q + k,) array
+        Where to begin: the best of them. Without any, where the calibration stands and where plain least squares ends.
+    like : Joint, optional
+        A fit whose noise this one's will resemble: saves time.
     blocks : bool, optional
         See :func:`~magbridge.diagnose.noise.fit_noise`.
     ridge : float
@@ -87,13 +90,13 @@ def fit_joint(
 
     def at(c: FloatArray) -> tuple[float, FloatArray, Noise]:
         left = problem.residual - X @ c
-        noise = fit_noise(left, follows, order, blocks=blocks)
+        noise = fit_noise(left, follows, order, blocks=blocks, like=None if like is None else like.noise)
         return noise.log_likelihood - 0.5 * float(prior @ (c - centre) ** 2), left, noise
 
     # noise with a long memory swallows what is slow, and least squares then never asks for it again: so it is
     # asked once as if the noise had none
-    first = centre if start is None else start
-    found = [(c, *at(c)) for c in (first, _plain(X, problem.residual, prior, centre))]
+    first = starts or (centre, _plain(X, problem.residual, prior, centre))
+    found = [(c, *at(c)) for c in first]
     c, value, left, noise = max(found, key=lambda entry: entry[1])
     for _ in range(rounds):
         A, y = noise.filter(X), noise.response(left)
@@ -132,10 +135,25 @@ class Information:
     matrix : (m, m) array
         Fisher information, in units of the prior widths.
     score : (m,) array
+    shift : (q + k, m) array
+        By how much calibration and model give way to one unit of each coefficient.
     """
 
     matrix: FloatArray
     score: FloatArray
+    shift: FloatArray
+
+    def moved(self, base: Joint, index: NDArray[np.intp], taken: FloatArray) -> FloatArray:
+        """Return calibration and model (q + k,) where they are best when the coefficients at `index` are `taken`."""
+        return np.append(base.z, base.coefficients) - self.shift[:, index] @ taken
+
+    def without(self, index: NDArray[np.intp]) -> Information:
+        """Project out the coefficients at `index`, too."""
+        S = self.matrix[np.ix_(index, index)] + 1e-6 * np.eye(len(index))
+        K = np.linalg.solve(S, self.matrix[index])
+        return Information(
+            self.matrix - self.matrix[:, index] @ K, self.score - K.T @ self.score[index], self.shift
+        )
 
 
 def information(
@@ -159,7 +177,9 @@ def information(
         b += A.T @ y[start : start + CHUNK]
     prior = np.append(np.ones(q), np.full(nuisance - q, 1e-6))
     pull = np.append(problem.centre - base.z, np.zeros(nuisance - q))
-    K = np.linalg.solve(G[:nuisance, :nuisance] + np.diag(prior), G[:nuisance, nuisance:])
+    K: FloatArray = np.asarray(
+        np.linalg.solve(G[:nuisance, :nuisance] + np.diag(prior), G[:nuisance, nuisance:]), float
+    )
     return Information(
-        G[nuisance:, nuisance:] - G[nuisance:, :nuisance] @ K, b[nuisance:] - K.T @ (b[:nuisance] + pull)
+        G[nuisance:, nuisance:] - G[nuisance:, :nuisance] @ K, b[nuisance:] - K.T @ (b[:nuisance] + pull), K
     )

@@ -19,7 +19,6 @@ least squares of
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -137,7 +136,13 @@ FEW = 20
 
 
 def fit_noise(
-    residual: FloatArray, follows: BoolArray, order: int, *, blocks: bool | None = None, rounds: int = 3
+    residual: FloatArray,
+    follows: BoolArray,
+    order: int,
+    *,
+    blocks: bool | None = None,
+    like: Noise | None = None,
+    rounds: int = 3,
 ) -> Noise:
     """Fit the noise model.
 
@@ -150,39 +155,35 @@ def fit_noise(
         p.
     blocks : bool, optional
         Let the level change from block to block; decided by the data if not given.
+    like : Noise, optional
+        One that it will resemble: begins from its level and tails.
     rounds : int
         Of the alternation between memory, tails and level.
     """
     past = _past(follows, order)
-    rows = np.flatnonzero(past)
     n = len(residual)
     block = np.minimum(np.arange(n) // BLOCK, max(n // BLOCK - 1, 0))
-    weight, nu = np.ones(n), 1e6
-    scale = np.full(n, 1.4826 * np.median(np.abs(residual)) + 1e-12)
-    lags = (
-        np.stack([residual[rows - k] for k in range(1, order + 1)], axis=1)
-        if order
-        else np.empty((rows.size, 0))
-    )
+    weight, nu = np.ones(n), 12.0 if like is None else like.nu
+    scale = np.full(n, 1.4826 * np.median(np.abs(residual)) + 1e-12) if like is None else like.scale
+    lags = np.zeros((order, n))
+    for k in range(1, order + 1):
+        lags[k - 1, k:] = residual[:-k]
+    lags *= past
     memory, share, v = np.zeros(order), 1.0, residual
-    tails: Sequence[float] = TAILS
     for _ in range(rounds):
-        root = np.sqrt(weight[rows]) / scale[rows]
-        if order and rows.size > 2 * order:
-            memory = _stable(np.linalg.lstsq(lags * root[:, None], residual[rows] * root, rcond=None)[0])
-        v = residual.copy()
-        v[rows] -= lags @ memory
+        if order and past.sum() > 2 * order:
+            own = lags * (weight / scale**2)
+            memory = _stable(np.asarray(np.linalg.lstsq(own @ lags.T, own @ residual, rcond=None)[0], float))
+        v = residual - memory @ lags
         share = (
-            min(1.0, float(np.sqrt(np.median(v[rows] ** 2) / (np.median(residual**2) + 1e-300))))
+            min(1.0, float(np.sqrt(np.median(v[past] ** 2) / (np.median(residual**2) + 1e-300))))
             if order
             else 1.0
         )
         v[~past] *= share
         if blocks is None:
             blocks = _uneven(v, block)
-        nu, scale = _tails(v, block if blocks else np.zeros(n, np.int64), scale, tails)
-        near = TAILS.index(nu)
-        tails = TAILS[max(near - 1, 0) : near + 2]
+        nu, scale = _tails(v, block if blocks else np.zeros(n, np.int64), nu)
         weight = (nu + 1.0) / (nu + (v / scale) ** 2)
     x = v / scale
     log_likelihood = float(np.sum(_log_t(x, nu) - np.log(scale)) + np.log(share) * np.sum(~past))
@@ -217,27 +218,32 @@ def _uneven(v: FloatArray, block: NDArray[np.int64]) -> bool:
     return bool(chi2 > count.size + 4.0 * np.sqrt(2.0 * count.size))
 
 
-def _tails(
-    v: FloatArray, block: NDArray[np.int64], start: FloatArray, tails: Sequence[float]
-) -> tuple[float, FloatArray]:
-    """Find the best tails and the level of each block, drawn towards the common one by as much as ten samples."""
+def _tails(v: FloatArray, block: NDArray[np.int64], nu: float) -> tuple[float, FloatArray]:
+    """Find the best tails, uphill from `nu`, and the level of each block under them."""
+    at = TAILS.index(nu)
+    tried = {at: _levels(v, block, nu)}
+    while True:
+        for near in (at - 1, at + 1):
+            if 0 <= near < len(TAILS) and near not in tried:
+                tried[near] = _levels(v, block, TAILS[near])
+        best = max((k for k in (at - 1, at, at + 1) if k in tried), key=lambda k: (tried[k][0], k == at))
+        if best == at:
+            return TAILS[at], tried[at][1]
+        at = best
+
+
+def _levels(v: FloatArray, block: NDArray[np.int64], nu: float) -> tuple[float, FloatArray]:
+    """Log likelihood and level of every sample; blocks are drawn towards the common one by as much as ten samples."""
     count = np.bincount(block)
-    best: tuple[float, float, FloatArray] = (-np.inf, 1e6, start)
-    common = float(np.median(np.abs(v))) * 1.4826 + 1e-12
-    for nu in tails:
-        level = np.full(count.size, common)
-        whole = common
-        for _ in range(6 if nu < 1e5 else 2):
-            x = v / level[block]
-            weighted = np.bincount(block, (nu + 1.0) / (nu + x * x) * v * v)
-            whole = float(np.sqrt(weighted.sum() / len(v))) + 1e-12
-            level = (
-                np.sqrt((weighted + 10.0 * whole**2) / (count + 10.0))
-                if count.size > 1
-                else np.array([whole])
-            )
-        scale = level[block]
-        value = float(np.sum(_log_t(v / scale, nu) - np.log(scale)))
-        if value > best[0] + 1e-9:
-            best = (value, nu, scale)
-    return best[1], best[2]
+    level = np.full(count.size, float(np.median(np.abs(v))) * 1.4826 + 1e-12)
+    square = v * v
+    for _ in range(6 if nu < 1e5 else 2):
+        weighted = (nu + 1.0) / (nu + square / level[block] ** 2) * square
+        whole = float(np.sqrt(weighted.mean())) + 1e-12
+        level = (
+            np.sqrt((np.bincount(block, weighted) + 10.0 * whole**2) / (count + 10.0))
+            if count.size > 1
+            else np.array([whole])
+        )
+    scale = level[block]
+    return float(np.sum(_log_t(v / scale, nu) - np.log(scale))), scale

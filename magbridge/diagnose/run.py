@@ -20,11 +20,12 @@ from magbridge.diagnose.extend import extend, settle
 from magbridge.diagnose.findings import findings_json
 from magbridge.diagnose.gain import Gain, held_out, paired
 from magbridge.diagnose.isolability import Isolability, isolability
-from magbridge.diagnose.joint import Joint, information
+from magbridge.diagnose.joint import Joint
 from magbridge.diagnose.problem import Problem, pose, samples_of
-from magbridge.diagnose.search import ODDS, Hypothesis, Outcome, search, slices, trials
+from magbridge.diagnose.search import Hypothesis, Outcome, Rival, search
 from magbridge.diagnose.survey import Survey, take
 from magbridge.diagnose.unexplained import Leftover, Outliers, leftover, outliers
+from magbridge.diagnose.weigh import ODDS
 from magbridge.errors import DataError
 from magbridge.field.grid import AnomalyGrid
 from magbridge.files import atomic_path
@@ -56,7 +57,7 @@ class Diagnosis:
     outcome : Outcome
     named : tuple of Hypothesis
         The causes that stand; their rivals in `rivals`.
-    rivals : tuple of tuple of Hypothesis
+    rivals : tuple of tuple of Rival
     wrong : Outliers or None
         Isolated wrong samples.
     unexplained : Leftover or None
@@ -76,7 +77,7 @@ class Diagnosis:
     problem: Problem
     outcome: Outcome
     named: tuple[Hypothesis, ...]
-    rivals: tuple[tuple[Hypothesis, ...], ...]
+    rivals: tuple[tuple[Rival, ...], ...]
     wrong: Outliers | None
     unexplained: Leftover | None
     calibration: Calibration
@@ -164,7 +165,7 @@ def diagnose(
         problem=problem, outcome=outcome, named=named, rivals=rivals, wrong=wrong, unexplained=rest,
         calibration=extended, fit=fit, before=before, after=after,
         total=paired(before, after, survey.dive, counts if counts.any() else ~counts), gains=tuple(gains),
-        isolability=_isolability(problem, outcome, flat, causes, untestable),
+        isolability=isolability(flat, outcome.info, outcome.trials, len(causes), untestable),
         verdict=_verdict(named, wrong, rest),
     )  # fmt: skip
     if out_dir is not None:
@@ -190,7 +191,7 @@ def write(
 
 def _accept(
     problem: Problem, outcome: Outcome, tone: Candidate | None
-) -> tuple[tuple[Hypothesis, ...], tuple[tuple[Hypothesis, ...], ...], Joint, Leftover | None]:
+) -> tuple[tuple[Hypothesis, ...], tuple[tuple[Rival, ...], ...], Joint, Leftover | None]:
     """Keep the names that fit: not one beside which as much again stays unexplained, or that a free curve beats."""
     model = [h.candidate for h in outcome.chosen]
     rest = leftover(problem, model, outcome.fit, outcome.order, tone)
@@ -221,22 +222,6 @@ def _without(fit: Joint, model: Sequence[Candidate], k: int) -> Joint:
     start = sum(candidate.size for candidate in model[:k])
     kept = np.delete(fit.coefficients, np.arange(start, start + model[k].size))
     return Joint(fit.log_likelihood, fit.z, kept, fit.covariance, fit.noise, fit.left)
-
-
-def _isolability(
-    problem: Problem,
-    outcome: Outcome,
-    candidates: list[Candidate],
-    causes: Mapping[str, Cause],
-    untestable: dict[str, str],
-) -> Isolability:
-    """Of the search's own columns, under the noise that is left: what it could have seen."""
-    fit = outcome.fit
-    base = Joint(0.0, problem.centre, np.empty(0), np.empty((0, 0)), fit.noise, fit.left)
-    info = information(problem, fit.noise, base, [], [c.columns for c in candidates])
-    return isolability(
-        candidates, info, trials(info, candidates, slices(candidates)), len(causes), untestable
-    )
 
 
 def _verdict(named: Sequence[Hypothesis], wrong: Outliers | None, rest: Leftover | None) -> str:

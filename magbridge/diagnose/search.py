@@ -1,19 +1,15 @@
-r"""The search: which causes the data speak for, one after the other, with look-elsewhere accounted for.
+r"""The search: which causes the data speak for, one after the other.
 
 Notes
 -----
-*Score.* For a candidate with projected information S and score b (:mod:`.joint`), ``R = b^T S^-1 b`` is what its
-likelihood ratio would be. Nobody knows beforehand how large an effect is, so its k coefficients have Zellner's prior
-``N(0, g S^-1)`` with the g that the data like best: log evidence ``(R - k)/2 - (k/2) log(R/k)``, 0 below ``R = k``
-(Liang et al. 2008, JASA 103:410, sec. 2.4). It asks the same price of every cause, whatever its unit.
-The noise under which both are taken may have swallowed the effect, so candidates are scored twice: under the
-noise of the model so far, and under the noise that is left when every cause may take what it can.
+Candidates are scored (:mod:`.weigh`) under two noises, since the noise of the model so far may have swallowed an effect:
+that one, and the noise that is left when every cause may take what it can. The best of each cause are then fitted
+jointly with noise and calibration. The best that passes the test is added; so on while one does; then what later
+findings have made needless is dropped. A cause that is found again is not another cause but needs more than one of
+its regressors: they become one candidate.
 
-*Test.* The best of each cause are fitted jointly with noise and calibration. A cause's p-value is that of its likelihood
-ratio, times the number of independent hypotheses N behind it: under no effect scores are ``N(0, S)``, so the smallest
-p-value over its grid is simulated from S, and ``N = 1 / E[p_min] - 1``. Times the number of causes, below 1 %: found.
-
-*Name.* By evidence, averaged over the grid; all within 20:1 of the best are named together.
+What a cause's place could be taken by is read off one matrix at the end: the information of all candidates under the
+noise that is left, the other causes projected out.
 """
 
 from __future__ import annotations
@@ -29,34 +25,25 @@ from magbridge.diagnose.candidates import Candidate
 from magbridge.diagnose.joint import Information, Joint, fit_joint, information
 from magbridge.diagnose.noise import memory_order
 from magbridge.diagnose.problem import Problem
+from magbridge.diagnose.weigh import IDEAL, LEVEL, Score, lead, score, slices, trials, weigh
 
-__all__ = ["LEVEL", "ODDS", "Hypothesis", "Outcome", "score", "search", "slices", "trials", "weigh"]
+__all__ = ["Hypothesis", "Outcome", "Rival", "search"]
 
 FloatArray = NDArray[np.float64]
 
-LEVEL = 0.01
-"""Family-wise false-alarm rate."""
-ODDS = np.log(20.0)
-"""Log evidence by which a cause must win to be named alone."""
-SIMULATIONS = 400
 SHORT_LIST = 9
 """Causes that are fitted jointly in a round."""
-IDEAL = 0.2
-"""How far from the truth an idealised regressor may be: what is left of a large effect is not another cause.
-
-The price: a second cause of less than a fifth of the strongest one's signal-to-noise is not named beside it.
-"""
 SHARPEN = 4
 """Halvings of a nonlinear parameter's bracket."""
 STARTS = 3
 """Causes that a chain of several may begin with."""
-MOST = 5
-"""Causes in one log."""
+MOST = 6
+"""Regressors in one log."""
 
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """One cause beside the model so far.
+    """One cause beside the others of a model.
 
     Attributes
     ----------
@@ -64,12 +51,11 @@ class Hypothesis:
     ratio : float
         Twice the gain in log likelihood.
     evidence : float
-        Log Bayes factor against the model so far.
+        Log Bayes factor against the model without it.
     p_value : float
         Look-elsewhere and number of causes included.
     fit : Joint
-    price : float
-        Log evidence, below 0, that its nonlinear parameters cost: 0 would be had they been known.
+        Of the whole model; this cause's coefficients are the last.
     """
 
     candidate: Candidate
@@ -77,7 +63,6 @@ class Hypothesis:
     evidence: float
     p_value: float
     fit: Joint
-    price: float = 0.0
 
     @property
     def signal_to_noise(self) -> float:
@@ -88,6 +73,15 @@ class Hypothesis:
         return float(np.sqrt(power)) if power > 0.0 else 0.0
 
 
+@dataclass(frozen=True)
+class Rival:
+    """What could stand in a cause's place: its name, and by how much log evidence it loses."""
+
+    cause: str
+    channel: str | None
+    behind: float
+
+
 @dataclass(frozen=True, eq=False)
 class Outcome:
     """What a search ends with.
@@ -96,82 +90,28 @@ class Outcome:
     ----------
     chosen : tuple of Hypothesis
         In the order found; each against the model without it.
-    rivals : tuple of tuple of Hypothesis
-        For each chosen one, all others within 20:1 in its place, the best first.
+    rivals : tuple of tuple of Rival
+        For each chosen one, all others that it does not beat by :func:`~.weigh.lead`, the best first.
     null, fit : Joint
         Without any cause, and with the chosen ones.
     order : int
         Memory of the noise.
     tested : dict
         Cause -> (smallest p-value, ratio) of the first round.
+    info : Information
+        Of all candidates under the noise that is left, only the calibration projected out.
+    trials : dict
+        Independent hypotheses behind each cause.
     """
 
     chosen: tuple[Hypothesis, ...]
-    rivals: tuple[tuple[Hypothesis, ...], ...]
+    rivals: tuple[tuple[Rival, ...], ...]
     null: Joint
     fit: Joint
     order: int
     tested: dict[str, tuple[float, float]]
-
-
-@dataclass(frozen=True, eq=False)
-class Score:
-    """Of one candidate under one noise: likelihood ratio, its degrees of freedom, log evidence, estimate."""
-
-    ratio: float
-    freedom: int
-    evidence: float
-    estimate: FloatArray
-    root: FloatArray
-
-
-def score(info: Information, at: slice) -> Score:
-    """Score the candidate whose columns stand at `at`."""
-    S, b = info.matrix[at, at], info.score[at]
-    values, vectors = np.linalg.eigh(S)
-    seen = values > 1e-3  # of the prior's own information: less is invisible
-    if not seen.any():
-        return Score(0.0, 0, 0.0, np.zeros(len(b)), np.zeros((len(b), 0)))
-    root = vectors[:, seen] / np.sqrt(values[seen])
-    ratio = float(np.sum((root.T @ b) ** 2))
-    estimate = vectors[:, seen] @ ((vectors[:, seen].T @ b) / (values[seen] + 1.0))
-    return Score(ratio, int(seen.sum()), weigh(ratio, int(seen.sum())), estimate, root)
-
-
-def weigh(ratio: float, freedom: int) -> float:
-    """Log evidence of a likelihood ratio that took so many free numbers."""
-    if ratio <= freedom or not freedom:
-        return 0.0
-    return 0.5 * (ratio - freedom) - 0.5 * freedom * float(np.log(ratio / freedom))
-
-
-def slices(candidates: Sequence[Candidate]) -> list[slice]:
-    """Where each candidate's columns stand."""
-    ends = np.cumsum([candidate.size for candidate in candidates])
-    return [
-        slice(int(end) - candidate.size, int(end)) for end, candidate in zip(ends, candidates, strict=True)
-    ]
-
-
-def trials(info: Information, candidates: Sequence[Candidate], at: Sequence[slice]) -> dict[str, float]:
-    """Return the number of independent hypotheses behind each cause."""
-    rng = np.random.default_rng(20131211)  # the same answer every time
-    found = {}
-    for cause in dict.fromkeys(candidate.cause for candidate in candidates):
-        own = [k for k, candidate in enumerate(candidates) if candidate.cause == cause]
-        index = np.concatenate([np.arange(at[k].start, at[k].stop) for k in own])
-        values, vectors = np.linalg.eigh(info.matrix[np.ix_(index, index)])
-        draws = (vectors * np.sqrt(np.maximum(values, 0.0))) @ rng.standard_normal((len(index), SIMULATIONS))
-        smallest = np.ones(SIMULATIONS)
-        place = 0
-        for k in own:
-            s = score(info, at[k])
-            block = draws[place : place + candidates[k].size]
-            place += candidates[k].size
-            if s.freedom:
-                smallest = np.minimum(smallest, chi2.sf(np.sum((s.root.T @ block) ** 2, axis=0), s.freedom))
-        found[cause] = max(1.0, 1.0 / float(smallest.mean()) - 1.0) * max(candidates[k].trials for k in own)
-    return found
+    info: Information
+    trials: dict[str, float]
 
 
 class _Search:
@@ -180,83 +120,91 @@ class _Search:
     def __init__(self, problem: Problem, candidates: Sequence[Candidate], order: int, causes: int) -> None:
         self.problem, self.candidates, self.order, self.causes = problem, list(candidates), order, causes
         self.at = slices(self.candidates)
+        self.columns = [candidate.columns for candidate in self.candidates]
         self.trials: dict[str, float] = {}
+        self.groups: dict[tuple[str, str | None], list[int]] = {}
+        for k, candidate in enumerate(self.candidates):
+            self.groups.setdefault(_key(candidate), []).append(k)
 
-    def fit(self, model: Sequence[Candidate], start: FloatArray | None = None, rounds: int = 4) -> Joint:
-        return fit_joint(self.problem, [c.columns for c in model], self.order, start, rounds=rounds)
+    def fit(
+        self, model: Sequence[Candidate], *starts: FloatArray, like: Joint | None = None, rounds: int = 4
+    ) -> Joint:
+        columns = [candidate.columns for candidate in model]
+        return fit_joint(self.problem, columns, self.order, *starts, like=like, rounds=rounds)
+
+    def scores(self, info: Information) -> list[Score]:
+        return [
+            score(info, at, positive=candidate.positive)
+            for at, candidate in zip(self.at, self.candidates, strict=True)
+        ]
+
+    def best(self, scores: Sequence[Score]) -> dict[tuple[str, str | None], tuple[int, float]]:
+        """Of each group its best member, and log of the grid's average against it: what the nonlinear parameters cost."""
+        found = {}
+        for group, members in self.groups.items():
+            evidences = np.array([scores[k].evidence for k in members])
+            top = int(np.argmax(evidences))
+            found[group] = members[top], float(np.log(np.mean(np.exp(evidences - evidences[top]))))
+        return found
 
     def round(self, model: list[Candidate], base: Joint) -> list[Hypothesis]:
         """Every cause beside `model`, the likeliest first."""
-        columns = [candidate.columns for candidate in model]
-        best: dict[tuple[str, str | None], list[tuple[float, float, int, Score]]] = {}
-        infos = [information(self.problem, base.noise, base, columns, [c.columns for c in self.candidates])]
+        model_columns = [candidate.columns for candidate in model]
+        own = information(self.problem, base.noise, base, model_columns, self.columns)
         if not self.trials:
-            self.trials = trials(infos[0], self.candidates, self.at)
-        infos.append(self._bare(model, base, infos[0]))
-        for info in infos:
-            scores = [score(info, at) for at in self.at]
-            groups: dict[tuple[str, str | None], list[int]] = {}
-            for k, candidate in enumerate(self.candidates):
-                groups.setdefault((candidate.cause, candidate.channel), []).append(k)
-            for group, members in groups.items():
-                evidences = np.array([scores[k].evidence for k in members])
-                top = int(np.argmax(evidences))
-                # the grid's average, as against its best: what the nonlinear parameters cost
-                average = float(np.log(np.mean(np.exp(evidences - evidences[top]))))
-                best.setdefault(group, []).append(
-                    (evidences[top], average, members[top], scores[members[top]])
-                )
-        listed = sorted(best.items(), key=lambda item: -max(entry[0] for entry in item[1]))
-        found = [self._joint(model, base, entries) for _, entries in listed[:SHORT_LIST]]
+            self.trials = trials(own, self.candidates, self.at)
+        under: dict[tuple[str, str | None], list[tuple[int, float, Score, Information]]] = {}
+        for info in (own, self._bare(model, base, own)):
+            scores = self.scores(info)
+            for group, (k, average) in self.best(scores).items():
+                under.setdefault(group, []).append((k, average, scores[k], info))
+        listed = sorted(under.values(), key=lambda entries: -max(entry[2].evidence for entry in entries))
+        found = [self._joint(model, base, entries) for entries in listed[:SHORT_LIST]]
         return sorted(found, key=lambda h: -h.evidence)
 
     def _bare(self, model: list[Candidate], base: Joint, info: Information) -> Information:
         """Score again under the noise that is left when the best of every cause takes what it can."""
         top: dict[str, tuple[float, int]] = {}
-        for k, at in enumerate(self.at):
-            s = score(info, at)
-            cause = self.candidates[k].cause
-            if s.evidence > top.get(cause, (-np.inf, 0))[0]:
-                top[cause] = (s.evidence, k)
+        for k, s in enumerate(self.scores(info)):
+            if s.evidence > top.get(self.candidates[k].cause, (-np.inf, 0))[0]:
+                top[self.candidates[k].cause] = (s.evidence, k)
         pool = [k for _, k in top.values()]
         index = np.concatenate([np.arange(self.at[k].start, self.at[k].stop) for k in pool])
-        S = info.matrix[np.ix_(index, index)]
-        taken = np.linalg.solve(S + np.eye(len(index)), info.score[index])
+        taken = np.linalg.solve(info.matrix[np.ix_(index, index)] + np.eye(len(index)), info.score[index])
         everything = fit_joint(
             self.problem,
             [c.columns for c in (*model, *(self.candidates[k] for k in pool))],
             self.order,
-            np.concatenate([base.z, base.coefficients, taken]),
+            np.append(info.moved(base, index, taken), taken),
             ridge=1.0,
-            rounds=2,
+            rounds=1,
         )
-        columns = [c.columns for c in model]
-        return information(
-            self.problem, everything.noise, base, columns, [c.columns for c in self.candidates]
-        )
+        return information(self.problem, everything.noise, base, [c.columns for c in model], self.columns)
 
     def _joint(
-        self, model: list[Candidate], base: Joint, entries: list[tuple[float, float, int, Score]]
+        self, model: list[Candidate], base: Joint, entries: list[tuple[int, float, Score, Information]]
     ) -> Hypothesis:
         """Fit one cause jointly, at the grid's points that won under either noise."""
         found = []
-        for _, average, k, s in {entry[2]: entry for entry in entries}.values():
+        for k in {entry[0] for entry in entries}:
             candidate = self.candidates[k]
-            start = np.concatenate([base.z, base.coefficients, s.estimate])
-            fit = self.fit([*model, candidate], start)
+            mine = [entry for entry in entries if entry[0] == k]
+            index = np.arange(self.at[k].start, self.at[k].stop)
+            starts = [np.append(info.moved(base, index, s.estimate), s.estimate) for _, _, s, info in mine]
+            fit = self.fit([*model, candidate], *starts, like=base, rounds=2)
             ratio = max(0.0, 2.0 * (fit.log_likelihood - base.log_likelihood))
-            tests = self.trials.get(candidate.cause, 1.0) * self.causes
-            p_value = min(1.0, tests * float(chi2.sf(ratio, max(s.freedom, 1))))
-            evidence = weigh(ratio, s.freedom) + average
-            if candidate.trials > 1.0:
-                evidence -= float(np.log(candidate.trials))
-            found.append(Hypothesis(candidate, ratio, evidence, p_value, fit, average))
+            if candidate.positive and fit.coefficients[-1] < 0.0:
+                ratio = 0.0
+            freedom = mine[0][2].freedom
+            p_value = self.p_value(candidate, ratio, freedom)
+            evidence = weigh(ratio, freedom) + mine[0][1] - float(np.log(candidate.trials))
+            found.append(Hypothesis(candidate, ratio, evidence, p_value, fit))
         return max(found, key=lambda h: h.evidence)
 
-    def place_of(self, model: list[Candidate], k: int) -> list[Hypothesis]:
-        """Return what could stand where the k-th of `model` stands."""
-        others = model[:k] + model[k + 1 :]
-        return self.round(others, self.fit(others))
+    def p_value(self, candidate: Candidate, ratio: float, freedom: int) -> float:
+        """Of a likelihood ratio, times the hypotheses behind its cause, times the causes."""
+        tests = self.trials.get(candidate.cause, 1.0) * self.causes
+        return min(1.0, tests * float(chi2.sf(ratio, max(freedom, 1))))
 
     def sharpen(self, model: list[Candidate], hypothesis: Hypothesis, base: Joint) -> Hypothesis:
         """Profile the nonlinear parameters between the grid's points, one after the other, by golden section."""
@@ -265,9 +213,7 @@ class _Search:
         if again is None:
             return best
         for position, name in enumerate(best.candidate.shape):
-            grid = sorted(
-                {c.shape[name][0] for c in self.candidates if (c.cause, c.channel) == _key(best.candidate)}
-            )
+            grid = sorted({self.candidates[k].shape[name][0] for k in self.groups[_key(best.candidate)]})
             here = best.candidate.shape[name][0]
             low = max((v for v in grid if v < here), default=here - 0.5 * (grid[-1] - grid[0]))
             high = min((v for v in grid if v > here), default=here + 0.5 * (grid[-1] - grid[0]))
@@ -279,10 +225,8 @@ class _Search:
                     values = [v for v, _ in best.candidate.shape.values()]
                     values[position] = low + share * (high - low)
                     candidate = again(*values)
-                    start = np.concatenate(
-                        [base.z, base.coefficients, best.fit.coefficients[-candidate.size :]]
-                    )
-                    fit = self.fit([*model, candidate], start, rounds=2)
+                    start = np.append(best.fit.z, best.fit.coefficients)
+                    fit = self.fit([*model, candidate], start, like=best.fit, rounds=1)
                     gain = 2.0 * (fit.log_likelihood - base.log_likelihood) - best.ratio
                     tried.append((gain, values[position], candidate, fit))
                 gain, value, candidate, fit = max(tried, key=lambda entry: entry[0])
@@ -328,68 +272,107 @@ def search(problem: Problem, candidates: Sequence[Candidate], causes: int) -> Ou
     for h in first:
         if h.p_value <= tested.get(h.candidate.cause, (np.inf, 0.0))[0]:
             tested[h.candidate.cause] = (h.p_value, h.ratio)
-    chosen, model, base = _chain(state, null, first)
+    chosen, base = _chain(state, null, first)
     if (
         len(chosen) > 1
     ):  # the first step may have gone astray where several causes act: begin with others, too
         kinds = {h.candidate.cause: h for h in reversed(first) if h.p_value < LEVEL}
         others = [h for cause, h in kinds.items() if cause != first[0].candidate.cause]
         others = sorted(others, key=lambda h: -h.evidence)[: STARTS - 1]
-        chains = [(chosen, model, base), *(_chain(state, null, [h]) for h in others)]
-        chosen, model, base = max(
+        chains = [(chosen, base), *(_chain(state, null, [h]) for h in others)]
+        chosen, base = max(
             chains,
             key=lambda chain: weigh(
-                2.0 * (chain[2].log_likelihood - null.log_likelihood), sum(c.size for c in chain[1])
+                2.0 * (chain[1].log_likelihood - null.log_likelihood), sum(h.candidate.size for h in chain[0])
             ),
         )
-    rivals = []
-    for k, own in enumerate(chosen):
-        others = [h for h in state.place_of(model, k) if _key(h.candidate) != _key(own.candidate)]
-        # a rival has the benefit of the doubt about its nonlinear parameters
-        rivals.append(
-            tuple(h for h in others if h.evidence - h.price > own.evidence - ODDS and h.p_value < LEVEL)
-        )
-    return Outcome(tuple(chosen), tuple(rivals), null, base, order, tested)
+    bare = replace(base, coefficients=np.empty(0))
+    info = information(
+        problem, base.noise, bare, [], [*state.columns, *(h.candidate.columns for h in chosen)]
+    )
+    rivals = tuple(_rivals(state, info, [h.candidate for h in chosen], base, k) for k in range(len(chosen)))
+    return Outcome(tuple(chosen), rivals, null, base, order, tested, info, state.trials)
 
 
-def _chain(
-    state: _Search, null: Joint, first: list[Hypothesis]
-) -> tuple[list[Hypothesis], list[Candidate], Joint]:
+def _chain(state: _Search, null: Joint, first: list[Hypothesis]) -> tuple[list[Hypothesis], Joint]:
     """Add cause after cause while one passes the test, beginning with the best of `first`; drop what became needless."""
-    chosen: list[Hypothesis] = []
     model: list[Candidate] = []
-    base, found = null, first
-    while len(chosen) < MOST:
-        sure = [h for h in found if h.p_value < LEVEL]
-        loudest = max((h.signal_to_noise for h in chosen), default=0.0)
-        if not sure or sure[0].signal_to_noise < IDEAL * loudest:
+    loudest, base, found = 0.0, null, first
+    for _ in range(MOST):
+        best = _next(found, model, loudest)
+        if best is None:
             break
-        best = state.sharpen(model, sure[0], base)
-        chosen.append(best)
-        model.append(best.candidate)
-        base = best.fit
-        found = state.round(model, base) if len(chosen) < MOST else []
-    return _remove(state, chosen, model, base)
+        best = state.sharpen(model, best, base)
+        loudest = max(loudest, best.signal_to_noise)
+        model, base = _with(state, model, best)
+        found = state.round(model, base)
+    return _remove(state, model, base, null)
+
+
+def _next(found: list[Hypothesis], model: list[Candidate], loudest: float) -> Hypothesis | None:
+    """Pick the best that passes the test; of what an idealised regressor may have left, only more of the same cause."""
+    named = {candidate.cause for candidate in model}
+    for h in found:
+        if h.p_value < LEVEL and (h.candidate.cause in named or h.signal_to_noise >= IDEAL * loudest):
+            return h
+    return None
+
+
+def _with(state: _Search, model: list[Candidate], best: Hypothesis) -> tuple[list[Candidate], Joint]:
+    """Add a candidate to the model, or to its cause's own if that is in it already."""
+    new = best.candidate
+    for k, own in enumerate(model):
+        if own.cause == new.cause:
+            grown = [*model[:k], own.with_(new), *model[k + 1 :]]
+            at = sum(candidate.size for candidate in model[: k + 1])
+            c = best.fit.coefficients
+            c = np.concatenate([c[:at], c[-new.size :], c[at : -new.size]])
+            return grown, state.fit(grown, np.append(best.fit.z, c), like=best.fit)
+    return [*model, new], best.fit
 
 
 def _remove(
-    state: _Search, chosen: list[Hypothesis], model: list[Candidate], base: Joint
-) -> tuple[list[Hypothesis], list[Candidate], Joint]:
+    state: _Search, model: list[Candidate], base: Joint, null: Joint
+) -> tuple[list[Hypothesis], Joint]:
     """Drop what later findings have made needless; measure what stays against the model without it."""
+    chosen: list[Hypothesis] = []
     k = 0
-    while k < len(chosen) and len(chosen) > 1:
-        others = model[:k] + model[k + 1 :]
-        without = state.fit(others)
+    while k < len(model):
+        own, others = model[k], model[:k] + model[k + 1 :]
+        without = state.fit(others) if others else null
         ratio = max(0.0, 2.0 * (base.log_likelihood - without.log_likelihood))
-        own = chosen[k].candidate
-        p_value = min(1.0, state.trials.get(own.cause, 1.0) * state.causes * float(chi2.sf(ratio, own.size)))
-        if p_value < LEVEL:
-            change = 0.5 * (ratio - chosen[k].ratio)
-            evidence = chosen[k].evidence + change
-            chosen[k] = replace(
-                chosen[k], ratio=ratio, p_value=p_value, evidence=evidence, fit=state.fit([*others, own])
-            )
-            k += 1
+        p_value = state.p_value(own, ratio, own.size)
+        if p_value >= LEVEL:
+            model, base, chosen, k = others, without, [], 0
             continue
-        chosen, model, base, k = chosen[:k] + chosen[k + 1 :], others, without, 0
-    return chosen, model, base
+        c, at = base.coefficients, sum(candidate.size for candidate in model[:k])
+        last = np.concatenate([c[:at], c[at + own.size :], c[at : at + own.size]])
+        fit = state.fit([*others, own], np.append(base.z, last), like=base, rounds=1)
+        chosen.append(Hypothesis(own, ratio, weigh(ratio, own.size), p_value, fit))
+        k += 1
+    return chosen, base
+
+
+def _rivals(
+    state: _Search, info: Information, model: list[Candidate], base: Joint, k: int
+) -> tuple[Rival, ...]:
+    """Return what could stand in the place of the k-th of `model`, whose columns are the last of `info`."""
+    ends = state.at[-1].stop + np.cumsum([0, *(candidate.size for candidate in model)])
+    own = np.arange(ends[k], ends[k + 1])
+    others = np.setdiff1d(np.arange(ends[0], ends[-1]), own)
+    c = base.coefficients[own - ends[0]]
+    alone = info.without(others)
+    # what the data say when this cause is taken out of the fit
+    alone = replace(alone, score=alone.score + alone.matrix[:, own] @ c)
+    mine = score(alone, slice(int(own[0]), int(own[-1]) + 1))
+    scores = state.scores(alone)
+    rivals = []
+    for group, (member, _) in state.best(scores).items():
+        candidate, s = state.candidates[member], scores[member]
+        if group == _key(model[k]) or group[0] in {other.cause for other in model if other is not model[k]}:
+            continue
+        # a rival has the benefit of the doubt about its nonlinear parameters
+        behind = mine.evidence - s.evidence + float(np.log(candidate.trials / model[k].trials))
+        if behind < lead(mine.ratio) and state.p_value(candidate, s.ratio, s.freedom) < LEVEL:
+            rivals.append(Rival(*group, behind))
+    return tuple(sorted(rivals, key=lambda rival: rival.behind))

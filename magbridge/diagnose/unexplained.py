@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -11,14 +12,20 @@ from scipy.special import gammaln
 from scipy.stats import chi2
 
 from magbridge.diagnose.candidates import Candidate
+from magbridge.diagnose.causes.timing import field_rates
 from magbridge.diagnose.joint import Joint, fit_joint, information
 from magbridge.diagnose.noise import TAILS
 from magbridge.diagnose.problem import Columns, Problem
-from magbridge.diagnose.search import LEVEL, score, weigh
+from magbridge.diagnose.weigh import LEVEL, score, weigh
 
-__all__ = ["Leftover", "Outliers", "kinds", "leftover", "outliers"]
+__all__ = ["Leftover", "Outliers", "flexible", "leftover", "outliers"]
 
 FloatArray = NDArray[np.float64]
+
+BURSTS = 64
+"""Pieces of a log in which something may come and go."""
+LOUD = 3
+"""Descriptions beside the slow ones that are fitted jointly."""
 
 
 class Leftover(NamedTuple):
@@ -53,33 +60,70 @@ class Outliers(NamedTuple):
     p_value: float
 
 
-def kinds(problem: Problem) -> dict[str, tuple[Columns, int, float]]:
-    """Flexible descriptions: kind -> (columns in units of a width, number of columns, hypotheses behind it)."""
+class Flexible(NamedTuple):
+    """A description without a name: columns in units of a width, how many, and the channel that it follows."""
+
+    kind: str
+    columns: Columns
+    size: int
+    channel: str | None = None
+
+
+def flexible(problem: Problem) -> list[Flexible]:
+    """List what structure of any kind is looked for with.
+
+    Slow curves, steps and a function of attitude along each axis of the body, bursts along the field, the rates of
+    change of the field, and a curve through each channel with the side that it came from.
+    """
     t = problem.survey.time
     n = len(t)
     u = (t - t[0]) / max(float(np.ptp(t)), 1.0)
     body = -problem.slopes[:, 6:]
-
-    def projected(basis: FloatArray, width: float) -> Columns:
-        """Each function of time along each axis of the body."""
-
-        def columns(rows: slice) -> FloatArray:
-            return np.asarray(
-                (basis[rows, :, None] * body[rows, None, :]).reshape(basis[rows].shape[0], -1) * width
-            )
-
-        return columns
-
-    slow = np.stack([np.cos(np.pi * k * u) for k in range(1, 13)], axis=1)
-    pieces = (np.arange(n) * 16 // n)[:, None] == np.arange(1, 16)
     x = body / np.linalg.norm(body, axis=1)[:, None]
     powers = [x[:, 0] ** i * x[:, 1] ** j * x[:, 2] ** (4 - i - j) for i in range(5) for j in range(5 - i)]
     attitude = np.stack(powers, axis=1)
-    return {
-        "drift": (projected(slow, 10.0), 36, 1.0),
-        "transient": (projected(pieces.astype(float), 20.0), 45, 1.0),
-        "broadband": (lambda rows: 30.0 * attitude[rows], 15, 1.0),
-    }
+    rates = field_rates(problem)
+    place = np.arange(n)
+
+    def projected(basis: Callable[[slice], FloatArray], width: float) -> Columns:
+        """Each function of time along each axis of the body."""
+
+        def columns(rows: slice) -> FloatArray:
+            part = basis(rows)
+            return np.asarray((part[:, :, None] * body[rows, None, :]).reshape(len(part), -1) * width)
+
+        return columns
+
+    def slow(rows: slice) -> FloatArray:
+        return np.asarray(np.cos(np.pi * u[rows, None] * np.arange(1, 13)))
+
+    def pieces(rows: slice, count: int = 16) -> FloatArray:
+        return np.asarray((place[rows] * count // n)[:, None] == np.arange(1, count), float)
+
+    def curve(values: FloatArray) -> Columns:
+        y = 2.0 * (values - values.min()) / np.ptp(values) - 1.0
+        moved = np.flatnonzero(np.abs(np.diff(y, prepend=y[0])) > 1e-3)
+        came = np.zeros(n)
+        if moved.size:
+            last = np.searchsorted(moved, place, "right") - 1
+            came = np.where(last >= 0, np.sign(np.diff(y, prepend=y[0])[moved[last]]), 0.0)
+        return projected(
+            lambda rows: np.stack([y[rows], y[rows] ** 2, y[rows] ** 3, y[rows] ** 4, came[rows]], 1), 30.0
+        )
+
+    listed = [
+        Flexible("drift", projected(slow, 10.0), 36),
+        Flexible("transient", projected(pieces, 20.0), 45),
+        Flexible("broadband", lambda rows: 30.0 * attitude[rows], 15),
+        Flexible(
+            "transient", lambda rows: 20.0 * problem.gain[rows, None] * pieces(rows, BURSTS), BURSTS - 1
+        ),
+        Flexible("broadband", projected(lambda rows: rates[:, rows].T, 0.3), 9),
+    ]
+    return listed + [
+        Flexible("broadband", curve(channel.values), 15, name)
+        for name, channel in problem.survey.channels.items()
+    ]
 
 
 def leftover(
@@ -94,35 +138,48 @@ def leftover(
     tone : Candidate, optional
         The best periodic disturbance, if the table does not hold that cause.
     """
-    columns = [candidate.columns for candidate in model]
-    found = []
-    for kind, (flexible, size, trials) in kinds(problem).items():
-        info = information(problem, fit.noise, fit, columns, [flexible])
-        s = score(info, slice(0, size))
-        start = np.concatenate([fit.z, fit.coefficients, s.estimate])
-        joint = fit_joint(problem, [*columns, flexible], order, start, ridge=1.0, rounds=4)
-        found.append(_judge(kind, joint, fit, s.freedom, size, 4.0 * trials))
+    listed = flexible(problem)
     if tone is not None:
-        info = information(problem, fit.noise, fit, columns, [tone.columns])
-        s = score(info, slice(0, tone.size))
+        listed.append(Flexible("tone", tone.columns, tone.size))
+    columns = [candidate.columns for candidate in model]
+    info = information(problem, fit.noise, fit, columns, [one.columns for one in listed])
+    ends = np.cumsum([0, *(one.size for one in listed)])
+    scores = [score(info, slice(int(a), int(b))) for a, b in pairwise(ends)]
+    # slow ones the noise may have swallowed: they are always fitted; of the others those that have something to say
+    loud = sorted(range(3, len(listed)), key=lambda k: -scores[k].evidence)[:LOUD]
+    found = []
+    for k in (0, 1, 2, *loud):
+        one, s = listed[k], scores[k]
+        index = np.arange(ends[k], ends[k + 1])
+        start = np.append(info.moved(fit, index, s.estimate), s.estimate)
         joint = fit_joint(
-            problem, [*columns, tone.columns], order, np.concatenate([fit.z, fit.coefficients, s.estimate])
+            problem, [*columns, one.columns], order, start, np.append(start[: -one.size], np.zeros(one.size)),
+            like=fit, ridge=1.0, rounds=3,
+        )  # fmt: skip
+        judged = _judge(
+            one,
+            joint,
+            fit,
+            s.freedom,
+            float(len(listed)) * (tone.trials if tone and one.kind == "tone" else 1.0),
         )
-        judged = _judge("tone", joint, fit, s.freedom, tone.size, tone.trials * 4)
-        found.append(
-            judged._replace(period_s=tone.shape["period"][0], evidence=judged.evidence - np.log(tone.trials))
-        )
-    # stricter than for a cause: with so many numbers the distribution is only asymptotic
-    sure = [entry for entry in found if entry.p_value < 0.1 * LEVEL]
+        if tone is not None and one.kind == "tone":
+            judged = judged._replace(
+                period_s=tone.shape["period"][0], evidence=judged.evidence - float(np.log(tone.trials))
+            )
+        found.append(judged)
+    # without a name stricter than for a cause: with so many numbers the distribution is only asymptotic
+    sure = [entry for entry in found if entry.p_value < (LEVEL if model else 0.1 * LEVEL)]
     if not sure:
         return None
     best = max(sure, key=lambda entry: entry.evidence)
     if best.kind == "transient":
         best = best._replace(kind=_steps(problem, fit))
-    return best._replace(best_channel=_goes_with(problem, fit))
+    return best if best.best_channel else best._replace(best_channel=_goes_with(problem, fit))
 
 
-def _judge(kind: str, joint: Joint, base: Joint, freedom: int, size: int, hypotheses: float) -> Leftover:
+def _judge(one: Flexible, joint: Joint, base: Joint, freedom: int, hypotheses: float) -> Leftover:
+    size = one.size
     b = joint.coefficients[-size:]
     # many slow numbers against few independent samples: the ratio's mean is above its freedom (Bartlett 1937)
     independent = max(base.noise.independent, 2.0 * freedom)
@@ -132,7 +189,7 @@ def _judge(kind: str, joint: Joint, base: Joint, freedom: int, size: int, hypoth
     own = np.linalg.inv(joint.covariance[-size:, -size:])
     # of the flexible fit's own numbers, those that the data determine
     power = max(float(b @ own @ b) - freedom, 0.0)
-    return Leftover(kind, power**0.5, p_value, evidence, None, None)
+    return Leftover(one.kind, power**0.5, p_value, evidence, None, one.channel)
 
 
 def _steps(problem: Problem, fit: Joint) -> str:

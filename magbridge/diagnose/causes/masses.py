@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from magbridge.calibration.followers import MonomialEffect, PlayEffect, PowersEffect
 from magbridge.calibration.terms import full_order
-from magbridge.diagnose.candidates import Candidate, of_effect
+from magbridge.diagnose.candidates import AXES, Candidate, of_effect
 from magbridge.diagnose.causes.channels import channels_of, extent
 from magbridge.diagnose.problem import Problem
 
@@ -59,7 +59,8 @@ def actuator_order(problem: Problem) -> list[Candidate]:
                 for p, e in zip(calibration.parameters, exponents, strict=True)
                 if e
             )
-            made.append(of_effect(problem, effect, 50.0, f"nT for {label}", channel=label))
+            names = tuple(f"{axis} {label}" for axis in AXES)
+            made.append(of_effect(problem, effect, 50.0, "nT", names=names))
     return made
 
 

@@ -8,14 +8,14 @@ from numpy.typing import NDArray
 from magbridge.calibration.followers import ClockEffect
 from magbridge.calibration.instrument import RateEffect
 from magbridge.diagnose.candidates import AXES, Candidate, of_effect
-from magbridge.diagnose.problem import Problem
+from magbridge.diagnose.problem import Columns, Problem, effect_columns
 
-__all__ = ["channel_skew", "clock_offset", "eddy_current", "filter_lag"]
+__all__ = ["channel_skew", "clock_offset", "eddy_current", "field_rates", "filter_lag", "mass_rates"]
 
 FloatArray = NDArray[np.float64]
 
 
-def _rates(problem: Problem) -> FloatArray:
+def field_rates(problem: Problem) -> FloatArray:
     """(3, n) dH_r/dt, nT/s, by differences both ways.
 
     A one-sided difference holds the sample's own noise, which would pass for an effect; a two-sided one is odd in
@@ -29,38 +29,68 @@ def _rates(problem: Problem) -> FloatArray:
     return out
 
 
+def mass_rates(problem: Problem) -> FloatArray:
+    """(9, n) rates of the nine coefficients as the masses move, by the larger of the differences before and after.
+
+    A drive starts and stops between samples and runs evenly meanwhile: a sample is in motion where the mass has moved
+    both before and after it, and the interval that it moved all through tells the speed. Telemetry has no noise that
+    a one-sided difference would bring in.
+    """
+    survey, calibration = problem.survey, problem.calibration
+    kernel = calibration.kernel
+    W = kernel.weights[: kernel.monomials] * np.array([calibration.reference.field] * 6 + [1.0] * 3)
+    positions = survey.values([parameter.name for parameter in calibration.parameters])
+    theta, t = W.T @ kernel.monomials_of(positions), survey.time
+    after = np.diff(theta, axis=1, append=theta[:, -1:]) / np.diff(t, append=t[-1] + 1.0)
+    after[:, :-1] *= survey.follows[1:]
+    before = np.roll(after, 1, axis=1)
+    larger = np.where(np.abs(before) > np.abs(after), before, after)
+    return np.where(before * after > 0.0, larger, 0.0)
+
+
 def eddy_current(problem: Problem) -> list[Candidate]:
     """A turning conductor carries currents: ``T_i += k_ij dH_j/dt``, i != j (Tolles & Lawson 1950)."""
     names = tuple(i + j for i in AXES for j in AXES if i != j)
     effect = RateEffect(cause="eddy_current", on="eddy")
-    return [of_effect(problem, effect, 0.3, "s", names=names, phi=_rates(problem))]
+    return [of_effect(problem, effect, 0.3, "s", names=names, phi=field_rates(problem))]
 
 
 def channel_skew(problem: Problem) -> list[Candidate]:
     """One digitiser takes the channels in turn: ``T_i += tau_i dH_i/dt`` (paper, section 3)."""
     effect = RateEffect(cause="channel_skew", on="skew")
-    return [of_effect(problem, effect, 0.5, "s", phi=_rates(problem))]
+    return [of_effect(problem, effect, 0.5, "s", phi=field_rates(problem))]
 
 
 def filter_lag(problem: Problem) -> list[Candidate]:
     """The anti-alias filter holds the field back against the telemetry: ``T += -tau dH/dt`` (paper, section 3).
 
-    In a uniform field on a vehicle without moving iron it is invisible: ``|H|`` does not change.
+    In a uniform field ``|H|`` does not see it but where masses move: ``u^T A dH_r/dt = -dF/dtheta dtheta/dt``, the
+    signature of a clock that is off the other way. What tells them apart is that no filter runs ahead.
     """
+    if not problem.calibration.parameters:
+        return []
+    columns = _delay(problem)
     effect = RateEffect(cause="filter_lag", on="lag")
-    return [of_effect(problem, effect, 2.0, "s", names=("delay",), phi=_rates(problem))]
+    width = np.array([2.0])
+    return [
+        Candidate(
+            "filter_lag", None, lambda rows: -width * columns(rows), width, ("delay",), ("s",), (effect,), positive=True
+        )
+    ]  # fmt: skip
 
 
 def clock_offset(problem: Problem) -> list[Candidate]:
     """Telemetry stamped by another clock: ``theta += tau dtheta/dp dp/dt``."""
-    survey, calibration = problem.survey, problem.calibration
-    if not calibration.parameters:
+    if not problem.calibration.parameters:
         return []
-    kernel = calibration.kernel
-    W = kernel.weights[: kernel.monomials] * np.array([calibration.reference.field] * 6 + [1.0] * 3)
-    positions = survey.values([parameter.name for parameter in calibration.parameters])
-    theta = W.T @ kernel.monomials_of(positions)
-    rates, t = np.zeros_like(theta), survey.time
-    both = np.flatnonzero(survey.follows[1:-1] & survey.follows[2:]) + 1
-    rates[:, both] = (theta[:, both + 1] - theta[:, both - 1]) / (t[both + 1] - t[both - 1])
-    return [of_effect(problem, ClockEffect(), 5.0, "s", names=("delay",), phi=rates)]
+    columns = _delay(problem)
+    width = np.array([5.0])
+    return [
+        Candidate(
+            "clock_offset", None, lambda rows: width * columns(rows), width, ("delay",), ("s",), (ClockEffect(),)
+        )
+    ]  # fmt: skip
+
+
+def _delay(problem: Problem) -> Columns:
+    return effect_columns(problem, ClockEffect(), mass_rates(problem))
