@@ -21,6 +21,7 @@ from magbridge.errors import ConfigError
 from magbridge.link.component import Component, check_publish
 from magbridge.link.parameters import alignment, telemetry_ages
 from magbridge.link.publish import Sample
+from magbridge.link.reports import Condition
 from magbridge.link.telemetry import TelemetryMap
 from magbridge.mavlink import Codec, Signing, spec
 from magbridge.mavlink.dialect import (
@@ -267,7 +268,7 @@ class Pipeline:
         else:
             say(f"calibration {self._calibration_id:08x}, {calibration.method}")
 
-    def _status(self) -> dict[str, object]:
+    def _status(self) -> Condition:
         """Return what MAG_STATUS says of the sensor, the samples and the log."""
         times, now_us = self._times, self.component.codec.now_us
         span_us = times[-1] - times[0] if len(times) > 1 else 0
@@ -277,22 +278,20 @@ class Pipeline:
             for bit, name in enumerate(self._config.telemetry)
             if bit < 32 and name in tracks and tracks[name].stale(now_us)
         )
-        return {
-            "samples": self._samples,
-            "samples_lost": self._lost,
-            "sensor_bytes_skipped": self._driver.bytes_skipped,
-            "sensor_frames_bad": self._driver.frames_bad,
-            "sensor_state": self.sensor.state,
-            "sensor_clock_drift": -self._clock.drift_ppm,
-            "sample_rate": (len(times) - 1) * 1e6 / span_us if span_us > 0 else nan,
-            "telemetry_stale": stale,
+        return Condition(
+            self._samples,
+            self._lost,
+            self._driver.bytes_skipped,
+            self._driver.frames_bad,
+            self.sensor.state,
+            -self._clock.drift_ppm,
+            (len(times) - 1) * 1e6 / span_us if span_us > 0 else nan,
+            stale,
             # with what waits to be sent: in a replay several timers may fire before it is drained
-            "log_records": self.journal.count + len(self.component.outbox.frames)
-            if self.journal.active
-            else 0,
-            "log_lost": self._log_lost,
-            "log_state": self._log_state,
-        }
+            self.journal.count + len(self.component.outbox.frames) if self.journal.active else 0,
+            self._log_lost,
+            self._log_state,
+        )
 
 
 def check(calibration: Calibration, config: Config) -> None:

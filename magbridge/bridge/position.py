@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from math import nan
+from typing import ClassVar
 
 from magbridge.errors import MagbridgeError
 from magbridge.mavlink import Message, spec
@@ -19,7 +20,7 @@ AGAIN_US = 1_000_000
 class Position:
     """The vehicle's last position; the field model is loaded when the first one comes."""
 
-    MESSAGE = POSITION.id
+    MESSAGE: ClassVar[int] = POSITION.id
 
     def __init__(self) -> None:
         self._where: tuple[float, float, float] | None = None

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import Any
 
 from magbridge.config import Link
 from magbridge.errors import ConfigError
@@ -15,7 +14,7 @@ from magbridge.link.parameter_service import ParameterService
 from magbridge.link.parameters import Parameters, Tunable, rate_name, rates
 from magbridge.link.publish import PUBLISHED, Publisher
 from magbridge.link.rates import Rate
-from magbridge.link.reports import Reports
+from magbridge.link.reports import Condition, Reports
 from magbridge.link.timers import Timers
 from magbridge.link.vehicle import Vehicle
 from magbridge.mavlink import Codec, Message, Signing, TapeWriter, spec
@@ -23,6 +22,7 @@ from magbridge.mavlink.dialect import MAV_SEVERITY
 
 __all__ = ["LIMITS", "Component", "check_publish"]
 
+TIMESYNC = spec("TIMESYNC")
 LIMITS = {
     "HEARTBEAT": (0.2, 10.0),
     "MAG_STATUS": (-1.0, 10.0),
@@ -73,7 +73,7 @@ class Component:
     kept : mapping of str to float
         Parameters that a station changed in an earlier run.
     status : callable
-        Returns the fields of MAG_STATUS that the component cannot know itself (samples, log, sensor).
+        Returns what MAG_STATUS says that the component cannot know itself (samples, log, sensor).
     speaking : callable
         Says whether the sensor speaks: the heartbeat is critical where it does not.
 
@@ -98,7 +98,7 @@ class Component:
         calibration_id: int = 0,
         version: str = "0.0.0",
         kept: Mapping[str, float] | None = None,
-        status: Callable[[], Mapping[str, Any]] = dict,
+        status: Callable[[], Condition] = Condition,
         speaking: Callable[[], bool] = bool,
     ) -> None:
         self._link = link
@@ -127,7 +127,7 @@ class Component:
             spec("PARAM_SET").id: self._if_ours(self._service.write),
             spec("COMMAND_LONG").id: self._command,
             spec("COMMAND_INT").id: self._command,
-            spec("TIMESYNC").id: self._timesync,
+            TIMESYNC.id: self._timesync,
         }
         self._reporters: dict[str, Callable[[], None]] = {
             "HEARTBEAT": self._reports.heartbeat,
@@ -191,23 +191,14 @@ class Component:
         if not self._for_us(message):
             return
         if message["tc1"] == 0:
-            self.outbox.send(
-                "TIMESYNC",
-                tc1=now_us * 1000,
-                ts1=message["ts1"],
-                target_system=message.system,
-                target_component=message.component,
-            )
+            answer = TIMESYNC.struct.pack(now_us * 1000, message["ts1"], message.system, message.component)
+            self.outbox.put(TIMESYNC, answer)
         elif (message.system, message.component) == (self._link.system, self._link.autopilot):
             self.vehicle.clock.answer(message["tc1"], message["ts1"], now_us)
 
     def _ask_time(self, t_us: int) -> None:
-        self.outbox.send(
-            "TIMESYNC",
-            ts1=self.vehicle.clock.ask(t_us),
-            target_system=self._link.system,
-            target_component=self._link.autopilot,
-        )
+        ts1 = self.vehicle.clock.ask(t_us)
+        self.outbox.put(TIMESYNC, TIMESYNC.struct.pack(0, ts1, self._link.system, self._link.autopilot))
 
     def _start_timer(self, name: str, first_us: int) -> None:
         hertz = self.rates[name].hertz

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from magbridge.mavlink import Codec
+from magbridge.mavlink import Codec, Spec
 
 __all__ = ["Outbox"]
 
@@ -24,9 +24,13 @@ class Outbox:
         self.codec = codec
         self.frames: list[tuple[int, bytes]] = []
 
-    def send(self, name: str, /, **fields: Any) -> None:
+    def send(self, _name: str, **fields: Any) -> None:
         """Pack a message by name; fields not named are zero."""
-        self.frames.append((self.codec.now_us, self.codec.pack(name, **fields)))
+        self.frames.append((self.codec.now_us, self.codec.pack(_name, **fields)))
+
+    def put(self, layout: Spec, payload: bytes) -> None:
+        """Send a packed payload (``layout.struct.pack(...)``): the cheapest way."""
+        self.frames.append((self.codec.now_us, self.codec.frame(layout, payload)))
 
     def drain(self) -> list[tuple[int, bytes]]:
         """Return what waits, and forget it."""

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Callable
+from math import nan
+from typing import NamedTuple
 
 from magbridge.link.outbox import Outbox
 from magbridge.link.vehicle import Vehicle
@@ -16,13 +17,16 @@ from magbridge.mavlink.dialect import (
     MAV_TYPE,
 )
 
-__all__ = ["Reports"]
+__all__ = ["Condition", "Reports"]
 
+HEARTBEAT, STATUS = spec("HEARTBEAT"), spec("MAG_STATUS")
 MASK = 0xFFFFFFFF
-COUNTERS = [field.name for field in spec("MAG_STATUS").fields.values() if field.code == "I"]
-UNKNOWN = float("nan")
-NOTHING = {**dict.fromkeys(COUNTERS, 0), "sample_rate": UNKNOWN, "sensor_clock_drift": UNKNOWN}
-"""What MAG_STATUS says where nobody above knows."""
+ALIVE, CRITICAL = (
+    HEARTBEAT.payload(
+        type=MAV_TYPE.ONBOARD_CONTROLLER, autopilot=MAV_AUTOPILOT.INVALID, system_status=state, mavlink_version=3
+    )
+    for state in (MAV_STATE.ACTIVE, MAV_STATE.CRITICAL)
+)
 OFFICIAL = 255
 """FIRMWARE_VERSION_TYPE_OFFICIAL"""
 CAPABILITIES = (
@@ -30,6 +34,22 @@ CAPABILITIES = (
     | MAV_PROTOCOL_CAPABILITY.COMMAND_INT
     | MAV_PROTOCOL_CAPABILITY.MAVLINK2
 )
+
+
+class Condition(NamedTuple):
+    """What MAG_STATUS says that the rooms above know; fields, units and states as in the message."""
+
+    samples: int = 0
+    samples_lost: int = 0
+    sensor_bytes_skipped: int = 0
+    sensor_frames_bad: int = 0
+    sensor_state: int = 0
+    sensor_clock_drift: float = nan
+    sample_rate: float = nan
+    telemetry_stale: int = 0
+    log_records: int = 0
+    log_lost: int = 0
+    log_state: int = 0
 
 
 class Reports:
@@ -45,7 +65,7 @@ class Reports:
         Of the program, ``"0.1.0"``.
     calibration_id : int
     status : callable
-        Returns fields of MAG_STATUS: what the rooms above know.
+        Returns the Condition.
     speaking : callable
         Says whether the sensor speaks.
     """
@@ -57,7 +77,7 @@ class Reports:
         start_us: int,
         version: str,
         calibration_id: int,
-        status: Callable[[], Mapping[str, Any]],
+        status: Callable[[], Condition],
         speaking: Callable[[], bool],
     ) -> None:
         self._outbox, self._vehicle, self._status = outbox, vehicle, status
@@ -66,39 +86,38 @@ class Reports:
 
     def heartbeat(self) -> None:
         """Send HEARTBEAT: active while the sensor speaks, else critical."""
-        self._outbox.send(
-            "HEARTBEAT",
-            type=MAV_TYPE.ONBOARD_CONTROLLER,
-            autopilot=MAV_AUTOPILOT.INVALID,
-            system_status=MAV_STATE.ACTIVE if self._speaking() else MAV_STATE.CRITICAL,
-            mavlink_version=3,
-        )
+        self._outbox.put(HEARTBEAT, ALIVE if self._speaking() else CRITICAL)
 
     def status(self) -> None:
         """Send MAG_STATUS."""
         codec, vehicle, clock = self._outbox.codec, self._vehicle, self._vehicle.clock
-        fields: dict[str, Any] = {
-            **NOTHING,
-            "calibration_id": self._calibration_id,
-            **self._status(),
-            "uptime": (codec.now_us - self._start_us) // 1_000_000,
-            "link_frames": codec.frames,
-            "link_frames_lost": vehicle.frames_lost,
-            "link_bytes_skipped": codec.bytes_skipped,
-            "link_refused": codec.signing.refused if codec.signing else 0,
-            "vehicle_reboots": vehicle.reboots & 0xFFFF,
-            "autopilot_state": vehicle.state,
-            "vehicle_clock_drift": clock.drift_ppm,
-            "vehicle_clock_sigma": clock.sigma,
-        }
-        for name in COUNTERS:
-            fields[name] &= MASK
-        self._outbox.send(
-            "MAG_STATUS",
-            time_usec=codec.now_us,
-            vehicle_clock_offset=round(clock.offset_us(codec.now_us)),
-            **fields,
+        condition = self._status()
+        payload = STATUS.struct.pack(
+            codec.now_us,
+            round(clock.offset_us(codec.now_us)),
+            (codec.now_us - self._start_us) // 1_000_000 & MASK,
+            self._calibration_id,
+            condition.samples & MASK,
+            condition.samples_lost & MASK,
+            condition.sensor_bytes_skipped & MASK,
+            condition.sensor_frames_bad & MASK,
+            codec.frames & MASK,
+            vehicle.frames_lost & MASK,
+            codec.bytes_skipped & MASK,
+            codec.signing.refused & MASK if codec.signing else 0,
+            condition.log_records & MASK,
+            condition.log_lost & MASK,
+            condition.telemetry_stale,
+            condition.sample_rate,
+            condition.sensor_clock_drift,
+            clock.sigma,
+            clock.drift_ppm,
+            vehicle.reboots & 0xFFFF,
+            condition.sensor_state,
+            vehicle.state,
+            condition.log_state,
         )
+        self._outbox.put(STATUS, payload)
 
     def version(self) -> None:
         """Send AUTOPILOT_VERSION."""
@@ -111,5 +130,5 @@ class Reports:
 
     def sample_interval_us(self) -> int:
         """Return the us between samples of late; 0 while not known."""
-        rate = self._status().get("sample_rate", 0.0)
+        rate = self._status().sample_rate
         return round(1e6 / rate) if rate > 0 else 0

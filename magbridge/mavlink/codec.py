@@ -77,9 +77,9 @@ class Codec:
         self._rest, self._looked = data[begin:], at - begin
         return found
 
-    def pack(self, name: str, /, **fields: Any) -> bytes:
+    def pack(self, _name: str, **fields: Any) -> bytes:
         """Return the frame of a message; fields not named are zero."""
-        layout = spec(name)
+        layout = spec(_name)
         return self.frame(layout, layout.payload(**fields))
 
     def frame(self, layout: Spec, payload: bytes) -> bytes:

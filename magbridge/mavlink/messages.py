@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from functools import cache, cached_property
+from functools import cache
 from struct import Struct
 from typing import Any
 
@@ -92,11 +92,10 @@ class Spec:
             form += field.struct.format[1:]
         self.size = offset
         self.struct = Struct(form)
-
-    @cached_property
-    def defaults(self) -> dict[str, Any]:
-        """Zeros: what a field is that nobody names."""
-        return {name: field.get(bytes(self.size)) for name, field in self.fields.items()}
+        zeros = bytes(offset)
+        self._defaults = {name: field.get(zeros) for name, field in self.fields.items()}
+        # not one number: texts and arrays
+        self._uneven = [field for field in self.fields.values() if field.count or field.code == "s"]
 
     def payload(self, **fields: Any) -> bytes:
         """Pack `fields` by name; those not named are zero.
@@ -108,22 +107,17 @@ class Spec:
         struct.error
             A value does not fit its field.
         """
-        given = self.defaults | fields  # in the order of the wire
+        given = self._defaults | fields  # in the order of the wire
         if len(given) != len(self.fields):
             raise KeyError(f"{self.name} has no field {', '.join(sorted(given.keys() - self.fields.keys()))}")
-        if not self.uneven:
+        if not self._uneven:
             return self.struct.pack(*given.values())
-        for field in self.uneven:
+        for field in self._uneven:
             given[field.name] = field.put(given[field.name])
         values: list[Any] = []
         for value in given.values():
             values += value if isinstance(value, tuple) else (value,)
         return self.struct.pack(*values)
-
-    @cached_property
-    def uneven(self) -> list[Field]:
-        """The fields that are not one number: texts and arrays."""
-        return [field for field in self.fields.values() if field.count or field.code == "s"]
 
 
 @cache

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from magbridge.config import Align, Link
 from magbridge.errors import ConfigError
 from magbridge.link import Component, alignment, check_publish
+from magbridge.link.reports import Condition
 from magbridge.mavlink import Codec, Signing, TapeReader, spec
 from magbridge.mavlink.dialect import MAG_PORT_STATE
 
@@ -50,7 +51,7 @@ def test_next_deadline_is_when_something_is_sent(link):
 def test_status(make_link):
     link = make_link(
         calibration_id=7,
-        status=lambda: {"samples": 5, "sensor_state": MAG_PORT_STATE.OK, "log_records": (1 << 32) + 3},
+        status=lambda: Condition(samples=5, sensor_state=MAG_PORT_STATE.OK, log_records=(1 << 32) + 3),
         speaking=lambda: True,
     )
     link.to(0)
