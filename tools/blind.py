@@ -18,7 +18,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # processes share the cores,
 sys.path.insert(0, str(Path(__file__).parent))
 
 from distributed import Client, LocalCluster, as_completed
-from study.cases import PARTS, case, plan
+from study.cases import PARTS, plan
 from study.figures import plot_confusion, plot_detection
 from study.table import lines
 
@@ -31,16 +31,26 @@ def read(log: Path) -> dict[int, Row]:
     return {row["number"]: row for row in (json.loads(line) for line in whole if line.endswith("\n"))}
 
 
+def case_there(folder: str, entry: Row) -> Row:
+    """Run a case on a worker; as a function of the main program it travels by value, and finds the tools there."""
+    if folder not in sys.path:
+        sys.path.insert(0, folder)
+    from study.cases import case  # noqa: PLC0415  (the worker's own)
+
+    return case(entry)
+
+
 def run(client: Client, todo: list[Row], log: Path) -> list[str]:
     """Run cases on a cluster; append each to the log as it comes. Returns what failed."""
-    client.run(sys.path.insert, 0, str(Path(__file__).parent))
     if log.exists() and not log.read_bytes().endswith(b"\n"):
         log.write_text(
             "".join(line for line in log.read_text().splitlines(keepends=True) if line.endswith("\n"))
         )
     failed = []
     with log.open("a") as file:
-        futures = {client.submit(case, entry, pure=False, retries=0): entry for entry in todo}
+        futures = {
+            client.submit(case_there, str(Path(__file__).parent), entry, pure=False): entry for entry in todo
+        }
         for k, future in enumerate(as_completed(futures), 1):
             error = future.exception()
             if error is None:
@@ -68,6 +78,9 @@ def main() -> None:
         "--scheduler", default="", help="address of a dask scheduler; a local cluster if not given"
     )
     parser.add_argument("--workers", type=int, default=2, help="processes of the local cluster")
+    parser.add_argument(
+        "--wait-for", type=int, default=1, help="workers that a scheduler must have before it starts"
+    )
     options = parser.parse_args()
     parts = tuple(options.part.split(","))
     if not set(parts) <= set(PARTS):
@@ -79,6 +92,7 @@ def main() -> None:
     print(f"{len(done)} cases done, {len(todo)} to do")
     if options.scheduler:
         with Client(options.scheduler) as client:
+            client.wait_for_workers(options.wait_for, timeout=60)
             failed = run(client, todo, log)
     elif todo:
         with (

@@ -67,12 +67,13 @@ def plot_detection(rows: Sequence[Row], path: Path) -> None:
             size, p, spread, fmt="o", color="tab:blue", label="measured" if size == sizes[0] else None
         )
     a = np.geomspace(1.5, 100.0, 200)
-    half, sure = np.array([r["half"] for r in single]).T
-    curve = norm.cdf((a[:, None] - half) / ((sure - half) / 1.645)).mean(axis=1)
-    axis.plot(a, curve, color="0.4", label="theory")
+    if single:
+        half, sure = np.array([r["half"] for r in single]).T
+        curve = norm.cdf((a[:, None] - half) / ((sure - half) / 1.645)).mean(axis=1)
+        axis.plot(a, curve, color="0.4", label="theory")
+        axis.legend()
     axis.set(xscale="log", xlabel="signal-to-noise", ylabel="share found", ylim=(-0.02, 1.04))
     axis.set_xticks(sizes, [f"{size:g}" for size in sizes])
     axis.minorticks_off()
     axis.grid(alpha=0.3)
-    axis.legend()
     figure.savefig(path, dpi=110)

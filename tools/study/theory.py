@@ -91,9 +91,11 @@ def ideal(
     inside = table > table.max(axis=0) - ODDS
     first = np.argmax(table, axis=0)
     me = names.index(name)
+    # what the log cannot test, nobody names
+    testable = any(c.cause == name for c in candidates)
     return {
-        "alone": float(np.mean((first == me) & (inside.sum(axis=0) == 1))),
-        "inside": float(np.mean(inside[me])),
+        "alone": float(np.mean((first == me) & (inside.sum(axis=0) == 1))) * testable,
+        "inside": float(np.mean(inside[me])) * testable,
         "size": float(np.mean(inside.sum(axis=0))),
         "beside": {cause: float(np.mean(inside[j])) for j, cause in enumerate(names) if inside[j].any()},
         "first": {cause: float(np.mean(first == j)) for j, cause in enumerate(names) if (first == j).any()},

@@ -1,0 +1,152 @@
+"""The blind study's own arithmetic, and its run on a cluster of two processes."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+import numpy as np
+import pytest
+from study.cases import PARTS, plan
+from study.stage import MEMORY, project, whiten
+from study.table import efficiency, lines, share
+from study.theory import weigh
+
+TOOLS = Path(__file__).parents[2] / "tools"
+
+
+def test_what_a_free_calibration_absorbs_against_the_naive_way() -> None:
+    rng = np.random.default_rng(1)
+    n, k = 300, 5
+    A, X = rng.normal(size=(n, k)), rng.normal(size=(n, 2))
+    prior = np.diag([0.1, 1.0, 10.0, 0.0, 1e-3]) * 0.1
+    whole = np.eye(n) + A @ prior @ A.T
+    np.testing.assert_allclose(project(X, A, prior), np.linalg.solve(whole, X), atol=1e-10)
+
+
+def test_whitened_noise_is_white() -> None:
+    rng = np.random.default_rng(2)
+    noise = rng.normal(size=20_000)
+    noise[1:] *= np.sqrt(1 - MEMORY**2)
+    for i in range(1, len(noise)):
+        noise[i] += MEMORY * noise[i - 1]
+    white = whiten(noise, "ar")
+    assert np.std(white) == pytest.approx(1.0, abs=0.02)
+    assert abs(np.mean(white[1:] * white[:-1])) < 0.02
+    assert np.std(whiten(1.5 * rng.normal(size=20_000), "half")) == pytest.approx(1.0, abs=0.02)
+
+
+def test_a_longer_study_holds_the_shorter_and_every_part_has_its_share() -> None:
+    short, long = plan(200), plan(800)
+    numbers = [entry["number"] for entry in long]
+    assert len(set(numbers)) == len(numbers)
+    assert {entry["number"] for entry in short} <= set(numbers)
+    assert sum(part.share for part in PARTS.values()) == pytest.approx(1.0)
+    assert {entry["part"] for entry in short} == set(PARTS)
+    first = [entry["part"] for entry in long[: len(long) // 4]]
+    for name, part in PARTS.items():  # no part waits for another
+        assert first.count(name) == pytest.approx(part.share * len(first), abs=3)
+    assert {entry["part"] for entry in plan(200, ("null",))} == {"null"}
+
+
+def test_the_point_of_half_detection_is_read_off_a_ladder() -> None:
+    rng = np.random.default_rng(3)
+    a = rng.uniform(2.0, 8.0, 2000)
+    rows = [
+        {
+            "wanted": x,
+            "half": [4.0, 5.6],
+            "verdict": "explained" if x / 1.2 + rng.normal() * 0.97 > 4.0 else "nothing_found",
+        }
+        for x in a
+    ]
+    factor, low, high = efficiency(rows) or (0.0, 0.0, 0.0)
+    assert factor == pytest.approx(1.2, abs=0.03)
+    assert low < factor < high < low + 0.06
+
+
+def test_evidence_asks_its_price() -> None:
+    assert weigh(np.array([3.0]), 3) == pytest.approx(0.0)
+    assert weigh(np.array([60.0]), 3) < weigh(np.array([60.0]), 1)
+
+
+def test_a_share_tells_its_interval() -> None:
+    rows = [{"k": k} for k in range(100)]
+    assert share(rows, lambda r: r["k"] < 1) == "1.0 % (0.0-5.4) | 1/100"
+    assert share([], bool) == "not run | 0"
+    assert "not run" in "\n".join(lines([]))
+
+
+def started(stack: ExitStack, *command: str, cwd: Path) -> None:
+    """A process that ends with the stack."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", *command], cwd=cwd, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+        env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
+    )  # fmt: skip
+
+    def end() -> None:
+        process.send_signal(signal.SIGTERM)
+        try:
+            process.wait(10)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+
+    stack.callback(end)
+
+
+@pytest.fixture
+def scheduler(tmp_path: Path) -> Iterator[str]:
+    """A real scheduler with two worker processes; its address."""
+    file = tmp_path / "scheduler.json"
+    with ExitStack() as stack:
+        started(
+            stack, "distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard",
+            "--scheduler-file", str(file), cwd=tmp_path,
+        )  # fmt: skip
+        deadline = time.monotonic() + 60.0
+        while not (file.exists() and file.read_text().strip()):
+            assert time.monotonic() < deadline, "no scheduler"
+            time.sleep(0.05)
+        address = json.loads(file.read_text())["address"]
+        for _ in range(2):
+            started(
+                stack, "distributed.cli.dask_worker", address, "--nworkers", "1", "--nthreads", "1", "--no-dashboard",
+                "--no-nanny", "--local-directory", str(tmp_path), cwd=tmp_path,
+            )  # fmt: skip
+        yield address
+
+
+def test_a_cluster_that_is_there_and_a_study_that_goes_on(scheduler: str, tmp_path: Path) -> None:
+    """Two worker processes share the cases; a second, longer run adds what is missing to the first."""
+
+    def run(cases: int) -> str:
+        command = [TOOLS / "blind.py", "--cases", str(cases), "--part", "null", "--out", tmp_path / "out"]
+        done = subprocess.run(
+            [sys.executable, *command, "--scheduler", scheduler, "--wait-for", "2"],
+            capture_output=True, text=True, timeout=240, check=False,
+        )  # fmt: skip
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    assert "0 cases done, 2 to do" in run(8)
+    log = tmp_path / "out" / "cases.jsonl"
+    before = log.read_text()
+    with log.open("a") as file:
+        file.write('{"number": 7')  # it was stopped while it wrote
+    assert "2 cases done, 1 to do" in run(12)
+    after = log.read_text()
+    assert after.startswith(before)
+    rows = [json.loads(line) for line in after.splitlines()]
+    assert [r["part"] for r in rows] == ["null"] * 3
+    assert len({r["worker"] for r in rows[:2]}) == 2
+    assert os.getpid() not in {r["worker"] for r in rows}
+    assert "false alarm on nulls | at most 1 % |" in (tmp_path / "out" / "table.md").read_text()
+    assert (tmp_path / "out" / "confusion.png").stat().st_size > 10_000
