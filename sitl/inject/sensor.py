@@ -71,10 +71,10 @@ def anti_alias(scene: Scene, size: float, rng: Generator) -> None:  # noqa: ARG0
     scene.truth["delay"] = size
 
 
-def late_stamps(scene: Scene, size: float, rng: Generator) -> None:  # noqa: ARG001  (a clock has no direction)
-    """The telemetry's clock is behind; size in s."""
-    scene.late = size
-    scene.truth["delay"] = size
+def late_stamps(scene: Scene, size: float, rng: Generator) -> None:
+    """The telemetry's clock is behind, or ahead; size in s."""
+    scene.late = size * float(rng.choice([-1.0, 1.0]))
+    scene.truth["delay"] = scene.late
 
 
 def core(scene: Scene, size: float, rng: Generator) -> None:

@@ -110,9 +110,10 @@ def test_a_late_clock_shifts_the_telemetry_only(stage: Stage) -> None:
     own, ds = effect(stage, "clock_offset", 20.0)
     assert not own.any()
     _, track, when = stage
-    assert ds["ballast"].to_numpy()[1:] == pytest.approx(
-        np.interp(when[1:] - 1.0, track.elapsed, track.parameters["ballast"])
-    )
+    late = json.loads(ds.attrs["truth"])["delay"]
+    assert abs(late) == pytest.approx(1.0)
+    then = np.interp(when - late, track.elapsed, track.parameters["ballast"])
+    assert ds["ballast"].to_numpy()[1:] == pytest.approx(then[1:])
 
 
 def test_skew_reads_each_channel_in_its_own_time(stage: Stage) -> None:

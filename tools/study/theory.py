@@ -49,7 +49,8 @@ def ideal(
     -------
     dict
         ``alone``: chance to name the truth alone; ``inside``: that the set holds it; ``size``: the set's mean size;
-        ``beside``: cause -> chance to be in the set; ``first``: to be named first; ``unlike``: signal-to-noise that the
+        ``beside``: cause -> chance to be in the set; ``first``: to be named first; ``own``: share of
+        the signal-to-noise that the table's regressors of the true cause reach; ``unlike``: signal-to-noise that the
         best imitation leaves, and ``mimic``: whose that is.
     """
     name, calibration = one.hidden.name, stall.stage.calibration
@@ -75,12 +76,16 @@ def ideal(
     spans += [(cause, "", slice(k, k + 1), 0.0) for k, cause in enumerate(others, len(S) - 1 - len(others))]
     for cause, channel, own, price in spans:
         root = _root(S[own, own])
-        explained = float(np.sum((root.T @ S[own, -1]) ** 2))
+        given = S[own, -1:]
+        drawn = scores[own]
+        if cause == "filter_lag":  # it cannot lead
+            given, drawn = np.maximum(given, 0.0), np.maximum(drawn, 0.0)
+        explained = float(np.sum((root.T @ given) ** 2))
         if cause == name:
             freedom[name] = max(freedom[name], (explained, root.shape[1]))
         elif explained > nearest[0]:
             nearest = (explained, cause)
-        ratio = np.sum((root.T @ scores[own]) ** 2, axis=0)
+        ratio = np.sum((root.T @ drawn) ** 2, axis=0)
         groups.setdefault((cause, channel), []).append((weigh(ratio, root.shape[1]), price))
     k = freedom[name][1]
     # its k - 1 other numbers fit nothing but noise
@@ -99,6 +104,7 @@ def ideal(
         "size": float(np.mean(inside.sum(axis=0))),
         "beside": {cause: float(np.mean(inside[j])) for j, cause in enumerate(names) if inside[j].any()},
         "first": {cause: float(np.mean(first == j)) for j, cause in enumerate(names) if (first == j).any()},
+        "own": float(np.sqrt(freedom[name][0] / S[-1, -1])),
         "unlike": float(np.sqrt(max(S[-1, -1] - nearest[0], 0.0))),
         "mimic": nearest[1],
     }
