@@ -2,11 +2,12 @@
 
 Notes
 -----
-With ``A, T`` at the sample's positions and V the covariance of the corrected vector::
+With ``A' = R A`` and T at the sample's positions, R the boresight and Omega its covariance, V the covariance of
+the corrected vector::
 
-    d = H_r - T,  b = A d,  F = |b|,  u = b / F
-    V_ij = Q_ij . (d d^T) + L_ij . d + O_ij         (dA, dT and the sensor's noise carried through)
-    sigma_F^2 = u^T V u
+    d = H_r - T,  b = A' d,  F = |b|,  u = b / F
+    V_ij = Q_ij . (d d^T) + L_ij . d + O_ij         (dA', dT and the sensor's noise carried through)
+    sigma_F^2 = u^T V u,  sigma_i^2 = V_ii + ([b] Omega [b]^T)_ii
 
 Every operation is elementwise IEEE arithmetic in one written order, on floats or on arrays, but for the
 products of :class:`~magbridge.calibration.kernel.Kernel`, which are exact in any order: so a sample
@@ -20,51 +21,43 @@ from typing import Any
 
 __all__ = ["apply", "prepare"]
 
+PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+
 
 def prepare(t: Sequence[Any]) -> tuple[Any, ...]:
-    """From the table's 69 sums to what a sample needs, at one set of positions.
+    """From the table's 81 sums to what a sample needs, at one set of positions.
 
-    ``L_ij,k = -(G_ik,j + G_jk,i)`` with ``G = S_aT A``, and ``O = A S_TT A``.
+    ``L_ij,k = -(G_ik,j + G_jk,i)`` with ``G = S_a'T A'^T``, and ``O = A' S_TT A'^T``.
     """
-    xx, yy, zz, xy, xz, yz = t[:6]
-    G = []
-    for s in range(45, 63, 3):
-        x, y, z = t[s : s + 3]
-        G.append((x * xx + y * xy + z * xz, x * xy + y * yy + z * yz, x * xz + y * yz + z * zz))
-    gxx, gyy, gzz, gxy, gxz, gyz = G
-    L = (
-        (-2.0 * gxx[0], -2.0 * gxy[0], -2.0 * gxz[0]),
-        (-2.0 * gxy[1], -2.0 * gyy[1], -2.0 * gyz[1]),
-        (-2.0 * gxz[2], -2.0 * gyz[2], -2.0 * gzz[2]),
-        (-(gxx[1] + gxy[0]), -(gxy[1] + gyy[0]), -(gxz[1] + gyz[0])),
-        (-(gxx[2] + gxz[0]), -(gxy[2] + gyz[0]), -(gxz[2] + gzz[0])),
-        (-(gxy[2] + gxz[1]), -(gyy[2] + gyz[1]), -(gyz[2] + gzz[1])),
-    )
-    a, b, c, d, e, f = t[63:69]  # S_TT: xx yy zz xy xz yz
-    px, py, pz = a * xx + d * xy + e * xz, d * xx + b * xy + f * xz, e * xx + f * xy + c * xz
-    qx, qy, qz = a * xy + d * yy + e * yz, d * xy + b * yy + f * yz, e * xy + f * yy + c * yz
-    rx, ry, rz = a * xz + d * yz + e * zz, d * xz + b * yz + f * zz, e * xz + f * yz + c * zz
-    O = (  # noqa: E741  (the notes' letter)
-        xx * px + xy * py + xz * pz,
-        xy * qx + yy * qy + yz * qz,
-        xz * rx + yz * ry + zz * rz,
-        xx * qx + xy * qy + xz * qz,
-        xx * rx + xy * ry + xz * rz,
-        xy * rx + yy * ry + yz * rz,
-    )
-    V = tuple((*t[9 + 6 * i : 15 + 6 * i], *L[i], O[i]) for i in range(6))
-    return (*t[:9], V)
+    A = t[0:3], t[3:6], t[6:9]
+    G = [
+        [x * ax + y * ay + z * az for ax, ay, az in A] for x, y, z in zip(*[iter(t[48:75])] * 3, strict=True)
+    ]
+    sxx, syy, szz, sxy, sxz, syz = t[75:81]
+    AS = [
+        (sxx * x + sxy * y + sxz * z, sxy * x + syy * y + syz * z, sxz * x + syz * y + szz * z)
+        for x, y, z in A
+    ]
+    V = []
+    for e, (i, j) in enumerate(PAIRS):
+        L = [-(G[3 * i + k][j] + G[3 * j + k][i]) for k in range(3)]
+        (x, y, z), (p, q, r) = A[i], AS[j]
+        V.append((*t[12 + 6 * e : 18 + 6 * e], *L, x * p + y * q + z * r))
+    return (*t[:12], V)
 
 
 def apply(
-    hx: Any, hy: Any, hz: Any, prepared: tuple[Any, ...], sight: tuple[float, ...] | None, root: Any
+    hx: Any, hy: Any, hz: Any, prepared: tuple[Any, ...], omega: tuple[float, ...] | None, root: Any
 ) -> tuple[Any, ...]:
-    """One sample (or arrays of them): total, sigma, vector, sigmas of the vector."""
-    xx, yy, zz, xy, xz, yz, tx, ty, tz, V = prepared
+    """One sample (or arrays of them): total, sigma, vector, sigmas of the vector.
+
+    `omega` holds xx, yy, zz, xy, xz, yz of the boresight's covariance; None where there is no boresight.
+    """
+    xx, xy, xz, yx, yy, yz, zx, zy, zz, tx, ty, tz, V = prepared
     dx, dy, dz = hx - tx, hy - ty, hz - tz
     bx = xx * dx + xy * dy + xz * dz
-    by = xy * dx + yy * dy + yz * dz
-    bz = xz * dx + yz * dy + zz * dz
+    by = yx * dx + yy * dy + yz * dz
+    bz = zx * dx + zy * dy + zz * dz
     F = root(bx * bx + by * by + bz * bz)
     over = 1.0 / (F + 1e-300)  # a vector of exactly nothing has no direction, and must not raise
     ux, uy, uz = bx * over, by * over, bz * over
@@ -77,26 +70,10 @@ def apply(
         ux * ux * vxx + uy * uy * vyy + uz * uz * vzz
         + 2.0 * (ux * uy * vxy + ux * uz * vxz + uy * uz * vyz)
     )  # fmt: skip
+    if omega is not None:  # it turns the vector, and leaves its length
+        oxx, oyy, ozz, oxy, oxz, oyz = omega
+        vxx = vxx + (bz * bz * oyy + by * by * ozz - 2.0 * by * bz * oyz)
+        vyy = vyy + (bz * bz * oxx + bx * bx * ozz - 2.0 * bx * bz * oxz)
+        vzz = vzz + (by * by * oxx + bx * bx * oyy - 2.0 * bx * by * oxy)
     # abs: rounding may leave a variance of nothing at -1e-12
-    if sight is None:
-        return F, root(abs(variance)), bx, by, bz, root(abs(vxx)), root(abs(vyy)), root(abs(vzz))
-    return (F, root(abs(variance)), *rotate(bx, by, bz, vxx, vyy, vzz, vxy, vxz, vyz, sight, root))
-
-
-def rotate(
-    bx: Any, by: Any, bz: Any, vxx: Any, vyy: Any, vzz: Any, vxy: Any, vxz: Any, vyz: Any,
-    sight: tuple[float, ...], root: Any,
-) -> tuple[Any, ...]:  # fmt: skip
-    """Into body axes: ``b' = R b``, ``V' = R V R^T + [b'] Omega [b']^T``, Omega the boresight's own."""
-    oxx, oyy, ozz, oxy, oxz, oyz = sight[9:]
-    rows = (sight[0:3], sight[3:6], sight[6:9])
-    px, py, pz = [rx * bx + ry * by + rz * bz for rx, ry, rz in rows]
-    wx, wy, wz = [
-        rx * rx * vxx + ry * ry * vyy + rz * rz * vzz
-        + 2.0 * (rx * ry * vxy + rx * rz * vxz + ry * rz * vyz)
-        for rx, ry, rz in rows
-    ]  # fmt: skip
-    wx = wx + (pz * pz * oyy + py * py * ozz - 2.0 * py * pz * oyz)
-    wy = wy + (pz * pz * oxx + px * px * ozz - 2.0 * px * pz * oxz)
-    wz = wz + (py * py * oxx + px * px * oyy - 2.0 * px * py * oxy)
-    return px, py, pz, root(abs(wx)), root(abs(wy)), root(abs(wz))
+    return F, root(abs(variance)), bx, by, bz, root(abs(vxx)), root(abs(vyy)), root(abs(vzz))

@@ -52,15 +52,12 @@ class CorrectedArrays(NamedTuple):
     quality: NDArray[np.int64]
 
 
-def _sight(calibration: Calibration) -> tuple[float, ...] | None:
-    """Boresight as 9 numbers of R, then 6 of its covariance."""
+def _omega(calibration: Calibration) -> tuple[float, ...] | None:
+    """Six entries of the boresight's covariance, as :func:`.arithmetic.apply` takes them."""
     if calibration.boresight is None:
         return None
     O = calibration.boresight.covariance  # noqa: E741
-    return (
-        *calibration.boresight.matrix().ravel().tolist(),
-        O[0][0], O[1][1], O[2][2], O[0][1], O[0][2], O[1][2],
-    )  # fmt: skip
+    return O[0][0], O[1][1], O[2][2], O[0][1], O[0][2], O[1][2]
 
 
 class Corrector:
@@ -78,7 +75,7 @@ class Corrector:
     def __init__(self, calibration: Calibration) -> None:
         self.calibration = calibration
         self._kernel = calibration.kernel
-        self._sight = _sight(calibration)
+        self._omega = _omega(calibration)
         self._steps = [effect.begin(calibration) for effect in calibration.effects]
         self._base = _base_flags(calibration)
         self._ranges = _ranges(calibration)
@@ -125,7 +122,7 @@ class Corrector:
             if regressors != self._last:
                 self._last = regressors
                 self._prepared = prepare(self._kernel.sums_of_one(regressors))
-        F, sigma, x, y, z, sx, sy, sz = apply(hx, hy, hz, self._prepared, self._sight, sqrt)
+        F, sigma, x, y, z, sx, sy, sz = apply(hx, hy, hz, self._prepared, self._omega, sqrt)
         quality |= self._flags
         if F - F != 0.0:  # NaN or infinite
             quality |= GAP if hx + hy + hz - (hx + hy + hz) != 0.0 else 0
@@ -194,7 +191,7 @@ def correct(
             f"found {channels.shape[1]}"
         )
     out = np.empty((8, n))
-    kernel, sight = calibration.kernel, _sight(calibration)
+    kernel, omega = calibration.kernel, _omega(calibration)
     steps = [effect.begin(calibration) for effect in calibration.effects]
     with np.errstate(all="ignore"):  # NaN in, NaN out: flagged below
         for start in range(0, n, CHUNK):
@@ -202,7 +199,7 @@ def correct(
             phi = _regressors(kernel, steps, field[part], channels[part], time[part])
             prepared = _stage_many(kernel, phi)
             hx, hy, hz = field[part].T
-            out[:, part] = apply(hx, hy, hz, prepared, sight, np.sqrt)
+            out[:, part] = apply(hx, hy, hz, prepared, omega, np.sqrt)
         quality = np.full(n, _base_flags(calibration))
         for value, (low, high) in zip(channels.T, _ranges(calibration), strict=False):
             quality |= np.where((value < low) | (value > high), EXTRAPOLATED, 0)
@@ -244,7 +241,7 @@ def _stage_many(kernel: Kernel, phi: FloatArray) -> tuple[Any, ...]:
     phi = phi[:, new]
     prepared = prepare(list(kernel.sums(phi)))
     back = np.cumsum(new) - 1
-    return (*(row[back] for row in prepared[:9]), [[row[back] for row in entry] for entry in prepared[9]])
+    return (*(row[back] for row in prepared[:12]), [[row[back] for row in entry] for entry in prepared[12]])
 
 
 def _base_flags(calibration: Calibration) -> int:

@@ -15,9 +15,10 @@ double *exactly*, in whatever order (Ozaki et al. 2012, Numer. Algorithms 59:95)
 gives the same bits as a million in a batch, here and on any other computer. What the split leaves
 out is 2e-13 of the largest: 1e-8 nT.
 
-For the covariance V of the corrected vector ``b = A d, d = H_r - T``, write ``db = dA d - A dT``: V is
-quadratic in d, and the table holds the covariance in just the combinations that V needs: 36 for the
-quadratic part Q, 18 for ``S_aT``, 6 for ``S_TT`` (with the sensor's own noise, which acts like T's).
+The nine become twelve in body axes: ``A' = R A`` (nine, R the boresight) and T. For the covariance V of the
+corrected vector ``b = A' d, d = H_r - T``, write ``db = dA' d - A' dT``: V is quadratic in d, and the table holds
+the covariance in just the combinations that V needs: 36 for the quadratic part Q, 27 for ``S_a'T``, 6 for
+``S_TT`` (with the sensor's own noise, which acts like T's).
 """
 
 from __future__ import annotations
@@ -47,6 +48,8 @@ EXPONENT = 3
 """psi is kept below 2^3, by a power of two where positions lie far outside the range seen: then
 2^24 . 2^21 . 256 products still fit 53 bits."""
 
+COLUMNS = 81
+"""Of the table: the twelve, then the 69 combinations of their covariance."""
 PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 SLOT = ((0, 3, 4), (3, 1, 5), (4, 5, 2))
 """Where ``A[i, k]`` stands among the nine."""
@@ -68,8 +71,8 @@ class Kernel:
         W, with ``A`` itself (not ``a``) in the first six.
     first, second : (q,) int arrays
         Product q is ``phi[first] * phi[second]``; the first m products are the regressors.
-    coarse, fine : (69, q) arrays
-        The table in two parts: nine coefficients, then 60 combinations of their covariance.
+    coarse, fine : (81, q) arrays
+        The table in two parts.
     """
 
     centre: tuple[float, ...]
@@ -83,7 +86,7 @@ class Kernel:
     fine: FloatArray
 
     def sums(self, phi: FloatArray) -> FloatArray:
-        """Return ``table psi`` (69, n) of many samples' regressors (m, n)."""
+        """Return ``table psi`` (81, n) of many samples' regressors (m, n)."""
         psi = np.empty((len(self.pairs), phi.shape[1]))
         for row, (i, j) in zip(psi, self.pairs, strict=True):
             np.multiply(phi[i], phi[j], out=row)
@@ -102,7 +105,7 @@ class Kernel:
         return np.asarray(found if scale is None else found / scale)
 
     def sums_of_one(self, phi: list[float]) -> list[float]:
-        """Return the same 69 sums of one sample's regressors: one product, so that it is quick."""
+        """Return the same 81 sums of one sample's regressors: one product, so that it is quick."""
         largest = max(*phi, -min(phi))
         scale = ldexp(1.0, min(EXPONENT - frexp(largest * largest)[1], 0))
         psi = np.array([phi[i] * phi[j] * scale for i, j in self.pairs])
@@ -113,7 +116,7 @@ class Kernel:
         fine += FINE
         fine -= FINE
         found = self.both @ parts
-        sums: list[float] = ((found[69:, 0] + found[:69, 1] + found[:69, 0]) / scale).tolist()
+        sums: list[float] = ((found[COLUMNS:, 0] + found[:COLUMNS, 1] + found[:COLUMNS, 0]) / scale).tolist()
         return sums
 
     @cached_property
@@ -123,7 +126,7 @@ class Kernel:
 
     @cached_property
     def both(self) -> FloatArray:
-        """(138, q) `coarse` above `fine`."""
+        """(162, q) `coarse` above `fine`."""
         return np.concatenate([self.coarse, self.fine])
 
     def powers(self, values: Sequence[Any], one: Any) -> list[Any]:
@@ -203,13 +206,25 @@ def _closed(exponents: set[Exponents], calibration: Calibration) -> list[Exponen
     return sorted(closed, key=lambda e: (sum(e), [-power for power in e]))
 
 
+def _body_axes(calibration: Calibration) -> FloatArray:
+    """(9, 12): from A's six entries and T's three to those of ``R A``, row by row, and T."""
+    R = np.eye(3) if calibration.boresight is None else calibration.boresight.matrix()
+    B = np.zeros((9, 12))
+    for i in range(3):
+        for j in range(3):
+            for k in range(3):
+                B[SLOT[j][k], 3 * i + k] += R[i, j]
+    B[6:, 9:] = np.eye(3)
+    return B
+
+
 def _table(
     P: FloatArray, W: FloatArray, calibration: Calibration, exponents: list[Exponents]
 ) -> tuple[NDArray[np.intp], NDArray[np.intp], FloatArray]:
     """Return the products of regressors and what each contributes."""
-    m = len(W)
-    flat = P.reshape(len(P), -1)
-    C = (flat.T @ calibration.covariance @ flat).reshape(m, 9, m, 9)
+    m, B = len(W), _body_axes(calibration)
+    flat = (P @ B).reshape(len(P), -1)
+    C = (flat.T @ calibration.covariance @ flat).reshape(m, 12, m, 12)
 
     def key(i: int, j: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
         powers = [np.array(exponents[r]) for r in (i, j) if r < len(exponents)]
@@ -221,22 +236,22 @@ def _table(
     for i in range(m):
         for j in range(i, m):
             products.setdefault(key(i, j), []).append((i, j))
-    table = np.zeros((len(products), 69))
-    table[:m, :9] = W
+    table = np.zeros((len(products), COLUMNS))
+    table[:m, :12] = W @ B
     for q, pairs in enumerate(products.values()):
         S = np.sum([C[i, :, j] + (C[j, :, i] if i != j else 0.0) for i, j in pairs], axis=0)
         if q == 0:  # the sensor's noise adds to what it reads just as T does
-            S[6:, 6:] += calibration.noise.sensor**2 * np.eye(3)
-        table[q, 9:] = _combinations(S)
+            S[9:, 9:] += calibration.noise.sensor**2 * np.eye(3)
+        table[q, 12:] = _combinations(S)
     first, second = np.array([pairs[0] for pairs in products.values()]).T
     return first, second, table
 
 
 def _combinations(S: FloatArray) -> FloatArray:
-    """(60,): Q of V's six entries by the six products of d, then ``S_aT`` (6 x 3), then ``S_TT``."""
+    """(69,): Q of V's six entries by the six products of d, then ``S_a'T`` (9 x 3), then ``S_TT``."""
     Q = [
-        S[SLOT[i][k], SLOT[j][l]] + (S[SLOT[i][l], SLOT[j][k]] if k != l else 0.0)
+        S[3 * i + k, 3 * j + l] + (S[3 * i + l, 3 * j + k] if k != l else 0.0)
         for i, j in PAIRS
         for k, l in PAIRS  # noqa: E741  (the index of the equation)
     ]
-    return np.array([*Q, *S[:6, 6:].ravel(), *(S[6 + i, 6 + j] for i, j in PAIRS)])
+    return np.array([*Q, *S[:9, 9:].ravel(), *(S[9 + i, 9 + j] for i, j in PAIRS)])

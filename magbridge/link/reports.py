@@ -23,7 +23,10 @@ HEARTBEAT, STATUS = spec("HEARTBEAT"), spec("MAG_STATUS")
 MASK = 0xFFFFFFFF
 ALIVE, CRITICAL = (
     HEARTBEAT.payload(
-        type=MAV_TYPE.ONBOARD_CONTROLLER, autopilot=MAV_AUTOPILOT.INVALID, system_status=state, mavlink_version=3
+        type=MAV_TYPE.ONBOARD_CONTROLLER,
+        autopilot=MAV_AUTOPILOT.INVALID,
+        system_status=state,
+        mavlink_version=3,
     )
     for state in (MAV_STATE.ACTIVE, MAV_STATE.CRITICAL)
 )
