@@ -127,27 +127,36 @@ class MonomialEffect(Effect, frozen=True, kw_only=True):
 
 
 class PlayEffect(Effect, frozen=True, kw_only=True):
-    """Backlash or remanence: ``T += c (y - p) / width``, y the play operator of the channel p.
+    """Backlash or remanence: ``T += sum_k c_k (v^k - x^k)``, y the play operator of the channel p.
 
     ``y = min(max(y, p - width / 2), p + width / 2)``: the last position drags behind by half the width, on the
-    side that the mass came from (Brokate & Sprekels 1996, *Hysteresis and Phase Transitions*, sec. 2.1).
+    side that the mass came from; ``v = (y - centre) / scale``, ``x = (p - centre) / scale``. Higher powers are those of
+    the generalised play, a curve on either branch: relays of one width at many places
+    (Brokate & Sprekels 1996, *Hysteresis and Phase Transitions*, sec. 2.1 and 2.4).
 
     Attributes
     ----------
     cause, channel : str
     width : float
         In the channel's unit.
+    order : int
+        Highest power.
+    centre, scale : float
+        In the channel's unit; a scale of 0 stands for the width.
     """
 
     kind: ClassVar[str] = "play"
     cause: str
     channel: str
     width: float
+    order: int = 1
+    centre: float = 0.0
+    scale: float = 0.0
 
     @property
     def size(self) -> int:
-        """One for each axis, nT from one side to the other."""
-        return 3
+        """Three for each power, nT."""
+        return 3 * self.order
 
     def channels(self) -> tuple[str, ...]:
         """Name the one that it follows."""
@@ -155,20 +164,27 @@ class PlayEffect(Effect, frozen=True, kw_only=True):
 
     def columns(self, field: float) -> FloatArray:  # noqa: ARG002  (others need it)
         """Offsets."""
-        return offsets(1)
+        return offsets(self.order)
 
     def begin(self, calibration: Calibration) -> Step:
         """Return a stepper that starts in the middle of its play."""
-        index, width = calibration.channels.index(self.channel), self.width
-        half, y, p, first = 0.5 * width, 0.0, 0.0, True
+        index, centre, scale = calibration.channels.index(self.channel), self.centre, self.scale or self.width
+        half, y, p, first, order = 0.5 * self.width, 0.0, 0.0, True, self.order
 
-        def step(time_us: int, hx: float, hy: float, hz: float, values: Sequence[float]) -> tuple[float]:  # noqa: ARG001
+        def step(time_us: int, hx: float, hy: float, hz: float, values: Sequence[float]) -> tuple[float, ...]:  # noqa: ARG001
             nonlocal y, p, first
             if not isnan(values[index]):
                 p = values[index]
                 y = p if first else min(max(y, p - half), p + half)
                 first = False
-            return ((y - p) / width,)
+            if order == 1:
+                return ((y - p) / scale,)
+            v, x = (y - centre) / scale, (p - centre) / scale
+            a, b, powers = v, x, [v - x]
+            for _ in range(order - 1):
+                a, b = a * v, b * x
+                powers.append(a - b)
+            return tuple(powers)
 
         return step
 

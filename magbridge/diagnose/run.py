@@ -25,7 +25,7 @@ from magbridge.diagnose.problem import Problem, pose, samples_of
 from magbridge.diagnose.search import Hypothesis, Outcome, Rival, search
 from magbridge.diagnose.survey import Survey, take
 from magbridge.diagnose.unexplained import Leftover, Outliers, leftover, outliers
-from magbridge.diagnose.weigh import ODDS
+from magbridge.diagnose.weigh import lead
 from magbridge.errors import DataError
 from magbridge.field.grid import AnomalyGrid
 from magbridge.files import atomic_path
@@ -205,7 +205,16 @@ def _accept(
         if rest is not None or len(model) == 1
         else None
     )
-    beaten = free is not None and free.evidence > sum(h.evidence for h in outcome.chosen) + ODDS
+    # a curve through the channel that a name follows anyhow is no other explanation
+    own = {h.candidate.channel for h in outcome.chosen}
+    if any(h.candidate.cause == "actuator_order" for h in outcome.chosen):
+        own |= {parameter.name for parameter in problem.calibration.parameters}
+    ahead = lead(max(h.ratio for h in outcome.chosen))
+    beaten = (
+        free is not None
+        and (free.channel is None or free.channel not in own)
+        and free.evidence > sum(h.evidence for h in outcome.chosen) + ahead
+    )
     if (rest is not None and rest.signal_to_noise > SHARE * loudest) or beaten:
         return (), (), outcome.null, free or rest
     return outcome.chosen, outcome.rivals, outcome.fit, rest

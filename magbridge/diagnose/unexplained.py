@@ -42,6 +42,8 @@ class Leftover(NamedTuple):
         Of a tone.
     best_channel : str or None
         The telemetry that goes with it best.
+    channel : str or None
+        The telemetry that the best description is a curve of.
     """
 
     kind: str
@@ -50,6 +52,7 @@ class Leftover(NamedTuple):
     evidence: float
     period_s: float | None
     best_channel: str | None
+    channel: str | None = None
 
 
 class Outliers(NamedTuple):
@@ -189,7 +192,7 @@ def _judge(one: Flexible, joint: Joint, base: Joint, freedom: int, hypotheses: f
     own = np.linalg.inv(joint.covariance[-size:, -size:])
     # of the flexible fit's own numbers, those that the data determine
     power = max(float(b @ own @ b) - freedom, 0.0)
-    return Leftover(one.kind, power**0.5, p_value, evidence, None, one.channel)
+    return Leftover(one.kind, power**0.5, p_value, evidence, None, one.channel, one.channel)
 
 
 def _steps(problem: Problem, fit: Joint) -> str:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from functools import reduce
 from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
 
 from magbridge.calibration.followers import MonomialEffect, PlayEffect, PowersEffect
-from magbridge.calibration.terms import full_order
+from magbridge.calibration.terms import Polynomial, full_order
 from magbridge.diagnose.candidates import AXES, Candidate, of_effect
 from magbridge.diagnose.causes.channels import channels_of, extent
 from magbridge.diagnose.problem import Problem
@@ -16,6 +17,13 @@ from magbridge.diagnose.problem import Problem
 __all__ = ["actuator_order", "hysteresis", "unmodelled_actuator"]
 
 FloatArray = NDArray[np.float64]
+
+MANY = 12
+"""Monomials that are tried together."""
+POWERS = 4
+"""Of one mass, beyond those that its polynomial has, that are tried together."""
+BRANCH = 3
+"""Order of a curved branch: what lies beyond the polynomial's own is a function of the position."""
 
 
 def unmodelled_actuator(problem: Problem) -> list[Candidate]:
@@ -43,40 +51,66 @@ def unmodelled_actuator(problem: Problem) -> list[Candidate]:
 
 
 def actuator_order(problem: Problem) -> list[Candidate]:
-    """A modelled mass needs a power or a cross term that its polynomial lacks: ``T += b prod x_k^e_k`` (paper, eq. 8)."""
+    """A modelled mass needs a power or a cross term that its polynomial lacks: ``T += b prod x_k^e_k`` (paper, eq. 8).
+
+    One term, or all of the next order, or a curve of one mass: its next powers, and across them the others.
+    """
     calibration = problem.calibration
     k = len(calibration.parameters)
     if not k:
         return []
-    present = {e for term in calibration.terms for e in term.expand(calibration).exponents}
+    present = {e for term in calibration.terms if isinstance(term, Polynomial) for e in term.exponents}
     highest = max(sum(e) for e in present)
-    made = []
-    for exponents in full_order(k, min(highest + 1, 5)):
-        if exponents not in present:
-            effect = MonomialEffect(cause="actuator_order", exponents=exponents)
-            label = " ".join(
-                f"{p.name}^{e}" if e > 1 else p.name
-                for p, e in zip(calibration.parameters, exponents, strict=True)
-                if e
-            )
-            names = tuple(f"{axis} {label}" for axis in AXES)
-            made.append(of_effect(problem, effect, 50.0, "nT", names=names))
-    return made
+    missing = [e for e in full_order(k, highest + 1) if e not in present]
+    groups = [missing] if 1 < len(missing) <= MANY else []
+    for i in range(k):
+        own = [
+            tuple(power * (i == j) for j in range(k)) for power in range(highest + 1, highest + POWERS + 1)
+        ]
+        groups.append([*own, *(e for e in missing if e[i] == highest)])
+    made = {e: _monomial(problem, e) for e in {*missing, *(e for group in groups for e in group)}}
+    return [
+        *(made[e] for e in missing),
+        *(reduce(Candidate.with_, [made[e] for e in group]) for group in groups),
+    ]
+
+
+def _monomial(problem: Problem, exponents: tuple[int, ...]) -> Candidate:
+    label = " ".join(
+        f"{p.name}^{e}" if e > 1 else p.name
+        for p, e in zip(problem.calibration.parameters, exponents, strict=True)
+        if e
+    )
+    effect = MonomialEffect(cause="actuator_order", exponents=exponents)
+    return of_effect(problem, effect, 50.0, "nT", names=tuple(f"{axis} {label}" for axis in AXES))
 
 
 def hysteresis(problem: Problem) -> list[Candidate]:
-    """Backlash of the drive, or steel remagnetised by its own motion: ``T += b (y - p) / width``, y the play of p."""
+    """Backlash of the drive, or steel remagnetised by its own motion: ``T += b (y - p) / width``, y the play of p.
+
+    Steel follows a curve on either branch: higher powers of y and p (generalised play).
+    """
     made = []
     # only of masses that are modelled: a wide play of another is that other itself
     for name in (parameter.name for parameter in problem.calibration.parameters):
         low, high = extent(problem, name)
+        centre, scale = 0.5 * (low + high), 0.5 * (high - low)
+        unit = problem.survey.channels[name].unit
 
-        def again(width: float, name: str = name) -> Candidate:
+        def straight(width: float, name: str = name, unit: str = unit) -> Candidate:
             effect = PlayEffect(cause="hysteresis", channel=name, width=width)
-            unit = problem.survey.channels[name].unit
-            return of_effect(
-                problem, effect, 50.0, "nT", channel=name, shape={"width": (width, unit)}, again=again
-            )
+            shape = {"width": (width, unit)}
+            return of_effect(problem, effect, 50.0, "nT", channel=name, shape=shape, again=straight)
 
-        made += [again(share * (high - low)) for share in (0.05, 0.15, 0.3, 0.5)]
+        def curved(
+            width: float, name: str = name, unit: str = unit, centre: float = centre, scale: float = scale
+        ) -> Candidate:
+            effect = PlayEffect(
+                cause="hysteresis", channel=name, width=width, order=BRANCH, centre=centre, scale=scale
+            )
+            shape = {"width": (width, unit)}
+            return of_effect(problem, effect, 50.0, "nT", channel=name, shape=shape, again=curved)
+
+        made += [straight(share * (high - low)) for share in (0.05, 0.15, 0.3)]
+        made += [curved(share * (high - low)) for share in (0.15, 0.3, 0.5)]
     return made
