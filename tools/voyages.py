@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
 from math import exp
+from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -28,6 +29,12 @@ Array = NDArray[np.float64]
 START = 1_386_201_600.0  # s, 2013-12-05
 PLACE = (49.5, -57.9)  # deg, Bonne Bay
 HOUR = 3600.0
+SPEEDS = (0.35, 0.25, 0.5)
+"""m/s, from run to run."""
+LEFT = {"auto": 0.5, "nominal": 125.0}
+"""nT, slow, beside 1 nT of white noise: what tools/accuracy.py finds on a survey, auto rounded up."""
+GLIDER = Options(current_sigma=0.05, bias_sigma=LEFT["auto"], bias_time=1800.0, map_sigma=1.0)
+AT_HOURS = (3.0, 4.0, 5.0, 6.0)
 OUTSIDE = float(chi2.ppf(0.9999, 2))  # squared distance: the truth is not where the filter says
 
 
@@ -81,39 +88,60 @@ def voyage(
     """
     rng = np.random.default_rng(seed)
     n = int(hours * HOUR / every)
-    time = START + every * np.arange(1, n + 1)
     legs = np.cumsum(rng.uniform(-100.0, 100.0, n // int(2700 / every) + 1)) + rng.uniform(0.0, 360.0)
-    heading = legs[np.arange(n) // int(2700 / every)]
-    o = options
+    heading = np.radians(legs[np.arange(n) // int(2700 / every)])
+    bias = _markov(rng, n, options.bias_sigma, every / options.bias_time)[:, 0]
+    errors = bias + rng.normal(size=n) * sigma
+    velocity = speed * np.column_stack([np.cos(heading), np.sin(heading)])
+    return adrift(grid, options, rng, velocity, errors, np.full(n, sigma), every=every, jump=jump)
+
+
+def adrift(
+    grid: AnomalyGrid,
+    options: Options,
+    rng: np.random.Generator,
+    velocity: Array,
+    errors: Array,
+    sigma: Array,
+    *,
+    every: float = 4.0,
+    jump: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> xr.Dataset:
+    """Return what a vehicle measures that moves so through a water that moves too, on a map with errors.
+
+    Parameters
+    ----------
+    velocity : Array, (n, 2)
+        m/s north and east through the water, each `every` s up to its sample.
+    errors, sigma : Array, (n,)
+        nT: of the corrected total field, and what the calibration claims for them.
+    """
+    o, n = options, len(velocity)
+    time = START + every * np.arange(1, n + 1)
     current = _markov(rng, n, o.current_sigma, every / o.current_time, 2)
     drift = rng.normal(size=(n, 2)) * o.drift * every**0.5
     away = rng.normal(size=2) * o.start_sigma + np.cumsum(current * every + drift, axis=0)
     away[time > START + jump[0] * HOUR] += jump[1:]
-    errors = (
-        _markov(rng, n, o.bias_sigma, every / o.bias_time)[:, 0]
-        + _markov(rng, n, o.map_sigma, every * speed / o.map_length)[:, 0]
-        + rng.normal(size=n) * sigma
-    )
+    metres = every * float(np.hypot(*velocity.T).mean())
+    errors = errors + _markov(rng, n, o.map_sigma, metres / o.map_length)[:, 0]
     reckoned, true = np.empty((n, 2)), np.empty((n, 2))
     where = PLACE
-    for i, along in enumerate(np.radians(heading)):
-        where = offset(*where, speed * every * float(np.cos(along)), speed * every * float(np.sin(along)))
+    for i, (north, east) in enumerate((every * velocity).tolist()):
+        where = offset(*where, north, east)
         reckoned[i], true[i] = where, offset(*where, *away[i].tolist())
     anomaly = np.nan_to_num(grid.evaluate(true[:, 1], true[:, 0]).anomaly)
     columns = {
         "total_field": total_field(true[:, 1], true[:, 0], 30.0, time) + anomaly + errors,
-        "total_field_sigma": np.full(n, sigma),
-        "heading": heading % 360.0,
-        "water_speed": np.full(n, speed),
+        "total_field_sigma": sigma,
+        "velocity_north": velocity[:, 0],
+        "velocity_east": velocity[:, 1],
         "depth": np.full(n, 30.0),
         "truth_latitude": true[:, 0],
         "truth_longitude": true[:, 1],
         "away_north": away[:, 0],
         "away_east": away[:, 1],
     }
-    return xr.Dataset(
-        {k: ("time", v) for k, v in columns.items()}, {"time": time}, {"source": f"voyage {seed}"}
-    )
+    return xr.Dataset({k: ("time", v) for k, v in columns.items()}, {"time": time}, {"source": "voyage"})
 
 
 def _markov(rng: np.random.Generator, n: int, sigma: float, decay: float, size: int = 1) -> Array:
@@ -135,35 +163,45 @@ class Run:
     nees: Array  # squared distance of the truth, two degrees of freedom
     state: NDArray[np.int64]
     vouched: NDArray[np.bool_]
-    bound: float  # m, second half
+    bound: float  # m, RMS of the second half
+    unaided: float  # m, the same of dead reckoning alone
     length: float  # m, correlation length of the map
-    seconds: float
-    samples: int
+    seconds: float  # of a processor, a sample
 
     @property
-    def drms(self) -> float:
-        """Error of the second half, m."""
-        return float(np.sqrt(np.mean(self.error[self._second] ** 2)))
-
-    @property
-    def _second(self) -> NDArray[np.bool_]:
+    def second_half(self) -> NDArray[np.bool_]:
+        """Records of the second half."""
         return self.hours > 0.5 * self.hours[-1]
 
-    @property
-    def lost(self) -> bool:
-        """Whether the truth lay outside for half an hour on end, in the second half."""
-        return (
-            self.outside(0.5) and longest(self.nees[self._second] > OUTSIDE, self.hours[self._second]) > 0.5
+    def score(self) -> Score:
+        """Return what the tables need."""
+        half = self.second_half
+        away = longest(self.nees > OUTSIDE, self.hours)
+        return Score(
+            drms=float(np.sqrt(np.mean(self.error[half] ** 2))),
+            bound=self.bound,
+            unaided=self.unaided,
+            lost=longest(self.nees[half] > OUTSIDE, self.hours[half]) > 0.5,
+            nees=float(np.mean(self.nees[half])) / 2,
+            at_hours=tuple(self.nees[np.searchsorted(self.hours, AT_HOURS) - 1].tolist()),
+            false_alarm=bool((self.state == State.LOST).any()) and away <= 0.1,
+            vouched=float(np.mean(self.vouched)),
+            seconds=self.seconds,
         )
 
-    def outside(self, hours: float) -> bool:
-        """Whether the truth ever lay outside for so long."""
-        return longest(self.nees > OUTSIDE, self.hours) > hours
 
-    @property
-    def flagged(self) -> bool:
-        """Whether the filter ever said it was lost."""
-        return bool((self.state == State.LOST).any())
+class Score(NamedTuple):
+    """One run in numbers: errors in m over the second half; NEES over its two degrees of freedom."""
+
+    drms: float
+    bound: float
+    unaided: float
+    lost: bool  # the truth lay outside for half an hour on end, in the second half
+    nees: float
+    at_hours: tuple[float, ...]  # NEES at AT_HOURS
+    false_alarm: bool  # said to be lost, and the truth was never outside for more than 6 minutes
+    vouched: float  # share of the time
+    seconds: float  # of a processor, a sample
 
 
 def longest(flags: NDArray[np.bool_], hours: Array) -> float:
@@ -173,34 +211,19 @@ def longest(flags: NDArray[np.bool_], hours: Array) -> float:
     return float(max(spans, default=0.0))
 
 
-def sail(ds: xr.Dataset, grid: AnomalyGrid, options: Options, truth: Options | None = None) -> Run:
-    """Run the navigator over a voyage; `truth` is what the bound is told, if not the same."""
+def sail(ds: xr.Dataset, grid: AnomalyGrid, options: Options) -> Run:
+    """Run the navigator over a voyage."""
     navigator = Navigator(grid, options)
-    time_us = np.round(ds["time"].to_numpy() * 1e6).astype(int).tolist()
-    columns = [
-        ds[name].to_numpy().tolist()
-        for name in ("heading", "water_speed", "depth", "total_field", "total_field_sigma")
-    ]
-    navigator.fix(time_us[0] - int(1e6 * float(ds["time"][1] - ds["time"][0])), *PLACE)
+    every = float(ds["time"][1] - ds["time"][0])
+    navigator.fix(round(1e6 * (float(ds["time"][0]) - every)), *PLACE)
     begun = clock.process_time()
     found = []
-    first = True
-    for t, heading, speed, depth, field, sigma in zip(time_us, *columns, strict=True):
-        if first:
-            navigator.telemetry(time_us[0] - 4_000_000, heading=heading, speed=speed, depth=depth)
-            first = False
-        record = navigator.measure(t, field, sigma)
-        navigator.telemetry(t, heading=heading, speed=speed, depth=depth)
+    for t, motion, field, sigma in telemetry(ds):
+        navigator.telemetry(round(1e6 * (t - every)), **motion)
+        record = navigator.measure(round(1e6 * t), field, sigma)
         if record is not None:
-            found.append(
-                (
-                    record.time_us * 1e-6,
-                    *navigator.x[:2],
-                    *navigator.P[:2, :2].ravel(),
-                    record.state,
-                    record.vouched,
-                )
-            )
+            place, spread = navigator.x[:2], navigator.P[:2, :2].ravel()
+            found.append((record.time_us * 1e-6, *place, *spread, record.state, record.vouched))
     seconds = clock.process_time() - begun
     table = np.array(found, float)
     away = np.stack(
@@ -214,10 +237,10 @@ def sail(ds: xr.Dataset, grid: AnomalyGrid, options: Options, truth: Options | N
         ds["time"].to_numpy()[corners],
         ds["truth_latitude"].to_numpy()[corners],
         ds["truth_longitude"].to_numpy()[corners],
-        truth or options,
-        float(ds["total_field_sigma"][0]),
+        options,
+        float(ds["total_field_sigma"].median()),
         30.0,
-        float(ds["time"][1] - ds["time"][0]),
+        every,
     )
     half = best.time > 0.5 * (best.time[0] + best.time[-1])
     return Run(
@@ -227,9 +250,9 @@ def sail(ds: xr.Dataset, grid: AnomalyGrid, options: Options, truth: Options | N
         table[:, 7].astype(int),
         table[:, 8] > 0,
         float(np.sqrt(np.mean(best.sigma[half] ** 2))),
+        float(np.sqrt(np.mean(best.unaided[half] ** 2))),
         grid.correlation_length,
-        seconds,
-        len(time_us),
+        seconds / ds.sizes["time"],
     )
 
 
@@ -237,15 +260,19 @@ def blocks(ds: xr.Dataset, grid: AnomalyGrid, options: Options) -> Iterator[tupl
     """Yield the measurements that the navigator makes of a voyage, and the metres travelled until each."""
     where = DeadReckoning()
     where.place(*PLACE)
-    collector = Collector(options.interval, block_length(grid), options.noise)
+    collector = Collector(options.interval, block_length(grid), options.noise, options.bias_sigma)
     every = float(ds["time"][1] - ds["time"][0])
-    columns = [
-        ds[name].to_numpy().tolist()
-        for name in ("heading", "water_speed", "depth", "total_field", "total_field_sigma")
-    ]
-    for t, heading, speed, depth, field, sigma in zip(ds["time"].to_numpy().tolist(), *columns, strict=True):
-        where.telemetry(t - every, {"heading": heading, "speed": speed, "depth": depth})
+    for t, motion, field, sigma in telemetry(ds):
+        where.telemetry(t - every, motion)
         where.advance(t)
         block = collector.add(round(t * 1e6), where, field, sigma)
         if block is not None:
             yield block, where.travelled
+
+
+def telemetry(ds: xr.Dataset) -> Iterator[tuple[float, dict[str, float], float, float]]:
+    """Yield the time of each sample, the motion up to it, the total field and its sigma."""
+    motion = {name: ds[name].to_numpy().tolist() for name in ("velocity_north", "velocity_east", "depth")}
+    columns = [ds[name].to_numpy().tolist() for name in ("time", "total_field", "total_field_sigma")]
+    for t, field, sigma, *moved in zip(*columns, *motion.values(), strict=True):
+        yield t, dict(zip(motion, moved, strict=True)), field, sigma

@@ -21,12 +21,13 @@ __all__ = ["Bank"]
 
 Array = NDArray[np.float64]
 
-MOST = 2_000  # hypotheses
+MOST = 6_000  # hypotheses
 AT_FIRST = 20_000  # of them, until the first measurement has thinned them out
 CELL = 0.8  # of the resolution, within which two hypotheses are one
 SPACING = 1.2  # of two neighbours, in their own sigma: their sum is flat to 1 %
 EDGE = 3.5  # sigma, as far as a start is covered
 FADED = 1e-7  # of the largest weight
+COARSER = 1.25  # at a time
 MERGE_EVERY = 4  # updates
 # One Gaussian as three narrower ones (DeMars et al. 2013, table 1), their variance such that the sum keeps its own.
 THREE = np.array([-1.0575154615, 0.0, 1.0575154615])
@@ -55,7 +56,9 @@ class Bank:
         self._grid, self._gate = grid, gate
         self._elsewhere = float(np.nanmean(grid.anomaly)), float(np.nanvar(grid.anomaly))
         self._updates = 0
-        self.resolution = resolution
+        self.resolution = self.finest = resolution
+        self.blur = 0.0
+        """nT², by which the map's curvature under the hypotheses' spread has blurred the last measurement."""
         self.w, self.x, self.P = self._cut(x, P)
 
     def __len__(self) -> int:
@@ -118,7 +121,9 @@ class Bank:
             hne * pne + hee * pee,
         )
         anomaly += block.slope_north * north + block.slope_east * east + 0.5 * (a + d)
-        v = v + block.variance + 0.5 * (a * a + 2.0 * b * c + d * d)
+        bent = 0.5 * (a * a + 2.0 * b * c + d * d)
+        self.blur = float(self.w @ bent)
+        v = v + block.variance + bent
         slopes = np.where(off, 0.0, (gn + block.slope_north, ge + block.slope_east))
         gain = slopes[0] * self.P[0] + slopes[1] * self.P[1] + self.P[4] + self.P[5]
         s = slopes[0] * gain[0] + slopes[1] * gain[1] + gain[4] + gain[5]
@@ -163,8 +168,11 @@ class Bank:
         keep = self.w > FADED * self.w.max()
         if not keep.all():
             self._take(keep)
-        if len(self) > MOST:
-            self._take(np.sort(np.argsort(-self.w, kind="stable")[:MOST]))
+        while len(self) > MOST:  # what is not known is looked at more coarsely, never cut off
+            self.resolution *= COARSER
+            self._merge()
+        if self.resolution > self.finest and len(self) < MOST / 4:
+            self.resolution = max(self.finest, self.resolution / COARSER)
         if self._updates % MERGE_EVERY == 0 and len(self) > 1:
             self._merge()
         pnn, pne, pee = self.P[0, 0], self.P[0, 1], self.P[1, 1]

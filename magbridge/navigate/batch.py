@@ -34,6 +34,7 @@ MOTIONS: dict[str, dict[str, str]] = {
 }
 """How a log tells motion, best first: its columns, and what the dead reckoning calls them."""
 
+GPS_SIGMA = 10.0  # m, each axis, of a receiver that has just surfaced
 YARDSTICKS = (
     ("truth_latitude", "truth_longitude"),
     ("gps_latitude", "gps_longitude"),
@@ -115,7 +116,7 @@ def navigate(
     for i, (t, f, s) in enumerate(zip(time_us.tolist(), field.tolist(), sigma.tolist(), strict=True)):
         navigator.telemetry(t, **{name: values[i] for name, values in rows.items()})
         if places is not None:
-            keep(navigator.fix(t, *next(places)))
+            keep(navigator.fix(t, *next(places), GPS_SIGMA))
         keep(navigator.measure(t, f, s))
         if progress is not None and i % 1000 == 0:
             progress(i)

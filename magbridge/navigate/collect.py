@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from math import inf, sqrt
 from typing import NamedTuple
 
 from magbridge.field.earth import wrap
@@ -11,26 +12,31 @@ from magbridge.navigate.model import Block
 
 __all__ = ["Collector"]
 
+LEAST = 1e-3  # nT: what claims less is not believed
+
 
 class Sums(NamedTuple):
-    """What the samples of the block so far add up to, relative to the first of them."""
+    """What the samples of the block so far add up to, each by its weight, relative to the first of them."""
 
     start_us: int
     latitude: float
     longitude: float
     travelled: float
-    n: int = 0
-    time: int = 0
+    weight: float = 0.0
+    time: float = 0.0
     d_latitude: float = 0.0
     d_longitude: float = 0.0
     anomaly: float = 0.0
-    variance: float = 0.0
+    white: float = 0.0
+    slow: float = 0.0
     slope_north: float = 0.0
     slope_east: float = 0.0
 
 
 class Collector:
     """Subtract the main field where dead reckoning puts the vehicle, and average until the block is full.
+
+    A sample counts by its precision: one in ten that was taken with a mass in motion spoils nothing.
 
     Parameters
     ----------
@@ -40,10 +46,13 @@ class Collector:
         m, that it covers at most.
     noise : float or None
         nT, the part of a sample's sigma that averages out; None: all of it.
+    bias : float
+        nT, the part that the filter's bias stands for.
     """
 
-    def __init__(self, interval: float, step: float, noise: float | None) -> None:
-        self._interval_us, self._step, self._noise = interval * 1e6, step, noise
+    def __init__(self, interval: float, step: float, noise: float | None, bias: float) -> None:
+        self._interval_us, self._step = interval * 1e6, step
+        self._white, self._bias = inf if noise is None else noise**2, bias**2
         self._main_field = NearbyField()
         self._sums: Sums | None = None
 
@@ -53,19 +62,22 @@ class Collector:
         main, slope_north, slope_east = self._main_field.at(
             where.latitude, where.longitude, where.depth, time_us * 1e-6
         )
+        variance = max(sigma, LEAST) ** 2
+        white, w = min(self._white, variance), 1.0 / variance
         self._sums = Sums(
             s.start_us,
             s.latitude,
             s.longitude,
             s.travelled,
-            s.n + 1,
-            s.time + time_us - s.start_us,
-            s.d_latitude + where.latitude - s.latitude,
-            s.d_longitude + wrap(where.longitude - s.longitude),
-            s.anomaly + total_field - main,
-            s.variance + sigma * sigma,
-            s.slope_north + slope_north,
-            s.slope_east + slope_east,
+            s.weight + w,
+            s.time + w * (time_us - s.start_us),
+            s.d_latitude + w * (where.latitude - s.latitude),
+            s.d_longitude + w * wrap(where.longitude - s.longitude),
+            s.anomaly + w * (total_field - main),
+            s.white + w * w * white,
+            s.slow + w * sqrt(max(0.0, variance - white - self._bias)),
+            s.slope_north + w * slope_north,
+            s.slope_east + w * slope_east,
         )
         full = time_us - s.start_us >= self._interval_us or where.travelled - s.travelled >= self._step
         return self.flush() if full else None
@@ -75,14 +87,13 @@ class Collector:
         s, self._sums = self._sums, None
         if s is None:
             return None
-        variance = s.variance / s.n
-        white = variance if self._noise is None else min(self._noise**2, variance)
+        w = s.weight
         return Block(
-            s.start_us + s.time // s.n,
-            s.latitude + s.d_latitude / s.n,
-            wrap(s.longitude + s.d_longitude / s.n),
-            s.anomaly / s.n,
-            white / s.n + (variance - white),
-            s.slope_north / s.n,
-            s.slope_east / s.n,
+            s.start_us + round(s.time / w),
+            s.latitude + s.d_latitude / w,
+            wrap(s.longitude + s.d_longitude / w),
+            s.anomaly / w,
+            (s.white + s.slow**2) / w**2,
+            s.slope_north / w,
+            s.slope_east / w,
         )

@@ -15,16 +15,27 @@ vehicle does, and one model serves every estimator, the smoother and the bound:
 
 from __future__ import annotations
 
-from math import exp
+from math import exp, hypot, log, sqrt
 from typing import NamedTuple
 
 import msgspec
 import numpy as np
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
+from magbridge.calibration.model import Calibration
 from magbridge.field.grid import AnomalyGrid
 
-__all__ = ["Block", "Options", "block_length", "measurement_row", "prior", "resolution", "transition"]
+__all__ = [
+    "Block",
+    "Options",
+    "block_length",
+    "informed",
+    "measurement_row",
+    "prior",
+    "resolution",
+    "transition",
+]
 
 Array = NDArray[np.float64]
 
@@ -48,7 +59,8 @@ class Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     map_sigma, map_length : float
         nT and m: the map's error, and how far it reaches. An independent error of each cell is the grid's own.
     noise : float or None
-        nT, the part of a sample's sigma that is white; the rest does not average out. None: all of it.
+        nT, the part of a sample's sigma that is white; of the rest, what goes beyond ``bias_sigma`` does not
+        average out. None: all of it is white.
     gate : float
         Largest innovation squared over its variance that is taken in.
     interval : float
@@ -101,6 +113,30 @@ class Block(NamedTuple):
     slope_east: float
 
 
+def informed(options: Options, calibration: Calibration, sigma: float) -> Options:
+    """Return options that know what a calibration says of its own errors.
+
+    Parameters
+    ----------
+    options : Options
+        Its bias is what there is besides: the map's level, the Earth's variation.
+    calibration : Calibration
+    sigma : float
+        nT, that it claims for a typical sample.
+
+    Notes
+    -----
+    White is the noise that the calibration runs showed, unless it lasts longer than a block: an error of a few
+    minutes does not average out, it is a bias, and lasts as long as it did there.
+    """
+    noise = calibration.noise
+    lasts = -noise.interval / log(noise.memory) if 0.0 < noise.memory < 1.0 else 0.0
+    white = noise.sensor if lasts <= options.interval else 0.0
+    slow = hypot(options.bias_sigma, sqrt(max(0.0, sigma**2 - white**2)))
+    time = options.bias_time if white else min(options.bias_time, lasts)
+    return replace(options, noise=white, bias_sigma=slow, bias_time=time)
+
+
 def prior(options: Options, position_sigma: float | None = None) -> tuple[Array, Array]:
     """Return mean (6,) and covariance (6, 6) before anything was measured."""
     o = options
@@ -145,17 +181,25 @@ def block_length(grid: AnomalyGrid) -> float:
     return 0.02 * grid.correlation_length
 
 
-def resolution(grid: AnomalyGrid, variance: float) -> float:
+def resolution(grid: AnomalyGrid, options: Options, variance: float) -> float:
     """Return the position spread, m, within which the map is straight to the noise of one measurement.
+
+    Parameters
+    ----------
+    variance : float
+        nT², of a measurement; to it comes what bias and map error change until the next, at half a spread: those
+        errors last, and so do the curvature's.
 
     Notes
     -----
     A spread s sees the curvature k as an error of variance ``(k s²)²/2``. With ``k = √3 σ/L²``, the rms
-    second derivative of a map of scatter σ and covariance ``exp(-r²/2L²)``, that stays below the noise while
+    second derivative of a map of scatter σ and covariance ``exp(-r²/2L²)``, that stays below the noise r while
     ``s² < √2 r/k``; and never more than a quarter of L, beyond which no Taylor series holds.
     """
     length = grid.correlation_length
     if not np.isfinite(length) or grid.rms == 0.0:
         return float("inf")
+    _, Q = transition(options, options.interval, block_length(grid))
+    noise = variance + (Q[4, 4] + Q[5, 5]) * 0.5**4
     curvature = 3.0**0.5 * grid.rms / length**2
-    return float(min(0.25 * length, FINE * (2.0 * variance) ** 0.25 / curvature**0.5))
+    return float(min(0.25 * length, FINE * (2.0 * noise) ** 0.25 / curvature**0.5))

@@ -37,6 +37,7 @@ CONTRADICTION = 25.0  # squared distance of a fix, two degrees of freedom: 4e-6 
 UNINFORMED = 0.8  # of what dead reckoning alone would have: the field has said nothing
 REACH = 300.0  # m, the least that the watch looks around
 JOIN, SPLIT = 1.2, 1.5  # of the map's resolution: below one hypothesis will do, above it will not
+FINER = 0.8  # of the resolution: so much better a measurement must be to be worth a finer one
 LEVEL_LASTS = 10.0  # times as long as a calibration's bias
 DOUBTFUL = 1.0  # log odds: another place explains the field better, if not yet beyond doubt
 SPREADS = (2.0, 4.0, 2.0, 8.0)  # times its reach, of the searches after each other
@@ -73,7 +74,9 @@ class Navigator:
         self.jumps: list[Jump] = []
         self.dropped = 0
         self._reckoning = DeadReckoning()
-        self._collector = Collector(self.options.interval, block_length(grid), self.options.noise)
+        self._collector = Collector(
+            self.options.interval, block_length(grid), self.options.noise, self.options.bias_sigma
+        )
         self._time_us, self._latest_us, self._travelled = 0, 0, 0.0
         self._filter: Tracker | Bank | None = None
         self._watch: Watch | None = None
@@ -172,8 +175,12 @@ class Navigator:
 
     def _update(self, block: Block) -> Record:
         seconds, metres = self._predict(block.time_us)
+        finer = resolution(self.grid, self.options, block.variance)
+        if finer < FINER * self._resolution:  # a first block may be a bad one, and says nothing of the rest
+            self._resolution = finer
+            if isinstance(self._filter, Bank):
+                self._filter.finest = finer
         if self._filter is None:
-            self._resolution = resolution(self.grid, block.variance)
             self._filter = self._estimator(self.x, self.P)
         innovation, variance, likelihood, accepted, anomaly = self._take_in(block)
         self._estimate()
@@ -251,10 +258,9 @@ class Navigator:
 
     def _judge(self, block: Block, seconds: float, metres: float, likelihood: float) -> None:
         """Compare the filter with its rivals; leave it where one of them has won."""
-        self._nowhere = max(
-            self._nowhere + self._unmapped.update(block, seconds, metres) - likelihood,
-            -log(self.options.doubt),
-        )
+        assert self._filter is not None
+        unmapped = self._unmapped.update(block, seconds, metres, self._filter.blur)
+        self._nowhere = max(self._nowhere + unmapped - likelihood, -log(self.options.doubt))
         if self._nowhere > log(self.options.doubt):
             self._search_anew()
             return

@@ -62,8 +62,12 @@ class Unmapped:
         self._x = 0.0, 0.0
         self._p = self._value, 0.0, self._slope
 
-    def update(self, block: Block, seconds: float, metres: float) -> float:
-        """Return the log-likelihood of a measurement so long after the one before, and take it in."""
+    def update(self, block: Block, seconds: float, metres: float, blur: float) -> float:
+        """Return the log-likelihood of a measurement so long after the one before, and take it in.
+
+        `blur` (nT²) is what the filter's own approximation adds to the measurement's variance: without it here, a
+        filter that still searches would lose to its own caution.
+        """
         o, rate = self._options, self._rate
         kept = exp(-rate * metres)
         a, b = kept * (1.0 + rate * metres), kept * metres
@@ -78,7 +82,7 @@ class Unmapped:
             a * c * (p - v) + (a * d + b * c) * q + b * d * (r - w),
             c * c * (p - v) + 2.0 * c * d * q + d * d * (r - w) + w,
         )
-        y, s = block.anomaly - self._mean - value, p + block.variance
+        y, s = block.anomaly - self._mean - value, p + block.variance + blur
         self._x = value + p / s * y, slope + q / s * y
         self._p = p - p * p / s, q - p * q / s, r - q * q / s
         return -0.5 * (y * y / s + log(2.0 * pi * s))

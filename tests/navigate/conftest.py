@@ -16,10 +16,10 @@ from magbridge.navigate.model import Options
 
 @pytest.fixture(scope="session")
 def study() -> Iterator[ModuleType]:
-    """tools/navigation.py, with tools/voyages.py beside it."""
+    """tools/voyages.py, with the others beside it."""
     tools = str(Path(__file__).parents[2] / "tools")
     sys.path.insert(0, tools)
-    yield import_module("navigation")
+    yield import_module("voyages")
     sys.path.remove(tools)
 
 

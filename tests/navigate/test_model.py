@@ -35,10 +35,10 @@ def test_no_time_is_no_motion():
 
 
 def test_resolution_follows_the_map(grid):
-    fine, coarse = resolution(grid, 0.1), resolution(grid, 10.0)
+    fine, coarse = resolution(grid, Options(), 0.1), resolution(grid, Options(), 10.0)
     assert 0 < fine < coarse <= 0.25 * grid.correlation_length
     flat = AnomalyGrid(grid.longitude, grid.latitude, np.zeros_like(grid.anomaly))
-    assert resolution(flat, 1.0) == np.inf
+    assert resolution(flat, Options(), 1.0) == np.inf
     assert block_length(flat) == np.inf
 
 

@@ -1,0 +1,51 @@
+"""Simulated gliders, calibrated as tools/accuracy.py calibrates them, whose survey is flown over a map."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from accuracy import at_rest, rms, total
+from voyages import PLACE, Map, Score, adrift, sail, synthetic
+
+from magbridge.calibration.data import observations
+from magbridge.calibration.fit import fit
+from magbridge.config import Align
+from magbridge.correction import Correction, correct_rows
+from magbridge.navigate.model import Options, informed
+from sitl import load, segments, simulate
+from sitl.world import to_local
+
+METHODS = {"nominal": {"axes_fixed": True, "equal_xz": True}, "cubic": {}, "auto": {}}
+"""With the options of the paper."""
+MASSES = ("battpos", "ballast")
+
+
+class Flown(NamedTuple):
+    """RMS error (nT) of the corrected field on the survey, the median sigma that was claimed, and how it navigated."""
+
+    error: float
+    claimed: float
+    score: Score
+
+
+def flown(kinds: tuple[Map, ...], seed: int) -> dict[tuple[int, str], Flown]:
+    """Return how one glider navigates on each map (by its number) with each calibration, all else the same."""
+    parts = segments(simulate(load("random_glider"), seed))
+    runs, survey = at_rest(parts["calibration"], MASSES), parts["survey"]
+    places = to_local(*(survey[f"truth_{name}"].to_numpy() for name in ("latitude", "longitude")), PLACE)
+    every = float(survey["time"][1] - survey["time"][0])
+    velocity = np.gradient(np.column_stack(places), every, axis=0)
+    found = {}
+    for method, options in METHODS.items():
+        fitted = fit(observations(runs, () if method == "nominal" else MASSES), method, **options).calibration
+        corrected = correct_rows(Correction(fitted, Align()), survey)
+        error = corrected["total_field"].to_numpy() - total(survey)
+        sigma = corrected["total_field_sigma"].to_numpy()
+        for k, kind in enumerate(kinds):
+            grid = synthetic(kind, seed % 10)
+            known = Options(start_sigma=grid.correlation_length, current_sigma=0.05, map_sigma=1.0)
+            known = informed(known, fitted, float(np.median(sigma)))
+            ds = adrift(grid, known, np.random.default_rng(seed), velocity, error, sigma, every=every)
+            found[k, method] = Flown(rms(error), float(np.median(sigma)), sail(ds, grid, known).score())
+    return found
