@@ -95,7 +95,7 @@ def squeezed(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def relay(scene: Scene, size: float, rng: Generator) -> None:
-    """A payload that nothing logs switches on and off; size in nT."""
-    flips = np.cumsum(rng.exponential(1500.0, 60))
+    """A payload that nothing logs switches on and off, a dozen times or so; size in nT."""
+    flips = np.cumsum(rng.exponential(0.08 * scene.t[-1], 60))
     state = np.searchsorted(flips, scene.t) % 2
     scene.field = scene.field + size * direction(rng) * state[:, None]

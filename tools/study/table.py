@@ -218,7 +218,7 @@ def _by_cause(part: dict[str, list[Row]]) -> list[str]:
             f"{np.mean([len(sets_of(r)) for r in named if r['found']] or [0.0]):.1f} ({theory['size']})",
             f"{_of(loud, found)}, {_of(loud, holds)}",
             f"{np.median(z):+.2f}, {100 * np.mean(np.abs(z) < 1.96):.0f} %, {z.size}" if z.size else "-",
-            f"{100 * gained(gain):.0f} %" if gain else "-", ", ".join(else_),
+            f"{100 * gained(gain):.0f} %" if np.isfinite(gained(gain)) else "-", ", ".join(else_),
         ]  # fmt: skip
         out.append(f"| {name} | " + " | ".join(cells) + " |")
     return out
