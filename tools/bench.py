@@ -1,8 +1,8 @@
 """How fast it is, each figure beside its floor in the same run.
 
-    python tools/bench.py                       everything: some minutes
-    python tools/bench.py processor start       some of it
-    python tools/bench.py --json                for machines, with details
+    python3 tools/dev.py bench                      everything: some minutes
+    python3 tools/dev.py bench processor start      some of it
+    python3 tools/dev.py bench --json               for machines, with details
 
 Repetitions of the thing and of its floor alternate, and medians are told, so that a busy machine slows both alike.
 Processor time and ratios hold on a busy machine; latencies do not: the load average is told with them, and the
@@ -24,6 +24,8 @@ from typing import Any
 from benchmarks.row import Row
 from rich.console import Console
 from rich.table import Table
+
+from magbridge import align
 
 __all__ = ["BENCHMARKS"]
 
@@ -53,7 +55,8 @@ def measure(name: str, factor: float) -> dict[str, Any]:
 def show(results: list[dict[str, Any]]) -> Table:
     """Return the table for people."""
     table = Table(
-        title=f"{platform.processor() or platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}"
+        title=f"{platform.processor() or platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}, "
+        f"live path {'in plain Python' if align.__file__.endswith('.py') else 'compiled'}"
     )
     for heading, justify in (
         ("what", "left"), ("measured", "right"), ("floor", "right"), ("ratio", "right"), ("asked", "right"), ("", "left"),
