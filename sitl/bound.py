@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import msgspec
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from sitl.platform import HARD_IRON, MOMENT, SOFT_IRON, VOLUME_SPREAD, Vehicle
 
-__all__ = ["information_bound", "oracle"]
+__all__ = ["information_bound", "informed_error", "oracle"]
 
 Array = NDArray[np.float64]
 
@@ -65,23 +65,62 @@ def information_bound(
     g the first factor over :math:`σ |\mathbf w|`, whitened by the noise's memory, the information is
     :math:`\sum \mathbf g \mathbf g^T` plus the prior's (Kay 1993, *Estimation Theory*, ch. 3 and 15).
     """
+    covariance, _, _, h, floor = _posterior(vehicle, calibration, survey, sigma, memory, at_sigma)
+    return np.sqrt(np.einsum("ni,ij,nj->n", h, covariance, h) + floor**2), floor
+
+
+def informed_error(
+    vehicle: Vehicle,
+    calibration: xr.Dataset,
+    survey: xr.Dataset,
+    sigma: float,
+    memory: float = 0.0,
+    at_sigma: float = 0.05,
+    *,
+    rng: np.random.Generator,
+) -> Array:
+    r"""Return the survey's error (n,), nT, of a fit that reaches :func:`information_bound`, on these very data.
+
+    The bound is what such a fit leaves on average; this is what luck makes of it on one vehicle. Arguments as there.
+
+    Notes
+    -----
+    Linear about the truth: with :math:`\mathbf e` the whitened noise of the calibration and a prior whose centre
+    is :math:`\mathbf p` of its widths off the truth, :math:`dθ = P (\mathbf g^T \mathbf e + \mathbf p)`.
+    """
+    covariance, g, whiten, h, _ = _posterior(vehicle, calibration, survey, sigma, memory, at_sigma)
+    noise, after = (
+        oracle(vehicle, part) - part["truth_total_field"].to_numpy() for part in (calibration, survey)
+    )
+    off = covariance @ (g.T @ whiten(noise[:, None])[:, 0] + rng.normal(size=len(covariance)))
+    return np.asarray(after - h @ off)
+
+
+def _posterior(
+    vehicle: Vehicle,
+    calibration: xr.Dataset,
+    survey: xr.Dataset,
+    sigma: float,
+    memory: float,
+    at_sigma: float,
+) -> tuple[Array, Array, Callable[[Array], Array], Array, Array]:
+    """Return the covariance of θ in units of its prior, g and its whitening, and the survey's g and floor (nT)."""
     g, floor = _sensitivity(vehicle, calibration, sigma)
-    g = g / floor[:, None]
-    if memory:
-        phi = np.exp(-1 / memory)
-        run = calibration["run"].to_numpy()
-        follows = np.diff(run, prepend=np.nan) == 0
-        before = np.roll(g, 1, axis=0)
-        g = np.where(follows[:, None], (g - phi * before) / np.sqrt(1 - phi**2), g)
+    follows = (np.diff(calibration["run"].to_numpy(), prepend=np.nan) == 0)[:, None]
+    phi = np.exp(-1 / memory) if memory else 0.0
+
+    def whiten(values: Array) -> Array:
+        values = values / floor[:, None]
+        return np.where(follows, (values - phi * np.roll(values, 1, axis=0)) / np.sqrt(1 - phi**2), values)
+
     widths = [*[SOFT_IRON] * 9, *[HARD_IRON] * 3]
     for mass in vehicle.mass.values():
         widths += [*[MOMENT] * 3, *(VOLUME_SPREAD * volume for volume in mass.volume), *[at_sigma] * 3]
     scale = np.array(widths)
-    g = g * scale  # θ in units of its prior: the information matrix is then well scaled
+    g = whiten(g) * scale  # θ in units of its prior: the information matrix is then well scaled
     covariance = np.linalg.inv(g.T @ g + np.eye(len(scale)))
     h, survey_floor = _sensitivity(vehicle, survey, sigma)
-    h = h * scale
-    return np.sqrt(np.einsum("ni,ij,nj->n", h, covariance, h) + survey_floor**2), survey_floor
+    return covariance, g, whiten, h * scale, survey_floor
 
 
 def _sensitivity(vehicle: Vehicle, deployment: xr.Dataset, sigma: float) -> tuple[Array, Array]:

@@ -27,7 +27,7 @@ from magbridge.calibration.geometry import Mounting, mounted_structure
 from magbridge.calibration.noise import OUTLIER, NoiseModel, estimate_noise
 from magbridge.calibration.nominal import check_scales, starts
 from magbridge.calibration.prior import Structure, free_structure
-from magbridge.calibration.residual import Samples, residuals_of
+from magbridge.calibration.residual import Samples, residuals, residuals_of
 from magbridge.calibration.solve import Prior, Solution, covariance_of, gauss_newton
 from magbridge.calibration.terms import full_order
 from magbridge.errors import CalibrationError
@@ -148,9 +148,21 @@ def _climb(
         white = white and not still and step < ROUNDS // 2
         if step < ROUNDS - 4:  # then let the noise's shape be, so that the rest can settle
             e = residuals_of(samples, structure.coefficients(z))
-            shape = estimate_noise(e, samples.follows & (not white), widths.determined)
+            doubt = (0.0, 0.0) if white else _doubt(samples, _prior(structure, eta), solution, noise)
+            shape = estimate_noise(e, samples.follows & (not white), widths.determined, doubt)
             noise = replace(shape, sigma=widths.sigma)
     return _Answer(solution, widths, noise, structure, quadratic, score)
+
+
+def _doubt(samples: Samples, prior: Prior, solution: Solution, noise: NoiseModel) -> tuple[float, float]:
+    """Variance of the model at a sample, and its covariance with the next one's, nT² (mean of all)."""
+    few = _thinned(samples)
+    _, g = residuals(few, prior.coefficients(solution.z))
+    J = (few.phi[:, :, None] * g[:, None, :]).reshape(len(g), -1)
+    P = covariance_of(solution.normal.hessian / noise.sigma**2 + prior.precision)
+    JP = J @ (prior.E @ P @ prior.E.T)
+    follows = few.follows[1:]
+    return float(np.mean((JP * J).sum(axis=1))), float(np.mean((JP[1:] * J[:-1]).sum(axis=1)[follows]))
 
 
 def _approach(samples: Samples, prior: Prior, z: FloatArray) -> tuple[FloatArray, NoiseModel]:

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from magbridge.calibration.dipole import dipole_columns, expand_dipole
 from magbridge.calibration.model import Parameter
-from magbridge.calibration.prior import FACTOR_MASS, Structure
+from magbridge.calibration.prior import FACTOR_MASS, Structure, gain_rotation
 from magbridge.calibration.terms import Exponents
 from magbridge.errors import CalibrationError, ConfigError
 
@@ -34,9 +34,10 @@ __all__ = ["Mounting", "mounted_structure", "read_vehicle"]
 FloatArray = NDArray[np.float64]
 Vector = tuple[float, float, float]
 
-MOMENT, INDUCED = 2000.0, 80.0  # nT at the sensor: a battery pack at arm's length
+MOMENT, INDUCED = 2000.0, 30.0  # nT at the sensor: a battery pack at arm's length
+INDUCED_APART = 0.4  # of the induced moment: iron is drawn along every axis the same way, if not as much
 TRAVEL_SIGMA = 0.03  # of the travel: the sensor's axes are a degree or two out of the vehicle's
-REST_T, REST_A = 2.0, 0.5  # nT over half the range: what a dipole there does not say
+REST_T, REST_A = 1.0, 0.25  # nT over half the range: what a dipole there does not say
 LATENT = 12  # numbers a mass
 
 
@@ -94,11 +95,13 @@ class _Mass:
 
     def columns(self, latent: FloatArray) -> tuple[FloatArray, FloatArray]:
         """(order, 9, 12) derivative of its coefficients by its latent numbers, and (order, 9) of them."""
-        moment, induced, shift, stretch = latent.reshape(4, 3)
+        moment, pulled, shift, stretch = latent.reshape(4, 3)
+        induced = gain_rotation() @ pulled
         p = self.parameter.centre + self.parameter.scale * chebyshev.chebpts1(4 * len(self.rows) + 4)
         r = self.at + shift + p[:, None] * (self.travel + stretch)
         # the scale of the moments stays that of the tape, or a shift would change them too
         by = dipole_columns(r, moment, induced, float(np.linalg.norm(self.at)))
+        by[3:6] = np.tensordot(gain_rotation().T, by[3:6], 1)
         by = np.concatenate([by, by[6:] * p[:, None]])
         powers = expand_dipole(by, len(self.rows))[:, 1:]  # its constant goes with the hard iron
         return np.moveaxis(powers, 0, -1), np.tensordot(latent[:6], powers[:6], 1)
@@ -140,6 +143,8 @@ def mounted_structure(
         first = q + LATENT * i
         design[first : first + 3, h + 2 * i] = 1.0
         design[first + 3 : first + 6, h + 2 * i + 1] = 1.0
+        constant[first + 3] = np.log(np.sqrt(3.0))
+        constant[first + 4 : first + 6] = np.log(INDUCED_APART)
         constant[first + 6 : first + 9] = np.log(mass.sigma)
         constant[first + 9 : first + 12] = np.log(TRAVEL_SIGMA * np.linalg.norm(mass.travel))
     centre = np.append(free.centre, np.log([MOMENT, INDUCED] * len(masses)))

@@ -41,7 +41,9 @@ class NoiseModel:
         return 0 if self.weight is None else int((self.weight == 0.0).sum())
 
 
-def estimate_noise(e: FloatArray, follows: NDArray[np.bool_], free: float) -> NoiseModel:
+def estimate_noise(
+    e: FloatArray, follows: NDArray[np.bool_], free: float, doubt: tuple[float, float] = (0.0, 0.0)
+) -> NoiseModel:
     """Noise model from the residuals of a fit.
 
     Parameters
@@ -52,9 +54,13 @@ def estimate_noise(e: FloatArray, follows: NDArray[np.bool_], free: float) -> No
         The sample before it is its neighbour.
     free : float
         How many numbers the data determined.
+    doubt : tuple of 2 float
+        nT², what the model's own uncertainty is at a sample, and what it shares with the next one.
+        A fit takes just so much out of the residuals, the slow part of the noise before all:
+        ``Cov e = R - J P J^T`` (R: the noise, P: posterior of the coefficients).
     """
     scale = _robust(e)
-    memory = _memory(np.clip(e, -3.0 * scale, 3.0 * scale), follows)
+    memory = _memory(np.clip(e, -3.0 * scale, 3.0 * scale), follows, doubt)
     white = whiten(e, follows, memory)
     weight = (np.abs(white) <= OUTLIER * _robust(white)).astype(float)
     kept = weight.sum()
@@ -67,10 +73,12 @@ def _robust(e: FloatArray) -> float:
     return 1.4826 * float(np.median(np.abs(e))) or float(np.abs(e).mean()) or 1e-9
 
 
-def _memory(e: FloatArray, follows: NDArray[np.bool_]) -> float:
+def _memory(e: FloatArray, follows: NDArray[np.bool_], doubt: tuple[float, float]) -> float:
     """Correlation of neighbours; what is within its own error of 0 is 0."""
     late, early = e[1:][follows[1:]], e[:-1][follows[1:]]
     if len(late) < 30:
         return 0.0
-    rho = float(late @ early / np.sqrt((late @ late) * (early @ early) + 1e-300))
+    n, (own, shared) = len(late), doubt
+    squares = np.sqrt((late @ late + n * own) * (early @ early + n * own))
+    rho = float((late @ early + n * shared) / (squares + 1e-300))
     return min(rho, 0.99) if rho > 3.0 / np.sqrt(len(late)) else 0.0

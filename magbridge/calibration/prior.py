@@ -31,7 +31,7 @@ FloatArray = NDArray[np.float64]
 GAIN, SOFT_IRON = 0.02, 0.015  # of the field
 HARD_IRON = 3000.0  # nT
 FIRST_T, FIRST_A, RATIO = 200.0, 8.0, 0.05  # nT and nT over half the range seen; travel over distance
-CROSS_T, CROSS_A = 0.3, 0.3  # nT
+CROSS_T, CROSS_A = 0.1, 0.1  # nT
 FACTOR_FIXED, FACTOR_MASS, FACTOR_RATIO = np.log(2.0), np.log(3.3), np.log(1.8)  # one sigma is a factor of
 
 
