@@ -72,6 +72,30 @@ def test_tcp_server_gone_and_back(make_rig: MakeRig, table: Row) -> None:
     replays(rig)
 
 
+def test_autopilot_on_a_serial_line_pulled_out_and_back(make_rig: MakeRig, table: Row) -> None:
+    rig = make_rig("serial")
+    rig.start()
+    mark = rig.mark
+    rig.autopilot.say("PARAM_REQUEST_READ", target_system=1, target_component=191, param_index=0)
+    rig.until(lambda: rig.of("PARAM_VALUE", mark))
+    last, mark = rig.of("MAG_FIELD")[-1]["sequence"], rig.mark
+    rig.autopilot.down()
+    rig.run(1.0)
+    rig.autopilot.up()
+    back = rig.until_well()
+    rig.until_said("link: open", mark)
+    lost = rig.of("MAG_FIELD", mark)[0]["sequence"] - last - 1
+    table(
+        "autopilot on a serial line: pulled out, back after 1.0 s",
+        '"link: unplugged" into the log, then over the link "link: open"; `stale_telemetry` meanwhile',
+        f"{back:.2f} s",
+        f"messages to the autopilot, seen by MAG_FIELD's `sequence` ({lost} here); the log has them all",
+    )
+    assert back < 2.0
+    assert 25 <= lost <= 100
+    replays(rig)
+
+
 def test_host_clock_set_forward_and_back(make_rig: MakeRig, table: Row) -> None:
     rig = make_rig(stepped=True)
     rig.start()

@@ -83,6 +83,31 @@ class Fluxgate:
         return self.encoder.encode(reading)
 
 
+class SerialEnd:
+    """One end of a serial line, spoken to as a socket is; the other end is a device called `name`."""
+
+    def __init__(self, name: Path) -> None:
+        self._master, self._slave = pty.openpty()
+        tty.setraw(self._slave)
+        os.set_blocking(self._master, False)
+        self._name = name
+        name.symlink_to(os.ttyname(self._slave))
+
+    def sendall(self, data: bytes) -> None:
+        """Put bytes on the line."""
+        os.write(self._master, data)
+
+    def recvfrom(self, size: int) -> tuple[bytes, None]:
+        """Take bytes from the line."""
+        return os.read(self._master, size), None
+
+    def close(self) -> None:
+        """Pull it out."""
+        self._name.unlink()
+        os.close(self._slave)
+        os.close(self._master)
+
+
 class Autopilot:
     """System 1, component 1, at the far end of the link."""
 
@@ -93,17 +118,25 @@ class Autopilot:
         self.retell: Callable[[bytes], list[bytes]] = lambda frame: [frame]
         """What the link makes of a telemetry frame."""
         self.bytes_heard = 0
-        self._kind, _, address = url.partition(":")
-        self.address = ("127.0.0.1", int(address.rpartition(":")[2]))
+        self._kind, _, self._at = url.partition(":")
         self._ear = Codec(0, 0)
         self._booted = self._beat = self._told = time.monotonic()
         self._boot_ms = 5000
         self._listener: socket.socket | None = None
-        self._line: socket.socket | None = None
+        self._line: socket.socket | SerialEnd | None = None
         self._peer: tuple[str, int] | None = None
+
+    @property
+    def address(self) -> tuple[str, int]:
+        """Where a socket is."""
+        host, _, port = self._at.rpartition(":")
+        return host, int(port)
 
     def up(self) -> None:
         """Open its end of the link."""
+        if self._kind == "serial":
+            self._line = SerialEnd(Path(self._at))
+            return
         if self._kind == "tcp":
             self._listener = socket.create_server(self.address)
             self._listener.setblocking(False)
@@ -137,7 +170,7 @@ class Autopilot:
         if self._line is None:
             return
         with suppress(BlockingIOError, ConnectionRefusedError, BrokenPipeError, ConnectionResetError):
-            if self._kind == "tcp":
+            if isinstance(self._line, SerialEnd) or self._kind == "tcp":
                 self._line.sendall(data)
             elif self._peer is not None:
                 self._line.sendto(data, self._peer)

@@ -1,6 +1,6 @@
 """A bridge on the bench: the real ``magbridge run`` in a process of its own, between a fluxgate and an autopilot.
 
-The fluxgate speaks into a pty, the autopilot on a UDP or TCP socket. Both are played by whoever calls
+The fluxgate speaks into a pty, the autopilot on a UDP or TCP socket or a pty of its own. Both are played by whoever calls
 :meth:`Rig.until`: nothing happens in the background, so a test says in plain order what goes wrong when.
 """
 
@@ -72,7 +72,7 @@ class Rig:
     folder : Path
         Empty; holds the configuration, the log and the sensor's device.
     link : str
-        ``udpout``, ``udpin`` or ``tcp``.
+        ``udpout``, ``udpin``, ``tcp`` or ``serial``.
     key : bytes or None
         The signing key.
     stepped : bool
@@ -94,7 +94,8 @@ class Rig:
         self.heard: list[Heard] = []
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
             probe.bind(("127.0.0.1", 0))
-            self.url = f"{link}:127.0.0.1:{probe.getsockname()[1]}"
+            place = f"127.0.0.1:{probe.getsockname()[1]}"
+        self.url = f"serial:{folder / 'autopilot'}" if link == "serial" else f"{link}:{place}"
         (folder / "dev").mkdir()
         self.config = folder / "bridge.toml"
         self.config.write_text(self.settings(self.url, key is not None) + more)
