@@ -35,7 +35,8 @@ Record = tuple[int, int, bytes]
 STAMP = Struct(">Q")
 WINDOW = 0.005
 """s between two writes: up to 200 events a second each is written at once, and ``kill -9`` costs at most the last
-one; above that, those of 5 ms. In latency and processor time, 5 ms could not be told from 50 at 1,000 Hz."""
+one; above that, those of 5 ms. Latency does not know the difference; the writing thread takes 66 us a sample at
+100 Hz, where every event is its own write, and 19 us at 1,000 Hz."""
 QUEUE = 100_000
 """Records (some 10 MB) that wait for a stalled disk before they are dropped."""
 RETRY_US = 2_000_000
