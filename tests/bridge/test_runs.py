@@ -87,7 +87,7 @@ def test_autopilot_on_a_serial_line_pulled_out_and_back(make_rig: MakeRig, table
     lost = rig.of("MAG_FIELD", mark)[0]["sequence"] - last - 1
     table(
         "autopilot on a serial line: pulled out, back after 1.0 s",
-        '"link: unplugged" into the log, then over the link "link: open"; `stale_telemetry` meanwhile',
+        '"link: No such file or directory" into the log, then over the link "link: open"; `stale_telemetry` meanwhile',
         f"{back:.2f} s",
         f"messages to the autopilot, seen by MAG_FIELD's `sequence` ({lost} here); the log has them all",
     )
