@@ -48,7 +48,8 @@ class Compile(BuildHookInterface[Any]):
         if done.returncode:
             if wish == "always":
                 raise RuntimeError(f"the live path does not compile:\n{done.stdout}{done.stderr}")
-            self.app.display_warning("no C compiler: the live path stays Python, at twice the processor time")
+            why = (done.stderr or done.stdout).strip().splitlines()[-1:]
+            self.app.display_warning(f"not compiled, so twice the processor time a sample: {' '.join(why)}")
             return
         libraries = [path for path in built.rglob("*") if path.suffix in (".so", ".pyd")]
         build_data["force_include"].update({str(path): str(path.relative_to(built)) for path in libraries})
