@@ -1,0 +1,78 @@
+"""Do the moving masses matter on a real glider? Each dive is corrected by a calibration of all the others.
+
+A Seaglider's compass counts in steps of about 1 mG (100 nT), and knows nothing of its battery and its buoyancy engine.
+Printed for each choice of masses: the RMS error of the dives left out in the sensor's own nT, beside what its steps
+alone leave, dive by dive.
+
+    python tools/seaglider.py ../shared/data/seaglider_sg167/*.nc
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from magbridge.calibration.data import observations
+from magbridge.calibration.validate import HeldOut, leave_runs_out
+from magbridge.errors import CalibrationError
+from magbridge.field.declination import with_true_heading
+from magbridge.field.reference import earth_field
+from magbridge.logs import read
+
+COUNT = 100.0
+"""nT, a step of the sensor: uniform, so its RMS is a step over sqrt(12)."""
+CHOICES: tuple[tuple[str, tuple[str, ...], int], ...] = (
+    ("nominal", (), 0),
+    ("auto", ("vbdCC",), 1),
+    ("auto", ("vbdCC",), 3),
+    ("auto", ("pitchCtl",), 1),
+    ("auto", ("pitchCtl", "vbdCC"), 1),
+    ("auto", ("pitchCtl", "vbdCC"), 3),
+    ("auto", ("pitchCtl", "rollCtl", "vbdCC"), 1),
+    ("auto", ("pitchCtl", "rollCtl", "vbdCC"), 3),
+    ("cubic", ("pitchCtl", "vbdCC"), 3),
+)
+"""Method, masses, order."""
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("files", nargs="+", type=Path, help="a Seaglider's dives, netCDF")
+    files = parser.parse_args().files
+    deployment = with_true_heading(read(sorted(files)))
+    table = Table(title=f"{len(files)} dives, each left out of its calibration", title_justify="left")
+    for heading in ("method", "order", "masses", "left out, nT", "over nominal: by dive", "sigma"):
+        table.add_column(heading, justify="left" if heading in {"method", "masses"} else "right")
+    nominal: HeldOut | None = None
+    for method, masses, order in CHOICES:
+        data = observations(deployment, list(masses), reference=earth_field)
+        try:
+            found = leave_runs_out(data, method, order)
+        except CalibrationError as refusal:
+            table.add_row(method, str(order), ", ".join(masses), "refused", str(refusal).partition(";")[0])
+            continue
+        nominal = nominal or found
+        ratios = [found.by_run()[dive] / rms for dive, rms in nominal.by_run().items()]
+        table.add_row(
+            method,
+            str(order),
+            ", ".join(masses) or "none",
+            f"{found.rms:.1f}",
+            " ".join(f"{ratio:.2f}" for ratio in ratios),
+            f"{np.nanstd(found.standardised):.2f}",
+        )
+    console = Console(width=140)
+    console.print(table)
+    console.print(
+        f"a step of the sensor is {COUNT:.0f} nT: {COUNT / np.sqrt(12):.0f} nT RMS a channel, if nothing else were wrong"
+    )
+
+
+if __name__ == "__main__":
+    main()
