@@ -60,7 +60,8 @@ def vehicle(seed: int, rms: float = 60.0) -> Stage:
     base = swap(base, instrument=instrument, world=world, motion=swap(base.motion, settle=40.0))
     spirals = simulate(swap(base, mission=(Spirals(),)), seed)
     calibration = fit(observations(spirals, ["battpos", "ballast"]), "auto").calibration
-    survey = CrissCross(hours=HOURS, roll=(0.0, 4.0), pitch=(24.0, 3.0), battery_spread=0.12, duration=700.0)
+    # no multiple of the sampling's 4 s: else every mass would start to move just when a sample is taken
+    survey = CrissCross(hours=HOURS, roll=(0.0, 4.0), pitch=(24.0, 3.0), battery_spread=0.12, duration=701.5)
     quiet = swap(base, instrument=swap(instrument, noise_sigma=0.0), mission=(survey,))
     return _flown(Twin.draw(quiet, seed), calibration)
 
