@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import reduce
+from functools import partial, reduce
 from itertools import product
 
 import numpy as np
@@ -13,6 +13,7 @@ from magbridge.calibration.terms import Polynomial, full_order
 from magbridge.diagnose.candidates import AXES, Candidate, of_effect
 from magbridge.diagnose.causes.channels import channels_of, extent
 from magbridge.diagnose.problem import Problem
+from magbridge.diagnose.regressors import play, powers
 
 __all__ = ["actuator_order", "hysteresis", "unmodelled_actuator"]
 
@@ -45,9 +46,14 @@ def unmodelled_actuator(problem: Problem) -> list[Candidate]:
                     width,
                     f"nT per {scale:.3g} {problem.survey.channels[name].unit}",
                     channel=name,
+                    phi=partial(_powers, problem.survey.channels[name].values, centre, scale, order),
                 )
             )
     return made
+
+
+def _powers(values: FloatArray, centre: float, scale: float, order: int, rows: slice) -> FloatArray:
+    return powers((values[rows] - centre) / scale, order)
 
 
 def actuator_order(problem: Problem) -> list[Candidate]:
@@ -82,7 +88,17 @@ def _monomial(problem: Problem, exponents: tuple[int, ...]) -> Candidate:
         if e
     )
     effect = MonomialEffect(cause="actuator_order", exponents=exponents)
-    return of_effect(problem, effect, 50.0, "nT", names=tuple(f"{axis} {label}" for axis in AXES))
+    factors = [
+        (problem.survey.channels[p.name].values, p.centre, p.scale, e)
+        for p, e in zip(problem.calibration.parameters, exponents, strict=True)
+        if e
+    ]
+
+    def phi(rows: slice) -> FloatArray:
+        product = [((values[rows] - centre) / scale) ** e for values, centre, scale, e in factors]
+        return np.asarray(np.prod(product, axis=0)[None])
+
+    return of_effect(problem, effect, 50.0, "nT", names=tuple(f"{axis} {label}" for axis in AXES), phi=phi)
 
 
 def hysteresis(problem: Problem) -> list[Candidate]:
@@ -97,20 +113,34 @@ def hysteresis(problem: Problem) -> list[Candidate]:
         centre, scale = 0.5 * (low + high), 0.5 * (high - low)
         unit = problem.survey.channels[name].unit
 
-        def straight(width: float, name: str = name, unit: str = unit) -> Candidate:
-            effect = PlayEffect(cause="hysteresis", channel=name, width=width)
-            shape = {"width": (width, unit)}
-            return of_effect(problem, effect, 50.0, "nT", channel=name, shape=shape, again=straight)
-
-        def curved(
-            width: float, name: str = name, unit: str = unit, centre: float = centre, scale: float = scale
+        def again(
+            width: float,
+            name: str = name,
+            order: int = 1,
+            unit: str = unit,
+            centre: float = centre,
+            scale: float = scale,
         ) -> Candidate:
             effect = PlayEffect(
-                cause="hysteresis", channel=name, width=width, order=BRANCH, centre=centre, scale=scale
+                cause="hysteresis",
+                channel=name,
+                width=width,
+                order=order,
+                centre=centre,
+                scale=width if order == 1 else scale,
             )
-            shape = {"width": (width, unit)}
-            return of_effect(problem, effect, 50.0, "nT", channel=name, shape=shape, again=curved)
+            p = problem.survey.channels[name].values
+            y = play(p, width)
 
-        made += [straight(share * (high - low)) for share in (0.05, 0.15, 0.3)]
-        made += [curved(share * (high - low)) for share in (0.15, 0.3, 0.5)]
+            def phi(rows: slice) -> FloatArray:
+                v, x = (y[rows] - centre) / effect.scale, (p[rows] - centre) / effect.scale
+                return powers(v, order) - powers(x, order)
+
+            return of_effect(
+                problem, effect, 50.0, "nT", channel=name, shape={"width": (width, unit)}, phi=phi,
+                again=partial(again, name=name, order=order, unit=unit, centre=centre, scale=scale),
+            )  # fmt: skip
+
+        made += [again(share * (high - low)) for share in (0.05, 0.15, 0.3)]
+        made += [again(share * (high - low), order=BRANCH) for share in (0.15, 0.3, 0.5)]
     return made

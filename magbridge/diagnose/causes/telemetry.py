@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cache
 from typing import Any, Literal
 
@@ -11,7 +12,8 @@ from numpy.typing import NDArray
 from magbridge.calibration.effects import ChannelEffect
 from magbridge.diagnose.candidates import Candidate, of_effect
 from magbridge.diagnose.causes.channels import channels_of, extent
-from magbridge.diagnose.problem import Problem, history
+from magbridge.diagnose.problem import Problem
+from magbridge.diagnose.regressors import lagged
 
 __all__ = ["current_field", "pressure_offset", "temperature_offset", "temperature_scale"]
 
@@ -36,15 +38,14 @@ def _thermal(problem: Problem, on: Literal["offset", "scale"]) -> list[Candidate
     for name in channels_of(problem, "temperature"):
 
         @cache
-        def lagged(lag: float, name: str = name) -> FloatArray:
-            effect = ChannelEffect(cause="", channel=name, lag=lag)
-            return history(problem.survey, problem.calibration, effect)
+        def level(lag: float, name: str = name) -> FloatArray:
+            return lagged(problem.survey.time, problem.survey.channels[name].values, lag)
 
-        def again(origin: float, lag: float, name: str = name, lagged: Any = lagged) -> Candidate:
+        def again(origin: float, lag: float, name: str = name, level: Any = level) -> Candidate:
             lag = max(lag, 0.0)
             effect = ChannelEffect(cause=f"temperature_{on}", channel=name, origin=origin, lag=lag, on=on)
             shape = {"origin": (origin, "degC"), "lag": (lag, "s")}
-            phi = lagged(lag)
+            phi = level(lag)
             return of_effect(
                 problem,
                 effect,
@@ -53,7 +54,7 @@ def _thermal(problem: Problem, on: Literal["offset", "scale"]) -> list[Candidate
                 channel=name,
                 shape=shape,
                 again=again,
-                phi=lambda rows: phi[:, rows] - origin,
+                phi=lambda rows: phi[None, rows] - origin,
             )
 
         lags = [lag for lag in LAGS if lag <= longest]
@@ -75,6 +76,11 @@ def temperature_scale(problem: Problem) -> list[Candidate]:
     return _thermal(problem, "scale")
 
 
+def _level(problem: Problem, name: str) -> Callable[[slice], FloatArray]:
+    values = problem.survey.channels[name].values
+    return lambda rows: values[None, rows]
+
+
 def current_field(problem: Problem) -> list[Candidate]:
     """A current loop is a fixed source: ``T += b I(t)`` (Biot and Savart), zero when the current is."""
     made = []
@@ -82,7 +88,16 @@ def current_field(problem: Problem) -> list[Candidate]:
         low, high = extent(problem, name)
         effect = ChannelEffect(cause="current_field", channel=name)
         unit = f"nT/{problem.survey.channels[name].unit or '1'}"
-        made.append(of_effect(problem, effect, 100.0 / max(abs(low), abs(high)), unit, channel=name))
+        made.append(
+            of_effect(
+                problem,
+                effect,
+                100.0 / max(abs(low), abs(high)),
+                unit,
+                channel=name,
+                phi=_level(problem, name),
+            )
+        )
     return made
 
 
@@ -93,5 +108,14 @@ def pressure_offset(problem: Problem) -> list[Candidate]:
         low, high = extent(problem, name)
         effect = ChannelEffect(cause="pressure_offset", channel=name)
         unit = f"nT/{problem.survey.channels[name].unit or '1'}"
-        made.append(of_effect(problem, effect, 50.0 / max(abs(low), abs(high)), unit, channel=name))
+        made.append(
+            of_effect(
+                problem,
+                effect,
+                50.0 / max(abs(low), abs(high)),
+                unit,
+                channel=name,
+                phi=_level(problem, name),
+            )
+        )
     return made

@@ -1,0 +1,100 @@
+"""What the search puts into its columns is what the live correction would step through."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from magbridge.calibration.effects import ChannelEffect
+from magbridge.calibration.followers import MonomialEffect, PlayEffect, PowersEffect
+from magbridge.calibration.model import Calibration, Noise, Parameter, Reference
+from magbridge.calibration.terms import Polynomial
+from magbridge.diagnose.causes import CAUSES
+from magbridge.diagnose.problem import Problem, effect_columns, history, pose
+from magbridge.diagnose.survey import Channel, Survey
+
+
+@pytest.fixture(scope="module")
+def problem() -> Problem:
+    """Half an hour of turning, with a gap, clocks that tremble, a mass that rests and moves, a temperature and a current."""
+    rng = np.random.default_rng(1)
+    n = 450
+    t = 1.7e9 + 4.0 * np.arange(n) + np.where(np.arange(n) > 300, 500.0, 0.0)
+    t[200:204] += rng.uniform(-0.5, 0.5, 4)
+    d = rng.normal(size=(n, 3)).cumsum(axis=0) * 0.1 + [0.3, 0.1, 0.9]
+    p = np.interp(
+        np.arange(n), [0, 60, 70, 150, 160, 300, 310, 449], [-0.5, -0.5, 0.8, 0.8, -1.0, -1.0, 0.6, 0.6]
+    )
+    warm = 3.0 + rng.normal(size=n).cumsum() * 0.1
+    amps = np.where(rng.uniform(size=n) > 0.7, 1.3, 0.0)
+    survey = Survey(
+        time=t, field=5e4 * d / np.linalg.norm(d, axis=1)[:, None], reference=np.full(n, 5e4), still=(),
+        follows=np.append(False, np.abs(np.diff(t) - 4.0) < 2.0), dive=np.arange(n) // 50, place=None, attitude=None,
+        learned=np.zeros(n, bool), cycles=np.empty(0), source="made",
+        channels={
+            "p": Channel(p, "in", ("position",)), "fin": Channel(p[::-1].copy(), "deg", ("position",)),
+            "warm": Channel(warm, "degC", ("temperature",)), "amps": Channel(amps, "A", ("current",)),
+        },
+    )  # fmt: skip
+    calibration = Calibration(
+        parameters=(Parameter("p", "in", -1.0, 1.0, 0.1, 0.9),),
+        terms=(Polynomial(exponents=((0,), (1,), (2,))),),
+        coefficients=rng.normal(0, 50.0, 27),
+        covariance=np.diag(np.full(27, 4.0)),
+        noise=Noise(1.0),
+        reference=Reference(5e4),
+    )
+    return pose(survey, calibration)
+
+
+FOLLOWERS = (ChannelEffect, PowersEffect, MonomialEffect, PlayEffect)
+
+
+def test_columns_are_those_of_the_stepped_effect(problem: Problem) -> None:
+    seen = 0
+    for cause in CAUSES.values():
+        for candidate in cause.candidates(problem):
+            if (
+                not all(isinstance(effect, FOLLOWERS) for effect in candidate.effects)
+                or not candidate.effects
+            ):
+                continue
+            stepped = [
+                effect_columns(problem, effect, history(problem.survey, problem.calibration, effect))(
+                    slice(0, None)
+                )
+                for effect in candidate.effects
+            ]
+            np.testing.assert_allclose(
+                candidate.columns(slice(0, None)) / candidate.width, np.hstack(stepped), rtol=1e-9, atol=1e-9
+            )
+            seen += 1
+    assert seen > 30
+
+
+def test_columns_in_pieces_are_the_columns(problem: Problem) -> None:
+    for cause in CAUSES.values():
+        for candidate in cause.candidates(problem):
+            whole = candidate.columns(slice(0, len(problem)))
+            np.testing.assert_array_equal(candidate.columns(slice(100, 230)), whole[100:230])
+
+
+def test_a_mass_rate_is_the_drives_speed_while_it_moves(problem: Problem) -> None:
+    """A clock that is off is seen where the mass has moved before and after, and nowhere else."""
+    (clock,) = CAUSES["clock_offset"].candidates(problem)
+    (lag,) = CAUSES["filter_lag"].candidates(problem)
+    rows = np.flatnonzero(clock.columns(slice(0, len(problem)))[:, 0])
+    assert set(rows) == {*range(61, 70), *range(151, 160), *range(302, 310)}
+    share = lag.columns(slice(0, len(problem)))[rows] / clock.columns(slice(0, len(problem)))[rows]
+    np.testing.assert_allclose(share, -lag.width[0] / clock.width[0])
+
+
+def test_a_cause_found_twice_is_one(problem: Problem) -> None:
+    first, second = CAUSES["hysteresis"].candidates(problem)[:2]
+    both = first.with_(second).with_(replace(second, shape={"width": (1.0, "in")}))
+    assert both.size == 9
+    assert len(set(both.names)) == 9
+    assert len(both.shape) == len(both.effects) == 3
+    np.testing.assert_array_equal(both.columns(slice(0, 50))[:, :3], first.columns(slice(0, 50)))
