@@ -154,12 +154,15 @@ class Navigation(Table, frozen=True):
     fix : str
         In which message a fix goes to the autopilot: ``EXTERNAL_POSITION_ESTIMATE`` or ``ODOMETRY`` (ArduPilot),
         ``GLOBAL_POSITION_SENSOR`` or ``ODOMETRY`` (PX4).
+    rate : float
+        Hz of the fixes, dead-reckoned between updates; 0 is with each update. Default 5 for ``ODOMETRY``, else 0.
     options : dict
         How well things are known beforehand: :class:`magbridge.navigate.Options`.
     """
 
     map: str
     fix: str
+    rate: NotNegative | None = None
     options: dict[str, Any] = msgspec.field(default_factory=dict)
 
 

@@ -6,13 +6,14 @@ from typing import NamedTuple
 
 import numpy as np
 from accuracy import at_rest, rms, total
-from voyages import PLACE, Map, Score, adrift, sail, synthetic
+from msgspec.structs import replace as with_options
+from voyages import GLIDER, PLACE, Map, Score, adrift, sail, synthetic
 
 from magbridge.calibration.data import observations
 from magbridge.calibration.fit import fit
 from magbridge.config import Align
 from magbridge.correction import Correction, correct_rows
-from magbridge.navigate.model import Options, informed
+from magbridge.navigate.model import informed
 from sitl import load, segments, simulate
 from sitl.world import to_local
 
@@ -44,7 +45,7 @@ def flown(kinds: tuple[Map, ...], seed: int) -> dict[tuple[int, str], Flown]:
         sigma = corrected["total_field_sigma"].to_numpy()
         for k, kind in enumerate(kinds):
             grid = synthetic(kind, seed % 10)
-            known = Options(start_sigma=grid.correlation_length, current_sigma=0.05, map_sigma=1.0)
+            known = with_options(GLIDER, start_sigma=grid.correlation_length)
             known = informed(known, fitted, float(np.median(sigma)))
             ds = adrift(grid, known, np.random.default_rng(seed), velocity, error, sigma, every=every)
             found[k, method] = Flown(rms(error), float(np.median(sigma)), sail(ds, grid, known).score())

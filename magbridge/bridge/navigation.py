@@ -5,17 +5,20 @@ from __future__ import annotations
 from collections.abc import Callable
 from math import degrees, nan
 
+from magbridge.calibration.model import Calibration
 from magbridge.config import Config, convert
 from magbridge.errors import ConfigError
 from magbridge.field.earth import separation
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.read import read_grid
 from magbridge.link.component import Component
-from magbridge.link.fixes import FIXES, Fix
+from magbridge.link.fixes import FIXES, Fix, Kind
 from magbridge.link.rates import Rate
 from magbridge.mavlink import Message, spec
 from magbridge.mavlink.dialect import MAV_SEVERITY
 from magbridge.navigate import Navigator, Options, Record, State
+from magbridge.navigate.model import informed
+from magbridge.navigate.record import Reckoned
 from magbridge.records import Corrected
 
 __all__ = ["Navigation", "open_navigation"]
@@ -40,14 +43,17 @@ class Navigation:
     ----------
     grid : AnomalyGrid
     options : Options
-    fix : str
-        Key of :data:`~magbridge.link.fixes.FIXES`.
+    fix : Kind
+        Of :data:`~magbridge.link.fixes.FIXES`.
     component : Component
     """
 
-    def __init__(self, grid: AnomalyGrid, options: Options, fix: str, component: Component) -> None:
+    def __init__(self, grid: AnomalyGrid, options: Options, fix: Kind, component: Component) -> None:
         self.navigator = Navigator(grid, options)
-        self._send_fix = FIXES[fix]
+        self._fix = fix
+        if fix.rate > 0.0:
+            now_us = component.codec.now_us
+            component.timers.every("fix", round(1e6 / fix.rate), self._between, now_us)
         self._component = component
         self._rate: Rate = component.rates["MAG_NAVIGATION"]
         self._origin: tuple[float, float] | None = None
@@ -125,28 +131,39 @@ class Navigation:
                 state=int(record.state),
                 accepted=int(record.accepted),
             )
-        if record.vouched:
-            self._send_fix(component.outbox, self._fix(record, offset_us), *component.peer)
+        if record.vouched and self._fix.rate == 0.0:
+            self._send(record)
 
-    def _fix(self, record: Record, offset_us: int) -> Fix:
-        origin = self._origin or (record.latitude, record.longitude)
-        north, east = separation(*origin, record.latitude, record.longitude)
-        return Fix(
-            time_us=record.time_us + offset_us,
-            age=(self._component.codec.now_us - record.time_us) * 1e-6,
-            latitude=record.latitude,
-            longitude=record.longitude,
-            covariance_nn=record.covariance_nn,
-            covariance_ne=record.covariance_ne,
-            covariance_ee=record.covariance_ee,
+    def _between(self, time_us: int) -> None:
+        """Send where the vehicle is now, while the filter vouches for it."""
+        if (now := self.navigator.reckon(time_us)) is not None:
+            self._send(now)
+
+    def _send(self, at: Record | Reckoned) -> None:
+        component = self._component
+        origin = self._origin or (at.latitude, at.longitude)
+        north, east = separation(*origin, at.latitude, at.longitude)
+        fix = Fix(
+            time_us=at.time_us + component.publisher.utc_offset_us,
+            age=(component.codec.now_us - at.time_us) * 1e-6,
+            latitude=at.latitude,
+            longitude=at.longitude,
+            covariance_nn=at.covariance_nn,
+            covariance_ne=at.covariance_ne,
+            covariance_ee=at.covariance_ee,
             north=north,
             east=east,
             resets=len(self.navigator.jumps),
         )
+        self._fix.send(component.outbox, fix, *component.peer)
 
 
-def open_navigation(config: Config, component: Component) -> Navigation | None:
+def open_navigation(
+    config: Config, component: Component, calibration: Calibration | None
+) -> Navigation | None:
     """Return the navigation that a configuration asks for.
+
+    What the configuration does not say of the calibration's errors, the calibration says.
 
     Raises
     ------
@@ -161,4 +178,9 @@ def open_navigation(config: Config, component: Component) -> Navigation | None:
     if wanted.fix not in FIXES:
         raise ConfigError(config.path, "navigation.fix", f"expected one of {', '.join(FIXES)}")
     options = convert(wanted.options, Options, config.path, "navigation.options.")
-    return Navigation(read_grid(config.resolve(wanted.map)), options, wanted.fix, component)
+    if calibration is not None and not wanted.options.keys() & {"noise", "bias_sigma"}:
+        options = informed(options, calibration, calibration.noise.sensor)
+    kind = FIXES[wanted.fix]
+    if wanted.rate is not None:
+        kind = kind._replace(rate=wanted.rate)
+    return Navigation(read_grid(config.resolve(wanted.map)), options, kind, component)

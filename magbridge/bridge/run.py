@@ -61,7 +61,7 @@ def set_up(config: Config, start: Start) -> Pipeline:
     if config.navigation is not None:
         from magbridge.bridge.navigation import open_navigation  # noqa: PLC0415 - it brings filterpy
 
-        pipeline.navigation = open_navigation(config, pipeline.component)
+        pipeline.navigation = open_navigation(config, pipeline.component, calibration)
     return pipeline
 
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from math import isfinite, nan, sqrt
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 
 from magbridge.link.outbox import Outbox
 
-__all__ = ["FIXES", "Fix"]
+__all__ = ["FIXES", "Fix", "Kind"]
 
 EXTERNAL_POSITION_ESTIMATE = 43003
 GLOBAL_FRAME, LOCAL_NED, BODY_FRD = 0, 1, 12
@@ -124,9 +124,16 @@ def odometry(outbox: Outbox, fix: Fix, system: int, autopilot: int) -> None:  # 
     )
 
 
-FIXES: dict[str, Callable[[Outbox, Fix, int, int], Any]] = {
-    "EXTERNAL_POSITION_ESTIMATE": external_position,
-    "GLOBAL_POSITION_SENSOR": global_position,
-    "ODOMETRY": odometry,
+class Kind(NamedTuple):
+    """How a fix is sent, and how often in Hz where nothing else is said; 0 is with every update."""
+
+    send: Callable[[Outbox, Fix, int, int], Any]
+    rate: float
+
+
+FIXES: dict[str, Kind] = {
+    "EXTERNAL_POSITION_ESTIMATE": Kind(external_position, 0.0),
+    "GLOBAL_POSITION_SENSOR": Kind(global_position, 0.0),
+    "ODOMETRY": Kind(odometry, 5.0),  # ArduPilot takes nothing below 4 Hz
 }
 """What ``[navigation] fix`` may name."""

@@ -51,6 +51,13 @@ class DeadReckoning:
             self._move(self._velocity[0] * elapsed, self._velocity[1] * elapsed)
         self._time = time
 
+    def ahead(self, time: float) -> tuple[float, float]:
+        """Return latitude and longitude at `time`, along the last known velocity, without moving there."""
+        elapsed = time - self._time
+        if not 0.0 < elapsed < LONGEST:
+            return self.latitude, self.longitude
+        return offset(self.latitude, self.longitude, self._velocity[0] * elapsed, self._velocity[1] * elapsed)
+
     def telemetry(self, time: float, values: dict[str, float]) -> None:
         """Take in what is known at `time` (s).
 

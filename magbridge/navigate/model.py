@@ -40,6 +40,7 @@ __all__ = [
 Array = NDArray[np.float64]
 
 N_STATES = 6
+LEG = 1_800.0  # s, between turns or from dive to climb
 FINE = 0.35  # of the spread that one measurement allows: errors of neighbours follow each other and add up
 
 
@@ -126,15 +127,15 @@ def informed(options: Options, calibration: Calibration, sigma: float) -> Option
 
     Notes
     -----
-    White is the noise that the calibration runs showed, unless it lasts longer than a block: an error of a few
-    minutes does not average out, it is a bias, and lasts as long as it did there.
+    White is the noise that the calibration runs showed, unless it lasted longer there than a block: that does not
+    average out, it is a bias. What a calibration gets wrong follows attitude and masses, and lasts for a leg.
     """
     noise = calibration.noise
     lasts = -noise.interval / log(noise.memory) if 0.0 < noise.memory < 1.0 else 0.0
     white = noise.sensor if lasts <= options.interval else 0.0
-    slow = hypot(options.bias_sigma, sqrt(max(0.0, sigma**2 - white**2)))
-    time = options.bias_time if white else min(options.bias_time, lasts)
-    return replace(options, noise=white, bias_sigma=slow, bias_time=time)
+    slow = sqrt(max(0.0, sigma**2 - white**2))
+    time = min(options.bias_time, LEG) if slow > options.bias_sigma else options.bias_time
+    return replace(options, noise=white, bias_sigma=hypot(options.bias_sigma, slow), bias_time=time)
 
 
 def prior(options: Options, position_sigma: float | None = None) -> tuple[Array, Array]:

@@ -23,7 +23,7 @@ from magbridge.navigate.bank import Bank, widest
 from magbridge.navigate.collect import Collector
 from magbridge.navigate.deadreckoning import DeadReckoning
 from magbridge.navigate.model import Block, Options, block_length, prior, resolution, transition
-from magbridge.navigate.record import Jump, Record, State
+from magbridge.navigate.record import Jump, Reckoned, Record, State
 from magbridge.navigate.tracker import Tracker
 from magbridge.navigate.watch import Unmapped, Verdict, Watch, distance
 from magbridge.records import Corrected, Quality
@@ -37,6 +37,7 @@ CONTRADICTION = 25.0  # squared distance of a fix, two degrees of freedom: 4e-6 
 UNINFORMED = 0.8  # of what dead reckoning alone would have: the field has said nothing
 REACH = 300.0  # m, the least that the watch looks around
 JOIN, SPLIT = 1.2, 1.5  # of the map's resolution: below one hypothesis will do, above it will not
+FRESH = 3.0  # intervals: an update older than that is not followed by others
 FINER = 0.8  # of the resolution: so much better a measurement must be to be worth a finer one
 LEVEL_LASTS = 10.0  # times as long as a calibration's bias
 DOUBTFUL = 1.0  # log odds: another place explains the field better, if not yet beyond doubt
@@ -84,7 +85,7 @@ class Navigator:
         self._nowhere = 0.0
         self._resolution = inf
         self._alone = self.P[:4, :4].copy()  # covariance of dead reckoning alone
-        self._lost = False
+        self._lost = self._vouched = False
         self._searches = 0
 
     # ---- what comes in -------------------------------------------------------------------------------
@@ -157,6 +158,22 @@ class Navigator:
         block = self._collector.flush()
         return None if block is None else self._update(block)
 
+    def reckon(self, time_us: int) -> Reckoned | None:
+        """Return the position at a time since the last update, dead-reckoned from there; nothing is changed.
+
+        None if the filter does not vouch for it: the last update was not vouched for, or is too long ago.
+        """
+        elapsed = (time_us - self._time_us) * 1e-6
+        if not self._vouched or elapsed > FRESH * self.options.interval:
+            return None
+        F, Q = transition(self.options, max(elapsed, 0.0), 0.0)
+        x, P = F @ self.x, F @ self.P @ F.T + Q
+        if widest(P) > self.options.vouch_sigma:
+            return None
+        place = offset(*self._reckoning.ahead(time_us * 1e-6), float(x[0]), float(x[1]))
+        (nn, ne), (_, ee) = P[:2, :2].tolist()
+        return Reckoned(time_us, *place, nn, ne, ee)
+
     # ---- one update ----------------------------------------------------------------------------------
 
     def _predict(self, time_us: int) -> tuple[float, float]:
@@ -191,10 +208,12 @@ class Navigator:
         latitude, longitude = offset(block.latitude, block.longitude, float(self.x[0]), float(self.x[1]))
         (nn, ne), (_, ee) = self.P[:2, :2].tolist()
         odds = self._watch.odds if self._watch else 0.0
+        sure = widest(self.P) < self.options.vouch_sigma
+        self._vouched = self.state is State.TRACKING and odds < DOUBTFUL and sure
         return Record(
             block.time_us,
             self.state,
-            self.state is State.TRACKING and odds < DOUBTFUL and widest(self.P) < self.options.vouch_sigma,
+            self._vouched,
             latitude,
             longitude,
             nn,

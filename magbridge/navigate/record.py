@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import msgspec
 
-__all__ = ["Jump", "Record", "State"]
+__all__ = ["Jump", "Reckoned", "Record", "State"]
 
 
 class State(IntEnum):
@@ -85,6 +85,17 @@ class Record(msgspec.Struct, frozen=True, gc=False):
     east: float
     hypotheses: int
     odds: float
+
+
+class Reckoned(NamedTuple):
+    """A position between updates: µs, deg, m²."""
+
+    time_us: int
+    latitude: float
+    longitude: float
+    covariance_nn: float
+    covariance_ne: float
+    covariance_ee: float
 
 
 class Jump(NamedTuple):

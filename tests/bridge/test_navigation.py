@@ -18,7 +18,7 @@ from magbridge.calibration.file import save
 from magbridge.calibration.model import Noise, identity
 from magbridge.config import load
 from magbridge.errors import ConfigError
-from magbridge.field.earth import offset
+from magbridge.field.earth import offset, separation
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.igrf import total_field
 from magbridge.field.read import read_grid
@@ -26,6 +26,7 @@ from magbridge.mavlink import Codec, Message
 from magbridge.records import Channel, Reading
 from sitl.fluxgate import open_encoder
 
+TRACKING = 2
 START = 1_780_000_000_000_000
 PLACE = (49.5, -57.9)
 SPEED, HEADING, OFF = 0.5, 60.0, 150.0
@@ -129,7 +130,10 @@ def test_the_field_finds_what_dead_reckoning_lost(folder: Path, fix: str, messag
     assert np.hypot(north, east) < max(4.0 * sigma, 15.0)
     assert sigma < 60.0
     assert messages[message], "a fix is sent once the filter vouches for it"
-    assert len(messages[message]) < len(messages["MAG_NAVIGATION"]), "and not before"
+    vouched = sum(one["state"] == TRACKING for one in messages["MAG_NAVIGATION"])
+    assert vouched < len(messages["MAG_NAVIGATION"])
+    if fix != "ODOMETRY":
+        assert len(messages[message]) <= vouched, "and not before"
     sent = messages[message][-1]
     if fix == "EXTERNAL_POSITION_ESTIMATE":
         assert (sent["command"], sent["target_system"], sent["target_component"]) == (43003, 1, 1)
@@ -138,8 +142,36 @@ def test_the_field_finds_what_dead_reckoning_lost(folder: Path, fix: str, messag
     elif fix == "GLOBAL_POSITION_SENSOR":
         assert (sent["lat"], sent["lon"]) == (last["lat"], last["lon"])
     else:
-        assert sent["pose_covariance"][0] == pytest.approx(last["covariance_nn"], rel=1e-6)
+        begun = next(one for one in messages["MAG_NAVIGATION"] if one["state"] == TRACKING)["time_usec"]
+        assert messages[message][0]["time_usec"] >= begun, "and not before"
+        assert sent["pose_covariance"][0] >= last["covariance_nn"] * (1 - 1e-6), "it grows between updates"
     assert any(re.match("navigation: tracks", text["text"]) for text in messages["STATUSTEXT"])
+
+
+def test_odometry_goes_on_between_updates(folder: Path) -> None:
+    """At 5 Hz, where the vehicle is by then, its doubt growing; and it ends when the field does."""
+    path = folder / "odometry.toml"
+    path.write_text(CONFIG.replace("FIX", "ODOMETRY"))
+    pipeline = set_up(load(path), Start(START))
+    told = list(events(read_grid(folder / "grid.nc"), path))
+    stream = b"".join(frame for event in told for _, frame in pipeline.feed(event))
+    silent = b"".join(
+        frame
+        for k in range(600)
+        for _, frame in pipeline.feed(Event(told[-1].time_us + 200_000 * k, Channel.LINK, b""))
+    )
+    sent = heard(stream)["ODOMETRY"]
+    times = np.array([one["time_usec"] for one in sent])
+    assert np.median(np.diff(times)) == 200_000
+    for one in sent[-200::50]:
+        latitude, longitude = truth(one)
+        start = separation(*PLACE, latitude, longitude)
+        sigma = np.sqrt(one["pose_covariance"][0] + one["pose_covariance"][6])
+        assert np.hypot(one["x"] - start[0], one["y"] - start[1]) < max(4.0 * sigma, 15.0)
+    after = heard(silent)["ODOMETRY"]
+    grown = [one["pose_covariance"][0] for one in after]
+    assert grown == sorted(grown)
+    assert 2.0 < (after[-1]["time_usec"] - times[-1]) * 1e-6 < 45.0
 
 
 def test_the_same_events_give_the_same_fixes(folder: Path) -> None:

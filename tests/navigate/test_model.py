@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import msgspec
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
+from magbridge.calibration.model import Calibration, Noise, identity
 from magbridge.field.grid import AnomalyGrid
-from magbridge.navigate.model import Options, block_length, prior, resolution, transition
+from magbridge.navigate.model import Options, block_length, informed, prior, resolution, transition
 
 
 def test_many_short_steps_are_one_long_step():
@@ -46,3 +50,19 @@ def test_options_refuse_what_they_do_not_know():
     with pytest.raises(msgspec.ValidationError, match="unknown field `gait`"):
         msgspec.convert({"gait": 1.0}, Options)
     assert msgspec.convert({"gate": 9.0}, Options).gate == 9.0
+
+
+def test_a_calibration_tells_what_is_white_and_what_is_not():
+    known = Options(bias_sigma=1.0)
+    white = with_noise(Noise(2.0))
+    assert informed(known, white, 2.0) == replace(known, noise=2.0)
+    slow = informed(known, white, 10.0)
+    assert slow.bias_sigma == pytest.approx(np.sqrt(1.0 + 100.0 - 4.0))
+    assert slow.bias_time < known.bias_time
+    lasting = informed(known, with_noise(Noise(10.0, memory=0.99, interval=4.0)), 10.0)
+    assert lasting.noise == 0.0
+    assert lasting.bias_sigma == pytest.approx(np.hypot(1.0, 10.0))
+
+
+def with_noise(noise: Noise) -> Calibration:
+    return dataclasses.replace(identity(), noise=noise)
