@@ -8,6 +8,7 @@ else that moves the reading, with a state of its own where it needs one: see
 
 from __future__ import annotations
 
+from abc import ABCMeta, abstractmethod
 from collections.abc import Callable, Sequence
 from importlib import import_module
 from importlib.metadata import entry_points
@@ -75,15 +76,19 @@ class Expansion(msgspec.Struct, frozen=True):
     columns: FloatArray
 
 
-class Term(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class _Interface(msgspec.StructMeta, ABCMeta):
+    """A struct that may leave methods to those who inherit."""
+
+
+class Term(msgspec.Struct, metaclass=_Interface, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Settings of a term; its coefficients stand in the calibration's vector."""
 
     kind: ClassVar[str]
 
     @property
+    @abstractmethod
     def size(self) -> int:
         """Number of coefficients."""
-        raise NotImplementedError
 
     def check(self, parameters: tuple[str, ...]) -> None:
         """Raise CalibrationError where the settings do not fit the calibration's parameters."""
@@ -92,9 +97,9 @@ class Term(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
 class PositionTerm(Term, frozen=True, kw_only=True):
     """A term that depends on the positions alone: a polynomial in them, or as good as one."""
 
+    @abstractmethod
     def expand(self, calibration: Calibration) -> Expansion:
         """Return the term as a polynomial in the positions as `calibration` scales them."""
-        raise NotImplementedError
 
 
 class Polynomial(PositionTerm, frozen=True, kw_only=True):
@@ -145,13 +150,13 @@ class Effect(Term, frozen=True, kw_only=True):
         """Names of the telemetry that it needs; beyond the parameters, in the deployment's columns."""
         return ()
 
+    @abstractmethod
     def columns(self, field: float) -> FloatArray:
         """(K, r, 9): what coefficient k makes of regressor r in each slot; `field` is F_0, nT."""
-        raise NotImplementedError
 
+    @abstractmethod
     def begin(self, calibration: Calibration) -> Step:
         """Return a fresh stepper, with a state as at switching on."""
-        raise NotImplementedError
 
 
 def full_order(parameters: int, order: int) -> tuple[Exponents, ...]:

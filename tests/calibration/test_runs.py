@@ -28,7 +28,7 @@ from magbridge.calibration.plan import (
     plan,
     trim_of,
 )
-from magbridge.calibration.terms import full_order
+from magbridge.calibration.terms import Effect, full_order
 from magbridge.errors import CalibrationError, ConfigError
 from sitl.mission import TABLE_1
 
@@ -188,3 +188,11 @@ def test_a_deployment_s_columns_become_observations() -> None:
         observations(ds, ["fin"])
     with pytest.raises(CalibrationError, match="'battpos': expected numbers"):
         observations(ds.assign(battpos=("time", np.array(["a"] * n))), ["battpos"])
+
+
+def test_a_term_that_lacks_a_method_cannot_be_made() -> None:
+    class Half(Effect, frozen=True, kw_only=True):
+        kind = "half"
+
+    with pytest.raises(TypeError, match="abstract methods? .*begin"):
+        Half()  # type: ignore[abstract]
