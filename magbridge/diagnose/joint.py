@@ -55,6 +55,7 @@ def fit_joint(
     columns: Sequence[Columns],
     order: int,
     *starts: FloatArray,
+    plain: bool = True,
     like: Joint | None = None,
     blocks: bool | None = None,
     ridge: float = 1e-2,
@@ -70,7 +71,9 @@ def fit_joint(
     order : int
         Of the noise's memory.
     *starts : (q + k,) array
-        Where to begin: the best of them. Without any, where the calibration stands and where plain least squares ends.
+        Where to begin: the best of them; the calibration as it stands if there is none.
+    plain : bool
+        Begin where plain least squares ends, too.
     like : Joint, optional
         A fit whose noise this one's will resemble: saves time.
     blocks : bool, optional
@@ -95,7 +98,9 @@ def fit_joint(
 
     # noise with a long memory swallows what is slow, and least squares then never asks for it again: so it is
     # asked once as if the noise had none
-    first = starts or (centre, _plain(X, problem.residual, prior, centre))
+    first = [*(starts or [centre])]
+    if plain:
+        first.append(_plain(X, problem.residual, prior, centre))
     found = [(c, *at(c)) for c in first]
     c, value, left, noise = max(found, key=lambda entry: entry[1])
     for _ in range(rounds):

@@ -127,10 +127,15 @@ class _Search:
             self.groups.setdefault(_key(candidate), []).append(k)
 
     def fit(
-        self, model: Sequence[Candidate], *starts: FloatArray, like: Joint | None = None, rounds: int = 4
+        self,
+        model: Sequence[Candidate],
+        *starts: FloatArray,
+        plain: bool = True,
+        like: Joint | None = None,
+        rounds: int = 4,
     ) -> Joint:
         columns = [candidate.columns for candidate in model]
-        return fit_joint(self.problem, columns, self.order, *starts, like=like, rounds=rounds)
+        return fit_joint(self.problem, columns, self.order, *starts, plain=plain, like=like, rounds=rounds)
 
     def scores(self, info: Information) -> list[Score]:
         return [
@@ -226,7 +231,7 @@ class _Search:
                     values[position] = low + share * (high - low)
                     candidate = again(*values)
                     start = np.append(best.fit.z, best.fit.coefficients)
-                    fit = self.fit([*model, candidate], start, like=best.fit, rounds=1)
+                    fit = self.fit([*model, candidate], start, plain=False, like=best.fit, rounds=1)
                     gain = 2.0 * (fit.log_likelihood - base.log_likelihood) - best.ratio
                     tried.append((gain, values[position], candidate, fit))
                 gain, value, candidate, fit = max(tried, key=lambda entry: entry[0])
@@ -347,7 +352,7 @@ def _remove(
             continue
         c, at = base.coefficients, sum(candidate.size for candidate in model[:k])
         last = np.concatenate([c[:at], c[at + own.size :], c[at : at + own.size]])
-        fit = state.fit([*others, own], np.append(base.z, last), like=base, rounds=1)
+        fit = state.fit([*others, own], np.append(base.z, last), plain=False, like=base, rounds=1)
         chosen.append(Hypothesis(own, ratio, weigh(ratio, own.size), p_value, fit))
         k += 1
     return chosen, base
