@@ -79,6 +79,7 @@ def calibrate(
     vehicle: Path | None = None,
     grid: Path | None = None,
     site_bias: Annotated[float, Parameter(validator=validators.Number(gte=0))] = 0.0,
+    filter_corner: Annotated[float, Parameter(validator=validators.Number(gte=0))] = 0.0,
     strict: bool = False,
     json: Json = False,
 ) -> None:
@@ -102,6 +103,8 @@ def calibrate(
         An anomaly grid, added to the IGRF.
     site_bias
         nT, 1-sigma of what the reference may be wrong by all over the site.
+    filter_corner
+        Hz, corner of the sensor's first-order anti-alias filter (0: none): what it takes off in turns is given back.
     strict
         Exit with 1 when the data do not support the fit.
     json
@@ -111,6 +114,7 @@ def calibrate(
     from magbridge.calibration.file import save
     from magbridge.calibration.fit import fit
     from magbridge.calibration.geometry import read_vehicle
+    from magbridge.calibration.lowpass import unfiltered
     from magbridge.columns import CHANNELS
     from magbridge.field.declination import with_true_heading
     from magbridge.field.read import read_grid
@@ -121,6 +125,8 @@ def calibrate(
     deployment = with_true_heading(read(some(files), required=(*CHANNELS, *parameter)))
     data = observations(deployment, parameter, reference=lambda ds: earth_field(ds, anomalies))
     data = replace(data, inputs={file.name: sha256(file.read_bytes()).hexdigest() for file in files})
+    if filter_corner:
+        data = unfiltered(data, filter_corner)
     options: dict[str, Any] = {"vehicle": read_vehicle(vehicle)} if vehicle else {}
     found = fit(data, method, order, site_bias=site_bias, **options)
     save(found.calibration, output)
