@@ -11,7 +11,7 @@ the table, against every other cause of the table by the same evidence that the 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -53,61 +53,66 @@ def ideal(
         the signal-to-noise that the table's regressors of the true cause reach; ``unlike``: signal-to-noise that the
         best imitation leaves, and ``mimic``: whose that is.
     """
-    name, calibration = one.hidden.name, stall.stage.calibration
-    problem = pose(take([ds], calibration), calibration)
-    candidates = [c for cause in causes.values() for c in cause.candidates(problem)]
-    ends = np.cumsum([c.size for c in candidates])
-    X = whiten(np.hstack([c.columns(slice(0, len(problem))) for c in candidates]), stall.noise)
-    X = np.column_stack([X, *others.values(), one.signature])
-    S = X.T @ project(X, stall.columns, stall.stage.prior)
+    name = one.hidden.name
+    spans, S = _information(one, stall, ds, causes, others)
     values, vectors = np.linalg.eigh(0.5 * (S + S.T))
     rng = np.random.default_rng(20131212)
     spread = rng.standard_normal((len(S), DRAWS)) * np.sqrt(np.maximum(values, 0.0))[:, None]
     scores = S[:, -1:] + vectors @ spread
-    groups: dict[
-        tuple[str, str | None], list[tuple[Array, float]]
-    ] = {}  # evidence, and what a long search costs
-    nearest = (0.0, "")
-    freedom = {name: (0.0, 1)}
-    spans = [
-        (c.cause, c.channel, slice(end - c.size, end), float(np.log(c.trials)))
-        for c, end in zip(candidates, ends.tolist(), strict=True)
-    ]
-    spans += [(cause, "", slice(k, k + 1), 0.0) for k, cause in enumerate(others, len(S) - 1 - len(others))]
-    for cause, channel, own, price in spans:
-        root = _root(S[own, own])
-        given = S[own, -1:]
-        drawn = scores[own]
-        if cause == "filter_lag":  # it cannot lead
+    groups: dict[tuple[str, str | None], list[tuple[Array, float]]] = {}
+    best: dict[str, tuple[float, int]] = {}  # what each cause explains of the truth, with how many numbers
+    for span in spans:
+        root, given, drawn = _root(S[span.own, span.own]), S[span.own, -1:], scores[span.own]
+        if span.cause == "filter_lag":  # it cannot lead
             given, drawn = np.maximum(given, 0.0), np.maximum(drawn, 0.0)
         explained = float(np.sum((root.T @ given) ** 2))
-        if cause == name:
-            freedom[name] = max(freedom[name], (explained, root.shape[1]))
-        elif explained > nearest[0]:
-            nearest = (explained, cause)
-        ratio = np.sum((root.T @ drawn) ** 2, axis=0)
-        groups.setdefault((cause, channel), []).append((weigh(ratio, root.shape[1]), price))
-    k = freedom[name][1]
+        best[span.cause] = max(best.get(span.cause, (0.0, 1)), (explained, root.shape[1]))
+        evidence = weigh(np.sum((root.T @ drawn) ** 2, axis=0), root.shape[1])
+        groups.setdefault((span.cause, span.channel), []).append((evidence, span.price))
+    testable = name in best  # what the log cannot test, nobody names
+    reached, k = best.pop(name, (0.0, 1))
     # its k - 1 other numbers fit nothing but noise
     truth = scores[-1] ** 2 / S[-1, -1] + 2.0 * rng.standard_gamma(0.5 * (k - 1), DRAWS)
-    evidence = _by_cause(groups, name, weigh(truth, k))
-    names = list(evidence)
-    table = np.array([evidence[cause] for cause in names])
-    inside = table > table.max(axis=0) - ODDS
-    first = np.argmax(table, axis=0)
-    me = names.index(name)
-    # what the log cannot test, nobody names
-    testable = any(c.cause == name for c in candidates)
+    found = _by_cause(groups, name, weigh(truth, k))
+    names, table = list(found), np.array([*found.values()])
+    inside, first, me = table > table.max(axis=0) - ODDS, np.argmax(table, axis=0), list(found).index(name)
+    mimic = max(best, key=lambda cause: best[cause])
     return {
         "alone": float(np.mean((first == me) & (inside.sum(axis=0) == 1))) * testable,
         "inside": float(np.mean(inside[me])) * testable,
         "size": float(np.mean(inside.sum(axis=0))),
         "beside": {cause: float(np.mean(inside[j])) for j, cause in enumerate(names) if inside[j].any()},
         "first": {cause: float(np.mean(first == j)) for j, cause in enumerate(names) if (first == j).any()},
-        "own": float(np.sqrt(freedom[name][0] / S[-1, -1])),
-        "unlike": float(np.sqrt(max(S[-1, -1] - nearest[0], 0.0))),
-        "mimic": nearest[1],
+        "own": float(np.sqrt(reached / S[-1, -1])),
+        "unlike": float(np.sqrt(max(S[-1, -1] - best[mimic][0], 0.0))),
+        "mimic": mimic,
     }
+
+
+class _Span(NamedTuple):
+    """One of a cause's hypotheses: its columns, and the log of how many others it stands for."""
+
+    cause: str
+    channel: str | None
+    own: slice
+    price: float
+
+
+def _information(
+    one: Found, stall: Stall, ds: xr.Dataset, causes: Mapping[str, Cause], others: Mapping[str, Array]
+) -> tuple[list[_Span], Array]:
+    """Fisher's information of every hypothesis' columns, with the truth's as the last one, calibration free."""
+    problem = pose(take([ds], stall.stage.calibration), stall.stage.calibration)
+    candidates = [c for cause in causes.values() for c in cause.candidates(problem)]
+    table = whiten(np.hstack([c.columns(slice(0, len(problem))) for c in candidates]), stall.noise)
+    X = np.column_stack([table, *others.values(), one.signature])
+    ends = np.cumsum([c.size for c in candidates]).tolist()
+    spans = [
+        _Span(c.cause, c.channel, slice(end - c.size, end), float(np.log(c.trials)))
+        for c, end in zip(candidates, ends, strict=True)
+    ]
+    spans += [_Span(cause, "", slice(k, k + 1), 0.0) for k, cause in enumerate(others, table.shape[1])]
+    return spans, X.T @ project(X, stall.columns, stall.stage.prior)
 
 
 def weigh(ratio: Array, freedom: int) -> Array:
