@@ -9,11 +9,11 @@ import sys
 
 from cyclopts import CycloptsError
 
-from magbridge.cli import ashore, doubt, onboard
+from magbridge.cli import ashore, doubt, onboard, way
 from magbridge.cli.common import app, complain
 from magbridge.errors import MagbridgeError, MissingExtra
 
-__all__ = ["app", "ashore", "doubt", "main", "onboard"]
+__all__ = ["app", "ashore", "doubt", "main", "onboard", "way"]
 
 EXTRAS = {
     **dict.fromkeys(

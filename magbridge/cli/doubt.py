@@ -1,11 +1,11 @@
-"""Commands that doubt and use what was corrected: diagnose, navigate."""
+"""Diagnose: what the simulation gets wrong, and why."""
 
 from __future__ import annotations
 
 import sys
 from pathlib import Path
 
-from magbridge.cli.common import Json, Output, app, complain, some, tell
+from magbridge.cli.common import Json, Output, app, some, tell
 
 
 @app.command
@@ -59,59 +59,6 @@ def diagnose(
     tell(
         facts, f"{facts['verdict']}: {', '.join(causes) or 'no cause'}; {rms}; {output / 'report.html'}", json
     )
-
-
-@app.command
-def navigate(
-    file: Path,
-    *more: Path,
-    calibration: Path,
-    map: Path,  # noqa: A002 - the flag's name
-    output: Output,
-    picture: Path | None = None,
-    json: Json = False,
-) -> None:
-    """Match the corrected field to an anomaly map: track, covariance, innovations, smoothed track.
-
-    Parameters
-    ----------
-    file
-        A log with telemetry from which motion can be reckoned.
-    more
-        Further logs of the same deployment.
-    calibration
-        The cal.json.
-    map
-        The anomaly grid.
-    output
-        The file to write.
-    picture
-        A PNG: the tracks on the map, errors and innovations.
-    json
-        Print the result for machines.
-    """
-    from magbridge.calibration.file import load
-    from magbridge.columns import CHANNELS
-    from magbridge.config import Align
-    from magbridge.correction import Correction, correct_rows
-    from magbridge.field.declination import with_true_heading
-    from magbridge.field.read import read_grid
-    from magbridge.logs import read, write
-    from magbridge.navigate.batch import navigate as find_way
-
-    deployment = with_true_heading(read((file, *more), required=CHANNELS))
-    corrected = correct_rows(Correction(load(calibration), Align()), deployment)
-    grid = read_grid(map)
-    track = find_way(deployment.assign(corrected.data_vars), grid)
-    write(track, output)
-    if picture:
-        from magbridge.navigate.draw import draw_navigation
-
-        draw_navigation(track, grid, picture)
-    for finding in track.attrs["findings"].splitlines():
-        complain(finding, 0)
-    facts = {"file": str(output), "rows": track.sizes["time"], **track.attrs}
-    tell(facts, f"{output}: {track.sizes['time']} updates", json)
 
 
 def _step(name: str) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,7 +14,10 @@ from magbridge.field.grid import AnomalyGrid
 from magbridge.field.igrf import total_field
 from magbridge.navigate.model import Options, block_length, measurement_row, prior, transition
 
-__all__ = ["Bound", "position_bound"]
+if TYPE_CHECKING:
+    import xarray as xr
+
+__all__ = ["Bound", "position_bound", "told"]
 
 Array = NDArray[np.float64]
 
@@ -114,3 +117,29 @@ def position_bound(
         covariance[i], unaided[i] = P, np.sqrt(alone[0, 0] + alone[1, 1])
     reached = np.sqrt(covariance[:, 0, 0] + covariance[:, 1, 1])
     return Bound(at, lat, (lon + 180.0) % 360.0 - 180.0, covariance, reached, unaided)
+
+
+def told(bound: Bound, grid: AnomalyGrid) -> xr.Dataset:
+    """Return the bound as a dataset on ``time``, with a sentence on it as the attribute ``findings``."""
+    import xarray as xr  # noqa: PLC0415 - the live path runs without it
+
+    columns = {
+        "latitude": ("deg", "planned latitude", bound.latitude),
+        "longitude": ("deg", "planned longitude", bound.longitude),
+        "sigma": ("m", "smallest possible position error (DRMS)", bound.sigma),
+        "unaided": ("m", "position error of dead reckoning alone (DRMS)", bound.unaided),
+    }
+    off = np.isnan(grid.evaluate(bound.longitude, bound.latitude).anomaly)
+    best = int(bound.sigma.argmin())
+    hours = (bound.time - bound.time[0]) / 3600.0
+    findings = (
+        f"at best {bound.sigma[best]:.0f} m after {hours[best]:.1f} h, at the end {bound.sigma[-1]:.0f} m;"
+        f" dead reckoning alone {bound.unaided[-1]:.0f} m"
+    )
+    if off.any():
+        findings += f"; off the map for {100.0 * off.mean():.0f} % of the track"
+    return xr.Dataset(
+        {k: ("time", v, {"units": unit, "long_name": name}) for k, (unit, name, v) in columns.items()},
+        {"time": ("time", bound.time, {"units": "s", "long_name": "seconds since 1970-01-01 UTC"})},
+        {"map": grid.name, "findings": findings},
+    )

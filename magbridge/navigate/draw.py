@@ -8,7 +8,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 from matplotlib.collections import LineCollection
+from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, MaxNLocator
+from numpy.typing import NDArray
 
 from magbridge.field.earth import metres_per_degree
 from magbridge.field.grid import AnomalyGrid
@@ -21,6 +24,8 @@ if TYPE_CHECKING:
 
 __all__ = ["draw_bound", "draw_navigation"]
 
+Array = NDArray[np.floating[Any]]
+
 SHADES = {State.SEARCHING: "#f5d76e", State.DEAD_RECKONING: "#d5d8dc", State.LOST: "#e59a93"}
 
 
@@ -30,8 +35,8 @@ def draw_navigation(result: xr.Dataset, grid: AnomalyGrid, path: str | Path) -> 
     panels = figure.subplot_mosaic(
         [["map", "field"], ["map", "innovation"], ["map", "sigma"]], width_ratios=(1.1, 1)
     )
-    _map(panels["map"], grid, result["longitude"].to_numpy(), result["latitude"].to_numpy())
-    _tracks(panels["map"], result)
+    tracks = _tracks(panels["map"], result)
+    _map(panels["map"], grid, *np.concatenate(tracks, axis=1))
     hours = (result["time"].to_numpy() - float(result["time"][0])) / 3600.0
 
     axis = panels["field"]
@@ -48,6 +53,12 @@ def draw_navigation(result: xr.Dataset, grid: AnomalyGrid, path: str | Path) -> 
     taken = result["accepted"].to_numpy() > 0
     axis.plot(hours[taken], result["innovation"][taken], ".", ms=2, color="C0", label="taken in")
     axis.plot(hours[~taken], result["innovation"][~taken], "x", ms=4, color="C3", label="beyond the gate")
+    reach = np.concatenate([spread, np.abs(result["innovation"])])
+    if np.isfinite(reach).any():
+        limit = 1.5 * float(
+            np.nanpercentile(reach, 98)
+        )  # a wide start's first innovations are as large as the map
+        axis.set_ylim(-limit, limit)
     axis.set_ylabel("innovation, nT")
     axis.legend(loc="upper right", fontsize=8, ncols=3)
 
@@ -60,7 +71,8 @@ def draw_navigation(result: xr.Dataset, grid: AnomalyGrid, path: str | Path) -> 
         axis.semilogy(
             hours, np.hypot(result["error_north"], result["error_east"]), color="0.2", lw=0.8, label="error"
         )
-    axis.set_ylabel("position, m")
+    axis.set_ylabel("position error, m")
+    _plain(axis)
     axis.set_xlabel("hours")
     _shade(axis, hours, result["state"].to_numpy())
     axis.legend(loc="upper right", fontsize=8)
@@ -68,65 +80,104 @@ def draw_navigation(result: xr.Dataset, grid: AnomalyGrid, path: str | Path) -> 
 
 
 def draw_bound(bound: Bound, grid: AnomalyGrid, path: str | Path) -> None:
-    """Draw a planned track on the map, coloured by the best position that can be had there."""
-    figure = Figure(figsize=(9.0, 7.5), layout="constrained")
-    axis = figure.subplots()
-    _map(axis, grid, bound.longitude, bound.latitude)
-    points = np.column_stack([bound.longitude, bound.latitude])
-    line = LineCollection(list(np.stack([points[:-1], points[1:]], axis=1)), cmap="viridis_r", linewidths=4)
+    """Draw a planned track on the map, coloured by the best position that can be had there, and both over time."""
+    figure = Figure(figsize=(9.0, 9.0), layout="constrained")
+    panels = figure.subplot_mosaic([["map"], ["time"]], height_ratios=(3, 1))
+    axis = panels["map"]
+    points = np.column_stack([np.unwrap(bound.longitude, period=360.0), bound.latitude])
+    _map(axis, grid, *points.T)
+    axis.plot(*points.T, color="w", lw=7, solid_capstyle="round")
+    line = LineCollection(
+        list(np.stack([points[:-1], points[1:]], axis=1)), cmap="viridis_r", norm=LogNorm(), linewidths=4
+    )
     line.set_array(bound.sigma[1:])
     axis.add_collection(line)
-    figure.colorbar(line, ax=axis, label="smallest possible position error (DRMS), m", shrink=0.8)
+    axis.plot(*points[0], "o", ms=9, mfc="w", mec="k", label="start")
+    axis.legend(loc="best", fontsize=8)
+    scale = figure.colorbar(line, ax=axis, label="smallest possible position error (DRMS), m", shrink=0.9)
+    _plain(scale.ax)
     axis.set_title(f"at the end {bound.sigma[-1]:.0f} m; dead reckoning alone {bound.unaided[-1]:.0f} m")
+
+    axis = panels["time"]
+    hours = (bound.time - bound.time[0]) / 3600.0
+    axis.semilogy(hours, bound.unaided, color="0.5", ls="--", label="dead reckoning alone")
+    axis.semilogy(hours, bound.sigma, color="C0", label="with the map, at best")
+    off = np.isnan(grid.evaluate(bound.longitude, bound.latitude).anomaly)
+    if off.any():
+        axis.fill_between(
+            hours, 0, 1, where=off, transform=axis.get_xaxis_transform(), color="0.9", label="off the map"
+        )
+    axis.set_xlabel("hours")
+    axis.set_ylabel("position error, m")
+    _plain(axis)
+    axis.grid(alpha=0.3)
+    axis.legend(loc="best", fontsize=8)
     _save(figure, path)
 
 
 def _map(axis: Axes, grid: AnomalyGrid, longitude: Any, latitude: Any) -> None:
+    """Draw the map around a track, whose longitudes may be unwound past 180 degrees."""
     low, high = np.nanpercentile(grid.anomaly, [1, 99])
-    axis.pcolormesh(
-        grid.longitude,
-        grid.latitude,
+    west = grid.longitude + 360.0 * np.round((np.nanmean(longitude) - grid.longitude.mean()) / 360.0)
+    dx, dy = (0.5 * (edge[-1] - edge[0]) / (edge.size - 1) for edge in (west, grid.latitude))
+    drawn = axis.imshow(
         grid.anomaly,
+        extent=(west[0] - dx, west[-1] + dx, grid.latitude[0] - dy, grid.latitude[-1] + dy),
+        origin="lower",
+        interpolation="bilinear",
         vmin=low,
         vmax=high,
         cmap="RdYlBu_r",
-        shading="nearest",
-        alpha=0.7,
+        alpha=0.6,
     )
-    for limits, values, edge in (
-        (axis.set_xlim, longitude, grid.longitude),
-        (axis.set_ylim, latitude, grid.latitude),
-    ):
-        margin = 0.15 * float(np.ptp(values)) + 0.005
-        limits(max(values.min() - margin, edge[0]), min(values.max() + margin, edge[-1]))
-    axis.set_aspect(1.0 / np.cos(np.radians(grid.latitude.mean())))
+    slender = float(np.cos(np.radians(np.nanmean(latitude))))  # of a degree of longitude
+    (x, width), (y, height) = (
+        (0.5 * (np.nanmin(v) + np.nanmax(v)), 0.65 * float(np.nanmax(v) - np.nanmin(v)) + 0.005)
+        for v in (longitude, latitude)
+    )
+    width, height = max(width, 0.8 * height / slender), max(height, 0.6 * width * slender)
+    axis.set_xlim(x - width, x + width)
+    axis.set_ylim(y - height, y + height)
+    axis.set_facecolor("0.92")  # off the map
+    axis.set_aspect(1.0 / slender)
     axis.ticklabel_format(useOffset=False)
+    axis.xaxis.set_major_locator(MaxNLocator(5))
     axis.set_xlabel("longitude, deg")
     axis.set_ylabel("latitude, deg")
+    scale = axis.inset_axes((0.04, 0.05, 0.3, 0.02))
+    axis.figure.colorbar(drawn, cax=scale, orientation="horizontal")
+    scale.set_title("anomaly, nT", fontsize=8)
+    scale.tick_params(labelsize=8)
 
 
-def _tracks(axis: Axes, result: xr.Dataset) -> None:
-    latitude, longitude = result["latitude"].to_numpy(), result["longitude"].to_numpy()
+def _tracks(axis: Axes, result: xr.Dataset) -> list[Array]:
+    """Draw what was reckoned, filtered, smoothed and known; return the tracks, (2, n) each."""
+    latitude = result["latitude"].to_numpy()
+    longitude = np.unwrap(result["longitude"].to_numpy(), period=360.0)
     per_latitude, per_longitude = metres_per_degree(latitude)
-    axis.plot(
-        longitude - result["east"] / per_longitude,
-        latitude - result["north"] / per_latitude,
-        color="0.4",
-        ls="--",
-        lw=1,
-        label="dead reckoning",
+
+    def back(north: str, east: str) -> Array:
+        return np.stack([longitude - result[east] / per_longitude, latitude - result[north] / per_latitude])
+
+    here = np.stack([longitude, latitude])
+    sure = np.where(result["vouched"] > 0, here, np.nan)
+    smoothed = np.stack(
+        [np.unwrap(result["smoothed_longitude"].to_numpy(), period=360.0), result["smoothed_latitude"]]
     )
-    axis.plot(longitude, latitude, color="k", lw=1.2, label="filter")
-    axis.plot(result["smoothed_longitude"], result["smoothed_latitude"], color="C2", lw=1.2, label="smoothed")
+    smoothed[0] += 360.0 * np.round((longitude.mean() - smoothed[0].mean()) / 360.0)
+    reckoned = back("north", "east")
+    axis.plot(*reckoned, color="0.35", ls="--", lw=1, label="dead reckoning")
+    axis.plot(*here, ".", color="0.35", ms=1.5, label="filter, not vouched for")
+    axis.plot(*sure, color="k", lw=1.5, label="filter, vouched for")
+    axis.plot(*smoothed, color="C2", lw=1.5, label="smoothed")
+    tracks = [reckoned, sure, smoothed]
     if "error_north" in result:
-        axis.plot(
-            longitude - result["error_east"] / per_longitude,
-            latitude - result["error_north"] / per_latitude,
-            color="C3",
-            lw=1,
-            label=f"yardstick ({result.attrs['yardstick'].rstrip('_')})",
-        )
+        known = back("error_north", "error_east")
+        name = result.attrs["yardstick"].rstrip("_")
+        axis.plot(*known, color="C3", lw=1.2, ls=(0, (4, 2)), label=f"known position ({name})")
+        tracks.append(known)
     axis.legend(loc="upper right", fontsize=8)
+    return tracks
 
 
 def _shade(axis: Axes, hours: Any, state: Any) -> None:
@@ -139,6 +190,13 @@ def _shade(axis: Axes, hours: Any, state: Any) -> None:
             end = hours[min(piece[-1] + 1, state.size - 1)]
             axis.axvspan(hours[piece[0]], end, color=SHADES[kind], alpha=0.5, lw=0, label=label)
             seen.add(kind)
+
+
+def _plain(axis: Axes) -> None:
+    """Write 100, not 10^2."""
+    plain = FuncFormatter(lambda value, _: f"{value:g}")
+    axis.yaxis.set_major_formatter(plain)
+    axis.yaxis.set_minor_formatter(lambda value, _: f"{value:g}" if f"{value:e}"[0] in "25" else "")
 
 
 def _save(figure: Figure, path: str | Path) -> None:

@@ -1,0 +1,131 @@
+"""Navigate: find the way by the field, or say beforehand what a map is worth."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from magbridge.cli.common import Json, Output, app, complain, tell
+
+if TYPE_CHECKING:
+    from magbridge.calibration.model import Calibration
+    from magbridge.navigate import Options
+
+__all__ = ["navigate"]
+
+
+@app.command
+def navigate(
+    file: Path,
+    *more: Path,
+    map: Path,  # noqa: A002 - the flag's name
+    output: Output,
+    calibration: Path | None = None,
+    config: Path | None = None,
+    bound: bool = False,
+    picture: Path | None = None,
+    json: Json = False,
+) -> None:
+    """Match the corrected field to an anomaly map: track, covariance, innovations, smoothed track.
+
+    With --bound FILE is a planned track (time, latitude, longitude: its corners are enough), and the result is
+    the smallest error that anyone could have along it, before the dive.
+
+    Parameters
+    ----------
+    file
+        A log with telemetry from which motion can be reckoned, or the plan.
+    more
+        Further logs of the same deployment.
+    map
+        The anomaly grid.
+    output
+        The file to write.
+    calibration
+        The cal.json; for a plan it says how good a sample is, 1 nT without.
+    config
+        A bridge.toml, for its [navigation.options]: how well the start, the current and the map are known.
+    bound
+        Draw what the map is worth along a plan.
+    picture
+        A PNG: the tracks on the map, errors and innovations; the bound on the map.
+    json
+        Print the result for machines.
+    """
+    from magbridge.calibration.file import load
+    from magbridge.errors import WrongUse
+
+    known, options = load(calibration) if calibration else None, _options(config)
+    if bound:
+        _bound((file, *more), map, output, options, known, picture, json)
+        return
+    if known is None:
+        raise WrongUse("expected --calibration; or --bound, which does without")
+
+    from magbridge.columns import CHANNELS
+    from magbridge.config import Align
+    from magbridge.correction import Correction, correct_rows
+    from magbridge.field.declination import with_true_heading
+    from magbridge.field.read import read_grid
+    from magbridge.logs import read, write
+    from magbridge.navigate import Options
+    from magbridge.navigate.batch import navigate as find_way
+    from magbridge.navigate.model import informed
+
+    deployment = with_true_heading(read((file, *more), required=CHANNELS))
+    corrected = correct_rows(Correction(known, Align()), deployment)
+    if options is None:
+        options = informed(Options(), known, float(corrected["total_field_sigma"].median()))
+    grid = read_grid(map)
+    track = find_way(deployment.assign(corrected.data_vars), grid, options)
+    write(track, output)
+    if picture:
+        from magbridge.navigate.draw import draw_navigation
+
+        draw_navigation(track, grid, picture)
+    for finding in track.attrs["findings"].splitlines():
+        complain(finding, 0)
+    facts = {"file": str(output), "rows": track.sizes["time"], **track.attrs}
+    tell(facts, f"{output}: {track.sizes['time']} updates", json)
+
+
+def _bound(
+    files: tuple[Path, ...],
+    map: Path,  # noqa: A002
+    output: Path,
+    options: Options | None,
+    calibration: Calibration | None,
+    picture: Path | None,
+    json: bool,
+) -> None:
+    from magbridge.field.read import read_grid
+    from magbridge.logs import read, write
+    from magbridge.navigate.bound import position_bound, told
+
+    plan = read(files, required=("latitude", "longitude")).dropna("time", subset=["latitude", "longitude"])
+    grid = read_grid(map)
+    track = [plan[name].to_numpy().astype(float) for name in ("time", "latitude", "longitude")]
+    sigma = calibration.noise.sensor if calibration else 1.0
+    best = position_bound(grid, track[0], track[1], track[2], options, sigma)
+    result = told(best, grid)
+    write(result, output)
+    if picture:
+        from magbridge.navigate.draw import draw_bound
+
+        draw_bound(best, grid, picture)
+    tell({"file": str(output), **result.attrs}, f"{output}: {result.attrs['findings']}", json)
+
+
+def _options(config: Path | None) -> Options | None:
+    """Return the options of a bridge's configuration; None where it has none."""
+    from magbridge.config import convert, load_toml
+    from magbridge.errors import ConfigError
+    from magbridge.navigate import Options
+
+    if config is None:
+        return None
+    section = load_toml(config).get("navigation", {})
+    given = section.get("options") if isinstance(section, dict) else None
+    if given is None:
+        raise ConfigError(config, "navigation.options", "missing key")
+    return convert(given, Options, config, "navigation.options.")

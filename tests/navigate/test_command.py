@@ -1,0 +1,162 @@
+"""`magbridge navigate` as a user has it: a log or a plan, maps of every kind, and what it answers."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from magbridge.calibration.file import save
+from magbridge.calibration.model import Noise, identity
+from magbridge.cli import main
+from magbridge.field.grid import AnomalyGrid
+from magbridge.logs import read, write
+
+PLAN = """time,latitude,longitude
+1386201600,49.48,-57.95
+1386208800,49.50,-57.90
+1386216000,49.50,-57.85
+"""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory, study, grid, options):
+    """A log of two hours whose channels are the field itself, its map, a calibration that changes nothing."""
+    path = tmp_path_factory.mktemp("navigate")
+    ds = study.voyage(grid, options, 6, hours=2.0)
+    field = ds["total_field"].to_numpy()
+    unit = {"units": "nT"}
+    channels = {"mag_x": 0.6 * field, "mag_y": 0.0 * field, "mag_z": 0.8 * field}
+    log = ds.drop_vars(["total_field", "total_field_sigma", "away_north", "away_east"]).assign(
+        {name: ("time", values, unit) for name, values in channels.items()}
+    )
+    # GPS at the start: the dead-reckoned position there, which is the truth less what it was off
+    first = {"gps_latitude": 49.5, "gps_longitude": -57.9}
+    for name, value in first.items():
+        log[name] = xr.full_like(log["depth"], np.nan)
+        log[name][0] = value
+    write(log, path / "log.nc")
+    perfect = identity()
+    perfect = type(perfect)(
+        **{k: getattr(perfect, k) for k in perfect.__dataclass_fields__}
+        | {"covariance": 1e-6 * np.eye(9), "noise": Noise(1.0), "method": "nominal"}
+    )
+    save(perfect, path / "cal.json")
+    grid.save(path / "grid.nc")
+    (path / "plan.csv").write_text(PLAN)
+    (path / "bridge.toml").write_text(
+        "[navigation.options]\nstart_sigma = 200.0\ncurrent_sigma = 0.05\nbias_sigma = 1.0\nmap_sigma = 1.0\n"
+    )
+    return path
+
+
+def run(folder, *arguments: str, calibration: bool = True) -> int:
+    given = ["--calibration", str(folder / "cal.json")] if calibration else []
+    return main(["navigate", *arguments, *given, "-o", str(folder / "out.nc")])
+
+
+def test_a_log_against_its_map(folder, capsys):
+    picture = folder / "track.png"
+    code = run(
+        folder,
+        *(str(folder / "log.nc"), "--map", str(folder / "grid.nc"), "--config", str(folder / "bridge.toml")),
+        *("--picture", str(picture), "--json"),
+    )
+    assert code == 0
+    said = capsys.readouterr()
+    assert json.loads(said.out)["findings"] == said.err == ""
+    track = read(folder / "out.nc")
+    error = np.hypot(track["error_north"], track["error_east"])
+    assert float(error[-100:].mean()) < 150.0
+    assert picture.stat().st_size > 40_000
+
+
+@pytest.mark.parametrize(
+    ("change", "answer"),
+    [
+        (lambda g: g.assign(anomaly=g["anomaly"] * 1e-3), "expected"),
+        (lambda g: g.assign_coords(longitude=g["longitude"] * 72_000.0), "projected coordinates"),
+        (lambda g: g.assign(anomaly=g["anomaly"] + 52_000.0), "subtract the IGRF first"),
+        (lambda g: g.assign(anomaly=g["anomaly"] * np.nan), "nothing but holes"),
+    ],
+    ids=["tesla", "projected", "whole field", "empty"],
+)
+def test_a_map_that_cannot_be_meant_is_one_line(folder, capsys, change, answer):
+    with xr.open_dataset(folder / "grid.nc") as whole:
+        grid = change(whole.load())
+    if answer == "expected":
+        grid["anomaly"].attrs["units"] = "furlong"
+    grid.to_netcdf(folder / "bad.nc")
+    assert run(folder, str(folder / "log.nc"), "--map", str(folder / "bad.nc")) in {1, 2}
+    line = capsys.readouterr().err
+    assert answer in line
+    assert line.count("\n") == 1
+    assert "Traceback" not in line
+
+
+def test_a_descending_axis_and_holes_change_nothing_elsewhere(folder, grid, capsys):
+    holed = grid.anomaly.copy()
+    holed[:4, :4] = np.nan
+    AnomalyGrid(grid.longitude, grid.latitude, holed).save(folder / "holed.nc")
+    with xr.open_dataset(folder / "holed.nc") as found:
+        found.load().isel(latitude=slice(None, None, -1)).to_netcdf(folder / "down.nc")
+    tracks = []
+    for name in ("grid.nc", "down.nc"):
+        assert run(folder, str(folder / "log.nc"), "--map", str(folder / name)) == 0
+        tracks.append(read(folder / "out.nc"))
+    np.testing.assert_allclose(tracks[0]["latitude"], tracks[1]["latitude"], atol=5e-4)
+    capsys.readouterr()
+
+
+def test_time_that_goes_back_is_one_line(folder, capsys):
+    write(read(folder / "log.nc").isel(time=slice(0, 5)), folder / "back.csv")
+    head, *rows = (folder / "back.csv").read_text().splitlines()
+    (folder / "back.csv").write_text("\n".join([head, rows[0], rows[2], rows[1], *rows[3:]]) + "\n")
+    assert run(folder, str(folder / "back.csv"), "--map", str(folder / "grid.nc")) in {1, 2}
+    line = capsys.readouterr().err
+    assert "time" in line
+    assert line.count("\n") == 1
+
+
+def test_a_plan_is_told_what_the_map_is_worth(folder, capsys):
+    picture = folder / "bound.png"
+    plan = (str(folder / "plan.csv"), "--map", str(folder / "grid.nc"), "--bound")
+    assert run(folder, *plan, "--picture", str(picture), calibration=False) == 0
+    assert "dead reckoning alone" in capsys.readouterr().out
+    bound = read(folder / "out.nc")
+    assert (bound["sigma"] <= bound["unaided"]).all()
+    assert picture.stat().st_size > 20_000
+
+
+@pytest.mark.parametrize(
+    ("text", "answer"),
+    [
+        (PLAN.replace("1386216000", "1386201000"), "time"),
+        (PLAN.replace("longitude", "x"), "longitude"),
+    ],
+)
+def test_a_plan_that_cannot_be_flown_is_one_line(folder, capsys, text, answer):
+    (folder / "bad.csv").write_text(text)
+    plan = (str(folder / "bad.csv"), "--map", str(folder / "grid.nc"), "--bound")
+    assert run(folder, *plan, calibration=False) in {1, 2}
+    line = capsys.readouterr().err
+    assert answer in line
+    assert line.count("\n") == 1
+
+
+def test_wrong_use_is_one_line(folder, capsys):
+    assert run(folder, str(folder / "log.nc"), "--map", str(folder / "grid.nc"), calibration=False) == 2
+    assert "expected --calibration" in capsys.readouterr().err
+    (folder / "other.toml").write_text("[navigation.options]\nstart_sgma = 1.0\n")
+    code = run(
+        folder,
+        str(folder / "log.nc"),
+        "--map",
+        str(folder / "grid.nc"),
+        "--config",
+        str(folder / "other.toml"),
+    )
+    assert code == 2
+    assert "navigation.options.start_sgma: unknown key" in capsys.readouterr().err
