@@ -8,9 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magbridge.calibration.data import observations
+from magbridge.calibration.limits import Limits, settled, trim_of
 from magbridge.calibration.mission import Mission
 from magbridge.calibration.model import Calibration
-from magbridge.calibration.plan import Limits, Plan, plan, trim_of
+from magbridge.calibration.plan import Plan, plan
 from magbridge.errors import CalibrationError
 
 if TYPE_CHECKING:
@@ -58,7 +59,7 @@ def flight_plan(
         names,
         reference=lambda _: (total, field_ned, "IGRF"),
     )
-    limits = Limits(roll=(-roll, roll), pitch_at=trim_of(data))
+    limits = Limits(roll=(-roll, roll), pitch_at=trim_of(data), flown=settled(data))
     return plan(calibration, Mission.of(data), np.nanmean(field_ned, axis=0), limits, runs=runs)
 
 

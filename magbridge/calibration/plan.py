@@ -14,17 +14,16 @@ the largest error over the mission small (G-optimality, by the eighth power mean
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from magbridge.calibration.boresight import field_body
-from magbridge.calibration.data import Observations
 from magbridge.calibration.forward import forward
+from magbridge.calibration.limits import Limits, PlannedRun, candidate_runs
 from magbridge.calibration.mission import Mission
 from magbridge.calibration.model import Calibration, Noise, Parameter, Reference
 from magbridge.calibration.prior import free_structure
@@ -32,44 +31,11 @@ from magbridge.calibration.residual import Samples, residuals
 from magbridge.calibration.terms import Polynomial, full_order
 from magbridge.errors import CalibrationError
 
-__all__ = ["Limits", "Plan", "PlannedRun", "evaluate_runs", "expected_calibration", "plan", "trim_of"]
+__all__ = ["Plan", "evaluate_runs", "expected_calibration", "plan"]
 
 FloatArray = NDArray[np.float64]
 HEADINGS = 24
-SLACK = 3.0  # deg, by which another trim of the vehicle changes the pitch at the same positions
 POWER = 4  # of the variance: the eighth power mean of sigma
-
-
-@dataclass(frozen=True)
-class PlannedRun:
-    """One spiral: deg, positions in their units."""
-
-    pitch: float
-    roll: float
-    parameters: tuple[float, ...]
-
-
-@dataclass(frozen=True)
-class Limits:
-    """What the vehicle can do.
-
-    Attributes
-    ----------
-    roll : tuple of float
-        deg, banks that it can hold in a spiral.
-    pitch : tuple of float
-        deg, smallest and largest, of dives and climbs alike.
-    parameters : tuple of (float, float)
-        Ends of each position.
-    pitch_at : callable, optional
-        Positions (k,) -> pitch that they trim the vehicle to (deg), see :func:`trim_of`; without it
-        pitch is free.
-    """
-
-    roll: tuple[float, float] = (-10.0, 10.0)
-    pitch: tuple[float, float] = (14.0, 30.0)
-    parameters: tuple[tuple[float, float], ...] = ()
-    pitch_at: Callable[[FloatArray], float] | None = None
 
 
 @dataclass(frozen=True)
@@ -104,19 +70,6 @@ def expected_calibration(
         reference=Reference(field),
         method="none",
     )
-
-
-def trim_of(data: Observations) -> Callable[[FloatArray], float] | None:
-    """Return the pitch (deg) that positions trim a vehicle to, linear in them; None if they do not tell it."""
-    if data.attitude is None or not data.names:
-        return None
-    known = np.isfinite(data.attitude[:, 1])
-    pitch = np.degrees(data.attitude[known, 1])
-    design = np.column_stack([np.ones(len(pitch)), data.parameters[known]])
-    trim, *_ = np.linalg.lstsq(design, pitch, rcond=None)
-    if np.var(pitch - design @ trim) > 0.1 * np.var(pitch):
-        return None
-    return lambda positions: float(trim[0] + positions @ trim[1:])
 
 
 class _Design:
@@ -245,7 +198,7 @@ def _plan(
     levels: int,
 ) -> Plan:
     design = _Design(calibration, mission, field_ned, samples)
-    candidates = list(_candidates(limits, calibration.parameters, levels))
+    candidates = list(candidate_runs(limits, calibration.parameters, levels))
     if not candidates:
         raise CalibrationError("plan: no pitch, roll and position lie within the vehicle's limits")
     factors = [design.factor(run) for run in candidates]
@@ -267,24 +220,3 @@ def _plan(
         if not changed:
             break
     return evaluate_runs(calibration, mission, field_ned, [candidates[i] for i in chosen], samples)
-
-
-def _candidates(limits: Limits, parameters: tuple[Parameter, ...], levels: int) -> list[PlannedRun]:
-    """Everything the vehicle can fly, on a grid."""
-    ends = limits.parameters or tuple((p.low, p.high) for p in parameters)
-    rolls = np.unique(np.append(np.linspace(*limits.roll, 5), np.clip(0.0, *limits.roll)))
-    found = []
-    for positions in product(*(np.linspace(low, high, levels) for low, high in ends)):
-        if limits.pitch_at is None:
-            steep = np.linspace(*limits.pitch, 3)
-            pitches = [*(-steep), *steep]
-        else:
-            trim = limits.pitch_at(np.array(positions))
-            pitches = [trim - SLACK, trim, trim + SLACK]
-        found += [
-            PlannedRun(float(pitch), float(roll), tuple(float(p) for p in positions))
-            for pitch in pitches
-            for roll in rolls
-            if limits.pitch[0] <= abs(pitch) <= limits.pitch[1]
-        ]
-    return found

@@ -18,16 +18,10 @@ from magbridge.calibration.dipole import Dipole, dipole_tensor
 from magbridge.calibration.fit import fit
 from magbridge.calibration.geometry import read_vehicle
 from magbridge.calibration.identify import combinations
+from magbridge.calibration.limits import Limits, PlannedRun, settled, trim_of
 from magbridge.calibration.mission import Mission, expected_error
 from magbridge.calibration.model import Calibration, Noise, Parameter, Reference, identity
-from magbridge.calibration.plan import (
-    Limits,
-    PlannedRun,
-    evaluate_runs,
-    expected_calibration,
-    plan,
-    trim_of,
-)
+from magbridge.calibration.plan import evaluate_runs, expected_calibration, plan
 from magbridge.calibration.terms import Effect, full_order
 from magbridge.errors import CalibrationError, ConfigError
 from sitl.mission import TABLE_1
@@ -140,11 +134,14 @@ def test_planned_runs_beat_table_1(glider: Gliders) -> None:
         before, mission, ned,
         [PlannedRun(pitch, 6.0, (battery, float(np.copysign(200.0, pitch)))) for _, pitch, battery, _ in TABLE_1],
     )  # fmt: skip
-    limits = Limits(roll=(-6.0, 6.0), pitch_at=trim_of(one.runs))
+    limits = Limits(roll=(-6.0, 6.0), pitch_at=trim_of(one.runs), flown=settled(one.runs))
     ours = plan(before, mission, ned, limits, runs=6, levels=7)
     assert len(ours.runs) == 6
     assert ours.worst[-1] < 0.5 * paper.worst[-1]
     assert ours.rms[-1] < 0.5 * paper.rms[-1]
+    assert all(run.pitch * run.parameters[1] > 0.0 for run in ours.runs), (
+        "dives with the ballast in, climbs out"
+    )
     assert all(-6.0 <= run.roll <= 6.0 and 14.0 <= abs(run.pitch) <= 30.0 for run in ours.runs)
     with pytest.raises(CalibrationError, match="within the vehicle's limits"):
         plan(before, mission, ned, replace(limits, pitch=(80.0, 85.0)), runs=1)
@@ -194,5 +191,5 @@ def test_a_term_that_lacks_a_method_cannot_be_made() -> None:
     class Half(Effect, frozen=True, kw_only=True):
         kind = "half"
 
-    with pytest.raises(TypeError, match="abstract methods? .*begin"):
+    with pytest.raises(TypeError, match=r"abstract methods? .*begin"):
         Half()  # type: ignore[abstract]
