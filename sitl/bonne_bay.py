@@ -54,6 +54,8 @@ class Trials:
         By (part, trial of the coefficients, method), nT.
     failed : dict of str
         Why, by (trial, method).
+    scales : dict of (float, float)
+        By (trial, method), the smallest and the largest of A on its runs: what the residual was bought with.
     anomaly : AnomalyGrid
         The map that the fit was given.
     """
@@ -61,6 +63,7 @@ class Trials:
     parts: dict[str, xr.Dataset]
     corrected: dict[tuple[str, str, str], Array]
     failed: dict[tuple[str, str], str]
+    scales: dict[tuple[str, str], tuple[float, float]]
     anomaly: AnomalyGrid
 
     def error(self, part: str, trial: str, method: str, against: str = "reference_field") -> Array:
@@ -81,19 +84,20 @@ def fly(seed: int, methods: Sequence[str] = tuple(METHODS)) -> Trials:
     instrument = twin.scenario.instrument
     when = np.arange(0.0, track.elapsed[-1] - max(instrument.channel_delay), 1 / instrument.rate)
     parts = segments(resting(one_time_base(twin.measure(track, when))))
-    corrected, failed = {}, {}
+    corrected, failed, scales = {}, {}, {}
     for trial, method in product(TRIALS, methods):
         used = () if method == "nominal" else MASSES
         try:
-            found = fit(observations(parts[trial], used), method, **METHODS[method]).calibration
+            fitted = fit(observations(parts[trial], used), method, **METHODS[method])
         except CalibrationError as error:
             failed[trial, method] = str(error)
             continue
+        found, scales[trial, method] = fitted.calibration, fitted.scales
         for part in (trial, "survey"):
             ds = parts[part]
             raw, masses = columns(ds, CHANNELS), columns(ds, used)
             corrected[part, trial, method] = correct(found, raw, masses, ds["time"].to_numpy()).total
-    return Trials(parts, corrected, failed, twin.anomaly_map())
+    return Trials(parts, corrected, failed, scales, twin.anomaly_map())
 
 
 def columns(deployment: xr.Dataset, names: Sequence[str]) -> Array:
