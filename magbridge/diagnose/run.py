@@ -150,8 +150,10 @@ def diagnose(
         counts[wrong.rows] = False
     before = problem.residual
     after = held_out(settled, columns, fit) if model else before
-    held = paired(before, after, survey.dive, counts if counts.any() else ~counts).ratio
-    if held > WORSE or (model and _spoils(survey, problem, extended, counts if counts.any() else ~counts)):
+    held = paired(before, after, survey.dive, counts if counts.any() else ~counts)
+    if (held.ratio > WORSE and held.interval[0] > 1.0) or (
+        model and _spoils(survey, problem, extended, counts if counts.any() else ~counts)
+    ):
         # names that make the dives worse that they never saw are no explanation
         named, rivals, model, fit, after, extended = (), (), [], outcome.null, before, calibration
         rest = leftover(problem, [], outcome.null, outcome.order, tones[0] if tones else None)
@@ -215,7 +217,8 @@ def _accept(
         and (free.channel is None or free.channel not in own)
         and free.evidence > sum(h.evidence for h in outcome.chosen) + ahead
     )
-    if (rest is not None and rest.signal_to_noise > SHARE * loudest) or beaten:
+    allowed = SHARE if rest is None or rest.channel is None or rest.channel not in own else 1.0
+    if (rest is not None and rest.signal_to_noise > allowed * loudest) or beaten:
         return (), (), outcome.null, free or rest
     return outcome.chosen, outcome.rivals, outcome.fit, rest
 

@@ -35,8 +35,6 @@ SHORT_LIST = 9
 """Causes that are fitted jointly in a round."""
 SHARPEN = 4
 """Halvings of a nonlinear parameter's bracket."""
-STARTS = 3
-"""Causes that a chain of several may begin with."""
 MOST = 6
 """Regressors in one log."""
 
@@ -122,6 +120,7 @@ class _Search:
         self.at = slices(self.candidates)
         self.columns = [candidate.columns for candidate in self.candidates]
         self.trials: dict[str, float] = {}
+        self.bare: Information
         self.groups: dict[tuple[str, str | None], list[int]] = {}
         for k, candidate in enumerate(self.candidates):
             self.groups.setdefault(_key(candidate), []).append(k)
@@ -159,7 +158,10 @@ class _Search:
         if not self.trials:
             self.trials = trials(own, self.candidates, self.at)
         under: dict[tuple[str, str | None], list[tuple[int, float, Score, Information]]] = {}
-        for info in (own, self._bare(model, base, own)):
+        bare = self._bare(model, base, own)
+        if not model:
+            self.bare = bare
+        for info in (own, bare):
             scores = self.scores(info)
             for group, (k, average) in self.best(scores).items():
                 under.setdefault(group, []).append((k, average, scores[k], info))
@@ -277,20 +279,19 @@ def search(problem: Problem, candidates: Sequence[Candidate], causes: int) -> Ou
     for h in first:
         if h.p_value <= tested.get(h.candidate.cause, (np.inf, 0.0))[0]:
             tested[h.candidate.cause] = (h.p_value, h.ratio)
-    chosen, base = _chain(state, null, first)
-    if (
-        len(chosen) > 1
-    ):  # the first step may have gone astray where several causes act: begin with others, too
-        kinds = {h.candidate.cause: h for h in reversed(first) if h.p_value < LEVEL}
-        others = [h for cause, h in kinds.items() if cause != first[0].candidate.cause]
-        others = sorted(others, key=lambda h: -h.evidence)[: STARTS - 1]
-        chains = [(chosen, base), *(_chain(state, null, [h]) for h in others)]
-        chosen, base = max(
-            chains,
-            key=lambda chain: weigh(
-                2.0 * (chain[1].log_likelihood - null.log_likelihood), sum(h.candidate.size for h in chain[0])
-            ),
-        )
+    model, base = _chain(state, null, first)
+    together = _together(state) if first else []
+    if together and {_key(c) for c in together} != {_key(c) for c in model}:
+        # one after the other may have gone astray where several causes act
+        other = state.fit(together, rounds=6)
+        if _worth(other, together, null) > _worth(base, model, null):
+            model, base = _refined(state, together, other)
+    if len({candidate.cause for candidate in model}) > 1:
+        alone = _enough(state, first)
+        if alone is not None:
+            alone = state.sharpen([], alone, null)
+            model, base = [alone.candidate], alone.fit
+    chosen, base = _remove(state, model, base, null)
     bare = replace(base, coefficients=np.empty(0))
     info = information(
         problem, base.noise, bare, [], [*state.columns, *(h.candidate.columns for h in chosen)]
@@ -299,8 +300,12 @@ def search(problem: Problem, candidates: Sequence[Candidate], causes: int) -> Ou
     return Outcome(tuple(chosen), rivals, null, base, order, tested, info, state.trials)
 
 
-def _chain(state: _Search, null: Joint, first: list[Hypothesis]) -> tuple[list[Hypothesis], Joint]:
-    """Add cause after cause while one passes the test, beginning with the best of `first`; drop what became needless."""
+def _worth(fit: Joint, model: Sequence[Candidate], null: Joint) -> float:
+    return weigh(2.0 * (fit.log_likelihood - null.log_likelihood), sum(c.size for c in model))
+
+
+def _chain(state: _Search, null: Joint, first: list[Hypothesis]) -> tuple[list[Candidate], Joint]:
+    """Add cause after cause while one passes the test, beginning with the best of `first`."""
     model: list[Candidate] = []
     loudest, base, found = 0.0, null, first
     for _ in range(MOST):
@@ -311,7 +316,72 @@ def _chain(state: _Search, null: Joint, first: list[Hypothesis]) -> tuple[list[H
         loudest = max(loudest, best.signal_to_noise)
         model, base = _with(state, model, best)
         found = state.round(model, base)
-    return _remove(state, model, base, null)
+    return model, base
+
+
+def _together(state: _Search) -> list[Candidate]:
+    """Choose causes under the noise that is left when every cause takes what it can, one beside the other.
+
+    All in the matrix of the first round: there the noise has swallowed nothing, and each is measured with the calibration
+    and those before it free.
+    """
+    info = state.bare
+    picked: list[int] = []
+    loudest = 0.0
+    while len(picked) < MOST:
+        scores = state.scores(info)
+        ranked = sorted(
+            ((scores[k].evidence + price, k) for k, price in state.best(scores).values()), reverse=True
+        )
+        for _, k in ranked:
+            s, candidate = scores[k], state.candidates[k]
+            size = float(np.sqrt(max(s.ratio - s.freedom, 0.0)))
+            sure = state.p_value(candidate, s.ratio, s.freedom) < LEVEL and size >= IDEAL * loudest
+            if sure and candidate.cause not in {state.candidates[j].cause for j in picked}:
+                break
+        else:
+            break
+        picked.append(k)
+        loudest = max(loudest, size)
+        info = info.without(np.arange(state.at[k].start, state.at[k].stop))
+    return [state.candidates[k] for k in picked]
+
+
+def _enough(state: _Search, first: list[Hypothesis]) -> Hypothesis | None:
+    """Return the best single cause, if there is one, beside which nothing else would be found."""
+    members = {(id(c.columns)): k for k, c in enumerate(state.candidates)}
+    for h in first:
+        k = members[id(h.candidate.columns)]
+        s = score(state.bare, state.at[k], positive=h.candidate.positive)
+        if h.p_value >= LEVEL or not s.freedom:
+            continue
+        left = state.bare.without(np.arange(state.at[k].start, state.at[k].stop))
+        others = [
+            (candidate, other)
+            for candidate, other in zip(state.candidates, state.scores(left), strict=True)
+            if candidate.cause != h.candidate.cause
+        ]
+        quiet = IDEAL**2 * s.ratio
+        if all(
+            other.ratio - other.freedom < quiet
+            or state.p_value(candidate, other.ratio, other.freedom) >= LEVEL
+            for candidate, other in others
+        ):
+            return h
+    return None
+
+
+def _refined(state: _Search, model: list[Candidate], base: Joint) -> tuple[list[Candidate], Joint]:
+    """Profile the nonlinear parameters of each member of a model beside the others."""
+    for _ in range(len(model)):
+        own, others = model[0], model[1:]
+        rest = state.fit(others, plain=False) if others else base
+        c = np.append(base.coefficients[own.size :], base.coefficients[: own.size])
+        there = state.fit([*others, own], np.append(base.z, c), plain=False, like=base, rounds=1)
+        ratio = 2.0 * (there.log_likelihood - rest.log_likelihood)
+        best = state.sharpen(others, Hypothesis(own, ratio, 0.0, 0.0, there), rest)
+        model, base = [*others, best.candidate], best.fit
+    return model, base
 
 
 def _next(found: list[Hypothesis], model: list[Candidate], loudest: float) -> Hypothesis | None:
