@@ -14,7 +14,7 @@ from threadpoolctl import threadpool_limits
 import magbridge
 from magbridge.calibration.boresight import find_boresight
 from magbridge.calibration.data import Observations
-from magbridge.calibration.identify import combinations, expected_ratio, warnings_for
+from magbridge.calibration.identify import combinations, expected_ratio, heading_gap, warnings_for
 from magbridge.calibration.model import Calibration, Noise, Parameter, Reference, Run, Sensor, with_boresight
 from magbridge.calibration.noise import NoiseModel
 from magbridge.calibration.residual import Samples, residuals_of, scales_and_offsets
@@ -36,6 +36,7 @@ METHODS: dict[str, str] = {
 
 ONE_ATTITUDE = 5.0  # deg from the mean direction
 UNSUPPORTED = 5.0  # times the noise is more than a calibration may leave
+UNSEEN = 270.0  # deg of the compass: what is seen in less than a quarter of it may be anything in the rest
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,11 +167,18 @@ def _judged(found: Fit, data: Observations, doubled: tuple[str, ...]) -> Fit:
     outliers = found.details.get("outliers", 0)
     if outliers > 0.02 * len(data):
         warnings.append(f"{outliers} of {len(data)} samples are outliers and took no part")
+    gap = heading_gap(data)
+    if gap > UNSEEN:
+        warnings.insert(
+            0,
+            f"the data do not support this fit: all headings lie within {360.0 - gap:.0f} degrees, and on others "
+            "iron cannot be told from field",
+        )
     if ratio > UNSUPPORTED:
         warnings.insert(
             0,
-            f"the data do not support this fit: near these runs, rolled 10 degrees further, "
-            f"expect {ratio * calibration.noise.sensor:.0f} nT of error",
+            f"the data do not support this fit: at these pitches and positions, on any heading and rolled 10 degrees "
+            f"further, expect {ratio * calibration.noise.sensor:.0f} nT of error",
         )
     seen = combinations(found.samples, calibration.coefficients, max(calibration.noise.sensor, 1e-9))
     details = {
@@ -184,7 +192,7 @@ def _judged(found: Fit, data: Observations, doubled: tuple[str, ...]) -> Fit:
         calibration=calibration,
         warnings=tuple(warnings),
         details=details,
-        supported=ratio <= UNSUPPORTED,
+        supported=ratio <= UNSUPPORTED and gap <= UNSEEN,
     )
 
 

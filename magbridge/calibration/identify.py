@@ -14,7 +14,7 @@ from magbridge.calibration.model import Calibration
 from magbridge.calibration.residual import Samples, residuals
 from magbridge.calibration.terms import Polynomial
 
-__all__ = ["Combinations", "combinations", "expected_ratio", "warnings_for"]
+__all__ = ["Combinations", "combinations", "expected_ratio", "heading_gap", "warnings_for"]
 
 FloatArray = NDArray[np.float64]
 ROWS = 5_000  # of the Jacobian: more do not change its rank
@@ -64,7 +64,7 @@ def combinations(samples: Samples, coefficients: FloatArray, sigma: float) -> Co
 
 
 def expected_ratio(calibration: Calibration, data: Observations) -> float:
-    """RMS error expected near the runs, rolled 10 deg further, over the noise of a sample."""
+    """RMS error expected near the runs, on all headings, rolled 10 deg further, over the noise of a sample."""
     error = expected_error(calibration, nearby_mission(calibration, data))
     return float(np.sqrt(np.mean(error**2)) / max(calibration.noise.sensor, 1e-9))
 
@@ -123,17 +123,34 @@ def _attitudes(calibration: Calibration, data: Observations) -> Iterator[str]:
             f"roll never left {low:.0f} to {high:.0f} degrees: the vertical offset is known to "
             f"{np.sqrt(theta):.0f} nT; fly a run banked the other way"
         )
-    if pitch.min() > -5.0 or pitch.max() < 5.0:
+    if pitch.min() > -5.0 and pitch.max() < 5.0:
+        yield (
+            f"pitch never left {pitch.min():.0f} to {pitch.max():.0f} degrees: steeper, nothing was measured; "
+            "fly dives and climbs"
+        )
+    elif pitch.min() > -5.0 or pitch.max() < 5.0:
         seen, lacking = ("climbs", "dives") if pitch.min() > -5.0 else ("dives", "climbs")
         yield f"only {seen} (pitch {pitch.min():.0f} to {pitch.max():.0f}): nothing was measured in {lacking}"
+    left, gap = _widest_gap(heading)
+    if gap > 60.0:
+        yield f"no run headed between {left:03.0f} and {(left + gap) % 360.0:03.0f}: fly full turns"
+
+
+def heading_gap(data: Observations) -> float:
+    """Width (deg) of the widest part of the compass that no sample headed to; 0 without attitude telemetry."""
+    if data.attitude is None:
+        return 0.0
+    heading = np.degrees(data.attitude[:, 2])
+    known = np.isfinite(heading)
+    return _widest_gap(heading[known])[1] if known.any() else 0.0
+
+
+def _widest_gap(heading: FloatArray) -> tuple[float, float]:
+    """Where it begins, and its width, deg."""
     courses = np.sort(heading % 360.0)
     gaps = np.diff(np.append(courses, courses[0] + 360.0))
     widest = int(np.argmax(gaps))
-    if gaps[widest] > 60.0:
-        yield (
-            f"no run headed between {courses[widest]:03.0f} and {(courses[widest] + gaps[widest]) % 360:03.0f}: "
-            "fly full turns"
-        )
+    return float(courses[widest]), float(gaps[widest])
 
 
 def _runs(calibration: Calibration, data: Observations) -> Iterator[str]:

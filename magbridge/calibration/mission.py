@@ -55,10 +55,10 @@ class Mission:
 
 
 def nearby_mission(calibration: Calibration, data: Observations, roll: float = 10.0) -> Mission:
-    """Return the calibration's own attitudes and positions, rolled a little further either way.
+    """Return the calibration's own attitudes and positions, rolled a little further either way, and on all headings.
 
-    That is what a survey after these runs meets at least; it needs no attitude telemetry, because the
-    corrected vectors themselves tell the attitude up to a turn about the field.
+    That is what a survey after these runs meets at least. The corrected vectors themselves tell the attitude up to
+    a turn about the field; where the vertical is, attitude telemetry must tell: without it, headings stay.
 
     Parameters
     ----------
@@ -72,8 +72,17 @@ def nearby_mission(calibration: Calibration, data: Observations, roll: float = 1
     positions = data.parameters[rows, :k]
     assert data.time is not None
     b = correct(calibration, data.field[rows], positions, data.time[rows]).vector
-    turns = [Rotation.from_euler("X", angle, degrees=True) for angle in (-roll, 0.0, roll)]
-    return Mission(np.concatenate([turn.apply(b) for turn in turns]), np.tile(positions, (3, 1)))
+    met = [Rotation.from_euler("X", angle, degrees=True).apply(b) for angle in (-roll, 0.0, roll)]
+    places = [positions] * len(met)
+    if data.attitude is not None:
+        known = np.isfinite(data.attitude[rows]).all(axis=1)
+        attitude = Rotation.from_euler("ZYX", data.attitude[rows[known], ::-1])
+        down = attitude.apply([0.0, 0.0, 1.0], inverse=True)
+        met += [
+            Rotation.from_rotvec(np.radians(angle) * down).apply(b[known]) for angle in range(60, 360, 60)
+        ]
+        places += [positions[known]] * (len(met) - len(places))
+    return Mission(np.concatenate(met), np.concatenate(places))
 
 
 def expected_error(calibration: Calibration, mission: Mission) -> FloatArray:

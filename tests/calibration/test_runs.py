@@ -106,6 +106,16 @@ def test_warnings_are_in_a_pilot_s_words(glider: Gliders) -> None:
     assert "only dives" in words
 
 
+def test_a_fit_from_a_corner_of_the_compass_is_not_supported(glider: Gliders) -> None:
+    """Any iron fits samples that all head one way: seen on a real ArduSub, 300 nT on its own and 1,700 nT beyond."""
+    runs = glider(0, 2).runs
+    turned = np.degrees(runs.attitude[:, 2]) % 360.0
+    found = fit(runs.part((turned > 200.0) & (turned < 260.0)), "nominal")
+    assert not found.supported
+    assert "all headings lie within 60 degrees" in found.warnings[0]
+    assert fit(runs, "nominal").supported
+
+
 def test_a_fit_that_the_data_cannot_hold_says_so(glider: Gliders) -> None:
     runs = glider(0, 2).runs
     few = runs.part((np.asarray(runs.runs) < 2) & (np.cos(runs.attitude[:, 2]) > 0.5))
