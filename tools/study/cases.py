@@ -157,18 +157,25 @@ def _theory(one: Found, stall: Stall, ds: xr.Dataset, without: str) -> dict[str,
 
 
 def _gained(hidden: Hidden, stall: Stall, ds: xr.Dataset, result: Diagnosis) -> dict[str, float]:
-    """Mean square error (nT²) on another deployment: as calibrated, extended, and extended by who knows the cause."""
+    """Mean square error (nT²) on another deployment: as calibrated, extended, and extended by who knows the cause.
+
+    Counted are the samples whose masses stand where the first deployment had them, too: elsewhere a polynomial has only
+    its own sigma to tell how little it knows. ``everywhere`` is what was extended on all samples.
+    """
     calibration = stall.stage.calibration
     oracle = diagnose([ds], calibration, causes={hidden.name: CAUSES[hidden.name]})
     there = again(stall.stage)
     other = disturb(there.twin, (hidden,), there.track, there.when, stall.number + 1)
     other = add_noise(other, "white", stall.number + 1)
-    before, after, best = (_error(other, c) for c in (calibration, result.calibration, oracle.calibration))
-    whole = np.isfinite(before) & np.isfinite(after) & np.isfinite(best)
-    return {
-        name: float(np.mean(e[whole] ** 2))
-        for name, e in (("before", before), ("after", after), ("oracle", best))
-    }
+    tried = {"before": calibration, "after": result.calibration, "oracle": oracle.calibration}
+    errors = {name: _error(other, c) for name, c in tried.items()}
+    whole = np.all([np.isfinite(e) for e in errors.values()], axis=0)
+    known = whole.copy()
+    for parameter in calibration.parameters:
+        known &= (other[parameter.name] >= ds[parameter.name].min()).to_numpy()
+        known &= (other[parameter.name] <= ds[parameter.name].max()).to_numpy()
+    found = {name: float(np.mean(e[known] ** 2)) for name, e in errors.items()}
+    return found | {"everywhere": float(np.mean(errors["after"][whole] ** 2))}
 
 
 def _error(ds: xr.Dataset, calibration: Calibration) -> Array:

@@ -183,6 +183,16 @@ def _gains(add: Callable[[str, str, str], None], rows: Sequence[Row]) -> None:
         "gain on another deployment, of an oracle's (S/N 20)", "at least 80 %",
         f"{100 * gained(rows):.0f} % ({100 * low:.0f}-{100 * high:.0f}) | {len(rows)}",
     )  # fmt: skip
+    add("... cases with 80 % of an oracle's", "", share(rows, lambda r: _reached(r["gain"])))
+    add(
+        "... cases that are worse than before",
+        "",
+        share(rows, lambda r: r["gain"]["after"] > 1.02 * r["gain"]["before"]),
+    )
+
+
+def _reached(gain: dict[str, float]) -> bool:
+    return gain["before"] - gain["after"] >= 0.8 * (gain["before"] - gain["oracle"])
 
 
 def _by_cause(part: dict[str, list[Row]]) -> list[str]:
