@@ -261,7 +261,7 @@ def blocks(ds: xr.Dataset, grid: AnomalyGrid, options: Options) -> Iterator[tupl
     """Yield the measurements that the navigator makes of a voyage, and the metres travelled until each."""
     where = DeadReckoning()
     where.place(*PLACE)
-    collector = Collector(options.interval, block_length(grid), options.noise, options.bias_sigma)
+    collector = Collector(options, block_length(grid))
     every = float(ds["time"][1] - ds["time"][0])
     for t, motion, field, sigma in telemetry(ds):
         where.telemetry(t - every, motion)

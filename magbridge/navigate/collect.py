@@ -8,7 +8,7 @@ from typing import NamedTuple
 from magbridge.field.earth import wrap
 from magbridge.field.nearby import NearbyField
 from magbridge.navigate.deadreckoning import DeadReckoning
-from magbridge.navigate.model import Block
+from magbridge.navigate.model import Block, Options
 
 __all__ = ["Collector"]
 
@@ -28,6 +28,7 @@ class Sums(NamedTuple):
     d_longitude: float = 0.0
     anomaly: float = 0.0
     white: float = 0.0
+    together: float = 0.0
     slow: float = 0.0
     slope_north: float = 0.0
     slope_east: float = 0.0
@@ -40,21 +41,23 @@ class Collector:
 
     Parameters
     ----------
-    interval : float
-        s, that a block lasts at most.
+    options : Options
     step : float
-        m, that it covers at most.
-    noise : float or None
-        nT, the part of a sample's sigma that averages out; None: all of it.
-    bias : float
-        nT, the part that the filter's bias stands for.
+        m, that a block covers at most.
+
+    Notes
+    -----
+    The variance of a mean of n samples of noise σ that lasts τ, over a time T, is ``σ² max(1/n, 2τ/(T + 2τ))``. What
+    a sample's sigma holds besides does not average out; of that, the filter's bias stands for its own variance.
     """
 
-    def __init__(self, interval: float, step: float, noise: float | None, bias: float) -> None:
-        self._interval_us, self._step = interval * 1e6, step
-        self._white, self._bias = inf if noise is None else noise**2, bias**2
+    def __init__(self, options: Options, step: float) -> None:
+        self._interval_us, self._step, self._lasts = options.interval * 1e6, step, 2.0 * options.memory
+        self._white = inf if options.noise is None else options.noise**2
+        self._bias = options.bias_sigma**2
         self._main_field = NearbyField()
         self._sums: Sums | None = None
+        self._seconds = 0.0  # from its first sample to its last
 
     def add(self, time_us: int, where: DeadReckoning, total_field: float, sigma: float) -> Block | None:
         """Take in a sample; return the block that it fills."""
@@ -75,11 +78,13 @@ class Collector:
             s.d_longitude + w * wrap(where.longitude - s.longitude),
             s.anomaly + w * (total_field - main),
             s.white + w * w * white,
+            s.together + w * sqrt(white),
             s.slow + w * sqrt(max(0.0, variance - white - self._bias)),
             s.slope_north + w * slope_north,
             s.slope_east + w * slope_east,
         )
         full = time_us - s.start_us >= self._interval_us or where.travelled - s.travelled >= self._step
+        self._seconds = (time_us - s.start_us) * 1e-6
         return self.flush() if full else None
 
     def flush(self) -> Block | None:
@@ -88,12 +93,14 @@ class Collector:
         if s is None:
             return None
         w = s.weight
+        lasting = self._lasts / (self._seconds + self._lasts) if self._lasts else 0.0
+        white = max(s.white, lasting * s.together**2)
         return Block(
             s.start_us + round(s.time / w),
             s.latitude + s.d_latitude / w,
             wrap(s.longitude + s.d_longitude / w),
             s.anomaly / w,
-            (s.white + s.slow**2) / w**2,
+            (white + s.slow**2) / w**2,
             s.slope_north / w,
             s.slope_east / w,
         )

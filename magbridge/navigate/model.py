@@ -40,6 +40,7 @@ __all__ = [
 Array = NDArray[np.float64]
 
 N_STATES = 6
+LASTING = 3.0  # intervals
 LEG = 1_800.0  # s, between turns or from dive to climb
 FINE = 0.35  # of the spread that one measurement allows: errors of neighbours follow each other and add up
 
@@ -62,6 +63,8 @@ class Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     noise : float or None
         nT, the part of a sample's sigma that is white; of the rest, what goes beyond ``bias_sigma`` does not
         average out. None: all of it is white.
+    memory : float
+        s, over which the correlation of that noise falls by e; longer ones than a few intervals are a bias.
     gate : float
         Largest innovation squared over its variance that is taken in.
     interval : float
@@ -82,6 +85,7 @@ class Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     map_sigma: float = 2.0
     map_length: float = 1_000.0
     noise: float | None = None
+    memory: float = 0.0
     gate: float = 16.0
     interval: float = 20.0
     vouch_sigma: float = 500.0
@@ -127,15 +131,23 @@ def informed(options: Options, calibration: Calibration, sigma: float) -> Option
 
     Notes
     -----
-    White is the noise that the calibration runs showed, unless it lasted longer there than a block: that does not
-    average out, it is a bias. What a calibration gets wrong follows attitude and masses, and lasts for a leg.
+    White is the noise that the calibration runs showed; one that lasted longer there than a few updates does not
+    average out, it is a bias, and white is what drives it, ``σ √(1 - ρ²)`` with ρ its correlation from sample to
+    sample. What else a calibration gets wrong follows attitude and masses, and lasts for a leg.
     """
     noise = calibration.noise
-    lasts = -noise.interval / log(noise.memory) if 0.0 < noise.memory < 1.0 else 0.0
-    white = noise.sensor if lasts <= options.interval else 0.0
+    white = noise.sensor
+    memory = -noise.interval / log(noise.memory) if 0.0 < noise.memory < 1.0 else 0.0
+    if memory > LASTING * options.interval:
+        white, memory = white * sqrt(1.0 - noise.memory**2), 0.0
     slow = sqrt(max(0.0, sigma**2 - white**2))
-    time = min(options.bias_time, LEG) if slow > options.bias_sigma else options.bias_time
-    return replace(options, noise=white, bias_sigma=hypot(options.bias_sigma, slow), bias_time=time)
+    return replace(
+        options,
+        noise=white,
+        memory=memory,
+        bias_sigma=hypot(options.bias_sigma, slow),
+        bias_time=min(options.bias_time, LEG) if slow > options.bias_sigma else options.bias_time,
+    )
 
 
 def prior(options: Options, position_sigma: float | None = None) -> tuple[Array, Array]:

@@ -75,9 +75,7 @@ class Navigator:
         self.jumps: list[Jump] = []
         self.dropped = 0
         self._reckoning = DeadReckoning()
-        self._collector = Collector(
-            self.options.interval, block_length(grid), self.options.noise, self.options.bias_sigma
-        )
+        self._collector = Collector(self.options, block_length(grid))
         self._time_us, self._latest_us, self._travelled = 0, 0, 0.0
         self._filter: Tracker | Bank | None = None
         self._watch: Watch | None = None
