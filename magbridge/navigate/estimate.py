@@ -1,0 +1,238 @@
+"""The estimate: one hypothesis or as many as it takes, and whether to believe them."""
+
+from __future__ import annotations
+
+from math import inf, isfinite, log, nan
+
+import numpy as np
+from msgspec.structs import replace
+from numpy.typing import NDArray
+
+from magbridge.field.earth import offset
+from magbridge.field.grid import AnomalyGrid
+from magbridge.navigate.bank import Bank, widest
+from magbridge.navigate.model import Block, Options, prior, resolution, transition
+from magbridge.navigate.record import Jump, State
+from magbridge.navigate.tracker import Innovation, Tracker
+from magbridge.navigate.watch import Unmapped, Verdict, Watch, distance
+
+__all__ = ["Estimate"]
+
+Array = NDArray[np.float64]
+
+CONTRADICTION = 25.0  # squared distance of a fix, two degrees of freedom: 4e-6 by chance
+UNINFORMED = 0.8  # of what dead reckoning alone would have: the field has said nothing
+REACH = 300.0  # m, the least that the watch looks around
+JOIN, SPLIT = 1.2, 1.5  # of the map's resolution: below one hypothesis will do, above it will not
+FINER = 0.8  # of the resolution: so much better a measurement must be to be worth a finer one
+LEVEL_LASTS = 10.0  # times as long as a calibration's bias
+DOUBTFUL = 1.0  # log odds: another place explains the field better, if not yet beyond doubt
+SPREADS = (2.0, 4.0, 2.0, 8.0)  # times its reach, of the searches after each other
+DOUBTED = 2  # searches in vain, after which the map's level is doubted too
+
+
+class Estimate:
+    """Position around a dead-reckoned track, from blocks of samples and fixes that are given in the order of their time.
+
+    Parameters
+    ----------
+    grid : AnomalyGrid
+    options : Options
+
+    Attributes
+    ----------
+    state : State
+    x, P : ndarray, (6,), (6, 6)
+        Estimate and covariance, of :mod:`~magbridge.navigate.model`'s states.
+    vouched : bool
+        The filter stands by the position.
+    moved : tuple of ndarray
+        F and Q from the update before to the last one, for a smoother.
+    jumps : list of Jump
+        Where the estimate began anew; a smoother must not look across.
+    """
+
+    def __init__(self, grid: AnomalyGrid, options: Options) -> None:
+        self.grid, self.options = grid, options
+        self.state = State.OFF
+        self.x, self.P = prior(options)
+        self.vouched = False
+        self.moved = np.eye(6), np.zeros((6, 6))
+        self.jumps: list[Jump] = []
+        self._time_us, self._travelled = 0, 0.0
+        self._reported = False
+        self._filter: Tracker | Bank | None = None
+        self._watch: Watch | None = None
+        self._unmapped = Unmapped(grid, options)
+        self._nowhere = 0.0
+        self._resolution = inf
+        self._alone = self.P[:4, :4].copy()  # covariance of dead reckoning alone
+        self._lost = False
+        self._searches = 0
+
+    @property
+    def odds(self) -> float:
+        """Natural logarithm of the odds of another place against this one."""
+        return self._watch.odds if self._watch else 0.0
+
+    @property
+    def hypotheses(self) -> int:
+        """How many there are."""
+        return len(self._filter) if isinstance(self._filter, Bank) else 1
+
+    def start(self, time_us: int, sigma: float) -> None:
+        """Begin at the dead-reckoned position, known to `sigma` m on each axis."""
+        self._time_us = time_us
+        self.x, self.P = prior(self.options, sigma)
+        self._alone = self.P[:4, :4].copy()
+        self.state = State.SEARCHING
+
+    def correct(self, there: Array, sigma: float) -> None:
+        """Take in a position, m from the dead-reckoned one, at the time of the last prediction; once there is a filter."""
+        assert self._filter is not None
+        self._read()
+        if distance(there - self.x[:2], self.P[:2, :2] + sigma**2 * np.eye(2)) > CONTRADICTION:
+            _, start = prior(self.options, sigma)
+            start[2:, 2:] += self.P[2:, 2:]
+            self._begin(np.concatenate([there, self.x[2:]]), start, "a fix contradicts the filter")
+        else:
+            self._filter.update_position(float(there[0]), float(there[1]), sigma)
+            self._read()
+        self._watch, self._lost = None, False
+        self._alone = np.diag([sigma**2, sigma**2, *np.diag(self.P)[2:4]])
+
+    def update(self, block: Block, travelled: float) -> Innovation:
+        """Take in a measurement, `travelled` m after the start; return what it said, NaN off the map."""
+        seconds, metres = self.predict(block.time_us, travelled)
+        finer = resolution(self.grid, self.options, block.variance)
+        if finer < FINER * self._resolution:  # a first block may be a bad one, and says nothing of the rest
+            self._resolution = finer
+            if isinstance(self._filter, Bank):
+                self._filter.finest = finer
+        if self._filter is None:
+            self._filter = self._estimator(self.x, self.P)
+        seen = self._take_in(block)
+        self._read()
+        on_the_map = isfinite(seen.anomaly)
+        if on_the_map:
+            self._judge(block, seconds, metres, seen.log_likelihood)
+        self._choose(on_the_map)
+        self._reported = True
+        sure = widest(self.P) < self.options.vouch_sigma
+        self.vouched = self.state is State.TRACKING and self.odds < DOUBTFUL and sure
+        return seen
+
+    def predict(self, time_us: int, travelled: float) -> tuple[float, float]:
+        """Move on to `time_us`, `travelled` m after the start; return the seconds and metres that it took."""
+        seconds, metres = (time_us - self._time_us) * 1e-6, travelled - self._travelled
+        self._time_us, self._travelled = time_us, travelled
+        F, Q = transition(self.options, seconds, metres)
+        self._alone = F[:4, :4] @ self._alone @ F[:4, :4].T + Q[:4, :4]
+        self.moved = (F, Q) if self._reported else (F @ self.moved[0], F @ self.moved[1] @ F.T + Q)
+        self._reported = False
+        if self._filter is None:
+            self.x, self.P = F @ self.x, F @ self.P @ F.T + Q
+        else:
+            self._filter.predict(F, Q)
+        return seconds, metres
+
+    def _take_in(self, block: Block) -> Innovation:
+        if isinstance(self._filter, Tracker):
+            return self._filter.update(block) or Innovation(nan, nan, 0.0, accepted=False)
+        assert self._filter is not None
+        innovation, variance, likelihood = self._filter.update(block)
+        best = self._filter.x[:, int(self._filter.w.argmax())]
+        latitude, longitude = offset(block.latitude, block.longitude, float(best[0]), float(best[1]))
+        anomaly = self.grid.look_up(longitude, latitude).anomaly
+        accepted = innovation**2 <= self.options.gate * variance
+        return Innovation(innovation, variance, likelihood, accepted, anomaly)
+
+    def _read(self) -> None:
+        if isinstance(self._filter, Bank):
+            self.x, self.P = self._filter.moments()
+        elif self._filter is not None:
+            self.x, self.P = self._filter.x, self._filter.P
+
+    # ---- one hypothesis or many, and whether to believe them -----------------------------------------
+
+    def _estimator(self, x: Array, P: Array) -> Tracker | Bank:
+        """Return one hypothesis, or as many as it takes."""
+        if widest(P) < SPLIT * self._resolution:
+            return Tracker(self.grid, x, P, self.options.gate)
+        return Bank(self.grid, x, P, self._resolution, self.options.gate)
+
+    def _begin(self, x: Array, P: Array, cause: str) -> None:
+        """Start again from a Gaussian."""
+        self._jump(x, cause)
+        self._filter, self.x, self.P = self._estimator(x, P), x, P
+
+    def _jump(self, x: Array, cause: str) -> None:
+        north, east = (x[:2] - self.x[:2]).tolist()
+        self.jumps.append(Jump(self._time_us, north, east, widest(self._alone), cause))
+        self._watch = None
+
+    def _judge(self, block: Block, seconds: float, metres: float, likelihood: float) -> None:
+        """Compare the filter with its rivals; leave it where one of them has won."""
+        assert self._filter is not None
+        unmapped = self._unmapped.update(block, seconds, metres, self._filter.blur)
+        self._nowhere = max(self._nowhere + unmapped - likelihood, -log(self.options.doubt))
+        if self._nowhere > log(self.options.doubt):
+            self._search_anew()
+            return
+        if not self._compact(widest(self.P)):
+            return
+        if self._watch is None:
+            reach = self._reach() * (2.0 if self._lost else 1.0)
+            self._watch = Watch(
+                self.grid, self.options, self.x, self.P, block.time_us, reach, self._resolution
+            )
+            return
+        verdict = self._watch.step(block, metres, self.x, self.P)
+        if verdict is Verdict.ELSEWHERE:
+            self._filter, self._lost = self._watch.surrender(block.time_us), True
+            self._jump(self._filter.moments()[0], verdict.value)
+            self._read()
+        elif verdict is Verdict.HOLDS:
+            self._watch = None
+            if self._nowhere < -0.5 * log(self.options.doubt):  # and the map does describe the field
+                self._lost, self._searches = False, 0
+
+    def _search_anew(self) -> None:
+        """Look around, further, and then for a map of another level."""
+        self._nowhere, self._lost = 0.0, True
+        if self._searches == DOUBTED and self.options.bias_sigma < self.grid.rms:
+            self.options = replace(
+                self.options, bias_sigma=self.grid.rms, bias_time=LEVEL_LASTS * self.options.bias_time
+            )
+        self._unmapped = Unmapped(self.grid, self.options)
+        x, P = prior(self.options)
+        P[:4, :4] = self._alone
+        P[:2, :2] += (self._reach() * SPREADS[self._searches % len(SPREADS)]) ** 2 * np.eye(2)
+        self._searches += 1
+        self._begin(x, P, Verdict.NOWHERE.value)
+
+    def _compact(self, width: float) -> bool:
+        """Return whether a position of this spread is one place, seen on the scale of the map."""
+        return width <= max(SPLIT * self._resolution, 0.25 * self.grid.correlation_length)
+
+    def _reach(self) -> float:
+        """Return how far around itself the filter is doubted: m."""
+        alone = widest(self._alone)
+        return max(REACH, alone, min(0.5 * self.grid.correlation_length, 5.0 * REACH))
+
+    def _choose(self, on_the_map: bool) -> None:
+        """Hand over from the bank to one filter, or back; and say what holds."""
+        width = widest(self.P)
+        if isinstance(self._filter, Bank) and width < JOIN * self._resolution:
+            self._filter = Tracker(self.grid, self.x, self.P, self.options.gate)
+        elif isinstance(self._filter, Tracker) and width > SPLIT * self._resolution:
+            self._filter = Bank(self.grid, self.x, self.P, self._resolution, self.options.gate)
+            self._watch = None
+        if self._lost:
+            self.state = State.LOST
+        elif not self._compact(width):
+            self.state = State.SEARCHING
+        elif not on_the_map or width > UNINFORMED * widest(self._alone):
+            self.state = State.DEAD_RECKONING
+        else:
+            self.state = State.TRACKING
