@@ -11,13 +11,14 @@ from filterpy.kalman import rts_smoother
 from numpy.typing import NDArray
 
 from magbridge.errors import FormatError
-from magbridge.field.earth import metres_per_degree, offset
+from magbridge.field.earth import offset
 from magbridge.field.grid import AnomalyGrid
 from magbridge.navigate.deadreckoning import GLIDE
 from magbridge.navigate.judge import judge
 from magbridge.navigate.model import Options
 from magbridge.navigate.navigator import UNUSABLE, Navigator
 from magbridge.navigate.record import Record
+from magbridge.navigate.yardstick import YARDSTICKS, with_errors, yardstick
 
 __all__ = ["MOTIONS", "navigate"]
 
@@ -35,11 +36,6 @@ MOTIONS: dict[str, dict[str, str]] = {
 """How a log tells motion, best first: its columns, and what the dead reckoning calls them."""
 
 GPS_SIGMA = 10.0  # m, each axis, of a receiver that has just surfaced
-YARDSTICKS = (
-    ("truth_latitude", "truth_longitude"),
-    ("gps_latitude", "gps_longitude"),
-    ("latitude", "longitude"),
-)
 
 UNITS = {
     "latitude": "deg", "longitude": "deg", "smoothed_latitude": "deg", "smoothed_longitude": "deg",
@@ -47,7 +43,6 @@ UNITS = {
     "innovation": "nT", "innovation_variance": "nT2", "anomaly": "nT", "map_anomaly": "nT",
     "bias": "nT", "bias_sigma": "nT", "map_error": "nT", "current_north": "m s-1", "current_east": "m s-1",
     "north": "m", "east": "m", "smoothed_sigma_north": "m", "smoothed_sigma_east": "m",
-    "error_north": "m", "error_east": "m", "smoothed_error_north": "m", "smoothed_error_east": "m",
 }  # fmt: skip
 
 
@@ -125,8 +120,9 @@ def navigate(
         raise FormatError(source, "expected samples of the total field at known times: none was usable")
     result = _dataset(records, _smooth(states))
     result.attrs = {"source": source, "map": grid.name, "motion": motion}
-    result = _with_errors(result, deployment, motion)
-    findings = judge(result, grid, options, navigator.jumps, _yardstick(deployment, motion))
+    known = yardstick(deployment, frozenset(MOTIONS[motion]))
+    result = with_errors(result, known)
+    findings = judge(result, grid, options, navigator.jumps, known)
     return result.assign_attrs(findings="\n".join(findings))
 
 
@@ -188,19 +184,6 @@ def _first_position(deployment: xr.Dataset, source: str) -> tuple[float, float]:
     raise FormatError(source, "expected a position to start from: latitude and longitude")
 
 
-def _yardstick(deployment: xr.Dataset, motion: str) -> xr.Dataset | None:
-    """Return the best position that the estimate has not used, with the field there; None if there is none."""
-    for pair in YARDSTICKS:
-        used = pair[0] in MOTIONS[motion]
-        if not used and all(name in deployment for name in pair):
-            wanted = [*pair, "total_field", *(["depth"] if "depth" in deployment else [])]
-            known = deployment[wanted].rename(dict(zip(pair, ("latitude", "longitude"), strict=True)))
-            known = known.dropna("time", subset=["latitude", "longitude"])
-            if known.sizes["time"]:
-                return known.assign_attrs(yardstick=pair[0].removesuffix("latitude") or "log")
-    return None
-
-
 def _smooth(states: list[tuple[Array, Array, Array, Array, int]]) -> tuple[Array, Array]:
     """Return smoothed means (n, 6) and covariances (n, 6, 6), pass by pass between jumps."""
     x, P, F, Q = (np.stack([state[k] for state in states]) for k in range(4))
@@ -236,38 +219,3 @@ def _dataset(records: list[Record], smoothed: tuple[Array, Array]) -> xr.Dataset
 
 def _attrs(name: str) -> dict[str, str]:
     return {"units": UNITS.get(name, "1"), "long_name": name.replace("_", " ")}
-
-
-def _with_errors(result: xr.Dataset, deployment: xr.Dataset, motion: str) -> xr.Dataset:
-    """Add metres from the yardstick to the track, where there is one within the log's own spacing."""
-    truth = _yardstick(deployment, motion)
-    if truth is None:
-        return result
-    time = result["time"].to_numpy()
-    known = truth["time"].to_numpy()
-    spacing = max(60.0, 2.0 * float(np.median(np.diff(known)))) if known.size > 1 else 60.0
-    nearest = np.abs(known[np.clip(np.searchsorted(known, time), 0, known.size - 1)] - time)
-    before = np.abs(known[np.clip(np.searchsorted(known, time) - 1, 0, known.size - 1)] - time)
-    near = np.minimum(nearest, before) <= spacing
-    latitude = np.interp(time, known, truth["latitude"].to_numpy())
-    longitude = np.interp(time, known, np.unwrap(truth["longitude"].to_numpy(), period=360.0))
-    added = {}
-    for prefix in ("", "smoothed_"):
-        north, east = _separations(
-            latitude,
-            longitude,
-            result[f"{prefix}latitude"].to_numpy(),
-            result[f"{prefix}longitude"].to_numpy(),
-        )
-        added[f"{prefix}error_north"] = np.where(near, north, np.nan)
-        added[f"{prefix}error_east"] = np.where(near, east, np.nan)
-    named = {name: ("time", values, _attrs(name)) for name, values in added.items()}
-    return result.assign(named).assign_attrs(yardstick=truth.attrs["yardstick"])
-
-
-def _separations(
-    latitude: Floats, longitude: Floats, to_latitude: Floats, to_longitude: Floats
-) -> tuple[Floats, Floats]:
-    per_latitude, per_longitude = metres_per_degree(np.asarray(latitude, np.float64))
-    turn = (to_longitude - longitude + 180.0) % 360.0 - 180.0
-    return (to_latitude - latitude) * per_latitude, turn * per_longitude

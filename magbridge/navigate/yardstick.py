@@ -1,0 +1,70 @@
+"""What an estimate is held against: the best position that the log has, and that it did not use."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from magbridge.field.earth import metres_per_degree
+
+__all__ = ["YARDSTICKS", "with_errors", "yardstick"]
+
+Floats = NDArray[np.floating[Any]]
+
+YARDSTICKS = (
+    ("truth_latitude", "truth_longitude"),
+    ("gps_latitude", "gps_longitude"),
+    ("latitude", "longitude"),
+)
+
+
+def yardstick(deployment: xr.Dataset, used: frozenset[str]) -> xr.Dataset | None:
+    """Return the best position that the estimate has not used, with the field there; None if there is none."""
+    for pair in YARDSTICKS:
+        if pair[0] not in used and all(name in deployment for name in pair):
+            wanted = [*pair, "total_field", *(["depth"] if "depth" in deployment else [])]
+            known = deployment[wanted].rename(dict(zip(pair, ("latitude", "longitude"), strict=True)))
+            known = known.dropna("time", subset=["latitude", "longitude"])
+            if known.sizes["time"]:
+                return known.assign_attrs(yardstick=pair[0].removesuffix("latitude") or "log")
+    return None
+
+
+def with_errors(result: xr.Dataset, truth: xr.Dataset | None) -> xr.Dataset:
+    """Add metres from the yardstick to the track, where there is one within the log's own spacing."""
+    if truth is None:
+        return result
+    time = result["time"].to_numpy()
+    known = truth["time"].to_numpy()
+    spacing = max(60.0, 2.0 * float(np.median(np.diff(known)))) if known.size > 1 else 60.0
+    nearest = np.abs(known[np.clip(np.searchsorted(known, time), 0, known.size - 1)] - time)
+    before = np.abs(known[np.clip(np.searchsorted(known, time) - 1, 0, known.size - 1)] - time)
+    near = np.minimum(nearest, before) <= spacing
+    latitude = np.interp(time, known, truth["latitude"].to_numpy())
+    longitude = np.interp(time, known, np.unwrap(truth["longitude"].to_numpy(), period=360.0))
+    added = {}
+    for prefix in ("", "smoothed_"):
+        north, east = _separations(
+            latitude,
+            longitude,
+            result[f"{prefix}latitude"].to_numpy(),
+            result[f"{prefix}longitude"].to_numpy(),
+        )
+        added[f"{prefix}error_north"] = np.where(near, north, np.nan)
+        added[f"{prefix}error_east"] = np.where(near, east, np.nan)
+    named = {
+        name: ("time", values, {"units": "m", "long_name": name.replace("_", " ")})
+        for name, values in added.items()
+    }
+    return result.assign(named).assign_attrs(yardstick=truth.attrs["yardstick"])
+
+
+def _separations(
+    latitude: Floats, longitude: Floats, to_latitude: Floats, to_longitude: Floats
+) -> tuple[Floats, Floats]:
+    per_latitude, per_longitude = metres_per_degree(np.asarray(latitude, np.float64))
+    turn = (to_longitude - longitude + 180.0) % 360.0 - 180.0
+    return (to_latitude - latitude) * per_latitude, turn * per_longitude
