@@ -82,7 +82,7 @@ class Observations:
         runs = np.zeros(n, int) if self.runs is None else np.asarray(self.runs)
         whole = np.isfinite(np.asarray(self.field, float)).all(axis=1) & np.isfinite(reference)
         whole &= np.isfinite(parameters).all(axis=1) & np.isfinite(time)
-        _enough(n, whole, parameters, self.names, reference)
+        _enough(n, whole, np.asarray(self.field, float), parameters, self.names, reference)
         put(self, "field", np.asarray(self.field, float)[whole])
         put(self, "reference", reference[whole])
         put(self, "parameters", parameters[whole])
@@ -126,18 +126,25 @@ class Observations:
 
 
 def _enough(
-    n: int, whole: NDArray[np.bool_], parameters: FloatArray, names: Sequence[str], reference: FloatArray
+    n: int,
+    whole: NDArray[np.bool_],
+    field: FloatArray,
+    parameters: FloatArray,
+    names: Sequence[str],
+    reference: FloatArray,
 ) -> None:
     """Refuse what cannot be fitted, saying which column is to blame."""
     if whole.sum() >= 10:
         if not (reference[whole] > 0).all():
             raise CalibrationError("reference field: expected positive numbers (nT)")
         return
-    reasons = [
-        f"{name!r} has {int(np.isfinite(column).sum())}"
-        for name, column in zip((*names, "reference field"), (*parameters.T, reference), strict=True)
-        if np.isfinite(column).sum() < 10
-    ]
+    columns = zip(
+        ("mag_x", "mag_y", "mag_z", *names, "reference field"),
+        (*field.T, *parameters.T, reference),
+        strict=True,
+    )
+    counts = {name: int(np.isfinite(column).sum()) for name, column in columns}
+    reasons = [f"{name!r} has {count}" for name, count in counts.items() if count < min(n, 10)]
     because = f" ({', '.join(reasons)} numbers)" if reasons else ""
     raise CalibrationError(
         f"only {int(whole.sum())} of {n} samples have every value{because}: at least 10 needed"

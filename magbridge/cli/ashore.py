@@ -124,7 +124,12 @@ def calibrate(
     anomalies = read_grid(grid) if grid else None
     deployment = with_true_heading(read(some(files), required=(*CHANNELS, *parameter)))
     data = observations(deployment, parameter, reference=lambda ds: earth_field(ds, anomalies))
-    data = replace(data, inputs={file.name: sha256(file.read_bytes()).hexdigest() for file in files})
+    seen: dict[str, Path] = {}
+    for file in files:
+        first = seen.setdefault(sha256(file.read_bytes()).hexdigest(), file)
+        if first is not file:
+            complain(f"{file}: the same as {first}: its samples are counted once", 0)
+    data = replace(data, inputs={file.name: digest for digest, file in seen.items()})
     if filter_corner:
         data = unfiltered(data, filter_corner)
     options: dict[str, Any] = {"vehicle": read_vehicle(vehicle)} if vehicle else {}

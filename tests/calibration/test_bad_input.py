@@ -1,0 +1,140 @@
+"""What bad calibration data get at the command line: exit 1, one clear line, no file."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from magbridge.cli import main
+from magbridge.field.grid import AnomalyGrid
+from magbridge.logs import write
+from sitl import load, segments, simulate
+
+PARAMETERS = ("--parameter", "battpos", "--parameter", "ballast")
+
+
+@pytest.fixture(scope="module")
+def runs() -> xr.Dataset:
+    return (
+        segments(simulate(load("demo"), 5))["calibration"]
+        .isel(time=slice(0, None, 4))
+        .drop_vars("reference_field")
+    )
+
+
+@pytest.fixture(scope="module")
+def good(runs: xr.Dataset, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """A good log and its calibration."""
+    folder = tmp_path_factory.mktemp("good")
+    write(runs, folder / "runs.csv")
+    assert main(["calibrate", str(folder / "runs.csv"), *PARAMETERS, "-o", str(folder / "cal.json")]) == 0
+    return folder / "runs.csv", folder / "cal.json"
+
+
+def one_line(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
+    capsys.readouterr()
+    assert main([str(argument) for argument in arguments]) == 1
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1, said
+    assert said.startswith("magbridge: ")
+    return said
+
+
+def changed(runs: xr.Dataset, **columns: Any) -> xr.Dataset:
+    return runs.assign(
+        {name: (("time"), np.broadcast_to(value, runs.sizes["time"])) for name, value in columns.items()}
+    )
+
+
+BAD: dict[str, tuple[Callable[[xr.Dataset], xr.Dataset], str]] = {
+    "too few samples": (
+        lambda ds: ds.isel(time=slice(0, 6)),
+        "only 6 of 6 samples have every value: at least 10",
+    ),
+    "one attitude": (
+        lambda ds: changed(ds, **{f"mag_{axis}": ds[f"mag_{axis}"].to_numpy()[0] for axis in "xyz"}),
+        "within 0.0 degrees of one attitude: fly turns",
+    ),
+    "all NaN": (lambda ds: changed(ds, mag_y=np.nan), "have every value ('mag_y' has 0 numbers)"),
+    "a parameter that never moves": (
+        lambda ds: changed(ds, battpos=0.3),
+        "'battpos' never moves (it is 0.3 throughout)",
+    ),
+    "after the IGRF": (lambda ds: ds.assign_coords(time=ds["time"] + 3e9), "the IGRF covers"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_data(case: str, runs: xr.Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    spoil, words = BAD[case]
+    write(spoil(runs), tmp_path / "bad.csv")
+    assert words in one_line(
+        capsys, "calibrate", tmp_path / "bad.csv", *PARAMETERS, "-o", tmp_path / "cal.json"
+    )
+    assert not (tmp_path / "cal.json").exists()
+
+
+def test_a_column_of_strings(
+    good: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    head, *rows = good[0].read_text().splitlines()
+    place = [name.partition(" ")[0] for name in head.split(",")].index("ballast")
+    cells = [row.split(",") for row in rows]
+    spoilt = [",".join([*row[:place], "in", *row[place + 1 :]]) for row in cells]
+    (tmp_path / "bad.csv").write_text("\n".join([head, *spoilt, ""]))
+    said = one_line(capsys, "calibrate", tmp_path / "bad.csv", *PARAMETERS, "-o", tmp_path / "cal.json")
+    assert "bad.csv: row 2, column 'ballast': expected a number, not 'in'" in said
+
+
+def test_positions_outside_the_grid(
+    good: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    axis = np.arange(10.0, 11.0, 0.1)
+    AnomalyGrid(axis, axis, np.zeros((len(axis), len(axis)))).save(tmp_path / "far.nc")
+    said = one_line(
+        capsys, "calibrate", good[0], *PARAMETERS, "--grid", tmp_path / "far.nc", "-o", tmp_path / "cal.json"
+    )
+    assert "far.nc" in said
+
+
+def test_a_run_given_twice_counts_once(
+    good: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    again = tmp_path / "again.csv"
+    again.write_bytes(good[0].read_bytes())
+    capsys.readouterr()
+    assert main(["calibrate", str(good[0]), str(again), *PARAMETERS, "-o", str(tmp_path / "cal.json")]) == 0
+    assert f"{again}: the same as {good[0]}: its samples are counted once" in capsys.readouterr().err
+    once, twice = (json.loads(path.read_text()) for path in (good[1], tmp_path / "cal.json"))
+    assert once["coefficients"] == twice["coefficients"]
+
+
+@pytest.mark.parametrize(
+    ("edit", "words"),
+    [
+        (lambda text: text[:500], "truncated"),
+        (lambda text: text.replace('"format":1', '"format":99').replace('"format": 1', '"format": 99'), "newer magbridge"),
+        (lambda text: text.replace('"coefficients":[', '"coefficients":["x",').replace(
+            '"coefficients": [', '"coefficients": ["x",'), "coefficients"),
+    ],
+    ids=["truncated", "newer", "by hand"],
+)  # fmt: skip
+def test_a_bad_calibration(
+    edit: Callable[[str], str],
+    words: str,
+    good: tuple[Path, Path],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    log, cal = good
+    (tmp_path / "bad.json").write_text(edit(cal.read_text()))
+    said = one_line(capsys, "correct", log, "--calibration", tmp_path / "bad.json", "-o", tmp_path / "x.csv")
+    assert words in said
+    assert "bad.json" in said
+    assert not (tmp_path / "x.csv").exists()
