@@ -21,7 +21,7 @@ from magbridge.link import alignment
 from magbridge.mavlink.dialect import MAV_SEVERITY
 from magbridge.monitor.ear import Ear
 from magbridge.monitor.state import Point
-from magbridge.monitor.words import FLAGS, ago, health, measured, silence
+from magbridge.monitor.words import FLAGS, ago, health, measured, silence, whereabouts
 
 __all__ = ["serve"]
 
@@ -88,6 +88,12 @@ class Page:
                     self._health = [_fact(name) for name in facts[:8]]
                 with _card("Losses"):
                     self._health += [_fact(name) for name in facts[8:]]
+            with (
+                ui.element().classes("w-full") as self._navigation,
+                _card("Position by the field; innovation and bias in nT"),
+                ui.element().classes(f"{GRID}3 gap-y-1"),
+            ):
+                self._whereabouts = [_fact(name) for name in whereabouts(self._state)]
             with ui.element().classes(f"{GRID}2"):
                 with _card("Messages, UTC"):
                     self._texts = ui.column().classes("w-full h-60 gap-1 overflow-auto flex-nowrap")
@@ -119,6 +125,10 @@ class Page:
         for labels, texts in zip(self._measured, measured(self._state).values(), strict=True):
             for label, text in zip(labels, texts, strict=True):
                 label.set_text(text)
+        self._navigation.set_visibility(bool(self._state.navigation))
+        for label, (text, well) in zip(self._whereabouts, whereabouts(self._state).values(), strict=True):
+            label.set_text(text)
+            label.style(f"color: {INK if well else RED}")
         for label, (text, well) in zip(self._health, health(self._state).values(), strict=True):
             label.set_text(text if self._state.status else "–")
             label.style(f"color: {INK if well or not self._state.status else RED}")

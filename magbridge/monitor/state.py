@@ -67,8 +67,8 @@ class State:
         s between its last two MAG_FIELDs; 0 before the second.
     received, lost : int
         Its messages, and those missing by its own numbering.
-    field, status : dict
-        The last MAG_FIELD and MAG_STATUS; empty before the first.
+    field, status, navigation : dict
+        The last MAG_FIELD, MAG_STATUS and MAG_NAVIGATION; empty before the first.
     flags : dict of str to tuple of 2 float
         The flags that stand, by their public names: since when, and when last seen.
     trace : deque of Point
@@ -85,6 +85,7 @@ class State:
         self.received = self.lost = 0
         self.field: dict[str, Any] = {}
         self.status: dict[str, Any] = {}
+        self.navigation: dict[str, Any] = {}
         self.flags: dict[str, tuple[float, float]] = {}
         self.trace: deque[Point] = deque()
         self.texts: deque[Text] = deque(maxlen=200)
@@ -93,7 +94,12 @@ class State:
         self._sequence = -1
         self._piece = (0, 0)
         self._beat = self._asked = -inf
-        handlers = {"MAG_FIELD": self._field, "MAG_STATUS": self._status, "STATUSTEXT": self._text}
+        handlers = {
+            "MAG_FIELD": self._field,
+            "MAG_STATUS": self._status,
+            "MAG_NAVIGATION": self._navigation,
+            "STATUSTEXT": self._text,
+        }
         self._handlers = {spec(name).id: handle for name, handle in handlers.items()}
         self._handlers[spec("PARAM_VALUE").id] = self._value
 
@@ -167,6 +173,9 @@ class State:
         if self.status["uptime"] < before:  # it began anew, perhaps with other parameters
             self.parameters.clear()
             self._count = 0
+
+    def _navigation(self, message: Message, _: float) -> None:
+        self.navigation = message.fields
 
     def _text(self, message: Message, now: float) -> None:
         number, piece = message["id"], message["chunk_seq"]

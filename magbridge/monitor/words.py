@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from math import isfinite, nan
+from math import hypot, isfinite, nan, sqrt
 
-from magbridge.mavlink.dialect import MAG_LOG_STATE, MAG_PORT_STATE
+from magbridge.mavlink.dialect import MAG_LOG_STATE, MAG_NAVIGATION_STATE, MAG_PORT_STATE
 from magbridge.monitor.state import State
 
-__all__ = ["FLAGS", "ago", "health", "measured", "silence"]
+__all__ = ["FLAGS", "ago", "health", "measured", "silence", "whereabouts"]
 
 SILENT, SLOW = 3.0, 30.0
 """s; a bridge speaks every second, a slow sensor less often: three of its intervals, but no more than `SLOW`."""
@@ -80,7 +80,32 @@ def health(state: State) -> dict[str, tuple[str, bool]]:
     }
 
 
+def whereabouts(state: State) -> dict[str, tuple[str, bool]]:
+    """Return what the position filter says: of each thing a word, and whether it is well."""
+    get = state.navigation.get
+    mode = MAG_NAVIGATION_STATE(get("state", 0))
+    nn, ne, ee = (get(f"covariance_{axes}", nan) for axes in ("nn", "ne", "ee"))
+    sigma = sqrt(0.5 * (nn + ee) + hypot(0.5 * (nn - ee), ne)) if nn + ee > 0.0 else nan
+    innovation, variance = get("innovation", nan), get("innovation_variance", nan)
+    return {
+        "State": (mode.name.lower().replace("_", " "), mode != MAG_NAVIGATION_STATE.LOST),
+        "Position": (f"{get('lat', 0) * 1e-7:.5f}, {get('lon', 0) * 1e-7:.5f}", True),
+        "1σ of the worse axis": (_number(sigma, ".0f", unit="m")[0], True),
+        "Innovation ± 2σ": (
+            " ".join(_number(innovation, "+.1f", 2.0 * sqrt(max(variance, 0.0)))),
+            bool(get("accepted", 1)),
+        ),
+        "Bias ± 2σ": (" ".join(_number(get("bias", nan), "+.1f", 2.0 * get("bias_sigma", nan))), True),
+        "Current": (
+            _number(hypot(get("current_north", nan), get("current_east", nan)), ".2f", unit="m/s")[0],
+            True,
+        ),
+    }
+
+
 def _number(value: float, form: str, two_sigma: float = nan, unit: str = "") -> tuple[str, str]:
     """Return a value with its unit, thousands apart, and its 2-sigma; a dash and nothing where not known."""
     text = f"{value:{form.replace('.', ',.')}} {unit}".replace(",", "\N{NARROW NO-BREAK SPACE}").rstrip()
-    return text if isfinite(value) else "–", f"± {two_sigma:{form}}" if isfinite(two_sigma) else ""
+    return text if isfinite(value) else "–", f"± {two_sigma:{form.lstrip('+')}}" if isfinite(
+        two_sigma
+    ) else ""

@@ -74,13 +74,22 @@ def test_page(page: tuple[str, tuple[str, int]]) -> None:
         assert (heard[0].system, heard[0].component) == (255, 190)
         for name, fields in (
             ("MAG_STATUS", {"sensor_state": 3, "uptime": 9}),
+            ("MAG_NAVIGATION", {"state": 2, "lat": 495_000_000, "lon": -579_000_000}),
             ("STATUSTEXT", {"severity": 3, "text": "sensor lost: unplugged"}),
             ("PARAM_VALUE", {"param_id": "MB_SETTLE_TIME", "param_value": 5.0, "param_count": 1}),
         ):
             sender.sendto(bridge.pack(name, **fields), link)
     time.sleep(0.5)
     html = get(url)
-    for text in ("52\u202f134.27", "± 1.20", "A mass is moving", "sensor lost: unplugged", "MB_SETTLE_TIME"):
+    shown = (
+        "52\u202f134.27",
+        "± 1.20",
+        "A mass is moving",
+        "49.50000, -57.90000",
+        "tracking",
+        "MB_SETTLE_TIME",
+    )
+    for text in (*shown, "sensor lost: unplugged"):
         assert text in html, text
     assert "vehicle 1, component 191" in html
     assert 'src="http' not in html  # it must show without a network

@@ -10,7 +10,7 @@ from magbridge.config import Align, Link
 from magbridge.link import Component, alignment
 from magbridge.mavlink import Codec
 from magbridge.monitor.state import State
-from magbridge.monitor.words import ago, health, measured, silence
+from magbridge.monitor.words import ago, health, measured, silence, whereabouts
 from magbridge.records import Quality
 
 NOW = 1_700_000_000.0
@@ -76,6 +76,18 @@ def test_figures(air: Air) -> None:
     assert told["Latency"] == ("4.2 ms", True)
     assert told["Calibration"] == ("0000beef", True)
     assert told["Samples lost at the sensor"] == ("7", False)
+
+
+def test_the_position_by_the_field(air: Air) -> None:
+    air.field(NOW)
+    assert whereabouts(air.state)["State"] == ("off", True)
+    place = {"lat": 495_000_000, "lon": -579_000_000, "covariance_nn": 400.0, "covariance_ee": 900.0}
+    air.say(NOW, "MAG_NAVIGATION", state=4, innovation=2.5, innovation_variance=1.0, bias=1.0, **place)
+    told = whereabouts(air.state)
+    assert told["State"] == ("lost", False)
+    assert told["Position"][0] == "49.50000, -57.90000"
+    assert told["1σ of the worse axis"][0] == "30 m"
+    assert told["Innovation ± 2σ"] == ("+2.5 ± 2.0", False)
 
 
 def test_only_the_first_bridge_is_heard(air: Air) -> None:
