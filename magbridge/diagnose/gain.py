@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from magbridge.diagnose.joint import Joint
+from magbridge.diagnose.joint import RIDGE, Joint
 from magbridge.diagnose.problem import Columns, Problem
 
 __all__ = ["Gain", "held_out", "paired"]
@@ -35,7 +35,7 @@ def held_out(problem: Problem, columns: Sequence[Columns], fit: Joint) -> FloatA
     """
     X = np.hstack([problem.free, *(column(slice(0, len(problem))) for column in columns)])
     q = len(problem.centre)
-    prior = np.append(np.ones(q), np.full(X.shape[1] - q, 1e-2))
+    prior = np.append(np.ones(q), np.full(X.shape[1] - q, RIDGE))
     centre = np.append(problem.centre, np.zeros(X.shape[1] - q))
     c = np.append(fit.z, fit.coefficients)
     A, y = fit.noise.filter(X), fit.noise.response(problem.residual - X @ c)

@@ -19,10 +19,13 @@ from numpy.typing import NDArray
 from magbridge.diagnose.noise import Noise, fit_noise
 from magbridge.diagnose.problem import Columns, Problem
 
-__all__ = ["Information", "Joint", "fit_joint", "information"]
+__all__ = ["RIDGE", "Information", "Joint", "fit_joint", "information"]
 
 FloatArray = NDArray[np.float64]
 CHUNK = 4096
+RIDGE = 0.1
+"""Prior precision of an effect, of a plausible size's: ten times that size is hardly believed, a hundred times not at
+all. Without it a bend of the channels and the calibration's scales grow against each other until the noise is gone."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +61,7 @@ def fit_joint(
     plain: bool = True,
     like: Joint | None = None,
     blocks: bool | None = None,
-    ridge: float = 1e-2,
+    ridge: float = RIDGE,
     rounds: int = 5,
 ) -> Joint:
     """Maximise the joint likelihood of calibration, effects and noise.
@@ -79,7 +82,7 @@ def fit_joint(
     blocks : bool, optional
         See :func:`~magbridge.diagnose.noise.fit_noise`.
     ridge : float
-        Prior precision of the effects, in units of their widths: ten times a plausible size is hardly believed.
+        Prior precision of the effects, in units of their widths.
     rounds : int
         At most.
     """

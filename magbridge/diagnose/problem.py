@@ -10,6 +10,9 @@ coefficients at every sample, a term or an effect that adds ``sum_rs phi_r C_krs
 and a coefficient that is really there, but not in the calibration, leaves minus that in the residual. So every cause
 passes through the forward model by the one rule. The calibration stays free, with its posterior
 as prior: ``c = c_0 + L z``, ``z ~ N(m, 1)``, where L holds only the directions that these data can see.
+
+Derivatives are taken where the reading would have had no residual, ``H_r - e w / |w|^2``: at the reading itself they hold
+its noise, and scales could grow against offsets until the noise is gone (errors in variables).
 """
 
 from __future__ import annotations
@@ -47,8 +50,10 @@ SEEN = 0.01
 """Share of a prior's information that data must add for its direction to be kept."""
 BROADEST = 1e-3
 """Precision, of the posterior's, below which a direction that only the given logs determined is not let."""
-STABLE = 1e-5
-"""Of the field: no fluxgate's scale, axes and offset hold better than ten parts per million from one day to another."""
+SOFT, HARD = 0.02, 2000.0
+"""Soft iron, of the field, and hard iron, nT: 1-sigma of what vehicles have."""
+STABLE = 2e-5
+"""Of the field: no fluxgate's scale, axes and offset hold better than twenty parts per million between days."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,7 +162,10 @@ def pose(survey: Survey, calibration: Calibration) -> Problem:
     for start in range(0, n, CHUNK):
         rows = slice(start, start + CHUNK)
         part = samples.part(rows)
-        e[rows], g[rows] = residuals(part, coefficients)
+        e[rows], slope = residuals(part, coefficients)
+        away = slope[:, 6:]
+        there = part.field + (e[rows] / (away * away).sum(axis=1))[:, None] * away
+        _, g[rows] = residuals(replace(part, field=there), coefficients)
         above, _ = residuals(replace(part, reference=part.reference + 1.0), coefficients)
         gain[rows] = e[rows] - above
     L, centre = _loosened(calibration, *_prior(survey, calibration, samples, e, g))
@@ -259,6 +267,25 @@ def _prior(
     A, y = white[:, :-1], white[:, -1]
     values, vectors = np.linalg.eigh(np.eye(len(centre)) - A.T @ A)
     held = values > 0.1  # elsewhere those samples were all there was, and they speak for themselves
-    centre = np.where(held, vectors.T @ (A.T @ y), 0.0) / np.where(held, values, 1.0)
-    values = np.maximum(values, BROADEST)
-    return L @ (vectors / np.sqrt(values)), centre * np.sqrt(values)
+    pull = vectors @ np.where(held, vectors.T @ (A.T @ y), 0.0)
+    bound = L / _physical(calibration)[:, None]
+    values, vectors = np.linalg.eigh((vectors * np.where(held, values, 0.0)) @ vectors.T + bound.T @ bound)
+    root = np.sqrt(np.maximum(values, BROADEST))
+    return L @ (vectors / root), (vectors.T @ pull) / root
+
+
+def _physical(calibration: Calibration) -> FloatArray:
+    """(K,) nT: how large coefficients are on any vehicle, soft iron of percents and hard iron of thousands of nanotesla.
+
+    Less at every order. On a glider's attitudes scale and offset can grow against each other without end, and take the
+    noise with them.
+    """
+    width, k = np.full(calibration.coefficients.size, np.inf), 0
+    for term in calibration.terms:
+        if isinstance(term, Polynomial):
+            for i, exponents in enumerate(term.exponents):
+                fall = 0.3 ** sum(exponents)
+                width[k + 9 * i : k + 9 * i + 6] = SOFT * calibration.reference.field * fall
+                width[k + 9 * i + 6 : k + 9 * i + 9] = HARD * fall
+        k += term.size
+    return width

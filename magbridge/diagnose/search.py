@@ -65,10 +65,14 @@ class Hypothesis:
     @property
     def signal_to_noise(self) -> float:
         """Whitened norm of what is the effect's own under the noise that is left, less what noise alone gives."""
-        k = self.candidate.size
-        b, own = self.fit.coefficients[-k:], self.fit.covariance[-k:, -k:]
-        power = float(b @ np.linalg.solve(own, b)) - k
+        power = _own(self.fit, self.candidate.size) - self.candidate.size
         return float(np.sqrt(power)) if power > 0.0 else 0.0
+
+
+def _own(fit: Joint, size: int) -> float:
+    """Wald's statistic of the last coefficients."""
+    b, own = fit.coefficients[-size:], fit.covariance[-size:, -size:]
+    return float(b @ np.linalg.solve(own, b))
 
 
 @dataclass(frozen=True)
@@ -202,6 +206,8 @@ class _Search:
             ratio = max(0.0, 2.0 * (fit.log_likelihood - base.log_likelihood))
             if candidate.positive and fit.coefficients[-1] < 0.0:
                 ratio = 0.0
+            # a gain that is not the effect's own, but of a noise that found another optimum beside it
+            ratio = min(ratio, _own(fit, candidate.size))
             freedom = mine[0][2].freedom
             p_value = self.p_value(candidate, ratio, freedom)
             evidence = weigh(ratio, freedom) + mine[0][1] - float(np.log(candidate.trials))
