@@ -49,9 +49,9 @@ def ideal(
     -------
     dict
         ``alone``: chance to name the truth alone; ``inside``: that the set holds it; ``size``: the set's mean size;
-        ``beside``: cause -> chance to be in the set; ``first``: to be named first; ``own``: share of
-        the signal-to-noise that the table's regressors of the true cause reach; ``unlike``: signal-to-noise that the
-        best imitation leaves, and ``mimic``: whose that is.
+        ``first``: cause -> chance to be named first; ``own``: share of the signal-to-noise that the table's regressors
+        of the true cause reach; ``apart``: cause -> signal-to-noise that its best imitation leaves; ``unlike`` and
+        ``mimic``: the smallest of those, and whose it is.
     """
     name = one.hidden.name
     spans, S = _information(one, stall, ds, causes, others)
@@ -76,16 +76,16 @@ def ideal(
     found = _by_cause(groups, name, weigh(truth, k))
     names, table = list(found), np.array([*found.values()])
     inside, first, me = table > table.max(axis=0) - ODDS, np.argmax(table, axis=0), list(found).index(name)
-    mimic = max(best, key=lambda cause: best[cause])
+    apart = {cause: float(np.sqrt(max(S[-1, -1] - like, 0.0))) for cause, (like, _) in best.items()}
     return {
         "alone": float(np.mean((first == me) & (inside.sum(axis=0) == 1))) * testable,
         "inside": float(np.mean(inside[me])) * testable,
         "size": float(np.mean(inside.sum(axis=0))),
-        "beside": {cause: float(np.mean(inside[j])) for j, cause in enumerate(names) if inside[j].any()},
         "first": {cause: float(np.mean(first == j)) for j, cause in enumerate(names) if (first == j).any()},
         "own": float(np.sqrt(reached / S[-1, -1])),
-        "unlike": float(np.sqrt(max(S[-1, -1] - best[mimic][0], 0.0))),
-        "mimic": mimic,
+        "apart": apart,
+        "unlike": min(apart.values()),
+        "mimic": min(apart, key=lambda cause: apart[cause]),
     }
 
 
