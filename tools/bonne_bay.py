@@ -162,7 +162,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=1, help="worlds")
     parser.add_argument("--out", type=Path, help="folder for figures and tables.txt")
     chosen = parser.parse_args()
-    console = Console(width=120, record=True)
+    console = Console(width=134, record=True)
     seeds = range(chosen.seed, chosen.seed + chosen.seeds)
     flights = [fly(seed) for seed in track(seeds, "worlds", console=Console(stderr=True))]
     tables(flights, console)
