@@ -111,7 +111,11 @@ def spectrum(diagnosis: Diagnosis) -> str:
 def channels(diagnosis: Diagnosis) -> str:
     """Draw the difference against each channel: means over twenty bins with their scatter."""
     survey = diagnosis.problem.survey
-    shown = {name: (channel.values, channel.unit) for name, channel in survey.channels.items()}
+    shown = {
+        name: (channel.values, channel.unit)
+        for name, channel in survey.channels.items()
+        if name not in survey.still
+    }
     if survey.attitude is not None:
         shown |= {name: (survey.attitude[:, k], "deg") for k, name in enumerate(("roll", "pitch", "heading"))}
     names = list(shown)[:12]

@@ -33,10 +33,11 @@ HINTS = (("temp", "temperature"), ("current", "current"), ("press", "pressure"))
 """Where a channel declares no unit, its name may help; else it is tried as everything."""
 TRUSTED = 0.5
 """Of the noise: how far a channel may be from where it is interpolated to."""
-NOT_TELEMETRY = (
-    "mag_", "truth_", "reference_field", "roll", "pitch", "heading", "latitude", "longitude", "run", "dive", "quality",
-    "total_field", "field_x", "field_y", "field_z", "anomaly", "power_cycle",
-)  # fmt: skip
+OURS = ("mag_", "truth_")
+NOT_TELEMETRY = {
+    "time", "learned", "reference_field", "roll", "pitch", "heading", "latitude", "longitude", "run", "dive", "quality",
+    "total_field", "total_field_sigma", "field_x", "field_y", "field_z", "anomaly", "power_cycle",
+}  # fmt: skip
 
 
 class Channel(NamedTuple):
@@ -60,7 +61,7 @@ class Survey:
     reference : (n,) array
         nT.
     channels : dict of Channel
-        Everything that varies; the calibration's own parameters too.
+        Everything that varies, and what the calibration needs.
     still : tuple of str
         Telemetry that never changes: nothing can be learned from it.
     follows : (n,) bool array
@@ -164,7 +165,7 @@ def take(
         for ds in (*datasets, *learned_from)
         for k, v in ds.data_vars.items()
     }
-    return _assemble(table, units, source)
+    return _assemble(table, units, source, calibration.channels)
 
 
 def _columns(
@@ -235,7 +236,9 @@ def _moving(table: dict[str, FloatArray], calibration: Calibration) -> NDArray[n
     return moving
 
 
-def _assemble(table: dict[str, FloatArray], units: dict[str, str], source: str) -> Survey:
+def _assemble(
+    table: dict[str, FloatArray], units: dict[str, str], source: str, needed: Sequence[str]
+) -> Survey:
     time = table["time"]
     step = np.diff(time, prepend=np.nan)
     interval = float(np.nanmedian(step))
@@ -243,12 +246,14 @@ def _assemble(table: dict[str, FloatArray], units: dict[str, str], source: str) 
     follows[1:] &= table["learned"][1:] == table["learned"][:-1]
     channels, still = {}, []
     for name in sorted(table):
-        if name in ("time", "learned") or name.startswith(NOT_TELEMETRY):
+        if name in NOT_TELEMETRY or name.startswith(OURS):
             continue
         values, unit = table[name], units.get(name, "")
         known = values[np.isfinite(values)]
         if known.size < FEWEST or np.ptp(known) <= 1e-9 * (np.abs(known).max() + 1e-30):
             still.append(name)
+            if name in needed and known.size:  # the correction takes it, but nothing can be learned from it
+                channels[name] = Channel(_held(values), unit, ())
             continue
         channels[name] = Channel(_held(values), unit, _kinds(name, unit))
     cycles = np.empty(0)

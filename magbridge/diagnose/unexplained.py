@@ -126,6 +126,7 @@ def flexible(problem: Problem) -> list[Flexible]:
     return listed + [
         Flexible("broadband", curve(channel.values), 15, name)
         for name, channel in problem.survey.channels.items()
+        if name not in problem.survey.still
     ]
 
 

@@ -110,6 +110,8 @@ def hysteresis(problem: Problem) -> list[Candidate]:
     # only of masses that are modelled: a wide play of another is that other itself
     for name in (parameter.name for parameter in problem.calibration.parameters):
         low, high = extent(problem, name)
+        if not high > low:
+            continue
         centre, scale = 0.5 * (low + high), 0.5 * (high - low)
         unit = problem.survey.channels[name].unit
 
