@@ -19,60 +19,20 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from magbridge.diagnose.candidates import Candidate
 from magbridge.diagnose.joint import Information, Joint, fit_joint, information
 from magbridge.diagnose.noise import memory_order
 from magbridge.diagnose.problem import Problem
-from magbridge.diagnose.weigh import IDEAL, LEVEL, Score, lead, score, slices, trials, weigh
+from magbridge.diagnose.rounds import Hypothesis, State, key
+from magbridge.diagnose.weigh import IDEAL, LEVEL, lead, score, weigh
 
 __all__ = ["Hypothesis", "Outcome", "Rival", "search"]
 
 FloatArray = NDArray[np.float64]
 
-SHORT_LIST = 9
-"""Causes that are fitted jointly in a round."""
-SHARPEN = 4
-"""Halvings of a nonlinear parameter's bracket."""
 MOST = 6
 """Regressors in one log."""
-
-
-@dataclass(frozen=True, eq=False)
-class Hypothesis:
-    """One cause beside the others of a model.
-
-    Attributes
-    ----------
-    candidate : Candidate
-    ratio : float
-        Twice the gain in log likelihood.
-    evidence : float
-        Log Bayes factor against the model without it.
-    p_value : float
-        Look-elsewhere and number of causes included.
-    fit : Joint
-        Of the whole model; this cause's coefficients are the last.
-    """
-
-    candidate: Candidate
-    ratio: float
-    evidence: float
-    p_value: float
-    fit: Joint
-
-    @property
-    def signal_to_noise(self) -> float:
-        """Whitened norm of what is the effect's own under the noise that is left, less what noise alone gives."""
-        power = _own(self.fit, self.candidate.size) - self.candidate.size
-        return float(np.sqrt(power)) if power > 0.0 else 0.0
-
-
-def _own(fit: Joint, size: int) -> float:
-    """Wald's statistic of the last coefficients."""
-    b, own = fit.coefficients[-size:], fit.covariance[-size:, -size:]
-    return float(b @ np.linalg.solve(own, b))
 
 
 @dataclass(frozen=True)
@@ -116,155 +76,6 @@ class Outcome:
     trials: dict[str, float]
 
 
-class _Search:
-    """The state of one search: the problem, its candidates, the model so far."""
-
-    def __init__(self, problem: Problem, candidates: Sequence[Candidate], order: int, causes: int) -> None:
-        self.problem, self.candidates, self.order, self.causes = problem, list(candidates), order, causes
-        self.at = slices(self.candidates)
-        self.columns = [candidate.columns for candidate in self.candidates]
-        self.trials: dict[str, float] = {}
-        self.bare: Information
-        self.groups: dict[tuple[str, str | None], list[int]] = {}
-        for k, candidate in enumerate(self.candidates):
-            self.groups.setdefault(_key(candidate), []).append(k)
-
-    def fit(
-        self,
-        model: Sequence[Candidate],
-        *starts: FloatArray,
-        plain: bool = True,
-        like: Joint | None = None,
-        rounds: int = 4,
-    ) -> Joint:
-        columns = [candidate.columns for candidate in model]
-        return fit_joint(self.problem, columns, self.order, *starts, plain=plain, like=like, rounds=rounds)
-
-    def scores(self, info: Information) -> list[Score]:
-        return [
-            score(info, at, positive=candidate.positive)
-            for at, candidate in zip(self.at, self.candidates, strict=True)
-        ]
-
-    def best(self, scores: Sequence[Score]) -> dict[tuple[str, str | None], tuple[int, float]]:
-        """Of each group its best member, and log of the grid's average against it: what the nonlinear parameters cost."""
-        found = {}
-        for group, members in self.groups.items():
-            evidences = np.array([scores[k].evidence for k in members])
-            top = int(np.argmax(evidences))
-            found[group] = members[top], float(np.log(np.mean(np.exp(evidences - evidences[top]))))
-        return found
-
-    def round(self, model: list[Candidate], base: Joint) -> list[Hypothesis]:
-        """Every cause beside `model`, the likeliest first."""
-        model_columns = [candidate.columns for candidate in model]
-        own = information(self.problem, base.noise, base, model_columns, self.columns)
-        if not self.trials:
-            self.trials = trials(own, self.candidates, self.at)
-        under: dict[tuple[str, str | None], list[tuple[int, float, Score, Information]]] = {}
-        bare = self._bare(model, base, own)
-        if not model:
-            self.bare = bare
-        for info in (own, bare):
-            scores = self.scores(info)
-            for group, (k, average) in self.best(scores).items():
-                under.setdefault(group, []).append((k, average, scores[k], info))
-        listed = sorted(under.values(), key=lambda entries: -max(entry[2].evidence for entry in entries))
-        found = [self._joint(model, base, entries) for entries in listed[:SHORT_LIST]]
-        return sorted(found, key=lambda h: -h.evidence)
-
-    def _bare(self, model: list[Candidate], base: Joint, info: Information) -> Information:
-        """Score again under the noise that is left when the best of every cause takes what it can."""
-        top: dict[str, tuple[float, int]] = {}
-        for k, s in enumerate(self.scores(info)):
-            if s.evidence > top.get(self.candidates[k].cause, (-np.inf, 0))[0]:
-                top[self.candidates[k].cause] = (s.evidence, k)
-        pool = [k for _, k in top.values()]
-        index = np.concatenate([np.arange(self.at[k].start, self.at[k].stop) for k in pool])
-        taken = np.linalg.solve(info.matrix[np.ix_(index, index)] + np.eye(len(index)), info.score[index])
-        everything = fit_joint(
-            self.problem,
-            [c.columns for c in (*model, *(self.candidates[k] for k in pool))],
-            self.order,
-            np.append(info.moved(base, index, taken), taken),
-            ridge=1.0,
-            rounds=1,
-        )
-        return information(self.problem, everything.noise, base, [c.columns for c in model], self.columns)
-
-    def _joint(
-        self, model: list[Candidate], base: Joint, entries: list[tuple[int, float, Score, Information]]
-    ) -> Hypothesis:
-        """Fit one cause jointly, at the grid's points that won under either noise."""
-        found = []
-        for k in {entry[0] for entry in entries}:
-            candidate = self.candidates[k]
-            mine = [entry for entry in entries if entry[0] == k]
-            index = np.arange(self.at[k].start, self.at[k].stop)
-            starts = [np.append(info.moved(base, index, s.estimate), s.estimate) for _, _, s, info in mine]
-            fit = self.fit([*model, candidate], *starts, like=base, rounds=2)
-            ratio = max(0.0, 2.0 * (fit.log_likelihood - base.log_likelihood))
-            if candidate.positive and fit.coefficients[-1] < 0.0:
-                ratio = 0.0
-            # a gain that is not the effect's own, but of a noise that found another optimum beside it
-            ratio = min(ratio, _own(fit, candidate.size))
-            freedom = mine[0][2].freedom
-            p_value = self.p_value(candidate, ratio, freedom)
-            evidence = weigh(ratio, freedom) + mine[0][1] - float(np.log(candidate.trials))
-            found.append(Hypothesis(candidate, ratio, evidence, p_value, fit))
-        return max(found, key=lambda h: h.evidence)
-
-    def p_value(self, candidate: Candidate, ratio: float, freedom: int) -> float:
-        """Of a likelihood ratio, times the hypotheses behind its cause, times the causes."""
-        tests = self.trials.get(candidate.cause, 1.0) * self.causes
-        return min(1.0, tests * float(chi2.sf(ratio, max(freedom, 1))))
-
-    def sharpen(self, model: list[Candidate], hypothesis: Hypothesis, base: Joint) -> Hypothesis:
-        """Profile the nonlinear parameters between the grid's points, one after the other, by golden section."""
-        best = hypothesis
-        again = best.candidate.again
-        if again is None:
-            return best
-        for position, name in enumerate(best.candidate.shape):
-            grid = sorted({self.candidates[k].shape[name][0] for k in self.groups[_key(best.candidate)]})
-            here = best.candidate.shape[name][0]
-            low = max((v for v in grid if v < here), default=here - 0.5 * (grid[-1] - grid[0]))
-            high = min((v for v in grid if v > here), default=here + 0.5 * (grid[-1] - grid[0]))
-            if name == "period":  # a resolved line is a thousandth wide, the grid is one of peaks
-                low, high = here / (1.0 + 0.6 * here / self.span), here * (1.0 + 0.6 * here / self.span)
-            for _ in range(SHARPEN):
-                tried = []
-                for share in (0.25, 0.5, 0.75):
-                    values = [v for v, _ in best.candidate.shape.values()]
-                    values[position] = low + share * (high - low)
-                    candidate = again(*values)
-                    start = np.append(best.fit.z, best.fit.coefficients)
-                    fit = self.fit([*model, candidate], start, plain=False, like=best.fit, rounds=1)
-                    gain = 2.0 * (fit.log_likelihood - base.log_likelihood) - best.ratio
-                    tried.append((gain, values[position], candidate, fit))
-                gain, value, candidate, fit = max(tried, key=lambda entry: entry[0])
-                if gain > 0.0:
-                    best = replace(
-                        best,
-                        candidate=candidate,
-                        fit=fit,
-                        ratio=best.ratio + gain,
-                        evidence=best.evidence + 0.5 * gain,
-                    )
-                quarter = 0.25 * (high - low)
-                low, high = max(low, value - quarter), min(high, value + quarter)
-        return best
-
-    @property
-    def span(self) -> float:
-        """S."""
-        return float(np.ptp(self.problem.survey.time))
-
-
-def _key(candidate: Candidate) -> tuple[str, str | None]:
-    return candidate.cause, candidate.channel
-
-
 def search(problem: Problem, candidates: Sequence[Candidate], causes: int) -> Outcome:
     """Find the causes that the data speak for.
 
@@ -278,7 +89,7 @@ def search(problem: Problem, candidates: Sequence[Candidate], causes: int) -> Ou
     """
     rough = fit_joint(problem, [], 1, rounds=2)
     order = memory_order(rough.left, problem.survey.follows)
-    state = _Search(problem, candidates, order, causes)
+    state = State(problem, candidates, order, causes)
     null = state.fit([])
     first = state.round([], null) if candidates else []
     tested: dict[str, tuple[float, float]] = {}
@@ -287,7 +98,7 @@ def search(problem: Problem, candidates: Sequence[Candidate], causes: int) -> Ou
             tested[h.candidate.cause] = (h.p_value, h.ratio)
     model, base = _chain(state, null, first)
     together = _together(state) if first else []
-    if together and {_key(c) for c in together} != {_key(c) for c in model}:
+    if together and {key(c) for c in together} != {key(c) for c in model}:
         # one after the other may have gone astray where several causes act
         other = state.fit(together, rounds=6)
         if _worth(other, together, null) > _worth(base, model, null):
@@ -310,7 +121,7 @@ def _worth(fit: Joint, model: Sequence[Candidate], null: Joint) -> float:
     return weigh(2.0 * (fit.log_likelihood - null.log_likelihood), sum(c.size for c in model))
 
 
-def _chain(state: _Search, null: Joint, first: list[Hypothesis]) -> tuple[list[Candidate], Joint]:
+def _chain(state: State, null: Joint, first: list[Hypothesis]) -> tuple[list[Candidate], Joint]:
     """Add cause after cause while one passes the test, beginning with the best of `first`."""
     model: list[Candidate] = []
     loudest, base, found = 0.0, null, first
@@ -325,7 +136,7 @@ def _chain(state: _Search, null: Joint, first: list[Hypothesis]) -> tuple[list[C
     return model, base
 
 
-def _together(state: _Search) -> list[Candidate]:
+def _together(state: State) -> list[Candidate]:
     """Choose causes under the noise that is left when every cause takes what it can, one beside the other.
 
     All in the matrix of the first round: there the noise has swallowed nothing, and each is measured with the calibration
@@ -353,7 +164,7 @@ def _together(state: _Search) -> list[Candidate]:
     return [state.candidates[k] for k in picked]
 
 
-def _enough(state: _Search, first: list[Hypothesis]) -> Hypothesis | None:
+def _enough(state: State, first: list[Hypothesis]) -> Hypothesis | None:
     """Return the best single cause, if there is one, beside which nothing else would be found."""
     members = {(id(c.columns)): k for k, c in enumerate(state.candidates)}
     for h in first:
@@ -377,7 +188,7 @@ def _enough(state: _Search, first: list[Hypothesis]) -> Hypothesis | None:
     return None
 
 
-def _refined(state: _Search, model: list[Candidate], base: Joint) -> tuple[list[Candidate], Joint]:
+def _refined(state: State, model: list[Candidate], base: Joint) -> tuple[list[Candidate], Joint]:
     """Profile the nonlinear parameters of each member of a model beside the others."""
     for _ in range(len(model)):
         own, others = model[0], model[1:]
@@ -399,7 +210,7 @@ def _next(found: list[Hypothesis], model: list[Candidate], loudest: float) -> Hy
     return None
 
 
-def _with(state: _Search, model: list[Candidate], best: Hypothesis) -> tuple[list[Candidate], Joint]:
+def _with(state: State, model: list[Candidate], best: Hypothesis) -> tuple[list[Candidate], Joint]:
     """Add a candidate to the model, or to its cause's own if that is in it already."""
     new = best.candidate
     for k, own in enumerate(model):
@@ -412,9 +223,7 @@ def _with(state: _Search, model: list[Candidate], best: Hypothesis) -> tuple[lis
     return [*model, new], best.fit
 
 
-def _remove(
-    state: _Search, model: list[Candidate], base: Joint, null: Joint
-) -> tuple[list[Hypothesis], Joint]:
+def _remove(state: State, model: list[Candidate], base: Joint, null: Joint) -> tuple[list[Hypothesis], Joint]:
     """Drop what later findings have made needless; measure what stays against the model without it."""
     chosen: list[Hypothesis] = []
     k = 0
@@ -435,7 +244,7 @@ def _remove(
 
 
 def _rivals(
-    state: _Search, info: Information, model: list[Candidate], base: Joint, k: int
+    state: State, info: Information, model: list[Candidate], base: Joint, k: int
 ) -> tuple[Rival, ...]:
     """Return what could stand in the place of the k-th of `model`, whose columns are the last of `info`."""
     ends = state.at[-1].stop + np.cumsum([0, *(candidate.size for candidate in model)])
@@ -450,7 +259,7 @@ def _rivals(
     rivals = []
     for group, (member, _) in state.best(scores).items():
         candidate, s = state.candidates[member], scores[member]
-        if group == _key(model[k]) or group[0] in {other.cause for other in model if other is not model[k]}:
+        if group == key(model[k]) or group[0] in {other.cause for other in model if other is not model[k]}:
             continue
         # a rival has the benefit of the doubt about its nonlinear parameters
         behind = mine.evidence - s.evidence + float(np.log(candidate.trials / model[k].trials))

@@ -1,0 +1,212 @@
+"""One round of the search: every cause scored and the likeliest fitted, beside a model that stands already."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from magbridge.diagnose.candidates import Candidate
+from magbridge.diagnose.joint import Information, Joint, fit_joint, information
+from magbridge.diagnose.problem import Problem
+from magbridge.diagnose.weigh import Score, score, slices, trials, weigh
+
+__all__ = ["Hypothesis", "State", "key"]
+
+FloatArray = NDArray[np.float64]
+
+SHORT_LIST = 9
+"""Causes that are fitted jointly in a round."""
+SHARPEN = 4
+"""Halvings of a nonlinear parameter's bracket."""
+
+
+@dataclass(frozen=True, eq=False)
+class Hypothesis:
+    """One cause beside the others of a model.
+
+    Attributes
+    ----------
+    candidate : Candidate
+    ratio : float
+        Twice the gain in log likelihood.
+    evidence : float
+        Log Bayes factor against the model without it.
+    p_value : float
+        Look-elsewhere and number of causes included.
+    fit : Joint
+        Of the whole model; this cause's coefficients are the last.
+    """
+
+    candidate: Candidate
+    ratio: float
+    evidence: float
+    p_value: float
+    fit: Joint
+
+    @property
+    def signal_to_noise(self) -> float:
+        """Whitened norm of what is the effect's own under the noise that is left, less what noise alone gives."""
+        power = own_ratio(self.fit, self.candidate.size) - self.candidate.size
+        return float(np.sqrt(power)) if power > 0.0 else 0.0
+
+
+def own_ratio(fit: Joint, size: int) -> float:
+    """Wald's statistic of the last coefficients."""
+    b, own = fit.coefficients[-size:], fit.covariance[-size:, -size:]
+    return float(b @ np.linalg.solve(own, b))
+
+
+class State:
+    """The state of one search: the problem, its candidates, the model so far."""
+
+    def __init__(self, problem: Problem, candidates: Sequence[Candidate], order: int, causes: int) -> None:
+        self.problem, self.candidates, self.order, self.causes = problem, list(candidates), order, causes
+        self.at = slices(self.candidates)
+        self.columns = [candidate.columns for candidate in self.candidates]
+        self.trials: dict[str, float] = {}
+        self.bare: Information
+        self.groups: dict[tuple[str, str | None], list[int]] = {}
+        for k, candidate in enumerate(self.candidates):
+            self.groups.setdefault(key(candidate), []).append(k)
+
+    def fit(
+        self,
+        model: Sequence[Candidate],
+        *starts: FloatArray,
+        plain: bool = True,
+        like: Joint | None = None,
+        rounds: int = 4,
+    ) -> Joint:
+        """Fit a model jointly with calibration and noise; see :func:`~.joint.fit_joint`."""
+        columns = [candidate.columns for candidate in model]
+        return fit_joint(self.problem, columns, self.order, *starts, plain=plain, like=like, rounds=rounds)
+
+    def scores(self, info: Information) -> list[Score]:
+        """Score every candidate."""
+        return [
+            score(info, at, positive=candidate.positive)
+            for at, candidate in zip(self.at, self.candidates, strict=True)
+        ]
+
+    def best(self, scores: Sequence[Score]) -> dict[tuple[str, str | None], tuple[int, float]]:
+        """Of each group its best member, and log of the grid's average against it: what the nonlinear parameters cost."""
+        found = {}
+        for group, members in self.groups.items():
+            evidences = np.array([scores[k].evidence for k in members])
+            top = int(np.argmax(evidences))
+            found[group] = members[top], float(np.log(np.mean(np.exp(evidences - evidences[top]))))
+        return found
+
+    def round(self, model: list[Candidate], base: Joint) -> list[Hypothesis]:
+        """Every cause beside `model`, the likeliest first."""
+        model_columns = [candidate.columns for candidate in model]
+        own = information(self.problem, base.noise, base, model_columns, self.columns)
+        if not self.trials:
+            self.trials = trials(own, self.candidates, self.at)
+        under: dict[tuple[str, str | None], list[tuple[int, float, Score, Information]]] = {}
+        bare = self._bare(model, base, own)
+        if not model:
+            self.bare = bare
+        for info in (own, bare):
+            scores = self.scores(info)
+            for group, (k, average) in self.best(scores).items():
+                under.setdefault(group, []).append((k, average, scores[k], info))
+        listed = sorted(under.values(), key=lambda entries: -max(entry[2].evidence for entry in entries))
+        found = [self._joint(model, base, entries) for entries in listed[:SHORT_LIST]]
+        return sorted(found, key=lambda h: -h.evidence)
+
+    def _bare(self, model: list[Candidate], base: Joint, info: Information) -> Information:
+        """Score again under the noise that is left when the best of every cause takes what it can."""
+        top: dict[str, tuple[float, int]] = {}
+        for k, s in enumerate(self.scores(info)):
+            if s.evidence > top.get(self.candidates[k].cause, (-np.inf, 0))[0]:
+                top[self.candidates[k].cause] = (s.evidence, k)
+        pool = [k for _, k in top.values()]
+        index = np.concatenate([np.arange(self.at[k].start, self.at[k].stop) for k in pool])
+        taken = np.linalg.solve(info.matrix[np.ix_(index, index)] + np.eye(len(index)), info.score[index])
+        everything = fit_joint(
+            self.problem,
+            [c.columns for c in (*model, *(self.candidates[k] for k in pool))],
+            self.order,
+            np.append(info.moved(base, index, taken), taken),
+            ridge=1.0,
+            rounds=1,
+        )
+        return information(self.problem, everything.noise, base, [c.columns for c in model], self.columns)
+
+    def _joint(
+        self, model: list[Candidate], base: Joint, entries: list[tuple[int, float, Score, Information]]
+    ) -> Hypothesis:
+        """Fit one cause jointly, at the grid's points that won under either noise."""
+        found = []
+        for k in {entry[0] for entry in entries}:
+            candidate = self.candidates[k]
+            mine = [entry for entry in entries if entry[0] == k]
+            index = np.arange(self.at[k].start, self.at[k].stop)
+            starts = [np.append(info.moved(base, index, s.estimate), s.estimate) for _, _, s, info in mine]
+            fit = self.fit([*model, candidate], *starts, like=base, rounds=2)
+            ratio = max(0.0, 2.0 * (fit.log_likelihood - base.log_likelihood))
+            if candidate.positive and fit.coefficients[-1] < 0.0:
+                ratio = 0.0
+            # a gain that is not the effect's own, but of a noise that found another optimum beside it
+            ratio = min(ratio, own_ratio(fit, candidate.size))
+            freedom = mine[0][2].freedom
+            p_value = self.p_value(candidate, ratio, freedom)
+            evidence = weigh(ratio, freedom) + mine[0][1] - float(np.log(candidate.trials))
+            found.append(Hypothesis(candidate, ratio, evidence, p_value, fit))
+        return max(found, key=lambda h: h.evidence)
+
+    def p_value(self, candidate: Candidate, ratio: float, freedom: int) -> float:
+        """Of a likelihood ratio, times the hypotheses behind its cause, times the causes."""
+        tests = self.trials.get(candidate.cause, 1.0) * self.causes
+        return min(1.0, tests * float(chi2.sf(ratio, max(freedom, 1))))
+
+    def sharpen(self, model: list[Candidate], hypothesis: Hypothesis, base: Joint) -> Hypothesis:
+        """Profile the nonlinear parameters between the grid's points, one after the other, by golden section."""
+        best = hypothesis
+        again = best.candidate.again
+        if again is None:
+            return best
+        for position, name in enumerate(best.candidate.shape):
+            grid = sorted({self.candidates[k].shape[name][0] for k in self.groups[key(best.candidate)]})
+            here = best.candidate.shape[name][0]
+            low = max((v for v in grid if v < here), default=here - 0.5 * (grid[-1] - grid[0]))
+            high = min((v for v in grid if v > here), default=here + 0.5 * (grid[-1] - grid[0]))
+            if name == "period":  # a resolved line is a thousandth wide, the grid is one of peaks
+                low, high = here / (1.0 + 0.6 * here / self.span), here * (1.0 + 0.6 * here / self.span)
+            for _ in range(SHARPEN):
+                tried = []
+                for share in (0.25, 0.5, 0.75):
+                    values = [v for v, _ in best.candidate.shape.values()]
+                    values[position] = low + share * (high - low)
+                    candidate = again(*values)
+                    start = np.append(best.fit.z, best.fit.coefficients)
+                    fit = self.fit([*model, candidate], start, plain=False, like=best.fit, rounds=1)
+                    gain = 2.0 * (fit.log_likelihood - base.log_likelihood) - best.ratio
+                    tried.append((gain, values[position], candidate, fit))
+                gain, value, candidate, fit = max(tried, key=lambda entry: entry[0])
+                if gain > 0.0:
+                    best = replace(
+                        best,
+                        candidate=candidate,
+                        fit=fit,
+                        ratio=best.ratio + gain,
+                        evidence=best.evidence + 0.5 * gain,
+                    )
+                quarter = 0.25 * (high - low)
+                low, high = max(low, value - quarter), min(high, value + quarter)
+        return best
+
+    @property
+    def span(self) -> float:
+        """S."""
+        return float(np.ptp(self.problem.survey.time))
+
+
+def key(candidate: Candidate) -> tuple[str, str | None]:
+    """Cause and channel: candidates that share both are one grid."""
+    return candidate.cause, candidate.channel
