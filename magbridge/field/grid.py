@@ -34,6 +34,7 @@ PAD = 16  # nodes: an influence of a cubic spline's end that far in is 1e-9
 VALUE = np.array([[1, -3, 3, -1], [4, 0, -6, 3], [1, 3, 3, -3], [0, 0, 0, 1]]) / 6.0
 SLOPE = np.array([[-3, 6, -3, 0], [0, -12, 9, 0], [3, 6, -9, 0], [0, 0, 3, 0]]) / 6.0
 CURVATURE = np.array([[6, -6, 0, 0], [-12, 18, 0, 0], [6, -18, 0, 0], [0, 6, 0, 0]]) / 6.0
+DOWN, ACROSS = [0, 1, 0, 2, 1, 0], [0, 0, 1, 0, 1, 2]  # which derivative of each, for Local's six
 WEIGHTS = np.concatenate([VALUE, SLOPE, CURVATURE])  # (12, 4) times powers of t
 
 
@@ -188,16 +189,14 @@ class AnomalyGrid:
             )
         per_degree = metres_per_degree(np.where(inside, lat, 0.0))
         north, east = 1.0 / (per_degree[0] * self._dy), 1.0 / (per_degree[1] * self._dx)
-        parts = (
-            (along[0] * lines[0]).sum(axis=0),
-            (along[1] * lines[0]).sum(axis=0) * north,
-            (along[0] * lines[1]).sum(axis=0) * east,
-            (along[2] * lines[0]).sum(axis=0) * north * north,
-            (along[1] * lines[1]).sum(axis=0) * north * east,
-            (along[0] * lines[2]).sum(axis=0) * east * east,
-            variance,
-        )
-        return Local(*(np.where(inside, part, nan) for part in parts))
+        parts = (along[DOWN] * lines[ACROSS]).sum(axis=1)  # (6, n), in the order of Local
+        parts[1] *= north
+        parts[2] *= east
+        parts[3:] *= north * north, north * east, east * east
+        if not inside.all():
+            parts[:, ~inside] = variance[~inside] = nan
+        value, slope_north, slope_east, north_north, north_east, east_east = parts
+        return Local(value, slope_north, slope_east, north_north, north_east, east_east, variance)
 
     def at(self, longitude: ArrayLike, latitude: ArrayLike) -> Array:
         """Return the anomaly at n places, nT, (n,).

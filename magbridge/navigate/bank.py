@@ -112,7 +112,7 @@ class Bank:
             block.longitude + east / per_longitude, block.latitude + north / per_latitude
         )
         off = np.isnan(local.anomaly)
-        anomaly, gn, ge, hnn, hne, hee, v = (np.where(off, 0.0, part) for part in local)
+        anomaly, gn, ge, hnn, hne, hee, v = np.where(off, 0.0, local) if off.any() else np.array(local)
         pnn, pne, pee = self.P[0, 0], self.P[0, 1], self.P[1, 1]
         a, b, c, d = (
             hnn * pnn + hne * pne,
