@@ -36,6 +36,7 @@ BENCHMARKS: dict[str, tuple[str, int]] = {
     "start": ("benchmarks.start:start", 5),
     "fitting": ("benchmarks.calibration:fitting", 3),
     "correcting": ("benchmarks.calibration:correcting", 5),
+    "diagnosing": ("benchmarks.diagnose:diagnosing", 1),
 }
 """Name to ``module:function`` and number of repetitions; the function takes a folder and that number."""
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 from magbridge.calibration.file import save
 from magbridge.calibration.model import Calibration
@@ -123,6 +124,23 @@ def diagnose(
     DataError
         The data do not allow it: one line that says which column is missing or too short.
     """
+    # one thread: matrices this narrow only wait for each other, and sums keep one order on any machine
+    with threadpool_limits(1, "blas"):
+        diagnosis = _examine(datasets, calibration, learned_from, grid, causes, progress)
+    if out_dir is not None:
+        progress("writing the report")
+        write(diagnosis, out_dir, causes)
+    return diagnosis
+
+
+def _examine(
+    datasets: Sequence[xr.Dataset],
+    calibration: Calibration,
+    learned_from: Sequence[xr.Dataset],
+    grid: AnomalyGrid | None,
+    causes: Mapping[str, Cause],
+    progress: Callable[[str], object],
+) -> Diagnosis:
     progress("reading")
     survey = take(datasets, calibration, learned_from, grid)
     problem = pose(survey, calibration)
@@ -163,17 +181,13 @@ def diagnose(
         # the others, the calibration and the noise are fitted anew; only the cause is missing
         without = held_out(problem, others, _without(fit, model, k))
         gains.append(paired(without, after, survey.dive, counts))
-    diagnosis = Diagnosis(
+    return Diagnosis(
         problem=problem, outcome=outcome, named=named, rivals=rivals, wrong=wrong, unexplained=rest,
         calibration=extended, fit=fit, before=before, after=after,
         total=paired(before, after, survey.dive, counts if counts.any() else ~counts), gains=tuple(gains),
         isolability=isolability(flat, outcome.info, outcome.trials, len(causes), untestable),
         verdict=_verdict(named, wrong, rest),
     )  # fmt: skip
-    if out_dir is not None:
-        progress("writing the report")
-        write(diagnosis, out_dir, causes)
-    return diagnosis
 
 
 def write(

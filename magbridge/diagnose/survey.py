@@ -152,6 +152,8 @@ def take(
     )
     parameters = [parameter.name for parameter in calibration.parameters]
     needed = [*(f"mag_{axis}" for axis in "xyz"), "reference_field", *parameters]
+    if sum(sizes) < FEWEST:
+        raise DataError(f"{source}: {sum(sizes)} samples, at least {FEWEST} needed")
     whole = np.all([np.isfinite(table[name]) for name in needed], axis=0)
     if whole.sum() < FEWEST:
         worst = min(needed, key=lambda name: int(np.isfinite(table[name]).sum()))
@@ -173,6 +175,9 @@ def _columns(
 ) -> dict[str, FloatArray]:
     """Return every column that counts; the channels at the row's time, the reference from wherever it is."""
     source = str(ds.attrs.get("source", "deployment"))
+    sensor = str(ds.attrs.get("sensor", ""))
+    if sensor and calibration.sensor.name and sensor != calibration.sensor.name:
+        raise DataError(f"{source}: sensor {sensor!r}, but the calibration is of {calibration.sensor.name!r}")
     for name in ("mag_x", "mag_y", "mag_z", *(parameter.name for parameter in calibration.parameters)):
         if name not in ds:
             raise DataError(

@@ -1,0 +1,71 @@
+"""What `diagnose` says about deployments that it can do nothing with: one line each, and which column it would take."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from magbridge.calibration.data import observations
+from magbridge.calibration.file import save
+from magbridge.calibration.fit import fit
+from magbridge.calibration.model import Calibration, Sensor
+from magbridge.cli import main
+from magbridge.diagnose.run import diagnose
+from magbridge.errors import DataError
+from magbridge.logs import write
+from sitl import load, segments, simulate
+
+
+@pytest.fixture(scope="module")
+def plain() -> tuple[xr.Dataset, Calibration]:
+    parts = segments(simulate(load("demo"), 1))
+    calibration = fit(observations(parts["calibration"], ["battpos", "ballast"]), "auto").calibration
+    return parts["survey"], calibration
+
+
+def test_the_demonstrations_survey_is_plain(plain: tuple[xr.Dataset, Calibration]) -> None:
+    assert diagnose([plain[0]], plain[1]).verdict == "nothing_found"
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            lambda ds: ds.drop_vars(["reference_field", "latitude", "longitude"]),
+            "latitude and longitude, or reference_field",
+        ),
+        (lambda ds: ds.drop_vars("battpos"), "'battpos' is missing"),
+        (lambda ds: ds.isel(time=slice(0, 3)), "3 samples, at least 60"),
+        (lambda ds: ds.assign(mag_y=ds["mag_y"] * np.nan), "'mag_y' has 0 numbers"),
+        (lambda ds: ds.assign_attrs(sensor="another"), "sensor 'another', but the calibration is of 'one'"),
+    ],
+)
+def test_one_line(plain: tuple[xr.Dataset, Calibration], change, message: str) -> None:
+    calibration = replace(plain[1], sensor=Sensor("one"))
+    with pytest.raises(DataError, match=message) as caught:
+        diagnose([change(plain[0])], calibration)
+    assert "\n" not in str(caught.value)
+
+
+def test_telemetry_that_stands_still_is_no_telemetry(plain: tuple[xr.Dataset, Calibration]) -> None:
+    ds = plain[0]
+    still = ds.assign({name: 0.0 * ds[name] + ds[name].mean() for name in ("sensor_temperature", "depth")})
+    found = diagnose([still], plain[1])
+    assert {"temperature_offset", "pressure_offset"} <= set(found.isolability.untestable)
+
+
+def test_the_command_line_says_it_in_one_line(
+    plain: tuple[xr.Dataset, Calibration], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    save(plain[1], tmp_path / "cal.json")
+    write(plain[0].isel(time=slice(0, 3)), tmp_path / "three.nc")
+    arguments = ["diagnose", str(tmp_path / "three.nc"), "--calibration", str(tmp_path / "cal.json")]
+    assert main([*arguments, "-o", str(tmp_path / "out")]) == 1
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert "3 samples" in said
+    assert not (tmp_path / "out").exists()

@@ -1,0 +1,95 @@
+"""Diagnosing: a night's deployment with every cause, and a month's, in a process of its own each."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import xarray as xr
+from benchmarks.row import Row
+
+from magbridge.calibration.data import observations
+from magbridge.calibration.fit import fit
+from magbridge.calibration.model import Calibration
+from sitl import load, segments, simulate
+from sitl.mission import CrissCross
+
+__all__ = ["diagnosing", "long_survey"]
+
+MONTH = 648_000
+"""Samples of 30 days at 0.25 Hz."""
+
+IN_ANOTHER = """
+import json, resource, sys, time
+from benchmarks.diagnose import long_survey
+from magbridge.diagnose.run import diagnose
+survey, calibration = long_survey(float(sys.argv[1]), int(sys.argv[2]))
+begun, used = time.monotonic(), time.process_time()
+found = diagnose([survey], calibration)
+causes = [h.candidate.cause for h in found.named]
+print(json.dumps([time.monotonic() - begun, time.process_time() - used, len(found.problem), found.verdict, causes,
+                  resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3]))
+"""
+
+
+def diagnosing(folder: Path, repetitions: int) -> list[Row]:  # noqa: ARG001  (others write there and repeat)
+    """Time `diagnose` without its figures: 12 h plain and with an effect, and 30 days."""
+    night, found, month = (_in_another(hours, size, count) for hours, size, count in (
+        (12.0, 0.0, 0), (12.0, 0.5, 0), (12.0, 0.0, MONTH),
+    ))  # fmt: skip
+    detail = {"verdicts": [night[3], found[3], month[3]], "causes": [night[4], found[4], month[4]]}
+    return [
+        Row(f"diagnose, 12 h at 0.25 Hz ({night[2]:,} samples), every cause, plain", night[0], "s", most=20.0),
+        Row("the same with an effect hidden in it", found[0], "s", most=20.0, detail=detail),
+        Row(f"diagnose, 30 days ({month[2]:,} samples), every cause", month[0], "s",
+            night[0] * month[2] / night[2], f"{month[2] / night[2]:.0f} times 12 h", most=240.0),
+        Row("memory of that", month[5], "MB", most=2000.0),
+    ]  # fmt: skip
+
+
+def _in_another(hours: float, size: float, count: int) -> list[float]:
+    command = [sys.executable, "-c", IN_ANOTHER.replace("int(sys.argv[2])", "int(sys.argv[2]), float(sys.argv[3])"),
+               str(hours), str(count), str(size)]  # fmt: skip
+    place = str(Path(__file__).parents[1])
+    done = subprocess.run(command, cwd=place, capture_output=True, text=True, check=True)
+    answer: list[float] = json.loads(done.stdout)
+    return answer
+
+
+def long_survey(hours: float, count: int = 0, size: float = 0.0) -> tuple[xr.Dataset, Calibration]:
+    """Return a glider's survey with its calibration.
+
+    Parameters
+    ----------
+    hours : float
+    count : int
+        So many samples: the survey again and again, with noise of its own each time; 0: once.
+    size : float
+        nT/degC of an offset that follows the logged temperature.
+    """
+    scenario = load("random_glider")
+    replace = msgspec.structs.replace
+    parts = (
+        scenario.mission[0],
+        CrissCross(hours=hours, roll=(1.0, 2.0), pitch=(25.0, 2.5), battery_spread=0.1),
+    )
+    whole = segments(simulate(replace(scenario, mission=parts), 3))
+    calibration = fit(observations(whole["calibration"], ["battpos", "ballast"]), "auto").calibration
+    survey, rng = whole["survey"], np.random.default_rng(4)
+    n = survey.sizes["time"]
+    if count:
+        time = survey["time"].to_numpy()
+        times = -(-count // n)
+        late = np.repeat(np.arange(times) * (time[-1] - time[0] + 4.0), n)[:count]
+        survey = survey.isel(time=np.tile(np.arange(n), times)[:count])
+        survey = survey.assign_coords(time=survey["time"].to_numpy() + late)
+    warm = survey["sensor_temperature"].to_numpy()
+    survey["amps"] = ("time", (rng.uniform(size=len(warm)) > 0.7).astype(float), {"units": "A"})
+    for axis, share in zip("xyz", (0.5, -0.3, 0.8), strict=True):
+        again = rng.normal(0.0, 0.1, len(warm)) + size * share * (warm - warm.mean())
+        survey[f"mag_{axis}"] = survey[f"mag_{axis}"] + again
+    return survey, calibration
