@@ -51,7 +51,7 @@ def _hours(diagnosis: Diagnosis) -> FloatArray:
 
 
 def _scale(diagnosis: Diagnosis) -> float:
-    return 1.3 * float(np.quantile(np.abs(diagnosis.before), 0.995)) + 1e-9
+    return 1.5 * float(np.quantile(np.abs(diagnosis.before), 0.995)) + 1e-9
 
 
 def measured(diagnosis: Diagnosis) -> str:
@@ -59,10 +59,13 @@ def measured(diagnosis: Diagnosis) -> str:
     hours, survey, part = _hours(diagnosis), diagnosis.problem.survey, _thin(len(diagnosis.problem))
     figure, axes = _figure(10, 5.2, 2, 1, sharex=True, height_ratios=[1, 1.5])
     top, low = axes[:, 0]
-    total = survey.reference + diagnosis.before
+    gap = np.append(np.diff(survey.time) > 20.0 * np.median(np.diff(survey.time)), False)
+    total = np.where(gap, np.nan, survey.reference + diagnosis.before)  # no line across a gap
     top.plot(hours[part], total[part], color=BEFORE, linewidth=0.7, label="measured, corrected as calibrated")
     top.plot(hours[part], survey.reference[part], color=INK, linewidth=1.0, label="simulated (reference)")
     top.set_ylabel("total field (nT)", fontsize=9)
+    ends = np.nanquantile(np.append(total, survey.reference), [0.002, 0.998])
+    top.set_ylim(ends[0] - 0.1 * np.ptp(ends), ends[1] + 0.35 * np.ptp(ends))
     low.plot(hours[part], diagnosis.before[part], ".", color=BEFORE, markersize=2, label="before")
     low.plot(
         hours[part], diagnosis.after[part], ".", color=AFTER, markersize=2, label="after, dives left out"
@@ -74,7 +77,7 @@ def measured(diagnosis: Diagnosis) -> str:
     low.set_ylabel("measured − simulated (nT)", fontsize=9)
     low.set_xlabel("hours since the start; grey lines part the dives", fontsize=9)
     for axis in (top, low):
-        axis.legend(fontsize=8, frameon=False, loc="upper right", markerscale=4)
+        axis.legend(fontsize=8, frameon=False, loc="upper right", markerscale=4, ncols=2)
     return _png(figure)
 
 

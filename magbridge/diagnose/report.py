@@ -11,10 +11,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from magbridge.diagnose import figures
-from magbridge.diagnose.findings import alternatives, parameters
+from magbridge.diagnose.findings import alternatives, parameters, told
 
 if TYPE_CHECKING:
     from magbridge.diagnose.causes import Cause
+    from magbridge.diagnose.gain import Gain
     from magbridge.diagnose.run import Diagnosis
     from magbridge.diagnose.search import Hypothesis
 
@@ -122,14 +123,16 @@ def _found(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> list[str]:
         )
         parts += [
             f"<h3>{_name(hypothesis)}</h3>",
-            f'<p class="faint">{escape((getdoc(causes[candidate.cause].candidates) or "").splitlines()[0])}</p>',
+            f'<p class="faint">{_physics(causes[candidate.cause])}</p>',
             (
                 f"<p>Signal-to-noise {hypothesis.signal_to_noise:.1f} with the calibration refitted; chance of a false alarm among "
-                f"all that was tried {hypothesis.p_value:.1g}. Leaving it out multiplies the held-out RMS by {1 / max(gain.ratio, 1e-9):.2f} "
+                f"all that was tried {_chance(hypothesis.p_value)}. Leaving it out multiplies the held-out RMS by {1 / max(gain.ratio, 1e-9):.2f} "
                 f"(95 %: {1 / max(gain.interval[1], 1e-9):.2f} to {1 / max(gain.interval[0], 1e-9):.2f}).</p>"
             ),
             f"<table>{rows}</table>",
-            doubt,
+            doubt
+            + f"<p>In a log like this one, theory gives it a chance of {100 * told(diagnosis, hypothesis):.0f} % to be named alone.</p>",
+            _no_gain(gain),
         ]
     if diagnosis.wrong is not None:
         rows_at = ", ".join(
@@ -141,6 +144,23 @@ def _found(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> list[str]:
             "they take no part in the figures above.</p>"
         )
     return parts
+
+
+def _physics(cause: Cause) -> str:
+    """Return the first line of the cause's own text, formulas set as such."""
+    line = escape((getdoc(cause.candidates) or "").splitlines()[0])
+    parts = line.split("``")
+    return "".join(f"<code>{part}</code>" if k % 2 else part for k, part in enumerate(parts))
+
+
+def _chance(p_value: float) -> str:
+    return f"{p_value:.1g}" if p_value > 1e-99 else "below 1e-99"
+
+
+def _no_gain(gain: Gain) -> str:
+    if gain.interval[1] < 1.0:
+        return ""
+    return "<p>The dives that were left out do not show that it gains anything: it may be what another effect leaves.</p>"
 
 
 def _left(diagnosis: Diagnosis) -> str:
