@@ -150,6 +150,11 @@ def take(
     source = ", ".join(
         dict.fromkeys(str(ds.attrs.get("source", "deployment")) for ds in (*datasets, *learned_from))
     )
+    twice = int(np.sum(np.diff(table["time"]) == 0.0))
+    if twice > 0.1 * table["time"].size:
+        raise DataError(
+            f"{source}: {twice} samples are given twice: a log is either diagnosed or learned from"
+        )
     parameters = [parameter.name for parameter in calibration.parameters]
     needed = [*(f"mag_{axis}" for axis in "xyz"), "reference_field", *parameters]
     if sum(sizes) < FEWEST:

@@ -51,6 +51,11 @@ def test_one_line(plain: tuple[xr.Dataset, Calibration], change, message: str) -
     assert "\n" not in str(caught.value)
 
 
+def test_a_log_cannot_be_both_diagnosed_and_learned_from(plain: tuple[xr.Dataset, Calibration]) -> None:
+    with pytest.raises(DataError, match="given twice"):
+        diagnose([plain[0]], plain[1], learned_from=[plain[0]])
+
+
 def test_telemetry_that_stands_still_is_no_telemetry(plain: tuple[xr.Dataset, Calibration]) -> None:
     ds = plain[0]
     still = ds.assign({name: 0.0 * ds[name] + ds[name].mean() for name in ("sensor_temperature", "depth")})
