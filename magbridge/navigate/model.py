@@ -132,21 +132,22 @@ def informed(options: Options, calibration: Calibration, sigma: float) -> Option
     Notes
     -----
     White is the noise that the calibration runs showed; one that lasted longer there than a few updates does not
-    average out, it is a bias, and white is what drives it, ``σ √(1 - ρ²)`` with ρ its correlation from sample to
-    sample. What else a calibration gets wrong follows attitude and masses, and lasts for a leg.
+    average out, it is a bias that lasts as long, and white is what drives it, ``σ √(1 - ρ²)`` with ρ its correlation
+    from sample to sample. What else a calibration gets wrong follows attitude and masses, and lasts for a leg.
     """
     noise = calibration.noise
     white = noise.sensor
     memory = -noise.interval / log(noise.memory) if 0.0 < noise.memory < 1.0 else 0.0
+    lasts = LEG
     if memory > LASTING * options.interval:
-        white, memory = white * sqrt(1.0 - noise.memory**2), 0.0
+        white, lasts, memory = white * sqrt(1.0 - noise.memory**2), memory, 0.0
     slow = sqrt(max(0.0, sigma**2 - white**2))
     return replace(
         options,
         noise=white,
         memory=memory,
         bias_sigma=hypot(options.bias_sigma, slow),
-        bias_time=min(options.bias_time, LEG) if slow > options.bias_sigma else options.bias_time,
+        bias_time=min(options.bias_time, lasts) if slow > options.bias_sigma else options.bias_time,
     )
 
 
