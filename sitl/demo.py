@@ -17,6 +17,7 @@ from magbridge.calibration.correct import correct
 from magbridge.calibration.data import observations
 from magbridge.calibration.file import save
 from magbridge.calibration.fit import Fit, fit
+from magbridge.calibration.lowpass import unfiltered
 from magbridge.config import load as load_config
 from magbridge.logs import write
 from magbridge.records import Quality
@@ -49,14 +50,16 @@ def demo(folder: Path, seed: int = 1, say: Callable[[str], None] = print) -> dic
         say(f"{time.monotonic() - begun:5.1f} s  {text}")
 
     step("simulating a glider with a moving battery and a ballast pump: calibration spirals, then a survey")
-    deployment = simulate(load("demo"), seed)
+    scenario = load("demo")
+    deployment = simulate(scenario, seed)
     write(deployment, folder / "deployment.nc")
     parts = segments(deployment)
     training, survey = parts["calibration"], parts["survey"]
 
     step(f"fitting the calibration to {training.sizes['time']} samples of the spirals")
-    nominal = fit(observations(training, ()), "nominal")
-    found = fit(observations(training, PARAMETERS), "auto")
+    corner = scenario.instrument.corner
+    nominal = fit(unfiltered(observations(training, ()), corner), "nominal")
+    found = fit(unfiltered(observations(training, PARAMETERS), corner), "auto")
     save(found.calibration, folder / "cal.json")
     config = folder / "bridge.toml"
     config.write_text(bridge_toml(deployment, PARAMETERS, calibrated=True, log="logs"), encoding="utf-8")
