@@ -109,7 +109,9 @@ def lines(rows: Sequence[Row]) -> list[str]:
     add("... mean size of the set where separable", "at most 1.5", _mean_set(clear))
     sizes = [r["theory"][0]["size"] for r in other if r["theory"][0]]
     add("... elsewhere", f"theory {np.mean(sizes) if sizes else np.nan:.2f}", _mean_set(other))
-    _parameters(add, [r for r in rows if r["wanted"] >= 8.0 and len(r["names"]) == 1])
+    single = [r for r in rows if len(r["names"]) == 1]
+    _parameters(add, "S/N 8 to 25", [r for r in single if 8.0 <= r["wanted"] <= 25.0])
+    _parameters(add, "S/N 50 and 100", [r for r in single if r["wanted"] > 25.0])
     _gains(add, part.get("gain", []))
     unknown = part.get("unknown", [])
     apart = [r for r in unknown if unlike(r)]
@@ -148,22 +150,21 @@ def _detection(add: Callable[[str, str, str], None], part: dict[str, list[Row]])
         )  # fmt: skip
 
 
-def _parameters(add: Callable[[str, str, str], None], rows: Sequence[Row]) -> None:
+def _parameters(add: Callable[[str, str, str], None], label: str, rows: Sequence[Row]) -> None:
     z = np.array([x for r in rows for x in r["scores"]])
     if not z.size:
-        add("parameters", "bias under 0.2 sigma", "not run | 0")
+        add(f"parameters, {label}", "bias under 0.2 sigma", "not run | 0")
         return
     add(
-        "parameters: median bias", "under 0.2 sigma",
+        f"parameters, {label}: median bias", "under 0.2 sigma",
         f"{np.median(z):+.2f} sigma (mean {z.mean():+.2f}) | {z.size} of {sum(bool(r['scores']) for r in rows)} cases",
     )  # fmt: skip
     inside = np.abs(z) < 1.96
     low, high = binomtest(int(inside.sum()), z.size).proportion_ci()
     add(
-        "... 95 % intervals cover",
-        "92-97 %",
+        "... 95 % intervals cover", "92-97 %",
         f"{100 * inside.mean():.1f} % ({100 * low:.1f}-{100 * high:.1f}) | {z.size}",
-    )
+    )  # fmt: skip
 
 
 def gained(rows: Sequence[Row]) -> float:
