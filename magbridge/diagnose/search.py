@@ -25,7 +25,7 @@ from magbridge.diagnose.joint import Information, Joint, fit_joint, information
 from magbridge.diagnose.noise import memory_order
 from magbridge.diagnose.problem import Problem
 from magbridge.diagnose.rounds import Hypothesis, State, key
-from magbridge.diagnose.weigh import IDEAL, LEVEL, lead, score, weigh
+from magbridge.diagnose.weigh import LEVEL, REMNANT, lead, score, weigh
 
 __all__ = ["Hypothesis", "Outcome", "Rival", "search"]
 
@@ -153,7 +153,7 @@ def _together(state: State) -> list[Candidate]:
         for _, k in ranked:
             s, candidate = scores[k], state.candidates[k]
             size = float(np.sqrt(max(s.ratio - s.freedom, 0.0)))
-            sure = state.p_value(candidate, s.ratio, s.freedom) < LEVEL and size >= IDEAL * loudest
+            sure = state.p_value(candidate, s.ratio, s.freedom) < LEVEL and size >= REMNANT * loudest
             if sure and candidate.cause not in {state.candidates[j].cause for j in picked}:
                 break
         else:
@@ -178,7 +178,7 @@ def _enough(state: State, first: list[Hypothesis]) -> Hypothesis | None:
             for candidate, other in zip(state.candidates, state.scores(left), strict=True)
             if candidate.cause != h.candidate.cause
         ]
-        quiet = IDEAL**2 * s.ratio
+        quiet = REMNANT**2 * s.ratio
         if all(
             other.ratio - other.freedom < quiet
             or state.p_value(candidate, other.ratio, other.freedom) >= LEVEL
@@ -205,7 +205,7 @@ def _next(found: list[Hypothesis], model: list[Candidate], loudest: float) -> Hy
     """Pick the best that passes the test; of what an idealised regressor may have left, only more of the same cause."""
     named = {candidate.cause for candidate in model}
     for h in found:
-        if h.p_value < LEVEL and (h.candidate.cause in named or h.signal_to_noise >= IDEAL * loudest):
+        if h.p_value < LEVEL and (h.candidate.cause in named or h.signal_to_noise >= REMNANT * loudest):
             return h
     return None
 

@@ -24,7 +24,7 @@ from scipy.stats import chi2
 from magbridge.diagnose.candidates import Candidate
 from magbridge.diagnose.joint import Information
 
-__all__ = ["IDEAL", "LEVEL", "ODDS", "Score", "lead", "score", "slices", "trials", "weigh"]
+__all__ = ["IDEAL", "LEVEL", "ODDS", "REMNANT", "Score", "lead", "score", "slices", "trials", "weigh"]
 
 FloatArray = NDArray[np.float64]
 
@@ -33,10 +33,12 @@ LEVEL = 0.01
 ODDS = float(np.log(20.0))
 """Log evidence by which a cause must win to be named alone, had its regressor no error."""
 IDEAL = 0.2
-"""How far from the truth an idealised regressor may be, as a share of its norm: what is left of a large effect is not
-another cause, and one that does not explain that much less is a rival.
+"""How far from the truth an idealised regressor may be, as a share of its norm: one that does not explain that much less
+is a rival."""
+REMNANT = 0.3
+"""Of the strongest cause's signal-to-noise: less is what its idealised regressor has left, not another cause.
 
-The price: a second cause of less than a fifth of the strongest one's signal-to-noise is not named beside it.
+The price: a second cause that weak is not named beside it.
 """
 SIMULATIONS = 400
 
