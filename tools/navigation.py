@@ -16,7 +16,7 @@ kept in a folder, and taken up again.
 What the columns of the accuracy tables hold, for the errors of the second half of each run:
 
 DRMS m        median over the runs of the error's root mean square
-ratio         median over the runs of that, over the bound **of the same run** (its track, map and noise): the issue's figure
+ratio         median over the runs of that, over the bound **of the same run** (its track, map and noise)
 90 %          the same ratio's 90th percentile
 RMS ratio     root mean square error of all runs together over that of all bounds: 1 for an efficient estimator. The median
               is below it, because one run's errors follow each other and so scatter widely about its bound
