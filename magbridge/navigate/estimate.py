@@ -45,7 +45,7 @@ class Estimate:
     x, P : ndarray, (6,), (6, 6)
         Estimate and covariance, of :mod:`~magbridge.navigate.model`'s states.
     vouched : bool
-        The filter stands by the position.
+        The filter stands by the position, and its rivals have come to it too since it began or moved to another place.
     moved : tuple of ndarray
         F and Q from the update before to the last one, for a smoother.
     jumps : list of Jump
@@ -69,6 +69,7 @@ class Estimate:
         self._alone = self.P[:4, :4].copy()  # covariance of dead reckoning alone
         self._lost = False
         self._searches = 0
+        self._confirmed = False
 
     @property
     def odds(self) -> float:
@@ -118,8 +119,8 @@ class Estimate:
             self._judge(block, seconds, metres, seen.log_likelihood)
         self._choose(on_the_map)
         self._reported = True
-        sure = widest(self.P) < self.options.vouch_sigma
-        self.vouched = self.state is State.TRACKING and self.odds < DOUBTFUL and sure
+        sure = self._confirmed and self.odds < DOUBTFUL and widest(self.P) < self.options.vouch_sigma
+        self.vouched = self.state is State.TRACKING and sure
         return seen
 
     def predict(self, time_us: int, travelled: float) -> tuple[float, float]:
@@ -169,7 +170,7 @@ class Estimate:
     def _jump(self, x: Array, cause: str) -> None:
         north, east = (x[:2] - self.x[:2]).tolist()
         self.jumps.append(Jump(self._time_us, north, east, widest(self._alone), cause))
-        self._watch = None
+        self._watch, self._confirmed = None, False
 
     def _judge(self, block: Block, seconds: float, metres: float, likelihood: float) -> None:
         """Compare the filter with its rivals; leave it where one of them has won."""
@@ -193,7 +194,7 @@ class Estimate:
             self._jump(self._filter.moments()[0], verdict.value)
             self._read()
         elif verdict is Verdict.HOLDS:
-            self._watch = None
+            self._watch, self._confirmed = None, True
             if self._nowhere < -0.5 * log(self.options.doubt):  # and the map does describe the field
                 self._lost, self._searches = False, 0
 
