@@ -94,7 +94,8 @@ def run(path: Path) -> None:
     pipeline = set_up(config, keeper.start(clock.now_us()))
     sensor = SerialPort(config.sensor.port, config.sensor.baudrate)
     link = open_link(config.link.url, config.link.baudrate, str(config.path))
-    edge = LiveEdge({Channel.SENSOR: sensor, Channel.LINK: link}, clock)
+    # the link first: that the sensor's port does not open must find somebody to be told to
+    edge = LiveEdge({Channel.LINK: link, Channel.SENSOR: sensor}, clock)
     keeper.attach(edge)
     log = _open_log(config, edge)
     for number in (signal.SIGINT, signal.SIGTERM):
