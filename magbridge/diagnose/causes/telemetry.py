@@ -83,39 +83,21 @@ def _level(problem: Problem, name: str) -> Callable[[slice], FloatArray]:
 
 def current_field(problem: Problem) -> list[Candidate]:
     """A current loop is a fixed source: ``T += b I(t)`` (Biot and Savart), zero when the current is."""
-    made = []
-    for name in channels_of(problem, "current"):
-        low, high = extent(problem, name)
-        effect = ChannelEffect(cause="current_field", channel=name)
-        unit = f"nT/{problem.survey.channels[name].unit or '1'}"
-        made.append(
-            of_effect(
-                problem,
-                effect,
-                100.0 / max(abs(low), abs(high)),
-                unit,
-                channel=name,
-                phi=_level(problem, name),
-            )
-        )
-    return made
+    return _proportional(problem, "current_field", "current", 100.0)
 
 
 def pressure_offset(problem: Problem) -> list[Candidate]:
     """Pressure strains the hull and its magnetisation follows (Villari effect), and the sensor's mount: ``T += b p``."""
+    return _proportional(problem, "pressure_offset", "pressure", 50.0)
+
+
+def _proportional(problem: Problem, cause: str, kind: str, largest: float) -> list[Candidate]:
+    """``T += b c(t)`` for every channel c of a kind; at its extent some `largest` nT."""
     made = []
-    for name in channels_of(problem, "pressure"):
+    for name in channels_of(problem, kind):
         low, high = extent(problem, name)
-        effect = ChannelEffect(cause="pressure_offset", channel=name)
+        effect = ChannelEffect(cause=cause, channel=name)
         unit = f"nT/{problem.survey.channels[name].unit or '1'}"
-        made.append(
-            of_effect(
-                problem,
-                effect,
-                50.0 / max(abs(low), abs(high)),
-                unit,
-                channel=name,
-                phi=_level(problem, name),
-            )
-        )
+        width = largest / max(abs(low), abs(high))
+        made.append(of_effect(problem, effect, width, unit, channel=name, phi=_level(problem, name)))
     return made
