@@ -16,7 +16,7 @@ from sitl.scenario import Scenario
 from sitl.trajectory import Track
 from sitl.twin import FINE_STEP, Twin
 
-__all__ = ["simulate_like"]
+__all__ = ["simulate_like", "where"]
 
 Array = NDArray[np.float64]
 
@@ -47,16 +47,8 @@ def simulate_like(log: xr.Dataset, scenario: Scenario, seed: int = 0) -> xr.Data
     FormatError
         The log lacks a column that the forward model needs, or one holds nothing.
     """
-    twin = Twin.draw(scenario, seed)
-    track, when = read_track(log, scenario, twin.vehicle.channels)
-    place = msgspec.structs.replace(
-        scenario.world,
-        latitude=float(np.median(track.latitude)),
-        longitude=float(np.median(track.longitude)),
-    )
-    start = datetime.fromtimestamp(track.start, UTC)
-    twin = Twin.draw(msgspec.structs.replace(scenario, world=place, start=start), seed)
-    measured = twin.measure(track, when)
+    twin = Twin.draw(where(log, scenario), seed)
+    measured = twin.measure(*read_track(log, scenario, twin.vehicle.channels))
     replaced = [name for name in log.data_vars if str(name).startswith(("mag_", "reference_field"))]
     own = [
         name
@@ -70,6 +62,18 @@ def simulate_like(log: xr.Dataset, scenario: Scenario, seed: int = 0) -> xr.Data
     return out
 
 
+def where(log: xr.Dataset, scenario: Scenario) -> Scenario:
+    """Return the scenario with the log's median position as its place and the log's first time as its start."""
+    latitude, longitude = (_column(log, name) for name in ("latitude", "longitude"))
+    place = msgspec.structs.replace(
+        scenario.world,
+        latitude=float(np.nanmedian(latitude)),
+        longitude=(float(np.nanmedian(longitude)) + 180) % 360 - 180,
+    )
+    start = datetime.fromtimestamp(float(log["time"][0]), UTC)
+    return msgspec.structs.replace(scenario, world=place, start=start)
+
+
 def read_track(log: xr.Dataset, scenario: Scenario, channels: Sequence[str]) -> tuple[Track, Array]:
     """Return a log's track with these `channels` on a uniform grid, and the log's times in s after its start."""
     time = log["time"].to_numpy().astype(np.float64)
@@ -81,16 +85,8 @@ def read_track(log: xr.Dataset, scenario: Scenario, channels: Sequence[str]) -> 
     grid = np.arange(0.0, last + 2 * step, step)
 
     def column(name: str) -> Array:
-        if name not in log:
-            raise FormatError(
-                _source(log), f"the forward model needs it; there are {', '.join(map(str, log))}", column=name
-            )
-        value = log[name].to_numpy().astype(np.float64)
+        value = _column(log, name)
         known = np.isfinite(value)
-        if not known.any():
-            raise FormatError(_source(log), "a value in at least one row", column=name)
-        if name in ("heading", "longitude"):
-            value[known] = np.unwrap(value[known], period=360)
         return np.interp(grid, when[known], value[known])
 
     latitude, longitude, depth = column("latitude"), column("longitude"), column("depth")
@@ -111,6 +107,20 @@ def read_track(log: xr.Dataset, scenario: Scenario, channels: Sequence[str]) -> 
         water=column("water_temperature") if "water_temperature" in log else None,
     )
     return track, when
+
+
+def _column(log: xr.Dataset, name: str) -> Array:
+    """Return a column (n,), NaN where it lacks a value; angles without their jumps by 360 deg."""
+    if name not in log:
+        there = ", ".join(map(str, log))
+        raise FormatError(_source(log), f"the forward model needs it; there are {there}", column=name)
+    value = log[name].to_numpy().astype(np.float64)
+    known = np.isfinite(value)
+    if not known.any():
+        raise FormatError(_source(log), "a value in at least one row", column=name)
+    if name in ("heading", "longitude"):
+        value[known] = np.unwrap(value[known], period=360)
+    return value
 
 
 def _source(log: xr.Dataset) -> str:

@@ -12,6 +12,8 @@ from magbridge.calibration.file import load as load_calibration
 from magbridge.cli import main
 from magbridge.config import Align
 from magbridge.correction import Correction, correct_rows
+from magbridge.field.igrf import total_field
+from magbridge.field.read import read_grid
 from magbridge.logs import read, write
 from sitl import load, simulate
 
@@ -38,6 +40,19 @@ def complaint(capsys: pytest.CaptureFixture[str], *arguments: object, code: int)
     assert captured.err.startswith("magbridge: ")
     assert "Traceback" not in captured.err
     return captured.err.removeprefix("magbridge: ").rstrip()
+
+
+@pytest.mark.parametrize("like", [False, True], ids=["mission", "like a log"])
+def test_the_simulated_world_has_a_map(deployment: Path, tmp_path: Path, like: bool) -> None:
+    out, anomaly = tmp_path / "twin.nc", tmp_path / "grid.nc"
+    driven = ["--like", str(deployment)] if like else []
+    assert main(["simulate", "demo", "-o", str(out), "--map", str(anomaly), "--seed", "5", *driven]) == 0
+    twin = read(out)
+    longitude, latitude = (twin[name].to_numpy() for name in ("truth_longitude", "truth_latitude"))
+    met = twin["truth_total_field"].to_numpy() - total_field(longitude, latitude, twin["depth"], twin["time"])
+    mapped = read_grid(anomaly).evaluate(longitude, latitude).anomaly
+    assert np.corrcoef(met, mapped)[0, 1] > 0.9  # from 90 m up it is smoother than what the vehicle meets
+    assert np.std(met - mapped) < 0.5 * np.std(met)
 
 
 def test_convert_there_and_back_keeps_every_number(deployment: Path, tmp_path: Path) -> None:

@@ -40,7 +40,13 @@ def convert(*files: Path, output: Output, json: Json = False) -> None:
 
 @app.command
 def simulate(
-    scenario: Path, *, output: Output, seed: int = 0, like: tuple[Path, ...] = (), json: Json = False
+    scenario: Path,
+    *,
+    output: Output,
+    seed: int = 0,
+    like: tuple[Path, ...] = (),
+    map_output: Annotated[Path | None, Parameter(name="--map")] = None,
+    json: Json = False,
 ) -> None:
     """Simulate a deployment from the forward model.
 
@@ -54,17 +60,27 @@ def simulate(
         Draws everything that the scenario leaves open; the same seed gives the same deployment.
     like
         Logs whose attitude, position and masses drive the simulation instead of the scenario's mission.
+    map_output
+        Where to write the anomaly grid that an aeromagnetic survey of the simulated world would have made.
     json
         Print the result for machines.
     """
     from magbridge.logs import read, write
-    from sitl.like import simulate_like
+    from sitl.like import simulate_like, where
     from sitl.scenario import load
+    from sitl.twin import Twin
     from sitl.twin import simulate as simulate_scenario
 
     chosen = load(scenario)
-    deployment = simulate_like(read(like), chosen, seed) if like else simulate_scenario(chosen, seed)
+    if like:
+        log = read(like)
+        chosen = where(log, chosen)
+        deployment = simulate_like(log, chosen, seed)
+    else:
+        deployment = simulate_scenario(chosen, seed)
     write(deployment, output)
+    if map_output is not None:
+        Twin.draw(chosen, seed).anomaly_map().save(map_output)
     rows = deployment.sizes["time"]
     tell({"file": str(output), "rows": rows, "seed": seed}, f"{output}: {rows} rows", json)
 
