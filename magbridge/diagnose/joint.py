@@ -10,7 +10,7 @@ scores, Occam factors, what is confounded with what, and the distribution of the
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,6 +23,8 @@ __all__ = ["RIDGE", "Information", "Joint", "fit_joint", "information"]
 
 FloatArray = NDArray[np.float64]
 CHUNK = 4096
+CACHED = 1 << 17
+"""Numbers of a piece of the columns that is whitened at a time, to stay near the processor."""
 RIDGE = 0.1
 """Prior precision of an effect, of a plausible size's: ten times that size is hardly believed, a hundred times not at
 all. Without it a bend of the channels and the calibration's scales grow against each other until the noise is gone."""
@@ -86,16 +88,14 @@ def fit_joint(
     rounds : int
         At most.
     """
-    q, n = problem.free.shape[1], len(problem)
-    whole = slice(0, n)
-    X = np.hstack([problem.free, *(column(whole) for column in columns)])
-    k = X.shape[1] - q
+    X = Design(problem, columns)
+    q, k = X.free.shape[1], X.own.shape[1]
     prior = np.append(np.ones(q), np.full(k, ridge))
     centre = np.append(problem.centre, np.zeros(k))
     follows = problem.survey.follows
 
     def at(c: FloatArray) -> tuple[float, FloatArray, Noise]:
-        left = problem.residual - X @ c
+        left = problem.residual - X.times(c)
         noise = fit_noise(left, follows, order, blocks=blocks, like=None if like is None else like.noise)
         return noise.log_likelihood - 0.5 * float(prior @ (c - centre) ** 2), left, noise
 
@@ -106,31 +106,81 @@ def fit_joint(
         first.append(_plain(X, problem.residual, prior, centre))
     found = [(c, *at(c)) for c in first]
     c, value, left, noise = max(found, key=lambda entry: entry[1])
-    for _ in range(rounds):
-        A, y = noise.filter(X), noise.response(left)
-        moved = c + np.linalg.solve(A.T @ A + np.diag(prior), A.T @ y - prior * (c - centre))
+    for step in range(rounds + 1):
+        P, b = X.normal(noise, noise.response(left))
+        P += np.diag(prior)
+        if step == rounds:
+            break
+        moved = c + np.linalg.solve(P, b - prior * (c - centre))
         tried = at(moved)
         gained = tried[0] - value
         if gained > 0.0:
             c, (value, left, noise) = moved, tried
-        if gained < 0.02:
+        if gained < 0.02:  # P is that of the last step: no other
             break
-    A = noise.filter(X)
-    covariance: FloatArray = np.asarray(np.linalg.inv(A.T @ A + np.diag(prior)), float)
+    covariance: FloatArray = np.asarray(np.linalg.inv(P), float)
     return Joint(value, c[:q], c[q:], covariance, noise, left)
 
 
-def _plain(X: FloatArray, residual: FloatArray, prior: FloatArray, centre: FloatArray) -> FloatArray:
+class Design:
+    """The columns of a hypothesis, the calibration's and the effects'; they are whitened piece by piece.
+
+    Parameters
+    ----------
+    problem : Problem
+    columns : sequence of Columns
+        The effects'.
+    """
+
+    def __init__(self, problem: Problem, columns: Sequence[Columns]) -> None:
+        whole = slice(0, len(problem))
+        self.free = problem.free
+        self.own = np.hstack([np.empty((len(problem), 0)), *(column(whole) for column in columns)])
+
+    def times(self, c: FloatArray) -> FloatArray:
+        """(n,) what the coefficients c (q + k,) leave."""
+        q = self.free.shape[1]
+        return np.asarray(self.free @ c[:q] + self.own @ c[q:])
+
+    def piece(self, rows: slice) -> FloatArray:
+        """(m, q + k) rows of all columns."""
+        return np.hstack([self.free[rows], self.own[rows]])
+
+    def pieces(self, past: int = 0) -> Iterator[tuple[FloatArray, int, int]]:
+        """Yield piece after piece, its first row, and how many rows before stand in it for the past only."""
+        n, size = len(self.free), self.free.shape[1] + self.own.shape[1]
+        for start in range(0, n, step := max(CACHED // size, 256)):
+            first = max(start - past, 0)
+            yield self.piece(slice(first, start + step)), first, start - first
+
+    def normal(self, noise: Noise | None, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return ``X^T X`` and ``X^T y``, X whitened by the noise if there is one."""
+        size = self.free.shape[1] + self.own.shape[1]
+        P, b = np.zeros((size, size)), np.zeros(size)
+        for X, first, skip in self.pieces(0 if noise is None else len(noise.memory)):
+            A = X if noise is None else noise.filter(X, first, skip)
+            P += A.T @ A
+            b += A.T @ y[first + skip : first + len(X)]
+        return P, b
+
+    def against(self, y: FloatArray) -> FloatArray:
+        """(q + k,) ``X^T y``."""
+        return np.append(self.free.T @ y, self.own.T @ y)
+
+
+def _plain(X: Design, residual: FloatArray, prior: FloatArray, centre: FloatArray) -> FloatArray:
     """Least squares as if the noise were white, outliers cut off."""
     level = 1.4826 * float(np.median(np.abs(residual - np.median(residual)))) + 1e-12
     c = centre
-    for _ in range(2):
-        left = residual - X @ c
-        cut = np.clip(left, *(np.median(left) + np.array([-8.0, 8.0]) * level)) if c is not centre else left
+    P, _ = X.normal(None, residual)
+    left = residual - X.times(c)
+    for step in range(2):
+        cut = np.clip(left, *(np.median(left) + np.array([-8.0, 8.0]) * level)) if step else left
         c = c + np.linalg.solve(
-            X.T @ X / level**2 + np.diag(prior), X.T @ cut / level**2 - prior * (c - centre)
+            P / level**2 + np.diag(prior), X.against(cut) / level**2 - prior * (c - centre)
         )
-        level = 1.4826 * float(np.median(np.abs(residual - X @ c))) + 1e-12
+        left = residual - X.times(c)
+        level = 1.4826 * float(np.median(np.abs(left))) + 1e-12
     return c
 
 

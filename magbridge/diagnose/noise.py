@@ -34,6 +34,12 @@ TAILS = (2.5, 3.0, 4.0, 5.0, 7.0, 12.0, 1e6)
 BLOCK = 150
 """Samples over which the noise's level is taken as constant."""
 ORDERS = (0, 1, 2, 3, 5)
+GAUSSIAN = 1e5
+"""Degrees of freedom from which on the tails are taken for Gaussian."""
+ALTERNATIONS = 6
+"""Between the weights of the samples and the level, at most."""
+SETTLED = 0.01
+"""Log likelihood: less is no gain."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,12 +98,13 @@ class Noise:
         """
         rows = slice(start + skip, start + len(values))
         out = values[skip:].copy()
-        past = self.past[rows]
         for k, a in enumerate(self.memory, start=1):
             late = max(k - skip, 0)  # the first rows of all have no past
-            out[late:] -= (a * past[late:])[:, None] * values[skip + late - k : len(values) - k]
-        factor = np.sqrt(self.kappa) * np.where(past, 1.0, self.share) / self.scale[rows]
-        out *= factor[:, None]
+            out[late:] -= a * values[skip + late - k : len(values) - k]
+        past = self.past[rows]
+        lone = np.flatnonzero(~past)
+        out[lone] = values[skip:][lone]
+        out *= (np.sqrt(self.kappa) * np.where(past, 1.0, self.share) / self.scale[rows])[:, None]
         return out
 
     def response(self, residual: FloatArray) -> FloatArray:
@@ -108,11 +115,9 @@ class Noise:
 
 def _past(follows: BoolArray, p: int) -> BoolArray:
     """Whether the p samples before are there, without a gap."""
-    broken = np.flatnonzero(~follows)
-    since = np.arange(len(follows)) - broken[np.searchsorted(broken, np.arange(len(follows)), "right") - 1]
-    return (
-        np.asarray(since >= p) if broken.size and not follows[0] else np.asarray(np.arange(len(follows)) >= p)
-    )
+    place = np.arange(len(follows))
+    start = np.where(follows, 0, place)
+    return np.asarray(place - np.maximum.accumulate(start) >= p)
 
 
 def memory_order(residual: FloatArray, follows: BoolArray) -> int:
@@ -162,39 +167,42 @@ def fit_noise(
     """
     past = _past(follows, order)
     n = len(residual)
-    block = np.minimum(np.arange(n) // BLOCK, max(n // BLOCK - 1, 0))
-    weight, nu = np.ones(n), 12.0 if like is None else like.nu
-    scale = np.full(n, 1.4826 * np.median(np.abs(residual)) + 1e-12) if like is None else like.scale
+    count = _counts(n)
+    typical = float(np.median(np.abs(residual)))
     lags = np.zeros((order, n))
     for k in range(1, order + 1):
         lags[k - 1, k:] = residual[:-k]
     lags *= past
-    memory, share, v = np.zeros(order), 1.0, residual
+    memory, share, nu = np.zeros(order), 1.0, 12.0
+    weight, scale = np.ones(n), np.full(n, 1.4826 * typical + 1e-12)
+    if like is not None:
+        nu, scale = like.nu, like.scale
+        weight = (nu + 1.0) / (nu + ((residual - like.memory @ lags) / scale) ** 2)
+    v, log_likelihood = residual, -np.inf
     for _ in range(rounds):
         if order and past.sum() > 2 * order:
             own = lags * (weight / scale**2)
             memory = _stable(np.asarray(np.linalg.lstsq(own @ lags.T, own @ residual, rcond=None)[0], float))
         v = residual - memory @ lags
-        share = (
-            min(1.0, float(np.sqrt(np.median(v[past] ** 2) / (np.median(residual**2) + 1e-300))))
-            if order
-            else 1.0
-        )
+        if order:
+            share = min(1.0, float(np.median(np.abs(v[past]))) / (typical + 1e-300))
         v[~past] *= share
         if blocks is None:
-            blocks = _uneven(v, block)
-        nu, scale = _tails(v, block if blocks else np.zeros(n, np.int64), nu)
+            blocks = _uneven(v, count)
+        before = log_likelihood
+        nu, scale, log_likelihood = _tails(v, count if blocks else np.array([n]), nu)
+        log_likelihood += float(np.log(share)) * np.sum(~past)
         weight = (nu + 1.0) / (nu + (v / scale) ** 2)
-    x = v / scale
-    log_likelihood = float(np.sum(_log_t(x, nu) - np.log(scale)) + np.log(share) * np.sum(~past))
-    return Noise(memory, scale, nu, share, past, log_likelihood, x)
+        if abs(log_likelihood - before) < SETTLED:
+            break
+    return Noise(memory, scale, nu, share, past, log_likelihood, v / scale)
 
 
-def _log_t(x: FloatArray, nu: float) -> FloatArray:
-    if nu > 1e5:
-        return np.asarray(-0.5 * (x * x + np.log(2.0 * np.pi)))
-    constant = gammaln((nu + 1.0) / 2.0) - gammaln(nu / 2.0) - 0.5 * np.log(nu * np.pi)
-    return np.asarray(constant - 0.5 * (nu + 1.0) * np.log1p(x * x / nu))
+def _counts(n: int) -> NDArray[np.int64]:
+    """(blocks,) samples in each block."""
+    count = np.full(max(n // BLOCK, 1), BLOCK)
+    count[-1] += n - count.sum()
+    return count
 
 
 def _stable(memory: FloatArray) -> FloatArray:
@@ -206,44 +214,63 @@ def _stable(memory: FloatArray) -> FloatArray:
     return np.asarray(-np.real(np.poly(roots * np.where(size > 0.9995, 0.9995 / size, 1.0)))[1:])
 
 
-def _uneven(v: FloatArray, block: NDArray[np.int64]) -> bool:
+def _uneven(v: FloatArray, count: NDArray[np.int64]) -> bool:
     """Tell whether the blocks' mean absolute values differ by more than their own scatter lets them."""
-    count = np.bincount(block)
     if count.size < 4:
         return False
-    clipped = np.minimum(np.abs(v), 5.0 * np.median(np.abs(v)))
-    mean = np.bincount(block, clipped) / count
+    size = np.abs(v)
+    clipped = np.minimum(size, 5.0 * np.median(size))
+    mean = _sums(clipped, count) / count
     expected = clipped.var() / count
     chi2 = float(np.sum((mean - clipped.mean()) ** 2 / expected))
     return bool(chi2 > count.size + 4.0 * np.sqrt(2.0 * count.size))
 
 
-def _tails(v: FloatArray, block: NDArray[np.int64], nu: float) -> tuple[float, FloatArray]:
-    """Find the best tails, uphill from `nu`, and the level of each block under them."""
+def _sums(values: FloatArray, count: NDArray[np.int64]) -> FloatArray:
+    """(blocks,) sum of each block."""
+    return np.asarray(np.add.reduceat(values, np.cumsum(count) - count))
+
+
+def _tails(v: FloatArray, count: NDArray[np.int64], nu: float) -> tuple[float, FloatArray, float]:
+    """Find the best tails, uphill from `nu`, the level of each sample under them, and the log likelihood."""
     at = TAILS.index(nu)
-    tried = {at: _levels(v, block, nu)}
+    square = v * v
+    start = np.full(count.size, float(np.median(np.abs(v))) * 1.4826 + 1e-12)
+    tried = {at: _levels(square, count, nu, start)}
     while True:
         for near in (at - 1, at + 1):
             if 0 <= near < len(TAILS) and near not in tried:
-                tried[near] = _levels(v, block, TAILS[near])
+                tried[near] = _levels(square, count, TAILS[near], tried[at][1])
         best = max((k for k in (at - 1, at, at + 1) if k in tried), key=lambda k: (tried[k][0], k == at))
         if best == at:
-            return TAILS[at], tried[at][1]
+            return TAILS[at], np.repeat(tried[at][1], count), tried[at][0]
         at = best
 
 
-def _levels(v: FloatArray, block: NDArray[np.int64], nu: float) -> tuple[float, FloatArray]:
-    """Log likelihood and level of every sample; blocks are drawn towards the common one by as much as ten samples."""
-    count = np.bincount(block)
-    level = np.full(count.size, float(np.median(np.abs(v))) * 1.4826 + 1e-12)
-    square = v * v
-    for _ in range(6 if nu < 1e5 else 2):
-        weighted = (nu + 1.0) / (nu + square / level[block] ** 2) * square
-        whole = float(np.sqrt(weighted.mean())) + 1e-12
-        level = (
-            np.sqrt((np.bincount(block, weighted) + 10.0 * whole**2) / (count + 10.0))
-            if count.size > 1
-            else np.array([whole])
-        )
-    scale = level[block]
-    return float(np.sum(_log_t(v / scale, nu) - np.log(scale))), scale
+def _levels(
+    square: FloatArray, count: NDArray[np.int64], nu: float, level: FloatArray
+) -> tuple[float, FloatArray]:
+    """Log likelihood and level of each block, from a first guess; drawn towards the common one by as much as ten samples."""
+    n = len(square)
+    power = level**2
+    for _ in range(ALTERNATIONS):
+        before, each = power, _each(power, count)
+        weighted = square if nu > GAUSSIAN else (nu + 1.0) * each * square / (nu * each + square)
+        sums = _sums(weighted, count)
+        whole = float(sums.sum()) / n
+        power = (sums + 10.0 * whole) / (count + 10.0) if count.size > 1 else sums / count
+        power = power + 1e-24
+        if nu > GAUSSIAN or np.abs(power / before - 1.0).max() < 1e-3:
+            break
+    x2 = square / _each(power, count)
+    if nu > GAUSSIAN:
+        value = -0.5 * (float(x2.sum()) + n * np.log(2.0 * np.pi))
+    else:
+        constant = gammaln((nu + 1.0) / 2.0) - gammaln(nu / 2.0) - 0.5 * np.log(nu * np.pi)
+        value = n * constant - 0.5 * (nu + 1.0) * float(np.log1p(x2 / nu).sum())
+    return float(value - 0.5 * count @ np.log(power)), np.sqrt(power)
+
+
+def _each(values: FloatArray, count: NDArray[np.int64]) -> FloatArray | float:
+    """(n,) a block's value for each of its samples; a number where there is one block."""
+    return np.repeat(values, count) if count.size > 1 else float(values[0])
