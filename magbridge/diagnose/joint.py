@@ -10,7 +10,8 @@ scores, Occam factors, what is confounded with what, and the distribution of the
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,9 +23,10 @@ from magbridge.diagnose.problem import Columns, Problem
 __all__ = ["RIDGE", "Information", "Joint", "fit_joint", "information"]
 
 FloatArray = NDArray[np.float64]
-CHUNK = 4096
-CACHED = 1 << 17
-"""Numbers of a piece of the columns that is whitened at a time, to stay near the processor."""
+CHUNK = 2048
+"""Rows that are whitened at a time, to stay near the processor."""
+THREADS, LONG = 2, 16
+"""Threads that share the pieces of a log, and pieces from which on it is worth the while."""
 RIDGE = 0.1
 """Prior precision of an effect, of a plausible size's: ten times that size is hardly believed, a hundred times not at
 all. Without it a bend of the channels and the calibration's scales grow against each other until the noise is gone."""
@@ -107,7 +109,7 @@ def fit_joint(
     found = [(c, *at(c)) for c in first]
     c, value, left, noise = max(found, key=lambda entry: entry[1])
     for step in range(rounds + 1):
-        P, b = X.normal(noise, noise.response(left))
+        P, b = normal(X.rows, noise.response(left), noise)
         P += np.diag(prior)
         if step == rounds:
             break
@@ -142,37 +144,49 @@ class Design:
         q = self.free.shape[1]
         return np.asarray(self.free @ c[:q] + self.own @ c[q:])
 
-    def piece(self, rows: slice) -> FloatArray:
+    def rows(self, rows: slice) -> FloatArray:
         """(m, q + k) rows of all columns."""
         return np.hstack([self.free[rows], self.own[rows]])
-
-    def pieces(self, past: int = 0) -> Iterator[tuple[FloatArray, int, int]]:
-        """Yield piece after piece, its first row, and how many rows before stand in it for the past only."""
-        n, size = len(self.free), self.free.shape[1] + self.own.shape[1]
-        for start in range(0, n, step := max(CACHED // size, 256)):
-            first = max(start - past, 0)
-            yield self.piece(slice(first, start + step)), first, start - first
-
-    def normal(self, noise: Noise | None, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return ``X^T X`` and ``X^T y``, X whitened by the noise if there is one."""
-        size = self.free.shape[1] + self.own.shape[1]
-        P, b = np.zeros((size, size)), np.zeros(size)
-        for X, first, skip in self.pieces(0 if noise is None else len(noise.memory)):
-            A = X if noise is None else noise.filter(X, first, skip)
-            P += A.T @ A
-            b += A.T @ y[first + skip : first + len(X)]
-        return P, b
 
     def against(self, y: FloatArray) -> FloatArray:
         """(q + k,) ``X^T y``."""
         return np.append(self.free.T @ y, self.own.T @ y)
 
 
+def normal(X: Columns, y: FloatArray, noise: Noise | None = None) -> tuple[FloatArray, FloatArray]:
+    """Return ``X^T X`` and ``X^T y``, X whitened if a noise is given; summed up in pieces that stay near the processor.
+
+    Long logs are shared out among threads, always in the same way: the same numbers on any machine.
+    """
+    past = 0 if noise is None else len(noise.memory)
+
+    def share(starts: Sequence[int]) -> tuple[FloatArray, FloatArray]:
+        P, b = np.zeros((0, 0)), np.zeros(0)
+        for start in starts:
+            first, end = max(start - past, 0), min(start + CHUNK, len(y))
+            A = X(slice(first, end))
+            if noise is not None:
+                A = noise.filter(A, first, start - first)
+            if not b.size:
+                P, b = np.zeros((A.shape[1],) * 2), np.zeros(A.shape[1])
+            P += A.T @ A
+            b += A.T @ y[start:end]
+        return P, b
+
+    starts = range(0, len(y), CHUNK)
+    if len(starts) < LONG:
+        return share(starts)
+    each = -(-len(starts) // THREADS)
+    with ThreadPoolExecutor(THREADS) as pool:
+        parts = list(pool.map(share, [starts[k : k + each] for k in range(0, len(starts), each)]))
+    return sum((P for P, _ in parts), start=np.zeros(())), sum((b for _, b in parts), start=np.zeros(()))
+
+
 def _plain(X: Design, residual: FloatArray, prior: FloatArray, centre: FloatArray) -> FloatArray:
     """Least squares as if the noise were white, outliers cut off."""
     level = 1.4826 * float(np.median(np.abs(residual - np.median(residual)))) + 1e-12
     c = centre
-    P, _ = X.normal(None, residual)
+    P, _ = normal(X.rows, residual)
     left = residual - X.times(c)
     for step in range(2):
         cut = np.clip(left, *(np.median(left) + np.array([-8.0, 8.0]) * level)) if step else left
@@ -218,21 +232,13 @@ def information(
     problem: Problem, noise: Noise, base: Joint, model: Sequence[Columns], candidates: Sequence[Columns]
 ) -> Information:
     """Sum up the candidates' information at the hypothesis `base`, whose effects are `model`, under `noise`."""
-    n, p = len(problem), len(noise.memory)
-    y = noise.response(base.left)
     q = problem.free.shape[1]
     nuisance = q + base.coefficients.size
-    G: FloatArray = np.zeros((0, 0))
-    b: FloatArray = np.zeros(0)
-    for start in range(0, n, CHUNK):
-        first = max(start - p, 0)
-        rows = slice(first, min(start + CHUNK, n))
-        X = np.hstack([problem.free[rows], *(column(rows) for column in (*model, *candidates))])
-        A = noise.filter(X, first, start - first)
-        if not G.size:
-            G, b = np.zeros((A.shape[1],) * 2), np.zeros(A.shape[1])
-        G += A.T @ A
-        b += A.T @ y[start : start + CHUNK]
+    G, b = normal(
+        lambda rows: np.hstack([problem.free[rows], *(column(rows) for column in (*model, *candidates))]),
+        noise.response(base.left),
+        noise,
+    )
     prior = np.append(np.ones(q), np.full(nuisance - q, 1e-6))
     pull = np.append(problem.centre - base.z, np.zeros(nuisance - q))
     K: FloatArray = np.asarray(

@@ -95,8 +95,8 @@ def _monomial(problem: Problem, exponents: tuple[int, ...]) -> Candidate:
     ]
 
     def phi(rows: slice) -> FloatArray:
-        product = [((values[rows] - centre) / scale) ** e for values, centre, scale, e in factors]
-        return np.asarray(np.prod(product, axis=0)[None])
+        product = [powers((values[rows] - centre) / scale, e)[-1] for values, centre, scale, e in factors]
+        return np.asarray(reduce(np.multiply, product)[None])
 
     return of_effect(problem, effect, 50.0, "nT", names=tuple(f"{axis} {label}" for axis in AXES), phi=phi)
 

@@ -44,10 +44,9 @@ def map_error(problem: Problem) -> list[Candidate]:
     for highest in (1, 2, 3):
         waves = [(i, j) for i in range(highest + 1) for j in range(highest + 1) if i + j > 0]
 
-        def basis(rows: slice, waves: list[tuple[int, int]] = waves) -> FloatArray:
-            return np.stack(
-                [np.cos(np.pi * i * u[rows, 0]) * np.cos(np.pi * j * u[rows, 1]) for i, j in waves], axis=1
-            )
+        def basis(rows: slice, waves: list[tuple[int, int]] = waves, highest: int = highest) -> FloatArray:
+            along = np.cos(np.pi * u[rows, :, None] * np.arange(highest + 1))
+            return np.stack([along[:, 0, i] * along[:, 1, j] for i, j in waves], axis=1)
 
         width = np.array([40.0 / (i + j) for i, j in waves])
         names = tuple(f"north {i} east {j}" for i, j in waves)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from magbridge.calibration.instrument import ResponseEffect
 from magbridge.diagnose.candidates import AXES, Candidate, of_effect
 from magbridge.diagnose.problem import Problem
+from magbridge.diagnose.regressors import powers
 
 __all__ = ["nonlinearity", "saturation"]
 
@@ -22,7 +23,7 @@ def nonlinearity(problem: Problem) -> list[Candidate]:
     made = []
     for power in (2, 3):
         effect = ResponseEffect(cause="nonlinearity", unit=unit, power=power)
-        phi = lambda rows, power=power: (H[rows].T / unit) ** power  # noqa: E731
+        phi = lambda rows, power=power: powers(H[rows].T / unit, power)[-1]  # noqa: E731
         made.append(
             of_effect(problem, effect, 50.0, f"nT at {unit:.0f} nT", phi=phi, shape={"power": (power, "1")})
         )
