@@ -15,8 +15,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import brentq
-from scipy.stats import chi2, ncx2, norm
+from scipy.special import chdtri, chndtrinc
+from scipy.stats import norm
 
 from magbridge.diagnose.candidates import Candidate
 from magbridge.diagnose.joint import Information
@@ -85,8 +85,8 @@ class Isolability:
 
 def threshold(freedom: int, hypotheses: float, chance: float) -> float:
     """Signal-to-noise at which an effect of `freedom` numbers is found with `chance`, among so many hypotheses."""
-    limit = float(chi2.isf(LEVEL / hypotheses, freedom))
-    return float(brentq(lambda a: ncx2.sf(limit, freedom, a * a) - chance, 0.05, 100.0))
+    limit = chdtri(freedom, LEVEL / hypotheses)
+    return float(np.sqrt(chndtrinc(limit, freedom, 1.0 - chance)))
 
 
 def isolability(

@@ -68,6 +68,7 @@ class State:
         self.at = slices(self.candidates)
         self.columns = [candidate.columns for candidate in self.candidates]
         self.trials: dict[str, float] = {}
+        self.own: Information
         self.bare: Information
         self.groups: dict[tuple[str, str | None], list[int]] = {}
         for k, candidate in enumerate(self.candidates):
@@ -110,7 +111,7 @@ class State:
         under: dict[tuple[str, str | None], list[tuple[int, float, Score, Information]]] = {}
         bare = self._bare(model, base, own)
         if not model:
-            self.bare = bare
+            self.own, self.bare = own, bare
         for info in (own, bare):
             scores = self.scores(info)
             for group, (k, average) in self.best(scores).items():

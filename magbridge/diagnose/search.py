@@ -110,9 +110,8 @@ def search(problem: Problem, candidates: Sequence[Candidate], causes: int) -> Ou
             model, base = [alone.candidate], alone.fit
     chosen, base = _remove(state, model, base, null)
     bare = replace(base, coefficients=np.empty(0))
-    info = information(
-        problem, base.noise, bare, [], [*state.columns, *(h.candidate.columns for h in chosen)]
-    )
+    columns = [*state.columns, *(h.candidate.columns for h in chosen)]
+    info = information(problem, base.noise, bare, [], columns) if chosen or not first else state.own
     rivals = tuple(_rivals(state, info, [h.candidate for h in chosen], base, k) for k in range(len(chosen)))
     return Outcome(tuple(chosen), rivals, null, base, order, tested, info, state.trials)
 
