@@ -73,6 +73,9 @@ def main() -> None:
         "--cases", type=int, default=800, help="of the whole study; parts have their shares of it"
     )
     parser.add_argument("--part", default=",".join(PARTS), help=f"some of {', '.join(PARTS)}")
+    parser.add_argument(
+        "--seed", type=int, default=0, help="another one hides other effects in other vehicles"
+    )
     parser.add_argument("--out", type=Path, default=Path("study"))
     parser.add_argument(
         "--scheduler", default="", help="address of a dask scheduler; a local cluster if not given"
@@ -88,7 +91,7 @@ def main() -> None:
     options.out.mkdir(parents=True, exist_ok=True)
     log = options.out / "cases.jsonl"
     done = read(log)
-    todo = [entry for entry in plan(options.cases, parts) if entry["number"] not in done]
+    todo = [entry for entry in plan(options.cases, parts, options.seed) if entry["number"] not in done]
     print(f"{len(done)} cases done, {len(todo)} to do")
     if options.scheduler:
         with Client(options.scheduler) as client:

@@ -17,7 +17,7 @@ import pytest
 from study.cases import PARTS, plan
 from study.stage import MEMORY, project, whiten
 from study.table import efficiency, lines, share
-from study.theory import weigh
+from study.theory import Span, weigh, with_another
 
 TOOLS = Path(__file__).parents[2] / "tools"
 
@@ -54,6 +54,25 @@ def test_a_longer_study_holds_the_shorter_and_every_part_has_its_share() -> None
     for name, part in PARTS.items():  # no part waits for another
         assert first.count(name) == pytest.approx(part.share * len(first), abs=3)
     assert {entry["part"] for entry in plan(200, ("null",))} == {"null"}
+
+
+def test_another_seed_shares_nothing() -> None:
+    numbers = [{entry["number"] for entry in plan(200, seed=seed)} for seed in (0, 1)]
+    assert numbers[0].isdisjoint(numbers[1])
+    assert len(numbers[0]) == len(numbers[1])
+
+
+def test_two_rivals_imitate_what_neither_does_alone() -> None:
+    """Against least squares: what the best rival and its best companion of each cause leave of the truth."""
+    rng = np.random.default_rng(5)
+    A, B, other = rng.normal(size=(3, 60, 2))
+    truth = A[:, 0] + B[:, 1] + 0.2 * rng.normal(size=60)
+    X = np.column_stack([A, B, other, truth])
+    spans = [Span("a", None, slice(0, 2), 0.0), Span("b", None, slice(2, 4), 0.0)]
+    left = with_another(X.T @ X, slice(0, 2), spans)
+    for cause, columns in (("a", A), ("b", np.column_stack([A, B]))):
+        naive = truth - columns @ np.linalg.lstsq(columns, truth, rcond=None)[0]
+        assert left[cause] == pytest.approx(np.linalg.norm(naive), rel=1e-6)
 
 
 def test_the_point_of_half_detection_is_read_off_a_ladder() -> None:

@@ -18,7 +18,7 @@ from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.findings import findings
 from magbridge.diagnose.run import Diagnosis, diagnose
 from sitl.inject import EFFECTS, FOREIGN, Hidden, disturb
-from study.stage import NOISES, Found, Stall, add_noise, again, stage_of
+from study.stage import NOISES, SEEDS, Found, Stall, add_noise, again, stage_of
 from study.theory import ideal
 
 Row = dict[str, Any]
@@ -88,13 +88,19 @@ PARTS: dict[str, Part] = {
 }
 
 
-def plan(cases: int, parts: tuple[str, ...] = tuple(PARTS)) -> list[Row]:
-    """The study's entries, every part's evenly among the others'; a longer study holds the shorter one."""
+def plan(cases: int, parts: tuple[str, ...] = tuple(PARTS), seed: int = 0) -> list[Row]:
+    """The study's entries, every part's evenly among the others'; a longer study holds the shorter one.
+
+    Another `seed` has other vehicles, and draws everything anew.
+    """
     made = []
     for place, (name, part) in enumerate(PARTS.items()):
         count = round(cases * part.share) if name in parts else 0
         made += [
-            ((k + 0.5) / part.share, part.entry(k) | {"part": name, "number": 100_000 * place + k})
+            (
+                (k + 0.5) / part.share,
+                part.entry(k) | {"part": name, "number": SEEDS * seed + 100_000 * place + k},
+            )
             for k in range(count)
         ]
     return [entry for _, entry in sorted(made, key=lambda item: item[0])]

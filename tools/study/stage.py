@@ -28,6 +28,8 @@ Array = NDArray[np.float64]
 HOURS = 6.0
 """Length of a deployment; the tests' are shorter."""
 VEHICLES = 24
+SEEDS = 1_000_000
+"""Numbers that a study of one seed may have."""
 INERTIA = 3.0
 """s, twice, with which the attitude follows what :mod:`sitl.trajectory` draws."""
 MEMORY = 0.8
@@ -85,7 +87,8 @@ def _flown(twin: Twin, calibration: Calibration) -> Stage:
 
 def stage_of(number: int, noise: str) -> Stage:
     """The stage of a case."""
-    return vehicle(number % VEHICLES, 300.0) if noise == "map" else vehicle(number % VEHICLES)
+    seed, place = divmod(number, SEEDS)
+    return vehicle(VEHICLES * seed + place % VEHICLES, 300.0 if noise == "map" else 60.0)
 
 
 def statistics(noise: str) -> tuple[float, float]:

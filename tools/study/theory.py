@@ -10,7 +10,7 @@ the table, against every other cause of the table by the same evidence that the 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -50,8 +50,9 @@ def ideal(
     dict
         ``alone``: chance to name the truth alone; ``inside``: that the set holds it; ``size``: the set's mean size;
         ``first``: cause -> chance to be named first; ``own``: share of the signal-to-noise that the table's regressors
-        of the true cause reach; ``apart``: cause -> signal-to-noise that its best imitation leaves; ``unlike`` and
-        ``mimic``: the smallest of those, and whose it is.
+        of the true cause reach; ``apart``: cause -> signal-to-noise that its best imitation leaves, of up to two of its
+        regressors; ``unlike`` and ``mimic``: the smallest of those, and whose it is; ``two``: what the best two of any
+        causes leave.
     """
     name = one.hidden.name
     spans, S = _information(one, stall, ds, causes, others)
@@ -60,23 +61,28 @@ def ideal(
     spread = rng.standard_normal((len(S), DRAWS)) * np.sqrt(np.maximum(values, 0.0))[:, None]
     scores = S[:, -1:] + vectors @ spread
     groups: dict[tuple[str, str | None], list[tuple[Array, float]]] = {}
-    best: dict[str, tuple[float, int]] = {}  # what each cause explains of the truth, with how many numbers
+    # of each cause what it explains of the truth, with how many numbers, and where they stand
+    best: dict[str, tuple[float, int, slice]] = {}
     for span in spans:
         root, given, drawn = _root(S[span.own, span.own]), S[span.own, -1:], scores[span.own]
         if span.cause == "filter_lag":  # it cannot lead
             given, drawn = np.maximum(given, 0.0), np.maximum(drawn, 0.0)
         explained = float(np.sum((root.T @ given) ** 2))
-        best[span.cause] = max(best.get(span.cause, (0.0, 1)), (explained, root.shape[1]))
+        if explained >= best.get(span.cause, (0.0,))[0]:
+            best[span.cause] = explained, root.shape[1], span.own
         evidence = weigh(np.sum((root.T @ drawn) ** 2, axis=0), root.shape[1])
         groups.setdefault((span.cause, span.channel), []).append((evidence, span.price))
     testable = name in best  # what the log cannot test, nobody names
-    reached, k = best.pop(name, (0.0, 1))
+    reached, k, _ = best.pop(name, (0.0, 1, slice(0)))
     # its k - 1 other numbers fit nothing but noise
     truth = scores[-1] ** 2 / S[-1, -1] + 2.0 * rng.standard_gamma(0.5 * (k - 1), DRAWS)
-    found = _by_cause(groups, name, weigh(truth, k))
-    names, table = list(found), np.array([*found.values()])
-    inside, first, me = table > table.max(axis=0) - ODDS, np.argmax(table, axis=0), list(found).index(name)
-    apart = {cause: float(np.sqrt(max(S[-1, -1] - like, 0.0))) for cause, (like, _) in best.items()}
+    weighed = _by_cause(groups, name, weigh(truth, k))
+    names, table = list(weighed), np.array([*weighed.values()])
+    inside, first, me = table > table.max(axis=0) - ODDS, np.argmax(table, axis=0), names.index(name)
+    wanted = float(np.sqrt(S[-1, -1]))
+    rivals = [span for span in spans if span.cause != name]
+    left = {cause: with_another(S, own, rivals) for cause, (like, _, own) in best.items() if like}
+    apart = {cause: left[cause][cause] if like else wanted for cause, (like, _, _) in best.items()}
     return {
         "alone": float(np.mean((first == me) & (inside.sum(axis=0) == 1))) * testable,
         "inside": float(np.mean(inside[me])) * testable,
@@ -86,10 +92,11 @@ def ideal(
         "apart": apart,
         "unlike": min(apart.values()),
         "mimic": min(apart, key=lambda cause: apart[cause]),
+        "two": min(value for found in left.values() for value in found.values()),
     }
 
 
-class _Span(NamedTuple):
+class Span(NamedTuple):
     """One of a cause's hypotheses: its columns, and the log of how many others it stands for."""
 
     cause: str
@@ -100,7 +107,7 @@ class _Span(NamedTuple):
 
 def _information(
     one: Found, stall: Stall, ds: xr.Dataset, causes: Mapping[str, Cause], others: Mapping[str, Array]
-) -> tuple[list[_Span], Array]:
+) -> tuple[list[Span], Array]:
     """Fisher's information of every hypothesis' columns, with the truth's as the last one, calibration free."""
     problem = pose(take([ds], stall.stage.calibration), stall.stage.calibration)
     candidates = [c for cause in causes.values() for c in cause.candidates(problem)]
@@ -108,10 +115,10 @@ def _information(
     X = np.column_stack([table, *others.values(), one.signature])
     ends = np.cumsum([c.size for c in candidates]).tolist()
     spans = [
-        _Span(c.cause, c.channel, slice(end - c.size, end), float(np.log(c.trials)))
+        Span(c.cause, c.channel, slice(end - c.size, end), float(np.log(c.trials)))
         for c, end in zip(candidates, ends, strict=True)
     ]
-    spans += [_Span(cause, "", slice(k, k + 1), 0.0) for k, cause in enumerate(others, table.shape[1])]
+    spans += [Span(cause, "", slice(k, k + 1), 0.0) for k, cause in enumerate(others, table.shape[1])]
     return spans, X.T @ project(X, stall.columns, stall.stage.prior)
 
 
@@ -121,6 +128,17 @@ def weigh(ratio: Array, freedom: int) -> Array:
         return np.zeros_like(ratio)
     more = np.maximum(ratio, freedom)
     return np.asarray(0.5 * (more - freedom) - 0.5 * freedom * np.log(more / freedom))
+
+
+def with_another(S: Array, own: slice, spans: Sequence[Span]) -> dict[str, float]:
+    """Signal-to-noise of the truth (the last of S) that the columns at `own` leave with the best other of each cause."""
+    taken = S[:, own] @ _root(S[own, own])
+    S = S - taken @ taken.T
+    left: dict[str, float] = {}
+    for span in spans:
+        explained = float(np.sum((_root(S[span.own, span.own]).T @ S[span.own, -1:]) ** 2))
+        left[span.cause] = min(left.get(span.cause, np.inf), float(S[-1, -1]) - explained)
+    return {cause: float(np.sqrt(max(value, 0.0))) for cause, value in left.items()}
 
 
 def _root(S: Array) -> Array:
