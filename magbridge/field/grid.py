@@ -74,6 +74,8 @@ class AnomalyGrid:
         m above the ellipsoid at which the map holds.
     name : str, optional
         What errors call the grid: its file.
+    vertical : array_like, (ny, nx), optional
+        nT/m, by which the anomaly grows downward about that altitude; without, it is the same at every depth.
 
     Raises
     ------
@@ -89,6 +91,7 @@ class AnomalyGrid:
         sigma: ArrayLike = 0.0,
         altitude: float = nan,
         name: str = "grid",
+        vertical: ArrayLike | None = None,
     ) -> None:
         values = np.array(anomaly, float)
         x, flip_x = _axis(longitude, name, "longitude")
@@ -110,6 +113,7 @@ class AnomalyGrid:
             )
         self.name, self.altitude = name, float(altitude)
         self.longitude, self.latitude, self.anomaly, self.sigma = x, y, values, scatter
+        self.vertical = None if vertical is None else np.asarray(vertical, float)[order]
         self._x0, self._dx = float(x[0]), float(x[-1] - x[0]) / (x.size - 1)
         self._y0, self._dy = float(y[0]), float(y[-1] - y[0]) / (y.size - 1)
         self._whole = ~(hole[1:, 1:] | hole[1:, :-1] | hole[:-1, 1:] | hole[:-1, :-1])
@@ -118,17 +122,22 @@ class AnomalyGrid:
 
     @cached_property
     def _coefficients(self) -> Array:
-        """B-spline coefficients, (ny + 2, nx + 2): one beyond each edge, the curvature there being zero."""
-        from scipy.ndimage import spline_filter  # noqa: PLC0415  the live path runs without scipy
+        return _spline(filled(self.anomaly))
 
-        pad = [(min(PAD, n - 1),) * 2 for n in self.anomaly.shape]
-        padded = np.pad(filled(self.anomaly), pad, mode="reflect", reflect_type="odd")
-        coefficients: Array = spline_filter(padded, order=3, mode="mirror")
-        (a, _), (b, _) = pad
-        return np.ascontiguousarray(coefficients[a - 1 : -a + 1 or None, b - 1 : -b + 1 or None])
+    @cached_property
+    def _vertical(self) -> Array:
+        return np.zeros_like(self._coefficients) if self.vertical is None else _spline(self.vertical)
 
-    def look_up(self, longitude: float, latitude: float) -> Local[float]:
-        """Return the map around one place, all NaN off the map; the fast path of the filter."""
+    def look_up(self, longitude: float, latitude: float, depth: float = nan) -> Local[float]:
+        """Return the map around one place, all NaN off the map; the fast path of the filter.
+
+        Parameters
+        ----------
+        longitude, latitude : float
+            deg.
+        depth : float, optional
+            m below the surface; default the map's own height.
+        """
         u = ((longitude - self._x0 + 180.0) % 360.0 - 180.0) / self._dx
         if u < 0.0:  # a grid may span more than half the globe
             u += 360.0 / self._dx
@@ -142,9 +151,10 @@ class AnomalyGrid:
         s, t = u - j, v - i
         across = (WEIGHTS @ (1.0, s, s * s, s * s * s)).reshape(3, 4)
         along = (WEIGHTS @ (1.0, t, t * t, t * t * t)).reshape(3, 4)
-        (f, fx, fxx), (fy, fxy, _), (fyy, _, _) = (
-            along @ self._coefficients[i : i + 4, j : j + 4] @ across.T
-        ).tolist()
+        patch = self._coefficients[i : i + 4, j : j + 4]
+        if self.vertical is not None and (below := depth + self.altitude) == below:
+            patch = patch + below * self._vertical[i : i + 4, j : j + 4]
+        (f, fx, fxx), (fy, fxy, _), (fyy, _, _) = (along @ patch @ across.T).tolist()
         per_latitude, per_longitude = metres_per_degree(latitude)
         north, east = 1.0 / (per_latitude * self._dy), 1.0 / (per_longitude * self._dx)
         if self._even_sigma:
@@ -157,8 +167,16 @@ class AnomalyGrid:
             f, fy * north, fx * east, fyy * north * north, fxy * north * east, fxx * east * east, variance
         )
 
-    def evaluate(self, longitude: ArrayLike, latitude: ArrayLike) -> Local[Array]:
-        """Return the map around n places as arrays (n,), NaN off the map and for NaN positions."""
+    def evaluate(self, longitude: ArrayLike, latitude: ArrayLike, depth: ArrayLike = nan) -> Local[Array]:
+        """Return the map around n places as arrays (n,), NaN off the map and for NaN positions.
+
+        Parameters
+        ----------
+        longitude, latitude : array_like
+            deg.
+        depth : array_like, optional
+            m below the surface; default, and where it is NaN, the map's own height.
+        """
         lon, lat = np.broadcast_arrays(
             np.atleast_1d(np.asarray(longitude, float)), np.atleast_1d(np.asarray(latitude, float))
         )
@@ -175,9 +193,11 @@ class AnomalyGrid:
         s, t = u - j, v - i
         across, along = _weights(s), _weights(t)
         wide = self._coefficients.shape[1]
-        patch = self._coefficients.ravel()[
-            (wide * i + j) + (wide * np.arange(4)[:, None] + np.arange(4))[..., None]
-        ]
+        window = (wide * i + j) + (wide * np.arange(4)[:, None] + np.arange(4))[..., None]
+        patch = self._coefficients.ravel()[window]
+        if self.vertical is not None:
+            below = np.asarray(depth, float) + self.altitude
+            patch = patch + np.where(np.isnan(below), 0.0, below) * self._vertical.ravel()[window]
         lines = (across[:, None] * patch).sum(
             axis=2
         )  # (3, 4, n): each row of the patch at s, with its slopes
@@ -302,6 +322,17 @@ def _axis(values: ArrayLike, name: str, what: str) -> tuple[Array, bool]:
     if step <= 0.0 or np.abs(axis - even).max() > EVEN * step:
         raise FormatError(name, "expected evenly spaced coordinates in order", column=what)
     return even, flip
+
+
+def _spline(values: Array) -> Array:
+    """Return B-spline coefficients (ny + 2, nx + 2): one beyond each edge, the curvature there being zero."""
+    from scipy.ndimage import spline_filter  # noqa: PLC0415  the live path runs without scipy
+
+    pad = [(min(PAD, n - 1),) * 2 for n in values.shape]
+    padded = np.pad(values, pad, mode="reflect", reflect_type="odd")
+    coefficients: Array = spline_filter(padded, order=3, mode="mirror")
+    (a, _), (b, _) = pad
+    return np.ascontiguousarray(coefficients[a - 1 : -a + 1 or None, b - 1 : -b + 1 or None])
 
 
 def _weights(t: Array) -> Array:

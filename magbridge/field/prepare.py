@@ -1,26 +1,22 @@
 """Several surveys to one map: continued to one altitude, merged, masked, smoothed (section 4 of the paper).
 
-The continuation is harmonica's; the pictures show every step, because a map is looked at before it is used.
+The pictures show every step, because a map is looked at before it is used.
 """
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from math import isfinite
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from magbridge.errors import MissingExtra, OutOfRange
-from magbridge.field.earth import metres_per_degree
-from magbridge.field.grid import AnomalyGrid, filled
+from magbridge.errors import OutOfRange
+from magbridge.field.continuation import continued
+from magbridge.field.grid import AnomalyGrid
 from magbridge.files import atomic_path
-
-if TYPE_CHECKING:
-    import xarray as xr
 
 __all__ = ["Step", "continue_upward", "draw_steps", "hanning", "merge", "prepare"]
 
@@ -87,50 +83,14 @@ def prepare(
 
 
 def continue_upward(grid: AnomalyGrid, height: float) -> AnomalyGrid:
-    """Return the grid as a survey `height` metres (>= 0) higher would have seen it; holes stay holes.
-
-    Notes
-    -----
-    ``F(k) -> F(k) exp(-|k| h)`` (Blakely 1995, eq. 12.8). The field is mirrored at its edges first, so that
-    the transform's wrap-around joins equal values.
-    """
+    """Return the grid as a survey `height` metres (>= 0) higher would have seen it; holes stay holes."""
     if height < 0.0:
         raise OutOfRange(
             "altitude",
             f"{grid.altitude + height:.0f} m",
             f"{grid.name} was surveyed at {grid.altitude:.0f} m: a field can only be continued upward",
         )
-    import xarray as xr  # noqa: PLC0415
-
-    upward_continuation = _harmonica()
-    ny, nx = grid.anomaly.shape
-    mirrored = np.pad(filled(grid.anomaly), ((0, ny), (0, nx)), mode="symmetric")
-    per_latitude, per_longitude = metres_per_degree(float(np.mean(grid.latitude)))
-    step_y, step_x = np.diff(grid.latitude[:2])[0], np.diff(grid.longitude[:2])[0]
-    plane = xr.DataArray(
-        mirrored,
-        {
-            "northing": np.arange(2 * ny) * step_y * per_latitude,
-            "easting": np.arange(2 * nx) * step_x * per_longitude,
-        },
-        ("northing", "easting"),
-    )
-    with warnings.catch_warnings():  # harmonica 0.7 on a newer xarray: about names, not numbers
-        warnings.simplefilter("ignore", FutureWarning)
-        raised = upward_continuation(plane, height).to_numpy()[:ny, :nx]
-    return _like(grid, np.where(np.isnan(grid.anomaly), np.nan, raised), altitude=grid.altitude + height)
-
-
-def _harmonica() -> Callable[[xr.DataArray, float], xr.DataArray]:
-    """Return the library's continuation; it pulls in numba, which takes seconds."""
-    try:
-        with warnings.catch_warnings():  # xrft's docstrings have stray backslashes
-            warnings.simplefilter("ignore")
-            from harmonica import upward_continuation  # noqa: PLC0415
-    except ImportError:
-        raise MissingExtra("harmonica", "grids") from None
-    continuation: Callable[[xr.DataArray, float], xr.DataArray] = upward_continuation
-    return continuation
+    return continued(grid, -(grid.altitude + height)).grid
 
 
 def merge(grids: Sequence[AnomalyGrid], spacing: float | None = None) -> AnomalyGrid:
@@ -218,9 +178,8 @@ def _masked(grid: AnomalyGrid, polygon: Array) -> AnomalyGrid:
     return _like(grid, np.where(inside, grid.anomaly, np.nan))
 
 
-def _like(grid: AnomalyGrid, values: Array, altitude: float | None = None) -> AnomalyGrid:
-    level = grid.altitude if altitude is None else altitude
-    return AnomalyGrid(grid.longitude, grid.latitude, values, grid.sigma, level, grid.name)
+def _like(grid: AnomalyGrid, values: Array) -> AnomalyGrid:
+    return AnomalyGrid(grid.longitude, grid.latitude, values, grid.sigma, grid.altitude, grid.name)
 
 
 def _cover(axes: Sequence[Array], step: float) -> Array:

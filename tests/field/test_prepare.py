@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from magbridge.errors import OutOfRange
+from magbridge.field.continuation import continued
 from magbridge.field.earth import metres_per_degree
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.prepare import continue_upward, draw_steps, hanning, merge, prepare
@@ -39,7 +40,39 @@ def test_continuation_keeps_a_constant_and_the_holes():
     np.testing.assert_allclose(raised.anomaly[~np.isnan(values)], 7.0, atol=1e-9)
 
 
-def test_nothing_is_continued_downward():
+@pytest.mark.parametrize("depth", [0.0, 60.0, 150.0])
+def test_below_a_map_the_error_is_told(depth: float) -> None:
+    """Half of what the height takes off comes back at least, and what does not is foretold within a third."""
+    low = AnomalyGrid(LON, LAT, monopole(90.0), altitude=90.0)
+    there = continued(low, depth)
+    middle = slice(15, -15), slice(20, -20)
+    truth = monopole(-depth)
+    error = (there.grid.anomaly - truth)[middle]
+    assert np.std(error) < 0.5 * np.std((low.anomaly - truth)[middle])
+    assert there.grid.altitude == -depth
+    everywhere = np.sqrt(np.mean((there.grid.anomaly - truth) ** 2))
+    assert there.sigma == pytest.approx(everywhere, rel=0.35)
+    assert 200.0 < there.length < 2_000.0, "as wide as the pole is deep"
+
+
+def test_a_dive_is_followed_through_the_map() -> None:
+    """About the middle of a dive the vertical gradient takes most of what the depth changes."""
+    there = continued(AnomalyGrid(LON, LAT, monopole(0.0), altitude=0.0), np.linspace(0.0, 120.0))
+    lon, lat = (axis[15:-15:5, 20:-20:5].ravel() for axis in np.meshgrid(LON, LAT))
+    for depth in (0.0, 120.0):
+        truth = AnomalyGrid(LON, LAT, monopole(-depth)).at(lon, lat)
+        followed = there.grid.evaluate(lon, lat, depth).anomaly
+        assert np.std(followed - truth) < 0.3 * np.std(there.grid.at(lon, lat) - truth)
+        one = there.grid.look_up(lon[7], lat[7], depth)
+        np.testing.assert_allclose(one.anomaly, followed[7], rtol=1e-12)
+
+
+def test_a_map_of_unknown_height_stays_as_it_is() -> None:
+    grid = AnomalyGrid(LON, LAT, monopole(90.0))
+    assert continued(grid, 50.0) == (grid, 0.0, np.inf)
+
+
+def test_nothing_is_prepared_downward():
     with pytest.raises(OutOfRange, match="surveyed at 90 m: a field can only be continued upward"):
         prepare([AnomalyGrid(LON, LAT, monopole(90.0), altitude=90.0, name="a.grd")], altitude=60.0)
 

@@ -1,0 +1,104 @@
+r"""The field at another height: upward exactly, downward as far as a map can say, with what that leaves out.
+
+A map is flown in the air, or continued to one altitude above the sea; the vehicle is below. Every wave of a
+field whose sources lie deeper decays with height (Blakely 1995, eq. 12.8),
+
+.. math:: \hat T(\mathbf k, z + h) = \hat T(\mathbf k, z)\, e^{-|\mathbf k| h} .
+
+Downward the inverse would blow up what the survey did not see. With p = 1 - exp(-|k| h) it is a series,
+exp(|k| h) = 1 / (1 - p) = 1 + p + p² + ...: its first two terms, "below it changes by as much as above", at most
+double the map's own noise; the terms after them are what is left out. About that level the field goes on with
+its vertical gradient, of spectrum |k| T.
+"""
+
+from __future__ import annotations
+
+from math import isfinite, sqrt
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from magbridge.field.earth import metres_per_degree
+from magbridge.field.grid import AnomalyGrid, filled
+
+__all__ = ["Continued", "continued"]
+
+Array = NDArray[np.float64]
+
+TERMS = 10
+"""Of the series: those beyond belong to waves that no survey from above sees."""
+LEVELS = (0.1, 0.3, 0.5, 0.7, 0.9)
+"""Quantiles of the depth at which the error is taken."""
+
+
+class Continued(NamedTuple):
+    """A grid at another height, and how far it can be believed.
+
+    Attributes
+    ----------
+    grid : AnomalyGrid
+    sigma : float
+        nT, 1-sigma of what the continuation leaves out; 0 upward to one level.
+    length : float
+        m, over which that error reaches: its correlation falls as exp(-r²/length²) at first.
+    """
+
+    grid: AnomalyGrid
+    sigma: float
+    length: float
+
+
+def continued(grid: AnomalyGrid, depth: ArrayLike) -> Continued:
+    """Return a grid as it is about a level.
+
+    Parameters
+    ----------
+    grid : AnomalyGrid
+        One of unknown altitude is returned as it is. Holes stay holes.
+    depth : array_like, (n,)
+        m below the surface, all at which it will be used; negative is above. Their mean is the level.
+
+    Notes
+    -----
+    The cosine transform mirrors the field at its edges, so that the wrap-around joins equal values. Of the error's
+    spectrum E(k), sigma² is the mean of |E|², and length² = 2 sigma² / mean of |k E|².
+    """
+    from scipy.fft import dctn, idctn  # noqa: PLC0415 - the live path runs without scipy
+
+    used = np.asarray(depth, float)
+    level = float(used.mean())
+    height = grid.altitude + level  # downward
+    if not isfinite(height):
+        return Continued(grid, 0.0, float("inf"))
+    k = _wavenumber(grid)
+    surveyed = dctn(filled(grid.anomaly), norm="ortho")
+    gain = 1 - np.expm1(-k * height) if height > 0 else np.exp(k * height)
+    error2 = np.zeros_like(k)
+    for below in np.quantile(used, LEVELS) - level:
+        linear = gain * (1 + k * below)
+        error2 += (surveyed * (_growth(k, height + below) - linear)) ** 2 / len(LEVELS)
+    hole = np.isnan(grid.anomaly)
+    anomaly, vertical = (np.where(hole, np.nan, idctn(surveyed * g, norm="ortho")) for g in (gain, k * gain))
+    there = AnomalyGrid(
+        grid.longitude, grid.latitude, anomaly, grid.sigma, -level, grid.name, filled(vertical)
+    )
+    sigma2, steepness2 = float(error2.mean()), float((k * k * error2).mean())
+    return Continued(there, sqrt(sigma2), sqrt(2 * sigma2 / steepness2) if steepness2 else float("inf"))
+
+
+def _growth(k: Array, height: float) -> Array:
+    """Return exp(k height), downward its series of :data:`TERMS`."""
+    if height <= 0:
+        return np.asarray(np.exp(k * height))
+    p = -np.expm1(-k * height)
+    return np.asarray((1 - p**TERMS) / (1 - p))
+
+
+def _wavenumber(grid: AnomalyGrid) -> Array:
+    """Return |k| (ny, nx), rad/m, of the cosine transform's terms."""
+    per_latitude, per_longitude = metres_per_degree(float(np.mean(grid.latitude)))
+    ny, nx = grid.anomaly.shape
+    height = ny * per_latitude * (grid.latitude[1] - grid.latitude[0])
+    width = nx * per_longitude * (grid.longitude[1] - grid.longitude[0])
+    return np.asarray(np.hypot(np.pi / height * np.arange(ny)[:, None], np.pi / width * np.arange(nx)))
