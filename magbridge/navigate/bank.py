@@ -50,9 +50,13 @@ class Bank:
         m, the position sigma to which a hypothesis is cut.
     gate : float
         Innovation squared over variance beyond which a hypothesis does not learn from a measurement.
+    level : float, optional
+        nT, 1-sigma of the bias for half of the hypotheses, at equal odds: what it is if it is not what P says.
     """
 
-    def __init__(self, grid: AnomalyGrid, x: Array, P: Array, resolution: float, gate: float) -> None:
+    def __init__(
+        self, grid: AnomalyGrid, x: Array, P: Array, resolution: float, gate: float, level: float = 0.0
+    ) -> None:
         self._grid, self._gate = grid, gate
         self._elsewhere = float(np.nanmean(grid.anomaly)), float(np.nanvar(grid.anomaly))
         self._updates = 0
@@ -60,6 +64,12 @@ class Bank:
         self.blur = 0.0
         """nT², by which the map's curvature under the hypotheses' spread has blurred the last measurement."""
         self.w, self.x, self.P = self._cut(x, P)
+        if level**2 > P[4, 4]:
+            free = P.copy()
+            free[4], free[:, 4], free[4, 4] = 0.0, 0.0, level**2
+            both = zip((self.w, self.x, self.P), self._cut(x, free), strict=True)
+            self.w, self.x, self.P = (np.concatenate(pair, axis=-1) for pair in both)
+            self.w /= 2.0
 
     def __len__(self) -> int:
         return self.w.size

@@ -5,13 +5,12 @@ from __future__ import annotations
 from math import inf, isfinite, log, nan
 
 import numpy as np
-from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from magbridge.field.earth import offset
 from magbridge.field.grid import AnomalyGrid
 from magbridge.navigate.bank import Bank, widest
-from magbridge.navigate.model import Block, Options, prior, resolution, transition
+from magbridge.navigate.model import Block, Options, any_level, prior, resolution, transition
 from magbridge.navigate.record import Jump, State
 from magbridge.navigate.tracker import Innovation, Tracker
 from magbridge.navigate.watch import Unmapped, Verdict, Watch, distance
@@ -25,10 +24,8 @@ UNINFORMED = 0.8  # of what dead reckoning alone would have: the field has said 
 REACH = 300.0  # m, the least that the watch looks around
 JOIN, SPLIT = 1.2, 1.5  # of the map's resolution: below one hypothesis will do, above it will not
 FINER = 0.8  # of the resolution: so much better a measurement must be to be worth a finer one
-LEVEL_LASTS = 10.0  # times as long as a calibration's bias
 DOUBTFUL = 1.0  # log odds: another place explains the field better, if not yet beyond doubt
 SPREADS = (2.0, 4.0, 2.0, 8.0)  # times its reach, of the searches after each other
-DOUBTED = 2  # searches in vain, after which the map's level is doubted too
 
 
 class Estimate:
@@ -45,7 +42,8 @@ class Estimate:
     x, P : ndarray, (6,), (6, 6)
         Estimate and covariance, of :mod:`~magbridge.navigate.model`'s states.
     vouched : bool
-        The filter stands by the position, and its rivals have come to it too since it began or moved to another place.
+        The filter stands by the position: the map describes the field, at the odds at which it would be given up, and
+        the filter began no narrower than its rivals do, or they have come to the same place since.
     moved : tuple of ndarray
         F and Q from the update before to the last one, for a smoother.
     jumps : list of Jump
@@ -53,7 +51,7 @@ class Estimate:
     """
 
     def __init__(self, grid: AnomalyGrid, options: Options) -> None:
-        self.grid, self.options = grid, options
+        self.grid, self.options, self._claimed = grid, options, options
         self.state = State.OFF
         self.x, self.P = prior(options)
         self.vouched = False
@@ -69,7 +67,8 @@ class Estimate:
         self._alone = self.P[:4, :4].copy()  # covariance of dead reckoning alone
         self._lost = False
         self._searches = 0
-        self._confirmed = False
+        self._confirmed = False  # by rivals that began wider
+        self._described = False  # is the field by the map
 
     @property
     def odds(self) -> float:
@@ -86,6 +85,7 @@ class Estimate:
         self._time_us = time_us
         self.x, self.P = prior(self.options, sigma)
         self._alone = self.P[:4, :4].copy()
+        self._confirmed = sigma >= self._reach()
         self.state = State.SEARCHING
 
     def correct(self, there: Array, sigma: float) -> None:
@@ -119,8 +119,9 @@ class Estimate:
             self._judge(block, seconds, metres, seen.log_likelihood)
         self._choose(on_the_map)
         self._reported = True
-        sure = self._confirmed and self.odds < DOUBTFUL and widest(self.P) < self.options.vouch_sigma
-        self.vouched = self.state is State.TRACKING and sure
+        proven = self._confirmed and self._described
+        doubted = self.odds > DOUBTFUL or self._nowhere > 0.0 or widest(self.P) > self.options.vouch_sigma
+        self.vouched = self.state is State.TRACKING and proven and not doubted
         return seen
 
     def predict(self, time_us: int, travelled: float) -> tuple[float, float]:
@@ -180,12 +181,13 @@ class Estimate:
         if self._nowhere > log(self.options.doubt):
             self._search_anew()
             return
+        self._described |= self._nowhere <= -log(self.options.doubt)
         if not self._compact(widest(self.P)):
             return
         if self._watch is None:
-            reach = self._reach() * (2.0 if self._lost else 1.0)
+            reach, level = self._reach() * (2.0 if self._lost else 1.0), self._claimed.bias_sigma
             self._watch = Watch(
-                self.grid, self.options, self.x, self.P, block.time_us, reach, self._resolution
+                self.grid, self.options, self.x, self.P, block.time_us, reach, self._resolution, level
             )
             return
         verdict = self._watch.step(block, metres, self.x, self.P)
@@ -195,22 +197,22 @@ class Estimate:
             self._read()
         elif verdict is Verdict.HOLDS:
             self._watch, self._confirmed = None, True
-            if self._nowhere < -0.5 * log(self.options.doubt):  # and the map does describe the field
+            if self._described:
                 self._lost, self._searches = False, 0
 
     def _search_anew(self) -> None:
-        """Look around, further, and then for a map of another level."""
-        self._nowhere, self._lost = 0.0, True
-        if self._searches == DOUBTED and self.options.bias_sigma < self.grid.rms:
-            self.options = replace(
-                self.options, bias_sigma=self.grid.rms, bias_time=LEVEL_LASTS * self.options.bias_time
-            )
+        """Look around, further each time, and at any level: where neither fits, the level may be what is wrong."""
+        self._nowhere, self._described, self._lost = 0.0, False, True
+        self.options = any_level(self.options, self.grid)
         self._unmapped = Unmapped(self.grid, self.options)
-        x, P = prior(self.options)
+        x, P = prior(self._claimed)
         P[:4, :4] = self._alone
         P[:2, :2] += (self._reach() * SPREADS[self._searches % len(SPREADS)]) ** 2 * np.eye(2)
         self._searches += 1
-        self._begin(x, P, Verdict.NOWHERE.value)
+        self._jump(x, Verdict.NOWHERE.value)
+        level = self.options.bias_sigma
+        self._filter = Bank(self.grid, x, P, self._resolution, self.options.gate, level)
+        self.x, self.P = x, P
 
     def _compact(self, width: float) -> bool:
         """Return whether a position of this spread is one place, seen on the scale of the map."""
@@ -218,8 +220,8 @@ class Estimate:
 
     def _reach(self) -> float:
         """Return how far around itself the filter is doubted: m."""
-        alone = widest(self._alone)
-        return max(REACH, alone, min(0.5 * self.grid.correlation_length, 5.0 * REACH))
+        length = self.grid.correlation_length * (0.5 if self._confirmed else 1.0)
+        return max(REACH, widest(self._alone), min(length, 5.0 * REACH))
 
     def _choose(self, on_the_map: bool) -> None:
         """Hand over from the bank to one filter, or back; and say what holds."""

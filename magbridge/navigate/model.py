@@ -15,7 +15,7 @@ vehicle does, and one model serves every estimator, the smoother and the bound:
 
 from __future__ import annotations
 
-from math import exp, hypot, log, sqrt
+from math import exp, hypot, log, nan, sqrt
 from typing import NamedTuple
 
 import msgspec
@@ -29,6 +29,7 @@ from magbridge.field.grid import AnomalyGrid
 __all__ = [
     "Block",
     "Options",
+    "any_level",
     "block_length",
     "informed",
     "measurement_row",
@@ -107,6 +108,8 @@ class Block(NamedTuple):
         nT², of that mean.
     slope_north, slope_east : float
         nT/m, of the main field.
+    depth : float
+        m, their mean; NaN where it is not known.
     """
 
     time_us: int
@@ -116,6 +119,7 @@ class Block(NamedTuple):
     variance: float
     slope_north: float
     slope_east: float
+    depth: float = nan
 
 
 def informed(options: Options, calibration: Calibration, sigma: float) -> Options:
@@ -149,6 +153,20 @@ def informed(options: Options, calibration: Calibration, sigma: float) -> Option
         bias_sigma=hypot(options.bias_sigma, slow),
         bias_time=min(options.bias_time, lasts) if slow > options.bias_sigma else options.bias_time,
     )
+
+
+def any_level(options: Options, grid: AnomalyGrid) -> Options:
+    """Return options to which the field's level says nothing any more, and its changes as much as before.
+
+    Notes
+    -----
+    A Gauss-Markov process wanders by ``2σ²/τ`` a second: σ grows to the map's own scatter, τ with σ².
+    """
+    o = options
+    if o.bias_sigma >= grid.rms:
+        return o
+    lasts = o.bias_time * (grid.rms / max(o.bias_sigma, 1e-3 * grid.rms)) ** 2
+    return replace(o, bias_sigma=grid.rms, bias_time=lasts)
 
 
 def prior(options: Options, position_sigma: float | None = None) -> tuple[Array, Array]:

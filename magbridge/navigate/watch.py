@@ -106,6 +106,8 @@ class Watch:
         m, 1-sigma of where else the vehicle might be.
     resolution : float
         m, of the banks.
+    level : float
+        nT, 1-sigma of the bias that was claimed; where `options` have more, half of *elsewhere* may be at any level.
     """
 
     def __init__(
@@ -117,17 +119,18 @@ class Watch:
         time_us: int,
         reach: float,
         resolution: float,
+        level: float,
     ) -> None:
         wide = P.copy()
         wide[:2, :2] += reach**2 * np.eye(2)
-        for state, sigma in ((2, options.current_sigma), (3, options.current_sigma), (4, options.bias_sigma)):
+        for state, sigma in ((2, options.current_sigma), (3, options.current_sigma), (4, level)):
             wide[state, state] = max(wide[state, state], sigma**2)
         self._options, self._time_us = options, time_us
         self._threshold = log(options.doubt)
         self._waiting: list[Block] = []
         self._metres, self._step = 0.0, STRIDES * block_length(grid)
         self.here = Bank(grid, x, P, resolution, options.gate)
-        self.elsewhere = Bank(grid, x, wide, resolution, options.gate)
+        self.elsewhere = Bank(grid, x, wide, resolution, options.gate, options.bias_sigma)
         self.odds = 0.0
         """Natural logarithm of the odds of *elsewhere* against *here*."""
 
