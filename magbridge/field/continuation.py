@@ -6,8 +6,8 @@ field whose sources lie deeper decays with height (Blakely 1995, eq. 12.8),
 .. math:: \hat T(\mathbf k, z + h) = \hat T(\mathbf k, z)\, e^{-|\mathbf k| h} .
 
 Downward the inverse would blow up what the survey did not see. With p = 1 - exp(-|k| h) it is a series,
-exp(|k| h) = 1 / (1 - p) = 1 + p + p² + ...: its first two terms, "below it changes by as much as above", at most
-double the map's own noise; the terms after them are what is left out. About that level the field goes on with
+exp(|k| h) = 1 / (1 - p) = 1 + p + p² + ...: its first three terms at most treble the map's own noise; those after
+them are what is left out. About that level the field goes on with
 its vertical gradient, of spectrum |k| T.
 """
 
@@ -26,8 +26,8 @@ __all__ = ["Continued", "continued"]
 
 Array = NDArray[np.float64]
 
-TERMS = 10
-"""Of the series: those beyond belong to waves that no survey from above sees."""
+SURE, TERMS = 3, 10
+"""Terms of the series that are believed, and that there are: those beyond are waves that no survey from above sees."""
 LEVELS = (0.1, 0.3, 0.5, 0.7, 0.9)
 """Quantiles of the depth at which the error is taken."""
 
@@ -73,11 +73,11 @@ def continued(grid: AnomalyGrid, depth: ArrayLike) -> Continued:
         return Continued(grid, 0.0, float("inf"))
     k = _wavenumber(grid)
     surveyed = dctn(filled(grid.anomaly), norm="ortho")
-    gain = 1 - np.expm1(-k * height) if height > 0 else np.exp(k * height)
+    gain = _growth(k, height, SURE)
     error2 = np.zeros_like(k)
     for below in np.quantile(used, LEVELS) - level:
         linear = gain * (1 + k * below)
-        error2 += (surveyed * (_growth(k, height + below) - linear)) ** 2 / len(LEVELS)
+        error2 += (surveyed * (_growth(k, height + below, TERMS) - linear)) ** 2 / len(LEVELS)
     hole = np.isnan(grid.anomaly)
     anomaly, vertical = (np.where(hole, np.nan, idctn(surveyed * g, norm="ortho")) for g in (gain, k * gain))
     there = AnomalyGrid(
@@ -87,12 +87,12 @@ def continued(grid: AnomalyGrid, depth: ArrayLike) -> Continued:
     return Continued(there, sqrt(sigma2), sqrt(2 * sigma2 / steepness2) if steepness2 else float("inf"))
 
 
-def _growth(k: Array, height: float) -> Array:
-    """Return exp(k height), downward its series of :data:`TERMS`."""
+def _growth(k: Array, height: float, terms: int) -> Array:
+    """Return exp(k height), downward the first `terms` of its series."""
     if height <= 0:
         return np.asarray(np.exp(k * height))
     p = -np.expm1(-k * height)
-    return np.asarray((1 - p**TERMS) / (1 - p))
+    return np.asarray((1 - p**terms) / (1 - p))
 
 
 def _wavenumber(grid: AnomalyGrid) -> Array:

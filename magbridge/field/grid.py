@@ -218,15 +218,15 @@ class AnomalyGrid:
         value, slope_north, slope_east, north_north, north_east, east_east = parts
         return Local(value, slope_north, slope_east, north_north, north_east, east_east, variance)
 
-    def at(self, longitude: ArrayLike, latitude: ArrayLike) -> Array:
-        """Return the anomaly at n places, nT, (n,).
+    def at(self, longitude: ArrayLike, latitude: ArrayLike, depth: ArrayLike = nan) -> Array:
+        """Return the anomaly at n places, nT, (n,): see :meth:`evaluate`.
 
         Raises
         ------
         OutOfRange
             A place that the map does not cover.
         """
-        anomaly = self.evaluate(longitude, latitude).anomaly
+        anomaly = self.evaluate(longitude, latitude, depth).anomaly
         lon, lat = np.broadcast_arrays(np.atleast_1d(longitude), np.atleast_1d(latitude))
         bad = np.flatnonzero(np.isnan(anomaly) & ~np.isnan(lon) & ~np.isnan(lat))
         if bad.size:

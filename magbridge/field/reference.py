@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magbridge.errors import FormatError
+from magbridge.field.continuation import continued
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.igrf import igrf, total_field
 
@@ -28,7 +29,7 @@ def reference_field(deployment: xr.Dataset, grid: AnomalyGrid | None = None, sit
         On ``time``; the column ``reference_field`` counts where it holds a number, the rest comes from
         ``latitude longitude depth``.
     grid : AnomalyGrid, optional
-        Added to the main field.
+        Added to the main field; if its altitude is known, continued to the deployment's depth.
     site_bias : float, optional
         nT, what the main-field model misses at the site; added where the field is modelled.
 
@@ -46,7 +47,8 @@ def reference_field(deployment: xr.Dataset, grid: AnomalyGrid | None = None, sit
 
     Notes
     -----
-    ``H_e = |IGRF(φ, λ, depth, t)| + anomaly(φ, λ) + site bias`` (eq. 4). The depth counts: about 0.02 nT/m.
+    ``H_e = |IGRF(φ, λ, depth, t)| + anomaly(φ, λ, depth) + site bias``: eq. 4, whose anomaly is the map's at its own
+    altitude. The depth counts, about 0.02 nT/m of the main field and far more of the anomalies of shallow rock.
     """
     size = deployment.sizes["time"]
     given = (
@@ -71,7 +73,8 @@ def reference_field(deployment: xr.Dataset, grid: AnomalyGrid | None = None, sit
         longitude[unknown], latitude[unknown], depth[unknown], time[unknown]
     )
     if grid is not None:
-        reference[unknown] += grid.at(longitude[unknown], latitude[unknown])
+        there = continued(grid, depth[unknown]).grid
+        reference[unknown] += there.at(longitude[unknown], latitude[unknown], depth[unknown])
     return reference
 
 
