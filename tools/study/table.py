@@ -60,6 +60,12 @@ def unlike(row: Row) -> bool:
     return all(t is not None and t["two"] >= APART for t in row["theory"])
 
 
+def _of_theory(rows: Sequence[Row], chance: Callable[[str, Row], float]) -> str:
+    """Theory's mean chance for all that is hidden in a case, as if one did not disturb the other."""
+    known = [[chance(*one) for one in zip(r["names"], r["theory"], strict=True)] for r in rows]
+    return f"{100 * np.mean([np.prod(chances) for chances in known]):.0f} %" if known else "unknown"
+
+
 def _mean_set(rows: Sequence[Row]) -> str:
     sizes = [len(sets_of(r)) for r in rows if r["found"]]
     return f"{np.mean(sizes):.2f} | {len(sizes)}" if sizes else "not run | 0"
@@ -104,7 +110,9 @@ def lines(rows: Sequence[Row]) -> list[str]:
     loud = part.get("named", [])
     clear, other = [r for r in loud if allowed(r)], [r for r in loud if not allowed(r)]
     add("S/N 8: named alone and right, where theory allows 95 %", "at least 90 %", share(clear, right_alone))
-    add("... elsewhere the set holds the truth", "at least 97 %", share(other, holds))
+    there = [r for r in other if all(r["theory"])]
+    expected = _of_theory(there, lambda _, t: t["inside"])
+    add("... elsewhere the set holds the truth", f"at least 97 % (theory {expected})", share(other, holds))
     add("... mean size of the set where separable", "at most 1.5", _mean_set(clear))
     sizes = [r["theory"][0]["size"] for r in other if r["theory"][0]]
     add("... elsewhere", f"theory {np.mean(sizes) if sizes else np.nan:.2f}", _mean_set(other))
@@ -126,10 +134,14 @@ def lines(rows: Sequence[Row]) -> list[str]:
     for label, chosen in (("each nameable alone", apart), ("any two", pairs)):
         add(
             f"two at S/N 10, {label}: both named",
-            "at least 80 %",
+            f"at least 80 % (theory {_of_theory(chosen, lambda name, t: t['first'].get(name, 0.0))})",
             share(chosen, lambda r: set(r["names"]) <= causes_of(r)),
         )
-        add("... both in the sets", "", share(chosen, holds))
+        add(
+            "... both in the sets",
+            f"theory {_of_theory(chosen, lambda _, t: t['inside'])}",
+            share(chosen, holds),
+        )
     return [*out, "", *_by_cause(part)]  # fmt: skip
 
 
