@@ -156,6 +156,8 @@ class Navigation(Table, frozen=True):
         ``GLOBAL_POSITION_SENSOR`` or ``ODOMETRY`` (PX4).
     rate : float
         Hz of the fixes, dead-reckoned between updates; 0 is with each update. Default 5 for ``ODOMETRY``, else 0.
+    depth : float
+        m, of the deepest dives; a map whose altitude is known is continued to the middle of them.
     options : dict
         How well things are known beforehand: :class:`magbridge.navigate.Options`.
     """
@@ -163,6 +165,7 @@ class Navigation(Table, frozen=True):
     map: str
     fix: str
     rate: NotNegative | None = None
+    depth: NotNegative = 0.0
     options: dict[str, Any] = msgspec.field(default_factory=dict)
 
 

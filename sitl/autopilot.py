@@ -19,6 +19,8 @@ __all__ = ["Autopilot"]
 HEARTBEAT_US = 1_000_000
 SUBMARINE, GENERIC, ACTIVE = 12, 0, 4
 """MAV_TYPE, MAV_AUTOPILOT and MAV_STATE of its heartbeat."""
+FIX_3D, GPS_ACCURACY = 3, 10_000
+"""GPS_FIX_TYPE and mm of its receiver."""
 
 
 class Autopilot:
@@ -57,24 +59,29 @@ class Autopilot:
             for name, telemetry in self._telemetry.items()
             if isfinite(row.get(name, nan))
         ]
-        attitude = [row.get(name, nan) for name in ("roll", "pitch", "heading")]
-        if all(map(isfinite, attitude)):
+        if attitude := _finite(row, "roll", "pitch", "heading"):
             roll, pitch, yaw = map(radians, attitude)
             frames.append(self._codec.pack("ATTITUDE", time_boot_ms=boot_ms, roll=roll, pitch=pitch, yaw=yaw))
-        latitude, longitude = row.get("latitude", nan), row.get("longitude", nan)
-        if isfinite(latitude) and isfinite(longitude):
-            depth = row.get("depth", nan)
+        return frames + self._position(row, boot_ms)
+
+    def _position(self, row: Mapping[str, float], boot_ms: int) -> list[bytes]:
+        """Return what tells position and motion: where it believes to be, local track, speed, GPS."""
+        pack, frames = self._codec.pack, []
+        depth = row.get("depth", nan)
+        if known := _finite(row, "latitude", "longitude"):
+            latitude, longitude = (round(angle * 1e7) for angle in known)
             altitude = round(-1e3 * depth) if isfinite(depth) else 0
-            frames.append(
-                self._codec.pack(
-                    "GLOBAL_POSITION_INT",
-                    time_boot_ms=boot_ms,
-                    lat=round(latitude * 1e7),
-                    lon=round(longitude * 1e7),
-                    alt=altitude,
-                    relative_alt=altitude,
-                )
-            )
+            place = {"lat": latitude, "lon": longitude, "alt": altitude, "relative_alt": altitude}
+            frames.append(pack("GLOBAL_POSITION_INT", time_boot_ms=boot_ms, **place))
+        if known := _finite(row, "local_north", "local_east"):
+            north, east = known
+            frames.append(pack("LOCAL_POSITION_NED", time_boot_ms=boot_ms, x=north, y=east, z=depth))
+        if known := _finite(row, "water_speed"):
+            frames.append(pack("VFR_HUD", airspeed=known[0]))
+        if known := _finite(row, "gps_latitude", "gps_longitude"):
+            latitude, longitude = (round(angle * 1e7) for angle in known)
+            fix = {"lat": latitude, "lon": longitude, "fix_type": FIX_3D, "h_acc": GPS_ACCURACY}
+            frames.append(pack("GPS_RAW_INT", time_usec=boot_ms * 1000, **fix))
         return frames
 
     def _parameter(self, telemetry: Telemetry, value: float, boot_ms: int) -> bytes:
@@ -92,3 +99,9 @@ class Autopilot:
             values[index] = number
             number = bytes(values) if field.code == "B" else values
         return self._codec.pack(telemetry.message, **{**fields, name: number})
+
+
+def _finite(row: Mapping[str, float], *names: str) -> tuple[float, ...]:
+    """Return the row's values under these names; nothing if one of them lacks."""
+    values = tuple(row.get(name, nan) for name in names)
+    return values if all(map(isfinite, values)) else ()

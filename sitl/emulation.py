@@ -52,6 +52,10 @@ def emulate(deployment: xr.Dataset, config: Config) -> Iterator[Event]:
     ConfigError
         The instrument cannot be emulated.
     """
+    if config.navigation is not None:
+        from sitl.motion import with_motion  # noqa: PLC0415 - filterpy takes a second
+
+        deployment = with_motion(deployment)
     begin_us = start_us(deployment)
     autopilot = Autopilot(config, begin_us)
     times = deployment["time"].to_numpy().astype(float)

@@ -9,11 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magbridge.mavlink import Codec, spec
+from magbridge.mavlink.dialect import MAG_NAVIGATION_STATE
 from magbridge.records import Quality
 
 __all__ = ["Listener"]
 
-FIELD, TEXT = spec("MAG_FIELD"), spec("STATUSTEXT")
+FIELD, TEXT, NAVIGATION = spec("MAG_FIELD"), spec("STATUSTEXT"), spec("MAG_NAVIGATION")
 COLUMNS = {
     "time": "time_usec",
     "total_field": "total_field",
@@ -35,10 +36,13 @@ class Listener:
         Messages by name.
     said : list of str
         The STATUSTEXTs, in order.
+    navigation : Counter
+        Updates of the position by the field, by what the filter said of itself.
     """
 
     def __init__(self) -> None:
         self.said: list[str] = []
+        self.navigation: Counter[str] = Counter()
         self._counts: Counter[int] = Counter()
         self._codec = Codec(255, 190)
         self._fields = [FIELD.fields[name] for name in COLUMNS.values()]
@@ -57,6 +61,8 @@ class Listener:
                 self._values.extend(field.get(message.payload) for field in self._fields)
             elif message.id == TEXT.id:
                 self.said.append(message["text"])
+            elif message.id == NAVIGATION.id:
+                self.navigation[MAG_NAVIGATION_STATE(message["state"]).name.lower()] += 1
 
     def field(self) -> dict[str, NDArray[np.float64]]:
         """Return the corrected field, (n,) each: ``time`` in s since 1970 UTC, the rest in nT, ``quality``."""

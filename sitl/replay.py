@@ -135,6 +135,7 @@ def _play(
         "messages": dict(sorted(listener.counts.items())),
         "flags": listener.flags(),
         "said": listener.said,
+        "navigation": dict(listener.navigation),
         "span_s": float(times[-1] - times[0]),
         "seconds": seconds,
         "parts": told,
@@ -176,15 +177,14 @@ def tell(result: Result) -> str:
     )
     lines = [first]
     if result["skipped"]:
-        skipped = ", ".join(f"{name.replace('_', ' ')} {count}" for name, count in result["skipped"].items())
-        lines.append(f"in the log: {skipped}")
+        lines.append(f"in the log: {_counted(result['skipped'])}")
     if result.get("simulated_field"):
         lines.append("the log has no magnetometer: real telemetry, simulated field")
     if "calibration" in result:
         lines.append(f"calibration: {result['calibration']}")
-    lines.append(
-        f"flags: {', '.join(f'{name} {count}' for name, count in result['flags'].items()) or 'none'}"
-    )
+    lines.append(f"flags: {_counted(result['flags'])}")
+    if result["navigation"]:
+        lines.append(f"updates of the position: {_counted(result['navigation'])}")
     lines.append("")
     lines.append(
         f"{'against the reference field, nT RMS':36} {'samples':>8} {'raw':>9} {'corrected':>10} {'sigma':>7}"
@@ -195,6 +195,10 @@ def tell(result: Result) -> str:
         cells = ["-" if number is None or number > UNKNOWN else f"{number:.1f}" for number in numbers]
         lines.append(f"{name:36} {part['samples']:8d} {cells[0]:>9} {cells[1]:>10} {cells[2]:>7}")
     return "\n".join(lines)
+
+
+def _counted(counts: dict[str, int]) -> str:
+    return ", ".join(f"{name.replace('_', ' ')} {count}" for name, count in counts.items()) or "none"
 
 
 def _tell_again(result: Result) -> str:

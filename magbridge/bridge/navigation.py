@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from math import degrees, nan
 
+import numpy as np
+
 from magbridge.calibration.model import Calibration
 from magbridge.config import Config, convert
 from magbridge.errors import ConfigError
@@ -17,6 +19,7 @@ from magbridge.link.rates import Rate
 from magbridge.mavlink import Message, spec
 from magbridge.mavlink.dialect import MAV_SEVERITY
 from magbridge.navigate import Navigator, Options, Record, State
+from magbridge.navigate.depth import at_depth
 from magbridge.navigate.model import informed
 from magbridge.navigate.record import Reckoned
 from magbridge.records import Corrected
@@ -183,4 +186,5 @@ def open_navigation(
     kind = FIXES[wanted.fix]
     if wanted.rate is not None:
         kind = kind._replace(rate=wanted.rate)
-    return Navigation(read_grid(config.resolve(wanted.map)), options, kind, component)
+    dives = np.linspace(0.0, wanted.depth)
+    return Navigation(*at_depth(read_grid(config.resolve(wanted.map)), options, dives), kind, component)

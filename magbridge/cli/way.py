@@ -8,7 +8,10 @@ from typing import TYPE_CHECKING
 from magbridge.cli.common import Json, Output, app, complain, tell
 
 if TYPE_CHECKING:
+    import xarray as xr
+
     from magbridge.calibration.model import Calibration
+    from magbridge.field.grid import AnomalyGrid
     from magbridge.navigate import Options
 
 __all__ = ["navigate"]
@@ -76,7 +79,7 @@ def navigate(
     corrected = correct_rows(Correction(known, Align()), deployment)
     if options is None:
         options = informed(Options(), known, float(corrected["total_field_sigma"].median()))
-    grid = read_grid(map)
+    grid, options = _where_it_swims(read_grid(map), options, deployment)
     track = find_way(deployment.assign(corrected.data_vars), grid, options)
     write(track, output)
     if picture:
@@ -100,10 +103,11 @@ def _bound(
 ) -> None:
     from magbridge.field.read import read_grid
     from magbridge.logs import read, write
+    from magbridge.navigate import Options
     from magbridge.navigate.bound import position_bound, told
 
     plan = read(files, required=("latitude", "longitude")).dropna("time", subset=["latitude", "longitude"])
-    grid = read_grid(map)
+    grid, options = _where_it_swims(read_grid(map), options or Options(), plan)
     track = [plan[name].to_numpy().astype(float) for name in ("time", "latitude", "longitude")]
     sigma = calibration.noise.sensor if calibration else 1.0
     best = position_bound(grid, track[0], track[1], track[2], options, sigma)
@@ -114,6 +118,22 @@ def _bound(
 
         draw_bound(best, grid, picture)
     tell({"file": str(output), **result.attrs}, f"{output}: {result.attrs['findings']}", json)
+
+
+def _where_it_swims(
+    grid: AnomalyGrid, options: Options, deployment: xr.Dataset
+) -> tuple[AnomalyGrid, Options]:
+    """Return the map at the deployment's depth, with the error that this leaves in it; and say so."""
+    from magbridge.navigate.depth import at_depth
+
+    there, known = at_depth(grid, options, deployment["depth"].to_numpy() if "depth" in deployment else 0.0)
+    if known != options:
+        complain(
+            f"{grid.name}: at {grid.altitude:.0f} m; continued to {-there.altitude:.0f} m below the surface, and what"
+            f" that leaves out counts as the map's error: {known.map_sigma:.1f} nT over {known.map_length:.0f} m",
+            0,
+        )
+    return there, known
 
 
 def _options(config: Path | None) -> Options | None:

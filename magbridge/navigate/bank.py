@@ -119,7 +119,7 @@ class Bank:
         north, east = self.x[:2]
         per_latitude, per_longitude = metres_per_degree(block.latitude)
         local = self._grid.evaluate(
-            block.longitude + east / per_longitude, block.latitude + north / per_latitude
+            block.longitude + east / per_longitude, block.latitude + north / per_latitude, block.depth
         )
         off = np.isnan(local.anomaly)
         anomaly, gn, ge, hnn, hne, hee, v = np.where(off, 0.0, local) if off.any() else np.array(local)

@@ -20,7 +20,7 @@ from magbridge.navigate.navigator import UNUSABLE, Navigator
 from magbridge.navigate.record import Record
 from magbridge.navigate.yardstick import YARDSTICKS, with_errors, yardstick
 
-__all__ = ["MOTIONS", "navigate"]
+__all__ = ["MOTIONS", "first_position", "motion_of", "navigate"]
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.floating[Any]]
@@ -39,7 +39,7 @@ GPS_SIGMA = 10.0  # m, each axis, of a receiver that has just surfaced
 
 UNITS = {
     "latitude": "deg", "longitude": "deg", "smoothed_latitude": "deg", "smoothed_longitude": "deg",
-    "covariance_nn": "m2", "covariance_ne": "m2", "covariance_ee": "m2",
+    "depth": "m", "covariance_nn": "m2", "covariance_ne": "m2", "covariance_ee": "m2",
     "innovation": "nT", "innovation_variance": "nT2", "anomaly": "nT", "map_anomaly": "nT",
     "bias": "nT", "bias_sigma": "nT", "map_error": "nT", "current_north": "m s-1", "current_east": "m s-1",
     "north": "m", "east": "m", "smoothed_sigma_north": "m", "smoothed_sigma_east": "m",
@@ -91,9 +91,9 @@ def navigate(
     source = str(deployment.attrs.get("source", "deployment"))
     options = options or Options()
     time, field, sigma = _samples(deployment, source)
-    motion = motion or _motion(deployment, source)
+    motion = motion or motion_of(deployment, source)
     navigator = Navigator(grid, options)
-    latitude, longitude = start if start is not None else _first_position(deployment, source)
+    latitude, longitude = start if start is not None else first_position(deployment, source)
     moves = _columns(deployment, MOTIONS[motion] | {"depth": "depth"}, source)
     surfaced = _columns(deployment, {"gps_latitude": "a", "gps_longitude": "o"}, source) if fixes else {}
     records: list[Record] = []
@@ -145,7 +145,8 @@ def _samples(deployment: xr.Dataset, source: str) -> tuple[Floats, Floats, Float
     return time, field, sigma
 
 
-def _motion(deployment: xr.Dataset, source: str) -> str:
+def motion_of(deployment: xr.Dataset, source: str) -> str:
+    """Return the first of :data:`MOTIONS` that the log has; else raise FormatError."""
     for name, columns in MOTIONS.items():
         there = all(column in deployment and deployment[column].notnull().any() for column in columns)
         if there and (name != "glide" or _glides(deployment)):
@@ -175,7 +176,8 @@ def _columns(deployment: xr.Dataset, names: Mapping[str, str], source: str) -> d
     }
 
 
-def _first_position(deployment: xr.Dataset, source: str) -> tuple[float, float]:
+def first_position(deployment: xr.Dataset, source: str) -> tuple[float, float]:
+    """Return the log's first latitude and longitude, deg; else raise FormatError."""
     for pair in (*YARDSTICKS[1:], ("dr_latitude", "dr_longitude")):
         if all(name in deployment for name in pair):
             known = deployment[list(pair)].to_dataframe().dropna()

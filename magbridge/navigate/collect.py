@@ -32,6 +32,7 @@ class Sums(NamedTuple):
     slow: float = 0.0
     slope_north: float = 0.0
     slope_east: float = 0.0
+    depth: float = 0.0
 
 
 class Collector:
@@ -82,6 +83,7 @@ class Collector:
             s.slow + w * sqrt(max(0.0, variance - white - self._bias)),
             s.slope_north + w * slope_north,
             s.slope_east + w * slope_east,
+            s.depth + w * where.depth,
         )
         full = time_us - s.start_us >= self._interval_us or where.travelled - s.travelled >= self._step
         self._seconds = (time_us - s.start_us) * 1e-6
@@ -103,4 +105,5 @@ class Collector:
             (white + s.slow**2) / w**2,
             s.slope_north / w,
             s.slope_east / w,
+            s.depth / w,
         )

@@ -145,7 +145,7 @@ class Estimate:
         innovation, variance, likelihood = self._filter.update(block)
         best = self._filter.x[:, int(self._filter.w.argmax())]
         latitude, longitude = offset(block.latitude, block.longitude, float(best[0]), float(best[1]))
-        anomaly = self.grid.look_up(longitude, latitude).anomaly
+        anomaly = self.grid.look_up(longitude, latitude, block.depth).anomaly
         accepted = innovation**2 <= self.options.gate * variance
         return Innovation(innovation, variance, likelihood, accepted, anomaly)
 

@@ -125,13 +125,13 @@ class Shift(NamedTuple):
     here: float
 
 
-def best_shift(grid: AnomalyGrid, latitude: Array, longitude: Array, anomaly: Array) -> Shift:
+def best_shift(grid: AnomalyGrid, latitude: Array, longitude: Array, depth: Array, anomaly: Array) -> Shift:
     """Return by how much the map must be moved to describe an anomaly measured at known positions.
 
     Parameters
     ----------
-    latitude, longitude : array, (n,)
-        deg.
+    latitude, longitude, depth : array, (n,)
+        deg, m.
     anomaly : array, (n,)
         nT; a constant is taken out.
     """
@@ -141,8 +141,8 @@ def best_shift(grid: AnomalyGrid, latitude: Array, longitude: Array, anomaly: Ar
     origin = np.inf
     for north in shifts:
         for east in shifts:
-            seen = grid.evaluate(longitude - east / per_longitude, latitude - north / per_latitude).anomaly
-            left = anomaly - seen
+            seen = grid.evaluate(longitude - east / per_longitude, latitude - north / per_latitude, depth)
+            left = anomaly - seen.anomaly
             if np.isfinite(left).mean() < 0.8:
                 continue
             scatter = float(np.nanstd(left))
@@ -156,16 +156,16 @@ def best_shift(grid: AnomalyGrid, latitude: Array, longitude: Array, anomaly: Ar
 def _told_by_positions(grid: AnomalyGrid, yardstick: xr.Dataset, options: Options) -> list[str]:
     """Compare the map with the field at known positions: its place, and whether it is this field's map."""
     latitude, longitude = yardstick["latitude"].to_numpy(), yardstick["longitude"].to_numpy()
-    depth = yardstick["depth"].fillna(0.0).to_numpy() if "depth" in yardstick else 0.0
+    depth = yardstick["depth"].fillna(0.0).to_numpy() if "depth" in yardstick else np.zeros(latitude.size)
     time = yardstick["time"].to_numpy()
     measured = yardstick["total_field"].to_numpy() - total_field(longitude, latitude, depth, time)
-    known = np.isfinite(measured + grid.evaluate(longitude, latitude).anomaly)
+    known = np.isfinite(measured + grid.evaluate(longitude, latitude, depth).anomaly)
     if known.sum() < SPARSE:
         return []
     thin = np.flatnonzero(known)[:: max(1, int(known.sum()) // 400)]
-    measured, latitude, longitude = measured[thin], latitude[thin], longitude[thin]
-    north, east, there, here = best_shift(grid, latitude, longitude, measured)
-    level = float(np.mean(measured - grid.evaluate(longitude, latitude).anomaly))
+    measured, latitude, longitude, depth = measured[thin], latitude[thin], longitude[thin], depth[thin]
+    north, east, there, here = best_shift(grid, latitude, longitude, depth, measured)
+    level = float(np.mean(measured - grid.evaluate(longitude, latitude, depth).anomaly))
     step = 2.0 * SEARCH / (LATTICE - 1)
     findings = []
     if abs(level) > LEVEL * options.bias_sigma + here:

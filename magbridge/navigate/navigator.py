@@ -141,6 +141,7 @@ class Navigator(Estimate):
             seen.variance,
             self.options.gate,
             seen.accepted,
+            block.depth,
             block.anomaly,
             seen.anomaly,
             float(self.x[4]),

@@ -45,6 +45,8 @@ class Record(msgspec.Struct, frozen=True, gc=False):
         Largest innovation squared over variance that is taken in.
     accepted : bool
         The measurement was taken in.
+    depth : float
+        m.
     anomaly : float
         nT, measured: total field minus main field at the dead-reckoned position.
     map_anomaly : float
@@ -74,6 +76,7 @@ class Record(msgspec.Struct, frozen=True, gc=False):
     innovation_variance: float
     gate: float
     accepted: bool
+    depth: float
     anomaly: float
     map_anomaly: float
     bias: float

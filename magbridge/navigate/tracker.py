@@ -71,7 +71,7 @@ class Tracker:
         north, east = float(self.x[0]), float(self.x[1])
         per_latitude, per_longitude = metres_per_degree(block.latitude)
         local = self._grid.look_up(
-            block.longitude + east / per_longitude, block.latitude + north / per_latitude
+            block.longitude + east / per_longitude, block.latitude + north / per_latitude, block.depth
         )
         if isnan(local.anomaly):
             return None

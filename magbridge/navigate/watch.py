@@ -185,11 +185,12 @@ def average(blocks: list[Block]) -> Block:
                 b.anomaly,
                 b.slope_north,
                 b.slope_east,
+                b.depth,
             )
             for b in blocks
         ]
     )
-    time, latitude, longitude, anomaly, north, east = (precision @ columns / precision.sum()).tolist()
+    time, latitude, longitude, anomaly, north, east, depth = (precision @ columns / precision.sum()).tolist()
     return Block(
         first.time_us + round(time),
         latitude,
@@ -198,4 +199,5 @@ def average(blocks: list[Block]) -> Block:
         1.0 / float(precision.sum()),
         north,
         east,
+        depth,
     )

@@ -1,0 +1,41 @@
+"""A map of another height: continued to where the vehicle is, and what that leaves out counted as the map's error."""
+
+from __future__ import annotations
+
+from math import hypot
+
+import numpy as np
+from msgspec.structs import replace
+from numpy.typing import ArrayLike
+
+from magbridge.field.continuation import continued
+from magbridge.field.grid import AnomalyGrid
+from magbridge.navigate.model import Options
+
+__all__ = ["at_depth"]
+
+
+def at_depth(grid: AnomalyGrid, options: Options, depth: ArrayLike) -> tuple[AnomalyGrid, Options]:
+    """Return the map where the vehicle is, and options that know how far it can be believed there.
+
+    Parameters
+    ----------
+    grid : AnomalyGrid
+        One of unknown altitude is returned as it is.
+    options : Options
+    depth : array_like, (n,)
+        m, the vehicle's, at any times; NaN is passed over, and nothing known is the surface.
+
+    Notes
+    -----
+    Independent errors of the map add their variances σᵢ² and their steepnesses σᵢ²/Lᵢ², so that together
+    1/L² = Σ(σᵢ²/Lᵢ²) / Σσᵢ².
+    """
+    known = np.asarray(depth, float)
+    known = known[np.isfinite(known)]
+    there = continued(grid, known if known.size else 0.0)
+    if there.sigma == 0.0:
+        return there.grid, options
+    sigma = hypot(options.map_sigma, there.sigma)
+    steepness = hypot(options.map_sigma / options.map_length, there.sigma / there.length)
+    return there.grid, replace(options, map_sigma=sigma, map_length=sigma / steepness)

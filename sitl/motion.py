@@ -1,0 +1,49 @@
+"""What a navigator needs to be told of a deployment's motion, in columns that an emulated autopilot can say."""
+
+from __future__ import annotations
+
+import numpy as np
+import xarray as xr
+
+from magbridge.navigate.batch import MOTIONS, first_position, motion_of
+from sitl.world import to_local
+
+__all__ = ["with_motion"]
+
+
+def with_motion(deployment: xr.Dataset) -> xr.Dataset:
+    """Return the deployment with the columns that the autopilot tells a navigator.
+
+    Parameters
+    ----------
+    deployment : Dataset (time)
+        With a first position and one of :data:`~magbridge.navigate.batch.MOTIONS`, which are tried in that order.
+
+    Returns
+    -------
+    Dataset (time)
+        ``gps_latitude gps_longitude`` (deg): the log's, or its first position; ``local_north local_east`` (m) of
+        a track or a velocity. From a speed or a glide the bridge reckons for itself.
+
+    Raises
+    ------
+    FormatError
+        The log has no position to start from, or no motion.
+    """
+    source = str(deployment.attrs.get("source", "deployment"))
+    motion = motion_of(deployment, source)
+    if "gps_latitude" not in deployment:
+        for name, first in zip(("latitude", "longitude"), first_position(deployment, source), strict=True):
+            fix = np.where(np.arange(deployment.sizes["time"]) == 0, first, np.nan)
+            deployment = deployment.assign({f"gps_{name}": ("time", fix)})
+    columns = [deployment[name].to_numpy().astype(float) for name in MOTIONS[motion]]
+    if motion == "velocity":
+        step = np.diff(deployment["time"].to_numpy().astype(float), prepend=np.nan)
+        local = [np.nancumsum(step * velocity) for velocity in columns]
+    elif motion in ("inertial", "position"):
+        latitude, longitude = columns
+        known = np.flatnonzero(np.isfinite(latitude + longitude))[0]
+        local = list(to_local(latitude, longitude, (float(latitude[known]), float(longitude[known]))))
+    else:
+        return deployment
+    return deployment.assign(local_north=("time", local[0]), local_east=("time", local[1]))
