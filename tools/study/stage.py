@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from dataclasses import field as attribute
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -22,7 +23,7 @@ from sitl.inject import Hidden, disturb
 from sitl.mission import CrissCross, Spirals
 from sitl.signals import first_order
 from sitl.trajectory import Track
-from sitl.world import Water
+from sitl.world import Water, World
 
 Array = NDArray[np.float64]
 HOURS = 6.0
@@ -36,6 +37,20 @@ MEMORY = 0.8
 """Correlation of neighbours in noise with a memory."""
 NOISES = ("white", "ar", "heavy", "uneven", "half", "map")
 """White; with a memory; heavy-tailed; louder at times; half as loud again as calibrated; over rock that is rough."""
+
+
+@dataclass(frozen=True)
+class Remembered(World):
+    """A world that remembers the field along a track: all cases of a vehicle fly through the same."""
+
+    known: dict[bytes, Array] = attribute(default_factory=dict)
+
+    def field(self, time: Array, latitude: Array, longitude: Array, depth: Array) -> Array:
+        """See :meth:`~sitl.world.World.field`."""
+        way = np.stack([time, latitude, longitude, depth]).tobytes()
+        if way not in self.known:
+            self.known[way] = super().field(time, latitude, longitude, depth)
+        return self.known[way]
 
 
 class Stage(NamedTuple):
@@ -74,6 +89,7 @@ def again(stage: Stage) -> Stage:
 
 
 def _flown(twin: Twin, calibration: Calibration) -> Stage:
+    twin = replace(twin, world=Remembered(twin.world.origin, twin.world.rock, twin.world.water))
     track = twin.fly()
     # a hull has inertia: without it the attitude has no rate, and a delay of a millisecond is a noise of its own
     smooth = {
