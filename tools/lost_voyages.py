@@ -1,10 +1,15 @@
-"""Voyages on which a filter is in the wrong place, and how long it stands by it."""
+"""Voyages on which a filter is in the wrong place or has the wrong map, and how long it stands by it."""
 
 from __future__ import annotations
 
 import numpy as np
 from msgspec.structs import replace as with_options
+from numpy.typing import NDArray
 from voyages import GLIDER, OUTSIDE, SPEEDS, Map, Run, longest, sail, synthetic, voyage
+
+from magbridge.field.grid import AnomalyGrid
+
+LEVEL = 60.0  # nT
 
 
 def carried(kind: Map, seed: int) -> tuple[float, float]:
@@ -24,7 +29,32 @@ def misled(kind: Map, seed: int) -> tuple[float, float]:
     return silence(sail(ds, grid, with_options(options, start_sigma=0.1 * grid.correlation_length)))
 
 
+def level(kind: Map, seed: int) -> tuple[float, float]:
+    """Measure 60 nT too much all along, where 0.5 nT is claimed; return as :func:`standing`."""
+    grid = synthetic(kind, seed % 10)
+    options = with_options(GLIDER, start_sigma=0.2 * grid.correlation_length)
+    ds = voyage(grid, options, 9000 + seed, speed=SPEEDS[seed % 3])
+    return standing(sail(ds.assign(total_field=ds["total_field"] + LEVEL), grid, options))
+
+
+def half(kind: Map, seed: int) -> tuple[float, float]:
+    """Sail on a field of which the map knows half the variance; return as :func:`standing`."""
+    grid, other = synthetic(kind, seed % 10), synthetic(kind, 10 + seed % 10)
+    field = AnomalyGrid(grid.longitude, grid.latitude, (grid.anomaly + other.anomaly) / 2**0.5)
+    options = with_options(GLIDER, start_sigma=0.2 * grid.correlation_length)
+    return standing(sail(voyage(field, options, 9000 + seed, speed=SPEEDS[seed % 3]), grid, options))
+
+
+def outside(run: Run) -> NDArray[np.bool_]:
+    """Return where the vehicle is not where the filter says, by its own ellipse and by the map's scale."""
+    return (run.nees > OUTSIDE) & (run.error > 0.25 * run.length)
+
+
 def silence(run: Run) -> tuple[float, float]:
     """Return for how many hours on end the filter vouched for a place where it was not; and was not there at all."""
-    outside = (run.nees > OUTSIDE) & (run.error > 0.25 * run.length)
-    return longest(outside & run.vouched, run.hours), longest(outside, run.hours)
+    return longest(outside(run) & run.vouched, run.hours), longest(outside(run), run.hours)
+
+
+def standing(run: Run) -> tuple[float, float]:
+    """Return the share of the time that the filter vouched for where it was, and for where it was not."""
+    return float(np.mean(run.vouched & ~outside(run))), float(np.mean(run.vouched & outside(run)))

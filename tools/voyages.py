@@ -6,7 +6,7 @@ import time as clock
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
-from math import exp
+from math import exp, inf
 from typing import NamedTuple
 
 import numpy as np
@@ -187,6 +187,7 @@ class Run:
             at_hours=tuple(self.nees[np.searchsorted(self.hours, AT_HOURS) - 1].tolist()),
             false_alarm=bool((self.state == State.LOST).any()) and away <= 0.1,
             vouched=float(np.mean(self.vouched)),
+            waited=float(self.hours[self.vouched][0]) if self.vouched.any() else inf,
             seconds=self.seconds,
         )
 
@@ -202,6 +203,7 @@ class Score(NamedTuple):
     at_hours: tuple[float, ...]  # NEES at AT_HOURS
     false_alarm: bool  # said to be lost, and the truth was never outside for more than 6 minutes
     vouched: float  # share of the time
+    waited: float  # hours, until it first vouched for its position
     seconds: float  # of a processor, a sample
 
 
