@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import xarray as xr
 
+from magbridge.calibration.file import save
+from magbridge.calibration.model import Noise, identity
 from magbridge.errors import FormatError, PortError, WrongUse
 from magbridge.logs import read, write
-from sitl import load, segments, simulate
+from sitl import Twin, load, segments, simulate
 from sitl.demo import demo
+from sitl.motion import with_motion
 from sitl.own_log import Recorded, is_own_log
 from sitl.rehearsal import bridge_toml, short_names
 from sitl.replay import replay, tell
+from sitl.world import from_local
 
 
 @pytest.fixture(scope="module")
@@ -84,6 +90,44 @@ def test_another_configuration_is_told_apart(survey: Path, tmp_path: Path) -> No
     assert not run["identical"]
     assert not run["same_config"]
     assert "not the same" in tell(result)
+
+
+@pytest.mark.parametrize("motion", ["glide", "position"])
+def test_a_replay_finds_its_way_by_the_field(tmp_path: Path, motion: str) -> None:
+    """However a log tells motion, the emulated autopilot tells the bridge, whose filter knows where it begins and is not lost."""
+    Twin.draw(load("demo"), 3).anomaly_map().save(tmp_path / "grid.nc")
+    save(
+        replace(identity(), covariance=1e-4 * np.eye(9), noise=Noise(1.0), method="nominal"),
+        tmp_path / "c.json",
+    )
+    log = segments(simulate(load("demo"), 3))["survey"].isel(time=slice(0, 800))
+    log = log.assign({f"mag_{axis}": log[f"truth_field_{axis}"] for axis in "xyz"})
+    write(log if motion == "glide" else log.drop_vars("pitch"), tmp_path / "log.nc")
+    path = config(tmp_path)
+    tables = '[calibration]\nfile = "c.json"\n[navigation]\nmap = "grid.nc"\nfix = "ODOMETRY"\noptions = {start_sigma = 20.0}\n'
+    path.write_text(path.read_text() + tables)
+    result = replay([tmp_path / "log.nc"], path)
+    assert sum(result["navigation"].values()) > 100
+    assert not {"off", "lost"} & set(result["navigation"])
+    assert "updates of the position" in tell(result)
+
+
+def test_a_velocity_is_told_as_a_track() -> None:
+    """Its integral: the same, to what trapezoids lose, as the track it was taken from."""
+    time = np.arange(0.0, 400.0, 4.0)
+    north, east = 200 * np.sin(time / 100), 150 * np.cos(time / 80)
+    place = from_local(north, east, (49.5, -57.9))
+    columns = dict(zip(("latitude", "longitude"), (("time", angle) for angle in place), strict=True))
+    log = xr.Dataset(columns, {"time": time})
+    rates = {
+        "velocity_north": ("time", 2 * np.cos(time / 100)),
+        "velocity_east": ("time", -1.875 * np.sin(time / 80)),
+    }
+    track, integral = with_motion(log), with_motion(log.assign(rates))
+    for name in ("local_north", "local_east"):
+        np.testing.assert_allclose(integral[name], track[name], atol=4.0)
+    assert integral["gps_latitude"].to_numpy()[0] == log["latitude"].to_numpy()[0]
+    assert np.isnan(integral["gps_latitude"].to_numpy()[1:]).all()
 
 
 def test_speed_is_kept(survey: Path, tmp_path: Path) -> None:
