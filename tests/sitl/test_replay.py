@@ -94,7 +94,7 @@ def test_another_configuration_is_told_apart(survey: Path, tmp_path: Path) -> No
 
 @pytest.mark.parametrize("motion", ["glide", "position"])
 def test_a_replay_finds_its_way_by_the_field(tmp_path: Path, motion: str) -> None:
-    """However a log tells motion, the emulated autopilot tells the bridge, whose filter knows where it begins and is not lost."""
+    """However a log tells motion, the bridge hears of it: its filter knows where it begins, and is not lost."""
     Twin.draw(load("demo"), 3).anomaly_map().save(tmp_path / "grid.nc")
     save(
         replace(identity(), covariance=1e-4 * np.eye(9), noise=Noise(1.0), method="nominal"),
@@ -104,7 +104,7 @@ def test_a_replay_finds_its_way_by_the_field(tmp_path: Path, motion: str) -> Non
     log = log.assign({f"mag_{axis}": log[f"truth_field_{axis}"] for axis in "xyz"})
     write(log if motion == "glide" else log.drop_vars("pitch"), tmp_path / "log.nc")
     path = config(tmp_path)
-    tables = '[calibration]\nfile = "c.json"\n[navigation]\nmap = "grid.nc"\nfix = "ODOMETRY"\noptions = {start_sigma = 20.0}\n'
+    tables = '[calibration]\nfile = "c.json"\n[navigation]\nmap = "grid.nc"\nfix = "ODOMETRY"\ndepth = 140.0\n'
     path.write_text(path.read_text() + tables)
     result = replay([tmp_path / "log.nc"], path)
     assert sum(result["navigation"].values()) > 100
