@@ -5,7 +5,8 @@
 accuracy      error over the posterior Cramér-Rao bound, lost runs, consistency, for narrow and wide starts, with what
               an auto calibration leaves
 nominal       the same, with what a nominal calibration leaves
-watch         how long a filter that is in the wrong place, or has the wrong map, vouches for it
+watch         how long a filter that is in the wrong place vouches for it
+misinformed   whether one vouches for its position that has been told the wrong level, or half a map
 calibrations  simulated gliders, each calibrated by nominal, cubic and auto, that fly the same survey
 speed         one update, 100,000 samples, the start
 peers         Stone Soup (tools/navigation_peers.py) on the same measurements; MagNav.jl's published flight
@@ -152,7 +153,7 @@ def calibrations(runs: Runs, _asked: argparse.Namespace) -> None:
 
 
 def watch(runs: Runs, _asked: argparse.Namespace) -> None:
-    """How soon a lost filter stops vouching for itself, and whether one with a wrong map does."""
+    """How soon a lost filter stops vouching for itself."""
     print(
         f"\n## A lost filter says so: {runs.count} runs of 6 h a row. Lost: the truth is outside the 99.99 % ellipse, and a"
         " quarter of\na correlation length away or more. Flagged: it no longer vouches for its position\n"
@@ -174,6 +175,10 @@ def watch(runs: Runs, _asked: argparse.Namespace) -> None:
                 )
             )
             show(table)
+
+
+def misinformed(runs: Runs, _asked: argparse.Namespace) -> None:
+    """Whether a filter believes itself whose map or calibration is not what it claims to be."""
     print(
         f"\n## Told wrong: {runs.count} runs of 6 h a row, on a field {LEVEL:g} nT off, or of which the map knows half the"
         " variance.\nShare of the time that it vouches for where it is, and for where it is not\n"
@@ -256,6 +261,7 @@ def show(table: Sequence[Sequence[str]]) -> None:
 PARTS = {
     "accuracy": accuracy,
     "watch": watch,
+    "misinformed": misinformed,
     "calibrations": calibrations,
     "nominal": partial(accuracy, left="nominal"),
     "speed": speed,
