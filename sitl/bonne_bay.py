@@ -17,11 +17,12 @@ from magbridge.calibration.fit import fit
 from magbridge.columns import CHANNEL_TIMES, CHANNELS
 from magbridge.errors import CalibrationError
 from magbridge.field.grid import AnomalyGrid
+from magbridge.field.reference import reference_field
 from sitl.columns import segments
 from sitl.scenario import load
 from sitl.twin import Twin
 
-__all__ = ["METHODS", "PAPER", "TRIALS", "Trials", "fly"]
+__all__ = ["METHODS", "PAPER", "TRIALS", "Trials", "fly", "measure"]
 
 Array = NDArray[np.float64]
 
@@ -77,13 +78,29 @@ class Trials:
         return float(np.sqrt(np.mean(self.error(part, trial, method, against) ** 2)))
 
 
-def fly(seed: int, methods: Sequence[str] = tuple(METHODS)) -> Trials:
-    """Simulate the deployment and calibrate it both times with each of the methods."""
-    twin = Twin.draw(load("bonne_bay"), seed)
+def measure(twin: Twin, *, at_depth: bool = False) -> dict[str, xr.Dataset]:
+    """Fly trial 1, survey and trial 2; return each on one time base, without the samples of masses in motion.
+
+    With `at_depth` the reference is the map continued down to the glider, as ``--grid`` makes it; else what the
+    scenario says: the map as it was flown, as the paper has it.
+    """
     track = twin.fly()
     instrument = twin.scenario.instrument
     when = np.arange(0.0, track.elapsed[-1] - max(instrument.channel_delay), 1 / instrument.rate)
     parts = segments(resting(one_time_base(twin.measure(track, when))))
+    if not at_depth:
+        return parts
+    grid = twin.anomaly_map()
+    for name, part in parts.items():
+        known = reference_field(part.drop_vars("reference_field"), grid)
+        parts[name] = part.assign(reference_field=("time", known))
+    return parts
+
+
+def fly(seed: int, methods: Sequence[str] = tuple(METHODS), *, at_depth: bool = False) -> Trials:
+    """Simulate the deployment and calibrate it both times with each of the methods, against :func:`measure`'s reference."""
+    twin = Twin.draw(load("bonne_bay"), seed)
+    parts = measure(twin, at_depth=at_depth)
     corrected, failed, scales = {}, {}, {}
     for trial, method in product(TRIALS, methods):
         used = () if method == "nominal" else MASSES

@@ -22,9 +22,7 @@ from magbridge.calibration.data import observations
 from magbridge.calibration.fit import fit
 from magbridge.calibration.model import Calibration
 from magbridge.diagnose.run import diagnose
-from magbridge.field.reference import reference_field
-from sitl.bonne_bay import MASSES, PAPER, columns, one_time_base, resting
-from sitl.columns import segments
+from sitl.bonne_bay import MASSES, PAPER, columns, measure
 from sitl.scenario import load
 from sitl.twin import Twin
 
@@ -37,18 +35,7 @@ def fly(seed: int, reference: str) -> dict[str, xr.Dataset]:
     scenario = load("bonne_bay")
     telemetry = msgspec.structs.replace(scenario.telemetry, reference="map" if reference == "map" else "true")
     twin = Twin.draw(msgspec.structs.replace(scenario, telemetry=telemetry), seed)
-    track = twin.fly()
-    instrument = scenario.instrument
-    when = np.arange(0.0, track.elapsed[-1] - max(instrument.channel_delay), 1 / instrument.rate)
-    parts = segments(resting(one_time_base(twin.measure(track, when))))
-    if reference != "map at its depth":
-        return parts
-    grid = twin.anomaly_map()
-    bare = {name: part.drop_vars("reference_field") for name, part in parts.items()}
-    return {
-        name: part.assign(reference_field=("time", reference_field(part, grid)))
-        for name, part in bare.items()
-    }
+    return measure(twin, at_depth=reference == "map at its depth")
 
 
 def rms(calibration: Calibration, ds: xr.Dataset, against: str = "truth_total_field") -> float:
