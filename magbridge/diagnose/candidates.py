@@ -44,6 +44,8 @@ class Candidate:
         Independent hypotheses that stand behind this one (frequencies searched).
     positive : bool
         Its coefficients cannot be negative.
+    parts : int
+        Regressors that it was put together from, one after the other.
     """
 
     cause: str
@@ -57,6 +59,7 @@ class Candidate:
     again: Callable[..., Candidate] | None = None
     trials: float = 1.0
     positive: bool = False
+    parts: int = 1
 
     @property
     def size(self) -> int:
@@ -78,6 +81,7 @@ class Candidate:
             effects=self.effects + other.effects,
             shape=self.shape | {name + mark: value for name, value in other.shape.items()},
             again=None,
+            parts=self.parts + other.parts,
         )
 
 

@@ -17,8 +17,9 @@ from magbridge.calibration.residual import residuals
 from magbridge.diagnose.candidates import Candidate
 from magbridge.diagnose.joint import Joint, fit_joint
 from magbridge.diagnose.problem import Columns, Problem, derivatives, samples_of
+from magbridge.diagnose.weigh import IDEAL
 
-__all__ = ["extend", "settle"]
+__all__ = ["extend", "settle", "widened"]
 
 STEPS = 4
 """Linearisations at most; a second one is rarely needed."""
@@ -86,6 +87,21 @@ def settle(
         if abs(fit.log_likelihood - before.log_likelihood) < 0.5:
             break
     return settled, columns, fit
+
+
+def widened(model: Sequence[Candidate], fit: Joint) -> Joint:
+    """Return the fit with what the regressors' idealisation adds to the covariance.
+
+    One that is off by :data:`~.weigh.IDEAL` of its norm has a size that is off by ``1 - sqrt(1 - IDEAL^2)`` of it.
+    """
+    share, at = 1.0 - float(np.sqrt(1.0 - IDEAL**2)), len(fit.z)
+    covariance = fit.covariance.copy()
+    for candidate in model:
+        own = slice(at, at + candidate.size)
+        b = share * fit.coefficients[at - len(fit.z) :][: candidate.size]
+        covariance[own, own] += np.outer(b, b)
+        at += candidate.size
+    return replace(fit, covariance=covariance)
 
 
 def _again(

@@ -33,7 +33,7 @@ BoolArray = NDArray[np.bool_]
 TAILS = (2.5, 3.0, 4.0, 5.0, 7.0, 12.0, 1e6)
 BLOCK = 150
 """Samples over which the noise's level is taken as constant."""
-ORDERS = (0, 1, 2, 3, 5)
+ORDERS = (0, 1, 2, 3, 5, 8, 13)
 GAUSSIAN = 1e5
 """Degrees of freedom from which on the tails are taken for Gaussian."""
 ALTERNATIONS = 6
@@ -121,7 +121,10 @@ def _past(follows: BoolArray, p: int) -> BoolArray:
 
 
 def memory_order(residual: FloatArray, follows: BoolArray) -> int:
-    """Choose p by the Bayesian information criterion, on a residual clipped against outliers."""
+    """Choose p by Akaike's criterion, on a residual clipped against outliers.
+
+    To whiten with too long a memory costs little, with too short a one it makes structure out of noise.
+    """
     scale = 1.4826 * np.median(np.abs(residual)) + 1e-12
     r = np.clip(residual, -6.0 * scale, 6.0 * scale)
     past = _past(follows, ORDERS[-1])
@@ -133,7 +136,7 @@ def memory_order(residual: FloatArray, follows: BoolArray) -> int:
     costs = []
     for p in ORDERS:
         left = r[rows] - (lags[:, :p] @ np.linalg.lstsq(lags[:, :p], r[rows], rcond=None)[0] if p else 0.0)
-        costs.append(n * np.log(left @ left / n + 1e-300) + 1.5 * p * np.log(n))
+        costs.append(n * np.log(left @ left / n + 1e-300) + 2.0 * p)
     return max(1, ORDERS[int(np.argmin(costs))])
 
 

@@ -68,6 +68,7 @@ class State:
         self.at = slices(self.candidates)
         self.columns = [candidate.columns for candidate in self.candidates]
         self.trials: dict[str, float] = {}
+        self.blocks: bool | None = None
         self.own: Information
         self.bare: Information
         self.groups: dict[tuple[str, str | None], list[int]] = {}
@@ -84,7 +85,9 @@ class State:
     ) -> Joint:
         """Fit a model jointly with calibration and noise; see :func:`~.joint.fit_joint`."""
         columns = [candidate.columns for candidate in model]
-        return fit_joint(self.problem, columns, self.order, *starts, plain=plain, like=like, rounds=rounds)
+        return fit_joint(
+            self.problem, columns, self.order, *starts, plain=plain, like=like, blocks=self.blocks, rounds=rounds
+        )  # fmt: skip
 
     def scores(self, info: Information) -> list[Score]:
         """Score every candidate."""

@@ -17,16 +17,17 @@ from magbridge.calibration.model import Calibration
 from magbridge.calibration.residual import residuals
 from magbridge.diagnose.candidates import Candidate
 from magbridge.diagnose.causes import CAUSES, Cause
-from magbridge.diagnose.extend import extend, settle
+from magbridge.diagnose.extend import extend, settle, widened
 from magbridge.diagnose.findings import findings_json
 from magbridge.diagnose.gain import Gain, held_out, paired
 from magbridge.diagnose.isolability import Isolability, isolability
 from magbridge.diagnose.joint import Joint
+from magbridge.diagnose.outliers import Outliers, outliers
 from magbridge.diagnose.problem import Problem, pose, samples_of
 from magbridge.diagnose.search import Hypothesis, Outcome, Rival, search
 from magbridge.diagnose.survey import Survey, take
-from magbridge.diagnose.unexplained import Leftover, Outliers, leftover, outliers
-from magbridge.diagnose.weigh import lead
+from magbridge.diagnose.unexplained import Leftover, accept, leftover
+from magbridge.diagnose.weigh import REMNANT
 from magbridge.errors import DataError
 from magbridge.field.grid import AnomalyGrid
 from magbridge.files import atomic_path
@@ -38,14 +39,10 @@ __all__ = ["Diagnosis", "diagnose"]
 
 FloatArray = NDArray[np.float64]
 
-SHARE = 0.5
-"""Of a named cause's signal-to-noise: when more than this stays unexplained, the name does not fit."""
 WORSE = 1.1
 """Ratio of held-out RMS above which the extended calibration is not believed."""
 SPOILT = 2.0
 """Ratio of RMS above which a calibration is not handed out: alike effects can cancel in the fit and not in use."""
-REMAINDER = 0.25
-"""Less than this is what an idealised regressor leaves, and not worth a word."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,11 +152,16 @@ def _examine(
     outcome = search(problem, flat, len(causes))
     progress("what is left")
     wrong = outliers(outcome.fit, len(causes))
-    tones = None if "interference_tone" in causes else CAUSES["interference_tone"].candidates(problem)
-    named, rivals, fit, rest = _accept(problem, outcome, tones[0] if tones else None)
+    tones = [] if "interference_tone" in causes else CAUSES["interference_tone"].candidates(problem)
+    tone = tones[0] if tones else None
+    stand, rest = accept(problem, outcome, tone)
+    named, rivals, fit = (outcome.chosen, outcome.rivals, outcome.fit) if stand else ((), (), outcome.null)
     model = [h.candidate for h in named]
+    if wrong is not None and named and wrong.ratio < (REMNANT * max(h.signal_to_noise for h in named)) ** 2:
+        wrong = None  # a few samples that the loudest cause's regressor has left
     progress("extending the calibration")
     settled, columns, fit = settle(problem, model, fit, outcome.order)
+    fit = widened(model, fit)
     extended = extend(settled, model, fit) if model else calibration
     progress("measuring the gain")
     counts = ~survey.learned
@@ -174,7 +176,7 @@ def _examine(
     ):
         # names that make the dives worse that they never saw are no explanation
         named, rivals, model, fit, after, extended = (), (), [], outcome.null, before, calibration
-        rest = leftover(problem, [], outcome.null, outcome.order, tones[0] if tones else None)
+        rest = leftover(problem, [], outcome.null, outcome.order, tone)
     gains = []
     for k in range(len(model)):
         others = [candidate.columns for i, candidate in enumerate(model) if i != k]
@@ -203,38 +205,6 @@ def write(
         beside.write_bytes(findings_json(diagnosis, causes))
     with atomic_path(folder / "report.html") as beside:
         beside.write_text(report_html(diagnosis, causes), encoding="utf-8")
-
-
-def _accept(
-    problem: Problem, outcome: Outcome, tone: Candidate | None
-) -> tuple[tuple[Hypothesis, ...], tuple[tuple[Rival, ...], ...], Joint, Leftover | None]:
-    """Keep the names that fit: not one beside which as much again stays unexplained, or that a free curve beats."""
-    model = [h.candidate for h in outcome.chosen]
-    rest = leftover(problem, model, outcome.fit, outcome.order, tone)
-    if not model:
-        return (), (), outcome.null, rest
-    loudest = max(h.signal_to_noise for h in outcome.chosen)
-    if rest is not None and rest.signal_to_noise < REMAINDER * loudest:
-        rest = None
-    free = (
-        leftover(problem, [], outcome.null, outcome.order, tone)
-        if rest is not None or len(model) == 1
-        else None
-    )
-    # a curve through the channel that a name follows anyhow is no other explanation
-    own = {h.candidate.channel for h in outcome.chosen}
-    if any(h.candidate.cause == "actuator_order" for h in outcome.chosen):
-        own |= {parameter.name for parameter in problem.calibration.parameters}
-    ahead = lead(max(h.ratio for h in outcome.chosen))
-    beaten = (
-        free is not None
-        and (free.channel is None or free.channel not in own)
-        and free.evidence > sum(h.evidence for h in outcome.chosen) + ahead
-    )
-    allowed = SHARE if rest is None or rest.channel is None or rest.channel not in own else 1.0
-    if (rest is not None and rest.signal_to_noise > allowed * loudest) or beaten:
-        return (), (), outcome.null, free or rest
-    return outcome.chosen, outcome.rivals, outcome.fit, rest
 
 
 def _spoils(survey: Survey, problem: Problem, extended: Calibration, counts: NDArray[np.bool_]) -> bool:

@@ -25,9 +25,9 @@ from magbridge.diagnose.joint import Information, Joint, fit_joint, information
 from magbridge.diagnose.noise import memory_order
 from magbridge.diagnose.problem import Problem
 from magbridge.diagnose.rounds import Hypothesis, State, key
-from magbridge.diagnose.weigh import LEVEL, REMNANT, lead, score, weigh
+from magbridge.diagnose.weigh import LEVEL, ODDS, REMNANT, lead, score, weigh
 
-__all__ = ["Hypothesis", "Outcome", "Rival", "search"]
+__all__ = ["Hypothesis", "Outcome", "Rival", "search", "worth"]
 
 FloatArray = NDArray[np.float64]
 
@@ -91,6 +91,7 @@ def search(problem: Problem, candidates: Sequence[Candidate], causes: int) -> Ou
     order = memory_order(rough.left, problem.survey.follows)
     state = State(problem, candidates, order, causes)
     null = state.fit([])
+    state.blocks = bool(np.ptp(null.noise.scale))  # likelihoods that are compared have one kind of noise
     first = state.round([], null) if candidates else []
     tested: dict[str, tuple[float, float]] = {}
     for h in first:
@@ -98,14 +99,19 @@ def search(problem: Problem, candidates: Sequence[Candidate], causes: int) -> Ou
             tested[h.candidate.cause] = (h.p_value, h.ratio)
     model, base = _chain(state, null, first)
     together = _together(state) if first else []
+
+    def better(fit: Joint, others: Sequence[Candidate]) -> bool:
+        gained = [2.0 * (one.log_likelihood - null.log_likelihood) for one in (fit, base)]
+        return worth(gained[0], others, causes) > worth(gained[1], model, causes)
+
     if together and {key(c) for c in together} != {key(c) for c in model}:
         # one after the other may have gone astray where several causes act
         other = state.fit(together, rounds=6)
-        if _worth(other, together, null) > _worth(base, model, null):
+        if better(other, together):
             model, base = _refined(state, together, other)
     if len({candidate.cause for candidate in model}) > 1:
         alone = _enough(state, first)
-        if alone is not None:
+        if alone is not None and better(alone.fit, [alone.candidate]):
             alone = state.sharpen([], alone, null)
             model, base = [alone.candidate], alone.fit
     chosen, base = _remove(state, model, base, null)
@@ -116,8 +122,13 @@ def search(problem: Problem, candidates: Sequence[Candidate], causes: int) -> Ou
     return Outcome(tuple(chosen), rivals, null, base, order, tested, info, state.trials)
 
 
-def _worth(fit: Joint, model: Sequence[Candidate], null: Joint) -> float:
-    return weigh(2.0 * (fit.log_likelihood - null.log_likelihood), sum(c.size for c in model))
+def worth(ratio: float, model: Sequence[Candidate], causes: int) -> float:
+    """Log evidence of a whole model of this likelihood ratio.
+
+    Every regressor after the first costs the odds that so much goes wrong in one log, and its choice among the causes.
+    """
+    further = max(sum(candidate.parts for candidate in model) - 1, 0)
+    return weigh(ratio, sum(candidate.size for candidate in model)) - further * (ODDS + float(np.log(causes)))
 
 
 def _chain(state: State, null: Joint, first: list[Hypothesis]) -> tuple[list[Candidate], Joint]:
@@ -201,12 +212,20 @@ def _refined(state: State, model: list[Candidate], base: Joint) -> tuple[list[Ca
 
 
 def _next(found: list[Hypothesis], model: list[Candidate], loudest: float) -> Hypothesis | None:
-    """Pick the best that passes the test; of what an idealised regressor may have left, only more of the same cause."""
+    """Pick the best that passes the test; of what an idealised regressor may have left, only more of the same cause.
+
+    More of a cause that is there already comes before another that explains hardly more.
+    """
     named = {candidate.cause for candidate in model}
-    for h in found:
-        if h.p_value < LEVEL and (h.candidate.cause in named or h.signal_to_noise >= REMNANT * loudest):
-            return h
-    return None
+    sure = [
+        h
+        for h in found
+        if h.p_value < LEVEL and (h.candidate.cause in named or h.signal_to_noise >= REMNANT * loudest)
+    ]
+    if not sure:
+        return None
+    near = sure[0].evidence - lead(sure[0].ratio)
+    return next((h for h in sure if h.candidate.cause in named and h.evidence > near), sure[0])
 
 
 def _with(state: State, model: list[Candidate], best: Hypothesis) -> tuple[list[Candidate], Joint]:

@@ -1,31 +1,48 @@
-"""What is left: structure of any kind that no cause of the table accounts for, described but not named."""
+r"""What is left: structure of any kind that no cause of the table accounts for, described but not named.
+
+Notes
+-----
+A free description has more numbers than anyone believes in, so they have a Gaussian prior of one common size g,
+which is the one that the data like best. With the projected information S and score b of its columns in units of their
+widths, and ``S = V diag(lambda) V^T``, ``y = V^T b``, its log evidence is
+
+.. math:: E = \max_g \tfrac12 \sum_i \left(\frac{g y_i^2}{1 + g \lambda_i} - \ln(1 + g \lambda_i)\right)
+
+which is a variance component's likelihood ratio: under no effect 2 E is at most a chi-square of one freedom (Self & Liang
+1987), whatever the number of columns. Noise that was fitted without the effect may have swallowed it. So a description is
+found under the noise that stands and under the one that is left when slow curves take what they can, and then weighed by the
+whole likelihood, with a noise of its own.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from itertools import pairwise
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import gammaln
 from scipy.stats import chi2
 
 from magbridge.diagnose.candidates import Candidate
-from magbridge.diagnose.causes.timing import field_rates
-from magbridge.diagnose.joint import Joint, fit_joint, information
-from magbridge.diagnose.noise import TAILS
+from magbridge.diagnose.free import Description, descriptions
+from magbridge.diagnose.joint import Joint, information
+from magbridge.diagnose.noise import Noise, fit_noise
 from magbridge.diagnose.problem import Columns, Problem
-from magbridge.diagnose.weigh import LEVEL, score, weigh
+from magbridge.diagnose.search import Outcome, worth
+from magbridge.diagnose.weigh import LEVEL, ODDS, REMNANT, lead
 
-__all__ = ["Leftover", "Outliers", "flexible", "leftover", "outliers"]
+__all__ = ["Leftover", "Ridge", "accept", "leftover", "ridge"]
 
 FloatArray = NDArray[np.float64]
 
-BURSTS = 64
-"""Pieces of a log in which something may come and go."""
 LOUD = 3
-"""Descriptions beside the slow ones that are fitted jointly."""
+"""Descriptions under each noise that are weighed by the whole likelihood."""
+SIZES = np.logspace(-7, 2, 64)
+"""Common sizes g, squared, in units of the widths."""
+CALM = 2
+"""Rounds in which slow curves and noise take from each other."""
+CHUNK = 8192
 
 
 class Leftover(NamedTuple):
@@ -37,13 +54,11 @@ class Leftover(NamedTuple):
         ``switching drift tone transient broadband``.
     signal_to_noise, p_value : float
     evidence : float
-        Log Bayes factor of the flexible description against the model.
+        Log Bayes factor of the description against the model.
     period_s : float or None
         Of a tone.
     best_channel : str or None
         The telemetry that goes with it best.
-    channel : str or None
-        The telemetry that the best description is a curve of.
     """
 
     kind: str
@@ -52,88 +67,49 @@ class Leftover(NamedTuple):
     evidence: float
     period_s: float | None
     best_channel: str | None
-    channel: str | None = None
 
 
-class Outliers(NamedTuple):
-    """Isolated wrong samples: which, twice the gain in log likelihood, and its p-value."""
+class Ridge(NamedTuple):
+    """The best common size: log evidence, its part that is prior and volume, estimate, and whitened norm of that."""
 
-    rows: NDArray[np.intp]
-    ratio: float
-    p_value: float
-
-
-class Flexible(NamedTuple):
-    """A description without a name: columns in units of a width, how many, and the channel that it follows."""
-
-    kind: str
-    columns: Columns
-    size: int
-    channel: str | None = None
+    evidence: float
+    price: float
+    estimate: FloatArray
+    signal_to_noise: float
 
 
-def flexible(problem: Problem) -> list[Flexible]:
-    """List what structure of any kind is looked for with.
+def ridge(S: FloatArray, b: FloatArray, width: FloatArray) -> Ridge:
+    """Evaluate the module's formula.
 
-    Slow curves, steps and a function of attitude along each axis of the body, bursts along the field, the rates of
-    change of the field, and a curve through each channel with the side that it came from.
+    Parameters
+    ----------
+    S : (k, k) array
+    b : (k,) array
+    width : (k,) array
     """
-    t = problem.survey.time
-    n = len(t)
-    u = (t - t[0]) / max(float(np.ptp(t)), 1.0)
-    body = -problem.slopes[:, 6:]
-    x = body / np.linalg.norm(body, axis=1)[:, None]
-    powers = [x[:, 0] ** i * x[:, 1] ** j * x[:, 2] ** (4 - i - j) for i in range(5) for j in range(5 - i)]
-    attitude = np.stack(powers, axis=1)
-    rates = field_rates(problem)
-    place = np.arange(n)
-
-    def projected(basis: Callable[[slice], FloatArray], width: float) -> Columns:
-        """Each function of time along each axis of the body."""
-
-        def columns(rows: slice) -> FloatArray:
-            part = basis(rows)
-            return np.asarray((part[:, :, None] * body[rows, None, :]).reshape(len(part), -1) * width)
-
-        return columns
-
-    def slow(rows: slice) -> FloatArray:
-        return np.asarray(np.cos(np.pi * u[rows, None] * np.arange(1, 13)))
-
-    def pieces(rows: slice, count: int = 16) -> FloatArray:
-        return np.asarray((place[rows] * count // n)[:, None] == np.arange(1, count), float)
-
-    def curve(values: FloatArray) -> Columns:
-        y = 2.0 * (values - values.min()) / np.ptp(values) - 1.0
-        moved = np.flatnonzero(np.abs(np.diff(y, prepend=y[0])) > 1e-3)
-        came = np.zeros(n)
-        if moved.size:
-            last = np.searchsorted(moved, place, "right") - 1
-            came = np.where(last >= 0, np.sign(np.diff(y, prepend=y[0])[moved[last]]), 0.0)
-        return projected(
-            lambda rows: np.stack([y[rows], y[rows] ** 2, y[rows] ** 3, y[rows] ** 4, came[rows]], 1), 30.0
-        )
-
-    listed = [
-        Flexible("drift", projected(slow, 10.0), 36),
-        Flexible("transient", projected(pieces, 20.0), 45),
-        Flexible("broadband", lambda rows: 30.0 * attitude[rows], 15),
-        Flexible(
-            "transient", lambda rows: 20.0 * problem.gain[rows, None] * pieces(rows, BURSTS), BURSTS - 1
-        ),
-        Flexible("broadband", projected(lambda rows: rates[:, rows].T, 0.3), 9),
-    ]
-    return listed + [
-        Flexible("broadband", curve(channel.values), 15, name)
-        for name, channel in problem.survey.channels.items()
-        if name not in problem.survey.still
-    ]
+    values, vectors = np.linalg.eigh(S * np.outer(width, width))
+    values = np.maximum(values, 0.0)
+    y = vectors.T @ (b * width)
+    table = SIZES[:, None] * y**2 / (1.0 + SIZES[:, None] * values) - np.log1p(SIZES[:, None] * values)
+    evidences = 0.5 * table.sum(axis=1)
+    k = int(np.argmax(evidences))
+    c = SIZES[k] * y / (1.0 + SIZES[k] * values)
+    price = 0.5 * float(c @ c / SIZES[k] + np.log1p(SIZES[k] * values).sum())
+    return Ridge(
+        float(evidences[k]), price, width * (vectors @ c), float(np.sqrt(c**2 @ values))
+    )  # fmt: skip
 
 
 def leftover(
-    problem: Problem, model: Sequence[Candidate], fit: Joint, order: int, tone: Candidate | None = None
+    problem: Problem,
+    model: Sequence[Candidate],
+    fit: Joint,
+    order: int,
+    tone: Candidate | None = None,
+    *,
+    but: Sequence[Candidate] = (),
 ) -> Leftover | None:
-    """Test whether anything is left beside `model`; the kind with the best evidence, or None.
+    """Test whether anything is left beside `model`; the description with the best evidence, or None.
 
     Parameters
     ----------
@@ -141,59 +117,102 @@ def leftover(
         The model that was found.
     tone : Candidate, optional
         The best periodic disturbance, if the table does not hold that cause.
+    but : sequence of Candidate
+        Causes that are not to be told again with more numbers.
     """
-    listed = flexible(problem)
-    if tone is not None:
-        listed.append(Flexible("tone", tone.columns, tone.size))
+    listed = [one for one in descriptions(problem, fit, tone) if not one.retells(but)]
     columns = [candidate.columns for candidate in model]
-    info = information(problem, fit.noise, fit, columns, [one.columns for one in listed])
-    ends = np.cumsum([0, *(one.size for one in listed)])
-    scores = [score(info, slice(int(a), int(b))) for a, b in pairwise(ends)]
-    # slow ones the noise may have swallowed: they are always fitted; of the others those that have something to say
-    loud = sorted(range(3, len(listed)), key=lambda k: -scores[k].evidence)[:LOUD]
     found = []
-    for k in (0, 1, 2, *loud):
-        one, s = listed[k], scores[k]
-        index = np.arange(ends[k], ends[k + 1])
-        start = np.append(info.moved(fit, index, s.estimate), s.estimate)
-        joint = fit_joint(
-            problem, [*columns, one.columns], order, start, np.append(start[: -one.size], np.zeros(one.size)),
-            like=fit, ridge=1.0, rounds=3,
-        )  # fmt: skip
-        judged = _judge(
-            one,
-            joint,
-            fit,
-            s.freedom,
-            float(len(listed)) * (tone.trials if tone and one.kind == "tone" else 1.0),
-        )
-        if tone is not None and one.kind == "tone":
-            judged = judged._replace(
-                period_s=tone.shape["period"][0], evidence=judged.evidence - float(np.log(tone.trials))
-            )
-        found.append(judged)
-    # without a name stricter than for a cause: with so many numbers the distribution is only asymptotic
-    sure = [entry for entry in found if entry.p_value < (LEVEL if model else 0.1 * LEVEL)]
-    if not sure:
+    for noise in (fit.noise, _calm(problem, columns, fit, order, listed[:2])):
+        scored = []
+        for one in listed:
+            info = information(problem, noise, fit, columns, [one.columns])
+            for kind, width in one.widths:
+                best = ridge(info.matrix, info.score, width)
+                scored.append((best.evidence - float(np.log(one.trials)), kind, one, best, info.shift))
+        scored.sort(key=lambda entry: -entry[0])
+        found += [
+            (_weighed(problem, columns, fit, order, one, best, shift), kind, one, best.signal_to_noise)
+            for _, kind, one, best, shift in scored[:LOUD]
+        ]
+    evidence, kind, one, size = max(found, key=lambda entry: entry[0])
+    p_value = min(1.0, sum(len(one.widths) for one in listed) * float(chi2.sf(2.0 * max(evidence, 0.0), 1)))
+    if p_value >= (
+        LEVEL if model else 0.1 * LEVEL
+    ):  # with so many numbers the distribution is only asymptotic
         return None
-    best = max(sure, key=lambda entry: entry.evidence)
-    if best.kind == "transient":
-        best = best._replace(kind=_steps(problem, fit))
-    return best if best.best_channel else best._replace(best_channel=_goes_with(problem, fit))
+    if kind == "transient":
+        kind = _steps(problem, fit)
+    return Leftover(kind, size, p_value, evidence, one.period, one.channel or _goes_with(problem, fit))
 
 
-def _judge(one: Flexible, joint: Joint, base: Joint, freedom: int, hypotheses: float) -> Leftover:
-    size = one.size
-    b = joint.coefficients[-size:]
-    # many slow numbers against few independent samples: the ratio's mean is above its freedom (Bartlett 1937)
-    independent = max(base.noise.independent, 2.0 * freedom)
-    ratio = max(0.0, 2.0 * (joint.log_likelihood - base.log_likelihood)) * (1.0 - freedom / independent)
-    p_value = min(1.0, hypotheses * float(chi2.sf(ratio, max(freedom, 1))))
-    evidence = weigh(ratio, max(freedom, 1))
-    own = np.linalg.inv(joint.covariance[-size:, -size:])
-    # of the flexible fit's own numbers, those that the data determine
-    power = max(float(b @ own @ b) - freedom, 0.0)
-    return Leftover(one.kind, power**0.5, p_value, evidence, None, one.channel, one.channel)
+def accept(problem: Problem, outcome: Outcome, tone: Candidate | None) -> tuple[bool, Leftover | None]:
+    """Say whether the names stand, and what is left beside them or, if they do not, at all.
+
+    Names stand unless a free description of the whole beats them as another name would have to. If more is left beside
+    them than an idealised regressor leaves, the burden of proof is theirs: they and what is left must beat it 20:1.
+    """
+    model = [h.candidate for h in outcome.chosen]
+    rest = leftover(problem, model, outcome.fit, outcome.order, tone)
+    if not model:
+        return False, rest
+    if rest is not None and rest.signal_to_noise < REMNANT * max(h.signal_to_noise for h in outcome.chosen):
+        rest = None
+    # what holds the names' own regressors and finds nothing beside them is no other explanation
+    free = leftover(problem, [], outcome.null, outcome.order, tone, but=() if rest else model)
+    ratio = 2.0 * (outcome.fit.log_likelihood - outcome.null.log_likelihood)
+    names = worth(ratio, model, len(outcome.trials)) + (rest.evidence - ODDS if rest else lead(ratio))
+    if free is not None and names < free.evidence:
+        return False, free
+    return True, rest
+
+
+def _calm(
+    problem: Problem, model: Sequence[Columns], fit: Joint, order: int, slow: Sequence[Description]
+) -> Noise:
+    """Return the noise that is left when slow curves take what they can, beginning with one that has no memory."""
+    jumps = np.abs(np.diff(fit.left))
+    level = 1.4826 * float(np.median(jumps)) / np.sqrt(2.0) + 1e-12
+    white = np.full(len(problem), level)
+    noise = replace(
+        fit.noise, memory=np.zeros(order), scale=white, nu=1e6, share=1.0, innovations=fit.left / level
+    )
+    width = np.concatenate([one.widths[1][1] for one in slow])
+    follows, blocks = problem.survey.follows, bool(np.ptp(fit.noise.scale))
+    for _ in range(CALM):
+        info = information(problem, noise, fit, model, [one.columns for one in slow])
+        c = ridge(info.matrix, info.score, width).estimate
+        left = fit.left + _taken(problem, model, -info.shift @ c, [one.columns for one in slow], c)
+        noise = fit_noise(left, follows, order, blocks=blocks)
+    return noise
+
+
+def _weighed(
+    problem: Problem, model: Sequence[Columns], fit: Joint, order: int, one: Description, best: Ridge, shift: FloatArray
+) -> float:  # fmt: skip
+    """Log evidence of a description against the model, the noise fitted anew with it (Laplace's approximation)."""
+    moved = -shift @ best.estimate
+    left = fit.left + _taken(problem, model, moved, [one.columns], best.estimate)
+    noise = fit_noise(
+        left, problem.survey.follows, order, blocks=bool(np.ptp(fit.noise.scale)), like=fit.noise
+    )
+    z = fit.z + moved[: len(fit.z)]
+    pull = float(np.sum((z - problem.centre) ** 2) - np.sum((fit.z - problem.centre) ** 2))
+    gained = noise.log_likelihood - fit.noise.log_likelihood - 0.5 * pull
+    return gained - best.price - float(np.log(one.trials))
+
+
+def _taken(
+    problem: Problem, model: Sequence[Columns], moved: FloatArray, columns: Sequence[Columns], c: FloatArray
+) -> FloatArray:
+    """(n,) by how much the residual changes when a description takes c, and calibration and model move by `moved`."""
+    out = np.empty(len(problem))
+    every = np.append(moved, c)
+    for start in range(0, len(problem), CHUNK):
+        rows = slice(start, min(start + CHUNK, len(problem)))
+        X = np.hstack([problem.free[rows], *(column(rows) for column in (*model, *columns))])
+        out[rows] = -X @ every
+    return out
 
 
 def _steps(problem: Problem, fit: Joint) -> str:
@@ -217,51 +236,3 @@ def _goes_with(problem: Problem, fit: Joint) -> str | None:
         if explained > best[0]:
             best = (explained, name)
     return best[1]
-
-
-def outliers(fit: Joint, causes: int) -> Outliers | None:
-    """Test for isolated wrong samples: a few innovations from a wide distribution of their own.
-
-    Heavy tails alone are no outliers: the mixture ``(1 - eps) t_nu + eps N(0, S^2)`` must beat the best ``t_nu``.
-    """
-    v = fit.noise.innovations
-    n = len(v)
-    alone = max(_mixture(v, nu, 0.0)[0] for nu in TAILS)
-    if np.abs(v).max() < 5.0:
-        return None
-    value, member = max((_mixture(v, nu, 3.0 / n) for nu in TAILS[1:]), key=lambda found: found[0])
-    ratio = 2.0 * (value - alone)
-    p_value = min(1.0, causes * float(chi2.sf(ratio, 2)))
-    rows = np.flatnonzero(member > 0.5)
-    if p_value >= LEVEL or not rows.size or rows.size > 0.05 * n:
-        return None
-    # the memory of the noise throws a shadow of every wrong sample on the next
-    first = rows[np.insert(np.diff(rows) > 1, 0, True)]
-    return Outliers(first, ratio, p_value)
-
-
-def _mixture(v: FloatArray, nu: float, eps: float) -> tuple[float, FloatArray]:
-    """Log likelihood of the mixture after expectation maximisation, and each sample's chance to be wrong."""
-    s, wide, member = (
-        1.4826 * float(np.median(np.abs(v))),
-        3.0 * float(np.abs(v).max()) / 3.0,
-        np.zeros(len(v)),
-    )
-    value = -np.inf
-    for _ in range(25):
-        x = v / s
-        if nu > 1e5:
-            log_t = -0.5 * (x * x + np.log(2 * np.pi)) - np.log(s)
-        else:
-            c = gammaln((nu + 1) / 2) - gammaln(nu / 2) - 0.5 * np.log(nu * np.pi)
-            log_t = c - 0.5 * (nu + 1) * np.log1p(x * x / nu) - np.log(s)
-        inside = np.exp(log_t) * (1.0 - eps)
-        outside = eps * np.exp(-0.5 * (v / wide) ** 2) / (wide * np.sqrt(2 * np.pi))
-        value = float(np.log(inside + outside + 1e-300).sum())
-        if eps > 0.0:
-            member = outside / (inside + outside + 1e-300)
-            eps = max(float(member.mean()), 0.1 / len(v))
-            wide = max(float(np.sqrt((member @ (v * v)) / (member.sum() + 1e-12))), 4.0 * s)
-        weight = (1.0 - member) * (nu + 1.0) / (nu + x * x)
-        s = float(np.sqrt((weight @ (v * v)) / (1.0 - member).sum()))
-    return value, member

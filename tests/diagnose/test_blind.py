@@ -70,7 +70,8 @@ def test_two_at_once() -> None:
 
 
 def test_what_no_cause_explains_is_called_unexplained() -> None:
-    row = blind("foreign", ("relay",), 15.0)
+    """A ship: in two hours a relay that nobody logs is a noise with a memory, in theory, too."""
+    row = blind("foreign", ("ship",), 15.0)
     assert row["unexplained"] is not None
     assert not row["found"]
 

@@ -59,10 +59,10 @@ def interference_tone(problem: Problem) -> list[Candidate]:
         return []
     flat = np.append(0.0, np.diff(problem.residual) * survey.follows[1:])
     size = 1 << int(np.ceil(np.log2(slots[-1] + 1)) + 1)
-    power = np.zeros(size // 2 + 1)
-    for axis in range(3):
-        series = np.bincount(slots, flat * problem.slopes[:, 6 + axis], minlength=size)
-        power += np.abs(np.fft.rfft(series)) ** 2
+    body = problem.slopes[:, 6:]
+    lines = np.array([np.fft.rfft(np.bincount(slots, flat * slope, minlength=size)) for slope in body.T])
+    # of all three axes together: what they share counts once
+    power = np.einsum("if,ij,jf->f", lines.conj(), np.linalg.inv(body.T @ body), lines).real
     frequency = np.fft.rfftfreq(size, interval)
     smooth = np.convolve(power, np.ones(201) / 201, mode="same") + 1e-300
     ratio = np.where(frequency * float(np.ptp(t)) > 20.0, power / smooth, 0.0)

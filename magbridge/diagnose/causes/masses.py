@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial, reduce
 from itertools import product
 
@@ -77,7 +78,7 @@ def actuator_order(problem: Problem) -> list[Candidate]:
     made = {e: _monomial(problem, e) for e in {*missing, *(e for group in groups for e in group)}}
     return [
         *(made[e] for e in missing),
-        *(reduce(Candidate.with_, [made[e] for e in group]) for group in groups),
+        *(replace(reduce(Candidate.with_, [made[e] for e in group]), parts=1) for group in groups),
     ]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -18,7 +19,7 @@ FloatArray = NDArray[np.float64]
 
 
 def nonlinearity(problem: Problem) -> list[Candidate]:
-    """The response bends: ``T_i += b_i (H_i / H_0)^p``, p = 2 (an even harmonic's leak) or 3 (a saturating core)."""
+    """The response bends: ``T_i += b_i (H_i / H_0)^p``, p = 2 (an even harmonic's leak), 3 (a saturating core), or both."""
     unit, H = problem.calibration.reference.field, problem.survey.field
     made = []
     for power in (2, 3):
@@ -27,7 +28,7 @@ def nonlinearity(problem: Problem) -> list[Candidate]:
         made.append(
             of_effect(problem, effect, 50.0, f"nT at {unit:.0f} nT", phi=phi, shape={"power": (power, "1")})
         )
-    return made
+    return [*made, replace(made[0].with_(made[1]), parts=1)]
 
 
 def saturation(problem: Problem) -> list[Candidate]:

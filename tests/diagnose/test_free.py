@@ -1,0 +1,49 @@
+"""What is described without a name, and what is not there at all."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.stats import multivariate_normal
+
+from magbridge.calibration.data import observations
+from magbridge.calibration.fit import fit
+from magbridge.calibration.lowpass import unfiltered
+from magbridge.diagnose.run import diagnose
+from magbridge.diagnose.unexplained import SIZES, ridge
+from sitl import load, simulate
+from sitl.columns import segments
+
+
+def test_ridge_is_the_marginal_likelihood_of_a_common_size() -> None:
+    """Against the naive oracle: the density of the data with the prior integrated out."""
+    rng = np.random.default_rng(1)
+    X, width = rng.normal(size=(60, 5)), np.array([3.0, 1.0, 1.0, 0.3, 0.0])
+    y = X @ np.array([2.0, -1.0, 0.5, 0.0, 0.0]) + rng.normal(size=60)
+
+    def density(g: float) -> float:
+        return float(multivariate_normal.logpdf(y, cov=np.eye(60) + g * (X * width**2) @ X.T))
+
+    best = ridge(X.T @ X, X.T @ y, width)
+    assert best.evidence == pytest.approx(max(density(g) for g in SIZES) - density(0.0), abs=1e-8)
+    gained = 0.5 * (y @ y - np.sum((y - X @ best.estimate) ** 2))
+    assert gained - best.price == pytest.approx(best.evidence, abs=1e-8)
+    assert best.estimate[-1] == 0.0
+
+
+def test_under_no_effect_twice_the_evidence_is_at_most_a_chi_square_of_one_freedom() -> None:
+    rng = np.random.default_rng(2)
+    X = rng.normal(size=(400, 40)) / np.arange(1, 41)
+    found = [ridge(X.T @ X, X.T @ rng.normal(size=400), np.ones(40)).evidence for _ in range(2000)]
+    assert np.mean(2.0 * np.array(found) > 6.63) < 0.015
+
+
+@pytest.mark.parametrize("seed", [2, 5])
+def test_a_plain_survey_is_plain(seed: int) -> None:
+    """Other gliders than the demonstration's own, calibrated from their spirals."""
+    scenario = load("demo")
+    parts = segments(simulate(scenario, seed))
+    learned = unfiltered(
+        observations(parts["calibration"], ("battpos", "ballast")), scenario.instrument.corner
+    )
+    assert diagnose([parts["survey"]], fit(learned, "auto").calibration).verdict == "nothing_found"
