@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from study.cases import PARTS, plan
-from study.stage import MEMORY, project, whiten
+from study.stage import MEMORY, autoregression, project, whiten
 from study.table import efficiency, lines, share
 from study.theory import Span, weigh, with_another
 
@@ -33,10 +33,8 @@ def test_what_a_free_calibration_absorbs_against_the_naive_way() -> None:
 
 def test_whitened_noise_is_white() -> None:
     rng = np.random.default_rng(2)
-    noise = rng.normal(size=20_000)
-    noise[1:] *= np.sqrt(1 - MEMORY**2)
-    for i in range(1, len(noise)):
-        noise[i] += MEMORY * noise[i - 1]
+    noise = autoregression(rng.normal(size=(20_000, 1)), MEMORY)[:, 0]
+    assert np.std(noise) == pytest.approx(1.0, abs=0.03)
     white = whiten(noise, "ar")
     assert np.std(white) == pytest.approx(1.0, abs=0.02)
     assert abs(np.mean(white[1:] * white[:-1])) < 0.02

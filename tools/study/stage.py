@@ -11,6 +11,7 @@ import msgspec
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
+from scipy.signal import lfilter
 
 from magbridge.calibration.correct import regressors
 from magbridge.calibration.data import observations
@@ -35,8 +36,11 @@ INERTIA = 3.0
 """s, twice, with which the attitude follows what :mod:`sitl.trajectory` draws."""
 MEMORY = 0.8
 """Correlation of neighbours in noise with a memory."""
-NOISES = ("white", "ar", "heavy", "uneven", "half", "map")
-"""White; with a memory; heavy-tailed; louder at times; half as loud again as calibrated; over rock that is rough."""
+SLOWER = 0.95
+"""Correlation of neighbours in the slower third of noise that is white upon something slower."""
+NOISES = ("white", "ar", "mixed", "heavy", "uneven", "half", "map")
+"""White; with a memory; white upon a longer one; heavy-tailed; louder at times; half as loud again as calibrated; over
+rock that is rough."""
 
 
 @dataclass(frozen=True)
@@ -112,6 +116,12 @@ def statistics(noise: str) -> tuple[float, float]:
     return (MEMORY if noise == "ar" else 0.0), (1.5 if noise == "half" else 1.0)
 
 
+def autoregression(white: Array, memory: float) -> Array:
+    """Give white noise of unit variance (n, k) a memory, and leave its variance."""
+    driven = np.vstack([white[:1], white[1:] * np.sqrt(1 - memory**2)])
+    return np.asarray(lfilter([1.0], [1.0, -memory], driven, axis=0))
+
+
 def add_noise(ds: xr.Dataset, kind: str, seed: int) -> xr.Dataset:
     """Add noise of unit variance, or what its `kind` says, to each channel."""
     rng = np.random.default_rng([seed, 99])
@@ -120,9 +130,9 @@ def add_noise(ds: xr.Dataset, kind: str, seed: int) -> xr.Dataset:
     if kind == "heavy":
         noise = rng.standard_t(4.0, (n, 3)) / np.sqrt(2.0)
     if kind == "ar":
-        noise[1:] *= np.sqrt(1 - MEMORY**2)
-        for i in range(1, n):
-            noise[i] += MEMORY * noise[i - 1]
+        noise = autoregression(noise, MEMORY)
+    if kind == "mixed":
+        noise = np.sqrt(2 / 3) * noise + np.sqrt(1 / 3) * autoregression(rng.standard_normal((n, 3)), SLOWER)
     if kind == "uneven":
         noise *= np.repeat(np.exp(rng.normal(0, 0.5, n // 300 + 1)), 300)[:n, None]
     out = ds.copy()
