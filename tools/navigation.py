@@ -9,7 +9,7 @@ watch         how long a filter that is in the wrong place vouches for it
 misinformed   whether one vouches for its position that has been told the wrong level, or half a map
 calibrations  simulated gliders, each calibrated by nominal, cubic and auto, that fly the same survey
 speed         one update, 100,000 samples, the start
-peers         Stone Soup (tools/navigation_peers.py) on the same measurements; MagNav.jl's published flight
+peers         Stone Soup (tools/voyages/stone_soup.py) on the same measurements; MagNav.jl's published flight
 
 A run takes about a second, accuracy of 100 runs a row a quarter of an hour on a free core; with ``--keep`` rows that are
 done are kept in a folder, and taken up again.
@@ -45,12 +45,12 @@ from pickle import dumps, loads
 from typing import Any, NamedTuple
 
 import numpy as np
-from calibrated_voyages import METHODS, flown
-from lost_voyages import LEVEL, carried, half, level, misled
 from msgspec.structs import replace as with_options
-from navigation_beside import magnav, stone_soup
 from scipy.stats import chi2
-from voyages import AT_HOURS, GLIDER, LEFT, PLACE, SPEEDS, START, Map, Score, sail, synthetic, voyage
+from voyages.beside import magnav, stone_soup
+from voyages.calibrated import METHODS, flown
+from voyages.lost import LEVEL, carried, half, level, misled
+from voyages.sail import AT_HOURS, GLIDER, LEFT, PLACE, SPEEDS, START, Map, Score, sail, synthetic, voyage
 
 from magbridge.navigate.batch import navigate
 from magbridge.navigate.model import Block, prior, transition

@@ -93,7 +93,7 @@ def test_a_wide_start_is_found(study, grid, options):
 
 
 def test_carried_off_it_says_that_it_is_lost_and_finds_itself_again(study):
-    hours_vouched, hours_lost = import_module("lost_voyages").carried(study.Map(30, 1500), 3)
+    hours_vouched, hours_lost = import_module("voyages.lost").carried(study.Map(30, 1500), 3)
     assert 0.0 < hours_lost < 2.0
     assert hours_vouched < 0.5
 

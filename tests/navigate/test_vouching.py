@@ -56,7 +56,7 @@ def test_a_calibration_that_is_off_is_not_answered_by_another_place(study, grid,
 
 
 def test_a_misled_filter_does_not_stand_by_it(study):
-    hours_vouched, hours_lost = import_module("lost_voyages").misled(study.Map(30, 1500), 6)
+    hours_vouched, hours_lost = import_module("voyages.lost").misled(study.Map(30, 1500), 6)
     assert hours_lost > 0.0
     assert hours_vouched < 0.5
 

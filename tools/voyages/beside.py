@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 from msgspec.structs import replace as with_options
-from voyages import PLACE, START, Map, blocks, sail, synthetic, voyage
 
 from magbridge.field.earth import metres_per_degree, separation
 from magbridge.field.igrf import total_field
 from magbridge.field.read import read_grid
 from magbridge.navigate.batch import navigate
 from magbridge.navigate.model import Options, prior, transition
+from voyages.sail import PLACE, START, Map, blocks, sail, synthetic, voyage
 
 
 def stone_soup(python: str, kind: Map, glider: Options, share: float, seed: int) -> tuple[float, ...]:
@@ -49,7 +49,7 @@ def stone_soup(python: str, kind: Map, glider: Options, share: float, seed: int)
             particles=20_000,
             seed=seed,
         )
-        subprocess.run([python, Path(__file__).with_name("navigation_peers.py"), given, made], check=True)
+        subprocess.run([python, Path(__file__).with_name("stone_soup.py"), given, made], check=True)
         theirs = dict(np.load(made))
     when = np.array([b.time_us for b, _ in found]) * 1e-6
     half = when > 0.5 * (when[0] + when[-1])

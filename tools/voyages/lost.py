@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from msgspec.structs import replace as with_options
 from numpy.typing import NDArray
-from voyages import GLIDER, OUTSIDE, SPEEDS, Map, Run, longest, sail, synthetic, voyage
 
 from magbridge.field.grid import AnomalyGrid
+from voyages.sail import GLIDER, OUTSIDE, SPEEDS, Map, Run, longest, sail, synthetic, voyage
 
 LEVEL = 60.0  # nT
 

@@ -7,7 +7,6 @@ from typing import NamedTuple
 import numpy as np
 from accuracy import at_rest, rms, total
 from msgspec.structs import replace as with_options
-from voyages import GLIDER, PLACE, Map, Score, adrift, sail, synthetic
 
 from magbridge.calibration.data import observations
 from magbridge.calibration.fit import fit
@@ -16,6 +15,7 @@ from magbridge.correction import Correction, correct_rows
 from magbridge.navigate.model import informed
 from sitl import load, segments, simulate
 from sitl.world import to_local
+from voyages.sail import GLIDER, PLACE, Map, Score, adrift, sail, synthetic
 
 METHODS = {"nominal": {"axes_fixed": True, "equal_xz": True}, "cubic": {}, "auto": {}}
 """With the options of the paper."""
