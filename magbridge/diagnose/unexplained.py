@@ -131,9 +131,15 @@ def leftover(
                 best = ridge(info.matrix, info.score, width)
                 scored.append((best.evidence - float(np.log(one.trials)), kind, one, best, info.shift))
         scored.sort(key=lambda entry: -entry[0])
+        # a gain beyond the formula's is not the description's own, but of a noise that found another optimum beside it
         found += [
-            (_weighed(problem, columns, fit, order, one, best, shift), kind, one, best.signal_to_noise)
-            for _, kind, one, best, shift in scored[:LOUD]
+            (
+                min(own, _weighed(problem, columns, fit, order, one, best, shift)),
+                kind,
+                one,
+                best.signal_to_noise,
+            )
+            for own, kind, one, best, shift in scored[:LOUD]
         ]
     evidence, kind, one, size = max(found, key=lambda entry: entry[0])
     p_value = min(1.0, sum(len(one.widths) for one in listed) * float(chi2.sf(2.0 * max(evidence, 0.0), 1)))
