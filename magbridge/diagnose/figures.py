@@ -9,19 +9,22 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogFormatter
 from numpy.typing import NDArray
 from scipy.signal import periodogram
 
 if TYPE_CHECKING:
     from magbridge.diagnose.run import Diagnosis
 
-__all__ = ["channels", "evidence", "likeness", "measured", "spectrum", "terms", "track"]
+__all__ = ["channels", "evidence", "label", "likeness", "measured", "spectrum", "terms", "track"]
 
 FloatArray = NDArray[np.float64]
 
 BEFORE, AFTER, INK, FAINT = "#c8553d", "#1f6f8b", "#22303c", "#9aa5b1"
 POINTS = 4000
 """Points drawn of a curve; more only make the page heavy."""
+MANY = 150
+"""Dives that are not parted by lines any more."""
 
 
 def _figure(width: float, height: float, rows: int = 1, columns: int = 1, **more: Any) -> tuple[Figure, Any]:
@@ -50,8 +53,16 @@ def _hours(diagnosis: Diagnosis) -> FloatArray:
     return np.asarray((t - t[0]) / 3600.0)
 
 
-def _scale(diagnosis: Diagnosis) -> float:
-    return 1.5 * float(np.quantile(np.abs(diagnosis.before), 0.995)) + 1e-9
+def _sides(diagnosis: Diagnosis) -> dict[str, tuple[FloatArray, str]]:
+    """Return what is compared, with its colour; where nothing was mended there is no after."""
+    if not diagnosis.named:
+        return {"difference": (diagnosis.before, AFTER)}
+    return {"before": (diagnosis.before, BEFORE), "after, dives left out": (diagnosis.after, AFTER)}
+
+
+def label(cause: str, channel: str | None) -> str:
+    """Return a cause as people read it."""
+    return cause.replace("_", " ") + (f" ({channel})" if channel else "")
 
 
 def measured(diagnosis: Diagnosis) -> str:
@@ -66,16 +77,20 @@ def measured(diagnosis: Diagnosis) -> str:
     top.set_ylabel("total field (nT)", fontsize=9)
     ends = np.nanquantile(np.append(total, survey.reference), [0.002, 0.998])
     top.set_ylim(ends[0] - 0.1 * np.ptp(ends), ends[1] + 0.35 * np.ptp(ends))
-    low.plot(hours[part], diagnosis.before[part], ".", color=BEFORE, markersize=2, label="before")
-    low.plot(
-        hours[part], diagnosis.after[part], ".", color=AFTER, markersize=2, label="after, dives left out"
-    )
-    for start in survey.time[np.flatnonzero(np.diff(survey.dive)) + 1]:
+    ends = np.zeros(2)
+    for name, (left, colour) in _sides(diagnosis).items():
+        low.plot(hours[part], left[part], ".", color=colour, markersize=2, label=name)
+        some = np.quantile(left, [0.002, 0.998])
+        ends = np.array([min(ends[0], some[0]), max(ends[1], some[1])])
+    dives = survey.time[np.flatnonzero(np.diff(survey.dive)) + 1]
+    for start in dives if dives.size < MANY else ():
         low.axvline((start - survey.time[0]) / 3600.0, color=FAINT, linewidth=0.4)
-    scale = _scale(diagnosis)
-    low.set_ylim(-scale, scale)
+    low.axhline(0.0, color=INK, linewidth=0.6)
+    low.set_ylim(ends[0] - 0.25 * np.ptp(ends), ends[1] + 0.4 * np.ptp(ends))
     low.set_ylabel("measured − simulated (nT)", fontsize=9)
-    low.set_xlabel("hours since the start; grey lines part the dives", fontsize=9)
+    low.set_xlabel(
+        "hours since the start" + ("; grey lines part the dives" if dives.size < MANY else ""), fontsize=9
+    )
     for axis in (top, low):
         axis.legend(fontsize=8, frameon=False, loc="upper right", markerscale=4, ncols=2)
     return _png(figure)
@@ -87,7 +102,7 @@ def spectrum(diagnosis: Diagnosis) -> str:
     interval = float(np.median(np.diff(survey.time)))
     figure, axes = _figure(5.6, 3.6)
     axis = axes[0, 0]
-    for values, colour, label in ((diagnosis.before, BEFORE, "before"), (diagnosis.after, AFTER, "after")):
+    for name, (values, colour) in _sides(diagnosis).items():
         frequency, power = periodogram(values, 1.0 / interval, detrend="constant")
         edges = np.unique(np.geomspace(1, len(frequency), 60).astype(int))
         where = [slice(a, b) for a, b in pairwise(edges)]
@@ -95,7 +110,7 @@ def spectrum(diagnosis: Diagnosis) -> str:
             [frequency[w].mean() for w in where],
             [np.sqrt(power[w].mean()) for w in where],
             color=colour,
-            label=label,
+            label=name,
         )
     noise = diagnosis.fit.noise
     frequency = np.geomspace(1.0 / float(np.ptp(survey.time)), 0.5 / interval, 200)
@@ -105,6 +120,9 @@ def spectrum(diagnosis: Diagnosis) -> str:
         frequency, spread * np.sqrt(2.0 * interval) / np.abs(1.0 - lags @ noise.memory), "--", color=INK, linewidth=1,
         label="noise model",
     )  # fmt: skip
+    axis.yaxis.set_major_formatter(LogFormatter())
+    axis.yaxis.set_minor_formatter(LogFormatter(minor_thresholds=(1.5, 0.6)))
+    axis.tick_params(which="minor", labelsize=8, colors=INK)
     axis.set_xlabel("frequency (Hz)", fontsize=9)
     axis.set_ylabel("nT/√Hz", fontsize=9)
     axis.legend(fontsize=8, frameon=False)
@@ -130,11 +148,11 @@ def channels(diagnosis: Diagnosis) -> str:
         edges = np.linspace(values.min(), values.max(), 21)
         bins = np.clip(np.searchsorted(edges, values) - 1, 0, 19)
         count = np.bincount(bins, minlength=20)
-        seen = count > 3
-        middle = 0.5 * (edges[1:] + edges[:-1])[seen]
-        for left, colour in ((diagnosis.before, BEFORE), (diagnosis.after, AFTER)):
-            mean = np.bincount(bins, left, 20)[seen] / count[seen]
-            spread = np.sqrt(np.maximum(np.bincount(bins, left**2, 20)[seen] / count[seen] - mean**2, 0.0))
+        count = np.where(count > 3, count, np.nan)  # no line through what was not visited
+        middle = 0.5 * (edges[1:] + edges[:-1])
+        for left, colour in _sides(diagnosis).values():
+            mean = np.bincount(bins, left, 20) / count
+            spread = np.sqrt(np.maximum(np.bincount(bins, left**2, 20) / count - mean**2, 0.0))
             axis.fill_between(middle, mean - spread, mean + spread, color=colour, alpha=0.15, linewidth=0)
             axis.plot(middle, mean, "o-", color=colour, markersize=2.5, linewidth=1)
         axis.set_xlabel(f"{name} ({unit or '1'})", fontsize=8)
@@ -151,12 +169,11 @@ def track(diagnosis: Diagnosis) -> str | None:
     if place is None or np.ptp(place, axis=0).max() < 1.0:
         return None
     part = _thin(len(place))
-    figure, axes = _figure(10, 3.8, 1, 2, sharex=True, sharey=True)
+    sides = _sides(diagnosis)
+    figure, axes = _figure(10 if len(sides) > 1 else 6, 3.8, 1, len(sides), sharex=True, sharey=True)
     limit = float(np.quantile(np.abs(diagnosis.before), 0.98)) + 1e-9
     dots = None
-    for axis, values, title in zip(
-        axes[0], (diagnosis.before, diagnosis.after), ("before", "after"), strict=True
-    ):
+    for axis, (title, (values, _)) in zip(axes[0], sides.items(), strict=True):
         dots = axis.scatter(
             place[part, 1] / 1e3,
             place[part, 0] / 1e3,
@@ -189,32 +206,33 @@ def terms(diagnosis: Diagnosis) -> str | None:
         share = candidate.columns(slice(0, len(diagnosis.problem))) @ own
         axis.plot(hours[part], share[part], color=AFTER, linewidth=0.8)
         axis.set_ylabel("nT", fontsize=8)
-        label = candidate.cause + (f" ({candidate.channel})" if candidate.channel else "")
-        axis.set_title(label, fontsize=9, loc="left")
+        axis.set_title(label(candidate.cause, candidate.channel), fontsize=9, loc="left")
     axes[-1, 0].set_xlabel("hours since the start", fontsize=9)
     return _png(figure)
 
 
 def evidence(diagnosis: Diagnosis) -> str:
-    """Draw how strongly the data speak for each cause alone."""
+    """Draw how strongly the data speak for each cause alone, with the chance that it is a false alarm."""
     tested = diagnosis.outcome.tested
     order = sorted(tested, key=lambda name: tested[name][1])
     figure, axes = _figure(5.6, 0.6 + 0.24 * max(len(order), 1))
     axis = axes[0, 0]
     named = {h.candidate.cause for h in diagnosis.named}
-    axis.barh(
-        order,
+    bars = axis.barh(
+        [label(name, None) for name in order],
         [np.sqrt(tested[name][1]) for name in order],
         color=[AFTER if name in named else FAINT for name in order],
     )
-    axis.set_xlabel("root of the likelihood ratio, alone, noise fitted anew", fontsize=8)
+    axis.bar_label(bars, [f" p = {tested[name][0]:.1g}" for name in order], fontsize=7, color=INK)
+    axis.margins(x=0.2)
+    axis.set_xlabel("root of the likelihood ratio; p: chance of a false alarm", fontsize=8)
     return _png(figure)
 
 
 def likeness(diagnosis: Diagnosis) -> str:
     """Draw which causes look alike in this log, whatever it shows."""
     visible, R = diagnosis.isolability.visible, diagnosis.isolability.correlation
-    names = [v.cause + (f" · {v.channel}" if v.channel else "") for v in visible]
+    names = [label(v.cause, v.channel) for v in visible]
     size = 2.6 + 0.21 * len(names)
     figure, axes = _figure(size + 1.0, size)
     axis = axes[0, 0]

@@ -22,6 +22,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
 from scipy.special import gammaln
 
@@ -34,6 +35,8 @@ TAILS = (2.5, 3.0, 4.0, 5.0, 7.0, 12.0, 1e6)
 BLOCK = 150
 """Samples over which the noise's level is taken as constant."""
 ORDERS = (0, 1, 2, 3, 5, 8, 13)
+BAND = 32
+"""Rows that are filtered by one product of matrices."""
 GAUSSIAN = 1e5
 """Degrees of freedom from which on the tails are taken for Gaussian."""
 ALTERNATIONS = 6
@@ -97,10 +100,7 @@ class Noise:
         (m - skip, k) array
         """
         rows = slice(start + skip, start + len(values))
-        out = values[skip:].copy()
-        for k, a in enumerate(self.memory, start=1):
-            late = max(k - skip, 0)  # the first rows of all have no past
-            out[late:] -= a * values[skip + late - k : len(values) - k]
+        out = _filtered(values, self.memory, skip)
         past = self.past[rows]
         lone = np.flatnonzero(~past)
         out[lone] = values[skip:][lone]
@@ -111,6 +111,26 @@ class Noise:
         """(n,) y of the module's notes; far from where the noise was fitted, with its weights from there."""
         weight = (self.nu + 1.0) / (self.nu + self.innovations**2)
         return np.asarray(weight * self.filter(residual[:, None])[:, 0] / self.kappa)
+
+
+def _filtered(values: FloatArray, memory: FloatArray, skip: int) -> FloatArray:
+    """``x_t - sum_k a_k x_(t-k)`` of the rows from `skip` on, zero before the first: a band matrix, band by band."""
+    p, k = len(memory), values.shape[1]
+    m = len(values) - skip
+    if skip < p:
+        values, skip = np.vstack([np.zeros((p - skip, k)), values]), p
+    values = np.ascontiguousarray(values[skip - p :])
+    count = m // BAND
+    band = np.zeros((BAND, BAND + p))
+    for lag, a in enumerate(np.append(-1.0, memory)):
+        band[np.arange(BAND), np.arange(BAND) + p - lag] = -a
+    step, each = values.strides
+    pieces = as_strided(values, (count, BAND + p, k), (BAND * step, step, each), writeable=False)
+    out = np.empty((m, k))
+    np.matmul(band, pieces, out=out[: count * BAND].reshape(count, BAND, k))
+    rest = m - count * BAND
+    out[count * BAND :] = band[:rest, : rest + p] @ values[count * BAND :]
+    return out
 
 
 def _past(follows: BoolArray, p: int) -> BoolArray:

@@ -169,11 +169,16 @@ def pose(survey: Survey, calibration: Calibration) -> Problem:
         above, _ = residuals(replace(part, reference=part.reference + 1.0), coefficients)
         gain[rows] = e[rows] - above
     L, centre = _loosened(calibration, *_prior(survey, calibration, samples, e, g))
-    free = -derivatives(calibration, samples, g, L)
-    values, vectors = np.linalg.eigh(free.T @ free / _level(calibration, e) ** 2)
+    seen = np.zeros((L.shape[1],) * 2)
+    for start in range(0, n, CHUNK):
+        rows = slice(start, start + CHUNK)
+        J = derivatives(calibration, samples.part(rows), g[rows], L)
+        seen += J.T @ J
+    values, vectors = np.linalg.eigh(seen / _level(calibration, e) ** 2)
     keep = values > SEEN
     V, rest = vectors[:, keep], L @ vectors[:, ~keep]
-    return Problem(survey, calibration, e, g, gain, free @ V, L @ V, V.T @ centre, rest @ rest.T)
+    free = -derivatives(calibration, samples, g, L @ V)
+    return Problem(survey, calibration, e, g, gain, free, L @ V, V.T @ centre, rest @ rest.T)
 
 
 def _level(calibration: Calibration, e: FloatArray) -> float:

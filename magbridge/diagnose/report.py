@@ -44,12 +44,16 @@ def report_html(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> str:
         f"{diagnosis.problem.calibration.coefficients.size} coefficients</p>"),
         f'<p class="verdict">{_verdict(diagnosis)}</p>',
         "<h2>Measured against simulated</h2>",
+        ("<p>The calibration knows what the vehicle's own magnetism and the sensor's errors do to every reading. What is left "
+         "after it has corrected them should be the Earth's field, and should differ from the reference by noise alone. "
+         "Whatever else is in the difference is something that the calibration does not know.</p>"),
         _figure(figures.measured(diagnosis), "The total field as measured and corrected by the calibration, and as the "
-                "reference says it should be; below, their difference before, and with the extended calibration on "
-                "dives that its fit had not seen."),
+                "reference says it should be; below, their difference"
+                + (" before, and with the extended calibration on dives that its fit had not seen." if diagnosis.named else ".")),
         '<div class="pair">',
         _figure(figures.spectrum(diagnosis), "Spectral density of the difference; dashed, the noise model."),
-        _figure(figures.evidence(diagnosis), "Each cause tried alone. Blue: what was named in the end."),
+        _figure(figures.evidence(diagnosis), "The likeliest causes, each tried alone, with calibration and "
+                "noise fitted anew. Below p = 0.01 a cause is found" + ("; blue: what was named in the end." if diagnosis.named else ".")),
         "</div>",
         _figure(figures.channels(diagnosis), "The difference against each channel: mean and scatter in twenty bins. A "
                 "line that is not flat is something the simulation gets wrong."),
@@ -112,10 +116,7 @@ def _found(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> list[str]:
         )
         at += candidate.size
         others = alternatives(rivals)
-        listed = ", ".join(
-            o["cause"].replace("_", " ") + (f" ({escape(o['channel'])})" if o["channel"] else "")
-            for o in others
-        )
+        listed = ", ".join(escape(figures.label(o["cause"], o["channel"])) for o in others)
         doubt = (
             f"<p>The data cannot tell it from {listed} (odds below 20:1). What would: {escape(causes[candidate.cause].separated_by)}.</p>"
             if others
@@ -129,7 +130,8 @@ def _found(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> list[str]:
                 f"all that was tried {_chance(hypothesis.p_value)}. Leaving it out multiplies the held-out RMS by {1 / max(gain.ratio, 1e-9):.2f} "
                 f"(95 %: {1 / max(gain.interval[1], 1e-9):.2f} to {1 / max(gain.interval[0], 1e-9):.2f}).</p>"
             ),
-            f"<table>{rows}</table>",
+            f"<table><tr><th>term</th><th>value</th><th>1 sigma</th><th>unit</th></tr>{rows}</table>",
+            _several(candidate.names),
             doubt
             + f"<p>In a log like this one, theory gives it a chance of {100 * told(diagnosis, hypothesis):.0f} % to be named alone.</p>",
             _no_gain(gain),
@@ -144,6 +146,13 @@ def _found(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> list[str]:
             "they take no part in the figures above.</p>"
         )
     return parts
+
+
+def _several(names: tuple[str, ...]) -> str:
+    """Say what a number in brackets means."""
+    if not any(name.endswith(")") for name in names):
+        return ""
+    return '<p class="faint">A number in brackets: the cause took more than one such term to describe; they act together.</p>'
 
 
 def _physics(cause: Cause) -> str:
@@ -184,13 +193,13 @@ def _left(diagnosis: Diagnosis) -> str:
 def _isolability(diagnosis: Diagnosis) -> list[str]:
     report = diagnosis.isolability
     rows = "".join(
-        f"<tr><td>{v.cause.replace('_', ' ')}{f' ({escape(v.channel)})' if v.channel else ''}</td>"
+        f"<tr><td>{escape(figures.label(v.cause, v.channel))}</td>"
         f'<td class="n">{v.half:.1f}</td><td class="n">{v.sure:.1f}</td>'
         f"<td>{', '.join(f'{escape(name)} {size:.3g} {escape(unit)}' for name, (size, unit) in v.sizes.items() if np.isfinite(size)) or 'invisible'}</td></tr>"
         for v in report.visible
     )
     pairs = "".join(
-        f'<tr><td>{escape(a)}</td><td>{escape(b)}</td><td class="n">{rho:.3f}</td></tr>'
+        f'<tr><td>{escape(a)}</td><td>{escape(b)}</td><td class="n">{100 * rho:.0f} %</td></tr>'
         for a, b, rho in report.pairs[:20]
     )
     missing = "; ".join(
@@ -202,7 +211,9 @@ def _isolability(diagnosis: Diagnosis) -> list[str]:
             "deployments like this one, and which causes look alike in it.</p>"
         ),
         f"<table><tr><th>cause</th><th>50 % at S/N</th><th>95 % at S/N</th><th>seen from</th></tr>{rows}</table>",
-        f"<h3>Look alike</h3><table>{pairs}</table>" if pairs else "",
+        f"<h3>Look alike</h3><table><tr><th>one</th><th>another</th><th>how alike</th></tr>{pairs}</table>"
+        if pairs
+        else "",
         f"<p>Not testable here, and what it would take: {missing}.</p>" if missing else "",
         _figure(
             figures.likeness(diagnosis),
