@@ -78,13 +78,13 @@ def _gain(k: int) -> Row:
 
 
 PARTS: dict[str, Part] = {
-    "null": Part(0.25, _null),
-    "named": Part(0.25, _named),
-    "ladder": Part(0.22, _ladder),
-    "loud": Part(0.08, _loud),
-    "unknown": Part(0.08, _unknown),
-    "pair": Part(0.06, _pair),
-    "gain": Part(0.06, _gain),
+    "null": Part(0.22, _null),
+    "named": Part(0.22, _named),
+    "ladder": Part(0.2, _ladder),
+    "loud": Part(0.1, _loud),
+    "unknown": Part(0.1, _unknown),
+    "pair": Part(0.08, _pair),
+    "gain": Part(0.08, _gain),
 }
 
 
