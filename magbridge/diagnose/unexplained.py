@@ -16,7 +16,7 @@ whole likelihood, with a noise of its own.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -40,6 +40,8 @@ LOUD = 3
 """Descriptions under each noise that are weighed by the whole likelihood."""
 SIZES = np.logspace(-7, 2, 64)
 """Common sizes g, squared, in units of the widths."""
+TOGETHER = 4
+"""Descriptions whose columns are whitened in one go."""
 CALM = 2
 """Rounds in which slow curves and noise take from each other."""
 CHUNK = 8192
@@ -122,30 +124,17 @@ def leftover(
     """
     listed = [one for one in descriptions(problem, fit, tone) if not one.retells(but)]
     columns = [candidate.columns for candidate in model]
-    found = []
+    found: list[tuple[float, str, Description, float]] = []
     for noise in (fit.noise, _calm(problem, columns, fit, order, listed[:2])):
-        scored = []
-        for one in listed:
-            info = information(problem, noise, fit, columns, [one.columns])
-            for kind, width in one.widths:
-                best = ridge(info.matrix, info.score, width)
-                scored.append((best.evidence - float(np.log(one.trials)), kind, one, best, info.shift))
-        scored.sort(key=lambda entry: -entry[0])
-        # a gain beyond the formula's is not the description's own, but of a noise that found another optimum beside it
-        found += [
-            (
-                min(own, _weighed(problem, columns, fit, order, one, best, shift)),
-                kind,
-                one,
-                best.signal_to_noise,
-            )
-            for own, kind, one, best, shift in scored[:LOUD]
-        ]
+        scored = _scored(problem, noise, fit, columns, listed)
+        for own, kind, one, best, shift in sorted(scored, key=lambda entry: -entry[0])[:LOUD]:
+            # a gain beyond the formula's is that of a noise which found another optimum beside the description
+            evidence = min(own, _weighed(problem, columns, fit, order, one, best, shift))
+            found.append((evidence, kind, one, best.signal_to_noise))
     evidence, kind, one, size = max(found, key=lambda entry: entry[0])
     p_value = min(1.0, sum(len(one.widths) for one in listed) * float(chi2.sf(2.0 * max(evidence, 0.0), 1)))
-    if p_value >= (
-        LEVEL if model else 0.1 * LEVEL
-    ):  # with so many numbers the distribution is only asymptotic
+    # without a name stricter than for a cause: it is the asymptotic distribution
+    if p_value >= (LEVEL if model else 0.1 * LEVEL):
         return None
     if kind == "transient":
         kind = _steps(problem, fit)
@@ -171,6 +160,21 @@ def accept(problem: Problem, outcome: Outcome, tone: Candidate | None) -> tuple[
     if free is not None and names < free.evidence:
         return False, free
     return True, rest
+
+
+def _scored(
+    problem: Problem, noise: Noise, fit: Joint, model: Sequence[Columns], listed: Sequence[Description]
+) -> Iterator[tuple[float, str, Description, Ridge, FloatArray]]:
+    """Yield each description with each of its widths: log evidence under `noise`, and by how much the model gives way."""
+    for first in range(0, len(listed), TOGETHER):
+        some = listed[first : first + TOGETHER]
+        info = information(problem, noise, fit, model, [one.columns for one in some])
+        ends = np.cumsum([0, *(one.widths[0][1].size for one in some)]).tolist()
+        for one, start, end in zip(some, ends, ends[1:], strict=False):
+            at = slice(start, end)
+            for kind, width in one.widths:
+                best = ridge(info.matrix[at, at], info.score[at], width)
+                yield best.evidence - float(np.log(one.trials)), kind, one, best, info.shift[:, at]
 
 
 def _calm(
