@@ -153,7 +153,7 @@ def channels(diagnosis: Diagnosis) -> str:
         for left, colour in _sides(diagnosis).values():
             mean = np.bincount(bins, left, 20) / count
             spread = np.sqrt(np.maximum(np.bincount(bins, left**2, 20) / count - mean**2, 0.0))
-            axis.fill_between(middle, mean - spread, mean + spread, color=colour, alpha=0.15, linewidth=0)
+            axis.vlines(middle, mean - spread, mean + spread, color=colour, alpha=0.2, linewidth=5)
             axis.plot(middle, mean, "o-", color=colour, markersize=2.5, linewidth=1)
         axis.set_xlabel(f"{name} ({unit or '1'})", fontsize=8)
     for axis in axes.flat[len(names) :]:
@@ -223,7 +223,9 @@ def evidence(diagnosis: Diagnosis) -> str:
         [np.sqrt(tested[name][1]) for name in order],
         color=[AFTER if name in named else FAINT for name in order],
     )
-    axis.bar_label(bars, [f" p = {tested[name][0]:.1g}" for name in order], fontsize=7, color=INK)
+    chances = [tested[name][0] for name in order]
+    told = [f" p = {p:.1g}" if p > 1e-99 else " p < 1e-99" for p in chances]
+    axis.bar_label(bars, told, fontsize=7, color=INK)
     axis.margins(x=0.2)
     axis.set_xlabel("root of the likelihood ratio; p: chance of a false alarm", fontsize=8)
     return _png(figure)

@@ -12,6 +12,7 @@ from magbridge.diagnose.candidates import Candidate
 from magbridge.diagnose.causes.timing import field_rates
 from magbridge.diagnose.joint import Joint
 from magbridge.diagnose.problem import Columns, Problem
+from magbridge.diagnose.regressors import powers
 
 __all__ = ["Description", "descriptions"]
 
@@ -144,10 +145,15 @@ def _window(problem: Problem, fit: Joint) -> Description:
 
 def _direction(body: FloatArray) -> Columns:
     """Cubic and quartic functions of the field's direction in the body."""
-    x, y, z = (body / np.linalg.norm(body, axis=1)[:, None]).T
-    powers = [x**i * y**j * z ** (d - i - j) for d in (3, 4) for i in range(d + 1) for j in range(d + 1 - i)]
-    table = np.stack(powers, axis=1)
-    return lambda rows: table[rows]
+    unit = body / np.linalg.norm(body, axis=1)[:, None]
+    exponents = [(i, j, d - i - j) for d in (3, 4) for i in range(d + 1) for j in range(d + 1 - i)]
+
+    def columns(rows: slice) -> FloatArray:
+        part = unit[rows].T
+        table = np.concatenate([np.ones((1, *part.shape)), powers(part, 4)])
+        return np.stack([table[i, 0] * table[j, 1] * table[k, 2] for i, j, k in exponents], axis=1)
+
+    return columns
 
 
 def _response(reading: FloatArray, slope: FloatArray) -> Columns:
@@ -163,9 +169,14 @@ def _curve(values: FloatArray) -> Columns:
     way = np.where(np.abs(step) > 1e-3, np.sign(step), 0.0)
     last = np.maximum.accumulate(np.where(way != 0.0, np.arange(len(y)), 0))
     side = way[last]
-    table = np.stack([y, y**2, y**3, y**4, side, side * y, side * y**2, way, way * y], axis=1)
-    table -= table.mean(axis=0)
-    return lambda rows: table[rows]
+
+    def columns(rows: slice) -> FloatArray:
+        v, w, d = y[rows], way[rows], side[rows]
+        one, two, three, four = powers(v, 4)
+        return np.stack([one, two, three, four, d, d * one, d * two, w, w * one], axis=1)
+
+    mean = columns(slice(None)).mean(axis=0)
+    return lambda rows: columns(rows) - mean
 
 
 def _scaled(values: FloatArray) -> FloatArray:

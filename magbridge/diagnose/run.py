@@ -45,6 +45,10 @@ SPOILT = 2.0
 """Ratio of RMS above which a calibration is not handed out: alike effects can cancel in the fit and not in use."""
 
 
+ABSURD = 0.5
+"""Of the field: when the corrected one is off by more, no cause of the table is looked for."""
+
+
 @dataclass(frozen=True, eq=False)
 class Diagnosis:
     """Everything that was found out.
@@ -141,6 +145,12 @@ def _examine(
     progress("reading")
     survey = take(datasets, calibration, learned_from, grid)
     problem = pose(survey, calibration)
+    off, field = float(np.median(np.abs(problem.residual))), float(np.median(survey.reference))
+    if off > ABSURD * field:
+        raise DataError(
+            f"{survey.source}: the corrected field is off by {off:.0f} nT of {field:.0f}: mag_x, mag_y, mag_z or a "
+            "parameter in other units than the calibration's, or of another vehicle"
+        )
     progress("preparing causes")
     candidates = {name: cause.candidates(problem) for name, cause in causes.items()}
     untestable = {name: causes[name].needs for name, made in candidates.items() if not made}

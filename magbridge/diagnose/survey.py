@@ -167,6 +167,8 @@ def take(
             f"(column {worst!r} has {int(np.isfinite(table[worst]).sum())} numbers)"
         )
     table = {name: column[whole] for name, column in table.items()}
+    if not any(np.ptp(table[f"mag_{axis}"]) for axis in "xyz"):
+        raise DataError(f"{source}: columns mag_x, mag_y, mag_z never change: nothing was measured")
     units = {
         str(k): str(v.attrs.get("units", ""))
         for ds in (*datasets, *learned_from)

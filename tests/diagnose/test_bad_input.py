@@ -41,6 +41,9 @@ def test_the_demonstrations_survey_is_plain(plain: tuple[xr.Dataset, Calibration
         (lambda ds: ds.drop_vars("battpos"), "'battpos' is missing"),
         (lambda ds: ds.isel(time=slice(0, 3)), "3 samples, at least 60"),
         (lambda ds: ds.assign(mag_y=ds["mag_y"] * np.nan), "'mag_y' has 0 numbers"),
+        (lambda ds: ds.assign({f"mag_{axis}": 0.0 * ds[f"mag_{axis}"] for axis in "xyz"}), "never change"),
+        (lambda ds: ds.assign({f"mag_{axis}": 1e-5 * ds[f"mag_{axis}"] for axis in "xyz"}), "in other units"),
+        (lambda ds: ds.assign(battpos=100.0 * ds["battpos"]), "in other units"),
         (lambda ds: ds.assign_attrs(sensor="another"), "sensor 'another', but the calibration is of 'one'"),
     ],
 )
@@ -54,6 +57,10 @@ def test_one_line(plain: tuple[xr.Dataset, Calibration], change, message: str) -
 def test_a_log_cannot_be_both_diagnosed_and_learned_from(plain: tuple[xr.Dataset, Calibration]) -> None:
     with pytest.raises(DataError, match="given twice"):
         diagnose([plain[0]], plain[1], learned_from=[plain[0]])
+
+
+def test_a_hundred_samples_are_few_but_enough(plain: tuple[xr.Dataset, Calibration]) -> None:
+    assert diagnose([plain[0].isel(time=slice(0, 100))], plain[1]).verdict == "nothing_found"
 
 
 def test_telemetry_that_stands_still_is_no_telemetry(plain: tuple[xr.Dataset, Calibration]) -> None:

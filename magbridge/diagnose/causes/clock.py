@@ -64,7 +64,8 @@ def interference_tone(problem: Problem) -> list[Candidate]:
     # of all three axes together: what they share counts once
     power = np.einsum("if,ij,jf->f", lines.conj(), np.linalg.inv(body.T @ body), lines).real
     frequency = np.fft.rfftfreq(size, interval)
-    smooth = np.convolve(power, np.ones(201) / 201, mode="same") + 1e-300
+    width = min(201, len(power))
+    smooth = np.convolve(power, np.ones(width) / width, mode="same") + 1e-300
     ratio = np.where(frequency * float(np.ptp(t)) > 20.0, power / smooth, 0.0)
     made: list[Candidate] = []
 
