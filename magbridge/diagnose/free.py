@@ -96,7 +96,7 @@ def descriptions(problem: Problem, fit: Joint, tone: Candidate | None = None) ->
     ]
     listed += [
         Description(
-            _response(problem.survey.field[:, axis], body[:, axis]), (("broadband", 30.0 / np.arange(1, BEND + 1)),)
+            _response(problem.reading[:, axis], body[:, axis]), (("broadband", 30.0 / np.arange(1, BEND + 1)),)
         )
         for axis in range(3)
     ]  # fmt: skip

@@ -64,6 +64,8 @@ class Problem:
     ----------
     survey : Survey
     calibration : Calibration
+    reading : (n, 3) array
+        nT, ``H_r - e w / |w|^2``: what bends with the reading must not hold its noise.
     residual : (n,) array
         e, nT of the sensor.
     slopes : (n, 9) array
@@ -82,6 +84,7 @@ class Problem:
 
     survey: Survey
     calibration: Calibration
+    reading: FloatArray
     residual: FloatArray
     slopes: FloatArray
     gain: FloatArray
@@ -158,14 +161,14 @@ def pose(survey: Survey, calibration: Calibration) -> Problem:
     """Linearise the comparison about `calibration`."""
     samples, coefficients = samples_of(survey, calibration)
     n = len(survey)
-    e, g, gain = np.empty(n), np.empty((n, 9)), np.empty(n)
+    e, g, gain, reading = np.empty(n), np.empty((n, 9)), np.empty(n), np.empty((n, 3))
     for start in range(0, n, CHUNK):
         rows = slice(start, start + CHUNK)
         part = samples.part(rows)
         e[rows], slope = residuals(part, coefficients)
         away = slope[:, 6:]
-        there = part.field + (e[rows] / (away * away).sum(axis=1))[:, None] * away
-        _, g[rows] = residuals(replace(part, field=there), coefficients)
+        reading[rows] = part.field + (e[rows] / (away * away).sum(axis=1))[:, None] * away
+        _, g[rows] = residuals(replace(part, field=reading[rows]), coefficients)
         above, _ = residuals(replace(part, reference=part.reference + 1.0), coefficients)
         gain[rows] = e[rows] - above
     L, centre = _loosened(calibration, *_prior(survey, calibration, samples, e, g))
@@ -178,7 +181,7 @@ def pose(survey: Survey, calibration: Calibration) -> Problem:
     keep = values > SEEN
     V, rest = vectors[:, keep], L @ vectors[:, ~keep]
     free = -derivatives(calibration, samples, g, L @ V)
-    return Problem(survey, calibration, e, g, gain, free, L @ V, V.T @ centre, rest @ rest.T)
+    return Problem(survey, calibration, reading, e, g, gain, free, L @ V, V.T @ centre, rest @ rest.T)
 
 
 def _level(calibration: Calibration, e: FloatArray) -> float:

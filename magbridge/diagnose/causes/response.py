@@ -20,7 +20,7 @@ FloatArray = NDArray[np.float64]
 
 def nonlinearity(problem: Problem) -> list[Candidate]:
     """The response bends: ``T_i += b_i (H_i / H_0)^p``, p = 2 (an even harmonic's leak), 3 (a saturating core), or both."""
-    unit, H = problem.calibration.reference.field, problem.survey.field
+    unit, H = problem.calibration.reference.field, problem.reading
     made = []
     for power in (2, 3):
         effect = ResponseEffect(cause="nonlinearity", unit=unit, power=power)
@@ -33,7 +33,7 @@ def nonlinearity(problem: Problem) -> list[Candidate]:
 
 def saturation(problem: Problem) -> list[Candidate]:
     """A channel compresses or clips near its end: ``T_i -= b_1 + b_2 (H_i - knee) / H_0`` beyond the knee."""
-    unit, H = problem.calibration.reference.field, problem.survey.field
+    unit, H = problem.calibration.reference.field, problem.reading
     made = []
     for axis, sign in product(range(3), (1.0, -1.0)):
         reading = sign * H[:, axis]
