@@ -151,14 +151,10 @@ def _detection(add: Callable[[str, str, str], None], part: dict[str, list[Row]])
     for size in sorted({r["wanted"] for r in single} | {8.0}):
         own = [r for r in single if r["wanted"] == size]
         add(f"detection at S/N {size:g}", targets.get(size, ""), share(own, found))
-    named = {name: [r for r in part.get("named", []) if tuple(r["names"]) == (name,)] for name in EFFECTS}
-    least = min((name for name in named if named[name]), key=lambda name: _rate(named[name]), default="")
-    if least:
-        add(
-            f"... of the cause that is found least often, {least}",
-            "at least 95 %",
-            share(named[least], found),
-        )
+        named = {name: [r for r in own if tuple(r["names"]) == (name,)] for name in EFFECTS}
+        least = min((name for name in named if named[name]), key=lambda name: _rate(named[name]), default="")
+        if size == 8.0 and least:
+            add(f"... each cause; least often {least}", "at least 95 %", share(named[least], found))
     known = part.get("ladder", []) + part.get("named", [])
     off = efficiency(known)
     if off:
