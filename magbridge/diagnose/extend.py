@@ -116,18 +116,19 @@ def _again(
     L = np.vstack([problem.directions, np.zeros((len(selector) - K, len(problem.centre)))])
     own = -derivatives(extended, samples, g, np.hstack([L, selector[:, K:]]))
     free, effects, at = own[:, : len(problem.centre)], own[:, len(problem.centre) :], 0
-    blocks = []
+    # what the residual would be at the first point, were it linear about this one; the reference was not mended in it
+    residual = e + free @ fit.z
+    blocks, place = [], 0
     for candidate in model:
         if not candidate.effects:
             blocks.append(candidate.columns(slice(0, len(problem))))
         else:
             blocks.append(effects[:, at : at + candidate.size] * candidate.width)
+            residual += blocks[-1] @ fit.coefficients[place : place + candidate.size]
             at += candidate.size
-    X = np.hstack([free, *blocks])
-    # what the residual would be at the first point, were it linear about this one; the reference was not mended in it
+        place += candidate.size
     c = np.append(fit.z, fit.coefficients)
-    own_part = np.concatenate([np.ones(len(fit.z), bool), *(np.full(m.size, bool(m.effects)) for m in model)])
-    again = replace(problem, residual=e + X[:, own_part] @ c[own_part], free=free, slopes=g)
+    again = replace(problem, residual=residual, free=free, slopes=g)
     columns: list[Columns] = [partial(_rows, block) for block in blocks]
     return again, columns, fit_joint(again, columns, order, c)
 

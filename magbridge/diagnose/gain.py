@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from magbridge.diagnose.joint import RIDGE, Joint
+from magbridge.diagnose.joint import RIDGE, Design, Joint
 from magbridge.diagnose.problem import Columns, Problem
 
 __all__ = ["Gain", "held_out", "paired"]
@@ -33,20 +33,28 @@ def held_out(problem: Problem, columns: Sequence[Columns], fit: Joint) -> FloatA
 
     Nonlinear parameters and noise are those of the whole; every coefficient is fitted anew without the fold.
     """
-    X = np.hstack([problem.free, *(column(slice(0, len(problem))) for column in columns)])
-    q = len(problem.centre)
-    prior = np.append(np.ones(q), np.full(X.shape[1] - q, RIDGE))
-    centre = np.append(problem.centre, np.zeros(X.shape[1] - q))
+    X, q, noise = Design(problem, columns), len(problem.centre), fit.noise
+    prior = np.append(np.ones(q), np.full(X.effects, RIDGE))
+    centre = np.append(problem.centre, np.zeros(X.effects))
     c = np.append(fit.z, fit.coefficients)
-    A, y = fit.noise.filter(X), fit.noise.response(problem.residual - X @ c)
-    y += A @ c
-    P, b = A.T @ A + np.diag(prior), A.T @ y + prior * centre
-    left = np.empty(len(problem))
+    y = noise.response(problem.residual - X.times(c))
     dives = np.unique(problem.survey.dive)
-    for fold in np.array_split(dives, min(FOLDS, dives.size)):
-        rows = np.isin(problem.survey.dive, fold)
-        own = np.linalg.solve(P - A[rows].T @ A[rows], b - A[rows].T @ y[rows])
-        left[rows] = problem.residual[rows] - X[rows] @ own
+    folds = np.array_split(dives, min(FOLDS, dives.size))
+    ends = [int(fold[-1]) for fold in folds]
+    of = np.searchsorted(ends, problem.survey.dive)
+    P, b = np.zeros((len(folds), c.size, c.size)), np.zeros((len(folds), c.size))
+    for rows in X.pieces:
+        first = max(rows.start - len(noise.memory), 0)
+        A = noise.filter(X.rows(slice(first, rows.stop)), first, rows.start - first)
+        for k in np.unique(of[rows]):
+            own = A[of[rows] == k]
+            P[k] += own.T @ own
+            b[k] += own.T @ (y[rows][of[rows] == k] + own @ c)
+    whole_P, whole_b = P.sum(axis=0) + np.diag(prior), b.sum(axis=0) + prior * centre
+    without = np.stack([np.linalg.solve(whole_P - P[k], whole_b - b[k]) for k in range(len(folds))])
+    left = np.empty(len(problem))
+    for rows in X.pieces:
+        left[rows] = problem.residual[rows] - np.einsum("ij,ij->i", X.rows(rows), without[of[rows]])
     return left
 
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from magbridge.diagnose.noise import Noise, fit_noise
 from magbridge.diagnose.problem import Columns, Problem
 
-__all__ = ["RIDGE", "Information", "Joint", "fit_joint", "information"]
+__all__ = ["RIDGE", "Design", "Information", "Joint", "fit_joint", "information"]
 
 FloatArray = NDArray[np.float64]
 CHUNK = 2048

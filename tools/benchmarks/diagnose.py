@@ -6,6 +6,7 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -22,12 +23,14 @@ __all__ = ["diagnosing", "long_survey"]
 
 MONTH = 648_000
 """Samples of 30 days at 0.25 Hz."""
+NIGHTLY, MONTHLY = 10.0, 1.0
+"""nT/degC: an effect of signal-to-noise 30 or 40 in a night, and in a month."""
 
 IN_ANOTHER = """
 import json, resource, sys, time
 from benchmarks.diagnose import long_survey
 from magbridge.diagnose.run import diagnose
-survey, calibration = long_survey(float(sys.argv[1]), int(sys.argv[2]))
+survey, calibration = long_survey(float(sys.argv[1]), int(sys.argv[2]), float(sys.argv[3]))
 begun, used = time.monotonic(), time.process_time()
 found = diagnose([survey], calibration)
 causes = [h.candidate.cause for h in found.named]
@@ -37,27 +40,30 @@ print(json.dumps([time.monotonic() - begun, time.process_time() - used, len(foun
 
 
 def diagnosing(folder: Path, repetitions: int) -> list[Row]:  # noqa: ARG001  (others write there and repeat)
-    """Time `diagnose` without its figures: 12 h plain and with an effect, and 30 days."""
-    night, found, month = (_in_another(hours, size, count) for hours, size, count in (
-        (12.0, 0.0, 0), (12.0, 0.5, 0), (12.0, 0.0, MONTH),
-    ))  # fmt: skip
-    detail = {"verdicts": [night[3], found[3], month[3]], "causes": [night[4], found[4], month[4]]}
+    """Time `diagnose` without its figures: 12 h and 30 days, plain and with an effect."""
+    night, found, month, loud = (
+        _in_another(size, count) for size, count in ((0.0, 0), (NIGHTLY, 0), (0.0, MONTH), (MONTHLY, MONTH))
+    )
+    detail = {name: [run[k] for run in (night, found, month, loud)]
+              for k, name in enumerate(("seconds", "processor seconds", "samples", "verdict", "causes", "MB"))}  # fmt: skip
+    slope = float(np.log(month[1] / night[1]) / np.log(month[2] / night[2]))
+    share = f"{month[2] / night[2]:.0f} times 12 h"
     return [
         Row(f"diagnose, 12 h at 0.25 Hz ({night[2]:,} samples), every cause, plain", night[0], "s", most=20.0),
         Row("the same with an effect hidden in it", found[0], "s", most=20.0, detail=detail),
-        Row(f"diagnose, 30 days ({month[2]:,} samples), every cause", month[0], "s",
-            night[0] * month[2] / night[2], f"{month[2] / night[2]:.0f} times 12 h", most=240.0),
-        Row("memory of that", month[5], "MB", most=2000.0),
+        Row(f"diagnose, 30 days ({month[2]:,} samples), every cause, plain", month[0], "s",
+            night[0] * month[2] / night[2], share, most=240.0),
+        Row("the same with an effect hidden in it", loud[0], "s", found[0] * loud[2] / found[2], share, most=240.0),
+        Row("memory of that", loud[5], "MB", most=2000.0),
+        Row("processor time grows as samples to the power of", slope, ""),
     ]  # fmt: skip
 
 
-def _in_another(hours: float, size: float, count: int) -> list[float]:
-    command = [sys.executable, "-c", IN_ANOTHER.replace("int(sys.argv[2])", "int(sys.argv[2]), float(sys.argv[3])"),
-               str(hours), str(count), str(size)]  # fmt: skip
+def _in_another(size: float, count: int) -> Any:
+    command = [sys.executable, "-c", IN_ANOTHER, "12", str(count), str(size)]
     place = str(Path(__file__).parents[1])
     done = subprocess.run(command, cwd=place, capture_output=True, text=True, check=True)
-    answer: list[float] = json.loads(done.stdout)
-    return answer
+    return json.loads(done.stdout)
 
 
 def long_survey(hours: float, count: int = 0, size: float = 0.0) -> tuple[xr.Dataset, Calibration]:
@@ -80,7 +86,11 @@ def long_survey(hours: float, count: int = 0, size: float = 0.0) -> tuple[xr.Dat
     whole = segments(simulate(replace(scenario, mission=parts), 3))
     calibration = fit(observations(whole["calibration"], ["battpos", "ballast"]), "auto").calibration
     # what is flown again and again must not bring its own noise again: that would be a tone
-    quiet = replace(scenario, instrument=replace(scenario.instrument, noise_sigma=0.0, channel_delay=(0.0, 0.0, 0.0)), mission=parts)
+    quiet = replace(
+        scenario,
+        instrument=replace(scenario.instrument, noise_sigma=0.0, channel_delay=(0.0, 0.0, 0.0)),
+        mission=parts,
+    )
     survey, rng = segments(simulate(quiet, 3))["survey"], np.random.default_rng(4)
     n = survey.sizes["time"]
     if count:
@@ -92,6 +102,8 @@ def long_survey(hours: float, count: int = 0, size: float = 0.0) -> tuple[xr.Dat
     warm = survey["sensor_temperature"].to_numpy()
     survey["amps"] = ("time", (rng.uniform(size=len(warm)) > 0.7).astype(float), {"units": "A"})
     for axis, share in zip("xyz", (0.5, -0.3, 0.8), strict=True):
-        again = rng.normal(0.0, scenario.instrument.noise_sigma, len(warm)) + size * share * (warm - warm.mean())
+        again = rng.normal(0.0, scenario.instrument.noise_sigma, len(warm)) + size * share * (
+            warm - warm.mean()
+        )
         survey[f"mag_{axis}"] = survey[f"mag_{axis}"] + again
     return survey, calibration
