@@ -7,6 +7,7 @@ accuracy      error over the posterior Cramér-Rao bound, lost runs, consistency
 nominal       the same, with what a nominal calibration leaves
 watch         how long a filter that is in the wrong place vouches for it
 misinformed   whether one vouches for its position that has been told the wrong level, or half a map
+dived         gliders that dive under a map flown 90 m above the sea, without and with its continuation
 calibrations  simulated gliders, each calibrated by nominal, cubic and auto, that fly the same survey
 speed         one update, 100,000 samples, the start
 peers         Stone Soup (tools/voyages/stone_soup.py) on the same measurements; MagNav.jl's published flight
@@ -49,6 +50,7 @@ from msgspec.structs import replace as with_options
 from scipy.stats import chi2
 from voyages.beside import magnav, stone_soup
 from voyages.calibrated import METHODS, flown
+from voyages.dived import dived
 from voyages.lost import LEVEL, carried, half, level, misled
 from voyages.sail import AT_HOURS, GLIDER, LEFT, PLACE, SPEEDS, START, Map, Score, sail, synthetic, voyage
 
@@ -192,6 +194,23 @@ def misinformed(runs: Runs, _asked: argparse.Namespace) -> None:
             show(table)
 
 
+def dives(runs: Runs, _asked: argparse.Namespace) -> None:
+    """What it costs to take a map for the field below it."""
+    print(
+        f"\n## Under a map from 90 m up: {runs.count} worlds, 4 h, dives of 140 m, 54 nT of rock 350 m down\n"
+    )
+    found = np.array(runs(partial(dived)))
+    table = [("map", "error m: median", "90 %", "worst", "NEES/2", "vouched %")]
+    for name, column in zip(
+        ("as it was flown", "at the glider's depth"), found.transpose(1, 2, 0), strict=True
+    ):
+        error, nees, vouched = column
+        cells = (np.median(error), np.percentile(error, 90), error.max())
+        ends = f"{np.median(nees):.2f}", f"{100 * vouched.mean():.0f}"
+        table.append((name, *(f"{cell:.0f}" for cell in cells), *ends))
+        show(table)
+
+
 # ---- speed, peers -------------------------------------------------------------------------------------------
 
 
@@ -262,6 +281,7 @@ PARTS = {
     "accuracy": accuracy,
     "watch": watch,
     "misinformed": misinformed,
+    "dived": dives,
     "calibrations": calibrations,
     "nominal": partial(accuracy, left="nominal"),
     "speed": speed,
