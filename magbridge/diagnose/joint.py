@@ -25,8 +25,8 @@ __all__ = ["RIDGE", "Design", "Information", "Joint", "fit_joint", "information"
 FloatArray = NDArray[np.float64]
 CHUNK = 2048
 """Rows that are whitened at a time, to stay near the processor."""
-KEPT = 1 << 25
-"""Numbers of a hypothesis' own columns that are kept: a quarter of a gigabyte."""
+KEPT = 25_000_000
+"""Numbers of a hypothesis' own columns that are kept: 200 MB."""
 THREADS, LONG = 2, 16
 """Threads that share the pieces of a log, and pieces from which on it is worth the while."""
 RIDGE = 0.1
