@@ -228,8 +228,10 @@ def regressors(
     calibration: Calibration, field: FloatArray, channels: FloatArray, time: FloatArray
 ) -> FloatArray:
     """(m, n) regressors of every sample, from a fresh state; arguments as for :func:`correct`."""
-    steps = [effect.begin(calibration) for effect in calibration.effects]
-    return _regressors(calibration.kernel, steps, field, channels.reshape(len(field), -1), time)
+    kernel, steps = calibration.kernel, [effect.begin(calibration) for effect in calibration.effects]
+    channels = channels.reshape(len(field), -1)
+    parts = [slice(start, start + CHUNK) for start in range(0, max(len(field), 1), CHUNK)]
+    return np.hstack([_regressors(kernel, steps, field[p], channels[p], time[p]) for p in parts])
 
 
 def _stage_many(kernel: Kernel, phi: FloatArray) -> tuple[Any, ...]:

@@ -14,7 +14,7 @@ from threadpoolctl import threadpool_limits
 
 from magbridge.calibration.file import save
 from magbridge.calibration.model import Calibration
-from magbridge.calibration.residual import residuals
+from magbridge.calibration.residual import residuals_of
 from magbridge.diagnose.candidates import Candidate
 from magbridge.diagnose.causes import CAUSES, Cause
 from magbridge.diagnose.extend import extend, settle, widened
@@ -219,7 +219,7 @@ def write(
 
 def _spoils(survey: Survey, problem: Problem, extended: Calibration, counts: NDArray[np.bool_]) -> bool:
     """Say whether the extended calibration itself, not linearised and without the map's part, is off by far more."""
-    e, _ = residuals(*samples_of(survey, extended))
+    e = residuals_of(*samples_of(survey, extended))
     return float(np.mean(e[counts] ** 2)) > SPOILT**2 * float(np.mean(problem.residual[counts] ** 2))
 
 

@@ -104,7 +104,9 @@ def test_a_replay_finds_its_way_by_the_field(tmp_path: Path, motion: str) -> Non
     log = log.assign({f"mag_{axis}": log[f"truth_field_{axis}"] for axis in "xyz"})
     write(log if motion == "glide" else log.drop_vars("pitch"), tmp_path / "log.nc")
     path = config(tmp_path)
-    tables = '[calibration]\nfile = "c.json"\n[navigation]\nmap = "grid.nc"\nfix = "ODOMETRY"\ndepth = 140.0\n'
+    tables = (
+        '[calibration]\nfile = "c.json"\n[navigation]\nmap = "grid.nc"\nfix = "ODOMETRY"\ndepth = 140.0\n'
+    )
     path.write_text(path.read_text() + tables)
     result = replay([tmp_path / "log.nc"], path)
     assert sum(result["navigation"].values()) > 100
