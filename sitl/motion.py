@@ -39,7 +39,7 @@ def with_motion(deployment: xr.Dataset) -> xr.Dataset:
     columns = [deployment[name].to_numpy().astype(float) for name in MOTIONS[motion]]
     if motion == "velocity":
         step = np.diff(deployment["time"].to_numpy().astype(float), prepend=np.nan)
-        local = [np.nancumsum(step * velocity) for velocity in columns]
+        local = [np.nancumsum(step * (velocity + np.roll(velocity, 1)) / 2) for velocity in columns]
     elif motion in ("inertial", "position"):
         latitude, longitude = columns
         known = np.flatnonzero(np.isfinite(latitude + longitude))[0]
