@@ -1,0 +1,37 @@
+"""A map flown above a vehicle that dives below."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from math import hypot
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+from magbridge.field.continuation import continued
+from magbridge.field.grid import AnomalyGrid
+from magbridge.navigate.depth import at_depth
+from magbridge.navigate.model import Options
+
+
+def test_errors_of_the_map_add_up(study: ModuleType) -> None:
+    drawn = study.synthetic(study.Map(30, 1500), 3)
+    flown = AnomalyGrid(drawn.longitude, drawn.latitude, drawn.anomaly, altitude=90.0)
+    depth, options = np.append(np.linspace(0.0, 120.0, 50), np.nan), Options(map_sigma=1.5, map_length=800.0)
+    there, known = at_depth(flown, options, depth)
+    left = continued(flown, depth[:-1])
+    assert there.altitude == pytest.approx(-60.0)
+    assert known.map_sigma == pytest.approx(hypot(1.5, left.sigma))
+    assert min(left.length, 800.0) < known.map_length < max(left.length, 800.0)
+    assert at_depth(drawn, options, depth) == (drawn, options), "an altitude that nobody knows"
+
+
+@pytest.mark.parametrize("seed", [2, 3])
+def test_a_glider_that_dives_under_it_is_found(study: ModuleType, seed: int) -> None:
+    """Taken for the field below it, the map leads the filter away; continued to the depth, it does not."""
+    assert study
+    flown, below = import_module("voyages.dived").dived(seed)
+    assert below.error < 0.2 * flown.error
+    assert below.nees < 2.0
+    assert below.vouched > 0.5
