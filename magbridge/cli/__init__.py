@@ -20,7 +20,7 @@ EXTRAS = {
         ("scipy", "xarray", "netCDF4", "matplotlib", "ppigrf", "filterpy", "rich", "pandas", "pymavlink"),
         "analysis",
     ),
-    **dict.fromkeys(("harmonica", "verde"), "grids"),
+    "harmonica": "grids",
     "nicegui": "monitor",
 }
 """Which extra brings a package."""

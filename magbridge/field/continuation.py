@@ -7,8 +7,7 @@ field whose sources lie deeper decays with height (Blakely 1995, eq. 12.8),
 
 Downward the inverse would blow up what the survey did not see. With p = 1 - exp(-|k| h) it is a series,
 exp(|k| h) = 1 / (1 - p) = 1 + p + p² + ...: its first three terms at most treble the map's own noise; those after
-them are what is left out. About that level the field goes on with
-its vertical gradient, of spectrum |k| T.
+them are what is left out. About that level the field goes on with its vertical gradient, of spectrum |k| T.
 """
 
 from __future__ import annotations

@@ -125,8 +125,8 @@ class AnomalyGrid:
         return _spline(filled(self.anomaly))
 
     @cached_property
-    def _vertical(self) -> Array:
-        return np.zeros_like(self._coefficients) if self.vertical is None else _spline(self.vertical)
+    def _vertical(self) -> Array | None:
+        return None if self.vertical is None else _spline(self.vertical)
 
     def look_up(self, longitude: float, latitude: float, depth: float = nan) -> Local[float]:
         """Return the map around one place, all NaN off the map; the fast path of the filter.
@@ -152,7 +152,7 @@ class AnomalyGrid:
         across = (WEIGHTS @ (1.0, s, s * s, s * s * s)).reshape(3, 4)
         along = (WEIGHTS @ (1.0, t, t * t, t * t * t)).reshape(3, 4)
         patch = self._coefficients[i : i + 4, j : j + 4]
-        if self.vertical is not None and (below := depth + self.altitude) == below:
+        if self._vertical is not None and (below := depth + self.altitude) == below:
             patch = patch + below * self._vertical[i : i + 4, j : j + 4]
         (f, fx, fxx), (fy, fxy, _), (fyy, _, _) = (along @ patch @ across.T).tolist()
         per_latitude, per_longitude = metres_per_degree(latitude)
@@ -195,7 +195,7 @@ class AnomalyGrid:
         wide = self._coefficients.shape[1]
         window = (wide * i + j) + (wide * np.arange(4)[:, None] + np.arange(4))[..., None]
         patch = self._coefficients.ravel()[window]
-        if self.vertical is not None:
+        if self._vertical is not None:
             below = np.asarray(depth, float) + self.altitude
             patch = patch + np.where(np.isnan(below), 0.0, below) * self._vertical.ravel()[window]
         lines = (across[:, None] * patch).sum(

@@ -109,7 +109,7 @@ class Block(NamedTuple):
     slope_north, slope_east : float
         nT/m, of the main field.
     depth : float
-        m, their mean; NaN where it is not known.
+        m, their mean; NaN stands for the map's own height.
     """
 
     time_us: int
