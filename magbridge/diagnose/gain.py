@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from magbridge.diagnose.joint import RIDGE, Design, Joint
+from magbridge.diagnose.joint import Design, Joint
 from magbridge.diagnose.problem import Columns, Problem
 
 __all__ = ["Gain", "held_out", "paired"]
@@ -33,8 +33,7 @@ def held_out(problem: Problem, columns: Sequence[Columns], fit: Joint) -> FloatA
 
     Nonlinear parameters and noise are those of the whole; every coefficient is fitted anew without the fold.
     """
-    X, q, noise = Design(problem, columns), len(problem.centre), fit.noise
-    prior = np.append(np.ones(q), np.full(X.effects, RIDGE))
+    X, noise, prior = Design(problem, columns), fit.noise, fit.prior
     centre = np.append(problem.centre, np.zeros(X.effects))
     c = np.append(fit.z, fit.coefficients)
     y = noise.response(problem.residual - X.times(c))

@@ -49,6 +49,8 @@ class Joint:
     noise : Noise
     left : (n,) array
         nT, what is left of the residual.
+    prior : (q + k,) array
+        Precision that every coefficient had before the data, effects in units of their widths.
     """
 
     log_likelihood: float
@@ -57,6 +59,7 @@ class Joint:
     covariance: FloatArray
     noise: Noise
     left: FloatArray
+    prior: FloatArray
 
 
 def fit_joint(
@@ -67,7 +70,7 @@ def fit_joint(
     plain: bool = True,
     like: Joint | None = None,
     blocks: bool | None = None,
-    ridge: float = RIDGE,
+    ridge: float | FloatArray = RIDGE,
     rounds: int = 5,
 ) -> Joint:
     """Maximise the joint likelihood of calibration, effects and noise.
@@ -87,14 +90,14 @@ def fit_joint(
         A fit whose noise this one's will resemble: saves time.
     blocks : bool, optional
         See :func:`~magbridge.diagnose.noise.fit_noise`.
-    ridge : float
+    ridge : float or (k,) array
         Prior precision of the effects, in units of their widths.
     rounds : int
         At most.
     """
     X = Design(problem, columns)
     q, k = X.free.shape[1], X.effects
-    prior = np.append(np.ones(q), np.full(k, ridge))
+    prior = np.append(np.ones(q), np.broadcast_to(ridge, k))
     centre = np.append(problem.centre, np.zeros(k))
     follows = problem.survey.follows
 
@@ -123,7 +126,7 @@ def fit_joint(
         if gained < 0.02:  # P is that of the last step: no other
             break
     covariance: FloatArray = np.asarray(np.linalg.inv(P), float)
-    return Joint(value, c[:q], c[q:], covariance, noise, left)
+    return Joint(value, c[:q], c[q:], covariance, noise, left, prior)
 
 
 class Design:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -226,8 +226,10 @@ def _spoils(survey: Survey, problem: Problem, extended: Calibration, counts: NDA
 def _without(fit: Joint, model: Sequence[Candidate], k: int) -> Joint:
     """Return the fit with the k-th effect's coefficients taken out."""
     start = sum(candidate.size for candidate in model[:k])
-    kept = np.delete(fit.coefficients, np.arange(start, start + model[k].size))
-    return Joint(fit.log_likelihood, fit.z, kept, fit.covariance, fit.noise, fit.left)
+    own = np.arange(start, start + model[k].size)
+    return replace(
+        fit, coefficients=np.delete(fit.coefficients, own), prior=np.delete(fit.prior, own + len(fit.z))
+    )
 
 
 def _verdict(named: Sequence[Hypothesis], wrong: Outliers | None, rest: Leftover | None) -> str:
