@@ -1,3 +1,73 @@
-"""magbridge: a magnetometer bridge for vehicles whose own iron moves."""
+"""magbridge: a magnetometer bridge for vehicles whose own iron moves.
 
-__version__ = "0.1.0"
+From logs of calibration runs to corrected samples::
+
+    import magbridge as mb
+
+    found = mb.fit(mb.observations(mb.read("runs.nc"), ("battpos", "ballast")))
+    mb.save(found.calibration, "cal.json")
+    mb.write(mb.correct_rows(mb.Correction(found.calibration), mb.read("survey.nc")), "corrected.nc")
+
+:func:`magbridge.diagnose.run.diagnose` and :func:`magbridge.navigate.batch.navigate` go on from there. Each name is imported
+when it is first asked for: the bridge itself needs few of them.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from magbridge.version import __version__
+
+if TYPE_CHECKING:
+    from magbridge.calibration.correct import Corrector, correct
+    from magbridge.calibration.data import observations
+    from magbridge.calibration.file import load, save
+    from magbridge.calibration.fit import fit
+    from magbridge.calibration.model import Calibration
+    from magbridge.correction import Correction, correct_rows
+    from magbridge.errors import MagbridgeError
+    from magbridge.field.read import read_grid
+    from magbridge.field.reference import reference_field
+    from magbridge.logs import read, write
+
+__all__ = [
+    "Calibration",
+    "Correction",
+    "Corrector",
+    "MagbridgeError",
+    "__version__",
+    "correct",
+    "correct_rows",
+    "fit",
+    "load",
+    "observations",
+    "read",
+    "read_grid",
+    "reference_field",
+    "save",
+    "write",
+]
+
+_HOMES = {
+    "Calibration": "calibration.model",
+    "Correction": "correction",
+    "Corrector": "calibration.correct",
+    "MagbridgeError": "errors",
+    "correct": "calibration.correct",
+    "correct_rows": "correction",
+    "fit": "calibration.fit",
+    "load": "calibration.file",
+    "observations": "calibration.data",
+    "read": "logs",
+    "read_grid": "field.read",
+    "reference_field": "field.reference",
+    "save": "calibration.file",
+    "write": "logs",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)

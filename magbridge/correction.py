@@ -41,13 +41,16 @@ class Correction:
     ----------
     calibration : Calibration or None
         Without one every sample passes unchanged, flagged ``uncalibrated``.
-    settings : Align
+    settings : Align, optional
     ages : mapping of str to float
         s after which a parameter's telemetry is stale; 30 s where not given.
     """
 
     def __init__(
-        self, calibration: Calibration | None, settings: Align, ages: Mapping[str, float] | None = None
+        self,
+        calibration: Calibration | None,
+        settings: Align | None = None,
+        ages: Mapping[str, float] | None = None,
     ) -> None:
         calibration = calibration if calibration is not None else identity()
         ranges = {parameter.name: (parameter.low, parameter.high) for parameter in calibration.parameters}
@@ -55,7 +58,7 @@ class Correction:
             Input(name, *ranges.get(name, (nan, nan)), max_age=(ages or {}).get(name, MAX_AGE))
             for name in calibration.channels
         )
-        self.aligner = Aligner(inputs, settings, calibration.sensor.power_cycle)
+        self.aligner = Aligner(inputs, settings or Align(), calibration.sensor.power_cycle)
         self.names = tuple(one.name for one in inputs)
         self._wants_temperature = TEMPERATURE in self.names
         self._corrector = Corrector(calibration)

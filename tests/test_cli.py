@@ -10,7 +10,6 @@ import pytest
 
 from magbridge.calibration.file import load as load_calibration
 from magbridge.cli import main
-from magbridge.config import Align
 from magbridge.correction import Correction, correct_rows
 from magbridge.field.igrf import total_field
 from magbridge.field.read import read_grid
@@ -84,8 +83,8 @@ def test_correct_writes_what_the_contract_names(
 def test_correct_gives_the_same_in_pieces(deployment: Path, calibration: Path, tmp_path: Path) -> None:
     """A month is corrected in pieces: the state goes on from one to the next."""
     rows = read(deployment)
-    whole = correct_rows(Correction(load_calibration(calibration), Align()), rows)
-    pieces = Correction(load_calibration(calibration), Align())
+    whole = correct_rows(Correction(load_calibration(calibration)), rows)
+    pieces = Correction(load_calibration(calibration))
     parts = [correct_rows(pieces, rows.isel(time=slice(k, k + 701))) for k in range(0, 3600, 701)]
     for name in whole:
         if name == "anomaly":

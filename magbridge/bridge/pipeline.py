@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-import magbridge
 from magbridge.bridge.events import Event
 from magbridge.bridge.journal import Journal
 from magbridge.bridge.position import Position
@@ -34,6 +33,7 @@ from magbridge.mavlink.dialect import (
 from magbridge.records import Channel, Quality, Reading
 from magbridge.sensors import open_driver
 from magbridge.sensors.clock import DeviceClock, Stamp
+from magbridge.version import __version__
 
 if TYPE_CHECKING:
     from magbridge.bridge.navigation import Navigation  # it brings filterpy, which few vehicles carry
@@ -116,7 +116,7 @@ class Pipeline:
             start_us=start.time_us,
             signing=self.signing,
             calibration_id=self._calibration_id,
-            version=magbridge.__version__,
+            version=__version__,
             kept=start.parameters,
             status=self._status,
             speaking=lambda: self.sensor.state == MAG_PORT_STATE.OK,
@@ -249,7 +249,7 @@ class Pipeline:
             signing_timestamp=start.signing_timestamp,
             calibration_id=self._calibration_id,
             config_digest=bytes.fromhex(self._config.digest),
-            version=magbridge.__version__,
+            version=__version__,
             driver=self._config.sensor.driver,
         )
         for name, value in start.parameters.items():

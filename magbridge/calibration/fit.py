@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-import magbridge
 from magbridge.calibration.boresight import find_boresight
 from magbridge.calibration.data import Observations
 from magbridge.calibration.identify import combinations, expected_ratio, heading_gap, warnings_for
@@ -20,6 +19,7 @@ from magbridge.calibration.noise import NoiseModel
 from magbridge.calibration.residual import Samples, residuals_of, scales_and_offsets
 from magbridge.calibration.terms import Polynomial
 from magbridge.errors import CalibrationError
+from magbridge.version import __version__
 
 __all__ = ["METHODS", "Fit", "fit"]
 
@@ -250,6 +250,6 @@ def assemble(
         runs=table,
         method=method,
         inputs=dict(data.inputs),
-        software=f"magbridge {magbridge.__version__}",
+        software=f"magbridge {__version__}",
     )
     return Fit(calibration, e, warnings, details or {}, samples)

@@ -273,12 +273,11 @@ def correct(file: Path, *more: Path, calibration: Path, output: Output, json: Js
     """
     from magbridge.calibration.file import load
     from magbridge.columns import CHANNELS
-    from magbridge.config import Align
     from magbridge.correction import Correction, correct_rows
     from magbridge.logs import Writer, read_chunks
     from magbridge.records import Quality
 
-    correction = Correction(load(calibration), Align())
+    correction = Correction(load(calibration))
     rows = flagged = 0
     with Writer(output) as writer:
         for part in track(read_chunks((file, *more), required=CHANNELS), "correcting"):

@@ -66,7 +66,6 @@ def navigate(
         raise WrongUse("expected --calibration; or --bound, which does without")
 
     from magbridge.columns import CHANNELS
-    from magbridge.config import Align
     from magbridge.correction import Correction, correct_rows
     from magbridge.field.declination import with_true_heading
     from magbridge.field.read import read_grid
@@ -76,7 +75,7 @@ def navigate(
     from magbridge.navigate.model import informed
 
     deployment = with_true_heading(read((file, *more), required=CHANNELS))
-    corrected = correct_rows(Correction(known, Align()), deployment)
+    corrected = correct_rows(Correction(known), deployment)
     if options is None:
         options = informed(Options(), known, float(corrected["total_field_sigma"].median()))
     grid, options = _where_it_swims(read_grid(map), options, deployment)

@@ -10,7 +10,6 @@ from msgspec.structs import replace as with_options
 
 from magbridge.calibration.data import observations
 from magbridge.calibration.fit import fit
-from magbridge.config import Align
 from magbridge.correction import Correction, correct_rows
 from magbridge.navigate.model import informed
 from sitl import load, segments, simulate
@@ -40,7 +39,7 @@ def flown(kinds: tuple[Map, ...], seed: int) -> dict[tuple[int, str], Flown]:
     found = {}
     for method, options in METHODS.items():
         fitted = fit(observations(runs, () if method == "nominal" else MASSES), method, **options).calibration
-        corrected = correct_rows(Correction(fitted, Align()), survey)
+        corrected = correct_rows(Correction(fitted), survey)
         error = corrected["total_field"].to_numpy() - total(survey)
         sigma = corrected["total_field_sigma"].to_numpy()
         for k, kind in enumerate(kinds):

@@ -1,0 +1,42 @@
+"""What a user imports: the names are there, cost nothing until they are asked for, and do what the docstring says."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import magbridge as mb
+from sitl import load, simulate
+
+
+def test_every_public_name_is_there() -> None:
+    assert len(mb.__all__) <= 15
+    assert not [name for name in mb.__all__ if getattr(mb, name) is None]
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        mb.nothing  # noqa: B018 - it is the look-up that fails
+
+
+def test_importing_it_brings_nothing_else() -> None:
+    heavy = "{'numpy', 'scipy', 'xarray', 'msgspec'} & set(sys.modules)"
+    script = f"import sys, magbridge; print(sorted({heavy}))"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_from_a_log_to_corrected_samples(tmp_path: Path) -> None:
+    deployment = simulate(load("demo"), 5)
+    runs, survey = tmp_path / "runs.nc", tmp_path / "survey.nc"
+    mb.write(deployment.isel(time=deployment["run"].to_numpy() < 11), runs)
+    mb.write(deployment.isel(time=deployment["run"].to_numpy() >= 11), survey)
+    found = mb.fit(mb.observations(mb.read(runs), ("battpos", "ballast")))
+    mb.save(found.calibration, tmp_path / "cal.json")
+    corrected = mb.correct_rows(mb.Correction(mb.load(tmp_path / "cal.json")), mb.read(survey))
+    truth = mb.read(survey)["truth_total_field"].to_numpy()
+    at_rest = corrected["quality"].to_numpy() == int(corrected["quality"].min())
+    error = corrected["total_field"].to_numpy() - truth
+    assert at_rest.mean() > 0.9
+    assert np.sqrt(np.mean(error[at_rest] ** 2)) < 5.0
