@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-import magbridge
+from magbridge.calibration.followers import ClockEffect
 from magbridge.calibration.instrument import RateEffect
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.residual import residuals
@@ -18,11 +18,14 @@ from magbridge.diagnose.candidates import Candidate
 from magbridge.diagnose.joint import Joint, fit_joint
 from magbridge.diagnose.problem import Columns, Problem, derivatives, samples_of
 from magbridge.diagnose.weigh import IDEAL
+from magbridge.version import __version__
 
 __all__ = ["extend", "settle", "widened"]
 
 STEPS = 4
 """Linearisations at most; a second one is rarely needed."""
+MODES = 64
+"""Directions among which the misfit of an idealised regressor is spread; measured in the blind study."""
 
 FloatArray = NDArray[np.float64]
 
@@ -61,7 +64,7 @@ def extend(problem: Problem, model: Sequence[Candidate], fit: Joint) -> Calibrat
         covariance=0.5 * (covariance + covariance.T),
         reference=reference,
         noise=noise,
-        software=f"magbridge {magbridge.__version__}",
+        software=f"magbridge {__version__}",
     )
 
 
@@ -78,7 +81,7 @@ def settle(
     Rates of change keep the columns of the search: a live effect's backward differences hold the sample's own noise.
     """
     columns = [candidate.columns for candidate in model]
-    if not model or any(isinstance(effect, RateEffect) for c in model for effect in c.effects):
+    if not model or any(isinstance(effect, (RateEffect, ClockEffect)) for c in model for effect in c.effects):
         return problem, columns, fit
     settled = problem
     for _ in range(STEPS):
@@ -90,18 +93,26 @@ def settle(
 
 
 def widened(model: Sequence[Candidate], fit: Joint) -> Joint:
-    """Return the fit with what the regressors' idealisation adds to the covariance.
+    r"""Return the fit with what the regressors' idealisation adds to the covariance.
 
-    One that is off by :data:`~.weigh.IDEAL` of its norm has a size that is off by ``1 - sqrt(1 - IDEAL^2)`` of it.
+    Notes
+    -----
+    A cause of Wald's statistic ``W = b^T C_bb^-1 b`` has a signal of the whitened norm ``sqrt(W)``. A regressor that is off by
+    :data:`~.weigh.IDEAL` of it leaves a misfit that nobody knows the shape of: one more noise, of the power
+    ``IDEAL^2 W / MODES`` in every direction, where the data's has 1. The cause's coefficients, and what the calibration
+    gives way to them, get that much more variance:
+
+    .. math:: C \leftarrow C + \frac{IDEAL^2 W}{MODES}\, C_{:b} C_{bb}^{-1} C_{b:}
     """
-    share, at = 1.0 - float(np.sqrt(1.0 - IDEAL**2)), len(fit.z)
-    covariance = fit.covariance.copy()
+    C, at = fit.covariance.copy(), len(fit.z)
     for candidate in model:
         own = slice(at, at + candidate.size)
-        b = share * fit.coefficients[at - len(fit.z) :][: candidate.size]
-        covariance[own, own] += np.outer(b, b)
+        b = fit.coefficients[at - len(fit.z) :][: candidate.size]
+        given = np.linalg.solve(fit.covariance[own, own], np.column_stack([b, fit.covariance[own]]))
+        power = IDEAL**2 * float(b @ given[:, 0]) / MODES
+        C += power * fit.covariance[:, own] @ given[:, 1:]
         at += candidate.size
-    return replace(fit, covariance=covariance)
+    return replace(fit, covariance=0.5 * (C + C.T))
 
 
 def _again(

@@ -11,6 +11,7 @@ import numpy as np
 from magbridge.diagnose.search import Hypothesis, Rival
 
 if TYPE_CHECKING:
+    from magbridge.diagnose.candidates import Candidate
     from magbridge.diagnose.causes import Cause
     from magbridge.diagnose.gain import Gain
     from magbridge.diagnose.run import Diagnosis
@@ -71,19 +72,38 @@ def alternatives(rivals: tuple[Rival, ...]) -> list[dict[str, Any]]:
 
 
 def parameters(diagnosis: Diagnosis, hypothesis: Hypothesis, at: int) -> dict[str, dict[str, Any]]:
-    """Value, sigma and unit of every coefficient, from place `at` of the joint fit, and of the nonlinear ones."""
+    """Value, sigma and unit of every coefficient, from place `at` of the joint fit, and of the nonlinear ones.
+
+    Where one channel acts with several lags, or an offset jumps more than once, a coefficient is what they do in all; its
+    parts stand beside it.
+    """
     candidate, q = hypothesis.candidate, len(diagnosis.problem.centre)
     rows = slice(at, at + candidate.size)
-    sigma = np.sqrt(np.diag(diagnosis.fit.covariance)[rows]) * candidate.width
+    covariance = diagnosis.fit.covariance[rows, rows] * np.outer(candidate.width, candidate.width)
     value = diagnosis.fit.coefficients[at - q : at - q + candidate.size] * candidate.width
-    linear = {
-        name: {"value": _round(v), "sigma": _round(s), "unit": unit}
-        for name, v, s, unit in zip(candidate.names, value, sigma, candidate.units, strict=True)
-    }
+    parts: dict[str, list[int]] = {}
+    for k, name in enumerate(candidate.names):
+        parts.setdefault(name.partition(" (")[0] if _adds_up(candidate) else name, []).append(k)
+    found: dict[str, dict[str, Any]] = {}
+    for name, own in parts.items():
+        listed = {f"{name} ({i})": [k] for i, k in enumerate(own, 1)} if len(own) > 1 else {}
+        for label, some in ({name: own} | listed).items():
+            sigma = float(np.sqrt(covariance[np.ix_(some, some)].sum()))
+            found[label] = {
+                "value": _round(float(value[some].sum())),
+                "sigma": _round(sigma),
+                "unit": candidate.units[own[0]],
+            }
     shape = {
         name: {"value": float(v), "sigma": None, "unit": unit} for name, (v, unit) in candidate.shape.items()
     }
-    return linear | shape
+    return found | shape
+
+
+def _adds_up(candidate: Candidate) -> bool:
+    """Tell whether parts of one name are one effect's: later than each other, of one channel."""
+    channels = {getattr(effect, "channel", None) for effect in candidate.effects}
+    return len(channels) == 1 and not candidate.shape.keys().isdisjoint(("lag", "onset"))
 
 
 def told(diagnosis: Diagnosis, hypothesis: Hypothesis) -> float:
