@@ -11,6 +11,7 @@ import argparse
 import json
 import os
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -47,6 +48,7 @@ def run(client: Client, todo: list[Row], log: Path) -> list[str]:
             "".join(line for line in log.read_text().splitlines(keepends=True) if line.endswith("\n"))
         )
     failed = []
+    began = time.monotonic()
     with log.open("a") as file:
         futures = {
             client.submit(case_there, str(Path(__file__).parent), entry, pure=False): entry for entry in todo
@@ -60,7 +62,8 @@ def run(client: Client, todo: list[Row], log: Path) -> list[str]:
                 entry = futures[future]
                 failed.append(f"{entry['part']} {entry['number']} {entry['names']}: {error!r}")
             future.release()
-            print(f"\r{k} of {len(todo)}", end="", file=sys.stderr)
+            left = (time.monotonic() - began) / k * (len(todo) - k) / 60.0
+            print(f"\r{k} of {len(todo)}, {left:.0f} min left ", end="", file=sys.stderr)
     print(file=sys.stderr)
     return failed
 

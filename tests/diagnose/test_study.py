@@ -15,9 +15,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from study.cases import PARTS, plan
+from study.draws import Draws, Span, weigh, with_another
+from study.nameless import against, allowed, nameless
 from study.stage import MEMORY, autoregression, project, whiten
 from study.table import efficiency, lines, share
-from study.theory import Span, weigh, with_another
+
+from magbridge.diagnose.free import Description
 
 TOOLS = Path(__file__).parents[2] / "tools"
 
@@ -67,10 +70,50 @@ def test_two_rivals_imitate_what_neither_does_alone() -> None:
     truth = A[:, 0] + B[:, 1] + 0.2 * rng.normal(size=60)
     X = np.column_stack([A, B, other, truth])
     spans = [Span("a", None, slice(0, 2), 0.0), Span("b", None, slice(2, 4), 0.0)]
-    left = with_another(X.T @ X, slice(0, 2), spans)
+    left = with_another(X.T @ X, spans[0], spans)
     for cause, columns in (("a", A), ("b", np.column_stack([A, B]))):
         naive = truth - columns @ np.linalg.lstsq(columns, truth, rcond=None)[0]
-        assert left[cause] == pytest.approx(np.linalg.norm(naive), rel=1e-6)
+        assert left[cause][0] == pytest.approx(np.linalg.norm(naive), rel=1e-6)
+
+
+def test_likelihood_ratios_are_drawn_without_any_data() -> None:
+    """Against least squares on simulated data: mean and scatter of what two rivals together explain."""
+    rng = np.random.default_rng(6)
+    A, B = rng.normal(size=(2, 60, 2))
+    truth = A[:, 0] - B[:, 1] + rng.normal(size=60)
+    X = np.column_stack([A, B, truth])
+    spans = [Span("a", None, slice(0, 2)), Span("b", None, slice(2, 4))]
+    ratio, freedom = Draws.of(X.T @ X).ratio(*spans, scale=0.5)
+    data = 0.5 * truth[:, None] + rng.normal(size=(60, 4000))
+    Q = np.linalg.qr(np.column_stack([A, B]))[0]
+    naive = np.sum((Q.T @ data) ** 2, axis=0)
+    assert freedom == 4
+    assert np.mean(ratio) == pytest.approx(np.mean(naive), rel=0.1)
+    assert np.std(ratio) == pytest.approx(np.std(naive), rel=0.15)
+
+
+def nameless_chances(apart: float, k: int = 3, wanted: float = 10.0) -> dict[str, float]:
+    """Of a truth of k numbers; one name of three leaves so much of it, a description of 27 holds it in twenty ways."""
+    X = np.zeros((31, 31))
+    X[:30, :30] = np.eye(30)
+    X[27, 30], X[0, 30] = np.sqrt(wanted**2 - apart**2), apart
+    X[:, 0] = X[:, 30] / wanted
+    draws, name = Draws.of(X.T @ X), Span("other", None, slice(27, 30))
+    needed = against(draws, {"other": allowed(*draws.ratio(name))}, [], {})
+    free = Description(lambda rows: X[rows, :27], (("drift", np.ones(27)),) * 20)
+    return nameless(draws, weigh(draws.truth(k), k), needed, [free])
+
+
+def test_what_has_no_name_must_beat_the_names() -> None:
+    """The chance grows with what the best name leaves; it needs more than 20 : 1, and no description does better."""
+    chances = [nameless_chances(apart) for apart in (0.0, 3.0, 4.5, 6.0, 8.0, 9.9)]
+    unnamed, described = ([chance[key] for chance in chances] for key in ("unnamed", "described"))
+    assert unnamed == sorted(unnamed)
+    assert unnamed[0] < 0.02
+    assert unnamed[1] < 0.5
+    assert unnamed[-1] == 1.0
+    assert all(a <= b for a, b in zip(described, unnamed, strict=True))
+    assert nameless_chances(5.7)["unnamed"] == pytest.approx(0.95, abs=0.03)
 
 
 def test_the_point_of_half_detection_is_read_off_a_ladder() -> None:
@@ -79,7 +122,7 @@ def test_the_point_of_half_detection_is_read_off_a_ladder() -> None:
     rows = [
         {
             "wanted": x,
-            "half": [4.0, 5.6],
+            "theory": [{"half": 4.0, "sure": 5.6}],
             "verdict": "explained" if x / 1.2 + rng.normal() * 0.97 > 4.0 else "nothing_found",
         }
         for x in a

@@ -16,10 +16,11 @@ from magbridge.calibration.correct import correct
 from magbridge.calibration.model import Calibration
 from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.findings import findings
+from magbridge.diagnose.free import descriptions
 from magbridge.diagnose.run import Diagnosis, diagnose
 from sitl.inject import EFFECTS, FOREIGN, Hidden, disturb
 from study.stage import NOISES, SEEDS, Found, Stall, add_noise, again, stage_of
-from study.theory import ideal
+from study.theory import Setting, ideal
 
 Row = dict[str, Any]
 Array = NDArray[np.float64]
@@ -35,6 +36,8 @@ LASTING = (
 """What is the same on another deployment: the rest has its moment or its place, or its range in one log."""
 
 
+TOLD = ("named", "ladder", "unknown", "pair")
+"""Parts of which theory says what comes out."""
 DELAYS = ("filter_lag", "clock_offset")
 """In a uniform field these two are one: what is left of a late field is the masses that moved meanwhile."""
 
@@ -120,19 +123,12 @@ def case(entry: Row) -> Row:
     row = entry | {
         "sizes": [one.hidden.size for one in hidden], "verdict": found["verdict"], "unexplained": found["unexplained"],
         "found": [[f["cause"], f["channel"], f["signal_to_noise"], [a["cause"] for a in f["alternatives"]]] for f in found["findings"]],
-        "half": _half(result, names),
         "scores": _scores(found, names, whole),
-        "theory": [_theory(one, stall, ds, without) for one in hidden] if entry["part"] in ("named", "unknown", "pair") else [],
+        "theory": [_theory(entry["part"], one, hidden, stall, ds, result) for one in hidden] if entry["part"] in TOLD else [],
     }  # fmt: skip
     if entry["part"] == "gain":
         row["gain"] = _gained(hidden[0].hidden, stall, ds, result)
     return row | {"seconds": time.process_time() - began, "worker": os.getpid()}
-
-
-def _half(result: Diagnosis, names: tuple[str, ...]) -> list[float] | None:
-    """Signal-to-noise at which theory expects half of, and 95 % of, such effects to be found."""
-    own = [(v.half, v.sure) for v in result.isolability.visible if names == (v.cause,)]
-    return list(min(own)) if own else None
 
 
 def _scores(found: Row, names: tuple[str, ...], whole: xr.Dataset) -> list[float]:
@@ -148,18 +144,22 @@ def _scores(found: Row, names: tuple[str, ...], whole: xr.Dataset) -> list[float
     ]
 
 
-def _theory(one: Found, stall: Stall, ds: xr.Dataset, without: str) -> dict[str, Any] | None:
+def _theory(
+    part: str, one: Found, hidden: list[Found], stall: Stall, ds: xr.Dataset, result: Diagnosis
+) -> dict[str, Any] | None:
     name = one.hidden.name
     if name == "outliers":  # nothing else comes one by one
         return None
-    table = {key: cause for key, cause in CAUSES.items() if key != without}
     # the table's rates are differences: the delays' own signatures are more alike than those
     others = {
         other: stall.show(Hidden(other, 0.1, stall.number)).signature
         for other in DELAYS
-        if name in DELAYS and other not in (name, without)
+        if name in DELAYS and other not in [each.hidden.name for each in hidden]
     }
-    return ideal(one, stall, ds, table, others)
+    beside = [other for other in hidden if other is not one]
+    free = () if part != "unknown" else descriptions(result.problem, result.outcome.null)
+    setting = Setting(CAUSES, result.outcome.trials, free, others, next(iter(beside), None))
+    return ideal(one, stall, ds, setting)
 
 
 def _gained(hidden: Hidden, stall: Stall, ds: xr.Dataset, result: Diagnosis) -> dict[str, float]:
@@ -169,18 +169,19 @@ def _gained(hidden: Hidden, stall: Stall, ds: xr.Dataset, result: Diagnosis) -> 
     its own sigma to tell how little it knows. ``everywhere`` is what was extended on all samples.
     """
     calibration = stall.stage.calibration
-    oracle = diagnose([ds], calibration, causes={hidden.name: CAUSES[hidden.name]})
+    known = DELAYS if hidden.name in DELAYS else (hidden.name,)
+    oracle = diagnose([ds], calibration, causes={name: CAUSES[name] for name in known})
     there = again(stall.stage)
     other = disturb(there.twin, (hidden,), there.track, there.when, stall.number + 1)
     other = add_noise(other, "white", stall.number + 1)
     tried = {"before": calibration, "after": result.calibration, "oracle": oracle.calibration}
     errors = {name: _error(other, c) for name, c in tried.items()}
     whole = np.all([np.isfinite(e) for e in errors.values()], axis=0)
-    known = whole.copy()
+    seen = whole.copy()
     for parameter in calibration.parameters:
-        known &= (other[parameter.name] >= ds[parameter.name].min()).to_numpy()
-        known &= (other[parameter.name] <= ds[parameter.name].max()).to_numpy()
-    found = {name: float(np.mean(e[known] ** 2)) for name, e in errors.items()}
+        seen &= (other[parameter.name] >= ds[parameter.name].min()).to_numpy()
+        seen &= (other[parameter.name] <= ds[parameter.name].max()).to_numpy()
+    found = {name: float(np.mean(e[seen] ** 2)) for name, e in errors.items()}
     return found | {"everywhere": float(np.mean(errors["after"][whole] ** 2))}
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
-from scipy.stats import norm
+from scipy.stats import binomtest, norm
 
 from study.cases import KNOWN
 from study.table import Row, found
@@ -35,7 +35,7 @@ def confusion(rows: Sequence[Row]) -> tuple[NDArray[np.float64], NDArray[np.floa
 
 def plot_confusion(rows: Sequence[Row], path: Path) -> None:
     """Draw both matrices."""
-    named = [r for r in rows if r["part"] == "named"]
+    named = [r for r in rows if r["part"] == "named" and any(r["theory"])]
     figure = Figure(figsize=(17, 8.5), layout="constrained")
     axes = figure.subplots(1, 2, sharey=True)
     titles = ("predicted: an ideal detector on the same cases", f"measured: {len(named)} cases")
@@ -55,23 +55,24 @@ def plot_confusion(rows: Sequence[Row], path: Path) -> None:
 
 def plot_detection(rows: Sequence[Row], path: Path) -> None:
     """Draw the share that was found against signal-to-noise, beside theory's."""
-    single = [r for r in rows if r["part"] in ("named", "ladder", "loud") and r["half"]]
+    single = [r for r in rows if r["part"] in ("named", "ladder", "loud", "gain")]
+    told = [r["theory"][0] for r in single if any(r["theory"])]
     figure = Figure(figsize=(8, 5), layout="constrained")
     axis = figure.subplots()
     sizes = sorted({r["wanted"] for r in single})
     for size in sizes:
         own = [found(r) for r in single if r["wanted"] == size]
-        p, n = float(np.mean(own)), len(own)
-        spread = np.sqrt((p * (1 - p) + 1.0 / n) / n)  # never quite sure
+        share, ends = float(np.mean(own)), binomtest(sum(own), len(own)).proportion_ci()
         axis.errorbar(
-            size, p, spread, fmt="o", color="tab:blue", label="measured" if size == sizes[0] else None
-        )
+            size, share, [[share - ends.low], [ends.high - share]], fmt="o", color="tab:blue", capsize=2,
+            label="measured, with 95 % interval" if size == sizes[0] else None,
+        )  # fmt: skip
     a = np.geomspace(1.5, 100.0, 200)
-    if single:
-        half, sure = np.array([r["half"] for r in single]).T
+    if told:
+        half, sure = np.array([(t["half"], t["sure"]) for t in told]).T
         curve = norm.cdf((a[:, None] - half) / ((sure - half) / 1.645)).mean(axis=1)
-        axis.plot(a, curve, color="0.4", label="theory")
-        axis.legend()
+        axis.plot(a, curve, color="0.4", label="an ideal detector")
+        axis.legend(loc="lower right")
     axis.set(xscale="log", xlabel="signal-to-noise", ylabel="share found", ylim=(-0.02, 1.04))
     axis.set_xticks(sizes, [f"{size:g}" for size in sizes])
     axis.minorticks_off()

@@ -14,9 +14,7 @@ from study.stage import NOISES
 
 Row = dict[str, Any]
 ALLOWED = 0.95
-"""Theory's chance to name the truth alone, from which on a detector is held to it."""
-APART = 6.0
-"""Signal-to-noise left by the best imitation, from which on a thing is like nothing else (95 % of 6 free numbers)."""
+"""Theory's chance to name the truth alone, or to name nothing, from which on a detector is held to it."""
 
 
 def share(rows: Sequence[Row], good: Callable[[Row], bool]) -> str:
@@ -56,8 +54,8 @@ def allowed(row: Row) -> bool:
 
 
 def unlike(row: Row) -> bool:
-    """No cause of the table imitates what is hidden, nor do two together."""
-    return all(t is not None and t["two"] >= APART for t in row["theory"])
+    """Theory can tell what is hidden from all that the table knows."""
+    return all(t["unnamed"] >= ALLOWED for t in row["theory"])
 
 
 def _of_theory(rows: Sequence[Row], chance: Callable[[str, Row], float]) -> str:
@@ -77,11 +75,11 @@ def efficiency(rows: Sequence[Row]) -> tuple[float, float, float] | None:
     Detection at signal-to-noise a is ``Phi((a / f - half) / width)``, f by maximum likelihood; `half`
     and the width are theory's of each case.
     """
-    rows = [r for r in rows if r["half"]]
+    rows = [r for r in rows if any(r["theory"])]
     if len(rows) < 8:
         return None
     a, y = np.array([r["wanted"] for r in rows]), np.array([found(r) for r in rows])
-    half, sure = np.array([r["half"] for r in rows]).T
+    half, sure = np.array([(r["theory"][0]["half"], r["theory"][0]["sure"]) for r in rows]).T
     width = (sure - half) / 1.645
 
     def cost(log_f: float) -> float:
@@ -123,15 +121,16 @@ def lines(rows: Sequence[Row]) -> list[str]:
     unknown = part.get("unknown", [])
     apart = [r for r in unknown if unlike(r)]
     for label, chosen in (("nothing in the table imitates it", apart), ("all", unknown)):
+        expected = f"{100 * np.mean([r['theory'][0]['unnamed'] for r in chosen]):.0f}" if chosen else "-"
         add(
             f"unknown at S/N 10, {label}: 'unexplained'",
-            "at least 90 %",
+            f"at least 90 % (theory {expected} %)",
             share(chosen, lambda r: r["unexplained"] is not None),
         )
         add("... a wrong name", "at most 5 %", share(chosen, lambda r: bool(r["found"])))
     pairs = part.get("pair", [])
     apart = [r for r in pairs if allowed(r)]
-    for label, chosen in (("each nameable alone", apart), ("any two", pairs)):
+    for label, chosen in (("each nameable beside the other", apart), ("any two", pairs)):
         add(
             f"two at S/N 10, {label}: both named",
             f"at least 80 % (theory {_of_theory(chosen, lambda name, t: t['first'].get(name, 0.0))})",
@@ -231,7 +230,7 @@ def _by_cause(part: dict[str, list[Row]]) -> list[str]:
         }
         z = np.array([x for key in ("named", "loud", "gain") for r in own.get(key, []) for x in r["scores"]])
         off = efficiency(own.get("ladder", []) + named)
-        half = [r["half"][0] for r in named if r["half"]]
+        half = [t["half"] for t in known]
         halves = (
             f"{np.mean(half):.1f} / {np.mean(half) * off[0]:.1f} ({_off(off)} %)" if half and off else "-"
         )

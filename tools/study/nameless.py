@@ -1,0 +1,62 @@
+r"""Whether an ideal analyst whose table lacks the cause would be misled by its names.
+
+Notes
+-----
+He weighs names, one or two of them, against N descriptions without a name. Names stand until they are beaten as another
+name would have to beat them: by 20:1, and what a regressor may miss of the truth. With the likelihood ratios R and free numbers k
+of names m and log evidence ``E(R, k) = (R - k)/2 - (k/2) ln(R/k)`` (a variance component of k freedoms) they need
+
+.. math:: T = \ln 20 + \max_m \left(E(R_m, k_m) + \tfrac12 \epsilon^2 R_m - c_m\right)
+
+c is the price of a name's grid and, of a pair, 20:1 and its choice among the causes.
+
+*unnamed*: at best one of the descriptions has the very shape of the truth, and as many numbers as its cause would have:
+``P(E(R_d, k) - ln N > T)``. No description that could have been anything else does better: a bound for all analysts. (Of a
+cause of three numbers at S/N 10, N = 20, it is 95 % where the best name of three numbers leaves 5.7, of six 5.1.)
+
+*described*: the chance with the descriptions that there are, ``P(max_j E_j > T)``: each has numbers of one common size,
+which is the likeliest, and pays for all the shapes that it could have taken.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magbridge.diagnose.free import Description
+from magbridge.diagnose.weigh import IDEAL, ODDS
+from study.draws import Draws, Span, weigh
+
+Array = NDArray[np.float64]
+
+
+def allowed(ratio: Array, freedom: int) -> Array:
+    """Log evidence of a name, with what its regressor may have missed."""
+    return weigh(ratio, freedom) + 0.5 * IDEAL**2 * ratio
+
+
+def against(
+    draws: Draws, names: Mapping[str, Array], pairs: Sequence[tuple[Span, Span]], trials: Mapping[str, float]
+) -> Array:
+    """Log evidence T that something without a name needs; `names` are priced for their grids, `pairs` are not."""
+    found = [*names.values()]
+    for pair in pairs:
+        grids = sum(np.log(trials.get(span.cause, 1.0)) for span in pair)
+        found.append(allowed(*draws.ratio(*pair)) - grids - ODDS - np.log(len(trials)))
+    return np.asarray(np.max(found, axis=0) + ODDS)
+
+
+def nameless(draws: Draws, truth: Array, needed: Array, free: Sequence[Description]) -> dict[str, float]:
+    """Chances of the module's notes; the columns of `free` are the first of `draws`."""
+    count = sum(len(one.widths) for one in free)
+    best, start = np.full(len(needed), -np.inf), 0
+    for one in free:
+        own = slice(start, start := start + one.widths[0][1].size)
+        for _, width in one.widths:
+            best = np.maximum(best, draws.component(own, width) - np.log(one.trials))
+    return {
+        "unnamed": float(np.mean(truth - np.log(count) > needed)),
+        "described": float(np.mean(best > needed)),
+    }
