@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import accumulate, repeat
 from math import isnan
+from operator import mul
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
@@ -30,10 +32,13 @@ def offsets(regressors: int) -> FloatArray:
     return columns
 
 
-class PowersEffect(Effect, frozen=True, kw_only=True):
-    """A mass that another channel moves: ``T += sum_k c_k x^k``, ``x = (p - centre) / scale``.
+def powers(x: float, order: int) -> tuple[float, ...]:
+    """``x, x^2, ... x^order``."""
+    return tuple(accumulate(repeat(x, order), mul))
 
-    A permanent moment on a mass at ``r(p)`` gives ``G(r(p)) m`` (see :mod:`.dipole`), a power series in p.
+
+class Follower(Effect, frozen=True, kw_only=True):
+    """Offsets in powers of what one channel makes of its position.
 
     Attributes
     ----------
@@ -44,7 +49,6 @@ class PowersEffect(Effect, frozen=True, kw_only=True):
         Highest power; three coefficients (nT) for each.
     """
 
-    kind: ClassVar[str] = "powers"
     cause: str
     channel: str
     centre: float
@@ -64,6 +68,15 @@ class PowersEffect(Effect, frozen=True, kw_only=True):
         """Offsets."""
         return offsets(self.order)
 
+
+class PowersEffect(Follower, frozen=True, kw_only=True):
+    """A mass that another channel moves: ``T += sum_k c_k x^k``, ``x = (p - centre) / scale``.
+
+    A permanent moment on a mass at ``r(p)`` gives ``G(r(p)) m`` (see :mod:`.dipole`), a power series in p.
+    """
+
+    kind: ClassVar[str] = "powers"
+
     def begin(self, calibration: Calibration) -> Step:
         """Return a stepper; a missing value leaves the last one standing."""
         index, order = calibration.channels.index(self.channel), self.order
@@ -73,10 +86,7 @@ class PowersEffect(Effect, frozen=True, kw_only=True):
             nonlocal x
             if not isnan(values[index]):
                 x = (values[index] - centre) / scale
-            powers = [x]
-            for _ in range(order - 1):
-                powers.append(powers[-1] * x)
-            return tuple(powers)
+            return powers(x, order)
 
         return step
 
@@ -126,7 +136,7 @@ class MonomialEffect(Effect, frozen=True, kw_only=True):
         return step
 
 
-class PlayEffect(Effect, frozen=True, kw_only=True):
+class PlayEffect(Follower, frozen=True, kw_only=True):
     """Backlash or remanence: ``T += sum_k c_k (v^k - x^k)``, y the play operator of the channel p.
 
     ``y = min(max(y, p - width / 2), p + width / 2)``: the last position drags behind by half the width, on the
@@ -136,35 +146,16 @@ class PlayEffect(Effect, frozen=True, kw_only=True):
 
     Attributes
     ----------
-    cause, channel : str
     width : float
         In the channel's unit.
-    order : int
-        Highest power.
     centre, scale : float
         In the channel's unit; a scale of 0 stands for the width.
     """
 
     kind: ClassVar[str] = "play"
-    cause: str
-    channel: str
     width: float
-    order: int = 1
     centre: float = 0.0
     scale: float = 0.0
-
-    @property
-    def size(self) -> int:
-        """Three for each power, nT."""
-        return 3 * self.order
-
-    def channels(self) -> tuple[str, ...]:
-        """Name the one that it follows."""
-        return (self.channel,)
-
-    def columns(self, field: float) -> FloatArray:  # noqa: ARG002  (others need it)
-        """Offsets."""
-        return offsets(self.order)
 
     def begin(self, calibration: Calibration) -> Step:
         """Return a stepper that starts in the middle of its play."""
@@ -177,14 +168,8 @@ class PlayEffect(Effect, frozen=True, kw_only=True):
                 p = values[index]
                 y = p if first else min(max(y, p - half), p + half)
                 first = False
-            if order == 1:
-                return ((y - p) / scale,)
-            v, x = (y - centre) / scale, (p - centre) / scale
-            a, b, powers = v, x, [v - x]
-            for _ in range(order - 1):
-                a, b = a * v, b * x
-                powers.append(a - b)
-            return tuple(powers)
+            dragged, here = ((at - centre) / scale for at in (y, p))
+            return tuple(v - x for v, x in zip(powers(dragged, order), powers(here, order), strict=True))
 
         return step
 
@@ -216,8 +201,7 @@ class ClockEffect(Effect, frozen=True, kw_only=True):
         kernel, field = calibration.kernel, calibration.reference.field
         W = kernel.weights[: kernel.monomials] * np.array([field] * 6 + [1.0] * 3)
         last: list[float] = []
-        still = (0.0,) * 9
-        then = 0
+        still, weights, then = (0.0,) * 9, W.T.tolist(), 0
 
         def step(time_us: int, hx: float, hy: float, hz: float, values: Sequence[float]) -> tuple[float, ...]:  # noqa: ARG001
             nonlocal last, then
@@ -227,8 +211,7 @@ class ClockEffect(Effect, frozen=True, kw_only=True):
                 return still
             rates = [(a - b) / (1e-6 * apart) for a, b in zip(now, before, strict=True)]
             return tuple(
-                sum(rate * weight for rate, weight in zip(rates, column, strict=True))
-                for column in W.T.tolist()
+                sum(rate * weight for rate, weight in zip(rates, column, strict=True)) for column in weights
             )
 
         return step

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from magbridge.calibration.followers import MAX_INTERVAL, offsets
+from magbridge.calibration.followers import MAX_INTERVAL, offsets, powers
 from magbridge.calibration.terms import Effect, Step
 
 if TYPE_CHECKING:
@@ -67,10 +67,7 @@ class TimeEffect(Effect, frozen=True, kw_only=True):
             x = (time_us - start) / period
             if shape == "tone":
                 return cos(2.0 * pi * x), sin(2.0 * pi * x)
-            powers = [x]
-            for _ in range(order - 1):
-                powers.append(powers[-1] * x)
-            return tuple(powers)
+            return powers(x, order)
 
         return step
 
