@@ -8,7 +8,7 @@ evaluated at both ends of what the parameter may have been.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from math import hypot, isfinite, nan
+from math import hypot, inf, isfinite, nan
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -21,7 +21,7 @@ from magbridge.columns import COLUMNS
 from magbridge.config import Align
 from magbridge.field.igrf import total_field
 from magbridge.field.reference import positions
-from magbridge.records import Corrected, Reading
+from magbridge.records import BEYOND, Corrected, Reading
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -91,6 +91,8 @@ class Correction:
                 change = total_at(field, (*before, high, *after)) - total_at(field, (*before, low, *after))
                 extra.append(0.5 * change)
         more = hypot(*extra)
+        if not more < BEYOND:  # also NaN: positions that are no positions
+            more = inf
         x, y, z = corrected.field_sigma
         return Corrected(
             corrected.total_field,

@@ -10,9 +10,12 @@ from math import nan
 
 import msgspec
 
-__all__ = ["Channel", "Corrected", "Quality", "Reading"]
+__all__ = ["BEYOND", "Channel", "Corrected", "Quality", "Reading"]
 
 Vector = tuple[float, float, float]
+
+BEYOND = 1e9
+"""nT (1 T): a field or a sigma above it is no measurement, but garbage that happens to be a number."""
 
 
 class Quality(IntFlag):

@@ -4,8 +4,9 @@ Notes
 -----
 The equations stand in :mod:`.arithmetic`, and are the same code for one sample and for many.
 
-What a missing value gives: a NaN channel of the field or position makes total and vector NaN and
-the sigmas infinite, flagged ``gap`` or ``stale_telemetry``; the total is never a guess.
+What a missing value gives: a NaN channel of the field or position, or one so large that the total is beyond all
+measure, makes total and vector NaN and the sigmas infinite, flagged ``gap`` where the field is to blame and
+``stale_telemetry`` where the telemetry is; the total is never a guess.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from magbridge.calibration.kernel import Kernel
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.terms import Step
 from magbridge.errors import CalibrationError
-from magbridge.records import Corrected, Quality
+from magbridge.records import BEYOND, Corrected, Quality
 
 __all__ = ["CorrectedArrays", "Corrector", "correct", "regressors"]
 
@@ -124,8 +125,8 @@ class Corrector:
                 self._prepared = prepare(self._kernel.sums_of_one(regressors))
         F, sigma, x, y, z, sx, sy, sz = apply(hx, hy, hz, self._prepared, self._omega, sqrt)
         quality |= self._flags
-        if F - F != 0.0:  # NaN or infinite
-            quality |= GAP if hx + hy + hz - (hx + hy + hz) != 0.0 else 0
+        if not F < BEYOND:  # also NaN
+            quality |= STALE_TELEMETRY if abs(hx) + abs(hy) + abs(hz) < BEYOND else GAP
             F = x = y = z = np.nan
             sigma = sx = sy = sz = inf
         return Corrected(F, sigma, (x, y, z), (sx, sy, sz), quality)
@@ -204,8 +205,9 @@ def correct(
         for value, (low, high) in zip(channels.T, _ranges(calibration), strict=False):
             quality |= np.where((value < low) | (value > high), EXTRAPOLATED, 0)
             quality |= np.where(np.isnan(value), STALE_TELEMETRY, 0)
-        lost = ~np.isfinite(out[0])
-        quality |= np.where(lost & ~np.isfinite(field.sum(axis=1)), GAP, 0)
+        lost = ~(out[0] < BEYOND)
+        measured = np.abs(field).sum(axis=1) < BEYOND
+        quality |= np.where(lost, np.where(measured, STALE_TELEMETRY, GAP), 0)
     out[np.ix_([0, 2, 3, 4], lost)] = np.nan
     out[np.ix_([1, 5, 6, 7], lost)] = inf
     return CorrectedArrays(out[0], out[1], out[2:5].T, out[5:8].T, quality)

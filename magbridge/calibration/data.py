@@ -14,6 +14,7 @@ from magbridge.calibration.model import Parameter
 from magbridge.calibration.residual import Samples
 from magbridge.calibration.terms import Exponents
 from magbridge.errors import CalibrationError
+from magbridge.records import BEYOND
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -26,7 +27,7 @@ _PER_SAMPLE = ("field", "reference", "parameters", "runs", "time", "attitude", "
 
 @dataclass(frozen=True, eq=False)
 class Observations:
-    """Calibration data as arrays; rows that lack a value are dropped when it is made.
+    """Calibration data as arrays; rows that lack a value, or hold an impossible field, are dropped when it is made.
 
     Attributes
     ----------
@@ -80,10 +81,12 @@ class Observations:
         reference = np.broadcast_to(np.asarray(self.reference, float), n)
         time = np.arange(n, dtype=float) if self.time is None else np.asarray(self.time, float)
         runs = np.zeros(n, int) if self.runs is None else np.asarray(self.runs)
-        whole = np.isfinite(np.asarray(self.field, float)).all(axis=1) & np.isfinite(reference)
+        field = np.asarray(self.field, float)
+        field = np.where(np.abs(field) < BEYOND, field, np.nan)
+        whole = np.isfinite(field).all(axis=1) & np.isfinite(reference)
         whole &= np.isfinite(parameters).all(axis=1) & np.isfinite(time)
-        _enough(n, whole, np.asarray(self.field, float), parameters, self.names, reference)
-        put(self, "field", np.asarray(self.field, float)[whole])
+        _enough(n, whole, field, parameters, self.names, reference)
+        put(self, "field", field[whole])
         put(self, "reference", reference[whole])
         put(self, "parameters", parameters[whole])
         put(self, "runs", runs[whole])

@@ -26,7 +26,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from math import frexp, ldexp
+from math import frexp, ldexp, nan
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -47,6 +47,8 @@ COARSE, FINE = 1.5 * 2.0 ** (52 - BITS), 1.5 * 2.0 ** (52 - 2 * BITS)
 EXPONENT = 3
 """psi is kept below 2^3, by a power of two where positions lie far outside the range seen: then
 2^24 . 2^21 . 256 products still fit 53 bits."""
+FARTHEST = 2.0**BITS
+"""A regressor as large is beyond use: beside its square the constant falls out of the split."""
 
 COLUMNS = 81
 """Of the table: the twelve, then the 69 combinations of their covariance."""
@@ -107,7 +109,7 @@ class Kernel:
     def sums_of_one(self, phi: list[float]) -> list[float]:
         """Return the same 81 sums of one sample's regressors: one product, so that it is quick."""
         largest = max(*phi, -min(phi))
-        scale = ldexp(1.0, min(EXPONENT - frexp(largest * largest)[1], 0))
+        scale = ldexp(1.0, min(EXPONENT - frexp(largest * largest)[1], 0)) if largest < FARTHEST else nan
         psi = np.array([phi[i] * phi[j] * scale for i, j in self.pairs])
         parts = np.empty((len(psi), 2))
         coarse = np.add(psi, COARSE, out=parts[:, 0])
@@ -146,9 +148,10 @@ class Kernel:
 
 
 def _scales(phi: FloatArray) -> FloatArray:
-    """(n,) power of two by which the products of each sample are made small enough, 1 for most."""
+    """(n,) power of two by which the products of each sample are made small enough, 1 for most; NaN: too far."""
     largest = np.abs(phi).max(axis=0)
-    return np.asarray(np.ldexp(1.0, np.minimum(EXPONENT - np.frexp(largest * largest)[1], 0)))
+    scales = np.ldexp(1.0, np.minimum(EXPONENT - np.frexp(largest * largest)[1], 0))
+    return np.where(largest < FARTHEST, scales, np.nan)
 
 
 def compile_kernel(calibration: Calibration) -> Kernel:

@@ -36,13 +36,15 @@ from zlib import crc32
 import msgspec
 from msgspec import Meta
 
-from magbridge.records import Reading
+from magbridge.records import BEYOND, Reading
 from magbridge.sensors.framing import NT_PER_UNIT, Framer
 
 __all__ = ["CHECKSUMS", "Ascii", "AsciiOptions"]
 
 LIMIT = 512
 """Longest line, in bytes."""
+COUNTS = 2**31
+"""What no converter counts to, and no message holds."""
 ENCODING = "latin-1"
 SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6}
 Positive = Annotated[float, Meta(gt=0)]
@@ -67,10 +69,17 @@ def _finite(text: bytes) -> float:
     return number
 
 
+def _measured(text: bytes) -> float:
+    number = float(text)  # NaN is how some say that they do not know
+    if abs(number) > BEYOND:
+        raise ValueError
+    return number
+
+
 KINDS: dict[str, Callable[[bytes], float]] = {
     "time": _finite,
-    "temperature": float,
-    "supply": float,
+    "temperature": _measured,
+    "supply": _measured,
     "sequence": int,
     "power_cycle": int,
 }
@@ -193,11 +202,12 @@ class Ascii:
         if len(cells) != self._width and not (self._more and len(cells) > self._width):
             raise ValueError
         x, y, z = map(float, self._xyz(cells))
-        if not isfinite(x + y + z):
-            raise ValueError
-        others: dict[str, Any] = {name: kind(cells[at]) for name, at, kind in self._others}
         scale, limit = self._scale, self.range_nt
         field = (x * scale, y * scale, z * scale)
+        largest = abs(field[0]) + abs(field[1]) + abs(field[2])
+        if not largest < BEYOND or (self._counts and not abs(x) + abs(y) + abs(z) < COUNTS):
+            raise ValueError
+        others: dict[str, Any] = {name: kind(cells[at]) for name, at, kind in self._others}
         inside = -limit < field[0] < limit and -limit < field[1] < limit and -limit < field[2] < limit
         return Reading(
             field,

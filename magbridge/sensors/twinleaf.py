@@ -12,7 +12,7 @@ from zlib import crc32
 import msgspec
 from msgspec import Meta
 
-from magbridge.records import Reading
+from magbridge.records import BEYOND, Reading
 from magbridge.sensors import tio
 from magbridge.sensors.framing import CRC32_RESIDUE, NT_PER_UNIT, Framer
 
@@ -207,13 +207,16 @@ class Twinleaf:
         for n in range(first, first + count):
             values = row.pick(row.fields.unpack_from(payload, 4 + (n - first) * row.size))
             x, y, z = values[0] * row.scale, values[1] * row.scale, values[2] * row.scale
+            temperature = values[3] if len(values) == 4 else nan
+            if abs(x) + abs(y) + abs(z) > BEYOND or abs(temperature) > BEYOND:
+                raise ValueError
             inside = -limit < x < limit and -limit < y < limit and -limit < z < limit
             readings.append(
                 Reading(
                     (x, y, z),
                     sequence=(zero + n) % WRAP_1,
                     device_time=begin + n * period,
-                    temperature=values[3] if len(values) == 4 else nan,
+                    temperature=temperature,
                     power_cycle=self._session,
                     saturated=not inside,
                 )

@@ -104,6 +104,7 @@ def test_counts_sequence_and_supply() -> None:
         "1 2 3_0",
         "1,2,3",
         "1 2 1e999",
+        "1 2 1e300",
         "\x00 1 2 3",
         "1 2 \xff",
     ],
@@ -113,6 +114,13 @@ def test_a_line_that_says_something_else_is_bad(line: str) -> None:
     assert driver.feed(line.encode("latin-1") + b"\n") == []
     assert driver.frames_bad == 1
     assert driver.bytes_skipped == len(line.encode("latin-1"))
+
+
+@pytest.mark.parametrize("line", ["1 2 3 1e300 4", "1 2 3 4 -1e39", "99999999999 2 3 4 5"])
+def test_a_number_that_no_message_holds_is_bad(line: str) -> None:
+    options = {"columns": ["x", "y", "z", "temperature", "supply"], "unit": "counts", "scale": 1e-3}
+    (reading,) = read(f"{line}\n1 2 3 nan 5\n", **options)
+    assert reading.counts == (1, 2, 3)
 
 
 def test_a_time_that_is_no_number_is_bad() -> None:
