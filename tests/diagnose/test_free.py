@@ -34,8 +34,8 @@ def test_ridge_is_the_marginal_likelihood_of_a_common_size() -> None:
 def test_under_no_effect_twice_the_evidence_is_at_most_a_chi_square_of_one_freedom() -> None:
     rng = np.random.default_rng(2)
     X = rng.normal(size=(400, 40)) / np.arange(1, 41)
-    found = [ridge(X.T @ X, X.T @ rng.normal(size=400), np.ones(40)).evidence for _ in range(2000)]
-    assert np.mean(2.0 * np.array(found) > 6.63) < 0.015
+    found = [ridge(X.T @ X, X.T @ rng.normal(size=400), np.ones(40)).evidence for _ in range(500)]
+    assert np.mean(2.0 * np.array(found) > 6.63) < 0.02
 
 
 @pytest.mark.parametrize("seed", [2, 5])

@@ -16,7 +16,7 @@ from magbridge.calibration.correct import correct
 from magbridge.calibration.model import Calibration
 from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.findings import findings
-from magbridge.diagnose.free import descriptions
+from magbridge.diagnose.free import Description, descriptions
 from magbridge.diagnose.run import Diagnosis, diagnose
 from sitl.inject import EFFECTS, FOREIGN, Hidden, disturb
 from study.stage import NOISES, SEEDS, Found, Stall, add_noise, again, stage_of
@@ -157,7 +157,10 @@ def _theory(
         if name in DELAYS and other not in [each.hidden.name for each in hidden]
     }
     beside = [other for other in hidden if other is not one]
-    free = () if part != "unknown" else descriptions(result.problem, result.outcome.null)
+    free: list[Description] = []
+    if part == "unknown":
+        tones = CAUSES[name].candidates(result.problem) if name == "interference_tone" else []
+        free = descriptions(result.problem, result.outcome.null, *tones[:1])
     setting = Setting(CAUSES, result.outcome.trials, free, others, next(iter(beside), None))
     return ideal(one, stall, ds, setting)
 

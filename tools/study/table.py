@@ -59,7 +59,7 @@ def unlike(row: Row) -> bool:
 
 
 def _of_theory(rows: Sequence[Row], chance: Callable[[str, Row], float]) -> str:
-    """Theory's mean chance for all that is hidden in a case, as if one did not disturb the other."""
+    """Theory's mean chance for all that is hidden in a case."""
     known = [[chance(*one) for one in zip(r["names"], r["theory"], strict=True)] for r in rows]
     return f"{100 * np.mean([np.prod(chances) for chances in known]):.0f} %" if known else "unknown"
 
@@ -121,10 +121,10 @@ def lines(rows: Sequence[Row]) -> list[str]:
     unknown = part.get("unknown", [])
     apart = [r for r in unknown if unlike(r)]
     for label, chosen in (("nothing in the table imitates it", apart), ("all", unknown)):
-        expected = f"{100 * np.mean([r['theory'][0]['unnamed'] for r in chosen]):.0f}" if chosen else "-"
+        at_best, so = (_of_theory(chosen, lambda _, t, key=key: t[key]) for key in ("unnamed", "described"))
         add(
             f"unknown at S/N 10, {label}: 'unexplained'",
-            f"at least 90 % (theory {expected} %)",
+            f"at least 90 % (theory {at_best}; of its descriptions {so})",
             share(chosen, lambda r: r["unexplained"] is not None),
         )
         add("... a wrong name", "at most 5 %", share(chosen, lambda r: bool(r["found"])))
