@@ -15,6 +15,9 @@ double *exactly*, in whatever order (Ozaki et al. 2012, Numer. Algorithms 59:95)
 gives the same bits as a million in a batch, here and on any other computer. What the split leaves
 out is 2e-13 of the largest: 1e-8 nT.
 
+That leaves too little of the constant when a regressor is large beside it, as a pressure in Pa. So what effects
+follow is first multiplied by a power of two: it is counted in what makes about 1,000 nT of difference.
+
 The nine become twelve in body axes: ``A' = R A`` (nine, R the boresight) and T. For the covariance V of the
 corrected vector ``b = A' d, d = H_r - T``, write ``db = dA' d - A' dT``: V is quadratic in d, and the table holds
 the covariance in just the combinations that V needs: 36 for the quadratic part Q, 27 for ``S_a'T``, 6 for
@@ -50,6 +53,9 @@ EXPONENT = 3
 FARTHEST = 2.0**BITS
 """A regressor as large is beyond use: beside its square the constant falls out of the split."""
 
+ORDINARY = 1024.0
+"""nT that a regressor of 1 makes, once it is counted as an effect's."""
+
 COLUMNS = 81
 """Of the table: the twelve, then the 69 combinations of their covariance."""
 PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
@@ -71,8 +77,10 @@ class Kernel:
         How many; the remaining regressors belong to effects.
     weights : (m, 9) array
         W, with ``A`` itself (not ``a``) in the first six.
+    units : tuple of float or None
+        Powers of two that the regressors are multiplied by; None where all are 1.
     first, second : (q,) int arrays
-        Product q is ``phi[first] * phi[second]``; the first m products are the regressors.
+        Product q is ``phi[first] * phi[second]``, of regressors in their units; the first m are the regressors.
     coarse, fine : (81, q) arrays
         The table in two parts.
     """
@@ -82,6 +90,7 @@ class Kernel:
     parents: tuple[tuple[int, int], ...]
     monomials: int
     weights: FloatArray
+    units: tuple[float, ...] | None
     first: NDArray[np.intp]
     second: NDArray[np.intp]
     coarse: FloatArray
@@ -89,6 +98,8 @@ class Kernel:
 
     def sums(self, phi: FloatArray) -> FloatArray:
         """Return ``table psi`` (81, n) of many samples' regressors (m, n)."""
+        if self.units is not None:
+            phi = phi * np.array(self.units)[:, None]
         psi = np.empty((len(self.pairs), phi.shape[1]))
         for row, (i, j) in zip(psi, self.pairs, strict=True):
             np.multiply(phi[i], phi[j], out=row)
@@ -108,6 +119,8 @@ class Kernel:
 
     def sums_of_one(self, phi: list[float]) -> list[float]:
         """Return the same 81 sums of one sample's regressors: one product, so that it is quick."""
+        if self.units is not None:
+            phi = [value * unit for value, unit in zip(phi, self.units, strict=True)]
         largest = max(*phi, -min(phi))
         scale = ldexp(1.0, min(EXPONENT - frexp(largest * largest)[1], 0)) if largest < FARTHEST else nan
         psi = np.array([phi[i] * phi[j] * scale for i, j in self.pairs])
@@ -174,6 +187,9 @@ def compile_kernel(calibration: Calibration) -> Kernel:
     W = np.tensordot(calibration.coefficients, P, 1)
     W[0, :3] += 1.0
     first, second, table = _table(P, W, calibration, exponents)
+    units = _units(P[:, len(exponents) :], W[len(exponents) :], calibration)
+    units = np.concatenate([np.ones(len(exponents)), units])
+    table /= (units[first] * units[second])[:, None]
     size = 2.0 ** np.frexp(np.abs(table).max(axis=0))[1]  # a power of two above each column
     coarse = ((table / size + COARSE) - COARSE).T * size[:, None]
     fine = ((table / size - coarse.T / size + FINE) - FINE).T * size[:, None]
@@ -183,6 +199,7 @@ def compile_kernel(calibration: Calibration) -> Kernel:
         parents=tuple((row[_parent(e)[0]], _parent(e)[1]) for e in exponents[1:]),
         monomials=len(exponents),
         weights=W,
+        units=tuple(units.tolist()) if effects else None,
         first=first,
         second=second,
         coarse=coarse,
@@ -207,6 +224,14 @@ def _closed(exponents: set[Exponents], calibration: Calibration) -> list[Exponen
             if any(exponent):
                 todo.append(_parent(exponent)[0])
     return sorted(closed, key=lambda e: (sum(e), [-power for power in e]))
+
+
+def _units(P: FloatArray, W: FloatArray, calibration: Calibration) -> FloatArray:
+    """(r,) powers of two near ``s / ORDINARY``, s what 1 of each effect's regressor makes, or may make, in nT."""
+    variance = np.einsum("kri,kl,lri->ri", P, calibration.covariance, P)
+    field = np.array([calibration.reference.field] * 6 + [1.0] * 3)
+    s = (np.sqrt(W * W + np.abs(variance)) * field).max(axis=1)
+    return np.ldexp(1.0, np.where(s > 0.0, np.frexp(s / ORDINARY)[1], 0))
 
 
 def _body_axes(calibration: Calibration) -> FloatArray:

@@ -158,6 +158,32 @@ def test_what_is_missing_is_flagged_and_never_a_number() -> None:
     assert live.step(0, (0.0, 0.0, 0.0), (0.0, 0.0)).total_field_sigma > 0.0
 
 
+def test_an_effect_may_follow_a_channel_in_any_unit() -> None:
+    """What is split off must not be worth a nanotesla because a pressure comes in Pa and not in dbar."""
+    rng = np.random.default_rng(9)
+    field, position, time = random_samples(9, 50, 2)
+    dbar = rng.uniform(0.0, 1000.0, 50)
+    found = []
+    for unit in (1.0, 1e4, 1e-6):
+        cal = random_calibration(9)
+        k = len(cal.coefficients)
+        covariance = np.zeros((k + 3, k + 3))
+        covariance[:k, :k], covariance[k:, k:] = cal.covariance, np.eye(3) * (0.01 / unit) ** 2
+        cal = replace(
+            cal,
+            effects=(ChannelEffect(cause="pressure_offset", channel="pressure"),),
+            coefficients=np.append(cal.coefficients, np.array([0.1, -0.05, 0.02]) / unit),
+            covariance=covariance,
+        )
+        channels = np.column_stack([position, dbar * unit])
+        found.append(correct(cal, field, channels, time))
+        live = Corrector(cal).step(0, tuple(field[7].tolist()), channels[7].tolist())
+        assert live.total_field == found[-1].total[7]
+    for other in found[1:]:
+        np.testing.assert_allclose(other.total, found[0].total, atol=1e-6)
+        np.testing.assert_allclose(other.sigma, found[0].sigma, rtol=1e-6)
+
+
 def test_extrapolation_is_flagged_and_sigma_grows() -> None:
     cal = random_calibration(6)
     field = np.repeat([[20_000.0, 1000.0, 45_000.0]], 3, axis=0)
