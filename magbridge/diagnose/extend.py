@@ -141,7 +141,8 @@ def _again(
     c = np.append(fit.z, fit.coefficients)
     again = replace(problem, residual=residual, free=free, slopes=g)
     columns: list[Columns] = [partial(_rows, block) for block in blocks]
-    return again, columns, fit_joint(again, columns, order, c, ridge=fit.prior[len(fit.z) :])
+    uneven = bool(np.ptp(fit.noise.scale))  # likelihoods that are compared have one kind of noise
+    return again, columns, fit_joint(again, columns, order, c, blocks=uneven, ridge=fit.prior[len(fit.z) :])
 
 
 def _rows(block: FloatArray, rows: slice) -> FloatArray:

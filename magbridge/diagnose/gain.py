@@ -1,9 +1,24 @@
-"""What mending gains: on dives that were left out, dive by dive against the calibration as it was."""
+r"""What mending gains: on dives that were left out, dive by dive against the calibration as it was.
+
+Notes
+-----
+The *score* of a model is the log predictive density of every fold of dives, given the others. With the log likelihood l of the
+noise at the fit c to all, the folds' information ``A_f^T A_f`` and P all of it with the prior's, Laplace's approximation
+(exact for Gaussian noise, by Woodbury's identity) is
+
+.. math:: S = l - \tfrac12 \sum_f \left[ (c - c_{-f})^T (P - A_f^T A_f) (c - c_{-f})
+              + \log\det P - \log\det (P - A_f^T A_f) \right]
+
+what the data say, less what it took to learn each fold's coefficients from the others. The difference of two models'
+scores is the log of the odds that the left-out dives give one against the other: the pseudo-Bayes factor (Geisser &
+Eddy 1979, JASA 74:153).
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +26,7 @@ from numpy.typing import NDArray
 from magbridge.diagnose.joint import Design, Joint
 from magbridge.diagnose.problem import Columns, Problem
 
-__all__ = ["Gain", "held_out", "paired"]
+__all__ = ["Gain", "HeldOut", "held_out", "paired"]
 
 FloatArray = NDArray[np.float64]
 FOLDS = 8
@@ -28,8 +43,15 @@ class Gain:
     interval: tuple[float, float]
 
 
-def held_out(problem: Problem, columns: Sequence[Columns], fit: Joint) -> FloatArray:
-    """(n,) residual, nT, of every sample under a fit that never saw its dive.
+class HeldOut(NamedTuple):
+    """(n,) residual, nT, of every sample under a fit that never saw its dive; and the model's score."""
+
+    left: FloatArray
+    score: float
+
+
+def held_out(problem: Problem, columns: Sequence[Columns], fit: Joint) -> HeldOut:
+    """Leave out dives, fold by fold.
 
     Nonlinear parameters and noise are those of the whole; every coefficient is fitted anew without the fold.
     """
@@ -50,11 +72,15 @@ def held_out(problem: Problem, columns: Sequence[Columns], fit: Joint) -> FloatA
             P[k] += own.T @ own
             b[k] += own.T @ (y[rows][of[rows] == k] + own @ c)
     whole_P, whole_b = P.sum(axis=0) + np.diag(prior), b.sum(axis=0) + prior * centre
-    without = np.stack([np.linalg.solve(whole_P - P[k], whole_b - b[k]) for k in range(len(folds))])
+    others = whole_P - P
+    without = np.linalg.solve(others, (whole_b - b)[:, :, None])[:, :, 0]
     left = np.empty(len(problem))
     for rows in X.pieces:
         left[rows] = problem.residual[rows] - np.einsum("ij,ij->i", X.rows(rows), without[of[rows]])
-    return left
+    away = c - without
+    learned = np.einsum("fi,fij,fj->", away, others, away)
+    learned += np.sum(np.linalg.slogdet(whole_P)[1] - np.linalg.slogdet(others)[1])
+    return HeldOut(left, noise.log_likelihood - 0.5 * float(learned))
 
 
 def paired(before: FloatArray, after: FloatArray, dive: NDArray[np.int64], counts: NDArray[np.bool_]) -> Gain:

@@ -14,7 +14,6 @@ from threadpoolctl import threadpool_limits
 
 from magbridge.calibration.file import save
 from magbridge.calibration.model import Calibration
-from magbridge.calibration.residual import residuals_of
 from magbridge.diagnose.candidates import Candidate
 from magbridge.diagnose.causes import CAUSES, Cause
 from magbridge.diagnose.extend import extend, settle, widened
@@ -23,11 +22,11 @@ from magbridge.diagnose.gain import Gain, held_out, paired
 from magbridge.diagnose.isolability import Isolability, isolability
 from magbridge.diagnose.joint import Joint
 from magbridge.diagnose.outliers import Outliers, outliers
-from magbridge.diagnose.problem import Problem, pose, samples_of
+from magbridge.diagnose.problem import Problem, pose
 from magbridge.diagnose.search import Hypothesis, Outcome, Rival, search
-from magbridge.diagnose.survey import Survey, take
+from magbridge.diagnose.survey import take
 from magbridge.diagnose.unexplained import Leftover, accept, leftover
-from magbridge.diagnose.weigh import REMNANT
+from magbridge.diagnose.weigh import ODDS, REMNANT
 from magbridge.errors import DataError
 from magbridge.field.grid import AnomalyGrid
 from magbridge.files import atomic_path
@@ -39,12 +38,8 @@ __all__ = ["Diagnosis", "diagnose"]
 
 FloatArray = NDArray[np.float64]
 
-WORSE = 1.1
-"""Ratio of held-out RMS above which the extended calibration is not believed."""
-SPOILT = 2.0
-"""Ratio of RMS above which a calibration is not handed out: alike effects can cancel in the fit and not in use."""
-
-
+LOUD = 2.0
+"""Times the noise that the calibration states: what is left is surely more, and it is no noise of that sensor's."""
 ABSURD = 0.5
 """Of the field: when the corrected one is off by more, no cause of the table is looked for."""
 
@@ -178,25 +173,25 @@ def _examine(
     if wrong is not None:
         counts = counts.copy()
         counts[wrong.rows] = False
-    before = problem.residual
-    after = held_out(settled, columns, fit) if model else before
-    held = paired(before, after, survey.dive, counts if counts.any() else ~counts)
-    if (held.ratio > WORSE and held.interval[0] > 1.0) or (
-        model and _spoils(survey, problem, extended, counts if counts.any() else ~counts)
-    ):
-        # names that make the dives worse that they never saw are no explanation
-        named, rivals, model, fit, after, extended = (), (), [], outcome.null, before, calibration
-        rest = leftover(problem, [], outcome.null, outcome.order, tone)
+    counts = counts if counts.any() else ~counts
+    before, after = problem.residual, problem.residual
+    if model:
+        after, score = held_out(settled, columns, fit)
+        if score < held_out(problem, [], outcome.null).score - ODDS:
+            # dives that were left out do without these names: they are no explanation
+            named, rivals, model, fit, after, extended = (), (), [], outcome.null, before, calibration
+            rest = leftover(problem, [], outcome.null, outcome.order, tone)
+    rest = rest or _loud(problem, fit, counts)
     gains = []
     for k in range(len(model)):
         others = [candidate.columns for i, candidate in enumerate(model) if i != k]
         # the others, the calibration and the noise are fitted anew; only the cause is missing
-        without = held_out(problem, others, _without(fit, model, k))
+        without, _ = held_out(problem, others, _without(fit, model, k))
         gains.append(paired(without, after, survey.dive, counts))
     return Diagnosis(
         problem=problem, outcome=outcome, named=named, rivals=rivals, wrong=wrong, unexplained=rest,
         calibration=extended, fit=fit, before=before, after=after,
-        total=paired(before, after, survey.dive, counts if counts.any() else ~counts), gains=tuple(gains),
+        total=paired(before, after, survey.dive, counts), gains=tuple(gains),
         isolability=isolability(flat, outcome.info, outcome.trials, len(causes), untestable),
         verdict=_verdict(named, wrong, rest),
     )  # fmt: skip
@@ -217,10 +212,16 @@ def write(
         beside.write_text(report_html(diagnosis, causes), encoding="utf-8")
 
 
-def _spoils(survey: Survey, problem: Problem, extended: Calibration, counts: NDArray[np.bool_]) -> bool:
-    """Say whether the extended calibration itself, not linearised and without the map's part, is off by far more."""
-    e = residuals_of(*samples_of(survey, extended))
-    return float(np.mean(e[counts] ** 2)) > SPOILT**2 * float(np.mean(problem.residual[counts] ** 2))
+def _loud(problem: Problem, fit: Joint, counts: NDArray[np.bool_]) -> Leftover | None:
+    """Describe what has no structure, but is surely more than the noise that the calibration states."""
+    stated = float(np.hypot(problem.calibration.noise.sensor, problem.calibration.noise.reference))
+    if stated <= 0.0:
+        return None
+    ratio = paired(np.full(len(fit.left), stated), fit.left, problem.survey.dive, counts)
+    if ratio.interval[0] < LOUD:
+        return None
+    signal_to_noise = float(np.sqrt(np.sum(counts) * (ratio.ratio**2 - 1.0)))
+    return Leftover("broadband", signal_to_noise, 0.025, 0.0, None, None)
 
 
 def _without(fit: Joint, model: Sequence[Candidate], k: int) -> Joint:
