@@ -54,10 +54,19 @@ def _hours(diagnosis: Diagnosis) -> FloatArray:
 
 
 def _sides(diagnosis: Diagnosis) -> dict[str, tuple[FloatArray, str]]:
-    """Return what is compared, with its colour; where nothing was mended there is no after."""
+    """Return what is compared, with its colour; where nothing was mended, what the calibration's own uncertainty takes."""
     if not diagnosis.named:
-        return {"difference": (diagnosis.before, AFTER)}
+        return {
+            "as calibrated": (diagnosis.before, BEFORE),
+            "calibration refitted": (diagnosis.fit.left, AFTER),
+        }
     return {"before": (diagnosis.before, BEFORE), "after, dives left out": (diagnosis.after, AFTER)}
+
+
+def _stated(diagnosis: Diagnosis) -> FloatArray:
+    """(n,) 1-sigma of the difference, nT, by the calibration: its noise, and what its coefficients may be off by."""
+    noise, free = diagnosis.problem.calibration.noise, diagnosis.problem.free
+    return np.asarray(np.sqrt(noise.sensor**2 + noise.reference**2 + (free * free).sum(axis=1)))
 
 
 def label(cause: str, channel: str | None) -> str:
@@ -82,6 +91,16 @@ def measured(diagnosis: Diagnosis) -> str:
         low.plot(hours[part], left[part], ".", color=colour, markersize=2, label=name)
         some = np.quantile(left, [0.002, 0.998])
         ends = np.array([min(ends[0], some[0]), max(ends[1], some[1])])
+    stated = 2.0 * _stated(diagnosis)[part]
+    low.fill_between(
+        hours[part],
+        -stated,
+        stated,
+        color=FAINT,
+        alpha=0.25,
+        linewidth=0,
+        label="what the calibration states, 2 sigma",
+    )
     dives = survey.time[np.flatnonzero(np.diff(survey.dive)) + 1]
     for start in dives if dives.size < MANY else ():
         low.axvline((start - survey.time[0]) / 3600.0, color=FAINT, linewidth=0.4)
@@ -92,7 +111,7 @@ def measured(diagnosis: Diagnosis) -> str:
         "hours since the start" + ("; grey lines part the dives" if dives.size < MANY else ""), fontsize=9
     )
     for axis in (top, low):
-        axis.legend(fontsize=8, frameon=False, loc="upper right", markerscale=4, ncols=2)
+        axis.legend(fontsize=8, frameon=False, loc="upper right", markerscale=4, ncols=3)
     return _png(figure)
 
 

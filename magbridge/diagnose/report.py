@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from html import escape
 from inspect import getdoc
@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from magbridge.diagnose import figures
-from magbridge.diagnose.findings import alternatives, parameters, told
+from magbridge.diagnose.findings import parameters, told
 
 if TYPE_CHECKING:
     from magbridge.diagnose.causes import Cause
     from magbridge.diagnose.gain import Gain
     from magbridge.diagnose.run import Diagnosis
-    from magbridge.diagnose.search import Hypothesis
+    from magbridge.diagnose.search import Hypothesis, Rival
 
 __all__ = ["report_html"]
 
@@ -29,6 +29,14 @@ table{border-collapse:collapse;font-size:.9rem;margin:.6rem 0}td,th{padding:.22r
 td.n{text-align:right;font-variant-numeric:tabular-nums}.verdict{font-size:1.1rem;background:#f2f6f8;border-left:4px solid #1f6f8b;padding:.8rem 1.1rem}
 .pair{display:flex;gap:1rem;flex-wrap:wrap;align-items:flex-start}.pair figure{flex:1 1 24rem}code{background:#f2f4f6;padding:0 .25em}
 """
+KINDS = {
+    "switching": "An offset that switches",
+    "drift": "A slow drift",
+    "tone": "A tone",
+    "transient": "A transient",
+    "broadband": "Something of no one frequency",
+}
+"""What is left, as a sentence's subject."""
 
 
 def report_html(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> str:
@@ -49,7 +57,8 @@ def report_html(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> str:
          "Whatever else is in the difference is something that the calibration does not know.</p>"),
         _figure(figures.measured(diagnosis), "The total field as measured and corrected by the calibration, and as the "
                 "reference says it should be; below, their difference"
-                + (" before, and with the extended calibration on dives that its fit had not seen." if diagnosis.named else ".")),
+                + (" before, and with the extended calibration on dives that its fit had not seen." if diagnosis.named else
+                   ", and what is left of it when the calibration may move within its own uncertainty.")),
         '<div class="pair">',
         _figure(figures.spectrum(diagnosis), "Spectral density of the difference; dashed, the noise model."),
         _figure(figures.evidence(diagnosis), "The likeliest causes, each tried alone, with calibration and "
@@ -87,7 +96,10 @@ def _name(hypothesis: Hypothesis) -> str:
 
 def _verdict(diagnosis: Diagnosis) -> str:
     total = diagnosis.total
-    causes = [_name(h) for h in diagnosis.named]
+    causes = [
+        _name(h) + (f" <span class=faint>or {_listed(rivals)}</span>" if rivals else "")
+        for h, rivals in zip(diagnosis.named, diagnosis.rivals, strict=True)
+    ]
     if diagnosis.wrong is not None:
         causes.append(f"<b>outliers</b> ({diagnosis.wrong.rows.size} wrong samples)")
     gained = (
@@ -95,7 +107,8 @@ def _verdict(diagnosis: Diagnosis) -> str:
         f"{total.interval[0]:.2f} to {total.interval[1]:.2f})."
     )
     return {
-        "nothing_found": f"Nothing was found: what is left, {total.before:.3g} nT RMS, cannot be told from noise.",
+        "nothing_found": f"Nothing was found: {total.before:.3g} nT RMS cannot be told from noise ({np.std(diagnosis.fit.left):.3g} nT) "
+        "and what the calibration states it may be off by.",
         "explained": f"Found: {', '.join(causes)}. {gained} Nothing else stands out of the noise.",
         "partly_explained": f"Found: {', '.join(causes)}. {gained} Something else is left that no cause explains.",
         "unexplained": f"Something is there ({total.before:.3g} nT RMS), but none of the known causes explains it.",
@@ -115,11 +128,9 @@ def _found(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> list[str]:
             for name, value in parameters(diagnosis, hypothesis, at).items()
         )
         at += candidate.size
-        others = alternatives(rivals)
-        listed = ", ".join(escape(figures.label(o["cause"], o["channel"])) for o in others)
         doubt = (
-            f"<p>The data cannot tell it from {listed} (odds below 20:1). What would: {escape(causes[candidate.cause].separated_by)}.</p>"
-            if others
+            f"<p>The data cannot tell it from {_listed(rivals)} (odds below 20:1). What would: {escape(causes[candidate.cause].separated_by)}.</p>"
+            if rivals
             else "<p>No other cause of the table comes within 20:1.</p>"
         )
         parts += [
@@ -148,6 +159,10 @@ def _found(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> list[str]:
     return parts
 
 
+def _listed(rivals: Sequence[Rival]) -> str:
+    return ", ".join(escape(figures.label(rival.cause, rival.channel)) for rival in rivals)
+
+
 def _several(names: tuple[str, ...]) -> str:
     """Say what a number in brackets means."""
     if not any(name.endswith(")") for name in names):
@@ -174,10 +189,10 @@ def _no_gain(gain: Gain) -> str:
 
 def _left(diagnosis: Diagnosis) -> str:
     rest, noise = diagnosis.unexplained, diagnosis.fit.noise
-    tails = "Gaussian" if noise.nu > 1e5 else f"Student's t with {noise.nu:g} degrees of freedom"
+    tails = "Gaussian" if noise.nu > 1e5 else f"tails like Student's t with {noise.nu:g} degrees of freedom"
     model = (
-        f"The noise that remains: {float(np.median(noise.scale)):.3g} nT a sample, memory "
-        f"{', '.join(f'{a:.2f}' for a in noise.memory)}, tails {tails}. The calibration predicted "
+        f"The noise that remains: {float(np.median(noise.scale)):.3g} nT a sample, {tails}; by its memory, {len(noise.scale)} "
+        f"samples say as much of a constant as {noise.independent:.0f} independent ones. The calibration stated "
         f"{diagnosis.problem.calibration.noise.sensor:.3g} nT."
     )
     if rest is None:
@@ -185,9 +200,15 @@ def _left(diagnosis: Diagnosis) -> str:
     goes = f", and goes best with <code>{escape(rest.best_channel)}</code>" if rest.best_channel else ""
     period = f" of period {rest.period_s:.4g} s" if rest.period_s else ""
     return (
-        f"<p>A <b>{rest.kind}</b>{period} is left, of signal-to-noise {rest.signal_to_noise:.1f}{goes}. It fits no cause of "
+        f"<p><b>{KINDS[rest.kind]}</b>{period} is left, of signal-to-noise {rest.signal_to_noise:.1f}{goes}. It fits no cause of "
         f"the table, so it has no name. {model}</p>"
     )
+
+
+def _plain(labelled: str) -> str:
+    """Return a cause with its channel, ``cause (channel)``, as people read it."""
+    cause, bracket, channel = labelled.partition(" (")
+    return escape(cause.replace("_", " ") + bracket + channel)
 
 
 def _isolability(diagnosis: Diagnosis) -> list[str]:
@@ -199,7 +220,7 @@ def _isolability(diagnosis: Diagnosis) -> list[str]:
         for v in report.visible
     )
     pairs = "".join(
-        f'<tr><td>{escape(a)}</td><td>{escape(b)}</td><td class="n">{100 * rho:.0f} %</td></tr>'
+        f'<tr><td>{_plain(a)}</td><td>{_plain(b)}</td><td class="n">{100 * rho:.0f} %</td></tr>'
         for a, b, rho in report.pairs[:20]
     )
     missing = "; ".join(
@@ -208,7 +229,8 @@ def _isolability(diagnosis: Diagnosis) -> list[str]:
     return [
         (
             '<p class="faint">From telemetry, attitude and noise alone: the size of each effect that would be found in 95 of 100 '
-            "deployments like this one, and which causes look alike in it.</p>"
+            "deployments like this one, and which causes look alike in it. Signal-to-noise (S/N) is the size of an effect's trace "
+            "in the whole log, in units of the noise, after the calibration has taken all of it that it can imitate.</p>"
         ),
         f"<table><tr><th>cause</th><th>50 % at S/N</th><th>95 % at S/N</th><th>seen from</th></tr>{rows}</table>",
         f"<h3>Look alike</h3><table><tr><th>one</th><th>another</th><th>how alike</th></tr>{pairs}</table>"
