@@ -14,6 +14,9 @@ __all__ = ["channel_skew", "clock_offset", "eddy_current", "field_rates", "filte
 
 FloatArray = NDArray[np.float64]
 
+MOMENT = 0.01
+"""s by which masses are moved on and back, to see what the coefficients do."""
+
 
 def field_rates(problem: Problem) -> FloatArray:
     """(3, n) dH_r/dt, nT/s, by differences both ways.
@@ -30,22 +33,23 @@ def field_rates(problem: Problem) -> FloatArray:
 
 
 def mass_rates(problem: Problem) -> FloatArray:
-    """(9, n) rates of the nine coefficients as the masses move, by the larger of the differences before and after.
+    """(9, n) rates of the nine coefficients as the masses move, each mass at the larger of its speeds before and after.
 
-    A drive starts and stops between samples and runs evenly meanwhile: a sample is in motion where the mass has moved
+    A drive starts and stops between samples and runs evenly meanwhile: a sample is in motion where that mass has moved
     both before and after it, and the interval that it moved all through tells the speed. Telemetry has no noise that
     a one-sided difference would bring in.
     """
     survey, calibration = problem.survey, problem.calibration
     kernel = calibration.kernel
     W = kernel.weights[: kernel.monomials] * np.array([calibration.reference.field] * 6 + [1.0] * 3)
-    positions = survey.values([parameter.name for parameter in calibration.parameters])
-    theta, t = W.T @ kernel.monomials_of(positions), survey.time
-    after = np.diff(theta, axis=1, append=theta[:, -1:]) / np.diff(t, append=t[-1] + 1.0)
-    after[:, :-1] *= survey.follows[1:]
-    before = np.roll(after, 1, axis=1)
+    p, t = survey.values([parameter.name for parameter in calibration.parameters]), survey.time
+    after = np.diff(p, axis=0, append=p[-1:]) / np.diff(t, append=t[-1] + 1.0)[:, None]
+    after[:-1] *= survey.follows[1:, None]
+    before = np.roll(after, 1, axis=0)
     larger = np.where(np.abs(before) > np.abs(after), before, after)
-    return np.where(before * after > 0.0, larger, 0.0)
+    moved = MOMENT * np.where(before * after > 0.0, larger, 0.0)
+    theta = W.T @ (kernel.monomials_of(p + moved) - kernel.monomials_of(p - moved))
+    return np.asarray(theta / (2.0 * MOMENT))
 
 
 def eddy_current(problem: Problem) -> list[Candidate]:
