@@ -12,6 +12,7 @@ from magbridge.calibration.followers import MonomialEffect, PlayEffect, PowersEf
 from magbridge.calibration.model import Calibration, Noise, Parameter, Reference
 from magbridge.calibration.terms import Polynomial
 from magbridge.diagnose.causes import CAUSES
+from magbridge.diagnose.causes.timing import mass_rates
 from magbridge.diagnose.problem import Problem, effect_columns, history, pose
 from magbridge.diagnose.survey import Channel, Survey
 
@@ -98,3 +99,25 @@ def test_a_cause_found_twice_is_one(problem: Problem) -> None:
     assert len(set(both.names)) == 9
     assert len(both.shape) == len(both.effects) == 3
     np.testing.assert_array_equal(both.columns(slice(0, 50))[:, :3], first.columns(slice(0, 50)))
+
+
+def test_a_mass_that_stops_while_another_goes_on_has_no_rate(problem: Problem) -> None:
+    """At 4 s a row: a stops between two samples, and b goes on."""
+    rows = np.arange(len(problem))
+    a = np.interp(rows, [10.0, 13.6], [-0.5, 0.5])
+    b = np.interp(rows, [10.0, 20.0], [0.8, -0.8])
+    parameters = (Parameter("a", "in", -1.0, 1.0, 0.0, 1.0), Parameter("b", "in", -1.0, 1.0, 0.0, 1.0))
+    calibration = replace(
+        problem.calibration,
+        parameters=parameters,
+        terms=(Polynomial(exponents=((0, 0), (1, 0), (0, 1))),),
+        coefficients=np.concatenate([np.zeros(9), np.arange(9.0), 10.0 + np.arange(9.0)]),
+    )
+    channels = {name: Channel(values, "in", ("position",)) for name, values in (("a", a), ("b", b))}
+    survey = replace(problem.survey, channels=channels)
+    rates = mass_rates(replace(problem, survey=survey, calibration=calibration))
+    only_b, both = rates[:, 15], rates[:, 12]
+    np.testing.assert_allclose(rates[:, 14], only_b, rtol=1e-6)
+    np.testing.assert_allclose(only_b[6:], -0.04 * (10.0 + np.arange(6.0, 9.0)), rtol=1e-6)
+    np.testing.assert_allclose(both[6:] - only_b[6:], np.arange(6.0, 9.0) / 3.6 / 4.0, rtol=1e-6)
+    assert not rates[:, 30:].any()
