@@ -1,0 +1,90 @@
+"""What the dives that were left out say."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import multivariate_normal
+
+from magbridge.calibration.model import Calibration, Noise, Parameter, Reference
+from magbridge.calibration.terms import Polynomial
+from magbridge.diagnose.gain import held_out
+from magbridge.diagnose.joint import Joint, fit_joint
+from magbridge.diagnose.problem import Problem, pose
+from magbridge.diagnose.survey import Channel, Survey
+
+DIVES = 5
+
+
+@pytest.fixture(scope="module")
+def problem() -> Problem:
+    """Five dives of turning, as calibrated but for 1 nT of noise."""
+    rng = np.random.default_rng(4)
+    n = 40 * DIVES
+    d = rng.normal(size=(n, 3)).cumsum(axis=0) * 0.1 + [0.3, 0.1, 0.9]
+    field = 5e4 * d / np.linalg.norm(d, axis=1)[:, None]
+    p = np.sin(np.arange(n) / 9.0)
+    survey = Survey(
+        time=1.7e9 + 4.0 * np.arange(n), field=field + rng.normal(size=(n, 3)), reference=np.full(n, 5e4), still=(),
+        follows=np.arange(n) % 40 > 0, dive=np.arange(n) // 40, place=None, attitude=None,
+        learned=np.zeros(n, bool), cycles=np.empty(0), source="made", channels={"p": Channel(p, "in", ("position",))},
+    )  # fmt: skip
+    calibration = Calibration(
+        parameters=(Parameter("p", "in", -1.0, 1.0, 0.0, 1.0),),
+        terms=(Polynomial(exponents=((0,), (1,))),),
+        coefficients=np.zeros(18),
+        covariance=np.diag(np.full(18, 4.0)),
+        noise=Noise(1.0),
+        reference=Reference(5e4),
+    )
+    return pose(survey, calibration)
+
+
+def gaussian(fit: Joint) -> Joint:
+    """The same fit, its noise's tails taken for Gaussian: then the formula is exact."""
+    return replace(fit, noise=replace(fit.noise, nu=1e12))
+
+
+def test_the_score_is_the_density_of_each_dive_given_the_others(problem: Problem) -> None:
+    shape = np.sin(np.arange(len(problem)) / 17.0)[:, None]
+    columns = [lambda rows: 3.0 * shape[rows]]
+    fit = gaussian(
+        fit_joint(replace(problem, residual=problem.residual + 2.0 * shape[:, 0]), columns, 1, rounds=20)
+    )
+    posed = replace(problem, residual=problem.residual + 2.0 * shape[:, 0])
+    c = np.append(fit.z, fit.coefficients)
+    A = fit.noise.filter(np.hstack([posed.free, 3.0 * shape]))
+    y = fit.noise.response(posed.residual)
+    white = fit.noise.response(fit.left)
+    assert np.abs(A.T @ white - fit.prior * (c - np.append(posed.centre, 0.0))).max() < 0.05 * np.abs(A).max()
+    told = fit.noise.log_likelihood + 0.5 * float(white @ white)
+    expected = told
+    for dive in range(DIVES):
+        out = posed.survey.dive == dive
+        P = A[~out].T @ A[~out] + np.diag(fit.prior)
+        mean = np.linalg.solve(P, A[~out].T @ y[~out] + fit.prior * np.append(posed.centre, 0.0))
+        spread = np.eye(out.sum()) + A[out] @ np.linalg.solve(P, A[out].T)
+        own = multivariate_normal(A[out] @ mean, spread).logpdf(y[out])
+        expected += own + 0.5 * out.sum() * np.log(2.0 * np.pi)
+    assert held_out(posed, columns, fit).score == pytest.approx(expected, abs=0.05)
+
+
+def test_what_is_there_wins_on_the_dives_left_out_and_what_is_not_does_not(problem: Problem) -> None:
+    shape = np.sin(np.arange(len(problem)) / 17.0)[:, None]
+    columns = [lambda rows: 3.0 * shape[rows]]
+    for size, wins in ((2.0, True), (0.0, False)):
+        posed = replace(problem, residual=problem.residual + size * shape[:, 0])
+        scores = [held_out(posed, some, fit_joint(posed, some, 1)).score for some in (columns, [])]
+        assert (scores[0] > scores[1] + 3.0) == wins
+
+
+def test_what_acts_in_one_dive_only_is_no_surprise_that_counts_against_it(problem: Problem) -> None:
+    """Its own dive is predicted with the prior's uncertainty, not with a zero that it contradicts."""
+    once = (problem.survey.dive == 2).astype(float)[:, None]
+    columns = [lambda rows: 10.0 * once[rows]]
+    posed = replace(problem, residual=problem.residual + 6.0 * once[:, 0])
+    with_it, without = (held_out(posed, some, fit_joint(posed, some, 1)) for some in (columns, []))
+    assert with_it.score > without.score
+    assert np.std(with_it.left[once[:, 0] > 0]) < 3.0
