@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import chi2
 from threadpoolctl import threadpool_limits
 
 from magbridge.calibration.file import save
@@ -39,7 +40,7 @@ __all__ = ["Diagnosis", "diagnose"]
 FloatArray = NDArray[np.float64]
 
 LOUD = 2.0
-"""Times the noise that the calibration states: what is left is surely more, and it is no noise of that sensor's."""
+"""Times what the calibration states of itself: noise half as loud again is still noise, of twice that something is wrong."""
 ABSURD = 0.5
 """Of the field: when the corrected one is off by more, no cause of the table is looked for."""
 
@@ -181,7 +182,7 @@ def _examine(
             # dives that were left out do without these names: they are no explanation
             named, rivals, model, fit, after, extended = (), (), [], outcome.null, before, calibration
             rest = leftover(problem, [], outcome.null, outcome.order, tone)
-    rest = rest or _loud(problem, fit, counts)
+    rest = rest or _loud(problem, after, counts)
     gains = []
     for k in range(len(model)):
         others = [candidate.columns for i, candidate in enumerate(model) if i != k]
@@ -212,16 +213,15 @@ def write(
         beside.write_text(report_html(diagnosis, causes), encoding="utf-8")
 
 
-def _loud(problem: Problem, fit: Joint, counts: NDArray[np.bool_]) -> Leftover | None:
-    """Describe what has no structure, but is surely more than the noise that the calibration states."""
-    stated = float(np.hypot(problem.calibration.noise.sensor, problem.calibration.noise.reference))
-    if stated <= 0.0:
+def _loud(problem: Problem, after: FloatArray, counts: NDArray[np.bool_]) -> Leftover | None:
+    """Describe what has no structure, but is more than the calibration states of its noise and of its coefficients."""
+    noise, free = problem.calibration.noise, problem.free
+    variance = noise.sensor**2 + noise.reference**2 + (free * free).sum(axis=1)
+    power = float(np.sum(after[counts] ** 2 / np.maximum(variance[counts], 1e-12)))
+    n = int(counts.sum())
+    if noise.sensor <= 0.0 or power < LOUD**2 * n:
         return None
-    ratio = paired(np.full(len(fit.left), stated), fit.left, problem.survey.dive, counts)
-    if ratio.interval[0] < LOUD:
-        return None
-    signal_to_noise = float(np.sqrt(np.sum(counts) * (ratio.ratio**2 - 1.0)))
-    return Leftover("broadband", signal_to_noise, 0.025, 0.0, None, None)
+    return Leftover("broadband", float(np.sqrt(power - n)), float(chi2.sf(power, n)), 0.0, None, None)
 
 
 def _without(fit: Joint, model: Sequence[Candidate], k: int) -> Joint:
