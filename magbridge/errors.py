@@ -11,6 +11,7 @@ the built-in that a caller who does not know magbridge would catch::
     │   ├── CalibrationError (ValueError) a calibration that cannot be fitted, read or used
     │   └── OutOfRange (ValueError)       a date, position or grid cell that nothing covers
     ├── PortError (OSError)               exit 1: a port that cannot be opened, read or written
+    ├── WriteError (OSError)              exit 1: a file that cannot be written; it is as it was before
     └── MissingExtra (ImportError)        exit 2: an optional dependency that is not installed
 """
 
@@ -27,6 +28,7 @@ __all__ = [
     "MissingExtra",
     "OutOfRange",
     "PortError",
+    "WriteError",
     "WrongUse",
 ]
 
@@ -88,6 +90,14 @@ class PortError(MagbridgeError, OSError):
     def __init__(self, port: str, reason: str) -> None:
         self.port, self.reason = port, reason
         super().__init__(f"{port}: {reason}")
+
+
+class WriteError(MagbridgeError, OSError):
+    """A file that cannot be written: ``file: cannot be written: reason``."""
+
+    def __init__(self, file: str | Path, reason: str) -> None:
+        self.file, self.reason = Path(file), reason
+        super().__init__(f"{file}: cannot be written: {reason}")
 
 
 class MissingExtra(MagbridgeError, ImportError):

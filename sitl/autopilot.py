@@ -8,9 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from math import isfinite, nan, radians
+from struct import error
 from typing import Any
 
 from magbridge.config import Config, Telemetry
+from magbridge.errors import DataError
 from magbridge.mavlink.codec import Codec
 from magbridge.mavlink.messages import spec, split_index
 
@@ -98,7 +100,10 @@ class Autopilot:
             values = [0] * field.count
             values[index] = number
             number = bytes(values) if field.code == "B" else values
-        return self._codec.pack(telemetry.message, **{**fields, name: number})
+        try:
+            return self._codec.pack(telemetry.message, **{**fields, name: number})
+        except (OverflowError, ValueError, error):
+            raise DataError(f"{value!r} does not fit {telemetry.message}.{telemetry.field}") from None
 
 
 def _finite(row: Mapping[str, float], *names: str) -> tuple[float, ...]:

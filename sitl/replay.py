@@ -59,6 +59,7 @@ def replay(
             raise WrongUse(f"{files[0]} is a bridge's own log: name its configuration with --config")
         return {"runs": [_again(run, config, speed, log) for run in runs(files)]}
     if config is not None:
+        load(config)  # what is wrong with it is told before anything begins
         deployment = read(files)
         times = deployment["time"].to_numpy()
         parts = [Part("all", float(times[0]), float(times[-1]))]

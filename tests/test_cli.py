@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import resource
 from pathlib import Path
 
 import numpy as np
@@ -109,7 +110,20 @@ def test_correct_gives_the_same_in_pieces(deployment: Path, calibration: Path, t
         (["calibrate", "{d}", "--parameter", "nose", "-o", "x.json"], 1, "column 'nose'"),
         (["calibrate", "{d}", "--method", "magic", "-o", "x.json"], 1, "'magic' is not known"),
         (["calibrate", "{d}", "--order", "0", "-o", "x.json"], 2, "order"),
+        (
+            ["calibrate", "{d}", "--parameter", "run", "--parameter", "run", "-o", "x.json"],
+            1,
+            "'run' is named twice",
+        ),
+        (["calibrate", "{d}", "--site-bias", "inf", "-o", "x.json"], 2, "--site-bias"),
         (["map", "none.nc", "-o", "x.nc"], 1, "none.nc"),
+        (["map", "none.nc", "-o", "x.foo"], 2, "must end in .nc"),
+        (["map", "none.nc", "-o", "x.nc", "--picture", "x.foo"], 2, "must end in .png"),
+        (["convert", "{d}", "-o", "nowhere/x.csv"], 2, "There is no folder nowhere"),
+        (["convert", "{d}", "-o", "."], 2, "It is a folder"),
+        (["simulate", "demo", "-o", "x.nc", "--seed", "-1"], 2, "--seed"),
+        (["replay", "{d}", "--config", "none.toml"], 2, "none.toml: No such file"),
+        (["demo", "--out", "/dev/null/demo"], 1, "/dev/null/demo: Not a directory"),
     ],
 )
 def test_bad_input_gets_one_line_and_leaves_nothing(
@@ -125,6 +139,66 @@ def test_bad_input_gets_one_line_and_leaves_nothing(
     line = complaint(capsys, *(argument.format(d=deployment) for argument in arguments), code=code)
     assert words in line
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".nc", ".parquet", ".tlog"])
+def test_a_full_disk_gets_one_line_and_leaves_nothing(
+    suffix: str, deployment: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, limits[1]))
+    try:
+        line = complaint(capsys, "convert", deployment, "-o", tmp_path / f"x{suffix}", code=1)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert line.startswith(f"{tmp_path / f'x{suffix}'}: cannot be written: ")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("column", "value", "words"),
+    [
+        ("time", 1.78e12, "row 12, column 'time': expected seconds since 1970"),
+        ("latitude", 4952.3, "row 12, column 'latitude': expected degrees"),
+        ("mag_time_z", 12.0, "row 12, column 'mag_time_z': expected a time within 60 s"),
+    ],
+)
+def test_what_would_be_another_place_or_moment(
+    deployment: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    column: str,
+    value: float,
+    words: str,
+) -> None:
+    lines = deployment.read_text().splitlines()
+    cells = lines[11].split(",")
+    cells[lines[0].split(",").index(column)] = repr(value)
+    bad = tmp_path / "bad.csv"
+    bad.write_text("\n".join([*lines[:11], ",".join(cells), *lines[12:]]))
+    assert words in complaint(capsys, "convert", bad, "-o", tmp_path / "x.nc", code=1)
+
+
+def test_one_position_that_is_none(
+    deployment: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rows = read(deployment)
+    rows["battpos"][7] = -9999.0
+    bad = tmp_path / "bad.nc"
+    write(rows, bad)
+    line = complaint(
+        capsys,
+        "calibrate",
+        bad,
+        "--parameter",
+        "battpos",
+        "--parameter",
+        "ballast",
+        "-o",
+        tmp_path / "c.json",
+        code=1,
+    )
+    assert "'battpos' is -9999 in 1 of 3600 samples" in line
 
 
 def test_help_names_every_command(capsys: pytest.CaptureFixture[str]) -> None:

@@ -155,7 +155,8 @@ class Corrector:
             kernel = self._kernel
             phi = np.array(kernel.powers(positions, 1.0))
             terms = phi[:, None] * kernel.weights[: kernel.monomials]
-            coefficients = self._asked[positions] = np.add.reduce(terms, axis=0).tolist()
+            with np.errstate(invalid="ignore"):  # infinite positions
+                coefficients = self._asked[positions] = np.add.reduce(terms, axis=0).tolist()
         xx, yy, zz, xy, xz, yz, tx, ty, tz = coefficients
         dx, dy, dz = field[0] - tx, field[1] - ty, field[2] - tz
         bx = xx * dx + xy * dy + xz * dz

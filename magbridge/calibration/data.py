@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 __all__ = ["Observations", "observations", "polynomial_samples"]
 
 FloatArray = NDArray[np.float64]
+COMMON, FAR = 0.005, 10.0
+"""A position is no position when it is farther from the median than FAR times what all but 2 COMMON of them span."""
 _PER_SAMPLE = ("field", "reference", "parameters", "runs", "time", "attitude", "reference_ned")
 
 
@@ -78,6 +80,9 @@ class Observations:
             raise CalibrationError(
                 f"parameters: {k} columns, but {len(self.names)} names and {len(self.units)} units"
             )
+        for i, name in enumerate(self.names):
+            if name in self.names[:i]:
+                raise CalibrationError(f"parameter {name!r} is named twice")
         reference = np.broadcast_to(np.asarray(self.reference, float), n)
         time = np.arange(n, dtype=float) if self.time is None else np.asarray(self.time, float)
         runs = np.zeros(n, int) if self.runs is None else np.asarray(self.runs)
@@ -86,6 +91,7 @@ class Observations:
         whole = np.isfinite(field).all(axis=1) & np.isfinite(reference)
         whole &= np.isfinite(parameters).all(axis=1) & np.isfinite(time)
         _enough(n, whole, field, parameters, self.names, reference)
+        _plausible(self.names, parameters[whole])
         put(self, "field", field[whole])
         put(self, "reference", reference[whole])
         put(self, "parameters", parameters[whole])
@@ -152,6 +158,18 @@ def _enough(
     raise CalibrationError(
         f"only {int(whole.sum())} of {n} samples have every value{because}: at least 10 needed"
     )
+
+
+def _plausible(names: Sequence[str], positions: FloatArray) -> None:
+    """Refuse a position far from all others: one -9999 that stands for "not known" would bend the whole fit."""
+    for name, column in zip(names, positions.T, strict=True):
+        low, middle, high = np.quantile(column, [COMMON, 0.5, 1.0 - COMMON])
+        far = np.abs(column - middle) > FAR * (high - low)
+        if high > low and far.any():
+            raise CalibrationError(
+                f"parameter {name!r} is {column[far][0]:g} in {int(far.sum())} of {len(column)} samples, and "
+                f"{low:g} to {high:g} in the others: leave empty what is not known"
+            )
 
 
 def polynomial_samples(data: Observations, exponents: tuple[Exponents, ...], kappa: float = 0.0) -> Samples:

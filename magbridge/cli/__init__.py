@@ -17,7 +17,18 @@ __all__ = ["app", "ashore", "doubt", "main", "onboard", "way"]
 
 EXTRAS = {
     **dict.fromkeys(
-        ("scipy", "xarray", "netCDF4", "matplotlib", "ppigrf", "filterpy", "rich", "pandas", "pymavlink"),
+        [
+            "scipy",
+            "xarray",
+            "netCDF4",
+            "matplotlib",
+            "ppigrf",
+            "filterpy",
+            "rich",
+            "pandas",
+            "pymavlink",
+            "threadpoolctl",
+        ],
         "analysis",
     ),
     "harmonica": "grids",
@@ -41,6 +52,14 @@ def main(arguments: list[str] | None = None) -> int:
         return complain(str(MissingExtra(str(error.name), extra)), 2)
     except BrokenPipeError:  # the reader of our output has gone, as `| head` does
         sys.stderr.close()
+    except (OSError, MemoryError) as error:  # the system does not give a file, a folder, room
+        return complain(_reason(error), 1)
     except KeyboardInterrupt:
         return complain("interrupted", 130)
     return 0
+
+
+def _reason(error: OSError | MemoryError) -> str:
+    if isinstance(error, OSError) and error.filename:
+        return f"{error.filename}: {error.strerror}"
+    return str(error) or "not enough memory"

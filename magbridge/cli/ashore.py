@@ -4,17 +4,18 @@ from __future__ import annotations
 
 from dataclasses import replace
 from hashlib import sha256
+from math import inf
 from pathlib import Path
 from typing import Annotated, Any
 
 from cyclopts import Parameter, validators
 
-from magbridge.cli.common import Json, Output, app, complain, some, tell
+from magbridge.cli.common import Grid, Json, Output, Picture, app, complain, file_to_write, some, tell
 from magbridge.errors import DataError
 from magbridge.progress import track
 
 
-@app.command
+@app.command(usage="Usage: magbridge convert FILE... -o FILE [OPTIONS]")
 def convert(*files: Path, output: Output, json: Json = False) -> None:
     """Convert logs of any readable format to any writable one; several are joined in time.
 
@@ -38,14 +39,15 @@ def convert(*files: Path, output: Output, json: Json = False) -> None:
     tell({"file": str(output), "rows": rows, "columns": names}, f"{output}: {rows} rows", json)
 
 
-@app.command
+@app.command(usage="Usage: magbridge simulate SCENARIO -o FILE [OPTIONS]")
 def simulate(
     scenario: Path,
+    /,
     *,
     output: Output,
-    seed: int = 0,
+    seed: Annotated[int, Parameter(validator=validators.Number(gte=0))] = 0,
     like: tuple[Path, ...] = (),
-    map_output: Annotated[Path | None, Parameter(name="--map")] = None,
+    map_output: Annotated[Path | None, Parameter(name="--map", validator=file_to_write(".nc"))] = None,
     json: Json = False,
 ) -> None:
     """Simulate a deployment from the forward model.
@@ -53,7 +55,8 @@ def simulate(
     Parameters
     ----------
     scenario
-        A scenario file, or the name of one that comes with magbridge: demo, bonne_bay, comet, seaglider.
+        A scenario file, or the name of one that comes with magbridge: demo, bonne_bay, random_glider;
+        comet and seaglider are driven by a log (--like).
     output
         The file to write.
     seed
@@ -85,7 +88,7 @@ def simulate(
     tell({"file": str(output), "rows": rows, "seed": seed}, f"{output}: {rows} rows", json)
 
 
-@app.command
+@app.command(usage="Usage: magbridge calibrate FILE... --parameter NAME... -o cal.json [OPTIONS]")
 def calibrate(
     *files: Path,
     output: Output,
@@ -94,8 +97,8 @@ def calibrate(
     method: str = "auto",
     vehicle: Path | None = None,
     grid: Path | None = None,
-    site_bias: Annotated[float, Parameter(validator=validators.Number(gte=0))] = 0.0,
-    filter_corner: Annotated[float, Parameter(validator=validators.Number(gte=0))] = 0.0,
+    site_bias: Annotated[float, Parameter(validator=validators.Number(gte=0, lt=inf))] = 0.0,
+    filter_corner: Annotated[float, Parameter(validator=validators.Number(gte=0, lt=inf))] = 0.0,
     strict: bool = False,
     json: Json = False,
 ) -> None:
@@ -173,13 +176,13 @@ def calibrate(
         raise DataError("the data do not support this fit, and --strict: see the warnings")
 
 
-@app.command
+@app.command(usage="Usage: magbridge plan --calibration cal.json --mission FILE [OPTIONS]")
 def plan(
     *,
     calibration: Path,
     mission: Path,
     runs: Annotated[int, Parameter(validator=validators.Number(gte=1))] = 10,
-    roll: float = 10.0,
+    roll: Annotated[float, Parameter(validator=validators.Number(gte=0, lte=90))] = 10.0,
     json: Json = False,
 ) -> None:
     """Tell which calibration runs to fly next: those after which the mission's worst error is smallest.
@@ -209,15 +212,15 @@ def plan(
     tell(flight_plan.facts(found, known), flight_plan.tell(found, known), json)
 
 
-@app.command
+@app.command(usage="Usage: magbridge map GRID... -o grid.nc [OPTIONS]")
 def map(  # noqa: A001 - the command's name
     *grids: Path,
-    output: Output,
-    altitude: float | None = None,
+    output: Grid,
+    altitude: Annotated[float | None, Parameter(validator=validators.Number(gt=-inf, lt=inf))] = None,
     passes: Annotated[int, Parameter(validator=validators.Number(gte=0))] = 20,
     mask: Path | None = None,
-    spacing: float | None = None,
-    picture: Path | None = None,
+    spacing: Annotated[float | None, Parameter(validator=validators.Number(gt=0, lt=inf))] = None,
+    picture: Picture = None,
     json: Json = False,
 ) -> None:
     """Make one anomaly map from the grids of several surveys: continue upward, merge, mask, smooth.
@@ -225,7 +228,7 @@ def map(  # noqa: A001 - the command's name
     Parameters
     ----------
     grids
-        Grids: netCDF, Surfer, ESRI ASCII, GeoTIFF, XYZ.
+        Grids: netCDF, Surfer, Geosoft, ESRI ASCII, GeoTIFF, XYZ.
     output
         The map to write, netCDF.
     altitude
@@ -254,16 +257,14 @@ def map(  # noqa: A001 - the command's name
     tell(facts, f"{output}: {', '.join(titles)}", json)
 
 
-@app.command
-def correct(file: Path, *more: Path, calibration: Path, output: Output, json: Json = False) -> None:
+@app.command(usage="Usage: magbridge correct FILE... --calibration cal.json -o FILE [OPTIONS]")
+def correct(*files: Path, calibration: Path, output: Output, json: Json = False) -> None:
     """Correct a log with a calibration, as the bridge would have done live.
 
     Parameters
     ----------
-    file
-        A log.
-    more
-        Further logs of the same deployment.
+    files
+        Logs of one deployment.
     calibration
         The cal.json.
     output
@@ -280,7 +281,7 @@ def correct(file: Path, *more: Path, calibration: Path, output: Output, json: Js
     correction = Correction(load(calibration))
     rows = flagged = 0
     with Writer(output) as writer:
-        for part in track(read_chunks((file, *more), required=CHANNELS), "correcting"):
+        for part in track(read_chunks(some(files), required=CHANNELS), "correcting"):
             corrected = correct_rows(correction, part)
             writer.append(corrected)
             rows += part.sizes["time"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,16 +13,45 @@ from cyclopts import App, Parameter
 from magbridge import __version__
 from magbridge.errors import WrongUse
 
-__all__ = ["Json", "Output", "app", "complain", "some", "tell"]
+__all__ = ["Folder", "Grid", "Json", "Output", "Picture", "app", "complain", "file_to_write", "some", "tell"]
+
+
+def _default(value: object) -> object:
+    """Return the default as the help shows it; None where there is nothing to tell."""
+    return None if value is False or value == () else value
+
 
 app = App(
     name="magbridge",
     help="A magnetometer bridge for vehicles whose own iron moves.",
     version=__version__,
-    help_format="plaintext",
+    help_format="markdown",  # so that paragraphs are wrapped as wide as the terminal is
+    help_epilogue="Ends with 0: done, 1: the data do not allow it, 2: wrong use.",
+    default_parameter=Parameter(negative=(), show_default=_default),
 )
-Output = Annotated[Path, Parameter(name=["--output", "-o"])]
-Json = Annotated[bool, Parameter(name="--json", negative="")]
+
+
+def file_to_write(suffix: str = "") -> Callable[[Any, Any], None]:
+    """Return a check of a file to write, before any work is done for it."""
+
+    def check(_: Any, path: Any) -> None:
+        if path is None:
+            return
+        if path.is_dir():
+            raise ValueError("It is a folder.")
+        if not path.parent.is_dir():
+            raise ValueError(f"There is no folder {path.parent}.")
+        if suffix and path.suffix.lower() != suffix:
+            raise ValueError(f"Its name must end in {suffix}.")
+
+    return check
+
+
+Output = Annotated[Path, Parameter(name=["--output", "-o"], validator=file_to_write())]
+Folder = Annotated[Path, Parameter(name=["--output", "-o"])]
+Grid = Annotated[Path, Parameter(name=["--output", "-o"], validator=file_to_write(".nc"))]
+Picture = Annotated[Path | None, Parameter(validator=file_to_write(".png"))]
+Json = Annotated[bool, Parameter(name="--json")]
 
 
 def some(files: tuple[Path, ...]) -> tuple[Path, ...]:

@@ -5,14 +5,14 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from magbridge.cli.common import Json, Output, app, some, tell
+from magbridge.cli.common import Folder, Json, app, some, tell
 
 
-@app.command
+@app.command(usage="Usage: magbridge diagnose FILE... --calibration cal.json -o DIR [OPTIONS]")
 def diagnose(
     *files: Path,
     calibration: Path,
-    output: Output,
+    output: Folder,
     learned_from: tuple[Path, ...] = (),
     grid: Path | None = None,
     json: Json = False,

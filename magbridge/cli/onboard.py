@@ -14,7 +14,12 @@ from magbridge.errors import DataError, WrongUse
 
 
 @app.command
-def demo(*, out: Path = Path("demo"), seed: int = 1, json: Json = False) -> None:
+def demo(
+    *,
+    out: Path = Path("demo"),
+    seed: Annotated[int, Parameter(validator=validators.Number(gte=0))] = 1,
+    json: Json = False,
+) -> None:
     """Do the main job end to end on a simulated glider: no hardware, no network, under a minute.
 
     Simulates a small deployment, fits a calibration to its spirals, replays the survey through a pty and a
@@ -35,7 +40,7 @@ def demo(*, out: Path = Path("demo"), seed: int = 1, json: Json = False) -> None
     tell(result, demonstration.tell(result), json)
 
 
-@app.command
+@app.command(usage="Usage: magbridge run --config bridge.toml")
 def run(*, config: Path) -> None:
     """Attach to the sensor and the autopilot link, and publish the corrected field until stopped.
 
@@ -49,7 +54,7 @@ def run(*, config: Path) -> None:
     attach(config)
 
 
-@app.command
+@app.command(usage="Usage: magbridge replay FILE... [--config bridge.toml] [OPTIONS]")
 def replay(
     *files: Path,
     config: Path | None = None,
@@ -83,14 +88,15 @@ def replay(
         raise DataError("what was published is not what the log holds")
 
 
-@app.command
+@app.command(usage="Usage: magbridge monitor [LINK] [OPTIONS]")
 def monitor(
     link: str = "udpin:0.0.0.0:14550",
+    /,
     *,
     host: str = "127.0.0.1",
     port: Annotated[int, Parameter(validator=validators.Number(gte=1, lte=65535))] = 8080,
     baudrate: Annotated[int, Parameter(validator=validators.Number(gt=0))] = 57600,
-    show: Annotated[bool, Parameter(negative="")] = False,
+    show: bool = False,
 ) -> None:
     """Serve the ground station's page: what a bridge measures and says, as it comes over MAVLink.
 

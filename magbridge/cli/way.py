@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from magbridge.cli.common import Json, Output, app, complain, tell
+from magbridge.cli.common import Json, Output, Picture, app, complain, some, tell
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -17,16 +17,15 @@ if TYPE_CHECKING:
 __all__ = ["navigate"]
 
 
-@app.command
+@app.command(usage="Usage: magbridge navigate FILE... --calibration cal.json --map grid.nc -o FILE [OPTIONS]")
 def navigate(
-    file: Path,
-    *more: Path,
+    *files: Path,
     map: Path,  # noqa: A002 - the flag's name
     output: Output,
     calibration: Path | None = None,
     config: Path | None = None,
     bound: bool = False,
-    picture: Path | None = None,
+    picture: Picture = None,
     json: Json = False,
 ) -> None:
     """Match the corrected field to an anomaly map: track, covariance, innovations, smoothed track.
@@ -36,10 +35,8 @@ def navigate(
 
     Parameters
     ----------
-    file
-        A log with telemetry from which motion can be reckoned, or the plan.
-    more
-        Further logs of the same deployment.
+    files
+        Logs of one deployment, with telemetry from which motion can be reckoned; or the plan.
     map
         The anomaly grid.
     output
@@ -60,7 +57,7 @@ def navigate(
 
     known, options = load(calibration) if calibration else None, _options(config)
     if bound:
-        _bound((file, *more), map, output, options, known, picture, json)
+        _bound(some(files), map, output, options, known, picture, json)
         return
     if known is None:
         raise WrongUse("expected --calibration; or --bound, which does without")
@@ -74,7 +71,7 @@ def navigate(
     from magbridge.navigate.batch import navigate as find_way
     from magbridge.navigate.model import informed
 
-    deployment = with_true_heading(read((file, *more), required=CHANNELS))
+    deployment = with_true_heading(read(some(files), required=CHANNELS))
     corrected = correct_rows(Correction(known), deployment)
     if options is None:
         options = informed(Options(), known, float(corrected["total_field_sigma"].median()))

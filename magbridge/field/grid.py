@@ -279,7 +279,10 @@ class AnomalyGrid:
             attrs |= {"altitude": self.altitude, "altitude_units": "m above the ellipsoid"}
         packed = {name: {"zlib": True, "dtype": "float32"} for name in fields}
         with atomic_path(path) as beside:
-            xr.Dataset(fields, axes, attrs).to_netcdf(beside, engine="netcdf4", encoding=packed)
+            try:
+                xr.Dataset(fields, axes, attrs).to_netcdf(beside, engine="netcdf4", encoding=packed)
+            except RuntimeError as error:  # all that netCDF says when it cannot write
+                raise OSError(f"{error} (is the disk full?)") from error
 
     def __repr__(self) -> str:
         return (

@@ -180,13 +180,13 @@ class Writer:
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self._path = Path(path)
         self._open = _format(self._path, write=True)
-        self._stack = ExitStack()
         self._columns: dict[str, dict[str, Any]] = {}
 
     def __enter__(self) -> Self:
-        self._stack.__enter__()
-        self._file = self._open(self._stack.enter_context(atomic_path(self._path)))
-        self._stack.callback(self._file.close)
+        with ExitStack() as stack:
+            self._file = self._open(stack.enter_context(atomic_path(self._path)))
+            stack.callback(self._file.close)
+            self._stack = stack.pop_all()
         return self
 
     def __exit__(

@@ -10,16 +10,22 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
-from magbridge.columns import COLUMNS, factor
+from magbridge.columns import CHANNEL_TIMES, COLUMNS, factor
 from magbridge.errors import FormatError
 from magbridge.records import Quality
 
-__all__ = ["MEANING", "deployment", "increasing", "join", "same_columns", "sliced"]
+__all__ = ["MEANING", "deployment", "increasing", "join", "plausible", "same_columns", "sliced"]
 
 Floats = NDArray[np.float64]
 
 MEANING = {"heading_reference": "true", "time_reference": "utc"}
 """Attributes that change what values mean, and what holds where they are absent."""
+YEAR_10000 = 253_402_300_800.0
+"""s since 1970: a time beyond is in another unit, and no calendar has it."""
+DEGREES = {"latitude": 90.0, "longitude": 540.0}
+"""The most that these may be; 4952.3 is degrees and minutes written together."""
+APART = 60.0
+"""s that a channel may be sampled before or after its row."""
 COUNTERS = ("bytes_skipped", "damages", "dropouts", "duplicate_rows", "rows_dropped")
 """Attributes that add up."""
 
@@ -104,15 +110,41 @@ def increasing(
         Names the first row that does not fit: its number in `rows`, or counted from 1.
     """
     steps = np.diff(time, prepend=after)
-    wrong = np.flatnonzero(~(np.isfinite(time) & (steps > 0)))
+    wrong = np.flatnonzero(~((steps > 0) & (np.abs(time) < YEAR_10000)))
     if not len(wrong):
         return
     k = int(wrong[0])
     before = float(time[k - 1]) if k else after
     expected = f"expected a time after {before!r}" if np.isfinite(before) else "expected a finite time"
+    if YEAR_10000 <= abs(time[k]) < np.inf:
+        expected = "expected seconds since 1970"
     raise FormatError(
         file, f"{expected}, not {float(time[k])!r}", row=rows[k] if rows else k + 1, column="time"
     )
+
+
+def plausible(file: str | Path, dataset: xr.Dataset, rows: Sequence[int]) -> None:
+    """Check what would be taken for another place or another moment: positions, and the channels' own times.
+
+    Raises
+    ------
+    FormatError
+        Names the first row that does not fit, by its number in `rows`.
+    """
+    time = dataset["time"].values
+    for name in (*DEGREES, *CHANNEL_TIMES):
+        if name not in dataset:
+            continue
+        values = dataset[name].values
+        if name in DEGREES:
+            wrong, expected = np.abs(values) > DEGREES[name], f"degrees, at most {DEGREES[name]:g}"
+        else:
+            wrong, expected = np.abs(values - time) > APART, f"a time within {APART:g} s of the row's"
+        if wrong.any():
+            k = int(wrong.argmax())
+            raise FormatError(
+                file, f"expected {expected}, not {float(values[k])!r}", row=rows[k], column=name
+            )
 
 
 def same_columns(dataset: xr.Dataset, like: Mapping[str, Mapping[str, Any]]) -> xr.Dataset:

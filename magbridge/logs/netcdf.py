@@ -14,6 +14,7 @@ OceanGliders format 1.0, https://oceangliderscommunity.github.io/OG-format-user-
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -24,7 +25,7 @@ from numpy.typing import NDArray
 
 from magbridge.errors import FormatError, MissingExtra
 from magbridge.logs import seaglider
-from magbridge.logs.deployment import deployment, increasing, sliced
+from magbridge.logs.deployment import deployment, increasing, plausible, sliced
 
 try:
     import netCDF4
@@ -93,9 +94,12 @@ def _chunks(path: Path, file: Any, rows: int) -> Iterator[xr.Dataset]:
     for row in range(0, total, rows):
         columns = {name: _floats(variable, slice(row, row + rows)) for name, variable in variables.items()}
         time = columns.pop("time") * scale + start
-        increasing(path, time, range(row + 1, row + 1 + len(time)), after=last)
+        numbers = range(row + 1, row + 1 + len(time))
+        increasing(path, time, numbers, after=last)
         last = float(time[-1])
-        yield deployment(path, time, columns, units, attrs, meanings)
+        dataset = deployment(path, time, columns, units, attrs, meanings)
+        plausible(path, dataset, numbers)
+        yield dataset
 
 
 def _floats(variable: Any, rows: slice) -> NDArray[np.float64]:
@@ -134,14 +138,15 @@ class FileWriter:
 
     def append(self, dataset: xr.Dataset, *, first: bool) -> None:
         """Write the rows, and before the first ones the definitions."""
-        if first:
-            self._define(dataset)
-        n = dataset.sizes["time"]
-        for name, variable in self._variables.items():
-            variable[self._rows : self._rows + n] = dataset[name].values
-        self._rows += n
-        if n:
-            self._file.time_coverage_end = _iso(float(dataset["time"][-1]))
+        with _told():
+            if first:
+                self._define(dataset)
+            n = dataset.sizes["time"]
+            for name, variable in self._variables.items():
+                variable[self._rows : self._rows + n] = dataset[name].values
+            self._rows += n
+            if n:
+                self._file.time_coverage_end = _iso(float(dataset["time"][-1]))
 
     def _define(self, dataset: xr.Dataset) -> None:
         file = self._file
@@ -182,7 +187,17 @@ class FileWriter:
 
     def close(self) -> None:
         """Bring everything to the file."""
-        self._file.close()
+        with _told():
+            self._file.close()
+
+
+@contextmanager
+def _told() -> Iterator[None]:
+    """Make an OSError of what the library says when it cannot write: it keeps the system's reason to itself."""
+    try:
+        yield
+    except RuntimeError as error:
+        raise OSError(f"{error} (is the disk full?)") from error
 
 
 def _iso(time: float) -> str:

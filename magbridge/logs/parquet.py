@@ -12,7 +12,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from magbridge.errors import FormatError, MissingExtra
-from magbridge.logs.deployment import deployment, increasing
+from magbridge.logs.deployment import deployment, increasing, plausible
 
 try:
     import pyarrow as pa
@@ -52,7 +52,9 @@ def _chunks(path: Path, file: Any, rows: int) -> Iterator[xr.Dataset]:
     for batch in file.iter_batches(batch_size=min(rows, 1 << 20)):
         columns = {field.name: _floats(path, field, batch.column(k)) for k, field in enumerate(schema)}
         dataset = deployment(path, columns.pop("time"), columns, units, attrs, meanings)
-        increasing(path, dataset["time"].values, range(row, row + batch.num_rows), after=last)
+        numbers = range(row, row + batch.num_rows)
+        increasing(path, dataset["time"].values, numbers, after=last)
+        plausible(path, dataset, numbers)
         row, last = row + batch.num_rows, float(dataset["time"][-1])
         yield dataset
 

@@ -21,7 +21,7 @@ import xarray as xr
 
 from magbridge.columns import COLUMNS
 from magbridge.errors import FormatError
-from magbridge.logs.deployment import MEANING, deployment, increasing
+from magbridge.logs.deployment import MEANING, deployment, increasing, plausible
 from magbridge.records import Quality
 
 __all__ = ["FileWriter", "chunks"]
@@ -42,7 +42,7 @@ def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
         try:
             yield from _chunks(path, file, rows)
         except UnicodeDecodeError:
-            raise FormatError(path, "expected text, not binary data") from None
+            raise FormatError(path, "expected text in UTF-8") from None
         except csv.Error as error:
             raise FormatError(path, f"expected comma-separated values: {error}") from None
 
@@ -77,6 +77,7 @@ def _chunks(path: Path, file: TextIO, rows: int) -> Iterator[xr.Dataset]:
         }
         dataset = deployment(path, columns.pop("time"), columns, units, attrs)
         increasing(path, dataset["time"].values, numbers, after=last)
+        plausible(path, dataset, numbers)
         last, nothing = float(dataset["time"][-1]), False
         yield dataset
     if nothing:

@@ -57,7 +57,7 @@ def test_csv(text: str, rows: int, tmp_path: Path) -> None:
 def test_csv_of_binary_data(tmp_path: Path) -> None:
     path = tmp_path / "log.csv"
     path.write_bytes(b"time,mag_x\n\xff\xfe\x00,1\n")
-    with pytest.raises(FormatError, match="expected text, not binary data"):
+    with pytest.raises(FormatError, match="expected text in UTF-8"):
         logs.read(path)
 
 

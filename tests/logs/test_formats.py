@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from magbridge import logs
-from magbridge.columns import COLUMNS
-from magbridge.logs.deployment import deployment
+from magbridge.columns import CHANNEL_TIMES, COLUMNS
+from magbridge.logs.deployment import APART, DEGREES, deployment
 
 EXACT = [".csv", ".nc", ".parquet"]
 WRITABLE = [*EXACT, ".tlog"]
@@ -41,11 +41,13 @@ def deployments(draw: st.DrawFn, width: int) -> xr.Dataset:
     steps = draw(st.lists(st.integers(1, 10**8), min_size=1, max_size=12))
     time = (1_700_000_000_000_000 + np.cumsum(steps)) / 1e6
     units = draw(others)
-    value = st.floats(allow_nan=True, allow_infinity=False, width=width)
-    columns = {
-        name: np.array(draw(st.lists(value, min_size=len(time), max_size=len(time))), dtype=float)
-        for name in [*draw(known), *units]
-    }
+    columns = {}
+    for name in [*draw(known), *units]:
+        most = DEGREES.get(name, APART / 2 if name in CHANNEL_TIMES else None)
+        bounds = {} if most is None else {"min_value": -most, "max_value": most}
+        value = st.floats(**bounds, allow_infinity=False, width=width) | st.just(np.nan)
+        column = np.array(draw(st.lists(value, min_size=len(time), max_size=len(time))), dtype=float)
+        columns[name] = time + column if name in CHANNEL_TIMES else column
     flags = st.sampled_from([0, 1, 3, 128, 255])
     columns["quality"] = np.array(draw(st.lists(flags, min_size=len(time), max_size=len(time))), dtype=float)
     return deployment(
