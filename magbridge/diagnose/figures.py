@@ -189,10 +189,16 @@ def track(diagnosis: Diagnosis) -> str | None:
         return None
     part = _thin(len(place))
     sides = _sides(diagnosis)
-    figure, axes = _figure(10 if len(sides) > 1 else 6, 3.8, 1, len(sides), sharex=True, sharey=True)
+    north, east = np.ptp(place, axis=0)[:2]
+    if east > 2.0 * north:  # a long track lies better above the other one
+        figure, axes = _figure(
+            10, 2.0 * (1.1 + 8.0 * max(float(north / east), 0.1)), 2, 1, sharex=True, sharey=True
+        )
+    else:
+        figure, axes = _figure(10, 3.8, 1, 2, sharex=True, sharey=True)
     limit = float(np.quantile(np.abs(diagnosis.before), 0.98)) + 1e-9
     dots = None
-    for axis, (title, (values, _)) in zip(axes[0], sides.items(), strict=True):
+    for axis, (title, (values, _)) in zip(axes.flat, sides.items(), strict=True):
         dots = axis.scatter(
             place[part, 1] / 1e3,
             place[part, 0] / 1e3,
@@ -204,8 +210,10 @@ def track(diagnosis: Diagnosis) -> str | None:
         )
         axis.set_aspect("equal", adjustable="box")
         axis.set_title(title, fontsize=9)
+    for axis in axes[-1]:
         axis.set_xlabel("east (km)", fontsize=9)
-    axes[0, 0].set_ylabel("north (km)", fontsize=9)
+    for axis in axes[:, 0]:
+        axis.set_ylabel("north (km)", fontsize=9)
     assert dots is not None
     figure.colorbar(dots, ax=axes, label="nT", shrink=0.8)
     return _png(figure)

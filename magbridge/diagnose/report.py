@@ -14,6 +14,7 @@ from magbridge.diagnose import figures
 from magbridge.diagnose.findings import parameters, told
 
 if TYPE_CHECKING:
+    from magbridge.diagnose.candidates import Candidate
     from magbridge.diagnose.causes import Cause
     from magbridge.diagnose.gain import Gain
     from magbridge.diagnose.run import Diagnosis
@@ -143,6 +144,7 @@ def _found(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> list[str]:
             ),
             f"<table><tr><th>term</th><th>value</th><th>1 sigma</th><th>unit</th></tr>{rows}</table>",
             _several(candidate.names),
+            _in_motion(diagnosis, at - candidate.size - len(diagnosis.problem.centre), candidate),
             doubt
             + f"<p>In a log like this one, theory gives it a chance of {100 * told(diagnosis, hypothesis):.0f} % to be named alone.</p>",
             _no_gain(gain),
@@ -168,6 +170,24 @@ def _several(names: tuple[str, ...]) -> str:
     if not any(name.endswith(")") for name in names):
         return ""
     return '<p class="faint">A number in brackets: the cause took more than one such term to describe; they act together.</p>'
+
+
+def _in_motion(diagnosis: Diagnosis, at: int, candidate: Candidate) -> str:
+    """Say so when a cause acts while masses move: a mass that moved between two rows, unseen, looks like that, too."""
+    survey = diagnosis.problem.survey
+    p = survey.values([parameter.name for parameter in diagnosis.problem.calibration.parameters])
+    steps = np.any(np.diff(p, axis=0) != 0.0, axis=1)
+    moving = np.append(steps, False) | np.append(False, steps)
+    b = diagnosis.fit.coefficients[at : at + candidate.size]
+    power = (candidate.columns(slice(0, len(survey))) @ b) ** 2
+    share, usual = float(power[moving].sum() / power.sum()), float(moving.mean())
+    if usual > 0.5 or share < 0.8:
+        return ""
+    interval = float(np.median(np.diff(survey.time)))
+    return (
+        f"<p>{100 * share:.0f} % of its trace lies in the {100 * usual:.0f} % of the samples next to which a mass moved. With "
+        f"{interval:.3g} s from row to row, a mass that was elsewhere than its row says would look like that, too.</p>"
+    )
 
 
 def _physics(cause: Cause) -> str:
