@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 import re
 import tomllib
+from math import inf, isfinite
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -31,8 +32,9 @@ __all__ = [
 ]
 
 T = TypeVar("T")
-Positive = Annotated[float, Meta(gt=0)]
-NotNegative = Annotated[float, Meta(ge=0)]
+Positive = Annotated[float, Meta(gt=0, le=1e9)]
+NotNegative = Annotated[float, Meta(ge=0, le=1e9)]
+"""With an end: TOML knows ``inf``, and deadlines and sizes are whole numbers inside."""
 SystemId = Annotated[int, Meta(ge=1, le=255)]
 
 
@@ -110,6 +112,12 @@ class Telemetry(Table, frozen=True):
     unit: str = ""
     max_age: Positive = 30.0
 
+    def __post_init__(self) -> None:
+        if not 0.0 < abs(self.scale) < inf:
+            raise ValueError(f"scale: a number other than 0, not {self.scale}")
+        if not isfinite(self.offset):
+            raise ValueError(f"offset: a number, not {self.offset}")
+
 
 class CalibrationFile(Table, frozen=True):
     """``[calibration]``: the ``cal.json`` to correct with."""
@@ -137,7 +145,7 @@ class Align(Table, frozen=True):
     """
 
     filter_delay: NotNegative = 0.0
-    gap_factor: Annotated[float, Meta(gt=1)] = 2.5
+    gap_factor: Annotated[float, Meta(gt=1, le=1e9)] = 2.5
     moving_rate: Positive = 0.005
     settle_time: NotNegative = 0.0
     stale_growth: NotNegative = 1.0

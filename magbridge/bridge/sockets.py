@@ -266,10 +266,13 @@ def open_link(url: str, baudrate: int, source: str = "bridge.toml") -> Port:
     Raises
     ------
     ConfigError
-        The address is not HOST:PORT.
+        A kind of link that there is not, or an address that is not HOST:PORT.
     """
-    kind, _, address = url.partition(":")
+    kind, colon, address = url.partition(":")
     if kind not in LINKS:
+        if colon and kind.isalnum() and kind != "serial" and not address.startswith("//"):
+            known = ", ".join(LINKS)
+            raise ConfigError(source, "link.url", f"expected {known} or a serial device, got {url!r}")
         return SerialPort(url.removeprefix("serial:"), baudrate)
     try:
         return LINKS[kind](url, _address(address))

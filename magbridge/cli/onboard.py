@@ -51,6 +51,8 @@ def run(*, config: Path) -> None:
     """
     from magbridge.bridge.run import run as attach
 
+    if sys.stderr.isatty():
+        print(f"{config}: running until Ctrl-C; what there is to say is said over the link", file=sys.stderr)
     attach(config)
 
 

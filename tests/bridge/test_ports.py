@@ -116,6 +116,12 @@ def test_an_address_that_is_none(url: str) -> None:
         open_link(url, 0)
 
 
+@pytest.mark.parametrize("url", ["udpot:192.0.2.1:14550", "http:example"])
+def test_a_kind_of_link_that_is_none(url: str) -> None:
+    with pytest.raises(ConfigError, match="expected udpin, udpout, tcp, tcpin or a serial device"):
+        open_link(url, 0)
+
+
 def test_a_port_that_cannot_be_opened_says_why(tmp_path) -> None:
     for name in (str(tmp_path / "ttyUSB*"), str(tmp_path / "ttyUSB0")):
         with pytest.raises(PortError, match=r"[Nn]o such (device|file)"):
