@@ -46,6 +46,9 @@ class Candidate:
         Its coefficients cannot be negative.
     parts : int
         Regressors that it was put together from, one after the other.
+    spectra : (l, k) array or None
+        Where its numbers have one common free size (:mod:`.statistic`): their prior variances, in units of the widths
+        squared and up to a common factor; each is tried.
     """
 
     cause: str
@@ -60,11 +63,17 @@ class Candidate:
     trials: float = 1.0
     positive: bool = False
     parts: int = 1
+    spectra: FloatArray | None = None
 
     @property
     def size(self) -> int:
-        """Free numbers."""
+        """Numbers."""
         return len(self.width)
+
+    @property
+    def freedom(self) -> int:
+        """Free numbers."""
+        return self.size if self.spectra is None else 1
 
     def with_(self, other: Candidate) -> Candidate:
         """Return both as one: a cause that takes more than one regressor to describe."""

@@ -106,7 +106,7 @@ def isolability(
     picked = [k for _, k in best.values()]
     visible = []
     for k in picked:
-        candidate, s = candidates[k], score(info, at[k])
+        candidate, s = candidates[k], score(info, at[k], candidates[k])
         hypotheses = causes * trials.get(candidate.cause, 1.0)
         freedom = max(s.freedom, 1)
         half, sure = threshold(freedom, hypotheses, 0.5), threshold(freedom, hypotheses, 0.95)

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from magbridge.diagnose.noise import Noise, fit_noise
 from magbridge.diagnose.problem import Columns, Problem
+from magbridge.diagnose.statistic import Statistic
 
 __all__ = ["RIDGE", "Design", "Information", "Joint", "fit_joint", "information"]
 
@@ -41,7 +42,8 @@ class Joint:
     Attributes
     ----------
     log_likelihood : float
-        Of the noise model, with the prior of the calibration and of the effects.
+        Of the noise model, with the prior of the calibration and of the effects; numbers of one common size are integrated
+        out (Laplace's approximation).
     z : (q,) array
     coefficients : (k,) array
         Of the effects, in units of their prior width.
@@ -68,6 +70,7 @@ def fit_joint(
     order: int,
     *starts: FloatArray,
     plain: bool = True,
+    spectra: Sequence[FloatArray | None] = (),
     like: Joint | None = None,
     blocks: bool | None = None,
     ridge: float | FloatArray = RIDGE,
@@ -86,6 +89,8 @@ def fit_joint(
         Where to begin: the best of them; the calibration as it stands if there is none.
     plain : bool
         Begin where plain least squares ends, too.
+    spectra : sequence of (l, k) array or None
+        For each of `columns` whose numbers have one common free size (:mod:`.statistic`): their prior variances.
     like : Joint, optional
         A fit whose noise this one's will resemble: saves time.
     blocks : bool, optional
@@ -98,13 +103,16 @@ def fit_joint(
     X = Design(problem, columns)
     q, k = X.free.shape[1], X.effects
     prior = np.append(np.ones(q), np.broadcast_to(ridge, k))
+    common = [(own, spectrum) for own, spectrum in zip(X.at, spectra, strict=False) if spectrum is not None]
     centre = np.append(problem.centre, np.zeros(k))
     follows = problem.survey.follows
 
-    def at(c: FloatArray) -> tuple[float, FloatArray, Noise]:
+    def at(c: FloatArray) -> tuple[FloatArray, Noise]:
         left = problem.residual - X.times(c)
-        noise = fit_noise(left, follows, order, blocks=blocks, like=None if like is None else like.noise)
-        return noise.log_likelihood - 0.5 * float(prior @ (c - centre) ** 2), left, noise
+        return left, fit_noise(left, follows, order, blocks=blocks, like=None if like is None else like.noise)
+
+    def value(c: FloatArray, noise: Noise) -> float:
+        return noise.log_likelihood - 0.5 * float(prior @ (c - centre) ** 2)
 
     # noise with a long memory swallows what is slow, and least squares then never asks for it again: so it is
     # asked once as if the noise had none
@@ -112,21 +120,39 @@ def fit_joint(
     if plain:
         first.append(_plain(X, problem.residual, prior, centre))
     found = [(c, *at(c)) for c in first]
-    c, value, left, noise = max(found, key=lambda entry: entry[1])
+    for own, _ in common:
+        prior[own] = 0.0  # no size is known yet
+    c, left, noise = max(found, key=lambda entry: value(entry[0], entry[2]))
     for step in range(rounds + 1):
         P, b = normal(X.rows, noise.response(left), noise)
+        for own, spectrum in common:
+            prior[own] = _sized(P, b + P @ c + prior * centre, prior, own, spectrum)
         P += np.diag(prior)
         if step == rounds:
             break
         moved = c + np.linalg.solve(P, b - prior * (c - centre))
         tried = at(moved)
-        gained = tried[0] - value
+        gained = value(moved, tried[1]) - value(c, noise)
         if gained > 0.0:
-            c, (value, left, noise) = moved, tried
+            c, (left, noise) = moved, tried
         if gained < 0.02:  # P is that of the last step: no other
             break
     covariance: FloatArray = np.asarray(np.linalg.inv(P), float)
-    return Joint(value, c[:q], c[q:], covariance, noise, left, prior)
+    volume = sum(volume_of(covariance[own, own], prior[own]) for own, _ in common)
+    return Joint(value(c, noise) - volume, c[:q], c[q:], covariance, noise, left, prior)
+
+
+def volume_of(covariance: FloatArray, prior: FloatArray) -> float:
+    """Return ``1/2 ln det(1 + g S)``: by how much the data have narrowed numbers of this prior precision."""
+    return -0.5 * float(np.linalg.slogdet(covariance)[1] + np.log(prior).sum())
+
+
+def _sized(P: FloatArray, h: FloatArray, prior: FloatArray, own: slice, spectra: FloatArray) -> FloatArray:
+    """Prior precision of the numbers at `own`, of the common size and spectrum that data of information P and h like best."""
+    others = np.delete(np.arange(len(h)), own)
+    K = np.linalg.solve(P[np.ix_(others, others)] + np.diag(prior[others]), P[others, own])
+    S, b = P[own, own] - P[own, others] @ K, h[own] - K.T @ h[others]
+    return np.asarray(1.0 / Statistic(S, spectra).best(b).variance)
 
 
 class Design:
@@ -143,7 +169,10 @@ class Design:
         self.free, self.columns = problem.free, columns
         n = len(problem)
         self.pieces = [slice(start, min(start + CHUNK, n)) for start in range(0, n, CHUNK)]
-        self.effects = self._made(self.pieces[0]).shape[1]
+        sizes = [column(self.pieces[0]).shape[1] for column in columns]
+        ends = self.free.shape[1] + np.cumsum([0, *sizes]).astype(int)
+        self.at = [slice(*own) for own in zip(ends.tolist(), ends.tolist()[1:], strict=False)]
+        self.effects = sum(sizes)
         self.kept: FloatArray | None = None
         if n * self.effects <= KEPT:
             self.kept = np.empty((n, self.effects))
@@ -232,9 +261,9 @@ class Information:
         """Return calibration and model (q + k,) where they are best when the coefficients at `index` are `taken`."""
         return np.append(base.z, base.coefficients) - self.shift[:, index] @ taken
 
-    def without(self, index: NDArray[np.intp]) -> Information:
-        """Project out the coefficients at `index`, too."""
-        S = self.matrix[np.ix_(index, index)] + 1e-6 * np.eye(len(index))
+    def without(self, index: NDArray[np.intp], prior: FloatArray) -> Information:
+        """Project out the coefficients at `index`, of this prior precision, too."""
+        S = self.matrix[np.ix_(index, index)] + np.diag(prior)
         K = np.linalg.solve(S, self.matrix[index])
         return Information(
             self.matrix - self.matrix[:, index] @ K, self.score - K.T @ self.score[index], self.shift
@@ -252,10 +281,9 @@ def information(
         noise.response(base.left),
         noise,
     )
-    prior = np.append(np.ones(q), np.full(nuisance - q, 1e-6))
-    pull = np.append(problem.centre - base.z, np.zeros(nuisance - q))
+    pull = base.prior * np.append(problem.centre - base.z, -base.coefficients)
     K: FloatArray = np.asarray(
-        np.linalg.solve(G[:nuisance, :nuisance] + np.diag(prior), G[:nuisance, nuisance:]), float
+        np.linalg.solve(G[:nuisance, :nuisance] + np.diag(base.prior), G[:nuisance, nuisance:]), float
     )
     return Information(
         G[nuisance:, nuisance:] - G[nuisance:, :nuisance] @ K, b[nuisance:] - K.T @ (b[:nuisance] + pull), K

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from magbridge.diagnose.candidates import Candidate
-from magbridge.diagnose.joint import Information, Joint, fit_joint, information
+from magbridge.diagnose.joint import RIDGE, Information, Joint, fit_joint, information, volume_of
 from magbridge.diagnose.problem import Problem
 from magbridge.diagnose.weigh import Score, score, slices, trials, weigh
 
@@ -50,14 +50,23 @@ class Hypothesis:
     @property
     def signal_to_noise(self) -> float:
         """Whitened norm of what is the effect's own under the noise that is left, less what noise alone gives."""
-        power = own_ratio(self.fit, self.candidate.size) - self.candidate.size
+        size = self.candidate.size
+        known = self.fit.prior[-size:] * np.diag(self.fit.covariance)[-size:]
+        power = wald(self.fit, size) - float(np.sum(1.0 - known))
         return float(np.sqrt(power)) if power > 0.0 else 0.0
 
 
-def own_ratio(fit: Joint, size: int) -> float:
+def wald(fit: Joint, size: int) -> float:
     """Wald's statistic of the last coefficients."""
     b, own = fit.coefficients[-size:], fit.covariance[-size:, -size:]
     return float(b @ np.linalg.solve(own, b))
+
+
+def own_ratio(fit: Joint, candidate: Candidate) -> float:
+    """Likelihood ratio of the last candidate's numbers under the noise that is left."""
+    own = slice(-candidate.size, None)
+    spread = 0.0 if candidate.spectra is None else volume_of(fit.covariance[own, own], fit.prior[own])
+    return wald(fit, candidate.size) - 2.0 * spread
 
 
 class State:
@@ -86,15 +95,13 @@ class State:
         """Fit a model jointly with calibration and noise; see :func:`~.joint.fit_joint`."""
         columns = [candidate.columns for candidate in model]
         return fit_joint(
-            self.problem, columns, self.order, *starts, plain=plain, like=like, blocks=self.blocks, rounds=rounds
+            self.problem, columns, self.order, *starts, plain=plain, spectra=[c.spectra for c in model],
+            like=like, blocks=self.blocks, ridge=_ridge(model), rounds=rounds,
         )  # fmt: skip
 
     def scores(self, info: Information) -> list[Score]:
         """Score every candidate."""
-        return [
-            score(info, at, positive=candidate.positive)
-            for at, candidate in zip(self.at, self.candidates, strict=True)
-        ]
+        return [score(info, at, candidate) for at, candidate in zip(self.at, self.candidates, strict=True)]
 
     def best(self, scores: Sequence[Score]) -> dict[tuple[str, str | None], tuple[int, float]]:
         """Of each group its best member, and log of the grid's average against it: what the nonlinear parameters cost."""
@@ -126,17 +133,20 @@ class State:
     def _bare(self, model: list[Candidate], base: Joint, info: Information) -> Information:
         """Score again under the noise that is left when the best of every cause takes what it can."""
         top: dict[str, tuple[float, int]] = {}
-        for k, s in enumerate(self.scores(info)):
+        scores = self.scores(info)
+        for k, s in enumerate(scores):
             if s.evidence > top.get(self.candidates[k].cause, (-np.inf, 0))[0]:
                 top[self.candidates[k].cause] = (s.evidence, k)
         pool = [k for _, k in top.values()]
         index = np.concatenate([np.arange(self.at[k].start, self.at[k].stop) for k in pool])
         taken = np.linalg.solve(info.matrix[np.ix_(index, index)] + np.eye(len(index)), info.score[index])
+        every = [*model, *(self.candidates[k] for k in pool)]
         everything = fit_joint(
             self.problem,
-            [c.columns for c in (*model, *(self.candidates[k] for k in pool))],
+            [candidate.columns for candidate in every],
             self.order,
             np.append(info.moved(base, index, taken), taken),
+            spectra=[candidate.spectra for candidate in every],
             ridge=1.0,
             rounds=1,
         )
@@ -157,7 +167,7 @@ class State:
             if candidate.positive and fit.coefficients[-1] < 0.0:
                 ratio = 0.0
             # a gain that is not the effect's own, but of a noise that found another optimum beside it
-            ratio = min(ratio, own_ratio(fit, candidate.size))
+            ratio = min(ratio, own_ratio(fit, candidate))
             freedom = mine[0][2].freedom
             p_value = self.p_value(candidate, ratio, freedom)
             evidence = weigh(ratio, freedom) + mine[0][1] - float(np.log(candidate.trials))
@@ -209,6 +219,13 @@ class State:
     def span(self) -> float:
         """S."""
         return float(np.ptp(self.problem.survey.time))
+
+
+def _ridge(model: Sequence[Candidate]) -> FloatArray:
+    """(k,) prior precision that a fit begins from."""
+    return np.concatenate(
+        [np.empty(0), *(np.full(c.size, RIDGE if c.spectra is None else 1.0) for c in model)]
+    )
 
 
 def key(candidate: Candidate) -> tuple[str, str | None]:

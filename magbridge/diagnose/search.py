@@ -14,7 +14,7 @@ noise that is left, the other causes projected out.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -25,7 +25,7 @@ from magbridge.diagnose.joint import Information, Joint, fit_joint, information
 from magbridge.diagnose.noise import memory_order
 from magbridge.diagnose.problem import Problem
 from magbridge.diagnose.rounds import Hypothesis, State, key
-from magbridge.diagnose.weigh import LEVEL, ODDS, REMNANT, lead, score, weigh
+from magbridge.diagnose.weigh import LEVEL, ODDS, REMNANT, lead, score, slack, weigh
 
 __all__ = ["Hypothesis", "Outcome", "Rival", "search", "worth"]
 
@@ -115,7 +115,7 @@ def search(problem: Problem, candidates: Sequence[Candidate], causes: int) -> Ou
             alone = state.sharpen([], alone, null)
             model, base = [alone.candidate], alone.fit
     chosen, base = _remove(state, model, base, null)
-    bare = replace(base, coefficients=np.empty(0))
+    bare = replace(base, coefficients=np.empty(0), prior=base.prior[: len(base.z)])
     columns = [*state.columns, *(h.candidate.columns for h in chosen)]
     info = information(problem, base.noise, bare, [], columns) if chosen or not first else state.own
     rivals = tuple(_rivals(state, info, [h.candidate for h in chosen], base, k) for k in range(len(chosen)))
@@ -128,19 +128,23 @@ def worth(ratio: float, model: Sequence[Candidate], causes: int) -> float:
     Every regressor after the first costs the odds that so much goes wrong in one log, and its choice among the causes.
     """
     further = max(sum(candidate.parts for candidate in model) - 1, 0)
-    return weigh(ratio, sum(candidate.size for candidate in model)) - further * (ODDS + float(np.log(causes)))
+    return weigh(ratio, sum(candidate.freedom for candidate in model)) - further * (
+        ODDS + float(np.log(causes))
+    )
 
 
 def _chain(state: State, null: Joint, first: list[Hypothesis]) -> tuple[list[Candidate], Joint]:
     """Add cause after cause while one passes the test, beginning with the best of `first`."""
     model: list[Candidate] = []
-    loudest, base, found = 0.0, null, first
+    base, found = null, first
+    heard: dict[str, float] = {}
     for _ in range(MOST):
-        best = _next(found, model, loudest)
+        best = _next(found, heard, 2.0 * (base.log_likelihood - null.log_likelihood))
         if best is None:
             break
         best = state.sharpen(model, best, base)
-        loudest = max(loudest, best.signal_to_noise)
+        cause = best.candidate.cause
+        heard[cause] = max(heard.get(cause, 0.0), best.signal_to_noise)
         model, base = _with(state, model, best)
         found = state.round(model, base)
     return model, base
@@ -154,23 +158,27 @@ def _together(state: State) -> list[Candidate]:
     """
     info = state.bare
     picked: list[int] = []
-    loudest = 0.0
+    loudest, ratio = 0.0, 0.0
     while len(picked) < MOST:
         scores = state.scores(info)
         ranked = sorted(
             ((scores[k].evidence + price, k) for k, price in state.best(scores).values()), reverse=True
         )
-        for _, k in ranked:
+        sure = []
+        for evidence, k in ranked:
             s, candidate = scores[k], state.candidates[k]
             size = float(np.sqrt(max(s.ratio - s.freedom, 0.0)))
-            sure = state.p_value(candidate, s.ratio, s.freedom) < LEVEL and size >= REMNANT * loudest
-            if sure and candidate.cause not in {state.candidates[j].cause for j in picked}:
-                break
-        else:
+            heard = state.p_value(candidate, s.ratio, s.freedom) < LEVEL and size >= REMNANT * loudest
+            if heard and candidate.cause not in {state.candidates[j].cause for j in picked}:
+                sure.append((evidence, k))
+        if not sure:
             break
+        alike = [k for evidence, k in sure if evidence >= sure[0][0] - slack(ratio)]
+        k = min(alike, key=lambda k: state.candidates[k].freedom)
         picked.append(k)
-        loudest = max(loudest, size)
-        info = info.without(np.arange(state.at[k].start, state.at[k].stop))
+        ratio += scores[k].ratio
+        loudest = max(loudest, float(np.sqrt(max(scores[k].ratio - scores[k].freedom, 0.0))))
+        info = info.without(np.arange(state.at[k].start, state.at[k].stop), scores[k].prior)
     return [state.candidates[k] for k in picked]
 
 
@@ -179,10 +187,10 @@ def _enough(state: State, first: list[Hypothesis]) -> Hypothesis | None:
     members = {(id(c.columns)): k for k, c in enumerate(state.candidates)}
     for h in first:
         k = members[id(h.candidate.columns)]
-        s = score(state.bare, state.at[k], positive=h.candidate.positive)
+        s = score(state.bare, state.at[k], h.candidate)
         if h.p_value >= LEVEL or not s.freedom:
             continue
-        left = state.bare.without(np.arange(state.at[k].start, state.at[k].stop))
+        left = state.bare.without(np.arange(state.at[k].start, state.at[k].stop), s.prior)
         others = [
             (candidate, other)
             for candidate, other in zip(state.candidates, state.scores(left), strict=True)
@@ -211,21 +219,31 @@ def _refined(state: State, model: list[Candidate], base: Joint) -> tuple[list[Ca
     return model, base
 
 
-def _next(found: list[Hypothesis], model: list[Candidate], loudest: float) -> Hypothesis | None:
-    """Pick the best that passes the test; of what an idealised regressor may have left, only more of the same cause.
+def _next(found: list[Hypothesis], heard: Mapping[str, float], ratio: float) -> Hypothesis | None:
+    """Pick the best that passes the test; of what idealised regressors may have left, only more of the same cause.
 
-    More of a cause that is there already comes before another that explains hardly more.
+    `heard` holds the signal-to-noise of the causes that are in the model, `ratio` is its likelihood ratio.
+
+    More of a cause that is there already comes before another that explains hardly more; and fewer numbers before more,
+    where what the model has left may be what makes the difference.
     """
-    named = {candidate.cause for candidate in model}
+
+    def left(cause: str) -> float:
+        return REMNANT * max((size for other, size in heard.items() if other != cause), default=0.0)
+
     sure = [
         h
         for h in found
-        if h.p_value < LEVEL and (h.candidate.cause in named or h.signal_to_noise >= REMNANT * loudest)
+        if h.p_value < LEVEL
+        and h.signal_to_noise >= left(h.candidate.cause)
+        and not (h.candidate.cause in heard and h.candidate.spectra is not None)
     ]
     if not sure:
         return None
     near = sure[0].evidence - lead(sure[0].ratio)
-    return next((h for h in sure if h.candidate.cause in named and h.evidence > near), sure[0])
+    more = next((h for h in sure if h.candidate.cause in heard and h.evidence > near), None)
+    alike = [h for h in sure if h.evidence >= sure[0].evidence - slack(ratio)]
+    return more or min(alike, key=lambda h: h.candidate.freedom)
 
 
 def _with(state: State, model: list[Candidate], best: Hypothesis) -> tuple[list[Candidate], Joint]:
@@ -249,14 +267,14 @@ def _remove(state: State, model: list[Candidate], base: Joint, null: Joint) -> t
         own, others = model[k], model[:k] + model[k + 1 :]
         without = state.fit(others) if others else null
         ratio = max(0.0, 2.0 * (base.log_likelihood - without.log_likelihood))
-        p_value = state.p_value(own, ratio, own.size)
+        p_value = state.p_value(own, ratio, own.freedom)
         if p_value >= LEVEL:
             model, base, chosen, k = others, without, [], 0
             continue
         c, at = base.coefficients, sum(candidate.size for candidate in model[:k])
         last = np.concatenate([c[:at], c[at + own.size :], c[at : at + own.size]])
         fit = state.fit([*others, own], np.append(base.z, last), plain=False, like=base, rounds=1)
-        chosen.append(Hypothesis(own, ratio, weigh(ratio, own.size), p_value, fit))
+        chosen.append(Hypothesis(own, ratio, weigh(ratio, own.freedom), p_value, fit))
         k += 1
     return chosen, base
 
@@ -269,10 +287,10 @@ def _rivals(
     own = np.arange(ends[k], ends[k + 1])
     others = np.setdiff1d(np.arange(ends[0], ends[-1]), own)
     c = base.coefficients[own - ends[0]]
-    alone = info.without(others)
+    alone = info.without(others, base.prior[len(base.z) + others - ends[0]])
     # what the data say when this cause is taken out of the fit
     alone = replace(alone, score=alone.score + alone.matrix[:, own] @ c)
-    mine = score(alone, slice(int(own[0]), int(own[-1]) + 1))
+    mine = score(alone, slice(int(own[0]), int(own[-1]) + 1), model[k])
     scores = state.scores(alone)
     rivals = []
     for group, (member, _) in state.best(scores).items():

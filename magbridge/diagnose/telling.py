@@ -19,6 +19,7 @@ from scipy.stats import chi2, ncx2, norm
 
 from magbridge.diagnose.candidates import Candidate
 from magbridge.diagnose.joint import Information
+from magbridge.diagnose.statistic import Statistic
 from magbridge.diagnose.weigh import LEVEL, lead, slices, weigh
 
 __all__ = ["Telling"]
@@ -46,13 +47,13 @@ class Telling:
         self.candidates, self.S, self.causes = candidates, info.matrix, causes
         self.at = slices(candidates)
         self.limit: dict[int, float] = {}
-        self.roots = []
+        self.freedoms = {c.cause: c.freedom for c in candidates if c.spectra is not None}
+        self.statistics = []
         for k, at in enumerate(self.at):
-            values, vectors = np.linalg.eigh(self.S[at, at])
-            seen = values > 1e-3
-            self.roots.append(vectors[:, seen] / np.sqrt(values[seen]))
+            statistic = Statistic(self.S[at, at], candidates[k].spectra)
+            self.statistics.append(statistic)
             tests = trials.get(candidates[k].cause, 1.0) * causes
-            self.limit[k] = float(chi2.isf(LEVEL / tests, max(int(seen.sum()), 1)))
+            self.limit[k] = float(chi2.isf(LEVEL / tests, max(statistic.freedom, 1)))
 
     def chance(self, cause: str, own: NDArray[np.intp], b: FloatArray, signal_to_noise: float) -> float:
         """Chance that `cause`, with the direction b of the coefficients at `own`, is named alone.
@@ -69,17 +70,17 @@ class Telling:
         if power <= 0.0 or signal_to_noise <= 0.0:
             return 0.0
         s = self.S[:, own] @ b * (signal_to_noise / np.sqrt(power))
-        freedom, a2 = len(own), signal_to_noise**2
+        freedom, a2 = self.freedoms.get(cause, len(own)), signal_to_noise**2
         mine = weigh(a2 + freedom, freedom)
         chances: dict[str, float] = {}
         for k, candidate in enumerate(self.candidates):
-            k_free = self.roots[k].shape[1]
+            k_free = self.statistics[k].freedom
             if candidate.cause == cause or not k_free:
                 continue
             part = s[self.at[k]]
             if candidate.positive and part.min() < 0.0:
                 continue
-            ratio = float(np.sum((self.roots[k].T @ part) ** 2))
+            ratio = float(self.statistics[k].ratio(part[:, None])[0])
             delta = max(np.sqrt(max(a2 - ratio, 0.0)), 1e-3)
             wins = float(norm.cdf((mine - weigh(ratio + k_free, k_free) - lead(a2)) / delta))
             heard = float(ncx2.sf(self.limit[k], k_free, max(ratio, 1e-9)))

@@ -1,15 +1,9 @@
-r"""What is left: structure of any kind that no cause of the table accounts for, described but not named.
+"""What is left: structure of any kind that no cause of the table accounts for, described but not named.
 
 Notes
 -----
-A free description has more numbers than anyone believes in, so they have a Gaussian prior of one common size g,
-which is the one that the data like best. With the projected information S and score b of its columns in units of their
-widths, and ``S = V diag(lambda) V^T``, ``y = V^T b``, its log evidence is
-
-.. math:: E = \max_g \tfrac12 \sum_i \left(\frac{g y_i^2}{1 + g \lambda_i} - \ln(1 + g \lambda_i)\right)
-
-which is a variance component's likelihood ratio: under no effect 2 E is at most a chi-square of one freedom (Self & Liang
-1987), whatever the number of columns. Noise that was fitted without the effect may have swallowed it. So a description is
+A free description has more numbers than anyone believes in, so they have one common free size (:mod:`.statistic`).
+Noise that was fitted without the effect may have swallowed it. So a description is
 found under the noise that stands and under the one that is left when slow curves take what they can, and then weighed by the
 whole likelihood, with a noise of its own.
 """
@@ -30,16 +24,15 @@ from magbridge.diagnose.joint import Joint, information
 from magbridge.diagnose.noise import Noise, fit_noise
 from magbridge.diagnose.problem import Columns, Problem
 from magbridge.diagnose.search import Outcome, worth
+from magbridge.diagnose.statistic import Ridge, Statistic
 from magbridge.diagnose.weigh import LEVEL, ODDS, REMNANT, lead
 
-__all__ = ["Leftover", "Ridge", "accept", "leftover", "ridge"]
+__all__ = ["Leftover", "accept", "leftover"]
 
 FloatArray = NDArray[np.float64]
 
 LOUD = 3
 """Descriptions under each noise that are weighed by the whole likelihood."""
-SIZES = np.logspace(-7, 2, 64)
-"""Common sizes g, squared, in units of the widths."""
 TOGETHER = 4
 """Descriptions whose columns are whitened in one go."""
 CALM = 2
@@ -69,37 +62,6 @@ class Leftover(NamedTuple):
     evidence: float
     period_s: float | None
     best_channel: str | None
-
-
-class Ridge(NamedTuple):
-    """The best common size: log evidence, its part that is prior and volume, estimate, and whitened norm of that."""
-
-    evidence: float
-    price: float
-    estimate: FloatArray
-    signal_to_noise: float
-
-
-def ridge(S: FloatArray, b: FloatArray, width: FloatArray) -> Ridge:
-    """Evaluate the module's formula.
-
-    Parameters
-    ----------
-    S : (k, k) array
-    b : (k,) array
-    width : (k,) array
-    """
-    values, vectors = np.linalg.eigh(S * np.outer(width, width))
-    values = np.maximum(values, 0.0)
-    y = vectors.T @ (b * width)
-    table = SIZES[:, None] * y**2 / (1.0 + SIZES[:, None] * values) - np.log1p(SIZES[:, None] * values)
-    evidences = 0.5 * table.sum(axis=1)
-    k = int(np.argmax(evidences))
-    c = SIZES[k] * y / (1.0 + SIZES[k] * values)
-    price = 0.5 * float(c @ c / SIZES[k] + np.log1p(SIZES[k] * values).sum())
-    return Ridge(
-        float(evidences[k]), price, width * (vectors @ c), float(np.sqrt(c**2 @ values))
-    )  # fmt: skip
 
 
 def leftover(
@@ -173,8 +135,8 @@ def _scored(
         for one, start, end in zip(some, ends, ends[1:], strict=False):
             at = slice(start, end)
             for kind, width in one.widths:
-                best = ridge(info.matrix[at, at], info.score[at], width)
-                yield best.evidence - float(np.log(one.trials)), kind, one, best, info.shift[:, at]
+                best = Statistic(info.matrix[at, at], width[None] ** 2).best(info.score[at])
+                yield 0.5 * best.ratio - float(np.log(one.trials)), kind, one, best, info.shift[:, at]
 
 
 def _calm(
@@ -191,7 +153,7 @@ def _calm(
     follows, blocks = problem.survey.follows, bool(np.ptp(fit.noise.scale))
     for _ in range(CALM):
         info = information(problem, noise, fit, model, [one.columns for one in slow])
-        c = ridge(info.matrix, info.score, width).estimate
+        c = Statistic(info.matrix, width[None] ** 2).best(info.score).estimate
         left = fit.left + _taken(problem, model, -info.shift @ c, [one.columns for one in slow], c)
         noise = fit_noise(left, follows, order, blocks=blocks)
     return noise

@@ -23,8 +23,21 @@ from scipy.stats import chi2
 
 from magbridge.diagnose.candidates import Candidate
 from magbridge.diagnose.joint import Information
+from magbridge.diagnose.statistic import Statistic
 
-__all__ = ["IDEAL", "LEVEL", "ODDS", "REMNANT", "Score", "lead", "score", "slices", "trials", "weigh"]
+__all__ = [
+    "IDEAL",
+    "LEVEL",
+    "ODDS",
+    "REMNANT",
+    "Score",
+    "lead",
+    "score",
+    "slack",
+    "slices",
+    "trials",
+    "weigh",
+]
 
 FloatArray = NDArray[np.float64]
 
@@ -41,32 +54,34 @@ REMNANT = 0.3
 The price: a second cause that weak is not named beside it.
 """
 SIMULATIONS = 400
+FLAT = 1e-6
+"""Prior precision of numbers that are free."""
 
 
 @dataclass(frozen=True, eq=False)
 class Score:
-    """Of one candidate under one noise: likelihood ratio, its degrees of freedom, log evidence, estimate."""
+    """Of one candidate under one noise: likelihood ratio, its degrees of freedom, log evidence, estimate, prior precision."""
 
     ratio: float
     freedom: int
     evidence: float
     estimate: FloatArray
-    root: FloatArray
+    prior: FloatArray
 
 
-def score(info: Information, at: slice, *, positive: bool = False) -> Score:
+def score(info: Information, at: slice, candidate: Candidate) -> Score:
     """Score the candidate whose columns stand at `at`; one that must be positive and is not has nothing to say."""
-    S, b = info.matrix[at, at], info.score[at]
-    values, vectors = np.linalg.eigh(S)
-    seen = values > 1e-3  # of the prior's own information: less is invisible
-    if not seen.any():
-        return Score(0.0, 0, 0.0, np.zeros(len(b)), np.zeros((len(b), 0)))
-    root, freedom = vectors[:, seen] / np.sqrt(values[seen]), int(seen.sum())
-    if positive and b.min() < 0.0:
-        return Score(0.0, freedom, 0.0, np.zeros(len(b)), root)
-    ratio = float(np.sum((root.T @ b) ** 2))
-    estimate = vectors[:, seen] @ ((vectors[:, seen].T @ b) / (values[seen] + 1.0))
-    return Score(ratio, freedom, weigh(ratio, freedom), estimate, root)
+    b, statistic = info.score[at], Statistic(info.matrix[at, at], candidate.spectra)
+    freedom = statistic.freedom
+    if not freedom or (candidate.positive and b.min() < 0.0):
+        return Score(0.0, freedom, 0.0, np.zeros(len(b)), np.ones(len(b)))
+    if candidate.spectra is not None:
+        best = statistic.best(b)
+        return Score(best.ratio, freedom, weigh(best.ratio, freedom), best.estimate, 1.0 / best.variance)
+    ratio, values, V = float(statistic.ratio(b[:, None])[0]), statistic.values, statistic.vectors
+    return Score(
+        ratio, freedom, weigh(ratio, freedom), V @ ((V.T @ b) / (values + 1.0)), np.full(len(b), FLAT)
+    )
 
 
 def weigh(ratio: float, freedom: int) -> float:
@@ -78,7 +93,12 @@ def weigh(ratio: float, freedom: int) -> float:
 
 def lead(ratio: float) -> float:
     """Log evidence by which a cause of this likelihood ratio must win to be named alone, its regressor's error allowed for."""
-    return ODDS + 0.5 * IDEAL**2 * ratio
+    return ODDS + slack(ratio)
+
+
+def slack(ratio: float) -> float:
+    """Log evidence that regressors' errors may lend to another cause, of a model of this likelihood ratio."""
+    return 0.5 * IDEAL**2 * ratio
 
 
 def slices(candidates: Sequence[Candidate]) -> list[slice]:
@@ -101,10 +121,10 @@ def trials(info: Information, candidates: Sequence[Candidate], at: Sequence[slic
         smallest = np.ones(SIMULATIONS)
         place = 0
         for k in own:
-            s = score(info, at[k])
+            statistic = Statistic(info.matrix[at[k], at[k]], candidates[k].spectra)
             block = draws[place : place + candidates[k].size]
             place += candidates[k].size
-            if s.freedom:
-                smallest = np.minimum(smallest, chi2.sf(np.sum((s.root.T @ block) ** 2, axis=0), s.freedom))
+            if statistic.freedom:
+                smallest = np.minimum(smallest, chi2.sf(statistic.ratio(block), statistic.freedom))
         found[cause] = max(1.0, 1.0 / float(smallest.mean()) - 1.0) * max(candidates[k].trials for k in own)
     return found

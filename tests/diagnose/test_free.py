@@ -10,7 +10,7 @@ from magbridge.calibration.data import observations
 from magbridge.calibration.fit import fit
 from magbridge.calibration.lowpass import unfiltered
 from magbridge.diagnose.run import diagnose
-from magbridge.diagnose.unexplained import SIZES, ridge
+from magbridge.diagnose.statistic import SIZES, Statistic
 from sitl import load, simulate
 from sitl.columns import segments
 
@@ -24,18 +24,18 @@ def test_ridge_is_the_marginal_likelihood_of_a_common_size() -> None:
     def density(g: float) -> float:
         return float(multivariate_normal.logpdf(y, cov=np.eye(60) + g * (X * width**2) @ X.T))
 
-    best = ridge(X.T @ X, X.T @ y, width)
-    assert best.evidence == pytest.approx(max(density(g) for g in SIZES) - density(0.0), abs=1e-8)
+    best = Statistic(X.T @ X, width[None] ** 2).best(X.T @ y)
+    assert 0.5 * best.ratio == pytest.approx(max(density(g) for g in SIZES) - density(0.0), abs=1e-8)
     gained = 0.5 * (y @ y - np.sum((y - X @ best.estimate) ** 2))
-    assert gained - best.price == pytest.approx(best.evidence, abs=1e-8)
+    assert gained - best.price == pytest.approx(0.5 * best.ratio, abs=1e-8)
     assert best.estimate[-1] == 0.0
 
 
 def test_under_no_effect_twice_the_evidence_is_at_most_a_chi_square_of_one_freedom() -> None:
     rng = np.random.default_rng(2)
     X = rng.normal(size=(400, 40)) / np.arange(1, 41)
-    found = [ridge(X.T @ X, X.T @ rng.normal(size=400), np.ones(40)).evidence for _ in range(500)]
-    assert np.mean(2.0 * np.array(found) > 6.63) < 0.02
+    statistic = Statistic(X.T @ X, np.ones((1, 40)))
+    assert np.mean(statistic.ratio(X.T @ rng.normal(size=(400, 2000))) > 6.63) < 0.015
 
 
 @pytest.mark.parametrize("seed", [2, 5])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 
 from magbridge.diagnose.candidates import Candidate, of_reference
 from magbridge.diagnose.problem import Problem
@@ -11,6 +12,15 @@ from magbridge.diagnose.problem import Problem
 __all__ = ["diurnal_variation", "map_error", "reference_bias"]
 
 FloatArray = NDArray[np.float64]
+
+CELLS, WAVES = 300, 200
+"""Places of a map's error, and functions of them, at most."""
+FINEST = 125.0
+"""m, a cell: from the height that maps are flown at nothing finer is seen."""
+LENGTHS = np.array([2.0, 4.0, 8.0, 16.0])
+"""Over which a map's error changes, in cells."""
+ERROR = 20.0
+"""nT: a map's."""
 
 
 def diurnal_variation(problem: Problem) -> list[Candidate]:
@@ -32,26 +42,69 @@ def diurnal_variation(problem: Problem) -> list[Candidate]:
 
 
 def map_error(problem: Problem) -> list[Candidate]:
-    """The anomaly map is wrong: smooth in place, the same on every pass; cosines over the box that was visited."""
+    r"""The anomaly map is wrong: smooth in place, the same on every pass; a Gaussian process (Matern 3/2) where the track went.
+
+    In the functions of Karhunen and Loeve at the cells that were visited, ``K(x, Z) V / lambda`` of ``K(Z, Z) = V lambda V^T``:
+    as many as there are, whatever the box. Lengths are told by the functions' variances ``diag(V^T K_l V)``.
+    """
     place = problem.survey.place
-    if place is None:
+    if place is None or np.ptp(place, axis=0).max() < 200.0:
         return []
-    low, size = place.min(axis=0), np.ptp(place, axis=0)
-    if size.max() < 200.0:
-        return []
-    u = (place - low) / max(float(size.max()), 1.0)
-    made = []
-    for highest in (1, 2, 3):
-        waves = [(i, j) for i in range(highest + 1) for j in range(highest + 1) if i + j > 0]
+    Z, cell = _cells(place)
+    lengths = cell * LENGTHS
+    middle = float(lengths[len(lengths) // 2])
+    values, vectors = np.linalg.eigh(_matern(Z, Z, middle))
+    values, V = values[::-1][:WAVES], vectors[:, ::-1][:, :WAVES]
+    between, corners = _between(place, cell)
+    at_corners = _matern(corners, Z, middle) @ (V / values)
+    spectra = np.array([np.einsum("ik,ij,jk->k", V, _matern(Z, Z, length), V) for length in lengths])
+    width = ERROR * np.sqrt(values)
+    names = tuple(f"function {k + 1}" for k in range(len(width)))
+    return [
+        of_reference(
+            problem,
+            "map_error",
+            lambda rows: between[rows] @ at_corners,
+            width,
+            names,
+            spectra=spectra / values,
+        )
+    ]
 
-        def basis(rows: slice, waves: list[tuple[int, int]] = waves, highest: int = highest) -> FloatArray:
-            along = np.cos(np.pi * u[rows, :, None] * np.arange(highest + 1))
-            return np.stack([along[:, 0, i] * along[:, 1, j] for i, j in waves], axis=1)
 
-        width = np.array([40.0 / (i + j) for i, j in waves])
-        names = tuple(f"north {i} east {j}" for i, j in waves)
-        made.append(of_reference(problem, "map_error", basis, width, names))
-    return made
+def _cells(place: FloatArray) -> tuple[FloatArray, float]:
+    """(m, 2) middles of at most :data:`CELLS` square cells that hold all of the track, and their side, m."""
+    side = FINEST
+    while (found := _each(np.floor(place / side)))[1].max() >= CELLS:
+        side *= 1.1
+    of = found[1]
+    return np.stack([np.bincount(of, x) for x in place.T], axis=1) / np.bincount(of)[:, None], side
+
+
+def _each(corners: FloatArray) -> tuple[FloatArray, NDArray[np.intp]]:
+    """Return the different ones (c, 2) of whole numbers (n, 2), and which each is (n,)."""
+    low = corners.min(axis=0)
+    wide = float(np.ptp(corners[:, 1])) + 1.0
+    keys, of = np.unique((corners - low) @ np.array([wide, 1.0]), return_inverse=True)
+    return np.stack([keys // wide, keys % wide], axis=1) + low, of
+
+
+def _between(place: FloatArray, side: float) -> tuple[csr_array, FloatArray]:
+    """(n, c) weights of linear interpolation between the corners (c, 2), m, of the cells that were visited."""
+    low = np.floor(place / side)
+    high = place / side - low
+    steps = list(np.ndindex(2, 2))
+    share = np.concatenate([np.prod(np.where(step, high, 1.0 - high), axis=1) for step in steps])
+    corners, of = _each(np.concatenate([low + step for step in steps]))
+    rows = np.tile(np.arange(len(place)), len(steps))
+    return csr_array((share, (rows, of)), (len(place), len(corners))), corners * side
+
+
+def _matern(a: FloatArray, b: FloatArray, length: float) -> FloatArray:
+    """(n, m) correlation between places, Matern's of order 3/2."""
+    r = np.sqrt(3.0) / length * np.hypot(*(a[:, None, axis] - b[None, :, axis] for axis in (0, 1)))
+    found: FloatArray = (1.0 + r) * np.exp(-r)
+    return found
 
 
 def reference_bias(problem: Problem) -> list[Candidate]:

@@ -1,0 +1,107 @@
+r"""What a candidate's numbers say: each of them free, or all of one common free size.
+
+Notes
+-----
+With projected information S and score b of k columns in units of their widths, numbers that are free have the
+likelihood ratio ``R = b^T S^-1 b``, of as many freedoms as the data see directions.
+
+Where there are more numbers than anyone believes in (a smooth function of the place, a slow curve), they have a Gaussian
+prior of a common size g and of a spectrum w, both the ones that the data like best: a Gaussian process. With
+``w^1/2 S w^1/2 = V diag(lambda) V^T``, ``y = V^T w^1/2 b`` the log evidence is
+
+.. math:: E = \max_{g, w} \tfrac12 \sum_i \left(\frac{g y_i^2}{1 + g \lambda_i} - \ln(1 + g \lambda_i)\right)
+
+which is a variance component's likelihood ratio: under no effect ``R = 2 E`` is at most a chi-square of one freedom
+(Self & Liang 1987), whatever the number of columns.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["Ridge", "Statistic"]
+
+FloatArray = NDArray[np.float64]
+
+SIZES = np.logspace(-7, 2, 64)
+"""Common sizes g, squared, in units of the widths."""
+VISIBLE = 1e-3
+"""Information, of the prior's own, below which a direction is invisible."""
+
+
+@dataclass(frozen=True, eq=False)
+class Ridge:
+    """What is best: likelihood ratio, estimate, and prior variance (k,) of every number.
+
+    Attributes
+    ----------
+    ratio : float
+    estimate : (k,) array
+    variance : (k,) array
+        Of the prior.
+    price : float
+        Log evidence: its part that is prior and volume.
+    signal_to_noise : float
+        Whitened norm of the estimate.
+    """
+
+    ratio: float
+    estimate: FloatArray
+    variance: FloatArray
+    price: float
+    signal_to_noise: float
+
+
+class Statistic:
+    """The likelihood ratio of one candidate's numbers.
+
+    Parameters
+    ----------
+    S : (k, k) array
+    spectra : (l, k) array, optional
+        Prior variances up to a common factor, each tried; free numbers if there are none.
+    """
+
+    def __init__(self, S: FloatArray, spectra: FloatArray | None = None) -> None:
+        self.spectra = spectra
+        if spectra is None:
+            values, vectors = np.linalg.eigh(S)
+            seen = values > VISIBLE
+            self.values, self.vectors = values[seen], vectors[:, seen]
+            self.freedom = len(self.values)
+            return
+        root = np.sqrt(spectra)
+        values, vectors = np.linalg.eigh(S * root[:, :, None] * root[:, None, :])
+        self.values, self.vectors = np.maximum(values, 0.0), root[:, :, None] * vectors
+        self.freedom = 1
+
+    def ratio(self, b: FloatArray) -> FloatArray:
+        """(m,) likelihood ratios of scores b (k, m)."""
+        if self.spectra is None:
+            return np.asarray(np.sum((self.vectors.T @ b) ** 2 / self.values[:, None], axis=0))
+        return np.asarray(
+            2.0 * np.max([self._evidences(k, b).max(axis=0) for k in range(len(self.spectra))], axis=0)
+        )
+
+    def _evidences(self, k: int, b: FloatArray) -> FloatArray:
+        """(sizes, m) log evidence with the k-th spectrum."""
+        y2, grown = (self.vectors[k].T @ b) ** 2, SIZES[:, None] * self.values[k]
+        return np.asarray(
+            0.5 * ((SIZES[:, None] / (1.0 + grown)) @ y2 - np.log1p(grown).sum(axis=1)[:, None])
+        )
+
+    def best(self, b: FloatArray) -> Ridge:
+        """Return the best size and spectrum for a score b (k,)."""
+        assert self.spectra is not None
+        tables = [self._evidences(k, b[:, None])[:, 0] for k in range(len(self.spectra))]
+        k = int(np.argmax([table.max() for table in tables]))
+        at = int(np.argmax(tables[k]))
+        values, g = self.values[k], SIZES[at]
+        c = g * (self.vectors[k].T @ b) / (1.0 + g * values)
+        price = 0.5 * float(c @ c / g + np.log1p(g * values).sum())
+        return Ridge(
+            2.0 * float(tables[k][at]), self.vectors[k] @ c, g * self.spectra[k], price, float(np.sqrt(c**2 @ values))
+        )  # fmt: skip
