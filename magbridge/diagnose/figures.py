@@ -23,7 +23,7 @@ FloatArray = NDArray[np.float64]
 BEFORE, AFTER, INK, FAINT = "#c8553d", "#1f6f8b", "#22303c", "#9aa5b1"
 POINTS = 4000
 """Points drawn of a curve; more only make the page heavy."""
-MANY = 150
+MANY = 60
 """Dives that are not parted by lines any more."""
 
 

@@ -30,6 +30,8 @@ table{border-collapse:collapse;font-size:.9rem;margin:.6rem 0}td,th{padding:.22r
 td.n{text-align:right;font-variant-numeric:tabular-nums}.verdict{font-size:1.1rem;background:#f2f6f8;border-left:4px solid #1f6f8b;padding:.8rem 1.1rem}
 .pair{display:flex;gap:1rem;flex-wrap:wrap;align-items:flex-start}.pair figure{flex:1 1 24rem}code{background:#f2f4f6;padding:0 .25em}
 """
+MANY = 24
+"""Numbers that a table lists openly."""
 KINDS = {
     "switching": "An offset that switches",
     "drift": "A slow drift",
@@ -142,7 +144,10 @@ def _found(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> list[str]:
                 f"all that was tried {_chance(hypothesis.p_value)}. Leaving it out multiplies the held-out RMS by {1 / max(gain.ratio, 1e-9):.2f} "
                 f"(95 %: {1 / max(gain.interval[1], 1e-9):.2f} to {1 / max(gain.interval[0], 1e-9):.2f}).</p>"
             ),
-            f"<table><tr><th>term</th><th>value</th><th>1 sigma</th><th>unit</th></tr>{rows}</table>",
+            _folded(
+                f"<table><tr><th>term</th><th>value</th><th>1 sigma</th><th>unit</th></tr>{rows}</table>",
+                candidate.size,
+            ),
             _several(candidate.names),
             _in_motion(diagnosis, at - candidate.size - len(diagnosis.problem.centre), candidate),
             doubt
@@ -163,6 +168,11 @@ def _found(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> list[str]:
 
 def _listed(rivals: Sequence[Rival]) -> str:
     return ", ".join(escape(figures.label(rival.cause, rival.channel)) for rival in rivals)
+
+
+def _folded(table: str, size: int) -> str:
+    """Fold a table that nobody reads line by line."""
+    return table if size <= MANY else f"<details><summary>{size} terms</summary>{table}</details>"
 
 
 def _several(names: tuple[str, ...]) -> str:
@@ -225,6 +235,17 @@ def _left(diagnosis: Diagnosis) -> str:
     )
 
 
+def _sizes(sizes: Mapping[str, tuple[float, str]]) -> str:
+    listed = [
+        f"{escape(name)} {size:.3g} {escape(unit)}"
+        for name, (size, unit) in sizes.items()
+        if np.isfinite(size)
+    ]
+    if len(listed) > MANY:
+        listed = [*listed[:3], f"and {len(listed) - 3} more"]
+    return ", ".join(listed) or "invisible"
+
+
 def _plain(labelled: str) -> str:
     """Return a cause with its channel, ``cause (channel)``, as people read it."""
     cause, bracket, channel = labelled.partition(" (")
@@ -236,7 +257,7 @@ def _isolability(diagnosis: Diagnosis) -> list[str]:
     rows = "".join(
         f"<tr><td>{escape(figures.label(v.cause, v.channel))}</td>"
         f'<td class="n">{v.half:.1f}</td><td class="n">{v.sure:.1f}</td>'
-        f"<td>{', '.join(f'{escape(name)} {size:.3g} {escape(unit)}' for name, (size, unit) in v.sizes.items() if np.isfinite(size)) or 'invisible'}</td></tr>"
+        f"<td>{_sizes(v.sizes)}</td></tr>"
         for v in report.visible
     )
     pairs = "".join(
