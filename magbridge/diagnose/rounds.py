@@ -20,8 +20,9 @@ FloatArray = NDArray[np.float64]
 
 SHORT_LIST = 9
 """Causes that are fitted jointly in a round."""
-SHARPEN = 4
-"""Halvings of a nonlinear parameter's bracket."""
+SHARPEN, STAGES = 144, 2
+"""Columns of the values that are tried between the ends of a nonlinear parameter's bracket, and how often it is narrowed to
+the neighbours of the best."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,40 +181,54 @@ class State:
         return min(1.0, tests * float(chi2.sf(ratio, max(freedom, 1))))
 
     def sharpen(self, model: list[Candidate], hypothesis: Hypothesis, base: Joint) -> Hypothesis:
-        """Profile the nonlinear parameters between the grid's points, one after the other, by golden section."""
+        """Profile the nonlinear parameters between the grid's points, one after the other.
+
+        Under the noise that stands, where many values are scored at once: a likelihood has more than one peak in an onset.
+        """
         best = hypothesis
         again = best.candidate.again
         if again is None:
             return best
+        columns = [candidate.columns for candidate in model]
         for position, name in enumerate(best.candidate.shape):
-            grid = sorted({self.candidates[k].shape[name][0] for k in self.groups[key(best.candidate)]})
-            here = best.candidate.shape[name][0]
-            low = max((v for v in grid if v < here), default=here - 0.5 * (grid[-1] - grid[0]))
-            high = min((v for v in grid if v > here), default=here + 0.5 * (grid[-1] - grid[0]))
-            if name == "period":  # a resolved line is a thousandth wide, the grid is one of peaks
-                low, high = here / (1.0 + 0.6 * here / self.span), here * (1.0 + 0.6 * here / self.span)
-            for _ in range(SHARPEN):
-                tried = []
-                for share in (0.25, 0.5, 0.75):
-                    values = [v for v, _ in best.candidate.shape.values()]
-                    values[position] = low + share * (high - low)
-                    candidate = again(*values)
-                    start = np.append(best.fit.z, best.fit.coefficients)
-                    fit = self.fit([*model, candidate], start, plain=False, like=best.fit, rounds=1)
-                    gain = 2.0 * (fit.log_likelihood - base.log_likelihood) - best.ratio
-                    tried.append((gain, values[position], candidate, fit))
-                gain, value, candidate, fit = max(tried, key=lambda entry: entry[0])
-                if gain > 0.0:
-                    best = replace(
-                        best,
-                        candidate=candidate,
-                        fit=fit,
-                        ratio=best.ratio + gain,
-                        evidence=best.evidence + 0.5 * gain,
-                    )
-                quarter = 0.25 * (high - low)
-                low, high = max(low, value - quarter), min(high, value + quarter)
+            low, high = self._bracket(best.candidate, name)
+            for _ in range(STAGES):
+                values = np.linspace(low, high, max(SHARPEN // best.candidate.size, 4) + 2)
+                made = []
+                for value in values[1:-1]:
+                    shape = [v for v, _ in best.candidate.shape.values()]
+                    shape[position] = float(value)
+                    made.append(again(*shape))
+                info = information(self.problem, best.fit.noise, base, columns, [c.columns for c in made])
+                scores = [score(info, at, made[0]) for at in slices(made)]
+                k = int(np.argmax([s.ratio for s in scores]))
+                low, high = values[k], values[k + 2]
+            at = slices(made)[k]
+            start = np.append(
+                info.moved(base, np.arange(at.start, at.stop), scores[k].estimate), scores[k].estimate
+            )
+            fit = self.fit([*model, made[k]], start, plain=False, like=best.fit, rounds=2)
+            gain = 2.0 * (fit.log_likelihood - base.log_likelihood) - best.ratio
+            if gain > 0.0:
+                best = replace(
+                    best,
+                    candidate=made[k],
+                    fit=fit,
+                    ratio=best.ratio + gain,
+                    evidence=best.evidence + 0.5 * gain,
+                )
         return best
+
+    def _bracket(self, candidate: Candidate, name: str) -> tuple[float, float]:
+        """Between which values of one nonlinear parameter its grid leaves a candidate free."""
+        here = candidate.shape[name][0]
+        if name == "period":  # a resolved line is a thousandth wide, the grid is one of peaks
+            share = 0.6 * here / self.span
+            return here / (1.0 + share), here * (1.0 + share)
+        grid = sorted({self.candidates[k].shape[name][0] for k in self.groups[key(candidate)]})
+        width = 0.5 * (grid[-1] - grid[0])
+        low = max((v for v in grid if v < here), default=here - width)
+        return low, min((v for v in grid if v > here), default=here + width)
 
     @property
     def span(self) -> float:
