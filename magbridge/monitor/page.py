@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from copy import deepcopy
 from functools import partial
-from math import nan
+from math import ceil, floor, isfinite, log10, nan
 from typing import Any
 
 from nicegui import ui
@@ -31,11 +31,13 @@ TUNABLES = {one.name: one for one in alignment(Align())}
 """What every bridge has: a PARAM_VALUE tells neither unit nor range."""
 INK, BLUE, GREEN, AMBER, RED = "#1e293b", "#1d4ed8", "#15803d", "#b45309", "#b91c1c"
 LINE = {"type": "line", "symbol": "none", "animation": False, "color": BLUE}
-BAND = {**LINE, "stack": "band", "lineStyle": {"opacity": 0}}
+BAND = {**LINE, "stack": "band", "stackStrategy": "all", "lineStyle": {"opacity": 0}}
+ROOM, LEAST = 5.0, 50.0
+"""The band gets no more of the chart, each way, than ROOM times the curve and LEAST nT: else the curve is a line."""
 CHART: dict[str, Any] = {
     "useUTC": True,
     "grid": {"left": 70, "right": 16, "top": 12, "bottom": 28},
-    "xAxis": {"type": "time"},
+    "xAxis": {"type": "time", "axisLabel": {"hideOverlap": True}},
     "yAxis": {"type": "value", "scale": True},
     "series": [BAND, {**BAND, "areaStyle": {"opacity": 0.2}}, {**LINE, "lineStyle": {"width": 1.5}}],
 }
@@ -197,6 +199,7 @@ class Page:
             curves = zip(*_curves(list(trace)), strict=True)
             for series, data in zip(self._chart.options["series"], curves, strict=True):
                 series["data"] = data
+            self._chart.options["yAxis"] |= _reach(list(trace))
             self._chart.update()
 
     def _new(self, key: str, value: Any, box: ui.element | None = None) -> bool:
@@ -217,6 +220,18 @@ def _curves(trace: list[Point]) -> Iterator[list[tuple[float, float]]]:
             yield [(ms - 1.0, nan)] * 3
         last, usual = point.time, gap
         yield [(ms, point.low), (ms, point.high - point.low), (ms, point.sum / point.count)]
+
+
+def _reach(trace: list[Point]) -> dict[str, float]:
+    """Return the ends of the axis in nT, round ones: all of the curve, and as much of the band as leaves it a curve."""
+    curve = [point.sum / point.count for point in trace if isfinite(point.sum)]
+    if not curve:
+        return {}
+    low, high = min(curve), max(curve)
+    room = ROOM * (high - low) + LEAST
+    low, high = max(low - room, min(p.low for p in trace)), min(high + room, max(p.high for p in trace))
+    step = 10.0 ** floor(log10(max(high - low, 1.0)) - 0.5)
+    return {"min": floor(low / step) * step, "max": ceil(high / step) * step}
 
 
 @contextmanager

@@ -105,7 +105,9 @@ def whereabouts(state: State) -> dict[str, tuple[str, bool]]:
 
 def _number(value: float, form: str, two_sigma: float = nan, unit: str = "") -> tuple[str, str]:
     """Return a value with its unit, thousands apart, and its 2-sigma; a dash and nothing where not known."""
-    text = f"{value:{form.replace('.', ',.')}} {unit}".replace(",", "\N{NARROW NO-BREAK SPACE}").rstrip()
-    return text if isfinite(value) else "–", f"± {two_sigma:{form.lstrip('+')}}" if isfinite(
-        two_sigma
-    ) else ""
+    apart = form.replace(".", ",.")
+    text, doubt = (
+        told.replace(",", "\N{NARROW NO-BREAK SPACE}").rstrip()
+        for told in (f"{value:{apart}} {unit}", f"± {two_sigma:{apart.lstrip('+')}}")
+    )
+    return text if isfinite(value) else "–", doubt if isfinite(two_sigma) else ""

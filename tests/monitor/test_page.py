@@ -15,6 +15,7 @@ import pytest
 
 from magbridge.cli import main
 from magbridge.mavlink import Codec
+from magbridge.monitor.state import Point
 
 pytest.importorskip("nicegui")
 
@@ -120,3 +121,13 @@ def test_a_missing_extra_is_named(
     assert (
         capsys.readouterr().err == "magbridge: nicegui is not installed: pip install 'magbridge[monitor]'\n"
     )
+
+
+def test_the_axis_shows_the_curve_whatever_its_band() -> None:
+    from magbridge.monitor.page import _reach  # noqa: PLC0415 - it needs NiceGUI
+
+    near = [Point(k, 52_000.0 + k, 1, 51_998.0 + k, 52_002.0 + k) for k in range(5)]
+    assert _reach(near) == {"min": 51_998.0, "max": 52_006.0}
+    wide = [Point(k, 52_000.0 + k, 1, -90_000.0, float("inf")) for k in range(5)]
+    assert _reach(wide) == {"min": 51_930.0, "max": 52_080.0}
+    assert _reach([Point(0.0, float("nan"), 1)]) == {}
