@@ -12,6 +12,8 @@ __all__ = ["track"]
 T = TypeVar("T")
 PATIENCE = 2.0
 """s before a bar appears."""
+PAUSE = 0.1
+"""s between two looks at it: drawing takes longer than most items do."""
 
 
 def track(items: Iterable[T], what: str, total: float | None = None) -> Iterator[T]:
@@ -20,11 +22,14 @@ def track(items: Iterable[T], what: str, total: float | None = None) -> Iterator
         yield from items
         return
     from rich.console import Console  # noqa: PLC0415 - only where there is somebody to look
-    from rich.progress import Progress  # noqa: PLC0415
+    from rich.progress import Progress  # noqa: PLC0415 - likewise
 
-    begun = time.monotonic()
+    begun = told = time.monotonic()
     with Progress(console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task(what, total=total, visible=False)
-        for item in items:
+        for done, item in enumerate(items, 1):
             yield item
-            progress.update(task, advance=1, visible=time.monotonic() - begun > PATIENCE)
+            now = time.monotonic()
+            if now - told > PAUSE:
+                progress.update(task, completed=done, visible=now - begun > PATIENCE)
+                told = now

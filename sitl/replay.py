@@ -18,6 +18,7 @@ from magbridge.config import load
 from magbridge.errors import DataError, WrongUse
 from magbridge.field.reference import reference_field
 from magbridge.logs import read
+from magbridge.progress import track
 from sitl.emulation import emulate, start_us
 from sitl.listener import Listener
 from sitl.own_log import Recorded, is_own_log, runs
@@ -78,7 +79,7 @@ def _again(files: Sequence[Path], config: Path, speed: float, log: Path | None) 
     published = bytearray()
     stage = Stage(config, published.extend, log)
     begun = time.monotonic()
-    stage.play(recorded.start, recorded.events(), speed)
+    stage.play(recorded.start, track(recorded.events(), "replaying"), speed)
     return {
         "files": [str(file) for file in files],
         "messages": recorded.messages,
@@ -107,7 +108,8 @@ def _play(
     listener = Listener()
     stage = Stage(config, listener.hear, log)
     begun = time.monotonic()
-    stage.play(Start(start_us(deployment)), emulate(deployment, load(config)), speed)
+    events = track(emulate(deployment, load(config)), "replaying")
+    stage.play(Start(start_us(deployment)), events, speed)
     seconds = time.monotonic() - begun
     field = listener.field()
     times = deployment["time"].to_numpy()

@@ -57,12 +57,31 @@ def test_any_order_of_channels_and_any_filter_delay(
     assert abs(sample.time_us - (START + (4.0 + min(delays) - filter_delay) * SECOND)) <= 5
 
 
+def test_delays_that_differ_from_reading_to_reading() -> None:
+    """A converter that loses its beat: the step between two readings of a channel is not the frames'."""
+    aligner = Aligner((), Align())
+    for t, delays in ((0.0, (0.0, 0.3, 0.9)), (4.0, (0.2, 0.8, 0.1))):
+        field = tuple(30.0 * (t + delay) for delay in delays)
+        sample = aligner.reading(Reading(field, channel_delay=delays), START + round(t * SECOND))  # type: ignore[arg-type]
+    np.testing.assert_allclose(sample.field, 30.0 * 4.1, atol=1e-6)
+
+
+def test_a_track_is_stale_after_its_greatest_age() -> None:
+    aligner = Aligner((BATTERY,), Align())
+    track = aligner.by_name["battpos"]
+    assert track.stale(START)
+    aligner.telemetry("battpos", START, 0.3)
+    limit = round(BATTERY.max_age * SECOND)
+    assert not track.stale(START + limit)
+    assert track.stale(START + limit + 4)
+
+
 def test_telemetry_is_looked_up_at_the_sample_s_time() -> None:
     aligner = Aligner((BATTERY,), Align(filter_delay=2.0, moving_rate=10.0))
     for k in range(8):
         aligner.telemetry("battpos", START + k * SECOND, 0.1 * k)
-    sample = aligner.reading(reading(), START + 7_500_000)
-    assert sample.values[0] == pytest.approx(0.55)  # at 5.5 s, between two values
+    sample = aligner.reading(reading(), START + 7_250_000)
+    assert sample.values[0] == pytest.approx(0.525)  # at 5.25 s, between two values
     assert sample.age == 0.0
     late = aligner.reading(reading(), START + 12 * SECOND)
     assert late.values[0] == pytest.approx(0.7)  # held

@@ -118,7 +118,7 @@ def test_correct_gives_the_same_in_pieces(deployment: Path, calibration: Path, t
         (["calibrate", "{d}", "--site-bias", "inf", "-o", "x.json"], 2, "--site-bias"),
         (["map", "none.nc", "-o", "x.nc"], 1, "none.nc"),
         (["map", "none.nc", "-o", "x.foo"], 2, "must end in .nc"),
-        (["map", "none.nc", "-o", "x.nc", "--picture", "x.foo"], 2, "must end in .png"),
+        (["map", "none.nc", "-o", "x.nc", "--picture", "x.foo"], 2, "must end in .png or .pdf or .svg"),
         (["convert", "{d}", "-o", "nowhere/x.csv"], 2, "There is no folder nowhere"),
         (["convert", "{d}", "-o", "."], 2, "It is a folder"),
         (["simulate", "demo", "-o", "x.nc", "--seed", "-1"], 2, "--seed"),

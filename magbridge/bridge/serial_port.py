@@ -35,7 +35,7 @@ class SerialPort(Port):
     def open(self) -> None:
         """Open the first device that the name or pattern finds; raises :class:`PortError`."""
         # a pattern may be absolute, which pathlib does not glob
-        names = sorted(glob.glob(self.name)) if glob.has_magic(self.name) else [self.name]  # noqa: PTH207
+        names = sorted(glob.glob(self.name)) if glob.has_magic(self.name) else [self.name]  # noqa: PTH207 - a pattern from the root
         reason: object = "no such device"
         for name in names:
             try:

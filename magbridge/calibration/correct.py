@@ -57,7 +57,7 @@ def _omega(calibration: Calibration) -> tuple[float, ...] | None:
     """Six entries of the boresight's covariance, as :func:`.arithmetic.apply` takes them."""
     if calibration.boresight is None:
         return None
-    O = calibration.boresight.covariance  # noqa: E741
+    O = calibration.boresight.covariance  # noqa: E741 - Omega, as in the equation
     return O[0][0], O[1][1], O[2][2], O[0][1], O[0][2], O[1][2]
 
 

@@ -71,7 +71,7 @@ class ChannelEffect(Effect, frozen=True, kw_only=True):
         origin, lag = self.origin, self.lag
         level, then, first = origin, 0, True
 
-        def step(time_us: int, hx: float, hy: float, hz: float, values: Sequence[float]) -> tuple[float]:  # noqa: ARG001
+        def step(time_us: int, hx: float, hy: float, hz: float, values: Sequence[float]) -> tuple[float]:
             nonlocal level, then, first
             value = values[index]
             if not isnan(value):  # without a value the last level holds

@@ -82,7 +82,7 @@ class PowersEffect(Follower, frozen=True, kw_only=True):
         index, order = calibration.channels.index(self.channel), self.order
         centre, scale, x = self.centre, self.scale, 0.0
 
-        def step(time_us: int, hx: float, hy: float, hz: float, values: Sequence[float]) -> tuple[float, ...]:  # noqa: ARG001
+        def step(time_us: int, hx: float, hy: float, hz: float, values: Sequence[float]) -> tuple[float, ...]:
             nonlocal x
             if not isnan(values[index]):
                 x = (values[index] - centre) / scale
@@ -127,7 +127,7 @@ class MonomialEffect(Effect, frozen=True, kw_only=True):
             for _ in range(self.exponents[k])
         ]
 
-        def step(time_us: int, hx: float, hy: float, hz: float, values: Sequence[float]) -> tuple[float]:  # noqa: ARG001
+        def step(time_us: int, hx: float, hy: float, hz: float, values: Sequence[float]) -> tuple[float]:
             product = 1.0
             for k, centre, scale in factors:
                 product *= (values[k] - centre) / scale
@@ -162,7 +162,7 @@ class PlayEffect(Follower, frozen=True, kw_only=True):
         index, centre, scale = calibration.channels.index(self.channel), self.centre, self.scale or self.width
         half, y, p, first, order = 0.5 * self.width, 0.0, 0.0, True, self.order
 
-        def step(time_us: int, hx: float, hy: float, hz: float, values: Sequence[float]) -> tuple[float, ...]:  # noqa: ARG001
+        def step(time_us: int, hx: float, hy: float, hz: float, values: Sequence[float]) -> tuple[float, ...]:
             nonlocal y, p, first
             if not isnan(values[index]):
                 p = values[index]
@@ -203,7 +203,7 @@ class ClockEffect(Effect, frozen=True, kw_only=True):
         last: list[float] = []
         still, weights, then = (0.0,) * 9, W.T.tolist(), 0
 
-        def step(time_us: int, hx: float, hy: float, hz: float, values: Sequence[float]) -> tuple[float, ...]:  # noqa: ARG001
+        def step(time_us: int, hx: float, hy: float, hz: float, values: Sequence[float]) -> tuple[float, ...]:
             nonlocal last, then
             now, before, apart = kernel.powers(values, 1.0), last, time_us - then
             last, then = now, time_us

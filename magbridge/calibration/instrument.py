@@ -61,7 +61,7 @@ class TimeEffect(Effect, frozen=True, kw_only=True):
         """Return a stepper; it has no state."""
         start, period, shape, order = round(self.start * 1e6), self.period * 1e6, self.shape, self.order
 
-        def step(time_us: int, hx: float, hy: float, hz: float, values: Sequence[float]) -> tuple[float, ...]:  # noqa: ARG001
+        def step(time_us: int, hx: float, hy: float, hz: float, values: Sequence[float]) -> tuple[float, ...]:
             if shape == "step":
                 return (1.0 if time_us >= start else 0.0,)
             x = (time_us - start) / period
@@ -118,7 +118,7 @@ class RateEffect(Effect, frozen=True, kw_only=True):
         slope: tuple[float, float, float] = (0.0, 0.0, 0.0)
         then, apart_before, count = 0, 0.0, 0
 
-        def step(time_us: int, hx: float, hy: float, hz: float, values: Sequence[float]) -> tuple[float, ...]:  # noqa: ARG001
+        def step(time_us: int, hx: float, hy: float, hz: float, values: Sequence[float]) -> tuple[float, ...]:
             nonlocal before, slope, then, apart_before, count
             if hx + hy + hz - (hx + hy + hz) != 0.0:  # NaN: as if the sample had not come
                 return 0.0, 0.0, 0.0
@@ -175,7 +175,7 @@ class ResponseEffect(Effect, frozen=True, kw_only=True):
         power, unit, axis, knee = self.power, self.unit, self.axis, self.knee
         sign = 1.0 if knee >= 0.0 else -1.0
 
-        def step(time_us: int, hx: float, hy: float, hz: float, values: Sequence[float]) -> tuple[float, ...]:  # noqa: ARG001
+        def step(time_us: int, hx: float, hy: float, hz: float, values: Sequence[float]) -> tuple[float, ...]:
             if power:
                 return tuple((h / unit) ** power for h in (hx, hy, hz))
             over = sign * ((hx, hy, hz)[axis] - knee)

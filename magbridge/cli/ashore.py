@@ -240,7 +240,7 @@ def map(  # noqa: A001 - the command's name
     spacing
         deg; the finest of the grids' if not given.
     picture
-        A PNG with every step.
+        A PNG, PDF or SVG with every step.
     json
         Print the result for machines.
     """

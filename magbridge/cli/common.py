@@ -31,7 +31,7 @@ app = App(
 )
 
 
-def file_to_write(suffix: str = "") -> Callable[[Any, Any], None]:
+def file_to_write(*suffixes: str) -> Callable[[Any, Any], None]:
     """Return a check of a file to write, before any work is done for it."""
 
     def check(_: Any, path: Any) -> None:
@@ -41,8 +41,8 @@ def file_to_write(suffix: str = "") -> Callable[[Any, Any], None]:
             raise ValueError("It is a folder.")
         if not path.parent.is_dir():
             raise ValueError(f"There is no folder {path.parent}.")
-        if suffix and path.suffix.lower() != suffix:
-            raise ValueError(f"Its name must end in {suffix}.")
+        if suffixes and path.suffix.lower() not in suffixes:
+            raise ValueError(f"Its name must end in {' or '.join(suffixes)}.")
 
     return check
 
@@ -50,7 +50,7 @@ def file_to_write(suffix: str = "") -> Callable[[Any, Any], None]:
 Output = Annotated[Path, Parameter(name=["--output", "-o"], validator=file_to_write())]
 Folder = Annotated[Path, Parameter(name=["--output", "-o"])]
 Grid = Annotated[Path, Parameter(name=["--output", "-o"], validator=file_to_write(".nc"))]
-Picture = Annotated[Path | None, Parameter(validator=file_to_write(".png"))]
+Picture = Annotated[Path | None, Parameter(validator=file_to_write(".png", ".pdf", ".svg"))]
 Json = Annotated[bool, Parameter(name="--json")]
 
 

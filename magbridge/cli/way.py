@@ -48,7 +48,7 @@ def navigate(
     bound
         Draw what the map is worth along a plan.
     picture
-        A PNG: the tracks on the map, errors and innovations; the bound on the map.
+        A PNG, PDF or SVG: the tracks on the map, errors and innovations; the bound on the map.
     json
         Print the result for machines.
     """

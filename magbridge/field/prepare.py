@@ -123,7 +123,7 @@ def merge(grids: Sequence[AnomalyGrid], spacing: float | None = None) -> Anomaly
 
 def hanning(grid: AnomalyGrid, passes: int) -> AnomalyGrid:
     """Return the grid after `passes` of the 3x3 Hanning kernel; at edges and holes over what there is."""
-    from scipy.ndimage import convolve  # noqa: PLC0415
+    from scipy.ndimage import convolve  # noqa: PLC0415  the live path runs without scipy
 
     present = np.isfinite(grid.anomaly)
     share = convolve(present.astype(float), HANNING, mode="constant")
@@ -169,7 +169,7 @@ def draw_steps(steps: Sequence[Step], path: str | Path) -> None:
 
 
 def _masked(grid: AnomalyGrid, polygon: Array) -> AnomalyGrid:
-    from matplotlib.path import Path as Polygon  # noqa: PLC0415
+    from matplotlib.path import Path as Polygon  # noqa: PLC0415  only a mask needs it
 
     x, y = np.meshgrid(grid.longitude, grid.latitude)
     inside = Polygon(polygon).contains_points(np.column_stack([x.ravel(), y.ravel()])).reshape(x.shape)

@@ -221,7 +221,7 @@ _SURFER: dict[bytes, Callable[[Path], Surfer]] = {
 
 def _geosoft(path: Path) -> Parts:
     try:
-        from harmonica import load_oasis_montaj_grid  # noqa: PLC0415
+        from harmonica import load_oasis_montaj_grid  # noqa: PLC0415  an extra of its own
     except ImportError:
         raise MissingExtra("harmonica", "grids") from None
     try:
@@ -323,7 +323,7 @@ def _geotiff(path: Path) -> Parts:
     try:
         with Image.open(path) as image:
             values = np.array(image, float)
-            tags: dict[int, Any] = dict(image.tag_v2)  # type: ignore[attr-defined]
+            tags: dict[int, Any] = dict(image.tag_v2)  # type: ignore[attr-defined]  # only TIFF images have it
             dx, dy = tags[33550][:2]
             column, row, _, x0, y0 = tags[33922][:5]
     except (UnidentifiedImageError, KeyError, AttributeError, ValueError) as error:

@@ -52,7 +52,3 @@ class Announcer:
             return
         self._said[key] = text, now_us
         self.say(text, severity)
-
-    def silently(self, key: str, text: str) -> None:
-        """Take `text` as what is known of `key`: the state to begin with is not news."""
-        self._said[key] = text, self._outbox.codec.now_us - PAUSE_US

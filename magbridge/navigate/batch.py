@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,7 @@ from magbridge.navigate.model import Options
 from magbridge.navigate.navigator import UNUSABLE, Navigator
 from magbridge.navigate.record import Record
 from magbridge.navigate.yardstick import YARDSTICKS, with_errors, yardstick
+from magbridge.progress import track
 
 __all__ = ["MOTIONS", "first_position", "motion_of", "navigate"]
 
@@ -54,7 +55,6 @@ def navigate(
     motion: str | None = None,
     start: tuple[float, float] | None = None,
     fixes: bool = False,
-    progress: Callable[[int], object] | None = None,
 ) -> xr.Dataset:
     """Return the track that the field and the map give.
 
@@ -71,8 +71,6 @@ def navigate(
         deg; default the log's first position.
     fixes : bool, optional
         Take in ``gps_latitude gps_longitude`` all along; default only the first, the others are the yardstick.
-    progress : callable, optional
-        Called with the number of rows done.
 
     Returns
     -------
@@ -108,13 +106,12 @@ def navigate(
     navigator.fix(int(time_us[0]) - 1, latitude, longitude)
     rows = {name: values.tolist() for name, values in moves.items()}
     places = zip(surfaced["a"].tolist(), surfaced["o"].tolist(), strict=True) if surfaced else None
-    for i, (t, f, s) in enumerate(zip(time_us.tolist(), field.tolist(), sigma.tolist(), strict=True)):
+    samples = zip(time_us.tolist(), field.tolist(), sigma.tolist(), strict=True)
+    for i, (t, f, s) in enumerate(track(samples, "navigating", total=len(time_us))):
         navigator.telemetry(t, **{name: values[i] for name, values in rows.items()})
         if places is not None:
             keep(navigator.fix(t, *next(places), GPS_SIGMA))
         keep(navigator.measure(t, f, s))
-        if progress is not None and i % 1000 == 0:
-            progress(i)
     keep(navigator.finish())
     if not records:
         raise FormatError(source, "expected samples of the total field at known times: none was usable")
