@@ -210,7 +210,7 @@ def _refined(state: State, model: list[Candidate], base: Joint) -> tuple[list[Ca
     """Profile the nonlinear parameters of each member of a model beside the others."""
     for _ in range(len(model)):
         own, others = model[0], model[1:]
-        rest = state.fit(others, plain=False) if others else base
+        rest = state.fit(others, plain=False)
         c = np.append(base.coefficients[own.size :], base.coefficients[: own.size])
         there = state.fit([*others, own], np.append(base.z, c), plain=False, like=base, rounds=1)
         ratio = 2.0 * (there.log_likelihood - rest.log_likelihood)
