@@ -41,6 +41,8 @@ class Description(NamedTuple):
         s, of a tone.
     holds : tuple of str
         Causes whose own regressors are among the columns.
+    turned : bool
+        The columns are functions along each of the body's axes.
     """
 
     columns: Columns
@@ -49,6 +51,7 @@ class Description(NamedTuple):
     trials: float = 1.0
     period: float | None = None
     holds: tuple[str, ...] = ()
+    turned: bool = False
 
     def retells(self, model: Sequence[Candidate]) -> bool:
         """Say whether it is what a cause of `model` says, with more numbers."""
@@ -83,7 +86,7 @@ def descriptions(problem: Problem, fit: Joint, tone: Candidate | None = None) ->
         return lambda rows: np.cos(u[rows, None] * np.arange(1, count + 1))
 
     listed = [
-        Description(projected(waves(BODY)), _spectra(BODY, 3)),
+        Description(projected(waves(BODY)), _spectra(BODY, 3), turned=True),
         Description(
             lambda rows: problem.gain[rows, None] * waves(EARTH)(rows),
             (*_spectra(EARTH, 1), ("transient", np.full(EARTH, 10.0))),
@@ -91,7 +94,7 @@ def descriptions(problem: Problem, fit: Joint, tone: Candidate | None = None) ->
         _window(problem, fit),
         _of("broadband", _direction(body), 25),
         _of("broadband", projected(lambda rows: rates[:, rows].T), 9, 1.0)._replace(
-            holds=("eddy_current", "channel_skew")
+            holds=("eddy_current", "channel_skew"), turned=True
         ),
     ]
     listed += [
@@ -101,7 +104,7 @@ def descriptions(problem: Problem, fit: Joint, tone: Candidate | None = None) ->
         for axis in range(3)
     ]  # fmt: skip
     listed += [
-        _of("broadband", projected(_curve(channel.values)), 27, channel=name)
+        _of("broadband", projected(_curve(channel.values)), 27, channel=name)._replace(turned=True)
         for name, channel in problem.survey.channels.items()
         if name not in problem.survey.still
     ]

@@ -102,7 +102,7 @@ def search(problem: Problem, candidates: Sequence[Candidate], causes: int) -> Ou
 
     def better(fit: Joint, others: Sequence[Candidate]) -> bool:
         gained = [2.0 * (one.log_likelihood - null.log_likelihood) for one in (fit, base)]
-        return worth(gained[0], others, causes) > worth(gained[1], model, causes)
+        return worth(gained[0], others, state.trials) > worth(gained[1], model, state.trials)
 
     if together and {key(c) for c in together} != {key(c) for c in model}:
         # one after the other may have gone astray where several causes act
@@ -122,15 +122,15 @@ def search(problem: Problem, candidates: Sequence[Candidate], causes: int) -> Ou
     return Outcome(tuple(chosen), rivals, null, base, order, tested, info, state.trials)
 
 
-def worth(ratio: float, model: Sequence[Candidate], causes: int) -> float:
+def worth(ratio: float, model: Sequence[Candidate], trials: Mapping[str, float]) -> float:
     """Log evidence of a whole model of this likelihood ratio.
 
-    Every regressor after the first costs the odds that so much goes wrong in one log, and its choice among the causes.
+    Every regressor pays for the hypotheses behind it that it was chosen from, and those after the first for the odds that
+    so much goes wrong in one log, and for their choice among the causes.
     """
-    further = max(sum(candidate.parts for candidate in model) - 1, 0)
-    return weigh(ratio, sum(candidate.freedom for candidate in model)) - further * (
-        ODDS + float(np.log(causes))
-    )
+    further = max(sum(candidate.parts for candidate in model) - 1, 0) * (ODDS + float(np.log(len(trials))))
+    grids = sum(candidate.parts * float(np.log(trials[candidate.cause])) for candidate in model)
+    return weigh(ratio, sum(candidate.freedom for candidate in model)) - further - grids
 
 
 def _chain(state: State, null: Joint, first: list[Hypothesis]) -> tuple[list[Candidate], Joint]:

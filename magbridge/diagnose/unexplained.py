@@ -35,6 +35,8 @@ LOUD = 3
 """Descriptions under each noise that are weighed by the whole likelihood."""
 TOGETHER = 4
 """Descriptions whose columns are whitened in one go."""
+TURNS = 6
+"""Alternations between a curve and its direction."""
 CALM = 2
 """Rounds in which slow curves and noise take from each other."""
 CHUNK = 8192
@@ -62,6 +64,26 @@ class Leftover(NamedTuple):
     evidence: float
     period_s: float | None
     best_channel: str | None
+
+
+def lone(S: FloatArray, b: FloatArray, width: FloatArray, whole: Ridge) -> Ridge:
+    """One curve along one direction of the body: ``c = f d^T`` has a third of the numbers of three curves, and two more.
+
+    f by the ridge along d, d by least squares with f, from the `whole` estimate on; the direction's two numbers cost what
+    :func:`~.weigh.weigh` asks for them.
+    """
+    count = len(width) // 3
+    own = np.linalg.svd(whole.estimate.reshape(count, 3), full_matrices=False)[2][0]
+    for _ in range(TURNS):
+        along = np.kron(np.eye(count), own[:, None])
+        best = Statistic(along.T @ S @ along, width[None, ::3] ** 2).best(along.T @ b)
+        axes = np.kron(best.estimate[:, None], np.eye(3))
+        own = np.linalg.lstsq(axes.T @ S @ axes, axes.T @ b, rcond=None)[0]
+        own /= max(float(np.linalg.norm(own)), 1e-300)
+    price = 1.0 + float(np.log(max(0.5 * best.ratio + best.price, 1.0)))
+    return replace(
+        best, ratio=best.ratio - 2.0 * price, estimate=along @ best.estimate, price=best.price + price
+    )
 
 
 def leftover(
@@ -118,7 +140,7 @@ def accept(problem: Problem, outcome: Outcome, tone: Candidate | None) -> tuple[
     # what holds the names' own regressors and finds nothing beside them is no other explanation
     free = leftover(problem, [], outcome.null, outcome.order, tone, but=() if rest else model)
     ratio = 2.0 * (outcome.fit.log_likelihood - outcome.null.log_likelihood)
-    names = worth(ratio, model, len(outcome.trials)) + (rest.evidence - ODDS if rest else lead(ratio))
+    names = worth(ratio, model, outcome.trials) + (rest.evidence - ODDS if rest else lead(ratio))
     if free is not None and names < free.evidence:
         return False, free
     return True, rest
@@ -135,7 +157,10 @@ def _scored(
         for one, start, end in zip(some, ends, ends[1:], strict=False):
             at = slice(start, end)
             for kind, width in one.widths:
-                best = Statistic(info.matrix[at, at], width[None] ** 2).best(info.score[at])
+                S, b = info.matrix[at, at], info.score[at]
+                best = Statistic(S, width[None] ** 2).best(b)
+                if one.turned:
+                    best = max(best, lone(S, b, width, best), key=lambda found: found.ratio)
                 yield 0.5 * best.ratio - float(np.log(one.trials)), kind, one, best, info.shift[:, at]
 
 

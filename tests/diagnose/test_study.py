@@ -70,7 +70,7 @@ def test_two_rivals_imitate_what_neither_does_alone() -> None:
     truth = A[:, 0] + B[:, 1] + 0.2 * rng.normal(size=60)
     X = np.column_stack([A, B, other, truth])
     spans = [Span("a", None, slice(0, 2), 0.0), Span("b", None, slice(2, 4), 0.0)]
-    left = with_another(X.T @ X, spans[0], spans)
+    left = with_another(Draws.of(X.T @ X), spans[0], spans)
     for cause, columns in (("a", A), ("b", np.column_stack([A, B]))):
         naive = truth - columns @ np.linalg.lstsq(columns, truth, rcond=None)[0]
         assert left[cause][0] == pytest.approx(np.linalg.norm(naive), rel=1e-6)
@@ -83,7 +83,9 @@ def test_likelihood_ratios_are_drawn_without_any_data() -> None:
     truth = A[:, 0] - B[:, 1] + rng.normal(size=60)
     X = np.column_stack([A, B, truth])
     spans = [Span("a", None, slice(0, 2)), Span("b", None, slice(2, 4))]
-    ratio, freedom = Draws.of(X.T @ X).ratio(*spans, scale=0.5)
+    draws = Draws.of(X.T @ X)
+    one, other = draws.ratio(spans[0], 0.5), draws.beside(spans[0]).ratio(spans[1], 0.5)
+    ratio, freedom = one[0] + other[0], one[1] + other[1]
     data = 0.5 * truth[:, None] + rng.normal(size=(60, 4000))
     Q = np.linalg.qr(np.column_stack([A, B]))[0]
     naive = np.sum((Q.T @ data) ** 2, axis=0)

@@ -9,21 +9,25 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from magbridge.diagnose.statistic import Statistic
+
 Array = NDArray[np.float64]
 DRAWS = 400
-COMMON = np.logspace(-7, 2, 37)
-"""Common sizes, squared, of what has no name."""
 
 
 @dataclass(frozen=True, eq=False)
 class Span:
-    """One of a cause's hypotheses: its columns, the log of how many others it stands for, and whether it has a sign."""
+    """One of a cause's hypotheses: its columns, the log of how many others it stands for, whether it has a sign.
+
+    Where its numbers have one common size, `spectra` (l, k) are their prior variances (:mod:`magbridge.diagnose.statistic`).
+    """
 
     cause: str
     channel: str | None
     own: slice
     price: float = 0.0
     positive: bool = False
+    spectra: Array | None = None
 
 
 class Draws(NamedTuple):
@@ -44,26 +48,21 @@ class Draws(NamedTuple):
         """Signal-to-noise of the truth."""
         return float(np.sqrt(self.S[-1, -1]))
 
-    def ratio(self, *spans: Span, scale: float | Array = 1.0) -> tuple[Array, int]:
-        """Likelihood ratios of hypotheses taken together, with the truth times `scale`, and their free numbers."""
-        at = np.concatenate([np.arange(span.own.start, span.own.stop) for span in spans])
-        root = root_of(self.S[np.ix_(at, at)])
-        given, drawn = root.T @ self.S[at, -1], root.T @ self.noise[at]
-        scale = np.asarray(scale)[..., None]
-        value = np.sum(drawn**2, axis=0) + 2.0 * scale * (given @ drawn) + scale**2 * (given @ given)
-        if spans[0].positive:
-            value = value * (drawn[0] + scale * given[0] > 0.0)
-        return value, root.shape[1]
+    def ratio(self, span: Span, scale: float | Array = 1.0) -> tuple[Array, int]:
+        """Likelihood ratios of a hypothesis, with the truth times `scale`, and its free numbers."""
+        statistic = Statistic(self.S[span.own, span.own], span.spectra)
+        given, scale = self.S[span.own, -1], np.asarray(scale)[..., None]
+        scores = np.moveaxis(self.noise[span.own] + scale[..., None] * given[:, None], -2, 0)
+        value = statistic.ratio(scores.reshape(len(given), -1)).reshape(scores.shape[1:])
+        return np.where(scores[0] > 0.0, value, 0.0) if span.positive else value, statistic.freedom
 
-    def component(self, own: slice, width: Array) -> Array:
-        """Log evidence of columns whose numbers have one common size, which is the likeliest, in units of `width`."""
-        values, vectors = np.linalg.eigh(self.S[own, own] * np.outer(width, width))
-        values = np.maximum(values, 0.0)[:, None]
-        y2 = (vectors.T @ (width[:, None] * (self.S[own, -1:] + self.noise[own]))) ** 2
-        tried = [np.sum(g * y2 / (1.0 + g * values) - np.log1p(g * values), axis=0) for g in COMMON]
-        return np.asarray(0.5 * np.max(tried, axis=0))
+    def beside(self, span: Span) -> Draws:
+        """Return what is left for others where a hypothesis takes what it can."""
+        taken = self.S[:, span.own] @ root_of(self.S, span)
+        own = root_of(self.S, span).T @ self.noise[span.own]
+        return Draws(self.S - taken @ taken.T, self.noise - taken @ own)
 
-    def truth(self, k: int, scale: float | Array = 1.0) -> Array:
+    def truth(self, k: float, scale: float | Array = 1.0) -> Array:
         """Likelihood ratios of the truth itself; its k - 1 other numbers fit nothing but noise."""
         more = 2.0 * np.random.default_rng(20131213).standard_gamma(0.5 * (k - 1), DRAWS) if k > 1 else 0.0
         return np.asarray(
@@ -75,10 +74,10 @@ def explained(S: Array, span: Span) -> float:
     """What a hypothesis explains of the truth's power; one of the wrong sign explains nothing."""
     if span.positive and S[span.own, -1].min() < 0.0:
         return 0.0
-    return float(np.sum((root_of(S[span.own, span.own]).T @ S[span.own, -1]) ** 2))
+    return float(np.sum((root_of(S, span).T @ S[span.own, -1]) ** 2))
 
 
-def weigh(ratio: Array, freedom: int) -> Array:
+def weigh(ratio: Array, freedom: float) -> Array:
     """Log evidence of likelihood ratios that took so many free numbers (Liang et al. 2008, sec. 2.4)."""
     if not freedom:
         return np.zeros_like(ratio)
@@ -86,10 +85,9 @@ def weigh(ratio: Array, freedom: int) -> Array:
     return np.asarray(0.5 * (more - freedom) - 0.5 * freedom * np.log(more / freedom))
 
 
-def with_another(S: Array, first: Span, spans: Sequence[Span]) -> dict[str, tuple[float, Span]]:
-    """Signal-to-noise of the truth (the last of S) that `first` leaves with the best other of each cause, and that one."""
-    taken = S[:, first.own] @ root_of(S[first.own, first.own])
-    S = S - taken @ taken.T
+def with_another(draws: Draws, first: Span, spans: Sequence[Span]) -> dict[str, tuple[float, Span]]:
+    """Signal-to-noise of the truth that `first` leaves with the best other of each cause, and that one."""
+    S = draws.beside(first).S
     left: dict[str, tuple[float, Span]] = {}
     for span in spans:
         value = float(np.sqrt(max(S[-1, -1] - explained(S, span), 0.0)))
@@ -99,11 +97,19 @@ def with_another(S: Array, first: Span, spans: Sequence[Span]) -> dict[str, tupl
     return left
 
 
-def root_of(S: Array) -> Array:
-    """Return R (k, f) with ``R R^T`` the inverse of S in the directions that the data see."""
-    values, vectors = np.linalg.eigh(S)
-    seen = values > 1e-3
-    return np.asarray(vectors[:, seen] / np.sqrt(values[seen]))
+def root_of(S: Array, span: Span) -> Array:
+    """Return R (k, f): ``R R^T`` is the covariance of a hypothesis' numbers in the directions that the data see."""
+    own = S[span.own, span.own]
+    if span.spectra is not None:  # with their prior, of the size that the truth would give them
+        own = own + np.diag(1.0 / Statistic(own, span.spectra).best(S[span.own, -1]).variance)
+    statistic = Statistic(own)
+    return np.asarray(statistic.vectors / np.sqrt(statistic.values))
+
+
+def numbers(S: Array, span: Span) -> float:
+    """Free numbers of a hypothesis: of those with a common size as many as the data decide on."""
+    root = root_of(S, span)
+    return float(np.trace(root.T @ S[span.own, span.own] @ root))
 
 
 def by_cause(evidences: Mapping[Span, Array], name: str = "", truth: Array | None = None) -> dict[str, Array]:

@@ -32,7 +32,7 @@ from study.draws import Draws, Span, weigh
 Array = NDArray[np.float64]
 
 
-def allowed(ratio: Array, freedom: int) -> Array:
+def allowed(ratio: Array, freedom: float) -> Array:
     """Log evidence of a name, with what its regressor may have missed."""
     return weigh(ratio, freedom) + 0.5 * IDEAL**2 * ratio
 
@@ -42,9 +42,11 @@ def against(
 ) -> Array:
     """Log evidence T that something without a name needs; `names` are priced for their grids, `pairs` are not."""
     found = [*names.values()]
-    for pair in pairs:
-        grids = sum(np.log(trials.get(span.cause, 1.0)) for span in pair)
-        found.append(allowed(*draws.ratio(*pair)) - grids - ODDS - np.log(len(trials)))
+    for first, second in pairs:
+        one, other = draws.ratio(first), draws.beside(first).ratio(second)
+        grids = sum(np.log(trials.get(span.cause, 1.0)) for span in (first, second))
+        value = allowed(one[0] + other[0], one[1] + other[1])
+        found.append(value - grids - ODDS - np.log(max(len(trials), 1)))
     return np.asarray(np.max(found, axis=0) + ODDS)
 
 
@@ -55,7 +57,8 @@ def nameless(draws: Draws, truth: Array, needed: Array, free: Sequence[Descripti
     for one in free:
         own = slice(start, start := start + one.widths[0][1].size)
         for _, width in one.widths:
-            best = np.maximum(best, draws.component(own, width) - np.log(one.trials))
+            ratio, _ = draws.ratio(Span("", None, own, spectra=width[None] ** 2))
+            best = np.maximum(best, 0.5 * ratio - np.log(one.trials))
     return {
         "unnamed": float(np.mean(truth - np.log(count) > needed)),
         "described": float(np.mean(best > needed)),

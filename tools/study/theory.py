@@ -29,7 +29,7 @@ from magbridge.diagnose.free import Description
 from magbridge.diagnose.problem import pose
 from magbridge.diagnose.survey import take
 from magbridge.diagnose.weigh import LEVEL, ODDS
-from study.draws import Draws, Span, by_cause, explained, root_of, weigh, with_another
+from study.draws import Draws, Span, by_cause, explained, numbers, weigh, with_another
 from study.nameless import against, allowed, nameless
 from study.stage import Found, Stall, project, whiten
 
@@ -90,13 +90,13 @@ def ideal(one: Found, stall: Stall, ds: xr.Dataset, setting: Setting) -> dict[st
     draws, rivals = Draws.of(S), [span for span in spans if span.cause != name]
     best = _best(S, rivals)
     own = max((span for span in spans if span.cause == name), key=lambda span: _worth(S, span), default=None)
-    k = max(root_of(S[own.own, own.own]).shape[1], 1) if own else 1  # what the log cannot test, nobody names
+    k = max(numbers(S, own), 1.0) if own else 1.0  # what the log cannot test, nobody names
     given = {span: draws.ratio(span) for span in spans}
     truth = draws.truth(k)
     weighed = by_cause({span: weigh(*given[span]) for span in spans}, name, weigh(truth, k))
     names, table = list(weighed), np.array([*weighed.values()])
     inside, first, me = table > table.max(axis=0) - ODDS, np.argmax(table, axis=0), names.index(name)
-    left = {c: with_another(S, span, rivals) for c, span in best.items() if explained(S, span)}
+    left = {c: with_another(draws, span, rivals) for c, span in best.items() if explained(S, span)}
     apart = {c: left[c][c][0] if c in left else draws.wanted for c in best}
     answers = {
         "alone": float(np.mean((first == me) & (inside.sum(axis=0) == 1))) * bool(own),
@@ -135,7 +135,7 @@ def _information(one: Found, stall: Stall, ds: xr.Dataset, setting: Setting) -> 
     first = sum(columns.shape[1] for columns in free)
     ends = (first + np.cumsum([c.size for c in candidates])).tolist()
     spans = [
-        Span(c.cause, c.channel, slice(end - c.size, end), float(np.log(c.trials)), c.positive)
+        Span(c.cause, c.channel, slice(end - c.size, end), float(np.log(c.trials)), c.positive, c.spectra)
         for c, end in zip(candidates, ends, strict=True)
     ]
     spans += [
@@ -157,20 +157,20 @@ def _best(S: Array, spans: Sequence[Span]) -> dict[str, Span]:
 
 def _worth(S: Array, span: Span) -> float:
     """Log evidence that a hypothesis has on the mean."""
-    freedom = root_of(S[span.own, span.own]).shape[1]
+    freedom = numbers(S, span)
     return float(weigh(np.array(explained(S, span) + freedom), freedom))
 
 
-def _found(draws: Draws, k: int, spans: Sequence[Span], name: str, setting: Setting) -> dict[str, float]:
+def _found(draws: Draws, k: float, spans: Sequence[Span], name: str, setting: Setting) -> dict[str, float]:
     """Half point and 95 % point of detection."""
 
-    def limit(cause: str, freedom: int) -> float:
+    def limit(cause: str, freedom: float) -> float:
         return float(chdtri(freedom, LEVEL / len(setting.causes) / setting.trials.get(cause, 1.0)))
 
     scale = SIZES / draws.wanted
     found = draws.truth(k, scale) > limit(name, k)
     for span in (span for span in spans if span.cause != name):
-        ratio, freedom = draws.ratio(span, scale=scale)
+        ratio, freedom = draws.ratio(span, scale)
         if freedom:
             found |= ratio > limit(span.cause, freedom)
     chance = np.maximum.accumulate(found.mean(axis=1))
