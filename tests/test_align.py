@@ -52,6 +52,7 @@ def test_any_order_of_channels_and_any_filter_delay(
     for t in (0.0, 4.0):
         field = tuple(level + slope * (t + delay) for delay in delays)
         sample = aligner.reading(Reading(field, channel_delay=delays), START + round(t * SECOND))  # type: ignore[arg-type]
+    assert sample.time_us % 4 == 0  # the two low bits belong to the log
     expected = level + slope * (4.0 + min(delays))
     np.testing.assert_allclose(sample.field, expected, atol=1e-6)
     assert abs(sample.time_us - (START + (4.0 + min(delays) - filter_delay) * SECOND)) <= 5

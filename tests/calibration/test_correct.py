@@ -205,6 +205,19 @@ def test_a_boresight_turns_the_vector_and_leaves_the_magnitude() -> None:
     assert (np.linalg.norm(got.vector_sigma, axis=1) > np.linalg.norm(raw.vector_sigma, axis=1)).all()
 
 
+def test_the_boresight_s_covariance_turns_the_vector() -> None:
+    """``V + [b] Omega [b]^T``, with an Omega that leaves no element out; the total does not notice."""
+    field, positions, time = random_samples(8, 5, 2)
+    root = np.array([[2.0, 0.0, 0.0], [0.7, 1.0, 0.0], [-0.5, 0.4, 1.5]]) * 1e-3
+    sharp = replace(random_calibration(8), boresight=Boresight((0.0, 0.0, 0.0), ((0.0,) * 3,) * 3))
+    loose = replace(sharp, boresight=Boresight((0.0, 0.0, 0.0), tuple(map(tuple, (root @ root.T).tolist()))))
+    before, after = (correct(cal, field, positions, time) for cal in (sharp, loose))
+    np.testing.assert_array_equal(after.sigma, before.sigma)
+    for b, one, other in zip(before.vector, before.vector_sigma, after.vector_sigma, strict=True):
+        cross = np.cross(np.eye(3), b)
+        np.testing.assert_allclose(other**2, one**2 + np.diag(cross @ root @ root.T @ cross.T), rtol=1e-9)
+
+
 def test_no_motion_no_actuator_correction_and_identity_changes_nothing() -> None:
     field, _, time = random_samples(9, 20, 0)
     got = correct(identity(), field, np.empty((20, 0)), time)

@@ -292,3 +292,12 @@ def test_a_site_bias_is_in_every_sigma(glider: Gliders) -> None:
     before, after = (correct(c, runs.field, runs.parameters, runs.time) for c in (without, with_bias))
     np.testing.assert_array_equal(before.total, after.total)
     np.testing.assert_allclose(np.sqrt(after.sigma**2 - before.sigma**2), 30.0, rtol=0.01)
+
+
+def test_a_sample_follows_the_one_before_unless_something_is_between() -> None:
+    time = np.array([0.0, 4.0, 8.1, 16.0, 20.0, 24.0])
+    data = Observations(
+        np.ones((12, 3)) * 3e4, np.full(12, 5e4), np.empty((12, 0)),
+        runs=np.repeat([0, 1], 6), time=np.concatenate([time, time + 28.0]),
+    )  # fmt: skip
+    assert data.follows.tolist() == [False, True, True, False, True, True] * 2
