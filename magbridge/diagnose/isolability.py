@@ -29,6 +29,9 @@ FloatArray = NDArray[np.float64]
 CONFOUNDED = 0.85
 """Correlation beyond which two causes are listed as a pair: at signal-to-noise 6 they part in 95 of 100."""
 
+FREE = 1e-3
+"""Prior precision, of a plausible size's, of numbers that are each free; those of one common size are held to it."""
+
 
 @dataclass(frozen=True)
 class Visible:
@@ -116,11 +119,14 @@ def isolability(
             name: (float(x * w) if x < 50.0 else float("inf"), unit)
             for name, x, w, unit in zip(candidate.names, size, candidate.width, candidate.units, strict=True)
         }
+        if candidate.spectra is not None:  # what counts is what all of them do together
+            x = sure / float(np.sqrt(max(own.sum(), 1e-300)))
+            sizes = {"size": (x if x < 50.0 else float("inf"), "of a plausible one")}
         visible.append(Visible(candidate.cause, candidate.channel, half, sure, sizes))
     R = np.eye(len(picked))
     for i, a in enumerate(picked):
         for j, b in enumerate(picked[:i]):
-            R[i, j] = R[j, i] = _alike(info, at[a], at[b])
+            R[i, j] = R[j, i] = _alike(info, candidates[a], at[a], candidates[b], at[b])
     names = [f"{v.cause} ({v.channel})" if v.channel else v.cause for v in visible]
     pairs = [
         (names[j], names[i], float(R[i, j]))
@@ -137,11 +143,12 @@ def isolability(
     )
 
 
-def _alike(info: Information, a: slice, b: slice) -> float:
+def _alike(info: Information, one: Candidate, a: slice, other: Candidate, b: slice) -> float:
     """Share of the one's signature, of a typical direction, that the other can imitate: root of the larger mean."""
     A, B, C = info.matrix[a, a], info.matrix[b, b], info.matrix[a, b]
-    M = C @ np.linalg.solve(B + 1e-3 * np.eye(len(B)), C.T)
-    N = C.T @ np.linalg.solve(A + 1e-3 * np.eye(len(A)), C)
+    p, q = (FREE if candidate.spectra is None else 1.0 for candidate in (one, other))
+    M = C @ np.linalg.solve(B + q * np.eye(len(B)), C.T)
+    N = C.T @ np.linalg.solve(A + p * np.eye(len(A)), C)
     shares = [float(np.trace(X) / (np.trace(Y) + 1e-12)) for X, Y in ((M, A), (N, B))]
     return float(np.sqrt(np.clip(max(shares), 0.0, 1.0)))
 
