@@ -174,7 +174,7 @@ def _together(state: State) -> list[Candidate]:
         if not sure:
             break
         alike = [k for evidence, k in sure if evidence >= sure[0][0] - slack(ratio)]
-        k = min(alike, key=lambda k: state.candidates[k].freedom)
+        k = min(alike, key=lambda k: state.candidates[k].size)
         picked.append(k)
         ratio += scores[k].ratio
         loudest = max(loudest, float(np.sqrt(max(scores[k].ratio - scores[k].freedom, 0.0))))
@@ -243,7 +243,7 @@ def _next(found: list[Hypothesis], heard: Mapping[str, float], ratio: float) -> 
     near = sure[0].evidence - lead(sure[0].ratio)
     more = next((h for h in sure if h.candidate.cause in heard and h.evidence > near), None)
     alike = [h for h in sure if h.evidence >= sure[0].evidence - slack(ratio)]
-    return more or min(alike, key=lambda h: h.candidate.freedom)
+    return more or min(alike, key=lambda h: h.candidate.size)
 
 
 def _with(state: State, model: list[Candidate], best: Hypothesis) -> tuple[list[Candidate], Joint]:
