@@ -14,6 +14,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from magbridge.bridge.pipeline import Start
+from magbridge.columns import CHANNELS
 from magbridge.config import load
 from magbridge.errors import DataError, WrongUse
 from magbridge.field.reference import reference_field
@@ -52,6 +53,8 @@ def replay(
 
     Raises
     ------
+    DataError
+        A log without the three channels, or of one row.
     WrongUse
         A bridge's own log without its configuration, or a log of a bridge together with other logs.
     """
@@ -61,7 +64,7 @@ def replay(
         return {"runs": [_again(run, config, speed, log) for run in runs(files)]}
     if config is not None:
         load(config)  # what is wrong with it is told before anything begins
-        deployment = read(files)
+        deployment = read(files, required=CHANNELS)
         times = deployment["time"].to_numpy()
         parts = [Part("all", float(times[0]), float(times[-1]))]
         return _play(deployment, config, parts, speed, log)
@@ -105,6 +108,8 @@ def _play(
     deployment: xr.Dataset, config: Path, parts: Sequence[Part], speed: float, log: Path | None
 ) -> Result:
     """Replay a deployment that two emulated devices speak, and compare the field with the reference."""
+    if deployment.sizes["time"] < 2:
+        raise DataError(f"{deployment.attrs['source']}: one row: at least 2 needed")
     listener = Listener()
     stage = Stage(config, listener.hear, log)
     begun = time.monotonic()
@@ -112,8 +117,10 @@ def _play(
     stage.play(Start(start_us(deployment)), events, speed)
     seconds = time.monotonic() - begun
     field = listener.field()
+    if not len(field["time"]):
+        raise DataError(f"{deployment.attrs['source']}: no row holds a reading of all three channels")
     times = deployment["time"].to_numpy()
-    raw = np.sqrt(sum(deployment[f"mag_{axis}"].to_numpy() ** 2 for axis in "xyz"))
+    raw = np.hypot.reduce([deployment[name].to_numpy() for name in CHANNELS])
     reference = _reference(deployment)
     nearest = _nearest(times, field["time"])
     told = []
@@ -167,7 +174,8 @@ def _reference(deployment: xr.Dataset) -> Floats:
 def _rms(values: Floats) -> float | None:
     """Return the root mean square of the finite values; None where there are none."""
     values = values[np.isfinite(values)]
-    return float(np.sqrt(np.mean(values**2))) if len(values) else None
+    with np.errstate(over="ignore"):  # what is no measurement is infinitely wrong
+        return float(np.sqrt(np.mean(values**2))) if len(values) else None
 
 
 def tell(result: Result) -> str:

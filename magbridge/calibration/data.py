@@ -72,7 +72,7 @@ class Observations:
     def __post_init__(self) -> None:
         n = len(self.field)
         put = object.__setattr__  # the one moment in which a frozen thing is made
-        parameters = np.asarray(self.parameters, float).reshape(n, -1)
+        parameters = np.asarray(self.parameters, float).reshape(n, -1 if n else len(self.names))
         k = parameters.shape[1]
         put(self, "names", tuple(self.names) or tuple(f"p{i + 1}" for i in range(k)))
         put(self, "units", tuple(self.units) or ("",) * k)

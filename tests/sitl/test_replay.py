@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import xarray as xr
 
 from magbridge.calibration.file import save
 from magbridge.calibration.model import Noise, identity
-from magbridge.errors import FormatError, PortError, WrongUse
+from magbridge.errors import DataError, FormatError, PortError, WrongUse
 from magbridge.logs import read, write
 from sitl import Twin, load, segments, simulate
 from sitl.demo import demo
@@ -151,6 +152,22 @@ def test_a_log_that_does_not_begin_a_run_is_refused(survey: Path, tmp_path: Path
     tail.write_bytes(log.read_bytes()[2000:])
     with pytest.raises(FormatError, match=r"tail\.tlog: expected the log of a bridge, from its start"):
         Recorded([tail])
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (lambda ds: ds.isel(time=slice(0, 1)), "one row: at least 2 needed"),
+        (lambda ds: ds.assign(mag_y=ds["mag_y"] * np.nan), "no row holds a reading of all three channels"),
+        (lambda ds: ds.drop_vars("mag_z"), "column 'mag_z': expected this column"),
+    ],
+)
+def test_a_log_of_which_nothing_comes_is_one_line(
+    spoil: Callable[[xr.Dataset], xr.Dataset], words: str, survey: Path, tmp_path: Path
+) -> None:
+    write(spoil(read(survey)), tmp_path / "bad.nc")
+    with pytest.raises(DataError, match=words):
+        replay([tmp_path / "bad.nc"], config(tmp_path))
 
 
 def test_a_bridge_that_cannot_start_says_why(survey: Path, tmp_path: Path) -> None:
