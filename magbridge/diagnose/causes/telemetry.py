@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache
+from functools import lru_cache
 from typing import Any, Literal
 
 import numpy as np
@@ -37,7 +37,7 @@ def _thermal(problem: Problem, on: Literal["offset", "scale"]) -> list[Candidate
     unit = "nT/degC" if on == "offset" else f"nT/degC at {field:.0f} nT"
     for name in channels_of(problem, "temperature"):
 
-        @cache
+        @lru_cache(len(LAGS))  # of a month each is 5 MB
         def level(lag: float, name: str = name) -> FloatArray:
             return lagged(problem.survey.time, problem.survey.channels[name].values, lag)
 
