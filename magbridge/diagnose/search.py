@@ -293,12 +293,16 @@ def _rivals(
     mine = score(alone, slice(int(own[0]), int(own[-1]) + 1), model[k])
     scores = state.scores(alone)
     rivals = []
-    for group, (member, _) in state.best(scores).items():
+    best = state.best(scores)
+    paid = best.get(key(model[k]), (0, 0.0))[1]
+    for group, (member, average) in best.items():
         candidate, s = state.candidates[member], scores[member]
         if group == key(model[k]) or group[0] in {other.cause for other in model if other is not model[k]}:
             continue
-        # a rival has the benefit of the doubt about its nonlinear parameters
-        behind = mine.evidence - s.evidence + float(np.log(candidate.trials / model[k].trials))
+        # both pay for their nonlinear parameters: a cause's evidence is its average over the grid
+        behind = (
+            mine.evidence + paid - s.evidence - average + float(np.log(candidate.trials / model[k].trials))
+        )
         if behind < lead(mine.ratio) and state.p_value(candidate, s.ratio, s.freedom) < LEVEL:
             rivals.append(Rival(*group, behind))
     return tuple(sorted(rivals, key=lambda rival: rival.behind))
