@@ -162,3 +162,13 @@ def test_reboot_resets_the_clock(link):
     assert link.component.vehicle.clock.known
     boots(link, link.autopilot, [100_000, 100, 200, 300])
     assert not link.component.vehicle.clock.known
+
+
+def test_a_clock_that_was_set_is_learned_anew_at_once():
+    rng, clock = random.Random(4), VehicleClock()
+    for i in range(10):
+        exchange(clock, rng, START + i * 1_000_000, 7_000_000)
+    exchange(clock, rng, START + 10_000_000, 12_000_000)
+    assert clock.offset_us(START + 10_000_000) == pytest.approx(12_000_000, abs=20_000)
+    exchange(clock, rng, START + 11_000_000, 12_000_000, slow=300_000.0)  # a slow one is no step
+    assert clock.offset_us(START + 11_000_000) == pytest.approx(12_000_000, abs=20_000)
