@@ -84,8 +84,30 @@ def navigate(
         draw_navigation(track, grid, picture)
     for finding in track.attrs["findings"].splitlines():
         complain(finding, 0)
-    facts = {"file": str(output), "rows": track.sizes["time"], **track.attrs}
-    tell(facts, f"{output}: {track.sizes['time']} updates", json)
+    vouched, sigma, error = _how_good(track)
+    off = "" if error is None else f"; off by {error:.0f} m RMS"
+    rows = track.sizes["time"]
+    tell(
+        {
+            "file": str(output),
+            "rows": rows,
+            "vouched": vouched,
+            "sigma_m": sigma,
+            "error_m": error,
+            **track.attrs,
+        },
+        f"{output}: {rows} updates, vouched for {vouched:.0%}, 1-sigma {sigma:.0f} m at the end{off}",
+        json,
+    )
+
+
+def _how_good(track: xr.Dataset) -> tuple[float, float, float | None]:
+    """Return the share vouched for, the last 1-sigma (m), and the error (m, RMS) where the position is known."""
+    sigma = float((track["covariance_nn"] + track["covariance_ee"])[-1]) ** 0.5
+    error = None
+    if "error_north" in track and track["error_north"].notnull().any():
+        error = float((track["error_north"] ** 2 + track["error_east"] ** 2).mean()) ** 0.5
+    return float(track["vouched"].mean()), sigma, error
 
 
 def _bound(
