@@ -64,6 +64,20 @@ def test_convert_there_and_back_keeps_every_number(deployment: Path, tmp_path: P
         np.testing.assert_array_equal(before[name], after[name], err_msg=str(name))
 
 
+def test_what_headings_are_counted_from_may_be_told(deployment: Path, tmp_path: Path) -> None:
+    out = tmp_path / "magnetic.csv"
+    assert main(["convert", str(deployment), "-o", str(out), "--heading-reference", "magnetic"]) == 0
+    assert read(out).attrs["heading_reference"] == "magnetic"
+    offsets = []
+    for reference in ("true", "magnetic"):
+        told = ["--method", "nominal", "--heading-reference", reference, "-o", str(tmp_path / "cal.json")]
+        assert main(["calibrate", str(deployment), *told]) == 0
+        boresight = load_calibration(tmp_path / "cal.json").boresight
+        assert boresight
+        offsets.append(boresight.rotation[2])
+    assert abs(np.degrees(offsets[0] - offsets[1])) > 5.0  # the declination off Newfoundland is 17 degrees
+
+
 def test_correct_writes_what_the_contract_names(
     deployment: Path, calibration: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -10,13 +10,24 @@ from typing import Annotated, Any
 
 from cyclopts import Parameter, validators
 
-from magbridge.cli.common import Grid, Json, Output, Picture, app, complain, file_to_write, some, tell
+from magbridge.cli.common import (
+    Grid,
+    Heading,
+    Json,
+    Output,
+    Picture,
+    app,
+    complain,
+    file_to_write,
+    some,
+    tell,
+)
 from magbridge.errors import DataError
 from magbridge.progress import track
 
 
 @app.command(usage="Usage: magbridge convert FILE... -o FILE [OPTIONS]")
-def convert(*files: Path, output: Output, json: Json = False) -> None:
+def convert(*files: Path, output: Output, heading_reference: Heading = None, json: Json = False) -> None:
     """Convert logs of any readable format to any writable one; several are joined in time.
 
     Parameters
@@ -25,6 +36,8 @@ def convert(*files: Path, output: Output, json: Json = False) -> None:
         Logs.
     output
         The file to write; its suffix says the format: .csv .nc .parquet .tlog.
+    heading_reference
+        What headings are counted from; if not given what the log says, else true north.
     json
         Print the result for machines.
     """
@@ -33,6 +46,8 @@ def convert(*files: Path, output: Output, json: Json = False) -> None:
     rows = 0
     with Writer(output) as writer:
         for part in track(read_chunks(some(files)), "reading"):
+            if heading_reference:
+                part.attrs["heading_reference"] = heading_reference
             writer.append(part)
             rows += part.sizes["time"]
             names = [str(name) for name in part.data_vars]
@@ -99,6 +114,7 @@ def calibrate(
     grid: Path | None = None,
     site_bias: Annotated[float, Parameter(validator=validators.Number(gte=0, lt=inf))] = 0.0,
     filter_corner: Annotated[float, Parameter(validator=validators.Number(gte=0, lt=inf))] = 0.0,
+    heading_reference: Heading = None,
     strict: bool = False,
     json: Json = False,
 ) -> None:
@@ -124,6 +140,8 @@ def calibrate(
         nT, 1-sigma of what the reference may be wrong by all over the site.
     filter_corner
         Hz, corner of the sensor's first-order anti-alias filter (0: none): what it takes off in turns is given back.
+    heading_reference
+        What headings are counted from; if not given what the log says, else true north.
     strict
         Exit with 1 when the data do not support the fit.
     json
@@ -141,7 +159,7 @@ def calibrate(
     from magbridge.logs import read
 
     anomalies = read_grid(grid) if grid else None
-    deployment = with_true_heading(read(some(files), required=(*CHANNELS, *parameter)))
+    deployment = with_true_heading(read(some(files), required=(*CHANNELS, *parameter)), heading_reference)
     data = observations(deployment, parameter, reference=lambda ds: earth_field(ds, anomalies))
     seen: dict[str, Path] = {}
     for file in files:
@@ -183,6 +201,7 @@ def plan(
     mission: Path,
     runs: Annotated[int, Parameter(validator=validators.Number(gte=1))] = 10,
     roll: Annotated[float, Parameter(validator=validators.Number(gte=0, lte=90))] = 10.0,
+    heading_reference: Heading = None,
     json: Json = False,
 ) -> None:
     """Tell which calibration runs to fly next: those after which the mission's worst error is smallest.
@@ -197,6 +216,8 @@ def plan(
         How many spirals.
     roll
         deg that the vehicle can bank in a spiral, either way.
+    heading_reference
+        What headings are counted from; if not given what the log says, else true north.
     json
         Print the result for machines.
     """
@@ -206,7 +227,7 @@ def plan(
     from magbridge.field.reference import earth_field
     from magbridge.logs import read
 
-    deployment = with_true_heading(read(mission))
+    deployment = with_true_heading(read(mission), heading_reference)
     known = load(calibration)
     found = flight_plan.flight_plan(known, deployment, earth_field(deployment)[1], runs=runs, roll=roll)
     tell(flight_plan.facts(found, known), flight_plan.tell(found, known), json)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import msgspec
 from cyclopts import App, Parameter
@@ -13,7 +13,19 @@ from cyclopts import App, Parameter
 from magbridge import __version__
 from magbridge.errors import WrongUse
 
-__all__ = ["Folder", "Grid", "Json", "Output", "Picture", "app", "complain", "file_to_write", "some", "tell"]
+__all__ = [
+    "Folder",
+    "Grid",
+    "Heading",
+    "Json",
+    "Output",
+    "Picture",
+    "app",
+    "complain",
+    "file_to_write",
+    "some",
+    "tell",
+]
 
 
 def _default(value: object) -> object:
@@ -50,6 +62,7 @@ def file_to_write(*suffixes: str) -> Callable[[Any, Any], None]:
 Output = Annotated[Path, Parameter(name=["--output", "-o"], validator=file_to_write())]
 Folder = Annotated[Path, Parameter(name=["--output", "-o"])]
 Grid = Annotated[Path, Parameter(name=["--output", "-o"], validator=file_to_write(".nc"))]
+Heading = Annotated[Literal["true", "magnetic"] | None, Parameter(name="--heading-reference")]
 Picture = Annotated[Path | None, Parameter(validator=file_to_write(".png", ".pdf", ".svg"))]
 Json = Annotated[bool, Parameter(name="--json")]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from magbridge.cli.common import Json, Output, Picture, app, complain, some, tell
+from magbridge.cli.common import Heading, Json, Output, Picture, app, complain, some, tell
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -26,6 +26,7 @@ def navigate(
     config: Path | None = None,
     bound: bool = False,
     picture: Picture = None,
+    heading_reference: Heading = None,
     json: Json = False,
 ) -> None:
     """Match the corrected field to an anomaly map: track, covariance, innovations, smoothed track.
@@ -49,6 +50,8 @@ def navigate(
         Draw what the map is worth along a plan.
     picture
         A PNG, PDF or SVG: the tracks on the map, errors and innovations; the bound on the map.
+    heading_reference
+        What headings are counted from; if not given what the log says, else true north.
     json
         Print the result for machines.
     """
@@ -71,7 +74,7 @@ def navigate(
     from magbridge.navigate.batch import navigate as find_way
     from magbridge.navigate.model import informed
 
-    deployment = with_true_heading(read(some(files), required=CHANNELS))
+    deployment = with_true_heading(read(some(files), required=CHANNELS), heading_reference)
     corrected = correct_rows(Correction(known), deployment)
     if options is None:
         options = informed(Options(), known, float(corrected["total_field_sigma"].median()))

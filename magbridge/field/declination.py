@@ -15,16 +15,22 @@ if TYPE_CHECKING:
 __all__ = ["with_true_heading"]
 
 
-def with_true_heading(deployment: xr.Dataset) -> xr.Dataset:
+def with_true_heading(deployment: xr.Dataset, reference: str | None = None) -> xr.Dataset:
     """Return the deployment with ``heading`` counted from true north.
+
+    Parameters
+    ----------
+    deployment : Dataset (time)
+    reference : {"true", "magnetic"}, optional
+        What the headings are counted from; default what the attribute ``heading_reference`` says.
 
     Notes
     -----
-    A deployment whose attribute ``heading_reference`` is ``"magnetic"`` gets the IGRF's declination at its
-    position added, ``D = atan2(B_east, B_north)``; any other comes back as it is. Without a position a magnetic
-    heading becomes NaN: it is not known against true north.
+    To magnetic headings the IGRF's declination at the position is added, ``D = atan2(B_east, B_north)``; any other
+    deployment comes back as it is. Without a position a magnetic heading becomes NaN: it is not known.
     """
-    if deployment.attrs.get("heading_reference") != "magnetic" or "heading" not in deployment:
+    reference = reference or deployment.attrs.get("heading_reference")
+    if reference != "magnetic" or "heading" not in deployment:
         return deployment
     declination = np.full(deployment.sizes["time"], np.nan)
     if {"latitude", "longitude"} <= set(deployment.variables):
