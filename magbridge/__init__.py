@@ -21,9 +21,9 @@ from magbridge.version import __version__
 
 if TYPE_CHECKING:
     from magbridge.calibration.correct import Corrector, correct
-    from magbridge.calibration.data import observations
     from magbridge.calibration.file import load, save
-    from magbridge.calibration.fit import fit
+    from magbridge.calibration.fitting.data import observations
+    from magbridge.calibration.fitting.fit import fit
     from magbridge.calibration.model import Calibration
     from magbridge.correction import Correction, correct_rows
     from magbridge.errors import MagbridgeError
@@ -56,9 +56,9 @@ _HOMES = {
     "MagbridgeError": "errors",
     "correct": "calibration.correct",
     "correct_rows": "correction",
-    "fit": "calibration.fit",
+    "fit": "calibration.fitting.fit",
     "load": "calibration.file",
-    "observations": "calibration.data",
+    "observations": "calibration.fitting.data",
     "read": "logs",
     "read_grid": "field.read",
     "reference_field": "field.reference",

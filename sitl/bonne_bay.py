@@ -12,8 +12,8 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from magbridge.calibration.correct import correct
-from magbridge.calibration.data import observations
-from magbridge.calibration.fit import fit
+from magbridge.calibration.fitting.data import observations
+from magbridge.calibration.fitting.fit import fit
 from magbridge.columns import CHANNEL_TIMES, CHANNELS
 from magbridge.errors import CalibrationError
 from magbridge.field.grid import AnomalyGrid

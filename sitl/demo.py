@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from magbridge.bridge.pipeline import Start
 from magbridge.calibration.correct import correct
-from magbridge.calibration.data import observations
 from magbridge.calibration.file import save
-from magbridge.calibration.fit import Fit, fit
-from magbridge.calibration.lowpass import unfiltered
+from magbridge.calibration.fitting.data import observations
+from magbridge.calibration.fitting.fit import Fit, fit
+from magbridge.calibration.fitting.lowpass import unfiltered
 from magbridge.config import load as load_config
 from magbridge.logs import write
 from magbridge.records import Quality

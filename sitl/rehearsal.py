@@ -15,9 +15,9 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from magbridge.calibration.data import observations
 from magbridge.calibration.file import save
-from magbridge.calibration.fit import fit
+from magbridge.calibration.fitting.data import observations
+from magbridge.calibration.fitting.fit import fit
 from magbridge.columns import CHANNELS, COLUMNS
 from magbridge.errors import CalibrationError, FormatError
 from magbridge.field.reference import reference_field

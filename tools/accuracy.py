@@ -36,8 +36,8 @@ from rich.table import Table
 from scipy.optimize import least_squares
 
 from magbridge.calibration.correct import correct
-from magbridge.calibration.data import observations
-from magbridge.calibration.fit import fit
+from magbridge.calibration.fitting.data import observations
+from magbridge.calibration.fitting.fit import fit
 from magbridge.errors import CalibrationError
 from magbridge.field.igrf import igrf
 from sitl import Twin, load, segments, simulate

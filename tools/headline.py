@@ -18,8 +18,8 @@ import numpy as np
 import xarray as xr
 
 from magbridge.calibration.correct import correct
-from magbridge.calibration.data import observations
-from magbridge.calibration.fit import fit
+from magbridge.calibration.fitting.data import observations
+from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.model import Calibration
 from magbridge.diagnose.run import diagnose
 from sitl.bonne_bay import MASSES, PAPER, columns, measure

@@ -22,11 +22,11 @@ from rich.progress import track
 from rich.table import Table
 
 from magbridge.calibration.correct import correct
-from magbridge.calibration.data import Observations, observations
-from magbridge.calibration.fit import fit
-from magbridge.calibration.limits import Limits, PlannedRun, settled, trim_of
-from magbridge.calibration.mission import Mission
-from magbridge.calibration.plan import Plan, evaluate_runs, expected_calibration, plan
+from magbridge.calibration.fitting.data import Observations, observations
+from magbridge.calibration.fitting.fit import fit
+from magbridge.calibration.fitting.mission import Mission
+from magbridge.calibration.planning.limits import Limits, PlannedRun, settled, trim_of
+from magbridge.calibration.planning.plan import Plan, evaluate_runs, expected_calibration, plan
 from magbridge.field.igrf import igrf
 from sitl import Twin, load, segments, simulate
 from sitl.bound import oracle

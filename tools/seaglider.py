@@ -16,8 +16,8 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from magbridge.calibration.data import observations
-from magbridge.calibration.validate import HeldOut, leave_runs_out
+from magbridge.calibration.fitting.data import observations
+from magbridge.calibration.fitting.validate import HeldOut, leave_runs_out
 from magbridge.errors import CalibrationError
 from magbridge.field.declination import with_true_heading
 from magbridge.field.reference import earth_field

@@ -147,11 +147,11 @@ def calibrate(
     json
         Print the result for machines.
     """
-    from magbridge.calibration.data import observations
     from magbridge.calibration.file import save
-    from magbridge.calibration.fit import fit
-    from magbridge.calibration.geometry import read_vehicle
-    from magbridge.calibration.lowpass import unfiltered
+    from magbridge.calibration.fitting.data import observations
+    from magbridge.calibration.fitting.fit import fit
+    from magbridge.calibration.fitting.geometry import read_vehicle
+    from magbridge.calibration.fitting.lowpass import unfiltered
     from magbridge.columns import CHANNELS
     from magbridge.field.declination import with_true_heading
     from magbridge.field.read import read_grid
@@ -221,8 +221,8 @@ def plan(
     json
         Print the result for machines.
     """
-    from magbridge.calibration import flight_plan
     from magbridge.calibration.file import load
+    from magbridge.calibration.planning import flight_plan
     from magbridge.field.declination import with_true_heading
     from magbridge.field.reference import earth_field
     from magbridge.logs import read

@@ -38,7 +38,7 @@ def diagnose(
     """
     from magbridge.calibration.file import load
     from magbridge.diagnose.causes import CAUSES
-    from magbridge.diagnose.findings import findings
+    from magbridge.diagnose.report.findings import findings
     from magbridge.diagnose.run import diagnose as examine
     from magbridge.field.read import read_grid
     from magbridge.logs import read

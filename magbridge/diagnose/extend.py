@@ -14,10 +14,11 @@ from magbridge.calibration.followers import ClockEffect
 from magbridge.calibration.instrument import RateEffect
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.residual import residuals
-from magbridge.diagnose.candidates import Candidate
-from magbridge.diagnose.joint import Joint, fit_joint
-from magbridge.diagnose.problem import Columns, Problem, derivatives, samples_of
-from magbridge.diagnose.weigh import IDEAL
+from magbridge.diagnose.causes.candidates import Candidate
+from magbridge.diagnose.compare.derivatives import derivatives
+from magbridge.diagnose.compare.problem import Columns, Problem, samples_of
+from magbridge.diagnose.inference.joint import Joint, fit_joint
+from magbridge.diagnose.inference.weigh import IDEAL
 from magbridge.version import __version__
 
 __all__ = ["extend", "settle", "widened"]
@@ -98,7 +99,7 @@ def widened(model: Sequence[Candidate], fit: Joint) -> Joint:
     Notes
     -----
     A cause of Wald's statistic ``W = b^T C_bb^-1 b`` has a signal of the whitened norm ``sqrt(W)``. A regressor that is off by
-    :data:`~.weigh.IDEAL` of it leaves a misfit that nobody knows the shape of: one more noise, of the power
+    :data:`~.inference.weigh.IDEAL` of it leaves a misfit that nobody knows the shape of: one more noise, of the power
     ``IDEAL^2 W / MODES`` in every direction, where the data's has 1. The cause's coefficients, and what the calibration
     gives way to them, get that much more variance:
 

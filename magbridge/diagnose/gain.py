@@ -23,8 +23,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from magbridge.diagnose.joint import Design, Joint
-from magbridge.diagnose.problem import Columns, Problem
+from magbridge.diagnose.compare.problem import Columns, Problem
+from magbridge.diagnose.inference.design import Design
+from magbridge.diagnose.inference.joint import Joint
 
 __all__ = ["Gain", "HeldOut", "held_out", "paired"]
 

@@ -1,11 +1,10 @@
-"""The whole of a diagnosis: compare, search, extend, measure the gain, write it down."""
+"""The whole of a diagnosis: compare, search, extend, measure the gain."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,29 +12,28 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 from threadpoolctl import threadpool_limits
 
-from magbridge.calibration.file import save
 from magbridge.calibration.model import Calibration
-from magbridge.diagnose.candidates import Candidate
 from magbridge.diagnose.causes import CAUSES, Cause
+from magbridge.diagnose.causes.candidates import Candidate
+from magbridge.diagnose.compare.problem import Problem, pose
+from magbridge.diagnose.compare.survey import Survey
+from magbridge.diagnose.compare.take import take
+from magbridge.diagnose.diagnosis import Diagnosis
 from magbridge.diagnose.extend import extend, settle, widened
-from magbridge.diagnose.findings import findings_json
 from magbridge.diagnose.gain import Gain, held_out, paired
-from magbridge.diagnose.isolability import Isolability, isolability
-from magbridge.diagnose.joint import Joint
-from magbridge.diagnose.outliers import Outliers, outliers
-from magbridge.diagnose.problem import Problem, pose
-from magbridge.diagnose.search import Hypothesis, Outcome, Rival, search
-from magbridge.diagnose.survey import take
-from magbridge.diagnose.unexplained import Leftover, accept, leftover
-from magbridge.diagnose.weigh import ODDS, REMNANT
+from magbridge.diagnose.inference.isolability import isolability
+from magbridge.diagnose.inference.joint import Joint
+from magbridge.diagnose.inference.outliers import Outliers, outliers
+from magbridge.diagnose.inference.search import Hypothesis, search
+from magbridge.diagnose.inference.unexplained import Leftover, accept, leftover
+from magbridge.diagnose.inference.weigh import ODDS, REMNANT
 from magbridge.errors import DataError
 from magbridge.field.grid import AnomalyGrid
-from magbridge.files import atomic_path
 
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["Diagnosis", "diagnose"]
+__all__ = ["diagnose"]
 
 FloatArray = NDArray[np.float64]
 
@@ -43,49 +41,6 @@ LOUD = 2.0
 """Times what the calibration states of itself: noise half as loud again is still noise, of twice that something is wrong."""
 ABSURD = 0.5
 """Of the field: when the corrected one is off by more, no cause of the table is looked for."""
-
-
-@dataclass(frozen=True, eq=False)
-class Diagnosis:
-    """Everything that was found out.
-
-    Attributes
-    ----------
-    problem : Problem
-    outcome : Outcome
-    named : tuple of Hypothesis
-        The causes that stand; their rivals in `rivals`.
-    rivals : tuple of tuple of Rival
-    wrong : Outliers or None
-        Isolated wrong samples.
-    unexplained : Leftover or None
-    calibration : Calibration
-        Extended.
-    fit : Joint
-        At the extended calibration.
-    before, after : (n,) array
-        nT, residuals with the calibration as it was, and extended, held out.
-    total : Gain
-    gains : tuple of Gain
-        Of each named cause beside the others.
-    isolability : Isolability
-    verdict : str
-    """
-
-    problem: Problem
-    outcome: Outcome
-    named: tuple[Hypothesis, ...]
-    rivals: tuple[tuple[Rival, ...], ...]
-    wrong: Outliers | None
-    unexplained: Leftover | None
-    calibration: Calibration
-    fit: Joint
-    before: FloatArray
-    after: FloatArray
-    total: Gain
-    gains: tuple[Gain, ...]
-    isolability: Isolability
-    verdict: str
 
 
 def diagnose(
@@ -125,6 +80,8 @@ def diagnose(
     with threadpool_limits(1, "blas"):
         diagnosis = _examine(datasets, calibration, learned_from, grid, causes, progress)
     if out_dir is not None:
+        from magbridge.diagnose.report.files import write  # noqa: PLC0415  (matplotlib only where a report is wanted)
+
         progress("writing the report")
         write(diagnosis, out_dir, causes)
     return diagnosis
@@ -139,23 +96,11 @@ def _examine(
     progress: Callable[[str], object],
 ) -> Diagnosis:
     progress("reading")
-    survey = take(datasets, calibration, learned_from, grid)
-    problem = pose(survey, calibration)
-    off, field = float(np.median(np.abs(problem.residual))), float(np.median(survey.reference))
-    if off > ABSURD * field:
-        raise DataError(
-            f"{survey.source}: the corrected field is off by {off:.0f} nT of {field:.0f}: mag_x, mag_y, mag_z or a "
-            "parameter in other units than the calibration's, or of another vehicle"
-        )
+    problem = _posed(take(datasets, calibration, learned_from, grid), calibration)
     progress("preparing causes")
-    candidates = {name: cause.candidates(problem) for name, cause in causes.items()}
-    untestable = {name: causes[name].needs for name, made in candidates.items() if not made}
-    if len(untestable) == len(causes):
-        needs = "; ".join(sorted(set(untestable.values())))
-        raise DataError(f"{survey.source}: nothing can be tested here; it would take {needs}")
-    flat = [candidate for made in candidates.values() for candidate in made]
+    candidates, untestable = _put_forward(problem, causes)
     progress("searching")
-    outcome = search(problem, flat, len(causes))
+    outcome = search(problem, candidates, len(causes))
     progress("what is left")
     wrong = outliers(outcome.fit, len(causes))
     tones = [] if "interference_tone" in causes else CAUSES["interference_tone"].candidates(problem)
@@ -170,11 +115,7 @@ def _examine(
     fit = widened(model, fit)
     extended = extend(settled, model, fit) if model else calibration
     progress("measuring the gain")
-    counts = ~survey.learned
-    if wrong is not None:
-        counts = counts.copy()
-        counts[wrong.rows] = False
-    counts = counts if counts.any() else ~counts
+    counts = _counted(problem, wrong)
     before, after = problem.residual, problem.residual
     if model:
         after, score = held_out(settled, columns, fit)
@@ -183,34 +124,55 @@ def _examine(
             named, rivals, model, fit, after, extended = (), (), [], outcome.null, before, calibration
             rest = leftover(problem, [], outcome.null, outcome.order, tone)
     rest = rest or _loud(problem, after, counts)
-    gains = []
-    for k in range(len(model)):
-        others = [candidate.columns for i, candidate in enumerate(model) if i != k]
-        # the others, the calibration and the noise are fitted anew; only the cause is missing
-        without, _ = held_out(problem, others, _without(fit, model, k))
-        gains.append(paired(without, after, survey.dive, counts))
     return Diagnosis(
         problem=problem, outcome=outcome, named=named, rivals=rivals, wrong=wrong, unexplained=rest,
         calibration=extended, fit=fit, before=before, after=after,
-        total=paired(before, after, survey.dive, counts), gains=tuple(gains),
-        isolability=isolability(flat, outcome.info, outcome.trials, len(causes), untestable),
+        total=paired(before, after, problem.survey.dive, counts), gains=_gains(problem, model, fit, after, counts),
+        isolability=isolability(candidates, outcome.info, outcome.trials, len(causes), untestable),
         verdict=_verdict(named, wrong, rest),
     )  # fmt: skip
 
 
-def write(
-    diagnosis: Diagnosis, out_dir: str | os.PathLike[str], causes: Mapping[str, Cause] = CAUSES
-) -> None:
-    """Write ``findings.json``, ``calibration.json`` and ``report.html``, each whole or not at all."""
-    from magbridge.diagnose.report import report_html  # noqa: PLC0415  (matplotlib only where a report is wanted)
+def _posed(survey: Survey, calibration: Calibration) -> Problem:
+    """Compare; a vehicle or a unit that is not the calibration's is no case for a search."""
+    problem = pose(survey, calibration)
+    off, field = float(np.median(np.abs(problem.residual))), float(np.median(survey.reference))
+    if off > ABSURD * field:
+        raise DataError(
+            f"{survey.source}: the corrected field is off by {off:.0f} nT of {field:.0f}: mag_x, mag_y, mag_z or a "
+            "parameter in other units than the calibration's, or of another vehicle"
+        )
+    return problem
 
-    folder = Path(out_dir)
-    folder.mkdir(parents=True, exist_ok=True)
-    save(diagnosis.calibration, folder / "calibration.json")
-    with atomic_path(folder / "findings.json") as beside:
-        beside.write_bytes(findings_json(diagnosis, causes))
-    with atomic_path(folder / "report.html") as beside:
-        beside.write_text(report_html(diagnosis, causes), encoding="utf-8")
+
+def _put_forward(problem: Problem, causes: Mapping[str, Cause]) -> tuple[list[Candidate], dict[str, str]]:
+    """Return all candidates, and what it would take to test the causes that have none."""
+    candidates = {name: cause.candidates(problem) for name, cause in causes.items()}
+    untestable = {name: causes[name].needs for name, made in candidates.items() if not made}
+    if len(untestable) == len(causes):
+        needs = "; ".join(sorted(set(untestable.values())))
+        raise DataError(f"{problem.survey.source}: nothing can be tested here; it would take {needs}")
+    return [candidate for made in candidates.values() for candidate in made], untestable
+
+
+def _counted(problem: Problem, wrong: Outliers | None) -> NDArray[np.bool_]:
+    """(n,) samples by which a gain is measured: new to the calibration, and not wrong."""
+    counts = ~problem.survey.learned
+    if wrong is not None:
+        counts[wrong.rows] = False
+    return counts if counts.any() else ~counts
+
+
+def _gains(
+    problem: Problem, model: Sequence[Candidate], fit: Joint, after: FloatArray, counts: NDArray[np.bool_]
+) -> tuple[Gain, ...]:
+    """Measure each cause beside the others: they, and the calibration, are fitted anew; only the cause is missing."""
+    gains = []
+    for k in range(len(model)):
+        others = [candidate.columns for i, candidate in enumerate(model) if i != k]
+        without = held_out(problem, others, _without(fit, model, k)).left
+        gains.append(paired(without, after, problem.survey.dive, counts))
+    return tuple(gains)
 
 
 def _loud(problem: Problem, after: FloatArray, counts: NDArray[np.bool_]) -> Leftover | None:

@@ -12,12 +12,12 @@ import pytest
 from scipy.optimize import least_squares
 
 from magbridge.calibration.correct import correct
-from magbridge.calibration.data import Observations, polynomial_samples
-from magbridge.calibration.evidence import Quadratic, evidence
-from magbridge.calibration.fit import METHODS, fit
+from magbridge.calibration.fitting.data import Observations, polynomial_samples
+from magbridge.calibration.fitting.evidence import Quadratic, evidence
+from magbridge.calibration.fitting.fit import METHODS, fit
+from magbridge.calibration.fitting.nominal import nominal, nominal_samples
+from magbridge.calibration.fitting.prior import free_structure
 from magbridge.calibration.model import Calibration
-from magbridge.calibration.nominal import nominal, nominal_samples
-from magbridge.calibration.prior import free_structure
 from magbridge.calibration.residual import Samples, normal_equations, residuals
 from magbridge.calibration.terms import full_order
 from magbridge.errors import CalibrationError

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from magbridge.calibration.data import Observations
-from magbridge.calibration.lowpass import unfiltered
+from magbridge.calibration.fitting.data import Observations
+from magbridge.calibration.fitting.lowpass import unfiltered
 
 CORNER = 0.33
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from magbridge.calibration.data import observations
-from magbridge.calibration.validate import leave_runs_out
+from magbridge.calibration.fitting.data import observations
+from magbridge.calibration.fitting.validate import leave_runs_out
 from magbridge.errors import CalibrationError
 from magbridge.field.declination import with_true_heading
 from magbridge.field.reference import earth_field

@@ -11,17 +11,17 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from magbridge.calibration.boresight import field_body, find_boresight
 from magbridge.calibration.correct import correct
-from magbridge.calibration.data import Observations, observations, polynomial_samples
 from magbridge.calibration.dipole import Dipole, dipole_tensor
-from magbridge.calibration.fit import fit
-from magbridge.calibration.geometry import read_vehicle
-from magbridge.calibration.identify import combinations
-from magbridge.calibration.limits import Limits, PlannedRun, settled, trim_of
-from magbridge.calibration.mission import Mission, expected_error
+from magbridge.calibration.fitting.boresight import field_body, find_boresight
+from magbridge.calibration.fitting.data import Observations, observations, polynomial_samples
+from magbridge.calibration.fitting.fit import fit
+from magbridge.calibration.fitting.geometry import read_vehicle
+from magbridge.calibration.fitting.identify import combinations
+from magbridge.calibration.fitting.mission import Mission, expected_error
 from magbridge.calibration.model import Calibration, Noise, Parameter, Reference, identity
-from magbridge.calibration.plan import evaluate_runs, expected_calibration, plan
+from magbridge.calibration.planning.limits import Limits, PlannedRun, settled, trim_of
+from magbridge.calibration.planning.plan import evaluate_runs, expected_calibration, plan
 from magbridge.calibration.terms import Effect, full_order
 from magbridge.errors import CalibrationError, ConfigError
 from sitl.mission import TABLE_1

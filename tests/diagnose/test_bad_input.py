@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from magbridge.calibration.data import observations
 from magbridge.calibration.file import save
-from magbridge.calibration.fit import fit
+from magbridge.calibration.fitting.data import observations
+from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.model import Calibration, Sensor
 from magbridge.cli import main
 from magbridge.diagnose.run import diagnose

@@ -15,8 +15,8 @@ from magbridge.calibration.instrument import RateEffect, ResponseEffect, TimeEff
 from magbridge.calibration.model import Calibration, Noise, Parameter, Reference
 from magbridge.calibration.residual import residuals
 from magbridge.calibration.terms import Effect, Polynomial
-from magbridge.diagnose.problem import add_effects, effect_columns, history, pose, samples_of
-from magbridge.diagnose.survey import Channel, Survey
+from magbridge.diagnose.compare.problem import add_effects, effect_columns, history, pose, samples_of
+from magbridge.diagnose.compare.survey import Channel, Survey
 
 FIELD = 50_000.0
 T0 = 1.7e9

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from magbridge.diagnose.candidates import Candidate
+from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.extend import MODES, widened
-from magbridge.diagnose.joint import Joint
-from magbridge.diagnose.noise import fit_noise
-from magbridge.diagnose.weigh import IDEAL
+from magbridge.diagnose.inference.fit_noise import fit_noise
+from magbridge.diagnose.inference.joint import Joint
+from magbridge.diagnose.inference.weigh import IDEAL
 
 
 def candidate(size: int) -> Candidate:

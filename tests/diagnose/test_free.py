@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from magbridge.calibration.data import observations
-from magbridge.calibration.fit import fit
-from magbridge.calibration.lowpass import unfiltered
+from magbridge.calibration.fitting.data import observations
+from magbridge.calibration.fitting.fit import fit
+from magbridge.calibration.fitting.lowpass import unfiltered
+from magbridge.diagnose.inference.statistic import SIZES, Statistic
 from magbridge.diagnose.run import diagnose
-from magbridge.diagnose.statistic import SIZES, Statistic
 from sitl import load, simulate
 from sitl.columns import segments
 

@@ -10,10 +10,10 @@ from scipy.stats import multivariate_normal
 
 from magbridge.calibration.model import Calibration, Noise, Parameter, Reference
 from magbridge.calibration.terms import Polynomial
+from magbridge.diagnose.compare.problem import Problem, pose
+from magbridge.diagnose.compare.survey import Channel, Survey
 from magbridge.diagnose.gain import held_out
-from magbridge.diagnose.joint import Joint, fit_joint
-from magbridge.diagnose.problem import Problem, pose
-from magbridge.diagnose.survey import Channel, Survey
+from magbridge.diagnose.inference.joint import Joint, fit_joint
 
 DIVES = 5
 

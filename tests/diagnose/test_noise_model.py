@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from magbridge.diagnose.noise import fit_noise, memory_order
+from magbridge.diagnose.inference.fit_noise import fit_noise, memory_order
 
 
 def made(kind: str, n: int = 6000, rho: float = 0.0, seed: int = 1) -> tuple[np.ndarray, np.ndarray]:

@@ -13,8 +13,8 @@ from magbridge.calibration.model import Calibration, Noise, Parameter, Reference
 from magbridge.calibration.terms import Polynomial
 from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.causes.timing import mass_rates
-from magbridge.diagnose.problem import Problem, effect_columns, history, pose
-from magbridge.diagnose.survey import Channel, Survey
+from magbridge.diagnose.compare.problem import Problem, effect_columns, history, pose
+from magbridge.diagnose.compare.survey import Channel, Survey
 
 
 @pytest.fixture(scope="module")

@@ -20,7 +20,7 @@ from study.nameless import against, allowed, nameless
 from study.stage import MEMORY, autoregression, project, whiten
 from study.table import efficiency, lines, share
 
-from magbridge.diagnose.free import Description
+from magbridge.diagnose.inference.free import Description
 
 TOOLS = Path(__file__).parents[2] / "tools"
 

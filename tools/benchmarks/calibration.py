@@ -17,8 +17,8 @@ from scipy.optimize import least_squares
 from threadpoolctl import threadpool_limits
 
 from magbridge.calibration.correct import CHUNK, Corrector, correct
-from magbridge.calibration.data import Observations, observations, polynomial_samples
-from magbridge.calibration.fit import fit
+from magbridge.calibration.fitting.data import Observations, observations, polynomial_samples
+from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.residual import residuals_of
 from magbridge.calibration.terms import full_order
 from sitl import load, segments, simulate
@@ -31,7 +31,7 @@ LARGE = (100_000, 1_000_000)
 IN_ANOTHER = """
 import json, resource, sys, time
 from benchmarks.calibration import many
-from magbridge.calibration.fit import fit
+from magbridge.calibration.fitting.fit import fit
 data = many(int(sys.argv[1]))
 begun = time.process_time()
 fit(data)

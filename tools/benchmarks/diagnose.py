@@ -13,8 +13,8 @@ import numpy as np
 import xarray as xr
 from benchmarks.row import Row
 
-from magbridge.calibration.data import observations
-from magbridge.calibration.fit import fit
+from magbridge.calibration.fitting.data import observations
+from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.model import Calibration
 from sitl import load, segments, simulate
 from sitl.mission import CrissCross

@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 from magbridge.calibration.correct import correct
 from magbridge.calibration.model import Calibration
 from magbridge.diagnose.causes import CAUSES
-from magbridge.diagnose.findings import findings
-from magbridge.diagnose.free import Description, descriptions
-from magbridge.diagnose.run import Diagnosis, diagnose
+from magbridge.diagnose.diagnosis import Diagnosis
+from magbridge.diagnose.inference.free import Description, descriptions
+from magbridge.diagnose.report.findings import findings
+from magbridge.diagnose.run import diagnose
 from sitl.inject import EFFECTS, FOREIGN, Hidden, disturb
 from study.stage import NOISES, SEEDS, Found, Stall, add_noise, again, stage_of
 from study.theory import Setting, ideal

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from magbridge.diagnose.statistic import Statistic
+from magbridge.diagnose.inference.statistic import Statistic
 
 Array = NDArray[np.float64]
 DRAWS = 400
@@ -19,7 +19,7 @@ DRAWS = 400
 class Span:
     """One of a cause's hypotheses: its columns, the log of how many others it stands for, whether it has a sign.
 
-    Where its numbers have one common size, `spectra` (l, k) are their prior variances (:mod:`magbridge.diagnose.statistic`).
+    Where its numbers have one common size, `spectra` (l, k) are their prior variances (:mod:`magbridge.diagnose.inference.statistic`).
     """
 
     cause: str

@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from magbridge.calibration.correct import regressors
-from magbridge.calibration.data import observations
-from magbridge.calibration.fit import fit
+from magbridge.calibration.fitting.data import observations
+from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.residual import Samples, residuals
-from magbridge.diagnose.problem import floor
+from magbridge.diagnose.compare.prior import floor
 from sitl import Twin, load, simulate
 from sitl.inject import Hidden, disturb
 from sitl.mission import CrissCross, Spirals

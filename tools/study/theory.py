@@ -25,10 +25,10 @@ from numpy.typing import NDArray
 from scipy.special import chdtri
 
 from magbridge.diagnose.causes import Cause
-from magbridge.diagnose.free import Description
-from magbridge.diagnose.problem import pose
-from magbridge.diagnose.survey import take
-from magbridge.diagnose.weigh import LEVEL, ODDS
+from magbridge.diagnose.compare.problem import pose
+from magbridge.diagnose.compare.take import take
+from magbridge.diagnose.inference.free import Description
+from magbridge.diagnose.inference.weigh import LEVEL, ODDS
 from study.draws import Draws, Span, by_cause, explained, numbers, weigh, with_another
 from study.nameless import against, allowed, nameless
 from study.stage import Found, Stall, project, whiten

@@ -8,8 +8,8 @@ import numpy as np
 from accuracy import at_rest, rms, total
 from msgspec.structs import replace as with_options
 
-from magbridge.calibration.data import observations
-from magbridge.calibration.fit import fit
+from magbridge.calibration.fitting.data import observations
+from magbridge.calibration.fitting.fit import fit
 from magbridge.correction import Correction, correct_rows
 from magbridge.navigate.model import informed
 from sitl import load, segments, simulate

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple
 
-from magbridge.diagnose.candidates import Candidate
+from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.causes.clock import interference_tone, offset_drift, offset_step
 from magbridge.diagnose.causes.masses import actuator_order, hysteresis, unmodelled_actuator
 from magbridge.diagnose.causes.reference import diurnal_variation, map_error, reference_bias
@@ -21,7 +21,7 @@ from magbridge.diagnose.causes.telemetry import (
     temperature_scale,
 )
 from magbridge.diagnose.causes.timing import channel_skew, clock_offset, eddy_current, filter_lag
-from magbridge.diagnose.problem import Problem
+from magbridge.diagnose.compare.problem import Problem
 
 __all__ = ["CAUSES", "Cause"]
 

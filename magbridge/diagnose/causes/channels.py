@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from magbridge.diagnose.problem import Problem
+from magbridge.diagnose.compare.problem import Problem
 
 __all__ = ["channels_of", "extent"]
 

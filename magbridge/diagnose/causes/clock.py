@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magbridge.calibration.instrument import TimeEffect
-from magbridge.diagnose.candidates import AXES, Candidate, of_effect
-from magbridge.diagnose.problem import Problem
+from magbridge.diagnose.causes.candidates import AXES, Candidate, of_effect
+from magbridge.diagnose.compare.problem import Problem
 
 __all__ = ["interference_tone", "offset_drift", "offset_step"]
 

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from magbridge.calibration.followers import MonomialEffect, PlayEffect, PowersEffect
 from magbridge.calibration.terms import Polynomial, full_order
-from magbridge.diagnose.candidates import AXES, Candidate, of_effect
+from magbridge.diagnose.causes.candidates import AXES, Candidate, of_effect
 from magbridge.diagnose.causes.channels import channels_of, extent
-from magbridge.diagnose.problem import Problem
-from magbridge.diagnose.regressors import play, powers
+from magbridge.diagnose.causes.regressors import play, powers
+from magbridge.diagnose.compare.problem import Problem
 
 __all__ = ["actuator_order", "hysteresis", "unmodelled_actuator"]
 

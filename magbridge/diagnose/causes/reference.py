@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from magbridge.diagnose.candidates import Candidate, of_reference
-from magbridge.diagnose.problem import Problem
+from magbridge.diagnose.causes.candidates import Candidate, of_reference
+from magbridge.diagnose.compare.problem import Problem
 
 __all__ = ["diurnal_variation", "map_error", "reference_bias"]
 

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magbridge.calibration.instrument import ResponseEffect
-from magbridge.diagnose.candidates import AXES, Candidate, of_effect
-from magbridge.diagnose.problem import Problem
-from magbridge.diagnose.regressors import powers
+from magbridge.diagnose.causes.candidates import AXES, Candidate, of_effect
+from magbridge.diagnose.causes.regressors import powers
+from magbridge.diagnose.compare.problem import Problem
 
 __all__ = ["nonlinearity", "saturation"]
 

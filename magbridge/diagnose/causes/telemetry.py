@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magbridge.calibration.effects import ChannelEffect
-from magbridge.diagnose.candidates import Candidate, of_effect
+from magbridge.diagnose.causes.candidates import Candidate, of_effect
 from magbridge.diagnose.causes.channels import channels_of, extent
-from magbridge.diagnose.problem import Problem
-from magbridge.diagnose.regressors import lagged
+from magbridge.diagnose.causes.regressors import lagged
+from magbridge.diagnose.compare.problem import Problem
 
 __all__ = ["current_field", "pressure_offset", "temperature_offset", "temperature_scale"]
 

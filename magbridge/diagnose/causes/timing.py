@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from magbridge.calibration.followers import ClockEffect
 from magbridge.calibration.instrument import RateEffect
-from magbridge.diagnose.candidates import AXES, Candidate, of_effect
-from magbridge.diagnose.problem import Columns, Problem, effect_columns
+from magbridge.diagnose.causes.candidates import AXES, Candidate, of_effect
+from magbridge.diagnose.compare.problem import Columns, Problem, effect_columns
 
 __all__ = ["channel_skew", "clock_offset", "eddy_current", "field_rates", "filter_lag", "mass_rates"]
 

@@ -1,0 +1,75 @@
+"""The rotation that a scalar fit leaves free, from attitude telemetry and the reference's direction.
+
+Notes
+-----
+Corrected vectors b (sensor axes) and the Earth's field in body axes ``v = R(attitude)^T H_ned`` differ by
+one rotation: ``v = R b`` (Wahba's problem; scipy solves it). Attitude errors wander slowly, so neighbours
+are no independent witnesses: the covariance is that between whole runs (sandwich estimate)::
+
+    I = sum (|v|^2 E - v v^T),   s_r = sum_(i in run r) v_i x (R b_i - v_i),   C = I^-1 (sum_r s_r s_r^T) I^-1
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from magbridge.calibration.correct import correct
+from magbridge.calibration.fitting.data import Observations
+from magbridge.calibration.model import Boresight, Calibration, with_boresight
+
+__all__ = ["field_body", "find_boresight"]
+
+FloatArray = NDArray[np.float64]
+FEWEST = 30  # samples with attitude and direction
+COMPASS_SIGMA = np.radians(0.5)  # rad, what hangs between two runs on the same compass is not in their spread
+
+
+def field_body(attitude: FloatArray, field_ned: FloatArray) -> FloatArray:
+    """Turn a field from world to body axes.
+
+    Parameters
+    ----------
+    attitude : (n, 3) array
+        rad, roll, pitch, heading (3-2-1).
+    field_ned : (n, 3) array
+        nT, north-east-down.
+    """
+    body_to_world = Rotation.from_euler("ZYX", attitude[:, ::-1])
+    return np.asarray(body_to_world.inv().apply(np.array(field_ned)))
+
+
+def find_boresight(calibration: Calibration, data: Observations) -> Boresight | None:
+    """Find the rotation from corrected sensor axes to body axes.
+
+    Returns
+    -------
+    Boresight or None
+        None where attitude, direction, or enough of them are lacking.
+    """
+    if data.attitude is None or data.reference_ned is None or calibration.effects:
+        return None
+    known = np.isfinite(data.attitude).all(axis=1) & np.isfinite(data.reference_ned).all(axis=1)
+    if known.sum() < FEWEST:
+        return None
+    part = data.part(np.asarray(known))
+    assert part.attitude is not None
+    assert part.reference_ned is not None
+    assert part.time is not None
+    assert part.runs is not None
+    k = len(calibration.parameters)
+    b = correct(with_boresight(calibration, None), part.field, part.parameters[:, :k], part.time).vector
+    v = field_body(part.attitude, part.reference_ned)
+    rotation, _ = Rotation.align_vectors(v, b)
+    score = np.cross(v, rotation.apply(b) - v)
+    information = np.sum(v * v) * np.eye(3) - v.T @ v
+    _, which = np.unique(part.runs, return_inverse=True)
+    between = np.stack([np.bincount(which, column) for column in score.T], axis=1)
+    runs = len(between)
+    inverse = np.linalg.inv(information)
+    spread = between.T @ between * (runs / max(runs - 1, 1))
+    covariance = inverse @ spread @ inverse + COMPASS_SIGMA**2 * np.eye(3)
+    x, y, z = rotation.as_rotvec().tolist()
+    (a, b_, c), (d, e, f), (g, h, i) = ((covariance + covariance.T) / 2).tolist()
+    return Boresight((x, y, z), ((a, b_, c), (d, e, f), (g, h, i)))

@@ -1,0 +1,63 @@
+"""The paper's own fit (section 2.2): nominal start, every coefficient a free polynomial.
+
+It is here to be compared with. On its calibration runs it looks as good as any; out of sample it
+pays for what the runs never showed, and its covariance says so: what neither runs nor physics hold
+is as uncertain as a coefficient can be.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magbridge.calibration.fitting.data import Observations, polynomial_samples
+from magbridge.calibration.fitting.fit import Fit, assemble
+from magbridge.calibration.fitting.noise import NoiseModel, estimate_noise
+from magbridge.calibration.fitting.nominal import check_scales, nominal
+from magbridge.calibration.fitting.solve import Prior, covariance_of, gauss_newton
+from magbridge.calibration.residual import residuals_of
+from magbridge.calibration.terms import full_order
+from magbridge.errors import CalibrationError
+
+__all__ = ["fit_cubic"]
+
+PLAIN = 1e4
+"""kappa at which all noise counts as the reference's: the residual is the paper's ``|A(H_r - T)| - H_e``."""
+ANYTHING = 1e4
+"""nT, the width at which a coefficient that nothing holds is left: it only keeps steps finite."""
+
+
+def fit_cubic(data: Observations, order: int = 3) -> Fit:
+    """Fit all coefficients by damped least squares on the scalar residual.
+
+    Parameters
+    ----------
+    data : Observations
+    order : int
+        Highest total degree; the paper's is 3.
+    """
+    ranges = data.ranges()
+    exponents = full_order(len(ranges), order)
+    samples = polynomial_samples(data, exponents, PLAIN)
+    start = np.zeros(9 * len(exponents))
+    start[:9] = _start(data)
+    prior = Prior(np.eye(len(start)) / ANYTHING**2, np.eye(len(start)))
+    noise = NoiseModel(float(np.std(residuals_of(samples, start))) or 1e-9)
+    for _ in range(2):  # once far from the answer, once with the noise found there
+        found = gauss_newton(samples, prior, noise, start, steps=200)
+        start = found.z
+        free = min(float(len(start)), len(data) / 2)
+        noise = NoiseModel(estimate_noise(residuals_of(samples, start), samples.follows, free).sigma)
+    check_scales(samples, start)
+    covariance = covariance_of(found.normal.hessian / noise.sigma**2 + prior.precision)
+    plain = polynomial_samples(data, exponents)
+    own = NoiseModel(noise.sigma * PLAIN)  # A is near I: what the magnitude has, the sensor has
+    return assemble(data, plain, ranges, exponents, start, covariance, own, "cubic")
+
+
+def _start(data: Observations) -> NDArray[np.float64]:
+    """Take the nominal fit with the paper's constraints, or none at all where it collapses."""
+    try:
+        return nominal(data, axes_fixed=True, equal_xz=True)[0]
+    except CalibrationError:
+        return np.zeros(9)

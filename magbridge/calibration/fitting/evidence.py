@@ -1,0 +1,121 @@
+"""The marginal likelihood of the prior's widths, its gradient, and where it is largest.
+
+Notes
+-----
+About the best coefficients the log likelihood is quadratic in z: ``-(c_0 - 2 b.z + z^T H z) / 2 sigma^2``.
+With a Gaussian prior of widths ``w = exp(constant + design . eta)`` the evidence is known in closed form.
+With ``W = diag(w)``, ``M = I + W H W / sigma^2`` and ``y = M^-1 W b / sigma^2`` (so the posterior mean is ``W y``)::
+
+    log Z = -n log sigma - c_0 / 2 sigma^2 + y.(W b) / 2 sigma^2 - log|M| / 2 + log p(eta)
+    d log Z / d log w_i = y_i^2 + (M^-1)_ii - 1                                     (MacKay 1992)
+    d log Z / d log sigma = -n + cost(W y) / sigma^2 + q - tr M^-1
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
+from scipy.optimize import minimize
+
+from magbridge.calibration.fitting.prior import Structure
+from magbridge.calibration.residual import NormalEquations
+
+__all__ = ["Quadratic", "Widths", "evidence", "is_maximum", "maximise"]
+
+FloatArray = NDArray[np.float64]
+FARTHEST = 10.0  # sigmas of the prior of eta: nothing physical lies beyond, and exp must not overflow
+STILL = 0.01  # of log evidence: two answers that differ by less are one
+SIGMA_STEP = 0.1  # a step in log sigma as large as one prior sigma in eta
+
+
+@dataclass(frozen=True, eq=False)
+class Quadratic:
+    """``cost(z) = c_0 - 2 b.z + z^T H z``, of n samples."""
+
+    H: FloatArray
+    b: FloatArray
+    c_0: float
+    n: float
+
+    @classmethod
+    def about(cls, z: FloatArray, normal: NormalEquations, n: float) -> Quadratic:
+        """Return the quadratic whose value, gradient and Hessian at `z` are `normal`'s."""
+        H, g = normal.hessian, normal.gradient
+        return cls(H, H @ z - g, float(normal.cost - 2.0 * g @ z + z @ H @ z), n)
+
+
+@dataclass(frozen=True, eq=False)
+class Widths:
+    """Where the evidence is largest: eta, the noise (sensor nT), log Z."""
+
+    eta: FloatArray
+    sigma: float
+    log_evidence: float
+    determined: float
+    """How many numbers the data, not the prior, determined: ``q - tr M^-1``."""
+    mean: FloatArray
+    """Posterior mean of z."""
+
+
+def evidence(
+    quadratic: Quadratic, structure: Structure, eta: FloatArray, log_sigma: float
+) -> tuple[float, FloatArray, FloatArray, float]:
+    """Log evidence, its gradient by (eta, log sigma), the posterior mean, and how much is determined."""
+    w = structure.widths(eta)
+    s2 = np.exp(2.0 * log_sigma)
+    M = (w[:, None] * quadratic.H * w) / s2
+    M.flat[:: len(w) + 1] += 1.0
+    factor, info = dpotrf(M, overwrite_a=True)
+    if info:
+        return -np.inf, np.zeros(len(eta) + 1), np.zeros(len(w)), 0.0
+    Wb = w * quadratic.b / s2
+    y = dpotrs(factor, Wb)[0]
+    off = (eta - structure.centre) / structure.spread
+    value = (
+        -quadratic.n * log_sigma
+        - 0.5 * quadratic.c_0 / s2
+        + 0.5 * Wb @ y
+        - np.log(np.diag(factor)).sum()
+        - 0.5 * off @ off
+    )
+    inverse = np.diag(dpotri(factor, overwrite_c=True)[0])
+    z = w * y
+    cost = quadratic.c_0 - 2.0 * quadratic.b @ z + z @ quadratic.H @ z
+    determined = float(len(w) - inverse.sum())
+    by_eta = structure.design.T @ (y * y + inverse - 1.0) - off / structure.spread
+    return float(value), np.append(by_eta, -quadratic.n + cost / s2 + determined), z, determined
+
+
+def maximise(quadratic: Quadratic, structure: Structure, eta: FloatArray, sigma: float) -> Widths:
+    """Climb from `eta` and `sigma` to where the evidence is largest."""
+    middle = np.append(structure.centre, np.log(sigma))
+    scale = np.append(structure.spread, SIGMA_STEP)
+
+    def downhill(x: FloatArray) -> tuple[float, FloatArray]:
+        if np.abs(x[:-1]).max() > FARTHEST:
+            return 1e300, 0.0 * x
+        at = middle + scale * x
+        value, slope, *_ = evidence(quadratic, structure, at[:-1], at[-1])
+        return (-value if np.isfinite(value) else 1e300), -slope * scale
+
+    start = np.append((eta - structure.centre) / structure.spread, 0.0)
+    x = middle + scale * minimize(downhill, start, jac=True, method="BFGS", options={"gtol": 1e-2}).x
+    value, _, z, determined = evidence(quadratic, structure, x[:-1], x[-1])
+    return Widths(x[:-1], float(np.exp(x[-1])), value, determined, z)
+
+
+def is_maximum(quadratic: Quadratic, structure: Structure, widths: Widths) -> bool:
+    """Check that the surface bends down in every direction, and that a Newton step would gain nothing."""
+    x = np.append(widths.eta, np.log(widths.sigma))
+    scale = np.append(structure.spread, SIGMA_STEP)
+
+    def slope(at: FloatArray) -> FloatArray:
+        return np.asarray(evidence(quadratic, structure, at[:-1], at[-1])[1] * scale)
+
+    bend = np.array([(slope(x + h) - slope(x - h)) / 2e-3 for h in 1e-3 * np.diag(scale)])
+    values, vectors = np.linalg.eigh(-0.5 * (bend + bend.T))
+    gain = 0.5 * np.sum((vectors.T @ slope(x)) ** 2 / np.maximum(values, 1e-300))
+    return bool(values[0] > 0.0 and gain < STILL)

@@ -1,0 +1,255 @@
+"""Fit a calibration: one door, and a table of methods behind it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from importlib import import_module
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+from magbridge.calibration.fitting.boresight import find_boresight
+from magbridge.calibration.fitting.data import Observations
+from magbridge.calibration.fitting.identify import combinations, expected_ratio, heading_gap, warnings_for
+from magbridge.calibration.fitting.noise import NoiseModel
+from magbridge.calibration.model import Calibration, Noise, Parameter, Reference, Run, Sensor, with_boresight
+from magbridge.calibration.residual import Samples, residuals_of, scales_and_offsets
+from magbridge.calibration.terms import Polynomial
+from magbridge.errors import CalibrationError
+from magbridge.version import __version__
+
+__all__ = ["METHODS", "Fit", "fit"]
+
+FloatArray = NDArray[np.float64]
+
+METHODS: dict[str, str] = {
+    "auto": "magbridge.calibration.fitting.auto:fit_auto",
+    "nominal": "magbridge.calibration.fitting.fit:fit_nominal",
+    "cubic": "magbridge.calibration.fitting.cubic:fit_cubic",
+    "runs": "magbridge.calibration.fitting.per_run:fit_per_run",
+    "horizontal": "magbridge.calibration.fitting.horizontal:fit_horizontal",
+}
+"""Name -> ``module:function``, each ``(observations, order, **options) -> Fit``."""
+
+ONE_ATTITUDE = 5.0  # deg from the mean direction
+UNSUPPORTED = 5.0  # times the noise is more than a calibration may leave
+UNSEEN = 270.0  # deg of the compass: what is seen in less than a quarter of it may be anything in the rest
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """What a fit gives back.
+
+    Attributes
+    ----------
+    calibration : Calibration
+    residual : (n,) array
+        nT in the sensor's own units: ``(F - H_e) / |A^T u|``.
+    warnings : tuple of str
+        What the data could not tell, in a pilot's words.
+    details : dict
+        Numbers of the method: evidence, widths, what was determined; rank and how well each estimable
+        combination is known from the data alone (nT).
+    samples : Samples
+        What was compared, for a closer look (:mod:`.identify`).
+    supported : bool
+        The data hold the fit: what it leaves open is small against the noise (``--strict``).
+    """
+
+    calibration: Calibration
+    residual: FloatArray
+    warnings: tuple[str, ...]
+    details: dict[str, Any]
+    samples: Samples
+    supported: bool = True
+
+    @property
+    def scales(self) -> tuple[float, float]:
+        """Smallest and largest scale of A where the samples are: what the residual was bought with."""
+        step = max(len(self.samples.phi) // 1000, 1)
+        scales, _ = scales_and_offsets(
+            self.samples.part(slice(None, None, step)), self.calibration.coefficients
+        )
+        return float(scales.min()), float(scales.max())
+
+    @property
+    def rms(self) -> float:
+        """RMS of the residual, nT."""
+        return float(np.sqrt(np.mean(self.residual**2)))
+
+
+def fit(
+    data: Observations, method: str = "auto", order: int = 3, *, site_bias: float = 0.0, **options: Any
+) -> Fit:
+    """Fit a calibration to `data`.
+
+    Parameters
+    ----------
+    data : Observations
+    method : str
+        One of :data:`METHODS`.
+    order : int
+        Highest total degree of the polynomials.
+    site_bias : float
+        nT, 1-sigma of what the reference may be wrong by all over the site. No scalar fit at one site
+        can tell it from the gain: it goes into the covariance.
+    **options
+        The method's own.
+
+    Raises
+    ------
+    CalibrationError
+        The data do not support the fit, or there is no such method.
+    """
+    if method not in METHODS:
+        raise CalibrationError(f"method {method!r} is not known: one of {', '.join(METHODS)}")
+    module, _, name = METHODS[method].partition(":")
+    chosen: Callable[..., Fit] = getattr(import_module(module), name)
+    # one thread: matrices this small only wait for each other, and sums keep one order on any machine
+    with threadpool_limits(1, "blas"):
+        _refuse_one_attitude(data)
+        data, doubled = _without_doubles(data)
+        found = _biased(chosen(data, order, **options), site_bias)
+        return _judged(found, data, doubled)
+
+
+def _without_doubles(data: Observations) -> tuple[Observations, tuple[str, ...]]:
+    """Count samples once that stand there twice: a run given in two files."""
+    assert data.time is not None
+    order = np.argsort(data.time, kind="stable")
+    time, field = data.time[order], data.field[order]
+    same = np.zeros(len(data), bool)
+    same[order[1:]] = (time[1:] == time[:-1]) & (field[1:] == field[:-1]).all(axis=1)
+    if not same.any():
+        return data, ()
+    return data.part(~same), (f"{int(same.sum())} samples stand in the data twice: they were counted once",)
+
+
+def _biased(found: Fit, sigma: float) -> Fit:
+    """Carry an unknown bias of the reference into the covariance: ``dA = A dF / F`` for all positions alike."""
+    calibration = found.calibration
+    field = calibration.reference.field
+    v = calibration.coefficients.reshape(-1, 9) / field
+    v[0, :3] += 1.0
+    v[:, 6:] = 0.0
+    return replace(
+        found,
+        calibration=replace(
+            calibration,
+            covariance=calibration.covariance + sigma**2 * np.outer(v, v),
+            reference=Reference(field, calibration.reference.model, 0.0, sigma),
+        ),
+    )
+
+
+def _refuse_one_attitude(data: Observations) -> None:
+    """Refuse samples that all point the same way: nothing in them turns the sensor's errors."""
+    unit = data.field / np.linalg.norm(data.field, axis=1)[:, None]
+    middle = unit.mean(axis=0)
+    off = np.degrees(np.arccos(np.clip(unit @ middle / np.linalg.norm(middle), -1.0, 1.0)))
+    if np.quantile(off, 0.95) < ONE_ATTITUDE:
+        raise CalibrationError(
+            f"all samples stand within {np.quantile(off, 0.95):.1f} degrees of one attitude: "
+            "fly turns (full circles, dives and climbs)"
+        )
+
+
+def _judged(found: Fit, data: Observations, doubled: tuple[str, ...]) -> Fit:
+    """Add the boresight, and say what the data could not tell."""
+    calibration = found.calibration
+    if calibration.boresight is None:
+        calibration = with_boresight(calibration, find_boresight(calibration, data))
+    ratio = expected_ratio(calibration, data)
+    warnings = [*doubled, *found.warnings, *warnings_for(calibration, data)]
+    outliers = found.details.get("outliers", 0)
+    if outliers > 0.02 * len(data):
+        warnings.append(f"{outliers} of {len(data)} samples are outliers and took no part")
+    gap = heading_gap(data)
+    if gap > UNSEEN:
+        warnings.insert(
+            0,
+            f"the data do not support this fit: all headings lie within {360.0 - gap:.0f} degrees, and on others "
+            "iron cannot be told from field",
+        )
+    if ratio > UNSUPPORTED:
+        warnings.insert(
+            0,
+            f"the data do not support this fit: at these pitches and positions, on any heading and rolled 10 degrees "
+            f"further, expect {ratio * calibration.noise.sensor:.0f} nT of error",
+        )
+    seen = combinations(found.samples, calibration.coefficients, max(calibration.noise.sensor, 1e-9))
+    details = {
+        **found.details,
+        "expected_over_noise": ratio,
+        "rank": seen.rank,
+        "combinations_nT": seen.sigma.tolist(),
+    }
+    return replace(
+        found,
+        calibration=calibration,
+        warnings=tuple(warnings),
+        details=details,
+        supported=ratio <= UNSUPPORTED and gap <= UNSEEN,
+    )
+
+
+def fit_nominal(data: Observations, order: int = 0, **options: Any) -> Fit:  # noqa: ARG001  (one ellipsoid has none)
+    """:func:`~magbridge.calibration.fitting.nominal.nominal` as a calibration without parameters."""
+    from magbridge.calibration.fitting.nominal import nominal, nominal_samples  # noqa: PLC0415  (a cycle else)
+
+    coefficients, covariance, noise = nominal(data, **options)
+    return assemble(data, nominal_samples(data), (), ((),), coefficients, covariance, noise, "nominal")
+
+
+def assemble(
+    data: Observations,
+    samples: Samples,
+    parameters: tuple[Parameter, ...],
+    exponents: tuple[tuple[int, ...], ...],
+    coefficients: FloatArray,
+    covariance: FloatArray,
+    noise: NoiseModel,
+    method: str,
+    warnings: tuple[str, ...] = (),
+    details: dict[str, Any] | None = None,
+) -> Fit:
+    """Put a fit's numbers into a calibration with its run table."""
+    e = residuals_of(samples, coefficients)
+    assert data.runs is not None
+    assert data.time is not None
+    labels, which = np.unique(data.runs, return_inverse=True)
+    count = np.bincount(which)
+    squares = np.bincount(which, e * e)
+    places = [np.bincount(which, column) / count for column in data.parameters.T]
+    table = tuple(
+        Run(
+            str(label),
+            int(count[r]),
+            float(np.sqrt(squares[r] / count[r])),
+            tuple(float(p[r]) for p in places),
+        )
+        for r, label in enumerate(labels)
+    )
+    steps = np.diff(data.time)
+    calibration = Calibration(
+        parameters=parameters,
+        terms=(Polynomial(exponents=exponents),),
+        coefficients=coefficients,
+        covariance=covariance,
+        noise=Noise(
+            noise.sigma,
+            samples.kappa * noise.sigma,
+            noise.memory,
+            float(np.median(steps)) if steps.size else 0.0,
+        ),
+        reference=Reference(samples.unit, data.model),
+        sensor=Sensor(data.sensor),
+        runs=table,
+        method=method,
+        inputs=dict(data.inputs),
+        software=f"magbridge {__version__}",
+    )
+    return Fit(calibration, e, warnings, details or {}, samples)

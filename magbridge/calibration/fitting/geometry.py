@@ -1,0 +1,181 @@
+r"""A prior from where the masses sit: the polynomials that dipoles there would make.
+
+Notes
+-----
+Latent numbers: for each mass a permanent moment (3), an induced one (3), its displacement from where
+the tape found it (3) and of its travel (3); and the free polynomials of :mod:`.prior`, now only for
+what dipoles leave (extended masses, a sensor a degree out of line), so far smaller. Coefficients are
+linear in the moments; in the displacements they are linearised, anew in each round of the fit, so
+that no place is held more certain than `at_sigma`.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+import numpy as np
+from msgspec import Meta
+from numpy.polynomial import chebyshev
+from numpy.typing import NDArray
+
+from magbridge.calibration.dipole import dipole_columns, expand_dipole
+from magbridge.calibration.fitting.prior import FACTOR_MASS, Structure, gain_rotation
+from magbridge.calibration.model import Parameter
+from magbridge.calibration.terms import Exponents
+from magbridge.errors import CalibrationError, ConfigError
+
+__all__ = ["Mounting", "mounted_structure", "read_vehicle"]
+
+FloatArray = NDArray[np.float64]
+Vector = tuple[float, float, float]
+
+MOMENT, INDUCED = 2000.0, 30.0  # nT at the sensor: a battery pack at arm's length
+INDUCED_APART = 0.4  # of the induced moment: iron is drawn along every axis the same way, if not as much
+TRAVEL_SIGMA = 0.03  # of the travel: the sensor's axes are a degree or two out of the vehicle's
+REST_T, REST_A = 1.0, 0.25  # nT over half the range: what a dipole there does not say
+LATENT = 12  # numbers a mass
+
+
+class Mounting(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """``[mass.NAME]``: where the mass that parameter NAME moves sits, seen from the sensor.
+
+    Attributes
+    ----------
+    at : tuple of 3 float
+        m, body frame, where the parameter is 0.
+    travel : tuple of 3 float
+        m per unit of the parameter.
+    at_sigma : float
+        m, 1-sigma of `at`.
+    """
+
+    at: Vector
+    travel: Vector
+    at_sigma: Annotated[float, Meta(gt=0)] = 0.05
+
+
+class _VehicleFile(msgspec.Struct, forbid_unknown_fields=True):
+    mass: dict[str, Mounting]
+
+
+def read_vehicle(path: str | Path) -> dict[str, Mounting]:
+    """Read ``vehicle.toml``.
+
+    Raises
+    ------
+    ConfigError
+        The file, a key or a type is not as expected.
+    """
+    try:
+        content = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+        return msgspec.convert(content, _VehicleFile).mass
+    except OSError as problem:
+        raise ConfigError(path, "", f"cannot be read: {problem.strerror}") from problem
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as problem:
+        raise ConfigError(path, "", f"not TOML: {problem}") from problem
+    except msgspec.ValidationError as problem:
+        text, _, where = str(problem).partition(" - at ")
+        raise ConfigError(path, where.strip("`").removeprefix("$."), text) from problem
+
+
+@dataclass(frozen=True, eq=False)
+class _Mass:
+    """A mounted mass in the fit: which rows of the coefficients it makes, and along which line."""
+
+    rows: NDArray[np.intp]  # of its monomials x, x^2 ...
+    at: FloatArray
+    travel: FloatArray
+    sigma: float
+    parameter: Parameter
+
+    def columns(self, latent: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """(order, 9, 12) derivative of its coefficients by its latent numbers, and (order, 9) of them."""
+        moment, pulled, shift, stretch = latent.reshape(4, 3)
+        induced = gain_rotation() @ pulled
+        p = self.parameter.centre + self.parameter.scale * chebyshev.chebpts1(4 * len(self.rows) + 4)
+        r = self.at + shift + p[:, None] * (self.travel + stretch)
+        # the scale of the moments stays that of the tape, or a shift would change them too
+        by = dipole_columns(r, moment, induced, float(np.linalg.norm(self.at)))
+        by[3:6] = np.tensordot(gain_rotation().T, by[3:6], 1)
+        by = np.concatenate([by, by[6:] * p[:, None]])
+        powers = expand_dipole(by, len(self.rows))[:, 1:]  # its constant goes with the hard iron
+        return np.moveaxis(powers, 0, -1), np.tensordot(latent[:6], powers[:6], 1)
+
+
+def mounted_structure(
+    free: Structure,
+    exponents: tuple[Exponents, ...],
+    parameters: tuple[Parameter, ...],
+    vehicle: Mapping[str, Mounting | Mapping[str, Any]],
+) -> Structure:
+    """Add dipoles where `vehicle` has masses to the free polynomials.
+
+    Raises
+    ------
+    CalibrationError
+        `vehicle` names a mass that no parameter moves, or one so near that no series stands for it.
+    """
+    names = [parameter.name for parameter in parameters]
+    masses = []
+    for name, found in vehicle.items():
+        mounting = found if isinstance(found, Mounting) else msgspec.convert(found, Mounting)
+        if name not in names:
+            raise CalibrationError(f"vehicle: mass {name!r}: the fit's parameters are {', '.join(names)}")
+        k = names.index(name)
+        order = max(powers[k] for powers in exponents)
+        rows = [exponents.index(tuple(n * (i == k) for i in range(len(names)))) for n in range(1, order + 1)]
+        parameter, travel = parameters[k], np.array(mounting.travel)
+        middle = np.linalg.norm(np.array(mounting.at) + parameter.centre * travel)
+        if middle < 3.0 * parameter.scale * np.linalg.norm(travel) or middle == 0.0:
+            raise CalibrationError(f"vehicle: mass {name!r} passes within three half-travels of the sensor")
+        masses.append(_Mass(np.array(rows), np.array(mounting.at), travel, mounting.at_sigma, parameter))
+    labels = tuple(f"{name} {kind}" for name in vehicle for kind in ("moment", "induced"))
+    q, h, extra = free.design.shape[0], free.design.shape[1], len(labels)
+    design = np.zeros((q + LATENT * len(masses), h + extra))
+    design[:q, :h] = free.design
+    constant = np.append(free.constant, np.zeros(LATENT * len(masses)))
+    for i, mass in enumerate(masses):
+        first = q + LATENT * i
+        design[first : first + 3, h + 2 * i] = 1.0
+        design[first + 3 : first + 6, h + 2 * i + 1] = 1.0
+        constant[first + 3] = np.log(np.sqrt(3.0))
+        constant[first + 4 : first + 6] = np.log(INDUCED_APART)
+        constant[first + 6 : first + 9] = np.log(mass.sigma)
+        constant[first + 9 : first + 12] = np.log(TRAVEL_SIGMA * np.linalg.norm(mass.travel))
+    centre = np.append(free.centre, np.log([MOMENT, INDUCED] * len(masses)))
+    for name in vehicle:
+        k = 3 + 3 * names.index(name)
+        centre[k], centre[k + 1] = np.log(REST_T), np.log(REST_A)
+    whole = Structure(
+        E=free.E,
+        offset=free.offset,
+        constant=constant,
+        design=design,
+        centre=centre,
+        spread=np.append(free.spread, np.full(extra, FACTOR_MASS)),
+        names=free.names + labels,
+    )
+    return _linearised(whole, free.E, masses, np.zeros((len(masses), LATENT)))
+
+
+def _linearised(whole: Structure, E: FloatArray, masses: list[_Mass], latent: FloatArray) -> Structure:
+    """Linearise: the structure with the dipoles' columns as they are at `latent`: ``c(l) ~ c(l_0) + J (l - l_0)``."""
+    size, q = len(E), E.shape[1]
+    J = np.zeros((size, q + LATENT * len(masses)))
+    J[:, :q] = E
+    offset = np.zeros(size)
+    for i, (mass, at) in enumerate(zip(masses, latent, strict=True)):
+        by, value = mass.columns(at)
+        place = (9 * mass.rows[:, None] + np.arange(9)).ravel()
+        J[place, q + LATENT * i : q + LATENT * (i + 1)] = by.reshape(-1, LATENT)
+        offset[place] += (value - by @ at).ravel()
+
+    def renew(z: FloatArray) -> tuple[Structure, FloatArray]:
+        return _linearised(whole, E, masses, z[q:].reshape(-1, LATENT)), z
+
+    return replace(whole, E=J, offset=offset, renew=renew)

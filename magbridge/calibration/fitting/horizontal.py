@@ -1,0 +1,84 @@
+"""The alternative that the paper names: level the vectors by attitude telemetry, fit the horizontal circle.
+
+Notes
+-----
+After Isezaki (1986) and Korenaga (1995): a vehicle with an attitude reference knows which part of its
+corrected field is horizontal, and both parts have known sizes whatever the heading::
+
+    l = R_y(pitch) R_x(roll) B (H_r - T),   |l_xy| = H_h,   l_z = Z
+
+with a full matrix B: tilts show, so all but one angle of the boresight comes with it. ``B = R A`` with A
+symmetric (polar decomposition). It is as good as the attitude is: half a degree is 150 nT of Z in H_h.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import polar
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from magbridge.calibration.fitting.data import Observations
+from magbridge.calibration.fitting.fit import Fit, assemble
+from magbridge.calibration.fitting.noise import estimate_noise
+from magbridge.calibration.fitting.nominal import HARD_IRON_SIGMA, SCALE_SIGMA, check_scales, nominal_samples
+from magbridge.calibration.residual import residuals_of
+from magbridge.errors import CalibrationError
+
+__all__ = ["fit_horizontal"]
+
+FloatArray = NDArray[np.float64]
+FIRST_NOISE = 1e-3  # of the field: of attitude errors, before it is known
+
+
+def fit_horizontal(data: Observations, order: int = 0) -> Fit:  # noqa: ARG001  (one ellipsoid has none)
+    """Fit one ellipsoid by levelled components.
+
+    Raises
+    ------
+    CalibrationError
+        Roll and pitch, or the reference's direction, are lacking.
+    """
+    if data.attitude is None or data.reference_ned is None:
+        raise CalibrationError("horizontal: needs roll, pitch and a position (for the field's inclination)")
+    known = np.isfinite(data.attitude[:, :2]).all(axis=1) & np.isfinite(data.reference_ned).all(axis=1)
+    if known.sum() < 30:
+        raise CalibrationError(f"horizontal: only {int(known.sum())} samples have roll, pitch and position")
+    data = data.part(np.asarray(known))
+    assert data.attitude is not None
+    assert data.reference_ned is not None
+    samples = nominal_samples(data)
+    unit = samples.unit
+    level = Rotation.from_euler("YX", data.attitude[:, 1::-1])
+    ned = data.reference_ned
+    horizontal, vertical = np.hypot(ned[:, 0], ned[:, 1]), ned[:, 2]
+    widths = np.array([SCALE_SIGMA] * 9 + [HARD_IRON_SIGMA] * 3)
+
+    def misfit(x: FloatArray, sigma: float) -> FloatArray:
+        B, T = np.eye(3) + x[:9].reshape(3, 3), unit * x[9:]
+        l = level.apply((data.field - T) @ B.T)  # noqa: E741  (the notes' letter)
+        parts = np.concatenate([np.hypot(l[:, 0], l[:, 1]) - horizontal, l[:, 2] - vertical])
+        return np.concatenate([parts / sigma, x / widths])
+
+    sigma, x = FIRST_NOISE * unit, np.zeros(12)
+    for _ in range(3):
+        found = least_squares(misfit, x, args=(sigma,), loss="soft_l1", f_scale=3.0)
+        x = found.x
+        sigma = float(np.sqrt(np.mean((misfit(x, sigma)[:-12] * sigma) ** 2)))
+    covariance = np.linalg.inv(found.jac.T @ found.jac)
+    map_ = np.array([(_own(x + h, unit) - _own(x - h, unit)) / 2e-6 for h in 1e-6 * np.eye(12)]).T
+    coefficients = _own(x, unit)
+    check_scales(samples, coefficients)
+    noise = estimate_noise(residuals_of(samples, coefficients), samples.follows, 9.0)
+    return assemble(
+        data, samples, (), ((),), coefficients, map_ @ covariance @ map_.T, noise, "horizontal",
+        details={"attitude_noise_nT": sigma},
+    )  # fmt: skip
+
+
+def _own(x: FloatArray, unit: float) -> FloatArray:
+    """B and T to the nine coefficients: ``B = R A``, nT."""
+    _, A = polar(np.eye(3) + x[:9].reshape(3, 3))
+    a = unit * (A - np.eye(3))
+    return np.concatenate([a[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]], unit * x[9:]])

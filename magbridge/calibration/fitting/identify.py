@@ -1,0 +1,168 @@
+"""What the data can tell, and what they cannot: rank, estimable combinations, words for a pilot."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magbridge.calibration.fitting.data import Observations
+from magbridge.calibration.fitting.mission import expected_error, nearby_mission
+from magbridge.calibration.model import Calibration
+from magbridge.calibration.residual import Samples, residuals
+from magbridge.calibration.terms import Polynomial
+
+__all__ = ["Combinations", "combinations", "expected_ratio", "heading_gap", "warnings_for"]
+
+FloatArray = NDArray[np.float64]
+ROWS = 5_000  # of the Jacobian: more do not change its rank
+RANK_TOLERANCE = 1e-9  # of the largest singular value
+
+
+@dataclass(frozen=True, eq=False)
+class Combinations:
+    """Combinations of coefficients that the data see, best known first.
+
+    Attributes
+    ----------
+    rank : int
+        How many they see at all, whatever the noise.
+    sigma : (rank,) array
+        nT, how well each is known from the data alone.
+    vectors : (rank, K) array
+        Each a unit vector over the coefficients (scaled by their monomials' size on the data).
+    """
+
+    rank: int
+    sigma: FloatArray
+    vectors: FloatArray
+
+
+def combinations(samples: Samples, coefficients: FloatArray, sigma: float) -> Combinations:
+    """Singular values of the whitened Jacobian.
+
+    Parameters
+    ----------
+    samples : Samples
+    coefficients : (9 m,) array
+        Where to linearise.
+    sigma : float
+        nT, noise of a sample.
+    """
+    step = max(len(samples.field) // ROWS, 1)
+    part = samples.part(slice(None, None, step))
+    _, g = residuals(part, coefficients)
+    J = (part.phi[:, :, None] * g[:, None, :]).reshape(len(g), -1) * np.sqrt(step) / sigma
+    # a power that hardly moves is no less estimable for its unit
+    size = np.linalg.norm(J, axis=0)
+    scale = np.where(size > 0.0, size, 1.0)
+    _, values, vectors = np.linalg.svd(J / scale * np.median(scale), full_matrices=False)
+    rank = int((values > RANK_TOLERANCE * values[0]).sum())
+    return Combinations(rank, 1.0 / values[:rank], vectors[:rank])
+
+
+def expected_ratio(calibration: Calibration, data: Observations) -> float:
+    """RMS error expected near the runs, on all headings, rolled 10 deg further, over the noise of a sample."""
+    error = expected_error(calibration, nearby_mission(calibration, data))
+    return float(np.sqrt(np.mean(error**2)) / max(calibration.noise.sensor, 1e-9))
+
+
+def warnings_for(calibration: Calibration, data: Observations) -> tuple[str, ...]:
+    """Say in a pilot's words what the runs left open."""
+    return tuple(text for check in CHECKS for text in check(calibration, data))
+
+
+def _positions(calibration: Calibration, data: Observations) -> Iterator[str]:
+    for k, parameter in enumerate(calibration.parameters):
+        order = max(
+            (e[k] for term in calibration.terms if isinstance(term, Polynomial) for e in term.exponents),
+            default=0,
+        )
+        column = np.sort(data.parameters[:, k])
+        jumps = np.flatnonzero(np.diff(column) > 0.02 * parameter.scale)
+        groups = [g for g in np.split(column, jumps + 1) if len(g) > 0.02 * len(column)]
+        if any(np.ptp(g) > 0.3 * parameter.scale for g in groups):
+            continue  # it moved all along: no positions to count
+        if len(groups) <= min(order, 3):
+            places = " and ".join(f"{np.median(g):.4g}" for g in groups)
+            yield (
+                f"{parameter.name} was only ever at {len(groups)} position{'s' * (len(groups) != 1)} "
+                f"({places} {parameter.unit}".rstrip()
+                + "): between and beyond, the correction is what physics "
+                "expects, not what was measured; fly a run with it somewhere else"
+            )
+
+
+def _together(calibration: Calibration, data: Observations) -> Iterator[str]:
+    names = [parameter.name for parameter in calibration.parameters]
+    if len(names) < 2:
+        return
+    together = np.atleast_2d(np.corrcoef(data.parameters[:, : len(names)].T))
+    for i, one in enumerate(names):
+        for j, other in enumerate(names[:i]):
+            if abs(together[i, j]) > 0.9:
+                yield (
+                    f"{other} and {one} always moved together (correlation {together[i, j]:.2f}): which of the two "
+                    "does what cannot be told; fly a run that moves only one of them"
+                )
+
+
+def _attitudes(calibration: Calibration, data: Observations) -> Iterator[str]:
+    if data.attitude is None:
+        return
+    known = data.attitude[np.isfinite(data.attitude).all(axis=1)]
+    if not len(known):
+        return
+    roll, pitch, heading = np.degrees(known).T
+    low, high = np.quantile(roll, [0.02, 0.98])
+    theta = calibration.covariance[8, 8]
+    if high - low < 10.0 and theta > (5.0 * calibration.noise.sensor) ** 2:
+        yield (
+            f"roll never left {low:.0f} to {high:.0f} degrees: the vertical offset is known to "
+            f"{np.sqrt(theta):.0f} nT; fly a run banked the other way"
+        )
+    if pitch.min() > -5.0 and pitch.max() < 5.0:
+        yield (
+            f"pitch never left {pitch.min():.0f} to {pitch.max():.0f} degrees: steeper, nothing was measured; "
+            "fly dives and climbs"
+        )
+    elif pitch.min() > -5.0 or pitch.max() < 5.0:
+        seen, lacking = ("climbs", "dives") if pitch.min() > -5.0 else ("dives", "climbs")
+        yield f"only {seen} (pitch {pitch.min():.0f} to {pitch.max():.0f}): nothing was measured in {lacking}"
+    left, gap = _widest_gap(heading)
+    if gap > 60.0:
+        yield f"no run headed between {left:03.0f} and {(left + gap) % 360.0:03.0f}: fly full turns"
+
+
+def heading_gap(data: Observations) -> float:
+    """Width (deg) of the widest part of the compass that no sample headed to; 0 without attitude telemetry."""
+    if data.attitude is None:
+        return 0.0
+    heading = np.degrees(data.attitude[:, 2])
+    known = np.isfinite(heading)
+    return _widest_gap(heading[known])[1] if known.any() else 0.0
+
+
+def _widest_gap(heading: FloatArray) -> tuple[float, float]:
+    """Where it begins, and its width, deg."""
+    courses = np.sort(heading % 360.0)
+    gaps = np.diff(np.append(courses, courses[0] + 360.0))
+    widest = int(np.argmax(gaps))
+    return float(courses[widest]), float(gaps[widest])
+
+
+def _runs(calibration: Calibration, data: Observations) -> Iterator[str]:
+    count = len(np.unique(data.runs)) if data.runs is not None else 1
+    if calibration.parameters and count < 4:
+        yield f"only {count} run{'s' * (count != 1)}: nothing can be left out to see whether the fit holds"
+
+
+CHECKS: tuple[Callable[[Calibration, Observations], Iterator[str]], ...] = (
+    _positions,
+    _together,
+    _attitudes,
+    _runs,
+)
+"""What may be wrong with a set of runs; each yields a sentence for each fault it finds."""

@@ -1,0 +1,51 @@
+r"""Undo an anti-alias filter before a fit: in a calibration's turns it takes a little off the field.
+
+Notes
+-----
+An RC filter of corner f_c gives y with :math:`\mathbf y + τ \dot{\mathbf y} = \mathbf x`, :math:`τ = 1/(2 π f_c)`. Of a
+field that turns with the vehicle it does not only lag; it shortens::
+
+    |y| = |x| - tau^2 |dx/dt|^2 / (2 |x|)
+
+With the paper's 0.33 Hz, in a spiral of four minutes a turn, 0.7 nT: little, but all of it goes into the gain, and from
+there into every sample of a straight survey.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magbridge.calibration.fitting.data import Observations
+
+__all__ = ["unfiltered"]
+
+REACH = 4.0  # time constants that a slope spans at least: shorter ones would be noise
+
+
+def unfiltered(data: Observations, corner: float) -> Observations:
+    """Return `data` as they would be without a first-order filter of that corner.
+
+    Parameters
+    ----------
+    data : Observations
+    corner : float
+        Hz.
+    """
+    assert data.time is not None
+    if len(data) < 3:
+        return data
+    tau = 1.0 / (2.0 * np.pi * corner)
+    reach = max(int(np.ceil(0.5 * REACH * tau / np.median(np.diff(data.time)))), 1)
+    stretch = np.cumsum(~data.follows)
+    rows = np.arange(len(data))
+    ahead, behind = np.minimum(rows + reach, len(data) - 1), np.maximum(rows - reach, 0)
+    # a slope does not reach into another run; at an end it looks one way only
+    ahead = np.where(stretch[ahead] == stretch, ahead, rows)
+    behind = np.where(stretch[behind] == stretch, behind, rows)
+    apart = data.time[ahead] - data.time[behind]
+    rise: NDArray[np.float64] = data.field[ahead] - data.field[behind]
+    slope = np.divide(rise, apart[:, None], out=np.zeros_like(rise), where=apart[:, None] > 0.0)
+    return replace(data, field=data.field + tau * slope)

@@ -1,0 +1,109 @@
+"""How well a calibration will do on a mission: the uncertainty of its model over what the mission meets."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from magbridge.calibration.correct import correct
+from magbridge.calibration.fitting.boresight import field_body
+from magbridge.calibration.fitting.data import Observations
+from magbridge.calibration.forward import forward
+from magbridge.calibration.model import Calibration, Noise
+from magbridge.errors import CalibrationError
+
+__all__ = ["Mission", "expected_error", "nearby_mission"]
+
+FloatArray = NDArray[np.float64]
+POINTS = 600  # of a mission are enough to know it by
+
+
+@dataclass(frozen=True, eq=False)
+class Mission:
+    """What a mission meets.
+
+    Attributes
+    ----------
+    field_body : (n, 3) array
+        nT, the true field in body axes.
+    parameters : (n, k) array
+        Positions there, in their units.
+    """
+
+    field_body: FloatArray
+    parameters: FloatArray
+
+    @classmethod
+    def of(cls, data: Observations) -> Mission:
+        """Take the attitudes and positions of a deployment.
+
+        Raises
+        ------
+        CalibrationError
+            Attitude or place are lacking.
+        """
+        if data.attitude is None or data.reference_ned is None:
+            raise CalibrationError("the mission needs roll, pitch, heading, latitude and longitude")
+        known = np.isfinite(data.attitude).all(axis=1) & np.isfinite(data.reference_ned).all(axis=1)
+        if not known.any():
+            raise CalibrationError("the mission has no sample with both attitude and position")
+        rows = np.flatnonzero(known)[:: max(int(known.sum()) // POINTS, 1)]
+        return cls(field_body(data.attitude[rows], data.reference_ned[rows]), data.parameters[rows])
+
+
+def nearby_mission(calibration: Calibration, data: Observations, roll: float = 10.0) -> Mission:
+    """Return the calibration's own attitudes and positions, rolled a little further either way, and on all headings.
+
+    That is what a survey after these runs meets at least. The corrected vectors themselves tell the attitude up to
+    a turn about the field; where the vertical is, attitude telemetry must tell: without it, headings stay.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    data : Observations
+    roll : float
+        deg either way.
+    """
+    rows = np.arange(0, len(data), max(3 * len(data) // POINTS, 1))
+    k = len(calibration.parameters)
+    positions = data.parameters[rows, :k]
+    assert data.time is not None
+    b = correct(calibration, data.field[rows], positions, data.time[rows]).vector
+    met = [Rotation.from_euler("X", angle, degrees=True).apply(b) for angle in (-roll, 0.0, roll)]
+    places = [positions] * len(met)
+    if data.attitude is not None:
+        known = np.isfinite(data.attitude[rows]).all(axis=1)
+        attitude = Rotation.from_euler("ZYX", data.attitude[rows[known], ::-1])
+        down = attitude.apply([0.0, 0.0, 1.0], inverse=True)
+        met += [
+            Rotation.from_rotvec(np.radians(angle) * down).apply(b[known]) for angle in range(60, 360, 60)
+        ]
+        places += [positions[known]] * (len(met) - len(places))
+    return Mission(np.concatenate(met), np.concatenate(places))
+
+
+def expected_error(calibration: Calibration, mission: Mission) -> FloatArray:
+    """1-sigma of the corrected total field that the calibration itself leaves, noise apart, nT.
+
+    Returns
+    -------
+    (n,) array
+    """
+    keep = sum(term.size for term in calibration.terms)
+    model = replace(
+        calibration,
+        effects=(),
+        coefficients=calibration.coefficients[:keep],
+        covariance=calibration.covariance[:keep, :keep],
+        noise=Noise(0.0),
+        boresight=None,
+    )
+    truth = mission.field_body
+    if calibration.boresight is not None:
+        truth = truth @ calibration.boresight.matrix()
+    time = np.zeros(len(truth))
+    reading = forward(model, truth, mission.parameters, time)
+    return correct(model, reading, mission.parameters, time).sigma

@@ -1,0 +1,150 @@
+"""The nominal fit: one ellipsoid for all samples, nine numbers (paper, section 2.1).
+
+Notes
+-----
+On a glider's narrow attitudes a free ellipsoid has a way out: ``A -> 0`` with ``T -> infinity`` sends every
+residual to zero. So scale and soft iron have a prior of physical width, residuals are reported in
+the sensor's own nT, and an answer that shrank all the same is refused.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magbridge.calibration.fitting.data import Observations
+from magbridge.calibration.fitting.noise import NoiseModel, estimate_noise
+from magbridge.calibration.fitting.solve import Prior, covariance_of, gauss_newton
+from magbridge.calibration.residual import Samples, residuals_of, scales_and_offsets
+from magbridge.errors import CalibrationError
+
+__all__ = ["SCALE_SIGMA", "check_scales", "nominal", "nominal_samples"]
+
+FloatArray = NDArray[np.float64]
+
+SCALE_SIGMA = 0.015
+"""Prior 1-sigma by which scales differ from each other, and of soft iron, on a vehicle."""
+GAIN_SIGMA = 0.02
+"""Prior 1-sigma of the gain that the three axes share: data of all attitudes overrule it."""
+HARD_IRON_SIGMA = 0.6
+"""Prior 1-sigma of the hard iron, as a fraction of the field."""
+
+
+def nominal_samples(data: Observations) -> Samples:
+    """Take `data` with the constant monomial only."""
+    return Samples(
+        data.field, data.reference, np.ones((len(data), 1)), data.follows, float(data.reference.mean())
+    )
+
+
+def nominal(
+    data: Observations,
+    *,
+    axes_fixed: bool = False,
+    equal_xz: bool = False,
+    scale_sigma: float = SCALE_SIGMA,
+    gain_sigma: float = GAIN_SIGMA,
+) -> tuple[FloatArray, FloatArray, NoiseModel]:
+    """Fit one ellipsoid.
+
+    Parameters
+    ----------
+    data : Observations
+        Its parameters are not used.
+    axes_fixed : bool
+        ``M = I``: no rotation, as the paper does.
+    equal_xz : bool
+        ``S_x = S_z``, as the paper does.
+    scale_sigma, gain_sigma : float
+        Prior 1-sigma of soft iron, and of the gain common to all axes.
+
+    Returns
+    -------
+    coefficients : (9,) array
+        nT.
+    covariance : (9, 9) array
+        nT².
+    noise : NoiseModel
+
+    Raises
+    ------
+    CalibrationError
+        The fit collapsed or did not settle.
+    """
+    samples = nominal_samples(data)
+    E = np.eye(9)
+    if equal_xz:
+        E[2, 0] = 1.0
+    keep = [s for s in range(9) if not (axes_fixed and s in {3, 4, 5}) and not (equal_xz and s == 2)]
+    E = E[:, keep]
+    prior = Prior(_precision(E, scale_sigma, gain_sigma) / samples.unit**2, E)
+    best = None
+    for start in starts(samples):
+        z = np.asarray(np.linalg.lstsq(E, start, rcond=None)[0], float)
+        noise = NoiseModel(1e-3 * samples.unit)  # wide at first: far from the answer nothing is noise
+        for _ in range(4):
+            found = gauss_newton(samples, prior, noise, z)
+            z = found.z
+            # the moving masses are still in the residual: no noise to whiten, only fewer witnesses
+            noise = estimate_noise(residuals_of(samples, E @ z), samples.follows, len(keep))
+            memory, noise = noise.memory, replace(noise, memory=0.0)
+        value = found.normal.cost
+        if found.settled and (best is None or value < 0.999 * best[0]):
+            best = (value, found, noise, memory)
+    if best is None:
+        check_scales(samples, E @ z)  # on its way to collapse it never settles
+        raise CalibrationError("nominal: no start settled; are the samples those of one sensor?")
+    _, found, noise, memory = best
+    noise = replace(noise, memory=memory)
+    witnesses = (1.0 - memory) / (1.0 + memory)
+    precision = found.normal.hessian * witnesses / noise.sigma**2 + prior.precision
+    covariance = E @ covariance_of(precision) @ E.T
+    coefficients = E @ found.z
+    check_scales(samples, coefficients)
+    return coefficients, covariance, noise
+
+
+def _precision(E: FloatArray, scale_sigma: float, gain_sigma: float) -> FloatArray:
+    """Prior precision in units of the field, of the numbers that E leaves."""
+    covariance = np.diag(np.array([scale_sigma] * 6 + [HARD_IRON_SIGMA] * 3) ** 2)
+    covariance[:3, :3] += gain_sigma**2
+    return np.asarray(E.T @ np.linalg.inv(covariance) @ E)
+
+
+def starts(samples: Samples) -> list[FloatArray]:
+    """No iron at all; and the sphere that is nearest by linear least squares.
+
+    ``|h|^2 = 2 h^T T + (F^2 - |T|^2)`` is linear in T and one constant.
+    """
+    h = samples.field
+    design = np.column_stack([2.0 * h, np.full(len(h), samples.unit)])
+    scale = np.abs(design).max(axis=0) + 1e-300
+    right = (h * h).sum(axis=1) - samples.reference**2
+    # a hundredth of the field holds directions the samples never went to
+    damp = np.diag(np.full(4, 1e-2 * np.sqrt(len(h))))
+    solved = np.linalg.lstsq(np.vstack([design / scale, damp]), np.append(right, np.zeros(4)), rcond=None)[0]
+    sphere = np.concatenate([np.zeros(6), (solved / scale)[:3]])
+    return [np.zeros(9), sphere]
+
+
+def check_scales(samples: Samples, coefficients: FloatArray) -> None:
+    """Refuse a collapsed fit.
+
+    Raises
+    ------
+    CalibrationError
+        Where the samples are, a scale of A outside 0.5 to 2, or a T above twice the field.
+    """
+    seen = samples.part(slice(None, None, max(len(samples.phi) // 1000, 1)))
+    scales, T = scales_and_offsets(seen, coefficients)
+    worst = int(
+        np.argmax(np.maximum(np.abs(np.log2(np.maximum(scales, 1e-3))).max(axis=1), T / (2.0 * samples.unit)))
+    )
+    if scales[worst, 0] < 0.5 or scales[worst, 2] > 2.0 or T[worst] / samples.unit > 2.0:
+        listed = ", ".join(f"{value:.3g}" for value in scales[worst])
+        raise CalibrationError(
+            f"the fit collapsed: scales {listed} (expected near 1), offset {T[worst]:.0f} nT in a field of "
+            f"{samples.unit:.0f} nT; the attitudes are too few to tell scale from offset"
+        )

@@ -1,0 +1,91 @@
+"""Which calibration runs to fly next, from a deployment that flies as the mission will."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magbridge.calibration.fitting.data import observations
+from magbridge.calibration.fitting.mission import Mission
+from magbridge.calibration.model import Calibration
+from magbridge.calibration.planning.limits import Limits, settled, trim_of
+from magbridge.calibration.planning.plan import Plan, plan
+from magbridge.errors import CalibrationError
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+__all__ = ["facts", "flight_plan", "tell"]
+
+FloatArray = NDArray[np.float64]
+
+
+def flight_plan(
+    calibration: Calibration,
+    mission: xr.Dataset,
+    field_ned: FloatArray | None,
+    *,
+    runs: int = 10,
+    roll: float = 10.0,
+) -> Plan:
+    """Choose runs for a mission.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        What is known so far.
+    mission : Dataset (time)
+        Attitude, position and masses as the mission will have them; magnetometer columns are not needed.
+    field_ned : (n, 3) array or None
+        nT, north-east-down, the Earth's field along it.
+    runs : int
+    roll : float
+        deg that the vehicle can bank, either way.
+
+    Raises
+    ------
+    CalibrationError
+        The mission has no attitude or position, or lacks a parameter of the calibration.
+    """
+    if field_ned is None:
+        raise CalibrationError("the mission needs latitude and longitude, to know the Earth's field there")
+    total = np.linalg.norm(field_ned, axis=1)
+    flat = ("time", np.zeros(mission.sizes["time"]))
+    names = tuple(parameter.name for parameter in calibration.parameters)
+    data = observations(
+        mission.assign({f"mag_{axis}": flat for axis in "xyz"}).drop_vars("reference_field", errors="ignore"),
+        names,
+        reference=lambda _: (total, field_ned, "IGRF"),
+    )
+    limits = Limits(roll=(-roll, roll), pitch_at=trim_of(data), flown=settled(data))
+    return plan(calibration, Mission.of(data), np.nanmean(field_ned, axis=0), limits, runs=runs)
+
+
+def facts(found: Plan, calibration: Calibration) -> dict[str, Any]:
+    """Return a plan for machines."""
+    names = [parameter.name for parameter in calibration.parameters]
+    return {
+        "expected_rms_nT": found.rms,
+        "expected_worst_nT": found.worst,
+        "runs": [
+            {"pitch": run.pitch, "roll": run.roll, **dict(zip(names, run.parameters, strict=True))}
+            for run in found.runs
+        ],
+    }
+
+
+def tell(found: Plan, calibration: Calibration) -> str:
+    """Return a plan for pilots: the runs in order of worth, and what each is expected to bring."""
+    names = [f"{one.name} [{one.unit}]" if one.unit else one.name for one in calibration.parameters]
+    head = f"{'run':>4} {'pitch':>7} {'roll':>7} {' '.join(f'{name:>14}' for name in names)}"
+    lines = [
+        f"{head}  {'error over the mission after it, nT: RMS':>40} {'worst':>8}",
+        f"{'none yet':>{len(head)}}  {found.rms[0]:40.2f} {found.worst[0]:8.2f}",
+    ]
+    for number, run in enumerate(found.runs, 1):
+        positions = " ".join(f"{value:14.3f}" for value in run.parameters)
+        flown = f"{number:4} {run.pitch:7.1f} {run.roll:7.1f} {positions}"
+        lines.append(f"{flown}  {found.rms[number]:40.2f} {found.worst[number]:8.2f}")
+    return "\n".join([*lines, "each run: all headings, as in a spiral; angles in degrees"])

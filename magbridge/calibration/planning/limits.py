@@ -1,0 +1,108 @@
+"""What a vehicle can fly when it is to be calibrated: banks, pitches, and where its masses can stand with them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magbridge.calibration.fitting.data import Observations
+from magbridge.calibration.model import Parameter
+
+__all__ = ["Limits", "PlannedRun", "candidate_runs", "settled", "trim_of"]
+
+FloatArray = NDArray[np.float64]
+SLACK = 3.0  # deg, by which another trim of the vehicle changes the pitch at the same positions
+STILL = 0.01  # of half a position's range from one sample to the next
+REACH = 0.35  # of half a position's range, by which a run may differ from positions that were flown
+
+
+@dataclass(frozen=True)
+class PlannedRun:
+    """One spiral: deg, positions in their units."""
+
+    pitch: float
+    roll: float
+    parameters: tuple[float, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Limits:
+    """What the vehicle can do.
+
+    Attributes
+    ----------
+    roll : tuple of float
+        deg, banks that it can hold in a spiral.
+    pitch : tuple of float
+        deg, smallest and largest, of dives and climbs alike.
+    parameters : tuple of (float, float)
+        Ends of each position.
+    pitch_at : callable, optional
+        Positions (k,) -> pitch that they trim the vehicle to (deg), see :func:`trim_of`; without it
+        pitch is free.
+    flown : (m, k) array, optional
+        Positions that the vehicle is known to fly with: a run keeps within :data:`REACH` of some of them. (No
+        glider dives with its ballast out.)
+    """
+
+    roll: tuple[float, float] = (-10.0, 10.0)
+    pitch: tuple[float, float] = (14.0, 30.0)
+    parameters: tuple[tuple[float, float], ...] = ()
+    pitch_at: Callable[[FloatArray], float] | None = None
+    flown: FloatArray | None = None
+
+
+def trim_of(data: Observations) -> Callable[[FloatArray], float] | None:
+    """Return the pitch (deg) that positions trim a vehicle to, linear in them; None if they do not tell it."""
+    if data.attitude is None or not data.names:
+        return None
+    known = np.isfinite(data.attitude[:, 1])
+    pitch = np.degrees(data.attitude[known, 1])
+    design = np.column_stack([np.ones(len(pitch)), data.parameters[known]])
+    trim, *_ = np.linalg.lstsq(design, pitch, rcond=None)
+    if np.var(pitch - design @ trim) > 0.1 * np.var(pitch):
+        return None
+    return lambda positions: float(trim[0] + positions @ trim[1:])
+
+
+def settled(data: Observations) -> FloatArray:
+    """(m, k) positions that `data` fly with, those left out that masses only pass on their way."""
+    scale = [parameter.scale for parameter in data.ranges()]
+    moving = np.abs(np.diff(data.parameters, axis=0) / scale).max(axis=1) > STILL
+    at_rest = np.ones(len(data), bool)
+    at_rest[1:] &= ~moving
+    at_rest[:-1] &= ~moving
+    return data.parameters[at_rest]
+
+
+def candidate_runs(limits: Limits, parameters: tuple[Parameter, ...], levels: int) -> list[PlannedRun]:
+    """Return everything the vehicle can fly, on a grid of `levels` of each position."""
+    ends = limits.parameters or tuple((p.low, p.high) for p in parameters)
+    rolls = np.unique(np.append(np.linspace(*limits.roll, 5), np.clip(0.0, *limits.roll)))
+    found = []
+    for positions in product(*(np.linspace(low, high, levels) for low, high in ends)):
+        if limits.flown is not None and not _near(np.array(positions), limits.flown, parameters):
+            continue
+        if limits.pitch_at is None:
+            steep = np.linspace(*limits.pitch, 3)
+            pitches = [*(-steep), *steep]
+        else:
+            trim = limits.pitch_at(np.array(positions))
+            pitches = [trim - SLACK, trim, trim + SLACK]
+        found += [
+            PlannedRun(float(pitch), float(roll), tuple(float(p) for p in positions))
+            for pitch in pitches
+            for roll in rolls
+            if limits.pitch[0] <= abs(pitch) <= limits.pitch[1]
+        ]
+    return found
+
+
+def _near(positions: FloatArray, flown: FloatArray, parameters: tuple[Parameter, ...]) -> bool:
+    """Whether some flown positions differ by no more than REACH in any parameter."""
+    off = np.abs(positions - flown) / [parameter.scale for parameter in parameters]
+    return bool((off.max(axis=1) <= REACH).any())

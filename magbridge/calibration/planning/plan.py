@@ -1,0 +1,222 @@
+"""Which calibration runs to fly next: those after which the mission's worst error is smallest.
+
+Notes
+-----
+A run at one attitude and position with all headings brings the information ``phi phi^T (x) G``, ``G`` the
+sum of ``g g^T / sigma^2`` over its samples, whether or not it was flown yet: only the geometry counts. With
+the calibration's covariance C and ``F = phi (x) G^(1/2)``::
+
+    C' = C - C F (I + F^T C F)^-1 F^T C
+
+Runs are chosen one by one, then exchanged for better ones until none is (Fedorov's exchange), to make
+the largest error over the mission small (G-optimality, by the eighth power mean, which is smooth).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+from magbridge.calibration.fitting.boresight import field_body
+from magbridge.calibration.fitting.mission import Mission
+from magbridge.calibration.fitting.prior import free_structure
+from magbridge.calibration.forward import forward
+from magbridge.calibration.model import Calibration, Noise, Parameter, Reference
+from magbridge.calibration.planning.limits import Limits, PlannedRun, candidate_runs
+from magbridge.calibration.residual import Samples, residuals
+from magbridge.calibration.terms import Polynomial, full_order
+from magbridge.errors import CalibrationError
+
+__all__ = ["Plan", "evaluate_runs", "expected_calibration", "plan"]
+
+FloatArray = NDArray[np.float64]
+HEADINGS = 24
+POWER = 4  # of the variance: the eighth power mean of sigma
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Runs to fly, in order of worth, and what they are expected to bring.
+
+    Attributes
+    ----------
+    runs : tuple of PlannedRun
+    rms, worst : tuple of float
+        nT, expected error over the mission before any run, after the first, after two ...
+    """
+
+    runs: tuple[PlannedRun, ...]
+    rms: tuple[float, ...]
+    worst: tuple[float, ...]
+
+
+def expected_calibration(
+    parameters: tuple[Parameter, ...], field: float, order: int = 3, noise: float = 1.0
+) -> Calibration:
+    """Return what is known of a vehicle before its first run: nothing but the physical widths."""
+    exponents = full_order(len(parameters), order)
+    structure = free_structure(exponents, tuple(p.name for p in parameters), field)
+    E = structure.E * structure.widths(structure.centre)
+    return Calibration(
+        parameters=parameters,
+        terms=(Polynomial(exponents=exponents),),
+        coefficients=np.zeros(len(E)),
+        covariance=E @ E.T,
+        noise=Noise(noise),
+        reference=Reference(field),
+        method="none",
+    )
+
+
+class _Design:
+    """The linear algebra of candidates about one calibration."""
+
+    def __init__(
+        self, calibration: Calibration, mission: Mission, field_ned: FloatArray, samples: int
+    ) -> None:
+        if (
+            len(calibration.terms) != 1
+            or not isinstance(calibration.terms[0], Polynomial)
+            or calibration.effects
+        ):
+            raise CalibrationError("plan: needs a calibration of polynomials only")
+        self.calibration, self.field_ned, self.samples = calibration, field_ned, samples
+        self.exponents = calibration.terms[0].exponents
+        phi, g = self.derivative(mission.field_body, mission.parameters)
+        self.points = (phi[:, :, None] * g[:, None, :]).reshape(len(g), -1)
+
+    def derivative(self, truth: FloatArray, positions: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Monomials and derivative of the residual at true fields in body axes."""
+        calibration = self.calibration
+        x = (positions - [p.centre for p in calibration.parameters]) / [
+            p.scale for p in calibration.parameters
+        ]
+        phi = np.stack([np.prod(x ** np.array(e), axis=1) for e in self.exponents], axis=1)
+        reading = forward(calibration, truth, positions, np.zeros(len(truth)))
+        size, follows = np.linalg.norm(truth, axis=1), np.zeros(len(truth), bool)
+        samples = Samples(reading, size, phi, follows, calibration.reference.field)
+        return phi, residuals(samples, calibration.coefficients)[1]
+
+    def factor(self, run: PlannedRun) -> FloatArray:
+        """F (K, 9) of a run through all headings."""
+        turn = np.linspace(0.0, 2.0 * np.pi, HEADINGS, endpoint=False)
+        attitude = np.column_stack([np.radians([[run.roll, run.pitch]] * HEADINGS), turn])
+        truth = field_body(attitude, np.tile(self.field_ned, (HEADINGS, 1)))
+        phi, g = self.derivative(truth, np.tile(run.parameters, (HEADINGS, 1)))
+        noise, memory = self.calibration.noise.sensor, self.calibration.noise.memory
+        weight = self.samples / HEADINGS / noise**2 * (1.0 - memory) / (1.0 + memory)
+        values, vectors = np.linalg.eigh(g.T @ g * weight)
+        return np.kron(phi[:1].T, vectors * np.sqrt(np.maximum(values, 0.0)))
+
+    def variances(self, C: FloatArray) -> FloatArray:
+        """(n,) variance over the mission's points."""
+        return np.asarray(np.einsum("ij,jk,ik->i", self.points, C, self.points))
+
+    def after(self, C: FloatArray, F: FloatArray) -> FloatArray:
+        """C' with one run more."""
+        CF = C @ F
+        return np.asarray(C - CF @ np.linalg.solve(np.eye(F.shape[1]) + F.T @ CF, CF.T))
+
+    def scores(self, C: FloatArray, factors: Sequence[FloatArray]) -> FloatArray:
+        """Power mean of the variance after each of the candidates."""
+        PC, before = self.points @ C, self.variances(C)
+        found = []
+        for F in factors:
+            U = PC @ F
+            gain = np.einsum("ij,ji->i", U, np.linalg.solve(np.eye(F.shape[1]) + F.T @ C @ F, U.T))
+            found.append(np.mean(np.maximum(before - gain, 0.0) ** POWER))
+        return np.array(found)
+
+
+def evaluate_runs(
+    calibration: Calibration,
+    mission: Mission,
+    field_ned: FloatArray,
+    runs: Sequence[PlannedRun],
+    samples: int = 225,
+) -> Plan:
+    """Return what given runs are expected to bring, one after the other; arguments as for :func:`plan`."""
+    design = _Design(calibration, mission, field_ned, samples)
+    C = calibration.covariance
+    course = [design.variances(C)]
+    for run in runs:
+        C = design.after(C, design.factor(run))
+        course.append(np.maximum(design.variances(C), 0.0))
+    return Plan(
+        tuple(runs),
+        tuple(float(np.sqrt(v.mean())) for v in course),
+        tuple(float(np.sqrt(v.max())) for v in course),
+    )
+
+
+def plan(
+    calibration: Calibration,
+    mission: Mission,
+    field_ned: FloatArray,
+    limits: Limits,
+    *,
+    runs: int = 10,
+    samples: int = 225,
+    levels: int = 7,
+) -> Plan:
+    """Choose the runs to fly next.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        What is known already; :func:`expected_calibration` before the first run.
+    mission : Mission
+        Where the error is to be small.
+    field_ned : (3,) array
+        nT, where the runs will be flown.
+    limits : Limits
+    runs, samples : int
+        How many spirals, and samples in each.
+    levels : int
+        Of each position that are tried.
+
+    Raises
+    ------
+    CalibrationError
+        The limits leave nothing to fly.
+    """
+    with threadpool_limits(1, "blas"):  # matrices this small only wait for each other
+        return _plan(calibration, mission, field_ned, limits, runs, samples, levels)
+
+
+def _plan(
+    calibration: Calibration,
+    mission: Mission,
+    field_ned: FloatArray,
+    limits: Limits,
+    runs: int,
+    samples: int,
+    levels: int,
+) -> Plan:
+    design = _Design(calibration, mission, field_ned, samples)
+    candidates = list(candidate_runs(limits, calibration.parameters, levels))
+    if not candidates:
+        raise CalibrationError("plan: no pitch, roll and position lie within the vehicle's limits")
+    factors = [design.factor(run) for run in candidates]
+    chosen: list[int] = []
+    C = calibration.covariance
+    for _ in range(runs):
+        chosen.append(int(np.argmin(design.scores(C, factors))))
+        C = design.after(C, factors[chosen[-1]])
+    for _ in range(3):  # exchanges: each run against all others, given the rest
+        changed = False
+        for i in range(len(chosen)):
+            C = calibration.covariance
+            for j in chosen[:i] + chosen[i + 1 :]:
+                C = design.after(C, factors[j])
+            scores = design.scores(C, factors)
+            best = int(np.argmin(scores))
+            if scores[best] < (1.0 - 1e-6) * scores[chosen[i]]:
+                chosen[i], changed = best, True
+        if not changed:
+            break
+    return evaluate_runs(calibration, mission, field_ned, [candidates[i] for i in chosen], samples)

@@ -1,0 +1,141 @@
+"""What a cause puts forward: effects with their nonlinear parameters set, their columns, their plausible size."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magbridge.calibration.terms import Effect
+from magbridge.diagnose.compare.problem import Columns, Problem, effect_columns, history
+
+__all__ = ["AXES", "Candidate", "of_effect", "of_reference"]
+
+FloatArray = NDArray[np.float64]
+AXES = ("x", "y", "z")
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """One hypothesis.
+
+    Attributes
+    ----------
+    cause : str
+        As in ``findings.json``.
+    channel : str or None
+        Telemetry that it follows.
+    columns : Columns
+        What its coefficients leave in the residual, each in units of its width.
+    width : (k,) array
+        Plausible size (1-sigma) of each coefficient, in its unit.
+    names, units : tuple of str
+        Of the coefficients.
+    effects : tuple of Effect
+        What it adds to the calibration; none where it is the reference that is wrong.
+    shape : dict
+        Nonlinear parameters: name -> (value, unit).
+    again : callable or None
+        Shape's values -> the same candidate with those: for profiling.
+    trials : float
+        Independent hypotheses that stand behind this one (frequencies searched).
+    positive : bool
+        Its coefficients cannot be negative.
+    parts : int
+        Regressors that it was put together from, one after the other.
+    spectra : (l, k) array or None
+        Where its numbers have one common free size (:mod:`~magbridge.diagnose.inference.statistic`): their prior variances, in units of the widths
+        squared and up to a common factor; each is tried.
+    """
+
+    cause: str
+    channel: str | None
+    columns: Columns
+    width: FloatArray
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    effects: tuple[Effect, ...] = ()
+    shape: dict[str, tuple[float, str]] = field(default_factory=dict)
+    again: Callable[..., Candidate] | None = None
+    trials: float = 1.0
+    positive: bool = False
+    parts: int = 1
+    spectra: FloatArray | None = None
+
+    @property
+    def size(self) -> int:
+        """Numbers."""
+        return len(self.width)
+
+    @property
+    def freedom(self) -> int:
+        """Free numbers."""
+        return self.size if self.spectra is None else 1
+
+    def with_(self, other: Candidate) -> Candidate:
+        """Return both as one: a cause that takes more than one regressor to describe."""
+        parts = (self, other)
+        taken = self.names + tuple(self.shape)
+        number = 2 + sum(name.startswith(f"{other.names[0]} (") for name in taken)
+        mark = "" if set(taken).isdisjoint(other.names) else f" ({number})"
+        return replace(
+            self,
+            columns=lambda rows: np.hstack([part.columns(rows) for part in parts]),
+            width=np.concatenate([part.width for part in parts]),
+            names=self.names + tuple(name + mark for name in other.names),
+            units=self.units + other.units,
+            effects=self.effects + other.effects,
+            shape=self.shape | {name + mark: value for name, value in other.shape.items()},
+            again=None,
+            parts=self.parts + other.parts,
+        )
+
+
+def of_effect(
+    problem: Problem,
+    effect: Effect,
+    width: float | FloatArray,
+    unit: str,
+    *,
+    channel: str | None = None,
+    names: tuple[str, ...] = (),
+    phi: FloatArray | Callable[[slice], FloatArray] | None = None,
+    **more: Any,
+) -> Candidate:
+    """Make a candidate of an effect; its regressors are stepped through where `phi` does not give them."""
+    if phi is None:
+        phi = history(problem.survey, problem.calibration, effect)
+    widths = np.broadcast_to(np.asarray(width, float), effect.size)
+    bare = effect_columns(problem, effect, phi)
+    cause: str = effect.cause  # type: ignore[attr-defined]
+    if not names:
+        powers = effect.size // 3
+        names = tuple(
+            axis + (str(power + 1) if powers > 1 else "") for power in range(powers) for axis in AXES
+        )
+    return Candidate(
+        cause, channel, lambda rows: bare(rows) * widths, widths, names, (unit,) * effect.size, (effect,), **more
+    )  # fmt: skip
+
+
+def of_reference(
+    problem: Problem,
+    cause: str,
+    basis: Callable[[slice], FloatArray],
+    width: FloatArray,
+    names: tuple[str, ...],
+    **more: Any,
+) -> Candidate:
+    """Make a candidate of an error in the reference: the field is ``H_e + sum_k b_k basis_k(t)``, nT."""
+    return Candidate(
+        cause,
+        None,
+        lambda rows: problem.gain[rows, None] * basis(rows) * width,
+        width,
+        names,
+        ("nT",) * len(width),
+        **more,
+    )

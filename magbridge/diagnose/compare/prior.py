@@ -1,0 +1,105 @@
+"""What is believed of a calibration before a deployment.
+
+Its posterior, without what these very data told it, and with what nobody holds constant between days.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magbridge.calibration.model import Calibration
+from magbridge.calibration.residual import Samples, whiten
+from magbridge.calibration.terms import Polynomial
+from magbridge.diagnose.compare.derivatives import derivatives
+from magbridge.diagnose.compare.survey import Survey
+
+__all__ = ["floor", "level", "loosened", "prior"]
+
+FloatArray = NDArray[np.float64]
+
+BROADEST = 1e-3
+"""Precision, of the posterior's, below which a direction that only the given logs determined is not let."""
+SOFT, HARD = 0.02, 2000.0
+"""Soft iron, of the field, and hard iron, nT: 1-sigma of what vehicles have."""
+STABLE = 2e-5
+"""Of the field: no fluxgate's scale, axes and offset hold better than twenty parts per million between days."""
+
+
+def level(calibration: Calibration, e: FloatArray) -> float:
+    """Return the noise's 1-sigma, nT: the calibration's, or that of the residual e (n,)."""
+    return calibration.noise.sensor or 1.4826 * float(np.median(np.abs(e))) or 1.0
+
+
+def floor(calibration: Calibration) -> FloatArray:
+    """(K, K) covariance, nT²: what the nine constants may have changed by since the calibration.
+
+    Its posterior knows only the noise of its samples, and a few thousand of them make that a hundredth of it. What
+    the runs' turns did to the filtered channels, and what nobody holds constant, is more.
+    """
+    spread, k = np.zeros(calibration.coefficients.size), 0
+    for term in calibration.terms:
+        if isinstance(term, Polynomial) and (0,) * len(calibration.parameters) in term.exponents:
+            first = k + 9 * term.exponents.index((0,) * len(calibration.parameters))
+            spread[first : first + 9] = STABLE * calibration.reference.field
+        k += term.size
+    return np.diag(spread**2)
+
+
+def loosened(calibration: Calibration, L: FloatArray, centre: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return L and m with :func:`floor` added."""
+    mean = L @ centre
+    broad = _factor(L @ L.T + floor(calibration))
+    return broad, np.asarray(np.linalg.lstsq(broad, mean, rcond=None)[0], float)
+
+
+def _factor(covariance: FloatArray) -> FloatArray:
+    """L with ``L L^T`` the covariance, of as many columns as it has rank."""
+    scale = np.sqrt(np.maximum(np.diag(covariance), 0.0)) + 1e-12
+    values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
+    kept = values > 1e-12 * values[-1]
+    return np.asarray(scale[:, None] * vectors[:, kept] * np.sqrt(values[kept]))
+
+
+def prior(
+    survey: Survey, calibration: Calibration, samples: Samples, e: FloatArray, g: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return L and m. What the calibration learned from samples that are here again is taken out of its posterior.
+
+    In the posterior's own units, ``P_0 = 1 - H`` with H the information of those samples, and since the gradient
+    vanished at c_0, ``P_0 m = L^T J^T W e``.
+    """
+    L = _factor(calibration.covariance)
+    centre = np.zeros(L.shape[1])
+    learned = np.flatnonzero(survey.learned)
+    if not learned.size:
+        return L, centre
+    J = derivatives(calibration, samples.part(learned), g[learned], L)
+    noise, follows = calibration.noise, survey.follows[learned]
+    white = np.column_stack([J, e[learned]])
+    white = whiten(white, follows, noise.memory) / level(calibration, e)
+    A, y = white[:, :-1], white[:, -1]
+    values, vectors = np.linalg.eigh(np.eye(len(centre)) - A.T @ A)
+    held = values > 0.1  # elsewhere those samples were all there was, and they speak for themselves
+    pull = vectors @ np.where(held, vectors.T @ (A.T @ y), 0.0)
+    bound = L / _physical(calibration)[:, None]
+    values, vectors = np.linalg.eigh((vectors * np.where(held, values, 0.0)) @ vectors.T + bound.T @ bound)
+    root = np.sqrt(np.maximum(values, BROADEST))
+    return L @ (vectors / root), (vectors.T @ pull) / root
+
+
+def _physical(calibration: Calibration) -> FloatArray:
+    """(K,) nT: how large coefficients are on any vehicle, soft iron of percents and hard iron of thousands of nanotesla.
+
+    Less at every order. On a glider's attitudes scale and offset can grow against each other without end, and take the
+    noise with them.
+    """
+    width, k = np.full(calibration.coefficients.size, np.inf), 0
+    for term in calibration.terms:
+        if isinstance(term, Polynomial):
+            for i, exponents in enumerate(term.exponents):
+                fall = 0.3 ** sum(exponents)
+                width[k + 9 * i : k + 9 * i + 6] = SOFT * calibration.reference.field * fall
+                width[k + 9 * i + 6 : k + 9 * i + 9] = HARD * fall
+        k += term.size
+    return width

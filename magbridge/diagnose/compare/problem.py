@@ -1,0 +1,181 @@
+r"""The comparison as a linear problem: residuals of a calibration, and what every coefficient would have left in them.
+
+Notes
+-----
+With the scalar residual e of :mod:`magbridge.calibration.residual` and its derivative g by the nine
+coefficients at every sample, a term or an effect that adds ``sum_rs phi_r C_krs`` to slot s moves it by
+
+.. math:: \partial e_t / \partial c_k = \sum_{rs} \phi_r(t)\, C_{krs}\, g_s(t)
+
+and a coefficient that is really there, but not in the calibration, leaves minus that in the residual. So every cause
+passes through the forward model by the one rule. The calibration stays free, with its posterior
+as prior: ``c = c_0 + L z``, ``z ~ N(m, 1)``, where L holds only the directions that these data can see.
+
+Derivatives are taken where the reading would have had no residual, ``H_r - e w / |w|^2``: at the reading itself they hold
+its noise, and scales could grow against offsets until the noise is gone (errors in variables).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magbridge.calibration.correct import regressors
+from magbridge.calibration.model import Calibration
+from magbridge.calibration.residual import Samples, residuals
+from magbridge.calibration.terms import Effect
+from magbridge.diagnose.compare.derivatives import CHUNK, derivatives
+from magbridge.diagnose.compare.prior import level, loosened, prior
+from magbridge.diagnose.compare.survey import Survey
+
+__all__ = [
+    "Columns",
+    "Problem",
+    "add_effects",
+    "effect_columns",
+    "history",
+    "pose",
+    "samples_of",
+]
+
+FloatArray = NDArray[np.float64]
+Columns = Callable[[slice], FloatArray]
+"""Rows -> (m, k): what one unit of each of k coefficients leaves in the residual."""
+
+SEEN = 0.01
+"""Share of a prior's information that data must add for its direction to be kept."""
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """What a search works on.
+
+    Attributes
+    ----------
+    survey : Survey
+    calibration : Calibration
+    reading : (n, 3) array
+        nT, ``H_r - e w / |w|^2``: what bends with the reading must not hold its noise.
+    residual : (n,) array
+        e, nT of the sensor.
+    slopes : (n, 9) array
+        g.
+    gain : (n,) array
+        1/s: what one nT of error in the reference does to e.
+    free : (n, q) array
+        ``-de/dz``.
+    directions : (K, q) array
+        L.
+    centre : (q,) array
+        m, prior mean of z.
+    unseen : (K, K) array
+        nT², covariance in the directions that these data cannot see.
+    """
+
+    survey: Survey
+    calibration: Calibration
+    reading: FloatArray
+    residual: FloatArray
+    slopes: FloatArray
+    gain: FloatArray
+    free: FloatArray
+    directions: FloatArray
+    centre: FloatArray
+    unseen: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.residual)
+
+
+def add_effects(calibration: Calibration, effects: tuple[Effect, ...]) -> Calibration:
+    """Return the calibration with `effects` at zero, perfectly known."""
+    extra = sum(effect.size for effect in effects)
+    size = calibration.coefficients.size
+    covariance = np.zeros((size + extra, size + extra))
+    covariance[:size, :size] = calibration.covariance
+    return replace(
+        calibration,
+        effects=(*calibration.effects, *effects),
+        coefficients=np.append(calibration.coefficients, np.zeros(extra)),
+        covariance=covariance,
+    )
+
+
+def history(survey: Survey, calibration: Calibration, effect: Effect) -> FloatArray:
+    """(r, n) regressors of one effect along the survey, stepped as the bridge would."""
+    probe = add_effects(
+        replace(
+            calibration,
+            effects=(),
+            coefficients=calibration.coefficients[: _terms(calibration)],
+            covariance=calibration.covariance[: _terms(calibration), : _terms(calibration)],
+        ),
+        (effect,),
+    )
+    step = effect.begin(probe)
+    channels = survey.values(probe.channels)
+    times = np.rint(survey.time * 1e6).astype(np.int64).tolist()
+    rows = zip(times, *survey.field.T.tolist(), channels.tolist(), strict=True)
+    return np.array([step(*row) for row in rows]).T
+
+
+def effect_columns(
+    problem: Problem, effect: Effect, phi: FloatArray | Callable[[slice], FloatArray]
+) -> Columns:
+    """Return what an effect's coefficients leave, from its regressors (r, n) or a function of the rows."""
+    tensor = effect.columns(problem.calibration.reference.field)
+    slots = np.flatnonzero(np.abs(tensor).sum(axis=(0, 1)))
+    tensor = tensor[:, :, slots]
+
+    def columns(rows: slice) -> FloatArray:
+        part = phi(rows) if callable(phi) else phi[:, rows]
+        slopes = problem.slopes[rows][:, slots]
+        return np.asarray(-sum((phi_r[:, None] * slopes) @ tensor[:, r].T for r, phi_r in enumerate(part)))
+
+    return columns
+
+
+def samples_of(survey: Survey, calibration: Calibration) -> tuple[Samples, FloatArray]:
+    """Return the residual's samples, with effects among the regressors, and its coefficients (9 m,)."""
+    phi = regressors(calibration, survey.field, survey.values(calibration.channels), survey.time)
+    unit = calibration.reference.field
+    W = calibration.kernel.weights.copy()
+    W[0, :3] -= 1.0
+    W[:, :6] *= unit
+    noise = calibration.noise
+    kappa = noise.reference / noise.sensor if noise.sensor > 0.0 else 0.0
+    return Samples(survey.field, survey.reference, phi.T, survey.follows, unit, kappa), W.ravel()
+
+
+def pose(survey: Survey, calibration: Calibration) -> Problem:
+    """Linearise the comparison about `calibration`."""
+    samples, coefficients = samples_of(survey, calibration)
+    n = len(survey)
+    e, g, gain, reading = np.empty(n), np.empty((n, 9)), np.empty(n), np.empty((n, 3))
+    for start in range(0, n, CHUNK):
+        rows = slice(start, start + CHUNK)
+        part = samples.part(rows)
+        e[rows], slope = residuals(part, coefficients)
+        away = slope[:, 6:]
+        reading[rows] = part.field + (e[rows] / (away * away).sum(axis=1))[:, None] * away
+        _, g[rows] = residuals(replace(part, field=reading[rows]), coefficients)
+        above, _ = residuals(replace(part, reference=part.reference + 1.0), coefficients)
+        gain[rows] = e[rows] - above
+    L, centre = loosened(calibration, *prior(survey, calibration, samples, e, g))
+    seen = np.zeros((L.shape[1],) * 2)
+    for start in range(0, n, CHUNK):
+        rows = slice(start, start + CHUNK)
+        J = derivatives(calibration, samples.part(rows), g[rows], L)
+        seen += J.T @ J
+    values, vectors = np.linalg.eigh(seen / level(calibration, e) ** 2)
+    keep = values > SEEN
+    V, rest = vectors[:, keep], L @ vectors[:, ~keep]
+    free = -derivatives(calibration, samples, g, L @ V)
+    return Problem(survey, calibration, reading, e, g, gain, free, L @ V, V.T @ centre, rest @ rest.T)
+
+
+def _terms(calibration: Calibration) -> int:
+    return sum(term.size for term in calibration.terms)

@@ -1,0 +1,195 @@
+"""A deployment as the arrays that a diagnosis compares, with every telemetry channel that varies."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magbridge.errors import DataError
+
+__all__ = ["FEWEST", "Channel", "Survey", "assemble"]
+
+FloatArray = NDArray[np.float64]
+
+FEWEST = 60
+"""Samples below which nothing can be said about noise and effect at once."""
+KINDS = {
+    "degC": "temperature", "K": "temperature", "A": "current", "mA": "current", "m": "pressure", "dbar": "pressure",
+    "bar": "pressure", "Pa": "pressure", "hPa": "pressure", "kPa": "pressure", "mbar": "pressure",
+}  # fmt: skip
+"""What a channel is, by its unit. Anything else is taken for the position of something that moves."""
+HINTS = (("temp", "temperature"), ("current", "current"), ("press", "pressure"))
+"""Where a channel declares no unit, its name may help; else it is tried as everything."""
+OURS = ("mag_", "truth_")
+NOT_TELEMETRY = {
+    "time", "learned", "reference_field", "roll", "pitch", "heading", "latitude", "longitude", "run", "dive", "quality",
+    "total_field", "total_field_sigma", "field_x", "field_y", "field_z", "anomaly", "power_cycle",
+}  # fmt: skip
+
+
+class Channel(NamedTuple):
+    """A telemetry channel: values (n,), unit, and which of the kinds it may be."""
+
+    values: FloatArray
+    unit: str
+    kinds: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Survey:
+    """A deployment as arrays; rows without field, reference or position of a modelled mass are gone.
+
+    Attributes
+    ----------
+    time : (n,) array
+        s since 1970 UTC.
+    field : (n, 3) array
+        nT, raw channels at `time`.
+    reference : (n,) array
+        nT.
+    channels : dict of Channel
+        Everything that varies, and what the calibration needs.
+    still : tuple of str
+        Telemetry that never changes: nothing can be learned from it.
+    follows : (n,) bool array
+        The sample comes one interval after the one before.
+    dive : (n,) int array
+        Whole dives, for leaving out.
+    place : (n, 2) array or None
+        m north and east of the middle.
+    attitude : (n, 3) array or None
+        deg, roll, pitch, heading.
+    learned : (n,) bool array
+        The calibration was made from this sample.
+    cycles : (c,) array
+        s, when the instrument was switched on again, as the log says.
+    source : str
+    """
+
+    time: FloatArray
+    field: FloatArray
+    reference: FloatArray
+    channels: dict[str, Channel]
+    still: tuple[str, ...]
+    follows: NDArray[np.bool_]
+    dive: NDArray[np.int64]
+    place: FloatArray | None
+    attitude: FloatArray | None
+    learned: NDArray[np.bool_]
+    cycles: FloatArray
+    source: str
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    def values(self, names: Sequence[str]) -> FloatArray:
+        """(n, k) channels, in this order."""
+        missing = [name for name in names if name not in self.channels]
+        if missing:
+            raise DataError(
+                f"{self.source}: the calibration needs the column {missing[0]!r}, which is missing"
+            )
+        return (
+            np.stack([self.channels[name].values for name in names], axis=1)
+            if names
+            else np.empty((len(self), 0))
+        )
+
+
+def assemble(
+    table: dict[str, FloatArray], units: dict[str, str], source: str, needed: Sequence[str]
+) -> Survey:
+    """Make a survey of columns that are whole: find the channels, the dives, the gaps.
+
+    Parameters
+    ----------
+    table : dict of (n,) arrays
+        In order of time; ``learned`` is 1 where the calibration was made from the sample.
+    units : dict
+        Column -> unit.
+    source : str
+    needed : sequence of str
+        Channels that are kept even if they never change.
+    """
+    time = table["time"]
+    step = np.diff(time, prepend=np.nan)
+    interval = float(np.nanmedian(step))
+    follows = (step > 0.5 * interval) & (step < 1.5 * interval)
+    follows[1:] &= table["learned"][1:] == table["learned"][:-1]
+    channels, still = {}, []
+    for name in sorted(table):
+        if name in NOT_TELEMETRY or name.startswith(OURS):
+            continue
+        values, unit = table[name], units.get(name, "")
+        known = values[np.isfinite(values)]
+        if known.size < FEWEST or np.ptp(known) <= 1e-9 * (np.abs(known).max() + 1e-30):
+            still.append(name)
+            if name in needed and known.size:  # the correction takes it, but nothing can be learned from it
+                channels[name] = Channel(_held(values), unit, ())
+            continue
+        channels[name] = Channel(_held(values), unit, _kinds(name, unit))
+    cycles = np.empty(0)
+    if "power_cycle" in table:
+        cycles = time[1:][np.diff(table["power_cycle"]) > 0]
+    place = None
+    if {"latitude", "longitude"} <= set(table):
+        middle = np.median(table["latitude"])
+        north = np.radians(table["latitude"] - middle) * 6.3712e6
+        east = (
+            np.radians(table["longitude"] - np.median(table["longitude"]))
+            * 6.3712e6
+            * np.cos(np.radians(middle))
+        )
+        place = np.stack([north, east], axis=1)
+    attitude = None
+    if {"roll", "pitch", "heading"} <= set(table):
+        attitude = np.stack([table[name] for name in ("roll", "pitch", "heading")], axis=1)
+    return Survey(
+        time=time,
+        field=np.stack([table[f"mag_{axis}"] for axis in "xyz"], axis=1),
+        reference=table["reference_field"],
+        channels=channels,
+        still=tuple(still),
+        follows=follows,
+        dive=_dives(table, follows),
+        place=place,
+        attitude=attitude,
+        learned=table["learned"] > 0.5,
+        cycles=cycles,
+        source=source,
+    )
+
+
+def _kinds(name: str, unit: str) -> tuple[str, ...]:
+    if unit in KINDS:
+        return (KINDS[unit],)
+    if unit in ("", "1"):
+        hinted = tuple(kind for hint, kind in HINTS if hint in name.lower())
+        return hinted or ("temperature", "current", "pressure", "position")
+    return ("position",)
+
+
+def _held(values: FloatArray) -> FloatArray:
+    """Return the last value known, and the first one before it."""
+    known = np.flatnonzero(np.isfinite(values))
+    last = np.maximum.accumulate(np.where(np.isfinite(values), np.arange(len(values)), known[0]))
+    return np.asarray(values[np.maximum(last, known[0])])
+
+
+def _dives(table: dict[str, FloatArray], follows: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Count the dives: as the log does, or from surface to surface, or pieces of an eighth of the log."""
+    for name in ("dive", "run"):
+        if name in table and np.unique(table[name]).size > 3:
+            return np.unique(table[name], return_inverse=True)[1].astype(np.int64)
+    if "depth" in table and np.nanmax(table["depth"]) > 5.0:
+        depth = _held(table["depth"])
+        shallow = depth < 0.15 * np.quantile(depth, 0.98)
+        start = shallow & ~np.append(False, shallow[:-1])
+        if 4 <= start.sum() <= 0.05 * len(depth):
+            return np.cumsum(start)
+    pieces = np.arange(len(follows)) * 8 // len(follows)
+    return pieces.astype(np.int64)

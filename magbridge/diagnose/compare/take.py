@@ -1,0 +1,165 @@
+"""From deployments to a survey: every column at the rows' times, the reference from wherever it is."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magbridge.calibration.model import Calibration
+from magbridge.config import Align
+from magbridge.diagnose.compare.survey import FEWEST, Survey, assemble
+from magbridge.errors import DataError
+from magbridge.field.grid import AnomalyGrid
+from magbridge.field.reference import positions, reference_field
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+__all__ = ["take"]
+
+FloatArray = NDArray[np.float64]
+
+TRUSTED = 0.5
+"""Of the noise: how far a channel may be from where it is interpolated to."""
+
+
+def take(
+    datasets: Sequence[xr.Dataset],
+    calibration: Calibration,
+    learned_from: Sequence[xr.Dataset] = (),
+    grid: AnomalyGrid | None = None,
+) -> Survey:
+    """Gather deployments.
+
+    Parameters
+    ----------
+    datasets : sequence of Dataset
+        To be diagnosed.
+    calibration : Calibration
+    learned_from : sequence of Dataset
+        The logs that the calibration was made from, if they are at hand.
+    grid : AnomalyGrid, optional
+        Added to the main field where a log has no reference of its own.
+
+    Raises
+    ------
+    DataError
+        A column is missing, or too few samples have all they need: one line that says which.
+    """
+    parts = [
+        _columns(ds, calibration, grid, learned)
+        for learned, group in ((False, datasets), (True, learned_from))
+        for ds in group
+    ]
+    names = {name for part in parts for name in part}
+    sizes = [part["time"].size for part in parts]
+    table = {
+        name: np.concatenate(
+            [part.get(name, np.full(n, np.nan)) for part, n in zip(parts, sizes, strict=True)]
+        )
+        for name in names
+    }
+    order = np.argsort(table["time"], kind="stable")
+    table = {name: column[order] for name, column in table.items()}
+    source = ", ".join(
+        dict.fromkeys(str(ds.attrs.get("source", "deployment")) for ds in (*datasets, *learned_from))
+    )
+    twice = int(np.sum(np.diff(table["time"]) == 0.0))
+    if twice > 0.1 * table["time"].size:
+        raise DataError(
+            f"{source}: {twice} samples are given twice: a log is either diagnosed or learned from"
+        )
+    parameters = [parameter.name for parameter in calibration.parameters]
+    needed = [*(f"mag_{axis}" for axis in "xyz"), "reference_field", *parameters]
+    if sum(sizes) < FEWEST:
+        raise DataError(f"{source}: {sum(sizes)} samples, at least {FEWEST} needed")
+    whole = np.all([np.isfinite(table[name]) for name in needed], axis=0)
+    if whole.sum() < FEWEST:
+        worst = min(needed, key=lambda name: int(np.isfinite(table[name]).sum()))
+        raise DataError(
+            f"{source}: only {int(whole.sum())} of {whole.size} samples can be compared, at least {FEWEST} needed "
+            f"(column {worst!r} has {int(np.isfinite(table[worst]).sum())} numbers)"
+        )
+    table = {name: column[whole] for name, column in table.items()}
+    if not any(np.ptp(table[f"mag_{axis}"]) for axis in "xyz"):
+        raise DataError(f"{source}: columns mag_x, mag_y, mag_z never change: nothing was measured")
+    units = {
+        str(k): str(v.attrs.get("units", ""))
+        for ds in (*datasets, *learned_from)
+        for k, v in ds.data_vars.items()
+    }
+    return assemble(table, units, source, calibration.channels)
+
+
+def _columns(
+    ds: xr.Dataset, calibration: Calibration, grid: AnomalyGrid | None, learned: bool
+) -> dict[str, FloatArray]:
+    """Return every column that counts; the channels at the row's time, the reference from wherever it is."""
+    source = str(ds.attrs.get("source", "deployment"))
+    sensor = str(ds.attrs.get("sensor", ""))
+    if sensor and calibration.sensor.name and sensor != calibration.sensor.name:
+        raise DataError(f"{source}: sensor {sensor!r}, but the calibration is of {calibration.sensor.name!r}")
+    for name in ("mag_x", "mag_y", "mag_z", *(parameter.name for parameter in calibration.parameters)):
+        if name not in ds:
+            raise DataError(
+                f"{source}: column {name!r} is missing; there are {', '.join(map(str, ds.data_vars))}"
+            )
+    time = ds["time"].to_numpy().astype(float)
+    table = {
+        str(name): column.to_numpy().astype(float)
+        for name, column in ds.data_vars.items()
+        if column.dtype.kind in "fiub" and not str(name).startswith("truth_")
+    }
+    in_turn = False
+    for axis in "xyz":  # a converter that takes the channels in turn says when it took each
+        own = table.pop(f"mag_time_{axis}", None)
+        if own is not None and np.isfinite(own).all() and not np.array_equal(own, time):
+            table[f"mag_{axis}"] = _at(time, own, table[f"mag_{axis}"], TRUSTED * calibration.noise.sensor)
+            in_turn = True
+    table |= {"time": time, "learned": np.full(time.size, float(learned))}
+    if in_turn:
+        for axis in "xyz":
+            table[f"mag_{axis}"][_moving(table, calibration)] = np.nan
+    table["reference_field"] = reference_field(ds, grid, calibration.reference.bias)
+    if {"latitude", "longitude"} <= set(table):
+        table["longitude"], table["latitude"], _ = positions(ds)
+    return table
+
+
+def _at(time: FloatArray, own: FloatArray, values: FloatArray, trusted: float) -> FloatArray:
+    """Return a channel at the row's time: the cubic through its sample, the one after and the two before.
+
+    A line between two is off by the turn's curvature, tenths of a nanotesla, always the same way. Where it matters
+    whether it is a cubic or a parabola, nobody knows what the channel was: NaN.
+    """
+    out = np.full(time.size, np.nan)
+    if time.size < 4:
+        return out
+    a, b, c, d, t = own[:-3], own[1:-2], own[2:-1], own[3:], time[2:-1]
+    first = (values[2:-1] - values[1:-2]) / (c - b)
+    after = (values[3:] - values[2:-1]) / (d - c)
+    before = (values[1:-2] - values[:-3]) / (b - a)
+    second, earlier = (after - first) / (d - b), (first - before) / (c - a)
+    bend = (second - earlier) / (d - a) * (t - b) * (t - c) * (t - d)
+    out[2:-1] = values[2:-1] + first * (t - c) + second * (t - c) * (t - b) + bend
+    out[2:-1][np.abs(bend) > trusted] = np.nan
+    return out
+
+
+def _moving(table: dict[str, FloatArray], calibration: Calibration) -> NDArray[np.bool_]:
+    """Say about which samples a mass is on its way, by the bridge's own criterion.
+
+    There each channel saw another vehicle, and no vector is common to them. A converter that takes all three at once
+    keeps such samples: only they tell a clock that is off.
+    """
+    moving = np.zeros(table["time"].size, bool)
+    elapsed = np.maximum(np.diff(table["time"]), 1.0)
+    for parameter in calibration.parameters:
+        fastest = Align().moving_rate * (parameter.high - parameter.low)
+        step = np.abs(np.diff(table[parameter.name])) > fastest * elapsed
+        moving[1:] |= step
+        moving[:-1] |= step  # the later channels of this sample were taken when it had begun
+    return moving

@@ -1,0 +1,92 @@
+"""The columns of a hypothesis, and their sums over a log of any length."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magbridge.diagnose.compare.problem import Columns, Problem
+from magbridge.diagnose.inference.noise import Noise
+
+__all__ = ["Design", "normal"]
+
+FloatArray = NDArray[np.float64]
+
+CHUNK = 2048
+"""Rows that are whitened at a time, to stay near the processor."""
+KEPT = 25_000_000
+"""Numbers of a hypothesis' own columns that are kept: 200 MB."""
+THREADS, LONG = 2, 16
+"""Threads that share the pieces of a log, and pieces from which on it is worth the while."""
+
+
+class Design:
+    """The columns of a hypothesis, the calibration's and the effects'; what would fill the memory is made anew each time.
+
+    Parameters
+    ----------
+    problem : Problem
+    columns : sequence of Columns
+        The effects'.
+    """
+
+    def __init__(self, problem: Problem, columns: Sequence[Columns]) -> None:
+        self.free, self.columns = problem.free, columns
+        n = len(problem)
+        self.pieces = [slice(start, min(start + CHUNK, n)) for start in range(0, n, CHUNK)]
+        sizes = [column(self.pieces[0]).shape[1] for column in columns]
+        ends = self.free.shape[1] + np.cumsum([0, *sizes]).astype(int)
+        self.at = [slice(*own) for own in zip(ends.tolist(), ends.tolist()[1:], strict=False)]
+        self.effects = sum(sizes)
+        self.kept: FloatArray | None = None
+        if n * self.effects <= KEPT:
+            self.kept = np.empty((n, self.effects))
+            for rows in self.pieces:
+                self.kept[rows] = self._made(rows)
+
+    def _made(self, rows: slice) -> FloatArray:
+        return np.hstack([column(rows) for column in self.columns]) if self.columns else self.free[rows, :0]
+
+    def rows(self, rows: slice) -> FloatArray:
+        """(m, q + k) rows of all columns."""
+        return np.hstack([self.free[rows], self._made(rows) if self.kept is None else self.kept[rows]])
+
+    def times(self, c: FloatArray) -> FloatArray:
+        """(n,) what the coefficients c (q + k,) leave."""
+        return np.concatenate([self.rows(rows) @ c for rows in self.pieces])
+
+    def against(self, y: FloatArray) -> FloatArray:
+        """(q + k,) ``X^T y``."""
+        return np.asarray(sum(self.rows(rows).T @ y[rows] for rows in self.pieces))
+
+
+def normal(X: Columns, y: FloatArray, noise: Noise | None = None) -> tuple[FloatArray, FloatArray]:
+    """Return ``X^T X`` and ``X^T y``, X whitened if a noise is given; summed up in pieces that stay near the processor.
+
+    Long logs are shared out among threads, always in the same way: the same numbers on any machine.
+    """
+    past = 0 if noise is None else len(noise.memory)
+
+    def share(starts: Sequence[int]) -> tuple[FloatArray, FloatArray]:
+        P, b = np.zeros((0, 0)), np.zeros(0)
+        for start in starts:
+            first, end = max(start - past, 0), min(start + CHUNK, len(y))
+            A = X(slice(first, end))
+            if noise is not None:
+                A = noise.filter(A, first, start - first)
+            if not b.size:
+                P, b = np.zeros((A.shape[1],) * 2), np.zeros(A.shape[1])
+            P += A.T @ A
+            b += A.T @ y[start:end]
+        return P, b
+
+    starts = range(0, len(y), CHUNK)
+    if len(starts) < LONG:
+        return share(starts)
+    each = -(-len(starts) // THREADS)
+    with ThreadPoolExecutor(THREADS) as pool:
+        parts = list(pool.map(share, [starts[k : k + each] for k in range(0, len(starts), each)]))
+    return sum((P for P, _ in parts), start=np.zeros(())), sum((b for _, b in parts), start=np.zeros(()))

@@ -1,0 +1,189 @@
+"""Fit a noise to a residual: memory, tails and level in turn, each at its maximum given the others."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import gammaln
+
+from magbridge.diagnose.inference.noise import Noise
+
+__all__ = ["TAILS", "fit_noise", "memory_order"]
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+TAILS = (2.5, 3.0, 4.0, 5.0, 7.0, 12.0, 1e6)
+BLOCK = 150
+"""Samples over which the noise's level is taken as constant."""
+ORDERS = (0, 1, 2, 3, 5, 8, 13)
+GAUSSIAN = 1e5
+"""Degrees of freedom from which on the tails are taken for Gaussian."""
+ALTERNATIONS = 6
+"""Between the weights of the samples and the level, at most."""
+SETTLED = 0.01
+"""Log likelihood: less is no gain."""
+FEW = 20
+
+
+def _past(follows: BoolArray, p: int) -> BoolArray:
+    """Whether the p samples before are there, without a gap."""
+    place = np.arange(len(follows))
+    start = np.where(follows, 0, place)
+    return np.asarray(place - np.maximum.accumulate(start) >= p)
+
+
+def memory_order(residual: FloatArray, follows: BoolArray) -> int:
+    """Choose p by Akaike's criterion, on a residual clipped against outliers.
+
+    To whiten with too long a memory costs little, with too short a one it makes structure out of noise.
+    """
+    scale = 1.4826 * np.median(np.abs(residual)) + 1e-12
+    r = np.clip(residual, -6.0 * scale, 6.0 * scale)
+    past = _past(follows, ORDERS[-1])
+    n = int(past.sum())
+    if n < 4 * FEW:
+        return 1
+    rows = np.flatnonzero(past)
+    lags = np.stack([r[rows - k] for k in range(1, ORDERS[-1] + 1)], axis=1)
+    costs = []
+    for p in ORDERS:
+        left = r[rows] - (lags[:, :p] @ np.linalg.lstsq(lags[:, :p], r[rows], rcond=None)[0] if p else 0.0)
+        costs.append(n * np.log(left @ left / n + 1e-300) + 2.0 * p)
+    return max(1, ORDERS[int(np.argmin(costs))])
+
+
+def fit_noise(
+    residual: FloatArray,
+    follows: BoolArray,
+    order: int,
+    *,
+    blocks: bool | None = None,
+    like: Noise | None = None,
+    rounds: int = 3,
+) -> Noise:
+    """Fit the noise model.
+
+    Parameters
+    ----------
+    residual : (n,) array
+        nT.
+    follows : (n,) bool array
+    order : int
+        p.
+    blocks : bool, optional
+        Let the level change from block to block; decided by the data if not given.
+    like : Noise, optional
+        One that it will resemble: begins from its level and tails.
+    rounds : int
+        Of the alternation between memory, tails and level.
+    """
+    past = _past(follows, order)
+    n = len(residual)
+    count = _counts(n)
+    typical = float(np.median(np.abs(residual)))
+    lags = np.zeros((order, n))
+    for k in range(1, order + 1):
+        lags[k - 1, k:] = residual[:-k]
+    lags *= past
+    memory, share, nu = np.zeros(order), 1.0, 12.0
+    weight, scale = np.ones(n), np.full(n, 1.4826 * typical + 1e-12)
+    if like is not None:
+        nu, scale = like.nu, like.scale
+        weight = (nu + 1.0) / (nu + ((residual - like.memory @ lags) / scale) ** 2)
+    v, log_likelihood = residual, -np.inf
+    for _ in range(rounds):
+        if order and past.sum() > 2 * order:
+            own = lags * (weight / scale**2)
+            memory = _stable(np.asarray(np.linalg.lstsq(own @ lags.T, own @ residual, rcond=None)[0], float))
+        v = residual - memory @ lags
+        if order:
+            share = min(1.0, float(np.median(np.abs(v[past]))) / (typical + 1e-300))
+        v[~past] *= share
+        if blocks is None:
+            blocks = _uneven(v, count)
+        before = log_likelihood
+        nu, scale, log_likelihood = _tails(v, count if blocks else np.array([n]), nu)
+        log_likelihood += float(np.log(share)) * np.sum(~past)
+        weight = (nu + 1.0) / (nu + (v / scale) ** 2)
+        if abs(log_likelihood - before) < SETTLED:
+            break
+    return Noise(memory, scale, nu, share, past, log_likelihood, v / scale)
+
+
+def _counts(n: int) -> NDArray[np.int64]:
+    """(blocks,) samples in each block."""
+    count = np.full(max(n // BLOCK, 1), BLOCK)
+    count[-1] += n - count.sum()
+    return count
+
+
+def _stable(memory: FloatArray) -> FloatArray:
+    """Pull roots that lie outside the unit circle back in."""
+    roots = np.roots(np.append(1.0, -memory))
+    size = np.abs(roots)
+    if size.max(initial=0.0) < 0.9995:
+        return memory
+    return np.asarray(-np.real(np.poly(roots * np.where(size > 0.9995, 0.9995 / size, 1.0)))[1:])
+
+
+def _uneven(v: FloatArray, count: NDArray[np.int64]) -> bool:
+    """Tell whether the blocks' mean absolute values differ by more than their own scatter lets them."""
+    if count.size < 4:
+        return False
+    size = np.abs(v)
+    clipped = np.minimum(size, 5.0 * np.median(size))
+    mean = _sums(clipped, count) / count
+    expected = clipped.var() / count
+    chi2 = float(np.sum((mean - clipped.mean()) ** 2 / expected))
+    return bool(chi2 > count.size + 4.0 * np.sqrt(2.0 * count.size))
+
+
+def _sums(values: FloatArray, count: NDArray[np.int64]) -> FloatArray:
+    """(blocks,) sum of each block."""
+    return np.asarray(np.add.reduceat(values, np.cumsum(count) - count))
+
+
+def _tails(v: FloatArray, count: NDArray[np.int64], nu: float) -> tuple[float, FloatArray, float]:
+    """Find the best tails, uphill from `nu`, the level of each sample under them, and the log likelihood."""
+    at = TAILS.index(nu)
+    square = v * v
+    start = np.full(count.size, float(np.median(np.abs(v))) * 1.4826 + 1e-12)
+    tried = {at: _levels(square, count, nu, start)}
+    while True:
+        for near in (at - 1, at + 1):
+            if 0 <= near < len(TAILS) and near not in tried:
+                tried[near] = _levels(square, count, TAILS[near], tried[at][1])
+        best = max((k for k in (at - 1, at, at + 1) if k in tried), key=lambda k: (tried[k][0], k == at))
+        if best == at:
+            return TAILS[at], np.repeat(tried[at][1], count), tried[at][0]
+        at = best
+
+
+def _levels(
+    square: FloatArray, count: NDArray[np.int64], nu: float, level: FloatArray
+) -> tuple[float, FloatArray]:
+    """Log likelihood and level of each block, from a first guess; drawn towards the common one by as much as ten samples."""
+    n = len(square)
+    power = level**2
+    for _ in range(ALTERNATIONS):
+        before, each = power, _each(power, count)
+        weighted = square if nu > GAUSSIAN else (nu + 1.0) * each * square / (nu * each + square)
+        sums = _sums(weighted, count)
+        whole = float(sums.sum()) / n
+        power = (sums + 10.0 * whole) / (count + 10.0) if count.size > 1 else sums / count
+        power = power + 1e-24
+        if nu > GAUSSIAN or np.abs(power / before - 1.0).max() < 1e-3:
+            break
+    x2 = square / _each(power, count)
+    if nu > GAUSSIAN:
+        value = -0.5 * (float(x2.sum()) + n * np.log(2.0 * np.pi))
+    else:
+        constant = gammaln((nu + 1.0) / 2.0) - gammaln(nu / 2.0) - 0.5 * np.log(nu * np.pi)
+        value = n * constant - 0.5 * (nu + 1.0) * float(np.log1p(x2 / nu).sum())
+    return float(value - 0.5 * count @ np.log(power)), np.sqrt(power)
+
+
+def _each(values: FloatArray, count: NDArray[np.int64]) -> FloatArray | float:
+    """(n,) a block's value for each of its samples; a number where there is one block."""
+    return np.repeat(values, count) if count.size > 1 else float(values[0])

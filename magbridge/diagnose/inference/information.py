@@ -1,0 +1,75 @@
+r"""What the data say of every candidate at once.
+
+Notes
+-----
+The whole search's arithmetic in one matrix: the whitened columns of *all* candidates against each other, summed up in
+chunks, linear in samples. From it come scores, Occam factors, what is confounded with what, and the distribution of the
+largest score under no effect.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magbridge.diagnose.compare.problem import Columns, Problem
+from magbridge.diagnose.inference.design import normal
+from magbridge.diagnose.inference.joint import Joint
+from magbridge.diagnose.inference.noise import Noise
+
+__all__ = ["Information", "information"]
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Information:
+    """What the data say of every candidate's coefficients, calibration (and model so far) projected out.
+
+    Attributes
+    ----------
+    matrix : (m, m) array
+        Fisher information, in units of the prior widths.
+    score : (m,) array
+    shift : (q + k, m) array
+        By how much calibration and model give way to one unit of each coefficient.
+    """
+
+    matrix: FloatArray
+    score: FloatArray
+    shift: FloatArray
+
+    def moved(self, base: Joint, index: NDArray[np.intp], taken: FloatArray) -> FloatArray:
+        """Return calibration and model (q + k,) where they are best when the coefficients at `index` are `taken`."""
+        return np.append(base.z, base.coefficients) - self.shift[:, index] @ taken
+
+    def without(self, index: NDArray[np.intp], prior: FloatArray) -> Information:
+        """Project out the coefficients at `index`, of this prior precision, too."""
+        S = self.matrix[np.ix_(index, index)] + np.diag(prior)
+        K = np.linalg.solve(S, self.matrix[index])
+        return Information(
+            self.matrix - self.matrix[:, index] @ K, self.score - K.T @ self.score[index], self.shift
+        )
+
+
+def information(
+    problem: Problem, noise: Noise, base: Joint, model: Sequence[Columns], candidates: Sequence[Columns]
+) -> Information:
+    """Sum up the candidates' information at the hypothesis `base`, whose effects are `model`, under `noise`."""
+    q = problem.free.shape[1]
+    nuisance = q + base.coefficients.size
+    G, b = normal(
+        lambda rows: np.hstack([problem.free[rows], *(column(rows) for column in (*model, *candidates))]),
+        noise.response(base.left),
+        noise,
+    )
+    pull = base.prior * np.append(problem.centre - base.z, -base.coefficients)
+    K: FloatArray = np.asarray(
+        np.linalg.solve(G[:nuisance, :nuisance] + np.diag(base.prior), G[:nuisance, nuisance:]), float
+    )
+    return Information(
+        G[nuisance:, nuisance:] - G[nuisance:, :nuisance] @ K, b[nuisance:] - K.T @ (b[:nuisance] + pull), K
+    )

@@ -1,0 +1,166 @@
+r"""Before any data: what this log, with this calibration, could show, and what it could never tell apart.
+
+Notes
+-----
+The information S of a cause's coefficients needs telemetry, attitude and the noise level, but no residual. An effect
+of signal-to-noise a is found with the chance that a noncentral chi-square of k freedoms and noncentrality ``a^2``
+passes the threshold. Between two causes whose signatures, whitened and projected, correlate by rho, the wrong one wins
+with the chance ``Phi(-a sqrt(1 - rho^2) / 2)`` (two points in Gaussian noise).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import chdtri, chndtrinc
+from scipy.stats import norm
+
+from magbridge.diagnose.causes.candidates import Candidate
+from magbridge.diagnose.inference.information import Information
+from magbridge.diagnose.inference.telling import Telling
+from magbridge.diagnose.inference.weigh import LEVEL, score, slices
+
+__all__ = ["Isolability", "Visible", "confusion", "isolability", "threshold"]
+
+FloatArray = NDArray[np.float64]
+CONFOUNDED = 0.85
+"""Correlation beyond which two causes are listed as a pair: at signal-to-noise 6 they part in 95 of 100."""
+
+FREE = 1e-3
+"""Prior precision, of a plausible size's, of numbers that are each free; those of one common size are held to it."""
+
+
+@dataclass(frozen=True)
+class Visible:
+    """What could be seen of one cause.
+
+    Attributes
+    ----------
+    cause, channel : str, str or None
+    half, sure : float
+        Signal-to-noise that is found with a chance of 50 and of 95 %.
+    sizes : dict
+        Coefficient -> (size that is found with 95 %, unit); infinite where the log cannot show it.
+    """
+
+    cause: str
+    channel: str | None
+    half: float
+    sure: float
+    sizes: dict[str, tuple[float, str]]
+
+    @property
+    def invisible(self) -> bool:
+        """No coefficient can be seen at fifty times its plausible size."""
+        return all(not np.isfinite(size) for size, _ in self.sizes.values())
+
+
+@dataclass(frozen=True)
+class Isolability:
+    """Report of a log before its residual is looked at.
+
+    Attributes
+    ----------
+    visible : tuple of Visible
+    pairs : tuple of (str, str, float)
+        Causes that look alike, with their correlation.
+    untestable : dict
+        Cause -> what a log would need for it.
+    correlation : (m, m) array
+        Between the causes of `visible`.
+    telling : Telling
+        The chance of each cause to be named alone.
+    """
+
+    visible: tuple[Visible, ...]
+    pairs: tuple[tuple[str, str, float], ...]
+    untestable: dict[str, str]
+    correlation: FloatArray
+    telling: Telling
+
+    def alone(self, cause: str, signal_to_noise: float) -> float:
+        """Chance that `cause`, at this signal-to-noise, is named and nothing beside it."""
+        return self.telling.alone(cause, signal_to_noise)
+
+
+def threshold(freedom: int, hypotheses: float, chance: float) -> float:
+    """Signal-to-noise at which an effect of `freedom` numbers is found with `chance`, among so many hypotheses."""
+    limit = chdtri(freedom, LEVEL / hypotheses)
+    return float(np.sqrt(chndtrinc(limit, freedom, 1.0 - chance)))
+
+
+def isolability(
+    candidates: Sequence[Candidate],
+    info: Information,
+    trials: Mapping[str, float],
+    causes: int,
+    untestable: Mapping[str, str],
+) -> Isolability:
+    """Evaluate what `info` holds; of a cause's grid the candidate that is seen best stands for all."""
+    at = slices(candidates)
+    best: dict[tuple[str, str | None], tuple[float, int]] = {}
+    for k, candidate in enumerate(candidates):
+        total = float(np.trace(info.matrix[at[k], at[k]])) / candidate.size
+        if total > best.get((candidate.cause, candidate.channel), (-1.0, 0))[0]:
+            best[candidate.cause, candidate.channel] = (total, k)
+    picked = [k for _, k in best.values()]
+    visible = []
+    for k in picked:
+        candidate, s = candidates[k], score(info, at[k], candidates[k])
+        hypotheses = causes * trials.get(candidate.cause, 1.0)
+        freedom = max(s.freedom, 1)
+        half, sure = threshold(freedom, hypotheses, 0.5), threshold(freedom, hypotheses, 0.95)
+        own = np.diag(info.matrix[at[k], at[k]])
+        size = sure / np.sqrt(np.maximum(own, 1e-300))
+        sizes = {
+            name: (float(x * w) if x < 50.0 else float("inf"), unit)
+            for name, x, w, unit in zip(candidate.names, size, candidate.width, candidate.units, strict=True)
+        }
+        if candidate.spectra is not None:  # what counts is what all of them do together
+            x = sure / float(np.sqrt(max(own.sum(), 1e-300)))
+            sizes = {"size": (x if x < 50.0 else float("inf"), "of a plausible one")}
+        visible.append(Visible(candidate.cause, candidate.channel, half, sure, sizes))
+    R = np.eye(len(picked))
+    for i, a in enumerate(picked):
+        for j, b in enumerate(picked[:i]):
+            R[i, j] = R[j, i] = _alike(info, candidates[a], at[a], candidates[b], at[b])
+    names = [f"{v.cause} ({v.channel})" if v.channel else v.cause for v in visible]
+    pairs = [
+        (names[j], names[i], float(R[i, j]))
+        for i in range(len(names))
+        for j in range(i)
+        if R[i, j] > CONFOUNDED and visible[i].cause != visible[j].cause
+    ]
+    return Isolability(
+        tuple(visible),
+        tuple(sorted(pairs, key=lambda p: -p[2])),
+        dict(untestable),
+        R,
+        Telling(candidates, info, trials, causes),
+    )
+
+
+def _alike(info: Information, one: Candidate, a: slice, other: Candidate, b: slice) -> float:
+    """Share of the one's signature, of a typical direction, that the other can imitate: root of the larger mean."""
+    A, B, C = info.matrix[a, a], info.matrix[b, b], info.matrix[a, b]
+    p, q = (FREE if candidate.spectra is None else 1.0 for candidate in (one, other))
+    M = C @ np.linalg.solve(B + q * np.eye(len(B)), C.T)
+    N = C.T @ np.linalg.solve(A + p * np.eye(len(A)), C)
+    shares = [float(np.trace(X) / (np.trace(Y) + 1e-12)) for X, Y in ((M, A), (N, B))]
+    return float(np.sqrt(np.clip(max(shares), 0.0, 1.0)))
+
+
+def confusion(correlation: FloatArray, signal_to_noise: float) -> FloatArray:
+    """(m, m) chance that the cause of the row is named as that of the column, at a signal-to-noise.
+
+    The pairwise chances, made to add up to one.
+    """
+    wrong = norm.cdf(-0.5 * signal_to_noise * np.sqrt(2.0 * np.clip(1.0 - correlation, 0.0, None)))
+    np.fill_diagonal(wrong, 0.0)
+    excess = np.maximum(wrong.sum(axis=1, keepdims=True), 1.0)
+    wrong = wrong / excess
+    np.fill_diagonal(wrong, 1.0 - wrong.sum(axis=1))
+    return np.asarray(wrong)

@@ -1,0 +1,164 @@
+r"""The joint likelihood: calibration free, effects free, the noise fitted anew under each hypothesis.
+
+Notes
+-----
+Noise that is fitted without an effect swallows a large slow one, so two hypotheses are compared only after each
+has had its own noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magbridge.diagnose.compare.problem import Columns, Problem
+from magbridge.diagnose.inference.design import Design, normal
+from magbridge.diagnose.inference.fit_noise import fit_noise
+from magbridge.diagnose.inference.noise import Noise
+from magbridge.diagnose.inference.statistic import Statistic
+
+__all__ = ["RIDGE", "Joint", "fit_joint"]
+
+FloatArray = NDArray[np.float64]
+RIDGE = 0.1
+"""Prior precision of an effect, of a plausible size's: ten times that size is hardly believed, a hundred times not at
+all. Without it a bend of the channels and the calibration's scales grow against each other until the noise is gone."""
+
+
+@dataclass(frozen=True, eq=False)
+class Joint:
+    """A hypothesis at its maximum.
+
+    Attributes
+    ----------
+    log_likelihood : float
+        Of the noise model, with the prior of the calibration and of the effects; numbers of one common size are integrated
+        out (Laplace's approximation).
+    z : (q,) array
+    coefficients : (k,) array
+        Of the effects, in units of their prior width.
+    covariance : (q + k, q + k) array
+    noise : Noise
+    left : (n,) array
+        nT, what is left of the residual.
+    prior : (q + k,) array
+        Precision that every coefficient had before the data, effects in units of their widths.
+    """
+
+    log_likelihood: float
+    z: FloatArray
+    coefficients: FloatArray
+    covariance: FloatArray
+    noise: Noise
+    left: FloatArray
+    prior: FloatArray
+
+
+def fit_joint(
+    problem: Problem,
+    columns: Sequence[Columns],
+    order: int,
+    *starts: FloatArray,
+    plain: bool = True,
+    spectra: Sequence[FloatArray | None] = (),
+    like: Joint | None = None,
+    blocks: bool | None = None,
+    ridge: float | FloatArray = RIDGE,
+    rounds: int = 5,
+) -> Joint:
+    """Maximise the joint likelihood of calibration, effects and noise.
+
+    Parameters
+    ----------
+    problem : Problem
+    columns : sequence of Columns
+        The effects'.
+    order : int
+        Of the noise's memory.
+    *starts : (q + k,) array
+        Where to begin: the best of them; the calibration as it stands if there is none.
+    plain : bool
+        Begin where plain least squares ends, too.
+    spectra : sequence of (l, k) array or None
+        For each of `columns` whose numbers have one common free size (:mod:`.statistic`): their prior variances.
+    like : Joint, optional
+        A fit whose noise this one's will resemble: saves time.
+    blocks : bool, optional
+        See :func:`~magbridge.diagnose.inference.noise.fit_noise`.
+    ridge : float or (k,) array
+        Prior precision of the effects, in units of their widths.
+    rounds : int
+        At most.
+    """
+    X = Design(problem, columns)
+    q, k = X.free.shape[1], X.effects
+    prior = np.append(np.ones(q), np.broadcast_to(ridge, k))
+    common = [(own, spectrum) for own, spectrum in zip(X.at, spectra, strict=False) if spectrum is not None]
+    centre = np.append(problem.centre, np.zeros(k))
+    follows = problem.survey.follows
+
+    def at(c: FloatArray) -> tuple[FloatArray, Noise]:
+        left = problem.residual - X.times(c)
+        return left, fit_noise(left, follows, order, blocks=blocks, like=None if like is None else like.noise)
+
+    def value(c: FloatArray, noise: Noise) -> float:
+        return noise.log_likelihood - 0.5 * float(prior @ (c - centre) ** 2)
+
+    # noise with a long memory swallows what is slow, and least squares then never asks for it again: so it is
+    # asked once as if the noise had none
+    first = [*(starts or [centre])]
+    if plain:
+        first.append(_plain(X, problem.residual, prior, centre))
+    found = [(c, *at(c)) for c in first]
+    for own, _ in common:
+        prior[own] = 0.0  # no size is known yet
+    c, left, noise = max(found, key=lambda entry: value(entry[0], entry[2]))
+    for step in range(rounds + 1):
+        P, b = normal(X.rows, noise.response(left), noise)
+        for own, spectrum in common:
+            prior[own] = _sized(P, b + P @ c + prior * centre, prior, own, spectrum)
+        P += np.diag(prior)
+        if step == rounds:
+            break
+        moved = c + np.linalg.solve(P, b - prior * (c - centre))
+        tried = at(moved)
+        gained = value(moved, tried[1]) - value(c, noise)
+        if gained > 0.0:
+            c, (left, noise) = moved, tried
+        if gained < 0.02:  # P is that of the last step: no other
+            break
+    covariance: FloatArray = np.asarray(np.linalg.inv(P), float)
+    volume = sum(volume_of(covariance[own, own], prior[own]) for own, _ in common)
+    return Joint(value(c, noise) - volume, c[:q], c[q:], covariance, noise, left, prior)
+
+
+def volume_of(covariance: FloatArray, prior: FloatArray) -> float:
+    """Return ``1/2 ln det(1 + g S)``: by how much the data have narrowed numbers of this prior precision."""
+    return -0.5 * float(np.linalg.slogdet(covariance)[1] + np.log(prior).sum())
+
+
+def _sized(P: FloatArray, h: FloatArray, prior: FloatArray, own: slice, spectra: FloatArray) -> FloatArray:
+    """Prior precision of the numbers at `own`, of the common size and spectrum that data of information P and h like best."""
+    others = np.delete(np.arange(len(h)), own)
+    K = np.linalg.solve(P[np.ix_(others, others)] + np.diag(prior[others]), P[others, own])
+    S, b = P[own, own] - P[own, others] @ K, h[own] - K.T @ h[others]
+    return np.asarray(1.0 / Statistic(S, spectra).best(b).variance)
+
+
+def _plain(X: Design, residual: FloatArray, prior: FloatArray, centre: FloatArray) -> FloatArray:
+    """Least squares as if the noise were white, outliers cut off."""
+    level = 1.4826 * float(np.median(np.abs(residual - np.median(residual)))) + 1e-12
+    c = centre
+    P, _ = normal(X.rows, residual)
+    left = residual - X.times(c)
+    for step in range(2):
+        cut = np.clip(left, *(np.median(left) + np.array([-8.0, 8.0]) * level)) if step else left
+        c = c + np.linalg.solve(
+            P / level**2 + np.diag(prior), X.against(cut) / level**2 - prior * (c - centre)
+        )
+        left = residual - X.times(c)
+        level = 1.4826 * float(np.median(np.abs(left))) + 1e-12
+    return c

@@ -1,0 +1,53 @@
+"""What could stand in a cause's place: the other names that these data do not rule out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from magbridge.diagnose.causes.candidates import Candidate
+from magbridge.diagnose.inference.information import Information
+from magbridge.diagnose.inference.joint import Joint
+from magbridge.diagnose.inference.rounds import State, key
+from magbridge.diagnose.inference.weigh import LEVEL, lead, score
+
+__all__ = ["Rival", "rivals_of"]
+
+
+@dataclass(frozen=True)
+class Rival:
+    """What could stand in a cause's place: its name, and by how much log evidence it loses."""
+
+    cause: str
+    channel: str | None
+    behind: float
+
+
+def rivals_of(
+    state: State, info: Information, model: list[Candidate], base: Joint, k: int
+) -> tuple[Rival, ...]:
+    """Return what could stand in the place of the k-th of `model`, whose columns are the last of `info`."""
+    ends = state.at[-1].stop + np.cumsum([0, *(candidate.size for candidate in model)])
+    own = np.arange(ends[k], ends[k + 1])
+    others = np.setdiff1d(np.arange(ends[0], ends[-1]), own)
+    c = base.coefficients[own - ends[0]]
+    alone = info.without(others, base.prior[len(base.z) + others - ends[0]])
+    # what the data say when this cause is taken out of the fit
+    alone = replace(alone, score=alone.score + alone.matrix[:, own] @ c)
+    mine = score(alone, slice(int(own[0]), int(own[-1]) + 1), model[k])
+    scores = state.scores(alone)
+    rivals = []
+    best = state.best(scores)
+    paid = best.get(key(model[k]), (0, 0.0))[1]
+    for group, (member, average) in best.items():
+        candidate, s = state.candidates[member], scores[member]
+        if group == key(model[k]) or group[0] in {other.cause for other in model if other is not model[k]}:
+            continue
+        # both pay for their nonlinear parameters: a cause's evidence is its average over the grid
+        behind = (
+            mine.evidence + paid - s.evidence - average + float(np.log(candidate.trials / model[k].trials))
+        )
+        if behind < lead(mine.ratio) and state.p_value(candidate, s.ratio, s.freedom) < LEVEL:
+            rivals.append(Rival(*group, behind))
+    return tuple(sorted(rivals, key=lambda rival: rival.behind))

@@ -1,0 +1,249 @@
+"""One round of the search: every cause scored and the likeliest fitted, beside a model that stands already."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from magbridge.diagnose.causes.candidates import Candidate
+from magbridge.diagnose.compare.problem import Problem
+from magbridge.diagnose.inference.information import Information, information
+from magbridge.diagnose.inference.joint import RIDGE, Joint, fit_joint, volume_of
+from magbridge.diagnose.inference.weigh import Score, score, slices, trials, weigh
+
+__all__ = ["Hypothesis", "State", "key"]
+
+FloatArray = NDArray[np.float64]
+
+SHORT_LIST = 9
+"""Causes that are fitted jointly in a round."""
+SHARPEN, STAGES = 144, 2
+"""Columns of the values that are tried between the ends of a nonlinear parameter's bracket, and how often it is narrowed to
+the neighbours of the best."""
+
+
+@dataclass(frozen=True, eq=False)
+class Hypothesis:
+    """One cause beside the others of a model.
+
+    Attributes
+    ----------
+    candidate : Candidate
+    ratio : float
+        Twice the gain in log likelihood.
+    evidence : float
+        Log Bayes factor against the model without it.
+    p_value : float
+        Look-elsewhere and number of causes included.
+    fit : Joint
+        Of the whole model; this cause's coefficients are the last.
+    """
+
+    candidate: Candidate
+    ratio: float
+    evidence: float
+    p_value: float
+    fit: Joint
+
+    @property
+    def signal_to_noise(self) -> float:
+        """Whitened norm of what is the effect's own under the noise that is left, less what noise alone gives."""
+        size = self.candidate.size
+        known = self.fit.prior[-size:] * np.diag(self.fit.covariance)[-size:]
+        power = wald(self.fit, size) - float(np.sum(1.0 - known))
+        return float(np.sqrt(power)) if power > 0.0 else 0.0
+
+
+def wald(fit: Joint, size: int) -> float:
+    """Wald's statistic of the last coefficients."""
+    b, own = fit.coefficients[-size:], fit.covariance[-size:, -size:]
+    return float(b @ np.linalg.solve(own, b))
+
+
+def own_ratio(fit: Joint, candidate: Candidate) -> float:
+    """Likelihood ratio of the last candidate's numbers under the noise that is left."""
+    own = slice(-candidate.size, None)
+    spread = 0.0 if candidate.spectra is None else volume_of(fit.covariance[own, own], fit.prior[own])
+    return wald(fit, candidate.size) - 2.0 * spread
+
+
+class State:
+    """The state of one search: the problem, its candidates, the model so far."""
+
+    def __init__(self, problem: Problem, candidates: Sequence[Candidate], order: int, causes: int) -> None:
+        self.problem, self.candidates, self.order, self.causes = problem, list(candidates), order, causes
+        self.at = slices(self.candidates)
+        self.columns = [candidate.columns for candidate in self.candidates]
+        self.trials: dict[str, float] = {}
+        self.blocks: bool | None = None
+        self.own: Information
+        self.bare: Information
+        self.groups: dict[tuple[str, str | None], list[int]] = {}
+        for k, candidate in enumerate(self.candidates):
+            self.groups.setdefault(key(candidate), []).append(k)
+
+    def fit(
+        self,
+        model: Sequence[Candidate],
+        *starts: FloatArray,
+        plain: bool = True,
+        like: Joint | None = None,
+        rounds: int = 4,
+    ) -> Joint:
+        """Fit a model jointly with calibration and noise; see :func:`~.joint.fit_joint`."""
+        columns = [candidate.columns for candidate in model]
+        return fit_joint(
+            self.problem, columns, self.order, *starts, plain=plain, spectra=[c.spectra for c in model],
+            like=like, blocks=self.blocks, ridge=_ridge(model), rounds=rounds,
+        )  # fmt: skip
+
+    def scores(self, info: Information) -> list[Score]:
+        """Score every candidate."""
+        return [score(info, at, candidate) for at, candidate in zip(self.at, self.candidates, strict=True)]
+
+    def best(self, scores: Sequence[Score]) -> dict[tuple[str, str | None], tuple[int, float]]:
+        """Of each group its best member, and log of the grid's average against it: what the nonlinear parameters cost."""
+        found = {}
+        for group, members in self.groups.items():
+            evidences = np.array([scores[k].evidence for k in members])
+            top = int(np.argmax(evidences))
+            found[group] = members[top], float(np.log(np.mean(np.exp(evidences - evidences[top]))))
+        return found
+
+    def round(self, model: list[Candidate], base: Joint) -> list[Hypothesis]:
+        """Every cause beside `model`, the likeliest first."""
+        model_columns = [candidate.columns for candidate in model]
+        own = information(self.problem, base.noise, base, model_columns, self.columns)
+        if not self.trials:
+            self.trials = trials(own, self.candidates, self.at)
+        under: dict[tuple[str, str | None], list[tuple[int, float, Score, Information]]] = {}
+        bare = self._bare(model, base, own)
+        if not model:
+            self.own, self.bare = own, bare
+        for info in (own, bare):
+            scores = self.scores(info)
+            for group, (k, average) in self.best(scores).items():
+                under.setdefault(group, []).append((k, average, scores[k], info))
+        listed = sorted(under.values(), key=lambda entries: -max(entry[2].evidence for entry in entries))
+        found = [self._joint(model, base, entries) for entries in listed[:SHORT_LIST]]
+        return sorted(found, key=lambda h: -h.evidence)
+
+    def _bare(self, model: list[Candidate], base: Joint, info: Information) -> Information:
+        """Score again under the noise that is left when the best of every cause takes what it can."""
+        top: dict[str, tuple[float, int]] = {}
+        scores = self.scores(info)
+        for k, s in enumerate(scores):
+            if s.evidence > top.get(self.candidates[k].cause, (-np.inf, 0))[0]:
+                top[self.candidates[k].cause] = (s.evidence, k)
+        pool = [k for _, k in top.values()]
+        index = np.concatenate([np.arange(self.at[k].start, self.at[k].stop) for k in pool])
+        taken = np.linalg.solve(info.matrix[np.ix_(index, index)] + np.eye(len(index)), info.score[index])
+        every = [*model, *(self.candidates[k] for k in pool)]
+        everything = fit_joint(
+            self.problem,
+            [candidate.columns for candidate in every],
+            self.order,
+            np.append(info.moved(base, index, taken), taken),
+            spectra=[candidate.spectra for candidate in every],
+            ridge=1.0,
+            rounds=1,
+        )
+        return information(self.problem, everything.noise, base, [c.columns for c in model], self.columns)
+
+    def _joint(
+        self, model: list[Candidate], base: Joint, entries: list[tuple[int, float, Score, Information]]
+    ) -> Hypothesis:
+        """Fit one cause jointly, at the grid's points that won under either noise."""
+        found = []
+        for k in {entry[0] for entry in entries}:
+            candidate = self.candidates[k]
+            mine = [entry for entry in entries if entry[0] == k]
+            index = np.arange(self.at[k].start, self.at[k].stop)
+            starts = [np.append(info.moved(base, index, s.estimate), s.estimate) for _, _, s, info in mine]
+            fit = self.fit([*model, candidate], *starts, like=base, rounds=2)
+            ratio = max(0.0, 2.0 * (fit.log_likelihood - base.log_likelihood))
+            if candidate.positive and fit.coefficients[-1] < 0.0:
+                ratio = 0.0
+            # a gain that is not the effect's own, but of a noise that found another optimum beside it
+            ratio = min(ratio, own_ratio(fit, candidate))
+            freedom = mine[0][2].freedom
+            p_value = self.p_value(candidate, ratio, freedom)
+            evidence = weigh(ratio, freedom) + mine[0][1] - float(np.log(candidate.trials))
+            found.append(Hypothesis(candidate, ratio, evidence, p_value, fit))
+        return max(found, key=lambda h: h.evidence)
+
+    def p_value(self, candidate: Candidate, ratio: float, freedom: int) -> float:
+        """Of a likelihood ratio, times the hypotheses behind its cause, times the causes."""
+        tests = self.trials.get(candidate.cause, 1.0) * self.causes
+        return min(1.0, tests * float(chi2.sf(ratio, max(freedom, 1))))
+
+    def sharpen(self, model: list[Candidate], hypothesis: Hypothesis, base: Joint) -> Hypothesis:
+        """Profile the nonlinear parameters between the grid's points, one after the other.
+
+        Under the noise that stands, where many values are scored at once: a likelihood has more than one peak in an onset.
+        """
+        best = hypothesis
+        again = best.candidate.again
+        if again is None:
+            return best
+        columns = [candidate.columns for candidate in model]
+        for position, name in enumerate(best.candidate.shape):
+            low, high = self._bracket(best.candidate, name)
+            for _ in range(STAGES):
+                values = np.linspace(low, high, max(SHARPEN // best.candidate.size, 4) + 2)
+                made = []
+                for value in values[1:-1]:
+                    shape = [v for v, _ in best.candidate.shape.values()]
+                    shape[position] = float(value)
+                    made.append(again(*shape))
+                info = information(self.problem, best.fit.noise, base, columns, [c.columns for c in made])
+                scores = [score(info, at, made[0]) for at in slices(made)]
+                k = int(np.argmax([s.ratio for s in scores]))
+                low, high = values[k], values[k + 2]
+            at = slices(made)[k]
+            start = np.append(
+                info.moved(base, np.arange(at.start, at.stop), scores[k].estimate), scores[k].estimate
+            )
+            fit = self.fit([*model, made[k]], start, plain=False, like=best.fit, rounds=2)
+            gain = 2.0 * (fit.log_likelihood - base.log_likelihood) - best.ratio
+            if gain > 0.0:
+                best = replace(
+                    best,
+                    candidate=made[k],
+                    fit=fit,
+                    ratio=best.ratio + gain,
+                    evidence=best.evidence + 0.5 * gain,
+                )
+        return best
+
+    def _bracket(self, candidate: Candidate, name: str) -> tuple[float, float]:
+        """Between which values of one nonlinear parameter its grid leaves a candidate free."""
+        here = candidate.shape[name][0]
+        if name == "period":  # a resolved line is a thousandth wide, the grid is one of peaks
+            share = 0.6 * here / self.span
+            return here / (1.0 + share), here * (1.0 + share)
+        grid = sorted({self.candidates[k].shape[name][0] for k in self.groups[key(candidate)]})
+        width = 0.5 * (grid[-1] - grid[0])
+        low = max((v for v in grid if v < here), default=here - width)
+        return low, min((v for v in grid if v > here), default=here + width)
+
+    @property
+    def span(self) -> float:
+        """S."""
+        return float(np.ptp(self.problem.survey.time))
+
+
+def _ridge(model: Sequence[Candidate]) -> FloatArray:
+    """(k,) prior precision that a fit begins from."""
+    return np.concatenate(
+        [np.empty(0), *(np.full(c.size, RIDGE if c.spectra is None else 1.0) for c in model)]
+    )
+
+
+def key(candidate: Candidate) -> tuple[str, str | None]:
+    """Cause and channel: candidates that share both are one grid."""
+    return candidate.cause, candidate.channel

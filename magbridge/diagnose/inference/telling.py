@@ -1,0 +1,110 @@
+r"""The chance that a cause, were it there, would be named alone: from telemetry, attitude and noise, not from the residual.
+
+Notes
+-----
+With the information S of all candidates, a cause's coefficients b of signal-to-noise ``a^2 = b^T S_jj b`` lend a rival i
+the ratio ``R_i = s^T S_ii^-1 s``, ``s = S_ij b``: what the rival can imitate. The difference of the two ratios is
+normal about ``a^2 - R_i = delta^2`` with standard deviation ``2 delta`` (two subspaces in Gaussian noise), so the
+log evidence by which the truth wins has the standard deviation delta, and the chance to be above
+:func:`~.weigh.lead` is a normal integral. Rivals are taken as independent.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2, ncx2, norm
+
+from magbridge.diagnose.causes.candidates import Candidate
+from magbridge.diagnose.inference.information import Information
+from magbridge.diagnose.inference.statistic import Statistic
+from magbridge.diagnose.inference.weigh import LEVEL, lead, slices, weigh
+
+__all__ = ["Telling"]
+
+FloatArray = NDArray[np.float64]
+DRAWS = 12
+
+
+class Telling:
+    """The theory of one log.
+
+    Parameters
+    ----------
+    candidates : sequence of Candidate
+    info : Information
+        Theirs, and after them perhaps others'.
+    trials : mapping
+        Hypotheses behind each cause.
+    causes : int
+    """
+
+    def __init__(
+        self, candidates: Sequence[Candidate], info: Information, trials: Mapping[str, float], causes: int
+    ) -> None:
+        self.candidates, self.S, self.causes = candidates, info.matrix, causes
+        self.at = slices(candidates)
+        self.limit: dict[int, float] = {}
+        self.freedoms = {c.cause: c.freedom for c in candidates if c.spectra is not None}
+        self.statistics = []
+        for k, at in enumerate(self.at):
+            statistic = Statistic(self.S[at, at], candidates[k].spectra)
+            self.statistics.append(statistic)
+            tests = trials.get(candidates[k].cause, 1.0) * causes
+            self.limit[k] = float(chi2.isf(LEVEL / tests, max(statistic.freedom, 1)))
+
+    def chance(self, cause: str, own: NDArray[np.intp], b: FloatArray, signal_to_noise: float) -> float:
+        """Chance that `cause`, with the direction b of the coefficients at `own`, is named alone.
+
+        Parameters
+        ----------
+        cause : str
+        own : (k,) int array
+            Places in the information.
+        b : (k,) array
+        signal_to_noise : float
+        """
+        power = float(b @ self.S[np.ix_(own, own)] @ b)
+        if power <= 0.0 or signal_to_noise <= 0.0:
+            return 0.0
+        s = self.S[:, own] @ b * (signal_to_noise / np.sqrt(power))
+        freedom, a2 = self.freedoms.get(cause, len(own)), signal_to_noise**2
+        mine = weigh(a2 + freedom, freedom)
+        chances: dict[str, float] = {}
+        for k, candidate in enumerate(self.candidates):
+            k_free = self.statistics[k].freedom
+            if candidate.cause == cause or not k_free:
+                continue
+            part = s[self.at[k]]
+            if candidate.positive and part.min() < 0.0:
+                continue
+            ratio = float(self.statistics[k].ratio(part[:, None])[0])
+            delta = max(np.sqrt(max(a2 - ratio, 0.0)), 1e-3)
+            wins = float(norm.cdf((mine - weigh(ratio + k_free, k_free) - lead(a2)) / delta))
+            heard = float(ncx2.sf(self.limit[k], k_free, max(ratio, 1e-9)))
+            chances[candidate.cause] = min(chances.get(candidate.cause, 1.0), 1.0 - (1.0 - wins) * heard)
+        return float(np.prod(list(chances.values())))
+
+    def alone(self, cause: str, signal_to_noise: float) -> float:
+        """Chance that `cause`, of no known direction or channel, is named alone: the mean over what is plausible.
+
+        Parameters
+        ----------
+        cause : str
+        signal_to_noise : float
+        """
+        rng = np.random.default_rng(20131214)
+        best: dict[str | None, tuple[float, int]] = {}
+        for k, candidate in enumerate(self.candidates):
+            seen = float(np.trace(self.S[self.at[k], self.at[k]])) / candidate.size
+            if candidate.cause == cause and seen > best.get(candidate.channel, (0.0, 0))[0]:
+                best[candidate.channel] = (seen, k)
+        found = []
+        for _, k in best.values():
+            own = np.arange(self.at[k].start, self.at[k].stop)
+            for b in rng.standard_normal((DRAWS, len(own))):
+                b = np.abs(b) if self.candidates[k].positive else b  # noqa: PLW2901  (the same draw)
+                found.append(self.chance(cause, own, b, signal_to_noise))
+        return float(np.mean(found)) if found else 0.0

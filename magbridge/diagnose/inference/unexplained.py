@@ -1,0 +1,237 @@
+"""What is left: structure of any kind that no cause of the table accounts for, described but not named.
+
+Notes
+-----
+A free description has more numbers than anyone believes in, so they have one common free size (:mod:`.statistic`).
+Noise that was fitted without the effect may have swallowed it. So a description is
+found under the noise that stands and under the one that is left when slow curves take what they can, and then weighed by the
+whole likelihood, with a noise of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from magbridge.diagnose.causes.candidates import Candidate
+from magbridge.diagnose.compare.problem import Columns, Problem
+from magbridge.diagnose.inference.fit_noise import fit_noise
+from magbridge.diagnose.inference.free import Description, descriptions
+from magbridge.diagnose.inference.information import information
+from magbridge.diagnose.inference.joint import Joint
+from magbridge.diagnose.inference.noise import Noise
+from magbridge.diagnose.inference.search import Outcome, worth
+from magbridge.diagnose.inference.statistic import Ridge, Statistic
+from magbridge.diagnose.inference.weigh import LEVEL, ODDS, REMNANT, lead
+
+__all__ = ["Leftover", "accept", "leftover"]
+
+FloatArray = NDArray[np.float64]
+
+LOUD = 3
+"""Descriptions under each noise that are weighed by the whole likelihood."""
+TOGETHER = 4
+"""Descriptions whose columns are whitened in one go."""
+TURNS = 6
+"""Alternations between a curve and its direction."""
+CALM = 2
+"""Rounds in which slow curves and noise take from each other."""
+CHUNK = 8192
+
+
+class Leftover(NamedTuple):
+    """Unexplained structure: its kind, size, and what it goes with.
+
+    Attributes
+    ----------
+    kind : str
+        ``switching drift tone transient broadband``.
+    signal_to_noise, p_value : float
+    evidence : float
+        Log Bayes factor of the description against the model.
+    period_s : float or None
+        Of a tone.
+    best_channel : str or None
+        The telemetry that goes with it best.
+    """
+
+    kind: str
+    signal_to_noise: float
+    p_value: float
+    evidence: float
+    period_s: float | None
+    best_channel: str | None
+
+
+def lone(S: FloatArray, b: FloatArray, width: FloatArray, whole: Ridge) -> Ridge:
+    """One curve along one direction of the body: ``c = f d^T`` has a third of the numbers of three curves, and two more.
+
+    f by the ridge along d, d by least squares with f, from the `whole` estimate on; the direction's two numbers cost what
+    :func:`~.weigh.weigh` asks for them.
+    """
+    count = len(width) // 3
+    own = np.linalg.svd(whole.estimate.reshape(count, 3), full_matrices=False)[2][0]
+    for _ in range(TURNS):
+        along = np.kron(np.eye(count), own[:, None])
+        best = Statistic(along.T @ S @ along, width[None, ::3] ** 2).best(along.T @ b)
+        axes = np.kron(best.estimate[:, None], np.eye(3))
+        own = np.linalg.lstsq(axes.T @ S @ axes, axes.T @ b, rcond=None)[0]
+        own /= max(float(np.linalg.norm(own)), 1e-300)
+    price = 1.0 + float(np.log(max(0.5 * best.ratio + best.price, 1.0)))
+    return replace(
+        best, ratio=best.ratio - 2.0 * price, estimate=along @ best.estimate, price=best.price + price
+    )
+
+
+def leftover(
+    problem: Problem,
+    model: Sequence[Candidate],
+    fit: Joint,
+    order: int,
+    tone: Candidate | None = None,
+    *,
+    but: Sequence[Candidate] = (),
+) -> Leftover | None:
+    """Test whether anything is left beside `model`; the description with the best evidence, or None.
+
+    Parameters
+    ----------
+    problem, model, fit, order
+        The model that was found.
+    tone : Candidate, optional
+        The best periodic disturbance, if the table does not hold that cause.
+    but : sequence of Candidate
+        Causes that are not to be told again with more numbers.
+    """
+    listed = [one for one in descriptions(problem, fit, tone) if not one.retells(but)]
+    columns = [candidate.columns for candidate in model]
+    found: list[tuple[float, str, Description, float]] = []
+    for noise in (fit.noise, _calm(problem, columns, fit, order, listed[:2])):
+        scored = _scored(problem, noise, fit, columns, listed)
+        for own, kind, one, best, shift in sorted(scored, key=lambda entry: -entry[0])[:LOUD]:
+            # a gain beyond the formula's is that of a noise which found another optimum beside the description
+            evidence = min(own, _weighed(problem, columns, fit, order, one, best, shift))
+            found.append((evidence, kind, one, best.signal_to_noise))
+    evidence, kind, one, size = max(found, key=lambda entry: entry[0])
+    p_value = min(1.0, sum(len(one.widths) for one in listed) * float(chi2.sf(2.0 * max(evidence, 0.0), 1)))
+    # without a name stricter than for a cause: it is the asymptotic distribution
+    if p_value >= (LEVEL if model else 0.1 * LEVEL):
+        return None
+    if kind == "transient":
+        kind = _steps(problem, fit)
+    return Leftover(kind, size, p_value, evidence, one.period, one.channel or _goes_with(problem, fit))
+
+
+def accept(problem: Problem, outcome: Outcome, tone: Candidate | None) -> tuple[bool, Leftover | None]:
+    """Say whether the names stand, and what is left beside them or, if they do not, at all.
+
+    Names stand unless a free description of the whole beats them as another name would have to. If more is left beside
+    them than an idealised regressor leaves, the burden of proof is theirs: they and what is left must beat it 20:1.
+    """
+    model = [h.candidate for h in outcome.chosen]
+    rest = leftover(problem, model, outcome.fit, outcome.order, tone)
+    if not model:
+        return False, rest
+    if rest is not None and rest.signal_to_noise < REMNANT * max(h.signal_to_noise for h in outcome.chosen):
+        rest = None
+    # what holds the names' own regressors and finds nothing beside them is no other explanation
+    free = leftover(problem, [], outcome.null, outcome.order, tone, but=() if rest else model)
+    ratio = 2.0 * (outcome.fit.log_likelihood - outcome.null.log_likelihood)
+    names = worth(ratio, model, outcome.trials) + (rest.evidence - ODDS if rest else lead(ratio))
+    if free is not None and names < free.evidence:
+        return False, free
+    return True, rest
+
+
+def _scored(
+    problem: Problem, noise: Noise, fit: Joint, model: Sequence[Columns], listed: Sequence[Description]
+) -> Iterator[tuple[float, str, Description, Ridge, FloatArray]]:
+    """Yield each description with each of its widths: log evidence under `noise`, and by how much the model gives way."""
+    for first in range(0, len(listed), TOGETHER):
+        some = listed[first : first + TOGETHER]
+        info = information(problem, noise, fit, model, [one.columns for one in some])
+        ends = np.cumsum([0, *(one.widths[0][1].size for one in some)]).tolist()
+        for one, start, end in zip(some, ends, ends[1:], strict=False):
+            at = slice(start, end)
+            for kind, width in one.widths:
+                S, b = info.matrix[at, at], info.score[at]
+                best = Statistic(S, width[None] ** 2).best(b)
+                if one.turned:
+                    best = max(best, lone(S, b, width, best), key=lambda found: found.ratio)
+                yield 0.5 * best.ratio - float(np.log(one.trials)), kind, one, best, info.shift[:, at]
+
+
+def _calm(
+    problem: Problem, model: Sequence[Columns], fit: Joint, order: int, slow: Sequence[Description]
+) -> Noise:
+    """Return the noise that is left when slow curves take what they can, beginning with one that has no memory."""
+    jumps = np.abs(np.diff(fit.left))
+    level = 1.4826 * float(np.median(jumps)) / np.sqrt(2.0) + 1e-12
+    white = np.full(len(problem), level)
+    noise = replace(
+        fit.noise, memory=np.zeros(order), scale=white, nu=1e6, share=1.0, innovations=fit.left / level
+    )
+    width = np.concatenate([one.widths[1][1] for one in slow])
+    follows, blocks = problem.survey.follows, bool(np.ptp(fit.noise.scale))
+    for _ in range(CALM):
+        info = information(problem, noise, fit, model, [one.columns for one in slow])
+        c = Statistic(info.matrix, width[None] ** 2).best(info.score).estimate
+        left = fit.left + _taken(problem, model, -info.shift @ c, [one.columns for one in slow], c)
+        noise = fit_noise(left, follows, order, blocks=blocks)
+    return noise
+
+
+def _weighed(
+    problem: Problem, model: Sequence[Columns], fit: Joint, order: int, one: Description, best: Ridge, shift: FloatArray
+) -> float:  # fmt: skip
+    """Log evidence of a description against the model, the noise fitted anew with it (Laplace's approximation)."""
+    moved = -shift @ best.estimate
+    left = fit.left + _taken(problem, model, moved, [one.columns], best.estimate)
+    noise = fit_noise(
+        left, problem.survey.follows, order, blocks=bool(np.ptp(fit.noise.scale)), like=fit.noise
+    )
+    z = fit.z + moved[: len(fit.z)]
+    pull = float(np.sum((z - problem.centre) ** 2) - np.sum((fit.z - problem.centre) ** 2))
+    gained = noise.log_likelihood - fit.noise.log_likelihood - 0.5 * pull
+    return gained - best.price - float(np.log(one.trials))
+
+
+def _taken(
+    problem: Problem, model: Sequence[Columns], moved: FloatArray, columns: Sequence[Columns], c: FloatArray
+) -> FloatArray:
+    """(n,) by how much the residual changes when a description takes c, and calibration and model move by `moved`."""
+    out = np.empty(len(problem))
+    every = np.append(moved, c)
+    for start in range(0, len(problem), CHUNK):
+        rows = slice(start, min(start + CHUNK, len(problem)))
+        X = np.hstack([problem.free[rows], *(column(rows) for column in (*model, *columns))])
+        out[rows] = -X @ every
+    return out
+
+
+def _steps(problem: Problem, fit: Joint) -> str:
+    """Tell one disturbance that comes and goes from a state that switches again and again."""
+    n = len(problem)
+    parts = np.arange(n) * min(64, max(n // 30, 2)) // n
+    level: FloatArray = np.bincount(parts, fit.left) / np.bincount(parts)
+    high = level > 0.5 * (level.max() + level.min())
+    return "switching" if np.count_nonzero(np.diff(high.astype(int))) > 4 else "transient"
+
+
+def _goes_with(problem: Problem, fit: Joint) -> str | None:
+    """Return the channel of which a curve through ten bins explains most of what is left."""
+    best: tuple[float, str | None] = (0.02, None)
+    total = float(fit.left @ fit.left)
+    for name, channel in problem.survey.channels.items():
+        edges = np.unique(np.quantile(channel.values, np.linspace(0.1, 0.9, 9)))
+        bins = np.searchsorted(edges, channel.values)
+        count = np.maximum(np.bincount(bins), 1)
+        explained = float(np.sum(np.bincount(bins, fit.left) ** 2 / count)) / total
+        if explained > best[0]:
+            best = (explained, name)
+    return best[1]

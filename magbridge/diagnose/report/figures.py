@@ -1,0 +1,273 @@
+"""Figures of the report: what was measured against what was simulated, before and after."""
+
+from __future__ import annotations
+
+from base64 import b64encode
+from io import BytesIO
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogFormatter
+from numpy.typing import NDArray
+from scipy.signal import periodogram
+
+if TYPE_CHECKING:
+    from magbridge.diagnose.diagnosis import Diagnosis
+
+__all__ = ["channels", "evidence", "label", "likeness", "measured", "spectrum", "terms", "track"]
+
+FloatArray = NDArray[np.float64]
+
+BEFORE, AFTER, INK, FAINT = "#c8553d", "#1f6f8b", "#22303c", "#9aa5b1"
+POINTS = 4000
+"""Points drawn of a curve; more only make the page heavy."""
+MANY = 60
+"""Dives that are not parted by lines any more."""
+
+
+def _figure(width: float, height: float, rows: int = 1, columns: int = 1, **more: Any) -> tuple[Figure, Any]:
+    figure = Figure(figsize=(width, height), layout="constrained", dpi=110)
+    axes = figure.subplots(rows, columns, squeeze=False, **more)
+    for axis in axes.flat:
+        axis.spines[["top", "right"]].set_visible(False)
+        axis.tick_params(colors=INK, labelsize=8)
+        axis.grid(color="#e6e9ec", linewidth=0.6)
+        axis.set_axisbelow(True)
+    return figure, axes
+
+
+def _png(figure: Figure) -> str:
+    buffer = BytesIO()
+    figure.savefig(buffer, format="png", metadata={"Software": None})
+    return b64encode(buffer.getvalue()).decode()
+
+
+def _thin(n: int) -> slice:
+    return slice(None, None, max(1, n // POINTS))
+
+
+def _hours(diagnosis: Diagnosis) -> FloatArray:
+    t = diagnosis.problem.survey.time
+    return np.asarray((t - t[0]) / 3600.0)
+
+
+def _sides(diagnosis: Diagnosis) -> dict[str, tuple[FloatArray, str]]:
+    """Return what is compared, with its colour; where nothing was mended, what the calibration's own uncertainty takes."""
+    if not diagnosis.named:
+        return {
+            "as calibrated": (diagnosis.before, BEFORE),
+            "calibration refitted": (diagnosis.fit.left, AFTER),
+        }
+    return {"before": (diagnosis.before, BEFORE), "after, dives left out": (diagnosis.after, AFTER)}
+
+
+def _stated(diagnosis: Diagnosis) -> FloatArray:
+    """(n,) 1-sigma of the difference, nT, by the calibration: its noise, and what its coefficients may be off by."""
+    noise, free = diagnosis.problem.calibration.noise, diagnosis.problem.free
+    return np.asarray(np.sqrt(noise.sensor**2 + noise.reference**2 + (free * free).sum(axis=1)))
+
+
+def label(cause: str, channel: str | None) -> str:
+    """Return a cause as people read it."""
+    return cause.replace("_", " ") + (f" ({channel})" if channel else "")
+
+
+def measured(diagnosis: Diagnosis) -> str:
+    """Draw the total field measured and simulated, and their difference before and after, over time."""
+    hours, survey, part = _hours(diagnosis), diagnosis.problem.survey, _thin(len(diagnosis.problem))
+    figure, axes = _figure(10, 5.2, 2, 1, sharex=True, height_ratios=[1, 1.5])
+    top, low = axes[:, 0]
+    gap = np.append(np.diff(survey.time) > 20.0 * np.median(np.diff(survey.time)), False)
+    total = np.where(gap, np.nan, survey.reference + diagnosis.before)  # no line across a gap
+    top.plot(hours[part], total[part], color=BEFORE, linewidth=0.7, label="measured, corrected as calibrated")
+    top.plot(hours[part], survey.reference[part], color=INK, linewidth=1.0, label="simulated (reference)")
+    top.set_ylabel("total field (nT)", fontsize=9)
+    ends = np.nanquantile(np.append(total, survey.reference), [0.002, 0.998])
+    top.set_ylim(ends[0] - 0.1 * np.ptp(ends), ends[1] + 0.35 * np.ptp(ends))
+    ends = np.zeros(2)
+    for name, (left, colour) in _sides(diagnosis).items():
+        low.plot(hours[part], left[part], ".", color=colour, markersize=2, label=name)
+        some = np.quantile(left, [0.002, 0.998])
+        ends = np.array([min(ends[0], some[0]), max(ends[1], some[1])])
+    stated = 2.0 * _stated(diagnosis)[part]
+    low.fill_between(
+        hours[part],
+        -stated,
+        stated,
+        color=FAINT,
+        alpha=0.25,
+        linewidth=0,
+        label="what the calibration states, 2 sigma",
+    )
+    dives = survey.time[np.flatnonzero(np.diff(survey.dive)) + 1]
+    for start in dives if dives.size < MANY else ():
+        low.axvline((start - survey.time[0]) / 3600.0, color=FAINT, linewidth=0.4)
+    low.axhline(0.0, color=INK, linewidth=0.6)
+    low.set_ylim(ends[0] - 0.25 * np.ptp(ends), ends[1] + 0.4 * np.ptp(ends))
+    low.set_ylabel("measured − simulated (nT)", fontsize=9)
+    low.set_xlabel(
+        "hours since the start" + ("; grey lines part the dives" if dives.size < MANY else ""), fontsize=9
+    )
+    for axis in (top, low):
+        axis.legend(fontsize=8, frameon=False, loc="upper right", markerscale=4, ncols=3)
+    return _png(figure)
+
+
+def spectrum(diagnosis: Diagnosis) -> str:
+    """Draw the spectral density of the difference, before and after, with the noise model's."""
+    survey = diagnosis.problem.survey
+    interval = float(np.median(np.diff(survey.time)))
+    figure, axes = _figure(5.6, 3.6)
+    axis = axes[0, 0]
+    for name, (values, colour) in _sides(diagnosis).items():
+        frequency, power = periodogram(values, 1.0 / interval, detrend="constant")
+        edges = np.unique(np.geomspace(1, len(frequency), 60).astype(int))
+        where = [slice(a, b) for a, b in pairwise(edges)]
+        axis.loglog(
+            [frequency[w].mean() for w in where],
+            [np.sqrt(power[w].mean()) for w in where],
+            color=colour,
+            label=name,
+        )
+    noise = diagnosis.fit.noise
+    frequency = np.geomspace(1.0 / float(np.ptp(survey.time)), 0.5 / interval, 200)
+    lags = np.exp(-2j * np.pi * frequency[:, None] * interval * np.arange(1, len(noise.memory) + 1))
+    spread = float(np.median(noise.scale)) * (np.sqrt(noise.nu / (noise.nu - 2.0)) if noise.nu < 1e5 else 1.0)
+    axis.loglog(
+        frequency, spread * np.sqrt(2.0 * interval) / np.abs(1.0 - lags @ noise.memory), "--", color=INK, linewidth=1,
+        label="noise model",
+    )  # fmt: skip
+    axis.yaxis.set_major_formatter(LogFormatter())
+    axis.yaxis.set_minor_formatter(LogFormatter(minor_thresholds=(1.5, 0.6)))
+    axis.tick_params(which="minor", labelsize=8, colors=INK)
+    axis.set_xlabel("frequency (Hz)", fontsize=9)
+    axis.set_ylabel("nT/√Hz", fontsize=9)
+    axis.legend(fontsize=8, frameon=False)
+    return _png(figure)
+
+
+def channels(diagnosis: Diagnosis) -> str:
+    """Draw the difference against each channel: means over twenty bins with their scatter."""
+    survey = diagnosis.problem.survey
+    shown = {
+        name: (channel.values, channel.unit)
+        for name, channel in survey.channels.items()
+        if name not in survey.still
+    }
+    if survey.attitude is not None:
+        shown |= {name: (survey.attitude[:, k], "deg") for k, name in enumerate(("roll", "pitch", "heading"))}
+    names = list(shown)[:12]
+    columns = min(3, max(len(names), 1))
+    rows = max(-(-len(names) // columns), 1)
+    figure, axes = _figure(10, 2.3 * rows, rows, columns)
+    for axis, name in zip(axes.flat, names, strict=False):
+        values, unit = shown[name]
+        edges = np.linspace(values.min(), values.max(), 21)
+        bins = np.clip(np.searchsorted(edges, values) - 1, 0, 19)
+        count = np.bincount(bins, minlength=20)
+        count = np.where(count > 3, count, np.nan)  # no line through what was not visited
+        middle = 0.5 * (edges[1:] + edges[:-1])
+        for left, colour in _sides(diagnosis).values():
+            mean = np.bincount(bins, left, 20) / count
+            spread = np.sqrt(np.maximum(np.bincount(bins, left**2, 20) / count - mean**2, 0.0))
+            axis.vlines(middle, mean - spread, mean + spread, color=colour, alpha=0.2, linewidth=5)
+            axis.plot(middle, mean, "o-", color=colour, markersize=2.5, linewidth=1)
+        axis.set_xlabel(f"{name} ({unit or '1'})", fontsize=8)
+    for axis in axes.flat[len(names) :]:
+        axis.set_visible(False)
+    for axis in axes[:, 0]:
+        axis.set_ylabel("difference (nT)", fontsize=8)
+    return _png(figure)
+
+
+def track(diagnosis: Diagnosis) -> str | None:
+    """Draw the difference along the track, before and after."""
+    place = diagnosis.problem.survey.place
+    if place is None or np.ptp(place, axis=0).max() < 1.0:
+        return None
+    part = _thin(len(place))
+    sides = _sides(diagnosis)
+    north, east = np.ptp(place, axis=0)[:2]
+    if east > 2.0 * north:  # a long track lies better above the other one
+        figure, axes = _figure(
+            10, 2.0 * (1.1 + 8.0 * max(float(north / east), 0.1)), 2, 1, sharex=True, sharey=True
+        )
+    else:
+        figure, axes = _figure(10, 3.8, 1, 2, sharex=True, sharey=True)
+    limit = float(np.quantile(np.abs(diagnosis.before), 0.98)) + 1e-9
+    dots = None
+    for axis, (title, (values, _)) in zip(axes.flat, sides.items(), strict=True):
+        dots = axis.scatter(
+            place[part, 1] / 1e3,
+            place[part, 0] / 1e3,
+            c=values[part],
+            s=5,
+            cmap="RdBu_r",
+            vmin=-limit,
+            vmax=limit,
+        )
+        axis.set_aspect("equal", adjustable="box")
+        axis.set_title(title, fontsize=9)
+    for axis in axes[-1]:
+        axis.set_xlabel("east (km)", fontsize=9)
+    for axis in axes[:, 0]:
+        axis.set_ylabel("north (km)", fontsize=9)
+    assert dots is not None
+    figure.colorbar(dots, ax=axes, label="nT", shrink=0.8)
+    return _png(figure)
+
+
+def terms(diagnosis: Diagnosis) -> str | None:
+    """Draw what each found cause adds to the total field, over time."""
+    if not diagnosis.named:
+        return None
+    hours, part = _hours(diagnosis), _thin(len(diagnosis.problem))
+    figure, axes = _figure(10, 1.9 * len(diagnosis.named), len(diagnosis.named), 1, sharex=True)
+    at = 0
+    for axis, hypothesis in zip(axes[:, 0], diagnosis.named, strict=True):
+        candidate = hypothesis.candidate
+        own = diagnosis.fit.coefficients[at : at + candidate.size]
+        at += candidate.size
+        share = candidate.columns(slice(0, len(diagnosis.problem))) @ own
+        axis.plot(hours[part], share[part], color=AFTER, linewidth=0.8)
+        axis.set_ylabel("nT", fontsize=8)
+        axis.set_title(label(candidate.cause, candidate.channel), fontsize=9, loc="left")
+    axes[-1, 0].set_xlabel("hours since the start", fontsize=9)
+    return _png(figure)
+
+
+def evidence(diagnosis: Diagnosis) -> str:
+    """Draw how strongly the data speak for each cause alone, with the chance that it is a false alarm."""
+    tested = diagnosis.outcome.tested
+    order = sorted(tested, key=lambda name: tested[name][1])
+    figure, axes = _figure(5.6, 0.6 + 0.24 * max(len(order), 1))
+    axis = axes[0, 0]
+    named = {h.candidate.cause for h in diagnosis.named}
+    bars = axis.barh(
+        [label(name, None) for name in order],
+        [np.sqrt(tested[name][1]) for name in order],
+        color=[AFTER if name in named else FAINT for name in order],
+    )
+    chances = [tested[name][0] for name in order]
+    told = [f" p = {p:.1g}" if p > 1e-99 else " p < 1e-99" for p in chances]
+    axis.bar_label(bars, told, fontsize=7, color=INK)
+    axis.margins(x=0.2)
+    axis.set_xlabel("root of the likelihood ratio; p: chance of a false alarm", fontsize=8)
+    return _png(figure)
+
+
+def likeness(diagnosis: Diagnosis) -> str:
+    """Draw which causes look alike in this log, whatever it shows."""
+    visible, R = diagnosis.isolability.visible, diagnosis.isolability.correlation
+    names = [label(v.cause, v.channel) for v in visible]
+    size = 2.6 + 0.21 * len(names)
+    figure, axes = _figure(size + 1.0, size)
+    axis = axes[0, 0]
+    axis.grid(visible=False)
+    image = axis.imshow(R, cmap="magma_r", vmin=0.0, vmax=1.0)
+    axis.set_xticks(range(len(names)), names, rotation=90, fontsize=7)
+    axis.set_yticks(range(len(names)), names, fontsize=7)
+    figure.colorbar(image, ax=axis, shrink=0.7, label="correlation of signatures")
+    return _png(figure)

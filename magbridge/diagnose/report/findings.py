@@ -1,0 +1,151 @@
+"""``findings.json``: what was found, for machines. Its names are public."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+import numpy as np
+
+from magbridge.diagnose.inference.rivals import Rival
+from magbridge.diagnose.inference.search import Hypothesis
+
+if TYPE_CHECKING:
+    from magbridge.diagnose.causes import Cause
+    from magbridge.diagnose.causes.candidates import Candidate
+    from magbridge.diagnose.diagnosis import Diagnosis
+    from magbridge.diagnose.gain import Gain
+
+__all__ = ["findings", "findings_json", "parameters"]
+
+LEVEL = 0.95
+
+
+def findings(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> dict[str, Any]:
+    """Return the contract's table as plain Python."""
+    listed = []
+    at = len(diagnosis.problem.centre)
+    for hypothesis, rivals, gain in zip(diagnosis.named, diagnosis.rivals, diagnosis.gains, strict=True):
+        candidate = hypothesis.candidate
+        listed.append(
+            {
+                "cause": candidate.cause,
+                "channel": candidate.channel,
+                "signal_to_noise": _round(hypothesis.signal_to_noise),
+                "p_value": _round(hypothesis.p_value),
+                "alternatives": alternatives(rivals),
+                "isolability": _round(told(diagnosis, hypothesis)),
+                "separated_by": causes[candidate.cause].separated_by if rivals else None,
+                "parameters": parameters(diagnosis, hypothesis, at),
+                "gain": _gain(gain),
+            }
+        )
+        at += candidate.size
+    if diagnosis.wrong is not None:
+        listed.append(_wrong(diagnosis))
+    rest = diagnosis.unexplained
+    return {
+        "verdict": diagnosis.verdict,
+        "rms_before_nT": _round(diagnosis.total.before),
+        "rms_after_nT": _round(diagnosis.total.after),
+        "gain": _gain(diagnosis.total),
+        "findings": listed,
+        "unexplained": None
+        if rest is None
+        else {
+            "kind": rest.kind,
+            "signal_to_noise": _round(rest.signal_to_noise),
+            "period_s": None if rest.period_s is None else _round(rest.period_s),
+            "best_channel": rest.best_channel,
+        },
+    }
+
+
+def findings_json(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> bytes:
+    """Return ``findings.json``."""
+    return msgspec.json.format(msgspec.json.encode(findings(diagnosis, causes)), indent=2) + b"\n"
+
+
+def alternatives(rivals: tuple[Rival, ...]) -> list[dict[str, Any]]:
+    """List the others within 20:1, the likeliest first."""
+    return [{"cause": rival.cause, "channel": rival.channel} for rival in rivals]
+
+
+def parameters(diagnosis: Diagnosis, hypothesis: Hypothesis, at: int) -> dict[str, dict[str, Any]]:
+    """Value, sigma and unit of every coefficient, from place `at` of the joint fit, and of the nonlinear ones.
+
+    Where one channel acts with several lags, or an offset jumps more than once, a coefficient is what they do in all; its
+    parts stand beside it.
+    """
+    candidate, q = hypothesis.candidate, len(diagnosis.problem.centre)
+    rows = slice(at, at + candidate.size)
+    covariance = diagnosis.fit.covariance[rows, rows] * np.outer(candidate.width, candidate.width)
+    value = diagnosis.fit.coefficients[at - q : at - q + candidate.size] * candidate.width
+    parts: dict[str, list[int]] = {}
+    for k, name in enumerate(candidate.names):
+        parts.setdefault(name.partition(" (")[0] if _adds_up(candidate) else name, []).append(k)
+    found: dict[str, dict[str, Any]] = {}
+    for name, own in parts.items():
+        listed = {f"{name} ({i})": [k] for i, k in enumerate(own, 1)} if len(own) > 1 else {}
+        for label, some in ({name: own} | listed).items():
+            sigma = float(np.sqrt(covariance[np.ix_(some, some)].sum()))
+            found[label] = {
+                "value": _round(float(value[some].sum())),
+                "sigma": _round(sigma),
+                "unit": candidate.units[own[0]],
+            }
+    shape = {
+        name: {"value": float(v), "sigma": None, "unit": unit} for name, (v, unit) in candidate.shape.items()
+    }
+    return found | shape
+
+
+def _adds_up(candidate: Candidate) -> bool:
+    """Tell whether parts of one name are one effect's: later than each other, of one channel."""
+    channels = {getattr(effect, "channel", None) for effect in candidate.effects}
+    return len(channels) == 1 and not candidate.shape.keys().isdisjoint(("lag", "onset"))
+
+
+def told(diagnosis: Diagnosis, hypothesis: Hypothesis) -> float:
+    """Theory's chance that this cause, of this size and direction, is named alone in this log."""
+    info, chosen = diagnosis.outcome.info, diagnosis.outcome.chosen
+    k = next(i for i, one in enumerate(chosen) if one.candidate is hypothesis.candidate)
+    first = len(info.score) - sum(one.candidate.size for one in chosen[k:])
+    own = np.arange(first, first + hypothesis.candidate.size)
+    b = hypothesis.fit.coefficients[-hypothesis.candidate.size :]
+    return diagnosis.isolability.telling.chance(
+        hypothesis.candidate.cause, own, b, hypothesis.signal_to_noise
+    )
+
+
+def _wrong(diagnosis: Diagnosis) -> dict[str, Any]:
+    wrong = diagnosis.wrong
+    assert wrong is not None
+    size = np.abs(diagnosis.fit.left[wrong.rows])
+    return {
+        "cause": "outliers",
+        "channel": None,
+        "signal_to_noise": _round(float(np.sqrt(wrong.ratio))),
+        "p_value": _round(wrong.p_value),
+        "alternatives": [],
+        "separated_by": None,
+        "parameters": {
+            "count": {"value": int(wrong.rows.size), "sigma": None, "unit": "1"},
+            "median_size": {"value": _round(float(np.median(size))), "sigma": None, "unit": "nT"},
+        },
+        "gain": None,
+    }
+
+
+def _gain(gain: Gain) -> dict[str, Any]:
+    return {
+        "rms_ratio": _round(gain.ratio),
+        "interval": [_round(gain.interval[0]), _round(gain.interval[1])],
+        "level": LEVEL,
+        "held_out": "dives",
+    }
+
+
+def _round(value: float) -> float:
+    return float(f"{value:.5g}")

@@ -1,0 +1,286 @@
+"""``report.html``: one file for someone who was not there."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
+from html import escape
+from inspect import getdoc
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from magbridge.diagnose.report import figures
+from magbridge.diagnose.report.findings import parameters, told
+
+if TYPE_CHECKING:
+    from magbridge.diagnose.causes import Cause
+    from magbridge.diagnose.causes.candidates import Candidate
+    from magbridge.diagnose.diagnosis import Diagnosis
+    from magbridge.diagnose.gain import Gain
+    from magbridge.diagnose.inference.rivals import Rival
+    from magbridge.diagnose.inference.search import Hypothesis
+
+__all__ = ["report_html"]
+
+STYLE = """
+:root{color-scheme:light}body{font:15px/1.55 system-ui,sans-serif;color:#22303c;max-width:62rem;margin:2.5rem auto;padding:0 1.2rem}
+h1{font-size:1.6rem;margin-bottom:.2rem}h2{font-size:1.15rem;margin-top:2.4rem;border-bottom:1px solid #dde2e6;padding-bottom:.3rem}
+h3{font-size:1rem;margin-bottom:.2rem}figure{margin:1rem 0}img{max-width:100%}figcaption,.faint{color:#66727e;font-size:.88rem}
+table{border-collapse:collapse;font-size:.9rem;margin:.6rem 0}td,th{padding:.22rem .8rem .22rem 0;text-align:left;border-bottom:1px solid #eceff1}
+td.n{text-align:right;font-variant-numeric:tabular-nums}.verdict{font-size:1.1rem;background:#f2f6f8;border-left:4px solid #1f6f8b;padding:.8rem 1.1rem}
+.pair{display:flex;gap:1rem;flex-wrap:wrap;align-items:flex-start}.pair figure{flex:1 1 24rem}code{background:#f2f4f6;padding:0 .25em}
+"""
+MANY = 24
+"""Numbers that a table lists openly."""
+KINDS = {
+    "switching": "An offset that switches",
+    "drift": "A slow drift",
+    "tone": "A tone",
+    "transient": "A transient",
+    "broadband": "Something of no one frequency",
+}
+"""What is left, as a sentence's subject."""
+
+
+def report_html(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> str:
+    """Return the page."""
+    survey = diagnosis.problem.survey
+    first, last = (
+        datetime.fromtimestamp(float(t), UTC).strftime("%Y-%m-%d %H:%M") for t in survey.time[[0, -1]]
+    )
+    body = [
+        f"<h1>Diagnosis of {escape(survey.source)}</h1>",
+        (f'<p class="faint">{first} to {last} UTC · {len(survey)} samples in {np.unique(survey.dive).size} dives · '
+        f"calibration: {escape(diagnosis.problem.calibration.method or 'unnamed')}, "
+        f"{diagnosis.problem.calibration.coefficients.size} coefficients</p>"),
+        f'<p class="verdict">{_verdict(diagnosis)}</p>',
+        "<h2>Measured against simulated</h2>",
+        ("<p>The calibration knows what the vehicle's own magnetism and the sensor's errors do to every reading. What is left "
+         "after it has corrected them should be the Earth's field, and should differ from the reference by noise alone. "
+         "Whatever else is in the difference is something that the calibration does not know.</p>"),
+        _figure(figures.measured(diagnosis), "The total field as measured and corrected by the calibration, and as the "
+                "reference says it should be; below, their difference"
+                + (" before, and with the extended calibration on dives that its fit had not seen." if diagnosis.named else
+                   ", and what is left of it when the calibration may move within its own uncertainty.")),
+        '<div class="pair">',
+        _figure(figures.spectrum(diagnosis), "Spectral density of the difference; dashed, the noise model."),
+        _figure(figures.evidence(diagnosis), "The likeliest causes, each tried alone, with calibration and "
+                "noise fitted anew. Below p = 0.01 a cause is found" + ("; blue: what was named in the end." if diagnosis.named else ".")),
+        "</div>",
+        _figure(figures.channels(diagnosis), "The difference against each channel: mean and scatter in twenty bins. A "
+                "line that is not flat is something the simulation gets wrong."),
+        _figure(figures.track(diagnosis), "The difference along the track: an error of the map looks the same on every pass."),
+        "<h2>What was found, and why it is believed</h2>",
+        *_found(diagnosis, causes),
+        "<h2>What is left</h2>",
+        _left(diagnosis),
+        "<h2>What this log could have shown at all</h2>",
+        *_isolability(diagnosis),
+    ]  # fmt: skip
+    content = "\n".join(part for part in body if part)
+    return (
+        f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>Diagnosis of {escape(survey.source)}</title>'
+        f"<style>{STYLE}</style></head><body>{content}</body></html>\n"
+    )
+
+
+def _figure(png: str | None, caption: str) -> str:
+    if png is None:
+        return ""
+    return f'<figure><img alt="{escape(caption)}" src="data:image/png;base64,{png}"><figcaption>{caption}</figcaption></figure>'
+
+
+def _name(hypothesis: Hypothesis) -> str:
+    channel = hypothesis.candidate.channel
+    return f"<b>{hypothesis.candidate.cause.replace('_', ' ')}</b>" + (
+        f" ({escape(channel)})" if channel else ""
+    )
+
+
+def _verdict(diagnosis: Diagnosis) -> str:
+    total = diagnosis.total
+    causes = [
+        _name(h) + (f" <span class=faint>or {_listed(rivals)}</span>" if rivals else "")
+        for h, rivals in zip(diagnosis.named, diagnosis.rivals, strict=True)
+    ]
+    if diagnosis.wrong is not None:
+        causes.append(f"<b>outliers</b> ({diagnosis.wrong.rows.size} wrong samples)")
+    gained = (
+        f"On dives left out, {total.before:.3g} nT RMS became {total.after:.3g} nT (ratio {total.ratio:.2f}, 95 % interval "
+        f"{total.interval[0]:.2f} to {total.interval[1]:.2f})."
+    )
+    return {
+        "nothing_found": f"Nothing was found: {total.before:.3g} nT RMS cannot be told from noise ({np.std(diagnosis.fit.left):.3g} nT) "
+        "and what the calibration states it may be off by.",
+        "explained": f"Found: {', '.join(causes)}. {gained} Nothing else stands out of the noise.",
+        "partly_explained": f"Found: {', '.join(causes)}. {gained} Something else is left that no cause explains.",
+        "unexplained": f"Something is there ({total.before:.3g} nT RMS), but none of the known causes explains it.",
+    }[diagnosis.verdict]
+
+
+def _found(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> list[str]:
+    if not diagnosis.named and diagnosis.wrong is None:
+        return ["<p>No cause passes the test at a family-wise false-alarm rate of 1 %.</p>"]
+    parts = [_figure(figures.terms(diagnosis), "What each cause adds to the total field.")]
+    at = len(diagnosis.problem.centre)
+    for hypothesis, rivals, gain in zip(diagnosis.named, diagnosis.rivals, diagnosis.gains, strict=True):
+        candidate = hypothesis.candidate
+        rows = "".join(
+            f'<tr><td>{escape(name)}</td><td class="n">{value["value"]:.4g}</td>'
+            f'<td class="n">{"" if value["sigma"] is None else "± {:.2g}".format(value["sigma"])}</td><td>{escape(value["unit"])}</td></tr>'
+            for name, value in parameters(diagnosis, hypothesis, at).items()
+        )
+        at += candidate.size
+        doubt = (
+            f"<p>The data cannot tell it from {_listed(rivals)} (odds below 20:1). What would: {escape(causes[candidate.cause].separated_by)}.</p>"
+            if rivals
+            else "<p>No other cause of the table comes within 20:1.</p>"
+        )
+        parts += [
+            f"<h3>{_name(hypothesis)}</h3>",
+            f'<p class="faint">{_physics(causes[candidate.cause])}</p>',
+            (
+                f"<p>Signal-to-noise {hypothesis.signal_to_noise:.1f} with the calibration refitted; chance of a false alarm among "
+                f"all that was tried {_chance(hypothesis.p_value)}. Leaving it out multiplies the held-out RMS by {1 / max(gain.ratio, 1e-9):.2f} "
+                f"(95 %: {1 / max(gain.interval[1], 1e-9):.2f} to {1 / max(gain.interval[0], 1e-9):.2f}).</p>"
+            ),
+            _folded(
+                f"<table><tr><th>term</th><th>value</th><th>1 sigma</th><th>unit</th></tr>{rows}</table>",
+                candidate.size,
+            ),
+            _several(candidate.names),
+            _in_motion(diagnosis, at - candidate.size - len(diagnosis.problem.centre), candidate),
+            doubt
+            + f"<p>In a log like this one, theory gives it a chance of {100 * told(diagnosis, hypothesis):.0f} % to be named alone.</p>",
+            _no_gain(gain),
+        ]
+    if diagnosis.wrong is not None:
+        rows_at = ", ".join(
+            datetime.fromtimestamp(float(t), UTC).strftime("%H:%M:%S")
+            for t in diagnosis.problem.survey.time[diagnosis.wrong.rows[:12]]
+        )
+        parts.append(
+            f"<h3><b>outliers</b></h3><p>{diagnosis.wrong.rows.size} isolated samples are wrong, the first at {rows_at} UTC; "
+            "they take no part in the figures above.</p>"
+        )
+    return parts
+
+
+def _listed(rivals: Sequence[Rival]) -> str:
+    return ", ".join(escape(figures.label(rival.cause, rival.channel)) for rival in rivals)
+
+
+def _folded(table: str, size: int) -> str:
+    """Fold a table that nobody reads line by line."""
+    return table if size <= MANY else f"<details><summary>{size} terms</summary>{table}</details>"
+
+
+def _several(names: tuple[str, ...]) -> str:
+    """Say what a number in brackets means."""
+    if not any(name.endswith(")") for name in names):
+        return ""
+    return '<p class="faint">A number in brackets: the cause took more than one such term to describe; they act together.</p>'
+
+
+def _in_motion(diagnosis: Diagnosis, at: int, candidate: Candidate) -> str:
+    """Say so when a cause acts while masses move: a mass that moved between two rows, unseen, looks like that, too."""
+    survey = diagnosis.problem.survey
+    p = survey.values([parameter.name for parameter in diagnosis.problem.calibration.parameters])
+    steps = np.any(np.diff(p, axis=0) != 0.0, axis=1)
+    moving = np.append(steps, False) | np.append(False, steps)
+    b = diagnosis.fit.coefficients[at : at + candidate.size]
+    power = (candidate.columns(slice(0, len(survey))) @ b) ** 2
+    share, usual = float(power[moving].sum() / power.sum()), float(moving.mean())
+    if usual > 0.5 or share < 0.8:
+        return ""
+    interval = float(np.median(np.diff(survey.time)))
+    return (
+        f"<p>{100 * share:.0f} % of its trace lies in the {100 * usual:.0f} % of the samples next to which a mass moved. With "
+        f"{interval:.3g} s from row to row, a mass that was elsewhere than its row says would look like that, too.</p>"
+    )
+
+
+def _physics(cause: Cause) -> str:
+    """Return the first line of the cause's own text, formulas set as such."""
+    line = escape((getdoc(cause.candidates) or "").splitlines()[0])
+    parts = line.split("``")
+    return "".join(f"<code>{part}</code>" if k % 2 else part for k, part in enumerate(parts))
+
+
+def _chance(p_value: float) -> str:
+    return f"{p_value:.1g}" if p_value > 1e-99 else "below 1e-99"
+
+
+def _no_gain(gain: Gain) -> str:
+    if gain.interval[1] < 1.0:
+        return ""
+    return "<p>The dives that were left out do not show that it gains anything: it may be what another effect leaves.</p>"
+
+
+def _left(diagnosis: Diagnosis) -> str:
+    rest, noise = diagnosis.unexplained, diagnosis.fit.noise
+    tails = "Gaussian" if noise.nu > 1e5 else f"tails like Student's t with {noise.nu:g} degrees of freedom"
+    model = (
+        f"The noise that remains: {float(np.median(noise.scale)):.3g} nT a sample, {tails}; by its memory, {len(noise.scale)} "
+        f"samples say as much of a constant as {noise.independent:.0f} independent ones. The calibration stated "
+        f"{diagnosis.problem.calibration.noise.sensor:.3g} nT."
+    )
+    if rest is None:
+        return f"<p>No structure is left that a slow curve, steps or a function of attitude would find. {model}</p>"
+    goes = f", and goes best with <code>{escape(rest.best_channel)}</code>" if rest.best_channel else ""
+    period = f" of period {rest.period_s:.4g} s" if rest.period_s else ""
+    return (
+        f"<p><b>{KINDS[rest.kind]}</b>{period} is left, of signal-to-noise {rest.signal_to_noise:.1f}{goes}. It fits no cause of "
+        f"the table, so it has no name. {model}</p>"
+    )
+
+
+def _sizes(sizes: Mapping[str, tuple[float, str]]) -> str:
+    listed = [
+        f"{escape(name)} {size:.3g} {escape(unit)}"
+        for name, (size, unit) in sizes.items()
+        if np.isfinite(size)
+    ]
+    if len(listed) > MANY:
+        listed = [*listed[:3], f"and {len(listed) - 3} more"]
+    return ", ".join(listed) or "invisible"
+
+
+def _plain(labelled: str) -> str:
+    """Return a cause with its channel, ``cause (channel)``, as people read it."""
+    cause, bracket, channel = labelled.partition(" (")
+    return escape(cause.replace("_", " ") + bracket + channel)
+
+
+def _isolability(diagnosis: Diagnosis) -> list[str]:
+    report = diagnosis.isolability
+    rows = "".join(
+        f"<tr><td>{escape(figures.label(v.cause, v.channel))}</td>"
+        f'<td class="n">{v.half:.1f}</td><td class="n">{v.sure:.1f}</td>'
+        f"<td>{_sizes(v.sizes)}</td></tr>"
+        for v in report.visible
+    )
+    pairs = "".join(
+        f'<tr><td>{_plain(a)}</td><td>{_plain(b)}</td><td class="n">{100 * rho:.0f} %</td></tr>'
+        for a, b, rho in report.pairs[:20]
+    )
+    missing = "; ".join(
+        f"{name.replace('_', ' ')}: {escape(needs)}" for name, needs in report.untestable.items()
+    )
+    return [
+        (
+            '<p class="faint">From telemetry, attitude and noise alone: the size of each effect that would be found in 95 of 100 '
+            "deployments like this one, and which causes look alike in it. Signal-to-noise (S/N) is the size of an effect's trace "
+            "in the whole log, in units of the noise, after the calibration has taken all of it that it can imitate.</p>"
+        ),
+        f"<table><tr><th>cause</th><th>50 % at S/N</th><th>95 % at S/N</th><th>seen from</th></tr>{rows}</table>",
+        f"<h3>Look alike</h3><table><tr><th>one</th><th>another</th><th>how alike</th></tr>{pairs}</table>"
+        if pairs
+        else "",
+        f"<p>Not testable here, and what it would take: {missing}.</p>" if missing else "",
+        _figure(
+            figures.likeness(diagnosis),
+            "How alike the signatures of two causes are in this log, calibration free.",
+        ),
+    ]
