@@ -17,6 +17,7 @@ from threadpoolctl import threadpool_limits
 from magbridge.calibration.correct import correct
 from magbridge.calibration.file import load
 from magbridge.diagnose.causes import CAUSES
+from magbridge.diagnose.report.findings import parameters
 from magbridge.diagnose.run import diagnose
 from magbridge.errors import DataError
 
@@ -107,6 +108,18 @@ def test_what_is_written(warm: tuple[xr.Dataset, object], written: tuple[Path, s
     page = (tmp_path / "out" / "report.html").read_text()
     assert page.count("data:image/png;base64,") >= 6
     assert "http" not in page.replace("http-equiv", "")
+
+
+def test_a_maps_error_is_told_by_its_size(short: None) -> None:
+    """A hundred functions of the place say nothing to anyone; their RMS does."""
+    here = stage.Stall.of(stage.vehicle(0), 24, "white")
+    hidden = here.hide("map_error", 40.0, 24)
+    diagnosis = diagnose([stage.add_noise(hidden.ds, "white", 24)], here.stage.calibration)
+    (named,) = [h for h in diagnosis.named if h.candidate.cause == "map_error"]
+    told = parameters(diagnosis, named, len(diagnosis.problem.centre))
+    assert set(told) == {"rms"}
+    assert told["rms"]["value"] == pytest.approx(np.std(hidden.signature), rel=0.2)
+    assert 0.0 < told["rms"]["sigma"] < 0.2 * told["rms"]["value"]
 
 
 def test_a_channels_name_does_not_decide(warm: tuple[xr.Dataset, object], written: tuple[Path, str]) -> None:

@@ -7,7 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
+from magbridge.diagnose.inference.design import normal
 from magbridge.diagnose.inference.rivals import Rival
 from magbridge.diagnose.inference.search import Hypothesis
 
@@ -18,6 +20,8 @@ if TYPE_CHECKING:
     from magbridge.diagnose.gain import Gain
 
 __all__ = ["findings", "findings_json", "parameters"]
+
+FloatArray = NDArray[np.float64]
 
 LEVEL = 0.95
 
@@ -76,10 +80,16 @@ def parameters(diagnosis: Diagnosis, hypothesis: Hypothesis, at: int) -> dict[st
     """Value, sigma and unit of every coefficient, from place `at` of the joint fit, and of the nonlinear ones.
 
     Where one channel acts with several lags, or an offset jumps more than once, a coefficient is what they do in all; its
-    parts stand beside it.
+    parts stand beside it. Where all numbers have one common size, that is what there is to tell: the RMS of what they do.
     """
     candidate, q = hypothesis.candidate, len(diagnosis.problem.centre)
     rows = slice(at, at + candidate.size)
+    if candidate.spectra is not None:
+        return {
+            "rms": _rms(
+                diagnosis, candidate, diagnosis.fit.coefficients[rows.start - q : rows.stop - q], rows
+            )
+        }
     covariance = diagnosis.fit.covariance[rows, rows] * np.outer(candidate.width, candidate.width)
     value = diagnosis.fit.coefficients[at - q : at - q + candidate.size] * candidate.width
     parts: dict[str, list[int]] = {}
@@ -99,6 +109,15 @@ def parameters(diagnosis: Diagnosis, hypothesis: Hypothesis, at: int) -> dict[st
         name: {"value": float(v), "sigma": None, "unit": unit} for name, (v, unit) in candidate.shape.items()
     }
     return found | shape
+
+
+def _rms(diagnosis: Diagnosis, candidate: Candidate, b: FloatArray, rows: slice) -> dict[str, Any]:
+    """RMS over the log of ``X b``, nT, and its sigma: ``f = sqrt(b^T M b)``, ``M = X^T X / n``, ``df/db = M b / f``."""
+    M = normal(candidate.columns, diagnosis.problem.residual)[0] / len(diagnosis.problem)
+    f = float(np.sqrt(b @ M @ b))
+    slope = M @ b / max(f, 1e-12)
+    sigma = float(np.sqrt(slope @ diagnosis.fit.covariance[rows, rows] @ slope))
+    return {"value": _round(f), "sigma": _round(sigma), "unit": "nT"}
 
 
 def _adds_up(candidate: Candidate) -> bool:

@@ -126,10 +126,11 @@ def _found(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> list[str]:
     at = len(diagnosis.problem.centre)
     for hypothesis, rivals, gain in zip(diagnosis.named, diagnosis.rivals, diagnosis.gains, strict=True):
         candidate = hypothesis.candidate
+        numbers = parameters(diagnosis, hypothesis, at)
         rows = "".join(
             f'<tr><td>{escape(name)}</td><td class="n">{value["value"]:.4g}</td>'
             f'<td class="n">{"" if value["sigma"] is None else "± {:.2g}".format(value["sigma"])}</td><td>{escape(value["unit"])}</td></tr>'
-            for name, value in parameters(diagnosis, hypothesis, at).items()
+            for name, value in numbers.items()
         )
         at += candidate.size
         doubt = (
@@ -147,7 +148,7 @@ def _found(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> list[str]:
             ),
             _folded(
                 f"<table><tr><th>term</th><th>value</th><th>1 sigma</th><th>unit</th></tr>{rows}</table>",
-                candidate.size,
+                len(numbers),
             ),
             _several(candidate.names),
             _in_motion(diagnosis, at - candidate.size - len(diagnosis.problem.centre), candidate),
