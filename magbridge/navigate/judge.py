@@ -27,6 +27,7 @@ FLAT = 3.0  # times what is known of the field: a map with less relief has nothi
 DOUBLE = 2.0  # of what bias and map error allow: a scatter beyond is another field
 BETTER = 0.6  # of the scatter at the map's own place: what a shift must reach to be believed
 LEVEL = 4.0  # sigma of the calibration's bias: beyond, it is not the calibration
+TOLD = 3  # jumps of the filter that are told one by one: a map of elsewhere makes dozens
 EXPLAINED = 0.5  # of the field's variance along the track, below which the map does not describe it
 
 
@@ -87,17 +88,20 @@ def _sigma(result: xr.Dataset, rows: NDArray[np.bool_]) -> float:
 
 
 def _told_by_jumps(jumps: Sequence[Jump], start: float) -> list[str]:
-    return [
-        f"after {(jump.time_us * 1e-6 - start) / 3600.0:.1f} h {jump.cause}:"
-        f" moved {hypot(jump.north, jump.east):.0f} m ({_compass(jump.north, jump.east)})"
-        + (
-            f", {hypot(jump.north, jump.east) / jump.allowed:.0f} times what dead reckoning allows:"
-            " the start or the map is in the wrong place (datum?)"
-            if hypot(jump.north, jump.east) > 3.0 * jump.allowed
-            else ""
-        )
-        for jump in jumps
-    ]
+    hours = [(jump.time_us * 1e-6 - start) / 3600.0 for jump in jumps]
+    said = []
+    for hour, jump in zip(hours, jumps[:TOLD], strict=False):
+        far = hypot(jump.north, jump.east)
+        sentence = f"after {hour:.1f} h {jump.cause}: moved {far:.0f} m ({_compass(jump.north, jump.east)})"
+        if far > 3.0 * jump.allowed:
+            sentence += (
+                f", {far / jump.allowed:.0f} times what dead reckoning allows:"
+                " the start or the map is in the wrong place (datum?)"
+            )
+        said.append(sentence)
+    if len(jumps) > TOLD:
+        said.append(f"moved {len(jumps) - TOLD} times more, the last time after {hours[-1]:.1f} h")
+    return said
 
 
 def _told_by_level(result: xr.Dataset, options: Options) -> list[str]:
