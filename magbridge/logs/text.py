@@ -63,7 +63,8 @@ def _chunks(path: Path, file: TextIO, rows: int) -> Iterator[xr.Dataset]:
         if not name or name in names[:k]:
             raise FormatError(path, f"expected a name of its own for column {k + 1}, not {name!r}", row=row)
     if "time" not in names:
-        raise FormatError(path, "expected this column", row=row, column="time")
+        there = " ".join(names)
+        raise FormatError(path, f"expected this column; there are: {there}", row=row, column="time")
     reader, last, nothing = csv.reader(file), -np.inf, True
     lines = ((row + reader.line_num, fields) for fields in reader if fields)
     while block := list(islice(lines, rows)):
