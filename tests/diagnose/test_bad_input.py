@@ -27,8 +27,18 @@ def plain() -> tuple[xr.Dataset, Calibration]:
     return parts["survey"], calibration
 
 
+def some(ds: xr.Dataset, count: int) -> xr.DataArray:
+    """False for the first so many samples."""
+    return ds["time"] >= ds["time"][count]
+
+
 def test_the_demonstrations_survey_is_plain(plain: tuple[xr.Dataset, Calibration]) -> None:
     assert diagnose([plain[0]], plain[1]).verdict == "nothing_found"
+
+
+def test_a_number_beyond_all_measure_is_no_reading(plain: tuple[xr.Dataset, Calibration]) -> None:
+    wild = plain[0].assign(mag_x=plain[0]["mag_x"].where(some(plain[0], 10), 1e300))
+    assert diagnose([wild], plain[1]).verdict == "nothing_found"
 
 
 @pytest.mark.parametrize(
@@ -43,7 +53,8 @@ def test_the_demonstrations_survey_is_plain(plain: tuple[xr.Dataset, Calibration
         (lambda ds: ds.assign(mag_y=ds["mag_y"] * np.nan), "'mag_y' has 0 numbers"),
         (lambda ds: ds.assign({f"mag_{axis}": 0.0 * ds[f"mag_{axis}"] for axis in "xyz"}), "never change"),
         (lambda ds: ds.assign({f"mag_{axis}": 1e-5 * ds[f"mag_{axis}"] for axis in "xyz"}), "in other units"),
-        (lambda ds: ds.assign(battpos=100.0 * ds["battpos"]), "in other units"),
+        (lambda ds: ds.assign(battpos=100.0 * ds["battpos"]), "'battpos' is .* expected its unit"),
+        (lambda ds: ds.assign(ballast=ds["ballast"].where(some(ds, 40), -9999.0)), "'ballast' is -9999"),
         (lambda ds: ds.assign_attrs(sensor="another"), "sensor 'another', but the calibration is of 'one'"),
     ],
 )

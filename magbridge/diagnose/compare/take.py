@@ -14,6 +14,7 @@ from magbridge.diagnose.compare.survey import FEWEST, Survey, assemble
 from magbridge.errors import DataError
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.reference import positions, reference_field
+from magbridge.records import BEYOND
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -24,6 +25,8 @@ FloatArray = NDArray[np.float64]
 
 TRUSTED = 0.5
 """Of the noise: how far a channel may be from where it is interpolated to."""
+FAR = 10.0
+"""Half ranges of a calibration from its middle: no position of a mass, but a number that stands for "not known"."""
 
 
 def take(
@@ -47,7 +50,7 @@ def take(
     Raises
     ------
     DataError
-        A column is missing, or too few samples have all they need: one line that says which.
+        A column is missing, too few samples have all they need, or a position is none: one line that says which.
     """
     parts = [
         _columns(ds, calibration, grid, learned)
@@ -76,6 +79,8 @@ def take(
     needed = [*(f"mag_{axis}" for axis in "xyz"), "reference_field", *parameters]
     if sum(sizes) < FEWEST:
         raise DataError(f"{source}: {sum(sizes)} samples, at least {FEWEST} needed")
+    for name in needed[:3]:
+        table[name][~(np.abs(table[name]) < BEYOND)] = np.nan
     whole = np.all([np.isfinite(table[name]) for name in needed], axis=0)
     if whole.sum() < FEWEST:
         worst = min(needed, key=lambda name: int(np.isfinite(table[name]).sum()))
@@ -84,6 +89,13 @@ def take(
             f"(column {worst!r} has {int(np.isfinite(table[worst]).sum())} numbers)"
         )
     table = {name: column[whole] for name, column in table.items()}
+    for parameter in calibration.parameters:
+        far = np.abs(table[parameter.name] - parameter.centre) > FAR * parameter.scale
+        if far.any():
+            raise DataError(
+                f"{source}: {parameter.name!r} is {table[parameter.name][far][0]:g} in {int(far.sum())} of {far.size} samples, and "
+                f"{parameter.low:g} to {parameter.high:g} in the calibration: expected its unit, and nothing where it is not known"
+            )
     if not any(np.ptp(table[f"mag_{axis}"]) for axis in "xyz"):
         raise DataError(f"{source}: columns mag_x, mag_y, mag_z never change: nothing was measured")
     units = {
