@@ -87,7 +87,7 @@ def fit_joint(
     like : Joint, optional
         A fit whose noise this one's will resemble: saves time.
     blocks : bool, optional
-        See :func:`~magbridge.diagnose.inference.noise.fit_noise`.
+        See :func:`~magbridge.diagnose.inference.fit_noise.fit_noise`.
     ridge : float or (k,) array
         Prior precision of the effects, in units of their widths.
     rounds : int
