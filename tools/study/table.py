@@ -120,7 +120,7 @@ def lines(rows: Sequence[Row]) -> list[str]:
     _gains(add, part.get("gain", []))
     unknown = part.get("unknown", [])
     apart = [r for r in unknown if unlike(r)]
-    for label, chosen in (("nothing in the table imitates it", apart), ("all", unknown)):
+    for label, chosen in (("where theory gives no name in 95 %", apart), ("all", unknown)):
         at_best, so = (_of_theory(chosen, lambda _, t, key=key: t[key]) for key in ("unnamed", "described"))
         add(
             f"unknown at S/N 10, {label}: 'unexplained'",
