@@ -126,7 +126,7 @@ def _again(
     K = problem.calibration.coefficients.size
     selector = np.eye(extended.coefficients.size)
     L = np.vstack([problem.directions, np.zeros((len(selector) - K, len(problem.centre)))])
-    own = -derivatives(extended, samples, g, np.hstack([L, selector[:, K:]]))
+    own = derivatives(extended, samples, g, -np.hstack([L, selector[:, K:]]))
     free, effects, at = own[:, : len(problem.centre)], own[:, len(problem.centre) :], 0
     # what the residual would be at the first point, were it linear about this one; the reference was not mended in it
     residual = e + free @ fit.z

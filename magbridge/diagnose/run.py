@@ -178,7 +178,7 @@ def _gains(
 def _loud(problem: Problem, after: FloatArray, counts: NDArray[np.bool_]) -> Leftover | None:
     """Describe what has no structure, but is more than the calibration states of its noise and of its coefficients."""
     noise, free = problem.calibration.noise, problem.free
-    variance = noise.sensor**2 + noise.reference**2 + (free * free).sum(axis=1)
+    variance = noise.sensor**2 + noise.reference**2 + np.einsum("ij,ij->i", free, free)
     power = float(np.sum(after[counts] ** 2 / np.maximum(variance[counts], 1e-12)))
     n = int(counts.sum())
     if noise.sensor <= 0.0 or power < LOUD**2 * n:

@@ -57,7 +57,7 @@ def map_error(problem: Problem) -> list[Candidate]:
     values, V = values[::-1][:WAVES], vectors[:, ::-1][:, :WAVES]
     between, corners = _between(place, cell)
     at_corners = _matern(corners, Z, middle) @ (V / values)
-    at_corners -= (between @ at_corners).mean(axis=0)  # a constant is another cause
+    at_corners -= between.mean(axis=0) @ at_corners  # a constant is another cause
     spectra = np.array([np.einsum("ik,ij,jk->k", V, _matern(Z, Z, length), V) for length in lengths])
     width = ERROR * np.sqrt(values)
     names = tuple(f"function {k + 1}" for k in range(len(width)))

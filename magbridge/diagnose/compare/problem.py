@@ -173,7 +173,7 @@ def pose(survey: Survey, calibration: Calibration) -> Problem:
     values, vectors = np.linalg.eigh(seen / level(calibration, e) ** 2)
     keep = values > SEEN
     V, rest = vectors[:, keep], L @ vectors[:, ~keep]
-    free = -derivatives(calibration, samples, g, L @ V)
+    free = derivatives(calibration, samples, g, -L @ V)
     return Problem(survey, calibration, reading, e, g, gain, free, L @ V, V.T @ centre, rest @ rest.T)
 
 
