@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from threading import Timer
 from typing import TypeVar
 
-__all__ = ["track"]
+__all__ = ["track", "waiting"]
 
 T = TypeVar("T")
 PATIENCE = 2.0
@@ -33,3 +35,27 @@ def track(items: Iterable[T], what: str, total: float | None = None) -> Iterator
             if now - told > PAUSE:
                 progress.update(task, completed=done, visible=now - begun > PATIENCE)
                 told = now
+
+
+@contextmanager
+def waiting(what: str) -> Iterator[Callable[[str], object]]:
+    """Once the block has taken two seconds, show on a terminal that it is at work, and since when.
+
+    What it yields tells the name of the next step.
+    """
+    if not sys.stderr.isatty():
+        yield str
+        return
+    from rich.console import Console  # noqa: PLC0415 - only where there is somebody to look
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn  # noqa: PLC0415 - likewise
+
+    columns = TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn()
+    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task(what, total=None, visible=False)
+        appear = Timer(PATIENCE, progress.update, (task,), {"visible": True})
+        appear.daemon = True
+        appear.start()
+        try:
+            yield lambda step: progress.update(task, description=step)
+        finally:
+            appear.cancel()

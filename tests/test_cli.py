@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
+import pty
 import resource
+import select
+import time
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +19,7 @@ from magbridge.correction import Correction, correct_rows
 from magbridge.field.igrf import total_field
 from magbridge.field.read import read_grid
 from magbridge.logs import read, write
+from magbridge.progress import waiting
 from sitl import load, simulate
 
 
@@ -220,3 +225,21 @@ def test_help_names_every_command(capsys: pytest.CaptureFixture[str]) -> None:
     text = capsys.readouterr().out
     for command in ("demo", "run", "replay", "simulate", "convert", "calibrate", "correct", "map"):
         assert command in text
+
+
+def test_what_takes_long_says_that_it_is_at_work(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a real terminal, a pty: nothing at first, then the step and a clock; and it leaves the line clean."""
+    master, slave = pty.openpty()
+    with os.fdopen(slave, "w") as terminal:
+        monkeypatch.setattr("sys.stderr", terminal)
+        monkeypatch.setattr("magbridge.progress.PATIENCE", 0.3)
+        monkeypatch.setenv("TERM", "xterm")
+        with waiting("fitting") as step:
+            assert not select.select([master], [], [], 0.1)[0] or b"fitting" not in os.read(master, 4096)
+            step("judging")
+            time.sleep(0.5)
+        terminal.flush()
+        shown = os.read(master, 65536)
+    os.close(master)
+    assert b"judging" in shown
+    assert b"0:00:0" in shown

@@ -23,7 +23,7 @@ from magbridge.cli.common import (
     tell,
 )
 from magbridge.errors import DataError
-from magbridge.progress import track
+from magbridge.progress import track, waiting
 
 
 @app.command(usage="Usage: magbridge convert FILE... -o FILE [OPTIONS]")
@@ -90,12 +90,13 @@ def simulate(
     from sitl.twin import simulate as simulate_scenario
 
     chosen = load(scenario)
-    if like:
-        log = read(like)
-        chosen = where(log, chosen)
-        deployment = simulate_like(log, chosen, seed)
-    else:
-        deployment = simulate_scenario(chosen, seed)
+    with waiting("simulating"):
+        if like:
+            log = read(like)
+            chosen = where(log, chosen)
+            deployment = simulate_like(log, chosen, seed)
+        else:
+            deployment = simulate_scenario(chosen, seed)
     write(deployment, output)
     if map_output is not None:
         Twin.draw(chosen, seed).anomaly_map().save(map_output)
@@ -170,7 +171,8 @@ def calibrate(
     if filter_corner:
         data = unfiltered(data, filter_corner)
     options: dict[str, Any] = {"vehicle": read_vehicle(vehicle)} if vehicle else {}
-    found = fit(data, method, order, site_bias=site_bias, **options)
+    with waiting("fitting"):
+        found = fit(data, method, order, site_bias=site_bias, **options)
     save(found.calibration, output)
     for warning in found.warnings:
         complain(warning, 0)
@@ -229,7 +231,8 @@ def plan(
 
     deployment = with_true_heading(read(mission), heading_reference)
     known = load(calibration)
-    found = flight_plan.flight_plan(known, deployment, earth_field(deployment)[1], runs=runs, roll=roll)
+    with waiting("planning"):
+        found = flight_plan.flight_plan(known, deployment, earth_field(deployment)[1], runs=runs, roll=roll)
     tell(flight_plan.facts(found, known), flight_plan.tell(found, known), json)
 
 

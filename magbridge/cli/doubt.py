@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 from magbridge.cli.common import Folder, Json, app, some, tell
+from magbridge.progress import waiting
 
 
 @app.command(usage="Usage: magbridge diagnose FILE... --calibration cal.json -o DIR [OPTIONS]")
@@ -43,14 +43,15 @@ def diagnose(
     from magbridge.field.read import read_grid
     from magbridge.logs import read
 
-    found = examine(
-        [read(path) for path in some(files)],
-        load(calibration),
-        output,
-        learned_from=[read(path) for path in learned_from],
-        grid=read_grid(grid) if grid else None,
-        progress=_step,
-    )
+    with waiting("reading") as step:
+        found = examine(
+            [read(path) for path in some(files)],
+            load(calibration),
+            output,
+            learned_from=[read(path) for path in learned_from],
+            grid=read_grid(grid) if grid else None,
+            progress=step,
+        )
     facts = findings(found, CAUSES)
     causes = [
         f"{one['cause']} ({one['channel']})" if one["channel"] else one["cause"] for one in facts["findings"]
@@ -59,8 +60,3 @@ def diagnose(
     tell(
         facts, f"{facts['verdict']}: {', '.join(causes) or 'no cause'}; {rms}; {output / 'report.html'}", json
     )
-
-
-def _step(name: str) -> None:
-    if sys.stderr.isatty():
-        print(name, file=sys.stderr)
