@@ -272,7 +272,8 @@ def map(  # noqa: A001 - the command's name
     from magbridge.field.read import read_grid, read_polygon
 
     polygon = read_polygon(mask) if mask else None
-    result, steps = prepare([read_grid(path) for path in some(grids)], altitude, passes, polygon, spacing)
+    with waiting("preparing"):
+        result, steps = prepare([read_grid(path) for path in some(grids)], altitude, passes, polygon, spacing)
     result.save(output)
     if picture:
         draw_steps(steps, picture)
