@@ -1,4 +1,4 @@
-"""The arithmetic of one corrected sample, of floats or of arrays: equations as code.
+"""The arithmetic of one corrected sample: equations as code, written for floats and good for arrays.
 
 Notes
 -----
@@ -12,48 +12,69 @@ the corrected vector::
 Every operation is elementwise IEEE arithmetic in one written order, on floats or on arrays, but for the
 products of :class:`~magbridge.calibration.kernel.Kernel`, which are exact in any order: so a sample
 corrected live, in a batch, or replayed on another computer gives identical bits.
+
+Compiled, a float is a number of the machine, and no array can pass for one. So arrays go through :func:`for_arrays`,
+this very source left uncompiled.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable
+from importlib.util import module_from_spec, spec_from_file_location
+from pathlib import Path
 from typing import Any
 
-__all__ = ["apply", "prepare"]
+__all__ = ["Prepared", "apply", "for_arrays", "prepare"]
 
+Prepared = tuple[list[float], list[list[float]]]
+"""What a sample needs at one set of positions: A' row by row and T (12); Q, L and O of V's six entries (10 each)."""
+Numbers = tuple[float, float, float, float, float, float, float, float]
 PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 
-def prepare(t: Sequence[Any]) -> tuple[Any, ...]:
+def for_arrays() -> Any:
+    """Return this module as Python reads it: the functions below, for arrays in place of floats."""
+    spec = spec_from_file_location(f"{__name__}_for_arrays", Path(__file__).with_name("arithmetic.py"))
+    assert spec is not None
+    assert spec.loader is not None
+    module = module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def prepare(t: list[float]) -> Prepared:
     """From the table's 81 sums to what a sample needs, at one set of positions.
 
     ``L_ij,k = -(G_ik,j + G_jk,i)`` with ``G = S_a'T A'^T``, and ``O = A' S_TT A'^T``.
     """
-    A = t[0:3], t[3:6], t[6:9]
-    G = [
-        [x * ax + y * ay + z * az for ax, ay, az in A] for x, y, z in zip(*[iter(t[48:75])] * 3, strict=True)
-    ]
+    A = [t[0:3], t[3:6], t[6:9]]
+    G = [[t[k] * ax + t[k + 1] * ay + t[k + 2] * az for ax, ay, az in A] for k in range(48, 75, 3)]
     sxx, syy, szz, sxy, sxz, syz = t[75:81]
     AS = [
-        (sxx * x + sxy * y + sxz * z, sxy * x + syy * y + syz * z, sxz * x + syz * y + szz * z)
+        [sxx * x + sxy * y + sxz * z, sxy * x + syy * y + syz * z, sxz * x + syz * y + szz * z]
         for x, y, z in A
     ]
     V = []
     for e, (i, j) in enumerate(PAIRS):
         L = [-(G[3 * i + k][j] + G[3 * j + k][i]) for k in range(3)]
         (x, y, z), (p, q, r) = A[i], AS[j]
-        V.append((*t[12 + 6 * e : 18 + 6 * e], *L, x * p + y * q + z * r))
-    return (*t[:12], V)
+        V.append([*t[12 + 6 * e : 18 + 6 * e], *L, x * p + y * q + z * r])
+    return t[:12], V
 
 
 def apply(
-    hx: Any, hy: Any, hz: Any, prepared: tuple[Any, ...], omega: tuple[float, ...] | None, root: Any
-) -> tuple[Any, ...]:
+    hx: float,
+    hy: float,
+    hz: float,
+    prepared: Prepared,
+    omega: tuple[float, ...] | None,
+    root: Callable[[float], float],
+) -> Numbers:
     """One sample (or arrays of them): total, sigma, vector, sigmas of the vector.
 
     `omega` holds xx, yy, zz, xy, xz, yz of the boresight's covariance; None where there is no boresight.
     """
-    xx, xy, xz, yx, yy, yz, zx, zy, zz, tx, ty, tz, V = prepared
+    (xx, xy, xz, yx, yy, yz, zx, zy, zz, tx, ty, tz), V = prepared
     dx, dy, dz = hx - tx, hy - ty, hz - tz
     bx = xx * dx + xy * dy + xz * dz
     by = yx * dx + yy * dy + yz * dz

@@ -12,14 +12,14 @@ measure, makes total and vector NaN and the sigmas infinite, flagged ``gap`` whe
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import inf, isnan, sqrt
+from math import inf, isnan, nan, sqrt
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from magbridge.calibration.arithmetic import apply, prepare
-from magbridge.calibration.kernel import Kernel
+from magbridge.calibration.arithmetic import Prepared, apply, for_arrays, prepare
+from magbridge.calibration.kernel import FARTHEST, Kernel
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.terms import Step
 from magbridge.errors import CalibrationError
@@ -33,6 +33,7 @@ ASKED = 16  # positions whose coefficients are remembered for what-ifs
 GAP, STALE_TELEMETRY = int(Quality.GAP), int(Quality.STALE_TELEMETRY)
 EXTRAPOLATED = int(Quality.EXTRAPOLATED)
 MARGIN = 0.02  # of the half range: telemetry that shakes at its end is not extrapolated
+MANY = for_arrays()
 
 
 class CorrectedArrays(NamedTuple):
@@ -84,7 +85,7 @@ class Corrector:
         self._values: tuple[float, ...] | None = None
         self._flags = self._base
         self._last: list[float] = []
-        self._prepared: tuple[Any, ...] = ()
+        self._prepared: Prepared = [], []
         self._asked: dict[tuple[float, ...], list[float]] = {}
 
     def step(
@@ -152,11 +153,11 @@ class Corrector:
         if coefficients is None:
             if len(self._asked) == ASKED:
                 self._asked.clear()
-            kernel = self._kernel
-            phi = np.array(kernel.powers(positions, 1.0))
-            terms = phi[:, None] * kernel.weights[: kernel.monomials]
-            with np.errstate(invalid="ignore"):  # infinite positions
-                coefficients = self._asked[positions] = np.add.reduce(terms, axis=0).tolist()
+            phi = self._kernel.powers(positions, 1.0)
+            if not max(map(abs, phi)) < FARTHEST:
+                return nan
+            terms = np.array(phi)[:, None] * self._kernel.weights[: len(phi)]
+            coefficients = self._asked[positions] = np.add.reduce(terms, axis=0).tolist()
         xx, yy, zz, xy, xz, yz, tx, ty, tz = coefficients
         dx, dy, dz = field[0] - tx, field[1] - ty, field[2] - tz
         bx = xx * dx + xy * dy + xz * dz
@@ -201,7 +202,7 @@ def correct(
             phi = _regressors(kernel, steps, field[part], channels[part], time[part])
             prepared = _stage_many(kernel, phi)
             hx, hy, hz = field[part].T
-            out[:, part] = apply(hx, hy, hz, prepared, omega, np.sqrt)
+            out[:, part] = MANY.apply(hx, hy, hz, prepared, omega, np.sqrt)
         quality = np.full(n, _base_flags(calibration))
         for value, (low, high) in zip(channels.T, _ranges(calibration), strict=False):
             quality |= np.where((value < low) | (value > high), EXTRAPOLATED, 0)
@@ -237,16 +238,16 @@ def regressors(
     return np.hstack([_regressors(kernel, steps, field[p], channels[p], time[p]) for p in parts])
 
 
-def _stage_many(kernel: Kernel, phi: FloatArray) -> tuple[Any, ...]:
+def _stage_many(kernel: Kernel, phi: FloatArray) -> Any:
     """Prepare (m, n) regressors; where most stand still, once for each run of equal ones."""
     new = np.ones(phi.shape[1], bool)
     new[1:] = (phi[:, 1:] != phi[:, :-1]).any(axis=0)
     if 2 * np.count_nonzero(new) > len(new):
-        return prepare(list(kernel.sums(phi)))
+        return MANY.prepare(list(kernel.sums(phi)))
     phi = phi[:, new]
-    prepared = prepare(list(kernel.sums(phi)))
+    linear, V = MANY.prepare(list(kernel.sums(phi)))
     back = np.cumsum(new) - 1
-    return (*(row[back] for row in prepared[:12]), [[row[back] for row in entry] for entry in prepared[12]])
+    return [row[back] for row in linear], [[row[back] for row in entry] for entry in V]
 
 
 def _base_flags(calibration: Calibration) -> int:

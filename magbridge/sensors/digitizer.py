@@ -65,7 +65,7 @@ FULL_SCALE = 1 << 23
 WRAP_US = 1 << 32
 NO_TEMPERATURE = -32768
 NO_SUPPLY = 65535
-HEAD = Struct("<BBHHIIIhHB")
+BODY = Struct("<BBHHIIIhHBHbHbHb")  # 24 bits: the lower 16, and the upper 8 with the sign
 Positive = Annotated[float, Meta(gt=0)]
 
 
@@ -135,10 +135,11 @@ class Digitizer:
         return readings
 
     def _reading(self, message: bytearray) -> Reading:
-        _, _, sequence, cycle, time_x, time_y, time_z, temperature, supply, flags = HEAD.unpack_from(message)
-        x = int.from_bytes(message[23:26], "little", signed=True)
-        y = int.from_bytes(message[26:29], "little", signed=True)
-        z = int.from_bytes(message[29:32], "little", signed=True)
+        (
+            _, _, sequence, cycle, time_x, time_y, time_z, temperature, supply, flags,
+            x_low, x_high, y_low, y_high, z_low, z_high,
+        ) = BODY.unpack_from(message)  # fmt: skip
+        x, y, z = x_low | x_high << 16, y_low | y_high << 16, z_low | z_high << 16
         scale, limit = self._scale, self._limit
         inside = -limit < x < limit and -limit < y < limit and -limit < z < limit
         return Reading(

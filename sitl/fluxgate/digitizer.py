@@ -23,14 +23,14 @@ class DigitizerEncoder(Encoder):
     def encode(self, reading: Reading) -> bytes:
         """Return one frame."""
         top, limit = wire.FULL_SCALE - 1, self.options.full_scale or inf
-        flags, counts = 0, b""
+        flags, counts = 0, []
         for channel, value in enumerate(reading.field):
             ideal = round(clip(value, limit) / self.options.nt_per_count)
             count = max(-top - 1, min(ideal, top))
             flags |= (count != ideal) << channel
-            counts += count.to_bytes(3, "little", signed=True)
+            counts += [count & 0xFFFF, count >> 16]
         temperature, supply = reading.temperature, reading.supply
-        head = wire.HEAD.pack(
+        message = wire.BODY.pack(
             wire.READING,
             wire.LENGTH,
             self.sequence % WRAP,
@@ -39,7 +39,7 @@ class DigitizerEncoder(Encoder):
             wire.NO_TEMPERATURE if isnan(temperature) else round(clip(temperature, 327.0) * 100),
             wire.NO_SUPPLY if isnan(supply) else round(clip(supply, 65.0) * 1000),
             flags,
+            *counts,
         )
         self.sequence += 1
-        message = head + counts
         return cobs_encode(message + crc32(message).to_bytes(4, "little")) + b"\0"
