@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -16,8 +17,8 @@ __all__ = ["atomic_path"]
 def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Yield a path beside `path` to write to; rename it onto `path` when the block succeeds.
 
-    When the block raises, what was written is removed and `path` is as it was. The suffix is kept,
-    because some writers choose the format by it.
+    When the block raises, what was written is removed and `path` is as it was. What a process that was killed
+    left beside it goes with the next write. The suffix is kept, because some writers choose the format by it.
 
     Raises
     ------
@@ -26,6 +27,8 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     """
     target = Path(path)
     beside = target.with_name(f".{target.stem}.{os.getpid()}.partial{target.suffix}")
+    with suppress(OSError):  # a folder that cannot be read, or is not there: the write itself will tell
+        _clear(target)
     try:
         yield beside
         beside.replace(target)
@@ -36,3 +39,25 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     finally:
         with suppress(OSError):  # it was renamed, or never made
             beside.unlink()
+
+
+def _clear(target: Path) -> None:
+    """Remove what processes that are no more left beside `target`."""
+    partial = re.compile(rf"\.{re.escape(target.stem)}\.(\d+)\.partial{re.escape(target.suffix)}")
+    for path in target.parent.iterdir():
+        found = partial.fullmatch(path.name)
+        if found and not _runs(int(found[1])):
+            path.unlink()
+
+
+def _runs(process: int) -> bool:
+    """Say whether a process is there, as far as can be told."""
+    if os.name != "posix":  # where to ask is to end it
+        return True
+    try:
+        os.kill(process, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except PermissionError:  # another user's
+        pass
+    return True
