@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-__all__ = ["CHANNELS", "CHANNEL_TIMES", "COLUMNS", "CORRECTED", "Column", "factor"]
+__all__ = ["CHANNELS", "CHANNEL_TIMES", "COLUMNS", "CORRECTED", "Column", "factor", "usual"]
 
 
 class Column(NamedTuple):
@@ -92,6 +92,10 @@ def factor(unit: str, column: str) -> float | None:
     """
     if column not in COLUMNS or not unit:
         return 1.0
-    wanted = COLUMNS[column].unit
-    unit = _SAME.get(unit, unit)
+    wanted, unit = COLUMNS[column].unit, usual(unit)
     return 1.0 if unit == wanted else _FACTORS.get((unit, wanted))
+
+
+def usual(unit: str) -> str:
+    """Return the unit as it is written here: ``degC`` for ``Celsius``."""
+    return _SAME.get(unit, unit)

@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
-from magbridge.columns import CHANNEL_TIMES, COLUMNS, factor
+from magbridge.columns import CHANNEL_TIMES, COLUMNS, factor, usual
 from magbridge.errors import FormatError
 from magbridge.records import Quality
 
@@ -22,8 +22,19 @@ MEANING = {"heading_reference": "true", "time_reference": "utc"}
 """Attributes that change what values mean, and what holds where they are absent."""
 YEAR_10000 = 253_402_300_800.0
 """s since 1970: a time beyond is in another unit, and no calendar has it."""
-DEGREES = {"latitude": 90.0, "longitude": 540.0}
+DEGREES = {"latitude": 90.0, **dict.fromkeys(("longitude", "roll", "pitch", "heading"), 540.0)}
 """The most that these may be; 4952.3 is degrees and minutes written together."""
+LEAST = {
+    "degC": -273.15,
+    "K": 0.0,
+    "Pa": -101325.0,
+    "hPa": -1013.25,
+    "mbar": -1013.25,
+    "kPa": -101.325,
+    "bar": -1.01325,
+    "dbar": -10.1325,
+}
+"""No temperature is lower, and no pressure, also one that counts from the surface's: -9999 says "not known"."""
 APART = 60.0
 """s that a channel may be sampled before or after its row."""
 COUNTERS = ("bytes_skipped", "damages", "dropouts", "duplicate_rows", "rows_dropped")
@@ -124,7 +135,7 @@ def increasing(
 
 
 def plausible(file: str | Path, dataset: xr.Dataset, rows: Sequence[int]) -> None:
-    """Check what would be taken for another place or another moment: positions, and the channels' own times.
+    """Check what would be taken for another place or another moment, or for a temperature or pressure that cannot be.
 
     Raises
     ------
@@ -132,18 +143,21 @@ def plausible(file: str | Path, dataset: xr.Dataset, rows: Sequence[int]) -> Non
         Names the first row that does not fit, by its number in `rows`.
     """
     time = dataset["time"].values
-    for name in (*DEGREES, *CHANNEL_TIMES):
-        if name not in dataset:
-            continue
-        values = dataset[name].values
+    for name, column in dataset.data_vars.items():
+        values, unit = column.values, usual(column.attrs.get("units", ""))
         if name in DEGREES:
-            wrong, expected = np.abs(values) > DEGREES[name], f"degrees, at most {DEGREES[name]:g}"
-        else:
+            wrong, expected = np.abs(values) > DEGREES[str(name)], f"degrees, at most {DEGREES[str(name)]:g}"
+        elif name in CHANNEL_TIMES:
             wrong, expected = np.abs(values - time) > APART, f"a time within {APART:g} s of the row's"
+        elif unit in LEAST:
+            wrong = values < LEAST[unit]
+            expected = f"at least {LEAST[unit]:g} {unit}, or nothing where it is not known"
+        else:
+            continue
         if wrong.any():
             k = int(wrong.argmax())
             raise FormatError(
-                file, f"expected {expected}, not {float(values[k])!r}", row=rows[k], column=name
+                file, f"expected {expected}, not {float(values[k])!r}", row=rows[k], column=str(name)
             )
 
 
@@ -213,10 +227,10 @@ def _first_known(values: Floats, starts: NDArray[np.intp]) -> Floats:
 
 
 def _join_attrs(all_attrs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    for key, usual in MEANING.items():
-        first = all_attrs[0].get(key, usual)
+    for key, default in MEANING.items():
+        first = all_attrs[0].get(key, default)
         for attrs in all_attrs:
-            if (other := attrs.get(key, usual)) != first:
+            if (other := attrs.get(key, default)) != first:
                 raise FormatError(attrs.get("source", ""), f"expected {key} {first} as before, not {other}")
     joined: dict[str, Any] = {}
     sources: list[str] = []

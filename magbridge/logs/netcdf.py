@@ -21,10 +21,10 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from magbridge.errors import FormatError, MissingExtra
 from magbridge.logs import seaglider
+from magbridge.logs.cf import floats
 from magbridge.logs.deployment import deployment, increasing, plausible, sliced
 
 try:
@@ -63,7 +63,6 @@ def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
     """
     try:
         with netCDF4.Dataset(path) as file:
-            file.set_auto_mask(False)  # its valid_min would turn a depth of -2 cm into nothing
             if seaglider.DIMENSION in file.dimensions:
                 yield from sliced(seaglider.dive(path, file), rows)
             elif DIMENSION in file.dimensions:
@@ -92,7 +91,7 @@ def _chunks(path: Path, file: Any, rows: int) -> Iterator[xr.Dataset]:
     attrs = {key: _plain(value) for key, value in file.__dict__.items() if key not in GENERATED}
     last = -np.inf
     for row in range(0, total, rows):
-        columns = {name: _floats(variable, slice(row, row + rows)) for name, variable in variables.items()}
+        columns = {name: floats(variable, slice(row, row + rows)) for name, variable in variables.items()}
         time = columns.pop("time") * scale + start
         numbers = range(row + 1, row + 1 + len(time))
         increasing(path, time, numbers, after=last)
@@ -100,14 +99,6 @@ def _chunks(path: Path, file: Any, rows: int) -> Iterator[xr.Dataset]:
         dataset = deployment(path, time, columns, units, attrs, meanings)
         plausible(path, dataset, numbers)
         yield dataset
-
-
-def _floats(variable: Any, rows: slice) -> NDArray[np.float64]:
-    values = variable[rows].astype(np.float64)
-    for missing in ("_FillValue", "missing_value"):
-        if missing in variable.ncattrs():
-            values[values == float(np.float64(getattr(variable, missing)))] = np.nan
-    return np.asarray(values)
 
 
 def _epoch(path: Path, variable: Any) -> tuple[float, float]:

@@ -25,6 +25,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from magbridge.errors import FormatError
+from magbridge.logs.cf import floats
 from magbridge.logs.deployment import deployment, increasing
 from magbridge.logs.resample import linear
 
@@ -66,7 +67,7 @@ def dive(path: Path, file: Any) -> xr.Dataset:
     path : Path
         Named in errors.
     file : netCDF4.Dataset
-        Open, with masking off.
+        Open.
 
     Raises
     ------
@@ -78,17 +79,17 @@ def dive(path: Path, file: Any) -> xr.Dataset:
             raise FormatError(
                 path, "expected this variable, as of a Seaglider with a raw compass", column=theirs
             )
-    time = _floats(file, "time")
+    time = floats(file["time"])
     increasing(path, time)
     columns, units = {}, {}
     for ours, (theirs, unit, scale) in COLUMNS.items():
         if theirs in file.variables and len(file[theirs]) == len(time):
-            columns[ours], units[ours] = _floats(file, theirs) * scale, unit
+            columns[ours], units[ours] = floats(file[theirs]) * scale, unit
     if "ctd_time" in file.variables:
-        ctd_time = _floats(file, "ctd_time")
+        ctd_time = floats(file["ctd_time"])
         for ours, (theirs, unit) in CTD.items():
             if theirs in file.variables:
-                columns[ours] = linear(time, ctd_time, _floats(file, theirs), MAX_GAP)
+                columns[ours] = linear(time, ctd_time, floats(file[theirs]), MAX_GAP)
                 units[ours] = unit
     for motor in MOTORS:
         if f"gc_{motor}_i" in file.variables:
@@ -99,18 +100,10 @@ def dive(path: Path, file: Any) -> xr.Dataset:
     return deployment(path, time, columns, units, attrs)
 
 
-def _floats(file: Any, name: str) -> Floats:
-    variable = file[name]
-    values = np.asarray(variable[:], dtype=np.float64)
-    if "_FillValue" in variable.ncattrs():
-        values[values == float(variable.getncattr("_FillValue"))] = np.nan
-    return values
-
-
 def _current(file: Any, motor: str, time: Floats) -> Floats:
     """Mean current of one motor during the manoeuvres in which it ran."""
     current = np.zeros(len(time))
-    starts, ends, amperes = (_floats(file, name) for name in ("gc_st_secs", "gc_end_secs", f"gc_{motor}_i"))
+    starts, ends, amperes = (floats(file[name]) for name in ("gc_st_secs", "gc_end_secs", f"gc_{motor}_i"))
     for start, end, ampere in zip(starts, ends, amperes, strict=True):
         current[(time >= start) & (time <= end)] = ampere
     return current

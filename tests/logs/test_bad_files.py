@@ -32,6 +32,9 @@ BAD_CSV = {
     "time,mag_x\n2,2\n2,3\n": "row 3, column 'time': expected a time after 2.0, not 2.0",
     "time,mag_x\n2016-06-23,2\n": "row 2, column 'time': expected a number, not '2016-06-23'",
     "time,mag_x [V]\n2,2\n": "column 'mag_x': expected nT, not V",
+    "time,heading\n1,-9999\n": "row 2, column 'heading': expected degrees, at most 540, not -9999.0",
+    "time,water [Celsius]\n1,4\n2,-999\n": "row 3, column 'water': expected at least -273.15 degC, or nothing where it "
+    "is not known, not -999.0",
     "time,quality\n2,splendid\n": "row 2, column 'quality': expected the names of flags, not 'splendid'",
     "# heading_reference = magnetic\ntime,mag_x\n1,2\n\n2,x\n": "row 5, column 'mag_x': expected a number, not 'x'",
 }

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from magbridge import logs
 from magbridge.columns import CHANNEL_TIMES, COLUMNS
-from magbridge.logs.deployment import APART, DEGREES, deployment
+from magbridge.logs.deployment import APART, DEGREES, LEAST, deployment
 
 EXACT = [".csv", ".nc", ".parquet"]
 WRITABLE = [*EXACT, ".tlog"]
@@ -44,7 +44,10 @@ def deployments(draw: st.DrawFn, width: int) -> xr.Dataset:
     columns = {}
     for name in [*draw(known), *units]:
         most = DEGREES.get(name, APART / 2 if name in CHANNEL_TIMES else None)
-        bounds = {} if most is None else {"min_value": -most, "max_value": most}
+        least = LEAST.get(COLUMNS[name].unit if name in COLUMNS else units[name])
+        bounds = (
+            {"min_value": least and int(least)} if most is None else {"min_value": -most, "max_value": most}
+        )
         value = st.floats(**bounds, allow_infinity=False, width=width) | st.just(np.nan)
         column = np.array(draw(st.lists(value, min_size=len(time), max_size=len(time))), dtype=float)
         columns[name] = time + column if name in CHANNEL_TIMES else column
@@ -289,17 +292,25 @@ def test_og1_file_of_someone_else(tmp_path: Path) -> None:
             ("DEPTH", "f4", [-0.02, 5, 6], None, {"units": "metres", "valid_min": np.float32(0)}),
             ("TEMP", "f4", [10, 11, 12], -9999.9, {"units": "Celsius"}),
             ("PHASE", "i1", [1, 2, 2], 0, {}),
+            ("FLAG", "i1", [1, -127, 2], None, {}),
+            ("BALLAST", "f4", [10, -999, 12], None, {"missing_value": np.float32(-999)}),
+            ("PACKED", "i2", [100, -32767, 300], None, {"scale_factor": 0.01, "add_offset": 1.0}),
         ):
             file.createVariable(name, dtype, ("N_MEASUREMENTS",), fill_value=fill).setncatts(attrs)
-            file[name].set_auto_mask(False)
+            file[name].set_auto_maskandscale(False)
             file[name][:] = np.array(values)
         file.createVariable("DEPLOYMENT_TIME", "f8", ())[...] = 5
+        file.createVariable("NEVER_WRITTEN", "f4", ("N_MEASUREMENTS",))
     back = logs.read(tmp_path / "a.nc")
     np.testing.assert_array_equal(back["time"], 1577836800 + np.array([0, 3600, 7200]))
     np.testing.assert_array_equal(back["latitude"], [50, np.nan, 51])
     np.testing.assert_allclose(back["depth"], [-0.02, 5, 6], rtol=1e-6)
     assert back["water_temperature"].attrs["units"] == "Celsius"
-    assert "phase" in back
+    np.testing.assert_array_equal(back["phase"], [1, 2, 2])
+    np.testing.assert_array_equal(back["flag"], [1, -127, 2])
+    np.testing.assert_array_equal(back["ballast"], [10, np.nan, 12])
+    np.testing.assert_allclose(back["packed"], [2, np.nan, 4])
+    assert back["never_written"].isnull().all()
     assert back["latitude"].attrs["units"] == "deg"
 
 
