@@ -9,6 +9,7 @@ import msgspec
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
 
 from sitl.inject.scene import Effect, Hidden, Scene, furnish
 from sitl.instrument import Instrument, Samples, rotation
@@ -18,6 +19,8 @@ from sitl.twin import Twin
 __all__ = ["measure"]
 
 Array = NDArray[np.float64]
+FINER = 5
+"""Times, than the simulation's grid, where the instrument looks between its points."""
 
 
 class _Tap(Instrument, frozen=True):
@@ -34,11 +37,29 @@ class _Tap(Instrument, frozen=True):
             track = scene.track
             turn = rotation(track.roll, track.pitch, track.heading)
             scene.field = scene.field + turn.apply(scene.earth, inverse=True)
-        samples = scene.instrument.measure(scene.field, scene.water, step, when, rng)
+        field, water = scene.field, scene.water
+        if scene.instrument.corner or any(scene.instrument.channel_delay):
+            field, water, step = _between(scene)
+        samples = scene.instrument.measure(field, water, step, when, rng)
         channels = samples.channels
         for bend in scene.bend:
             channels = bend(channels)
         return Samples(channels, samples.times, samples.temperature, samples.power_cycle)
+
+
+def _between(scene: Scene) -> tuple[Array, Array, float]:
+    """Field, water and step on a finer grid.
+
+    Between two points a field that turns is no straight line, and a delay would see its chord; masses start and stop
+    at once.
+    """
+    track, t = scene.track, scene.t
+    turn = rotation(track.roll, track.pitch, track.heading)
+    earth = turn.apply(turn.apply(scene.field).mean(axis=0), inverse=True)
+    fine = np.linspace(0.0, t[-1], FINER * (len(t) - 1) + 1)
+    rest = [np.interp(fine, t, values) for values in (scene.field - earth).T]
+    field = np.column_stack(rest) + CubicSpline(t, earth)(fine)
+    return field, np.interp(fine, t, scene.water), track.step / FINER
 
 
 def measure(

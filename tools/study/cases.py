@@ -153,9 +153,8 @@ def _theory(
     name = one.hidden.name
     if name == "outliers":  # nothing else comes one by one
         return None
-    # the table's rates are differences: the delays' own signatures are more alike than those
     others = {
-        other: stall.show(Hidden(other, 0.1, stall.number)).signature
+        other: _alike(other, one, stall)
         for other in DELAYS
         if name in DELAYS and other not in [each.hidden.name for each in hidden]
     }
@@ -166,6 +165,16 @@ def _theory(
         free = descriptions(result.problem, result.outcome.null, *tones[:1])
     setting = Setting(CAUSES, result.outcome.trials, free, others, next(iter(beside), None))
     return ideal(one, stall, ds, setting)
+
+
+def _alike(other: str, one: Found, stall: Stall) -> Array:
+    """Signature of another delay with the sign of what is hidden.
+
+    The table's rates are differences, and the delays' own signatures are more alike than those: a late field is an early
+    clock, but for a mass that starts or stops within the delay of a sample.
+    """
+    shown = [stall.show(Hidden(other, size, stall.number)).signature for size in (0.1, -0.1)]
+    return max(shown, key=lambda d: float(d @ one.signature))
 
 
 def _gained(hidden: Hidden, stall: Stall, ds: xr.Dataset, result: Diagnosis) -> dict[str, float]:

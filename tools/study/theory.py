@@ -81,9 +81,9 @@ def ideal(one: Found, stall: Stall, ds: xr.Dataset, setting: Setting) -> dict[st
         ``alone``: chance to name the truth alone; ``inside``: that the set holds it; ``size``: the set's mean size;
         ``first``: cause -> chance to be named first; ``half``, ``sure``: signal-to-noise at which 50 and 95 % are found;
         ``own``: share of the signal-to-noise that the table's regressors of the true cause reach; ``apart``: cause ->
-        signal-to-noise that its best imitation leaves; ``unlike`` and ``mimic``: the smallest of those, and whose it is;
-        ``two``: what the best two of any causes leave; ``unnamed`` and ``described``: see :mod:`study.nameless`, where the
-        setting has descriptions.
+        signal-to-noise that its best imitation leaves; ``unlike`` and ``mimic``: the smallest of those, and whose it is.
+        Where the setting has descriptions, ``two``: what the best two of any causes leave; ``unnamed`` and
+        ``described``: see :mod:`study.nameless`.
     """
     name = one.hidden.name
     spans, S = _information(one, stall, ds, setting)
@@ -96,7 +96,11 @@ def ideal(one: Found, stall: Stall, ds: xr.Dataset, setting: Setting) -> dict[st
     weighed = by_cause({span: weigh(*given[span]) for span in spans}, name, weigh(truth, k))
     names, table = list(weighed), np.array([*weighed.values()])
     inside, first, me = table > table.max(axis=0) - ODDS, np.argmax(table, axis=0), names.index(name)
-    left = {c: with_another(draws, span, rivals) for c, span in best.items() if explained(S, span)}
+    left = {
+        c: with_another(draws, span, rivals if setting.free else [r for r in rivals if r.cause == c])
+        for c, span in best.items()
+        if explained(S, span)
+    }
     apart = {c: left[c][c][0] if c in left else draws.wanted for c in best}
     answers = {
         "alone": float(np.mean((first == me) & (inside.sum(axis=0) == 1))) * bool(own),
@@ -108,14 +112,14 @@ def ideal(one: Found, stall: Stall, ds: xr.Dataset, setting: Setting) -> dict[st
         "apart": apart,
         "unlike": min(apart.values()),
         "mimic": min(apart, key=lambda cause: apart[cause]),
-        "two": min(value for found in left.values() for value, _ in found.values()),
     }
     if not setting.free:
         return answers
     pairs = [(best[c], min(found.values(), key=lambda entry: entry[0])[1]) for c, found in left.items()]
     names = by_cause({span: allowed(*given[span]) for span in rivals})
     needed = against(draws, names, pairs, setting.trials)
-    return answers | nameless(draws, weigh(truth, k), needed, setting.free)
+    two = min(value for found in left.values() for value, _ in found.values())
+    return answers | {"two": two} | nameless(draws, weigh(truth, k), needed, setting.free)
 
 
 def _information(one: Found, stall: Stall, ds: xr.Dataset, setting: Setting) -> tuple[list[Span], Array]:
