@@ -77,7 +77,7 @@ def main() -> None:
     )
     parser.add_argument("--part", default=",".join(PARTS), help=f"some of {', '.join(PARTS)}")
     parser.add_argument(
-        "--seed", type=int, default=0, help="another one hides other effects in other vehicles"
+        "--seed", type=int, default=0, help="another one has other vehicles, and draws all else anew"
     )
     parser.add_argument("--out", type=Path, default=Path("study"))
     parser.add_argument(

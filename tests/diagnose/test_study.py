@@ -19,6 +19,7 @@ from study.draws import Draws, Span, weigh, with_another
 from study.nameless import against, allowed, nameless
 from study.stage import MEMORY, autoregression, project, whiten
 from study.table import efficiency, lines, share
+from study.theory import SHOWN, regressed
 
 from magbridge.diagnose.inference.free import Description
 
@@ -92,6 +93,18 @@ def test_likelihood_ratios_are_drawn_without_any_data() -> None:
     assert freedom == 4
     assert np.mean(ratio) == pytest.approx(np.mean(naive), rel=0.1)
     assert np.std(ratio) == pytest.approx(np.std(naive), rel=0.15)
+
+
+def test_causes_that_are_one_share_the_chance_to_be_named() -> None:
+    rng = np.random.default_rng(8)
+    A, B, noise = rng.normal(size=(3, 60, 2))
+    X = np.column_stack([A, A, B, 2.0 * A[:, 0] + 0.05 * noise[:, 0]])
+    spans = [Span(name, None, slice(2 * k, 2 * k + 2)) for k, name in enumerate(("a", "the same", "b"))]
+    spans.append(Span("b", SHOWN, slice(6, 7)))  # the very shape, which the table does not have
+    draws = Draws.of(X.T @ X)
+    given = {span: draws.ratio(span) for span in spans}
+    assert regressed(given, "a") == regressed(given, "the same") == pytest.approx(0.5, abs=0.01)
+    assert regressed(given, "b") == regressed(given, "none") == 0.0
 
 
 def nameless_chances(apart: float, k: int = 3, wanted: float = 10.0) -> dict[str, float]:

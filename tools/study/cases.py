@@ -37,8 +37,6 @@ LASTING = (
     "eddy_current", "channel_skew", "filter_lag", "clock_offset", "nonlinearity", "pressure_offset", "reference_bias",
 )  # fmt: skip
 """What is the same on another deployment: the rest has its moment or its place, or its range in one log."""
-
-
 TOLD = ("named", "ladder", "unknown", "pair")
 """Parts of which theory says what comes out."""
 DELAYS = ("filter_lag", "clock_offset")
@@ -97,7 +95,7 @@ PARTS: dict[str, Part] = {
 def plan(cases: int, parts: tuple[str, ...] = tuple(PARTS), seed: int = 0) -> list[Row]:
     """The study's entries, every part's evenly among the others'; a longer study holds the shorter one.
 
-    Another `seed` has other vehicles, and draws everything anew.
+    Another `seed` hides the same causes at the same signal-to-noise, in other vehicles, and draws all else anew.
     """
     made = []
     for place, (name, part) in enumerate(PARTS.items()):

@@ -133,7 +133,8 @@ def lines(rows: Sequence[Row]) -> list[str]:
     for label, chosen in (("each nameable beside the other", apart), ("any two", pairs)):
         add(
             f"two at S/N 10, {label}: both named",
-            f"at least 80 % (theory {_of_theory(chosen, lambda name, t: t['first'].get(name, 0.0))})",
+            f"at least 80 % (theory {_of_theory(chosen, lambda name, t: t['first'].get(name, 0.0))}; "
+            f"of its regressors {_of_theory(chosen, lambda _, t: t['regressed'])})",
             share(chosen, lambda r: set(r["names"]) <= causes_of(r)),
         )
         add(

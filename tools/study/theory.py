@@ -36,6 +36,8 @@ from study.stage import Found, Stall, project, whiten
 Array = NDArray[np.float64]
 SIZES = np.linspace(1.0, 10.0, 37)
 """Signal-to-noise at which the chance to be found is evaluated."""
+SHOWN = "as shown"
+"""In a channel's place: a cause's own signature, not the table's columns."""
 
 
 class Setting(NamedTuple):
@@ -79,7 +81,7 @@ def ideal(one: Found, stall: Stall, ds: xr.Dataset, setting: Setting) -> dict[st
     -------
     dict
         ``alone``: chance to name the truth alone; ``inside``: that the set holds it; ``size``: the set's mean size;
-        ``first``: cause -> chance to be named first; ``half``, ``sure``: signal-to-noise at which 50 and 95 % are found;
+        ``first``: cause -> chance to be named first; ``regressed``: the truth's, had it but the table's regressors; ``half``, ``sure``: signal-to-noise at which 50 and 95 % are found;
         ``own``: share of the signal-to-noise that the table's regressors of the true cause reach; ``apart``: cause ->
         signal-to-noise that its best imitation leaves; ``unlike`` and ``mimic``: the smallest of those, and whose it is.
         Where the setting has descriptions, ``two``: what the best two of any causes leave; ``unnamed`` and
@@ -107,6 +109,7 @@ def ideal(one: Found, stall: Stall, ds: xr.Dataset, setting: Setting) -> dict[st
         "inside": float(np.mean(inside[me])) * bool(own),
         "size": float(np.mean(inside.sum(axis=0))),
         "first": {cause: float(np.mean(first == j)) for j, cause in enumerate(names) if (first == j).any()},
+        "regressed": regressed(given, name),
         **_found(draws, k, spans, name, setting),
         "own": float(np.sqrt(explained(S, own))) / draws.wanted if own else 0.0,
         "apart": apart,
@@ -143,7 +146,7 @@ def _information(one: Found, stall: Stall, ds: xr.Dataset, setting: Setting) -> 
         for c, end in zip(candidates, ends, strict=True)
     ]
     spans += [
-        Span(cause, "", slice(k, k + 1), positive=cause == "filter_lag")
+        Span(cause, SHOWN, slice(k, k + 1), positive=cause == "filter_lag")
         for k, cause in enumerate(setting.others, first + table.shape[1])
     ]
     return spans, S
@@ -163,6 +166,15 @@ def _worth(S: Array, span: Span) -> float:
     """Log evidence that a hypothesis has on the mean."""
     freedom = numbers(S, span)
     return float(weigh(np.array(explained(S, span) + freedom), freedom))
+
+
+def regressed(given: Mapping[Span, tuple[Array, float]], name: str) -> float:
+    """Chance that the table's own regressors name the truth first; causes that are one share it."""
+    table = by_cause({span: weigh(*ratio) for span, ratio in given.items() if span.channel != SHOWN})
+    if name not in table:
+        return 0.0
+    first = np.array([*table.values()]) > np.max([*table.values()], axis=0) - 1e-6
+    return float(np.mean(first[list(table).index(name)] / first.sum(axis=0)))
 
 
 def _found(draws: Draws, k: float, spans: Sequence[Span], name: str, setting: Setting) -> dict[str, float]:
