@@ -70,8 +70,8 @@ def simulate(
     Parameters
     ----------
     scenario
-        A scenario file, or the name of one that comes with magbridge: demo, bonne_bay, random_glider;
-        comet and seaglider are driven by a log (--like).
+        A scenario file, or the name of one that comes with magbridge: demo, survey, bonne_bay,
+        random_glider; comet and seaglider are driven by a log (--like).
     output
         The file to write.
     seed

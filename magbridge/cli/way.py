@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -73,6 +74,7 @@ def navigate(
     from magbridge.navigate import Options
     from magbridge.navigate.batch import navigate as find_way
     from magbridge.navigate.model import informed
+    from magbridge.navigate.yardstick import errors
 
     deployment = with_true_heading(read(some(files), required=CHANNELS), heading_reference)
     corrected = correct_rows(Correction(known), deployment)
@@ -87,30 +89,24 @@ def navigate(
         draw_navigation(track, grid, picture)
     for finding in track.attrs["findings"].splitlines():
         complain(finding, 0)
-    vouched, sigma, error = _how_good(track)
-    off = "" if error is None else f"; off by {error:.0f} m RMS"
-    rows = track.sizes["time"]
+    vouched, rows = float(track["vouched"].mean()), track.sizes["time"]
+    sigma = float((track["covariance_nn"] + track["covariance_ee"])[-1]) ** 0.5
+    error, reckoned = (float((one**2).mean()) ** 0.5 for one in errors(track))
+    judged = isfinite(error)
+    off = f"; off by {error:.0f} m RMS, dead reckoning alone by {reckoned:.0f} m" if judged else ""
     tell(
         {
             "file": str(output),
             "rows": rows,
             "vouched": vouched,
             "sigma_m": sigma,
-            "error_m": error,
+            "error_m": error if judged else None,
+            "dead_reckoning_error_m": reckoned if judged else None,
             **track.attrs,
         },
         f"{output}: {rows} updates, vouched for {vouched:.0%}, 1-sigma {sigma:.0f} m at the end{off}",
         json,
     )
-
-
-def _how_good(track: xr.Dataset) -> tuple[float, float, float | None]:
-    """Return the share vouched for, the last 1-sigma (m), and the error (m, RMS) where the position is known."""
-    sigma = float((track["covariance_nn"] + track["covariance_ee"])[-1]) ** 0.5
-    error = None
-    if "error_north" in track and track["error_north"].notnull().any():
-        error = float((track["error_north"] ** 2 + track["error_east"] ** 2).mean()) ** 0.5
-    return float(track["vouched"].mean()), sigma, error
 
 
 def _bound(

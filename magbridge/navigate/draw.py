@@ -18,6 +18,7 @@ from magbridge.field.grid import AnomalyGrid
 from magbridge.files import atomic_path
 from magbridge.navigate.bound import Bound
 from magbridge.navigate.record import State
+from magbridge.navigate.yardstick import errors
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -45,7 +46,6 @@ def draw_navigation(result: xr.Dataset, grid: AnomalyGrid, path: str | Path) -> 
     )
     axis.plot(hours, result["map_anomaly"], color="C3", lw=1, label="map under the track")
     axis.set_ylabel("anomaly, nT")
-    axis.legend(loc="upper right", fontsize=8)
 
     axis = panels["innovation"]
     spread = 2.0 * np.sqrt(result["innovation_variance"])
@@ -60,22 +60,22 @@ def draw_navigation(result: xr.Dataset, grid: AnomalyGrid, path: str | Path) -> 
         )  # a wide start's first innovations are as large as the map
         axis.set_ylim(-limit, limit)
     axis.set_ylabel("innovation, nT")
-    axis.legend(loc="upper right", fontsize=8, ncols=3)
 
     axis = panels["sigma"]
     sigma = np.sqrt(result["covariance_nn"] + result["covariance_ee"])
     axis.semilogy(hours, sigma, color="C0", label="sigma, filter")
     smoothed = np.hypot(result["smoothed_sigma_north"], result["smoothed_sigma_east"])
     axis.semilogy(hours, smoothed, color="C2", label="sigma, smoothed")
-    if "error_north" in result:
-        axis.semilogy(
-            hours, np.hypot(result["error_north"], result["error_east"]), color="0.2", lw=0.8, label="error"
-        )
+    error, reckoned = errors(result)
+    if np.isfinite(error).any():
+        axis.semilogy(hours, error, color="0.2", lw=0.8, label="error")
+        axis.semilogy(hours, reckoned, color="0.35", ls="--", lw=1, label="error, dead reckoning alone")
     axis.set_ylabel("position error, m")
     _plain(axis)
     axis.set_xlabel("hours")
     _shade(axis, hours, result["state"].to_numpy())
-    axis.legend(loc="upper right", fontsize=8)
+    for name in ("field", "innovation", "sigma"):
+        _legend_above(panels[name])
     _save(figure, path)
 
 
@@ -190,6 +190,14 @@ def _shade(axis: Axes, hours: Any, state: Any) -> None:
             end = hours[min(piece[-1] + 1, state.size - 1)]
             axis.axvspan(hours[piece[0]], end, color=SHADES[kind], alpha=0.5, lw=0, label=label)
             seen.add(kind)
+
+
+def _legend_above(axis: Axes) -> None:
+    """Explain the lines where none can be hidden by it."""
+    entries = axis.get_legend_handles_labels()[1]
+    axis.legend(
+        loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=min(len(entries), 3), fontsize=8, frameon=False
+    )
 
 
 def _plain(axis: Axes) -> None:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from magbridge.field.earth import metres_per_degree
 
-__all__ = ["YARDSTICKS", "with_errors", "yardstick"]
+__all__ = ["YARDSTICKS", "errors", "with_errors", "yardstick"]
 
 Floats = NDArray[np.floating[Any]]
 
@@ -60,6 +60,15 @@ def with_errors(result: xr.Dataset, truth: xr.Dataset | None) -> xr.Dataset:
         for name, values in added.items()
     }
     return result.assign(named).assign_attrs(yardstick=truth.attrs["yardstick"])
+
+
+def errors(result: xr.Dataset) -> tuple[xr.DataArray, xr.DataArray]:
+    """(n,) m each: how far off the estimate is, and how far dead reckoning alone; NaN where nobody knows."""
+    if "error_north" not in result:
+        nobody = result["north"] * np.nan
+        return nobody, nobody
+    north, east = result["error_north"], result["error_east"]
+    return (north**2 + east**2) ** 0.5, ((north - result["north"]) ** 2 + (east - result["east"]) ** 2) ** 0.5
 
 
 def _separations(
