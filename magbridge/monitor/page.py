@@ -34,11 +34,13 @@ LINE = {"type": "line", "symbol": "none", "animation": False, "color": BLUE}
 BAND = {**LINE, "stack": "band", "stackStrategy": "all", "lineStyle": {"opacity": 0}}
 ROOM, LEAST = 5.0, 50.0
 """The band gets no more of the chart, each way, than ROOM times the curve and LEAST nT: else the curve is a line."""
+ROUND = {"showMinLabel": False, "showMaxLabel": False}
+"""The ends of an axis are where they are, and would be written over the round number beside them."""
 CHART: dict[str, Any] = {
     "useUTC": True,
-    "grid": {"left": 70, "right": 16, "top": 12, "bottom": 28},
-    "xAxis": {"type": "time", "axisLabel": {"hideOverlap": True}},
-    "yAxis": {"type": "value", "scale": True},
+    "grid": {"left": 70, "right": 32, "top": 12, "bottom": 28},
+    "xAxis": {"type": "time", "axisLabel": {"hideOverlap": True, **ROUND}},
+    "yAxis": {"type": "value", "scale": True, "axisLabel": ROUND},
     "series": [BAND, {**BAND, "areaStyle": {"opacity": 0.2}}, {**LINE, "lineStyle": {"width": 1.5}}],
 }
 GRID = "w-full grid gap-4 grid-cols-1 lg:grid-cols-"
