@@ -1,0 +1,88 @@
+"""Anomaly grids in netCDF: CF's, today's GMT's, and GMT's of before 2007."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magbridge.errors import FormatError
+
+__all__ = ["ANOMALY", "LATITUDE", "LONGITUDE", "Parts", "netcdf"]
+
+Array = NDArray[np.floating[Any]]
+Parts = tuple[Array, Array, Array, dict[str, Any]]
+"""Longitudes and latitudes (deg) of the nodes, values, options of AnomalyGrid; and ``unit``, where it says one."""
+LONGITUDE, LATITUDE = ("longitude", "lon", "long", "x"), ("latitude", "lat", "y")
+ANOMALY = ("anomaly", "magnetic_anomaly", "mag_anomaly", "tfa", "tmi", "mag", "nt", "value", "z")
+SIGMA = ("sigma", "error", "uncertainty", "std")
+PROJECTED = ("easting", "northing", "projection_x_coordinate", "projection_y_coordinate", "utm_x", "utm_y")
+
+
+def netcdf(path: Path, variable: str | None = None) -> Parts:
+    """CF or GMT netCDF: one two-dimensional variable on geographic axes."""
+    import xarray as xr  # noqa: PLC0415  the live path runs without xarray
+
+    try:
+        with xr.open_dataset(path, engine="netcdf4") as data:
+            data.load()
+    except (OSError, ValueError) as error:
+        raise FormatError(path, "expected a netCDF grid") from error
+    if {"x_range", "y_range", "dimension", "z"} <= set(data.variables):
+        return _old_gmt(data)
+    flat = {str(name): da.squeeze(drop=True) for name, da in data.data_vars.items()}
+    flat = {name: da for name, da in flat.items() if da.ndim == 2 and da.dtype.kind in "fiu"}
+    named = [name for name in ANOMALY if name in {n.lower() for n in flat}]
+    sigmas = [name for name in flat if name.lower() in SIGMA]
+    choice = variable or next((n for n in flat if named and n.lower() == named[0]), None)
+    if choice is None and len(rest := [n for n in flat if n not in sigmas]) == 1:
+        choice = rest[0]
+    if choice is None or choice not in flat:
+        raise FormatError(path, f"expected one grid, found {' '.join(flat) or 'none'}: name the variable")
+    grid = flat[choice]
+    x, y = (
+        _coordinate(path, grid, names, kind) for names, kind in ((LONGITUDE, "east"), (LATITUDE, "north"))
+    )
+    options: dict[str, Any] = {"unit": grid.attrs.get("units")}
+    if sigmas and variable not in sigmas:
+        options["sigma"] = flat[sigmas[0]].transpose(y, x).to_numpy()
+    for where in (grid.attrs, data.attrs):
+        if "altitude" in where:
+            options.setdefault("altitude", float(where["altitude"]))
+    return grid[x].to_numpy(), grid[y].to_numpy(), grid.transpose(y, x).to_numpy().astype(float), options
+
+
+def _coordinate(path: Path, grid: Any, names: tuple[str, ...], kind: str) -> str:
+    """Return the dimension that runs `kind` ("east", "north"), by units, standard name or name."""
+    for dimension in map(str, grid.dims):
+        attrs = grid[dimension].attrs if dimension in grid.coords else {}
+        called = {
+            dimension.lower(),
+            str(attrs.get("standard_name", "")),
+            str(attrs.get("long_name", "")).lower(),
+        }
+        metres = str(attrs.get("units", "")).lower() in ("m", "metre", "meter", "km")
+        if called & set(PROJECTED) or (metres and called & set(names)):
+            raise FormatError(
+                path,
+                "projected coordinates: reproject the grid to longitude and latitude",
+                column=dimension,
+            )
+        if str(attrs.get("units", "")).lower().startswith(f"degrees_{kind}") or called & set(names):
+            return dimension
+    raise FormatError(path, f"expected the axis {names[0]!r}, found {' '.join(map(str, grid.dims))}")
+
+
+def _old_gmt(data: Any) -> Parts:
+    """GMT's netCDF of before 2007: ranges and one long row, from the north-west corner."""
+    nx, ny = (int(n) for n in data["dimension"].to_numpy())
+    half = 0.5 * int(data["z"].attrs.get("node_offset", 0))
+    axes = []
+    for name, n in (("x_range", nx), ("y_range", ny)):
+        low, high = (float(v) for v in data[name].to_numpy())
+        step = (high - low) / (n - 1 + 2 * half)
+        axes.append(low + (np.arange(n) + half) * step)
+    values = data["z"].to_numpy().reshape(ny, nx)[::-1].astype(float)
+    return axes[0], axes[1], values, {"unit": data["z"].attrs.get("units")}
