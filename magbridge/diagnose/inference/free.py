@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from magbridge.calibration.followers import ClockEffect
 from magbridge.diagnose.causes.candidates import Candidate
-from magbridge.diagnose.causes.regressors import powers
-from magbridge.diagnose.causes.timing import field_rates
-from magbridge.diagnose.compare.problem import Columns, Problem
+from magbridge.diagnose.causes.regressors import play, powers
+from magbridge.diagnose.causes.timing import field_rates, mass_rates
+from magbridge.diagnose.compare.problem import Columns, Problem, effect_columns
+from magbridge.diagnose.inference.events import passage, step
 from magbridge.diagnose.inference.joint import Joint
 
 __all__ = ["Description", "descriptions"]
@@ -22,6 +24,8 @@ BODY, EARTH = 24, 48
 """Half waves in a log of slow curves along the body's axes, and along the field."""
 BEND = 10
 """Order of a channel's free response."""
+PLAYS = (0.3, 0.8)
+"""Widths of a channel's memory, half of its range being one."""
 
 
 class Description(NamedTuple):
@@ -43,6 +47,8 @@ class Description(NamedTuple):
         Causes whose own regressors are among the columns.
     turned : bool
         The columns are functions along each of the body's axes.
+    remembers : bool
+        It is the past of the channel, not its value, that it follows.
     """
 
     columns: Columns
@@ -52,11 +58,17 @@ class Description(NamedTuple):
     period: float | None = None
     holds: tuple[str, ...] = ()
     turned: bool = False
+    remembers: bool = False
 
     def retells(self, model: Sequence[Candidate]) -> bool:
         """Say whether it is what a cause of `model` says, with more numbers."""
         return any(
-            candidate.cause in self.holds or (candidate.channel and candidate.channel == self.channel)
+            candidate.cause in self.holds
+            or (
+                candidate.channel is not None
+                and candidate.channel == self.channel
+                and (candidate.cause == "hysteresis") == self.remembers
+            )
             for candidate in model
         )
 
@@ -64,14 +76,14 @@ class Description(NamedTuple):
 def descriptions(problem: Problem, fit: Joint, tone: Candidate | None = None) -> list[Description]:
     """List what structure of any kind is looked for with.
 
-    Slow curves along each axis of the body and along the field, the loudest window of the log, the direction of the
-    field, its rates of change, each channel's response, and a curve through each telemetry channel with the way that
-    it goes and the side that it came from.
+    Slow curves along each axis of the body and along the field, and a constant along that; since when the offsets are
+    others, and what passed by; the direction of the field, its rates of change, the channels' response, one delay of
+    everything; of each telemetry channel a curve through its values, and its memory of where it was.
     """
     body = -problem.slopes[:, 6:]
     u = problem.survey.time - problem.survey.time[0]
     u = np.pi * u / max(float(u[-1]), 1.0)
-    rates = field_rates(problem)
+    rates, fresh = field_rates(problem), ~problem.survey.learned
 
     def projected(basis: Columns) -> Columns:
         """Each function along each axis of the body."""
@@ -85,65 +97,50 @@ def descriptions(problem: Problem, fit: Joint, tone: Candidate | None = None) ->
     def waves(count: int) -> Columns:
         return lambda rows: np.cos(u[rows, None] * np.arange(1, count + 1))
 
+    since, moments = step(problem, fit)
+    passing, times = passage(problem, fit)
     listed = [
         Description(projected(waves(BODY)), _spectra(BODY, 3), turned=True),
         Description(
             lambda rows: problem.gain[rows, None] * waves(EARTH)(rows),
             (*_spectra(EARTH, 1), ("transient", np.full(EARTH, 10.0))),
         ),
-        _window(problem, fit),
+        _of("drift", lambda rows: (problem.gain * fresh)[rows, None], 1, 1.0, holds=("reference_bias",)),
+        _of("switching", since, 3, trials=moments, holds=("offset_step",)),
+        _of("transient", passing, 3, trials=times),
         _of("broadband", _direction(body), 25),
-        _of("broadband", projected(lambda rows: rates[:, rows].T), 9, 1.0)._replace(
-            holds=("eddy_current", "channel_skew"), turned=True
+        _of(
+            "broadband", projected(lambda rows: rates[:, rows].T), 9, 1.0,
+            holds=("eddy_current", "channel_skew"), turned=True,
         ),
-    ]
-    listed += [
-        Description(
-            _response(problem.reading[:, axis], body[:, axis]), (("broadband", 30.0 / np.arange(1, BEND + 1)),)
-        )
-        for axis in range(3)
+        Description(_response(problem.reading, body), _bends()),
     ]  # fmt: skip
-    listed += [
-        _of("broadband", projected(_curve(channel.values)), 27, channel=name)._replace(turned=True)
-        for name, channel in problem.survey.channels.items()
-        if name not in problem.survey.still
-    ]
+    own = {parameter.name for parameter in problem.calibration.parameters}
+    if own:
+        late = effect_columns(problem, ClockEffect(), mass_rates(problem))
+        listed.append(_of("broadband", late, 1, 1.0, holds=("clock_offset", "filter_lag")))
+    for name, channel in problem.survey.channels.items():
+        if name not in problem.survey.still:
+            held = ("actuator_order",) if name in own else ()
+            curve, memory = projected(_curve(channel.values)), projected(_memory(channel.values))
+            listed += [
+                _of("broadband", curve, 12, channel=name, turned=True, holds=held),
+                _of("broadband", memory, 24, channel=name, turned=True, remembers=True),
+            ]
     if tone is not None:
         width = (("tone", np.ones(tone.size)),)
         listed.append(Description(tone.columns, width, None, tone.trials, tone.shape["period"][0]))
     return listed
 
 
-def _of(
-    kind: str, columns: Columns, size: int, width: float = 30.0, channel: str | None = None
-) -> Description:
-    return Description(columns, ((kind, np.full(size, width)),), channel)
+def _of(kind: str, columns: Columns, size: int, width: float = 30.0, **more: Any) -> Description:
+    return Description(columns, ((kind, np.full(size, width)),), **more)
 
 
 def _spectra(count: int, axes: int) -> tuple[tuple[str, FloatArray], ...]:
     """Widths of an exponential memory's half waves (a relaxation, a telegraph): ``1 / sqrt(1 + (k / k_0)^2)``."""
     k = np.repeat(np.arange(1, count + 1), axes)
-    return tuple((kind, 10.0 / np.sqrt(1.0 + (k / corner) ** 2)) for kind, corner in (("drift", 1.0), ("transient", 8.0)))  # fmt: skip
-
-
-def _window(problem: Problem, fit: Joint) -> Description:
-    """Find the window in which the field is most surely off by a constant: all lengths, at every quarter of one."""
-    n = len(problem)
-    gain = fit.noise.filter(problem.gain[:, None])[:, 0]
-    with_y, own = (np.append(0.0, np.cumsum(gain * x)) for x in (fit.noise.response(fit.left), gain))
-    best, first, end, trials, length = 0.0, 0, 1, 0, 4
-    while length <= max(n // 8, 4):
-        starts = np.arange(0, n - length + 1, max(length // 4, 1))
-        trials += starts.size
-        z = np.abs(with_y[starts + length] - with_y[starts]) / np.sqrt(own[starts + length] - own[starts])
-        at = int(np.argmax(z)) if starts.size else 0
-        if starts.size and z[at] > best:
-            best, first, end = float(z[at]), int(starts[at]), int(starts[at]) + length
-        length = int(1.5 * length) + 1
-    inside = np.zeros(n)
-    inside[first:end] = 1.0
-    columns: Columns = lambda rows: (problem.gain[rows] * inside[rows])[:, None]  # noqa: E731  (as the others)
-    return _of("transient", columns, 1)._replace(trials=float(max(trials, 1)))
+    return tuple((kind, 10.0 / np.sqrt(1.0 + (k / corner) ** 2)) for kind, corner in (("drift", 1.0), ("switching", 8.0)))  # fmt: skip
 
 
 def _direction(body: FloatArray) -> Columns:
@@ -159,25 +156,46 @@ def _direction(body: FloatArray) -> Columns:
     return columns
 
 
-def _response(reading: FloatArray, slope: FloatArray) -> Columns:
-    """One channel's error as any smooth function of its own reading: Chebyshev polynomials."""
-    angle = np.arccos(np.clip(_scaled(reading), -1.0, 1.0))
-    return lambda rows: slope[rows, None] * np.cos(angle[rows, None] * np.arange(1, BEND + 1))
+def _response(reading: FloatArray, slopes: FloatArray) -> Columns:
+    """Each channel's error as any smooth function of its own reading: Chebyshev polynomials."""
+    angle = np.stack([np.arccos(np.clip(_scaled(x), -1.0, 1.0)) for x in reading.T], axis=1)
+
+    def columns(rows: slice) -> FloatArray:
+        waves = np.cos(angle[rows, :, None] * np.arange(1, BEND + 1))
+        return np.asarray((slopes[rows, :, None] * waves).reshape(len(waves), -1))
+
+    return columns
+
+
+def _bends() -> tuple[tuple[str, FloatArray], ...]:
+    """Widths of a response's polynomials: of all channels, with a corner or without, or of one that has a corner."""
+    k = np.arange(1.0, BEND + 1.0)
+    alone = [np.repeat(np.arange(3) == axis, BEND) * np.tile(30.0 / k**2, 3) for axis in range(3)]
+    return tuple(("broadband", width) for width in (np.tile(30.0 / k**2, 3), np.tile(30.0 / k**3, 3), *alone))
 
 
 def _curve(values: FloatArray) -> Columns:
-    """Powers of a channel, and the way that it goes and the side that it came from, across its first powers."""
+    """Powers of a channel."""
     y = _scaled(values)
-    step = np.diff(y, prepend=y[0])
-    way = np.where(np.abs(step) > 1e-3, np.sign(step), 0.0)
-    last = np.maximum.accumulate(np.where(way != 0.0, np.arange(len(y)), 0))
-    side = way[last]
+    return _centred(lambda rows: powers(y[rows], 4).T)
+
+
+def _memory(values: FloatArray) -> Columns:
+    """Return what a channel's past adds: curved branches, narrow and wide, and the way that it goes."""
+    y = _scaled(values)
+    plays = [play(y, width) for width in PLAYS]
+    change = np.diff(y, prepend=y[0])
+    way = np.where(np.abs(change) > 1e-3, np.sign(change), 0.0)
 
     def columns(rows: slice) -> FloatArray:
-        v, w, d = y[rows], way[rows], side[rows]
-        one, two, three, four = powers(v, 4)
-        return np.stack([one, two, three, four, d, d * one, d * two, w, w * one], axis=1)
+        v, w = y[rows], way[rows]
+        branches = [powers(x[rows], 3) - powers(v, 3) for x in plays]
+        return np.concatenate([*branches, [w, w * v]]).T
 
+    return _centred(columns)
+
+
+def _centred(columns: Columns) -> Columns:
     mean = columns(slice(None)).mean(axis=0)
     return lambda rows: columns(rows) - mean
 

@@ -25,7 +25,7 @@ from magbridge.diagnose.inference.free import Description, descriptions
 from magbridge.diagnose.inference.information import information
 from magbridge.diagnose.inference.joint import Joint
 from magbridge.diagnose.inference.noise import Noise
-from magbridge.diagnose.inference.search import Outcome, worth
+from magbridge.diagnose.inference.search import Hypothesis, Outcome, worth
 from magbridge.diagnose.inference.statistic import Ridge, Statistic
 from magbridge.diagnose.inference.weigh import LEVEL, ODDS, REMNANT, lead
 
@@ -58,6 +58,8 @@ class Leftover(NamedTuple):
         Of a tone.
     best_channel : str or None
         The telemetry that goes with it best.
+    description : Description, optional
+        What told it.
     """
 
     kind: str
@@ -66,6 +68,7 @@ class Leftover(NamedTuple):
     evidence: float
     period_s: float | None
     best_channel: str | None
+    description: Description | None = None
 
 
 def lone(S: FloatArray, b: FloatArray, width: FloatArray, whole: Ridge) -> Ridge:
@@ -122,16 +125,16 @@ def leftover(
     # without a name stricter than for a cause: it is the asymptotic distribution
     if p_value >= (LEVEL if model else 0.1 * LEVEL):
         return None
-    if kind == "transient":
-        kind = _steps(problem, fit)
-    return Leftover(kind, size, p_value, evidence, one.period, one.channel or _goes_with(problem, fit))
+    channel = one.channel or _goes_with(problem, fit)
+    return Leftover(kind, size, p_value, evidence, one.period, channel, one)
 
 
 def accept(problem: Problem, outcome: Outcome, tone: Candidate | None) -> tuple[bool, Leftover | None]:
     """Say whether the names stand, and what is left beside them or, if they do not, at all.
 
     Names stand unless a free description of the whole beats them as another name would have to. If more is left beside
-    them than an idealised regressor leaves, the burden of proof is theirs: they and what is left must beat it 20:1.
+    them than an idealised regressor leaves, and of another sort than they are, the burden of proof is theirs: they and what
+    is left must beat it 20:1.
     """
     model = [h.candidate for h in outcome.chosen]
     rest = leftover(problem, model, outcome.fit, outcome.order, tone)
@@ -139,13 +142,22 @@ def accept(problem: Problem, outcome: Outcome, tone: Candidate | None) -> tuple[
         return False, rest
     if rest is not None and rest.signal_to_noise < REMNANT * max(h.signal_to_noise for h in outcome.chosen):
         rest = None
-    # what holds the names' own regressors and finds nothing beside them is no other explanation
-    free = leftover(problem, [], outcome.null, outcome.order, tone, but=() if rest else model)
+    other = None if rest is None or _same(outcome.chosen, rest) else rest
+    # what holds the names' own regressors and finds nothing else beside them is no other explanation
+    free = leftover(problem, [], outcome.null, outcome.order, tone, but=() if other else model)
     ratio = 2.0 * (outcome.fit.log_likelihood - outcome.null.log_likelihood)
-    names = worth(ratio, model, outcome.trials) + (rest.evidence - ODDS if rest else lead(ratio))
+    names = worth(ratio, model, outcome.trials) + (other.evidence - ODDS if other else lead(ratio))
     if free is not None and names < free.evidence:
         return False, free
     return True, rest
+
+
+def _same(chosen: Sequence[Hypothesis], rest: Leftover) -> bool:
+    """Say whether what is left is more of what a louder name says: its regressor is idealised."""
+    told = rest.description
+    return told is not None and any(
+        told.retells([h.candidate]) and h.signal_to_noise > rest.signal_to_noise for h in chosen
+    )
 
 
 def _scored(
@@ -212,15 +224,6 @@ def _taken(
         X = np.hstack([problem.free[rows], *(column(rows) for column in (*model, *columns))])
         out[rows] = -X @ every
     return out
-
-
-def _steps(problem: Problem, fit: Joint) -> str:
-    """Tell one disturbance that comes and goes from a state that switches again and again."""
-    n = len(problem)
-    parts = np.arange(n) * min(64, max(n // 30, 2)) // n
-    level: FloatArray = np.bincount(parts, fit.left) / np.bincount(parts)
-    high = level > 0.5 * (level.max() + level.min())
-    return "switching" if np.count_nonzero(np.diff(high.astype(int))) > 4 else "transient"
 
 
 def _goes_with(problem: Problem, fit: Joint) -> str | None:

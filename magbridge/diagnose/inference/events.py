@@ -1,0 +1,103 @@
+"""What has a moment: since when the body's own field is another, and what passed by."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
+
+from magbridge.diagnose.compare.problem import Columns, Problem
+from magbridge.diagnose.inference.joint import Joint
+
+__all__ = ["passage", "step"]
+
+FloatArray = NDArray[np.float64]
+
+MOMENTS = 96
+"""At which a step is looked for."""
+DURATIONS, SHORTEST, LONGEST = 12, 8.0, 0.125
+"""Of a passage: how many are tried, from so many samples to this share of the log."""
+QUARTERS = np.arange(-12, 13)
+"""Of its duration, over which a passage is looked for."""
+
+
+def step(problem: Problem, fit: Joint) -> tuple[Columns, float]:
+    """Find since when the offsets are most surely other ones, the calibration free.
+
+    Returns
+    -------
+    Columns
+        Of the three offsets since then.
+    trials : float
+        Moments that were tried.
+    """
+    n, q, past = len(problem), problem.free.shape[1], len(fit.noise.memory)
+    body, y = -problem.slopes[:, 6:], fit.noise.response(fit.left)
+    edges = np.unique(np.linspace(0, n, MOMENTS + 2).astype(int))
+    pieces = len(edges) - 1
+    G, b = np.zeros((pieces, q + 3, q + 3)), np.zeros((pieces, 3))
+    for k, (start, end) in enumerate(pairwise(edges)):
+        first = max(start - past, 0)
+        X = np.hstack([problem.free[first:end], body[first:end]])
+        X = fit.noise.filter(X, first, start - first)
+        G[k], b[k] = X.T @ X, X[:, q:].T @ y[start:end]
+    # sums from each moment on; the first is that of the whole log
+    G, b = (np.cumsum(x[::-1], axis=0)[::-1] for x in (G, b))
+    P, K = G[0, :q, :q] + np.diag(fit.prior[:q]), G[1:, :q, q:]
+    S = G[1:, q:, q:] - K.transpose(0, 2, 1) @ np.linalg.solve(P, K)
+    onset = edges[1 + int(np.argmax(_ratio(S, b[1:])))]
+    since = np.arange(n) >= onset
+    return lambda rows: body[rows] * since[rows, None], float(MOMENTS)
+
+
+def passage(problem: Problem, fit: Joint) -> tuple[Columns, float]:
+    r"""Find when, and for how long, a distant source most surely passed: all durations T, at every half of one.
+
+    Returns
+    -------
+    Columns
+        Of three numbers.
+    trials : float
+        Moments that were tried at this duration, times the durations.
+
+    Notes
+    -----
+    Along a straight course a dipole adds to the field :math:`(b_0 + b_1 s + b_2 s^2) / (1 + s^2)^{5/2}`, s the time from
+    its nearest point in units of T, distance over speed (Anderson's functions: Ginzburg, Frumkis & Kaplan 2002, Sens.
+    Actuators A 102:67).
+    """
+    t = problem.survey.time - problem.survey.time[0]
+    gain = fit.noise.filter(problem.gain[:, None])[:, 0]
+    with_y, own = gain * fit.noise.response(fit.left), gain * gain
+    shape = _passing(QUARTERS / 4.0)
+    pairs = np.einsum("ik,jk->ijk", shape, shape).reshape(9, -1)
+    best, nearest, scale, trials = -np.inf, 0.0, 1.0, 1.0
+    for duration in np.geomspace(SHORTEST / len(t), LONGEST, DURATIONS) * float(t[-1]):
+        quarters = (4.0 * t / duration).astype(int)
+        b, S = (_around(np.bincount(quarters, x)) @ f.T for x, f in ((with_y, shape), (own, pairs)))
+        ratio = _ratio(S.reshape(-1, 3, 3), b)
+        at, count = int(np.argmax(ratio)), float(ratio.size * DURATIONS)
+        evidence = 0.5 * float(ratio[at]) - float(np.log(count))
+        if evidence > best:
+            best, nearest, scale, trials = evidence, (2 * at + 0.5) * duration / 4.0, duration, count
+    return lambda rows: problem.gain[rows, None] * _passing((t[rows] - nearest) / scale).T, trials
+
+
+def _passing(s: FloatArray) -> FloatArray:
+    """(3, n) functions of Anderson."""
+    return np.stack([np.ones_like(s), s, s * s]) / (1.0 + s * s) ** 2.5
+
+
+def _around(values: NDArray[Any]) -> FloatArray:
+    """Return what stands about every other value, quarter by quarter."""
+    return sliding_window_view(np.pad(values, len(QUARTERS) // 2), len(QUARTERS))[::2]
+
+
+def _ratio(S: FloatArray, b: FloatArray) -> FloatArray:
+    """(m,) likelihood ratios of scores b (m, k), information S (m, k, k)."""
+    size = np.trace(S, axis1=1, axis2=2)[:, None, None] + 1e-300
+    S = S + 1e-6 * size * np.eye(b.shape[1])
+    return np.asarray(np.einsum("mi,mi->m", b, np.linalg.solve(S, b[:, :, None])[:, :, 0]))
