@@ -83,12 +83,15 @@ def _again(files: Sequence[Path], config: Path, speed: float, log: Path | None) 
     stage = Stage(config, published.extend, log)
     begun = time.monotonic()
     stage.play(recorded.start, track(recorded.events(), "replaying"), speed)
+    held = len(recorded.published)
+    first = _first_difference(published[:held], recorded.published)
     return {
         "files": [str(file) for file in files],
         "messages": recorded.messages,
-        "bytes": len(recorded.published),
-        "identical": bool(published == recorded.published),
-        "first_difference": _first_difference(published, recorded.published),
+        "bytes": held,
+        "identical": first is None,
+        "first_difference": first,
+        "beyond": max(len(published) - held, 0),  # a log that breaks off lacks what its last input brought
         "same_config": load(config).digest == recorded.config_digest,
         "damages": recorded.damages,
         "seconds": time.monotonic() - begun,
@@ -221,6 +224,8 @@ def _tell_again(result: Result) -> str:
     lines = [f"{result['files'][0]}: {size} {verdict}, in {result['seconds']:.1f} s"]
     if not result["same_config"]:
         lines.append("the configuration is not the one that the log was made with")
+    if result["identical"] and result["beyond"]:
+        lines.append(f"the log breaks off before the last {result['beyond']} bytes")
     if result["damages"]:
         lines.append(f"{result['damages']} damaged places in the log were passed over")
     return "\n".join(lines)

@@ -69,6 +69,18 @@ def test_convert_there_and_back_keeps_every_number(deployment: Path, tmp_path: P
         np.testing.assert_array_equal(before[name], after[name], err_msg=str(name))
 
 
+def test_a_log_that_is_read_is_not_written_over(
+    deployment: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log, link = tmp_path / "log.csv", tmp_path / "link.csv"
+    log.write_bytes(deployment.read_bytes())
+    link.symlink_to(log)
+    for output in (log, link):
+        line = complaint(capsys, "convert", log, "-o", output, code=2)
+        assert line == f"{output}: expected another file to write than those to read"
+    assert log.read_bytes() == deployment.read_bytes()
+
+
 def test_what_headings_are_counted_from_may_be_told(deployment: Path, tmp_path: Path) -> None:
     out = tmp_path / "magnetic.csv"
     assert main(["convert", str(deployment), "-o", str(out), "--heading-reference", "magnetic"]) == 0

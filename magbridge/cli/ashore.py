@@ -45,7 +45,7 @@ def convert(*files: Path, output: Output, heading_reference: Heading = None, jso
 
     rows = 0
     with Writer(output) as writer:
-        for part in track(read_chunks(some(files)), "reading"):
+        for part in track(read_chunks(some(files, output)), "reading"):
             if heading_reference:
                 part.attrs["heading_reference"] = heading_reference
             writer.append(part)
@@ -160,7 +160,9 @@ def calibrate(
     from magbridge.logs import read
 
     anomalies = read_grid(grid) if grid else None
-    deployment = with_true_heading(read(some(files), required=(*CHANNELS, *parameter)), heading_reference)
+    deployment = with_true_heading(
+        read(some(files, output), required=(*CHANNELS, *parameter)), heading_reference
+    )
     data = observations(deployment, parameter, reference=lambda ds: earth_field(ds, anomalies))
     seen: dict[str, Path] = {}
     for file in files:
@@ -273,7 +275,9 @@ def map(  # noqa: A001 - the command's name
 
     polygon = read_polygon(mask) if mask else None
     with waiting("preparing"):
-        result, steps = prepare([read_grid(path) for path in some(grids)], altitude, passes, polygon, spacing)
+        result, steps = prepare(
+            [read_grid(path) for path in some(grids, output)], altitude, passes, polygon, spacing
+        )
     result.save(output)
     if picture:
         draw_steps(steps, picture)
@@ -306,7 +310,7 @@ def correct(*files: Path, calibration: Path, output: Output, json: Json = False)
     correction = Correction(load(calibration))
     rows = flagged = 0
     with Writer(output) as writer:
-        for part in track(read_chunks(some(files), required=CHANNELS), "correcting"):
+        for part in track(read_chunks(some(files, output), required=CHANNELS), "correcting"):
             corrected = correct_rows(correction, part)
             writer.append(corrected)
             rows += part.sizes["time"]

@@ -67,10 +67,12 @@ Picture = Annotated[Path | None, Parameter(validator=file_to_write(".png", ".pdf
 Json = Annotated[bool, Parameter(name="--json")]
 
 
-def some(files: tuple[Path, ...]) -> tuple[Path, ...]:
-    """Return `files`, if there are any."""
+def some(files: tuple[Path, ...], output: Path | None = None) -> tuple[Path, ...]:
+    """Return `files`, if there are any, and `output` is none of them: a log that is read is never written over."""
     if not files:
         raise WrongUse("expected at least one FILE")
+    if output is not None and output.resolve() in [file.resolve() for file in files]:
+        raise WrongUse(f"{output}: expected another file to write than those to read")
     return files
 
 
