@@ -5,8 +5,11 @@ from __future__ import annotations
 import gc
 import signal
 import sys
+import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from threading import Thread
 from typing import Protocol
 
 from magbridge.bridge import states
@@ -29,6 +32,8 @@ KEEP_US = 60_000_000
 """µs between two savings of the signing time stamp; after a crash a minute is added to it."""
 SWITCH = 0.0005
 """s after which the log's thread must let the bridge go on; Python's 5 ms would be seen in the latency."""
+TELL = 0.2
+"""s between looks at what there is to say on the terminal."""
 LOG_LOOK_US = 1_000_000
 """µs between looks at how the log is."""
 
@@ -80,8 +85,14 @@ def drive(pipeline: Pipeline, edge: Edge, log: TlogWriter | None, after: Callabl
         after(event.time_us)
 
 
-def run(path: Path) -> None:
+def run(path: Path, *, aloud: bool = False) -> None:
     """Attach to the sensor and the link that a ``bridge.toml`` names, until stopped by a signal.
+
+    Parameters
+    ----------
+    path : Path
+    aloud : bool
+        Say on stderr, too, what is said over the link.
 
     Raises
     ------
@@ -92,6 +103,9 @@ def run(path: Path) -> None:
     keeper = Keeper(config)
     clock = Clock()
     pipeline = set_up(config, keeper.start(clock.now_us()))
+    if aloud:
+        said = pipeline.component.announcer.said
+        Thread(target=_say, args=(said,), name="voice", daemon=True).start()
     sensor = SerialPort(config.sensor.port, config.sensor.baudrate)
     link = open_link(config.link.url, config.link.baudrate, str(config.path))
     # the link first: that the sensor's port does not open must find somebody to be told to
@@ -116,6 +130,14 @@ def run(path: Path) -> None:
         edge.close()
         if log is not None:
             log.close()
+
+
+def _say(texts: deque[str]) -> None:
+    """Tell a terminal; on a thread of its own, because one that hangs must not hold up the bridge."""
+    while True:
+        while texts:
+            print(f"magbridge: {texts.popleft()}", file=sys.stderr, flush=True)
+        time.sleep(TELL)
 
 
 def _open_log(config: Config, edge: LiveEdge) -> TlogWriter | None:

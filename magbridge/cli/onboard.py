@@ -51,9 +51,12 @@ def run(*, config: Path) -> None:
     """
     from magbridge.bridge.run import run as attach
 
-    if sys.stderr.isatty():
-        print(f"{config}: running until Ctrl-C; what there is to say is said over the link", file=sys.stderr)
-    attach(config)
+    aloud = sys.stderr.isatty()
+    if aloud:
+        print(
+            f"{config}: running until Ctrl-C; what is said over the link is said here, too", file=sys.stderr
+        )
+    attach(config, aloud=aloud)
 
 
 @app.command(usage="Usage: magbridge replay FILE... [--config bridge.toml] [OPTIONS]")

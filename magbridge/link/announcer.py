@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import deque
+
 from magbridge.link.outbox import Outbox
 from magbridge.link.timers import Timers
 from magbridge.mavlink.dialect import MAV_SEVERITY
@@ -10,20 +12,30 @@ __all__ = ["Announcer"]
 
 CHUNK = 50
 """Characters in one STATUSTEXT."""
+LATELY = 32
+"""Texts that are kept for a terminal."""
 PAUSE_US = 1_000_000
 """us; a state that flaps is told once a second, and always its last word."""
 
 
 class Announcer:
-    """Says things, and changes of state only when they change."""
+    """Says things, and changes of state only when they change.
+
+    Attributes
+    ----------
+    said : deque of str
+        The last things said: whoever takes them out may tell them elsewhere, too.
+    """
 
     def __init__(self, outbox: Outbox, timers: Timers) -> None:
         self._outbox, self._timers = outbox, timers
-        self._said: dict[str, tuple[str, int]] = {}
+        self.said: deque[str] = deque(maxlen=LATELY)
+        self._last: dict[str, tuple[str, int]] = {}
         self._number = 0
 
     def say(self, text: str, severity: MAV_SEVERITY = MAV_SEVERITY.INFO) -> None:
         """Send `text`, in pieces where it is long; what is not ASCII becomes a question mark."""
+        self.said.append(text)
         data = text.encode("ascii", "replace")
         pieces = [data[i : i + CHUNK] for i in range(0, len(data), CHUNK)]
         if len(pieces) > 1:
@@ -42,7 +54,7 @@ class Announcer:
     def state(self, key: str, text: str, severity: MAV_SEVERITY = MAV_SEVERITY.INFO) -> None:
         """Say that the state of `key` is now `text`, unless that was the last thing said of it."""
         now_us = self._outbox.codec.now_us
-        said, when_us = self._said.get(key, ("", now_us - PAUSE_US))
+        said, when_us = self._last.get(key, ("", now_us - PAUSE_US))
         timer = f"say {key}"
         self._timers.cancel(timer)
         if said == text:
@@ -50,5 +62,5 @@ class Announcer:
         if now_us - when_us < PAUSE_US:
             self._timers.at(timer, when_us + PAUSE_US, lambda _: self.state(key, text, severity))
             return
-        self._said[key] = text, now_us
+        self._last[key] = text, now_us
         self.say(text, severity)
