@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from magbridge.errors import FormatError, OutOfRange
 from magbridge.field.earth import metres_per_degree
+from magbridge.field.spline import WEIGHTS, coefficients, weights
 from magbridge.files import atomic_path
 
 __all__ = ["AnomalyGrid", "Local"]
@@ -28,14 +29,8 @@ EVEN = 1e-3  # of a step: what rounded coordinates may deviate from an even spac
 HOLE = 9.9e4  # nT: beyond any anomaly; 99999 and 1.7e38 are how formats without NaN write a hole
 FLAT = 1e-6  # nT: what rounding leaves of a plane
 NOT_AN_ANOMALY = 15_000.0  # nT: a median this large is the whole field, not what is left of it
-PAD = 16  # nodes: an influence of a cubic spline's end that far in is 1e-9
 
-# Cubic B-spline on a uniform axis: weights of four nodes as cubics in the fraction t, powers t⁰ t¹ t² t³.
-VALUE = np.array([[1, -3, 3, -1], [4, 0, -6, 3], [1, 3, 3, -3], [0, 0, 0, 1]]) / 6.0
-SLOPE = np.array([[-3, 6, -3, 0], [0, -12, 9, 0], [3, 6, -9, 0], [0, 0, 3, 0]]) / 6.0
-CURVATURE = np.array([[6, -6, 0, 0], [-12, 18, 0, 0], [6, -18, 0, 0], [0, 6, 0, 0]]) / 6.0
 DOWN, ACROSS = [0, 1, 0, 2, 1, 0], [0, 0, 1, 0, 1, 2]  # which derivative of each, for Local's six
-WEIGHTS = np.concatenate([VALUE, SLOPE, CURVATURE])  # (12, 4) times powers of t
 
 
 class Local(NamedTuple, Generic[T]):
@@ -122,11 +117,11 @@ class AnomalyGrid:
 
     @cached_property
     def _coefficients(self) -> Array:
-        return _spline(filled(self.anomaly))
+        return coefficients(filled(self.anomaly))
 
     @cached_property
     def _vertical(self) -> Array | None:
-        return None if self.vertical is None else _spline(self.vertical)
+        return None if self.vertical is None else coefficients(self.vertical)
 
     def look_up(self, longitude: float, latitude: float, depth: float = nan) -> Local[float]:
         """Return the map around one place, all NaN off the map; the fast path of the filter.
@@ -191,7 +186,7 @@ class AnomalyGrid:
         i = np.minimum(v.astype(np.intp), rows - 1)
         inside &= self._whole[i, j]
         s, t = u - j, v - i
-        across, along = _weights(s), _weights(t)
+        across, along = weights(s), weights(t)
         wide = self._coefficients.shape[1]
         window = (wide * i + j) + (wide * np.arange(4)[:, None] + np.arange(4))[..., None]
         patch = self._coefficients.ravel()[window]
@@ -325,20 +320,3 @@ def _axis(values: ArrayLike, name: str, what: str) -> tuple[Array, bool]:
     if step <= 0.0 or np.abs(axis - even).max() > EVEN * step:
         raise FormatError(name, "expected evenly spaced coordinates in order", column=what)
     return even, flip
-
-
-def _spline(values: Array) -> Array:
-    """Return B-spline coefficients (ny + 2, nx + 2): one beyond each edge, the curvature there being zero."""
-    from scipy.ndimage import spline_filter  # noqa: PLC0415  the live path runs without scipy
-
-    pad = [(min(PAD, n - 1),) * 2 for n in values.shape]
-    padded = np.pad(values, pad, mode="reflect", reflect_type="odd")
-    coefficients: Array = spline_filter(padded, order=3, mode="mirror")
-    (a, _), (b, _) = pad
-    return np.ascontiguousarray(coefficients[a - 1 : -a + 1 or None, b - 1 : -b + 1 or None])
-
-
-def _weights(t: Array) -> Array:
-    """Return value, slope and curvature weights of four nodes, (3, 4, n): n last, along which memory runs."""
-    weights: Array = (WEIGHTS @ np.stack([np.ones_like(t), t, t * t, t * t * t])).reshape(3, 4, -1)
-    return weights

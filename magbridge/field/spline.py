@@ -1,0 +1,35 @@
+"""Cubic B-splines through the nodes of a uniform grid: their coefficients, and what four nodes weigh between them."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["WEIGHTS", "coefficients", "weights"]
+
+Array = NDArray[np.float64]
+
+PAD = 16  # nodes: an influence of a cubic spline's end that far in is 1e-9
+
+# Cubic B-spline on a uniform axis: weights of four nodes as cubics in the fraction t, powers t⁰ t¹ t² t³.
+VALUE = np.array([[1, -3, 3, -1], [4, 0, -6, 3], [1, 3, 3, -3], [0, 0, 0, 1]]) / 6.0
+SLOPE = np.array([[-3, 6, -3, 0], [0, -12, 9, 0], [3, 6, -9, 0], [0, 0, 3, 0]]) / 6.0
+CURVATURE = np.array([[6, -6, 0, 0], [-12, 18, 0, 0], [6, -18, 0, 0], [0, 6, 0, 0]]) / 6.0
+WEIGHTS = np.concatenate([VALUE, SLOPE, CURVATURE])  # (12, 4) times powers of t
+
+
+def coefficients(values: Array) -> Array:
+    """Return B-spline coefficients (ny + 2, nx + 2): one beyond each edge, the curvature there being zero."""
+    from scipy.ndimage import spline_filter  # noqa: PLC0415  the live path runs without scipy
+
+    pad = [(min(PAD, n - 1),) * 2 for n in values.shape]
+    padded = np.pad(values, pad, mode="reflect", reflect_type="odd")
+    found: Array = spline_filter(padded, order=3, mode="mirror")
+    (a, _), (b, _) = pad
+    return np.ascontiguousarray(found[a - 1 : -a + 1 or None, b - 1 : -b + 1 or None])
+
+
+def weights(t: Array) -> Array:
+    """Return value, slope and curvature weights of four nodes, (3, 4, n): n last, along which memory runs."""
+    found: Array = (WEIGHTS @ np.stack([np.ones_like(t), t, t * t, t * t * t])).reshape(3, 4, -1)
+    return found
