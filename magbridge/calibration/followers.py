@@ -182,10 +182,13 @@ class ClockEffect(Effect, frozen=True, kw_only=True):
     Attributes
     ----------
     cause : str
+    sign : float
+        -1: by which the field's samples lag behind the telemetry, as a filter's do.
     """
 
     kind: ClassVar[str] = "clock"
     cause: str = "clock_offset"
+    sign: float = 1.0
 
     @property
     def size(self) -> int:
@@ -194,7 +197,7 @@ class ClockEffect(Effect, frozen=True, kw_only=True):
 
     def columns(self, field: float) -> FloatArray:  # noqa: ARG002  (others need it)
         """Nine regressors, the rates of the nine coefficients, under one coefficient."""
-        return np.eye(9)[None]
+        return self.sign * np.eye(9)[None]
 
     def begin(self, calibration: Calibration) -> Step:
         """Return a stepper; rates are differences to the sample before."""

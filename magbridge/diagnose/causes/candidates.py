@@ -44,6 +44,8 @@ class Candidate:
         Independent hypotheses that stand behind this one (frequencies searched).
     positive : bool
         Its coefficients cannot be negative.
+    narrow : float
+        Log of how much narrower than their grid's cells the data hold its nonlinear parameters.
     parts : int
         Regressors that it was put together from, one after the other.
     spectra : (l, k) array or None
@@ -62,6 +64,7 @@ class Candidate:
     again: Callable[..., Candidate] | None = None
     trials: float = 1.0
     positive: bool = False
+    narrow: float = 0.0
     parts: int = 1
     spectra: FloatArray | None = None
 
@@ -90,6 +93,7 @@ class Candidate:
             effects=self.effects + other.effects,
             shape=self.shape | {name + mark: value for name, value in other.shape.items()},
             again=None,
+            narrow=self.narrow + other.narrow,
             parts=self.parts + other.parts,
         )
 

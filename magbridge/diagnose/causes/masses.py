@@ -24,6 +24,8 @@ MANY = 12
 """Monomials that are tried together."""
 POWERS = 4
 """Of one mass, beyond those that its polynomial has, that are tried together."""
+FALLS = (1.0, 0.3)
+"""Of a field's series, from order to order."""
 BRANCH = 3
 """Order of a curved branch: what lies beyond the polynomial's own is a function of the position."""
 
@@ -60,7 +62,8 @@ def _powers(values: FloatArray, centre: float, scale: float, order: int, rows: s
 def actuator_order(problem: Problem) -> list[Candidate]:
     """A modelled mass needs a power or a cross term that its polynomial lacks: ``T += b prod x_k^e_k`` (paper, eq. 8).
 
-    One term, or all of the next order, or a curve of one mass: its next powers, and across them the others.
+    One term; or all of the next order, or a curve of one mass, its next powers and across them the others: those are more
+    numbers than anyone believes in, and have one common size, which falls from order to order as a field's series does.
     """
     calibration = problem.calibration
     k = len(calibration.parameters)
@@ -69,17 +72,27 @@ def actuator_order(problem: Problem) -> list[Candidate]:
     present = {e for term in calibration.terms if isinstance(term, Polynomial) for e in term.exponents}
     highest = max(sum(e) for e in present)
     missing = [e for e in full_order(k, highest + 1) if e not in present]
-    groups = [missing] if 1 < len(missing) <= MANY else []
-    for i in range(k):
-        own = [
-            tuple(power * (i == j) for j in range(k)) for power in range(highest + 1, highest + POWERS + 1)
-        ]
-        groups.append([*own, *(e for e in missing if e[i] == highest)])
-    made = {e: _monomial(problem, e) for e in {*missing, *(e for group in groups for e in group)}}
+    own = [
+        [tuple(power * (i == j) for j in range(k)) for power in range(highest + 1, highest + POWERS + 1)]
+        for i in range(k)
+    ]
+    curves = [[*powers_, *(e for e in missing if e[i] == highest)] for i, powers_ in enumerate(own)]
+    next_ = [e for e in full_order(k, highest + 2) if e not in present]
+    series = sorted({*(next_ if len(next_) <= MANY else missing), *(e for curve in own for e in curve)})
+    made = {e: _monomial(problem, e) for e in series}
+    groups = [[made[e] for e in group] for group in ([missing] if 1 < len(missing) <= MANY else []) + curves]
     return [
         *(made[e] for e in missing),
-        *(replace(reduce(Candidate.with_, [made[e] for e in group]), parts=1) for group in groups),
+        *(replace(reduce(Candidate.with_, group), parts=1) for group in groups),
+        _series([made[e] for e in series], series),
     ]
+
+
+def _series(terms: list[Candidate], exponents: list[tuple[int, ...]]) -> Candidate:
+    """Terms of one series, three numbers each."""
+    orders = np.repeat([float(sum(e)) for e in exponents], 3)
+    spectra = np.array([fall ** (2.0 * (orders - orders.min())) for fall in FALLS])
+    return replace(reduce(Candidate.with_, terms), parts=1, spectra=spectra)
 
 
 def _monomial(problem: Problem, exponents: tuple[int, ...]) -> Candidate:

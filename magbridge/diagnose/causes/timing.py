@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from magbridge.calibration.followers import ClockEffect
 from magbridge.calibration.instrument import RateEffect
 from magbridge.diagnose.causes.candidates import AXES, Candidate, of_effect
-from magbridge.diagnose.compare.problem import Columns, Problem, effect_columns
+from magbridge.diagnose.compare.problem import Problem
 
 __all__ = ["channel_skew", "clock_offset", "eddy_current", "field_rates", "filter_lag", "mass_rates"]
 
@@ -69,32 +69,19 @@ def filter_lag(problem: Problem) -> list[Candidate]:
     """The anti-alias filter holds the field back against the telemetry: ``T += -tau dH/dt`` (paper, section 3).
 
     In a uniform field ``|H|`` does not see it but where masses move: ``u^T A dH_r/dt = -dF/dtheta dtheta/dt``, the
-    signature of a clock that is off the other way. What tells them apart is that no filter runs ahead.
+    signature of a clock that is off the other way, and mended by the same. What tells them apart is that no filter runs
+    ahead.
     """
-    if not problem.calibration.parameters:
-        return []
-    columns = _delay(problem)
-    effect = RateEffect(cause="filter_lag", on="lag")
-    width = np.array([2.0])
-    return [
-        Candidate(
-            "filter_lag", None, lambda rows: -width * columns(rows), width, ("delay",), ("s",), (effect,), positive=True
-        )
-    ]  # fmt: skip
+    return _delay(problem, ClockEffect(cause="filter_lag", sign=-1.0), 2.0, positive=True)
 
 
 def clock_offset(problem: Problem) -> list[Candidate]:
     """Telemetry stamped by another clock: ``theta += tau dtheta/dp dp/dt``."""
+    return _delay(problem, ClockEffect(), 5.0)
+
+
+def _delay(problem: Problem, effect: ClockEffect, width: float, *, positive: bool = False) -> list[Candidate]:
     if not problem.calibration.parameters:
         return []
-    columns = _delay(problem)
-    width = np.array([5.0])
-    return [
-        Candidate(
-            "clock_offset", None, lambda rows: width * columns(rows), width, ("delay",), ("s",), (ClockEffect(),)
-        )
-    ]  # fmt: skip
-
-
-def _delay(problem: Problem) -> Columns:
-    return effect_columns(problem, ClockEffect(), mass_rates(problem))
+    phi = mass_rates(problem)
+    return [of_effect(problem, effect, width, "s", names=("delay",), phi=phi, positive=positive)]

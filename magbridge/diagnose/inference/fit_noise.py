@@ -8,7 +8,7 @@ from scipy.special import gammaln
 
 from magbridge.diagnose.inference.noise import Noise
 
-__all__ = ["TAILS", "fit_noise", "memory_order"]
+__all__ = ["TAILS", "certainty", "fit_noise", "memory_order"]
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -51,6 +51,26 @@ def memory_order(residual: FloatArray, follows: BoolArray) -> int:
         left = r[rows] - (lags[:, :p] @ np.linalg.lstsq(lags[:, :p], r[rows], rcond=None)[0] if p else 0.0)
         costs.append(n * np.log(left @ left / n + 1e-300) + 2.0 * p)
     return max(1, ORDERS[int(np.argmin(costs))])
+
+
+def certainty(residual: FloatArray, noise: Noise) -> float:
+    r"""Degrees of freedom of the noise's level at the lowest frequencies, where slow causes lie.
+
+    Notes
+    -----
+    The level is ``S_0 = s^2 / (1 - sum a)^2``, and coefficients a that were fitted have the covariance C = (L^T L)^-1 of their
+    regression, L the residuals before in units of s:
+
+    .. math:: \operatorname{var} \ln S_0 = \frac{2}{n} + \frac{4\, 1^T C\, 1}{(1 - \sum a)^2}
+
+    An estimate of f degrees of freedom has the variance 2 / f.
+    """
+    rows = np.flatnonzero(noise.past)
+    if len(rows) <= 2 * len(noise.memory):
+        return float(len(residual))
+    lags = np.array([residual[rows - k] for k in range(1, len(noise.memory) + 1)]) / noise.scale[rows]
+    covariance = np.linalg.pinv(lags @ lags.T)
+    return 2.0 / float(2.0 / len(residual) + 4.0 * covariance.sum() / (1.0 - noise.memory.sum()) ** 2)
 
 
 def fit_noise(

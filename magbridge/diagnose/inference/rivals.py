@@ -17,11 +17,30 @@ __all__ = ["Rival", "rivals_of"]
 
 @dataclass(frozen=True)
 class Rival:
-    """What could stand in a cause's place: its name, and by how much log evidence it loses."""
+    """What could stand in a cause's place: the best of its name and channel.
 
-    cause: str
-    channel: str | None
+    Attributes
+    ----------
+    candidate : Candidate
+    behind : float
+        Log evidence by which it loses.
+    cheaper : float
+        ... and what of that its nonlinear parameters have less to pay: a cause's evidence is its average over the grid.
+    """
+
+    candidate: Candidate
     behind: float
+    cheaper: float
+
+    @property
+    def cause(self) -> str:
+        """Its name."""
+        return self.candidate.cause
+
+    @property
+    def channel(self) -> str | None:
+        """What it follows."""
+        return self.candidate.channel
 
 
 def rivals_of(
@@ -44,10 +63,8 @@ def rivals_of(
         candidate, s = state.candidates[member], scores[member]
         if group == key(model[k]) or group[0] in {other.cause for other in model if other is not model[k]}:
             continue
-        # both pay for their nonlinear parameters: a cause's evidence is its average over the grid
-        behind = (
-            mine.evidence + paid - s.evidence - average + float(np.log(candidate.trials / model[k].trials))
-        )
-        if behind < lead(mine.ratio) and state.p_value(candidate, s.ratio, s.freedom) < LEVEL:
-            rivals.append(Rival(*group, behind))
+        cheaper = average - paid - float(np.log(candidate.trials / model[k].trials))
+        behind = mine.evidence - s.evidence - cheaper
+        if behind < lead(mine.ratio) and state.p_value(candidate, s.ratio, s.freedom, base) < LEVEL:
+            rivals.append(Rival(candidate, behind, cheaper))
     return tuple(sorted(rivals, key=lambda rival: rival.behind))

@@ -7,13 +7,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import fdtrc
 
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.compare.problem import Problem
+from magbridge.diagnose.inference.fit_noise import certainty
 from magbridge.diagnose.inference.information import Information, information
 from magbridge.diagnose.inference.joint import RIDGE, Joint, fit_joint, volume_of
-from magbridge.diagnose.inference.weigh import Score, score, slices, trials, weigh
+from magbridge.diagnose.inference.weigh import Score, evidence_of, score, slices, trials
 
 __all__ = ["Hypothesis", "State", "key"]
 
@@ -80,6 +81,8 @@ class State:
         self.columns = [candidate.columns for candidate in self.candidates]
         self.trials: dict[str, float] = {}
         self.blocks: bool | None = None
+        self.certain = np.inf
+        self.last: tuple[Joint | None, Information | None] = None, None
         self.own: Information
         self.bare: Information
         self.groups: dict[tuple[str, str | None], list[int]] = {}
@@ -132,6 +135,17 @@ class State:
         found = [self._joint(model, base, entries) for entries in listed[:SHORT_LIST]]
         return sorted(found, key=lambda h: -h.evidence)
 
+    def beside(self, model: Sequence[Candidate], base: Joint) -> Information:
+        """Information of all candidates, those of `model` at the end, under its noise; only the calibration projected out."""
+        known, info = self.last
+        if known is not base:
+            bare = replace(base, coefficients=np.empty(0), prior=base.prior[: len(base.z)])
+            columns = [*self.columns, *(candidate.columns for candidate in model)]
+            info = information(self.problem, base.noise, bare, [], columns)
+            self.last = base, info
+        assert info is not None
+        return info
+
     def _bare(self, model: list[Candidate], base: Joint, info: Information) -> Information:
         """Score again under the noise that is left when the best of every cause takes what it can."""
         top: dict[str, tuple[float, int]] = {}
@@ -152,6 +166,8 @@ class State:
             ridge=1.0,
             rounds=1,
         )
+        if not model:
+            self.certain = certainty(everything.left, everything.noise)
         return information(self.problem, everything.noise, base, [c.columns for c in model], self.columns)
 
     def _joint(
@@ -171,29 +187,36 @@ class State:
             # a gain that is not the effect's own, but of a noise that found another optimum beside it
             ratio = min(ratio, own_ratio(fit, candidate))
             freedom = mine[0][2].freedom
-            p_value = self.p_value(candidate, ratio, freedom)
-            evidence = weigh(ratio, freedom) + mine[0][1] - float(np.log(candidate.trials))
+            p_value = self.p_value(candidate, ratio, freedom, fit)
+            evidence = evidence_of(candidate, ratio, freedom) + mine[0][1] - float(np.log(candidate.trials))
             found.append(Hypothesis(candidate, ratio, evidence, p_value, fit))
         return max(found, key=lambda h: h.evidence)
 
-    def p_value(self, candidate: Candidate, ratio: float, freedom: int) -> float:
-        """Of a likelihood ratio, times the hypotheses behind its cause, times the causes."""
+    def p_value(self, candidate: Candidate, ratio: float, freedom: int, fit: Joint | None = None) -> float:
+        """Of a likelihood ratio, times the hypotheses behind its cause, times the causes.
+
+        The noise's level is an estimate, so the distribution is Fisher's F: the level that `fit` leaves, or what is left when
+        every cause takes what it can.
+        """
         tests = self.trials.get(candidate.cause, 1.0) * self.causes
-        return min(1.0, tests * float(chi2.sf(ratio, max(freedom, 1))))
+        certain = self.certain if fit is None else certainty(fit.left, fit.noise)
+        return min(1.0, tests * float(fdtrc(max(freedom, 1), certain, ratio / max(freedom, 1))))
 
     def sharpen(self, model: list[Candidate], hypothesis: Hypothesis, base: Joint) -> Hypothesis:
         """Profile the nonlinear parameters between the grid's points, one after the other.
 
         Under the noise that stands, where many values are scored at once: a likelihood has more than one peak in an onset.
+        What the evidence's average over the bracket lacks to its peak is what knowing them better costs.
         """
         best = hypothesis
         again = best.candidate.again
         if again is None:
             return best
         columns = [candidate.columns for candidate in model]
+        narrow = 0.0
         for position, name in enumerate(best.candidate.shape):
             low, high = self._bracket(best.candidate, name)
-            for _ in range(STAGES):
+            for stage in range(STAGES):
                 values = np.linspace(low, high, max(SHARPEN // best.candidate.size, 4) + 2)
                 made = []
                 for value in values[1:-1]:
@@ -202,7 +225,13 @@ class State:
                     made.append(again(*shape))
                 info = information(self.problem, best.fit.noise, base, columns, [c.columns for c in made])
                 scores = [score(info, at, made[0]) for at in slices(made)]
-                k = int(np.argmax([s.ratio for s in scores]))
+                ratios = np.array([s.ratio for s in scores])
+                k = int(np.argmax(ratios))
+                if not stage:
+                    share = 2.0 * float(
+                        np.mean(np.exp(0.5 * (ratios - ratios[k])))
+                    )  # of a cell: two are between
+                    narrow -= min(float(np.log(share)), 0.0)
                 low, high = values[k], values[k + 2]
             at = slices(made)[k]
             start = np.append(
@@ -218,7 +247,7 @@ class State:
                     ratio=best.ratio + gain,
                     evidence=best.evidence + 0.5 * gain,
                 )
-        return best
+        return replace(best, candidate=replace(best.candidate, narrow=narrow))
 
     def _bracket(self, candidate: Candidate, name: str) -> tuple[float, float]:
         """Between which values of one nonlinear parameter its grid leaves a candidate free."""

@@ -15,7 +15,7 @@ noise that is left, the other causes projected out.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,11 +23,11 @@ from numpy.typing import NDArray
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.fit_noise import memory_order
-from magbridge.diagnose.inference.information import Information, information
+from magbridge.diagnose.inference.information import Information
 from magbridge.diagnose.inference.joint import Joint, fit_joint
 from magbridge.diagnose.inference.rivals import Rival, rivals_of
 from magbridge.diagnose.inference.rounds import Hypothesis, State, key
-from magbridge.diagnose.inference.weigh import LEVEL, ODDS, REMNANT, lead, score, slack, weigh
+from magbridge.diagnose.inference.weigh import LEVEL, ODDS, REMNANT, evidence_of, lead, score, slack, weigh
 
 __all__ = ["Hypothesis", "Outcome", "search", "worth"]
 
@@ -35,6 +35,8 @@ FloatArray = NDArray[np.float64]
 
 MOST = 6
 """Regressors in one log."""
+EXCHANGES = 3
+"""Rivals that are tried in a cause's place."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,25 +95,26 @@ def search(problem: Problem, candidates: Sequence[Candidate], causes: int) -> Ou
     model, base = _chain(state, null, first)
     together = _together(state) if first else []
 
-    def better(fit: Joint, others: Sequence[Candidate]) -> bool:
-        gained = [2.0 * (one.log_likelihood - null.log_likelihood) for one in (fit, base)]
-        return worth(gained[0], others, state.trials) > worth(gained[1], model, state.trials)
+    def value(model: Sequence[Candidate], fit: Joint) -> float:
+        # what an idealised regressor leaves is not yet another cause
+        ratio, causes = 2.0 * (fit.log_likelihood - null.log_likelihood), {c.cause for c in model}
+        narrow = sum(candidate.narrow for candidate in model)
+        return worth(ratio, model, state.trials) - narrow - len(causes) * slack(ratio)
 
-    if together and {key(c) for c in together} != {key(c) for c in model}:
-        # one after the other may have gone astray where several causes act
-        other = state.fit(together, rounds=6)
-        if better(other, together):
-            model, base = _refined(state, together, other)
+    found = [_exchanged(state, model, base, null)] if model else [(model, base)]
+    if together and (model or len(together) > 1) and {key(c) for c in together} != {key(c) for c in model}:
+        # one after the other may have gone astray where several causes act; a single one has had its test
+        found.append(_exchanged(state, *_refined(state, together, state.fit(together, rounds=6)), null))
+    model, base = max(found, key=lambda entry: value(*entry))
     if len({candidate.cause for candidate in model}) > 1:
         alone = _enough(state, first)
-        if alone is not None and better(alone.fit, [alone.candidate]):
+        if alone is not None and value([alone.candidate], alone.fit) > value(model, base):
             alone = state.sharpen([], alone, null)
             model, base = [alone.candidate], alone.fit
     chosen, base = _remove(state, model, base, null)
-    bare = replace(base, coefficients=np.empty(0), prior=base.prior[: len(base.z)])
-    columns = [*state.columns, *(h.candidate.columns for h in chosen)]
-    info = information(problem, base.noise, bare, [], columns) if chosen or not first else state.own
-    rivals = tuple(rivals_of(state, info, [h.candidate for h in chosen], base, k) for k in range(len(chosen)))
+    model = [h.candidate for h in chosen]
+    info = state.beside(model, base) if chosen or not first else state.own
+    rivals = tuple(rivals_of(state, info, model, base, k) for k in range(len(chosen)))
     return Outcome(tuple(chosen), rivals, null, base, order, tested, info, state.trials)
 
 
@@ -119,11 +122,22 @@ def worth(ratio: float, model: Sequence[Candidate], trials: Mapping[str, float])
     """Log evidence of a whole model of this likelihood ratio.
 
     Every regressor pays for the hypotheses behind it that it was chosen from, and those after the first for the odds that
-    so much goes wrong in one log, and for their choice among the causes.
+    so much goes wrong in one log, and for their choice among the causes. How narrowly the data then hold the nonlinear
+    parameters counts between names alone: a free description is profiled, too, and pays nothing for it.
     """
     further = max(sum(candidate.parts for candidate in model) - 1, 0) * (ODDS + float(np.log(len(trials))))
     grids = sum(candidate.parts * float(np.log(trials[candidate.cause])) for candidate in model)
-    return weigh(ratio, sum(candidate.freedom for candidate in model)) - further - grids
+    return _evidence(ratio, model) - further - grids
+
+
+def _evidence(ratio: float, model: Sequence[Candidate]) -> float:
+    """Log evidence of a whole model, its nonlinear parameters given."""
+    free = sum(candidate.size for candidate in model if candidate.spectra is None)
+    sided = float(np.log(2.0)) * sum(candidate.positive for candidate in model)
+    spectra = sum(
+        float(np.log(len(candidate.spectra))) for candidate in model if candidate.spectra is not None
+    )
+    return (weigh(ratio, free) if free else 0.5 * ratio) + sided - spectra
 
 
 def _chain(state: State, null: Joint, first: list[Hypothesis]) -> tuple[list[Candidate], Joint]:
@@ -132,7 +146,12 @@ def _chain(state: State, null: Joint, first: list[Hypothesis]) -> tuple[list[Can
     base, found = null, first
     heard: dict[str, float] = {}
     for _ in range(MOST):
-        best = _next(found, heard, 2.0 * (base.log_likelihood - null.log_likelihood))
+        # numbers of one common size are a whole: it neither grows nor is a part
+        whole = {c.cause for c in model if c.spectra is not None}
+        grown = [
+            h for h in found if h.candidate.cause not in (whole if h.candidate.spectra is None else heard)
+        ]
+        best = _next(grown, heard, 2.0 * (base.log_likelihood - null.log_likelihood))
         if best is None:
             break
         best = state.sharpen(model, best, base)
@@ -212,6 +231,41 @@ def _refined(state: State, model: list[Candidate], base: Joint) -> tuple[list[Ca
     return model, base
 
 
+def _exchanged(
+    state: State, model: list[Candidate], base: Joint, null: Joint
+) -> tuple[list[Candidate], Joint]:
+    """Put a rival in a cause's place, profiled there, as long as the evidence of the whole grows.
+
+    What was found first was chosen without what was found later.
+    """
+
+    def evidence(model: Sequence[Candidate], fit: Joint) -> float:
+        ratio = 2.0 * (fit.log_likelihood - null.log_likelihood)
+        return _evidence(ratio, model) - sum(candidate.narrow for candidate in model)
+
+    for _ in range(MOST):
+        info, own = state.beside(model, base), evidence(model, base)
+        tried = []
+        for k in range(len(model)):
+            best: dict[str, Rival] = {}
+            for rival in rivals_of(state, info, model, base, k):
+                best.setdefault(rival.cause, rival)
+            best.pop(model[k].cause, None)
+            others = model[:k] + model[k + 1 :]
+            rest = state.fit(others) if best else base
+            for rival in list(best.values())[:EXCHANGES]:
+                fit = state.fit([*others, rival.candidate], like=base)
+                ratio = 2.0 * (fit.log_likelihood - rest.log_likelihood)
+                there = state.sharpen(others, Hypothesis(rival.candidate, ratio, 0.0, 0.0, fit), rest)
+                changed = [*others, there.candidate]
+                tried.append((evidence(changed, there.fit) + rival.cheaper - own, changed, there.fit))
+        gain, *_ = better = max(tried, key=lambda entry: entry[0], default=(0.0, model, base))
+        if gain <= 0.0:
+            break
+        _, model, base = better
+    return model, base
+
+
 def _next(found: list[Hypothesis], heard: Mapping[str, float], ratio: float) -> Hypothesis | None:
     """Pick the best that passes the test; of what idealised regressors may have left, only more of the same cause.
 
@@ -224,13 +278,7 @@ def _next(found: list[Hypothesis], heard: Mapping[str, float], ratio: float) -> 
     def left(cause: str) -> float:
         return REMNANT * max((size for other, size in heard.items() if other != cause), default=0.0)
 
-    sure = [
-        h
-        for h in found
-        if h.p_value < LEVEL
-        and h.signal_to_noise >= left(h.candidate.cause)
-        and not (h.candidate.cause in heard and h.candidate.spectra is not None)
-    ]
+    sure = [h for h in found if h.p_value < LEVEL and h.signal_to_noise >= left(h.candidate.cause)]
     if not sure:
         return None
     near = sure[0].evidence - lead(sure[0].ratio)
@@ -260,13 +308,13 @@ def _remove(state: State, model: list[Candidate], base: Joint, null: Joint) -> t
         own, others = model[k], model[:k] + model[k + 1 :]
         without = state.fit(others) if others else null
         ratio = max(0.0, 2.0 * (base.log_likelihood - without.log_likelihood))
-        p_value = state.p_value(own, ratio, own.freedom)
+        p_value = state.p_value(own, ratio, own.freedom, base)
         if p_value >= LEVEL:
             model, base, chosen, k = others, without, [], 0
             continue
         c, at = base.coefficients, sum(candidate.size for candidate in model[:k])
         last = np.concatenate([c[:at], c[at + own.size :], c[at : at + own.size]])
         fit = state.fit([*others, own], np.append(base.z, last), plain=False, like=base, rounds=1)
-        chosen.append(Hypothesis(own, ratio, weigh(ratio, own.freedom), p_value, fit))
+        chosen.append(Hypothesis(own, ratio, evidence_of(own, ratio, own.freedom), p_value, fit))
         k += 1
     return chosen, base

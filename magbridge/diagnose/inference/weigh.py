@@ -10,6 +10,10 @@ likelihood ratio would be. Nobody knows beforehand how large an effect is, so it
 *Test.* A cause's p-value is that of its likelihood ratio, times the number of independent hypotheses N behind it: under
 no effect scores are ``N(0, S)``, so the smallest p-value over its grid is simulated from S, and ``N = 1 / E[p_min] - 1``.
 Times the number of causes, below 1 %: found.
+
+Two kinds have a prior of their own. Numbers of one common size (:mod:`.statistic`) have had theirs in the ratio: the evidence
+is R / 2, less the log of how many spectra it was chosen from. A number that cannot be negative has half a Gaussian, twice
+as dense: ``log 2 Phi(sqrt(R))`` more.
 """
 
 from __future__ import annotations
@@ -19,6 +23,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import log_ndtr
 from scipy.stats import chi2
 
 from magbridge.diagnose.causes.candidates import Candidate
@@ -31,6 +36,7 @@ __all__ = [
     "ODDS",
     "REMNANT",
     "Score",
+    "evidence_of",
     "lead",
     "score",
     "slack",
@@ -77,11 +83,19 @@ def score(info: Information, at: slice, candidate: Candidate) -> Score:
         return Score(0.0, freedom, 0.0, np.zeros(len(b)), np.ones(len(b)))
     if candidate.spectra is not None:
         best = statistic.best(b)
-        return Score(best.ratio, freedom, weigh(best.ratio, freedom), best.estimate, 1.0 / best.variance)
+        evidence = evidence_of(candidate, best.ratio, freedom)
+        return Score(best.ratio, freedom, evidence, best.estimate, 1.0 / best.variance)
     ratio, values, V = float(statistic.ratio(b[:, None])[0]), statistic.values, statistic.vectors
-    return Score(
-        ratio, freedom, weigh(ratio, freedom), V @ ((V.T @ b) / (values + 1.0)), np.full(len(b), FLAT)
-    )
+    evidence = evidence_of(candidate, ratio, freedom)
+    return Score(ratio, freedom, evidence, V @ ((V.T @ b) / (values + 1.0)), np.full(len(b), FLAT))
+
+
+def evidence_of(candidate: Candidate, ratio: float, freedom: int) -> float:
+    """Log evidence of one candidate's likelihood ratio, by the prior that its numbers have."""
+    if candidate.spectra is not None:
+        return 0.5 * ratio - float(np.log(len(candidate.spectra)))
+    sided = float(np.log(2.0) + log_ndtr(np.sqrt(ratio))) if candidate.positive else 0.0
+    return weigh(ratio, freedom) + sided
 
 
 def weigh(ratio: float, freedom: int) -> float:
