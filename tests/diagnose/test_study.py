@@ -114,7 +114,8 @@ def nameless_chances(apart: float, k: int = 3, wanted: float = 10.0) -> dict[str
     X[27, 30], X[0, 30] = np.sqrt(wanted**2 - apart**2), apart
     X[:, 0] = X[:, 30] / wanted
     draws, name = Draws.of(X.T @ X), Span("other", None, slice(27, 30))
-    needed = against(draws, {"other": allowed(*draws.ratio(name))}, [], {})
+    ratio, freedom = draws.ratio(name)
+    needed = against(draws, {"other": allowed(weigh(ratio, freedom), ratio)}, [], {})
     free = Description(lambda rows: X[rows, :27], (("drift", np.ones(27)),) * 20)
     return nameless(draws, weigh(draws.truth(k), k), needed, [free])
 

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtr
 
 from magbridge.diagnose.inference.statistic import Statistic
 
@@ -83,6 +84,18 @@ def weigh(ratio: Array, freedom: float) -> Array:
         return np.zeros_like(ratio)
     more = np.maximum(ratio, freedom)
     return np.asarray(0.5 * (more - freedom) - 0.5 * freedom * np.log(more / freedom))
+
+
+def evidence(span: Span, ratio: Array, freedom: float) -> Array:
+    """Log evidence of a hypothesis' likelihood ratios; numbers of one common size are integrated out of theirs."""
+    if span.spectra is not None:
+        return 0.5 * ratio - np.log(len(span.spectra))
+    return weigh(ratio, freedom) + signed(span, ratio)
+
+
+def signed(span: Span | None, ratio: Array) -> Array:
+    """Log evidence that a known sign adds: what of the posterior has it, where half of the prior had."""
+    return np.log(2.0 * ndtr(np.sqrt(ratio))) if span and span.positive else np.zeros_like(ratio)
 
 
 def with_another(draws: Draws, first: Span, spans: Sequence[Span]) -> dict[str, tuple[float, Span]]:

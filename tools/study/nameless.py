@@ -32,9 +32,9 @@ from study.draws import Draws, Span, weigh
 Array = NDArray[np.float64]
 
 
-def allowed(ratio: Array, freedom: float) -> Array:
-    """Log evidence of a name, with what its regressor may have missed."""
-    return weigh(ratio, freedom) + 0.5 * IDEAL**2 * ratio
+def allowed(evidence: Array, ratio: Array) -> Array:
+    """Log evidence of a name of a likelihood ratio, with what its regressor may have missed."""
+    return evidence + 0.5 * IDEAL**2 * ratio
 
 
 def against(
@@ -45,7 +45,8 @@ def against(
     for first, second in pairs:
         one, other = draws.ratio(first), draws.beside(first).ratio(second)
         grids = sum(np.log(trials.get(span.cause, 1.0)) for span in (first, second))
-        value = allowed(one[0] + other[0], one[1] + other[1])
+        ratio = one[0] + other[0]
+        value = allowed(weigh(ratio, one[1] + other[1]), ratio)
         found.append(value - grids - ODDS - np.log(max(len(trials), 1)))
     return np.asarray(np.max(found, axis=0) + ODDS)
 

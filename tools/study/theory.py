@@ -29,7 +29,7 @@ from magbridge.diagnose.compare.problem import pose
 from magbridge.diagnose.compare.take import take
 from magbridge.diagnose.inference.free import Description
 from magbridge.diagnose.inference.weigh import LEVEL, ODDS
-from study.draws import Draws, Span, by_cause, explained, numbers, weigh, with_another
+from study.draws import Draws, Span, by_cause, evidence, explained, numbers, signed, weigh, with_another
 from study.nameless import against, allowed, nameless
 from study.stage import Found, Stall, project, whiten
 
@@ -95,7 +95,8 @@ def ideal(one: Found, stall: Stall, ds: xr.Dataset, setting: Setting) -> dict[st
     k = max(numbers(S, own), 1.0) if own else 1.0  # what the log cannot test, nobody names
     given = {span: draws.ratio(span) for span in spans}
     truth = draws.truth(k)
-    weighed = by_cause({span: weigh(*given[span]) for span in spans}, name, weigh(truth, k))
+    own_evidence = weigh(truth, k) + signed(own, truth)
+    weighed = by_cause({span: evidence(span, *given[span]) for span in spans}, name, own_evidence)
     names, table = list(weighed), np.array([*weighed.values()])
     inside, first, me = table > table.max(axis=0) - ODDS, np.argmax(table, axis=0), names.index(name)
     left = {
@@ -119,7 +120,7 @@ def ideal(one: Found, stall: Stall, ds: xr.Dataset, setting: Setting) -> dict[st
     if not setting.free:
         return answers
     pairs = [(best[c], min(found.values(), key=lambda entry: entry[0])[1]) for c, found in left.items()]
-    names = by_cause({span: allowed(*given[span]) for span in rivals})
+    names = by_cause({span: allowed(evidence(span, *given[span]), given[span][0]) for span in rivals})
     needed = against(draws, names, pairs, setting.trials)
     two = min(value for found in left.values() for value, _ in found.values())
     return answers | {"two": two} | nameless(draws, weigh(truth, k), needed, setting.free)
@@ -170,7 +171,7 @@ def _worth(S: Array, span: Span) -> float:
 
 def regressed(given: Mapping[Span, tuple[Array, float]], name: str) -> float:
     """Chance that the table's own regressors name the truth first; causes that are one share it."""
-    table = by_cause({span: weigh(*ratio) for span, ratio in given.items() if span.channel != SHOWN})
+    table = by_cause({span: evidence(span, *ratio) for span, ratio in given.items() if span.channel != SHOWN})
     if name not in table:
         return 0.0
     first = np.array([*table.values()]) > np.max([*table.values()], axis=0) - 1e-6
