@@ -121,7 +121,9 @@ def leftover(
             evidence = min(own, _weighed(problem, columns, fit, order, one, best, shift))
             found.append((evidence, kind, one, best.signal_to_noise))
     evidence, kind, one, size = max(found, key=lambda entry: entry[0])
-    p_value = min(1.0, sum(len(one.widths) for one in listed) * float(chi2.sf(2.0 * max(evidence, 0.0), 1)))
+    # half of a chi-square's tail: a size that cannot be negative is zero as often as not (Self & Liang 1987)
+    tail = 0.5 * float(chi2.sf(2.0 * max(evidence, 0.0), 1))
+    p_value = min(1.0, sum(len(one.widths) for one in listed) * tail)
     # without a name stricter than for a cause: it is the asymptotic distribution
     if p_value >= (LEVEL if model else 0.1 * LEVEL):
         return None
