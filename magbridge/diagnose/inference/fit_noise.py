@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaln
 
+from magbridge.diagnose.compare.problem import Columns
 from magbridge.diagnose.inference.noise import Noise
 
 __all__ = ["TAILS", "certainty", "fit_noise", "memory_order"]
@@ -24,6 +27,8 @@ ALTERNATIONS = 6
 SETTLED = 0.01
 """Log likelihood: less is no gain."""
 FEW = 20
+PIECE, PIECES = 600, 64
+"""Samples by which a column's frequencies are told: pieces this long, so many at most."""
 
 
 def _past(follows: BoolArray, p: int) -> BoolArray:
@@ -53,24 +58,38 @@ def memory_order(residual: FloatArray, follows: BoolArray) -> int:
     return max(1, ORDERS[int(np.argmin(costs))])
 
 
-def certainty(residual: FloatArray, noise: Noise) -> float:
-    r"""Degrees of freedom of the noise's level at the lowest frequencies, where slow causes lie.
+def certainty(residual: FloatArray, noise: Noise, columns: Sequence[Columns]) -> list[float]:
+    r"""Degrees of freedom of the noise's level at the frequencies where each of `columns` has its power.
 
     Notes
     -----
-    The level is ``S_0 = s^2 / (1 - sum a)^2``, and coefficients a that were fitted have the covariance C = (L^T L)^-1 of their
-    regression, L the residuals before in units of s:
+    Coefficients a that were fitted have the covariance ``C = (L^T L)^-1`` of their regression, L the residuals before in units
+    of s; a column x has the information ``|w|^2``, ``w_t = x_t - sum_k a_k x_(t-k)``:
 
-    .. math:: \operatorname{var} \ln S_0 = \frac{2}{n} + \frac{4\, 1^T C\, 1}{(1 - \sum a)^2}
+    .. math:: D_k = \frac{\partial \ln |w|^2}{\partial a_k} = -\frac{2 \sum_t w_t x_{t-k}}{|w|^2}, \qquad
+              \operatorname{var} \ln |w|^2 = \frac{2}{n} + D^T C D
 
-    An estimate of f degrees of freedom has the variance 2 / f.
+    An estimate of f degrees of freedom has the variance 2 / f. What is slow sees the level that is known worst.
     """
+    n, p = len(residual), len(noise.memory)
     rows = np.flatnonzero(noise.past)
-    if len(rows) <= 2 * len(noise.memory):
-        return float(len(residual))
-    lags = np.array([residual[rows - k] for k in range(1, len(noise.memory) + 1)]) / noise.scale[rows]
-    covariance = np.linalg.pinv(lags @ lags.T)
-    return 2.0 / float(2.0 / len(residual) + 4.0 * covariance.sum() / (1.0 - noise.memory.sum()) ** 2)
+    if len(rows) <= 2 * p:
+        return [float(n)] * len(columns)
+    before = np.array([residual[rows - k] for k in range(1, p + 1)]) / noise.scale[rows]
+    C = np.linalg.pinv(before @ before.T)
+    pieces = range(0, max(n - PIECE, 0) + 1, max(PIECE, n // PIECES))
+    found = []
+    for column in columns:
+        power, slope = 1e-300, np.zeros(p)
+        for start in pieces:
+            x = column(slice(start, start + PIECE))
+            lags = np.array([x[p - k : len(x) - k] for k in range(1, p + 1)])
+            w = x[p:] - np.tensordot(noise.memory, lags, 1)
+            power += float(np.sum(w * w))
+            slope += np.tensordot(lags, w, 2)
+        D = -2.0 * slope / power
+        found.append(2.0 / float(2.0 / n + D @ C @ D))
+    return found
 
 
 def fit_noise(

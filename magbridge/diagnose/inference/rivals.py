@@ -65,6 +65,6 @@ def rivals_of(
             continue
         cheaper = average - paid - float(np.log(candidate.trials / model[k].trials))
         behind = mine.evidence - s.evidence - cheaper
-        if behind < lead(mine.ratio) and state.p_value(candidate, s.ratio, s.freedom, base) < LEVEL:
+        if behind < lead(mine.ratio) and state.p_value(candidate, s.ratio, s.freedom) < LEVEL:
             rivals.append(Rival(candidate, behind, cheaper))
     return tuple(sorted(rivals, key=lambda rival: rival.behind))

@@ -81,7 +81,7 @@ class State:
         self.columns = [candidate.columns for candidate in self.candidates]
         self.trials: dict[str, float] = {}
         self.blocks: bool | None = None
-        self.certain = np.inf
+        self.certain: dict[tuple[str, str | None], float] = {}
         self.last: tuple[Joint | None, Information | None] = None, None
         self.own: Information
         self.bare: Information
@@ -167,7 +167,9 @@ class State:
             rounds=1,
         )
         if not model:
-            self.certain = certainty(everything.left, everything.noise)
+            middle = [self.columns[members[len(members) // 2]] for members in self.groups.values()]
+            certain = certainty(everything.left, everything.noise, middle)
+            self.certain = dict(zip(self.groups, certain, strict=True))
         return information(self.problem, everything.noise, base, [c.columns for c in model], self.columns)
 
     def _joint(
@@ -187,20 +189,19 @@ class State:
             # a gain that is not the effect's own, but of a noise that found another optimum beside it
             ratio = min(ratio, own_ratio(fit, candidate))
             freedom = mine[0][2].freedom
-            p_value = self.p_value(candidate, ratio, freedom, fit)
+            p_value = self.p_value(candidate, ratio, freedom)
             evidence = evidence_of(candidate, ratio, freedom) + mine[0][1] - float(np.log(candidate.trials))
             found.append(Hypothesis(candidate, ratio, evidence, p_value, fit))
         return max(found, key=lambda h: h.evidence)
 
-    def p_value(self, candidate: Candidate, ratio: float, freedom: int, fit: Joint | None = None) -> float:
+    def p_value(self, candidate: Candidate, ratio: float, freedom: int) -> float:
         """Of a likelihood ratio, times the hypotheses behind its cause, times the causes.
 
-        The noise's level is an estimate, so the distribution is Fisher's F: the level that `fit` leaves, or what is left when
-        every cause takes what it can.
+        The noise's level is an estimate, so the distribution is Fisher's F.
         """
         tests = self.trials.get(candidate.cause, 1.0) * self.causes
-        certain = self.certain if fit is None else certainty(fit.left, fit.noise)
-        return min(1.0, tests * float(fdtrc(max(freedom, 1), certain, ratio / max(freedom, 1))))
+        freedom, certain = max(freedom, 1), self.certain.get(key(candidate), np.inf)
+        return min(1.0, tests * float(fdtrc(freedom, certain, ratio / freedom)))
 
     def sharpen(self, model: list[Candidate], hypothesis: Hypothesis, base: Joint) -> Hypothesis:
         """Profile the nonlinear parameters between the grid's points, one after the other.

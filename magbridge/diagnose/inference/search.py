@@ -308,7 +308,7 @@ def _remove(state: State, model: list[Candidate], base: Joint, null: Joint) -> t
         own, others = model[k], model[:k] + model[k + 1 :]
         without = state.fit(others) if others else null
         ratio = max(0.0, 2.0 * (base.log_likelihood - without.log_likelihood))
-        p_value = state.p_value(own, ratio, own.freedom, base)
+        p_value = state.p_value(own, ratio, own.freedom)
         if p_value >= LEVEL:
             model, base, chosen, k = others, without, [], 0
             continue
