@@ -27,6 +27,7 @@ EFFECTS: list[Effect] = [
     MonomialEffect(cause="actuator_order", exponents=(4,)),
     PlayEffect(cause="hysteresis", channel="p", width=0.3),
     ClockEffect(),
+    ClockEffect(cause="filter_lag", sign=-1.0),
     TimeEffect(cause="offset_step", shape="step", start=T0 + 200.0),
     TimeEffect(cause="offset_drift", shape="drift", start=T0, period=500.0, order=2),
     TimeEffect(cause="interference_tone", shape="tone", start=T0, period=17.3),

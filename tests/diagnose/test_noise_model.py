@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from magbridge.diagnose.inference.fit_noise import fit_noise, memory_order
+from magbridge.diagnose.inference.fit_noise import certainty, fit_noise, memory_order
 
 
 def made(kind: str, n: int = 6000, rho: float = 0.0, seed: int = 1) -> tuple[np.ndarray, np.ndarray]:
@@ -63,3 +63,19 @@ def test_least_squares_of_the_filtered_is_generalised_least_squares() -> None:
     C = rho ** np.abs(np.subtract.outer(np.arange(n), np.arange(n))) / (1 - rho**2)
     A = noise.filter(X)
     np.testing.assert_allclose(A.T @ A, X.T @ np.linalg.solve(C, X), rtol=1e-4)
+
+
+@pytest.mark.parametrize(("period", "slow"), [(np.inf, True), (5.0, False)])
+def test_the_level_is_known_as_well_as_refitted_noises_agree_on_it(period: float, slow: bool) -> None:
+    """Against many noises fitted to as many residuals: the scatter of the column's information is 2 / f."""
+    n = 1200
+    t = np.arange(n)
+    column = np.cos(2.0 * np.pi * t / period)[:, None]
+    logs, freedoms = [], []
+    for seed in range(60):
+        r, follows = made("white", n, rho=0.9, seed=seed)
+        noise = fit_noise(r, follows, 1)
+        logs.append(float(np.log(np.sum(noise.filter(column) ** 2))))
+        freedoms += certainty(r, noise, [lambda rows: column[rows]])
+    assert 2.0 / np.var(logs) == pytest.approx(np.median(freedoms), rel=0.5)
+    assert (np.median(freedoms) < 100) == slow
