@@ -45,7 +45,14 @@ EFFECTS: dict[str, Effect] = {
     "outliers": sensor.bit_flips,
 }
 """Cause, as the contract names it -> what is hidden."""
-FOREIGN: dict[str, Effect] = {"relay": vehicle.relay, "ship": surroundings.ship}
+FOREIGN: dict[str, Effect] = {
+    "relay": vehicle.relay,
+    "ship": surroundings.ship,
+    "pan": vehicle.pan,
+    "loose": vehicle.loose,
+    "corrosion": vehicle.corrosion,
+    "pulsation": surroundings.pulsation,
+}
 """Effects that the contract has no name for."""
 
 

@@ -56,3 +56,14 @@ def ship(scene: Scene, size: float, rng: Generator) -> None:
     r = np.column_stack([4.0 * (scene.t - t0), np.full_like(scene.t, 900.0), np.full_like(scene.t, -50.0)])
     own = dipole_field(r, np.broadcast_to(direction(rng), r.shape))
     scene.earth = scene.earth + size * own / np.linalg.norm(own, axis=1).max()
+
+
+def pulsation(scene: Scene, size: float, rng: Generator) -> None:
+    """Field lines ring after a gust of solar wind: packets of Pc5, periods of 150 to 600 s (Jacobs et al. 1964); size in nT."""
+    total = np.zeros_like(scene.t)
+    for _ in range(4):
+        t0, length = rng.uniform(0.0, 1.0) * scene.t[-1], rng.uniform(600.0, 2400.0)
+        since = scene.t - t0
+        phase = 2 * np.pi * since / rng.uniform(150.0, 600.0) * (1.0 + 0.1 * since / length)
+        total += rng.uniform(0.5, 1.0) * np.exp(-0.5 * (since / length) ** 2) * np.cos(phase)
+    scene.earth = scene.earth + size * np.outer(total, [0.7, 0.5, 0.3])

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from sitl.inject.scene import Generator, Scene, direction
 from sitl.instrument import rotation
-from sitl.signals import first_order
+from sitl.signals import autoregressive, first_order
 from sitl.world import MU_0_OVER_4_PI, dipole_field
 
 Array = NDArray[np.float64]
@@ -99,3 +99,27 @@ def relay(scene: Scene, size: float, rng: Generator) -> None:
     flips = np.cumsum(rng.exponential(0.08 * scene.t[-1], 60))
     state = np.searchsorted(flips, scene.t) % 2
     scene.field = scene.field + size * direction(rng) * state[:, None]
+
+
+def pan(scene: Scene, size: float, rng: Generator) -> None:
+    """A scanning head that nothing logs: its magnet sweeps a sector to and fro, no two sweeps of one length; size in nT."""
+    turns = np.cumsum(rng.uniform(0.02, 0.06, 80)) * scene.t[-1]
+    angle = np.radians(150.0) * np.interp(scene.t, turns, (-1.0) ** np.arange(80))
+    a, b = direction(rng), direction(rng)
+    scene.field = scene.field + size * (np.outer(np.cos(angle), a) + np.outer(np.sin(angle), b))
+
+
+def loose(scene: Scene, size: float, rng: Generator) -> None:
+    """A magnet that came loose slides to whichever end is low, and sticks until the hull tips the other way; size in nT."""
+    tip = scene.track.pitch - rng.uniform(-5.0, 5.0)
+    stick = rng.uniform(5.0, 12.0)
+    last = np.maximum.accumulate(np.where(np.abs(tip) > stick, np.arange(len(tip)), 0))
+    slid = first_order(np.sign(tip[last]), scene.track.step, 3.0)
+    scene.field = scene.field + size * direction(rng) * slid[:, None]
+
+
+def corrosion(scene: Scene, size: float, rng: Generator) -> None:
+    """A galvanic current through the hull: paint and fouling let it wander within the hour, speed feeds it; size in nT."""
+    wander = autoregressive(rng, (len(scene.t),), 1.0, 2500.0 / scene.track.step)
+    fed = np.sqrt(1.0 + np.abs(np.gradient(scene.track.depth, scene.track.step)))
+    scene.field = scene.field + size * direction(rng) * (fed * wander)[:, None]

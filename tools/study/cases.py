@@ -37,8 +37,12 @@ LASTING = (
     "eddy_current", "channel_skew", "filter_lag", "clock_offset", "nonlinearity", "pressure_offset", "reference_bias",
 )  # fmt: skip
 """What is the same on another deployment: the rest has its moment or its place, or its range in one log."""
-TOLD = ("named", "ladder", "unknown", "pair")
+NAMELESS = ("unknown", "foreign")
+"""Parts in which nothing in the table is what is hidden."""
+TOLD = ("named", "ladder", "pair", *NAMELESS)
 """Parts of which theory says what comes out."""
+STRANGE = ("pan", "loose", "corrosion", "pulsation")
+"""Of the foreign ones those that were made after the detector: it has no description for them either."""
 DELAYS = ("filter_lag", "clock_offset")
 """In a uniform field these two are one: what is left of a late field is the masses that moved meanwhile."""
 
@@ -67,9 +71,17 @@ def _loud(k: int) -> Row:
 
 
 def _unknown(k: int) -> Row:
-    names = (*KNOWN, *FOREIGN)
+    names = (*KNOWN, *(name for name in FOREIGN if name not in STRANGE))
     name = names[k % len(names)]
     return {"names": (name,), "wanted": 10.0, "noise": "white", "without": name if name in CAUSES else ""}
+
+
+def _foreign(k: int) -> Row:
+    return {
+        "names": (STRANGE[k % len(STRANGE)],),
+        "wanted": 10.0,
+        "noise": ("white", "ar")[k // len(STRANGE) % 2],
+    }
 
 
 def _pair(k: int) -> Row:
@@ -84,11 +96,12 @@ def _gain(k: int) -> Row:
 PARTS: dict[str, Part] = {
     "null": Part(0.22, _null),
     "named": Part(0.22, _named),
-    "ladder": Part(0.2, _ladder),
-    "loud": Part(0.1, _loud),
+    "ladder": Part(0.18, _ladder),
+    "loud": Part(0.08, _loud),
     "unknown": Part(0.1, _unknown),
     "pair": Part(0.08, _pair),
     "gain": Part(0.08, _gain),
+    "foreign": Part(0.04, _foreign),
 }
 
 
@@ -158,7 +171,7 @@ def _theory(
     }
     beside = [other for other in hidden if other is not one]
     free: list[Description] = []
-    if part == "unknown":
+    if part in NAMELESS:
         tones = CAUSES[name].candidates(result.problem) if name == "interference_tone" else []
         free = descriptions(result.problem, result.outcome.null, *tones[:1])
     setting = Setting(CAUSES, result.outcome.trials, free, others, next(iter(beside), None))

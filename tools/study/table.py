@@ -120,7 +120,12 @@ def lines(rows: Sequence[Row]) -> list[str]:
     _gains(add, part.get("gain", []))
     unknown = part.get("unknown", [])
     apart = [r for r in unknown if unlike(r)]
-    for label, chosen in (("where theory gives no name in 95 %", apart), ("all", unknown)):
+    groups = (
+        ("where theory gives no name in 95 %", apart),
+        ("all", unknown),
+        ("foreign to table and descriptions", part.get("foreign", [])),
+    )
+    for label, chosen in groups:
         at_best, so = (_of_theory(chosen, lambda _, t, key=key: t[key]) for key in ("unnamed", "described"))
         add(
             f"unknown at S/N 10, {label}: 'unexplained'",
