@@ -92,6 +92,24 @@ def test_a_mass_rate_is_the_drives_speed_while_it_moves(problem: Problem) -> Non
     np.testing.assert_allclose(share, -lag.width[0] / clock.width[0])
 
 
+def test_a_candidate_profiled_again_stays_its_own_channels(problem: Problem) -> None:
+    cold = Channel(problem.survey.channels["warm"].values[::-1].copy(), "degC", ("temperature",))
+    survey = replace(problem.survey, channels={**problem.survey.channels, "cold": cold})
+    seen = 0
+    for cause in CAUSES.values():
+        for candidate in cause.candidates(pose(survey, problem.calibration)):
+            if candidate.again is None:
+                continue
+            shape = [value for value, _ in candidate.shape.values()]
+            once = candidate.again(*shape)
+            assert once.again is not None
+            twice = once.again(*shape)
+            assert (twice.channel, twice.effects) == (candidate.channel, candidate.effects)
+            np.testing.assert_array_equal(twice.columns(slice(0, 100)), candidate.columns(slice(0, 100)))
+            seen += 1
+    assert seen > 50
+
+
 def test_a_cause_found_twice_is_one(problem: Problem) -> None:
     first, second = CAUSES["hysteresis"].candidates(problem)[:2]
     both = first.with_(second).with_(replace(second, shape={"width": (1.0, "in")}))

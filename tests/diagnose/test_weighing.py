@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from magbridge.diagnose.causes.candidates import Candidate
-from magbridge.diagnose.inference.search import worth
-from magbridge.diagnose.inference.weigh import evidence_of, weigh
+from magbridge.diagnose.inference.weigh import evidence_of, weigh, worth
 
 
 def candidate(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial, reduce
 from itertools import product
@@ -124,39 +125,30 @@ def hysteresis(problem: Problem) -> list[Candidate]:
     # only of masses that are modelled: a wide play of another is that other itself
     for name in (parameter.name for parameter in problem.calibration.parameters):
         low, high = extent(problem, name)
-        if not high > low:
-            continue
-        centre, scale = 0.5 * (low + high), 0.5 * (high - low)
-        unit = problem.survey.channels[name].unit
-
-        def again(
-            width: float,
-            name: str = name,
-            order: int = 1,
-            unit: str = unit,
-            centre: float = centre,
-            scale: float = scale,
-        ) -> Candidate:
-            effect = PlayEffect(
-                cause="hysteresis",
-                channel=name,
-                width=width,
-                order=order,
-                centre=centre,
-                scale=width if order == 1 else scale,
-            )
-            p = problem.survey.channels[name].values
-            y = play(p, width)
-
-            def phi(rows: slice) -> FloatArray:
-                v, x = (y[rows] - centre) / effect.scale, (p[rows] - centre) / effect.scale
-                return powers(v, order) - powers(x, order)
-
-            return of_effect(
-                problem, effect, 50.0, "nT", channel=name, shape={"width": (width, unit)}, phi=phi,
-                again=partial(again, name=name, order=order, unit=unit, centre=centre, scale=scale),
-            )  # fmt: skip
-
-        made += [again(share * (high - low)) for share in (0.05, 0.15, 0.3)]
-        made += [again(share * (high - low), order=BRANCH) for share in (0.15, 0.3, 0.5)]
+        if high > low:
+            made += _play(problem, name, 1, [share * (high - low) for share in (0.05, 0.15, 0.3)])
+            made += _play(problem, name, BRANCH, [share * (high - low) for share in (0.15, 0.3, 0.5)])
     return made
+
+
+def _play(problem: Problem, name: str, order: int, widths: Sequence[float]) -> list[Candidate]:
+    """One mass', on branches of one order."""
+    low, high = extent(problem, name)
+    centre, half = 0.5 * (low + high), 0.5 * (high - low)
+    channel = problem.survey.channels[name]
+
+    def again(width: float) -> Candidate:
+        scale = width if order == 1 else half
+        effect = PlayEffect(
+            cause="hysteresis", channel=name, width=width, order=order, centre=centre, scale=scale
+        )
+        p = channel.values
+        y = play(p, width)
+
+        def phi(rows: slice) -> FloatArray:
+            return powers((y[rows] - centre) / scale, order) - powers((p[rows] - centre) / scale, order)
+
+        shape = {"width": (width, channel.unit)}
+        return of_effect(problem, effect, 50.0, "nT", channel=name, shape=shape, phi=phi, again=again)
+
+    return [again(width) for width in widths]

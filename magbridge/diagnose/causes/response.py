@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import product
 
@@ -33,28 +34,31 @@ def nonlinearity(problem: Problem) -> list[Candidate]:
 
 def saturation(problem: Problem) -> list[Candidate]:
     """A channel compresses or clips near its end: ``T_i -= b_1 + b_2 (H_i - knee) / H_0`` beyond the knee."""
-    unit, H = problem.calibration.reference.field, problem.reading
     made = []
     for axis, sign in product(range(3), (1.0, -1.0)):
-        reading = sign * H[:, axis]
-        if reading.max() < 0.2 * unit:  # nowhere near any end
-            continue
-        for share in (0.7, 0.85, 0.95, 0.99):
-            knee = sign * float(np.quantile(reading, share))
-
-            def again(knee: float, axis: int = axis) -> Candidate:
-                effect = ResponseEffect(cause="saturation", unit=unit, axis=axis, knee=knee)
-                way = 1.0 if knee >= 0.0 else -1.0
-
-                def phi(rows: slice) -> FloatArray:
-                    over = way * (H[rows, axis] - knee)
-                    return np.stack([way * (over >= 0), way * np.maximum(over, 0.0) / unit])
-
-                names = (f"{AXES[axis]} beyond", f"{AXES[axis]} slope")
-                return of_effect(
-                    problem, effect, np.array([100.0, 0.1 * unit]), "nT", names=names, phi=phi,
-                    shape={"knee": (knee, "nT")}, again=again,
-                )  # fmt: skip
-
-            made.append(again(knee))
+        reading = sign * problem.reading[:, axis]
+        if reading.max() >= 0.2 * problem.calibration.reference.field:  # anywhere near an end
+            knees = [sign * float(np.quantile(reading, share)) for share in (0.7, 0.85, 0.95, 0.99)]
+            made += _clipped(problem, axis, knees)
     return made
+
+
+def _clipped(problem: Problem, axis: int, knees: Sequence[float]) -> list[Candidate]:
+    """One axis', at one end."""
+    unit, H = problem.calibration.reference.field, problem.reading
+    names = (f"{AXES[axis]} beyond", f"{AXES[axis]} slope")
+
+    def again(knee: float) -> Candidate:
+        effect = ResponseEffect(cause="saturation", unit=unit, axis=axis, knee=knee)
+        way = 1.0 if knee >= 0.0 else -1.0
+
+        def phi(rows: slice) -> FloatArray:
+            over = way * (H[rows, axis] - knee)
+            return np.stack([way * (over >= 0), way * np.maximum(over, 0.0) / unit])
+
+        return of_effect(
+            problem, effect, np.array([100.0, 0.1 * unit]), "nT", names=names, phi=phi,
+            shape={"knee": (knee, "nT")}, again=again,
+        )  # fmt: skip
+
+    return [again(knee) for knee in knees]

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import lru_cache
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,34 +32,32 @@ def _origins(problem: Problem, name: str) -> list[float]:
 
 
 def _thermal(problem: Problem, on: Literal["offset", "scale"]) -> list[Candidate]:
-    found = []
-    field, longest = problem.calibration.reference.field, 2.0 * float(np.ptp(problem.survey.time))
+    longest = 2.0 * float(np.ptp(problem.survey.time))
+    lags = [lag for lag in LAGS if lag <= longest]
+    return [c for name in channels_of(problem, "temperature") for c in _warmed(problem, on, name, lags)]
+
+
+def _warmed(
+    problem: Problem, on: Literal["offset", "scale"], name: str, lags: Sequence[float]
+) -> list[Candidate]:
+    """One temperature's."""
+    field = problem.calibration.reference.field
     unit = "nT/degC" if on == "offset" else f"nT/degC at {field:.0f} nT"
-    for name in channels_of(problem, "temperature"):
 
-        @lru_cache(len(LAGS))  # of a month each is 5 MB
-        def level(lag: float, name: str = name) -> FloatArray:
-            return lagged(problem.survey.time, problem.survey.channels[name].values, lag)
+    @lru_cache(len(LAGS))  # of a month each is 5 MB
+    def level(lag: float) -> FloatArray:
+        return lagged(problem.survey.time, problem.survey.channels[name].values, lag)
 
-        def again(origin: float, lag: float, name: str = name, level: Any = level) -> Candidate:
-            lag = max(lag, 0.0)
-            effect = ChannelEffect(cause=f"temperature_{on}", channel=name, origin=origin, lag=lag, on=on)
-            shape = {"origin": (origin, "degC"), "lag": (lag, "s")}
-            phi = level(lag)
-            return of_effect(
-                problem,
-                effect,
-                5.0,
-                unit,
-                channel=name,
-                shape=shape,
-                again=again,
-                phi=lambda rows: phi[None, rows] - origin,
-            )
+    def again(origin: float, lag: float) -> Candidate:
+        lag = max(lag, 0.0)
+        effect = ChannelEffect(cause=f"temperature_{on}", channel=name, origin=origin, lag=lag, on=on)
+        phi = level(lag)
+        return of_effect(
+            problem, effect, 5.0, unit, channel=name, shape={"origin": (origin, "degC"), "lag": (lag, "s")},
+            again=again, phi=lambda rows: phi[None, rows] - origin,
+        )  # fmt: skip
 
-        lags = [lag for lag in LAGS if lag <= longest]
-        found += [again(origin, lag) for origin in _origins(problem, name) for lag in lags]
-    return found
+    return [again(origin, lag) for origin in _origins(problem, name) for lag in lags]
 
 
 def temperature_offset(problem: Problem) -> list[Candidate]:

@@ -22,9 +22,6 @@ FloatArray = NDArray[np.float64]
 
 SHORT_LIST = 9
 """Causes that are fitted jointly in a round."""
-SHARPEN, STAGES = 144, 2
-"""Columns of the values that are tried between the ends of a nonlinear parameter's bracket, and how often it is narrowed to
-the neighbours of the best."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,69 +199,6 @@ class State:
         tests = self.trials.get(candidate.cause, 1.0) * self.causes
         freedom, certain = max(freedom, 1), self.certain.get(key(candidate), np.inf)
         return min(1.0, tests * float(fdtrc(freedom, certain, ratio / freedom)))
-
-    def sharpen(self, model: list[Candidate], hypothesis: Hypothesis, base: Joint) -> Hypothesis:
-        """Profile the nonlinear parameters between the grid's points, one after the other.
-
-        Under the noise that stands, where many values are scored at once: a likelihood has more than one peak in an onset.
-        What the evidence's average over the bracket lacks to its peak is what knowing them better costs.
-        """
-        best = hypothesis
-        again = best.candidate.again
-        if again is None:
-            return best
-        columns = [candidate.columns for candidate in model]
-        narrow = 0.0
-        for position, name in enumerate(best.candidate.shape):
-            low, high = self._bracket(best.candidate, name)
-            for stage in range(STAGES):
-                values = np.linspace(low, high, max(SHARPEN // best.candidate.size, 4) + 2)
-                made = []
-                for value in values[1:-1]:
-                    shape = [v for v, _ in best.candidate.shape.values()]
-                    shape[position] = float(value)
-                    made.append(again(*shape))
-                info = information(self.problem, best.fit.noise, base, columns, [c.columns for c in made])
-                scores = [score(info, at, made[0]) for at in slices(made)]
-                ratios = np.array([s.ratio for s in scores])
-                k = int(np.argmax(ratios))
-                if not stage:
-                    share = 2.0 * float(
-                        np.mean(np.exp(0.5 * (ratios - ratios[k])))
-                    )  # of a cell: two are between
-                    narrow -= min(float(np.log(share)), 0.0)
-                low, high = values[k], values[k + 2]
-            at = slices(made)[k]
-            start = np.append(
-                info.moved(base, np.arange(at.start, at.stop), scores[k].estimate), scores[k].estimate
-            )
-            fit = self.fit([*model, made[k]], start, plain=False, like=best.fit, rounds=2)
-            gain = 2.0 * (fit.log_likelihood - base.log_likelihood) - best.ratio
-            if gain > 0.0:
-                best = replace(
-                    best,
-                    candidate=made[k],
-                    fit=fit,
-                    ratio=best.ratio + gain,
-                    evidence=best.evidence + 0.5 * gain,
-                )
-        return replace(best, candidate=replace(best.candidate, narrow=narrow))
-
-    def _bracket(self, candidate: Candidate, name: str) -> tuple[float, float]:
-        """Between which values of one nonlinear parameter its grid leaves a candidate free."""
-        here = candidate.shape[name][0]
-        if name == "period":  # a resolved line is a thousandth wide, the grid is one of peaks
-            share = 0.6 * here / self.span
-            return here / (1.0 + share), here * (1.0 + share)
-        grid = sorted({self.candidates[k].shape[name][0] for k in self.groups[key(candidate)]})
-        width = 0.5 * (grid[-1] - grid[0])
-        low = max((v for v in grid if v < here), default=here - width)
-        return low, min((v for v in grid if v > here), default=here + width)
-
-    @property
-    def span(self) -> float:
-        """S."""
-        return float(np.ptp(self.problem.survey.time))
 
 
 def _ridge(model: Sequence[Candidate]) -> FloatArray:

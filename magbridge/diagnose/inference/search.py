@@ -4,9 +4,10 @@ Notes
 -----
 Candidates are scored (:mod:`.weigh`) under two noises, since the noise of the model so far may have swallowed an effect:
 that one, and the noise that is left when every cause may take what it can. The best of each cause are then fitted
-jointly with noise and calibration. The best that passes the test is added; so on while one does; then what later
-findings have made needless is dropped. A cause that is found again is not another cause but needs more than one of
-its regressors: they become one candidate.
+jointly with noise and calibration. The best that passes the test is added; so on while one does. A cause that is found
+again is not another cause but needs more than one of its regressors: they become one candidate. Then causes change places
+with their rivals (:mod:`.exchange`); another start is a choice of all at once (:mod:`.together`); and what later findings
+have made needless is dropped.
 
 What a cause's place could be taken by is read off one matrix at the end: the information of all candidates under the
 noise that is left, the other causes projected out.
@@ -22,21 +23,19 @@ from numpy.typing import NDArray
 
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.compare.problem import Problem
+from magbridge.diagnose.inference.exchange import exchanged
 from magbridge.diagnose.inference.fit_noise import memory_order
 from magbridge.diagnose.inference.information import Information
 from magbridge.diagnose.inference.joint import Joint, fit_joint
 from magbridge.diagnose.inference.rivals import Rival, rivals_of
 from magbridge.diagnose.inference.rounds import Hypothesis, State, key
-from magbridge.diagnose.inference.weigh import LEVEL, ODDS, REMNANT, evidence_of, lead, score, slack, weigh
+from magbridge.diagnose.inference.sharpen import refined, sharpen
+from magbridge.diagnose.inference.together import MOST, enough, together
+from magbridge.diagnose.inference.weigh import LEVEL, REMNANT, evidence_of, lead, slack, worth
 
-__all__ = ["Hypothesis", "Outcome", "search", "worth"]
+__all__ = ["Hypothesis", "Outcome", "search"]
 
 FloatArray = NDArray[np.float64]
-
-MOST = 6
-"""Regressors in one log."""
-EXCHANGES = 3
-"""Rivals that are tried in a cause's place."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,25 +91,7 @@ def search(problem: Problem, candidates: Sequence[Candidate], causes: int) -> Ou
     for h in first:
         if h.p_value <= tested.get(h.candidate.cause, (np.inf, 0.0))[0]:
             tested[h.candidate.cause] = (h.p_value, h.ratio)
-    model, base = _chain(state, null, first)
-    together = _together(state) if first else []
-
-    def value(model: Sequence[Candidate], fit: Joint) -> float:
-        # what an idealised regressor leaves is not yet another cause
-        ratio, causes = 2.0 * (fit.log_likelihood - null.log_likelihood), {c.cause for c in model}
-        narrow = sum(candidate.narrow for candidate in model)
-        return worth(ratio, model, state.trials) - narrow - len(causes) * slack(ratio)
-
-    found = [_exchanged(state, model, base, null)] if model else [(model, base)]
-    if together and (model or len(together) > 1) and {key(c) for c in together} != {key(c) for c in model}:
-        # one after the other may have gone astray where several causes act; a single one has had its test
-        found.append(_exchanged(state, *_refined(state, together, state.fit(together, rounds=6)), null))
-    model, base = max(found, key=lambda entry: value(*entry))
-    if len({candidate.cause for candidate in model}) > 1:
-        alone = _enough(state, first)
-        if alone is not None and value([alone.candidate], alone.fit) > value(model, base):
-            alone = state.sharpen([], alone, null)
-            model, base = [alone.candidate], alone.fit
+    model, base = _likeliest(state, null, first) if first else ([], null)
     chosen, base = _remove(state, model, base, null)
     model = [h.candidate for h in chosen]
     info = state.beside(model, base) if chosen or not first else state.own
@@ -118,26 +99,29 @@ def search(problem: Problem, candidates: Sequence[Candidate], causes: int) -> Ou
     return Outcome(tuple(chosen), rivals, null, base, order, tested, info, state.trials)
 
 
-def worth(ratio: float, model: Sequence[Candidate], trials: Mapping[str, float]) -> float:
-    """Log evidence of a whole model of this likelihood ratio.
+def _likeliest(state: State, null: Joint, first: list[Hypothesis]) -> tuple[list[Candidate], Joint]:
+    """Return what is worth most: causes found one after the other, chosen together, or a single one, if that is enough."""
 
-    Every regressor pays for the hypotheses behind it that it was chosen from, and those after the first for the odds that
-    so much goes wrong in one log, and for their choice among the causes. How narrowly the data then hold the nonlinear
-    parameters counts between names alone: a free description is profiled, too, and pays nothing for it.
-    """
-    further = max(sum(candidate.parts for candidate in model) - 1, 0) * (ODDS + float(np.log(len(trials))))
-    grids = sum(candidate.parts * float(np.log(trials[candidate.cause])) for candidate in model)
-    return _evidence(ratio, model) - further - grids
+    def value(model: Sequence[Candidate], fit: Joint) -> float:
+        # what an idealised regressor leaves is not yet another cause
+        ratio, causes = 2.0 * (fit.log_likelihood - null.log_likelihood), {c.cause for c in model}
+        narrow = sum(candidate.narrow for candidate in model)
+        return worth(ratio, model, state.trials) - narrow - len(causes) * slack(ratio)
 
-
-def _evidence(ratio: float, model: Sequence[Candidate]) -> float:
-    """Log evidence of a whole model, its nonlinear parameters given."""
-    free = sum(candidate.size for candidate in model if candidate.spectra is None)
-    sided = float(np.log(2.0)) * sum(candidate.positive for candidate in model)
-    spectra = sum(
-        float(np.log(len(candidate.spectra))) for candidate in model if candidate.spectra is not None
-    )
-    return (weigh(ratio, free) if free else 0.5 * ratio) + sided - spectra
+    one_by_one, at_once = _chain(state, null, first), together(state)
+    found = [exchanged(state, *one_by_one, null) if one_by_one[0] else one_by_one]
+    before = {key(candidate) for candidate in one_by_one[0]}
+    if at_once and (before or len(at_once) > 1) and {key(candidate) for candidate in at_once} != before:
+        # a single one has had its test
+        start = refined(state, at_once, state.fit(at_once, rounds=6))
+        found.append(exchanged(state, *start, null))
+    model, base = max(found, key=lambda entry: value(*entry))
+    if len({candidate.cause for candidate in model}) > 1:
+        alone = enough(state, first)
+        if alone is not None and value([alone.candidate], alone.fit) > value(model, base):
+            alone = sharpen(state, [], alone, null)
+            model, base = [alone.candidate], alone.fit
+    return model, base
 
 
 def _chain(state: State, null: Joint, first: list[Hypothesis]) -> tuple[list[Candidate], Joint]:
@@ -154,115 +138,11 @@ def _chain(state: State, null: Joint, first: list[Hypothesis]) -> tuple[list[Can
         best = _next(grown, heard, 2.0 * (base.log_likelihood - null.log_likelihood))
         if best is None:
             break
-        best = state.sharpen(model, best, base)
+        best = sharpen(state, model, best, base)
         cause = best.candidate.cause
         heard[cause] = max(heard.get(cause, 0.0), best.signal_to_noise)
         model, base = _with(state, model, best)
         found = state.round(model, base)
-    return model, base
-
-
-def _together(state: State) -> list[Candidate]:
-    """Choose causes under the noise that is left when every cause takes what it can, one beside the other.
-
-    All in the matrix of the first round: there the noise has swallowed nothing, and each is measured with the calibration
-    and those before it free.
-    """
-    info = state.bare
-    picked: list[int] = []
-    loudest, ratio = 0.0, 0.0
-    while len(picked) < MOST:
-        scores = state.scores(info)
-        ranked = sorted(
-            ((scores[k].evidence + price, k) for k, price in state.best(scores).values()), reverse=True
-        )
-        sure = []
-        for evidence, k in ranked:
-            s, candidate = scores[k], state.candidates[k]
-            size = float(np.sqrt(max(s.ratio - s.freedom, 0.0)))
-            heard = state.p_value(candidate, s.ratio, s.freedom) < LEVEL and size >= REMNANT * loudest
-            if heard and candidate.cause not in {state.candidates[j].cause for j in picked}:
-                sure.append((evidence, k))
-        if not sure:
-            break
-        alike = [k for evidence, k in sure if evidence >= sure[0][0] - slack(ratio)]
-        k = min(alike, key=lambda k: state.candidates[k].size)
-        picked.append(k)
-        ratio += scores[k].ratio
-        loudest = max(loudest, float(np.sqrt(max(scores[k].ratio - scores[k].freedom, 0.0))))
-        info = info.without(np.arange(state.at[k].start, state.at[k].stop), scores[k].prior)
-    return [state.candidates[k] for k in picked]
-
-
-def _enough(state: State, first: list[Hypothesis]) -> Hypothesis | None:
-    """Return the best single cause, if there is one, beside which nothing else would be found."""
-    members = {(id(c.columns)): k for k, c in enumerate(state.candidates)}
-    for h in first:
-        k = members[id(h.candidate.columns)]
-        s = score(state.bare, state.at[k], h.candidate)
-        if h.p_value >= LEVEL or not s.freedom:
-            continue
-        left = state.bare.without(np.arange(state.at[k].start, state.at[k].stop), s.prior)
-        others = [
-            (candidate, other)
-            for candidate, other in zip(state.candidates, state.scores(left), strict=True)
-            if candidate.cause != h.candidate.cause
-        ]
-        quiet = REMNANT**2 * s.ratio
-        if all(
-            other.ratio - other.freedom < quiet
-            or state.p_value(candidate, other.ratio, other.freedom) >= LEVEL
-            for candidate, other in others
-        ):
-            return h
-    return None
-
-
-def _refined(state: State, model: list[Candidate], base: Joint) -> tuple[list[Candidate], Joint]:
-    """Profile the nonlinear parameters of each member of a model beside the others."""
-    for _ in range(len(model)):
-        own, others = model[0], model[1:]
-        rest = state.fit(others, plain=False)
-        c = np.append(base.coefficients[own.size :], base.coefficients[: own.size])
-        there = state.fit([*others, own], np.append(base.z, c), plain=False, like=base, rounds=1)
-        ratio = 2.0 * (there.log_likelihood - rest.log_likelihood)
-        best = state.sharpen(others, Hypothesis(own, ratio, 0.0, 0.0, there), rest)
-        model, base = [*others, best.candidate], best.fit
-    return model, base
-
-
-def _exchanged(
-    state: State, model: list[Candidate], base: Joint, null: Joint
-) -> tuple[list[Candidate], Joint]:
-    """Put a rival in a cause's place, profiled there, as long as the evidence of the whole grows.
-
-    What was found first was chosen without what was found later.
-    """
-
-    def evidence(model: Sequence[Candidate], fit: Joint) -> float:
-        ratio = 2.0 * (fit.log_likelihood - null.log_likelihood)
-        return _evidence(ratio, model) - sum(candidate.narrow for candidate in model)
-
-    for _ in range(MOST):
-        info, own = state.beside(model, base), evidence(model, base)
-        tried = []
-        for k in range(len(model)):
-            best: dict[str, Rival] = {}
-            for rival in rivals_of(state, info, model, base, k):
-                best.setdefault(rival.cause, rival)
-            best.pop(model[k].cause, None)
-            others = model[:k] + model[k + 1 :]
-            rest = state.fit(others) if best else base
-            for rival in list(best.values())[:EXCHANGES]:
-                fit = state.fit([*others, rival.candidate], like=base)
-                ratio = 2.0 * (fit.log_likelihood - rest.log_likelihood)
-                there = state.sharpen(others, Hypothesis(rival.candidate, ratio, 0.0, 0.0, fit), rest)
-                changed = [*others, there.candidate]
-                tried.append((evidence(changed, there.fit) + rival.cheaper - own, changed, there.fit))
-        gain, *_ = better = max(tried, key=lambda entry: entry[0], default=(0.0, model, base))
-        if gain <= 0.0:
-            break
-        _, model, base = better
     return model, base
 
 

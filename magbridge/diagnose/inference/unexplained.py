@@ -25,9 +25,9 @@ from magbridge.diagnose.inference.free import Description, descriptions
 from magbridge.diagnose.inference.information import information
 from magbridge.diagnose.inference.joint import Joint
 from magbridge.diagnose.inference.noise import Noise
-from magbridge.diagnose.inference.search import Hypothesis, Outcome, worth
+from magbridge.diagnose.inference.search import Hypothesis, Outcome
 from magbridge.diagnose.inference.statistic import Ridge, Statistic
-from magbridge.diagnose.inference.weigh import LEVEL, ODDS, REMNANT, lead
+from magbridge.diagnose.inference.weigh import LEVEL, ODDS, REMNANT, lead, worth
 
 __all__ = ["Leftover", "accept", "leftover"]
 

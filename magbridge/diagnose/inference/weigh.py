@@ -18,7 +18,7 @@ as dense: ``log 2 Phi(sqrt(R))`` more.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -37,12 +37,14 @@ __all__ = [
     "REMNANT",
     "Score",
     "evidence_of",
+    "evidence_of_all",
     "lead",
     "score",
     "slack",
     "slices",
     "trials",
     "weigh",
+    "worth",
 ]
 
 FloatArray = NDArray[np.float64]
@@ -142,3 +144,25 @@ def trials(info: Information, candidates: Sequence[Candidate], at: Sequence[slic
                 smallest = np.minimum(smallest, chi2.sf(statistic.ratio(block), statistic.freedom))
         found[cause] = max(1.0, 1.0 / float(smallest.mean()) - 1.0) * max(candidates[k].trials for k in own)
     return found
+
+
+def worth(ratio: float, model: Sequence[Candidate], trials: Mapping[str, float]) -> float:
+    """Log evidence of a whole model of this likelihood ratio.
+
+    Every regressor pays for the hypotheses behind it that it was chosen from, and those after the first for the odds that
+    so much goes wrong in one log, and for their choice among the causes. How narrowly the data then hold the nonlinear
+    parameters counts between names alone: a free description is profiled, too, and pays nothing for it.
+    """
+    further = max(sum(candidate.parts for candidate in model) - 1, 0) * (ODDS + float(np.log(len(trials))))
+    grids = sum(candidate.parts * float(np.log(trials[candidate.cause])) for candidate in model)
+    return evidence_of_all(ratio, model) - further - grids
+
+
+def evidence_of_all(ratio: float, model: Sequence[Candidate]) -> float:
+    """Log evidence of a whole model, its nonlinear parameters given."""
+    free = sum(candidate.size for candidate in model if candidate.spectra is None)
+    sided = float(np.log(2.0)) * sum(candidate.positive for candidate in model)
+    spectra = sum(
+        float(np.log(len(candidate.spectra))) for candidate in model if candidate.spectra is not None
+    )
+    return (weigh(ratio, free) if free else 0.5 * ratio) + sided - spectra

@@ -1,0 +1,98 @@
+"""Nonlinear parameters between the points of their grid: profiled, beside the other causes of a model."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magbridge.diagnose.causes.candidates import Candidate
+from magbridge.diagnose.inference.information import information
+from magbridge.diagnose.inference.joint import Joint
+from magbridge.diagnose.inference.rounds import Hypothesis, State, key
+from magbridge.diagnose.inference.weigh import score, slices
+
+__all__ = ["refined", "sharpen"]
+
+FloatArray = NDArray[np.float64]
+
+COLUMNS, STAGES = 144, 2
+"""Of the values that are tried between the ends of a nonlinear parameter's bracket, and how often it is narrowed to the
+neighbours of the best."""
+
+
+def sharpen(state: State, model: list[Candidate], hypothesis: Hypothesis, base: Joint) -> Hypothesis:
+    """Profile the nonlinear parameters of a cause beside `model`, whose fit is `base`, one after the other.
+
+    Under the noise that stands, where many values are scored at once: a likelihood has more than one peak in an onset.
+    What the evidence's average over the bracket lacks to its peak is what knowing them better costs.
+    """
+    best, narrow = hypothesis, 0.0
+    if best.candidate.again is None:
+        return best
+    for position, name in enumerate(best.candidate.shape):
+        candidate, start, narrower = _profiled(state, model, best, base, position, name)
+        narrow += narrower
+        fit = state.fit([*model, candidate], start, plain=False, like=best.fit, rounds=2)
+        gain = 2.0 * (fit.log_likelihood - base.log_likelihood) - best.ratio
+        if gain > 0.0:
+            ratio, evidence = best.ratio + gain, best.evidence + 0.5 * gain
+            best = replace(best, candidate=candidate, fit=fit, ratio=ratio, evidence=evidence)
+    return replace(best, candidate=replace(best.candidate, narrow=narrow))
+
+
+def _profiled(
+    state: State, model: list[Candidate], best: Hypothesis, base: Joint, position: int, name: str
+) -> tuple[Candidate, FloatArray, float]:
+    """Return the best value's candidate, coefficients to begin from, and how much narrower than the bracket it is held."""
+    again = best.candidate.again
+    assert again is not None
+    columns = [candidate.columns for candidate in model]
+    low, high = _bracket(state, best.candidate, name)
+    narrower = 0.0
+    for stage in range(STAGES):
+        values = np.linspace(low, high, max(COLUMNS // best.candidate.size, 4) + 2)
+        made = []
+        for value in values[1:-1]:
+            shape = [v for v, _ in best.candidate.shape.values()]
+            shape[position] = float(value)
+            made.append(again(*shape))
+        info = information(state.problem, best.fit.noise, base, columns, [c.columns for c in made])
+        at = slices(made)
+        scores = [score(info, own, made[0]) for own in at]
+        ratios = np.array([s.ratio for s in scores])
+        k = int(np.argmax(ratios))
+        if not stage:
+            # of a cell: two are between
+            share = 2.0 * float(np.mean(np.exp(0.5 * (ratios - ratios[k]))))
+            narrower = max(-float(np.log(share)), 0.0)
+        low, high = values[k], values[k + 2]
+    there = scores[k].estimate
+    moved = info.moved(base, np.arange(at[k].start, at[k].stop), there)
+    return made[k], np.append(moved, there), narrower
+
+
+def _bracket(state: State, candidate: Candidate, name: str) -> tuple[float, float]:
+    """Between which values of one nonlinear parameter its grid leaves a candidate free."""
+    here = candidate.shape[name][0]
+    if name == "period":  # a resolved line is a thousandth wide, the grid is one of peaks
+        share = 0.6 * here / float(np.ptp(state.problem.survey.time))
+        return here / (1.0 + share), here * (1.0 + share)
+    grid = sorted({state.candidates[k].shape[name][0] for k in state.groups[key(candidate)]})
+    width = 0.5 * (grid[-1] - grid[0])
+    low = max((v for v in grid if v < here), default=here - width)
+    return low, min((v for v in grid if v > here), default=here + width)
+
+
+def refined(state: State, model: list[Candidate], base: Joint) -> tuple[list[Candidate], Joint]:
+    """Profile the nonlinear parameters of each member of a model beside the others."""
+    for _ in range(len(model)):
+        own, others = model[0], model[1:]
+        rest = state.fit(others, plain=False)
+        c = np.append(base.coefficients[own.size :], base.coefficients[: own.size])
+        there = state.fit([*others, own], np.append(base.z, c), plain=False, like=base, rounds=1)
+        ratio = 2.0 * (there.log_likelihood - rest.log_likelihood)
+        best = sharpen(state, others, Hypothesis(own, ratio, 0.0, 0.0, there), rest)
+        model, base = [*others, best.candidate], best.fit
+    return model, base

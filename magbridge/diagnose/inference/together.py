@@ -1,0 +1,74 @@
+"""Another start of the search: all causes chosen at once, in the one matrix of the first round.
+
+There the noise has swallowed nothing: it is what is left when every cause takes what it can. Causes that were found one after
+the other may have gone astray where several act.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from magbridge.diagnose.causes.candidates import Candidate
+from magbridge.diagnose.inference.rounds import Hypothesis, State
+from magbridge.diagnose.inference.weigh import LEVEL, REMNANT, score, slack
+
+__all__ = ["MOST", "enough", "together"]
+
+MOST = 6
+"""Regressors in one log."""
+
+
+def together(state: State) -> list[Candidate]:
+    """Choose causes under the noise that is left when every cause takes what it can, one beside the other.
+
+    All in the matrix of the first round: there the noise has swallowed nothing, and each is measured with the calibration
+    and those before it free.
+    """
+    info = state.bare
+    picked: list[int] = []
+    loudest, ratio = 0.0, 0.0
+    while len(picked) < MOST:
+        scores = state.scores(info)
+        ranked = sorted(
+            ((scores[k].evidence + price, k) for k, price in state.best(scores).values()), reverse=True
+        )
+        sure = []
+        for evidence, k in ranked:
+            s, candidate = scores[k], state.candidates[k]
+            size = float(np.sqrt(max(s.ratio - s.freedom, 0.0)))
+            heard = state.p_value(candidate, s.ratio, s.freedom) < LEVEL and size >= REMNANT * loudest
+            if heard and candidate.cause not in {state.candidates[j].cause for j in picked}:
+                sure.append((evidence, k))
+        if not sure:
+            break
+        alike = [k for evidence, k in sure if evidence >= sure[0][0] - slack(ratio)]
+        k = min(alike, key=lambda k: state.candidates[k].size)
+        picked.append(k)
+        ratio += scores[k].ratio
+        loudest = max(loudest, float(np.sqrt(max(scores[k].ratio - scores[k].freedom, 0.0))))
+        info = info.without(np.arange(state.at[k].start, state.at[k].stop), scores[k].prior)
+    return [state.candidates[k] for k in picked]
+
+
+def enough(state: State, first: list[Hypothesis]) -> Hypothesis | None:
+    """Return the best single cause, if there is one, beside which nothing else would be found."""
+    members = {(id(c.columns)): k for k, c in enumerate(state.candidates)}
+    for h in first:
+        k = members[id(h.candidate.columns)]
+        s = score(state.bare, state.at[k], h.candidate)
+        if h.p_value >= LEVEL or not s.freedom:
+            continue
+        left = state.bare.without(np.arange(state.at[k].start, state.at[k].stop), s.prior)
+        others = [
+            (candidate, other)
+            for candidate, other in zip(state.candidates, state.scores(left), strict=True)
+            if candidate.cause != h.candidate.cause
+        ]
+        quiet = REMNANT**2 * s.ratio
+        if all(
+            other.ratio - other.freedom < quiet
+            or state.p_value(candidate, other.ratio, other.freedom) >= LEVEL
+            for candidate, other in others
+        ):
+            return h
+    return None
