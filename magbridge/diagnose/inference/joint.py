@@ -20,12 +20,14 @@ from magbridge.diagnose.inference.fit_noise import fit_noise
 from magbridge.diagnose.inference.noise import Noise
 from magbridge.diagnose.inference.statistic import Statistic
 
-__all__ = ["RIDGE", "Joint", "fit_joint"]
+__all__ = ["FLAT", "RIDGE", "Joint", "fit_joint"]
 
 FloatArray = NDArray[np.float64]
 RIDGE = 0.1
 """Prior precision of an effect, of a plausible size's: ten times that size is hardly believed, a hundred times not at
 all. Without it a bend of the channels and the calibration's scales grow against each other until the noise is gone."""
+FLAT = 1e-6
+"""Prior precision of numbers that are free, or of no known size."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +116,7 @@ def fit_joint(
         first.append(_plain(X, problem.residual, prior, centre))
     found = [(c, *at(c)) for c in first]
     for own, _ in common:
-        prior[own] = 0.0  # no size is known yet
+        prior[own] = FLAT  # no size is known yet
     c, left, noise = max(found, key=lambda entry: value(entry[0], entry[2]))
     for step in range(rounds + 1):
         P, b = normal(X.rows, noise.response(left), noise)

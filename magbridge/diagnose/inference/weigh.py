@@ -28,6 +28,7 @@ from scipy.stats import chi2
 
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.inference.information import Information
+from magbridge.diagnose.inference.joint import FLAT
 from magbridge.diagnose.inference.statistic import Statistic
 
 __all__ = [
@@ -62,8 +63,6 @@ REMNANT = 0.3
 The price: a second cause that weak is not named beside it.
 """
 SIMULATIONS = 400
-FLAT = 1e-6
-"""Prior precision of numbers that are free."""
 
 
 @dataclass(frozen=True, eq=False)
