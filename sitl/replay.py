@@ -83,15 +83,14 @@ def _again(files: Sequence[Path], config: Path, speed: float, log: Path | None) 
     stage = Stage(config, published.extend, log)
     begun = time.monotonic()
     stage.play(recorded.start, track(recorded.events(), "replaying"), speed)
-    held = len(recorded.published)
-    first = _first_difference(published[:held], recorded.published)
+    first = _first_difference(published, recorded.published)
     return {
         "files": [str(file) for file in files],
         "messages": recorded.messages,
-        "bytes": held,
+        "bytes": len(recorded.published),
         "identical": first is None,
         "first_difference": first,
-        "beyond": max(len(published) - held, 0),  # a log that breaks off lacks what its last input brought
+        "beyond": max(len(published) - len(recorded.published), 0),
         "same_config": load(config).digest == recorded.config_digest,
         "damages": recorded.damages,
         "seconds": time.monotonic() - begun,
@@ -218,14 +217,17 @@ def _counted(counts: dict[str, int]) -> str:
 def _tell_again(result: Result) -> str:
     if result["identical"]:
         verdict = "published again, bit for bit"
+    elif result["first_difference"] == result["bytes"] and result["beyond"]:
+        verdict = (
+            f"published again, bit for bit as far as the log goes, and {result['beyond']} bytes that it does not hold: "
+            "it breaks off, or the bridge said less"
+        )
     else:
         verdict = f"published, but not the same: the first difference is at byte {result['first_difference']}"
     size = f"{result['messages']} messages ({result['bytes']} bytes)"
     lines = [f"{result['files'][0]}: {size} {verdict}, in {result['seconds']:.1f} s"]
     if not result["same_config"]:
         lines.append("the configuration is not the one that the log was made with")
-    if result["identical"] and result["beyond"]:
-        lines.append(f"the log breaks off before the last {result['beyond']} bytes")
     if result["damages"]:
         lines.append(f"{result['damages']} damaged places in the log were passed over")
     return "\n".join(lines)
