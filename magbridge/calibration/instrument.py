@@ -78,8 +78,7 @@ class RateEffect(Effect, frozen=True, kw_only=True):
     Attributes
     ----------
     cause : str
-    on : {"lag", "skew", "eddy"}
-        ``lag``: an anti-alias filter's delay tau common to all channels, ``T = -tau dH/dt``: one coefficient.
+    on : {"skew", "eddy"}
         ``skew``: each channel is sampled tau_i later than the log says, ``T_i = tau_i dH_i/dt``: three.
         ``eddy``: currents that a changing field drives, ``T_i = k_ij dH_j/dt``, i != j: six, in the order
         xy, xz, yx, yz, zx, zy (Tolles & Lawson 1950, in the notation of Leliak 1961). All in s.
@@ -91,19 +90,17 @@ class RateEffect(Effect, frozen=True, kw_only=True):
 
     kind: ClassVar[str] = "rate"
     cause: str
-    on: Literal["lag", "skew", "eddy"]
+    on: Literal["skew", "eddy"]
 
     @property
     def size(self) -> int:
         """How many times."""
-        return {"lag": 1, "skew": 3, "eddy": 6}[self.on]
+        return {"skew": 3, "eddy": 6}[self.on]
 
     def columns(self, field: float) -> FloatArray:  # noqa: ARG002  (others need it)
         """Three regressors, the rates of the three channels (nT/s)."""
         columns = np.zeros((self.size, 3, 9))
-        if self.on == "lag":
-            columns[0, :, 6:9] = -np.eye(3)
-        elif self.on == "skew":
+        if self.on == "skew":
             for k in range(3):
                 columns[k, k, 6 + k] = 1.0
         else:

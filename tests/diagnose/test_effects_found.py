@@ -31,7 +31,6 @@ EFFECTS: list[Effect] = [
     TimeEffect(cause="offset_step", shape="step", start=T0 + 200.0),
     TimeEffect(cause="offset_drift", shape="drift", start=T0, period=500.0, order=2),
     TimeEffect(cause="interference_tone", shape="tone", start=T0, period=17.3),
-    RateEffect(cause="filter_lag", on="lag"),
     RateEffect(cause="channel_skew", on="skew"),
     RateEffect(cause="eddy_current", on="eddy"),
     ResponseEffect(cause="nonlinearity", unit=FIELD, power=3),

@@ -19,11 +19,7 @@ MOST = 6
 
 
 def together(state: State) -> list[Candidate]:
-    """Choose causes under the noise that is left when every cause takes what it can, one beside the other.
-
-    All in the matrix of the first round: there the noise has swallowed nothing, and each is measured with the calibration
-    and those before it free.
-    """
+    """Choose causes one beside the other, each measured with the calibration and those before it free."""
     info = state.bare
     picked: list[int] = []
     loudest, ratio = 0.0, 0.0
