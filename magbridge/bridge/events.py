@@ -38,8 +38,11 @@ class Clock:
     THRESHOLD_US = 50_000
     """Smaller differences are the host's own slewing, and are left alone."""
 
+    AT_ONCE_US = 5_000
+    """The host's two clocks are read within this, or again: a process may be held up between any two lines."""
+
     def __init__(self) -> None:
-        self._offset_us = time.time_ns() // 1000 - time.monotonic_ns() // 1000
+        self._offset_us = self._ahead_us()
         self._known_step_us = 0
 
     def now_us(self) -> int:
@@ -48,8 +51,15 @@ class Clock:
 
     def step_us(self) -> int:
         """Return by how much the host's clock was set since this was last asked; 0 where it was not."""
-        difference = time.time_ns() // 1000 - self.now_us() - self._known_step_us
+        difference = self._ahead_us() - self._offset_us - self._known_step_us
         if abs(difference) < self.THRESHOLD_US:
             return 0
         self._known_step_us += difference
         return difference
+
+    def _ahead_us(self) -> int:
+        """Return by how much the host's UTC is ahead of its steady clock, right to `AT_ONCE_US`."""
+        while True:
+            before, utc, after = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
+            if after - before < 1000 * self.AT_ONCE_US:
+                return (utc - before) // 1000
