@@ -40,19 +40,19 @@ def test_a_process_that_is_held_up_tells_no_step() -> None:
 
 @pytest.mark.parametrize("held", ["before", "after"])
 def test_held_up_beside_a_look_at_utc(monkeypatch: pytest.MonkeyPatch, held: str) -> None:
-    clock, host = Clock(), time.time_ns
+    clock, host, offset_us = Clock(), time.time_ns, [0]
     waits = [1.4e-6 * Clock.THRESHOLD_US, 0.0]
 
     def slow() -> int:
         wait = waits.pop(0) if waits else 0.0
         if held == "before":
             time.sleep(wait)
-        utc = host() + 1000 * step
+        utc = host() + 1000 * offset_us[0]
         if held == "after":
             time.sleep(wait)
         return utc
 
-    for step, told in ((0, 0), (-3_600_000_000, -3_600_000_000), (-3_600_000_000, 0)):
+    for offset_us[0], told in ((0, 0), (-3_600_000_000, -3_600_000_000), (-3_600_000_000, 0)):
         waits[:] = [1.4e-6 * Clock.THRESHOLD_US, 0.0]
         monkeypatch.setattr(time, "time_ns", slow)
         assert clock.step_us() == pytest.approx(told, abs=Clock.AT_ONCE_US)
