@@ -232,6 +232,26 @@ def test_one_position_that_is_none(
     assert "'battpos' is -9999 in 1 of 3600 samples" in line
 
 
+def test_numbers_that_may_say_not_known_are_told(
+    deployment: Path, calibration: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rows = read(deployment).isel(time=slice(0, 400))
+    rows["pump_current"] = rows["depth"] * 0.0 + 0.5
+    rows["pump_current"].attrs["units"] = "A"
+    rows["pump_current"][[7, 30]] = -9999.0
+    diagnosed = ["--calibration", str(calibration), "-o", str(tmp_path / "doubt")]
+    write(rows, tmp_path / "log.csv")
+    assert main(["diagnose", str(tmp_path / "log.csv"), *diagnosed]) == 0
+    told = capsys.readouterr().err
+    assert "log.csv, column 'pump_current': -9999 in 2 of 400 rows is taken for a number" in told
+    assert told.count("\n") == 1
+    declared = tmp_path / "declared.csv"
+    declared.write_text("# fill_value = -9999\n" + (tmp_path / "log.csv").read_text())
+    assert main(["diagnose", str(declared), *diagnosed]) == 0
+    assert not capsys.readouterr().err
+    assert np.isnan(read(declared)["pump_current"]).sum() == 2
+
+
 def test_help_names_every_command(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["--help"]) == 0
     text = capsys.readouterr().out

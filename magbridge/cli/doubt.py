@@ -3,9 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from magbridge.cli.common import Folder, Json, app, some, tell
+from magbridge.cli.common import Folder, Json, app, complain, some, tell
 from magbridge.progress import waiting
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+NOTHING = (-9999.0, -99999.0)
+"""What often says "not known", in any unit."""
 
 
 @app.command(usage="Usage: magbridge diagnose FILE... --calibration cal.json -o DIR [OPTIONS]")
@@ -44,8 +51,11 @@ def diagnose(
     from magbridge.logs import read
 
     with waiting("reading") as step:
+        logs = [read(path) for path in some(files)]
+        for log in logs:
+            _suspect(log)
         found = examine(
-            [read(path) for path in some(files)],
+            logs,
             load(calibration),
             output,
             learned_from=[read(path) for path in learned_from],
@@ -60,3 +70,17 @@ def diagnose(
     tell(
         facts, f"{facts['verdict']}: {', '.join(causes) or 'no cause'}; {rms}; {output / 'report.html'}", json
     )
+
+
+def _suspect(log: xr.Dataset) -> None:
+    """Tell of numbers that would be taken for an effect: they stand alone, and may stand for 'not known'."""
+    for name, column in log.data_vars.items():
+        values = column.to_numpy()
+        for nothing in NOTHING:
+            alone = values == nothing
+            if alone.any() and not (values[~alone] < 0.1 * nothing).any():
+                complain(
+                    f"{log.attrs['source']}, column {str(name)!r}: {nothing:g} in {alone.sum()} of {len(values)} rows is taken"
+                    f" for a number; if it says 'not known', leave it empty, or write # fill_value = {nothing:g} above a CSV's header",
+                    0,
+                )

@@ -2,7 +2,7 @@
 
 A heading is ``name`` or ``name [unit]``: ``battpos [in]``. Columns of the public table need no unit; one in
 another unit that we know (``mag_x [uT]``, ``roll [rad]``) is converted. Before the header there may be
-lines ``# heading_reference = magnetic``. ``quality`` holds the names of the flags, separated by spaces. Numbers
+lines ``# heading_reference = magnetic``, and ``# fill_value = -9999`` where that stands for a value that is lacking. ``quality`` holds the names of the flags, separated by spaces. Numbers
 are written with as many digits as bring back the same bits.
 """
 
@@ -49,10 +49,13 @@ def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
 
 def _chunks(path: Path, file: TextIO, rows: int) -> Iterator[xr.Dataset]:
     attrs: dict[str, str] = {}
+    fill = nan
     line, row = file.readline(), 1
     while line.startswith("#"):
         if match := ATTRIBUTE.fullmatch(line.rstrip("\r\n")):
             attrs[match[1]] = match[2]
+            if match[1] == "fill_value":
+                (fill,) = _numbers(path, match[1], [attrs.pop(match[1])], [row])
         line, row = file.readline(), row + 1
     if not line.strip():
         raise FormatError(path, "expected a header row, the file is empty", row=row)
@@ -76,6 +79,8 @@ def _chunks(path: Path, file: TextIO, rows: int) -> Iterator[xr.Dataset]:
             name: np.array(_numbers(path, name, column, numbers))
             for name, column in zip(names, zip(*texts, strict=True), strict=True)
         }
+        for column in columns.values():
+            column[column == fill] = nan
         dataset = deployment(path, columns.pop("time"), columns, units, attrs)
         increasing(path, dataset["time"].values, numbers, after=last)
         plausible(path, dataset, numbers)

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from magbridge import logs
 from magbridge.columns import CHANNEL_TIMES, COLUMNS
-from magbridge.logs.deployment import APART, DEGREES, LEAST, deployment
+from magbridge.logs.deployment import APART, DEGREES, LEAST, deployment, join
 
 EXACT = [".csv", ".nc", ".parquet"]
 WRITABLE = [*EXACT, ".tlog"]
@@ -265,6 +265,19 @@ def test_csv_is_as_plain_as_can_be(tmp_path: Path) -> None:
         "1.5,1.0,0.1,",
         "2.0,,2.0,stale_telemetry extrapolated",
     ]
+
+
+@pytest.mark.parametrize("rows", [1, 1000])
+def test_csv_says_which_number_stands_for_none(rows: int, tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    path.write_text(
+        "# fill_value = -9999\ntime,mag_x,pump [A],latitude\n1,-9999.0,2,50\n2,-9998,-9999,-9999\n"
+    )
+    read = join(list(logs.read_chunks(path, rows)))
+    np.testing.assert_array_equal(read["mag_x"], [np.nan, -9998.0])
+    np.testing.assert_array_equal(read["pump"], [2.0, np.nan])
+    np.testing.assert_array_equal(read["latitude"], [50.0, np.nan])
+    assert "fill_value" not in read.attrs
 
 
 def test_netcdf_has_the_shape_of_og1(tmp_path: Path) -> None:
