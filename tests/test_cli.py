@@ -235,7 +235,7 @@ def test_one_position_that_is_none(
 def test_numbers_that_may_say_not_known_are_told(
     deployment: Path, calibration: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    rows = read(deployment).isel(time=slice(0, 400))
+    rows = read(deployment).isel(time=slice(0, 150))
     rows["pump_current"] = rows["depth"] * 0.0 + 0.5
     rows["pump_current"].attrs["units"] = "A"
     rows["pump_current"][[7, 30]] = -9999.0
@@ -243,13 +243,24 @@ def test_numbers_that_may_say_not_known_are_told(
     write(rows, tmp_path / "log.csv")
     assert main(["diagnose", str(tmp_path / "log.csv"), *diagnosed]) == 0
     told = capsys.readouterr().err
-    assert "log.csv, column 'pump_current': -9999 in 2 of 400 rows is taken for a number" in told
+    assert "log.csv, column 'pump_current': -9999 in 2 of 150 rows is taken for a number" in told
     assert told.count("\n") == 1
     declared = tmp_path / "declared.csv"
     declared.write_text("# fill_value = -9999\n" + (tmp_path / "log.csv").read_text())
     assert main(["diagnose", str(declared), *diagnosed]) == 0
     assert not capsys.readouterr().err
     assert np.isnan(read(declared)["pump_current"]).sum() == 2
+
+
+def test_a_log_that_the_calibration_was_made_from_is_told(
+    deployment: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log, cal = tmp_path / "log.csv", tmp_path / "cal.json"
+    write(read(deployment).isel(time=slice(0, 300)), log)
+    assert main(["calibrate", str(log), "--method", "nominal", "-o", str(cal)]) == 0
+    capsys.readouterr()
+    assert main(["diagnose", str(log), "--calibration", str(cal), "-o", str(tmp_path / "doubt")]) == 0
+    assert f"{log}: the calibration was made from it" in capsys.readouterr().err
 
 
 def test_help_names_every_command(capsys: pytest.CaptureFixture[str]) -> None:

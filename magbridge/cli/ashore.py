@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from hashlib import sha256
 from math import inf
 from pathlib import Path
 from typing import Annotated, Any
@@ -18,6 +17,7 @@ from magbridge.cli.common import (
     Picture,
     app,
     complain,
+    digest,
     file_to_write,
     some,
     tell,
@@ -166,10 +166,10 @@ def calibrate(
     data = observations(deployment, parameter, reference=lambda ds: earth_field(ds, anomalies))
     seen: dict[str, Path] = {}
     for file in files:
-        first = seen.setdefault(sha256(file.read_bytes()).hexdigest(), file)
+        first = seen.setdefault(digest(file), file)
         if first is not file:
             complain(f"{file}: the same as {first}: its samples are counted once", 0)
-    data = replace(data, inputs={file.name: digest for digest, file in seen.items()})
+    data = replace(data, inputs={file.name: key for key, file in seen.items()})
     if filter_corner:
         data = unfiltered(data, filter_corner)
     options: dict[str, Any] = {"vehicle": read_vehicle(vehicle)} if vehicle else {}

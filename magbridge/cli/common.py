@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from hashlib import file_digest
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -22,6 +23,7 @@ __all__ = [
     "Picture",
     "app",
     "complain",
+    "digest",
     "file_to_write",
     "some",
     "tell",
@@ -74,6 +76,12 @@ def some(files: tuple[Path, ...], output: Path | None = None) -> tuple[Path, ...
     if output is not None and output.resolve() in [file.resolve() for file in files]:
         raise WrongUse(f"{output}: expected another file to write than those to read")
     return files
+
+
+def digest(path: Path) -> str:
+    """Return the SHA-256 of a file, by which a calibration knows what it was made from."""
+    with path.open("rb") as file:
+        return file_digest(file, "sha256").hexdigest()
 
 
 def tell(result: dict[str, Any], sentence: str, as_json: bool) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from magbridge.cli.common import Folder, Json, app, complain, some, tell
+from magbridge.cli.common import Folder, Json, app, complain, digest, some, tell
 from magbridge.progress import waiting
 
 if TYPE_CHECKING:
@@ -13,6 +13,10 @@ if TYPE_CHECKING:
 
 NOTHING = (-9999.0, -99999.0)
 """What often says "not known", in any unit."""
+ITSELF = (
+    "the calibration was made from it, and follows its errors where it can; calibrate on calibration runs of their own,"
+    " with --filter-corner where the sensor has an anti-alias filter"
+)
 
 
 @app.command(usage="Usage: magbridge diagnose FILE... --calibration cal.json -o DIR [OPTIONS]")
@@ -50,13 +54,16 @@ def diagnose(
     from magbridge.field.read import read_grid
     from magbridge.logs import read
 
+    known = load(calibration)
     with waiting("reading") as step:
         logs = [read(path) for path in some(files)]
-        for log in logs:
+        for path, log in zip(files, logs, strict=True):
+            if digest(path) in known.inputs.values():
+                complain(f"{path}: {ITSELF}", 0)
             _suspect(log)
         found = examine(
             logs,
-            load(calibration),
+            known,
             output,
             learned_from=[read(path) for path in learned_from],
             grid=read_grid(grid) if grid else None,
