@@ -36,14 +36,16 @@ ROOM, LEAST = 5.0, 50.0
 """The band gets no more of the chart, each way, than ROOM times the curve and LEAST nT: else the curve is a line."""
 ROUND = {"showMinLabel": False, "showMaxLabel": False}
 """The ends of an axis are where they are, and would be written over the round number beside them."""
+APART = "value => value.toLocaleString('en').replaceAll(',', '\N{NARROW NO-BREAK SPACE}')"
+"""Thousands, as everywhere on the page."""
 CHART: dict[str, Any] = {
     "useUTC": True,
     "grid": {"left": 70, "right": 32, "top": 12, "bottom": 28},
     "xAxis": {"type": "time", "axisLabel": {"hideOverlap": True, **ROUND}},
-    "yAxis": {"type": "value", "scale": True, "axisLabel": ROUND},
+    "yAxis": {"type": "value", "scale": True, "axisLabel": {":formatter": APART, **ROUND}},
     "series": [BAND, {**BAND, "areaStyle": {"opacity": 0.2}}, {**LINE, "lineStyle": {"width": 1.5}}],
 }
-GRID = "w-full grid gap-4 grid-cols-1 lg:grid-cols-"
+GRID = "w-full grid gap-4 grid-cols-1"
 
 
 def serve(link: str, baudrate: int, host: str, port: int, *, show: bool) -> None:
@@ -80,12 +82,12 @@ class Page:
             self._stream = ui.label().classes("text-sm px-3 py-1 rounded-full")
         facts = list(health(self._state))
         with ui.column().classes("w-full max-w-screen-2xl mx-auto gap-4") as self._body:
-            with ui.element().classes(f"{GRID}[18rem_1fr]"):
+            with ui.element().classes(f"{GRID} md:grid-cols-[18rem_1fr]"):
                 with _card("Field, nT ± 2σ"):
                     self._measured = [_quantity(name) for name in measured(self._state)]
                 with _card("Total field, nT ± 2σ, of the last ten minutes, UTC"):
                     self._chart = ui.echart(deepcopy(CHART)).classes("w-full h-72")
-            with ui.element().classes(f"{GRID}3"):
+            with ui.element().classes(f"{GRID} lg:grid-cols-3"):
                 with _card("Flags"):
                     self._flags = ui.column().classes("gap-2")
                 with _card("Bridge"):
@@ -95,15 +97,15 @@ class Page:
             with (
                 ui.element().classes("w-full") as self._navigation,
                 _card("Position by the field; innovation and bias in nT"),
-                ui.element().classes(f"{GRID}3 gap-y-1"),
+                ui.element().classes(f"{GRID} md:grid-cols-3 gap-y-1"),
             ):
                 self._whereabouts = [_fact(name) for name in whereabouts(self._state)]
-            with ui.element().classes(f"{GRID}2"):
+            with ui.element().classes(f"{GRID} lg:grid-cols-2"):
                 with _card("Messages, UTC"):
                     self._texts = ui.column().classes("w-full h-60 gap-1 overflow-auto flex-nowrap")
                 with _card("Parameters (Enter sets one)"):
                     self._parameters = ui.element().classes(
-                        "w-full h-60 grid grid-cols-3 gap-x-4 overflow-auto"
+                        "w-full h-60 grid grid-cols-3 content-start gap-x-4 overflow-auto"
                     )
         self._refresh()
         ui.timer(0.5, self._refresh)
@@ -166,7 +168,7 @@ class Page:
                     ui.label(_clock(when)).classes("text-slate-500 tabular-nums")
                     word = MAV_SEVERITY(severity & 7).name.lower()
                     ui.label(word).classes("w-20 shrink-0").style(f"color: {color}")
-                    ui.label(text)
+                    ui.label(text).classes("min-w-0 break-words")
 
     def _tell_parameters(self) -> None:
         known = self._state.parameters

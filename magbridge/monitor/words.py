@@ -75,8 +75,11 @@ def health(state: State) -> dict[str, tuple[str, bool]]:
         ),
         "Calibration": (f"{field('calibration_id', 0):08x}".replace("0" * 8, "none"), True),
         "Uptime": (ago(get("uptime", 0)), True),
-        "Messages lost on the way here": (f"{state.lost} of {state.lost + state.received}", not state.lost),
-        **{name: (str(count), not count) for name, count in told.items()},
+        "Messages lost on the way here": (
+            f"{_count(state.lost)} of {_count(state.lost + state.received)}",
+            not state.lost,
+        ),
+        **{name: (_count(count), not count) for name, count in told.items()},
     }
 
 
@@ -101,6 +104,10 @@ def whereabouts(state: State) -> dict[str, tuple[str, bool]]:
             True,
         ),
     }
+
+
+def _count(count: int) -> str:
+    return _number(count, ".0f")[0]
 
 
 def _number(value: float, form: str, two_sigma: float = nan, unit: str = "") -> tuple[str, str]:
