@@ -109,7 +109,10 @@ def load(path: str | Path) -> Scenario:
     """
     path = Path(path)
     if path.suffix == "":
-        path = SCENARIOS / f"{path.name}.toml"
+        known = {one.stem: one for one in sorted(SCENARIOS.glob("*.toml"))}
+        if str(path) not in known:
+            raise ConfigError(path, "", f"expected a scenario file (.toml), or one of {', '.join(known)}")
+        path = known[str(path)]
     table = load_toml(path)
     # msgspec does not name the key of a dict, so each entry is checked under its own name first
     vehicle = table.get("vehicle")

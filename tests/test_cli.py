@@ -7,11 +7,15 @@ import os
 import pty
 import resource
 import select
+import signal
+import subprocess
+import sys
 import time
 from pathlib import Path
 
 import numpy as np
 import pytest
+import xarray as xr
 
 from magbridge.calibration.file import load as load_calibration
 from magbridge.cli import main
@@ -135,10 +139,17 @@ def test_correct_gives_the_same_in_pieces(deployment: Path, calibration: Path, t
         (["replay", "{d}", "--speed", "fast"], 2, "--speed fast: expected a positive number"),
         (["replay", "{d}", "--speed", "-1"], 2, "expected a positive number"),
         (["run", "--config", "none.toml"], 2, "none.toml: No such file"),
-        (["simulate", "none", "-o", "x.csv"], 2, "none.toml: No such file"),
+        (
+            ["simulate", "none", "-o", "x.csv"],
+            2,
+            "none: expected a scenario file (.toml), or one of bonne_bay, ",
+        ),
+        (["simulate", "none.toml", "-o", "x.csv"], 2, "none.toml: No such file"),
         (["correct", "{d}", "--calibration", "none.json", "-o", "x.csv"], 1, "none.json: cannot be read"),
         (["correct", "{d}", "--calibration", "{d}", "-o", "x.csv"], 1, "not a calibration"),
         (["calibrate", "{d}", "--parameter", "nose", "-o", "x.json"], 1, "column 'nose'"),
+        (["calibrate", "{d}", "--parameter", "mag_x", "-o", "x.json"], 1, "'mag_x' is a channel"),
+        (["calibrate", "{d}", "--filter-corner", "1e-9", "-o", "x.json"], 1, "filter corner = 1e-09 Hz"),
         (["calibrate", "{d}", "--method", "magic", "-o", "x.json"], 1, "'magic' is not known"),
         (["calibrate", "{d}", "--order", "0", "-o", "x.json"], 2, "order"),
         (
@@ -149,6 +160,7 @@ def test_correct_gives_the_same_in_pieces(deployment: Path, calibration: Path, t
         (["calibrate", "{d}", "--site-bias", "inf", "-o", "x.json"], 2, "--site-bias"),
         (["map", "none.nc", "-o", "x.nc"], 1, "none.nc"),
         (["map", "none.nc", "-o", "x.foo"], 2, "must end in .nc"),
+        (["map", "none.nc", "-o", "x.nc", "--altitude", "1e308"], 2, "Must be <= 1000000"),
         (["map", "none.nc", "-o", "x.nc", "--picture", "x.foo"], 2, "must end in .png or .pdf or .svg"),
         (["convert", "{d}", "-o", "nowhere/x.csv"], 2, "There is no folder nowhere"),
         (["convert", "{d}", "-o", "."], 2, "It is a folder"),
@@ -184,6 +196,26 @@ def test_a_full_disk_gets_one_line_and_leaves_nothing(
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert line.startswith(f"{tmp_path / f'x{suffix}'}: cannot be written: ")
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_stopped_in_the_middle_leaves_nothing(
+    deployment: Path, tmp_path: Path, number: signal.Signals, code: int
+) -> None:
+    rows = read(deployment)
+    long = [rows.assign_coords(time=rows["time"] + 1e5 * k) for k in range(20)]
+    write(xr.concat(long, "time"), tmp_path / "long.nc")
+    command = [sys.executable, "-m", "magbridge.cli", "convert", "long.nc", "-o", "x.csv"]
+    with subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stderr
+        while not list(tmp_path.glob(".x.*.partial.csv")):
+            assert process.poll() is None
+            time.sleep(0.01)
+        process.send_signal(number)
+        said = process.stderr.read()
+    assert process.returncode == code
+    assert said == ("magbridge: interrupted\n" if number == signal.SIGINT else "")
+    assert [path.name for path in tmp_path.iterdir()] == ["long.nc"]
 
 
 @pytest.mark.parametrize(

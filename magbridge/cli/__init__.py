@@ -5,7 +5,9 @@ Exit codes: 0 done, 1 the data do not allow it, 2 wrong use. What is wrong goes 
 
 from __future__ import annotations
 
+import signal
 import sys
+from contextlib import suppress
 
 from cyclopts import CycloptsError
 
@@ -39,6 +41,8 @@ EXTRAS = {
 
 def main(arguments: list[str] | None = None) -> int:
     """Run a command; return its exit code."""
+    with suppress(ValueError):  # on another thread than the first: signals are another's business
+        signal.signal(signal.SIGTERM, _terminated)
     try:
         app(arguments, exit_on_error=False, print_error=False, result_action="return_value")
     except CycloptsError as error:
@@ -57,6 +61,11 @@ def main(arguments: list[str] | None = None) -> int:
     except KeyboardInterrupt:
         return complain("interrupted", 130)
     return 0
+
+
+def _terminated(*_: object) -> None:
+    """End as by Ctrl-C: what is half-written goes."""
+    raise SystemExit(128 + signal.SIGTERM)
 
 
 def _reason(error: OSError | MemoryError) -> str:

@@ -242,8 +242,8 @@ def plan(
 def map(  # noqa: A001 - the command's name
     *grids: Path,
     output: Grid,
-    altitude: Annotated[float | None, Parameter(validator=validators.Number(gt=-inf, lt=inf))] = None,
-    passes: Annotated[int, Parameter(validator=validators.Number(gte=0))] = 20,
+    altitude: Annotated[float | None, Parameter(validator=validators.Number(gte=-1e6, lte=1e6))] = None,
+    passes: Annotated[int, Parameter(validator=validators.Number(gte=0, lte=10_000))] = 20,
     mask: Path | None = None,
     spacing: Annotated[float | None, Parameter(validator=validators.Number(gt=0, lt=inf))] = None,
     picture: Picture = None,

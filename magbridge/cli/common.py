@@ -39,6 +39,7 @@ app = App(
     name="magbridge",
     help="A magnetometer bridge for vehicles whose own iron moves.",
     version=__version__,
+    suppress_keyboard_interrupt=False,  # main says it
     help_format="markdown",  # so that paragraphs are wrapped as wide as the terminal is
     help_epilogue="Ends with 0: done, 1: the data do not allow it, 2: wrong use.",
     default_parameter=Parameter(negative=(), show_default=_default),

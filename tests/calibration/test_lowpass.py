@@ -8,6 +8,7 @@ from scipy.signal import lfilter
 
 from magbridge.calibration.fitting.data import Observations
 from magbridge.calibration.fitting.lowpass import unfiltered
+from magbridge.errors import CalibrationError
 
 CORNER = 0.33
 
@@ -45,3 +46,11 @@ def test_slopes_stay_within_their_run() -> None:
         field=field, reference=np.full(40, 49_244.0), parameters=np.empty((40, 0)), runs=np.arange(40) // 20
     )
     assert np.array_equal(unfiltered(data, CORNER).field, field)
+
+
+@pytest.mark.parametrize("corner", [1e-320, 1e-9, 0.004])
+def test_a_filter_slower_than_the_data_is_refused(corner: float) -> None:
+    field = np.tile([[20_000.0, 0.0, 45_000.0]], (40, 1))
+    data = Observations(field=field, reference=np.full(40, 49_244.0), parameters=np.empty((40, 0)))
+    with pytest.raises(CalibrationError, match="and the data are 39 s long"):
+        unfiltered(data, corner)

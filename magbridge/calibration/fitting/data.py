@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from magbridge.calibration.model import Parameter
 from magbridge.calibration.residual import Samples
 from magbridge.calibration.terms import Exponents
+from magbridge.columns import CHANNELS
 from magbridge.errors import CalibrationError
 from magbridge.records import BEYOND
 
@@ -203,7 +204,11 @@ def observations(
     CalibrationError
         A column is missing or does not hold numbers.
     """
-    names = ("mag_x", "mag_y", "mag_z", *parameters)
+    if channels := [name for name in parameters if name in CHANNELS]:
+        raise CalibrationError(
+            f"parameter {channels[0]!r} is a channel of the magnetometer: it moves no mass"
+        )
+    names = (*CHANNELS, *parameters)
     columns = {name: _column(ds, name) for name in names}
     vector: FloatArray | None = None
     model = "reference_field"

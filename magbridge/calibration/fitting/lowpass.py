@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magbridge.calibration.fitting.data import Observations
+from magbridge.errors import CalibrationError
 
 __all__ = ["unfiltered"]
 
@@ -33,11 +34,21 @@ def unfiltered(data: Observations, corner: float) -> Observations:
     data : Observations
     corner : float
         Hz.
+
+    Raises
+    ------
+    CalibrationError
+        The filter would remember more than the data tell.
     """
     assert data.time is not None
     if len(data) < 3:
         return data
     tau = 1.0 / (2.0 * np.pi * corner)
+    told = float(np.ptp(data.time))
+    if tau > told:
+        raise CalibrationError(
+            f"filter corner = {corner:g} Hz: that is a time constant of {tau:.3g} s, and the data are {told:.3g} s long"
+        )
     reach = max(int(np.ceil(0.5 * REACH * tau / np.median(np.diff(data.time)))), 1)
     stretch = np.cumsum(~data.follows)
     rows = np.arange(len(data))
