@@ -14,12 +14,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from study.both import held, named, weighed
 from study.cases import PARTS, plan
-from study.draws import Draws, Span, weigh, with_another
+from study.draws import SHOWN, Draws, Span, evidence, weigh, with_another
 from study.nameless import against, allowed, nameless
 from study.stage import MEMORY, autoregression, project, whiten
 from study.table import efficiency, lines, share
-from study.theory import SHOWN, regressed
 
 from magbridge.diagnose.inference.free import Description
 
@@ -95,16 +95,24 @@ def test_likelihood_ratios_are_drawn_without_any_data() -> None:
     assert np.std(ratio) == pytest.approx(np.std(naive), rel=0.15)
 
 
-def test_causes_that_are_one_share_the_chance_to_be_named() -> None:
-    rng = np.random.default_rng(8)
-    A, B, noise = rng.normal(size=(3, 60, 2))
-    X = np.column_stack([A, A, B, 2.0 * A[:, 0] + 0.05 * noise[:, 0]])
-    spans = [Span(name, None, slice(2 * k, 2 * k + 2)) for k, name in enumerate(("a", "the same", "b"))]
-    spans.append(Span("b", SHOWN, slice(6, 7)))  # the very shape, which the table does not have
-    draws = Draws.of(X.T @ X)
-    given = {span: draws.ratio(span) for span in spans}
-    assert regressed(given, "a") == regressed(given, "the same") == pytest.approx(0.5, abs=0.01)
-    assert regressed(given, "b") == regressed(given, "none") == 0.0
+def test_two_are_named_unless_another_whole_says_the_same() -> None:
+    """By one cause that swallows both, or by two others; and the set holds what cannot be told from them."""
+    one, two, both, else_ = 10.0 * np.linalg.qr(np.random.default_rng(8).normal(size=(60, 4)))[0].T
+    trials = dict.fromkeys("abcd", 1.0)
+
+    def chances(*columns: tuple[str, np.ndarray]) -> tuple[float, float]:
+        X = np.column_stack([*(column for _, column in columns), one + two])
+        spans = [Span(name, None, slice(k, k + 1)) for k, (name, _) in enumerate(columns)]
+        wholes = weighed(Draws.of(X.T @ X), spans, spans, trials)
+        return named(wholes, frozenset("ab")), held(wholes, frozenset("ab"))
+
+    truth = (("a", one), ("b", two))
+    assert chances(*truth, ("c", both), ("d", else_)) == (1.0, 1.0)
+    assert chances(*truth, ("c", one + two)) < (0.05, 0.05)  # one cause is likelier than two that say no more
+    first, inside = chances(*truth, ("c", one + 0.01 * else_))
+    assert first == pytest.approx(0.5, abs=0.1)
+    assert inside == 1.0
+    assert chances(("c", both), ("d", else_)) == (0.0, 0.0)
 
 
 def nameless_chances(apart: float, k: int = 3, wanted: float = 10.0) -> dict[str, float]:
@@ -117,7 +125,8 @@ def nameless_chances(apart: float, k: int = 3, wanted: float = 10.0) -> dict[str
     ratio, freedom = draws.ratio(name)
     needed = against(draws, {"other": allowed(weigh(ratio, freedom), ratio)}, [], {})
     free = Description(lambda rows: X[rows, :27], (("drift", np.ones(27)),) * 20)
-    return nameless(draws, weigh(draws.truth(k), k), needed, [free])
+    truth = Span("truth", SHOWN, slice(30, 31), more=k - 1)
+    return nameless(draws, evidence(truth, *draws.ratio(truth)), needed, [free])
 
 
 def test_what_has_no_name_must_beat_the_names() -> None:

@@ -22,6 +22,7 @@ from magbridge.diagnose.inference.search import search
 from magbridge.diagnose.report.findings import findings
 from magbridge.diagnose.run import diagnose
 from sitl.inject import EFFECTS, FOREIGN, Hidden, disturb
+from study.both import both
 from study.stage import NOISES, SEEDS, Found, Stall, add_noise, again, stage_of
 from study.theory import Setting, ideal
 
@@ -138,7 +139,7 @@ def case(entry: Row) -> Row:
         "sizes": [one.hidden.size for one in hidden], "verdict": found["verdict"], "unexplained": found["unexplained"],
         "found": [[f["cause"], f["channel"], f["signal_to_noise"], [a["cause"] for a in f["alternatives"]]] for f in found["findings"]],
         "scores": _scores(found, names, whole),
-        "theory": [_theory(entry["part"], one, hidden, stall, ds, result) for one in hidden] if entry["part"] in TOLD else [],
+        "theory": _theory(entry["part"], hidden, stall, ds, result),
     }  # fmt: skip
     if entry["part"] == "gain":
         row["gain"] = _gained(hidden[0].hidden, stall, ds, result)
@@ -159,23 +160,24 @@ def _scores(found: Row, names: tuple[str, ...], whole: xr.Dataset) -> list[float
 
 
 def _theory(
-    part: str, one: Found, hidden: list[Found], stall: Stall, ds: xr.Dataset, result: Diagnosis
-) -> dict[str, Any] | None:
-    name = one.hidden.name
-    if name == "outliers":  # nothing else comes one by one
-        return None
+    part: str, hidden: list[Found], stall: Stall, ds: xr.Dataset, result: Diagnosis
+) -> list[dict[str, Any]]:
+    """What theory says of a case: of one that is hidden, or of two at once."""
+    names = [one.hidden.name for one in hidden]
+    if part not in TOLD or "outliers" in names:  # nothing else comes one by one
+        return []
+    late = next((one for one in hidden if one.hidden.name in DELAYS), hidden[0])
     others = {
-        other: _alike(other, one, stall)
+        other: _alike(other, late, stall)
         for other in DELAYS
-        if name in DELAYS and other not in [each.hidden.name for each in hidden]
+        if late.hidden.name in DELAYS and other not in names
     }
-    beside = [other for other in hidden if other is not one]
     free: list[Description] = []
     if part in NAMELESS:
-        tones = CAUSES[name].candidates(result.problem) if name == "interference_tone" else []
+        tones = CAUSES[names[0]].candidates(result.problem) if names[0] == "interference_tone" else []
         free = descriptions(result.problem, result.outcome.null, *tones[:1])
-    setting = Setting(CAUSES, result.outcome.trials, free, others, next(iter(beside), None))
-    return ideal(one, stall, ds, setting)
+    setting = Setting(CAUSES, result.outcome.trials, free, others)
+    return [both(hidden, stall, ds, setting) if len(hidden) > 1 else ideal(hidden[0], stall, ds, setting)]
 
 
 def _alike(other: str, one: Found, stall: Stall) -> Array:

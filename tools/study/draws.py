@@ -14,6 +14,8 @@ from magbridge.diagnose.inference.statistic import Statistic
 
 Array = NDArray[np.float64]
 DRAWS = 400
+SHOWN = "as shown"
+"""In a channel's place: a cause's own signature, not the table's columns."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,6 +23,7 @@ class Span:
     """One of a cause's hypotheses: its columns, the log of how many others it stands for, whether it has a sign.
 
     Where its numbers have one common size, `spectra` (l, k) are their prior variances (:mod:`magbridge.diagnose.inference.statistic`).
+    Of a true shape `more` is how many further numbers its cause has: they fit nothing but noise.
     """
 
     cause: str
@@ -29,6 +32,7 @@ class Span:
     price: float = 0.0
     positive: bool = False
     spectra: Array | None = None
+    more: float = 0.0
 
 
 class Draws(NamedTuple):
@@ -49,26 +53,23 @@ class Draws(NamedTuple):
         """Signal-to-noise of the truth."""
         return float(np.sqrt(self.S[-1, -1]))
 
-    def ratio(self, span: Span, scale: float | Array = 1.0) -> tuple[Array, int]:
+    def ratio(self, span: Span, scale: float | Array = 1.0) -> tuple[Array, float]:
         """Likelihood ratios of a hypothesis, with the truth times `scale`, and its free numbers."""
         statistic = Statistic(self.S[span.own, span.own], span.spectra)
         given, scale = self.S[span.own, -1], np.asarray(scale)[..., None]
         scores = np.moveaxis(self.noise[span.own] + scale[..., None] * given[:, None], -2, 0)
         value = statistic.ratio(scores.reshape(len(given), -1)).reshape(scores.shape[1:])
-        return np.where(scores[0] > 0.0, value, 0.0) if span.positive else value, statistic.freedom
+        if span.more:
+            value = value + 2.0 * np.random.default_rng(20131213).standard_gamma(0.5 * span.more, DRAWS)
+        return np.where(
+            scores[0] > 0.0, value, 0.0
+        ) if span.positive else value, statistic.freedom + span.more
 
     def beside(self, span: Span) -> Draws:
         """Return what is left for others where a hypothesis takes what it can."""
         taken = self.S[:, span.own] @ root_of(self.S, span)
         own = root_of(self.S, span).T @ self.noise[span.own]
         return Draws(self.S - taken @ taken.T, self.noise - taken @ own)
-
-    def truth(self, k: float, scale: float | Array = 1.0) -> Array:
-        """Likelihood ratios of the truth itself; its k - 1 other numbers fit nothing but noise."""
-        more = 2.0 * np.random.default_rng(20131213).standard_gamma(0.5 * (k - 1), DRAWS) if k > 1 else 0.0
-        return np.asarray(
-            (self.noise[-1] / self.wanted + np.asarray(scale)[..., None] * self.wanted) ** 2 + more
-        )
 
 
 def explained(S: Array, span: Span) -> float:
@@ -87,15 +88,11 @@ def weigh(ratio: Array, freedom: float) -> Array:
 
 
 def evidence(span: Span, ratio: Array, freedom: float) -> Array:
-    """Log evidence of a hypothesis' likelihood ratios; numbers of one common size are integrated out of theirs."""
+    """Log evidence of a hypothesis' likelihood ratios; those of one common size are integrated out of theirs."""
     if span.spectra is not None:
         return 0.5 * ratio - np.log(len(span.spectra))
-    return weigh(ratio, freedom) + signed(span, ratio)
-
-
-def signed(span: Span | None, ratio: Array) -> Array:
-    """Log evidence that a known sign adds: what of the posterior has it, where half of the prior had."""
-    return np.log(2.0 * ndtr(np.sqrt(ratio))) if span and span.positive else np.zeros_like(ratio)
+    # a known sign: what of the posterior has it, where half of the prior had
+    return weigh(ratio, freedom) + (np.log(2.0 * ndtr(np.sqrt(ratio))) if span.positive else 0.0)
 
 
 def with_another(draws: Draws, first: Span, spans: Sequence[Span]) -> dict[str, tuple[float, Span]]:

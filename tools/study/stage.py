@@ -220,12 +220,11 @@ class Stall(NamedTuple):
 
     def hide(self, name: str, wanted: float, seed: int) -> Found:
         """Find the size at which the effect has the signal-to-noise that is wanted."""
-        size, made = 1.0, None
+        size = 1.0
         for _ in range(6):
             made = self.show(Hidden(name, size, seed))
             found = size_of(name, made.signature, self.columns, self.stage.prior)
             if abs(found / wanted - 1.0) < 0.02:
-                break
+                return made
             size *= wanted / max(found, 1e-9)
-        assert made is not None
-        return made
+        raise RuntimeError(f"{name}, seed {seed}: no size gives S/N {wanted:g}; the last gave {found:.3g}")

@@ -2,8 +2,7 @@ r"""What a detector could do at best that knows the noise and the true shape of 
 
 Notes
 -----
-Let d be the hidden signature and X a rival's columns, whitened, with the calibration projected out (and, of two that are
-hidden at once, the other). Scores of all columns are then ``N(X^T d, X^T X)``, whatever the data were: so the ideal
+Let d be the hidden signature and X a rival's columns, whitened, with the calibration projected out. Scores of all columns are then ``N(X^T d, X^T X)``, whatever the data were: so the ideal
 detector's answers are drawn from that distribution without a deployment. It weighs the truth, a single column d with as
 many free numbers k as the cause has in the table, against every other cause of the table by the same evidence E that the
 real one uses, and names all within 20:1.
@@ -11,7 +10,7 @@ real one uses, and names all within 20:1.
 *Found* is what passes one of the tests of the table, or the truth's own: ``chi2_k`` beyond its quantile at 1 % over all
 causes and their independent hypotheses. Half point and 95 % point are read off the draws with d at other sizes.
 
-What has no name is :mod:`study.nameless`'s.
+What has no name is :mod:`study.nameless`'s, two that are hidden at once :mod:`study.both`'s.
 """
 
 from __future__ import annotations
@@ -29,15 +28,13 @@ from magbridge.diagnose.compare.problem import pose
 from magbridge.diagnose.compare.take import take
 from magbridge.diagnose.inference.free import Description
 from magbridge.diagnose.inference.weigh import LEVEL, ODDS
-from study.draws import Draws, Span, by_cause, evidence, explained, numbers, signed, weigh, with_another
+from study.draws import DRAWS, SHOWN, Draws, Span, by_cause, evidence, explained, numbers, weigh, with_another
 from study.nameless import against, allowed, nameless
 from study.stage import Found, Stall, project, whiten
 
 Array = NDArray[np.float64]
 SIZES = np.linspace(1.0, 10.0, 37)
 """Signal-to-noise at which the chance to be found is evaluated."""
-SHOWN = "as shown"
-"""In a channel's place: a cause's own signature, not the table's columns."""
 
 
 class Setting(NamedTuple):
@@ -53,15 +50,12 @@ class Setting(NamedTuple):
         What structure without a name is looked for with, where the cause is to be without one.
     others : mapping of array (n,)
         Whitened true signatures of other causes, beside what the table makes of them.
-    beside : Found or None
-        What else is hidden there; it is known, but for its size.
     """
 
     causes: Mapping[str, Cause]
     trials: Mapping[str, float]
     free: Sequence[Description]
     others: Mapping[str, Array]
-    beside: Found | None = None
 
 
 def ideal(one: Found, stall: Stall, ds: xr.Dataset, setting: Setting) -> dict[str, Any]:
@@ -81,22 +75,21 @@ def ideal(one: Found, stall: Stall, ds: xr.Dataset, setting: Setting) -> dict[st
     -------
     dict
         ``alone``: chance to name the truth alone; ``inside``: that the set holds it; ``size``: the set's mean size;
-        ``first``: cause -> chance to be named first; ``regressed``: the truth's, had it but the table's regressors; ``half``, ``sure``: signal-to-noise at which 50 and 95 % are found;
+        ``first``: cause -> chance to be named first; ``half``, ``sure``: signal-to-noise at which 50 and 95 % are found;
         ``own``: share of the signal-to-noise that the table's regressors of the true cause reach; ``apart``: cause ->
         signal-to-noise that its best imitation leaves; ``unlike`` and ``mimic``: the smallest of those, and whose it is.
         Where the setting has descriptions, ``two``: what the best two of any causes leave; ``unnamed`` and
         ``described``: see :mod:`study.nameless`.
     """
     name = one.hidden.name
-    spans, S = _information(one, stall, ds, setting)
+    spans, S = information([one], stall, ds, setting)
     draws, rivals = Draws.of(S), [span for span in spans if span.cause != name]
-    best = _best(S, rivals)
-    own = max((span for span in spans if span.cause == name), key=lambda span: _worth(S, span), default=None)
-    k = max(numbers(S, own), 1.0) if own else 1.0  # what the log cannot test, nobody names
-    given = {span: draws.ratio(span) for span in spans}
-    truth = draws.truth(k)
-    own_evidence = weigh(truth, k) + signed(own, truth)
-    weighed = by_cause({span: evidence(span, *given[span]) for span in spans}, name, own_evidence)
+    best = best_of(S, rivals)
+    own = own_span(S, spans, name)
+    true = true_span(S, own, name, len(S) - 1)
+    given = {span: draws.ratio(span) for span in (*spans, true)}
+    truth = evidence(true, *given[true])
+    weighed = by_cause({span: evidence(span, *given[span]) for span in spans}, name, truth)
     names, table = list(weighed), np.array([*weighed.values()])
     inside, first, me = table > table.max(axis=0) - ODDS, np.argmax(table, axis=0), names.index(name)
     left = {
@@ -110,8 +103,7 @@ def ideal(one: Found, stall: Stall, ds: xr.Dataset, setting: Setting) -> dict[st
         "inside": float(np.mean(inside[me])) * bool(own),
         "size": float(np.mean(inside.sum(axis=0))),
         "first": {cause: float(np.mean(first == j)) for j, cause in enumerate(names) if (first == j).any()},
-        "regressed": regressed(given, name),
-        **_found(draws, k, spans, name, setting),
+        **_found(draws, [true, *rivals], setting),
         "own": float(np.sqrt(explained(S, own))) / draws.wanted if own else 0.0,
         "apart": apart,
         "unlike": min(apart.values()),
@@ -120,26 +112,23 @@ def ideal(one: Found, stall: Stall, ds: xr.Dataset, setting: Setting) -> dict[st
     if not setting.free:
         return answers
     pairs = [(best[c], min(found.values(), key=lambda entry: entry[0])[1]) for c, found in left.items()]
-    names = by_cause({span: allowed(evidence(span, *given[span]), given[span][0]) for span in rivals})
-    needed = against(draws, names, pairs, setting.trials)
+    rival = by_cause({span: allowed(evidence(span, *given[span]), given[span][0]) for span in rivals})
+    needed = against(draws, rival, pairs, setting.trials)
     two = min(value for found in left.values() for value, _ in found.values())
-    return answers | {"two": two} | nameless(draws, weigh(truth, k), needed, setting.free)
+    return answers | {"two": two} | nameless(draws, truth, needed, setting.free)
 
 
-def _information(one: Found, stall: Stall, ds: xr.Dataset, setting: Setting) -> tuple[list[Span], Array]:
-    """Fisher's information of every hypothesis' columns, with the truth's as the last one; the rest is projected out."""
+def information(
+    hidden: Sequence[Found], stall: Stall, ds: xr.Dataset, setting: Setting
+) -> tuple[list[Span], Array]:
+    """Fisher's information of every hypothesis' columns; what is hidden stands last, one by one and, of several, their sum."""
     problem = pose(take([ds], stall.stage.calibration), stall.stage.calibration)
-    named = setting.beside.hidden.name if setting.beside else ""
-    candidates = [
-        c for key, cause in setting.causes.items() if key != named for c in cause.candidates(problem)
-    ]
+    candidates = [c for cause in setting.causes.values() for c in cause.candidates(problem)]
     table = whiten(np.hstack([c.columns(slice(0, len(problem))) for c in candidates]), stall.noise)
-    known = [setting.beside.signature] if setting.beside else []
     free = [whiten(description.columns(slice(0, len(problem))), stall.noise) for description in setting.free]
-    X = np.column_stack([*known, *free, table, *setting.others.values(), one.signature])
-    S = X.T @ project(X, stall.columns, stall.stage.prior)
-    if known:
-        S = S[1:, 1:] - np.outer(S[1:, 0], S[0, 1:]) / S[0, 0]
+    truth = [one.signature for one in hidden]
+    every = [sum(truth)] if len(truth) > 1 else []
+    X = np.column_stack([*free, table, *setting.others.values(), *truth, *every])
     first = sum(columns.shape[1] for columns in free)
     ends = (first + np.cumsum([c.size for c in candidates])).tolist()
     spans = [
@@ -150,10 +139,23 @@ def _information(one: Found, stall: Stall, ds: xr.Dataset, setting: Setting) -> 
         Span(cause, SHOWN, slice(k, k + 1), positive=cause == "filter_lag")
         for k, cause in enumerate(setting.others, first + table.shape[1])
     ]
-    return spans, S
+    return spans, X.T @ project(X, stall.columns, stall.stage.prior)
 
 
-def _best(S: Array, spans: Sequence[Span]) -> dict[str, Span]:
+def own_span(S: Array, spans: Sequence[Span], name: str) -> Span | None:
+    """Of the true cause the hypothesis of most evidence; what the log cannot test has none."""
+    return max((span for span in spans if span.cause == name), key=lambda span: _worth(S, span), default=None)
+
+
+def true_span(S: Array, own: Span | None, name: str, at: int) -> Span:
+    """Return the true shape, which stands at `at`, with as many numbers as its cause's `own` hypothesis has."""
+    shape = slice(at, at + 1)
+    if own is None:
+        return Span(name, SHOWN, shape)
+    return Span(name, SHOWN, shape, positive=own.positive, more=max(numbers(S, own), 1.0) - 1.0)
+
+
+def best_of(S: Array, spans: Sequence[Span]) -> dict[str, Span]:
     """Of each cause the hypothesis that explains most of the truth."""
     found: dict[str, tuple[float, Span]] = {}
     for span in spans:
@@ -169,26 +171,14 @@ def _worth(S: Array, span: Span) -> float:
     return float(weigh(np.array(explained(S, span) + freedom), freedom))
 
 
-def regressed(given: Mapping[Span, tuple[Array, float]], name: str) -> float:
-    """Chance that the table's own regressors name the truth first; causes that are one share it."""
-    table = by_cause({span: evidence(span, *ratio) for span, ratio in given.items() if span.channel != SHOWN})
-    if name not in table:
-        return 0.0
-    first = np.array([*table.values()]) > np.max([*table.values()], axis=0) - 1e-6
-    return float(np.mean(first[list(table).index(name)] / first.sum(axis=0)))
-
-
-def _found(draws: Draws, k: float, spans: Sequence[Span], name: str, setting: Setting) -> dict[str, float]:
+def _found(draws: Draws, spans: Sequence[Span], setting: Setting) -> dict[str, float]:
     """Half point and 95 % point of detection."""
-
-    def limit(cause: str, freedom: float) -> float:
-        return float(chdtri(freedom, LEVEL / len(setting.causes) / setting.trials.get(cause, 1.0)))
-
     scale = SIZES / draws.wanted
-    found = draws.truth(k, scale) > limit(name, k)
-    for span in (span for span in spans if span.cause != name):
+    found = np.zeros((len(SIZES), DRAWS), bool)
+    for span in spans:
         ratio, freedom = draws.ratio(span, scale)
         if freedom:
-            found |= ratio > limit(span.cause, freedom)
+            level = LEVEL / len(setting.causes) / setting.trials.get(span.cause, 1.0)
+            found |= ratio > chdtri(freedom, level)
     chance = np.maximum.accumulate(found.mean(axis=1))
     return {"half": float(np.interp(0.5, chance, SIZES)), "sure": float(np.interp(0.95, chance, SIZES))}

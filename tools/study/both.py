@@ -1,0 +1,92 @@
+r"""Whether an ideal analyst would name two causes that are hidden at once.
+
+Notes
+-----
+He knows neither, and weighs every cause alone and every two of them. The log evidence of two is that of the one, and of the
+other beside it, in the order that suits them better; every cause pays for its independent hypotheses, the second 20:1 and its
+choice among the causes, too. He names the best whole; his set holds the causes of all within 20:1 of it.
+
+*both* is his chance to name the two if he has their true shapes beside the table's columns, *inside* that his set holds them,
+*regressed* his chance with the columns alone: what those do not tell of the one may speak for another.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from magbridge.diagnose.inference.weigh import ODDS
+from study.draws import SHOWN, Draws, Span, evidence
+from study.stage import Found, Stall
+from study.theory import Setting, best_of, information, own_span, true_span
+
+Array = NDArray[np.float64]
+Wholes = dict[frozenset[str], Array]
+
+
+def both(hidden: Sequence[Found], stall: Stall, ds: xr.Dataset, setting: Setting) -> dict[str, float]:
+    """Chances of the module's notes; see :func:`study.theory.ideal`."""
+    spans, S = information(hidden, stall, ds, setting)
+    draws, table = Draws.of(S), [span for span in spans if span.channel != SHOWN]
+    truth = frozenset(one.hidden.name for one in hidden)
+    likely, last = [*best_of(S, spans).values()], len(S) - 1 - len(hidden)
+    shown = []
+    for k, one in enumerate(hidden, last):
+        alone = S[np.ix_([*range(last), k], [*range(last), k])]
+        own = own_span(alone, spans, one.hidden.name)
+        if own is None:
+            return dict.fromkeys(("both", "inside", "regressed"), 0.0)
+        likely.append(own)
+        shown.append(true_span(alone, own, one.hidden.name, k))
+    regressed = weighed(draws, table, [one for one in likely if one in table], setting.trials)
+    known = weighed(draws, [*spans, *shown], [*likely, *shown], setting.trials)
+    return {
+        "both": named(known, truth),
+        "inside": held(known, truth),
+        "regressed": named(regressed, truth),
+    }
+
+
+def weighed(
+    draws: Draws, spans: Sequence[Span], firsts: Sequence[Span], trials: Mapping[str, float]
+) -> Wholes:
+    """Log evidence of every cause, and of every two of which one of `firsts` is one."""
+
+    def own(draws: Draws, span: Span) -> Array:
+        return np.asarray(evidence(span, *draws.ratio(span)) - np.log(trials.get(span.cause, 1.0)))
+
+    def best(draws: Draws, but: str = "") -> dict[str, Array]:
+        found: dict[str, Array] = {}
+        for span in spans:
+            if span.cause != but:
+                value = own(draws, span)
+                found[span.cause] = np.maximum(found.get(span.cause, value), value)
+        return found
+
+    wholes = {frozenset((cause,)): value for cause, value in best(draws).items()}
+    price = ODDS + np.log(max(len(trials), 1))
+    for first in firsts:
+        for cause, value in best(draws.beside(first), first.cause).items():
+            whole = frozenset((first.cause, cause))
+            two = own(draws, first) + value - price
+            wholes[whole] = np.maximum(wholes.get(whole, two), two)
+    return wholes
+
+
+def named(wholes: Wholes, truth: frozenset[str]) -> float:
+    """Chance that the truth is the best whole."""
+    best = np.max([*wholes.values()], axis=0)
+    return float(np.mean(wholes[truth] >= best)) if truth in wholes else 0.0
+
+
+def held(wholes: Wholes, truth: frozenset[str]) -> float:
+    """Chance that each cause of the truth is in a whole within 20:1 of the best."""
+    near = np.max([*wholes.values()], axis=0) - ODDS
+    inside = [
+        np.max([value for whole, value in wholes.items() if cause in whole], axis=0, initial=-np.inf) > near
+        for cause in truth
+    ]
+    return float(np.mean(np.all(inside, axis=0)))
