@@ -73,15 +73,26 @@ def test_convert_there_and_back_keeps_every_number(deployment: Path, tmp_path: P
         np.testing.assert_array_equal(before[name], after[name], err_msg=str(name))
 
 
-def test_a_log_that_is_read_is_not_written_over(
+def test_what_is_read_is_not_written_over(
     deployment: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    log, link = tmp_path / "log.csv", tmp_path / "link.csv"
+    log, link, folder = tmp_path / "log.csv", tmp_path / "link.csv", tmp_path / "calibration.json"
     log.write_bytes(deployment.read_bytes())
     link.symlink_to(log)
-    for output in (log, link):
-        line = complaint(capsys, "convert", log, "-o", output, code=2)
-        assert line == f"{output}: expected another file to write than those to read"
+    for written, arguments in (
+        (log, ["convert", log, "-o", log]),
+        (link, ["convert", log, "-o", link]),
+        (log, ["correct", deployment, "--calibration", log, "-o", log]),
+        (log, ["calibrate", deployment, "--grid", log, "-o", log]),
+        (log, ["calibrate", deployment, "--vehicle", log, "-o", link]),
+        (log, ["simulate", "demo", "--like", log, "-o", log]),
+        (log, ["simulate", log, "-o", log]),
+        (log, ["navigate", deployment, "--map", log, "--bound", "-o", log]),
+        (folder, ["diagnose", deployment, "--calibration", folder, "-o", tmp_path]),
+    ):
+        line = complaint(capsys, *arguments, code=2)
+        assert line.endswith(": expected another file to write than those to read")
+        assert Path(line.partition(": expected")[0]).resolve() == written.resolve()
     assert log.read_bytes() == deployment.read_bytes()
 
 
@@ -164,6 +175,9 @@ def test_correct_gives_the_same_in_pieces(deployment: Path, calibration: Path, t
         (["map", "none.nc", "-o", "x.nc", "--picture", "x.foo"], 2, "must end in .png or .pdf or .svg"),
         (["convert", "{d}", "-o", "nowhere/x.csv"], 2, "There is no folder nowhere"),
         (["convert", "{d}", "-o", "."], 2, "It is a folder"),
+        (["convert", "{d}", "-o", "/proc/self/x.csv"], 2, "The folder /proc/self cannot be written to"),
+        (["diagnose", "{d}", "--calibration", "{d}", "-o", "{d}"], 2, "It is a file"),
+        (["demo", "--out", "{d}"], 2, "It is a file"),
         (["simulate", "demo", "-o", "x.nc", "--seed", "-1"], 2, "--seed"),
         (["replay", "{d}", "--config", "none.toml"], 2, "none.toml: No such file"),
         (["demo", "--out", "/dev/null/demo"], 1, "/dev/null/demo: Not a directory"),
@@ -198,7 +212,7 @@ def test_a_full_disk_gets_one_line_and_leaves_nothing(
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, -signal.SIGTERM)])
 def test_stopped_in_the_middle_leaves_nothing(
     deployment: Path, tmp_path: Path, number: signal.Signals, code: int
 ) -> None:

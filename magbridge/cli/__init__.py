@@ -60,12 +60,18 @@ def main(arguments: list[str] | None = None) -> int:
         return complain(_reason(error), 1)
     except KeyboardInterrupt:
         return complain("interrupted", 130)
+    except _Terminated:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        signal.raise_signal(signal.SIGTERM)
     return 0
 
 
+class _Terminated(SystemExit):
+    """The process is to end; what is half-written goes first."""
+
+
 def _terminated(*_: object) -> None:
-    """End as by Ctrl-C: what is half-written goes."""
-    raise SystemExit(128 + signal.SIGTERM)
+    raise _Terminated
 
 
 def _reason(error: OSError | MemoryError) -> str:

@@ -89,6 +89,8 @@ def simulate(
     from sitl.twin import Twin
     from sitl.twin import simulate as simulate_scenario
 
+    some((scenario, *like), output)
+    some((scenario, *like, output), map_output)
     chosen = load(scenario)
     with waiting("simulating"):
         if like:
@@ -159,10 +161,9 @@ def calibrate(
     from magbridge.field.reference import earth_field
     from magbridge.logs import read
 
+    some(files, output, vehicle, grid)
     anomalies = read_grid(grid) if grid else None
-    deployment = with_true_heading(
-        read(some(files, output), required=(*CHANNELS, *parameter)), heading_reference
-    )
+    deployment = with_true_heading(read(files, required=(*CHANNELS, *parameter)), heading_reference)
     data = observations(deployment, parameter, reference=lambda ds: earth_field(ds, anomalies))
     seen: dict[str, Path] = {}
     for file in files:
@@ -273,11 +274,10 @@ def map(  # noqa: A001 - the command's name
     from magbridge.field.prepare import draw_steps, prepare
     from magbridge.field.read import read_grid, read_polygon
 
+    some(grids, output, mask)
     polygon = read_polygon(mask) if mask else None
     with waiting("preparing"):
-        result, steps = prepare(
-            [read_grid(path) for path in some(grids, output)], altitude, passes, polygon, spacing
-        )
+        result, steps = prepare([read_grid(path) for path in grids], altitude, passes, polygon, spacing)
     result.save(output)
     if picture:
         draw_steps(steps, picture)
@@ -307,10 +307,11 @@ def correct(*files: Path, calibration: Path, output: Output, json: Json = False)
     from magbridge.logs import Writer, read_chunks
     from magbridge.records import Quality
 
+    some(files, output, calibration)
     correction = Correction(load(calibration))
     rows = flagged = 0
     with Writer(output) as writer:
-        for part in track(read_chunks(some(files, output), required=CHANNELS), "correcting"):
+        for part in track(read_chunks(files, required=CHANNELS), "correcting"):
             corrected = correct_rows(correction, part)
             writer.append(corrected)
             rows += part.sizes["time"]

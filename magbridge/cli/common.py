@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Callable
 from hashlib import file_digest
@@ -56,25 +57,33 @@ def file_to_write(*suffixes: str) -> Callable[[Any, Any], None]:
             raise ValueError("It is a folder.")
         if not path.parent.is_dir():
             raise ValueError(f"There is no folder {path.parent}.")
+        if not os.access(path.parent, os.W_OK):
+            raise ValueError(f"The folder {path.parent} cannot be written to.")
         if suffixes and path.suffix.lower() not in suffixes:
             raise ValueError(f"Its name must end in {' or '.join(suffixes)}.")
 
     return check
 
 
+def _folder_to_write(_: Any, path: Path) -> None:
+    if path.exists() and not path.is_dir():
+        raise ValueError("It is a file.")
+
+
 Output = Annotated[Path, Parameter(name=["--output", "-o"], validator=file_to_write())]
-Folder = Annotated[Path, Parameter(name=["--output", "-o"])]
+Folder = Annotated[Path, Parameter(validator=_folder_to_write)]
 Grid = Annotated[Path, Parameter(name=["--output", "-o"], validator=file_to_write(".nc"))]
 Heading = Annotated[Literal["true", "magnetic"] | None, Parameter(name="--heading-reference")]
 Picture = Annotated[Path | None, Parameter(validator=file_to_write(".png", ".pdf", ".svg"))]
 Json = Annotated[bool, Parameter(name="--json")]
 
 
-def some(files: tuple[Path, ...], output: Path | None = None) -> tuple[Path, ...]:
-    """Return `files`, if there are any, and `output` is none of them: a log that is read is never written over."""
+def some(files: tuple[Path, ...], output: Path | None = None, *others: Path | None) -> tuple[Path, ...]:
+    """Return `files`, if there are any; what is read, they and `others`, is never written over by `output`."""
     if not files:
         raise WrongUse("expected at least one FILE")
-    if output is not None and output.resolve() in [file.resolve() for file in files]:
+    read = [path.resolve() for path in (*files, *others) if path is not None]
+    if output is not None and output.resolve() in read:
         raise WrongUse(f"{output}: expected another file to write than those to read")
     return files
 

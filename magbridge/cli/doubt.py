@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter
 
 from magbridge.cli.common import Folder, Json, app, complain, digest, some, tell
 from magbridge.progress import waiting
@@ -23,7 +25,7 @@ ITSELF = (
 def diagnose(
     *files: Path,
     calibration: Path,
-    output: Folder,
+    output: Annotated[Folder, Parameter(name=["--output", "-o"])],
     learned_from: tuple[Path, ...] = (),
     grid: Path | None = None,
     json: Json = False,
@@ -54,9 +56,10 @@ def diagnose(
     from magbridge.field.read import read_grid
     from magbridge.logs import read
 
+    some(files, output / "calibration.json", calibration)
     known = load(calibration)
     with waiting("reading") as step:
-        logs = [read(path) for path in some(files)]
+        logs = [read(path) for path in files]
         for path, log in zip(files, logs, strict=True):
             if digest(path) in known.inputs.values():
                 complain(f"{path}: {ITSELF}", 0)

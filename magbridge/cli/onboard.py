@@ -9,14 +9,14 @@ from typing import Annotated
 
 from cyclopts import Parameter, validators
 
-from magbridge.cli.common import Json, app, some, tell
+from magbridge.cli.common import Folder, Json, app, some, tell
 from magbridge.errors import DataError, WrongUse
 
 
 @app.command
 def demo(
     *,
-    out: Path = Path("demo"),
+    out: Folder = Path("demo"),
     seed: Annotated[int, Parameter(validator=validators.Number(gte=0))] = 1,
     json: Json = False,
 ) -> None:

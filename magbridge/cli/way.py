@@ -59,9 +59,10 @@ def navigate(
     from magbridge.calibration.file import load
     from magbridge.errors import WrongUse
 
+    some(files, output, map, calibration, config)
     known, options = load(calibration) if calibration else None, _options(config)
     if bound:
-        _bound(some(files, output), map, output, options, known, picture, json)
+        _bound(files, map, output, options, known, picture, json)
         return
     if known is None:
         raise WrongUse("expected --calibration; or --bound, which does without")
@@ -76,7 +77,7 @@ def navigate(
     from magbridge.navigate.model import informed
     from magbridge.navigate.yardstick import errors
 
-    deployment = with_true_heading(read(some(files, output), required=CHANNELS), heading_reference)
+    deployment = with_true_heading(read(files, required=CHANNELS), heading_reference)
     corrected = correct_rows(Correction(known), deployment)
     if options is None:
         options = informed(Options(), known, float(corrected["total_field_sigma"].median()))

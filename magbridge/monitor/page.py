@@ -6,7 +6,7 @@ import socket
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from copy import deepcopy
 from functools import partial
 from math import ceil, floor, isfinite, log10, nan
@@ -64,7 +64,8 @@ def serve(link: str, baudrate: int, host: str, port: int, *, show: bool) -> None
     ear.start()
     print(f"listening on {link}; the page is http://{host}:{port}", file=sys.stderr)
     options: dict[str, Any] = {"title": "magbridge", "favicon": "🧲", "show_welcome_message": False}
-    ui.run(partial(Page, ear), host=host, port=port, show=show, reload=False, **options)
+    with suppress(KeyboardInterrupt):  # as it is told: until interrupted
+        ui.run(partial(Page, ear), host=host, port=port, show=show, reload=False, **options)
 
 
 class Page:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import socket
 import subprocess
 import sys
@@ -45,7 +46,9 @@ def page() -> Iterator[tuple[str, tuple[str, int]]]:
         assert process.stderr
         assert b"the page is" in process.stderr.readline()
         yield f"http://127.0.0.1:{port}/", ("127.0.0.1", link)
-        process.terminate()
+        process.send_signal(signal.SIGINT)
+        assert not process.stderr.read().strip()
+    assert process.returncode == 0
 
 
 def get(url: str) -> str:
