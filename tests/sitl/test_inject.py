@@ -42,6 +42,11 @@ def stage() -> Stage:
     return twin, track, np.arange(0.0, track.elapsed[-1] - 30.0, 4.0)
 
 
+@pytest.fixture(scope="module")
+def clean(stage: Stage) -> xr.Dataset:
+    return seen(stage)
+
+
 def seen(stage: Stage, *hidden: Hidden) -> xr.Dataset:
     return disturb(stage[0], hidden, *stage[1:], seed=3)
 
@@ -50,10 +55,10 @@ def channels(ds: xr.Dataset) -> np.ndarray:
     return np.column_stack([ds[f"mag_{axis}"] for axis in "xyz"])
 
 
-def effect(stage: Stage, name: str, times: float = 1.0) -> tuple[np.ndarray, xr.Dataset]:
+def effect(stage: Stage, clean: xr.Dataset, name: str, times: float = 1.0) -> tuple[np.ndarray, xr.Dataset]:
     """What it does to the channels (n, 3), and the log."""
     ds = seen(stage, Hidden(name, times * SIZE.get(name, 5.0), 11))
-    return channels(ds) - channels(seen(stage)), ds
+    return channels(ds) - channels(clean), ds
 
 
 def imported(path: Path) -> list[str]:
@@ -86,16 +91,17 @@ def test_a_filter_shows_a_turning_field_as_it_was(stage: Stage) -> None:
     np.testing.assert_allclose(filtered[1:], channels(disturb(twin, (), late, when, 3))[1:], atol=0.2)
 
 
-def test_nothing_hidden_is_the_twins_own_measurement(stage: Stage) -> None:
+def test_nothing_hidden_is_the_twins_own_measurement(stage: Stage, clean: xr.Dataset) -> None:
     twin, track, when = stage
-    np.testing.assert_array_equal(channels(seen(stage)), channels(twin.measure(track, when)))
+    np.testing.assert_array_equal(channels(clean), channels(twin.measure(track, when)))
 
 
 @pytest.mark.parametrize("name", [*EFFECTS, *FOREIGN])
-def test_twice_the_size_does_twice_as_much_and_the_seed_decides_the_rest(stage: Stage, name: str) -> None:
+def test_twice_the_size_does_twice_as_much_and_the_seed_decides_the_rest(
+    stage: Stage, clean: xr.Dataset, name: str
+) -> None:
     def change(times: float) -> np.ndarray:
-        own, ds = effect(stage, name, times)
-        clean = seen(stage)
+        own, ds = effect(stage, clean, name, times)
         others = [ds[c] - clean[c] for c in ("reference_field", "battpos", "ballast")]
         return np.column_stack([own, *others])
 
@@ -105,13 +111,10 @@ def test_twice_the_size_does_twice_as_much_and_the_seed_decides_the_rest(stage: 
     np.testing.assert_array_equal(change(1.0), one)
 
 
-def test_several_add_up(stage: Stage) -> None:
+def test_several_add_up(stage: Stage, clean: xr.Dataset) -> None:
     a, b = Hidden("current_field", 3.0, 1), Hidden("offset_step", 4.0, 2)
-    clean = channels(seen(stage))
-    both = channels(seen(stage, a, b)) - clean
-    np.testing.assert_allclose(
-        both, channels(seen(stage, a)) + channels(seen(stage, b)) - 2 * clean, atol=1e-3
-    )
+    both, *each = (channels(seen(stage, *hidden)) - channels(clean) for hidden in ((a, b), (a,), (b,)))
+    np.testing.assert_allclose(both, sum(each), atol=1e-3)
 
 
 @pytest.mark.parametrize("name", ["current_field", "pressure_offset"])
@@ -121,15 +124,15 @@ def test_a_vehicles_field_is_the_same_on_another_track(stage: Stage, name: str) 
     for seed in (4, 5):
         track = Twin.draw(twin.scenario, seed).fly()
         there = (twin, track, np.arange(0.0, track.elapsed[-1] - 30.0, 4.0))
-        own, ds = effect(there, name)
+        own, ds = effect(there, seen(there), name)
         truth = json.loads(ds.attrs["truth"])
         for k, axis in enumerate("xyz"):
             slopes = [np.polyfit(ds[c], own[:, k], 1)[0] for c in ("amps_a", "amps_b", "depth")]
             assert min(abs(s / truth[axis] - 1.0) for s in slopes) < 0.03
 
 
-def test_a_late_clock_shifts_the_telemetry_only(stage: Stage) -> None:
-    own, ds = effect(stage, "clock_offset", 20.0)
+def test_a_late_clock_shifts_the_telemetry_only(stage: Stage, clean: xr.Dataset) -> None:
+    own, ds = effect(stage, clean, "clock_offset", 20.0)
     assert not own.any()
     _, track, when = stage
     late = json.loads(ds.attrs["truth"])["delay"]
@@ -150,10 +153,10 @@ def test_skew_reads_each_channel_in_its_own_time(stage: Stage) -> None:
     assert not {"mag_time_x", "mag_time_z"} & set(ds.data_vars)  # nobody says so
 
 
-def test_a_ring_couples_across_axes_only(stage: Stage) -> None:
-    own, ds = effect(stage, "eddy_current")
+def test_a_ring_couples_across_axes_only(stage: Stage, clean: xr.Dataset) -> None:
+    own, ds = effect(stage, clean, "eddy_current")
     truth = json.loads(ds.attrs["truth"])
-    rate = np.gradient(channels(seen(stage)), 4.0, axis=0)
+    rate = np.gradient(channels(clean), 4.0, axis=0)
     # it turns the field of one axis into that of the others
     strongest = max(truth, key=lambda pair: abs(truth[pair]))
     i, j = ("xyz".index(axis) for axis in strongest)
@@ -161,11 +164,11 @@ def test_a_ring_couples_across_axes_only(stage: Stage) -> None:
     assert np.std(own[:, j]) < 0.2 * np.std(own[:, i])
 
 
-def test_steel_remembers_where_the_mass_came_from(stage: Stage) -> None:
+def test_steel_remembers_where_the_mass_came_from(stage: Stage, clean: xr.Dataset) -> None:
     """At one place it is magnetised one way or the other, by where the mass came from."""
     _, track, _ = stage
     x = track.parameters["battpos"]
-    own, _ = effect(stage, "hysteresis")
+    own, _ = effect(stage, clean, "hysteresis")
     at = np.interp(stage[2], track.elapsed, x)
     rising = np.gradient(at) > 1e-3
     falling = np.gradient(at) < -1e-3
@@ -185,8 +188,8 @@ def test_heat_soaks_in_later_than_one_lag_and_all_the_way() -> None:
     assert core[np.searchsorted(t, 0.1 * lag)] < 0.5 * (1.0 - np.exp(-0.1))
 
 
-def test_foreign_effects_are_no_ones(stage: Stage) -> None:
+def test_foreign_effects_are_no_ones(stage: Stage, clean: xr.Dataset) -> None:
     assert not set(EFFECTS) & set(FOREIGN)
-    relay, _ = effect(stage, "relay")
+    relay, _ = effect(stage, clean, "relay")
     levels = np.unique(np.round(np.linalg.norm(relay, axis=1), 2))
     assert len(levels) == 2
