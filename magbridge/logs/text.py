@@ -27,6 +27,8 @@ from magbridge.records import Quality
 __all__ = ["FileWriter", "chunks"]
 
 HEADING = re.compile(r"(?P<name>.*?)\s*(?:\[(?P<unit>[^\]]*)\])?")
+LONGEST = 1 << 20
+"""Characters of a line."""
 ATTRIBUTE = re.compile(r"#\s*(\w+)\s*=\s*(.*?)\s*")
 
 
@@ -50,13 +52,14 @@ def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
 def _chunks(path: Path, file: TextIO, rows: int) -> Iterator[xr.Dataset]:
     attrs: dict[str, str] = {}
     fill = nan
-    line, row = file.readline(), 1
+    text = _lines(file)
+    line, row = next(text, ""), 1
     while line.startswith("#"):
         if match := ATTRIBUTE.fullmatch(line.rstrip("\r\n")):
             attrs[match[1]] = match[2]
             if match[1] == "fill_value":
                 (fill,) = _numbers(path, match[1], [attrs.pop(match[1])], [row])
-        line, row = file.readline(), row + 1
+        line, row = next(text, ""), row + 1
     if not line.strip():
         raise FormatError(path, "expected a header row, the file is empty", row=row)
     matches = [HEADING.fullmatch(heading.strip()) for heading in next(csv.reader([line]))]
@@ -68,7 +71,7 @@ def _chunks(path: Path, file: TextIO, rows: int) -> Iterator[xr.Dataset]:
     if "time" not in names:
         there = " ".join(names)
         raise FormatError(path, f"expected this column; there are: {there}", row=row, column="time")
-    reader, last, nothing = csv.reader(file), -np.inf, True
+    reader, last, nothing = csv.reader(text), -np.inf, True
     lines = ((row + reader.line_num, fields) for fields in reader if fields)
     while block := list(islice(lines, rows)):
         numbers, texts = zip(*block, strict=True)
@@ -88,6 +91,14 @@ def _chunks(path: Path, file: TextIO, rows: int) -> Iterator[xr.Dataset]:
         yield dataset
     if nothing:
         raise FormatError(path, "expected rows after the header", row=row + 1)
+
+
+def _lines(file: TextIO) -> Iterator[str]:
+    """Yield the lines; what has no ends, as the zeros that a crash leaves, is never held as one."""
+    while line := file.readline(LONGEST):
+        if len(line) == LONGEST:
+            raise csv.Error(f"a line has more than {LONGEST:,} characters")
+        yield line
 
 
 def _numbers(path: Path, name: str, texts: Sequence[str], rows: Sequence[int]) -> list[float]:

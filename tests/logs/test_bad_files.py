@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
 
@@ -57,6 +59,18 @@ def test_csv(text: str, rows: int, tmp_path: Path) -> None:
         list(logs.read_chunks(path, rows))
     assert one_line(caught.value, path) == BAD_CSV[text]
     assert caught.value.exit_code == 1
+
+
+@pytest.mark.parametrize("head", ["", "time,mag_x\n1,2\n"])
+def test_csv_of_endless_zeros_is_not_held(head: str, tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    path.write_text(head)
+    os.truncate(path, 300_000_000)
+    tracemalloc.start()
+    with pytest.raises(FormatError, match="a line has more than 1,048,576 characters"):
+        logs.read(path)
+    assert tracemalloc.get_traced_memory()[1] < 30e6
+    tracemalloc.stop()
 
 
 def test_csv_of_binary_data(tmp_path: Path) -> None:
