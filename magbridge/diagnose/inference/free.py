@@ -15,6 +15,7 @@ from magbridge.diagnose.causes.timing import field_rates, mass_rates
 from magbridge.diagnose.compare.problem import Columns, Problem, effect_columns
 from magbridge.diagnose.inference.events import passage, step
 from magbridge.diagnose.inference.joint import Joint
+from magbridge.diagnose.inference.packets import packets
 
 __all__ = ["Description", "descriptions"]
 
@@ -26,6 +27,8 @@ BEND = 10
 """Order of a channel's free response."""
 PLAYS = (0.3, 0.8)
 """Widths of a channel's memory, half of its range being one."""
+SLOPES = (0.0, 0.1, 0.2)
+"""Sines of the angles at which what lies loose in the hull slides."""
 
 
 class Description(NamedTuple):
@@ -77,8 +80,9 @@ def descriptions(problem: Problem, fit: Joint, tone: Candidate | None = None) ->
     """List what structure of any kind is looked for with.
 
     Slow curves along each axis of the body and along the field, and a constant along that; since when the offsets are
-    others, and what passed by; the direction of the field, its rates of change, the channels' response, one delay of
-    everything; of each telemetry channel a curve through its values, and its memory of where it was.
+    others, what passed by, and what rang for a while; the direction of the field, its rates of change, the channels' response,
+    one delay of everything; what hangs in the hull, and what lies loose at its lower end; of each telemetry channel a curve through
+    its values, and its memory of where it was.
     """
     body = -problem.slopes[:, 6:]
     u = problem.survey.time - problem.survey.time[0]
@@ -127,6 +131,17 @@ def descriptions(problem: Problem, fit: Joint, tone: Candidate | None = None) ->
                 _of("broadband", curve, 12, channel=name, turned=True, holds=held),
                 _of("broadband", memory, 24, channel=name, turned=True, remembers=True),
             ]
+    if problem.survey.attitude is not None:
+        roll, pitch = np.radians(problem.survey.attitude[:, :2].T)
+        for down in (-np.sin(pitch), np.sin(roll) * np.cos(pitch)):
+            listed += [
+                _of("broadband", projected(_curve(down)), 12, turned=True),
+                _of("switching", projected(_ends(down)), 3 * len(SLOPES), turned=True),
+            ]
+    rings = packets(problem, fit)
+    if rings is not None:
+        width = (("tone", np.full(2 * rings.number, 30.0)),)
+        listed.append(Description(rings.columns, width, None, rings.trials, rings.period))
     if tone is not None:
         width = (("tone", np.ones(tone.size)),)
         listed.append(Description(tone.columns, width, None, tone.trials, tone.shape["period"][0]))
@@ -168,10 +183,9 @@ def _response(reading: FloatArray, slopes: FloatArray) -> Columns:
 
 
 def _bends() -> tuple[tuple[str, FloatArray], ...]:
-    """Widths of a response's polynomials: of all channels, with a corner or without, or of one that has a corner."""
+    """Widths of a response's polynomials: with a corner or without."""
     k = np.arange(1.0, BEND + 1.0)
-    alone = [np.repeat(np.arange(3) == axis, BEND) * np.tile(30.0 / k**2, 3) for axis in range(3)]
-    return tuple(("broadband", width) for width in (np.tile(30.0 / k**2, 3), np.tile(30.0 / k**3, 3), *alone))
+    return tuple(("broadband", width) for width in (np.tile(30.0 / k**2, 3), np.tile(30.0 / k**3, 3)))
 
 
 def _curve(values: FloatArray) -> Columns:
@@ -193,6 +207,16 @@ def _memory(values: FloatArray) -> Columns:
         return np.concatenate([*branches, [w, w * v]]).T
 
     return _centred(columns)
+
+
+def _ends(down: FloatArray) -> Columns:
+    """Return at which end of the hull lies what slides to the lower one, and sticks until it is tipped by so much."""
+    place = np.arange(len(down))
+    ends = []
+    for slope in SLOPES:
+        last = np.maximum.accumulate(np.where(np.abs(down) > slope, place, 0))
+        ends.append(np.sign(down[last]))
+    return _centred(lambda rows: np.stack([end[rows] for end in ends], axis=1))
 
 
 def _centred(columns: Columns) -> Columns:

@@ -27,7 +27,7 @@ from magbridge.diagnose.inference.joint import Joint
 from magbridge.diagnose.inference.noise import Noise
 from magbridge.diagnose.inference.search import Hypothesis, Outcome
 from magbridge.diagnose.inference.statistic import Ridge, Statistic
-from magbridge.diagnose.inference.weigh import LEVEL, ODDS, REMNANT, lead, worth
+from magbridge.diagnose.inference.weigh import LEVEL, ODDS, REMNANT, slack, worth
 
 __all__ = ["Leftover", "accept", "leftover"]
 
@@ -60,6 +60,8 @@ class Leftover(NamedTuple):
         The telemetry that goes with it best.
     description : Description, optional
         What told it.
+    choice : int
+        How many it was chosen from.
     """
 
     kind: str
@@ -69,6 +71,7 @@ class Leftover(NamedTuple):
     period_s: float | None
     best_channel: str | None
     description: Description | None = None
+    choice: int = 1
 
 
 def lone(S: FloatArray, b: FloatArray, width: FloatArray, whole: Ridge) -> Ridge:
@@ -123,18 +126,19 @@ def leftover(
     evidence, kind, one, size = max(found, key=lambda entry: entry[0])
     # half of a chi-square's tail: a size that cannot be negative is zero as often as not (Self & Liang 1987)
     tail = 0.5 * float(chi2.sf(2.0 * max(evidence, 0.0), 1))
-    p_value = min(1.0, sum(len(one.widths) for one in listed) * tail)
+    count = sum(len(one.widths) for one in listed)
+    p_value = min(1.0, count * tail)
     # without a name stricter than for a cause: it is the asymptotic distribution
     if p_value >= (LEVEL if model else 0.1 * LEVEL):
         return None
     channel = one.channel or _goes_with(problem, fit)
-    return Leftover(kind, size, p_value, evidence, one.period, channel, one)
+    return Leftover(kind, size, p_value, evidence, one.period, channel, one, count)
 
 
 def accept(problem: Problem, outcome: Outcome, tone: Candidate | None) -> tuple[bool, Leftover | None]:
     """Say whether the names stand, and what is left beside them or, if they do not, at all.
 
-    Names stand unless a free description of the whole beats them as another name would have to. If more is left beside
+    Names and a free description of the whole have equal odds, but what a name's regressor may miss is forgiven. If more is left beside
     them than an idealised regressor leaves, and of another sort than they are, the burden of proof is theirs: they and what
     is left must beat it 20:1.
     """
@@ -148,8 +152,9 @@ def accept(problem: Problem, outcome: Outcome, tone: Candidate | None) -> tuple[
     # what holds the names' own regressors and finds nothing else beside them is no other explanation
     free = leftover(problem, [], outcome.null, outcome.order, tone, but=() if other else model)
     ratio = 2.0 * (outcome.fit.log_likelihood - outcome.null.log_likelihood)
-    names = worth(ratio, model, outcome.trials) + (other.evidence - ODDS if other else lead(ratio))
-    if free is not None and names < free.evidence:
+    names = worth(ratio, model, outcome.trials) + (other.evidence - ODDS if other else slack(ratio))
+    # each pays for what it was chosen from
+    if free is not None and names - np.log(len(outcome.trials)) < free.evidence - np.log(free.choice):
         return False, free
     return True, rest
 

@@ -1,0 +1,171 @@
+r"""Oscillations of limited duration: what rings, surges or bursts for a while.
+
+Notes
+-----
+A packet is a wave along the field under a Gaussian, with an amplitude and a phase of its own (Gabor 1946, J. IEE 93:429):
+
+.. math:: e^{-(t - t_0)^2 / 2 (Q P)^2} \left(a \cos \tfrac{2 \pi (t - t_0)}{P} + b \sin \tfrac{2 \pi (t - t_0)}{P}\right)
+
+Its moment t_0 is as likely as any other; its period P and its cycles Q are uniform in their logarithms. With g the score of each single
+sample and h its information at that frequency, the likelihood ratio of a and b is ``R = |B|^2 / S``,
+
+.. math:: B(t_0) = \sum_t g_t e^{-(t - t_0)^2 / 2 (Q P)^2 + 2 \pi i (t - t_0) / P}, \qquad
+          S(t_0) = \tfrac12 \sum_t h_t e^{-(t - t_0)^2 / (Q P)^2}
+
+so all moments are two convolutions. A packet is worth its place if the evidence, averaged over all places that it could have had, is
+above one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.fft import fft, ifft, next_fast_len
+
+from magbridge.diagnose.compare.problem import Columns, Problem
+from magbridge.diagnose.inference.joint import Joint
+from magbridge.diagnose.inference.weigh import weigh
+
+__all__ = ["Packets", "packets"]
+
+FloatArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+CYCLES = (0.75, 2.25, 6.75)
+"""Q."""
+SHORTEST, LONGEST = 4.0, 1.0 / 6.0
+"""Period, in samples; length Q P, of the log."""
+HEARD = 6.0
+"""Likelihood ratio below which a place is none."""
+MOST = 12
+"""Packets in a log."""
+APART = 2.5
+"""Lengths, or bandwidths, from which on two packets are two."""
+REACH = 5.0
+"""Lengths, beyond which a packet is over."""
+
+
+class Places(NamedTuple):
+    """Where packets of one period and length may be: moments (m,), likelihood ratios (m,), log of a place's share."""
+
+    period: float
+    length: float
+    moment: FloatArray
+    ratio: FloatArray
+    share: float
+
+
+class Packets(NamedTuple):
+    """Packets that are worth their places: two columns each, how many, the number of sets of so many, the loudest's period (s)."""
+
+    columns: Columns
+    number: int
+    trials: float
+    period: float
+
+
+def packets(problem: Problem, fit: Joint) -> Packets | None:
+    """Find the packets in what a fit has left, the loudest first."""
+    places = list(_places(problem, fit))
+    found: list[tuple[float, Places]] = []
+    price = 0.0
+    while len(found) < MOST:
+        best = max(places, key=lambda own: own.ratio.max(), default=None)
+        if best is None:
+            break
+        at = int(np.argmax(best.ratio))
+        ratio, moment = float(best.ratio[at]), float(best.moment[at])
+        near = 0.0
+        for own in places:
+            length, band = np.hypot(own.length, best.length), np.hypot(1.0 / own.length, 1.0 / best.length)
+            if abs(1.0 / own.period - 1.0 / best.period) < APART * band / (2.0 * np.pi):
+                same = np.abs(own.moment - moment) < APART * length
+                near += float(np.sum(np.exp(own.share + 0.5 * (own.ratio[same] - ratio))))
+                own.ratio[same] = 0.0
+        if weigh(ratio, 2) + np.log(near) <= 0.0:
+            break
+        price -= float(np.log(near))
+        found.append((moment, best))
+    if not found:
+        return None
+    step = float(np.median(np.diff(problem.survey.time)))
+    return Packets(_columns(problem, found), len(found), float(np.exp(price)), found[0][1].period * step)
+
+
+def _columns(problem: Problem, found: list[tuple[float, Places]]) -> Columns:
+    place = np.arange(len(problem), dtype=float)
+
+    def columns(rows: slice) -> FloatArray:
+        out = np.zeros((len(place[rows]), 2 * len(found)))
+        for k, (moment, own) in enumerate(found):
+            since = (place[rows] - moment) / own.length
+            here = np.abs(since) < REACH
+            turns = 2.0 * np.pi * own.length / own.period * since[here]
+            # in units of what white noise lets see of it
+            under = np.exp(-0.5 * since[here] ** 2) / np.sqrt(own.length)
+            out[here, 2 * k], out[here, 2 * k + 1] = under * np.cos(turns), under * np.sin(turns)
+        return np.asarray(problem.gain[rows, None] * out)
+
+    return columns
+
+
+def _places(problem: Problem, fit: Joint) -> Iterator[Places]:
+    """Yield the places of each period and length where anything is heard."""
+    noise, n = fit.noise, len(problem)
+    finest = 2 ** max(int(np.log2(n)) - 6, 0)
+    whole = finest * next_fast_len(int((1.0 + 3.0 * LONGEST) * n / finest) + 1)
+    G = fft(problem.gain * _back(fit), whole)
+    # after a gap nothing is whitened, and a sample is its own
+    h = problem.gain**2 * noise.kappa / noise.scale**2
+    H, lone = (
+        fft(np.where(noise.past, h, 0.0), whole),
+        fft(np.where(noise.past, 0.0, noise.share**2 * h), whole),
+    )
+    lags = np.arange(1, len(noise.memory) + 1)
+    for Q in CYCLES:
+        # one bandwidth 1 / (2 pi Q) apart
+        count = max(int(2.0 * np.pi * Q * np.log(LONGEST * n / Q / SHORTEST)), 0)
+        for period in SHORTEST * np.exp(np.arange(count) / (2.0 * np.pi * Q)):
+            length = Q * period
+            # so few samples still hold all frequencies below twice its own
+            every = min(2 ** int(np.log2(period / SHORTEST)), finest)
+            f = np.arange(whole // every // 2 + 1) / whole
+            B = _smooth(G, np.exp(-0.5 * (2.0 * np.pi * length * (f - 1.0 / period)) ** 2), every)
+            # of a packet's own band: Gauss and Hermite's nodes
+            near = 1.0 / period + np.array([-1.0, 0.0, 1.0]) * np.sqrt(1.5) / (2.0 * np.pi * length)
+            whitened = np.abs(1.0 - np.exp(-2j * np.pi * np.outer(near, lags)) @ noise.memory) ** 2
+            seen = float(np.array([1.0, 4.0, 1.0]) @ whitened) / 6.0
+            # real, so the negative frequencies' half is the positive ones'
+            half = np.where(f > 0.0, 1.0, 0.5) * np.exp(-0.25 * (2.0 * np.pi * length * f) ** 2)
+            S = 2.0 * _smooth(seen * H + lone, half, every).real
+            # the kernels' own sums: sqrt(2 pi) length, and sqrt(pi) length
+            known = 0.5 * np.sqrt(np.pi) * length * S
+            moment = every * np.arange(-(-n // every))
+            ratio = (2.0 * np.pi * length**2 * np.abs(B) ** 2 / np.maximum(known, 1e-3 * known.max()))[
+                : len(moment)
+            ]
+            heard = np.flatnonzero(ratio > HEARD)
+            if heard.size:
+                share = -float(np.log(len(CYCLES) * count * len(moment)))
+                yield Places(period, length, moment[heard].astype(float), ratio[heard], share)
+
+
+def _smooth(spectrum: ComplexArray, kernel: FloatArray, every: int) -> ComplexArray:
+    """Every so many samples of the convolution with a `kernel`, given at the lowest frequencies that are not negative."""
+    out = np.zeros(len(spectrum) // every, complex)
+    out[: len(kernel)] = spectrum[: len(kernel)] * kernel
+    return np.asarray(ifft(out) / every)
+
+
+def _back(fit: Joint) -> FloatArray:
+    """(n,) score of each sample: the whitened residual, filtered backwards."""
+    noise = fit.noise
+    v = np.sqrt(noise.kappa) * noise.response(fit.left) / noise.scale
+    after = np.where(noise.past, v, 0.0)
+    out = np.where(noise.past, v, noise.share * v)
+    for k, a in enumerate(noise.memory, 1):
+        out[:-k] -= a * after[k:]
+    return np.asarray(out)

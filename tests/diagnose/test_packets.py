@@ -1,0 +1,80 @@
+"""What rings for a while: found where it is, and not where it is not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from magbridge.calibration.fitting.data import observations
+from magbridge.calibration.fitting.fit import fit
+from magbridge.calibration.fitting.lowpass import unfiltered
+from magbridge.diagnose.compare.problem import Problem, pose
+from magbridge.diagnose.compare.take import take
+from magbridge.diagnose.inference.free import _ends
+from magbridge.diagnose.inference.information import information
+from magbridge.diagnose.inference.joint import fit_joint
+from magbridge.diagnose.inference.packets import packets
+from magbridge.diagnose.inference.statistic import Statistic
+from sitl import load, simulate
+from sitl.columns import segments
+
+
+@pytest.fixture(scope="module")
+def problem() -> Problem:
+    scenario = load("demo")
+    parts = segments(simulate(scenario, 2))
+    learned = unfiltered(
+        observations(parts["calibration"], ("battpos", "ballast")), scenario.instrument.corner
+    )
+    calibration = fit(learned, "auto").calibration
+    return pose(take([parts["survey"]], calibration), calibration)
+
+
+def drawn(problem: Problem, memory: float, rng: np.random.Generator) -> NDArray[np.float64]:
+    """Noise of unit variance that begins anew after a gap."""
+    r = rng.normal(size=len(problem))
+    for k in np.flatnonzero(problem.survey.follows):
+        r[k] = memory * r[k - 1] + np.sqrt(1.0 - memory**2) * r[k]
+    return np.asarray(r)
+
+
+@pytest.mark.parametrize("memory", [0.0, 0.8])
+def test_two_packets_are_found_where_they_are_in_noise_of_any_memory(problem: Problem, memory: float) -> None:
+    n, rng = len(problem), np.random.default_rng(3)
+    t = np.arange(n)
+    planted = np.zeros(n)
+    for moment, period, length in ((0.3 * n, 40.0, 90.0), (0.7 * n, 25.0, 30.0)):
+        planted += 2.5 * np.exp(-0.5 * ((t - moment) / length) ** 2) * np.cos(2 * np.pi * t / period + 1.0)
+    noise = drawn(problem, memory, rng)
+    given = replace(problem, residual=problem.gain * planted + noise)
+    base = fit_joint(given, [], 1)
+    found = packets(given, base)
+    assert found is not None
+    info = information(given, base.noise, base, [], [found.columns])
+    best = Statistic(info.matrix, np.ones((1, 2 * found.number))).best(info.score)
+    estimate = found.columns(slice(None)) @ best.estimate
+    planted *= problem.gain
+    assert np.sum((estimate - planted) ** 2) < np.sum(planted**2) / 3.0
+    assert 0.5 * best.ratio - np.log(found.trials) > 10.0
+    assert 20.0 < found.period / np.median(np.diff(problem.survey.time)) < 50.0
+
+
+@pytest.mark.parametrize("memory", [0.0, 0.8])
+def test_noise_has_no_packet_that_is_worth_its_place(problem: Problem, memory: float) -> None:
+    rng = np.random.default_rng(4)
+    worth = []
+    for _ in range(10):
+        given = replace(problem, residual=drawn(problem, memory, rng))
+        found = packets(given, fit_joint(given, [], 1))
+        worth.append(found is not None)
+    assert sum(worth) <= 2
+
+
+def test_what_lies_loose_changes_ends_when_it_is_tipped_far_enough() -> None:
+    down = np.sin(np.radians([0.0, 4.0, 8.0, 4.0, -4.0, -8.0, -4.0, 4.0, 30.0]))
+    ends = _ends(down)(slice(None))
+    steps = np.diff(ends, axis=0)
+    assert (steps[:, 1] != 0.0).tolist() == [False, True, False, False, True, False, False, True]
