@@ -75,6 +75,6 @@ def _terminated(*_: object) -> None:
 
 
 def _reason(error: OSError | MemoryError) -> str:
-    if isinstance(error, OSError) and error.filename:
-        return f"{error.filename}: {error.strerror}"
+    if isinstance(error, OSError) and error.strerror:
+        return f"{error.filename}: {error.strerror}" if error.filename else error.strerror
     return str(error) or "not enough memory"

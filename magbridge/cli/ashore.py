@@ -165,12 +165,7 @@ def calibrate(
     anomalies = read_grid(grid) if grid else None
     deployment = with_true_heading(read(files, required=(*CHANNELS, *parameter)), heading_reference)
     data = observations(deployment, parameter, reference=lambda ds: earth_field(ds, anomalies))
-    seen: dict[str, Path] = {}
-    for file in files:
-        first = seen.setdefault(digest(file), file)
-        if first is not file:
-            complain(f"{file}: the same as {first}: its samples are counted once", 0)
-    data = replace(data, inputs={file.name: key for key, file in seen.items()})
+    data = replace(data, inputs=_digests(files))
     if filter_corner:
         data = unfiltered(data, filter_corner)
     options: dict[str, Any] = {"vehicle": read_vehicle(vehicle)} if vehicle else {}
@@ -197,6 +192,16 @@ def calibrate(
     tell(result, summary, json)
     if strict and not found.supported:
         raise DataError("the data do not support this fit, and --strict: see the warnings")
+
+
+def _digests(files: tuple[Path, ...]) -> dict[str, str]:
+    """Return each file's name and digest; tell of one that is there twice."""
+    seen: dict[str, Path] = {}
+    for file in files:
+        first = seen.setdefault(digest(file), file)
+        if first is not file:
+            complain(f"{file}: the same as {first}: its samples are counted once", 0)
+    return {file.name: key for key, file in seen.items()}
 
 
 @app.command(usage="Usage: magbridge plan --calibration cal.json --mission FILE [OPTIONS]")

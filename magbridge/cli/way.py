@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from math import isfinite
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from magbridge.cli.common import Heading, Json, Output, Picture, app, complain, some, tell
 
@@ -75,7 +75,6 @@ def navigate(
     from magbridge.navigate import Options
     from magbridge.navigate.batch import navigate as find_way
     from magbridge.navigate.model import informed
-    from magbridge.navigate.yardstick import errors
 
     deployment = with_true_heading(read(files, required=CHANNELS), heading_reference)
     corrected = correct_rows(Correction(known), deployment)
@@ -90,24 +89,28 @@ def navigate(
         draw_navigation(track, grid, picture)
     for finding in track.attrs["findings"].splitlines():
         complain(finding, 0)
+    facts, summary = _judged(track)
+    tell({"file": str(output), **facts}, f"{output}: {summary}", json)
+
+
+def _judged(track: xr.Dataset) -> tuple[dict[str, Any], str]:
+    """Return how good a track is: by what the filter claims, and by the truth where the log tells it."""
+    from magbridge.navigate.yardstick import errors
+
     vouched, rows = float(track["vouched"].mean()), track.sizes["time"]
     sigma = float((track["covariance_nn"] + track["covariance_ee"])[-1]) ** 0.5
     error, reckoned = (float((one**2).mean()) ** 0.5 for one in errors(track))
     judged = isfinite(error)
     off = f"; off by {error:.0f} m RMS, dead reckoning alone by {reckoned:.0f} m" if judged else ""
-    tell(
-        {
-            "file": str(output),
-            "rows": rows,
-            "vouched": vouched,
-            "sigma_m": sigma,
-            "error_m": error if judged else None,
-            "dead_reckoning_error_m": reckoned if judged else None,
-            **track.attrs,
-        },
-        f"{output}: {rows} updates, vouched for {vouched:.0%}, 1-sigma {sigma:.0f} m at the end{off}",
-        json,
-    )
+    facts = {
+        "rows": rows,
+        "vouched": vouched,
+        "sigma_m": sigma,
+        "error_m": error if judged else None,
+        "dead_reckoning_error_m": reckoned if judged else None,
+        **track.attrs,
+    }
+    return facts, f"{rows} updates, vouched for {vouched:.0%}, 1-sigma {sigma:.0f} m at the end{off}"
 
 
 def _bound(
