@@ -35,6 +35,8 @@ T = TypeVar("T")
 Positive = Annotated[float, Meta(gt=0, le=1e9)]
 NotNegative = Annotated[float, Meta(ge=0, le=1e9)]
 """With an end: TOML knows ``inf``, and deadlines and sizes are whole numbers inside."""
+Rate = Annotated[float, Meta(ge=-1e9, le=1e9)]
+Name = Annotated[str, Meta(min_length=1)]
 SystemId = Annotated[int, Meta(ge=1, le=255)]
 
 
@@ -61,7 +63,7 @@ class Sensor(Table, frozen=True):
     """
 
     driver: str
-    port: str
+    port: Name
     baudrate: Annotated[int, Meta(gt=0)] = 9600
     timeout: Positive = 10.0
     options: dict[str, Any] = msgspec.field(default_factory=dict)
@@ -88,13 +90,17 @@ class Link(Table, frozen=True):
         File that keeps parameters changed over the link.
     """
 
-    url: str
+    url: Name
     system: SystemId = 1
     component: SystemId = 191
     autopilot: SystemId = 1
     baudrate: Annotated[int, Meta(gt=0)] = 57600
     signing_key: str | None = None
-    parameters: str = "parameters.json"
+    parameters: Name = "parameters.json"
+
+    def __post_init__(self) -> None:
+        if self.component == self.autopilot:
+            raise ValueError(f"component: another than the autopilot's, {self.autopilot}")
 
 
 class Telemetry(Table, frozen=True):
@@ -188,14 +194,18 @@ class Log(Table, frozen=True):
 
 
 class Config(Table, frozen=True):
-    """A whole ``bridge.toml``. `path` is the file itself, `digest` the first 8 bytes of its SHA-256 in hex."""
+    """A whole ``bridge.toml``.
+
+    `publish` holds Hz of each message: 0 is with every sample, a negative rate never. `path` is the file itself,
+    `digest` the first 8 bytes of its SHA-256 in hex.
+    """
 
     sensor: Sensor
     link: Link
     telemetry: dict[str, Telemetry] = msgspec.field(default_factory=dict)
     calibration: CalibrationFile | None = None
     align: Align = Align()
-    publish: dict[str, float] = msgspec.field(default_factory=lambda: {"MAG_FIELD": 0.0})
+    publish: dict[str, Rate] = msgspec.field(default_factory=lambda: {"MAG_FIELD": 0.0})
     log: Log | None = None
     navigation: Navigation | None = None
     path: Path = Path("bridge.toml")
@@ -221,7 +231,7 @@ def load(path: str | Path) -> Config:
         if reserved in table:
             raise ConfigError(path, reserved, "unknown key")
     # msgspec does not name the key of a dict, so each entry is checked under its own name first
-    for section, kind in (("telemetry", Telemetry), ("publish", float)):
+    for section, kind in (("telemetry", Telemetry), ("publish", Rate)):
         entries = table.get(section)
         for name, value in entries.items() if isinstance(entries, dict) else ():
             convert(value, kind, path, f"{section}.{name}.")

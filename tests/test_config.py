@@ -66,6 +66,11 @@ def test_the_contract_s_example_is_read(tmp_path: Path) -> None:
             'url = "udpout:x"\nsystem = 256',
             "link.system: expected `int` <= 255",
         ),
+        ('url = "udpout:192.0.2.1:14550"', 'url = ""', "link.url: expected `str` of length >= 1"),
+        ('port = "/dev/ttyUSB0"', 'port = ""', "sensor.port: expected `str` of length >= 1"),
+        ("[telemetry", "component = 1\n[telemetry", "link: component: another than the autopilot's, 1"),
+        ("HIGHRES_IMU = 0", "HIGHRES_IMU = nan", "publish.HIGHRES_IMU: expected `float` "),
+        ("HIGHRES_IMU = 0", "HIGHRES_IMU = inf", "publish.HIGHRES_IMU: expected `float` <= 1000000000"),
         ("[sensor]", "path = 'x'\n[sensor]", "path: unknown key"),
     ],
 )
