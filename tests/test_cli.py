@@ -94,6 +94,11 @@ def test_what_is_read_is_not_written_over(
         assert line.endswith(": expected another file to write than those to read")
         assert Path(line.partition(": expected")[0]).resolve() == written.resolve()
     assert log.read_bytes() == deployment.read_bytes()
+    loop = tmp_path / "loop.csv"
+    loop.symlink_to(loop)
+    assert "expected a file, there is none" in complaint(
+        capsys, "convert", loop, "-o", tmp_path / "x.csv", code=1
+    )
 
 
 def test_what_headings_are_counted_from_may_be_told(deployment: Path, tmp_path: Path) -> None:

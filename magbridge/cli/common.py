@@ -82,8 +82,8 @@ def some(files: tuple[Path, ...], output: Path | None = None, *others: Path | No
     """Return `files`, if there are any; what is read, they and `others`, is never written over by `output`."""
     if not files:
         raise WrongUse("expected at least one FILE")
-    read = [path.resolve() for path in (*files, *others) if path is not None]
-    if output is not None and output.resolve() in read:
+    read = [os.path.realpath(path) for path in (*files, *others) if path is not None]
+    if output is not None and os.path.realpath(output) in read:
         raise WrongUse(f"{output}: expected another file to write than those to read")
     return files
 
