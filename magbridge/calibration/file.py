@@ -98,7 +98,7 @@ def decode_calibration(data: bytes, file: str | Path = "cal.json") -> Calibratio
         content = msgspec.json.decode(data, type=_File)
         terms = tuple(_term_in(term, file) for term in content.terms)
         effects = tuple(_term_in(effect, file) for effect in content.effects)
-    except msgspec.DecodeError as problem:
+    except (msgspec.DecodeError, UnicodeDecodeError) as problem:
         raise FormatError(file, f"not a calibration: {_plain(problem)}") from problem
     try:
         return _checked(content, terms, effects)
@@ -192,7 +192,7 @@ def _check_covariance(covariance: FloatArray) -> None:
         raise CalibrationError("covariance: expected a positive semidefinite matrix")
 
 
-def _plain(problem: msgspec.DecodeError) -> str:
+def _plain(problem: Exception) -> str:
     """Put the path first in msgspec's message: ``noise.sensor: Expected `float`, got `str```."""
     text, _, path = str(problem).partition(" - at ")
     return f"{path.strip('`').removeprefix('$.')}: {text}" if path else text

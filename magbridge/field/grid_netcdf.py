@@ -28,7 +28,7 @@ def netcdf(path: Path, variable: str | None = None) -> Parts:
     try:
         with xr.open_dataset(path, engine="netcdf4") as data:
             data.load()
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RuntimeError) as error:  # RuntimeError: what netCDF says of damaged data
         raise FormatError(path, "expected a netCDF grid") from error
     if {"x_range", "y_range", "dimension", "z"} <= set(data.variables):
         return _old_gmt(data)

@@ -40,7 +40,7 @@ def load(path: str | Path) -> Kept:
         return msgspec.json.decode(Path(path).read_bytes(), type=Kept)
     except FileNotFoundError:
         return Kept()
-    except msgspec.DecodeError as error:
+    except (msgspec.DecodeError, UnicodeDecodeError) as error:
         raise FormatError(path, f"kept parameters as JSON: {error}") from error
 
 

@@ -35,7 +35,7 @@ def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
     try:
         with pq.ParquetFile(path) as file:
             yield from _chunks(path, file, rows)
-    except (pa.ArrowException, OSError) as error:
+    except (pa.ArrowException, OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
         raise FormatError(path, f"expected a whole Parquet file: {str(error).splitlines()[0]}") from None
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -166,6 +167,21 @@ def test_any_edit_is_read_or_refused_in_one_line(data: st.DataObject, cal: Calib
         told = f"cal.json: {read.method}"
     assert told.startswith("cal.json: ")
     assert "\n" not in told or told == f"cal.json: {content['method']}"
+
+
+@settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(places=st.lists(st.tuples(st.integers(0, 10**9), st.integers(0, 255)), min_size=1, max_size=4))
+def test_any_damage_is_read_or_refused_in_one_line(places: list[tuple[int, int]], cal: Calibration) -> None:
+    content = bytearray(encode_calibration(cal))
+    for place, byte in places:
+        content[place % len(content)] = byte
+    with suppress(FormatError, CalibrationError):
+        decode_calibration(bytes(content), "cal.json")
+
+
+def test_a_key_that_is_no_text(cal: Calibration) -> None:
+    with pytest.raises(FormatError, match="not a calibration"):
+        decode_calibration(encode_calibration(cal).replace(b'"name":"', b'"\xf9ame":"'), "cal.json")
 
 
 @given(noise=st.binary(max_size=60))

@@ -8,7 +8,7 @@ from contextlib import suppress
 import numpy as np
 import pytest
 import xarray as xr
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 from PIL.TiffImagePlugin import ImageFileDirectory_v2
@@ -216,6 +216,19 @@ def test_whatever_a_file_holds_the_answer_is_a_grid_or_one_line(tmp_path_factory
 
 
 @pytest.mark.real
+@settings(max_examples=60, deadline=None, derandomize=True)  # HDF5 itself may not live through any damage
+@given(places=st.lists(st.tuples(st.integers(0, 10**9), st.integers(0, 255)), min_size=1, max_size=30))
+def test_a_damaged_grid_is_a_grid_or_one_line(tmp_path_factory, places):
+    path = tmp_path_factory.mktemp("damaged") / "map.nc"
+    AnomalyGrid(LON, LAT, MAP).save(path)
+    content = bytearray(path.read_bytes())
+    for place, byte in places:
+        content[place % len(content)] = byte
+    path.write_bytes(content)
+    with suppress(FormatError):
+        read_grid(path)
+
+
 def test_magnavs_published_map_matches_its_own_flight(real_data):
     """The example's compensated magnetometer against its map, at the true track: other programs made both."""
     grid = read_grid(real_data / "magnav_example" / "map")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import tracemalloc
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -213,3 +214,30 @@ def test_any_bytes_are_a_deployment_or_one_line(suffix: str, content: bytes, tmp
         logs.read(path)
     except FormatError as error:
         one_line(error, path)
+
+
+@pytest.mark.parametrize("suffix", [".nc", ".parquet"])
+@settings(max_examples=60, deadline=None, derandomize=True)  # HDF5 itself may not live through any damage
+@given(places=st.lists(st.tuples(st.integers(0, 10**9), st.integers(0, 255)), min_size=1, max_size=9))
+def test_a_damaged_file_is_a_deployment_or_one_line(
+    suffix: str, places: list[tuple[int, int]], tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    path = tmp_path_factory.mktemp("damaged") / f"log{suffix}"
+    logs.write(deployment("made", np.arange(40.0), {name: np.arange(40.0) for name in CHANNELS}), path)
+    content = bytearray(path.read_bytes())
+    for place, byte in places:
+        content[place % len(content)] = byte
+    path.write_bytes(content)
+    with suppress(FormatError):
+        logs.read(path)
+
+
+@pytest.mark.parametrize("said", [b"\xff", b"{"])
+def test_parquet_of_other_metadata(said: bytes, tmp_path: Path) -> None:
+    pa = pytest.importorskip("pyarrow")
+    parquet = pytest.importorskip("pyarrow.parquet")
+    path = tmp_path / "log.parquet"
+    parquet.write_table(pa.table({"time": [1.0, 2.0]}).replace_schema_metadata({"magbridge": said}), path)
+    with pytest.raises(FormatError) as caught:
+        logs.read(path)
+    assert "expected a whole Parquet file" in one_line(caught.value, path)
