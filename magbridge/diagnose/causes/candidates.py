@@ -46,8 +46,8 @@ class Candidate:
         Its coefficients cannot be negative.
     narrow : float
         Log of how much narrower than their grid's cells the data hold its nonlinear parameters.
-    parts : int
-        Regressors that it was put together from, one after the other.
+    parts : tuple of Candidate
+        Those that it was put together from, one after the other.
     spectra : (l, k) array or None
         Where its numbers have one common free size (:mod:`~magbridge.diagnose.inference.statistic`): their prior variances, in units of the widths
         squared and up to a common factor; each is tried.
@@ -65,7 +65,7 @@ class Candidate:
     trials: float = 1.0
     positive: bool = False
     narrow: float = 0.0
-    parts: int = 1
+    parts: tuple[Candidate, ...] = ()
     spectra: FloatArray | None = None
 
     @property
@@ -77,6 +77,11 @@ class Candidate:
     def freedom(self) -> int:
         """Free numbers."""
         return self.size if self.spectra is None else 1
+
+    @property
+    def pieces(self) -> tuple[Candidate, ...]:
+        """Its parts, or itself."""
+        return self.parts or (self,)
 
     def with_(self, other: Candidate) -> Candidate:
         """Return both as one: a cause that takes more than one regressor to describe."""
@@ -94,7 +99,7 @@ class Candidate:
             shape=self.shape | {name + mark: value for name, value in other.shape.items()},
             again=None,
             narrow=self.narrow + other.narrow,
-            parts=self.parts + other.parts,
+            parts=(*self.pieces, *other.pieces),
         )
 
 

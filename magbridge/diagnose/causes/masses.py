@@ -84,7 +84,7 @@ def actuator_order(problem: Problem) -> list[Candidate]:
     groups = [[made[e] for e in group] for group in ([missing] if 1 < len(missing) <= MANY else []) + curves]
     return [
         *(made[e] for e in missing),
-        *(replace(reduce(Candidate.with_, group), parts=1) for group in groups),
+        *(replace(reduce(Candidate.with_, group), parts=()) for group in groups),
         _series([made[e] for e in series], series),
     ]
 
@@ -93,7 +93,7 @@ def _series(terms: list[Candidate], exponents: list[tuple[int, ...]]) -> Candida
     """Terms of one series, three numbers each."""
     orders = np.repeat([float(sum(e)) for e in exponents], 3)
     spectra = np.array([fall ** (2.0 * (orders - orders.min())) for fall in FALLS])
-    return replace(reduce(Candidate.with_, terms), parts=1, spectra=spectra)
+    return replace(reduce(Candidate.with_, terms), parts=(), spectra=spectra)
 
 
 def _monomial(problem: Problem, exponents: tuple[int, ...]) -> Candidate:

@@ -29,7 +29,7 @@ def nonlinearity(problem: Problem) -> list[Candidate]:
         made.append(
             of_effect(problem, effect, 50.0, f"nT at {unit:.0f} nT", phi=phi, shape={"power": (power, "1")})
         )
-    return [*made, replace(made[0].with_(made[1]), parts=1)]
+    return [*made, replace(made[0].with_(made[1]), parts=())]
 
 
 def saturation(problem: Problem) -> list[Candidate]:

@@ -2,50 +2,71 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from functools import reduce
+from itertools import combinations
+
+import numpy as np
 
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.inference.joint import Joint
-from magbridge.diagnose.inference.rivals import Rival, rivals_of
-from magbridge.diagnose.inference.rounds import Hypothesis, State
-from magbridge.diagnose.inference.sharpen import sharpen
-from magbridge.diagnose.inference.weigh import evidence_of_all
+from magbridge.diagnose.inference.pairs import pairs_of
+from magbridge.diagnose.inference.rivals import rivals_of
+from magbridge.diagnose.inference.rounds import State
+from magbridge.diagnose.inference.sharpen import refined
+from magbridge.diagnose.inference.weigh import slack
 
 __all__ = ["exchanged"]
 
 CHANGES = 6
 """At most."""
 TRIED = 3
-"""Rivals, in a cause's place."""
+"""Of what could stand there, at a time."""
 
 
-def exchanged(
-    state: State, model: list[Candidate], base: Joint, null: Joint
-) -> tuple[list[Candidate], Joint]:
-    """Put a rival in a cause's place, profiled there, as long as the evidence of the whole grows."""
+def exchanged(state: State, model: list[Candidate], base: Joint) -> tuple[list[Candidate], Joint]:
+    """Put others in the place of one cause or of two, profiled there, as long as the evidence of the whole grows.
 
-    def evidence(model: Sequence[Candidate], fit: Joint) -> float:
-        ratio = 2.0 * (fit.log_likelihood - null.log_likelihood)
-        return evidence_of_all(ratio, model) - sum(candidate.narrow for candidate in model)
-
+    More numbers must win by what the errors of the rest's regressors may lend them, fewer may lose by that.
+    """
+    pieces = [piece for candidate in model for piece in candidate.pieces]
     for _ in range(CHANGES):
-        info, own = state.beside(model, base), evidence(model, base)
-        tried = []
-        for k in range(len(model)):
-            best: dict[str, Rival] = {}
-            for rival in rivals_of(state, info, model, base, k):
-                best.setdefault(rival.cause, rival)
-            best.pop(model[k].cause, None)
-            others = model[:k] + model[k + 1 :]
-            rest = state.fit(others) if best else base
-            for rival in list(best.values())[:TRIED]:
-                fit = state.fit([*others, rival.candidate], like=base)
-                ratio = 2.0 * (fit.log_likelihood - rest.log_likelihood)
-                there = sharpen(state, others, Hypothesis(rival.candidate, ratio, 0.0, 0.0, fit), rest)
-                changed = [*others, there.candidate]
-                tried.append((evidence(changed, there.fit) + rival.cheaper - own, changed, there.fit))
-        gain, *_ = better = max(tried, key=lambda entry: entry[0], default=(0.0, model, base))
+        own, tried = state.value(pieces, base), [(0.0, pieces, base)]
+        for new, at in _changes(state, pieces, base):
+            rest = [piece for n, piece in enumerate(pieces) if n not in at]
+            changed, fit = refined(state, [*new, *rest], state.fit([*new, *rest], like=base), len(new))
+            more = float(np.sign(sum(c.size for c in new) - sum(pieces[n].size for n in at)))
+            if len({c.cause for c in changed}) > len({piece.cause for piece in pieces}):
+                more = max(more, 0.0)  # another cause is never the simpler
+            lent = slack(state.ratio(state.fit(rest, like=base))) if rest and more else 0.0
+            tried.append((state.value(changed, fit) - own - more * lent, changed, fit))
+        gain, *_ = better = max(tried, key=lambda entry: entry[0])
         if gain <= 0.0:
             break
-        _, model, base = better
-    return model, base
+        _, pieces, base = better
+    return _gathered(state, pieces, base)
+
+
+def _changes(state: State, pieces: list[Candidate], base: Joint) -> list[tuple[list[Candidate], list[int]]]:
+    """List what could stand in which places, the likeliest first."""
+    info = state.beside(pieces, base)
+    found = []
+    if len(pieces) == 1:
+        found = [(r.behind, [r.candidate], [0]) for r in rivals_of(state, info, pieces, base, 0)]
+    for places in combinations(range(len(pieces)), min(2, len(pieces))):
+        for pair in pairs_of(state, info, pieces, base, *places):
+            kept = [n for n in places if pieces[n] is pair.first or pieces[n] is pair.second]
+            new = [c for c in (pair.first, pair.second) if not any(c is pieces[n] for n in kept)]
+            found.append((pair.behind, new, [n for n in places if n not in kept]))
+    return [entry[1:] for entry in sorted(found, key=lambda entry: entry[0])[:TRIED]]
+
+
+def _gathered(state: State, pieces: list[Candidate], base: Joint) -> tuple[list[Candidate], Joint]:
+    """Make each cause's pieces one candidate."""
+    causes = list(dict.fromkeys(piece.cause for piece in pieces))
+    if len(causes) == len(pieces):
+        return pieces, base
+    ends = np.cumsum([0, *(piece.size for piece in pieces)])
+    order = sorted(range(len(pieces)), key=lambda n: causes.index(pieces[n].cause))
+    c = np.concatenate([base.coefficients[ends[n] : ends[n + 1]] for n in order])
+    model = [reduce(Candidate.with_, [p for p in pieces if p.cause == cause]) for cause in causes]
+    return model, state.fit(model, np.append(base.z, c), plain=False, like=base, rounds=1)

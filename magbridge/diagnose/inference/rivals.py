@@ -23,14 +23,11 @@ class Rival:
     ----------
     candidate : Candidate
     behind : float
-        Log evidence by which it loses.
-    cheaper : float
-        ... and what of that its nonlinear parameters have less to pay: a cause's evidence is its average over the grid.
+        Log evidence by which it loses, as an average over the grid of its nonlinear parameters.
     """
 
     candidate: Candidate
     behind: float
-    cheaper: float
 
     @property
     def cause(self) -> str:
@@ -66,5 +63,5 @@ def rivals_of(
         cheaper = average - paid - float(np.log(candidate.trials / model[k].trials))
         behind = mine.evidence - s.evidence - cheaper
         if behind < lead(mine.ratio) and state.p_value(candidate, s.ratio, s.freedom) < LEVEL:
-            rivals.append(Rival(candidate, behind, cheaper))
+            rivals.append(Rival(candidate, behind))
     return tuple(sorted(rivals, key=lambda rival: rival.behind))

@@ -14,7 +14,7 @@ from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.fit_noise import certainty
 from magbridge.diagnose.inference.information import Information, information
 from magbridge.diagnose.inference.joint import RIDGE, Joint, fit_joint, volume_of
-from magbridge.diagnose.inference.weigh import Score, evidence_of, score, slices, trials
+from magbridge.diagnose.inference.weigh import Score, evidence_of, score, slack, slices, trials, worth
 
 __all__ = ["Hypothesis", "State", "key"]
 
@@ -80,6 +80,7 @@ class State:
         self.blocks: bool | None = None
         self.certain: dict[tuple[str, str | None], float] = {}
         self.last: tuple[Joint | None, Information | None] = None, None
+        self.null: Joint
         self.own: Information
         self.bare: Information
         self.groups: dict[tuple[str, str | None], list[int]] = {}
@@ -100,6 +101,16 @@ class State:
             self.problem, columns, self.order, *starts, plain=plain, spectra=[c.spectra for c in model],
             like=like, blocks=self.blocks, ridge=_ridge(model), rounds=rounds,
         )  # fmt: skip
+
+    def ratio(self, fit: Joint) -> float:
+        """Twice the log likelihood that a model has gained over none."""
+        return 2.0 * (fit.log_likelihood - self.null.log_likelihood)
+
+    def value(self, model: Sequence[Candidate], fit: Joint) -> float:
+        """Log evidence of a whole model; what an idealised regressor leaves is not yet another cause."""
+        ratio, causes = self.ratio(fit), {candidate.cause for candidate in model}
+        narrow = sum(candidate.narrow for candidate in model)
+        return worth(ratio, model, self.trials) - narrow - len(causes) * slack(ratio)
 
     def scores(self, info: Information) -> list[Score]:
         """Score every candidate."""

@@ -27,11 +27,12 @@ from magbridge.diagnose.inference.exchange import exchanged
 from magbridge.diagnose.inference.fit_noise import memory_order
 from magbridge.diagnose.inference.information import Information
 from magbridge.diagnose.inference.joint import Joint, fit_joint
-from magbridge.diagnose.inference.rivals import Rival, rivals_of
+from magbridge.diagnose.inference.rivals import Rival
 from magbridge.diagnose.inference.rounds import Hypothesis, State, key
+from magbridge.diagnose.inference.sets import sets_of
 from magbridge.diagnose.inference.sharpen import refined, sharpen
 from magbridge.diagnose.inference.together import MOST, enough, together
-from magbridge.diagnose.inference.weigh import LEVEL, REMNANT, evidence_of, lead, slack, worth
+from magbridge.diagnose.inference.weigh import LEVEL, REMNANT, evidence_of, lead, slack
 
 __all__ = ["Hypothesis", "Outcome", "search"]
 
@@ -84,7 +85,7 @@ def search(problem: Problem, candidates: Sequence[Candidate], causes: int) -> Ou
     rough = fit_joint(problem, [], 1, rounds=2)
     order = memory_order(rough.left, problem.survey.follows)
     state = State(problem, candidates, order, causes)
-    null = state.fit([])
+    null = state.null = state.fit([])
     state.blocks = bool(np.ptp(null.noise.scale))  # likelihoods that are compared have one kind of noise
     first = state.round([], null) if candidates else []
     tested: dict[str, tuple[float, float]] = {}
@@ -95,30 +96,23 @@ def search(problem: Problem, candidates: Sequence[Candidate], causes: int) -> Ou
     chosen, base = _remove(state, model, base, null)
     model = [h.candidate for h in chosen]
     info = state.beside(model, base) if chosen or not first else state.own
-    rivals = tuple(rivals_of(state, info, model, base, k) for k in range(len(chosen)))
+    rivals = sets_of(state, info, model, base) if model else ()
     return Outcome(tuple(chosen), rivals, null, base, order, tested, info, state.trials)
 
 
 def _likeliest(state: State, null: Joint, first: list[Hypothesis]) -> tuple[list[Candidate], Joint]:
     """Return what is worth most: causes found one after the other, chosen together, or a single one, if that is enough."""
-
-    def value(model: Sequence[Candidate], fit: Joint) -> float:
-        # what an idealised regressor leaves is not yet another cause
-        ratio, causes = 2.0 * (fit.log_likelihood - null.log_likelihood), {c.cause for c in model}
-        narrow = sum(candidate.narrow for candidate in model)
-        return worth(ratio, model, state.trials) - narrow - len(causes) * slack(ratio)
-
     one_by_one, at_once = _chain(state, null, first), together(state)
-    found = [exchanged(state, *one_by_one, null) if one_by_one[0] else one_by_one]
+    found = [exchanged(state, *one_by_one) if one_by_one[0] else one_by_one]
     before = {key(candidate) for candidate in one_by_one[0]}
     if at_once and (before or len(at_once) > 1) and {key(candidate) for candidate in at_once} != before:
         # a single one has had its test
         start = refined(state, at_once, state.fit(at_once, rounds=6))
-        found.append(exchanged(state, *start, null))
-    model, base = max(found, key=lambda entry: value(*entry))
+        found.append(exchanged(state, *start))
+    model, base = max(found, key=lambda entry: state.value(*entry))
     if len({candidate.cause for candidate in model}) > 1:
         alone = enough(state, first)
-        if alone is not None and value([alone.candidate], alone.fit) > value(model, base):
+        if alone is not None and state.value([alone.candidate], alone.fit) > state.value(model, base):
             alone = sharpen(state, [], alone, null)
             model, base = [alone.candidate], alone.fit
     return model, base
@@ -135,7 +129,7 @@ def _chain(state: State, null: Joint, first: list[Hypothesis]) -> tuple[list[Can
         grown = [
             h for h in found if h.candidate.cause not in (whole if h.candidate.spectra is None else heard)
         ]
-        best = _next(grown, heard, 2.0 * (base.log_likelihood - null.log_likelihood))
+        best = _next(grown, heard, state.ratio(base))
         if best is None:
             break
         best = sharpen(state, model, best, base)

@@ -85,14 +85,18 @@ def _bracket(state: State, candidate: Candidate, name: str) -> tuple[float, floa
     return low, min((v for v in grid if v > here), default=here + width)
 
 
-def refined(state: State, model: list[Candidate], base: Joint) -> tuple[list[Candidate], Joint]:
-    """Profile the nonlinear parameters of each member of a model beside the others."""
-    for _ in range(len(model)):
+def refined(
+    state: State, model: list[Candidate], base: Joint, members: int | None = None
+) -> tuple[list[Candidate], Joint]:
+    """Profile the nonlinear parameters of the first `members` of a model beside the others; they end up last."""
+    for _ in range(len(model) if members is None else members):
         own, others = model[0], model[1:]
-        rest = state.fit(others, plain=False)
         c = np.append(base.coefficients[own.size :], base.coefficients[: own.size])
-        there = state.fit([*others, own], np.append(base.z, c), plain=False, like=base, rounds=1)
-        ratio = 2.0 * (there.log_likelihood - rest.log_likelihood)
-        best = sharpen(state, others, Hypothesis(own, ratio, 0.0, 0.0, there), rest)
-        model, base = [*others, best.candidate], best.fit
+        base = state.fit([*others, own], np.append(base.z, c), plain=False, like=base, rounds=1)
+        model = [*others, own]
+        if own.again is not None:
+            rest = state.fit(others, plain=False)
+            ratio = 2.0 * (base.log_likelihood - rest.log_likelihood)
+            best = sharpen(state, others, Hypothesis(own, ratio, 0.0, 0.0, base), rest)
+            model, base = [*others, best.candidate], best.fit
     return model, base

@@ -152,8 +152,10 @@ def worth(ratio: float, model: Sequence[Candidate], trials: Mapping[str, float])
     so much goes wrong in one log, and for their choice among the causes. How narrowly the data then hold the nonlinear
     parameters counts between names alone: a free description is profiled, too, and pays nothing for it.
     """
-    further = max(sum(candidate.parts for candidate in model) - 1, 0) * (ODDS + float(np.log(len(trials))))
-    grids = sum(candidate.parts * float(np.log(trials[candidate.cause])) for candidate in model)
+    further = max(sum(len(candidate.pieces) for candidate in model) - 1, 0) * (
+        ODDS + float(np.log(len(trials)))
+    )
+    grids = sum(len(candidate.pieces) * float(np.log(trials[candidate.cause])) for candidate in model)
     return evidence_of_all(ratio, model) - further - grids
 
 

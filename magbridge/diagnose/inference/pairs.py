@@ -1,0 +1,241 @@
+r"""Two causes at once: every pair of candidates in the place of two regressors of a model.
+
+Notes
+-----
+A cause that was found may hold another's place only because the one beside it holds a third's: neither gives way alone. So
+what could stand there is weighed in pairs, all others of the model projected out (:mod:`.information`):
+
+.. math:: E_{ab} = E_a + E_{b \mid a}, \qquad
+          E_{AB} = \ln \frac{1}{|A| |B|} \sum_{a \in A, b \in B} e^{E_{ab}}
+
+with A, B the grids of two causes' nonlinear parameters. A candidate whose numbers have one common size is only ever the first
+of its pair, at the size that it would have alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import log_ndtr, logsumexp
+
+from magbridge.diagnose.causes.candidates import Candidate
+from magbridge.diagnose.inference.information import Information
+from magbridge.diagnose.inference.joint import Joint
+from magbridge.diagnose.inference.rounds import State, key
+from magbridge.diagnose.inference.statistic import VISIBLE
+from magbridge.diagnose.inference.weigh import LEVEL, REMNANT, lead, score
+
+__all__ = ["Pair", "pairs_of"]
+
+FloatArray = NDArray[np.float64]
+Group = tuple[str, str | None]
+
+
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """Two that could stand in the place of two others.
+
+    Attributes
+    ----------
+    first, second : Candidate
+        In this one's and that one's place.
+    behind : float
+        Log evidence by which they lose, each averaged over its grid.
+    """
+
+    first: Candidate
+    second: Candidate
+    behind: float
+
+
+class _Stack:
+    """Candidates of one size, whose free numbers are scored at once."""
+
+    def __init__(
+        self, places: Sequence[int], at: Sequence[slice], candidates: Sequence[Candidate], info: Information
+    ) -> None:
+        self.places = np.array(places)
+        self.index = np.array([np.r_[at[k]] for k in places])
+        self.positive = np.array([candidates[k].positive for k in places])
+        self.S = info.matrix[self.index[:, :, None], self.index[:, None, :]]
+        self.b = info.score[self.index]
+
+    def beside(
+        self, rows: FloatArray, K: FloatArray, taken: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """(m,) log evidences, likelihood ratios and freedoms (:func:`~.weigh.score`) beside another.
+
+        Parameters
+        ----------
+        rows, K : (k, M) array
+            Its information with all columns, and what it takes of them.
+        taken : (k,) array
+            What it takes of the score.
+        """
+        U = rows[:, self.index]
+        S = self.S - np.einsum("amk,aml->mkl", U, K[:, self.index])
+        b = self.b - np.einsum("amk,a->mk", U, taken)
+        values, vectors = np.linalg.eigh(S)
+        seen = values > VISIBLE
+        y = np.einsum("mij,mi->mj", vectors, b)
+        ratio = np.sum(np.where(seen, y**2 / np.where(seen, values, 1.0), 0.0), axis=1)
+        ratio[self.positive & (b.min(axis=1) < 0.0)] = 0.0
+        freedom = seen.sum(axis=1)
+        over = np.maximum(ratio / np.maximum(freedom, 1), 1.0)
+        evidence = 0.5 * freedom * (over - 1.0 - np.log(over))
+        evidence += np.where(self.positive & (ratio > 0.0), np.log(2.0) + log_ndtr(np.sqrt(ratio)), 0.0)
+        return evidence, ratio, freedom
+
+
+def pairs_of(
+    state: State, info: Information, model: Sequence[Candidate], base: Joint, *places: int
+) -> list[Pair]:
+    """Return what two could stand in the place of one of `model`, or of two, the likeliest first.
+
+    Parameters
+    ----------
+    state : State
+    info : Information
+        Of all candidates and of `model`, whose columns are the last: :meth:`~.rounds.State.beside`.
+    model : sequence of Candidate
+    base : Joint
+        Its fit.
+    *places : int
+        Of the one or the two.
+    """
+    table = _Table(state, info, model, base, places)
+    groups = list(table.members)
+    pairs = (table.pair(A, B) for n, A in enumerate(groups) for B in groups[n:])
+    return sorted((pair for pair in pairs if pair is not None), key=lambda pair: pair.behind)
+
+
+class _Table:
+    """Log evidences of all pairs in the place of two of a model."""
+
+    def __init__(
+        self, state: State, info: Information, model: Sequence[Candidate], base: Joint, places: Sequence[int]
+    ) -> None:
+        ends = state.at[-1].stop + np.cumsum([0, *(candidate.size for candidate in model)])
+        here = [slice(int(ends[n]), int(ends[n + 1])) for n in places]
+        own = np.r_[*here]
+        others = np.setdiff1d(np.arange(ends[0], ends[-1]), own)
+        alone = info.without(others, base.prior[len(base.z) + others - ends[0]])
+        c = base.coefficients
+        self.signals = [alone.matrix[:, at] @ c[np.r_[at] - ends[0]] for at in here]
+        # what the data say when all of them are taken out of the fit
+        self.info = replace(alone, score=alone.score + sum(self.signals))
+        self.state, self.base, self.standing = state, base, [model[n] for n in places]
+        self.candidates = [*state.candidates, *self.standing]
+        self.at = [*state.at, *here]
+        self.members = {group: list(members) for group, members in state.groups.items()}
+        for n, candidate in enumerate(self.standing):
+            self.members[key(candidate)].append(len(state.candidates) + n)
+        self._fill()
+        self.best, self.lead = self._own()
+        self.paid = float(np.sum(np.log([candidate.trials for candidate in self.standing])))
+
+    def _fill(self) -> None:
+        """Score every candidate alone, and beside each."""
+        m, info = len(self.candidates), self.info
+        sizes: dict[int, list[int]] = {}
+        for n, candidate in enumerate(self.candidates):
+            if candidate.spectra is None:
+                sizes.setdefault(candidate.size, []).append(n)
+        stacks = [_Stack(places, self.at, self.candidates, info) for places in sizes.values()]
+        self.scores = [score(info, own, c) for own, c in zip(self.at, self.candidates, strict=True)]
+        beside, self.ratio = np.full((m, m), -np.inf), np.zeros((m, m))
+        self.freedom = np.ones((m, m), int)
+        for n, (own, first) in enumerate(zip(self.at, self.scores, strict=True)):
+            rows = info.matrix[own]
+            A, every = rows[:, own] + np.diag(first.prior), np.column_stack([rows, info.score[own]])
+            solved: FloatArray = np.asarray(np.linalg.solve(A, every), float)
+            for stack in stacks:
+                evidence, ratio, freedom = stack.beside(rows, solved[:, :-1], solved[:, -1])
+                beside[n, stack.places] = first.evidence + evidence
+                self.ratio[n, stack.places], self.freedom[n, stack.places] = ratio, freedom
+        self.evidence = np.maximum(beside, beside.T)
+        np.fill_diagonal(self.evidence, -np.inf)
+
+    def _own(self) -> tuple[float, float]:
+        """Log evidence of what stands there, as an average over its grids, and by how much of that it must win."""
+        m, groups = len(self.state.candidates), [key(candidate) for candidate in self.standing]
+        # under the noise that is left all ratios are larger than what the models gain
+        whole = self.state.ratio(self.base)
+        if len(groups) == 1:
+            own, grid = self.scores[m], [self.scores[n].evidence for n in self.state.groups[groups[0]]]
+            needed = lead(min(own.ratio, whole))
+            # a pair has one more to account for, and it must not be what the single one's regressor leaves
+            return own.evidence + _average(np.array(grid)) + needed + float(
+                np.log(len(self.state.trials))
+            ), needed
+        found = []
+        for a, b in ((m, m + 1), (m + 1, m)):
+            first = self.scores[a]
+            second = score(self.info.without(np.r_[self.at[a]], first.prior), self.at[b], self.candidates[b])
+            found.append((first.evidence + second.evidence, first.ratio + second.ratio))
+        best, ratio = max(found)
+        return best + self._price(*groups), lead(min(ratio, whole))
+
+    def _price(self, A: Group, B: Group) -> float:
+        """Log evidence of the average over two grids, against the best there."""
+        return _average(self.evidence[np.ix_(self.state.groups[A], self.state.groups[B])])
+
+    def pair(self, A: Group, B: Group) -> Pair | None:
+        """Return the best of two grids, if it is no worse than what stands there by more than :func:`~.weigh.lead`."""
+        own = [key(candidate) for candidate in self.standing]
+        block = self.evidence[np.ix_(self.members[A], self.members[B])]
+        top = float(block.max())
+        if (
+            (len(own) > 1 and {A, B} == set(own))
+            or (len(own) == 1 and own[0] in (A, B))
+            or not np.isfinite(top)
+        ):
+            return None
+        rows, columns = np.unravel_index(int(np.argmax(block)), block.shape)
+        a, b = self.members[A][int(rows)], self.members[B][int(columns)]
+        one, two = self.candidates[a], self.candidates[b]
+        behind = self.best - top - self._price(A, B) + float(np.log(one.trials * two.trials)) - self.paid
+        if behind > self.lead or not self._heard(a, b):
+            return None
+        return Pair(two, one, behind) if self._swapped(a, b) else Pair(one, two, behind)
+
+    def _heard(self, a: int, b: int) -> bool:
+        """Say whether each passes its test beside the other; where one cause stood, neither may be what the other leaves."""
+        ratios = []
+        for n, other in ((a, b), (b, a)):
+            one, alone = self.candidates[n], self.scores[n]
+            ratio, freedom = self.ratio[other, n], self.freedom[other, n]
+            if one.spectra is not None:
+                ratio, freedom = alone.ratio, alone.freedom
+            if self.state.p_value(one, float(ratio), int(freedom)) >= LEVEL:
+                return False
+            ratios.append(ratio)
+        same = len({candidate.cause for candidate in self.standing}) == 1
+        return not same or min(ratios) >= REMNANT**2 * max(ratios)
+
+    def _swapped(self, a: int, b: int) -> bool:
+        """Say whether a rather stands in the second's place: by name, else by what it can take of that one's signal."""
+        if len(self.standing) == 1:
+            return False
+        names = [candidate.cause for candidate in self.standing]
+        one, two = self.candidates[a].cause, self.candidates[b].cause
+        straight, crossed = (one == names[0]) + (two == names[1]), (one == names[1]) + (two == names[0])
+        if straight != crossed:
+            return crossed > straight
+
+        def takes(n: int, signal: FloatArray) -> float:
+            own = self.at[n]
+            s = signal[own]
+            return float(s @ np.linalg.solve(self.info.matrix[own, own] + np.diag(self.scores[n].prior), s))
+
+        k, j = self.signals
+        return takes(a, j) + takes(b, k) > takes(a, k) + takes(b, j)
+
+
+def _average(evidences: FloatArray) -> float:
+    """Log of their average against the best."""
+    top = float(np.max(evidences))
+    return float(logsumexp(evidences - top)) - float(np.log(np.size(evidences))) if np.isfinite(top) else 0.0

@@ -1,0 +1,106 @@
+"""Two causes at once: the whole table of pairs against one after the other; two that take each other's place."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from magbridge.calibration.model import Calibration, Noise, Parameter, Reference
+from magbridge.calibration.terms import Polynomial
+from magbridge.diagnose.causes.candidates import Candidate
+from magbridge.diagnose.compare.problem import Problem, pose
+from magbridge.diagnose.compare.survey import Channel, Survey
+from magbridge.diagnose.inference.exchange import exchanged
+from magbridge.diagnose.inference.pairs import pairs_of
+from magbridge.diagnose.inference.rounds import State
+from magbridge.diagnose.inference.sets import sets_of
+from magbridge.diagnose.inference.weigh import score
+
+ROWS = 600
+Array = NDArray[np.float64]
+
+
+def made() -> Problem:
+    """A vehicle that is right but for noise."""
+    rng = np.random.default_rng(4)
+    d = rng.normal(size=(ROWS, 3))
+    survey = Survey(
+        time=1.7e9 + 4.0 * np.arange(ROWS), field=5e4 * d / np.linalg.norm(d, axis=1)[:, None],
+        reference=np.full(ROWS, 5e4), still=(), follows=np.arange(ROWS) > 0, dive=np.arange(ROWS) // 50, place=None,
+        attitude=None, learned=np.zeros(ROWS, bool), cycles=np.empty(0), source="made",
+        channels={"p": Channel(np.linspace(-1.0, 1.0, ROWS), "in", ("position",))},
+    )  # fmt: skip
+    calibration = Calibration(
+        parameters=(Parameter("p", "in", -1.0, 1.0, 0.0, 1.0),), terms=(Polynomial(exponents=((0,),)),),
+        coefficients=np.zeros(9), covariance=np.diag(np.full(9, 1e-6)), noise=Noise(1.0), reference=Reference(5e4),
+    )  # fmt: skip
+    return pose(survey, calibration)
+
+
+def of(cause: str, *columns: Array, **more: object) -> Candidate:
+    X, k = np.column_stack(columns), len(columns)
+    return Candidate(cause, None, lambda rows: X[rows], np.ones(k), ("b",) * k, ("nT",) * k, **more)  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module")
+def state() -> State:
+    """Two causes that act, one that looks like both, one like the first; another that has nothing to do with it."""
+    rng, t = np.random.default_rng(5), np.arange(ROWS)
+    a, b = np.sin(t / 7.0), np.sign(np.sin(t / 40.0))
+    problem = replace(made(), residual=a + b + rng.normal(size=ROWS))
+    both, alike, other = (
+        a + b + 0.3 * np.cos(t / 90.0),
+        a + 0.2 * np.cos(t / 11.0),
+        rng.normal(size=(2, ROWS)),
+    )
+    candidates = [
+        of("a", a), of("b", b, positive=True), of("both", both), of("alike", alike),
+        of("other", *other), of("series", *rng.normal(size=(4, ROWS)), spectra=np.ones((1, 4))),
+    ]  # fmt: skip
+    found = State(problem, candidates, 1, 6)
+    found.null = found.fit([])
+    found.round([], found.null)
+    return found
+
+
+def test_all_pairs_at_once_are_one_after_the_other(state: State) -> None:
+    """What stands there loses to each pair by what the two say, the second beside the first."""
+    model = [state.candidates[2], state.candidates[4]]
+    base = state.fit(model)
+    info = state.beside(model, base)
+    pairs = {(pair.first.cause, pair.second.cause): pair for pair in pairs_of(state, info, model, base, 0, 1)}
+    ends = np.cumsum([state.at[-1].stop, *(c.size for c in model)])
+    own = np.arange(ends[0], ends[-1])
+    alone = replace(info, score=info.score + info.matrix[:, own] @ base.coefficients)
+
+    def together(a: slice, one: Candidate, b: slice, two: Candidate) -> float:
+        first = score(alone, a, one)
+        return first.evidence + score(alone.without(np.r_[a], first.prior), b, two).evidence
+
+    places = [slice(int(x), int(y)) for x, y in pairwise(ends)]
+    standing = max(together(places[n], model[n], places[1 - n], model[1 - n]) for n in (0, 1))
+    single = {c.cause: (at, c) for at, c in zip(state.at, state.candidates, strict=True)}
+    pairs = {names: pair for names, pair in pairs.items() if set(names) <= single.keys() - {"both", "other"}}
+    assert pairs
+    for names, pair in pairs.items():
+        there = max(together(*single[x], *single[y]) for x, y in (names, names[::-1]))
+        assert pair.behind == pytest.approx(standing - there, abs=1e-6)
+
+
+def test_two_take_the_place_of_one_that_had_swallowed_both(state: State) -> None:
+    alone = [state.candidates[2]]
+    model, base = exchanged(state, alone, state.fit(alone))
+    assert {candidate.cause for candidate in model} == {"a", "b"}
+    assert state.value(model, base) > state.value(alone, state.fit(alone))
+
+
+def test_the_sets_hold_whatever_a_whole_within_20_to_1_is_made_of(state: State) -> None:
+    model = [state.candidates[3], state.candidates[1]]
+    base = state.fit(model)
+    sets = sets_of(state, state.beside(model, base), model, base)
+    assert "a" in {rival.cause for rival in sets[0]}
+    assert "other" not in {rival.cause for some in sets for rival in some}
