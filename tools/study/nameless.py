@@ -2,20 +2,20 @@ r"""Whether an ideal analyst whose table lacks the cause would be misled by its 
 
 Notes
 -----
-He weighs names, one or two of them, against N descriptions without a name. Names stand until they are beaten as another
-name would have to beat them: by 20:1, and what a regressor may miss of the truth. With the likelihood ratios R and free numbers k
-of names m and log evidence ``E(R, k) = (R - k)/2 - (k/2) ln(R/k)`` (a variance component of k freedoms) they need
+He weighs the names of M causes, one or two of them, against N descriptions without a name. Each pays for its choice; a name is
+granted what its regressor may miss of the truth. With the likelihood ratios R and free numbers k of names m and log evidence
+``E(R, k) = (R - k)/2 - (k/2) ln(R/k)`` (a variance component of k freedoms) something without a name needs
 
-.. math:: T = \ln 20 + \max_m \left(E(R_m, k_m) + \tfrac12 \epsilon^2 R_m - c_m\right)
+.. math:: T = \max_m \left(E(R_m, k_m) + \tfrac12 \epsilon^2 R_m - c_m\right) - \ln M
 
 c is the price of a name's grid and, of a pair, 20:1 and its choice among the causes.
 
 *unnamed*: at best one of the descriptions has the very shape of the truth, and as many numbers as its cause would have:
 ``P(E(R_d, k) - ln N > T)``. No description that could have been anything else does better: a bound for all analysts. (Of a
-cause of three numbers at S/N 10, N = 20, it is 95 % where the best name of three numbers leaves 5.7, of six 5.1.)
+cause of three numbers at S/N 10, N = 20, it is 95 % where the best name of three numbers leaves 5.2.)
 
-*described*: the chance with the descriptions that there are, ``P(max_j E_j > T)``: each has numbers of one common size,
-which is the likeliest, and pays for all the shapes that it could have taken.
+*described*: the chance with the descriptions that there are, ``P(max_j E_j - ln N > T)``: each has numbers of one common size,
+which is the likeliest, and pays for all the shapes that it could have taken, and for its choice.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def against(
         ratio = one[0] + other[0]
         value = allowed(weigh(ratio, one[1] + other[1]), ratio)
         found.append(value - grids - ODDS - np.log(max(len(trials), 1)))
-    return np.asarray(np.max(found, axis=0) + ODDS)
+    return np.asarray(np.max(found, axis=0) - np.log(max(len(trials), 1)))
 
 
 def nameless(draws: Draws, truth: Array, needed: Array, free: Sequence[Description]) -> dict[str, float]:
@@ -62,5 +62,5 @@ def nameless(draws: Draws, truth: Array, needed: Array, free: Sequence[Descripti
             best = np.maximum(best, 0.5 * ratio - np.log(one.trials))
     return {
         "unnamed": float(np.mean(truth - np.log(count) > needed)),
-        "described": float(np.mean(best > needed)),
+        "described": float(np.mean(best - np.log(count) > needed)),
     }

@@ -76,10 +76,8 @@ def ideal(one: Found, stall: Stall, ds: xr.Dataset, setting: Setting) -> dict[st
     dict
         ``alone``: chance to name the truth alone; ``inside``: that the set holds it; ``size``: the set's mean size;
         ``first``: cause -> chance to be named first; ``half``, ``sure``: signal-to-noise at which 50 and 95 % are found;
-        ``own``: share of the signal-to-noise that the table's regressors of the true cause reach; ``apart``: cause ->
-        signal-to-noise that its best imitation leaves; ``unlike`` and ``mimic``: the smallest of those, and whose it is.
-        Where the setting has descriptions, ``two``: what the best two of any causes leave; ``unnamed`` and
-        ``described``: see :mod:`study.nameless`.
+        ``apart``: cause -> signal-to-noise that its best imitation leaves. Where the setting has descriptions, ``two``: what
+        the best two of any causes leave; ``unnamed`` and ``described``: see :mod:`study.nameless`.
     """
     name = one.hidden.name
     spans, S = information([one], stall, ds, setting)
@@ -97,17 +95,13 @@ def ideal(one: Found, stall: Stall, ds: xr.Dataset, setting: Setting) -> dict[st
         for c, span in best.items()
         if explained(S, span)
     }
-    apart = {c: left[c][c][0] if c in left else draws.wanted for c in best}
     answers = {
         "alone": float(np.mean((first == me) & (inside.sum(axis=0) == 1))) * bool(own),
         "inside": float(np.mean(inside[me])) * bool(own),
         "size": float(np.mean(inside.sum(axis=0))),
         "first": {cause: float(np.mean(first == j)) for j, cause in enumerate(names) if (first == j).any()},
         **_found(draws, [true, *rivals], setting),
-        "own": float(np.sqrt(explained(S, own))) / draws.wanted if own else 0.0,
-        "apart": apart,
-        "unlike": min(apart.values()),
-        "mimic": min(apart, key=lambda cause: apart[cause]),
+        "apart": {c: left[c][c][0] if c in left else draws.wanted for c in best},
     }
     if not setting.free:
         return answers
