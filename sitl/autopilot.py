@@ -14,7 +14,7 @@ from typing import Any
 from magbridge.config import Config, Telemetry
 from magbridge.errors import DataError
 from magbridge.mavlink.codec import Codec
-from magbridge.mavlink.messages import spec, split_index
+from magbridge.mavlink.messages import east_e7, spec, split_index
 
 __all__ = ["Autopilot"]
 
@@ -23,6 +23,9 @@ SUBMARINE, GENERIC, ACTIVE = 12, 0, 4
 """MAV_TYPE, MAV_AUTOPILOT and MAV_STATE of its heartbeat."""
 FIX_3D, GPS_ACCURACY = 3, 10_000
 """GPS_FIX_TYPE and mm of its receiver."""
+
+LARGEST = 2e6
+"""m, deg, m/s: what fits every field in which a position or a motion is told, mm in 32 bits too."""
 
 
 class Autopilot:
@@ -69,9 +72,9 @@ class Autopilot:
     def _position(self, row: Mapping[str, float], boot_ms: int) -> list[bytes]:
         """Return what tells position and motion: where it believes to be, local track, speed, GPS."""
         pack, frames = self._codec.pack, []
-        depth = row.get("depth", nan)
+        (depth,) = _finite(row, "depth") or (nan,)
         if known := _finite(row, "latitude", "longitude"):
-            latitude, longitude = (round(angle * 1e7) for angle in known)
+            latitude, longitude = round(known[0] * 1e7), east_e7(known[1])
             altitude = round(-1e3 * depth) if isfinite(depth) else 0
             place = {"lat": latitude, "lon": longitude, "alt": altitude, "relative_alt": altitude}
             frames.append(pack("GLOBAL_POSITION_INT", time_boot_ms=boot_ms, **place))
@@ -81,7 +84,7 @@ class Autopilot:
         if known := _finite(row, "water_speed"):
             frames.append(pack("VFR_HUD", airspeed=known[0]))
         if known := _finite(row, "gps_latitude", "gps_longitude"):
-            latitude, longitude = (round(angle * 1e7) for angle in known)
+            latitude, longitude = round(known[0] * 1e7), east_e7(known[1])
             fix = {"lat": latitude, "lon": longitude, "fix_type": FIX_3D, "h_acc": GPS_ACCURACY}
             frames.append(pack("GPS_RAW_INT", time_usec=boot_ms * 1000, **fix))
         return frames
@@ -107,6 +110,6 @@ class Autopilot:
 
 
 def _finite(row: Mapping[str, float], *names: str) -> tuple[float, ...]:
-    """Return the row's values under these names; nothing if one of them lacks."""
+    """Return the row's values under these names; nothing if one of them lacks, or no message takes it."""
     values = tuple(row.get(name, nan) for name in names)
-    return values if all(map(isfinite, values)) else ()
+    return values if all(abs(value) < LARGEST for value in values) else ()

@@ -10,7 +10,7 @@ are all units and the attributes that change what values mean.
 
 from __future__ import annotations
 
-from math import isnan, nan, radians
+from math import isfinite, isnan, nan, radians
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ from magbridge.columns import CHANNEL_TIMES, CHANNELS, CORRECTED
 from magbridge.logs.deployment import MEANING
 from magbridge.logs.telemetry_fields import COUNTED_POWER_CYCLES, UNKNOWN_INT
 from magbridge.mavlink import Codec, Spec, pack_record, spec
+from magbridge.mavlink.messages import east_e7
 from magbridge.records import Channel, Quality
 
 __all__ = ["FileWriter"]
@@ -106,7 +107,9 @@ class FileWriter:
 
     def _position(self, time_us: int, row: Row) -> None:
         # 0 is how autopilots say that they do not know
-        latitude, longitude = (_integer(row.get(name, nan) * 1e7) or 1 for name in POSITION[:2])
+        latitude = _integer(row.get("latitude", nan) * 1e7) or 1
+        east = row.get("longitude", nan)
+        longitude = east_e7(east) or 1 if isfinite(east) else UNKNOWN_INT
         altitude = _integer(-row.get("depth", nan) * 1e3)
         boot_ms = self._boot_ms(time_us)
         fields = boot_ms, latitude, longitude, altitude, altitude, 0, 0, 0, UNKNOWN_HEADING

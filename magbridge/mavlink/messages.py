@@ -11,13 +11,15 @@ import msgspec
 
 from magbridge.mavlink.dialect import MESSAGES
 
-__all__ = ["BAD_DATA", "REFUSED", "Field", "Message", "Spec", "spec", "split_index"]
+__all__ = ["BAD_DATA", "REFUSED", "Field", "Message", "Spec", "east_e7", "spec", "split_index"]
 
 BAD_DATA = -1
 """`Message.id` of bytes that belonged to no frame."""
 REFUSED = -2
 """`Message.id` of a frame whose signature is missing, wrong or old."""
 
+TURN_E7 = 3_600_000_000
+"""1e-7 deg of a full circle."""
 IDS = {name: number for number, (name, _, _) in MESSAGES.items()}
 
 
@@ -181,3 +183,8 @@ def split_index(field: str) -> tuple[str, int | None]:
     if match is None:
         return field, None
     return match[1], int(match[2]) if match[2] else None
+
+
+def east_e7(longitude: float) -> int:
+    """Return a longitude (deg, of any turn) in 1e-7 deg from -180 to 180: beyond 214 it would not fit its 32 bits."""
+    return (round(longitude * 1e7) + TURN_E7 // 2) % TURN_E7 - TURN_E7 // 2

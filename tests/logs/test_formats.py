@@ -280,6 +280,15 @@ def test_csv_says_which_number_stands_for_none(rows: int, tmp_path: Path) -> Non
     assert "fill_value" not in read.attrs
 
 
+def test_longitudes_to_the_east_fit_a_telemetry_log(tmp_path: Path) -> None:
+    """302 degrees are -58: as 32 bits of 1e-7 deg they would not fit."""
+    east = np.array([-58.0, 0.0, 58.0, 179.5, 180.5, 200.0, 302.0, np.nan])
+    columns = {"mag_x": np.ones(8), "latitude": np.where(np.isnan(east), np.nan, 49.5), "longitude": east}
+    logs.write(deployment("made", np.arange(8.0), columns), tmp_path / "log.tlog")
+    read = logs.read(tmp_path / "log.tlog")["longitude"].to_numpy()
+    np.testing.assert_allclose(read[:7], (east[:7] + 180.0) % 360.0 - 180.0, atol=2e-7)
+
+
 def test_netcdf_has_the_shape_of_og1(tmp_path: Path) -> None:
     netCDF4 = pytest.importorskip("netCDF4")
     logs.write(example(5), tmp_path / "a.nc")

@@ -12,9 +12,12 @@ import xarray as xr
 
 from magbridge.calibration.file import save
 from magbridge.calibration.model import Noise, identity
+from magbridge.config import load as load_config
 from magbridge.errors import DataError, FormatError, PortError, WrongUse
 from magbridge.logs import read, write
+from magbridge.mavlink import Codec
 from sitl import Twin, load, segments, simulate
+from sitl.autopilot import Autopilot
 from sitl.demo import demo
 from sitl.motion import with_motion
 from sitl.own_log import Recorded, is_own_log
@@ -147,6 +150,14 @@ def test_a_velocity_is_told_as_a_track() -> None:
         np.testing.assert_allclose(integral[name], track[name], atol=4.0)
     assert integral["gps_latitude"].to_numpy()[0] == log["latitude"].to_numpy()[0]
     assert np.isnan(integral["gps_latitude"].to_numpy()[1:]).all()
+
+
+def test_a_position_of_any_turn_and_a_depth_that_is_none_are_told(tmp_path: Path) -> None:
+    row = {"latitude": 49.5, "longitude": 302.0, "depth": 1e300, "water_speed": 1e300}
+    said = Codec(255, 190).parse(b"".join(Autopilot(load_config(config(tmp_path)), 0).row(4, row)))
+    (told,) = [message for message in said if message.name == "GLOBAL_POSITION_INT"]
+    assert (told["lat"], told["lon"], told["alt"]) == (495_000_000, -580_000_000, 0)
+    assert [message.name for message in said] == ["GLOBAL_POSITION_INT"]
 
 
 def test_speed_is_kept(survey: Path, tmp_path: Path) -> None:
