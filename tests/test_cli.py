@@ -241,7 +241,7 @@ def test_stopped_in_the_middle_leaves_nothing(
     ("column", "value", "words"),
     [
         ("time", 1.78e12, "row 12, column 'time': expected seconds since 1970"),
-        ("latitude", 4952.3, "row 12, column 'latitude': expected degrees"),
+        ("latitude", 4952.3, "row 12, column 'latitude': expected deg, at most 90"),
         ("mag_time_z", 12.0, "row 12, column 'mag_time_z': expected a time within 60 s"),
     ],
 )

@@ -22,8 +22,8 @@ MEANING = {"heading_reference": "true", "time_reference": "utc"}
 """Attributes that change what values mean, and what holds where they are absent."""
 YEAR_10000 = 253_402_300_800.0
 """s since 1970: a time beyond is in another unit, and no calendar has it."""
-DEGREES = {"latitude": 90.0, **dict.fromkeys(("longitude", "roll", "pitch", "heading"), 540.0)}
-"""The most that these may be; 4952.3 is degrees and minutes written together."""
+MOST = {"latitude": 90.0, **dict.fromkeys(("longitude", "roll", "pitch", "heading"), 540.0), "depth": 1e5}
+"""The most, deg or m, that these may be either way; 4952.3 is degrees and minutes written together."""
 LEAST = {
     "degC": -273.15,
     "K": 0.0,
@@ -145,8 +145,8 @@ def plausible(file: str | Path, dataset: xr.Dataset, rows: Sequence[int]) -> Non
     time = dataset["time"].values
     for name, column in dataset.data_vars.items():
         values, unit = column.values, usual(column.attrs.get("units", ""))
-        if name in DEGREES:
-            wrong, expected = np.abs(values) > DEGREES[str(name)], f"degrees, at most {DEGREES[str(name)]:g}"
+        if name in MOST:
+            wrong, expected = np.abs(values) > MOST[str(name)], f"{unit}, at most {MOST[str(name)]:g}"
         elif name in CHANNEL_TIMES:
             wrong, expected = np.abs(values - time) > APART, f"a time within {APART:g} s of the row's"
         elif unit in LEAST:

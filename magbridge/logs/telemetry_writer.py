@@ -123,9 +123,8 @@ class FileWriter:
     def _raw(self, time_us: int, row: Row) -> None:
         x, y, z, temperature, supply, cycle = (row.get(name, nan) for name in SAMPLE)
         delays = [_delay(row.get(name, nan), time_us) for name in CHANNEL_TIMES]
-        counted = not isnan(cycle)
         fields = time_us, 0, x, y, z, 0, 0, 0, *delays, temperature, supply
-        power = (int(cycle) & 0xFFFF, 0, COUNTED_POWER_CYCLES) if counted else (0, 0, 0)
+        power = (int(cycle) & 0xFFFF, 0, COUNTED_POWER_CYCLES) if isfinite(cycle) else (0, 0, 0)
         self._say(time_us, Channel.SENT, self._bridge, RAW_, *fields, *power)
 
     def _field(self, time_us: int, row: Row) -> None:

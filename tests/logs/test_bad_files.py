@@ -35,7 +35,8 @@ BAD_CSV = {
     "time,mag_x\n2,2\n2,3\n": "row 3, column 'time': expected a time after 2.0, not 2.0",
     "time,mag_x\n2016-06-23,2\n": "row 2, column 'time': expected a number, not '2016-06-23'",
     "time,mag_x [V]\n2,2\n": "column 'mag_x': expected nT, not V",
-    "time,heading\n1,-9999\n": "row 2, column 'heading': expected degrees, at most 540, not -9999.0",
+    "time,heading\n1,-9999\n": "row 2, column 'heading': expected deg, at most 540, not -9999.0",
+    "time,depth\n1,4\n2,1e300\n": "row 3, column 'depth': expected m, at most 100000, not 1e+300",
     "time,water [Celsius]\n1,4\n2,-999\n": "row 3, column 'water': expected at least -273.15 degC, or nothing where it "
     "is not known, not -999.0",
     "# fill_value = none\ntime,mag_x\n1,2\n": "row 1, column 'fill_value': expected a number, not 'none'",

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from magbridge import logs
 from magbridge.columns import CHANNEL_TIMES, COLUMNS
-from magbridge.logs.deployment import APART, DEGREES, LEAST, deployment, join
+from magbridge.logs.deployment import APART, LEAST, MOST, deployment, join
 
 EXACT = [".csv", ".nc", ".parquet"]
 WRITABLE = [*EXACT, ".tlog"]
@@ -43,7 +43,7 @@ def deployments(draw: st.DrawFn, width: int) -> xr.Dataset:
     units = draw(others)
     columns = {}
     for name in [*draw(known), *units]:
-        most = DEGREES.get(name, APART / 2 if name in CHANNEL_TIMES else None)
+        most = MOST.get(name, APART / 2 if name in CHANNEL_TIMES else None)
         least = LEAST.get(COLUMNS[name].unit if name in COLUMNS else units[name])
         bounds = (
             {"min_value": least and int(least)} if most is None else {"min_value": -most, "max_value": most}
@@ -287,6 +287,13 @@ def test_longitudes_to_the_east_fit_a_telemetry_log(tmp_path: Path) -> None:
     logs.write(deployment("made", np.arange(8.0), columns), tmp_path / "log.tlog")
     read = logs.read(tmp_path / "log.tlog")["longitude"].to_numpy()
     np.testing.assert_allclose(read[:7], (east[:7] + 180.0) % 360.0 - 180.0, atol=2e-7)
+
+
+def test_a_count_that_is_none_fits_a_telemetry_log(tmp_path: Path) -> None:
+    columns = {"mag_x": np.ones(4), "power_cycle": [3.0, np.inf, -1e300, np.nan]}
+    logs.write(deployment("made", np.arange(4.0), columns), tmp_path / "log.tlog")
+    counted = logs.read(tmp_path / "log.tlog")["power_cycle"].to_numpy()
+    np.testing.assert_array_equal(counted, [3.0, np.nan, np.nan, np.nan])
 
 
 def test_netcdf_has_the_shape_of_og1(tmp_path: Path) -> None:
