@@ -13,7 +13,7 @@ from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.lowpass import unfiltered
 from magbridge.diagnose.compare.problem import Problem, pose
 from magbridge.diagnose.compare.take import take
-from magbridge.diagnose.inference.free import _ends
+from magbridge.diagnose.inference.free import _ends, _repeated
 from magbridge.diagnose.inference.information import information
 from magbridge.diagnose.inference.joint import fit_joint
 from magbridge.diagnose.inference.packets import packets
@@ -78,3 +78,12 @@ def test_what_lies_loose_changes_ends_when_it_is_tipped_far_enough() -> None:
     ends = _ends(down)(slice(None))
     steps = np.diff(ends, axis=0)
     assert (steps[:, 1] != 0.0).tolist() == [False, True, False, False, True, False, False, True]
+
+
+def test_what_each_dive_repeats_holds_a_decay_from_its_start(problem: Problem) -> None:
+    survey = problem.survey
+    start = np.flatnonzero(np.diff(survey.dive, prepend=survey.dive[0] - 1))
+    since = survey.time - np.repeat(survey.time[start], np.diff([*start, len(survey.dive)]))
+    X, decay = _repeated(problem)(slice(None)), np.exp(-since / 60.0)
+    left = decay - decay.mean() - X @ np.linalg.lstsq(X, decay - decay.mean(), rcond=None)[0]
+    assert left @ left < 0.1 * np.sum((decay - decay.mean()) ** 2)

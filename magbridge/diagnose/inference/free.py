@@ -23,6 +23,8 @@ FloatArray = NDArray[np.float64]
 
 BODY, EARTH = 24, 48
 """Half waves in a log of slow curves along the body's axes, and along the field."""
+REPEATED = 8
+"""Half waves in a dive of what repeats itself with each."""
 BEND = 10
 """Order of a channel's free response."""
 PLAYS = (0.3, 0.8)
@@ -80,9 +82,9 @@ def descriptions(problem: Problem, fit: Joint, tone: Candidate | None = None) ->
     """List what structure of any kind is looked for with.
 
     Slow curves along each axis of the body and along the field, and a constant along that; since when the offsets are
-    others, what passed by, and what rang for a while; the direction of the field, its rates of change, the channels' response,
-    one delay of everything; what hangs in the hull, and what lies loose at its lower end; of each telemetry channel a curve through
-    its values, and its memory of where it was.
+    others, what passed by, what rang for a while, and what each dive repeats; the direction of the field, its rates of
+    change, the channels' response, one delay of everything; what hangs in the hull, and what lies loose at its lower end; of
+    each telemetry channel a curve through its values, and its memory of where it was.
     """
     body = -problem.slopes[:, 6:]
     u = problem.survey.time - problem.survey.time[0]
@@ -112,7 +114,7 @@ def descriptions(problem: Problem, fit: Joint, tone: Candidate | None = None) ->
         _of("drift", lambda rows: (problem.gain * fresh)[rows, None], 1, 1.0, holds=("reference_bias",)),
         _of("switching", since, 3, trials=moments, holds=("offset_step",)),
         _of("transient", passing, 3, trials=times),
-        _of("broadband", _direction(body), 25),
+        _of("broadband", _direction(body), 34),
         _of(
             "broadband", projected(lambda rows: rates[:, rows].T), 9, 1.0,
             holds=("eddy_current", "channel_skew"), turned=True,
@@ -138,6 +140,9 @@ def descriptions(problem: Problem, fit: Joint, tone: Candidate | None = None) ->
                 _of("broadband", projected(_curve(down)), 12, turned=True),
                 _of("switching", projected(_ends(down)), 3 * len(SLOPES), turned=True),
             ]
+    dive = problem.survey.dive
+    if np.ptp(dive):
+        listed.append(_of("broadband", projected(_repeated(problem)), 3 * REPEATED, turned=True))
     rings = packets(problem, fit)
     if rings is not None:
         width = (("tone", np.full(2 * rings.number, 30.0)),)
@@ -159,9 +164,9 @@ def _spectra(count: int, axes: int) -> tuple[tuple[str, FloatArray], ...]:
 
 
 def _direction(body: FloatArray) -> Columns:
-    """Cubic and quartic functions of the field's direction in the body."""
+    """Functions up to quartic of the field's direction in the body."""
     unit = body / np.linalg.norm(body, axis=1)[:, None]
-    exponents = [(i, j, d - i - j) for d in (3, 4) for i in range(d + 1) for j in range(d + 1 - i)]
+    exponents = [(i, j, d - i - j) for d in (1, 2, 3, 4) for i in range(d + 1) for j in range(d + 1 - i)]
 
     def columns(rows: slice) -> FloatArray:
         part = unit[rows].T
@@ -207,6 +212,17 @@ def _memory(values: FloatArray) -> Columns:
         return np.concatenate([*branches, [w, w * v]]).T
 
     return _centred(columns)
+
+
+def _repeated(problem: Problem) -> Columns:
+    """Return half waves in the course of a dive, the same in all."""
+    dive, time = problem.survey.dive, problem.survey.time
+    start = np.flatnonzero(np.diff(dive, prepend=dive[0] - 1))
+    since = time - np.repeat(time[start], np.diff([*start, len(dive)]))
+    # a long last one is no reason to stretch the others
+    usual = max(float(np.median([since[end - 1] for end in [*start[1:], len(dive)]])), 1.0)
+    u = np.minimum(since / usual, 1.0)
+    return _centred(lambda rows: np.cos(np.pi * u[rows, None] * np.arange(1, REPEATED + 1)))
 
 
 def _ends(down: FloatArray) -> Columns:

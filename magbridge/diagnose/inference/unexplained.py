@@ -73,6 +73,11 @@ class Leftover(NamedTuple):
     description: Description | None = None
     choice: int = 1
 
+    @property
+    def among(self) -> float:
+        """Log evidence, with the price of the choice."""
+        return self.evidence - float(np.log(self.choice))
+
 
 def lone(S: FloatArray, b: FloatArray, width: FloatArray, whole: Ridge) -> Ridge:
     """One curve along one direction of the body: ``c = f d^T`` has a third of the numbers of three curves, and two more.
@@ -138,9 +143,9 @@ def leftover(
 def accept(problem: Problem, outcome: Outcome, tone: Candidate | None) -> tuple[bool, Leftover | None]:
     """Say whether the names stand, and what is left beside them or, if they do not, at all.
 
-    Names and a free description of the whole have equal odds, but what a name's regressor may miss is forgiven. If more is left beside
-    them than an idealised regressor leaves, and of another sort than they are, the burden of proof is theirs: they and what
-    is left must beat it 20:1.
+    Names and a free description of the whole have equal odds, and pay for what they were chosen from; what a name's regressor
+    may miss is forgiven. If more is left beside them than an idealised regressor leaves, and of another sort than they are,
+    the burden of proof is theirs: they and what is left must beat it 20:1.
     """
     model = [h.candidate for h in outcome.chosen]
     rest = leftover(problem, model, outcome.fit, outcome.order, tone)
@@ -152,9 +157,9 @@ def accept(problem: Problem, outcome: Outcome, tone: Candidate | None) -> tuple[
     # what holds the names' own regressors and finds nothing else beside them is no other explanation
     free = leftover(problem, [], outcome.null, outcome.order, tone, but=() if other else model)
     ratio = 2.0 * (outcome.fit.log_likelihood - outcome.null.log_likelihood)
-    names = worth(ratio, model, outcome.trials) + (other.evidence - ODDS if other else slack(ratio))
-    # each pays for what it was chosen from
-    if free is not None and names - np.log(len(outcome.trials)) < free.evidence - np.log(free.choice):
+    names = worth(ratio, model, outcome.trials) - float(np.log(len(outcome.trials)))
+    names += other.among - ODDS if other else slack(ratio)
+    if free is not None and names < free.among:
         return False, free
     return True, rest
 
