@@ -14,7 +14,7 @@ from magbridge.calibration.terms import Polynomial
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.compare.problem import Problem, pose
 from magbridge.diagnose.compare.survey import Channel, Survey
-from magbridge.diagnose.inference.exchange import exchanged
+from magbridge.diagnose.inference.exchange import _separate, exchanged
 from magbridge.diagnose.inference.pairs import pairs_of
 from magbridge.diagnose.inference.rounds import State
 from magbridge.diagnose.inference.sets import sets_of
@@ -104,3 +104,10 @@ def test_the_sets_hold_whatever_a_whole_within_20_to_1_is_made_of(state: State) 
     sets = sets_of(state, state.beside(model, base), model, base)
     assert "a" in {rival.cause for rival in sets[0]}
     assert "other" not in {rival.cause for some in sets for rival in some}
+
+
+def test_numbers_of_one_common_size_stay_a_whole(state: State) -> None:
+    """No exchange makes a series and a part of it one cause's regressors."""
+    series, other = state.candidates[5], replace(state.candidates[4], cause="series")
+    assert not _separate([other], [series, state.candidates[0]], [1])
+    assert _separate([other], [series, state.candidates[0]], [0])

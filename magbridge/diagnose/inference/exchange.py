@@ -57,7 +57,15 @@ def _changes(state: State, pieces: list[Candidate], base: Joint) -> list[tuple[l
             kept = [n for n in places if pieces[n] is pair.first or pieces[n] is pair.second]
             new = [c for c in (pair.first, pair.second) if not any(c is pieces[n] for n in kept)]
             found.append((pair.behind, new, [n for n in places if n not in kept]))
+    found = [entry for entry in found if _separate(entry[1], pieces, entry[2])]
     return [entry[1:] for entry in sorted(found, key=lambda entry: entry[0])[:TRIED]]
+
+
+def _separate(new: list[Candidate], pieces: list[Candidate], at: list[int]) -> bool:
+    """Say whether numbers of one common size stay a whole: they are no part of a cause's others."""
+    changed = [*new, *(piece for n, piece in enumerate(pieces) if n not in at)]
+    causes = [candidate.cause for candidate in changed]
+    return all(candidate.spectra is None or causes.count(candidate.cause) == 1 for candidate in changed)
 
 
 def _gathered(state: State, pieces: list[Candidate], base: Joint) -> tuple[list[Candidate], Joint]:
