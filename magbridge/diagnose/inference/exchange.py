@@ -30,7 +30,7 @@ def exchanged(state: State, model: list[Candidate], base: Joint) -> tuple[list[C
     """
     pieces = [piece for candidate in model for piece in candidate.pieces]
     for _ in range(CHANGES):
-        own, tried = state.value(pieces, base), [(0.0, pieces, base)]
+        own, better = state.value(pieces, base), (0.0, pieces, base)
         for new, at in _changes(state, pieces, base):
             rest = [piece for n, piece in enumerate(pieces) if n not in at]
             changed, fit = refined(state, [*new, *rest], state.fit([*new, *rest], like=base), len(new))
@@ -38,9 +38,10 @@ def exchanged(state: State, model: list[Candidate], base: Joint) -> tuple[list[C
             if len({c.cause for c in changed}) > len({piece.cause for piece in pieces}):
                 more = max(more, 0.0)  # another cause is never the simpler
             lent = slack(state.ratio(state.fit(rest, like=base))) if rest and more else 0.0
-            tried.append((state.value(changed, fit) - own - more * lent, changed, fit))
-        gain, *_ = better = max(tried, key=lambda entry: entry[0])
-        if gain <= 0.0:
+            gain = state.value(changed, fit) - own - more * lent
+            if gain > better[0]:  # a month's fit is large: only one is kept
+                better = gain, changed, fit
+        if better[1] is pieces:
             break
         _, pieces, base = better
     return _gathered(state, pieces, base)
