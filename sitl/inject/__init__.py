@@ -52,6 +52,11 @@ FOREIGN: dict[str, Effect] = {
     "loose": vehicle.loose,
     "corrosion": vehicle.corrosion,
     "pulsation": surroundings.pulsation,
+    "needle": vehicle.needle,
+    "thermostat": vehicle.thermostat,
+    "perming": sensor.perming,
+    "staircase": sensor.staircase,
+    "swell": surroundings.swell,
 }
 """Effects that the contract has no name for."""
 

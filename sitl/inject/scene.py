@@ -14,7 +14,7 @@ from sitl.instrument import Instrument
 from sitl.signals import autoregressive, first_order
 from sitl.trajectory import Track
 
-__all__ = ["Effect", "Generator", "Hidden", "Scene", "direction", "furnish"]
+__all__ = ["Effect", "Generator", "Hidden", "Scene", "direction", "furnish", "relays"]
 
 Array = NDArray[np.float64]
 Generator = np.random.Generator
@@ -86,6 +86,16 @@ def direction(rng: Generator) -> Array:
     """Draw a unit vector."""
     d = rng.normal(size=3)
     return np.asarray(d / np.linalg.norm(d))
+
+
+def relays(x: Array, centres: Array, widths: Array) -> Array:
+    """Mean of many relays that a history x (n,) has switched (Preisach 1935), but for what depends on its present alone."""
+    total = np.zeros(len(x))
+    for c, w in zip(centres, widths, strict=True):
+        up, down = x >= c + w / 2, x <= c - w / 2
+        last = np.maximum.accumulate(np.where(up | down, np.arange(len(x)), 0))
+        total += np.where(up[last], 1.0, -1.0) - np.where(x >= c, 1.0, -1.0)
+    return total / len(centres)
 
 
 def furnish(scene: Scene, rng: Generator) -> None:

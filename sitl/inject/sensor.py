@@ -6,7 +6,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from sitl.inject.scene import Generator, Scene, direction
+from sitl.inject.scene import Generator, Scene, direction, relays
 from sitl.signals import first_order
 
 Array = NDArray[np.float64]
@@ -110,5 +110,25 @@ def bit_flips(scene: Scene, size: float, rng: Generator) -> None:
             size * rng.choice([-1.0, 1.0], 12) * 2.0 ** rng.integers(0, 3, 12)
         )
         return out
+
+    scene.bend.append(bend)
+
+
+def perming(scene: Scene, size: float, rng: Generator) -> None:
+    """Cores that are never quite saturated remember the fields that they were in, each by relays of its own; size in nT."""
+    memory = [
+        rng.normal() * relays(h / 2e4, rng.normal(0.0, 0.8, 80), rng.lognormal(np.log(0.6), 0.5, 80))
+        for h in scene.field.T
+    ]
+    scene.field = scene.field + size * np.stack(memory, axis=1)
+
+
+def staircase(scene: Scene, size: float, rng: Generator) -> None:
+    """Most of the field is cancelled in steps, the rest is measured: with another gain, by steps that differ; size in nT."""
+    step, gain, steps = 4000.0, rng.choice([-1.0, 1.0]), 0.5 * rng.normal(size=(64, 3))
+
+    def bend(H: Array) -> Array:
+        code = np.round(H / step).astype(int)
+        return H + size * (gain * (H / step - code) + np.take_along_axis(steps, code % 64, axis=0))
 
     scene.bend.append(bend)

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sitl.inject.scene import Generator, Scene, direction
+from sitl.signals import autoregressive
 from sitl.world import dipole_field, to_local
 
 Array = NDArray[np.float64]
@@ -67,3 +68,16 @@ def pulsation(scene: Scene, size: float, rng: Generator) -> None:
         phase = 2 * np.pi * since / rng.uniform(150.0, 600.0) * (1.0 + 0.1 * since / length)
         total += rng.uniform(0.5, 1.0) * np.exp(-0.5 * (since / length) ** 2) * np.cos(phase)
     scene.earth = scene.earth + size * np.outer(total, [0.7, 0.5, 0.3])
+
+
+def swell(scene: Scene, size: float, rng: Generator) -> None:
+    """Sea water that a swell moves through the Earth's field, the less the deeper (Weaver 1965); size in nT at the surface."""
+    track, omega = scene.track, 2 * np.pi / rng.uniform(11.0, 17.0)
+    wave = omega**2 / 9.81
+    origin = float(track.latitude[0]), float(track.longitude[0])
+    course = rng.uniform(0.0, 2 * np.pi)
+    north, east = to_local(track.latitude, track.longitude, origin)
+    groups = autoregressive(rng, (len(scene.t), 2), 1.0, rng.uniform(100.0, 300.0) / track.step)
+    phase = omega * scene.t - wave * (north * np.cos(course) + east * np.sin(course))
+    moved = groups[:, 0] * np.cos(phase) + groups[:, 1] * np.sin(phase)
+    scene.earth = scene.earth + size * np.outer(np.exp(-wave * track.depth) * moved, [0.6, 0.2, 0.77])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from sitl.inject.scene import Generator, Scene, direction
+from sitl.inject.scene import Generator, Scene, direction, relays
 from sitl.instrument import rotation
 from sitl.signals import autoregressive, first_order
 from sitl.world import MU_0_OVER_4_PI, dipole_field
@@ -55,17 +55,11 @@ def neighbours(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def preisach(scene: Scene, size: float, rng: Generator) -> None:
-    """Steel in the battery's path, remagnetised as it moves: relays of many widths (Preisach 1935); size in nT."""
+    """Steel in the battery's path, remagnetised as it moves: relays of many widths; size in nT."""
     x = scene.track.parameters["battpos"] / SWING["battpos"]
-    centres, widths = rng.normal(0, 0.35, 80), rng.lognormal(np.log(0.5), 0.4, 80)
-    total = np.zeros(len(x))
-    for c, w in zip(centres, widths, strict=True):
-        up, down = x >= c + w / 2, x <= c - w / 2
-        last = np.maximum.accumulate(np.where(up | down, np.arange(len(x)), 0))
-        state = np.where(up[last], 1.0, -1.0)
-        # what does not depend on the past belongs to the position, and to any calibration
-        total += state - np.where(x >= c, 1.0, -1.0)
-    scene.field = scene.field + size * direction(rng) * (total / 80)[:, None]
+    # what does not depend on the past belongs to the position, and to any calibration
+    memory = relays(x, rng.normal(0, 0.35, 80), rng.lognormal(np.log(0.5), 0.4, 80))
+    scene.field = scene.field + size * direction(rng) * memory[:, None]
 
 
 def ring(scene: Scene, size: float, rng: Generator) -> None:
@@ -123,3 +117,27 @@ def corrosion(scene: Scene, size: float, rng: Generator) -> None:
     wander = autoregressive(rng, (len(scene.t),), 1.0, 2500.0 / scene.track.step)
     fed = np.sqrt(1.0 + np.abs(np.gradient(scene.track.depth, scene.track.step)))
     scene.field = scene.field + size * direction(rng) * (fed * wander)[:, None]
+
+
+def needle(scene: Scene, size: float, rng: Generator) -> None:
+    """A payload's own compass: a card that floats level and points north, but is dragged along in turns; size in nT."""
+    track = scene.track
+    turned = np.radians(track.heading)
+    dragged = rng.uniform(0.1, 0.4) * (
+        turned - first_order(turned, track.step, float(rng.uniform(10.0, 40.0)))
+    )
+    level = np.column_stack([np.cos(dragged), np.sin(dragged), np.zeros_like(dragged)])
+    card = rotation(track.roll, track.pitch, track.heading).apply(level, inverse=True)
+    own = dipole_field(np.broadcast_to(direction(rng), card.shape), card)
+    scene.field = scene.field + size * own / np.linalg.norm(own, axis=1).max()
+
+
+def thermostat(scene: Scene, size: float, rng: Generator) -> None:
+    """A payload that nothing logs keeps itself warm, between two temperatures: the colder the water, the longer it heats; size in nT."""
+    lag, band = rng.uniform(400.0, 1200.0), rng.uniform(1.0, 3.0)
+    warm, heats, on = 15.0, False, np.empty(len(scene.t))
+    for k, water in enumerate(scene.water):
+        heats = warm < 15.0 + (0.5 if heats else -0.5) * band
+        warm += scene.track.step / lag * (water - warm + 30.0 * heats)
+        on[k] = heats
+    scene.field = scene.field + size * direction(rng) * on[:, None]

@@ -38,12 +38,14 @@ LASTING = (
     "eddy_current", "channel_skew", "filter_lag", "clock_offset", "nonlinearity", "pressure_offset", "reference_bias",
 )  # fmt: skip
 """What is the same on another deployment: the rest has its moment or its place, or its range in one log."""
-NAMELESS = ("unknown", "foreign")
+NAMELESS = ("unknown", "seen", "foreign")
 """Parts in which nothing in the table is what is hidden."""
 TOLD = ("named", "ladder", "pair", *NAMELESS)
 """Parts of which theory says what comes out."""
-STRANGE = ("pan", "loose", "corrosion", "pulsation")
+STRANGE = ("needle", "thermostat", "perming", "staircase", "swell")
 """Of the foreign ones those that were made after the detector: it has no description for them either."""
+SEEN = ("pan", "loose", "corrosion", "pulsation")
+"""Those that were so once, before the detector was last mended."""
 DELAYS = ("filter_lag", "clock_offset")
 """In a uniform field these two are one: what is left of a late field is the masses that moved meanwhile."""
 
@@ -72,17 +74,15 @@ def _loud(k: int) -> Row:
 
 
 def _unknown(k: int) -> Row:
-    names = (*KNOWN, *(name for name in FOREIGN if name not in STRANGE))
+    names = (*KNOWN, *(name for name in FOREIGN if name not in STRANGE + SEEN))
     name = names[k % len(names)]
     return {"names": (name,), "wanted": 10.0, "noise": "white", "without": name if name in CAUSES else ""}
 
 
-def _foreign(k: int) -> Row:
-    return {
-        "names": (STRANGE[k % len(STRANGE)],),
-        "wanted": 10.0,
-        "noise": ("white", "ar")[k // len(STRANGE) % 2],
-    }
+def _foreign(names: tuple[str, ...]) -> Callable[[int], Row]:
+    return lambda k: {
+        "names": (names[k % len(names)],), "wanted": 10.0, "noise": ("white", "ar")[k // len(names) % 2],
+    }  # fmt: skip
 
 
 def _pair(k: int) -> Row:
@@ -97,12 +97,13 @@ def _gain(k: int) -> Row:
 PARTS: dict[str, Part] = {
     "null": Part(0.22, _null),
     "named": Part(0.22, _named),
-    "ladder": Part(0.18, _ladder),
+    "ladder": Part(0.16, _ladder),
     "loud": Part(0.08, _loud),
     "unknown": Part(0.1, _unknown),
     "pair": Part(0.08, _pair),
-    "gain": Part(0.08, _gain),
-    "foreign": Part(0.04, _foreign),
+    "gain": Part(0.07, _gain),
+    "seen": Part(0.03, _foreign(SEEN)),
+    "foreign": Part(0.04, _foreign(STRANGE)),
 }
 
 
