@@ -129,6 +129,7 @@ def staircase(scene: Scene, size: float, rng: Generator) -> None:
 
     def bend(H: Array) -> Array:
         code = np.round(H / step).astype(int)
-        return H + size * (gain * (H / step - code) + np.take_along_axis(steps, code % 64, axis=0))
+        own = gain * (H / step - code) + np.take_along_axis(steps, code % 64, axis=0)
+        return np.asarray(H + size * own)
 
     scene.bend.append(bend)
