@@ -15,6 +15,7 @@ from magbridge.calibration.instrument import RateEffect, ResponseEffect, TimeEff
 from magbridge.calibration.model import Calibration, Noise, Parameter, Reference
 from magbridge.calibration.residual import residuals
 from magbridge.calibration.terms import Effect, Polynomial
+from magbridge.diagnose.compare.past import FAR
 from magbridge.diagnose.compare.problem import add_effects, effect_columns, history, pose, samples_of
 from magbridge.diagnose.compare.survey import Channel, Survey
 
@@ -47,9 +48,9 @@ def survey() -> Survey:
     field = FIELD * d / np.linalg.norm(d, axis=1)[:, None] + [300.0, -200.0, 500.0]
     p = np.sin(np.arange(n) / 20.0)
     heat = 3.0 + rng.normal(size=n).cumsum() * 0.1
-    follows = np.append(False, np.ones(n - 1, bool))
+    steps = np.where(np.arange(n) > 0, 1, FAR)
     return Survey(
-        time=t, field=field, reference=np.full(n, FIELD), still=(), follows=follows, dive=np.arange(n) // 50, place=None,
+        time=t, field=field, reference=np.full(n, FIELD), still=(), steps=steps, dive=np.arange(n) // 50, place=None,
         channels={"p": Channel(p, "in", ("position",)), "heat": Channel(heat, "degC", ("temperature",))},
         attitude=None, learned=np.zeros(n, bool), cycles=np.empty(0), source="made",
     )  # fmt: skip

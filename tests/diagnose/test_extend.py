@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from magbridge.diagnose.causes.candidates import Candidate
+from magbridge.diagnose.compare.past import Past
 from magbridge.diagnose.extend import MODES, widened
 from magbridge.diagnose.inference.fit_noise import fit_noise
 from magbridge.diagnose.inference.joint import Joint
@@ -26,7 +27,7 @@ def fit(coefficients: np.ndarray, calibration: int = 4) -> Joint:
     rng = np.random.default_rng(3)
     size = calibration + len(coefficients)
     X = rng.standard_normal((200, size)) @ (np.eye(size) + 0.3 * rng.standard_normal((size, size)))
-    noise = fit_noise(rng.standard_normal(50), np.ones(50, bool), 1)
+    noise = fit_noise(rng.standard_normal(50), Past(np.ones(50, int), 1))
     return Joint(
         0.0, np.zeros(calibration), coefficients, np.linalg.inv(X.T @ X), noise, noise.scale, np.ones(size)
     )

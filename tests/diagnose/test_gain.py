@@ -10,6 +10,7 @@ from scipy.stats import multivariate_normal
 
 from magbridge.calibration.model import Calibration, Noise, Parameter, Reference
 from magbridge.calibration.terms import Polynomial
+from magbridge.diagnose.compare.past import FAR
 from magbridge.diagnose.compare.problem import Problem, pose
 from magbridge.diagnose.compare.survey import Channel, Survey
 from magbridge.diagnose.gain import held_out
@@ -28,7 +29,7 @@ def problem() -> Problem:
     p = np.sin(np.arange(n) / 9.0)
     survey = Survey(
         time=1.7e9 + 4.0 * np.arange(n), field=field + rng.normal(size=(n, 3)), reference=np.full(n, 5e4), still=(),
-        follows=np.arange(n) % 40 > 0, dive=np.arange(n) // 40, place=None, attitude=None,
+        steps=np.where(np.arange(n) % 40 > 0, 1, FAR), dive=np.arange(n) // 40, place=None, attitude=None,
         learned=np.zeros(n, bool), cycles=np.empty(0), source="made", channels={"p": Channel(p, "in", ("position",))},
     )  # fmt: skip
     calibration = Calibration(

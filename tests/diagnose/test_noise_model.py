@@ -3,10 +3,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from magbridge.diagnose.inference.fit_noise import certainty, fit_noise, memory_order
+from magbridge.diagnose.compare.past import FAR, Past
+from magbridge.diagnose.inference.fit_noise import LONGEST, certainty, fit_noise, memory_order
+from magbridge.diagnose.inference.noise import Noise
 
 
 def made(kind: str, n: int = 6000, rho: float = 0.0, seed: int = 1) -> tuple[np.ndarray, np.ndarray]:
+    """A noise, and steps that tell of two breaks in it."""
     rng = np.random.default_rng(seed)
     v = rng.standard_t(3.0, n) if kind == "heavy" else rng.normal(size=n)
     if kind == "uneven":
@@ -14,55 +17,95 @@ def made(kind: str, n: int = 6000, rho: float = 0.0, seed: int = 1) -> tuple[np.
     r = v.copy()
     for i in range(1, n):
         r[i] += rho * r[i - 1]
-    follows = np.ones(n, bool)
-    follows[[0, n // 6, n // 2]] = False
-    return r, follows
+    steps = np.ones(n, int)
+    steps[[0, n // 6, n // 2]] = FAR
+    return r, steps
 
 
 @pytest.mark.parametrize("rho", [0.0, 0.5, 0.95])
 def test_memory_and_level_are_found(rho: float) -> None:
-    r, follows = made("white", rho=rho)
-    noise = fit_noise(r, follows, 1)
+    r, steps = made("white", rho=rho)
+    noise = fit_noise(r, Past(steps, 1))
     assert noise.memory[0] == pytest.approx(rho, abs=0.04)
     assert float(np.median(noise.scale)) == pytest.approx(1.0, abs=0.04)
     assert noise.nu > 10
-    assert memory_order(r, follows) == 1
+    assert memory_order(r, Past(steps, LONGEST)) == 1
 
 
 def test_heavy_tails_are_found_and_the_score_is_of_unit_variance() -> None:
-    r, follows = made("heavy", rho=0.6)
-    noise = fit_noise(r, follows, 1)
+    r, steps = made("heavy", rho=0.6)
+    noise = fit_noise(r, Past(steps, 1))
     assert noise.nu in (2.5, 3.0, 4.0)
     assert float(np.std(noise.response(r))) == pytest.approx(1.0, abs=0.05)
 
 
 def test_a_level_that_changes_is_followed() -> None:
-    r, follows = made("uneven")
-    noise = fit_noise(r, follows, 1)
+    r, steps = made("uneven")
+    noise = fit_noise(r, Past(steps, 1))
     assert np.ptp(np.log(noise.scale)) > 1.0
-    even, follows = made("white")
-    assert np.ptp(fit_noise(even, follows, 1).scale) == 0.0
+    even, steps = made("white")
+    assert np.ptp(fit_noise(even, Past(steps, 1)).scale) == 0.0
 
 
 def test_filtering_in_pieces_is_filtering_the_whole() -> None:
-    r, follows = made("heavy", n=900, rho=0.6)
-    noise = fit_noise(r, follows, 3)
+    r, steps = made("heavy", n=900, rho=0.6)
+    noise = fit_noise(r, Past(steps, 3))
     X = np.random.default_rng(2).normal(size=(900, 2))
     whole = noise.filter(X)
     np.testing.assert_allclose(noise.filter(X[397:600], 397, 3), whole[400:600])
 
 
-def test_least_squares_of_the_filtered_is_generalised_least_squares() -> None:
-    """Against the naive oracle: the full covariance of an AR(1), inverted."""
-    n, rho = 200, 0.7
+def covariance(memory: np.ndarray, reach: int) -> np.ndarray:
+    """(reach,) of an autoregression, from its response to an impulse."""
+    impulse = np.append(1.0, np.zeros(4000))
+    for k in range(1, len(impulse)):
+        before = impulse[max(k - len(memory), 0) : k][::-1]
+        impulse[k] = memory[: len(before)] @ before
+    return np.array([impulse[: len(impulse) - lag] @ impulse[lag:] for lag in range(reach)])
+
+
+@pytest.mark.parametrize(
+    ("memory", "breaks", "lost"),
+    [((0.9, -0.5, 0.3), (0, 2, 70, 71, 150), ()), ((0.97,), (0, 90), (4, 5, 6, 30, 31, 77, 100, 150, 152, 154))],
+)  # fmt: skip
+def test_least_squares_of_the_filtered_is_generalised_least_squares(
+    memory: tuple[float, ...], breaks: tuple[int, ...], lost: tuple[int, ...]
+) -> None:
+    """Against the naive oracle, the full covariance inverted: of stretches that know nothing of each other, and beside gaps."""
+    a, p = np.array(memory), len(memory)
+    place = np.setdiff1d(np.arange(200), lost)
+    n, stretch = len(place), np.searchsorted(breaks, place, "right")
+    steps = np.where(np.diff(stretch, prepend=-1) > 0, FAR, np.diff(place, prepend=0))
     rng = np.random.default_rng(3)
     X = rng.normal(size=(n, 2)).cumsum(axis=0)
-    follows = np.append(False, np.ones(n - 1, bool))
-    noise = fit_noise(rng.normal(size=n), follows, 1, blocks=False)
-    noise = type(noise)(np.array([rho]), np.ones(n), 1e6, np.sqrt(1 - rho**2), noise.past, 0.0, np.zeros(n))
-    C = rho ** np.abs(np.subtract.outer(np.arange(n), np.arange(n))) / (1 - rho**2)
+    noise = Noise(a, np.ones(n), 1e6, Past(steps, p), 0.0, np.zeros(n))
+    apart = np.abs(np.subtract.outer(place, place))
+    C = covariance(a, 200)[apart] * np.equal.outer(stretch, stretch)
     A = noise.filter(X)
-    np.testing.assert_allclose(A.T @ A, X.T @ np.linalg.solve(C, X), rtol=1e-4)
+    np.testing.assert_allclose(A.T @ A, X.T @ np.linalg.solve(C, X), rtol=1e-5)
+    y = rng.normal(size=n)
+    np.testing.assert_allclose(X.T @ noise.back(y), A.T @ y)
+
+
+@pytest.mark.parametrize("lost", ["every 24th", "one in twelve", "76 of 100"])
+def test_what_says_how_much_a_constant_pulls_is_right_beside_gaps(lost: str) -> None:
+    """Under white noise upon one that remembers 40 samples, fitted with a memory of 8."""
+    pulls = []
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        whole = made("white", 4000, rho=0.975, seed=seed)[0] + 2.0 * rng.normal(size=4000)
+        place = np.arange(4000)
+        keep = {
+            "every 24th": place % 24 > 0,
+            "one in twelve": rng.random(4000) > 1 / 12,
+            "76 of 100": place % 100 > 75,
+        }
+        place = np.flatnonzero(keep[lost])
+        past = Past(np.append(FAR, np.diff(place)), 8)
+        noise = fit_noise(whole[place], past, blocks=False)
+        one = noise.filter(np.ones((len(place), 1)))[:, 0]
+        pulls.append(float(one @ noise.response(whole[place]) / np.sqrt(one @ one)))
+    assert float(np.std(pulls)) == pytest.approx(1.0, abs=0.3)
 
 
 @pytest.mark.parametrize(("period", "slow"), [(np.inf, True), (5.0, False)])
@@ -73,8 +116,8 @@ def test_the_level_is_known_as_well_as_refitted_noises_agree_on_it(period: float
     column = np.cos(2.0 * np.pi * t / period)[:, None]
     logs, freedoms = [], []
     for seed in range(60):
-        r, follows = made("white", n, rho=0.9, seed=seed)
-        noise = fit_noise(r, follows, 1)
+        r, steps = made("white", n, rho=0.9, seed=seed)
+        noise = fit_noise(r, Past(steps, 1))
         logs.append(float(np.log(np.sum(noise.filter(column) ** 2))))
         freedoms += certainty(r, noise, [lambda rows: column[rows]])
     assert 2.0 / np.var(logs) == pytest.approx(np.median(freedoms), rel=0.5)

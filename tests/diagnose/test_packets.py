@@ -34,11 +34,12 @@ def problem() -> Problem:
 
 
 def drawn(problem: Problem, memory: float, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Noise of unit variance that begins anew after a gap."""
-    r = rng.normal(size=len(problem))
-    for k in np.flatnonzero(problem.survey.follows):
+    """Noise of unit variance, of which a log with gaps has a part."""
+    place = np.cumsum(np.append(0, problem.survey.steps[1:]))
+    r = rng.normal(size=int(place[-1]) + 1)
+    for k in range(1, len(r)):
         r[k] = memory * r[k - 1] + np.sqrt(1.0 - memory**2) * r[k]
-    return np.asarray(r)
+    return np.asarray(r[place])
 
 
 @pytest.mark.parametrize("memory", [0.0, 0.8])

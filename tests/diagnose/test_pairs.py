@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from magbridge.calibration.model import Calibration, Noise, Parameter, Reference
 from magbridge.calibration.terms import Polynomial
 from magbridge.diagnose.causes.candidates import Candidate
+from magbridge.diagnose.compare.past import FAR
 from magbridge.diagnose.compare.problem import Problem, pose
 from magbridge.diagnose.compare.survey import Channel, Survey
 from magbridge.diagnose.inference.exchange import _separate, exchanged
@@ -30,7 +31,7 @@ def made() -> Problem:
     d = rng.normal(size=(ROWS, 3))
     survey = Survey(
         time=1.7e9 + 4.0 * np.arange(ROWS), field=5e4 * d / np.linalg.norm(d, axis=1)[:, None],
-        reference=np.full(ROWS, 5e4), still=(), follows=np.arange(ROWS) > 0, dive=np.arange(ROWS) // 50, place=None,
+        reference=np.full(ROWS, 5e4), still=(), steps=np.where(np.arange(ROWS) > 0, 1, FAR), dive=np.arange(ROWS) // 50, place=None,
         attitude=None, learned=np.zeros(ROWS, bool), cycles=np.empty(0), source="made",
         channels={"p": Channel(np.linspace(-1.0, 1.0, ROWS), "in", ("position",))},
     )  # fmt: skip

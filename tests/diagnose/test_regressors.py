@@ -13,6 +13,7 @@ from magbridge.calibration.model import Calibration, Noise, Parameter, Reference
 from magbridge.calibration.terms import Polynomial
 from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.causes.timing import mass_rates
+from magbridge.diagnose.compare.past import FAR
 from magbridge.diagnose.compare.problem import Problem, effect_columns, history, pose
 from magbridge.diagnose.compare.survey import Channel, Survey
 
@@ -32,7 +33,7 @@ def problem() -> Problem:
     amps = np.where(rng.uniform(size=n) > 0.7, 1.3, 0.0)
     survey = Survey(
         time=t, field=5e4 * d / np.linalg.norm(d, axis=1)[:, None], reference=np.full(n, 5e4), still=(),
-        follows=np.append(False, np.abs(np.diff(t) - 4.0) < 2.0), dive=np.arange(n) // 50, place=None, attitude=None,
+        steps=np.append(FAR, np.rint(np.diff(t) / 4.0).astype(int)), dive=np.arange(n) // 50, place=None, attitude=None,
         learned=np.zeros(n, bool), cycles=np.empty(0), source="made",
         channels={
             "p": Channel(p, "in", ("position",)), "fin": Channel(p[::-1].copy(), "deg", ("position",)),

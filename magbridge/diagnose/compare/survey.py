@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from magbridge.diagnose.compare.past import FAR, Past
 from magbridge.errors import DataError
 
 __all__ = ["FEWEST", "Channel", "Survey", "assemble"]
@@ -55,8 +57,8 @@ class Survey:
         Everything that varies, and what the calibration needs.
     still : tuple of str
         Telemetry that never changes: nothing can be learned from it.
-    follows : (n,) bool array
-        The sample comes one interval after the one before.
+    steps : (n,) int array
+        Intervals since the sample before, :data:`~.past.FAR` where that tells nothing of this one's noise.
     dive : (n,) int array
         Whole dives, for leaving out.
     place : (n, 2) array or None
@@ -75,7 +77,7 @@ class Survey:
     reference: FloatArray
     channels: dict[str, Channel]
     still: tuple[str, ...]
-    follows: NDArray[np.bool_]
+    steps: NDArray[np.int64]
     dive: NDArray[np.int64]
     place: FloatArray | None
     attitude: FloatArray | None
@@ -85,6 +87,21 @@ class Survey:
 
     def __len__(self) -> int:
         return len(self.time)
+
+    @property
+    def follows(self) -> NDArray[np.bool_]:
+        """(n,) the sample comes one interval after the one before."""
+        return np.asarray(self.steps == 1)
+
+    def past(self, order: int) -> Past:
+        """Return what came before each sample, as far back as a noise of this order remembers."""
+        if order not in self._pasts:
+            self._pasts[order] = Past(self.steps, order)
+        return self._pasts[order]
+
+    @cached_property
+    def _pasts(self) -> dict[int, Past]:
+        return {}
 
     def values(self, names: Sequence[str]) -> FloatArray:
         """(n, k) channels, in this order."""
@@ -118,8 +135,8 @@ def assemble(
     time = table["time"]
     step = np.diff(time, prepend=np.nan)
     interval = float(np.nanmedian(step))
-    follows = (step > 0.5 * interval) & (step < 1.5 * interval)
-    follows[1:] &= table["learned"][1:] == table["learned"][:-1]
+    steps = np.where(step > 0.5 * interval, np.minimum(np.rint(step / interval), FAR), FAR).astype(np.int64)
+    steps[1:][table["learned"][1:] != table["learned"][:-1]] = FAR
     channels, still = {}, []
     for name in sorted(table):
         if name in NOT_TELEMETRY or name.startswith(OURS):
@@ -154,8 +171,8 @@ def assemble(
         reference=table["reference_field"],
         channels=channels,
         still=tuple(still),
-        follows=follows,
-        dive=_dives(table, follows),
+        steps=steps,
+        dive=_dives(table),
         place=place,
         attitude=attitude,
         learned=table["learned"] > 0.5,
@@ -180,7 +197,7 @@ def _held(values: FloatArray) -> FloatArray:
     return np.asarray(values[np.maximum(last, known[0])])
 
 
-def _dives(table: dict[str, FloatArray], follows: NDArray[np.bool_]) -> NDArray[np.int64]:
+def _dives(table: dict[str, FloatArray]) -> NDArray[np.int64]:
     """Count the dives: as the log does, or from surface to surface, or pieces of an eighth of the log."""
     for name in ("dive", "run"):
         if name in table and np.unique(table[name]).size > 3:
@@ -191,5 +208,5 @@ def _dives(table: dict[str, FloatArray], follows: NDArray[np.bool_]) -> NDArray[
         start = shallow & ~np.append(False, shallow[:-1])
         if 4 <= start.sum() <= 0.05 * len(depth):
             return np.cumsum(start)
-    pieces = np.arange(len(follows)) * 8 // len(follows)
-    return pieces.astype(np.int64)
+    n = len(table["time"])
+    return np.arange(n) * 8 // n

@@ -8,18 +8,19 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaln
 
+from magbridge.diagnose.compare.past import Past
 from magbridge.diagnose.compare.problem import Columns
-from magbridge.diagnose.inference.noise import Noise
+from magbridge.diagnose.inference.noise import Noise, Predictors
 
-__all__ = ["TAILS", "certainty", "fit_noise", "memory_order"]
+__all__ = ["LONGEST", "TAILS", "certainty", "fit_noise", "memory_order"]
 
 FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 TAILS = (2.5, 3.0, 4.0, 5.0, 7.0, 12.0, 1e6)
 BLOCK = 150
 """Samples over which the noise's level is taken as constant."""
 ORDERS = (0, 1, 2, 3, 5, 8, 13)
+LONGEST = ORDERS[-1]
 GAUSSIAN = 1e5
 """Degrees of freedom from which on the tails are taken for Gaussian."""
 ALTERNATIONS = 6
@@ -31,26 +32,18 @@ PIECE, PIECES = 600, 64
 """Samples by which a column's frequencies are told: pieces this long, so many at most."""
 
 
-def _past(follows: BoolArray, p: int) -> BoolArray:
-    """Whether the p samples before are there, without a gap."""
-    place = np.arange(len(follows))
-    start = np.where(follows, 0, place)
-    return np.asarray(place - np.maximum.accumulate(start) >= p)
-
-
-def memory_order(residual: FloatArray, follows: BoolArray) -> int:
+def memory_order(residual: FloatArray, past: Past) -> int:
     """Choose p by Akaike's criterion, on a residual clipped against outliers.
 
-    To whiten with too long a memory costs little, with too short a one it makes structure out of noise.
+    `past` is that of the longest. To whiten with too long a memory costs little, with too short a one it makes structure out of noise.
     """
     scale = 1.4826 * np.median(np.abs(residual)) + 1e-12
     r = np.clip(residual, -6.0 * scale, 6.0 * scale)
-    past = _past(follows, ORDERS[-1])
-    n = int(past.sum())
+    rows = np.flatnonzero(past.whole)
+    n = len(rows)
     if n < 4 * FEW:
         return 1
-    rows = np.flatnonzero(past)
-    lags = np.stack([r[rows - k] for k in range(1, ORDERS[-1] + 1)], axis=1)
+    lags = np.stack([r[rows - k] for k in range(1, LONGEST + 1)], axis=1)
     costs = []
     for p in ORDERS:
         left = r[rows] - (lags[:, :p] @ np.linalg.lstsq(lags[:, :p], r[rows], rcond=None)[0] if p else 0.0)
@@ -72,7 +65,7 @@ def certainty(residual: FloatArray, noise: Noise, columns: Sequence[Columns]) ->
     An estimate of f degrees of freedom has the variance 2 / f. What is slow sees the level that is known worst.
     """
     n, p = len(residual), len(noise.memory)
-    rows = np.flatnonzero(noise.past)
+    rows = np.flatnonzero(noise.past.whole)
     if len(rows) <= 2 * p:
         return [float(n)] * len(columns)
     before = np.array([residual[rows - k] for k in range(1, p + 1)]) / noise.scale[rows]
@@ -94,8 +87,7 @@ def certainty(residual: FloatArray, noise: Noise, columns: Sequence[Columns]) ->
 
 def fit_noise(
     residual: FloatArray,
-    follows: BoolArray,
-    order: int,
+    past: Past,
     *,
     blocks: bool | None = None,
     like: Noise | None = None,
@@ -107,9 +99,8 @@ def fit_noise(
     ----------
     residual : (n,) array
         nT.
-    follows : (n,) bool array
-    order : int
-        p.
+    past : Past
+        What came before each sample, as far back as the noise shall remember.
     blocks : bool, optional
         Let the level change from block to block; decided by the data if not given.
     like : Noise, optional
@@ -117,37 +108,35 @@ def fit_noise(
     rounds : int
         Of the alternation between memory, tails and level.
     """
-    past = _past(follows, order)
-    n = len(residual)
+    n, order, whole = len(residual), past.order, past.whole
     count = _counts(n)
     typical = float(np.median(np.abs(residual)))
     lags = np.zeros((order, n))
     for k in range(1, order + 1):
         lags[k - 1, k:] = residual[:-k]
-    lags *= past
-    memory, share, nu = np.zeros(order), 1.0, 12.0
+    lags *= whole
+    memory, nu = np.zeros(order), 12.0
     weight, scale = np.ones(n), np.full(n, 1.4826 * typical + 1e-12)
     if like is not None:
         nu, scale = like.nu, like.scale
         weight = (nu + 1.0) / (nu + ((residual - like.memory @ lags) / scale) ** 2)
     v, log_likelihood = residual, -np.inf
     for _ in range(rounds):
-        if order and past.sum() > 2 * order:
+        if whole.sum() > 2 * order:
             own = lags * (weight / scale**2)
             memory = _stable(np.asarray(np.linalg.lstsq(own @ lags.T, own @ residual, rcond=None)[0], float))
         v = residual - memory @ lags
-        if order:
-            share = min(1.0, float(np.median(np.abs(v[past]))) / (typical + 1e-300))
-        v[~past] *= share
+        beside_gaps = Predictors(past, memory)
+        v[past.rows] = beside_gaps.whitened(residual)[1]
         if blocks is None:
             blocks = _uneven(v, count)
         before = log_likelihood
         nu, scale, log_likelihood = _tails(v, count if blocks else np.array([n]), nu)
-        log_likelihood += float(np.log(share)) * np.sum(~past)
+        log_likelihood += float(np.log(beside_gaps.f)[past.pattern].sum())
         weight = (nu + 1.0) / (nu + (v / scale) ** 2)
         if abs(log_likelihood - before) < SETTLED:
             break
-    return Noise(memory, scale, nu, share, past, log_likelihood, v / scale)
+    return Noise(memory, scale, nu, past, log_likelihood, v / scale)
 
 
 def _counts(n: int) -> NDArray[np.int64]:

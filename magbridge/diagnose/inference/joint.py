@@ -100,11 +100,11 @@ def fit_joint(
     prior = np.append(np.ones(q), np.broadcast_to(ridge, k))
     common = [(own, spectrum) for own, spectrum in zip(X.at, spectra, strict=False) if spectrum is not None]
     centre = np.append(problem.centre, np.zeros(k))
-    follows = problem.survey.follows
+    past = problem.survey.past(order)
 
     def at(c: FloatArray) -> tuple[FloatArray, Noise]:
         left = problem.residual - X.times(c)
-        return left, fit_noise(left, follows, order, blocks=blocks, like=None if like is None else like.noise)
+        return left, fit_noise(left, past, blocks=blocks, like=None if like is None else like.noise)
 
     def value(c: FloatArray, noise: Noise) -> float:
         return noise.log_likelihood - 0.5 * float(prior @ (c - centre) ** 2)

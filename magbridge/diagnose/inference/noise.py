@@ -7,9 +7,12 @@ change from block to block::
 
     v_t = f_t (r_t - sum_k a_k r_(t-k)),   v_t / s_t ~ t_nu
 
-After a gap there is no past to look at: there ``v_t = f r_t``, f the innovations' share of the whole
-standard deviation. One step of Fisher scoring towards the maximum of the likelihood is then ordinary
-least squares of
+Beside a gap the p samples before a sample were at other lags: there a are the best coefficients for those, and f is
+how much less surely they predict, both from the autocovariance C of the memory a (Vecchia 1988, JRSS B 50:297),
+
+    a = G^-1 c,   G_ij = C(|l_i - l_j|),   c_i = C(l_i),   f^-2 = C(0) - c^T a   in units of s^2
+
+One step of Fisher scoring towards the maximum of the likelihood is then ordinary least squares of
 
     y_t = psi(v_t / s_t) / sqrt(kappa)   on   sqrt(kappa) f (X_t - sum_k a_k X_(t-k)) / s_t
     psi(x) = (nu + 1) x / (nu + x^2),   kappa = (nu + 1) / (nu + 3)
@@ -20,18 +23,23 @@ least squares of
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
+from scipy.signal import lfilter, lfiltic
 
-__all__ = ["Noise"]
+from magbridge.diagnose.compare.past import FAR, Past
+
+__all__ = ["Noise", "Predictors", "autocovariance"]
 
 FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 BAND = 32
 """Rows that are filtered by one product of matrices."""
+SOLVED = 4096
+"""Patterns of lags whose coefficients are found at a time."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,10 +54,8 @@ class Noise:
         nT, s of every sample.
     nu : float
         Degrees of freedom of the tails; 1e6 is Gaussian.
-    share : float
-        f where there is no past.
-    past : (n,) bool array
-        The p samples before are there.
+    past : Past
+        What came before each sample.
     log_likelihood : float
     innovations : (n,) array
         v / s.
@@ -58,8 +64,7 @@ class Noise:
     memory: FloatArray
     scale: FloatArray
     nu: float
-    share: float
-    past: BoolArray
+    past: Past
     log_likelihood: float
     innovations: FloatArray
 
@@ -70,8 +75,13 @@ class Noise:
 
     @property
     def independent(self) -> float:
-        """How many independent samples say as much of a constant: ``n (1 - sum a)^2 / f^2``."""
-        return float(len(self.scale) * (1.0 - self.memory.sum()) ** 2 / max(self.share, 1e-6) ** 2)
+        """How many independent samples say as much of a constant: ``n (1 - sum a)^2 C(0)``."""
+        return float(len(self.scale) * (1.0 - self.memory.sum()) ** 2 * autocovariance(self.memory, 0)[0])
+
+    @cached_property
+    def beside_gaps(self) -> Predictors:
+        """What predicts samples that have not all of their past."""
+        return Predictors(self.past, self.memory)
 
     def filter(self, values: FloatArray, start: int = 0, skip: int = 0) -> FloatArray:
         """Whiten columns for least squares.
@@ -90,16 +100,102 @@ class Noise:
         """
         rows = slice(start + skip, start + len(values))
         out = _filtered(values, self.memory, skip)
-        past = self.past[rows]
-        lone = np.flatnonzero(~past)
-        out[lone] = values[skip:][lone]
-        out *= (np.sqrt(self.kappa) * np.where(past, 1.0, self.share) / self.scale[rows])[:, None]
+        own, whitened = self.beside_gaps.whitened(values, start, skip)
+        out[own] = whitened
+        out *= (np.sqrt(self.kappa) / self.scale[rows])[:, None]
+        return out
+
+    def back(self, y: FloatArray) -> FloatArray:
+        """(n,) of y (n,), filtered backwards: the transpose of :meth:`filter`."""
+        y = np.sqrt(self.kappa) * y / self.scale
+        early, gaps = self.past.rows, self.beside_gaps
+        whole = np.where(self.past.whole, y, 0.0)
+        out = whole.copy()
+        out[early] = gaps.f[self.past.pattern] * y[early]
+        for k, weight in enumerate(self.memory, 1):
+            out[:-k] -= weight * whole[k:]
+            # of samples that are not there a is 0
+            out[early - k] -= (gaps.f * gaps.a[:, k - 1])[self.past.pattern] * y[early]
         return out
 
     def response(self, residual: FloatArray) -> FloatArray:
         """(n,) y of the module's notes; far from where the noise was fitted, with its weights from there."""
         weight = (self.nu + 1.0) / (self.nu + self.innovations**2)
         return np.asarray(weight * self.filter(residual[:, None])[:, 0] / self.kappa)
+
+
+class Predictors:
+    """Predictions of samples beside gaps.
+
+    Parameters
+    ----------
+    past : Past
+    memory : (p,) array
+
+    Attributes
+    ----------
+    past : Past
+    a : (l, p) array
+        Of each of the patterns of lags.
+    f : (l,) array
+    """
+
+    def __init__(self, past: Past, memory: FloatArray) -> None:
+        self.past = past
+        lags = past.lags
+        here = lags < FAR
+        C = autocovariance(memory, int(lags[here].max(initial=0)))
+        self.a, self.f = np.zeros(lags.shape), np.ones(len(lags))
+        own = np.arange(lags.shape[1])
+        for start in range(0, len(lags), SOLVED):
+            part = slice(start, start + SOLVED)
+            l, there = np.where(here[part], lags[part], 0), here[part]  # noqa: E741 - as in the equation
+            both = there[:, :, None] & there[:, None, :]
+            G = np.where(both, C[np.abs(l[:, :, None] - l[:, None, :])], 0.0)
+            G[:, own, own] = C[0]
+            c = np.where(there, C[l], 0.0)
+            self.a[part] = a = np.linalg.solve(G, c[:, :, None])[:, :, 0]
+            self.f[part] = 1.0 / np.sqrt(np.maximum(C[0] - np.sum(a * c, axis=1), 1.0))
+
+    def whitened(
+        self, values: FloatArray, start: int = 0, skip: int = 0
+    ) -> tuple[NDArray[np.intp], FloatArray]:
+        """Rows beside gaps, counted after the first `skip`, and v of each.
+
+        Parameters
+        ----------
+        values : (m, ...) array
+            Rows `start` and on of the whole.
+        start, skip : int
+        """
+        rows = self.past.rows
+        some = slice(*np.searchsorted(rows, [start + skip, start + len(values)]))
+        at, pattern = rows[some] - start, self.past.pattern[some]
+        v = values[at]
+        for k in range(self.past.order):  # of samples that are not there a is 0
+            v = v - (self.a[pattern, k] * values[at - 1 - k].T).T
+        return at - skip, (self.f[pattern] * v.T).T
+
+
+def autocovariance(memory: FloatArray, reach: int) -> FloatArray:
+    """(reach + 1,) C of an autoregression whose innovations have variance 1.
+
+    Levinson's recursion backwards gives the best coefficients for 0, 1, ... p samples (Brockwell & Davis 1991, sec. 5.2).
+    """
+    p, shorter, variance = len(memory), [memory], 1.0
+    while shorter[-1].size:
+        a = shorter[-1]
+        k = a[-1]
+        shorter.append((a[:-1] + k * a[-2::-1]) / (1.0 - k * k))
+        variance /= 1.0 - k * k
+    C = np.zeros(max(p, reach) + 1)
+    C[0] = variance
+    for m in range(1, p + 1):
+        C[m] = shorter[p - m] @ C[m - 1 :: -1][:m]
+    if reach > p:
+        tail = lfiltic([1.0], np.append(1.0, -memory), C[p:0:-1])
+        C[p + 1 :] = lfilter([1.0], np.append(1.0, -memory), np.zeros(reach - p), zi=tail)[0]
+    return C[: reach + 1]
 
 
 def _filtered(values: FloatArray, memory: FloatArray, skip: int) -> FloatArray:

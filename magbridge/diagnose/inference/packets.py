@@ -23,10 +23,11 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.fft import fft, ifft, next_fast_len
+from scipy.fft import ifft, next_fast_len, rfft
 
 from magbridge.diagnose.compare.problem import Columns, Problem
 from magbridge.diagnose.inference.joint import Joint
+from magbridge.diagnose.inference.noise import Noise
 from magbridge.diagnose.inference.weigh import weigh
 
 __all__ = ["Packets", "packets"]
@@ -117,14 +118,9 @@ def _places(problem: Problem, fit: Joint) -> Iterator[Places]:
     noise, n = fit.noise, len(problem)
     finest = 2 ** max(int(np.log2(n)) - 6, 0)
     whole = finest * next_fast_len(int((1.0 + 3.0 * LONGEST) * n / finest) + 1)
-    G = fft(problem.gain * _back(fit), whole)
-    # after a gap nothing is whitened, and a sample is its own
+    G = rfft(problem.gain * noise.back(noise.response(fit.left)), whole)
     h = problem.gain**2 * noise.kappa / noise.scale**2
-    H, lone = (
-        fft(np.where(noise.past, h, 0.0), whole),
-        fft(np.where(noise.past, 0.0, noise.share**2 * h), whole),
-    )
-    lags = np.arange(1, len(noise.memory) + 1)
+    H = np.array([rfft(h * some, whole) for some in (noise.past.whole, ~noise.past.whole)])
     for Q in CYCLES:
         # one bandwidth 1 / (2 pi Q) apart
         count = max(int(2.0 * np.pi * Q * np.log(LONGEST * n / Q / SHORTEST)), 0)
@@ -133,14 +129,14 @@ def _places(problem: Problem, fit: Joint) -> Iterator[Places]:
             # so few samples still hold all frequencies below twice its own
             every = min(2 ** int(np.log2(period / SHORTEST)), finest)
             f = np.arange(whole // every // 2 + 1) / whole
-            B = _smooth(G, np.exp(-0.5 * (2.0 * np.pi * length * (f - 1.0 / period)) ** 2), every)
+            kernel = np.exp(-0.5 * (2.0 * np.pi * length * (f - 1.0 / period)) ** 2)
+            B = _smooth(G, kernel, whole // every) / every
             # of a packet's own band: Gauss and Hermite's nodes
             near = 1.0 / period + np.array([-1.0, 0.0, 1.0]) * np.sqrt(1.5) / (2.0 * np.pi * length)
-            whitened = np.abs(1.0 - np.exp(-2j * np.pi * np.outer(near, lags)) @ noise.memory) ** 2
-            seen = float(np.array([1.0, 4.0, 1.0]) @ whitened) / 6.0
+            seen = _passed(noise, near) @ np.array([1.0, 4.0, 1.0]) / 6.0
             # real, so the negative frequencies' half is the positive ones'
             half = np.where(f > 0.0, 1.0, 0.5) * np.exp(-0.25 * (2.0 * np.pi * length * f) ** 2)
-            S = 2.0 * _smooth(seen * H + lone, half, every).real
+            S = 2.0 * _smooth(seen @ H[:, : len(half)], half, whole // every).real / every
             # the kernels' own sums: sqrt(2 pi) length, and sqrt(pi) length
             known = 0.5 * np.sqrt(np.pi) * length * S
             moment = every * np.arange(-(-n // every))
@@ -153,19 +149,18 @@ def _places(problem: Problem, fit: Joint) -> Iterator[Places]:
                 yield Places(period, length, moment[heard].astype(float), ratio[heard], share)
 
 
-def _smooth(spectrum: ComplexArray, kernel: FloatArray, every: int) -> ComplexArray:
-    """Every so many samples of the convolution with a `kernel`, given at the lowest frequencies that are not negative."""
-    out = np.zeros(len(spectrum) // every, complex)
+def _smooth(spectrum: ComplexArray, kernel: FloatArray, count: int) -> ComplexArray:
+    """(count,) convolution with a `kernel`, given at the lowest frequencies that are not negative."""
+    out = np.zeros(count, complex)
     out[: len(kernel)] = spectrum[: len(kernel)] * kernel
-    return np.asarray(ifft(out) / every)
+    return np.asarray(ifft(out))
 
 
-def _back(fit: Joint) -> FloatArray:
-    """(n,) score of each sample: the whitened residual, filtered backwards."""
-    noise = fit.noise
-    v = np.sqrt(noise.kappa) * noise.response(fit.left) / noise.scale
-    after = np.where(noise.past, v, 0.0)
-    out = np.where(noise.past, v, noise.share * v)
-    for k, a in enumerate(noise.memory, 1):
-        out[:-k] -= a * after[k:]
-    return np.asarray(out)
+def _passed(noise: Noise, frequency: FloatArray) -> FloatArray:
+    """(2, k) power that whitening lets pass of waves of so many turns a sample: of whole pasts, and on average beside gaps."""
+    past, gaps = noise.past, noise.beside_gaps
+    lags = np.arange(1, past.order + 1)
+    whole = np.abs(1.0 - np.exp(-2j * np.pi * np.outer(frequency, lags)) @ noise.memory) ** 2
+    waves = np.exp(-2j * np.pi * frequency[:, None, None] * past.lags)
+    early = np.abs(gaps.f * (1.0 - np.sum(gaps.a * waves, axis=2))) ** 2
+    return np.stack([whole, early @ np.bincount(past.pattern) / max(len(past.rows), 1)])

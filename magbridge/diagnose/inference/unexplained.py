@@ -197,16 +197,14 @@ def _calm(
     jumps = np.abs(np.diff(fit.left))
     level = 1.4826 * float(np.median(jumps)) / np.sqrt(2.0) + 1e-12
     white = np.full(len(problem), level)
-    noise = replace(
-        fit.noise, memory=np.zeros(order), scale=white, nu=1e6, share=1.0, innovations=fit.left / level
-    )
+    noise = replace(fit.noise, memory=np.zeros(order), scale=white, nu=1e6, innovations=fit.left / level)
     width = np.concatenate([one.widths[1][1] for one in slow])
-    follows, blocks = problem.survey.follows, bool(np.ptp(fit.noise.scale))
+    past, blocks = problem.survey.past(order), bool(np.ptp(fit.noise.scale))
     for _ in range(CALM):
         info = information(problem, noise, fit, model, [one.columns for one in slow])
         c = Statistic(info.matrix, width[None] ** 2).best(info.score).estimate
         left = fit.left + _taken(problem, model, -info.shift @ c, [one.columns for one in slow], c)
-        noise = fit_noise(left, follows, order, blocks=blocks)
+        noise = fit_noise(left, past, blocks=blocks)
     return noise
 
 
@@ -216,9 +214,7 @@ def _weighed(
     """Log evidence of a description against the model, the noise fitted anew with it (Laplace's approximation)."""
     moved = -shift @ best.estimate
     left = fit.left + _taken(problem, model, moved, [one.columns], best.estimate)
-    noise = fit_noise(
-        left, problem.survey.follows, order, blocks=bool(np.ptp(fit.noise.scale)), like=fit.noise
-    )
+    noise = fit_noise(left, problem.survey.past(order), blocks=bool(np.ptp(fit.noise.scale)), like=fit.noise)
     z = fit.z + moved[: len(fit.z)]
     pull = float(np.sum((z - problem.centre) ** 2) - np.sum((fit.z - problem.centre) ** 2))
     gained = noise.log_likelihood - fit.noise.log_likelihood - 0.5 * pull
