@@ -50,8 +50,8 @@ class Samples:
         nT, H_e.
     phi : (n, m) array
         Monomials of the positions.
-    follows : (n,) bool array
-        The sample before it belongs to the same run and came one interval earlier.
+    steps : (n,) array
+        Intervals since the sample before; infinite where that belongs to another run.
     unit : float
         nT, F_0: ``A = I + a / F_0``.
     kappa : float
@@ -61,14 +61,14 @@ class Samples:
     field: FloatArray
     reference: FloatArray
     phi: FloatArray
-    follows: NDArray[np.bool_]
+    steps: FloatArray
     unit: float
     kappa: float = 0.0
 
     def part(self, rows: slice | NDArray[np.bool_] | NDArray[np.intp]) -> Samples:
         """Pick samples."""
         return Samples(
-            self.field[rows], self.reference[rows], self.phi[rows], self.follows[rows], self.unit, self.kappa
+            self.field[rows], self.reference[rows], self.phi[rows], self.steps[rows], self.unit, self.kappa
         )
 
 
@@ -160,7 +160,7 @@ def normal_equations(
         e, g = residuals(part, coefficients)
         J = (part.phi[:, :, None] * g[:, None, :]).reshape(len(e), size)
         if memory:
-            e, J = whiten(e, part.follows, memory), whiten(J, part.follows, memory)
+            e, J = whiten(e, part.steps, memory), whiten(J, part.steps, memory)
         e, J = e[start - first :], J[start - first :]
         if weight is not None:
             root = np.sqrt(weight[start : start + CHUNK])
@@ -171,9 +171,10 @@ def normal_equations(
     return NormalEquations(hessian, gradient, cost)
 
 
-def whiten(values: FloatArray, follows: NDArray[np.bool_], memory: float) -> FloatArray:
-    """``(v_i - rho v_(i-1)) / sqrt(1 - rho^2)`` where a sample follows another; as it is elsewhere."""
-    white = values.copy()
-    mask = follows[1:]
-    white[1:][mask] = (values[1:][mask] - memory * values[:-1][mask]) / np.sqrt(1.0 - memory**2)
+def whiten(values: FloatArray, steps: FloatArray, memory: float) -> FloatArray:
+    """``(v_i - r v_(i-1)) / sqrt(1 - r^2)``, r = memory^steps: an AR(1)'s correlation also beside gaps."""
+    white, r, gaps = values.copy(), np.full(len(values) - 1, memory), np.flatnonzero(steps[1:] != 1)
+    r[gaps] = memory ** steps[1:][gaps]
+    r = r.reshape(-1, *(1,) * (values.ndim - 1))
+    white[1:] = (values[1:] - r * values[:-1]) / np.sqrt(1.0 - r**2)
     return white

@@ -18,7 +18,7 @@ from magbridge.calibration.fitting.fit import METHODS, fit
 from magbridge.calibration.fitting.nominal import nominal, nominal_samples
 from magbridge.calibration.fitting.prior import free_structure
 from magbridge.calibration.model import Calibration
-from magbridge.calibration.residual import Samples, normal_equations, residuals
+from magbridge.calibration.residual import Samples, normal_equations, residuals, whiten
 from magbridge.calibration.terms import full_order
 from magbridge.errors import CalibrationError
 
@@ -54,7 +54,7 @@ def some_samples() -> Samples:
         rng.normal(size=(n, 3)) * 3e4,
         np.full(n, 5e4),
         rng.normal(size=(n, 3)),
-        np.arange(n) % 7 > 0,
+        np.where(np.arange(n) % 7 > 0, 1.0, np.inf),
         5e4,
         0.5,
     )
@@ -294,10 +294,22 @@ def test_a_site_bias_is_in_every_sigma(glider: Gliders) -> None:
     np.testing.assert_allclose(np.sqrt(after.sigma**2 - before.sigma**2), 30.0, rtol=0.01)
 
 
-def test_a_sample_follows_the_one_before_unless_something_is_between() -> None:
+def test_least_squares_of_the_whitened_is_generalised_least_squares_beside_gaps_too() -> None:
+    """Against the naive oracle: the covariance of an AR(1) of which some samples are lost, inverted."""
+    rng = np.random.default_rng(2)
+    place = np.flatnonzero(rng.random(120) > 0.2)
+    n, run = len(place), np.arange(len(place)) // 40
+    steps = np.where(np.diff(run, prepend=-1) > 0, np.inf, np.diff(place, prepend=0))
+    X = rng.normal(size=(n, 3)).cumsum(axis=0)
+    C = 0.9 ** np.abs(np.subtract.outer(place, place)) * np.equal.outer(run, run)
+    white = whiten(X, steps, 0.9)
+    np.testing.assert_allclose(white.T @ white, X.T @ np.linalg.solve(C, X), rtol=1e-9)
+
+
+def test_how_long_before_a_sample_the_last_one_came() -> None:
     time = np.array([0.0, 4.0, 8.1, 16.0, 20.0, 24.0])
     data = Observations(
         np.ones((12, 3)) * 3e4, np.full(12, 5e4), np.empty((12, 0)),
         runs=np.repeat([0, 1], 6), time=np.concatenate([time, time + 28.0]),
     )  # fmt: skip
-    assert data.follows.tolist() == [False, True, True, False, True, True] * 2
+    assert data.steps.tolist() == [np.inf, 1.0, 1.0, 2.0, 1.0, 1.0] * 2

@@ -149,9 +149,7 @@ def compare(ds: xr.Dataset, calibration: Calibration) -> tuple[Array, Array]:
     W = calibration.kernel.weights.copy()
     W[0, :3] -= 1.0
     W[:, :6] *= calibration.reference.field
-    samples = Samples(
-        H, ds["reference_field"].to_numpy(), phi, np.ones(len(H), bool), calibration.reference.field
-    )
+    samples = Samples(H, ds["reference_field"].to_numpy(), phi, np.ones(len(H)), calibration.reference.field)
     e, g = residuals(samples, W.ravel())
     return e, (phi[:, :, None] * g[:, None, :]).reshape(len(e), -1)
 

@@ -119,7 +119,7 @@ def _thinned(samples: Samples) -> Samples:
         np.linspace(0, blocks - 1, ENOUGH // BLOCK).astype(int)[:, None] * BLOCK + np.arange(BLOCK)
     ).ravel()
     part = samples.part(rows)
-    part.follows[::BLOCK] = False
+    part.steps[::BLOCK] = np.inf
     return part
 
 
@@ -149,7 +149,7 @@ def _climb(
         if step < ROUNDS - 4:  # then let the noise's shape be, so that the rest can settle
             e = residuals_of(samples, structure.coefficients(z))
             doubt = (0.0, 0.0) if white else _doubt(samples, _prior(structure, eta), solution, noise)
-            shape = estimate_noise(e, samples.follows & (not white), widths.determined, doubt)
+            shape = estimate_noise(e, np.where(white, np.inf, samples.steps), widths.determined, doubt)
             noise = replace(shape, sigma=widths.sigma)
     return _Answer(solution, widths, noise, structure, quadratic, score)
 
@@ -161,13 +161,13 @@ def _doubt(samples: Samples, prior: Prior, solution: Solution, noise: NoiseModel
     J = (few.phi[:, :, None] * g[:, None, :]).reshape(len(g), -1)
     P = covariance_of(solution.normal.hessian / noise.sigma**2 + prior.precision)
     JP = J @ (prior.E @ P @ prior.E.T)
-    follows = few.follows[1:]
-    return float(np.mean((JP * J).sum(axis=1))), float(np.mean((JP[1:] * J[:-1]).sum(axis=1)[follows]))
+    next_one = few.steps[1:] == 1
+    return float(np.mean((JP * J).sum(axis=1))), float(np.mean((JP[1:] * J[:-1]).sum(axis=1)[next_one]))
 
 
 def _approach(samples: Samples, prior: Prior, z: FloatArray) -> tuple[FloatArray, NoiseModel]:
     """Come near the answer: noise as large as the residuals' bulk, smaller with each step."""
-    apart = np.zeros(len(samples.field), bool)
+    apart = np.full(len(samples.field), np.inf)
     noise = estimate_noise(residuals_of(samples, prior.coefficients(z)), apart, 0.0)
     for _ in range(ROUNDS):
         z = gauss_newton(samples, prior, noise, z, steps=1, tolerance=0.1).z
@@ -180,7 +180,7 @@ def _approach(samples: Samples, prior: Prior, z: FloatArray) -> tuple[FloatArray
 def _score(widths: Widths, noise: NoiseModel, samples: Samples) -> float:
     """Log evidence of all samples: an outlier counts as one just at the limit, whitening by its Jacobian."""
     outlier = np.log(widths.sigma) + 0.5 * OUTLIER**2
-    whitening = 0.5 * samples.follows.sum() * np.log(1.0 - noise.memory**2)
+    whitening = 0.5 * np.log(1.0 - noise.memory ** (2.0 * samples.steps)).sum()
     return float(widths.log_evidence - noise.rejected * outlier - whitening)
 
 

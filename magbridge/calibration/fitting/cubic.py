@@ -47,7 +47,7 @@ def fit_cubic(data: Observations, order: int = 3) -> Fit:
         found = gauss_newton(samples, prior, noise, start, steps=200)
         start = found.z
         free = min(float(len(start)), len(data) / 2)
-        noise = NoiseModel(estimate_noise(residuals_of(samples, start), samples.follows, free).sigma)
+        noise = NoiseModel(estimate_noise(residuals_of(samples, start), samples.steps, free).sigma)
     check_scales(samples, start)
     covariance = covariance_of(found.normal.hessian / noise.sigma**2 + prior.precision)
     plain = polynomial_samples(data, exponents)

@@ -112,15 +112,16 @@ class Observations:
         return replace(self, **picked)
 
     @property
-    def follows(self) -> NDArray[np.bool_]:
-        """(n,) whether a sample comes one interval after the one before, in the same run."""
+    def steps(self) -> FloatArray:
+        """(n,) intervals since the sample before, infinite where that belongs to another run or came no earlier."""
         assert self.time is not None
         assert self.runs is not None
-        follows = np.zeros(len(self), bool)
-        step = np.diff(self.time)
-        if step.size:
-            follows[1:] = (self.runs[1:] == self.runs[:-1]) & (step > 0) & (step < 1.5 * np.median(step))
-        return follows
+        steps = np.full(len(self), np.inf)
+        apart = np.diff(self.time)
+        if apart.size:
+            near = (self.runs[1:] == self.runs[:-1]) & (apart > 0)
+            steps[1:][near] = np.maximum(np.rint(apart[near] / np.median(apart)), 1.0)
+        return steps
 
     def ranges(self) -> tuple[Parameter, ...]:
         """Return the parameters with the range seen, scaled to [-1, 1]."""
@@ -178,7 +179,7 @@ def polynomial_samples(data: Observations, exponents: tuple[Exponents, ...], kap
     ranges = data.ranges()
     x = (data.parameters - [p.centre for p in ranges]) / [p.scale for p in ranges]
     phi = np.stack([np.prod(x ** np.array(powers), axis=1) for powers in exponents], axis=1)
-    return Samples(data.field, data.reference, phi, data.follows, float(data.reference.mean()), kappa)
+    return Samples(data.field, data.reference, phi, data.steps, float(data.reference.mean()), kappa)
 
 
 def observations(

@@ -70,7 +70,7 @@ def fit_horizontal(data: Observations, order: int = 0) -> Fit:  # noqa: ARG001  
     map_ = np.array([(_own(x + h, unit) - _own(x - h, unit)) / 2e-6 for h in 1e-6 * np.eye(12)]).T
     coefficients = _own(x, unit)
     check_scales(samples, coefficients)
-    noise = estimate_noise(residuals_of(samples, coefficients), samples.follows, 9.0)
+    noise = estimate_noise(residuals_of(samples, coefficients), samples.steps, 9.0)
     return assemble(
         data, samples, (), ((),), coefficients, map_ @ covariance @ map_.T, noise, "horizontal",
         details={"attitude_noise_nT": sigma},

@@ -50,7 +50,7 @@ def unfiltered(data: Observations, corner: float) -> Observations:
             f"filter corner = {corner:g} Hz: that is a time constant of {tau:.3g} s, and the data are {told:.3g} s long"
         )
     reach = max(int(np.ceil(0.5 * REACH * tau / np.median(np.diff(data.time)))), 1)
-    stretch = np.cumsum(~data.follows)
+    stretch = np.cumsum(data.steps != 1)
     rows = np.arange(len(data))
     ahead, behind = np.minimum(rows + reach, len(data) - 1), np.maximum(rows - reach, 0)
     # a slope does not reach into another run; at an end it looks one way only

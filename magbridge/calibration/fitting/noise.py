@@ -42,7 +42,7 @@ class NoiseModel:
 
 
 def estimate_noise(
-    e: FloatArray, follows: NDArray[np.bool_], free: float, doubt: tuple[float, float] = (0.0, 0.0)
+    e: FloatArray, steps: FloatArray, free: float, doubt: tuple[float, float] = (0.0, 0.0)
 ) -> NoiseModel:
     """Noise model from the residuals of a fit.
 
@@ -50,8 +50,8 @@ def estimate_noise(
     ----------
     e : (n,) array
         Residuals, nT.
-    follows : (n,) bool array
-        The sample before it is its neighbour.
+    steps : (n,) array
+        Intervals since the sample before.
     free : float
         How many numbers the data determined.
     doubt : tuple of 2 float
@@ -60,8 +60,8 @@ def estimate_noise(
         ``Cov e = R - J P J^T`` (R: the noise, P: posterior of the coefficients).
     """
     scale = _robust(e)
-    memory = _memory(np.clip(e, -3.0 * scale, 3.0 * scale), follows, doubt)
-    white = whiten(e, follows, memory)
+    memory = _memory(np.clip(e, -3.0 * scale, 3.0 * scale), steps == 1, doubt)
+    white = whiten(e, steps, memory)
     weight = (np.abs(white) <= OUTLIER * _robust(white)).astype(float)
     kept = weight.sum()
     sigma = float(np.sqrt((weight * white * white).sum() / max(kept - free, 1.0)))

@@ -35,7 +35,7 @@ HARD_IRON_SIGMA = 0.6
 def nominal_samples(data: Observations) -> Samples:
     """Take `data` with the constant monomial only."""
     return Samples(
-        data.field, data.reference, np.ones((len(data), 1)), data.follows, float(data.reference.mean())
+        data.field, data.reference, np.ones((len(data), 1)), data.steps, float(data.reference.mean())
     )
 
 
@@ -88,7 +88,7 @@ def nominal(
             found = gauss_newton(samples, prior, noise, z)
             z = found.z
             # the moving masses are still in the residual: no noise to whiten, only fewer witnesses
-            noise = estimate_noise(residuals_of(samples, E @ z), samples.follows, len(keep))
+            noise = estimate_noise(residuals_of(samples, E @ z), samples.steps, len(keep))
             memory, noise = noise.memory, replace(noise, memory=0.0)
         value = found.normal.cost
         if found.settled and (best is None or value < 0.999 * best[0]):

@@ -57,7 +57,7 @@ def fit_per_run(data: Observations, order: int = 3) -> Fit:
         for _ in range(3):
             found = gauss_newton(part, prior, own, z)
             z = found.z
-            own = estimate_noise(residuals_of(part, prior.coefficients(z)), part.follows, 5.0)
+            own = estimate_noise(residuals_of(part, prior.coefficients(z)), part.steps, 5.0)
         Lambda = found.normal.hessian / own.sigma**2 + prior.precision
         precision += np.kron(np.outer(typical, typical), Lambda)
         right += np.kron(typical, Lambda @ prior.coefficients(z))
@@ -66,5 +66,5 @@ def fit_per_run(data: Observations, order: int = 3) -> Fit:
     covariance = covariance_of(precision)
     coefficients = covariance @ right
     check_scales(samples, coefficients)
-    left = estimate_noise(residuals_of(samples, coefficients), samples.follows, 0.0)
+    left = estimate_noise(residuals_of(samples, coefficients), samples.steps, 0.0)
     return assemble(data, samples, ranges, exponents, coefficients, covariance, left, "runs")

@@ -97,8 +97,8 @@ class _Design:
         ]
         phi = np.stack([np.prod(x ** np.array(e), axis=1) for e in self.exponents], axis=1)
         reading = forward(calibration, truth, positions, np.zeros(len(truth)))
-        size, follows = np.linalg.norm(truth, axis=1), np.zeros(len(truth), bool)
-        samples = Samples(reading, size, phi, follows, calibration.reference.field)
+        size, alone = np.linalg.norm(truth, axis=1), np.full(len(truth), np.inf)
+        samples = Samples(reading, size, phi, alone, calibration.reference.field)
         return phi, residuals(samples, calibration.coefficients)[1]
 
     def factor(self, run: PlannedRun) -> FloatArray:

@@ -75,9 +75,9 @@ def prior(
     if not learned.size:
         return L, centre
     J = derivatives(calibration, samples.part(learned), g[learned], L)
-    noise, follows = calibration.noise, survey.follows[learned]
+    noise, steps = calibration.noise, survey.steps[learned].astype(float)
     white = np.column_stack([J, e[learned]])
-    white = whiten(white, follows, noise.memory) / level(calibration, e)
+    white = whiten(white, steps, noise.memory) / level(calibration, e)
     A, y = white[:, :-1], white[:, -1]
     values, vectors = np.linalg.eigh(np.eye(len(centre)) - A.T @ A)
     held = values > 0.1  # elsewhere those samples were all there was, and they speak for themselves

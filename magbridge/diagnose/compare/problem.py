@@ -147,7 +147,7 @@ def samples_of(survey: Survey, calibration: Calibration) -> tuple[Samples, Float
     W[:, :6] *= unit
     noise = calibration.noise
     kappa = noise.reference / noise.sensor if noise.sensor > 0.0 else 0.0
-    return Samples(survey.field, survey.reference, phi.T, survey.follows, unit, kappa), W.ravel()
+    return Samples(survey.field, survey.reference, phi.T, survey.steps.astype(float), unit, kappa), W.ravel()
 
 
 def pose(survey: Survey, calibration: Calibration) -> Problem:
