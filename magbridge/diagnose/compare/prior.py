@@ -75,7 +75,8 @@ def prior(
     if not learned.size:
         return L, centre
     J = derivatives(calibration, samples.part(learned), g[learned], L)
-    noise, steps = calibration.noise, survey.steps[learned].astype(float)
+    noise = calibration.noise
+    steps = np.asarray(survey.steps[learned] * (survey.interval / noise.interval if noise.interval else 1.0))
     white = np.column_stack([J, e[learned]])
     white = whiten(white, steps, noise.memory) / level(calibration, e)
     A, y = white[:, :-1], white[:, -1]

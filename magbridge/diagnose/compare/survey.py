@@ -19,6 +19,8 @@ FloatArray = NDArray[np.float64]
 
 FEWEST = 60
 """Samples below which nothing can be said about noise and effect at once."""
+SHORT = 0.25
+"""Share of the steps that may be shorter than what counts as an interval: some gliders sample faster near the surface."""
 KINDS = {
     "degC": "temperature", "K": "temperature", "A": "current", "mA": "current", "m": "pressure", "dbar": "pressure",
     "bar": "pressure", "Pa": "pressure", "hPa": "pressure", "kPa": "pressure", "mbar": "pressure",
@@ -89,9 +91,16 @@ class Survey:
         return len(self.time)
 
     @property
+    def interval(self) -> float:
+        """s, of one step."""
+        known = self.steps[1:] < FAR
+        return float(np.median(np.diff(self.time)[known] / self.steps[1:][known])) if known.any() else 1.0
+
+    @property
     def follows(self) -> NDArray[np.bool_]:
-        """(n,) the sample comes one interval after the one before."""
-        return np.asarray(self.steps == 1)
+        """(n,) the sample comes as soon after the one before as most do, so that the two tell a rate of change."""
+        apart = np.diff(self.time, prepend=np.inf)
+        return np.asarray((apart > 0.0) & (apart < 1.5 * np.median(apart)) & (self.steps < FAR))
 
     def past(self, order: int) -> Past:
         """Return what came before each sample, as far back as a noise of this order remembers."""
@@ -134,7 +143,7 @@ def assemble(
     """
     time = table["time"]
     step = np.diff(time, prepend=np.nan)
-    interval = float(np.nanmedian(step))
+    interval = float(np.nanquantile(step, SHORT))
     steps = np.where(step > 0.5 * interval, np.minimum(np.rint(step / interval), FAR), FAR).astype(np.int64)
     steps[1:][table["learned"][1:] != table["learned"][:-1]] = FAR
     channels, still = {}, []
