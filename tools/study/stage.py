@@ -38,9 +38,11 @@ MEMORY = 0.8
 """Correlation of neighbours in noise with a memory."""
 SLOWER = 0.95
 """Correlation of neighbours in the slower third of noise that is white upon something slower."""
-NOISES = ("white", "ar", "mixed", "heavy", "uneven", "half", "map")
+NOISES = ("white", "ar", "mixed", "heavy", "uneven", "half", "map", "lost")
 """White; with a memory; white upon a longer one; heavy-tailed; louder at times; half as loud again as calibrated; over
-rock that is rough."""
+rock that is rough; white upon a longer memory, and some samples are lost."""
+LOST = 0.05
+"""Share of the samples that are lost, here and there."""
 
 
 @dataclass(frozen=True)
@@ -123,7 +125,7 @@ def autoregression(white: Array, memory: float) -> Array:
 
 
 def add_noise(ds: xr.Dataset, kind: str, seed: int) -> xr.Dataset:
-    """Add noise of unit variance, or what its `kind` says, to each channel."""
+    """Add noise of unit variance, or what its `kind` says, to each channel; a kind may lose samples."""
     rng = np.random.default_rng([seed, 99])
     n = ds.sizes["time"]
     noise = rng.standard_normal((n, 3))
@@ -131,14 +133,14 @@ def add_noise(ds: xr.Dataset, kind: str, seed: int) -> xr.Dataset:
         noise = rng.standard_t(4.0, (n, 3)) / np.sqrt(2.0)
     if kind == "ar":
         noise = autoregression(noise, MEMORY)
-    if kind == "mixed":
+    if kind in ("mixed", "lost"):
         noise = np.sqrt(2 / 3) * noise + np.sqrt(1 / 3) * autoregression(rng.standard_normal((n, 3)), SLOWER)
     if kind == "uneven":
         noise *= np.repeat(np.exp(rng.normal(0, 0.5, n // 300 + 1)), 300)[:n, None]
     out = ds.copy()
     for k, axis in enumerate("xyz"):
         out[f"mag_{axis}"] = out[f"mag_{axis}"] + statistics(kind)[1] * noise[:, k]
-    return out
+    return out.isel(time=np.flatnonzero(rng.random(n) > LOST)) if kind == "lost" else out
 
 
 def compare(ds: xr.Dataset, calibration: Calibration) -> tuple[Array, Array]:
