@@ -53,6 +53,7 @@ def test_filtering_in_pieces_is_filtering_the_whole() -> None:
     X = np.random.default_rng(2).normal(size=(900, 2))
     whole = noise.filter(X)
     np.testing.assert_allclose(noise.filter(X[397:600], 397, 3), whole[400:600])
+    np.testing.assert_allclose(noise.filter(X[:2]), whole[:2])
 
 
 def covariance(memory: np.ndarray, reach: int) -> np.ndarray:

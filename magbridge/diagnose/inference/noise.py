@@ -173,7 +173,7 @@ class Predictors:
         at, pattern = rows[some] - start, self.past.pattern[some]
         v = values[at]
         for k in range(self.past.order):  # of samples that are not there a is 0
-            v = v - (self.a[pattern, k] * values[at - 1 - k].T).T
+            v = v - (self.a[pattern, k] * values[np.maximum(at - 1 - k, 0)].T).T
         return at - skip, (self.f[pattern] * v.T).T
 
 
