@@ -1,8 +1,59 @@
-"""The study's rooms are tools: tests find them beside the package."""
+"""What tests of a diagnosis share; the study's rooms are tools, found beside the package."""
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
+import pytest
+
+from magbridge.calibration.fitting.data import observations
+from magbridge.calibration.fitting.fit import fit
+from magbridge.calibration.fitting.lowpass import unfiltered
+from magbridge.calibration.model import Calibration, Noise, Parameter, Reference
+from magbridge.calibration.terms import Polynomial
+from magbridge.diagnose.compare.past import FAR
+from magbridge.diagnose.compare.problem import Problem, pose
+from magbridge.diagnose.compare.survey import Channel, Survey
+from magbridge.diagnose.compare.take import take
+from sitl import load, simulate
+from sitl.columns import segments
+
 sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
+
+
+@pytest.fixture(scope="module")
+def problem() -> Problem:
+    """The demo's survey against the calibration of its own runs."""
+    scenario = load("demo")
+    parts = segments(simulate(scenario, 2))
+    learned = unfiltered(
+        observations(parts["calibration"], ("battpos", "ballast")), scenario.instrument.corner
+    )
+    calibration = fit(learned, "auto").calibration
+    return pose(take([parts["survey"]], calibration), calibration)
+
+
+def _right(rows: int) -> Problem:
+    """A vehicle that is right but for noise."""
+    rng = np.random.default_rng(4)
+    d = rng.normal(size=(rows, 3))
+    survey = Survey(
+        time=1.7e9 + 4.0 * np.arange(rows), field=5e4 * d / np.linalg.norm(d, axis=1)[:, None],
+        reference=np.full(rows, 5e4), still=(), steps=np.where(np.arange(rows) > 0, 1, FAR), dive=np.arange(rows) // 50, place=None,
+        attitude=None, learned=np.zeros(rows, bool), cycles=np.empty(0), source="made",
+        channels={"p": Channel(np.linspace(-1.0, 1.0, rows), "in", ("position",))},
+    )  # fmt: skip
+    calibration = Calibration(
+        parameters=(Parameter("p", "in", -1.0, 1.0, 0.0, 1.0),), terms=(Polynomial(exponents=((0,),)),),
+        coefficients=np.zeros(9), covariance=np.diag(np.full(9, 1e-6)), noise=Noise(1.0), reference=Reference(5e4),
+    )  # fmt: skip
+    return pose(survey, calibration)
+
+
+@pytest.fixture(scope="session")
+def right() -> Callable[[int], Problem]:
+    """``right(rows)``: a vehicle that is right but for noise."""
+    return _right

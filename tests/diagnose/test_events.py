@@ -5,31 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import pytest
 from numpy.typing import NDArray
 
-from magbridge.calibration.fitting.data import observations
-from magbridge.calibration.fitting.fit import fit
-from magbridge.calibration.fitting.lowpass import unfiltered
 from magbridge.diagnose.causes.masses import actuator_order, hysteresis
-from magbridge.diagnose.compare.problem import Columns, Problem, pose
-from magbridge.diagnose.compare.take import take
+from magbridge.diagnose.compare.problem import Columns, Problem
 from magbridge.diagnose.inference.events import MOMENTS, passage, step
 from magbridge.diagnose.inference.free import descriptions
 from magbridge.diagnose.inference.joint import fit_joint
-from sitl import load, simulate
-from sitl.columns import segments
-
-
-@pytest.fixture(scope="module")
-def problem() -> Problem:
-    scenario = load("demo")
-    parts = segments(simulate(scenario, 2))
-    learned = unfiltered(
-        observations(parts["calibration"], ("battpos", "ballast")), scenario.instrument.corner
-    )
-    calibration = fit(learned, "auto").calibration
-    return pose(take([parts["survey"]], calibration), calibration)
 
 
 def with_(problem: Problem, planted: NDArray[np.float64]) -> Problem:

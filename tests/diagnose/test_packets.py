@@ -8,29 +8,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from magbridge.calibration.fitting.data import observations
-from magbridge.calibration.fitting.fit import fit
-from magbridge.calibration.fitting.lowpass import unfiltered
-from magbridge.diagnose.compare.problem import Problem, pose
-from magbridge.diagnose.compare.take import take
+from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.free import _ends, _repeated
 from magbridge.diagnose.inference.information import information
 from magbridge.diagnose.inference.joint import fit_joint
 from magbridge.diagnose.inference.packets import packets
 from magbridge.diagnose.inference.statistic import Statistic
-from sitl import load, simulate
-from sitl.columns import segments
-
-
-@pytest.fixture(scope="module")
-def problem() -> Problem:
-    scenario = load("demo")
-    parts = segments(simulate(scenario, 2))
-    learned = unfiltered(
-        observations(parts["calibration"], ("battpos", "ballast")), scenario.instrument.corner
-    )
-    calibration = fit(learned, "auto").calibration
-    return pose(take([parts["survey"]], calibration), calibration)
 
 
 def drawn(problem: Problem, memory: float, rng: np.random.Generator) -> NDArray[np.float64]:

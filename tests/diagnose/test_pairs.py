@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
 
@@ -9,12 +10,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from magbridge.calibration.model import Calibration, Noise, Parameter, Reference
-from magbridge.calibration.terms import Polynomial
 from magbridge.diagnose.causes.candidates import Candidate
-from magbridge.diagnose.compare.past import FAR
-from magbridge.diagnose.compare.problem import Problem, pose
-from magbridge.diagnose.compare.survey import Channel, Survey
+from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.exchange import _separate, exchanged
 from magbridge.diagnose.inference.pairs import pairs_of
 from magbridge.diagnose.inference.rounds import State
@@ -25,34 +22,17 @@ ROWS = 600
 Array = NDArray[np.float64]
 
 
-def made() -> Problem:
-    """A vehicle that is right but for noise."""
-    rng = np.random.default_rng(4)
-    d = rng.normal(size=(ROWS, 3))
-    survey = Survey(
-        time=1.7e9 + 4.0 * np.arange(ROWS), field=5e4 * d / np.linalg.norm(d, axis=1)[:, None],
-        reference=np.full(ROWS, 5e4), still=(), steps=np.where(np.arange(ROWS) > 0, 1, FAR), dive=np.arange(ROWS) // 50, place=None,
-        attitude=None, learned=np.zeros(ROWS, bool), cycles=np.empty(0), source="made",
-        channels={"p": Channel(np.linspace(-1.0, 1.0, ROWS), "in", ("position",))},
-    )  # fmt: skip
-    calibration = Calibration(
-        parameters=(Parameter("p", "in", -1.0, 1.0, 0.0, 1.0),), terms=(Polynomial(exponents=((0,),)),),
-        coefficients=np.zeros(9), covariance=np.diag(np.full(9, 1e-6)), noise=Noise(1.0), reference=Reference(5e4),
-    )  # fmt: skip
-    return pose(survey, calibration)
-
-
 def of(cause: str, *columns: Array, **more: object) -> Candidate:
     X, k = np.column_stack(columns), len(columns)
     return Candidate(cause, None, lambda rows: X[rows], np.ones(k), ("b",) * k, ("nT",) * k, **more)  # type: ignore[arg-type]
 
 
 @pytest.fixture(scope="module")
-def state() -> State:
+def state(right: Callable[[int], Problem]) -> State:
     """Two causes that act, one that looks like both, one like the first; another that has nothing to do with it."""
     rng, t = np.random.default_rng(5), np.arange(ROWS)
     a, b = np.sin(t / 7.0), np.sign(np.sin(t / 40.0))
-    problem = replace(made(), residual=a + b + rng.normal(size=ROWS))
+    problem = replace(right(ROWS), residual=a + b + rng.normal(size=ROWS))
     both, alike, other = (
         a + b + 0.3 * np.cos(t / 90.0),
         a + 0.2 * np.cos(t / 11.0),
