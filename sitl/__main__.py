@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 
-from magbridge.cli import main
+from magbridge.__main__ import main
 
 if __name__ == "__main__":
     sys.exit(main(["replay", *sys.argv[1:]]))

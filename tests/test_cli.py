@@ -18,6 +18,7 @@ import pytest
 import xarray as xr
 
 from magbridge.calibration.file import load as load_calibration
+from magbridge.calibration.fitting.fit import METHODS
 from magbridge.cli import main
 from magbridge.correction import Correction, correct_rows
 from magbridge.field.igrf import total_field
@@ -25,6 +26,8 @@ from magbridge.field.read import read_grid
 from magbridge.logs import read, write
 from magbridge.progress import waiting
 from sitl import load, simulate
+
+METHOD_NAMES = ", ".join(f'"{name}"' for name in METHODS)
 
 
 @pytest.fixture(scope="module")
@@ -149,7 +152,8 @@ def test_correct_gives_the_same_in_pieces(deployment: Path, calibration: Path, t
     [
         (["convert", "-o", "x.csv"], 2, "expected at least one FILE"),
         (["convert", "none.csv", "-o", "x.csv"], 1, "none.csv: expected a file"),
-        (["convert", "{d}", "-o", "x.foo"], 1, "x.foo: expected a file name that ends in one of"),
+        (["convert", "{d}", "-o", "x.foo"], 2, "must end in .csv or .nc or .parquet or .tlog"),
+        (["simulate", "demo", "-o", "x.bin"], 2, "must end in .csv"),
         (["convert", "{d}"], 2, "--output"),
         (["fly"], 2, "fly"),
         (["replay", "{d}", "--speed", "fast"], 2, "--speed fast: expected a positive number"),
@@ -166,7 +170,7 @@ def test_correct_gives_the_same_in_pieces(deployment: Path, calibration: Path, t
         (["calibrate", "{d}", "--parameter", "nose", "-o", "x.json"], 1, "column 'nose'"),
         (["calibrate", "{d}", "--parameter", "mag_x", "-o", "x.json"], 1, "'mag_x' is a channel"),
         (["calibrate", "{d}", "--filter-corner", "1e-9", "-o", "x.json"], 1, "filter corner = 1e-09 Hz"),
-        (["calibrate", "{d}", "--method", "magic", "-o", "x.json"], 1, "'magic' is not known"),
+        (["calibrate", "{d}", "--method", "magic", "-o", "x.json"], 2, f"Choose from: {METHOD_NAMES}"),
         (["calibrate", "{d}", "--order", "0", "-o", "x.json"], 2, "order"),
         (
             ["calibrate", "{d}", "--parameter", "run", "--parameter", "run", "-o", "x.json"],
@@ -226,10 +230,9 @@ def test_stopped_in_the_middle_leaves_nothing(
     ]  # their own times would not be the rows' any more
     long = [rows.assign_coords(time=rows["time"] + 1e5 * k) for k in range(20)]
     write(xr.concat(long, "time"), tmp_path / "long.nc")
-    command = [sys.executable, "-m", "magbridge.cli", "convert", "long.nc", "-o", "x.csv"]
+    command = [sys.executable, "-m", "magbridge", "convert", "long.nc", "-o", "x.csv"]
     with subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True) as process:
         assert process.stderr
-        # something is written: an interrupt while Python's libraries are still being loaded is theirs to tell
         while not any(path.stat().st_size for path in tmp_path.glob(".x.*.partial.csv")):
             assert process.poll() is None
             time.sleep(0.01)
@@ -238,6 +241,18 @@ def test_stopped_in_the_middle_leaves_nothing(
     assert process.returncode == code
     assert said == ("magbridge: interrupted\n" if number == signal.SIGINT else "")
     assert [path.name for path in tmp_path.iterdir()] == ["long.nc"]
+
+
+def test_interrupted_while_libraries_are_loaded(tmp_path: Path) -> None:
+    (tmp_path / "cyclopts.py").write_text("import signal; signal.raise_signal(signal.SIGINT)")
+    ended = subprocess.run(
+        [sys.executable, "-m", "magbridge", "--version"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (ended.returncode, ended.stderr, ended.stdout) == (130, "magbridge: interrupted\n", "")
 
 
 @pytest.mark.parametrize(

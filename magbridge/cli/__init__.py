@@ -58,8 +58,6 @@ def main(arguments: list[str] | None = None) -> int:
         sys.stderr.close()
     except (OSError, MemoryError) as error:  # the system does not give a file, a folder, room
         return complain(_reason(error), 1)
-    except KeyboardInterrupt:
-        return complain("interrupted", 130)
     except _Terminated:
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
         signal.raise_signal(signal.SIGTERM)

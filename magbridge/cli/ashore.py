@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from math import inf
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter, validators
 
@@ -13,6 +13,7 @@ from magbridge.cli.common import (
     Grid,
     Heading,
     Json,
+    Log,
     Output,
     Picture,
     app,
@@ -27,7 +28,7 @@ from magbridge.progress import track, waiting
 
 
 @app.command(usage="Usage: magbridge convert FILE... -o FILE [OPTIONS]")
-def convert(*files: Path, output: Output, heading_reference: Heading = None, json: Json = False) -> None:
+def convert(*files: Path, output: Log, heading_reference: Heading = None, json: Json = False) -> None:
     """Convert logs of any readable format to any writable one; several are joined in time.
 
     Parameters
@@ -59,7 +60,7 @@ def simulate(
     scenario: Path,
     /,
     *,
-    output: Output,
+    output: Log,
     seed: Annotated[int, Parameter(validator=validators.Number(gte=0))] = 0,
     like: tuple[Path, ...] = (),
     map_output: Annotated[Path | None, Parameter(name="--map", validator=file_to_write(".nc"))] = None,
@@ -112,7 +113,7 @@ def calibrate(
     output: Output,
     parameter: tuple[str, ...] = (),
     order: Annotated[int, Parameter(validator=validators.Number(gte=1, lte=6))] = 3,
-    method: str = "auto",
+    method: Literal["auto", "nominal", "cubic", "runs", "horizontal"] = "auto",
     vehicle: Path | None = None,
     grid: Path | None = None,
     site_bias: Annotated[float, Parameter(validator=validators.Number(gte=0, lt=inf))] = 0.0,
@@ -134,7 +135,7 @@ def calibrate(
     order
         Highest total degree of the polynomials in the parameters.
     method
-        auto, or what it is compared with: nominal, cubic, runs, horizontal.
+        auto, or what it is compared with.
     vehicle
         A vehicle.toml that says where the moving masses sit, seen from the sensor.
     grid
@@ -292,7 +293,7 @@ def map(  # noqa: A001 - the command's name
 
 
 @app.command(usage="Usage: magbridge correct FILE... --calibration cal.json -o FILE [OPTIONS]")
-def correct(*files: Path, calibration: Path, output: Output, json: Json = False) -> None:
+def correct(*files: Path, calibration: Path, output: Log, json: Json = False) -> None:
     """Correct a log with a calibration, as the bridge would have done live.
 
     Parameters

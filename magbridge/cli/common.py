@@ -14,12 +14,14 @@ from cyclopts import App, Parameter
 
 from magbridge import __version__
 from magbridge.errors import WrongUse
+from magbridge.logs import suffixes
 
 __all__ = [
     "Folder",
     "Grid",
     "Heading",
     "Json",
+    "Log",
     "Output",
     "Picture",
     "app",
@@ -65,12 +67,17 @@ def file_to_write(*suffixes: str) -> Callable[[Any, Any], None]:
     return check
 
 
+def _log_to_write(kind: Any, path: Any) -> None:
+    file_to_write(*suffixes(write=True))(kind, path)
+
+
 def _folder_to_write(_: Any, path: Path) -> None:
     if path.exists() and not path.is_dir():
         raise ValueError("It is a file.")
 
 
 Output = Annotated[Path, Parameter(name=["--output", "-o"], validator=file_to_write())]
+Log = Annotated[Path, Parameter(name=["--output", "-o"], validator=_log_to_write)]
 Folder = Annotated[Path, Parameter(validator=_folder_to_write)]
 Grid = Annotated[Path, Parameter(name=["--output", "-o"], validator=file_to_write(".nc"))]
 Heading = Annotated[Literal["true", "magnetic"] | None, Parameter(name="--heading-reference")]

@@ -6,7 +6,7 @@ from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from magbridge.cli.common import Heading, Json, Output, Picture, app, complain, some, tell
+from magbridge.cli.common import Heading, Json, Log, Picture, app, complain, some, tell
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -22,7 +22,7 @@ __all__ = ["navigate"]
 def navigate(
     *files: Path,
     map: Path,  # noqa: A002 - the flag's name
-    output: Output,
+    output: Log,
     calibration: Path | None = None,
     config: Path | None = None,
     bound: bool = False,

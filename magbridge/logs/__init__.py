@@ -33,7 +33,7 @@ from magbridge.files import atomic_path
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["FORMATS", "Writer", "read", "read_chunks", "write"]
+__all__ = ["FORMATS", "Writer", "read", "read_chunks", "suffixes", "write"]
 
 FORMATS: dict[str, tuple[str, str, str]] = {
     # suffix: (module, reader, writer or "")
@@ -53,20 +53,26 @@ Paths = str | os.PathLike[str] | Sequence[str | os.PathLike[str]]
 
 
 @cache
-def _plugins() -> dict[str, tuple[str, str, str]]:
-    return {
+def _formats() -> dict[str, tuple[str, str, str]]:
+    """Return :data:`FORMATS`, and what packages add."""
+    plugins = {
         f".{point.name.lower()}": (point.value, "chunks", "FileWriter")
         for point in entry_points(group="magbridge.formats")
     }
+    return {**plugins, **FORMATS}
+
+
+def suffixes(*, write: bool = False) -> list[str]:
+    """Return the endings of the file names that can be read, or written."""
+    return sorted(suffix for suffix, (_, _, writer) in _formats().items() if writer or not write)
 
 
 def _format(path: Path, *, write: bool = False) -> Any:
     """Return the reader or the writer for the suffix of `path`."""
-    formats = {**_plugins(), **FORMATS}
-    module, reader, writer = formats.get(path.suffix.lower(), ("", "", ""))
+    module, reader, writer = _formats().get(path.suffix.lower(), ("", "", ""))
     name = writer if write else reader
     if not name:
-        known = " ".join(sorted(suffix for suffix, entry in formats.items() if entry[2] or not write))
+        known = " ".join(suffixes(write=write))
         raise FormatError(path, f"expected a file name that ends in one of {known}")
     loaded: ModuleType = import_module(module)
     return getattr(loaded, name)

@@ -22,7 +22,7 @@ def test_a_terminal_is_told_what_the_link_is(tmp_path: Path) -> None:
     (tmp_path / "bridge.toml").write_text(CONFIG)
     ours, theirs = pty.openpty()
     process = subprocess.Popen(
-        [sys.executable, "-m", "magbridge.cli", "run", "--config", "bridge.toml"], cwd=tmp_path, stderr=theirs
+        [sys.executable, "-m", "magbridge", "run", "--config", "bridge.toml"], cwd=tmp_path, stderr=theirs
     )
     os.close(theirs)
     os.set_blocking(ours, False)

@@ -33,7 +33,7 @@ def page() -> Iterator[tuple[str, tuple[str, int]]]:
     command = [
         sys.executable,
         "-m",
-        "magbridge.cli",
+        "magbridge",
         "monitor",
         f"udpin:127.0.0.1:{link}",
         "--port",

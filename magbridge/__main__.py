@@ -1,0 +1,22 @@
+"""The program: ``magbridge``, or ``python -m magbridge``."""
+
+from __future__ import annotations
+
+import sys
+
+__all__ = ["main"]
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run a command; return its exit code. Ctrl-C is one line, also while libraries are still being loaded."""
+    try:
+        from magbridge.cli import main as command  # noqa: PLC0415 - in reach of what Ctrl-C raises
+
+        return command(arguments)
+    except KeyboardInterrupt:
+        print("magbridge: interrupted", file=sys.stderr)
+        return 130
+
+
+if __name__ == "__main__":
+    sys.exit(main())
