@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
@@ -73,13 +73,17 @@ def diagnose(
             progress=step,
         )
     facts = findings(found, CAUSES)
-    causes = [
-        f"{one['cause']} ({one['channel']})" if one["channel"] else one["cause"] for one in facts["findings"]
-    ]
+    causes = [_plain(one) for one in facts["findings"]]
+    if facts["verdict"] == "unexplained" and (within := facts["unexplained"]["alternatives"]):
+        causes = [f"no name asserted; within 20:1: {', '.join(_plain(one) for one in within)}"]
     rms = f"{facts['rms_before_nT']:.2f} -> {facts['rms_after_nT']:.2f} nT RMS held out"
     tell(
         facts, f"{facts['verdict']}: {', '.join(causes) or 'no cause'}; {rms}; {output / 'report.html'}", json
     )
+
+
+def _plain(one: dict[str, Any]) -> str:
+    return f"{one['cause']} ({one['channel']})" if one["channel"] else str(one["cause"])
 
 
 def _suspect(log: xr.Dataset) -> None:

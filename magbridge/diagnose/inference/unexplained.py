@@ -25,6 +25,7 @@ from magbridge.diagnose.inference.free import Description, descriptions
 from magbridge.diagnose.inference.information import information
 from magbridge.diagnose.inference.joint import Joint
 from magbridge.diagnose.inference.noise import Noise
+from magbridge.diagnose.inference.rivals import Rival
 from magbridge.diagnose.inference.search import Hypothesis, Outcome
 from magbridge.diagnose.inference.statistic import Ridge, Statistic
 from magbridge.diagnose.inference.weigh import LEVEL, ODDS, REMNANT, slack, worth
@@ -62,6 +63,8 @@ class Leftover(NamedTuple):
         What told it.
     choice : int
         How many it was chosen from.
+    within : tuple of Rival
+        The names that it beats by less than 20:1.
     """
 
     kind: str
@@ -72,6 +75,7 @@ class Leftover(NamedTuple):
     best_channel: str | None
     description: Description | None = None
     choice: int = 1
+    within: tuple[Rival, ...] = ()
 
     @property
     def among(self) -> float:
@@ -146,6 +150,8 @@ def accept(problem: Problem, outcome: Outcome, tone: Candidate | None) -> tuple[
     Names and a free description of the whole have equal odds, and pay for what they were chosen from; what a name's regressor
     may miss is forgiven. If more is left beside them than an idealised regressor leaves, and of another sort than they are,
     the burden of proof is theirs: they and what is left must beat it 20:1.
+
+    Names that a description beats by less than 20:1 are not asserted, nor are they ruled out.
     """
     model = [h.candidate for h in outcome.chosen]
     rest = leftover(problem, model, outcome.fit, outcome.order, tone)
@@ -158,10 +164,18 @@ def accept(problem: Problem, outcome: Outcome, tone: Candidate | None) -> tuple[
     free = leftover(problem, [], outcome.null, outcome.order, tone, but=() if other else model)
     ratio = 2.0 * (outcome.fit.log_likelihood - outcome.null.log_likelihood)
     names = worth(ratio, model, outcome.trials) - float(np.log(len(outcome.trials)))
-    names += other.among - ODDS if other else slack(ratio)
-    if free is not None and names < free.among:
-        return False, free
-    return True, rest
+    names += other.among if other else slack(ratio)
+    if free is None or names - (ODDS if other else 0.0) >= free.among:
+        return True, rest
+    return False, free._replace(within=tuple(_within(outcome, free.among - names)))
+
+
+def _within(outcome: Outcome, behind: float) -> Iterator[Rival]:
+    """Yield the names that found no belief, and their rivals, as far as what beat them by `behind` does so by less than 20:1."""
+    for hypothesis, rivals in zip(outcome.chosen, outcome.rivals, strict=True):
+        for one in (Rival(hypothesis.candidate, 0.0), *rivals):
+            if one.behind + behind < ODDS:
+                yield replace(one, behind=one.behind + behind)
 
 
 def _same(chosen: Sequence[Hypothesis], rest: Leftover) -> bool:

@@ -62,6 +62,7 @@ def findings(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> dict[str, Any
             "signal_to_noise": _round(rest.signal_to_noise),
             "period_s": None if rest.period_s is None else _round(rest.period_s),
             "best_channel": rest.best_channel,
+            "alternatives": alternatives(rest.within),
         },
     }
 

@@ -74,7 +74,7 @@ def report_html(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> str:
         "<h2>What was found, and why it is believed</h2>",
         *_found(diagnosis, causes),
         "<h2>What is left</h2>",
-        _left(diagnosis),
+        _left(diagnosis, causes),
         "<h2>What this log could have shown at all</h2>",
         *_isolability(diagnosis),
     ]  # fmt: skip
@@ -219,7 +219,7 @@ def _no_gain(gain: Gain) -> str:
     return "<p>The dives that were left out do not show that it gains anything: it may be what another effect leaves.</p>"
 
 
-def _left(diagnosis: Diagnosis) -> str:
+def _left(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> str:
     rest, noise = diagnosis.unexplained, diagnosis.fit.noise
     tails = "Gaussian" if noise.nu > 1e5 else f"tails like Student's t with {noise.nu:g} degrees of freedom"
     model = (
@@ -231,10 +231,13 @@ def _left(diagnosis: Diagnosis) -> str:
         return f"<p>No structure is left that a slow curve, steps or a function of attitude would find. {model}</p>"
     goes = f", and goes best with <code>{escape(rest.best_channel)}</code>" if rest.best_channel else ""
     period = f" of period {rest.period_s:.4g} s" if rest.period_s else ""
-    return (
-        f"<p><b>{KINDS[rest.kind]}</b>{period} is left, of signal-to-noise {rest.signal_to_noise:.1f}{goes}. It fits no cause of "
-        f"the table, so it has no name. {model}</p>"
+    doubt = (
+        f"No name is asserted: it is likelier than every cause of the table. Within 20:1 of it stays: {_listed(rest.within)}. What would "
+        f"tell: {escape(causes[rest.within[0].cause].separated_by)}."
+        if rest.within
+        else "It fits no cause of the table, so it has no name."
     )
+    return f"<p><b>{KINDS[rest.kind]}</b>{period} is left, of signal-to-noise {rest.signal_to_noise:.1f}{goes}. {doubt} {model}</p>"
 
 
 def _sizes(sizes: Mapping[str, tuple[float, str]]) -> str:
