@@ -12,6 +12,7 @@ import pytest
 import xarray as xr
 from study import stage
 from study.cases import case
+from study.noise import LOSSES, NOISES
 from threadpoolctl import threadpool_limits
 
 from magbridge.calibration.correct import correct
@@ -39,9 +40,16 @@ def short() -> Iterator[None]:
 
 
 def blind(
-    part: str, names: tuple[str, ...], wanted: float, noise: str = "white", number: int = 24
+    part: str,
+    names: tuple[str, ...],
+    wanted: float,
+    noise: str = "white",
+    number: int = 24,
+    losses: str = "",
 ) -> dict[str, Any]:
-    return case({"part": part, "names": names, "wanted": wanted, "noise": noise, "number": number})
+    return case(
+        {"part": part, "names": names, "wanted": wanted, "noise": noise, "number": number, "losses": losses}
+    )
 
 
 @pytest.mark.parametrize("name", list(CAUSES))
@@ -60,18 +68,21 @@ def test_outliers_are_found() -> None:
     assert [found[0] for found in row["found"]] == ["outliers"]
 
 
-@pytest.mark.parametrize("noise", stage.NOISES)
+@pytest.mark.parametrize("noise", NOISES)
 def test_nothing_is_found_where_nothing_is(noise: str) -> None:
     assert blind("null", (), 0.0, noise, number=6)["verdict"] == "nothing_found"
 
 
-def test_samples_that_are_lost_hide_nothing() -> None:
+@pytest.mark.parametrize("losses", LOSSES)
+def test_samples_that_are_lost_are_nothing_either(losses: str) -> None:
     """Noise remembers longer than the log goes without a gap."""
-    here = stage.Stall.of(stage.vehicle(0), 24, "mixed")
-    ds = stage.add_noise(here.hide("current_field", 25.0, 24).ds, "lost", 24)
-    found = diagnose([ds], here.stage.calibration)
-    assert [hypothesis.candidate.cause for hypothesis in found.named] == ["current_field"]
-    assert found.unexplained is None
+    assert blind("null", (), 0.0, "mixed", number=6, losses=losses)["verdict"] == "nothing_found"
+
+
+def test_samples_that_are_lost_hide_nothing() -> None:
+    row = blind("named", ("current_field",), 25.0, "mixed", losses="single")
+    assert [found[0] for found in row["found"]] == ["current_field"]
+    assert row["unexplained"] is None
 
 
 def test_two_at_once() -> None:
@@ -91,7 +102,7 @@ def test_what_no_cause_explains_is_called_unexplained() -> None:
 @pytest.fixture(scope="module")
 def warm(short: None) -> tuple[xr.Dataset, object]:
     here = stage.Stall.of(stage.vehicle(0), 24, "white")
-    return stage.add_noise(here.hide("current_field", 60.0, 24).ds, "white", 24), here.stage.calibration
+    return here.log(here.hide("current_field", 60.0, 24).ds), here.stage.calibration
 
 
 @pytest.fixture(scope="module")
@@ -125,7 +136,7 @@ def test_a_maps_error_is_told_by_its_size(short: None) -> None:
     """A hundred functions of the place say nothing to anyone; their RMS does."""
     here = stage.Stall.of(stage.vehicle(0), 24, "white")
     hidden = here.hide("map_error", 40.0, 24)
-    diagnosis = diagnose([stage.add_noise(hidden.ds, "white", 24)], here.stage.calibration)
+    diagnosis = diagnose([here.log(hidden.ds)], here.stage.calibration)
     (named,) = [h for h in diagnosis.named if h.candidate.cause == "map_error"]
     told = parameters(diagnosis, named, len(diagnosis.problem.centre))
     assert set(told) == {"rms"}

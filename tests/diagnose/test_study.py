@@ -18,8 +18,10 @@ from study.both import held, named, weighed
 from study.cases import PARTS, plan
 from study.draws import SHOWN, Draws, Span, evidence, weigh, with_another
 from study.nameless import against, allowed, nameless
-from study.stage import MEMORY, autoregression, project, whiten
-from study.table import efficiency, lines, share
+from study.noise import LOSSES, MEMORY, autoregression, left, whiten
+from study.rates import efficiency, share
+from study.stage import project
+from study.table import lines
 
 from magbridge.diagnose.inference.free import Description
 
@@ -39,10 +41,32 @@ def test_whitened_noise_is_white() -> None:
     rng = np.random.default_rng(2)
     noise = autoregression(rng.normal(size=(20_000, 1)), MEMORY)[:, 0]
     assert np.std(noise) == pytest.approx(1.0, abs=0.03)
-    white = whiten(noise, "ar")
-    assert np.std(white) == pytest.approx(1.0, abs=0.02)
-    assert abs(np.mean(white[1:] * white[:-1])) < 0.02
-    assert np.std(whiten(1.5 * rng.normal(size=20_000), "half")) == pytest.approx(1.0, abs=0.02)
+    for losses in ("", *LOSSES):
+        rows = left(losses, len(noise), 3)
+        white = whiten(noise[rows], "ar", rows)
+        assert np.std(white) == pytest.approx(1.0, abs=0.02)
+        assert abs(np.mean(white[1:] * white[:-1])) < 0.02
+    every = np.arange(20_000)
+    assert np.std(whiten(1.5 * rng.normal(size=20_000), "half", every)) == pytest.approx(1.0, abs=0.02)
+
+
+def test_what_the_losses_leave_is_what_theory_knows() -> None:
+    """Against the inverse of the covariance of the samples that there are; the first row is left out, as it has no past."""
+    rng = np.random.default_rng(4)
+    rows = np.flatnonzero(rng.random(80) > 0.3)
+    covariance = MEMORY ** np.abs(rows[:, None] - rows)
+    X = rng.normal(size=(len(rows), 3))
+    white = whiten(X, "ar", rows)
+    naive = X.T @ np.linalg.solve(covariance, X) - np.outer(X[0], X[0])
+    np.testing.assert_allclose(white.T @ white, naive, rtol=1e-9)
+
+
+def test_a_quarter_of_every_part_loses_samples() -> None:
+    long = plan(2000)
+    for name in PARTS:
+        own = [entry["losses"] for entry in long if entry["part"] == name]
+        assert sum(map(bool, own)) == pytest.approx(len(own) / 4, abs=0.02 * len(own) + 1)
+        assert set(own) == {"", *LOSSES}
 
 
 def test_a_longer_study_holds_the_shorter_and_every_part_has_its_share() -> None:

@@ -12,18 +12,16 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from magbridge.calibration.correct import correct
-from magbridge.calibration.model import Calibration
 from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.diagnosis import Diagnosis
-from magbridge.diagnose.extend import extend, settle, widened
 from magbridge.diagnose.inference.free import Description, descriptions
-from magbridge.diagnose.inference.search import search
 from magbridge.diagnose.report.findings import findings
 from magbridge.diagnose.run import diagnose
-from sitl.inject import EFFECTS, FOREIGN, Hidden, disturb
+from sitl.inject import EFFECTS, FOREIGN, Hidden
 from study.both import both
-from study.stage import NOISES, SEEDS, Found, Stall, add_noise, again, stage_of
+from study.gain import DELAYS, gain
+from study.noise import LOSSES, NOISES
+from study.stage import SEEDS, Found, Stall, stage_of
 from study.theory import Setting, ideal
 
 Row = dict[str, Any]
@@ -46,8 +44,7 @@ STRANGE = ("needle", "thermostat", "perming", "staircase", "swell")
 """Of the foreign ones those that were made after the detector: it has no description for them either."""
 SEEN = ("pan", "loose", "corrosion", "pulsation")
 """Those that were so once, before the detector was last mended."""
-DELAYS = ("filter_lag", "clock_offset")
-"""In a uniform field these two are one: what is left of a late field is the masses that moved meanwhile."""
+GOLDEN = 0.6180339887498949
 
 
 class Part(NamedTuple):
@@ -107,6 +104,12 @@ PARTS: dict[str, Part] = {
 }
 
 
+def losses(k: int) -> str:
+    """What the k-th case of a part loses: one in four does, in one way or another; the golden section keeps step with nothing."""
+    place = int(4 * len(LOSSES) * (GOLDEN * k % 1.0))
+    return LOSSES[place] if place < len(LOSSES) else ""
+
+
 def plan(cases: int, parts: tuple[str, ...] = tuple(PARTS), seed: int = 0) -> list[Row]:
     """The study's entries, every part's evenly among the others'; a longer study holds the shorter one.
 
@@ -118,7 +121,8 @@ def plan(cases: int, parts: tuple[str, ...] = tuple(PARTS), seed: int = 0) -> li
         made += [
             (
                 (k + 0.5) / part.share,
-                part.entry(k) | {"part": name, "number": SEEDS * seed + 100_000 * place + k},
+                part.entry(k)
+                | {"part": name, "number": SEEDS * seed + 100_000 * place + k, "losses": losses(k)},
             )
             for k in range(count)
         ]
@@ -129,10 +133,10 @@ def case(entry: Row) -> Row:
     """Hide, diagnose, and say what came out, with what theory says of it."""
     began = time.process_time()
     number, noise, names, without = entry["number"], entry["noise"], entry["names"], entry.get("without", "")
-    stall = Stall.of(stage_of(number, noise), number, noise)
+    stall = Stall.of(stage_of(number, noise), number, noise, entry["losses"])
     hidden = [stall.hide(name, entry["wanted"], number + 7919 * k) for k, name in enumerate(names)]
     whole = hidden[0].ds if len(hidden) == 1 else stall.measure(*(one.hidden for one in hidden))
-    ds = add_noise(whole, noise, number)
+    ds = stall.log(whole)
     table = {name: cause for name, cause in CAUSES.items() if name != without}
     result = diagnose([ds], stall.stage.calibration, causes=table)
     found = findings(result, table)
@@ -143,7 +147,7 @@ def case(entry: Row) -> Row:
         "theory": _theory(entry["part"], hidden, stall, ds, result),
     }  # fmt: skip
     if entry["part"] == "gain":
-        row["gain"] = _gained(hidden[0].hidden, stall, ds, result)
+        row["gain"] = gain(hidden[0].hidden, stall, ds, result)
     return row | {"seconds": time.process_time() - began, "worker": os.getpid()}
 
 
@@ -189,44 +193,3 @@ def _alike(other: str, one: Found, stall: Stall) -> Array:
     """
     shown = [stall.show(Hidden(other, size, stall.number)).signature for size in (0.1, -0.1)]
     return max(shown, key=lambda d: float(d @ one.signature))
-
-
-def _gained(hidden: Hidden, stall: Stall, ds: xr.Dataset, result: Diagnosis) -> dict[str, float]:
-    """Mean square error (nT²) on another deployment: as calibrated, extended, and extended by who knows the cause.
-
-    Counted are the samples whose masses stand where the first deployment had them, too: elsewhere a polynomial has only
-    its own sigma to tell how little it knows. ``everywhere`` is what was extended on all samples.
-    """
-    calibration = stall.stage.calibration
-    there = again(stall.stage)
-    other = disturb(there.twin, (hidden,), there.track, there.when, stall.number + 1)
-    other = add_noise(other, "white", stall.number + 1)
-    tried = {"before": calibration, "after": result.calibration, "oracle": _oracle(hidden.name, result)}
-    errors = {name: _error(other, c) for name, c in tried.items()}
-    whole = np.all([np.isfinite(e) for e in errors.values()], axis=0)
-    seen = whole.copy()
-    for parameter in calibration.parameters:
-        seen &= (other[parameter.name] >= ds[parameter.name].min()).to_numpy()
-        seen &= (other[parameter.name] <= ds[parameter.name].max()).to_numpy()
-    found = {name: float(np.mean(e[seen] ** 2)) for name, e in errors.items()}
-    return found | {"everywhere": float(np.mean(errors["after"][whole] ** 2))}
-
-
-def _oracle(name: str, result: Diagnosis) -> Calibration:
-    """Extend by who knows the cause: its regressors alone, profiled and fitted as a diagnosis does, and nobody doubts them.
-
-    Of the two delays it takes the telemetry's: that has no noise, of which a reading's rate of change would add more.
-    """
-    problem = result.problem
-    known = "clock_offset" if name in DELAYS else name
-    outcome = search(problem, CAUSES[known].candidates(problem), 1)
-    model = [hypothesis.candidate for hypothesis in outcome.chosen]
-    settled, _, fit = settle(problem, model, outcome.fit, outcome.order)
-    return extend(settled, model, widened(model, fit))
-
-
-def _error(ds: xr.Dataset, calibration: Calibration) -> Array:
-    H = np.column_stack([ds[f"mag_{axis}"] for axis in "xyz"])
-    p = np.column_stack([ds[name] for name in calibration.channels])
-    reference = ds["reference_field"].to_numpy() + calibration.reference.bias
-    return np.asarray(correct(calibration, H, p, ds["time"].to_numpy()).total - reference)

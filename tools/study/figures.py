@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.stats import binomtest
 
 from study.cases import KNOWN
-from study.table import Row, curve, efficiency, found, told
+from study.rates import Row, curve, efficiency, found, told
 
 NEITHER = "no name"
 

@@ -1,4 +1,4 @@
-"""Vehicles with their calibrations, deployments with their noise, and effects of a wanted size hidden in them."""
+"""Vehicles with their calibrations, their deployments, and effects of a wanted size hidden in them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ import msgspec
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
-from scipy.signal import lfilter
 
 from magbridge.calibration.correct import regressors
 from magbridge.calibration.fitting.data import observations
@@ -25,6 +24,7 @@ from sitl.mission import CrissCross, Spirals
 from sitl.signals import first_order
 from sitl.trajectory import Track
 from sitl.world import Water, World
+from study.noise import Rows, add_noise, left, whiten
 
 Array = NDArray[np.float64]
 HOURS = 6.0
@@ -34,15 +34,6 @@ SEEDS = 1_000_000
 """Numbers that a study of one seed may have."""
 INERTIA = 3.0
 """s, twice, with which the attitude follows what :mod:`sitl.trajectory` draws."""
-MEMORY = 0.8
-"""Correlation of neighbours in noise with a memory."""
-SLOWER = 0.95
-"""Correlation of neighbours in the slower third of noise that is white upon something slower."""
-NOISES = ("white", "ar", "mixed", "heavy", "uneven", "half", "map", "lost")
-"""White; with a memory; white upon a longer one; heavy-tailed; louder at times; half as loud again as calibrated; over
-rock that is rough; white upon a longer memory, and some samples are lost."""
-LOST = 0.05
-"""Share of the samples that are lost, here and there."""
 
 
 @dataclass(frozen=True)
@@ -113,36 +104,6 @@ def stage_of(number: int, noise: str) -> Stage:
     return vehicle(VEHICLES * seed + place % VEHICLES, 300.0 if noise == "map" else 60.0)
 
 
-def statistics(noise: str) -> tuple[float, float]:
-    """Correlation of neighbours, and 1-sigma (nT)."""
-    return (MEMORY if noise == "ar" else 0.0), (1.5 if noise == "half" else 1.0)
-
-
-def autoregression(white: Array, memory: float) -> Array:
-    """Give white noise of unit variance (n, k) a memory, and leave its variance."""
-    driven = np.vstack([white[:1], white[1:] * np.sqrt(1 - memory**2)])
-    return np.asarray(lfilter([1.0], [1.0, -memory], driven, axis=0))
-
-
-def add_noise(ds: xr.Dataset, kind: str, seed: int) -> xr.Dataset:
-    """Add noise of unit variance, or what its `kind` says, to each channel; a kind may lose samples."""
-    rng = np.random.default_rng([seed, 99])
-    n = ds.sizes["time"]
-    noise = rng.standard_normal((n, 3))
-    if kind == "heavy":
-        noise = rng.standard_t(4.0, (n, 3)) / np.sqrt(2.0)
-    if kind == "ar":
-        noise = autoregression(noise, MEMORY)
-    if kind in ("mixed", "lost"):
-        noise = np.sqrt(2 / 3) * noise + np.sqrt(1 / 3) * autoregression(rng.standard_normal((n, 3)), SLOWER)
-    if kind == "uneven":
-        noise *= np.repeat(np.exp(rng.normal(0, 0.5, n // 300 + 1)), 300)[:n, None]
-    out = ds.copy()
-    for k, axis in enumerate("xyz"):
-        out[f"mag_{axis}"] = out[f"mag_{axis}"] + statistics(kind)[1] * noise[:, k]
-    return out.isel(time=np.flatnonzero(rng.random(n) > LOST)) if kind == "lost" else out
-
-
 def compare(ds: xr.Dataset, calibration: Calibration) -> tuple[Array, Array]:
     """Residual (n,) and its derivative by the calibration's coefficients (n, K)."""
     H = np.column_stack([ds[f"mag_{axis}"] for axis in "xyz"])
@@ -154,12 +115,6 @@ def compare(ds: xr.Dataset, calibration: Calibration) -> tuple[Array, Array]:
     samples = Samples(H, ds["reference_field"].to_numpy(), phi, np.ones(len(H)), calibration.reference.field)
     e, g = residuals(samples, W.ravel())
     return e, (phi[:, :, None] * g[:, None, :]).reshape(len(e), -1)
-
-
-def whiten(x: Array, noise: str) -> Array:
-    """Innovations in units of their 1-sigma, by the true noise; the first row has no past and is left out."""
-    rho, sigma = statistics(noise)
-    return np.asarray((x[1:] - rho * x[:-1]) / (sigma * np.sqrt(1 - rho**2)))
 
 
 def project(X: Array, A: Array, covariance: Array) -> Array:
@@ -192,31 +147,36 @@ class Found(NamedTuple):
 
 
 class Stall(NamedTuple):
-    """What all sizes share: the log without any effect, its residual, and the calibration's columns, whitened."""
+    """What all sizes share: the rows that the log has, its residual without any effect, and the calibration's columns, whitened."""
 
     stage: Stage
     number: int
     noise: str
-    clean: xr.Dataset
+    rows: Rows
     residual: Array
     columns: Array
 
     @classmethod
-    def of(cls, stage: Stage, number: int, noise: str) -> Stall:
-        """Set up; `number` draws what the vehicle logs beside."""
+    def of(cls, stage: Stage, number: int, noise: str, losses: str = "") -> Stall:
+        """Set up; `number` draws what the vehicle logs beside, and which samples are lost."""
         clean = disturb(stage.twin, (), stage.track, stage.when, number)
+        rows = left(losses, len(stage.when), number)
         e, J = compare(clean, stage.calibration)
-        return cls(stage, number, noise, clean, e, whiten(J, noise))
+        return cls(stage, number, noise, rows, e, whiten(J[rows], noise, rows))
 
     def measure(self, *hidden: Hidden) -> xr.Dataset:
-        """The log with effects, before its noise."""
+        """The log with effects, before its noise and its losses."""
         return disturb(self.stage.twin, hidden, self.stage.track, self.stage.when, self.number)
 
     def show(self, hidden: Hidden) -> Found:
         """What an effect does here."""
         ds = self.measure(hidden)
-        d = whiten(compare(ds, self.stage.calibration)[0] - self.residual, self.noise)
-        return Found(hidden, d, ds)
+        d = compare(ds, self.stage.calibration)[0] - self.residual
+        return Found(hidden, whiten(d[self.rows], self.noise, self.rows), ds)
+
+    def log(self, ds: xr.Dataset) -> xr.Dataset:
+        """What is there to be diagnosed: with noise, without what was lost."""
+        return add_noise(ds, self.noise, self.number).isel(time=self.rows)
 
     def hide(self, name: str, wanted: float, seed: int) -> Found:
         """Find the size at which the effect has the signal-to-noise that is wanted."""

@@ -30,7 +30,8 @@ from magbridge.diagnose.inference.free import Description
 from magbridge.diagnose.inference.weigh import LEVEL, ODDS
 from study.draws import DRAWS, SHOWN, Draws, Span, by_cause, evidence, explained, numbers, weigh, with_another
 from study.nameless import against, allowed, nameless
-from study.stage import Found, Stall, project, whiten
+from study.noise import whiten
+from study.stage import Found, Stall, project
 
 Array = NDArray[np.float64]
 SIZES = np.linspace(1.0, 10.0, 37)
@@ -118,8 +119,13 @@ def information(
     """Fisher's information of every hypothesis' columns; what is hidden stands last, one by one and, of several, their sum."""
     problem = pose(take([ds], stall.stage.calibration), stall.stage.calibration)
     candidates = [c for cause in setting.causes.values() for c in cause.candidates(problem)]
-    table = whiten(np.hstack([c.columns(slice(0, len(problem))) for c in candidates]), stall.noise)
-    free = [whiten(description.columns(slice(0, len(problem))), stall.noise) for description in setting.free]
+    table = whiten(
+        np.hstack([c.columns(slice(0, len(problem))) for c in candidates]), stall.noise, stall.rows
+    )
+    free = [
+        whiten(description.columns(slice(0, len(problem))), stall.noise, stall.rows)
+        for description in setting.free
+    ]
     truth = [one.signature for one in hidden]
     every = [sum(truth)] if len(truth) > 1 else []
     X = np.column_stack([*free, table, *setting.others.values(), *truth, *every])

@@ -1,0 +1,62 @@
+"""What a diagnosis buys: errors on another deployment of the same vehicle, beside those of who knows the cause."""
+
+from __future__ import annotations
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from magbridge.calibration.correct import correct
+from magbridge.calibration.model import Calibration
+from magbridge.diagnose.causes import CAUSES
+from magbridge.diagnose.diagnosis import Diagnosis
+from magbridge.diagnose.extend import extend, settle, widened
+from magbridge.diagnose.inference.search import search
+from sitl.inject import Hidden, disturb
+from study.noise import add_noise
+from study.stage import Stall, again
+
+Array = NDArray[np.float64]
+DELAYS = ("filter_lag", "clock_offset")
+"""In a uniform field these two are one: what is left of a late field is the masses that moved meanwhile."""
+
+
+def gain(hidden: Hidden, stall: Stall, ds: xr.Dataset, result: Diagnosis) -> dict[str, float]:
+    """Mean square error (nT²) on another deployment: as calibrated, extended, and extended by who knows the cause.
+
+    Counted are the samples whose masses stand where the first deployment had them, too: elsewhere a polynomial has only
+    its own sigma to tell how little it knows. ``everywhere`` is what was extended on all samples.
+    """
+    calibration = stall.stage.calibration
+    there = again(stall.stage)
+    other = disturb(there.twin, (hidden,), there.track, there.when, stall.number + 1)
+    other = add_noise(other, "white", stall.number + 1)
+    tried = {"before": calibration, "after": result.calibration, "oracle": _oracle(hidden.name, result)}
+    errors = {name: error(other, c) for name, c in tried.items()}
+    whole = np.all([np.isfinite(e) for e in errors.values()], axis=0)
+    seen = whole.copy()
+    for parameter in calibration.parameters:
+        seen &= (other[parameter.name] >= ds[parameter.name].min()).to_numpy()
+        seen &= (other[parameter.name] <= ds[parameter.name].max()).to_numpy()
+    found = {name: float(np.mean(e[seen] ** 2)) for name, e in errors.items()}
+    return found | {"everywhere": float(np.mean(errors["after"][whole] ** 2))}
+
+
+def _oracle(name: str, result: Diagnosis) -> Calibration:
+    """Extend by who knows the cause: its regressors alone, profiled and fitted as a diagnosis does, and nobody doubts them.
+
+    Of the two delays it takes the telemetry's: that has no noise, of which a reading's rate of change would add more.
+    """
+    problem = result.problem
+    known = "clock_offset" if name in DELAYS else name
+    outcome = search(problem, CAUSES[known].candidates(problem), 1)
+    model = [hypothesis.candidate for hypothesis in outcome.chosen]
+    settled, _, fit = settle(problem, model, outcome.fit, outcome.order)
+    return extend(settled, model, widened(model, fit))
+
+
+def error(ds: xr.Dataset, calibration: Calibration) -> Array:
+    H = np.column_stack([ds[f"mag_{axis}"] for axis in "xyz"])
+    p = np.column_stack([ds[name] for name in calibration.channels])
+    reference = ds["reference_field"].to_numpy() + calibration.reference.bias
+    return np.asarray(correct(calibration, H, p, ds["time"].to_numpy()).total - reference)

@@ -1,0 +1,75 @@
+"""What stands between an effect and whoever looks for it: a log's noise, and the samples that it lacks."""
+
+from __future__ import annotations
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+from scipy.signal import lfilter
+
+Array = NDArray[np.float64]
+Rows = NDArray[np.intp]
+MEMORY = 0.8
+"""Correlation of neighbours in noise with a memory."""
+SLOWER = 0.95
+"""Correlation of neighbours in the slower third of noise that is white upon something slower."""
+NOISES = ("white", "ar", "mixed", "heavy", "uneven", "half", "map")
+"""White; with a memory; white upon a longer one; heavy-tailed; louder at times; half as loud again as calibrated; over
+rock that is rough."""
+LOSSES = ("single", "bursts", "hole")
+"""One sample in twenty; a dozen times some two minutes; a sixth of the log at once."""
+
+
+def statistics(noise: str) -> tuple[float, float]:
+    """Correlation of neighbours, and 1-sigma (nT), that who knows the noise reckons with."""
+    return (MEMORY if noise == "ar" else 0.0), (1.5 if noise == "half" else 1.0)
+
+
+def autoregression(white: Array, memory: float) -> Array:
+    """Give white noise of unit variance (n, k) a memory, and leave its variance."""
+    driven = np.vstack([white[:1], white[1:] * np.sqrt(1 - memory**2)])
+    return np.asarray(lfilter([1.0], [1.0, -memory], driven, axis=0))
+
+
+def add_noise(ds: xr.Dataset, kind: str, seed: int) -> xr.Dataset:
+    """Add noise of unit variance, or what its `kind` says, to each channel."""
+    rng = np.random.default_rng([seed, 99])
+    n = ds.sizes["time"]
+    noise = rng.standard_normal((n, 3))
+    if kind == "heavy":
+        noise = rng.standard_t(4.0, (n, 3)) / np.sqrt(2.0)
+    if kind == "ar":
+        noise = autoregression(noise, MEMORY)
+    if kind == "mixed":
+        noise = np.sqrt(2 / 3) * noise + np.sqrt(1 / 3) * autoregression(rng.standard_normal((n, 3)), SLOWER)
+    if kind == "uneven":
+        noise *= np.repeat(np.exp(rng.normal(0, 0.5, n // 300 + 1)), 300)[:n, None]
+    out = ds.copy()
+    for k, axis in enumerate("xyz"):
+        out[f"mag_{axis}"] = out[f"mag_{axis}"] + statistics(kind)[1] * noise[:, k]
+    return out
+
+
+def left(losses: str, n: int, seed: int) -> Rows:
+    """Of a log's n rows those that are left, all of them where `losses` is empty."""
+    rng = np.random.default_rng([seed, 98])
+    there = np.ones(n, bool)
+    if losses == "single":
+        there = rng.random(n) > 0.05
+    if losses == "bursts":
+        for start, length in zip(rng.integers(0, n, 12), rng.geometric(1 / 30, 12), strict=True):
+            there[start : start + length] = False
+    if losses == "hole":
+        start = rng.integers(1, n - n // 6)
+        there[start : start + n // 6] = False
+    return np.flatnonzero(there)
+
+
+def whiten(x: Array, noise: str, rows: Rows) -> Array:
+    """Innovations in units of their 1-sigma, by the true noise, of what was measured at `rows` alone.
+
+    Over a step of k rows an AR(1) is one of ``rho^k``. The first row has no past and is left out.
+    """
+    memory, sigma = statistics(noise)
+    rho = (memory ** np.diff(rows)).reshape(-1, *[1] * (x.ndim - 1))
+    return np.asarray((x[1:] - rho * x[:-1]) / (sigma * np.sqrt(1 - rho**2)))
