@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -57,3 +58,17 @@ def _right(rows: int) -> Problem:
 def right() -> Callable[[int], Problem]:
     """``right(rows)``: a vehicle that is right but for noise."""
     return _right
+
+
+def _thinned(survey: Survey, here: np.ndarray) -> Survey:
+    """Return what is left of a survey of even steps when samples are lost."""
+    rows = {name: getattr(survey, name)[here] for name in ("time", "field", "reference", "dive", "learned")}
+    channels = {name: c._replace(values=c.values[here]) for name, c in survey.channels.items()}
+    steps = np.append(FAR, np.minimum(np.diff(np.flatnonzero(here)), FAR))
+    return replace(survey, **rows, channels=channels, steps=steps)
+
+
+@pytest.fixture(scope="session")
+def thinned() -> Callable[[Survey, np.ndarray], Survey]:
+    """``thinned(survey, here)``: what is left of a survey of even steps when samples are lost."""
+    return _thinned

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from magbridge.diagnose.compare.problem import Problem
+from magbridge.diagnose.compare.problem import Problem, pose
+from magbridge.diagnose.compare.survey import Survey
 from magbridge.diagnose.inference.free import _ends, _repeated
 from magbridge.diagnose.inference.information import information
 from magbridge.diagnose.inference.joint import fit_joint
@@ -55,6 +57,32 @@ def test_noise_has_no_packet_that_is_worth_its_place(problem: Problem, memory: f
         found = packets(given, fit_joint(given, [], 1))
         worth.append(found is not None)
     assert sum(worth) <= 2
+
+
+@pytest.mark.parametrize("kept", ["seven of eight", "a hole", "half at half the rate"])
+def test_a_packet_keeps_its_period_and_place_where_samples_are_lost(
+    right: Callable[[int], Problem], thinned: Callable[..., Survey], kept: str
+) -> None:
+    whole, rng = right(4000), np.random.default_rng(5)
+    n, here = len(whole), np.ones(4000, bool)
+    if kept == "seven of eight":
+        here = rng.random(n) > 0.125
+    elif kept == "a hole":
+        here[1500:2400] = False
+    else:
+        here[1 : n // 2 : 2] = False
+    t = np.arange(n)
+    planted = 2.5 * np.exp(-0.5 * ((t - 1200.0) / 90.0) ** 2) * np.cos(2 * np.pi * t / 41.0 + 1.0)
+    log = pose(thinned(whole.survey, here), whole.calibration)
+    planted = log.gain * planted[here]
+    given = replace(log, residual=planted + drawn(log, 0.5, rng))
+    base = fit_joint(given, [], 1)
+    found = packets(given, base)
+    assert found is not None
+    info = information(given, base.noise, base, [], [found.columns])
+    best = Statistic(info.matrix, np.ones((1, 2 * found.number))).best(info.score)
+    assert np.sum((found.columns(slice(None)) @ best.estimate - planted) ** 2) < 0.2 * np.sum(planted**2)
+    assert found.period == pytest.approx(4.0 * 41.0, rel=0.1)
 
 
 def test_what_lies_loose_changes_ends_when_it_is_tipped_far_enough() -> None:

@@ -27,7 +27,9 @@ def test_a_step_is_what_a_quarter_of_the_samples_take_and_gaps_are_counted_in_it
     expected = np.concatenate([[FAR], np.full(40, 1), np.full(60, 4)])
     expected[71] = 8
     assert s.steps.tolist() == expected.tolist()
-    assert s.follows.tolist() == [k not in (0, 71) for k in range(101)]
+    assert s.slots.tolist() == [0, *np.cumsum(expected[1:])]
+    assert s.follows().tolist() == [k not in (0, 71) for k in range(101)]
+    assert s.follows(1).tolist() == [k != 0 for k in range(101)]
 
 
 def test_nothing_is_known_before_a_log_and_where_another_begins() -> None:

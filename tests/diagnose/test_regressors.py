@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +13,7 @@ from magbridge.calibration.followers import MonomialEffect, PlayEffect, PowersEf
 from magbridge.calibration.model import Calibration, Noise, Parameter, Reference
 from magbridge.calibration.terms import Polynomial
 from magbridge.diagnose.causes import CAUSES
-from magbridge.diagnose.causes.timing import mass_rates
+from magbridge.diagnose.causes.timing import field_rates, mass_rates
 from magbridge.diagnose.compare.past import FAR
 from magbridge.diagnose.compare.problem import Problem, effect_columns, history, pose
 from magbridge.diagnose.compare.survey import Channel, Survey
@@ -81,6 +82,29 @@ def test_columns_in_pieces_are_the_columns(problem: Problem) -> None:
         for candidate in cause.candidates(problem):
             whole = candidate.columns(slice(0, len(problem)))
             np.testing.assert_array_equal(candidate.columns(slice(100, 230)), whole[100:230])
+
+
+@pytest.mark.parametrize("share", [0.05, 0.125])
+def test_a_rate_of_change_is_the_whole_logs_where_samples_are_lost(
+    right: Callable[[int], Problem], thinned: Callable[..., Survey], share: float
+) -> None:
+    """And holds no more of its own noise than by chance, as a one-sided difference would."""
+    whole, rng = right(3000), np.random.default_rng(2)
+    survey = whole.survey
+    turning = 2e4 * np.sin(2.0 * np.pi * survey.time[:, None] / np.array([150.0, 230.0, 700.0]))
+    here = np.append(True, rng.random(len(whole) - 1) > share)
+
+    def rates(field: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        log = thinned(replace(survey, field=field), rows)
+        return field_rates(replace(whole, survey=log)).T
+
+    expected, found = rates(turning, here | True)[here], rates(turning, here)
+    seen = found.any(axis=1)
+    assert seen.mean() > 0.995
+    assert np.sum((found - expected)[seen] ** 2) < 0.01 * np.sum(expected[seen] ** 2)
+    noise = rng.normal(size=turning.shape)
+    own = np.sum(rates(noise, here) * noise[here]) / 3.0
+    assert abs(own) < 0.05 * len(found) / whole.survey.interval
 
 
 def test_a_mass_rate_is_the_drives_speed_while_it_moves(problem: Problem) -> None:

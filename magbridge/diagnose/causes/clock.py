@@ -57,7 +57,7 @@ def interference_tone(problem: Problem) -> list[Candidate]:
     slots = np.rint((t - t[0]) / interval).astype(np.int64)
     if slots[-1] > 8 * len(t):
         return []
-    flat = np.append(0.0, np.diff(problem.residual) * survey.follows[1:])
+    flat = np.append(0.0, np.diff(problem.residual) * survey.follows()[1:])
     size = 1 << int(np.ceil(np.log2(slots[-1] + 1)) + 1)
     body = problem.slopes[:, 6:]
     lines = np.array([np.fft.rfft(np.bincount(slots, flat * slope, minlength=size)) for slope in body.T])

@@ -14,21 +14,30 @@ __all__ = ["channel_skew", "clock_offset", "eddy_current", "field_rates", "filte
 
 FloatArray = NDArray[np.float64]
 
+LOST = 3
+"""Samples between two that may be lost: the rate beside them still holds 98 % of the true one's power."""
 MOMENT = 0.01
 """s by which masses are moved on and back, to see what the coefficients do."""
 
 
 def field_rates(problem: Problem) -> FloatArray:
-    """(3, n) dH_r/dt, nT/s, by differences both ways.
+    r"""(3, n) dH_r/dt, nT/s, by differences both ways.
 
-    A one-sided difference holds the sample's own noise, which would pass for an effect; a two-sided one is odd in
-    time, so that against stationary noise its inner product vanishes on average.
+    Notes
+    -----
+    With the times h and k to the samples before and after
+
+    .. math:: \dot H_0 = \frac{h^2 (H_+ - H_0) + k^2 (H_0 - H_-)}{h k (h + k)}
+
+    Differences ``D e`` of noise e have the inner product :math:`E[(D e)^T \Sigma^{-1} e] = \mathrm{tr} D` with itself, whatever
+    its covariance. That of a one-sided difference would pass for an effect; here it is the sum of ``1/h - 1/k``, so nothing.
     """
     survey = problem.survey
-    H, t = survey.field, survey.time
-    out = np.zeros((3, len(t)))
-    both = np.flatnonzero(survey.follows[1:-1] & survey.follows[2:]) + 1
-    out[:, both] = ((H[both + 1] - H[both - 1]) / (t[both + 1] - t[both - 1])[:, None]).T
+    H, t, follows = survey.field.T, survey.time, survey.follows(LOST)
+    out = np.zeros_like(H)
+    at = np.flatnonzero(follows[1:-1] & follows[2:]) + 1
+    h, k = t[at] - t[at - 1], t[at + 1] - t[at]
+    out[:, at] = (h**2 * (H[:, at + 1] - H[:, at]) + k**2 * (H[:, at] - H[:, at - 1])) / (h * k * (h + k))
     return out
 
 
@@ -44,7 +53,7 @@ def mass_rates(problem: Problem) -> FloatArray:
     W = kernel.weights[: kernel.monomials] * np.array([calibration.reference.field] * 6 + [1.0] * 3)
     p, t = survey.values([parameter.name for parameter in calibration.parameters]), survey.time
     after = np.diff(p, axis=0, append=p[-1:]) / np.diff(t, append=t[-1] + 1.0)[:, None]
-    after[:-1] *= survey.follows[1:, None]
+    after[:-1] *= survey.follows(LOST)[1:, None]
     before = np.roll(after, 1, axis=0)
     larger = np.where(np.abs(before) > np.abs(after), before, after)
     moved = MOMENT * np.where(before * after > 0.0, larger, 0.0)

@@ -96,11 +96,15 @@ class Survey:
         known = self.steps[1:] < FAR
         return float(np.median(np.diff(self.time)[known] / self.steps[1:][known])) if known.any() else 1.0
 
-    @property
-    def follows(self) -> NDArray[np.bool_]:
-        """(n,) the sample comes as soon after the one before as most do, so that the two tell a rate of change."""
+    @cached_property
+    def slots(self) -> NDArray[np.int64]:
+        """(n,) intervals since the first sample; a gap of which nothing is known counts :data:`~.past.FAR`."""
+        return np.asarray(np.cumsum(self.steps) - self.steps[0])
+
+    def follows(self, lost: int = 0) -> NDArray[np.bool_]:
+        """(n,) the sample comes as soon after the one before as most do; or with so many between them lost."""
         apart = np.diff(self.time, prepend=np.inf)
-        return np.asarray((apart > 0.0) & (apart < 1.5 * np.median(apart)) & (self.steps < FAR))
+        return np.asarray((apart > 0.0) & (apart < (lost + 1.5) * np.median(apart)) & (self.steps < FAR))
 
     def past(self, order: int) -> Past:
         """Return what came before each sample, as far back as a noise of this order remembers."""

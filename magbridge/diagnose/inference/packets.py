@@ -12,7 +12,7 @@ sample and h its information at that frequency, the likelihood ratio of a and b 
 .. math:: B(t_0) = \sum_t g_t e^{-(t - t_0)^2 / 2 (Q P)^2 + 2 \pi i (t - t_0) / P}, \qquad
           S(t_0) = \tfrac12 \sum_t h_t e^{-(t - t_0)^2 / (Q P)^2}
 
-so all moments are two convolutions. A packet is worth its place if the evidence, averaged over all places that it could have had, is
+so all moments are two convolutions, over intervals: those without a sample have g = h = 0. A packet is worth its place if the evidence, averaged over all places that it could have had, is
 above one.
 """
 
@@ -38,7 +38,7 @@ ComplexArray = NDArray[np.complex128]
 CYCLES = (0.75, 2.25, 6.75)
 """Q."""
 SHORTEST, LONGEST = 4.0, 1.0 / 6.0
-"""Period, in samples; length Q P, of the log."""
+"""Period, in intervals; length Q P, of the log."""
 HEARD = 6.0
 """Likelihood ratio below which a place is none."""
 MOST = 12
@@ -47,10 +47,12 @@ APART = 2.5
 """Lengths, or bandwidths, from which on two packets are two."""
 REACH = 5.0
 """Lengths, beyond which a packet is over."""
+SPARSE = 8
+"""Intervals for each sample, beyond which a log holds no packets that anyone could follow."""
 
 
 class Places(NamedTuple):
-    """Where packets of one period and length may be: moments (m,), likelihood ratios (m,), log of a place's share."""
+    """Where packets of one period and length, in intervals, may be: moments (m,), likelihood ratios (m,), log of a place's share."""
 
     period: float
     length: float
@@ -70,6 +72,9 @@ class Packets(NamedTuple):
 
 def packets(problem: Problem, fit: Joint) -> Packets | None:
     """Find the packets in what a fit has left, the loudest first."""
+    slots = problem.survey.slots
+    if slots[-1] > SPARSE * len(slots):
+        return None
     places = list(_places(problem, fit))
     found: list[tuple[float, Places]] = []
     price = 0.0
@@ -92,17 +97,17 @@ def packets(problem: Problem, fit: Joint) -> Packets | None:
         found.append((moment, best))
     if not found:
         return None
-    step = float(np.median(np.diff(problem.survey.time)))
-    return Packets(_columns(problem, found), len(found), float(np.exp(price)), found[0][1].period * step)
+    period = found[0][1].period * problem.survey.interval
+    return Packets(_columns(problem, found), len(found), float(np.exp(price)), period)
 
 
 def _columns(problem: Problem, found: list[tuple[float, Places]]) -> Columns:
-    place = np.arange(len(problem), dtype=float)
+    slots = problem.survey.slots
 
     def columns(rows: slice) -> FloatArray:
-        out = np.zeros((len(place[rows]), 2 * len(found)))
+        out = np.zeros((len(slots[rows]), 2 * len(found)))
         for k, (moment, own) in enumerate(found):
-            since = (place[rows] - moment) / own.length
+            since = (slots[rows] - moment) / own.length
             here = np.abs(since) < REACH
             turns = 2.0 * np.pi * own.length / own.period * since[here]
             # in units of what white noise lets see of it
@@ -115,12 +120,15 @@ def _columns(problem: Problem, found: list[tuple[float, Places]]) -> Columns:
 
 def _places(problem: Problem, fit: Joint) -> Iterator[Places]:
     """Yield the places of each period and length where anything is heard."""
-    noise, n = fit.noise, len(problem)
+    noise, slots = fit.noise, problem.survey.slots
+    n = int(slots[-1]) + 1
     finest = 2 ** max(int(np.log2(n)) - 6, 0)
     whole = finest * next_fast_len(int((1.0 + 3.0 * LONGEST) * n / finest) + 1)
-    G = rfft(problem.gain * noise.back(noise.response(fit.left)), whole)
+    G = rfft(np.bincount(slots, problem.gain * noise.back(noise.response(fit.left))), whole)
     h = problem.gain**2 * noise.kappa / noise.scale**2
-    H = np.array([rfft(h * some, whole) for some in (noise.past.whole, ~noise.past.whole)])
+    H = np.array(
+        [rfft(np.bincount(slots, h * some), whole) for some in (noise.past.whole, ~noise.past.whole)]
+    )
     for Q in CYCLES:
         # one bandwidth 1 / (2 pi Q) apart
         count = max(int(2.0 * np.pi * Q * np.log(LONGEST * n / Q / SHORTEST)), 0)
