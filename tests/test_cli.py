@@ -171,6 +171,7 @@ def test_correct_gives_the_same_in_pieces(deployment: Path, calibration: Path, t
         (["calibrate", "{d}", "--parameter", "mag_x", "-o", "x.json"], 1, "'mag_x' is a channel"),
         (["calibrate", "{d}", "--filter-corner", "1e-9", "-o", "x.json"], 1, "filter corner = 1e-09 Hz"),
         (["calibrate", "{d}", "--method", "magic", "-o", "x.json"], 2, f"Choose from: {METHOD_NAMES}"),
+        (["calibrate", "{d}", "--method", "cubic", "--vehicle", "v.toml", "-o", "x.json"], 2, "--vehicle: "),
         (["calibrate", "{d}", "--order", "0", "-o", "x.json"], 2, "order"),
         (
             ["calibrate", "{d}", "--parameter", "run", "--parameter", "run", "-o", "x.json"],

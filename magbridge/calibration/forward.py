@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from magbridge.calibration.correct import regressors
 from magbridge.calibration.model import Calibration
+from magbridge.calibration.terms import symmetric
 
 __all__ = ["coefficients_at", "forward"]
 
@@ -25,7 +26,7 @@ def coefficients_at(
     """Return ``A`` (n, 3, 3) and ``T`` (n, 3) of every sample, effects included; arguments as for `correct`."""
     phi = regressors(calibration, np.asarray(field, float), np.asarray(channels, float), time)
     theta = phi.T @ calibration.kernel.weights
-    return theta[:, [0, 3, 4, 3, 1, 5, 4, 5, 2]].reshape(-1, 3, 3), theta[:, 6:]
+    return symmetric(theta), theta[:, 6:]
 
 
 def forward(

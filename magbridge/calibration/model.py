@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magbridge.calibration.kernel import Kernel, compile_kernel
-from magbridge.calibration.terms import Effect, Polynomial, PositionTerm
+from magbridge.calibration.terms import Effect, Polynomial, PositionTerm, symmetric
 from magbridge.errors import CalibrationError
 
 __all__ = [
@@ -202,7 +202,7 @@ class Calibration:
             nT.
         """
         theta = self.kernel.monomials_of(positions).T @ self.kernel.weights[: self.kernel.monomials]
-        return theta[:, [0, 3, 4, 3, 1, 5, 4, 5, 2]].reshape(-1, 3, 3), theta[:, 6:]
+        return symmetric(theta), theta[:, 6:]
 
 
 def identity(parameters: tuple[Parameter, ...] = (), field: float = 50_000.0) -> Calibration:

@@ -24,6 +24,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from magbridge.calibration.terms import symmetric
+
 __all__ = [
     "NormalEquations",
     "Samples",
@@ -90,8 +92,7 @@ def residuals(samples: Samples, coefficients: FloatArray) -> tuple[FloatArray, F
         nT, monomial by monomial.
     """
     theta = samples.phi @ coefficients.reshape(-1, 9)
-    a = theta[:, :6] / samples.unit
-    A = a[:, [0, 3, 4, 3, 1, 5, 4, 5, 2]].reshape(-1, 3, 3) + np.eye(3)
+    A = np.eye(3) + symmetric(theta[:, :6] / samples.unit)
     d = samples.field - theta[:, 6:]
     b = _times(A, d)
     F = np.sqrt((b * b).sum(axis=1))
@@ -126,7 +127,7 @@ def residuals_of(samples: Samples, coefficients: FloatArray) -> FloatArray:
 def scales_and_offsets(samples: Samples, coefficients: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Eigenvalues of A (n, 3) and size of T (n,), nT, at every sample."""
     theta = samples.phi @ coefficients.reshape(-1, 9)
-    A = theta[:, [0, 3, 4, 3, 1, 5, 4, 5, 2]].reshape(-1, 3, 3) / samples.unit + np.eye(3)
+    A = np.eye(3) + symmetric(theta) / samples.unit
     return np.asarray(np.linalg.eigvalsh(A)), np.asarray(np.linalg.norm(theta[:, 6:], axis=1))
 
 

@@ -33,6 +33,7 @@ __all__ = [
     "PositionTerm",
     "Term",
     "full_order",
+    "symmetric",
     "term_class",
 ]
 
@@ -166,6 +167,11 @@ def full_order(parameters: int, order: int) -> tuple[Exponents, ...]:
         for degree in range(order + 1)
         for picks in combinations_with_replacement(range(parameters), degree)
     )
+
+
+def symmetric(entries: FloatArray) -> FloatArray:
+    """Return (n, 3, 3) symmetric matrices of their six entries, (n, 6 or more) in the order of :data:`SLOTS`."""
+    return entries[:, [0, 3, 4, 3, 1, 5, 4, 5, 2]].reshape(-1, 3, 3)
 
 
 def term_class(kind: str) -> type[Term]:

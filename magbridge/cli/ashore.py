@@ -23,7 +23,7 @@ from magbridge.cli.common import (
     some,
     tell,
 )
-from magbridge.errors import DataError
+from magbridge.errors import DataError, WrongUse
 from magbridge.progress import track, waiting
 
 
@@ -137,7 +137,7 @@ def calibrate(
     method
         auto, or what it is compared with.
     vehicle
-        A vehicle.toml that says where the moving masses sit, seen from the sensor.
+        A vehicle.toml that says where the moving masses sit, seen from the sensor (method auto).
     grid
         An anomaly grid, added to the IGRF.
     site_bias
@@ -163,6 +163,8 @@ def calibrate(
     from magbridge.logs import read
 
     some(files, output, vehicle, grid)
+    if vehicle and method != "auto":
+        raise WrongUse(f"--vehicle: method {method} does not ask where masses sit; auto does")
     anomalies = read_grid(grid) if grid else None
     deployment = with_true_heading(read(files, required=(*CHANNELS, *parameter)), heading_reference)
     data = observations(deployment, parameter, reference=lambda ds: earth_field(ds, anomalies))

@@ -20,7 +20,7 @@ from magbridge.records import BEYOND
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["Observations", "observations", "polynomial_samples"]
+__all__ = ["Observations", "monomials", "observations", "polynomial_samples"]
 
 FloatArray = NDArray[np.float64]
 COMMON, FAR = 0.005, 10.0
@@ -113,7 +113,10 @@ class Observations:
 
     @property
     def steps(self) -> FloatArray:
-        """(n,) intervals since the sample before, infinite where that belongs to another run or came no earlier."""
+        """(n,) whole intervals since the sample before, infinite where that belongs to another run or came no earlier.
+
+        What came sooner counts as one interval: how noise hangs together is known for one, and not guessed for less.
+        """
         assert self.time is not None
         assert self.runs is not None
         steps = np.full(len(self), np.inf)
@@ -174,11 +177,18 @@ def _plausible(names: Sequence[str], positions: FloatArray) -> None:
             )
 
 
+def monomials(
+    positions: FloatArray, parameters: Sequence[Parameter], exponents: Sequence[Exponents]
+) -> FloatArray:
+    """(n, m) monomials of positions (n, k, in their units), scaled as `parameters` say."""
+    x = (positions - [p.centre for p in parameters]) / [p.scale for p in parameters]
+    return np.stack([np.prod(x ** np.array(powers), axis=1) for powers in exponents], axis=1)
+
+
 def polynomial_samples(data: Observations, exponents: tuple[Exponents, ...], kappa: float = 0.0) -> Samples:
     """Take `data` with the monomials of its scaled positions."""
     ranges = data.ranges()
-    x = (data.parameters - [p.centre for p in ranges]) / [p.scale for p in ranges]
-    phi = np.stack([np.prod(x ** np.array(powers), axis=1) for powers in exponents], axis=1)
+    phi = monomials(data.parameters, ranges, exponents)
     return Samples(data.field, data.reference, phi, data.steps, float(data.reference.mean()), kappa)
 
 

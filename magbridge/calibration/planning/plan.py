@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from magbridge.calibration.fitting.boresight import field_body
+from magbridge.calibration.fitting.data import monomials
 from magbridge.calibration.fitting.mission import Mission
 from magbridge.calibration.fitting.prior import free_structure
 from magbridge.calibration.forward import forward
@@ -92,10 +93,7 @@ class _Design:
     def derivative(self, truth: FloatArray, positions: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Monomials and derivative of the residual at true fields in body axes."""
         calibration = self.calibration
-        x = (positions - [p.centre for p in calibration.parameters]) / [
-            p.scale for p in calibration.parameters
-        ]
-        phi = np.stack([np.prod(x ** np.array(e), axis=1) for e in self.exponents], axis=1)
+        phi = monomials(positions, calibration.parameters, self.exponents)
         reading = forward(calibration, truth, positions, np.zeros(len(truth)))
         size, alone = np.linalg.norm(truth, axis=1), np.full(len(truth), np.inf)
         samples = Samples(reading, size, phi, alone, calibration.reference.field)
