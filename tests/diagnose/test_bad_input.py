@@ -14,6 +14,7 @@ from magbridge.calibration.fitting.data import observations
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.model import Calibration, Sensor
 from magbridge.cli import main
+from magbridge.diagnose.compare.take import take
 from magbridge.diagnose.run import diagnose
 from magbridge.errors import DataError
 from magbridge.logs import write
@@ -39,6 +40,14 @@ def test_the_demonstrations_survey_is_plain(plain: tuple[xr.Dataset, Calibration
 def test_a_number_beyond_all_measure_is_no_reading(plain: tuple[xr.Dataset, Calibration]) -> None:
     wild = plain[0].assign(mag_x=plain[0]["mag_x"].where(some(plain[0], 10), 1e300))
     assert diagnose([wild], plain[1]).verdict == "nothing_found"
+
+
+def test_a_sample_that_is_given_twice_is_one(plain: tuple[xr.Dataset, Calibration]) -> None:
+    ds, calibration = plain
+    again = np.sort([*range(ds.sizes["time"]), *range(5, 500, 20)])
+    once, twice = take([ds], calibration), take([ds.isel(time=again)], calibration)
+    for name in ("time", "field", "reference", "steps", "dive"):
+        np.testing.assert_array_equal(getattr(once, name), getattr(twice, name))
 
 
 @pytest.mark.parametrize(

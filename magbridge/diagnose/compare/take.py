@@ -89,6 +89,8 @@ def take(
             f"(column {worst!r} has {int(np.isfinite(table[worst]).sum())} numbers)"
         )
     table = {name: column[whole] for name, column in table.items()}
+    once = np.diff(table["time"], prepend=-np.inf) > 0.0  # what two logs share is there once
+    table = {name: column[once] for name, column in table.items()}
     for parameter in calibration.parameters:
         far = np.abs(table[parameter.name] - parameter.centre) > FAR * parameter.scale
         if far.any():
@@ -119,6 +121,9 @@ def _columns(
             raise DataError(
                 f"{source}: column {name!r} is missing; there are {', '.join(map(str, ds.data_vars))}"
             )
+    once = np.unique(ds["time"], return_index=True)[1]
+    if once.size < ds.sizes["time"]:
+        ds = ds.isel(time=once)
     time = ds["time"].to_numpy().astype(float)
     table = {
         str(name): column.to_numpy().astype(float)
