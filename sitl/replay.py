@@ -19,6 +19,7 @@ from magbridge.config import load
 from magbridge.errors import DataError, WrongUse
 from magbridge.field.reference import reference_field
 from magbridge.logs import read
+from magbridge.logs.deployment import passed_over
 from magbridge.progress import track
 from sitl.emulation import emulate, start_us
 from sitl.listener import Listener
@@ -151,11 +152,7 @@ def _play(
         "span_s": float(times[-1] - times[0]),
         "seconds": seconds,
         "parts": told,
-        "skipped": {
-            name: int(deployment.attrs[name])
-            for name in ("bytes_skipped", "damages", "rows_dropped", "duplicate_rows")
-            if name in deployment.attrs
-        },
+        "skipped": passed_over(deployment.attrs),
     }
 
 

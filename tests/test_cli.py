@@ -27,6 +27,7 @@ from magbridge.logs import read, write
 from magbridge.progress import waiting
 from sitl import load, simulate
 
+FEW = 40  # rows, which a diagnosis refuses: what it says before is said all the same
 METHOD_NAMES = ", ".join(f'"{name}"' for name in METHODS)
 
 
@@ -74,6 +75,24 @@ def test_convert_there_and_back_keeps_every_number(deployment: Path, tmp_path: P
     assert set(before) == set(after)
     for name in before:
         np.testing.assert_array_equal(before[name], after[name], err_msg=str(name))
+
+
+def test_what_was_passed_over_is_told(
+    deployment: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of a damaged log, and of two that tell of the same times; not again of what was made from them."""
+    rows = read(deployment).isel(time=slice(0, 200))
+    log, other, both = tmp_path / "log.tlog", tmp_path / "other.nc", tmp_path / "both.nc"
+    write(rows, log)
+    data = log.read_bytes()
+    log.write_bytes(data[: len(data) // 2] + bytes(500) + data[len(data) // 2 :])
+    write(rows.isel(time=slice(150, 200)), other)
+    assert main(["convert", str(other), str(log), "-o", str(both)]) == 0
+    told = capsys.readouterr().err
+    assert told.startswith("magbridge: in the logs: bytes skipped 5")
+    assert ", damages 1, duplicate rows 50" in told
+    assert main(["convert", str(both), "-o", str(tmp_path / "again.csv")]) == 0
+    assert not capsys.readouterr().err
 
 
 def test_what_is_read_is_not_written_over(
@@ -305,20 +324,20 @@ def test_one_position_that_is_none(
 def test_numbers_that_may_say_not_known_are_told(
     deployment: Path, calibration: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    rows = read(deployment).isel(time=slice(0, 150))
+    rows = read(deployment).isel(time=slice(0, FEW))
     rows["pump_current"] = rows["depth"] * 0.0 + 0.5
     rows["pump_current"].attrs["units"] = "A"
     rows["pump_current"][[7, 30]] = -9999.0
     diagnosed = ["--calibration", str(calibration), "-o", str(tmp_path / "doubt")]
     write(rows, tmp_path / "log.csv")
-    assert main(["diagnose", str(tmp_path / "log.csv"), *diagnosed]) == 0
-    told = capsys.readouterr().err
-    assert "log.csv, column 'pump_current': -9999 in 2 of 150 rows is taken for a number" in told
-    assert told.count("\n") == 1
+    assert main(["diagnose", str(tmp_path / "log.csv"), *diagnosed]) == 1
+    told, refused = capsys.readouterr().err.splitlines()
+    assert f"log.csv, column 'pump_current': -9999 in 2 of {FEW} rows is taken for a number" in told
+    assert refused.endswith(f"{FEW} samples, at least 60 needed")
     declared = tmp_path / "declared.csv"
     declared.write_text("# fill_value = -9999\n" + (tmp_path / "log.csv").read_text())
-    assert main(["diagnose", str(declared), *diagnosed]) == 0
-    assert not capsys.readouterr().err
+    assert main(["diagnose", str(declared), *diagnosed]) == 1
+    assert capsys.readouterr().err.count("\n") == 1
     assert np.isnan(read(declared)["pump_current"]).sum() == 2
 
 
@@ -326,10 +345,10 @@ def test_a_log_that_the_calibration_was_made_from_is_told(
     deployment: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     log, cal = tmp_path / "log.csv", tmp_path / "cal.json"
-    write(read(deployment).isel(time=slice(0, 300)), log)
+    write(read(deployment).isel(time=slice(0, FEW)), log)
     assert main(["calibrate", str(log), "--method", "nominal", "-o", str(cal)]) == 0
     capsys.readouterr()
-    assert main(["diagnose", str(log), "--calibration", str(cal), "-o", str(tmp_path / "doubt")]) == 0
+    assert main(["diagnose", str(log), "--calibration", str(cal), "-o", str(tmp_path / "doubt")]) == 1
     assert f"{log}: the calibration was made from it" in capsys.readouterr().err
 
 

@@ -20,6 +20,7 @@ from magbridge.cli.common import (
     complain,
     digest,
     file_to_write,
+    note_losses,
     some,
     tell,
 )
@@ -44,14 +45,16 @@ def convert(*files: Path, output: Log, heading_reference: Heading = None, json: 
     """
     from magbridge.logs import Writer, read_chunks
 
-    rows = 0
+    rows, pieces = 0, []
     with Writer(output) as writer:
         for part in track(read_chunks(some(files, output)), "reading"):
+            pieces.append(part.attrs)
             if heading_reference:
                 part.attrs["heading_reference"] = heading_reference
             writer.append(part)
             rows += part.sizes["time"]
             names = [str(name) for name in part.data_vars]
+    note_losses(*pieces)
     tell({"file": str(output), "rows": rows, "columns": names}, f"{output}: {rows} rows", json)
 
 
@@ -96,6 +99,7 @@ def simulate(
     with waiting("simulating"):
         if like:
             log = read(like)
+            note_losses(log.attrs)
             chosen = where(log, chosen)
             deployment = simulate_like(log, chosen, seed)
         else:
@@ -167,6 +171,7 @@ def calibrate(
         raise WrongUse(f"--vehicle: method {method} does not ask where masses sit; auto does")
     anomalies = read_grid(grid) if grid else None
     deployment = with_true_heading(read(files, required=(*CHANNELS, *parameter)), heading_reference)
+    note_losses(deployment.attrs)
     data = observations(deployment, parameter, reference=lambda ds: earth_field(ds, anomalies))
     data = replace(data, inputs=_digests(files))
     if filter_corner:
@@ -241,6 +246,7 @@ def plan(
     from magbridge.logs import read
 
     deployment = with_true_heading(read(mission), heading_reference)
+    note_losses(deployment.attrs)
     known = load(calibration)
     with waiting("planning"):
         found = flight_plan.flight_plan(known, deployment, earth_field(deployment)[1], runs=runs, roll=roll)
@@ -317,14 +323,16 @@ def correct(*files: Path, calibration: Path, output: Log, json: Json = False) ->
 
     some(files, output, calibration)
     correction = Correction(load(calibration))
-    rows = flagged = 0
+    rows, flagged, pieces = 0, 0, []
     with Writer(output) as writer:
         for part in track(read_chunks(files, required=CHANNELS), "correcting"):
+            pieces.append(part.attrs)
             corrected = correct_rows(correction, part)
             writer.append(corrected)
             rows += part.sizes["time"]
             flagged += int(
                 (corrected["quality"].to_numpy().astype(int) & ~int(Quality.NO_BORESIGHT) != 0).sum()
             )
+    note_losses(*pieces)
     summary = f"{output}: {rows} samples, {flagged} of them flagged"
     tell({"file": str(output), "rows": rows, "flagged": flagged}, summary, json)

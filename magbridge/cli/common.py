@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from hashlib import file_digest
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -28,6 +28,7 @@ __all__ = [
     "complain",
     "digest",
     "file_to_write",
+    "note_losses",
     "some",
     "tell",
 ]
@@ -99,6 +100,15 @@ def digest(path: Path) -> str:
     """Return the SHA-256 of a file, by which a calibration knows what it was made from."""
     with path.open("rb") as file:
         return file_digest(file, "sha256").hexdigest()
+
+
+def note_losses(*pieces: Mapping[str, Any]) -> None:
+    """Say on stderr what reading passed over, as the attributes of a deployment or of its pieces count it."""
+    from magbridge.logs.deployment import passed_over
+
+    if counts := passed_over(*pieces):
+        told = ", ".join(f"{name.replace('_', ' ')} {count}" for name, count in counts.items())
+        complain(f"in the logs: {told}", 0)
 
 
 def tell(result: dict[str, Any], sentence: str, as_json: bool) -> None:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from magbridge.cli.common import Folder, Json, app, complain, digest, some, tell
+from magbridge.cli.common import Folder, Json, app, complain, digest, note_losses, some, tell
 from magbridge.progress import waiting
 
 if TYPE_CHECKING:
@@ -60,6 +60,7 @@ def diagnose(
     known = load(calibration)
     with waiting("reading") as step:
         logs = [read(path) for path in files]
+        note_losses(*(log.attrs for log in logs))
         for path, log in zip(files, logs, strict=True):
             if digest(path) in known.inputs.values():
                 complain(f"{path}: {ITSELF}", 0)

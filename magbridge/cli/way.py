@@ -6,7 +6,7 @@ from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from magbridge.cli.common import Heading, Json, Log, Picture, app, complain, some, tell
+from magbridge.cli.common import Heading, Json, Log, Picture, app, complain, note_losses, some, tell
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -77,6 +77,7 @@ def navigate(
     from magbridge.navigate.model import informed
 
     deployment = with_true_heading(read(files, required=CHANNELS), heading_reference)
+    note_losses(deployment.attrs)
     corrected = correct_rows(Correction(known), deployment)
     if options is None:
         options = informed(Options(), known, float(corrected["total_field_sigma"].median()))

@@ -124,7 +124,7 @@ def read(paths: Paths, *, required: Iterable[str] = ()) -> xr.Dataset:
     -------
     xarray.Dataset
         On ``time``; each variable float64 with ``units`` and ``long_name``. Attributes: ``source`` (file names),
-        ``heading_reference`` where it is not true north, ``duplicate_rows`` and what the reader had to skip.
+        ``heading_reference`` where it is not true north, and counts of what was passed over (``duplicate_rows`` ...).
 
     Raises
     ------
@@ -208,7 +208,11 @@ class Writer:
         FormatError
             Time does not increase, or a column was not in the first deployment.
         """
-        from magbridge.logs.deployment import increasing, same_columns  # noqa: PLC0415 - xarray is for ashore
+        from magbridge.logs.deployment import (  # noqa: PLC0415 - xarray is for ashore
+            increasing,
+            same_columns,
+            uncounted,
+        )
 
         first = not self._columns
         if first:
@@ -223,4 +227,4 @@ class Writer:
         increasing(self._path, time, after=self._last)
         if len(time):
             self._last = float(time[-1])
-        self._file.append(dataset if first else same_columns(dataset, self._columns), first=first)
+        self._file.append(uncounted(dataset) if first else same_columns(dataset, self._columns), first=first)

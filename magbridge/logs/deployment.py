@@ -14,7 +14,17 @@ from magbridge.columns import CHANNEL_TIMES, COLUMNS, factor, usual
 from magbridge.errors import FormatError
 from magbridge.records import Quality
 
-__all__ = ["MEANING", "deployment", "increasing", "join", "plausible", "same_columns", "sliced"]
+__all__ = [
+    "MEANING",
+    "deployment",
+    "increasing",
+    "join",
+    "passed_over",
+    "plausible",
+    "same_columns",
+    "sliced",
+    "uncounted",
+]
 
 Floats = NDArray[np.float64]
 
@@ -38,7 +48,7 @@ LEAST = {
 APART = 60.0
 """s that a channel may be sampled before or after its row."""
 COUNTERS = ("bytes_skipped", "damages", "dropouts", "duplicate_rows", "rows_dropped")
-"""Attributes that add up."""
+"""Attributes that count what reading passed over: they add up, and are not of the file that is written next."""
 
 
 def deployment(
@@ -214,6 +224,19 @@ def join(parts: Sequence[xr.Dataset]) -> xr.Dataset:
     return xr.Dataset(
         variables, coords={"time": ("time", time[order][starts], parts[0]["time"].attrs)}, attrs=attrs
     )
+
+
+def uncounted(dataset: xr.Dataset) -> xr.Dataset:
+    """Return the deployment without its counts of what was passed over."""
+    bare = dataset.copy(deep=False)
+    bare.attrs = {name: value for name, value in dataset.attrs.items() if name not in COUNTERS}
+    return bare
+
+
+def passed_over(*pieces: Mapping[str, Any]) -> dict[str, int]:
+    """Return what reading passed over, from the attributes of a deployment or of its pieces; nothing where it is none."""
+    counts = {name: sum(int(attrs.get(name, 0)) for attrs in pieces) for name in COUNTERS}
+    return {name: count for name, count in counts.items() if count}
 
 
 def _first_known(values: Floats, starts: NDArray[np.intp]) -> Floats:

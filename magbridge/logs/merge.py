@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 import numpy as np
 import xarray as xr
 
-from magbridge.logs.deployment import join, same_columns
+from magbridge.logs.deployment import join, same_columns, uncounted
 
 __all__ = ["merge"]
 
@@ -47,5 +47,5 @@ def merge(sources: Sequence[Open], rows: int) -> Iterator[xr.Dataset]:
             if n == piece.sizes["time"]:
                 advance(k, pieces)
             else:
-                active[k] = piece.isel(time=slice(n, None)), pieces
+                active[k] = uncounted(piece.isel(time=slice(n, None))), pieces
         yield same_columns(join([part for part in parts if part.sizes["time"]]), columns)
