@@ -32,6 +32,17 @@ def test_memory_and_level_are_found(rho: float) -> None:
     assert memory_order(r, Past(steps, LONGEST)) == 1
 
 
+@pytest.mark.parametrize("lost", [0.0, 0.05, 0.125])
+def test_a_memory_is_taken_for_no_shorter_where_few_samples_have_all_of_their_past(lost: float) -> None:
+    """White noise upon a slow one: too short a memory would make structure out of it."""
+    rng = np.random.default_rng(5)
+    n = 6000
+    slow, _ = made("white", n, 0.95, seed=6)
+    here = np.flatnonzero(rng.random(n) >= lost)
+    r = (1.4 * rng.normal(size=n) + np.sqrt(1.0 - 0.95**2) * slow)[here]
+    assert memory_order(r, Past(np.append(FAR, np.diff(here)), LONGEST)) == LONGEST
+
+
 def test_heavy_tails_are_found_and_the_score_is_of_unit_variance() -> None:
     r, steps = made("heavy", rho=0.6)
     noise = fit_noise(r, Past(steps, 1))

@@ -40,14 +40,14 @@ def memory_order(residual: FloatArray, past: Past) -> int:
     scale = 1.4826 * np.median(np.abs(residual)) + 1e-12
     r = np.clip(residual, -6.0 * scale, 6.0 * scale)
     rows = np.flatnonzero(past.whole)
-    n = len(rows)
-    if n < 4 * FEW:
+    if len(rows) < 4 * FEW:
         return 1
+    n = len(r) - LONGEST  # all will be whitened, also those that do not tell the memory
     lags = np.stack([r[rows - k] for k in range(1, LONGEST + 1)], axis=1)
     costs = []
     for p in ORDERS:
         left = r[rows] - (lags[:, :p] @ np.linalg.lstsq(lags[:, :p], r[rows], rcond=None)[0] if p else 0.0)
-        costs.append(n * np.log(left @ left / n + 1e-300) + 2.0 * p)
+        costs.append(n * np.log(left @ left / len(rows) + 1e-300) + 2.0 * p)
     return max(1, ORDERS[int(np.argmin(costs))])
 
 
