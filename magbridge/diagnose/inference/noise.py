@@ -29,6 +29,7 @@ import numpy as np
 from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
 from scipy.signal import lfilter, lfiltic
+from scipy.sparse import csr_array
 
 from magbridge.diagnose.compare.past import FAR, Past
 
@@ -138,6 +139,8 @@ class Predictors:
     a : (l, p) array
         Of each of the patterns of lags.
     f : (l,) array
+    weights : (l, p + 1) array
+        Of a sample and of those before: f, and ``-f a``.
     """
 
     def __init__(self, past: Past, memory: FloatArray) -> None:
@@ -156,6 +159,7 @@ class Predictors:
             c = np.where(there, C[l], 0.0)
             self.a[part] = a = np.linalg.solve(G, c[:, :, None])[:, :, 0]
             self.f[part] = 1.0 / np.sqrt(np.maximum(C[0] - np.sum(a * c, axis=1), 1.0))
+        self.weights = self.f[:, None] * np.hstack([np.ones((len(lags), 1)), -self.a])
 
     def whitened(
         self, values: FloatArray, start: int = 0, skip: int = 0
@@ -168,13 +172,13 @@ class Predictors:
             Rows `start` and on of the whole.
         start, skip : int
         """
-        rows = self.past.rows
+        rows, lags = self.past.rows, np.arange(self.past.order + 1)
         some = slice(*np.searchsorted(rows, [start + skip, start + len(values)]))
         at, pattern = rows[some] - start, self.past.pattern[some]
-        v = values[at]
-        for k in range(self.past.order):  # of samples that are not there a is 0
-            v = v - (self.a[pattern, k] * values[np.maximum(at - 1 - k, 0)].T).T
-        return at - skip, (self.f[pattern] * v.T).T
+        before = np.maximum(at[:, None] - lags, 0)  # of samples that are not there a is 0
+        ends = lags.size * np.arange(at.size + 1)
+        W = csr_array((self.weights[pattern].ravel(), before.ravel(), ends), (at.size, len(values)))
+        return at - skip, W @ values
 
 
 def autocovariance(memory: FloatArray, reach: int) -> FloatArray:
