@@ -86,9 +86,9 @@ def settle(
         return problem, columns, fit
     settled = problem
     for _ in range(STEPS):
-        before = fit
+        before, settled, columns = fit.log_likelihood, problem, []  # the last one's arrays are free again
         settled, columns, fit = _again(settled, model, fit, order)
-        if abs(fit.log_likelihood - before.log_likelihood) < 0.5:
+        if abs(fit.log_likelihood - before) < 0.5:
             break
     return settled, columns, fit
 

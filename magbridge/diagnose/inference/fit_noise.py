@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from scipy.special import gammaln
 
+from magbridge.diagnose.compare.derivatives import CHUNK
 from magbridge.diagnose.compare.past import Past
 from magbridge.diagnose.compare.problem import Columns
 from magbridge.diagnose.inference.noise import Noise, Predictors
@@ -111,21 +113,18 @@ def fit_noise(
     n, order, whole = len(residual), past.order, past.whole
     count = _counts(n)
     typical = float(np.median(np.abs(residual)))
-    lags = np.zeros((order, n))
-    for k in range(1, order + 1):
-        lags[k - 1, k:] = residual[:-k]
-    lags *= whole
+    # a view of the p samples before each, which takes no memory
+    lags = sliding_window_view(np.append(np.zeros(order), residual), order)[:n, ::-1]
     memory, nu = np.zeros(order), 12.0
     weight, scale = np.ones(n), np.full(n, 1.4826 * typical + 1e-12)
     if like is not None:
         nu, scale = like.nu, like.scale
-        weight = (nu + 1.0) / (nu + ((residual - like.memory @ lags) / scale) ** 2)
+        weight = (nu + 1.0) / (nu + ((residual - lags @ like.memory) / scale) ** 2)
     v, log_likelihood = residual, -np.inf
     for _ in range(rounds):
         if whole.sum() > 2 * order:
-            own = lags * (weight / scale**2)
-            memory = _stable(np.asarray(np.linalg.lstsq(own @ lags.T, own @ residual, rcond=None)[0], float))
-        v = residual - memory @ lags
+            memory = _stable(_regressed(lags, residual, whole * weight / scale**2))
+        v = residual - lags @ memory
         beside_gaps = Predictors(past, memory)
         v[past.rows] = beside_gaps.whitened(residual)[1]
         if blocks is None:
@@ -137,6 +136,19 @@ def fit_noise(
         if abs(log_likelihood - before) < SETTLED:
             break
     return Noise(memory, scale, nu, past, log_likelihood, v / scale)
+
+
+def _regressed(lags: FloatArray, r: FloatArray, weight: FloatArray) -> FloatArray:
+    """(p,) coefficients of weighted least squares of r (n,) on lags (n, p), in bounded memory."""
+    p = lags.shape[1]
+    P, b = np.zeros((p, p)), np.zeros(p)
+    for start in range(0, len(r), CHUNK):
+        rows = slice(start, start + CHUNK)
+        X = np.ascontiguousarray(lags[rows])
+        own = X * weight[rows, None]
+        P += own.T @ X
+        b += own.T @ r[rows]
+    return np.asarray(np.linalg.lstsq(P, b, rcond=None)[0], float)
 
 
 def _counts(n: int) -> NDArray[np.int64]:
@@ -184,7 +196,7 @@ def _tails(v: FloatArray, count: NDArray[np.int64], nu: float) -> tuple[float, F
                 tried[near] = _levels(square, count, TAILS[near], tried[at][1])
         best = max((k for k in (at - 1, at, at + 1) if k in tried), key=lambda k: (tried[k][0], k == at))
         if best == at:
-            return TAILS[at], np.repeat(tried[at][1], count), tried[at][0]
+            return TAILS[at], _spread(tried[at][1], count), tried[at][0]
         at = best
 
 
@@ -210,6 +222,13 @@ def _levels(
         constant = gammaln((nu + 1.0) / 2.0) - gammaln(nu / 2.0) - 0.5 * np.log(nu * np.pi)
         value = n * constant - 0.5 * (nu + 1.0) * float(np.log1p(x2 / nu).sum())
     return float(value - 0.5 * count @ np.log(power)), np.sqrt(power)
+
+
+def _spread(levels: FloatArray, count: NDArray[np.int64]) -> FloatArray:
+    """(n,) level of each sample; of a single block it takes no memory."""
+    if count.size == 1:
+        return np.broadcast_to(levels, count.sum())
+    return np.repeat(levels, count)
 
 
 def _each(values: FloatArray, count: NDArray[np.int64]) -> FloatArray | float:
