@@ -207,6 +207,8 @@ def test_correct_gives_the_same_in_pieces(deployment: Path, calibration: Path, t
         (["convert", "{d}", "-o", "/proc/self/x.csv"], 2, "The folder /proc/self cannot be written to"),
         (["diagnose", "{d}", "--calibration", "{d}", "-o", "{d}"], 2, "It is a file"),
         (["demo", "--out", "{d}"], 2, "It is a file"),
+        (["replay", "{d}", "--log", "/proc/self/new"], 2, "The folder /proc/self cannot be written to"),
+        (["demo", "--out", "/proc/self/new/demo"], 2, "The folder /proc/self cannot be written to"),
         (["simulate", "demo", "-o", "x.nc", "--seed", "-1"], 2, "--seed"),
         (["replay", "{d}", "--config", "none.toml"], 2, "none.toml: No such file"),
         (["demo", "--out", "/dev/null/demo"], 1, "/dev/null/demo: Not a directory"),

@@ -28,6 +28,7 @@ __all__ = [
     "complain",
     "digest",
     "file_to_write",
+    "folder_to_write",
     "note_losses",
     "some",
     "tell",
@@ -72,14 +73,20 @@ def _log_to_write(kind: Any, path: Any) -> None:
     file_to_write(*suffixes(write=True))(kind, path)
 
 
-def _folder_to_write(_: Any, path: Path) -> None:
+def folder_to_write(_: Any, path: Any) -> None:
+    """Check a folder to write to, before any work is done for it."""
+    if path is None:
+        return
     if path.exists() and not path.is_dir():
         raise ValueError("It is a file.")
+    there = next(folder for folder in (path, *path.absolute().parents) if folder.exists())
+    if not os.access(there, os.W_OK):
+        raise ValueError(f"The folder {there} cannot be written to.")
 
 
 Output = Annotated[Path, Parameter(name=["--output", "-o"], validator=file_to_write())]
 Log = Annotated[Path, Parameter(name=["--output", "-o"], validator=_log_to_write)]
-Folder = Annotated[Path, Parameter(validator=_folder_to_write)]
+Folder = Annotated[Path, Parameter(validator=folder_to_write)]
 Grid = Annotated[Path, Parameter(name=["--output", "-o"], validator=file_to_write(".nc"))]
 Heading = Annotated[Literal["true", "magnetic"] | None, Parameter(name="--heading-reference")]
 Picture = Annotated[Path | None, Parameter(validator=file_to_write(".png", ".pdf", ".svg"))]

@@ -9,7 +9,7 @@ from typing import Annotated
 
 from cyclopts import Parameter, validators
 
-from magbridge.cli.common import Folder, Json, app, some, tell
+from magbridge.cli.common import Folder, Json, app, folder_to_write, some, tell
 from magbridge.errors import DataError, WrongUse
 
 
@@ -64,7 +64,7 @@ def replay(
     *files: Path,
     config: Path | None = None,
     speed: str = "max",
-    log: Path | None = None,
+    log: Annotated[Path | None, Parameter(validator=folder_to_write)] = None,
     json: Json = False,
 ) -> None:
     """Replay logs through the unmodified bridge: real bytes through a pty, real MAVLink through a socket.
