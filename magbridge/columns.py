@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-__all__ = ["CHANNELS", "CHANNEL_TIMES", "COLUMNS", "CORRECTED", "Column", "factor", "usual"]
+__all__ = ["CHANNELS", "CHANNEL_TIMES", "COLUMNS", "CORRECTED", "NT_PER_UNIT", "Column", "factor", "usual"]
 
 
 class Column(NamedTuple):
@@ -49,15 +49,22 @@ COLUMNS: dict[str, Column] = {
 CORRECTED = ("total_field", "total_field_sigma", "field_x", "field_y", "field_z", "anomaly", "quality")
 """What ``magbridge correct`` writes beside ``time``."""
 
+NT_PER_UNIT = {
+    "fT": 1e-6,
+    "pT": 1e-3,
+    "nT": 1.0,
+    "uT": 1e3,
+    "µT": 1e3,
+    "mT": 1e6,
+    "T": 1e9,
+    "uG": 1e-1,
+    "mG": 1e2,
+    "G": 1e5,
+}
+"""nT in one unit of magnetic flux density."""
+
 _FACTORS = {
-    ("T", "nT"): 1e9,
-    ("mT", "nT"): 1e6,
-    ("uT", "nT"): 1e3,
-    ("µT", "nT"): 1e3,
-    ("G", "nT"): 1e5,
-    ("gauss", "nT"): 1e5,
-    ("mG", "nT"): 1e2,
-    ("mgauss", "nT"): 1e2,
+    **{(unit, "nT"): factor for unit, factor in NT_PER_UNIT.items()},
     ("ms", "s"): 1e-3,
     ("rad", "deg"): 57.29577951308232,
     ("cm", "m"): 1e-2,
@@ -82,6 +89,12 @@ _SAME = {
     "degree_C": "degC",
     "°C": "degC",
     "nanotesla": "nT",
+    "nanoteslas": "nT",
+    "gamma": "nT",
+    "gammas": "nT",
+    "tesla": "T",
+    "gauss": "G",
+    "mgauss": "mG",
 }
 
 

@@ -12,15 +12,14 @@ from math import hypot, inf, isfinite, nan
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from magbridge.align import Aligner, Input, Sample
 from magbridge.calibration.correct import Corrector
 from magbridge.calibration.model import Calibration, identity
 from magbridge.columns import COLUMNS
 from magbridge.config import Align
-from magbridge.field.igrf import total_field
-from magbridge.field.reference import positions
+from magbridge.field.igrf import magnitude
+from magbridge.field.reference import main_field
 from magbridge.records import BEYOND, Corrected, Reading
 
 if TYPE_CHECKING:
@@ -127,7 +126,7 @@ def correct_rows(correction: Correction, deployment: xr.Dataset) -> xr.Dataset:
     ).reshape(-1, 6)
     names = ("total_field", "total_field_sigma", "field_x", "field_y", "field_z", "quality")
     columns = dict(zip(names, results.T, strict=True))
-    columns["anomaly"] = columns["total_field"] - _main_field(deployment)
+    columns["anomaly"] = columns["total_field"] - magnitude(main_field(deployment))
     return xr.Dataset(
         {
             name: ("time", column, {"units": COLUMNS[name].unit, "long_name": COLUMNS[name].long_name})
@@ -136,19 +135,6 @@ def correct_rows(correction: Correction, deployment: xr.Dataset) -> xr.Dataset:
         coords={"time": deployment["time"]},
         attrs={"source": deployment.attrs.get("source", "")},
     )
-
-
-def _main_field(deployment: xr.Dataset) -> NDArray[np.float64]:
-    """Return the IGRF's total field (nT) at every row; NaN where there is no position."""
-    if not {"latitude", "longitude"} <= set(deployment.variables):
-        return np.full(deployment.sizes["time"], nan)
-    longitude, latitude, depth = positions(deployment)
-    known = np.isfinite(longitude) & np.isfinite(latitude)
-    field = np.full(len(known), nan)
-    if known.any():
-        time = deployment["time"].to_numpy()
-        field[known] = total_field(longitude[known], latitude[known], depth[known], time[known])
-    return field
 
 
 def _readings(correction: Correction, deployment: xr.Dataset) -> Iterator[tuple[Reading, int]]:

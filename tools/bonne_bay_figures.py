@@ -13,7 +13,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from magbridge.columns import CHANNELS
-from magbridge.field.igrf import total_field
+from magbridge.field.igrf import magnitude
+from magbridge.field.reference import main_field
 from sitl.bonne_bay import METHODS, TRIALS, Trials
 
 INK = {"nominal": "#c9a227", "cubic": "#1f77a4", "auto": "#b3315c", "local": "#1b1b1b", "igrf": "#8a8a8a"}
@@ -148,7 +149,7 @@ def _figure_5(flight: Trials) -> Figure:
 def _figure_6(flight: Trials) -> Figure:
     figure, panels = plt.subplots(1, 2, figsize=(9, 4.6), sharex=True, sharey=True)
     survey = flight.parts["survey"]
-    main = _main_field(survey)
+    main = magnitude(main_field(survey))
     method = "cubic" if ("survey", "trial 2", "cubic") in flight.corrected else "auto"
     measured = flight.corrected["survey", "trial 2", method] - main
     mapped = survey["reference_field"] - main
@@ -176,15 +177,14 @@ def _figure_6(flight: Trials) -> Figure:
     return figure
 
 
-def _main_field(part: xr.Dataset) -> np.ndarray:
-    return total_field(
-        *(part[name].to_numpy() for name in ("longitude", "latitude", "depth")), part["time"].to_numpy()
-    )
-
-
 def _references(panel: Axes, part: xr.Dataset) -> None:
     panel.plot(
-        _hours(part), _main_field(part), color=INK["igrf"], linewidth=1.0, linestyle="--", label="IGRF"
+        _hours(part),
+        magnitude(main_field(part)),
+        color=INK["igrf"],
+        linewidth=1.0,
+        linestyle="--",
+        label="IGRF",
     )
     panel.plot(_hours(part), part["reference_field"], color=INK["local"], linewidth=1.0, label="IGRF + map")
     panel.grid(axis="y", linewidth=0.3, alpha=0.6)

@@ -6,8 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from magbridge.field.igrf import igrf
-from magbridge.field.reference import positions
+from magbridge.field.reference import main_field
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -32,15 +31,8 @@ def with_true_heading(deployment: xr.Dataset, reference: str | None = None) -> x
     reference = reference or deployment.attrs.get("heading_reference")
     if reference != "magnetic" or "heading" not in deployment:
         return deployment
-    declination = np.full(deployment.sizes["time"], np.nan)
-    if {"latitude", "longitude"} <= set(deployment.variables):
-        longitude, latitude, depth = positions(deployment)
-        known = np.isfinite(longitude) & np.isfinite(latitude)
-        if known.any():
-            time = deployment["time"].to_numpy()
-            field = igrf(longitude[known], latitude[known], depth[known], time[known])
-            declination[known] = np.degrees(np.arctan2(field[:, 1], field[:, 0]))
-    heading = (deployment["heading"].to_numpy() + declination) % 360.0
+    north, east, _ = main_field(deployment).T
+    heading = (deployment["heading"].to_numpy() + np.degrees(np.arctan2(east, north))) % 360.0
     out = deployment.assign(heading=("time", heading, deployment["heading"].attrs))
     out.attrs["heading_reference"] = "true"
     return out

@@ -18,14 +18,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magbridge.errors import FormatError, MissingExtra, OutOfRange
+from magbridge.field.earth import ECCENTRICITY_SQUARED, EQUATORIAL_RADIUS
 
-__all__ = ["coverage", "igrf", "total_field"]
+__all__ = ["coverage", "igrf", "magnitude", "total_field"]
 
 Array = NDArray[np.float64]
 
 REFERENCE_RADIUS = 6_371_200.0  # m, of the model's sphere
-EQUATORIAL_RADIUS = 6_378_137.0  # m, WGS84
-ECCENTRICITY_SQUARED = 6.694_379_990_14e-3  # WGS84
 BLOCK = 2048  # samples; the working arrays of a block stay in the cache
 
 
@@ -84,9 +83,12 @@ def igrf(longitude: ArrayLike, latitude: ArrayLike, depth: ArrayLike, time: Arra
 
 def total_field(longitude: ArrayLike, latitude: ArrayLike, depth: ArrayLike, time: ArrayLike) -> Array:
     """Return the magnitude of :func:`igrf`, nT, (n,); same arguments and errors."""
-    field = igrf(longitude, latitude, depth, time)
-    total: Array = np.sqrt(np.einsum("ij,ij->i", field, field))
-    return total
+    return magnitude(igrf(longitude, latitude, depth, time))
+
+
+def magnitude(field: Array) -> Array:
+    """Return the length (n,) of vectors (n, 3)."""
+    return np.asarray(np.sqrt(np.einsum("ij,ij->i", field, field)))
 
 
 def coverage() -> tuple[float, float]:

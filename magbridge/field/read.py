@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from magbridge.columns import NT_PER_UNIT, usual
 from magbridge.errors import FormatError
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.grid_formats import ascii_grid, begins, folder, geotiff, grd, table
@@ -22,10 +23,8 @@ __all__ = ["READERS", "read_grid", "read_polygon"]
 
 Array = NDArray[np.floating[Any]]
 
-NANOTESLA = {
-    "nt": 1.0, "nanotesla": 1.0, "nanoteslas": 1.0, "gamma": 1.0, "gammas": 1.0,
-    "pt": 1e-3, "ut": 1e3, "µt": 1e3, "mgauss": 1e2, "gauss": 1e5, "t": 1e9, "tesla": 1e9,
-}  # fmt: skip
+NANOTESLA = {unit.lower(): factor for unit, factor in NT_PER_UNIT.items()}
+"""nT in one unit, however it is written."""
 
 READERS: dict[str, Callable[..., Parts]] = {
     ".nc": netcdf,
@@ -98,6 +97,6 @@ def _scale(path: Path, unit: str | None) -> float:
     if unit is None or not unit.strip():
         return 1.0
     try:
-        return NANOTESLA[unit.strip().lower()]
+        return NANOTESLA[usual(unit.strip().lower()).lower()]
     except KeyError:
         raise FormatError(path, f"expected a magnetic field in nT, found the unit {unit!r}") from None

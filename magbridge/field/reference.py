@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 from magbridge.errors import FormatError
 from magbridge.field.continuation import continued
 from magbridge.field.grid import AnomalyGrid
-from magbridge.field.igrf import igrf, total_field
+from magbridge.field.igrf import igrf, magnitude, total_field
 
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["earth_field", "positions", "reference_field"]
+__all__ = ["earth_field", "main_field", "positions", "reference_field"]
 
 Array = NDArray[np.float64]
 
@@ -92,15 +92,23 @@ def earth_field(deployment: xr.Dataset, grid: AnomalyGrid | None = None) -> tupl
     total = reference_field(deployment, grid)
     if not {"latitude", "longitude"} <= set(deployment.variables):
         return total, None, "reference_field"
-    longitude, latitude, depth = positions(deployment)
-    known = np.isfinite(longitude) & np.isfinite(latitude)
-    vector = np.full((total.size, 3), np.nan)
-    if known.any():
-        field = igrf(longitude[known], latitude[known], depth[known], deployment["time"].to_numpy()[known])
-        vector[known] = field * (total[known] / np.linalg.norm(field, axis=1))[:, None]
+    field = main_field(deployment)
+    vector = field * (total / magnitude(field))[:, None]
     given = "reference_field" in deployment
     name = " + ".join(["reference_field" if given else "IGRF", *([grid.name] if grid is not None else [])])
     return total, vector, name
+
+
+def main_field(deployment: xr.Dataset) -> Array:
+    """Return the IGRF at every sample, (n, 3) nT, north-east-down; NaN where there is no position."""
+    field = np.full((deployment.sizes["time"], 3), np.nan)
+    if {"latitude", "longitude"} <= set(deployment.variables):
+        longitude, latitude, depth = positions(deployment)
+        known = np.isfinite(longitude) & np.isfinite(latitude)
+        if known.any():
+            time = deployment["time"].to_numpy()
+            field[known] = igrf(longitude[known], latitude[known], depth[known], time[known])
+    return field
 
 
 def positions(deployment: xr.Dataset) -> tuple[Array, Array, Array]:

@@ -36,8 +36,9 @@ from zlib import crc32
 import msgspec
 from msgspec import Meta
 
+from magbridge.columns import NT_PER_UNIT
 from magbridge.records import BEYOND, Reading
-from magbridge.sensors.framing import NT_PER_UNIT, Framer
+from magbridge.sensors.framing import Framer
 
 __all__ = ["CHECKSUMS", "Ascii", "AsciiOptions"]
 

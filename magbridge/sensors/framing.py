@@ -1,22 +1,8 @@
-"""What several protocols share: frames between delimiters, COBS, units."""
+"""What several protocols share: frames between delimiters, COBS."""
 
 from __future__ import annotations
 
-__all__ = ["CRC32_RESIDUE", "NT_PER_UNIT", "Framer", "cobs_decode", "cobs_encode"]
-
-NT_PER_UNIT = {
-    "fT": 1e-6,
-    "pT": 1e-3,
-    "nT": 1.0,
-    "uT": 1e3,
-    "µT": 1e3,
-    "mT": 1e6,
-    "T": 1e9,
-    "uG": 1e-1,
-    "mG": 1e2,
-    "G": 1e5,
-}
-"""nT in one unit of magnetic flux density."""
+__all__ = ["CRC32_RESIDUE", "Framer", "cobs_decode", "cobs_encode"]
 
 CRC32_RESIDUE = 0x2144DF1C
 """CRC-32 (IEEE 802.3) of any message followed by its own CRC-32 in little-endian order."""

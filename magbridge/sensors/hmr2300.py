@@ -18,8 +18,9 @@ from typing import Annotated, ClassVar, Literal
 import msgspec
 from msgspec import Meta
 
+from magbridge.columns import NT_PER_UNIT
 from magbridge.records import Reading
-from magbridge.sensors.framing import NT_PER_UNIT, Framer
+from magbridge.sensors.framing import Framer
 
 __all__ = ["Hmr2300", "Hmr2300Options"]
 

@@ -12,9 +12,10 @@ from zlib import crc32
 import msgspec
 from msgspec import Meta
 
+from magbridge.columns import NT_PER_UNIT
 from magbridge.records import BEYOND, Reading
 from magbridge.sensors import tio
-from magbridge.sensors.framing import CRC32_RESIDUE, NT_PER_UNIT, Framer
+from magbridge.sensors.framing import CRC32_RESIDUE, Framer
 
 __all__ = ["Twinleaf", "TwinleafOptions"]
 

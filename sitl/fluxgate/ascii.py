@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from math import inf
 
+from magbridge.columns import NT_PER_UNIT
 from magbridge.records import Reading
 from magbridge.sensors import ascii as wire
-from magbridge.sensors.framing import NT_PER_UNIT
 from sitl.fluxgate.encoder import Encoder, clip
 
 __all__ = ["AsciiEncoder"]

@@ -5,10 +5,11 @@ from __future__ import annotations
 from fractions import Fraction
 from zlib import crc32
 
+from magbridge.columns import NT_PER_UNIT
 from magbridge.records import Reading
 from magbridge.sensors import tio
 from magbridge.sensors import twinleaf as wire
-from magbridge.sensors.framing import CRC32_RESIDUE, NT_PER_UNIT, Framer
+from magbridge.sensors.framing import CRC32_RESIDUE, Framer
 from sitl.fluxgate.encoder import Encoder, clip
 
 __all__ = ["TwinleafEncoder"]
