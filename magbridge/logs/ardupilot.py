@@ -34,8 +34,6 @@ __all__ = ["chunks"]
 Floats = NDArray[np.float64]
 
 NT_PER_MG = 100.0
-MAX_AGE = 30.0
-"""s; an older value is not carried to a row."""
 FIELDS: dict[str, tuple[tuple[str, str, str, float], ...]] = {
     # record: (column, field, unit, factor); '#' is the number of the instance where it is not the first
     "ATT": (("roll", "Roll", "deg", 1.0), ("pitch", "Pitch", "deg", 1.0), ("heading", "Yaw", "deg", 1.0)),
@@ -93,14 +91,14 @@ def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
     units = {}
     for number, (when, other) in mags.items():
         for name, values in _field(other, f"mag{number + 1}").items():
-            columns[name], units[name] = latest(time, when, values, MAX_AGE), "nT"
+            columns[name], units[name] = latest(time, when, values), "nT"
     for record, fields in FIELDS.items():
         for number, (when, table) in _instances(tables, record, offset).items():
             for column, field, unit, factor in fields:
                 name = column.replace("#", str(number + 1) if number else "")
                 if field not in table or name in columns or (record == "RCOU" and not np.any(table[field])):
                     continue  # an output that is always 0 does not exist
-                columns[name] = latest(time, when, table[field] * factor, MAX_AGE)
+                columns[name] = latest(time, when, table[field] * factor)
                 units[name] = unit
     attrs: dict[str, Any] = {"bytes_skipped": skipped}
     if not offset:

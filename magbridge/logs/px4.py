@@ -36,8 +36,6 @@ __all__ = ["chunks"]
 Floats = NDArray[np.float64]
 
 NT_PER_GAUSS = 1e5
-MAX_AGE = 30.0
-"""s; an older value is not carried to a row."""
 FIELDS: dict[str, tuple[tuple[str, str, str, float], ...]] = {
     # topic: (column, field, unit, factor); '#' is the number of the instance where it is not the first
     "vehicle_global_position": (("latitude", "lat", "deg", 1.0), ("longitude", "lon", "deg", 1.0)),
@@ -93,12 +91,12 @@ def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
         for axis in "xyz":
             column = f"mag{number + 1}_{axis}"
             columns[column], units[column] = (
-                latest(time, _time(mag, offset), NT_PER_GAUSS * mag[axis], MAX_AGE),
+                latest(time, _time(mag, offset), NT_PER_GAUSS * mag[axis]),
                 "nT",
             )
     for column, unit, when, values in _telemetry(topics, offset):
         if column not in columns and (np.any(values) or not column.startswith(UNUSED)):
-            columns[column], units[column] = latest(time, when, values, MAX_AGE), unit
+            columns[column], units[column] = latest(time, when, values), unit
     attrs: dict[str, Any] = {"dropouts": len(log.dropouts)}
     if not offset:
         attrs["time_reference"] = "boot"

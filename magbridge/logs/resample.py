@@ -5,12 +5,15 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["latest", "linear"]
+__all__ = ["MAX_AGE", "latest", "linear"]
 
 Floats = NDArray[np.float64]
 
+MAX_AGE = 30.0
+"""s; what a live listener heard longer ago is not carried to a row."""
 
-def latest(at: Floats, time: Floats, values: Floats, max_age: float) -> Floats:
+
+def latest(at: Floats, time: Floats, values: Floats) -> Floats:
     """Return the last value at or before each time, as a live listener would know it.
 
     Parameters
@@ -19,19 +22,18 @@ def latest(at: Floats, time: Floats, values: Floats, max_age: float) -> Floats:
         s, the rows.
     time, values : (m,) array
         s, increasing or equal, and what was said then; NaN is not a value.
-    max_age : float
-        s; an older value is NaN, as are rows before the first.
 
     Returns
     -------
     (n,) array
+        NaN before the first value, and once the last is older than :data:`MAX_AGE`.
     """
     known = np.isfinite(values)
     time, values = time[known], values[known]
     if not len(time):
         return np.full(len(at), np.nan)
     k = np.searchsorted(time, at, side="right") - 1
-    fresh = (k >= 0) & (at - time[k] <= max_age)
+    fresh = (k >= 0) & (at - time[k] <= MAX_AGE)
     return np.where(fresh, values[k], np.nan)
 
 

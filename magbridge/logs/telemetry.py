@@ -1,7 +1,8 @@
 """MAVLink telemetry logs (``.tlog``), ours and anyone's, as deployments.
 
-A row is a magnetometer message of the best kind that the log holds (:data:`~magbridge.logs.telemetry_fields.SOURCES`), from the sender of most of
-them; every other column is the last value that this vehicle said before it (NaN once older than `MAX_AGE_US`).
+A row is a magnetometer message of the best kind that the log holds (:data:`~magbridge.logs.telemetry_fields.SOURCES`),
+from the sender of most of them; every other column is the last value that this vehicle said before it (NaN once
+older than :data:`~magbridge.logs.resample.MAX_AGE`).
 
 - ``MAG_RAW`` (ours): nT as float32 (0.004 nT at 50,000 nT), time to the µs, channel times, temperature, supply,
   power cycles. The ``MAG_FIELD`` that follows it becomes the columns of ``magbridge correct``.
@@ -9,8 +10,9 @@ them; every other column is the last value that this vehicle said before it (NaN
   its own offsets already in them; time is the record's stamp. Further magnetometers become ``mag1_x`` ... ``mag3_z``.
 - Without any of these, ``ATTITUDE`` or position makes the rows, and there is no ``mag_x``.
 
-Telemetry is what the log itself declares by ``MAG_COLUMN`` (a bridge's own, one from :mod:`magbridge.logs`), what :data:`~magbridge.logs.telemetry_fields.TELEMETRY` lists, and every ``NAMED_VALUE_FLOAT`` by its name. What is damaged is passed over
-and counted in the attributes ``bytes_skipped`` and ``damages``, a row whose time does not increase in
+Telemetry is what the log itself declares by ``MAG_COLUMN`` (a bridge's own, one from :mod:`magbridge.logs`), what
+:data:`~magbridge.logs.telemetry_fields.TELEMETRY` lists, and every ``NAMED_VALUE_FLOAT`` by its name. What is damaged
+is passed over and counted in the attributes ``bytes_skipped`` and ``damages``, a row whose time does not increase in
 ``rows_dropped``.
 """
 
@@ -25,6 +27,7 @@ import xarray as xr
 
 from magbridge.columns import CORRECTED
 from magbridge.logs.deployment import deployment
+from magbridge.logs.resample import MAX_AGE
 from magbridge.logs.telemetry_fields import SOURCES, TELEMETRY, Columns, correction
 from magbridge.logs.telemetry_survey import Survey, survey
 from magbridge.logs.telemetry_writer import FileWriter
@@ -33,7 +36,7 @@ from magbridge.records import Channel
 
 __all__ = ["FileWriter", "chunks"]
 
-MAX_AGE_US = 30_000_000
+MAX_AGE_US = round(MAX_AGE * 1e6)
 NEVER = -(1 << 62)
 FIELD, NAMED = spec("MAG_FIELD").id, spec("NAMED_VALUE_FLOAT")
 
