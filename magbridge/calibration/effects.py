@@ -9,9 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from math import exp, isnan
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
 from magbridge.calibration.terms import Effect, Step
@@ -25,7 +26,7 @@ FloatArray = NDArray[np.float64]
 
 
 class ChannelEffect(Effect, frozen=True, kw_only=True):
-    """Offset or scale that follows a channel, at once or through a first-order lag.
+    """Offset or scale that follows a channel, at once or through lags in series.
 
     Attributes
     ----------
@@ -36,7 +37,9 @@ class ChannelEffect(Effect, frozen=True, kw_only=True):
     origin : float
         Where the channel does nothing (the temperature at calibration; 0 A).
     lag : float
-        s, time constant of ``dy/dt = (x - y) / lag``; 0: at once.
+        s, by how much it is behind in all, of a number of equal first-order lags ``dy/dt = (x - y) / (lag / stages)``; 0: at once.
+    stages : int
+        How many stand in series, each following the one before: 1, a single store of heat; 2, what heat reaches through another.
     on : {"offset", "scale"}
         ``offset``: three coefficients, nT per unit of the channel, added to T. ``scale``: three,
         added to the diagonal of ``a``, nT at F_0 per unit.
@@ -47,6 +50,7 @@ class ChannelEffect(Effect, frozen=True, kw_only=True):
     channel: str
     origin: float = 0.0
     lag: float = 0.0
+    stages: Annotated[int, Meta(ge=1)] = 1
     on: Literal["offset", "scale"] = "offset"
 
     @property
@@ -68,18 +72,20 @@ class ChannelEffect(Effect, frozen=True, kw_only=True):
     def begin(self, calibration: Calibration) -> Step:
         """Return a stepper that starts in equilibrium with the first value it sees."""
         index = calibration.channels.index(self.channel)
-        origin, lag = self.origin, self.lag
-        level, then, first = origin, 0, True
+        origin, stages, lag = self.origin, self.stages, self.lag / self.stages
+        levels, then, first = [origin] * stages, 0, True
 
         def step(time_us: int, hx: float, hy: float, hz: float, values: Sequence[float]) -> tuple[float]:
-            nonlocal level, then, first
+            nonlocal then, first
             value = values[index]
             if not isnan(value):  # without a value the last level holds
                 if first or lag == 0.0:
-                    level, first = value, False
+                    levels[:], first = [value] * stages, False
                 else:
-                    level += (value - level) * (1.0 - exp((then - time_us) * 1e-6 / lag))
+                    share = 1.0 - exp((then - time_us) * 1e-6 / lag)
+                    for k, level in enumerate(levels):
+                        value = levels[k] = level + (value - level) * share
                 then = time_us
-            return (level - origin,)
+            return (levels[-1] - origin,)
 
         return step

@@ -39,7 +39,9 @@ def random_calibration(
                 induced=(40.0, 20.0, 20.0),
             ),
         )
-        effects = (ChannelEffect(cause="temperature_offset", channel="sensor_temperature", lag=60.0),)
+        effects = (
+            ChannelEffect(cause="temperature_offset", channel="sensor_temperature", lag=60.0, stages=2),
+        )
     size = sum(term.size for term in (*terms, *effects))
     root = rng.normal(size=(size, size))
     return Calibration(

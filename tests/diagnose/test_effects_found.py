@@ -22,7 +22,7 @@ from magbridge.diagnose.compare.survey import Channel, Survey
 FIELD = 50_000.0
 T0 = 1.7e9
 EFFECTS: list[Effect] = [
-    ChannelEffect(cause="temperature_offset", channel="heat", origin=3.0, lag=200.0),
+    ChannelEffect(cause="temperature_offset", channel="heat", origin=3.0, lag=200.0, stages=2),
     ChannelEffect(cause="temperature_scale", channel="heat", origin=3.0, lag=50.0, on="scale"),
     PowersEffect(cause="unmodelled_actuator", channel="heat", centre=3.0, scale=2.0, order=3),
     MonomialEffect(cause="actuator_order", exponents=(4,)),

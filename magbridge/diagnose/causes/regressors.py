@@ -11,18 +11,26 @@ __all__ = ["lagged", "play", "powers"]
 FloatArray = NDArray[np.float64]
 
 
-def lagged(time: FloatArray, values: FloatArray, lag: float) -> FloatArray:
-    """(n,) y with ``dy/dt = (x - y) / lag``, stepped as :class:`~magbridge.calibration.effects.ChannelEffect` does.
+def lagged(time: FloatArray, values: FloatArray, lag: float, stages: int = 1) -> FloatArray:
+    """(n,) y that follows x through equal lags in series, stepped as :class:`~magbridge.calibration.effects.ChannelEffect` does.
 
     Parameters
     ----------
     time, values : (n,) array
         s, and x.
     lag : float
-        s; 0: x itself.
+        s, of all stages; 0: x itself.
+    stages : int
     """
     if lag <= 0.0 or len(time) < 2:
         return values
+    for _ in range(stages):
+        values = _followed(time, values, lag / stages)
+    return values
+
+
+def _followed(time: FloatArray, values: FloatArray, lag: float) -> FloatArray:
+    """(n,) y with ``dy/dt = (x - y) / lag``."""
     share = -np.expm1(-np.diff(time) / lag)
     usual = float(np.median(share))
     odd = np.flatnonzero(np.abs(share - usual) > 1e-6 * usual) + 1  # gaps, and clocks that tremble
