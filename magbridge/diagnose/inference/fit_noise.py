@@ -21,7 +21,7 @@ FloatArray = NDArray[np.float64]
 TAILS = (2.5, 3.0, 4.0, 5.0, 7.0, 12.0, 1e6)
 BLOCK = 150
 """Samples over which the noise's level is taken as constant."""
-ORDERS = (0, 1, 2, 3, 5, 8, 13)
+ORDERS = (1, 2, 3, 5, 8, 13)
 LONGEST = ORDERS[-1]
 GAUSSIAN = 1e5
 """Degrees of freedom from which on the tails are taken for Gaussian."""
@@ -30,27 +30,42 @@ ALTERNATIONS = 6
 SETTLED = 0.01
 """Log likelihood: less is no gain."""
 FEW = 20
+NEAR = 0.9999
+"""Partial correlation, at most."""
 PIECE, PIECES = 600, 64
 """Samples by which a column's frequencies are told: pieces this long, so many at most."""
 
 
-def memory_order(residual: FloatArray, past: Past) -> int:
-    """Choose p by Akaike's criterion, on a residual clipped against outliers.
+def memory_order(residual: FloatArray, slots: NDArray[np.int64]) -> int:
+    r"""Choose p by Akaike's criterion, on a residual clipped against outliers; `slots` (n,) count the intervals.
 
-    `past` is that of the longest. To whiten with too long a memory costs little, with too short a one it makes structure out of noise.
+    To whiten with too long a memory costs little, with too short a one it makes structure out of noise.
+
+    Notes
+    -----
+    Autocovariances c_k from all pairs that are there (Dunsmuir & Robinson 1981, J. Am. Stat. Assoc. 76:560), then Levinson's recursion:
+
+    .. math:: \kappa_p = \frac{c_p - \sum_k a_k c_{p-k}}{v_{p-1}}, \qquad v_p = v_{p-1} (1 - \kappa_p^2)
     """
+    n = len(residual)
+    if n < 4 * FEW:
+        return 1
     scale = 1.4826 * np.median(np.abs(residual)) + 1e-12
     r = np.clip(residual, -6.0 * scale, 6.0 * scale)
-    rows = np.flatnonzero(past.whole)
-    if len(rows) < 4 * FEW:
-        return 1
-    n = len(r) - LONGEST  # all will be whitened, also those that do not tell the memory
-    lags = np.stack([r[rows - k] for k in range(1, LONGEST + 1)], axis=1)
-    costs = []
-    for p in ORDERS:
-        left = r[rows] - (lags[:, :p] @ np.linalg.lstsq(lags[:, :p], r[rows], rcond=None)[0] if p else 0.0)
-        costs.append(n * np.log(left @ left / len(rows) + 1e-300) + 2.0 * p)
-    return max(1, ORDERS[int(np.argmin(costs))])
+    c = np.array([_product(r, slots, k) for k in range(LONGEST + 1)])
+    a, v, costs = np.zeros(0), c[0] + 1e-300, {}
+    for p in range(1, LONGEST + 1):
+        kappa = np.clip((c[p] - a @ c[p - 1 : 0 : -1]) / v, -NEAR, NEAR)
+        a, v = np.append(a - kappa * a[::-1], kappa), v * (1.0 - kappa**2)
+        costs[p] = n * np.log(v) + 2.0 * p
+    return min(ORDERS, key=lambda p: costs[p])
+
+
+def _product(r: FloatArray, slots: NDArray[np.int64], lag: int) -> float:
+    """Mean product of samples that are so many intervals apart."""
+    before = np.searchsorted(slots, slots - lag)
+    pair = slots[before] == slots - lag
+    return float(np.mean(r[pair] * r[before[pair]])) if pair.any() else 0.0
 
 
 def certainty(residual: FloatArray, noise: Noise, columns: Sequence[Columns]) -> list[float]:

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.exchange import exchanged
-from magbridge.diagnose.inference.fit_noise import LONGEST, memory_order
+from magbridge.diagnose.inference.fit_noise import memory_order
 from magbridge.diagnose.inference.information import Information
 from magbridge.diagnose.inference.joint import Joint, fit_joint
 from magbridge.diagnose.inference.rivals import Rival
@@ -83,7 +83,7 @@ def search(problem: Problem, candidates: Sequence[Candidate], causes: int) -> Ou
         How many causes were asked about.
     """
     rough = fit_joint(problem, [], 1, rounds=2)
-    order = memory_order(rough.left, problem.survey.past(LONGEST))
+    order = memory_order(rough.left, problem.survey.slots)
     state = State(problem, candidates, order, causes)
     null = state.null = state.fit([])
     state.blocks = bool(np.ptp(null.noise.scale))  # likelihoods that are compared have one kind of noise
