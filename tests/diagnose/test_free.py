@@ -9,6 +9,7 @@ from scipy.stats import multivariate_normal
 from magbridge.calibration.fitting.data import observations
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.lowpass import unfiltered
+from magbridge.diagnose.inference.free import _bends, _response
 from magbridge.diagnose.inference.statistic import SIZES, Statistic
 from magbridge.diagnose.run import diagnose
 from sitl import load, simulate
@@ -47,3 +48,16 @@ def test_a_plain_survey_is_plain(seed: int) -> None:
         observations(parts["calibration"], ("battpos", "ballast")), scenario.instrument.corner
     )
     assert diagnose([parts["survey"]], fit(learned, "auto").calibration).verdict == "nothing_found"
+
+
+def test_a_converter_whose_steps_differ_is_described() -> None:
+    """Signal-to-noise 10, in one level for each of 25 steps and channel."""
+    rng = np.random.default_rng(3)
+    reading = rng.uniform(-5e4, 5e4, (4000, 3))
+    slopes = reading / np.linalg.norm(reading, axis=1)[:, None]
+    code = np.round(reading / 4000.0).astype(int)
+    bent = np.sum(slopes * np.take_along_axis(rng.normal(size=(26, 3)), code % 26, axis=0), axis=1)
+    given = 10.0 * bent / np.linalg.norm(bent) + rng.normal(size=4000)
+    X = _response(reading, slopes)(slice(None))
+    S, b = X.T @ X, X.T @ given
+    assert Statistic(S, np.array([width**2 for _, width in _bends()])).best(b).ratio > 2.0 * 10.0

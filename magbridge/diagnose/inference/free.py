@@ -25,8 +25,8 @@ BODY, EARTH = 24, 48
 """Half waves in a log of slow curves along the body's axes, and along the field."""
 REPEATED = 8
 """Half waves in a dive of what repeats itself with each."""
-BEND = 10
-"""Order of a channel's free response."""
+BEND = 32
+"""Order of a channel's free response: as fine as a converter's coarsest steps."""
 PLAYS = (0.3, 0.8)
 """Widths of a channel's memory, half of its range being one."""
 SLOPES = (0.0, 0.1, 0.2)
@@ -188,9 +188,11 @@ def _response(reading: FloatArray, slopes: FloatArray) -> Columns:
 
 
 def _bends() -> tuple[tuple[str, FloatArray], ...]:
-    """Widths of a response's polynomials: with a corner or without."""
+    """Widths of a response's polynomials: with steps, with a corner, or without."""
     k = np.arange(1.0, BEND + 1.0)
-    return tuple(("broadband", width) for width in (np.tile(30.0 / k**2, 3), np.tile(30.0 / k**3, 3)))
+    return tuple(
+        ("broadband", np.tile(30.0 / width, 3)) for width in (np.sqrt(1.0 + (k / 8.0) ** 2), k**2, k**3)
+    )
 
 
 def _curve(values: FloatArray) -> Columns:
