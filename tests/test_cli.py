@@ -18,7 +18,10 @@ import pytest
 import xarray as xr
 
 from magbridge.calibration.file import load as load_calibration
+from magbridge.calibration.file import save as save_calibration
+from magbridge.calibration.fitting.data import observations
 from magbridge.calibration.fitting.fit import METHODS
+from magbridge.calibration.planning.plan import expected_calibration
 from magbridge.cli import main
 from magbridge.correction import Correction, correct_rows
 from magbridge.field.igrf import total_field
@@ -197,7 +200,7 @@ def test_correct_gives_the_same_in_pieces(deployment: Path, calibration: Path, t
             1,
             "'run' is named twice",
         ),
-        (["calibrate", "{d}", "--site-bias", "inf", "-o", "x.json"], 2, "--site-bias"),
+        (["calibrate", "{d}", "--site-bias", "1e300", "-o", "x.json"], 2, "--site-bias. Must be <= 100000"),
         (["map", "none.nc", "-o", "x.nc"], 1, "none.nc"),
         (["map", "none.nc", "-o", "x.foo"], 2, "must end in .nc"),
         (["map", "none.nc", "-o", "x.nc", "--altitude", "1e308"], 2, "Must be <= 1000000"),
@@ -352,6 +355,31 @@ def test_a_log_that_the_calibration_was_made_from_is_told(
     capsys.readouterr()
     assert main(["diagnose", str(log), "--calibration", str(cal), "-o", str(tmp_path / "doubt")]) == 1
     assert f"{log}: the calibration was made from it" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("names", [(), ("battpos", "ballast")], ids=["nominal", "two masses"])
+def test_plan(
+    names: tuple[str, ...], deployment: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    known = expected_calibration(observations(read(deployment), names).ranges(), 52_000.0, order=2)
+    save_calibration(known, tmp_path / "cal.json")
+    arguments = [
+        "plan",
+        "--calibration",
+        str(tmp_path / "cal.json"),
+        "--mission",
+        str(deployment),
+        "--runs",
+        "2",
+    ]
+    assert main([*arguments, "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    before, first, second = told["expected_worst_nT"]
+    assert before > first > second
+    assert [set(run) for run in told["runs"]] == [{"pitch", "roll", *names}] * 2
+    assert main(arguments) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines] == ["run", "none", "1", "2", "each"]
 
 
 def test_help_names_every_command(capsys: pytest.CaptureFixture[str]) -> None:

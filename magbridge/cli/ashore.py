@@ -120,7 +120,7 @@ def calibrate(
     method: Literal["auto", "nominal", "cubic", "runs", "horizontal"] = "auto",
     vehicle: Path | None = None,
     grid: Path | None = None,
-    site_bias: Annotated[float, Parameter(validator=validators.Number(gte=0, lt=inf))] = 0.0,
+    site_bias: Annotated[float, Parameter(validator=validators.Number(gte=0, lte=1e5))] = 0.0,
     filter_corner: Annotated[float, Parameter(validator=validators.Number(gte=0, lt=inf))] = 0.0,
     heading_reference: Heading = None,
     strict: bool = False,

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from math import cos, pi, sin, sqrt
-from typing import overload
+from typing import TypeVar, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["metres_per_degree", "offset", "separation"]
+__all__ = ["metres_per_degree", "offset", "separation", "wrap"]
 
 EQUATORIAL_RADIUS = 6_378_137.0  # m
 ECCENTRICITY_SQUARED = 6.694_379_990_14e-3  # both WGS84
@@ -17,6 +17,7 @@ ACROSS = EQUATORIAL_RADIUS * RADIAN  # m per degree of longitude, divided by w
 ALONG = ACROSS * (1.0 - ECCENTRICITY_SQUARED)  # m per degree of latitude, divided by w³
 
 Array = NDArray[np.float64]
+Angle = TypeVar("Angle", float, Array)
 
 
 @overload
@@ -60,6 +61,6 @@ def separation(
     )
 
 
-def wrap(degrees: float) -> float:
-    """Return an angle in -180..180 deg."""
+def wrap(degrees: Angle) -> Angle:
+    """Return an angle, or an array of them, in -180..180 deg."""
     return (degrees + 180.0) % 360.0 - 180.0

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from magbridge.errors import FormatError
 from magbridge.field.continuation import continued
+from magbridge.field.earth import wrap
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.igrf import igrf, magnitude, total_field
 
@@ -120,11 +121,7 @@ def positions(deployment: xr.Dataset) -> tuple[Array, Array, Array]:
     time = deployment["time"].to_numpy()
     longitude = _between(time, deployment, "longitude", turn=360.0)
     depth = _between(time, deployment, "depth") if "depth" in deployment else np.zeros(time.size)
-    return (
-        (longitude + 180.0) % 360.0 - 180.0,
-        _between(time, deployment, "latitude"),
-        np.nan_to_num(depth),
-    )
+    return wrap(longitude), _between(time, deployment, "latitude"), np.nan_to_num(depth)
 
 
 def _between(time: Array, deployment: xr.Dataset, column: str, turn: float | None = None) -> Array:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magbridge.errors import OutOfRange
-from magbridge.field.earth import metres_per_degree, separation
+from magbridge.field.earth import metres_per_degree, separation, wrap
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.igrf import total_field
 from magbridge.navigate.model import Options, block_length, measurement_row, prior, transition
@@ -75,7 +75,7 @@ def position_bound(
     Raises
     ------
     OutOfRange
-        A track in which time does not increase.
+        A track of one corner, or one in which time does not increase.
 
     Notes
     -----
@@ -85,7 +85,9 @@ def position_bound(
     """
     o = options or Options()
     corners = np.asarray(time, float)
-    if corners.size < 2 or (np.diff(corners) <= 0.0).any():
+    if corners.size < 2:
+        raise OutOfRange("corners", corners.size, "a track has at least two")
+    if (np.diff(corners) <= 0.0).any():
         raise OutOfRange("time", "the track's", "it must increase from corner to corner")
     lat, lon = np.asarray(latitude, float), np.unwrap(np.asarray(longitude, float), period=360.0)
     legs = [separation(*a, *b) for a, b in pairwise(zip(lat, lon, strict=True))]
@@ -93,7 +95,7 @@ def position_bound(
     speed = along[-1] / (corners[-1] - corners[0])
     interval = max(every, min(o.interval, block_length(grid) / max(speed, 1e-9)))
     at = np.arange(corners[0] + 0.5 * interval, corners[-1], interval)
-    lat, lon = np.interp(at, corners, lat), np.interp(at, corners, lon)
+    lat, lon = np.interp(at, corners, lat), wrap(np.interp(at, corners, lon))
     metres = np.diff(np.interp(at, corners, along), prepend=0.0)
     local = grid.evaluate(lon, lat)
     main = total_field(lon, lat, depth, at)
@@ -116,7 +118,7 @@ def position_bound(
             P = P - gain @ gain.T / float((row @ gain)[0, 0] + variance + local.variance[i])
         covariance[i], unaided[i] = P, np.sqrt(alone[0, 0] + alone[1, 1])
     reached = np.sqrt(covariance[:, 0, 0] + covariance[:, 1, 1])
-    return Bound(at, lat, (lon + 180.0) % 360.0 - 180.0, covariance, reached, unaided)
+    return Bound(at, lat, lon, covariance, reached, unaided)
 
 
 def told(bound: Bound, grid: AnomalyGrid) -> xr.Dataset:

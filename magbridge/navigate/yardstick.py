@@ -8,7 +8,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from magbridge.field.earth import metres_per_degree
+from magbridge.field.earth import metres_per_degree, wrap
 
 __all__ = ["YARDSTICKS", "errors", "with_errors", "yardstick"]
 
@@ -75,5 +75,4 @@ def _separations(
     latitude: Floats, longitude: Floats, to_latitude: Floats, to_longitude: Floats
 ) -> tuple[Floats, Floats]:
     per_latitude, per_longitude = metres_per_degree(np.asarray(latitude, np.float64))
-    turn = (to_longitude - longitude + 180.0) % 360.0 - 180.0
-    return (to_latitude - latitude) * per_latitude, turn * per_longitude
+    return (to_latitude - latitude) * per_latitude, wrap(to_longitude - longitude) * per_longitude

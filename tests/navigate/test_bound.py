@@ -45,9 +45,25 @@ def test_off_the_map_it_is_dead_reckoning(grid, options):
     np.testing.assert_allclose(bound.sigma, bound.unaided)
 
 
+@pytest.mark.parametrize("way", [1, -1], ids=["east", "west"])
+def test_across_the_date_line(grid, options, way):
+    """The same as anywhere else, but for the main field."""
+    turn = 180.0 - 57.9
+    there = AnomalyGrid(grid.longitude - turn, grid.latitude, grid.anomaly)
+    time, latitude, longitude = TRACK[0], TRACK[1][::way], TRACK[2][::way]
+    crossing = [(degrees - turn + 180.0) % 360.0 - 180.0 for degrees in longitude]
+    bound = position_bound(there, time, latitude, crossing, options)
+    assert np.ptp(bound.longitude) > 359.0
+    assert (np.abs(bound.longitude) <= 180.0).all()
+    expected = position_bound(grid, time, latitude, longitude, options)
+    assert bound.sigma[-1] == pytest.approx(expected.sigma[-1], rel=0.15)
+
+
 def test_time_must_increase(grid):
     with pytest.raises(OutOfRange, match="must increase"):
         position_bound(grid, TRACK[0][::-1], *TRACK[1:])
+    with pytest.raises(OutOfRange, match="corners = 1: a track has at least two"):
+        position_bound(grid, *([one[0]] for one in TRACK))
 
 
 def test_its_picture(grid, options, tmp_path):

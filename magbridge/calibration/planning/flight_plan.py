@@ -59,7 +59,8 @@ def flight_plan(
         names,
         reference=lambda _: (total, field_ned, "IGRF"),
     )
-    limits = Limits(roll=(-roll, roll), pitch_at=trim_of(data), flown=settled(data))
+    flown = settled(data) if names else None
+    limits = Limits(roll=(-roll, roll), pitch_at=trim_of(data), flown=flown)
     return plan(calibration, Mission.of(data), np.nanmean(field_ned, axis=0), limits, runs=runs)
 
 
