@@ -112,7 +112,8 @@ def _numbers(path: Path, name: str, texts: Sequence[str], rows: Sequence[int]) -
         try:
             number(text)
         except ValueError as error:
-            raise FormatError(path, f"expected {error}, not {text!r}", row=row, column=name) from None
+            expected = "seconds since 1970" if name == "time" else error
+            raise FormatError(path, f"expected {expected}, not {text!r}", row=row, column=name) from None
     raise AssertionError
 
 

@@ -62,6 +62,10 @@ BAD: dict[str, tuple[Callable[[xr.Dataset], xr.Dataset], str]] = {
         "within 0.0 degrees of one attitude: fly turns",
     ),
     "all NaN": (lambda ds: changed(ds, mag_y=np.nan), "have every value ('mag_y' has 0 numbers)"),
+    "a sensor that is not there": (
+        lambda ds: changed(ds, **{f"mag_{axis}": 0.0 for axis in "xyz"}),
+        "have every value ('mag_x' has 0, 'mag_y' has 0, 'mag_z' has 0 numbers)",
+    ),
     "a parameter that never moves": (
         lambda ds: changed(ds, battpos=0.3),
         "'battpos' never moves (it is 0.3 throughout)",

@@ -33,7 +33,7 @@ BAD_CSV = {
     "time,mag_x\n1,2\n,3\n": "row 3, column 'time': expected a time after 1.0, not nan",
     "time,mag_x\n2,2\n1,3\n": "row 3, column 'time': expected a time after 2.0, not 1.0",
     "time,mag_x\n2,2\n2,3\n": "row 3, column 'time': expected a time after 2.0, not 2.0",
-    "time,mag_x\n2016-06-23,2\n": "row 2, column 'time': expected a number, not '2016-06-23'",
+    "time,mag_x\n2016-06-23,2\n": "row 2, column 'time': expected seconds since 1970, not '2016-06-23'",
     "time,mag_x [V]\n2,2\n": "column 'mag_x': expected nT, not V",
     "time,heading\n1,-9999\n": "row 2, column 'heading': expected deg, at most 540, not -9999.0",
     "time,depth\n1,4\n2,1e300\n": "row 3, column 'depth': expected m, at most 100000, not 1e+300",

@@ -88,7 +88,8 @@ class Observations:
         time = np.arange(n, dtype=float) if self.time is None else np.asarray(self.time, float)
         runs = np.zeros(n, int) if self.runs is None else np.asarray(self.runs)
         field = np.asarray(self.field, float)
-        field = np.where(np.abs(field) < BEYOND, field, np.nan)
+        absent = (field == 0.0).all(axis=1, keepdims=True)  # what a sensor says that is not there
+        field = np.where((np.abs(field) < BEYOND) & ~absent, field, np.nan)
         whole = np.isfinite(field).all(axis=1) & np.isfinite(reference)
         whole &= np.isfinite(parameters).all(axis=1) & np.isfinite(time)
         _enough(n, whole, field, parameters, self.names, reference)
