@@ -43,6 +43,14 @@ def test_a_memory_is_taken_for_no_shorter_where_few_samples_have_all_of_their_pa
     assert memory_order(r, here) == LONGEST
 
 
+def test_a_memory_is_no_longer_than_what_samples_with_a_whole_past_can_tell() -> None:
+    """As of a glider that samples fast near the surface only."""
+    slow, _ = made("white", 6000, 0.95, seed=6)
+    r = 1.4 * np.random.default_rng(5).normal(size=6000) + np.sqrt(1.0 - 0.95**2) * slow
+    here = np.flatnonzero((np.arange(6000) % 1000 < 60) | (np.arange(6000) % 4 == 0))
+    assert 1 < memory_order(r[here], here) < LONGEST
+
+
 def test_heavy_tails_are_found_and_the_score_is_of_unit_variance() -> None:
     r, steps = made("heavy", rho=0.6)
     noise = fit_noise(r, Past(steps, 1))

@@ -29,7 +29,8 @@ ALTERNATIONS = 6
 """Between the weights of the samples and the level, at most."""
 SETTLED = 0.01
 """Log likelihood: less is no gain."""
-FEW = 20
+LOSS = 0.02
+"""Of the prediction, at most: what p coefficients lose that are fitted to samples with a whole past, p for each of those."""
 NEAR = 0.9999
 """Partial correlation, at most."""
 PIECE, PIECES = 600, 64
@@ -48,8 +49,6 @@ def memory_order(residual: FloatArray, slots: NDArray[np.int64]) -> int:
     .. math:: \kappa_p = \frac{c_p - \sum_k a_k c_{p-k}}{v_{p-1}}, \qquad v_p = v_{p-1} (1 - \kappa_p^2)
     """
     n = len(residual)
-    if n < 4 * FEW:
-        return 1
     scale = 1.4826 * np.median(np.abs(residual)) + 1e-12
     r = np.clip(residual, -6.0 * scale, 6.0 * scale)
     c = np.array([_product(r, slots, k) for k in range(LONGEST + 1)])
@@ -58,7 +57,8 @@ def memory_order(residual: FloatArray, slots: NDArray[np.int64]) -> int:
         kappa = np.clip((c[p] - a @ c[p - 1 : 0 : -1]) / v, -NEAR, NEAR)
         a, v = np.append(a - kappa * a[::-1], kappa), v * (1.0 - kappa**2)
         costs[p] = n * np.log(v) + 2.0 * p
-    return min(ORDERS, key=lambda p: costs[p])
+    told = [p for p in ORDERS if p <= LOSS * np.count_nonzero(slots[p:] - slots[:-p] == p)]
+    return min(told, key=lambda p: costs[p], default=1)
 
 
 def _product(r: FloatArray, slots: NDArray[np.int64], lag: int) -> float:
