@@ -57,6 +57,10 @@ FOREIGN: dict[str, Effect] = {
     "perming": sensor.perming,
     "staircase": sensor.staircase,
     "swell": surroundings.swell,
+    "cargo": vehicle.cargo,
+    "contact": vehicle.contact,
+    "strobe": vehicle.strobe,
+    "storm": surroundings.storm,
 }
 """Effects that the contract has no name for."""
 

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sitl.inject.scene import Generator, Scene, direction
-from sitl.signals import autoregressive
+from sitl.signals import autoregressive, first_order
 from sitl.world import dipole_field, to_local
 
 Array = NDArray[np.float64]
@@ -81,3 +81,21 @@ def swell(scene: Scene, size: float, rng: Generator) -> None:
     phase = omega * scene.t - wave * (north * np.cos(course) + east * np.sin(course))
     moved = groups[:, 0] * np.cos(phase) + groups[:, 1] * np.sin(phase)
     scene.earth = scene.earth + size * np.outer(np.exp(-wave * track.depth) * moved, [0.6, 0.2, 0.77])
+
+
+def storm(scene: Scene, size: float, rng: Generator) -> None:
+    """A magnetic storm: the wind's shock, then a ring current that it feeds by fits and starts (Burton et al. 1975); size in nT."""
+    t0 = rng.uniform(0.1, 0.4) * scene.t[-1]
+    since = scene.t - t0
+    after = since > rng.uniform(900.0, 3600.0)
+    south = np.repeat(rng.normal(0.6, 0.8, 60), len(since) // 60 + 1)[
+        : len(since)
+    ]  # a new wind every few minutes
+    ring = (
+        7.7
+        * 3600.0
+        * first_order(np.where(after, np.maximum(south, 0.0), 0.0), scene.track.step, 7.7 * 3600.0)
+    )
+    shock = np.where(since > 0.0, 1.0 - np.exp(-np.maximum(since, 0.0) / 120.0), 0.0)
+    total = ring / max(float(ring.max()), 1e-9) - rng.uniform(0.15, 0.35) * shock
+    scene.earth = scene.earth + size * np.outer(total, [-0.5, 0.05, 0.45])

@@ -141,3 +141,43 @@ def thermostat(scene: Scene, size: float, rng: Generator) -> None:
         warm += scene.track.step / lag * (water - warm + 30.0 * heats)
         on[k] = heats
     scene.field = scene.field + size * direction(rng) * on[:, None]
+
+
+def cargo(scene: Scene, size: float, rng: Generator) -> None:
+    """Iron in a sling stays below when the hull rolls, but its bearing rubs; the Earth's field is induced in it; size in nT."""
+    roll, rubs, held = scene.track.roll, rng.uniform(1.0, 3.0), 0.0
+    hung = np.empty_like(roll)
+    for k, angle in enumerate(roll):
+        held = min(max(held, angle - rubs), angle + rubs)
+        hung[k] = held
+    hung = first_order(hung, scene.track.step, 4.0)
+    arm, place = np.array([0.0, 0.0, 0.3]), np.array([-0.6, 0.0, 0.05]) + 0.1 * rng.normal(size=3)
+    turn = rotation(hung, np.zeros_like(hung), np.zeros_like(hung))
+    away, rest = -(place + turn.apply(arm, inverse=True)), -(place + arm)
+    own = turn.apply(direction(rng), inverse=True) + 0.5 * scene.field / np.linalg.norm(scene.field[0])
+    moved = dipole_field(away, own) - dipole_field(np.broadcast_to(rest, own.shape), own)
+    scene.field = scene.field + size * moved / np.linalg.norm(moved, axis=1).max()
+
+
+def contact(scene: Scene, size: float, rng: Generator) -> None:
+    """A corroded joint that pressure closes leads part of a motor's current through the hull, each time another part; size in nT/A."""
+    name = str(rng.choice(["amps_a", "amps_b"]))
+    closes = rng.uniform(0.25, 0.6) * scene.track.depth.max()
+    shut, part, leads = False, 0.0, np.empty(len(scene.t))
+    for k, depth in enumerate(scene.track.depth):
+        if shut != (depth > closes + (-8.0 if shut else 8.0)):
+            shut, part = not shut, float(rng.lognormal(0.0, 0.4))
+        leads[k] = part * shut
+    scene.field = scene.field + size * direction(rng) * (leads * scene.logged[name][0])[:, None]
+
+
+def strobe(scene: Scene, size: float, rng: Generator) -> None:
+    """A payload that nothing logs works a part of each cycle, and its clock slows as its cells run down; size in nT."""
+    along = scene.t / scene.t[-1]
+    slower = rng.uniform(0.15, 0.4) * along**2 + 0.01 * autoregressive(
+        rng, (len(along),), 1.0, 900.0 / scene.track.step
+    )
+    turns = np.cumsum(1.0 - slower) * scene.track.step / rng.uniform(60.0, 240.0)
+    on = (turns % 1.0 < rng.uniform(0.1, 0.4)).astype(float)
+    drawn = first_order(on, scene.track.step, 2.0) * (1.0 - 0.15 * along)
+    scene.field = scene.field + size * direction(rng) * drawn[:, None]
