@@ -11,7 +11,8 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from magbridge.errors import FormatError
-from magbridge.field.igrf import igrf
+from magbridge.field.declination import with_true_heading
+from magbridge.field.earth import wrap
 from sitl.scenario import Scenario
 from sitl.trajectory import Track
 from sitl.twin import FINE_STEP, Twin
@@ -68,7 +69,7 @@ def where(log: xr.Dataset, scenario: Scenario) -> Scenario:
     place = msgspec.structs.replace(
         scenario.world,
         latitude=float(np.nanmedian(latitude)),
-        longitude=(float(np.nanmedian(longitude)) + 180) % 360 - 180,
+        longitude=wrap(float(np.nanmedian(longitude))),
     )
     start = datetime.fromtimestamp(float(log["time"][0]), UTC)
     return msgspec.structs.replace(scenario, world=place, start=start)
@@ -76,6 +77,7 @@ def where(log: xr.Dataset, scenario: Scenario) -> Scenario:
 
 def read_track(log: xr.Dataset, scenario: Scenario, channels: Sequence[str]) -> tuple[Track, Array]:
     """Return a log's track with these `channels` on a uniform grid, and the log's times in s after its start."""
+    log = with_true_heading(log)
     time = log["time"].to_numpy().astype(np.float64)
     if len(time) < 2:
         raise FormatError(_source(log), "at least two rows")
@@ -89,20 +91,15 @@ def read_track(log: xr.Dataset, scenario: Scenario, channels: Sequence[str]) -> 
         known = np.isfinite(value)
         return np.interp(grid, when[known], value[known])
 
-    latitude, longitude, depth = column("latitude"), column("longitude"), column("depth")
-    heading = column("heading")
-    if log.attrs.get("heading_reference") == "magnetic":
-        field = igrf((longitude + 180) % 360 - 180, latitude, depth, time[0] + grid)
-        heading = heading + np.degrees(np.arctan2(field[:, 1], field[:, 0]))
     track = Track(
         start=float(time[0]),
         step=step,
-        latitude=latitude,
-        longitude=(longitude + 180) % 360 - 180,
-        depth=depth,
+        latitude=column("latitude"),
+        longitude=wrap(column("longitude")),
+        depth=column("depth"),
         roll=column("roll"),
         pitch=column("pitch"),
-        heading=heading,
+        heading=column("heading"),
         parameters={name: column(name) for name in channels},
         water=column("water_temperature") if "water_temperature" in log else None,
     )

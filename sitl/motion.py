@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import xarray as xr
 
+from magbridge.field.earth import separation
 from magbridge.navigate.batch import MOTIONS, first_position, motion_of
-from sitl.world import to_local
 
 __all__ = ["with_motion"]
 
@@ -43,7 +43,7 @@ def with_motion(deployment: xr.Dataset) -> xr.Dataset:
     elif motion in ("inertial", "position"):
         latitude, longitude = columns
         known = np.flatnonzero(np.isfinite(latitude + longitude))[0]
-        local = list(to_local(latitude, longitude, (float(latitude[known]), float(longitude[known]))))
+        local = list(separation(float(latitude[known]), float(longitude[known]), latitude, longitude))
     else:
         return deployment
     return deployment.assign(local_north=("time", local[0]), local_east=("time", local[1]))

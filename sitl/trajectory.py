@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from magbridge.config import NotNegative, Positive, Table
 from magbridge.errors import OutOfRange
+from magbridge.field.earth import offset
 from sitl.mission import LIMITS, Leg, Limit
 from sitl.signals import autoregressive, first_order
-from sitl.world import from_local
 
 __all__ = ["Motion", "Track", "fly"]
 
@@ -152,7 +152,7 @@ def fly(
     ahead = motion.speed * np.cos(path)
     north = np.cumsum(ahead * np.cos(np.radians(heading)) + motion.current[0]) * step
     east = np.cumsum(ahead * np.sin(np.radians(heading)) + motion.current[1]) * step
-    latitude, longitude = from_local(north, east, start[1:])
+    latitude, longitude = offset(*start[1:], north, east)
     names = dict.fromkeys((*limits, *(name for leg in legs for name in leg.parameters)))
     return Track(
         start=start[0],

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from magbridge.calibration.file import load as load_calibration
 from magbridge.errors import WrongUse
+from magbridge.field.earth import offset, separation
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.igrf import total_field
 from sitl.columns import dataset
@@ -23,7 +24,7 @@ from sitl.instrument import rotation
 from sitl.platform import Calibrated, Vehicle, draw_vehicle
 from sitl.scenario import Scenario
 from sitl.trajectory import Track, fly
-from sitl.world import World, from_local, to_local
+from sitl.world import World
 
 __all__ = ["Twin", "simulate"]
 
@@ -167,10 +168,10 @@ class Twin:
         for name in ("roll", "pitch"):
             seen[name] = true[name] + rng.normal(0, settings.roll_pitch_sigma, len(when))
         seen["heading"] = (true["heading"] + rng.normal(0, settings.heading_sigma, len(when))) % 360
-        north, east = to_local(true["latitude"], true["longitude"], self.world.origin)
+        north, east = separation(*self.world.origin, true["latitude"], true["longitude"])
         current = rng.normal(0, settings.drift, 2)
-        seen["latitude"], seen["longitude"] = from_local(
-            north - current[0] * when, east - current[1] * when, self.world.origin
+        seen["latitude"], seen["longitude"] = offset(
+            *self.world.origin, north - current[0] * when, east - current[1] * when
         )
         return seen
 

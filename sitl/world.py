@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magbridge.config import Table
-from magbridge.field.earth import metres_per_degree
+from magbridge.field.earth import offset, separation
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.igrf import igrf, total_field
 
-__all__ = ["Geology", "Rock", "Water", "World", "dipole_field", "from_local", "to_local"]
+__all__ = ["Geology", "Rock", "Water", "World", "dipole_field"]
 
 Array = NDArray[np.float64]
 
@@ -45,18 +45,6 @@ def dipole_field(r: Array, m: Array) -> Array:
     r2 = np.sum(r * r, axis=-1, keepdims=True)
     mr = np.sum(m * r, axis=-1, keepdims=True)
     return np.asarray(MU_0_OVER_4_PI * (3 * mr * r / r2 - m) / (r2 * np.sqrt(r2)))
-
-
-def to_local(latitude: Array, longitude: Array, origin: tuple[float, float]) -> tuple[Array, Array]:
-    """Return metres (north, east) of `origin` (latitude, longitude in deg), on the plane that touches it."""
-    north, east = metres_per_degree(origin[0])
-    return (latitude - origin[0]) * north, ((longitude - origin[1] + 180) % 360 - 180) * east
-
-
-def from_local(north: Array, east: Array, origin: tuple[float, float]) -> tuple[Array, Array]:
-    """Return latitude and longitude (deg, -180 to 180); the inverse of :func:`to_local`."""
-    per_latitude, per_longitude = metres_per_degree(origin[0])
-    return origin[0] + north / per_latitude, (origin[1] + east / per_longitude + 180) % 360 - 180
 
 
 class Geology(Table, frozen=True):
@@ -179,7 +167,7 @@ class World:
 
     def field(self, time: Array, latitude: Array, longitude: Array, depth: Array) -> Array:
         """Return the field (n, 3) in nT, north-east-down, at times (s since 1970) and positions (deg, deg, m)."""
-        north, east = to_local(latitude, longitude, self.origin)
+        north, east = separation(*self.origin, latitude, longitude)
         return igrf(longitude, latitude, depth, time) + self.rock.field(np.column_stack([north, east, depth]))
 
     def anomaly_map(
@@ -197,7 +185,7 @@ class World:
             m above the surface; half the side of the square; between nodes.
         """
         side = np.arange(-extent, extent + spacing / 2, spacing)
-        latitude, longitude = from_local(side, side, self.origin)
+        latitude, longitude = offset(*self.origin, side, side)
         lat, lon = (a.ravel() for a in np.meshgrid(latitude, longitude, indexing="ij"))
         when, high = np.full(lat.shape, time), np.full(lat.shape, -altitude)
         total = np.linalg.norm(self.field(when, lat, lon, high), axis=1)

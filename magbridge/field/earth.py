@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from math import cos, pi, sin, sqrt
-from typing import TypeVar, overload
+from typing import Any, TypeVar, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,7 @@ ACROSS = EQUATORIAL_RADIUS * RADIAN  # m per degree of longitude, divided by w
 ALONG = ACROSS * (1.0 - ECCENTRICITY_SQUARED)  # m per degree of latitude, divided by w³
 
 Array = NDArray[np.float64]
-Angle = TypeVar("Angle", float, Array)
+Number = TypeVar("Number", float, Array)
 
 
 @overload
@@ -40,8 +40,8 @@ def metres_per_degree(latitude: float | Array) -> tuple[float | Array, float | A
     return ALONG / w_squared**1.5, ACROSS * np.cos(phi) / np.sqrt(w_squared)
 
 
-def offset(latitude: float, longitude: float, north: float, east: float) -> tuple[float, float]:
-    """Return (latitude, longitude) `north` and `east` metres from a position; longitude in -180..180.
+def offset(latitude: float, longitude: float, north: Number, east: Number) -> tuple[Number, Number]:
+    """Return (latitude, longitude) `north` and `east` metres from a position, one or many; longitude in -180..180.
 
     Both radii are those at the position one starts from, so :func:`separation` is its exact inverse;
     over 20 km at 60 degrees that bends an east-west line by 50 m at most.
@@ -50,17 +50,23 @@ def offset(latitude: float, longitude: float, north: float, east: float) -> tupl
     return latitude + north / per_latitude, wrap(longitude + east / per_longitude)
 
 
+@overload
 def separation(
     latitude: float, longitude: float, to_latitude: float, to_longitude: float
-) -> tuple[float, float]:
-    """Return metres (north, east) from one position to another; inverse of :func:`offset`."""
+) -> tuple[float, float]: ...
+@overload
+def separation(
+    latitude: float | Array, longitude: float | Array, to_latitude: Array, to_longitude: Array
+) -> tuple[Array, Array]: ...
+def separation(latitude: Any, longitude: Any, to_latitude: Any, to_longitude: Any) -> tuple[Any, Any]:
+    """Return metres (north, east) from one position to another, from one to many, or pair by pair.
+
+    The inverse of :func:`offset`.
+    """
     per_latitude, per_longitude = metres_per_degree(latitude)
-    return (
-        (to_latitude - latitude) * per_latitude,
-        wrap(to_longitude - longitude) * per_longitude,
-    )
+    return (to_latitude - latitude) * per_latitude, wrap(to_longitude - longitude) * per_longitude
 
 
-def wrap(degrees: Angle) -> Angle:
+def wrap(degrees: Number) -> Number:
     """Return an angle, or an array of them, in -180..180 deg."""
     return (degrees + 180.0) % 360.0 - 180.0

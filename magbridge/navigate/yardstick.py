@@ -8,7 +8,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from magbridge.field.earth import metres_per_degree, wrap
+from magbridge.field.earth import separation
 
 __all__ = ["YARDSTICKS", "errors", "with_errors", "yardstick"]
 
@@ -47,12 +47,8 @@ def with_errors(result: xr.Dataset, truth: xr.Dataset | None) -> xr.Dataset:
     longitude = np.interp(time, known, np.unwrap(truth["longitude"].to_numpy(), period=360.0))
     added = {}
     for prefix in ("", "smoothed_"):
-        north, east = _separations(
-            latitude,
-            longitude,
-            result[f"{prefix}latitude"].to_numpy(),
-            result[f"{prefix}longitude"].to_numpy(),
-        )
+        there = (result[f"{prefix}{name}"].to_numpy() for name in ("latitude", "longitude"))
+        north, east = separation(latitude, longitude, *there)
         added[f"{prefix}error_north"] = np.where(near, north, np.nan)
         added[f"{prefix}error_east"] = np.where(near, east, np.nan)
     named = {
@@ -69,10 +65,3 @@ def errors(result: xr.Dataset) -> tuple[xr.DataArray, xr.DataArray]:
         return nobody, nobody
     north, east = result["error_north"], result["error_east"]
     return (north**2 + east**2) ** 0.5, ((north - result["north"]) ** 2 + (east - result["east"]) ** 2) ** 0.5
-
-
-def _separations(
-    latitude: Floats, longitude: Floats, to_latitude: Floats, to_longitude: Floats
-) -> tuple[Floats, Floats]:
-    per_latitude, per_longitude = metres_per_degree(np.asarray(latitude, np.float64))
-    return (to_latitude - latitude) * per_latitude, wrap(to_longitude - longitude) * per_longitude

@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from magbridge.field.earth import separation
 from sitl.inject.scene import Generator, Scene, direction
 from sitl.signals import autoregressive, first_order
-from sitl.world import dipole_field, to_local
+from sitl.world import dipole_field
 
 Array = NDArray[np.float64]
 
@@ -26,7 +27,7 @@ def bad_map(scene: Scene, size: float, rng: Generator) -> None:
     """The map lacks some bodies: bumps a kilometre or so across; size in nT."""
     seen = scene.track.at(scene.when)
     origin = float(scene.track.latitude[0]), float(scene.track.longitude[0])
-    north, east = to_local(seen["latitude"], seen["longitude"], origin)
+    north, east = separation(*origin, seen["latitude"], seen["longitude"])
     width = 0.35 * max(np.ptp(north), np.ptp(east))
     for _ in range(3):
         k = rng.integers(len(north))
@@ -76,7 +77,7 @@ def swell(scene: Scene, size: float, rng: Generator) -> None:
     wave = omega**2 / 9.81
     origin = float(track.latitude[0]), float(track.longitude[0])
     course = rng.uniform(0.0, 2 * np.pi)
-    north, east = to_local(track.latitude, track.longitude, origin)
+    north, east = separation(*origin, track.latitude, track.longitude)
     groups = autoregressive(rng, (len(scene.t), 2), 1.0, rng.uniform(100.0, 300.0) / track.step)
     phase = omega * scene.t - wave * (north * np.cos(course) + east * np.sin(course))
     moved = groups[:, 0] * np.cos(phase) + groups[:, 1] * np.sin(phase)

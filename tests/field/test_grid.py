@@ -152,3 +152,7 @@ def test_offset_and_separation_are_inverse():
     there = offset(60.0, 179.9, 12_000.0, 15_000.0)
     assert there[1] < -179
     assert separation(60.0, 179.9, *there) == pytest.approx((12_000.0, 15_000.0), abs=1e-6)
+    north, east = np.array([12_000.0, -3e4]), np.array([15_000.0, -2e4])
+    many = offset(60.0, 179.9, north, east)
+    assert (many[0][0], many[1][0]) == there
+    np.testing.assert_allclose(separation(60.0, 179.9, *many), [north, east], atol=1e-6)

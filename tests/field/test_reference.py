@@ -7,11 +7,11 @@ import pytest
 import xarray as xr
 
 from magbridge.errors import FormatError, OutOfRange
+from magbridge.field.earth import offset
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.igrf import total_field
 from magbridge.field.reference import positions, reference_field
 from sitl import Twin, load
-from sitl.world import from_local
 
 TIME = 1386201600.0 + np.arange(6.0)
 
@@ -35,7 +35,7 @@ def test_a_map_flown_above_is_continued_to_the_depth():
     flown = twin.anomaly_map()
     unknown = AnomalyGrid(flown.longitude, flown.latitude, flown.anomaly)
     time, depth = TIME[0] + np.arange(300.0), rng.uniform(0.0, 140.0, 300)
-    latitude, longitude = from_local(*rng.uniform(-4_000.0, 4_000.0, (2, 300)), twin.world.origin)
+    latitude, longitude = offset(*twin.world.origin, *rng.uniform(-4_000.0, 4_000.0, (2, 300)))
     truth = np.linalg.norm(twin.world.field(time, latitude, longitude, depth), axis=1)
     columns = {"latitude": latitude, "longitude": longitude, "depth": depth}
     there = xr.Dataset({name: ("time", values) for name, values in columns.items()}, {"time": time})

@@ -14,6 +14,7 @@ from magbridge.calibration.file import save
 from magbridge.calibration.model import Noise, identity
 from magbridge.config import load as load_config
 from magbridge.errors import DataError, FormatError, PortError, WrongUse
+from magbridge.field.earth import offset
 from magbridge.logs import read, write
 from magbridge.mavlink import Codec
 from sitl import Twin, load, segments, simulate
@@ -23,7 +24,6 @@ from sitl.motion import with_motion
 from sitl.own_log import Recorded, is_own_log
 from sitl.rehearsal import bridge_toml, short_names
 from sitl.replay import replay, tell
-from sitl.world import from_local
 
 
 @pytest.fixture(scope="module")
@@ -138,7 +138,7 @@ def test_a_velocity_is_told_as_a_track() -> None:
     """Its integral: the same, to what trapezoids lose, as the track it was taken from."""
     time = np.arange(0.0, 400.0, 4.0)
     north, east = 200 * np.sin(time / 100), 150 * np.cos(time / 80)
-    place = from_local(north, east, (49.5, -57.9))
+    place = offset(49.5, -57.9, north, east)
     columns = dict(zip(("latitude", "longitude"), (("time", angle) for angle in place), strict=True))
     log = xr.Dataset(columns, {"time": time})
     rates = {

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from magbridge.errors import OutOfRange
+from magbridge.field.earth import separation
 from sitl.mission import LIMITS, TABLE_1, CrissCross, Leg, Legs, Run, Spirals
 from sitl.trajectory import Motion, Track, fly
-from sitl.world import to_local
 
 START = (1386763200.0, 49.52, -57.87)
 CALM = Motion(wander=(0.0, 0.0, 0.0))
@@ -28,7 +28,7 @@ def test_a_leg_settles_on_what_was_commanded() -> None:
 def test_a_clockwise_spiral_turns_to_starboard_and_ends_where_it_began() -> None:
     track = fly_legs(Leg(duration=900, pitch=-20, turn=0.8))
     assert track.heading[-1] - track.heading[0] == pytest.approx(720, rel=0.03)
-    north, east = to_local(track.latitude, track.longitude, START[1:])
+    north, east = separation(*START[1:], track.latitude, track.longitude)
     assert np.hypot(north, east).max() < 2.2 * 0.35 / np.radians(0.8)  # the diameter of the turn
     assert east[100:200].mean() > 0
 
@@ -47,7 +47,7 @@ def test_a_current_carries_the_vehicle() -> None:
         fly_legs(Leg(duration=600, pitch=-26)),
         fly_legs(Leg(duration=600, pitch=-26), motion=drift),
     )
-    north, east = to_local(carried.latitude, carried.longitude, (still.latitude[-1], still.longitude[-1]))
+    north, east = separation(still.latitude[-1], still.longitude[-1], carried.latitude, carried.longitude)
     assert (north[-1], east[-1]) == pytest.approx((60, -120), abs=0.5)
 
 
@@ -103,7 +103,7 @@ def test_the_survey_goes_out_and_comes_back() -> None:
     legs = CrissCross(hours=6.0).legs(np.random.default_rng(1), GLIDER)
     assert sum(leg.duration for leg in legs) == 6 * 3600
     track = fly(legs, START, 1.0, np.random.default_rng(2))
-    north, east = to_local(track.latitude, track.longitude, START[1:])
+    north, east = separation(*START[1:], track.latitude, track.longitude)
     away = np.hypot(north, east)
     assert away.max() > 1500
     assert away[-1] < 0.4 * away.max()

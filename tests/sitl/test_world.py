@@ -4,7 +4,7 @@ import choclo
 import numpy as np
 import pytest
 
-from sitl.world import Geology, Rock, Water, World, dipole_field, from_local, to_local
+from sitl.world import Geology, Rock, Water, World, dipole_field
 
 MAIN = np.array([17000.0, -6000.0, 49600.0])
 WINTER = 1386763200.0  # s, 2013-12-11T12:00Z
@@ -74,16 +74,6 @@ def test_without_rock_there_is_only_the_main_field() -> None:
     field = world.field(np.full(2, WINTER), np.array([49.52, 49.53]), np.full(2, -57.87), np.zeros(2))
     assert 52_500 < np.linalg.norm(field[0]) < 53_200  # nT, ppigrf: 52 880
     np.testing.assert_allclose(world.anomaly_map(WINTER, 90.0, 500.0, 250.0).anomaly, 0.0, atol=1e-9)
-
-
-def test_local_metres_and_back_across_the_antimeridian() -> None:
-    origin = (-17.0, 179.99)
-    latitude, longitude = np.array([-17.01, -16.9]), np.array([-179.98, 179.9])
-    north, east = to_local(latitude, longitude, origin)
-    assert east[0] == pytest.approx(0.03 * 111_320 * np.cos(np.radians(17)), rel=1e-3)
-    back = from_local(north, east, origin)
-    np.testing.assert_allclose(back[0], latitude)
-    np.testing.assert_allclose((back[1] + 180) % 360 - 180, longitude)
 
 
 def test_water_has_two_layers() -> None:

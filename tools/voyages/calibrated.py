@@ -11,9 +11,9 @@ from msgspec.structs import replace as with_options
 from magbridge.calibration.fitting.data import observations
 from magbridge.calibration.fitting.fit import fit
 from magbridge.correction import Correction, correct_rows
+from magbridge.field.earth import separation
 from magbridge.navigate.model import informed
 from sitl import load, segments, simulate
-from sitl.world import to_local
 from voyages.sail import GLIDER, PLACE, Map, Score, adrift, sail, synthetic
 
 METHODS = {"nominal": {"axes_fixed": True, "equal_xz": True}, "cubic": {}, "auto": {}}
@@ -33,7 +33,7 @@ def flown(kinds: tuple[Map, ...], seed: int) -> dict[tuple[int, str], Flown]:
     """Return how one glider navigates on each map (by its number) with each calibration, all else the same."""
     parts = segments(simulate(load("random_glider"), seed))
     runs, survey = at_rest(parts["calibration"], MASSES), parts["survey"]
-    places = to_local(*(survey[f"truth_{name}"].to_numpy() for name in ("latitude", "longitude")), PLACE)
+    places = separation(*PLACE, *(survey[f"truth_{name}"].to_numpy() for name in ("latitude", "longitude")))
     every = float(survey["time"][1] - survey["time"][0])
     velocity = np.gradient(np.column_stack(places), every, axis=0)
     found = {}
