@@ -68,8 +68,9 @@ def _warmed(
 def temperature_offset(problem: Problem) -> list[Candidate]:
     """Core and electronics have an offset that follows temperature: ``T += b (theta_2 - theta_0)``.
 
-    Through the hull's store of heat: ``dtheta_1/dt = 2 (theta - theta_1) / lag``, ``dtheta_2/dt = 2 (theta_1 - theta_2) / lag``. Typically 0.1 nT/degC for a good fluxgate, several for a low-power
-    one (Primdahl 1979, J. Phys. E 12:241). Separated from depth by the thermal hysteresis of dive and climb.
+    Through the hull's store of heat: ``dtheta_1/dt = 2 (theta - theta_1) / lag``, ``dtheta_2/dt = 2 (theta_1 - theta_2) / lag``.
+    Typically 0.1 nT/degC for a good fluxgate, several for a low-power one (Primdahl 1979, J. Phys. E 12:241). Separated from
+    depth by the thermal hysteresis of dive and climb.
     """
     return _thermal(problem, "offset")
 
