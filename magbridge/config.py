@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 import re
 import tomllib
+from collections.abc import Mapping
 from math import inf, isfinite
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -26,6 +27,7 @@ __all__ = [
     "Navigation",
     "Sensor",
     "Telemetry",
+    "check_entries",
     "convert",
     "load",
     "load_toml",
@@ -230,11 +232,8 @@ def load(path: str | Path) -> Config:
     for reserved in ("path", "digest"):
         if reserved in table:
             raise ConfigError(path, reserved, "unknown key")
-    # msgspec does not name the key of a dict, so each entry is checked under its own name first
-    for section, kind in (("telemetry", Telemetry), ("publish", Rate)):
-        entries = table.get(section)
-        for name, value in entries.items() if isinstance(entries, dict) else ():
-            convert(value, kind, path, f"{section}.{name}.")
+    check_entries(table, "telemetry", Telemetry, path)
+    check_entries(table, "publish", Rate, path)
     config = msgspec.structs.replace(
         convert(table, Config, path), path=path, digest=hashlib.sha256(path.read_bytes()).hexdigest()[:16]
     )
@@ -257,6 +256,19 @@ def load_toml(path: str | Path) -> dict[str, Any]:
         raise ConfigError(path, "", error.strerror or str(error)) from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ConfigError(path, "", f"not TOML: {error}") from error
+
+
+def check_entries(table: Mapping[str, Any], key: str, kind: Any, path: str | Path, prefix: str = "") -> None:
+    """Check each entry of the table `key` under its own name, which :func:`convert` of the whole does not tell.
+
+    Raises
+    ------
+    ConfigError
+        As :func:`convert`.
+    """
+    entries = table.get(key)
+    for name, value in entries.items() if isinstance(entries, dict) else ():
+        convert(value, kind, path, f"{prefix}{key}.{name}.")
 
 
 def convert(table: Any, kind: type[T], path: str | Path, prefix: str = "") -> T:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import msgspec
 from msgspec import Meta
 
-from magbridge.config import NotNegative, Table, convert, load_toml
+from magbridge.config import NotNegative, Table, check_entries, convert, load_toml
 from magbridge.errors import ConfigError
 from sitl.instrument import Instrument
 from sitl.mission import LIMITS, Limit, Part
@@ -114,10 +114,9 @@ def load(path: str | Path) -> Scenario:
             raise ConfigError(path, "", f"expected a scenario file (.toml), or one of {', '.join(known)}")
         path = known[str(path)]
     table = load_toml(path)
-    # msgspec does not name the key of a dict, so each entry is checked under its own name first
     vehicle = table.get("vehicle")
-    _check_entries(vehicle if isinstance(vehicle, dict) else {}, "mass", Mass, path, "vehicle.")
-    _check_entries(table, "limits", Limit, path)
+    check_entries(vehicle if isinstance(vehicle, dict) else {}, "mass", Mass, path, "vehicle.")
+    check_entries(table, "limits", Limit, path)
     scenario = convert(table, Scenario, path)
     for name in scenario.masses:
         if name not in MOUNTINGS:
@@ -128,9 +127,3 @@ def load(path: str | Path) -> Scenario:
     if not calibration.is_file():
         raise ConfigError(path, "calibration", f"no such file: {calibration}")
     return msgspec.structs.replace(scenario, calibration=str(calibration))
-
-
-def _check_entries(table: dict[str, Any], key: str, kind: type, path: Path, prefix: str = "") -> None:
-    entries = table.get(key)
-    for name, value in entries.items() if isinstance(entries, dict) else ():
-        convert(value, kind, path, f"{prefix}{key}.{name}.")

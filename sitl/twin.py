@@ -76,7 +76,13 @@ class Twin:
         return cls(scenario, seed, world, vehicle)
 
     def fly(self) -> Track:
-        """Fly the scenario's mission."""
+        """Fly the scenario's mission.
+
+        Raises
+        ------
+        WrongUse
+            It has none.
+        """
         rng = _stream(self.seed, 2)
         limits = self.scenario.all_limits
         legs = [leg for part in self.scenario.mission for leg in part.legs(rng, limits)]

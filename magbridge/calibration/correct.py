@@ -184,6 +184,11 @@ def correct(
     Returns
     -------
     CorrectedArrays
+
+    Raises
+    ------
+    CalibrationError
+        Another number of columns than the calibration's channels.
     """
     field = np.asarray(field, float)
     n = len(field)

@@ -41,7 +41,7 @@ def metres_per_degree(latitude: float | Array) -> tuple[float | Array, float | A
 
 
 def offset(latitude: float, longitude: float, north: Number, east: Number) -> tuple[Number, Number]:
-    """Return (latitude, longitude) `north` and `east` metres from a position, one or many; longitude in -180..180.
+    """Return (latitude, longitude) `north` and `east` m from a position in deg, one or many; longitude in -180..180.
 
     Both radii are those at the position one starts from, so :func:`separation` is its exact inverse;
     over 20 km at 60 degrees that bends an east-west line by 50 m at most.
@@ -59,7 +59,7 @@ def separation(
     latitude: float | Array, longitude: float | Array, to_latitude: Array, to_longitude: Array
 ) -> tuple[Array, Array]: ...
 def separation(latitude: Any, longitude: Any, to_latitude: Any, to_longitude: Any) -> tuple[Any, Any]:
-    """Return metres (north, east) from one position to another, from one to many, or pair by pair.
+    """Return m (north, east) from one position (deg) to another, from one to many, or pair by pair.
 
     The inverse of :func:`offset`.
     """

@@ -253,7 +253,13 @@ class AnomalyGrid:
         return sqrt(2.0) * self.rms / slope if self.rms > FLAT else inf
 
     def save(self, path: str | Path) -> None:
-        """Write the grid as CF netCDF, which :func:`~magbridge.field.read.read_grid` and GMT read."""
+        """Write the grid as CF netCDF, which :func:`~magbridge.field.read.read_grid` and GMT read.
+
+        Raises
+        ------
+        WriteError
+            The file cannot be written; it is as it was before.
+        """
         import xarray as xr  # noqa: PLC0415  the live path runs without xarray
 
         axes = {

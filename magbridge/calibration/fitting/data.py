@@ -128,7 +128,13 @@ class Observations:
         return steps
 
     def ranges(self) -> tuple[Parameter, ...]:
-        """Return the parameters with the range seen, scaled to [-1, 1]."""
+        """Return the parameters with the range seen, scaled to [-1, 1].
+
+        Raises
+        ------
+        CalibrationError
+            A parameter that never moves.
+        """
         found = []
         for name, unit, column in zip(self.names, self.units, self.parameters.T, strict=True):
             low, high = float(column.min()), float(column.max())

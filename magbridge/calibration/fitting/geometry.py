@@ -11,7 +11,6 @@ that no place is held more certain than `at_sigma`.
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -27,7 +26,8 @@ from magbridge.calibration.dipole import dipole_columns, expand_dipole
 from magbridge.calibration.fitting.prior import FACTOR_MASS, Structure, gain_rotation
 from magbridge.calibration.model import Parameter
 from magbridge.calibration.terms import Exponents
-from magbridge.errors import CalibrationError, ConfigError
+from magbridge.config import check_entries, convert, load_toml
+from magbridge.errors import CalibrationError
 
 __all__ = ["Mounting", "mounted_structure", "read_vehicle"]
 
@@ -71,16 +71,9 @@ def read_vehicle(path: str | Path) -> dict[str, Mounting]:
     ConfigError
         The file, a key or a type is not as expected.
     """
-    try:
-        content = tomllib.loads(Path(path).read_text(encoding="utf-8"))
-        return msgspec.convert(content, _VehicleFile).mass
-    except OSError as problem:
-        raise ConfigError(path, "", f"cannot be read: {problem.strerror}") from problem
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as problem:
-        raise ConfigError(path, "", f"not TOML: {problem}") from problem
-    except msgspec.ValidationError as problem:
-        text, _, where = str(problem).partition(" - at ")
-        raise ConfigError(path, where.strip("`").removeprefix("$."), text) from problem
+    table = load_toml(path)
+    check_entries(table, "mass", Mounting, path)
+    return convert(table, _VehicleFile, path).mass
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,6 +107,16 @@ def mounted_structure(
     vehicle: Mapping[str, Mounting | Mapping[str, Any]],
 ) -> Structure:
     """Add dipoles where `vehicle` has masses to the free polynomials.
+
+    Parameters
+    ----------
+    free : Structure
+        Of :func:`~magbridge.calibration.fitting.prior.free_structure`.
+    exponents : tuple of tuple of int
+        Its monomials.
+    parameters : tuple of Parameter
+    vehicle : mapping of Mounting (or of its fields)
+        By parameter.
 
     Raises
     ------

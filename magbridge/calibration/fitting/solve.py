@@ -122,7 +122,13 @@ def _solve(precision: FloatArray, gradient: FloatArray) -> FloatArray:
 
 
 def covariance_of(precision: FloatArray) -> FloatArray:
-    """Inverse of a positive definite precision, symmetric to the last bit."""
+    """Inverse of a positive definite precision, symmetric to the last bit.
+
+    Raises
+    ------
+    CalibrationError
+        The precision leaves a combination free.
+    """
     scale = np.sqrt(np.diag(precision))
     try:
         factor, lower = cho_factor(precision / np.outer(scale, scale), lower=True)

@@ -58,7 +58,17 @@ class Plan:
 def expected_calibration(
     parameters: tuple[Parameter, ...], field: float, order: int = 3, noise: float = 1.0
 ) -> Calibration:
-    """Return what is known of a vehicle before its first run: nothing but the physical widths."""
+    """Return what is known of a vehicle before its first run: nothing but the physical widths.
+
+    Parameters
+    ----------
+    parameters : tuple of Parameter
+        What moves, with the ranges to be seen.
+    field, noise : float
+        nT, the field where runs are flown, and a sample's noise.
+    order : int
+        Highest total degree.
+    """
     exponents = full_order(len(parameters), order)
     structure = free_structure(exponents, tuple(p.name for p in parameters), field)
     E = structure.E * structure.widths(structure.centre)
