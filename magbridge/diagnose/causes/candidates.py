@@ -49,8 +49,8 @@ class Candidate:
     parts : tuple of Candidate
         Those that it was put together from, one after the other.
     spectra : (l, k) array or None
-        Where its numbers have one common free size (:mod:`~magbridge.diagnose.inference.statistic`): their prior variances, in units of the widths
-        squared and up to a common factor; each is tried.
+        Where its numbers have one common free size (:mod:`~magbridge.diagnose.inference.statistic`): their prior variances, in
+        units of the widths squared and up to a common factor; each is tried.
     """
 
     cause: str

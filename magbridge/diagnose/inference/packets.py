@@ -6,14 +6,14 @@ A packet is a wave along the field under a Gaussian, with an amplitude and a pha
 
 .. math:: e^{-(t - t_0)^2 / 2 (Q P)^2} \left(a \cos \tfrac{2 \pi (t - t_0)}{P} + b \sin \tfrac{2 \pi (t - t_0)}{P}\right)
 
-Its moment t_0 is as likely as any other; its period P and its cycles Q are uniform in their logarithms. With g the score of each single
-sample and h its information at that frequency, the likelihood ratio of a and b is ``R = |B|^2 / S``,
+Its moment t_0 is as likely as any other; its period P and its cycles Q are uniform in their logarithms. With g the score of
+each single sample and h its information at that frequency, the likelihood ratio of a and b is ``R = |B|^2 / S``,
 
 .. math:: B(t_0) = \sum_t g_t e^{-(t - t_0)^2 / 2 (Q P)^2 + 2 \pi i (t - t_0) / P}, \qquad
           S(t_0) = \tfrac12 \sum_t h_t e^{-(t - t_0)^2 / (Q P)^2}
 
-so all moments are two convolutions, over intervals: those without a sample have g = h = 0. A packet is worth its place if the evidence, averaged over all places that it could have had, is
-above one.
+so all moments are two convolutions, over intervals: those without a sample have g = h = 0. A packet is worth its place if the
+evidence, averaged over all places that it could have had, is above one.
 """
 
 from __future__ import annotations
