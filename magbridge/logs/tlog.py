@@ -17,22 +17,20 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
-from struct import Struct
 from threading import Event, Thread
 from types import TracebackType
 from typing import Self
 
 from magbridge.config import Telemetry
 from magbridge.errors import PortError
-from magbridge.mavlink import Codec
+from magbridge.mavlink import Codec, pack_record
 from magbridge.records import Channel
 
-__all__ = ["STAMP", "TlogWriter", "declarations"]
+__all__ = ["TlogWriter", "declarations"]
 
 Record = tuple[int, int, bytes]
 """µs of the event, channel, frame."""
 
-STAMP = Struct(">Q")
 WINDOW = 0.005
 """s between two writes: up to 200 events a second each is written at once, and ``kill -9`` costs at most the last
 one; above that, those of 5 ms. Latency does not know the difference; the writing thread takes 66 us a sample at
@@ -242,9 +240,7 @@ class TlogWriter:
 
 
 def _packed(records: Sequence[Record]) -> bytes:
-    stamp = STAMP.pack
-    parts = [part for time_us, channel, frame in records for part in (stamp(time_us | channel), frame)]
-    return b"".join(parts)
+    return b"".join([pack_record(*record) for record in records])
 
 
 def declarations(system: int, component: int, telemetry: Mapping[str, Telemetry]) -> list[bytes]:
