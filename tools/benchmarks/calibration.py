@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import subprocess
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -12,6 +9,7 @@ from statistics import median
 
 import msgspec
 import numpy as np
+from benchmarks.apart import apart
 from benchmarks.row import Row
 from scipy.optimize import least_squares
 from threadpoolctl import threadpool_limits
@@ -54,13 +52,7 @@ def fitting(folder: Path, repetitions: int) -> list[Row]:  # noqa: ARG001  (the 
                     lambda: least_squares(lambda c: residuals_of(samples, c), np.zeros(90), method="lm")
                 )
             )
-    place = str(Path(__file__).parents[1])
-    large = []
-    for count in LARGE:
-        command = [sys.executable, "-c", IN_ANOTHER, str(count)]
-        done = subprocess.run(command, cwd=place, capture_output=True, text=True, check=True)
-        large.append(json.loads(done.stdout))
-    (few, _), (all_, memory) = large
+    (few, _), (all_, memory) = (apart(IN_ANOTHER, count) for count in LARGE)
     return [
         Row(f"auto, {len(data)} samples, 2 masses, one core", median(ours), "s", most=1.0),
         Row("the same by scipy, finite differences, no hyperparameters", median(theirs), "s", median(ours), "auto",

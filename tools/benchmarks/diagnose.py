@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import json
-import subprocess
-import sys
 from pathlib import Path
-from typing import Any
 
 import msgspec
 import numpy as np
 import xarray as xr
+from benchmarks.apart import apart
 from benchmarks.row import Row
 
 from magbridge.calibration.fitting.data import observations
@@ -42,7 +39,8 @@ print(json.dumps([time.monotonic() - begun, time.process_time() - used, len(foun
 def diagnosing(folder: Path, repetitions: int) -> list[Row]:  # noqa: ARG001  (others write there and repeat)
     """Time `diagnose` without its figures: 12 h and 30 days, plain and with an effect."""
     night, found, month, loud = (
-        _in_another(size, count) for size, count in ((0.0, 0), (NIGHTLY, 0), (0.0, MONTH), (MONTHLY, MONTH))
+        apart(IN_ANOTHER, 12, count, size)
+        for size, count in ((0.0, 0), (NIGHTLY, 0), (0.0, MONTH), (MONTHLY, MONTH))
     )
     detail = {name: [run[k] for run in (night, found, month, loud)]
               for k, name in enumerate(("seconds", "processor seconds", "samples", "verdict", "causes", "MB"))}  # fmt: skip
@@ -57,13 +55,6 @@ def diagnosing(folder: Path, repetitions: int) -> list[Row]:  # noqa: ARG001  (o
         Row("memory of that", loud[5], "MB", most=2000.0),
         Row("processor time grows as samples to the power of", slope, ""),
     ]  # fmt: skip
-
-
-def _in_another(size: float, count: int) -> Any:
-    command = [sys.executable, "-c", IN_ANOTHER, "12", str(count), str(size)]
-    place = str(Path(__file__).parents[1])
-    done = subprocess.run(command, cwd=place, capture_output=True, text=True, check=True)
-    return json.loads(done.stdout)
 
 
 def long_survey(hours: float, count: int = 0, size: float = 0.0) -> tuple[xr.Dataset, Calibration]:
