@@ -32,7 +32,10 @@ BRANCH = 3
 
 
 def unmodelled_actuator(problem: Problem) -> list[Candidate]:
-    """Something else that moves carries iron: ``T += G(r(p)) m``, to third order in p (see :mod:`~.calibration.dipole`)."""
+    """Something else that moves carries iron: ``T += G(r(p)) m``, to third order in p.
+
+    See :mod:`~magbridge.calibration.dipole`.
+    """
     made = []
     for name in channels_of(problem, "position"):
         low, high = extent(problem, name)

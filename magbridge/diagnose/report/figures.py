@@ -23,6 +23,8 @@ FloatArray = NDArray[np.float64]
 BEFORE, AFTER, INK, FAINT = "#c8553d", "#1f6f8b", "#22303c", "#9aa5b1"
 POINTS = 4000
 """Points drawn of a curve; more only make the page heavy."""
+GAP = 20.0
+"""Usual steps between two points that no line joins any more."""
 MANY = 60
 """Dives that are not parted by lines any more."""
 
@@ -48,9 +50,13 @@ def _thin(n: int) -> slice:
     return slice(None, None, max(1, n // POINTS))
 
 
-def _hours(diagnosis: Diagnosis) -> FloatArray:
-    t = diagnosis.problem.survey.time
-    return np.asarray((t - t[0]) / 3600.0)
+def _curves(diagnosis: Diagnosis, *values: FloatArray) -> tuple[FloatArray, ...]:
+    """Return the hours since the start and each of `values`, thinned, with no line across a gap."""
+    t, part = diagnosis.problem.survey.time, _thin(len(diagnosis.problem))
+    hours = (t[part] - t[0]) / 3600.0
+    steps = np.diff(hours)
+    gap = np.append(steps > GAP * np.median(steps), False)
+    return hours, *(np.where(gap, np.nan, value[part]) for value in values)
 
 
 def _sides(diagnosis: Diagnosis) -> dict[str, tuple[FloatArray, str]]:
@@ -76,24 +82,24 @@ def label(cause: str, channel: str | None) -> str:
 
 def measured(diagnosis: Diagnosis) -> str:
     """Draw the total field measured and simulated, and their difference before and after, over time."""
-    hours, survey, part = _hours(diagnosis), diagnosis.problem.survey, _thin(len(diagnosis.problem))
+    survey, part = diagnosis.problem.survey, _thin(len(diagnosis.problem))
     figure, axes = _figure(10, 5.2, 2, 1, sharex=True, height_ratios=[1, 1.5])
     top, low = axes[:, 0]
-    gap = np.append(np.diff(survey.time) > 20.0 * np.median(np.diff(survey.time)), False)
-    total = np.where(gap, np.nan, survey.reference + diagnosis.before)  # no line across a gap
-    top.plot(hours[part], total[part], color=BEFORE, linewidth=0.7, label="measured, corrected as calibrated")
-    top.plot(hours[part], survey.reference[part], color=INK, linewidth=1.0, label="simulated (reference)")
+    hours, total, reference, stated = _curves(
+        diagnosis, survey.reference + diagnosis.before, survey.reference, 2.0 * _stated(diagnosis)
+    )
+    top.plot(hours, total, color=BEFORE, linewidth=0.7, label="measured, corrected as calibrated")
+    top.plot(hours, reference, color=INK, linewidth=1.0, label="simulated (reference)")
     top.set_ylabel("total field (nT)", fontsize=9)
-    ends = np.nanquantile(np.append(total, survey.reference), [0.002, 0.998])
+    ends = np.nanquantile(np.append(total, reference), [0.002, 0.998])
     top.set_ylim(ends[0] - 0.1 * np.ptp(ends), ends[1] + 0.35 * np.ptp(ends))
     ends = np.zeros(2)
     for name, (left, colour) in _sides(diagnosis).items():
-        low.plot(hours[part], left[part], ".", color=colour, markersize=2, label=name)
+        low.plot(hours, left[part], ".", color=colour, markersize=2, label=name)
         some = np.quantile(left, [0.002, 0.998])
         ends = np.array([min(ends[0], some[0]), max(ends[1], some[1])])
-    stated = 2.0 * _stated(diagnosis)[part]
     low.fill_between(
-        hours[part],
+        hours,
         -stated,
         stated,
         color=FAINT,
@@ -223,7 +229,6 @@ def terms(diagnosis: Diagnosis) -> str | None:
     """Draw what each found cause adds to the total field, over time."""
     if not diagnosis.named:
         return None
-    hours, part = _hours(diagnosis), _thin(len(diagnosis.problem))
     figure, axes = _figure(10, 1.9 * len(diagnosis.named), len(diagnosis.named), 1, sharex=True)
     at = 0
     for axis, hypothesis in zip(axes[:, 0], diagnosis.named, strict=True):
@@ -231,7 +236,7 @@ def terms(diagnosis: Diagnosis) -> str | None:
         own = diagnosis.fit.coefficients[at : at + candidate.size]
         at += candidate.size
         share = candidate.columns(slice(0, len(diagnosis.problem))) @ own
-        axis.plot(hours[part], share[part], color=AFTER, linewidth=0.8)
+        axis.plot(*_curves(diagnosis, share), color=AFTER, linewidth=0.8)
         axis.set_ylabel("nT", fontsize=8)
         axis.set_title(label(candidate.cause, candidate.channel), fontsize=9, loc="left")
     axes[-1, 0].set_xlabel("hours since the start", fontsize=9)

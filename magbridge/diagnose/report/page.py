@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from html import escape
 from inspect import getdoc
+from math import floor, isfinite, log10
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -107,15 +108,15 @@ def _verdict(diagnosis: Diagnosis) -> str:
     if diagnosis.wrong is not None:
         causes.append(f"<b>outliers</b> ({diagnosis.wrong.rows.size} wrong samples)")
     gained = (
-        f"On dives left out, {total.before:.3g} nT RMS became {total.after:.3g} nT (ratio {total.ratio:.2f}, 95 % interval "
+        f"On dives left out, {_number(total.before)} nT RMS became {_number(total.after)} nT (ratio {total.ratio:.2f}, 95 % interval "
         f"{total.interval[0]:.2f} to {total.interval[1]:.2f})."
     )
     return {
-        "nothing_found": f"Nothing was found: {total.before:.3g} nT RMS cannot be told from noise ({np.std(diagnosis.fit.left):.3g} nT) "
+        "nothing_found": f"Nothing was found: {_number(total.before)} nT RMS cannot be told from noise ({_number(float(np.std(diagnosis.fit.left)))} nT) "
         "and what the calibration states it may be off by.",
         "explained": f"Found: {', '.join(causes)}. {gained} Nothing else stands out of the noise.",
         "partly_explained": f"Found: {', '.join(causes)}. {gained} Something else is left that no cause explains.",
-        "unexplained": f"Something is there ({total.before:.3g} nT RMS), but none of the known causes explains it.",
+        "unexplained": f"Something is there ({_number(total.before)} nT RMS), but none of the known causes explains it.",
     }[diagnosis.verdict]
 
 
@@ -128,8 +129,9 @@ def _found(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> list[str]:
         candidate = hypothesis.candidate
         numbers = parameters(diagnosis, hypothesis, at)
         rows = "".join(
-            f'<tr><td>{escape(name)}</td><td class="n">{value["value"]:.4g}</td>'
-            f'<td class="n">{"" if value["sigma"] is None else "± {:.2g}".format(value["sigma"])}</td><td>{escape(value["unit"])}</td></tr>'
+            f'<tr><td>{escape(name)}</td><td class="n">{_measured(value["value"], value["sigma"])}</td>'
+            f'<td class="n">{"± " + _measured(value["sigma"], value["sigma"]) if value["sigma"] else ""}</td>'
+            f"<td>{escape(value['unit'])}</td></tr>"
             for name, value in numbers.items()
         )
         at += candidate.size
@@ -209,6 +211,19 @@ def _physics(cause: Cause) -> str:
     return "".join(f"<code>{part}</code>" if k % 2 else part for k, part in enumerate(parts))
 
 
+def _number(value: float, digits: int = 3) -> str:
+    """Write a number to so many digits, as people do: 1070, not 1.07e+03."""
+    return f"{float(f'{value:.{digits}g}'):g}"
+
+
+def _measured(value: float, sigma: float | None) -> str:
+    """Write a number to the second digit of its sigma."""
+    if not sigma or not isfinite(sigma):
+        return _number(value, 4)
+    places = 1 - floor(log10(sigma))
+    return f"{round(value, places):.{max(places, 0)}f}"
+
+
 def _chance(p_value: float) -> str:
     return f"{p_value:.1g}" if p_value > 1e-99 else "below 1e-99"
 
@@ -223,9 +238,9 @@ def _left(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> str:
     rest, noise = diagnosis.unexplained, diagnosis.fit.noise
     tails = "Gaussian" if noise.nu > 1e5 else f"tails like Student's t with {noise.nu:g} degrees of freedom"
     model = (
-        f"The noise that remains: {float(np.median(noise.scale)):.3g} nT a sample, {tails}; by its memory, {len(noise.scale)} "
+        f"The noise that remains: {_number(float(np.median(noise.scale)))} nT a sample, {tails}; by its memory, {len(noise.scale)} "
         f"samples say as much of a constant as {noise.independent:.0f} independent ones. The calibration stated "
-        f"{diagnosis.problem.calibration.noise.sensor:.3g} nT."
+        f"{_number(diagnosis.problem.calibration.noise.sensor)} nT."
     )
     if rest is None:
         return f"<p>No structure is left that a slow curve, steps or a function of attitude would find. {model}</p>"
@@ -242,7 +257,7 @@ def _left(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> str:
 
 def _sizes(sizes: Mapping[str, tuple[float, str]]) -> str:
     listed = [
-        f"{escape(name)} {size:.3g} {escape(unit)}"
+        f"{escape(name)} {_number(size)} {escape(unit)}"
         for name, (size, unit) in sizes.items()
         if np.isfinite(size)
     ]
