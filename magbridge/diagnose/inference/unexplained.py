@@ -148,8 +148,9 @@ def accept(problem: Problem, outcome: Outcome, tone: Candidate | None) -> tuple[
     """Say whether the names stand, and what is left beside them or, if they do not, at all.
 
     Names and a free description of the whole have equal odds, and pay for what they were chosen from; what a name's regressor
-    may miss is forgiven. If more is left beside them than an idealised regressor leaves, and of another sort than they are,
-    the burden of proof is theirs: they and what is left must beat it 20:1.
+    may miss is forgiven, and what it did leave, told by a description beside it, is counted with it. If more is left than an
+    idealised regressor leaves, and of another sort than the names are, the burden of proof is theirs: they and what is left must
+    beat it 20:1.
 
     Names that a description beats by less than 20:1 are not asserted, nor are they ruled out.
     """
@@ -157,14 +158,15 @@ def accept(problem: Problem, outcome: Outcome, tone: Candidate | None) -> tuple[
     rest = leftover(problem, model, outcome.fit, outcome.order, tone)
     if not model:
         return False, rest
+    remnant = 0.0
     if rest is not None and rest.signal_to_noise < REMNANT * max(h.signal_to_noise for h in outcome.chosen):
-        rest = None
+        remnant, rest = rest.among, None
     other = None if rest is None or _same(outcome.chosen, rest) else rest
     # what holds the names' own regressors and finds nothing else beside them is no other explanation
     free = leftover(problem, [], outcome.null, outcome.order, tone, but=() if other else model)
     ratio = 2.0 * (outcome.fit.log_likelihood - outcome.null.log_likelihood)
     names = worth(ratio, model, outcome.trials) - float(np.log(len(outcome.trials)))
-    names += other.among if other else slack(ratio)
+    names += other.among if other else max(slack(ratio), remnant)
     if free is None or names - (ODDS if other else 0.0) >= free.among:
         return True, rest
     return False, free._replace(within=tuple(_within(outcome, free.among - names)))
