@@ -2,13 +2,32 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import wraps
+from weakref import WeakKeyDictionary
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-__all__ = ["lagged", "play", "powers"]
+from magbridge.diagnose.compare.problem import Problem
+
+__all__ = ["lagged", "once", "play", "powers"]
 
 FloatArray = NDArray[np.float64]
+
+
+def once(regressor: Callable[[Problem], FloatArray]) -> Callable[[Problem], FloatArray]:
+    """Evaluate a regressor once for a problem: of a month it is 50 MB, and causes share it."""
+    known: WeakKeyDictionary[Problem, FloatArray] = WeakKeyDictionary()
+
+    @wraps(regressor)
+    def of(problem: Problem) -> FloatArray:
+        if problem not in known:
+            known[problem] = regressor(problem)
+        return known[problem]
+
+    return of
 
 
 def lagged(time: FloatArray, values: FloatArray, lag: float, stages: int = 1) -> FloatArray:

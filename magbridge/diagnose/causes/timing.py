@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from magbridge.calibration.followers import ClockEffect
 from magbridge.calibration.instrument import RateEffect
 from magbridge.diagnose.causes.candidates import AXES, Candidate, of_effect
+from magbridge.diagnose.causes.regressors import once
 from magbridge.diagnose.compare.problem import Problem
 
 __all__ = ["channel_skew", "clock_offset", "eddy_current", "field_rates", "filter_lag", "mass_rates"]
@@ -20,6 +21,7 @@ MOMENT = 0.01
 """s by which masses are moved on and back, to see what the coefficients do."""
 
 
+@once
 def field_rates(problem: Problem) -> FloatArray:
     r"""(3, n) dH_r/dt, nT/s, by differences both ways.
 
@@ -41,6 +43,7 @@ def field_rates(problem: Problem) -> FloatArray:
     return out
 
 
+@once
 def mass_rates(problem: Problem) -> FloatArray:
     """(9, n) rates of the nine coefficients as the masses move, each mass at the larger of its speeds before and after.
 
