@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from magbridge.config import NotNegative, Positive, Table
 from magbridge.errors import OutOfRange
-from magbridge.field.earth import offset
+from magbridge.field.earth import offset, separation
 from sitl.mission import LIMITS, Leg, Limit
 from sitl.signals import autoregressive, first_order
 
@@ -99,6 +99,10 @@ class Track:
         columns = {name: getattr(self, name) for name in names} | self.parameters
         elapsed = self.elapsed
         return {name: np.interp(when, elapsed, column) for name, column in columns.items()}
+
+    def local(self, latitude: Array, longitude: Array) -> tuple[Array, Array]:
+        """Return places (deg) as metres north and east of where the track begins."""
+        return separation(float(self.latitude[0]), float(self.longitude[0]), latitude, longitude)
 
 
 def fly(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from magbridge.field.earth import separation
 from sitl.inject.scene import Generator, Scene, direction
 from sitl.signals import autoregressive, first_order
 from sitl.world import dipole_field
@@ -26,8 +25,7 @@ def ionosphere(scene: Scene, size: float, rng: Generator) -> None:
 def bad_map(scene: Scene, size: float, rng: Generator) -> None:
     """The map lacks some bodies: bumps a kilometre or so across; size in nT."""
     seen = scene.track.at(scene.when)
-    origin = float(scene.track.latitude[0]), float(scene.track.longitude[0])
-    north, east = separation(*origin, seen["latitude"], seen["longitude"])
+    north, east = scene.track.local(seen["latitude"], seen["longitude"])
     width = 0.35 * max(np.ptp(north), np.ptp(east))
     for _ in range(3):
         k = rng.integers(len(north))
@@ -75,9 +73,8 @@ def swell(scene: Scene, size: float, rng: Generator) -> None:
     """Sea water that a swell moves through the Earth's field, the less the deeper (Weaver 1965); size in nT at the surface."""
     track, omega = scene.track, 2 * np.pi / rng.uniform(11.0, 17.0)
     wave = omega**2 / 9.81
-    origin = float(track.latitude[0]), float(track.longitude[0])
     course = rng.uniform(0.0, 2 * np.pi)
-    north, east = separation(*origin, track.latitude, track.longitude)
+    north, east = track.local(track.latitude, track.longitude)
     groups = autoregressive(rng, (len(scene.t), 2), 1.0, rng.uniform(100.0, 300.0) / track.step)
     phase = omega * scene.t - wave * (north * np.cos(course) + east * np.sin(course))
     moved = groups[:, 0] * np.cos(phase) + groups[:, 1] * np.sin(phase)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 from magbridge.diagnose.causes import CAUSES
-from magbridge.diagnose.report.page import _measured, _number, _physics
+from magbridge.diagnose.causes.candidates import Candidate
+from magbridge.diagnose.report.page import IMPLAUSIBLE, _implausible, _measured, _number, _physics
 
 
 @pytest.mark.parametrize("cause", CAUSES)
@@ -37,3 +39,10 @@ def test_a_number_is_written_to_two_digits_of_its_sigma(value: float, sigma: flo
 )
 def test_a_size_is_written_without_an_exponent(value: float, told: str) -> None:
     assert _number(value) == told
+
+
+def test_a_cause_that_is_larger_than_such_causes_are_is_doubted() -> None:
+    """A constant of 360 nT where main-field models are 30 nT off."""
+    bias = Candidate("reference_bias", None, lambda _: np.ones((1, 1)), np.array([30.0]), ("bias",), ("nT",))
+    assert "12 times" in _implausible(bias, np.array([-12.0]))
+    assert not _implausible(bias, np.array([0.99 * IMPLAUSIBLE]))

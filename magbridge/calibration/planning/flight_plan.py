@@ -52,10 +52,10 @@ def flight_plan(
     if field_ned is None:
         raise CalibrationError("the mission needs latitude and longitude, to know the Earth's field there")
     total = np.linalg.norm(field_ned, axis=1)
-    flat = ("time", np.zeros(mission.sizes["time"]))
+    some = ("time", np.ones(mission.sizes["time"]))  # readings that nobody looks at; zeros would be none
     names = tuple(parameter.name for parameter in calibration.parameters)
     data = observations(
-        mission.assign({f"mag_{axis}": flat for axis in "xyz"}).drop_vars("reference_field", errors="ignore"),
+        mission.assign({f"mag_{axis}": some for axis in "xyz"}).drop_vars("reference_field", errors="ignore"),
         names,
         reference=lambda _: (total, field_ned, "IGRF"),
     )

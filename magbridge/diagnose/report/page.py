@@ -10,6 +10,7 @@ from math import floor, isfinite, log10
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from magbridge.diagnose.report import figures
 from magbridge.diagnose.report.findings import parameters, told
@@ -34,6 +35,8 @@ td.n{text-align:right;font-variant-numeric:tabular-nums}.verdict{font-size:1.1re
 """
 MANY = 24
 """Numbers that a table lists openly."""
+IMPLAUSIBLE = 5.0
+"""Times its plausible size: a cause that is larger is doubted."""
 KINDS = {
     "switching": "An offset that switches",
     "drift": "A slow drift",
@@ -134,7 +137,7 @@ def _found(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> list[str]:
             f"<td>{escape(value['unit'])}</td></tr>"
             for name, value in numbers.items()
         )
-        at += candidate.size
+        start, at = at - len(diagnosis.problem.centre), at + candidate.size
         doubt = (
             f"<p>The data cannot tell it from {_listed(rivals)} (odds below 20:1). What would: {escape(causes[candidate.cause].separated_by)}.</p>"
             if rivals
@@ -153,7 +156,8 @@ def _found(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> list[str]:
                 len(numbers),
             ),
             _several(candidate.names),
-            _in_motion(diagnosis, at - candidate.size - len(diagnosis.problem.centre), candidate),
+            _implausible(candidate, diagnosis.fit.coefficients[start : start + candidate.size]),
+            _in_motion(diagnosis, start, candidate),
             doubt
             + f"<p>In a log like this one, theory gives it a chance of {100 * told(diagnosis, hypothesis):.0f} % to be named alone.</p>",
             _no_gain(gain),
@@ -184,6 +188,17 @@ def _several(names: tuple[str, ...]) -> str:
     if not any(name.endswith(")") for name in names):
         return ""
     return '<p class="faint">A number in brackets: the cause took more than one such term to describe; they act together.</p>'
+
+
+def _implausible(candidate: Candidate, b: NDArray[np.float64]) -> str:
+    """Say so when a cause is larger than such causes are: two that cancel each other grow together."""
+    times = float(np.abs(b).max())
+    if candidate.spectra is not None or times < IMPLAUSIBLE:
+        return ""
+    return (
+        f"<p>This is {_number(times, 2)} times what such a cause usually amounts to. Two causes that cancel each other can grow like "
+        "that: hold the extended field against another reference before it is flown.</p>"
+    )
 
 
 def _in_motion(diagnosis: Diagnosis, at: int, candidate: Candidate) -> str:
