@@ -7,15 +7,11 @@ import os
 import pty
 import resource
 import select
-import signal
-import subprocess
-import sys
 import time
 from pathlib import Path
 
 import numpy as np
 import pytest
-import xarray as xr
 
 from magbridge.calibration.file import load as load_calibration
 from magbridge.calibration.file import save as save_calibration
@@ -244,40 +240,6 @@ def test_a_full_disk_gets_one_line_and_leaves_nothing(
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert line.startswith(f"{tmp_path / f'x{suffix}'}: cannot be written: ")
     assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, -signal.SIGTERM)])
-def test_stopped_in_the_middle_leaves_nothing(
-    deployment: Path, tmp_path: Path, number: signal.Signals, code: int
-) -> None:
-    rows = read(deployment)[
-        [f"mag_{axis}" for axis in "xyz"]
-    ]  # their own times would not be the rows' any more
-    long = [rows.assign_coords(time=rows["time"] + 1e5 * k) for k in range(20)]
-    write(xr.concat(long, "time"), tmp_path / "long.nc")
-    command = [sys.executable, "-m", "magbridge", "convert", "long.nc", "-o", "x.csv"]
-    with subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True) as process:
-        assert process.stderr
-        while not any(path.stat().st_size for path in tmp_path.glob(".x.*.partial.csv")):
-            assert process.poll() is None
-            time.sleep(0.01)
-        process.send_signal(number)
-        said = process.stderr.read()
-    assert process.returncode == code
-    assert said == ("magbridge: interrupted\n" if number == signal.SIGINT else "")
-    assert [path.name for path in tmp_path.iterdir()] == ["long.nc"]
-
-
-def test_interrupted_while_libraries_are_loaded(tmp_path: Path) -> None:
-    (tmp_path / "cyclopts.py").write_text("import signal; signal.raise_signal(signal.SIGINT)")
-    ended = subprocess.run(
-        [sys.executable, "-m", "magbridge", "--version"],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert (ended.returncode, ended.stderr, ended.stdout) == (130, "magbridge: interrupted\n", "")
 
 
 @pytest.mark.parametrize(
