@@ -10,7 +10,10 @@ from pathlib import Path
 
 from magbridge.errors import MagbridgeError, WriteError
 
-__all__ = ["atomic_path"]
+__all__ = ["atomic_path", "systems_reason"]
+
+ROOM = 1 << 20
+"""Bytes, more than a library writes at a time."""
 
 
 @contextmanager
@@ -39,6 +42,26 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     finally:
         with suppress(OSError):  # it was renamed, or never made
             beside.unlink()
+
+
+@contextmanager
+def systems_reason(path: Path) -> Iterator[None]:
+    """Raise the system's own reason where a library that writes to `path` fails.
+
+    netCDF keeps it to itself: a full disk is 'HDF error' to it, or 'Permission denied'. So one more piece is written
+    to what is spoilt already, and the system asked.
+
+    Raises
+    ------
+    OSError
+        The file cannot be written, and why.
+    """
+    try:
+        yield
+    except (OSError, RuntimeError) as error:
+        with path.open("ab") as file:
+            file.write(bytes(ROOM))
+        raise OSError(str(error)) from error
 
 
 def _clear(target: Path) -> None:

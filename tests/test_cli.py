@@ -209,6 +209,7 @@ def test_correct_gives_the_same_in_pieces(deployment: Path, calibration: Path, t
         (["replay", "{d}", "--log", "/proc/self/new"], 2, "The folder /proc/self cannot be written to"),
         (["demo", "--out", "/proc/self/new/demo"], 2, "The folder /proc/self cannot be written to"),
         (["simulate", "demo", "-o", "x.nc", "--seed", "-1"], 2, "--seed"),
+        (["simulate", "demo", "-o", "x.nc", "--seed", "1.5"], 2, "--seed: expected a whole number, not 1.5"),
         (["replay", "{d}", "--config", "none.toml"], 2, "none.toml: No such file"),
         (["demo", "--out", "/dev/null/demo"], 1, "/dev/null/demo: Not a directory"),
     ],
@@ -228,17 +229,20 @@ def test_bad_input_gets_one_line_and_leaves_nothing(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize("room", [0, 20_000])
 @pytest.mark.parametrize("suffix", [".csv", ".nc", ".parquet", ".tlog"])
 def test_a_full_disk_gets_one_line_and_leaves_nothing(
-    suffix: str, deployment: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    suffix: str, room: int, deployment: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    """The limit of a file's size stands for the disk's end: the reason told is the system's own."""
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, limits[1]))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (room, limits[1]))
     try:
         line = complaint(capsys, "convert", deployment, "-o", tmp_path / f"x{suffix}", code=1)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert line.startswith(f"{tmp_path / f'x{suffix}'}: cannot be written: ")
+    assert line.endswith("File too large")
     assert list(tmp_path.iterdir()) == []
 
 

@@ -1,7 +1,8 @@
-"""A command that is told to end: one line, nothing half-written."""
+"""A command that is told to end, or whose reader has gone: one line at most, nothing half-written."""
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import sys
@@ -44,3 +45,14 @@ def test_interrupted_while_libraries_are_loaded(tmp_path: Path) -> None:
         check=False,
     )
     assert (ended.returncode, ended.stderr, ended.stdout) == (130, "magbridge: interrupted\n", "")
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["simulate", "--help"], ["--version"]])
+def test_a_reader_who_has_read_enough_is_no_error(arguments: list[str]) -> None:
+    """As ``| head -1`` is."""
+    reading, writing = os.pipe()
+    os.close(reading)
+    command = [sys.executable, "-m", "magbridge", *arguments]
+    ended = subprocess.run(command, stdout=writing, stderr=subprocess.PIPE, check=False)
+    os.close(writing)
+    assert (ended.returncode, ended.stderr) == (0, b"")

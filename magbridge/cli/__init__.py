@@ -61,6 +61,9 @@ def main(arguments: list[str] | None = None) -> int:
     except _Terminated:
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
         signal.raise_signal(signal.SIGTERM)
+    except SystemExit as end:  # what rich makes of a reader that has gone, while it prints the help
+        if not isinstance(end.__context__, BrokenPipeError):
+            raise
     return 0
 
 

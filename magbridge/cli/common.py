@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from hashlib import file_digest
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import msgspec
-from cyclopts import App, Parameter
+from cyclopts import App, Parameter, Token
 
 from magbridge import __version__
 from magbridge.errors import WrongUse
@@ -24,6 +24,7 @@ __all__ = [
     "Log",
     "Output",
     "Picture",
+    "Whole",
     "app",
     "complain",
     "digest",
@@ -84,12 +85,21 @@ def folder_to_write(_: Any, path: Any) -> None:
         raise ValueError(f"The folder {there} cannot be written to.")
 
 
+def _whole(_: Any, tokens: Sequence[Token]) -> int:
+    """Read a whole number; by itself the parser would round 1.5 to 2."""
+    try:
+        return int(tokens[0].value)
+    except ValueError:
+        raise ValueError(f"expected a whole number, not {tokens[0].value}.") from None
+
+
 Output = Annotated[Path, Parameter(name=["--output", "-o"], validator=file_to_write())]
 Log = Annotated[Path, Parameter(name=["--output", "-o"], validator=_log_to_write)]
 Folder = Annotated[Path, Parameter(validator=folder_to_write)]
 Grid = Annotated[Path, Parameter(name=["--output", "-o"], validator=file_to_write(".nc"))]
 Heading = Annotated[Literal["true", "magnetic"] | None, Parameter(name="--heading-reference")]
 Picture = Annotated[Path | None, Parameter(validator=file_to_write(".png", ".pdf", ".svg"))]
+Whole = Annotated[int, Parameter(converter=_whole)]
 Json = Annotated[bool, Parameter(name="--json")]
 
 

@@ -9,7 +9,7 @@ from typing import Annotated
 
 from cyclopts import Parameter, validators
 
-from magbridge.cli.common import Folder, Json, app, folder_to_write, some, tell
+from magbridge.cli.common import Folder, Json, Whole, app, folder_to_write, some, tell
 from magbridge.errors import DataError, WrongUse
 
 
@@ -17,7 +17,7 @@ from magbridge.errors import DataError, WrongUse
 def demo(
     *,
     out: Folder = Path("demo"),
-    seed: Annotated[int, Parameter(validator=validators.Number(gte=0))] = 1,
+    seed: Annotated[Whole, Parameter(validator=validators.Number(gte=0))] = 1,
     json: Json = False,
 ) -> None:
     """Do the main job end to end on a simulated glider: no hardware, no network, under a minute.
@@ -99,8 +99,8 @@ def monitor(
     /,
     *,
     host: str = "127.0.0.1",
-    port: Annotated[int, Parameter(validator=validators.Number(gte=1, lte=65535))] = 8080,
-    baudrate: Annotated[int, Parameter(validator=validators.Number(gt=0))] = 57600,
+    port: Annotated[Whole, Parameter(validator=validators.Number(gte=1, lte=65535))] = 8080,
+    baudrate: Annotated[Whole, Parameter(validator=validators.Number(gt=0))] = 57600,
     show: bool = False,
 ) -> None:
     """Serve the ground station's page: what a bridge measures and says, as it comes over MAVLink.

@@ -8,7 +8,7 @@ from typing import Any, TypeVar, overload
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["metres_per_degree", "offset", "separation", "wrap"]
+__all__ = ["metres_per_degree", "offset", "separation", "worse_axis", "wrap"]
 
 EQUATORIAL_RADIUS = 6_378_137.0  # m
 ECCENTRICITY_SQUARED = 6.694_379_990_14e-3  # both WGS84
@@ -65,6 +65,17 @@ def separation(latitude: Any, longitude: Any, to_latitude: Any, to_longitude: An
     """
     per_latitude, per_longitude = metres_per_degree(latitude)
     return (to_latitude - latitude) * per_latitude, wrap(to_longitude - longitude) * per_longitude
+
+
+def worse_axis(nn: Number, ne: Number, ee: Number) -> Number:
+    """Return a position's 1-sigma (m) along the longer axis of its ellipse; the covariance (m²) is of north and east.
+
+    Notes
+    -----
+    The larger eigenvalue is ``(P_nn + P_ee) / 2 + sqrt((P_nn - P_ee)² / 4 + P_ne²)``.
+    """
+    half: Number = 0.5 * (nn - ee)
+    return (0.5 * (nn + ee) + (half * half + ne * ne) ** 0.5) ** 0.5
 
 
 def wrap(degrees: Number) -> Number:

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from magbridge.errors import FormatError, OutOfRange
 from magbridge.field.earth import metres_per_degree
 from magbridge.field.spline import WEIGHTS, coefficients, weights
-from magbridge.files import atomic_path
+from magbridge.files import atomic_path, systems_reason
 
 __all__ = ["AnomalyGrid", "Local"]
 
@@ -279,11 +279,8 @@ class AnomalyGrid:
         if isfinite(self.altitude):
             attrs |= {"altitude": self.altitude, "altitude_units": "m above the ellipsoid"}
         packed = {name: {"zlib": True, "dtype": "float32"} for name in fields}
-        with atomic_path(path) as beside:
-            try:
-                xr.Dataset(fields, axes, attrs).to_netcdf(beside, engine="netcdf4", encoding=packed)
-            except RuntimeError as error:  # all that netCDF says when it cannot write
-                raise OSError(f"{error} (is the disk full?)") from error
+        with atomic_path(path) as beside, systems_reason(beside):
+            xr.Dataset(fields, axes, attrs).to_netcdf(beside, engine="netcdf4", encoding=packed)
 
     def __repr__(self) -> str:
         return (

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from math import isfinite, nan, sqrt
+from math import isfinite, nan
 from typing import Any, NamedTuple
 
 import msgspec
 
+from magbridge.field.earth import worse_axis
 from magbridge.link.outbox import Outbox
 
 __all__ = ["FIXES", "Fix", "Kind"]
@@ -52,11 +53,7 @@ class Fix(msgspec.Struct, frozen=True, gc=False):
     @property
     def sigma(self) -> float:
         """m, 1-sigma of the worse axis."""
-        mean, half = (
-            0.5 * (self.covariance_nn + self.covariance_ee),
-            0.5 * (self.covariance_nn - self.covariance_ee),
-        )
-        return sqrt(mean + sqrt(half * half + self.covariance_ne**2))
+        return worse_axis(self.covariance_nn, self.covariance_ne, self.covariance_ee)
 
 
 def external_position(outbox: Outbox, fix: Fix, system: int, autopilot: int) -> None:

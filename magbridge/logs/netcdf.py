@@ -14,7 +14,6 @@ OceanGliders format 1.0, https://oceangliderscommunity.github.io/OG-format-user-
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -23,6 +22,7 @@ import numpy as np
 import xarray as xr
 
 from magbridge.errors import FormatError, MissingExtra
+from magbridge.files import systems_reason
 from magbridge.logs import seaglider
 from magbridge.logs.cf import floats
 from magbridge.logs.deployment import deployment, increasing, plausible, sliced
@@ -123,13 +123,15 @@ class FileWriter:
     """Writes deployments one after the other; the columns are those of the first."""
 
     def __init__(self, path: Path) -> None:
-        self._file = netCDF4.Dataset(path, "w", format="NETCDF4")
+        self._path = path
+        with systems_reason(path):
+            self._file = netCDF4.Dataset(path, "w", format="NETCDF4")
         self._variables: dict[str, Any] = {}
         self._rows = 0
 
     def append(self, dataset: xr.Dataset, *, first: bool) -> None:
         """Write the rows, and before the first ones the definitions."""
-        with _told():
+        with systems_reason(self._path):
             if first:
                 self._define(dataset)
             n = dataset.sizes["time"]
@@ -178,17 +180,8 @@ class FileWriter:
 
     def close(self) -> None:
         """Bring everything to the file."""
-        with _told():
+        with systems_reason(self._path):
             self._file.close()
-
-
-@contextmanager
-def _told() -> Iterator[None]:
-    """Make an OSError of what the library says when it cannot write: it keeps the system's reason to itself."""
-    try:
-        yield
-    except RuntimeError as error:
-        raise OSError(f"{error} (is the disk full?)") from error
 
 
 def _iso(time: float) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from math import hypot, isfinite, nan, sqrt
 
+from magbridge.field.earth import worse_axis
 from magbridge.mavlink.dialect import MAG_LOG_STATE, MAG_NAVIGATION_STATE, MAG_PORT_STATE
 from magbridge.monitor.state import State
 
@@ -88,7 +89,7 @@ def whereabouts(state: State) -> dict[str, tuple[str, bool]]:
     get = state.navigation.get
     mode = MAG_NAVIGATION_STATE(get("state", 0))
     nn, ne, ee = (get(f"covariance_{axes}", nan) for axes in ("nn", "ne", "ee"))
-    sigma = sqrt(0.5 * (nn + ee) + hypot(0.5 * (nn - ee), ne)) if nn + ee > 0.0 else nan
+    sigma = worse_axis(nn, ne, ee) if nn + ee > 0.0 else nan
     innovation, variance = get("innovation", nan), get("innovation_variance", nan)
     return {
         "State": (mode.name.lower().replace("_", " "), mode != MAG_NAVIGATION_STATE.LOST),

@@ -8,12 +8,12 @@ Nothing is drawn at random: the same samples give the same bits. With one hypoth
 
 from __future__ import annotations
 
-from math import hypot, log, pi, sqrt
+from math import log, pi
 
 import numpy as np
 from numpy.typing import NDArray
 
-from magbridge.field.earth import metres_per_degree
+from magbridge.field.earth import metres_per_degree, worse_axis
 from magbridge.field.grid import AnomalyGrid
 from magbridge.navigate.model import N_STATES, Block
 
@@ -185,9 +185,8 @@ class Bank:
             self.resolution = max(self.finest, self.resolution / COARSER)
         if self._updates % MERGE_EVERY == 0 and len(self) > 1:
             self._merge()
-        pnn, pne, pee = self.P[0, 0], self.P[0, 1], self.P[1, 1]
-        largest = 0.5 * (pnn + pee) + np.hypot(0.5 * (pnn - pee), pne)
-        wide = (largest > (1.5 * self.resolution) ** 2) & (self.w > 1e-4)
+        width = worse_axis(self.P[0, 0], self.P[0, 1], self.P[1, 1])
+        wide = (width > 1.5 * self.resolution) & (self.w > 1e-4)
         if wide.any() and len(self) + 2 * int(wide.sum()) <= 2 * MOST:
             self._split(wide)
 
@@ -225,5 +224,5 @@ class Bank:
 
 def widest(P: Array) -> float:
     """Return the largest 1-sigma of the position, m."""
-    (a, b), (_, c) = P[:2, :2].tolist()
-    return sqrt(0.5 * (a + c) + hypot(0.5 * (a - c), b))
+    (nn, ne), (_, ee) = P[:2, :2].tolist()
+    return worse_axis(nn, ne, ee)

@@ -7,7 +7,7 @@ import pytest
 from scipy.interpolate import RectBivariateSpline
 
 from magbridge.errors import FormatError, OutOfRange
-from magbridge.field.earth import metres_per_degree, offset, separation
+from magbridge.field.earth import metres_per_degree, offset, separation, worse_axis
 from magbridge.field.grid import AnomalyGrid
 
 LON, LAT = np.linspace(10.0, 10.5, 51), np.linspace(54.0, 54.4, 41)
@@ -156,3 +156,12 @@ def test_offset_and_separation_are_inverse():
     many = offset(60.0, 179.9, north, east)
     assert (many[0][0], many[1][0]) == there
     np.testing.assert_allclose(separation(60.0, 179.9, *many), [north, east], atol=1e-6)
+
+
+def test_the_worse_axis_is_the_larger_eigenvalue():
+    roots = np.random.default_rng(3).normal(0.0, 100.0, (50, 2, 2))
+    covariances = roots @ np.swapaxes(roots, 1, 2)
+    expected = np.sqrt(np.linalg.eigvalsh(covariances)[:, 1])
+    nn, ne, ee = covariances[:, 0, 0], covariances[:, 0, 1], covariances[:, 1, 1]
+    np.testing.assert_allclose(worse_axis(nn, ne, ee), expected)
+    assert worse_axis(float(nn[0]), float(ne[0]), float(ee[0])) == pytest.approx(expected[0])
