@@ -75,7 +75,8 @@ def worse_axis(nn: Number, ne: Number, ee: Number) -> Number:
     The larger eigenvalue is ``(P_nn + P_ee) / 2 + sqrt((P_nn - P_ee)² / 4 + P_ne²)``.
     """
     half: Number = 0.5 * (nn - ee)
-    return (0.5 * (nn + ee) + (half * half + ne * ne) ** 0.5) ** 0.5
+    sigma: Number = (0.5 * (nn + ee) + (half * half + ne * ne) ** 0.5) ** 0.5
+    return sigma
 
 
 def wrap(degrees: Number) -> Number:

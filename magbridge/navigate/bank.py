@@ -225,4 +225,4 @@ class Bank:
 def widest(P: Array) -> float:
     """Return the largest 1-sigma of the position, m."""
     (nn, ne), (_, ee) = P[:2, :2].tolist()
-    return worse_axis(nn, ne, ee)
+    return float(worse_axis(nn, ne, ee))
