@@ -108,6 +108,17 @@ def test_a_rate_of_change_is_the_whole_logs_where_samples_are_lost(
     assert abs(own) < 0.05 * len(found) / whole.survey.interval
 
 
+def test_a_rate_of_change_holds_a_turn_of_a_few_samples(right: Callable[[int], Problem]) -> None:
+    """Six of them: a difference both ways lacks a sixth."""
+    whole = right(300)
+    phase = 2.0 * np.pi * np.arange(len(whole))[:, None] / 6.0 + np.arange(3.0)
+    survey = replace(whole.survey, field=2e4 * np.sin(phase))
+    expected = 2e4 * 2.0 * np.pi / 6.0 / survey.interval * np.cos(phase)
+    found = field_rates(replace(whole, survey=survey)).T
+    np.testing.assert_allclose(found[10:-10], 0.992 * expected[10:-10], rtol=0.002, atol=1.0)
+    assert not found[[0, -1]].any()
+
+
 def test_a_mass_rate_is_the_drives_speed_while_it_moves(problem: Problem) -> None:
     """A clock that is off is seen where the mass has moved before and after, and nowhere else."""
     (clock,) = CAUSES["clock_offset"].candidates(problem)

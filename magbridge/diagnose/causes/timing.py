@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
 
 from magbridge.calibration.followers import ClockEffect
 from magbridge.calibration.instrument import RateEffect
@@ -23,23 +24,25 @@ MOMENT = 0.01
 
 @once
 def field_rates(problem: Problem) -> FloatArray:
-    r"""(3, n) dH_r/dt, nT/s, by differences both ways.
+    r"""(3, n) dH_r/dt, nT/s: of the cubic spline through a leg's samples; zero at its ends.
 
     Notes
     -----
-    With the times h and k to the samples before and after
+    Of a turn of angular frequency w, sampled every h, a difference both ways holds ``sin(wh)/wh = 1 - (wh)^2/6 + ...``, and
+    its coefficient would be too large by as much; the spline ``3 sin(wh)/(wh (2 + cos(wh))) = 1 - (wh)^4/180 + ...``.
 
-    .. math:: \dot H_0 = \frac{h^2 (H_+ - H_0) + k^2 (H_0 - H_-)}{h k (h + k)}
-
-    Differences ``D e`` of noise e have the inner product :math:`E[(D e)^T \Sigma^{-1} e] = \mathrm{tr} D` with itself, whatever
-    its covariance. That of a one-sided difference would pass for an effect; here it is the sum of ``1/h - 1/k``, so nothing.
+    Rates ``D e`` of noise e have the inner product :math:`E[(D e)^T \Sigma^{-1} e] = \mathrm{tr} D` with itself, whatever its
+    covariance. That of a one-sided difference would pass for an effect; a spline has nothing, being the same backwards.
     """
     survey = problem.survey
-    H, t, follows = survey.field.T, survey.time, survey.follows(LOST)
+    H, t = survey.field.T, survey.time
     out = np.zeros_like(H)
-    at = np.flatnonzero(follows[1:-1] & follows[2:]) + 1
-    h, k = t[at] - t[at - 1], t[at + 1] - t[at]
-    out[:, at] = (h**2 * (H[:, at + 1] - H[:, at]) + k**2 * (H[:, at] - H[:, at - 1])) / (h * k * (h + k))
+    starts = np.flatnonzero(~survey.follows(LOST))
+    for start, end in zip(starts, np.append(starts[1:], len(t)), strict=True):
+        if end - start > 2:
+            for axis in range(3):  # a month's at a time
+                slopes = CubicSpline(t[start:end], H[axis, start:end]).c[2]
+                out[axis, start + 1 : end - 1] = slopes[1:]
     return out
 
 
