@@ -16,17 +16,18 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "2")
 import msgspec
 import numpy as np
 import xarray as xr
+from study.gain import corrected
+from study.stage import CHARTS
 
-from magbridge.calibration.correct import correct
 from magbridge.calibration.fitting.data import observations
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.model import Calibration
 from magbridge.diagnose.run import diagnose
-from sitl.bonne_bay import MASSES, PAPER, columns, measure
+from sitl.bonne_bay import MASSES, PAPER, measure
 from sitl.scenario import load
 from sitl.twin import Twin
 
-REFERENCES = ("true", "map at its depth", "map")
+REFERENCES = ("true", *CHARTS)
 """The field that was there; the aeromagnetic map continued down to the glider, as ``--grid`` does; as it was flown."""
 
 
@@ -40,13 +41,7 @@ def fly(seed: int, reference: str) -> dict[str, xr.Dataset]:
 
 def rms(calibration: Calibration, ds: xr.Dataset, against: str = "truth_total_field") -> float:
     """Error of the corrected total field, nT."""
-    total = correct(
-        calibration,
-        columns(ds, ("mag_x", "mag_y", "mag_z")),
-        columns(ds, calibration.channels),
-        ds["time"].to_numpy(),
-    ).total
-    return float(np.sqrt(np.mean((total - ds[against].to_numpy()) ** 2)))
+    return float(np.sqrt(np.mean((corrected(ds, calibration) - ds[against].to_numpy()) ** 2)))
 
 
 def main() -> None:

@@ -20,10 +20,11 @@ from study.draws import SHOWN, Draws, Span, evidence, weigh, with_another
 from study.nameless import against, allowed, nameless
 from study.noise import LOSSES, MEMORY, autoregression, left, whiten
 from study.rates import efficiency, share
-from study.stage import project
+from study.stage import CHARTS, charted, drawn, project
 from study.table import lines
 
 from magbridge.diagnose.inference.free import Description
+from sitl import Twin, load
 
 TOOLS = Path(__file__).parents[2] / "tools"
 
@@ -61,12 +62,40 @@ def test_what_the_losses_leave_is_what_theory_knows() -> None:
     np.testing.assert_allclose(white.T @ white, naive, rtol=1e-9)
 
 
-def test_a_quarter_of_every_part_loses_samples() -> None:
+def test_a_third_of_every_part_loses_samples() -> None:
+    """But where the vehicle surfaces in every log."""
     long = plan(2000)
     for name in PARTS:
         own = [entry["losses"] for entry in long if entry["part"] == name]
-        assert sum(map(bool, own)) == pytest.approx(len(own) / 4, abs=0.02 * len(own) + 1)
+        if name == "charted":
+            assert set(own) == {"surfacing"}
+            continue
+        assert sum(map(bool, own)) == pytest.approx(len(own) / 3, abs=0.02 * len(own) + 1)
         assert set(own) == {"", *LOSSES}
+
+
+def test_a_dive_loses_as_much_as_the_next() -> None:
+    rows = left("surfacing", 5000, 5)
+    gone = np.diff(rows)[np.diff(rows) > 1]
+    assert set(gone) == {12}
+    assert np.ptp(np.diff(np.flatnonzero(np.diff(rows) > 1))) <= 1
+    assert 15 <= len(gone) <= 100
+
+
+def test_a_map_is_off_and_less_so_at_its_depth() -> None:
+    """And what a reference was off before it still is."""
+    twin = Twin.draw(load("demo"), 3)
+    track = twin.fly()
+    ds = twin.measure(track, np.arange(0.0, track.elapsed[-1] - 1.0, 20.0))
+    shifted = ds.assign(reference_field=ds["reference_field"] - 30.0)
+    off = {}
+    for reference in CHARTS:
+        chart = drawn(twin, reference)
+        wrong = charted(ds, chart)["reference_field"] - ds["truth_total_field"]
+        again = charted(shifted, chart)["reference_field"] - ds["truth_total_field"]
+        np.testing.assert_allclose(again, wrong - 30.0, atol=1e-6)
+        off[reference] = float(np.std(wrong))
+    assert 0.5 < off["map at its depth"] < 0.6 * off["map"]
 
 
 def test_a_longer_study_holds_the_shorter_and_every_part_has_its_share() -> None:

@@ -19,9 +19,9 @@ from magbridge.diagnose.report.findings import findings
 from magbridge.diagnose.run import diagnose
 from sitl.inject import EFFECTS, FOREIGN, Hidden
 from study.both import both
-from study.gain import DELAYS, gain
-from study.noise import LOSSES, NOISES
-from study.stage import SEEDS, Found, Stall, stage_of
+from study.gain import DELAYS, gain, harm
+from study.noise import GLIDER, LOSSES, NOISES
+from study.stage import CHARTS, SEEDS, Found, Stall, stage_of
 from study.theory import Setting, ideal
 
 Row = dict[str, Any]
@@ -91,22 +91,32 @@ def _gain(k: int) -> Row:
     return {"names": (LASTING[k % len(LASTING)],), "wanted": 20.0, "noise": "white"}
 
 
+def _charted(k: int) -> Row:
+    """As the paper's log is: the reference is a map, the vehicle surfaces; in every third nothing else is wrong."""
+    names = () if k % 3 == 0 else (LASTING[k % len(LASTING)],)
+    return {
+        "names": names, "wanted": LOUD[k % len(LOUD)] * bool(names), "noise": GLIDER,
+        "reference": CHARTS[k // len(LOUD) % len(CHARTS)], "losses": "surfacing",
+    }  # fmt: skip
+
+
 PARTS: dict[str, Part] = {
-    "null": Part(0.22, _null),
+    "null": Part(0.2, _null),
     "named": Part(0.22, _named),
-    "ladder": Part(0.16, _ladder),
+    "ladder": Part(0.14, _ladder),
     "loud": Part(0.08, _loud),
     "unknown": Part(0.1, _unknown),
     "pair": Part(0.08, _pair),
     "gain": Part(0.07, _gain),
     "seen": Part(0.03, _foreign(SEEN)),
     "foreign": Part(0.04, _foreign(STRANGE)),
+    "charted": Part(0.04, _charted),
 }
 
 
 def losses(k: int) -> str:
-    """What the k-th case of a part loses: one in four does, in one way or another; the golden section keeps step with nothing."""
-    place = int(4 * len(LOSSES) * (GOLDEN * k % 1.0))
+    """What the k-th case of a part loses: one in three does, in one way or another; the golden section keeps step with nothing."""
+    place = int(3 * len(LOSSES) * (GOLDEN * k % 1.0))
     return LOSSES[place] if place < len(LOSSES) else ""
 
 
@@ -121,8 +131,9 @@ def plan(cases: int, parts: tuple[str, ...] = tuple(PARTS), seed: int = 0) -> li
         made += [
             (
                 (k + 0.5) / part.share,
-                part.entry(k)
-                | {"part": name, "number": SEEDS * seed + 100_000 * place + k, "losses": losses(k)},
+                {"losses": losses(k)}
+                | part.entry(k)
+                | {"part": name, "number": SEEDS * seed + 100_000 * place + k},
             )
             for k in range(count)
         ]
@@ -133,12 +144,13 @@ def case(entry: Row) -> Row:
     """Hide, diagnose, and say what came out, with what theory says of it."""
     began = time.process_time()
     number, noise, names, without = entry["number"], entry["noise"], entry["names"], entry.get("without", "")
-    stall = Stall.of(stage_of(number, noise), number, noise, entry["losses"])
+    stage = stage_of(number, noise, entry.get("reference", "true"))
+    stall = Stall.of(stage, number, noise, entry["losses"])
     hidden = [stall.hide(name, entry["wanted"], number + 7919 * k) for k, name in enumerate(names)]
     whole = hidden[0].ds if len(hidden) == 1 else stall.measure(*(one.hidden for one in hidden))
     ds = stall.log(whole)
     table = {name: cause for name, cause in CAUSES.items() if name != without}
-    result = diagnose([ds], stall.stage.calibration, causes=table)
+    result = diagnose([ds], stage.calibration, learned_from=stage.learned, causes=table)
     found = findings(result, table)
     row = entry | {
         "sizes": [one.hidden.size for one in hidden], "verdict": found["verdict"], "unexplained": found["unexplained"],
@@ -148,6 +160,8 @@ def case(entry: Row) -> Row:
     }  # fmt: skip
     if entry["part"] == "gain":
         row["gain"] = gain(hidden[0].hidden, stall, ds, result)
+    if entry["part"] == "charted":
+        row["gain"] = harm(tuple(one.hidden for one in hidden), stall, ds, result)
     return row | {"seconds": time.process_time() - began, "worker": os.getpid()}
 
 

@@ -8,13 +8,15 @@ from numpy.typing import NDArray
 
 from magbridge.calibration.correct import correct
 from magbridge.calibration.model import Calibration
+from magbridge.columns import CHANNELS
 from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.diagnosis import Diagnosis
 from magbridge.diagnose.extend import extend, settle, widened
 from magbridge.diagnose.inference.search import search
-from sitl.inject import Hidden, disturb
+from sitl.bonne_bay import columns
+from sitl.inject import Hidden
 from study.noise import add_noise
-from study.stage import Stall, again
+from study.stage import DAY, Stall, again
 
 Array = NDArray[np.float64]
 DELAYS = ("filter_lag", "clock_offset")
@@ -28,18 +30,36 @@ def gain(hidden: Hidden, stall: Stall, ds: xr.Dataset, result: Diagnosis) -> dic
     its own sigma to tell how little it knows. ``everywhere`` is what was extended on all samples.
     """
     calibration = stall.stage.calibration
-    there = again(stall.stage)
-    other = disturb(there.twin, (hidden,), there.track, there.when, stall.number + 1)
-    other = add_noise(other, "white", stall.number + 1)
+    other = add_noise(again(stall.stage).measure((hidden,), stall.number + 1), "white", stall.number + 1)
     tried = {"before": calibration, "after": result.calibration, "oracle": _oracle(hidden.name, result)}
     errors = {name: error(other, c) for name, c in tried.items()}
     whole = np.all([np.isfinite(e) for e in errors.values()], axis=0)
-    seen = whole.copy()
-    for parameter in calibration.parameters:
-        seen &= (other[parameter.name] >= ds[parameter.name].min()).to_numpy()
-        seen &= (other[parameter.name] <= ds[parameter.name].max()).to_numpy()
+    seen = whole & _inside(other, ds, calibration)
     found = {name: float(np.mean(e[seen] ** 2)) for name, e in errors.items()}
     return found | {"everywhere": float(np.mean(errors["after"][whole] ** 2))}
+
+
+def harm(hidden: tuple[Hidden, ...], stall: Stall, ds: xr.Dataset, result: Diagnosis) -> dict[str, float]:
+    """Mean square error (nT²) against the field that is there, as calibrated and extended: of this log and of one on another day."""
+    calibration = stall.stage.calibration
+    other = again(stall.stage, DAY).measure(hidden, stall.number + 1)
+    found: dict[str, float] = {}
+    for log, where in ((ds, ""), (add_noise(other, stall.noise, stall.number + 1), " elsewhere")):
+        truth = log["truth_total_field"].to_numpy()
+        tried = {"before": calibration, "after": result.calibration}
+        errors = {name: corrected(log, c) - truth for name, c in tried.items()}
+        seen = np.isfinite(errors["after"]) & _inside(log, ds, calibration)
+        found |= {name + where: float(np.mean(e[seen] ** 2)) for name, e in errors.items()}
+    return found
+
+
+def _inside(other: xr.Dataset, ds: xr.Dataset, calibration: Calibration) -> NDArray[np.bool_]:
+    """Samples of a log whose masses stand where those of `ds` did."""
+    inside = np.ones(other.sizes["time"], bool)
+    for parameter in calibration.parameters:
+        known = ds[parameter.name]
+        inside &= ((other[parameter.name] >= known.min()) & (other[parameter.name] <= known.max())).to_numpy()
+    return inside
 
 
 def _oracle(name: str, result: Diagnosis) -> Calibration:
@@ -56,7 +76,11 @@ def _oracle(name: str, result: Diagnosis) -> Calibration:
 
 
 def error(ds: xr.Dataset, calibration: Calibration) -> Array:
-    H = np.column_stack([ds[f"mag_{axis}"] for axis in "xyz"])
-    p = np.column_stack([ds[name] for name in calibration.channels])
-    reference = ds["reference_field"].to_numpy() + calibration.reference.bias
-    return np.asarray(correct(calibration, H, p, ds["time"].to_numpy()).total - reference)
+    """Of the corrected total field, (n,) nT, against the reference."""
+    return corrected(ds, calibration) - ds["reference_field"].to_numpy() - calibration.reference.bias
+
+
+def corrected(ds: xr.Dataset, calibration: Calibration) -> Array:
+    """Total field, (n,) nT."""
+    H, p = columns(ds, CHANNELS), columns(ds, calibration.channels)
+    return np.asarray(correct(calibration, H, p, ds["time"].to_numpy()).total)

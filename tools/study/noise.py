@@ -16,13 +16,15 @@ SLOWER = 0.95
 NOISES = ("white", "ar", "mixed", "heavy", "uneven", "half", "map")
 """White; with a memory; white upon a longer one; heavy-tailed; louder at times; half as loud again as calibrated; over
 rock that is rough."""
-LOSSES = ("single", "bursts", "hole")
-"""One sample in twenty; a dozen times some two minutes; a sixth of the log at once."""
+GLIDER = "glider"
+"""As in the paper's twin: eight times as loud, with a memory."""
+LOSSES = ("single", "bursts", "hole", "surfacing")
+"""One sample in twenty; a dozen times some two minutes; a sixth of the log at once; 44 s of every dive."""
 
 
 def statistics(noise: str) -> tuple[float, float]:
     """Correlation of neighbours, and 1-sigma (nT), that who knows the noise reckons with."""
-    return (MEMORY if noise == "ar" else 0.0), (1.5 if noise == "half" else 1.0)
+    return (MEMORY if noise in ("ar", GLIDER) else 0.0), {"half": 1.5, GLIDER: 8.0}.get(noise, 1.0)
 
 
 def autoregression(white: Array, memory: float) -> Array:
@@ -38,7 +40,7 @@ def add_noise(ds: xr.Dataset, kind: str, seed: int) -> xr.Dataset:
     noise = rng.standard_normal((n, 3))
     if kind == "heavy":
         noise = rng.standard_t(4.0, (n, 3)) / np.sqrt(2.0)
-    if kind == "ar":
+    if kind in ("ar", GLIDER):
         noise = autoregression(noise, MEMORY)
     if kind == "mixed":
         noise = np.sqrt(2 / 3) * noise + np.sqrt(1 / 3) * autoregression(rng.standard_normal((n, 3)), SLOWER)
@@ -62,6 +64,9 @@ def left(losses: str, n: int, seed: int) -> Rows:
     if losses == "hole":
         start = rng.integers(1, n - n // 6)
         there[start : start + n // 6] = False
+    if losses == "surfacing":
+        dive = rng.integers(50, 300)
+        there[(np.arange(n) + rng.integers(dive)) % dive < 11] = False
     return np.flatnonzero(there)
 
 

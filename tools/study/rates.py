@@ -69,7 +69,10 @@ def reached(row: Row) -> bool:
 
 
 def worse(row: Row) -> bool:
-    return bool(row["gain"]["after"] > 1.02 * row["gain"]["before"])
+    """An extension does harm: on the log that it was made from, or on another."""
+    gain = row["gain"]
+    there = [where for where in ("", " elsewhere") if "after" + where in gain]
+    return any(gain["after" + where] > 1.02 * gain["before" + where] for where in there)
 
 
 def gained(rows: Sequence[Row]) -> float:

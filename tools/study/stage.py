@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from dataclasses import field as attribute
+from datetime import timedelta
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -18,13 +19,15 @@ from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.residual import Samples, residuals
 from magbridge.diagnose.compare.prior import floor
+from magbridge.field.grid import AnomalyGrid
+from magbridge.field.reference import reference_field
 from sitl import Twin, load, simulate
 from sitl.inject import Hidden, disturb
 from sitl.mission import CrissCross, Spirals
 from sitl.signals import first_order
 from sitl.trajectory import Track
 from sitl.world import Water, World
-from study.noise import Rows, add_noise, left, whiten
+from study.noise import GLIDER, Rows, add_noise, left, statistics, whiten
 
 Array = NDArray[np.float64]
 HOURS = 6.0
@@ -34,6 +37,11 @@ SEEDS = 1_000_000
 """Numbers that a study of one seed may have."""
 INERTIA = 3.0
 """s, twice, with which the attitude follows what :mod:`sitl.trajectory` draws."""
+TURN_ON = 20.0
+"""nT an axis, by which the paper's offset settles anew at every power-on."""
+DAY = timedelta(days=1)
+CHARTS = ("map at its depth", "map")
+"""An aeromagnetic map, continued down to the glider or taken as it was flown, for a reference."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +61,8 @@ class Remembered(World):
 class Stage(NamedTuple):
     """A vehicle with its calibration, and a deployment's track with the times of its rows.
 
-    `prior` (K, K) is what the calibration's coefficients are allowed: its covariance, and what no instrument holds.
+    `prior` (K, K) is what the calibration's coefficients are allowed: its covariance, and what no instrument holds;
+    `learned` the calibration's own log, where a diagnosis is given it; `chart` the map that both have for a reference.
     """
 
     twin: Twin
@@ -61,28 +70,71 @@ class Stage(NamedTuple):
     when: Array
     calibration: Calibration
     prior: Array
+    learned: tuple[xr.Dataset, ...] = ()
+    chart: AnomalyGrid | None = None
+
+    def measure(self, hidden: tuple[Hidden, ...], number: int) -> xr.Dataset:
+        """The log with effects, before its noise and its losses."""
+        ds = disturb(self.twin, hidden, self.track, self.when, number)
+        return ds if self.chart is None else charted(ds, self.chart)
 
 
 @lru_cache(maxsize=VEHICLES)
-def vehicle(seed: int, rms: float = 60.0) -> Stage:
-    """Draw a vehicle, calibrate it on a log of its own, and fly its survey; `rms` (nT) is that of the rock's field."""
+def vehicle(seed: int, rms: float = 60.0, reference: str = "true") -> Stage:
+    """Draw a vehicle, calibrate it on a log of its own, and fly its survey; `rms` (nT) is that of the rock's field.
+
+    Against a map, one of :data:`CHARTS`, it is a glider like the paper's: its log is louder, and its offset has settled
+    anew when it surveys.
+    """
     swap = msgspec.structs.replace
     base = load("demo")
-    instrument = swap(base.instrument, corner=0.0, channel_delay=(0.0, 0.0, 0.0), noise_sigma=1.0)
+    memory, sigma = statistics("white" if reference == "true" else GLIDER)
+    instrument = swap(
+        base.instrument, corner=0.0, channel_delay=(0.0, 0.0, 0.0),
+        noise_sigma=sigma, noise_memory=-1.0 / np.log(memory) if memory else 0.0,
+    )  # fmt: skip
     water = Water(surface=6.0, deep=2.5, thermocline=50.0, thickness=30.0)
     world = swap(base.world, water=water, geology=swap(base.world.geology, rms=rms))
     base = swap(base, instrument=instrument, world=world, motion=swap(base.motion, settle=40.0))
-    spirals = simulate(swap(base, mission=(Spirals(),)), seed)
-    calibration = fit(observations(spirals, ["battpos", "ballast"]), "auto").calibration
+    trial = swap(base, mission=(Spirals(),))
     # no multiple of the sampling's 4 s: else every mass would start to move just when a sample is taken
     survey = CrissCross(hours=HOURS, roll=(0.0, 4.0), pitch=(24.0, 3.0), battery_spread=0.12, duration=701.5)
-    quiet = swap(base, instrument=swap(instrument, noise_sigma=0.0), mission=(survey,))
-    return _flown(Twin.draw(quiet, seed), calibration)
+    twin = Twin.draw(swap(base, instrument=swap(instrument, noise_sigma=0.0), mission=(survey,)), seed)
+    if reference == "true":
+        return _flown(twin, calibrated(simulate(trial, seed)))
+    chart = drawn(twin, reference)
+    spirals = charted(simulate(swap(trial, start=trial.start - DAY), seed), chart)
+    settled = instrument.offset + np.random.default_rng([seed, 97]).normal(0.0, TURN_ON, 3)
+    started = swap(twin.scenario.instrument, offset=tuple(settled.tolist()))
+    twin = replace(twin, scenario=swap(twin.scenario, instrument=started))
+    return _flown(twin, calibrated(spirals))._replace(learned=(spirals,), chart=chart)
 
 
-def again(stage: Stage) -> Stage:
-    """Another deployment of the same vehicle in the same waters."""
-    return _flown(replace(stage.twin, seed=stage.twin.seed + 1000), stage.calibration)
+def drawn(twin: Twin, reference: str) -> AnomalyGrid:
+    """The map of a twin's waters: one of :data:`CHARTS`."""
+    chart = twin.anomaly_map()
+    if reference == "map at its depth":
+        return chart
+    return AnomalyGrid(
+        chart.longitude, chart.latitude, chart.anomaly, name=chart.name
+    )  # that knows no altitude
+
+
+def charted(ds: xr.Dataset, chart: AnomalyGrid) -> xr.Dataset:
+    """A log whose reference is a map, off by what it was off before besides."""
+    known = reference_field(ds.drop_vars("reference_field"), chart)
+    return ds.assign(reference_field=ds["reference_field"] - ds["truth_total_field"] + known)
+
+
+def calibrated(spirals: xr.Dataset) -> Calibration:
+    return fit(observations(spirals, ["battpos", "ballast"]), "auto").calibration
+
+
+def again(stage: Stage, later: timedelta = timedelta()) -> Stage:
+    """Another deployment of the same vehicle in the same waters, whose reference is true."""
+    scenario = msgspec.structs.replace(stage.twin.scenario, start=stage.twin.scenario.start + later)
+    twin = replace(stage.twin, scenario=scenario, seed=stage.twin.seed + 1000)
+    return _flown(twin, stage.calibration)
 
 
 def _flown(twin: Twin, calibration: Calibration) -> Stage:
@@ -98,10 +150,11 @@ def _flown(twin: Twin, calibration: Calibration) -> Stage:
     return Stage(twin, track, when, calibration, calibration.covariance + floor(calibration))
 
 
-def stage_of(number: int, noise: str) -> Stage:
+def stage_of(number: int, noise: str, reference: str = "true") -> Stage:
     """The stage of a case."""
     seed, place = divmod(number, SEEDS)
-    return vehicle(VEHICLES * seed + place % VEHICLES, 300.0 if noise == "map" else 60.0)
+    rms = {"map": 300.0, GLIDER: 120.0}.get(noise, 60.0)
+    return vehicle(VEHICLES * seed + place % VEHICLES, rms, reference)
 
 
 def compare(ds: xr.Dataset, calibration: Calibration) -> tuple[Array, Array]:
@@ -159,14 +212,14 @@ class Stall(NamedTuple):
     @classmethod
     def of(cls, stage: Stage, number: int, noise: str, losses: str = "") -> Stall:
         """Set up; `number` draws what the vehicle logs beside, and which samples are lost."""
-        clean = disturb(stage.twin, (), stage.track, stage.when, number)
+        clean = stage.measure((), number)
         rows = left(losses, len(stage.when), number)
         e, J = compare(clean, stage.calibration)
         return cls(stage, number, noise, rows, e, whiten(J[rows], noise, rows))
 
     def measure(self, *hidden: Hidden) -> xr.Dataset:
         """The log with effects, before its noise and its losses."""
-        return disturb(self.stage.twin, hidden, self.stage.track, self.stage.when, self.number)
+        return self.stage.measure(hidden, self.number)
 
     def show(self, hidden: Hidden) -> Found:
         """What an effect does here."""

@@ -32,6 +32,7 @@ from study.rates import (
     unlike,
     worse,
 )
+from study.stage import CHARTS
 
 Parts = dict[str, list[Row]]
 Line = tuple[str, str, str, str]
@@ -41,16 +42,17 @@ Line = tuple[str, str, str, str]
 def lines(rows: Sequence[Row]) -> list[str]:
     """Return the tables: the figures, logs with losses beside whole ones, and cause by cause."""
     part = {name: [r for r in rows if r["part"] == name] for name in {r["part"] for r in rows}}
+    true = [r for r in rows if r["part"] != "charted"]
     figures = [
-        *_nulls(part.get("null", [])), *_detection(part), *_sets(part.get("named", [])), *_parameters(rows),
-        *_gains(part.get("gain", [])), *_nameless(part), *_pairs(part.get("pair", [])),
+        *_nulls(part.get("null", [])), *_detection(part), *_sets(part.get("named", [])), *_parameters(true),
+        *_gains(part.get("gain", [])), *_harm(part), *_nameless(part), *_pairs(part.get("pair", [])),
     ]  # fmt: skip
     return [
         "| figure | target | ideal detector | measured (95 % interval) | cases |",
         "|---|---|---|---|---|",
         *(f"| {' | '.join(line)} |" for line in figures),
         "",
-        *_losses(rows),
+        *_losses(true),
         "",
         *by_cause(part),
     ]
@@ -132,7 +134,21 @@ def _gains(rows: Sequence[Row]) -> list[Line]:
     return [
         (f"{label}: median", "at least 80 %", "100 %", f"{percent(gained(rows))} | {len(rows)}"),
         ("... cases with 80 % of an oracle's", "", "100 %", share(rows, reached)),
-        ("... cases that are worse than before", "", "0 %", share(rows, worse)),
+    ]
+
+
+def _harm(part: Parts) -> list[Line]:
+    """Against what is there: the true field, or on another deployment what is true of the reference."""
+    gain, charted = part.get("gain", []), part.get("charted", [])
+    return [
+        (f"harm: extension makes the corrected field worse{label}", "0", "0 %", share(rows, worse))
+        for label, rows in (
+            ("", gain + charted),
+            *(
+                (f"; reference is a {kind}", [r for r in charted if r["reference"] == kind])
+                for kind in CHARTS
+            ),
+        )
     ]
 
 
