@@ -157,6 +157,8 @@ class Page:
         if not self._new("texts", list(self._state.texts), self._texts):
             return
         with self._texts:
+            if not self._state.texts:
+                _nothing()
             for when, severity, text in self._state.texts:
                 color = (
                     RED
@@ -175,6 +177,8 @@ class Page:
         known = self._state.parameters
         if self._new("names", sorted(known), self._parameters):
             with self._parameters:
+                if not known:
+                    _nothing()
                 self._inputs = {name: self._input(name) for name in sorted(known)}
         for name, one in known.items():
             if self._new(name, (one.value, one.error, one.asked)):
@@ -260,6 +264,10 @@ def _fact(name: str) -> ui.label:
     with ui.row().classes("w-full justify-between text-sm"):
         ui.label(name).classes("text-slate-600")
         return ui.label().classes("font-medium tabular-nums")
+
+
+def _nothing() -> None:
+    ui.label("None yet").classes("text-sm text-slate-500")
 
 
 def _clock(when: float) -> str:

@@ -13,10 +13,12 @@ from matplotlib.ticker import LogFormatter
 from numpy.typing import NDArray
 from scipy.signal import periodogram
 
+from magbridge.diagnose.report.words import label
+
 if TYPE_CHECKING:
     from magbridge.diagnose.diagnosis import Diagnosis
 
-__all__ = ["channels", "evidence", "label", "likeness", "measured", "spectrum", "terms", "track"]
+__all__ = ["channels", "evidence", "likeness", "measured", "spectrum", "terms", "track"]
 
 FloatArray = NDArray[np.float64]
 
@@ -73,11 +75,6 @@ def _stated(diagnosis: Diagnosis) -> FloatArray:
     """(n,) 1-sigma of the difference, nT, by the calibration: its noise, and what its coefficients may be off by."""
     noise, free = diagnosis.problem.calibration.noise, diagnosis.problem.free
     return np.asarray(np.sqrt(noise.sensor**2 + noise.reference**2 + (free * free).sum(axis=1)))
-
-
-def label(cause: str, channel: str | None) -> str:
-    """Return a cause as people read it."""
-    return cause.replace("_", " ") + (f" ({channel})" if channel else "")
 
 
 def measured(diagnosis: Diagnosis) -> str:
@@ -155,7 +152,7 @@ def spectrum(diagnosis: Diagnosis) -> str:
 
 
 def channels(diagnosis: Diagnosis) -> str:
-    """Draw the difference against each channel: means over twenty bins with their scatter."""
+    """Draw the difference against each channel: means over twenty bins with their scatter, all at one scale."""
     survey = diagnosis.problem.survey
     shown = {
         name: (channel.values, channel.unit)
@@ -167,7 +164,8 @@ def channels(diagnosis: Diagnosis) -> str:
     names = list(shown)[:12]
     columns = min(3, max(len(names), 1))
     rows = max(-(-len(names) // columns), 1)
-    figure, axes = _figure(10, 2.3 * rows, rows, columns)
+    figure, axes = _figure(10, 2.3 * rows, rows, columns, sharey=True)
+    ends = []
     for axis, name in zip(axes.flat, names, strict=False):
         values, unit = shown[name]
         edges = np.linspace(values.min(), values.max(), 21)
@@ -180,11 +178,15 @@ def channels(diagnosis: Diagnosis) -> str:
             spread = np.sqrt(np.maximum(np.bincount(bins, left**2, 20) / count - mean**2, 0.0))
             axis.vlines(middle, mean - spread, mean + spread, color=colour, alpha=0.2, linewidth=5)
             axis.plot(middle, mean, "o-", color=colour, markersize=2.5, linewidth=1)
+            ends += [mean - spread, mean + spread]
         axis.set_xlabel(f"{name} ({unit or '1'})", fontsize=8)
     for axis in axes.flat[len(names) :]:
         axis.set_visible(False)
     for axis in axes[:, 0]:
         axis.set_ylabel("difference (nT)", fontsize=8)
+    if ends:  # a bin or two of wild samples do not set the scale
+        low, high = np.nanquantile(ends, [0.02, 0.98])
+        axes[0, 0].set_ylim(low - 0.1 * (high - low), high + 0.1 * (high - low))
     return _png(figure)
 
 
@@ -197,9 +199,8 @@ def track(diagnosis: Diagnosis) -> str | None:
     sides = _sides(diagnosis)
     north, east = np.ptp(place, axis=0)[:2]
     if east > 2.0 * north:  # a long track lies better above the other one
-        figure, axes = _figure(
-            10, 2.0 * (1.1 + 8.0 * max(float(north / east), 0.1)), 2, 1, sharex=True, sharey=True
-        )
+        height = 0.4 + 2.0 * (0.35 + 8.0 * max(float(north / east), 0.1))
+        figure, axes = _figure(10, height, 2, 1, sharex=True, sharey=True)
     else:
         figure, axes = _figure(10, 3.8, 1, 2, sharex=True, sharey=True)
     limit = float(np.quantile(np.abs(diagnosis.before), 0.98)) + 1e-9

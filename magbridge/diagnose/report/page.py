@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from datetime import UTC, datetime
 from html import escape
-from inspect import getdoc
-from math import floor, isfinite, log10
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,13 +12,23 @@ from numpy.typing import NDArray
 
 from magbridge.diagnose.report import figures
 from magbridge.diagnose.report.findings import parameters, told
+from magbridge.diagnose.report.words import (
+    MANY,
+    chance,
+    label,
+    listed,
+    measured,
+    number,
+    physics,
+    plain,
+    sizes,
+)
 
 if TYPE_CHECKING:
     from magbridge.diagnose.causes import Cause
     from magbridge.diagnose.causes.candidates import Candidate
     from magbridge.diagnose.diagnosis import Diagnosis
     from magbridge.diagnose.gain import Gain
-    from magbridge.diagnose.inference.rivals import Rival
     from magbridge.diagnose.inference.search import Hypothesis
 
 __all__ = ["report_html"]
@@ -30,11 +38,9 @@ STYLE = """
 h1{font-size:1.6rem;margin-bottom:.2rem}h2{font-size:1.15rem;margin-top:2.4rem;border-bottom:1px solid #dde2e6;padding-bottom:.3rem}
 h3{font-size:1rem;margin-bottom:.2rem}figure{margin:1rem 0}img{max-width:100%}figcaption,.faint{color:#66727e;font-size:.88rem}
 table{border-collapse:collapse;font-size:.9rem;margin:.6rem 0}td,th{padding:.22rem .8rem .22rem 0;text-align:left;border-bottom:1px solid #eceff1}
-td.n{text-align:right;font-variant-numeric:tabular-nums}.verdict{font-size:1.1rem;background:#f2f6f8;border-left:4px solid #1f6f8b;padding:.8rem 1.1rem}
+th{white-space:nowrap}td.n{text-align:right;font-variant-numeric:tabular-nums}.verdict{font-size:1.1rem;background:#f2f6f8;border-left:4px solid #1f6f8b;padding:.8rem 1.1rem}
 .pair{display:flex;gap:1rem;flex-wrap:wrap;align-items:flex-start}.pair figure{flex:1 1 24rem}code{background:#f2f4f6;padding:0 .25em}
 """
-MANY = 24
-"""Numbers that a table lists openly."""
 IMPLAUSIBLE = 5.0
 """Times its plausible size: a cause that is larger is doubted."""
 KINDS = {
@@ -105,26 +111,34 @@ def _name(hypothesis: Hypothesis) -> str:
 def _verdict(diagnosis: Diagnosis) -> str:
     total = diagnosis.total
     causes = [
-        _name(h) + (f" <span class=faint>or {_listed(rivals)}</span>" if rivals else "")
+        _name(h) + (f" <span class=faint>or {listed(rivals)}</span>" if rivals else "")
         for h, rivals in zip(diagnosis.named, diagnosis.rivals, strict=True)
     ]
     if diagnosis.wrong is not None:
         causes.append(f"<b>outliers</b> ({diagnosis.wrong.rows.size} wrong samples)")
     gained = (
-        f"On dives left out, {_number(total.before)} nT RMS became {_number(total.after)} nT (ratio {total.ratio:.2f}, 95 % interval "
+        f"On dives left out, {number(total.before)} nT RMS became {number(total.after)} nT (ratio {total.ratio:.2f}, 95 % interval "
         f"{total.interval[0]:.2f} to {total.interval[1]:.2f})."
     )
+    withheld = diagnosis.unexplained.within if diagnosis.unexplained else ()
+    name = (
+        f"no name is asserted; not ruled out: {listed(withheld)}"
+        if withheld
+        else "none of the known causes explains it"
+    )
     return {
-        "nothing_found": f"Nothing was found: {_number(total.before)} nT RMS cannot be told from noise ({_number(float(np.std(diagnosis.fit.left)))} nT) "
+        "nothing_found": f"Nothing was found: {number(total.before)} nT RMS cannot be told from noise ({number(float(np.std(diagnosis.fit.left)))} nT) "
         "and what the calibration states it may be off by.",
         "explained": f"Found: {', '.join(causes)}. {gained} Nothing else stands out of the noise.",
         "partly_explained": f"Found: {', '.join(causes)}. {gained} Something else is left that no cause explains.",
-        "unexplained": f"Something is there ({_number(total.before)} nT RMS), but none of the known causes explains it.",
+        "unexplained": f"Something is there ({number(total.before)} nT RMS), but {name}.",
     }[diagnosis.verdict]
 
 
 def _found(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> list[str]:
     if not diagnosis.named and diagnosis.wrong is None:
+        if diagnosis.unexplained is not None:
+            return ["<p>Something, but no name is asserted: see what is left.</p>"]
         return ["<p>No cause passes the test at a family-wise false-alarm rate of 1 %.</p>"]
     parts = [_figure(figures.terms(diagnosis), "What each cause adds to the total field.")]
     at = len(diagnosis.problem.centre)
@@ -132,23 +146,23 @@ def _found(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> list[str]:
         candidate = hypothesis.candidate
         numbers = parameters(diagnosis, hypothesis, at)
         rows = "".join(
-            f'<tr><td>{escape(name)}</td><td class="n">{_measured(value["value"], value["sigma"])}</td>'
-            f'<td class="n">{"± " + _measured(value["sigma"], value["sigma"]) if value["sigma"] else ""}</td>'
+            f'<tr><td>{escape(name)}</td><td class="n">{measured(value["value"], value["sigma"])}</td>'
+            f'<td class="n">{"± " + measured(value["sigma"], value["sigma"]) if value["sigma"] else ""}</td>'
             f"<td>{escape(value['unit'])}</td></tr>"
             for name, value in numbers.items()
         )
         start, at = at - len(diagnosis.problem.centre), at + candidate.size
         doubt = (
-            f"<p>The data cannot tell it from {_listed(rivals)} (odds below 20:1). What would: {escape(causes[candidate.cause].separated_by)}.</p>"
+            f"<p>The data cannot tell it from {listed(rivals)} (odds below 20:1). What would: {escape(causes[candidate.cause].separated_by)}.</p>"
             if rivals
             else "<p>No other cause of the table comes within 20:1.</p>"
         )
         parts += [
             f"<h3>{_name(hypothesis)}</h3>",
-            f'<p class="faint">{_physics(causes[candidate.cause])}</p>',
+            f'<p class="faint">{physics(causes[candidate.cause])}</p>',
             (
                 f"<p>Signal-to-noise {hypothesis.signal_to_noise:.1f} with the calibration refitted; chance of a false alarm among "
-                f"all that was tried {_chance(hypothesis.p_value)}. Leaving it out multiplies the held-out RMS by {1 / max(gain.ratio, 1e-9):.2f} "
+                f"all that was tried {chance(hypothesis.p_value)}. Leaving it out multiplies the held-out RMS by {1 / max(gain.ratio, 1e-9):.2f} "
                 f"(95 %: {1 / max(gain.interval[1], 1e-9):.2f} to {1 / max(gain.interval[0], 1e-9):.2f}).</p>"
             ),
             _folded(
@@ -159,7 +173,8 @@ def _found(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> list[str]:
             _implausible(candidate, diagnosis.fit.coefficients[start : start + candidate.size]),
             _in_motion(diagnosis, start, candidate),
             doubt
-            + f"<p>In a log like this one, theory gives it a chance of {100 * told(diagnosis, hypothesis):.0f} % to be named alone.</p>",
+            + f"<p>In a log like this one, theory gives it a chance of {100 * told(diagnosis, hypothesis):.0f} % to be named alone"
+            + ("; here it was not.</p>" if rivals else ".</p>"),
             _no_gain(gain),
         ]
     if diagnosis.wrong is not None:
@@ -172,10 +187,6 @@ def _found(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> list[str]:
             "they take no part in the figures above.</p>"
         )
     return parts
-
-
-def _listed(rivals: Sequence[Rival]) -> str:
-    return ", ".join(escape(figures.label(rival.cause, rival.channel)) for rival in rivals)
 
 
 def _folded(table: str, size: int) -> str:
@@ -196,7 +207,7 @@ def _implausible(candidate: Candidate, b: NDArray[np.float64]) -> str:
     if candidate.spectra is not None or times < IMPLAUSIBLE:
         return ""
     return (
-        f"<p>This is {_number(times, 2)} times what such a cause usually amounts to. Two causes that cancel each other can grow like "
+        f"<p>This is {number(times, 2)} times what such a cause usually amounts to. Two causes that cancel each other can grow like "
         "that: hold the extended field against another reference before it is flown.</p>"
     )
 
@@ -219,30 +230,6 @@ def _in_motion(diagnosis: Diagnosis, at: int, candidate: Candidate) -> str:
     )
 
 
-def _physics(cause: Cause) -> str:
-    """Return the first line of the cause's own text, formulas set as such."""
-    line = escape((getdoc(cause.candidates) or "").splitlines()[0])
-    parts = line.split("``")
-    return "".join(f"<code>{part}</code>" if k % 2 else part for k, part in enumerate(parts))
-
-
-def _number(value: float, digits: int = 3) -> str:
-    """Write a number to so many digits, as people do: 1070, not 1.07e+03."""
-    return f"{float(f'{value:.{digits}g}'):g}"
-
-
-def _measured(value: float, sigma: float | None) -> str:
-    """Write a number to the second digit of its sigma."""
-    if not sigma or not isfinite(sigma):
-        return _number(value, 4)
-    places = 1 - floor(log10(sigma))
-    return f"{round(value, places):.{max(places, 0)}f}"
-
-
-def _chance(p_value: float) -> str:
-    return f"{p_value:.1g}" if p_value > 1e-99 else "below 1e-99"
-
-
 def _no_gain(gain: Gain) -> str:
     if gain.interval[1] < 1.0:
         return ""
@@ -252,17 +239,22 @@ def _no_gain(gain: Gain) -> str:
 def _left(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> str:
     rest, noise = diagnosis.unexplained, diagnosis.fit.noise
     tails = "Gaussian" if noise.nu > 1e5 else f"tails like Student's t with {noise.nu:g} degrees of freedom"
+    samples = len(noise.scale)
+    memory = (
+        f"by its memory, {samples} samples say as much of a constant as {noise.independent:.0f} independent ones"
+        if noise.independent < 0.95 * samples
+        else "without memory that matters"
+    )
     model = (
-        f"The noise that remains: {_number(float(np.median(noise.scale)))} nT a sample, {tails}; by its memory, {len(noise.scale)} "
-        f"samples say as much of a constant as {noise.independent:.0f} independent ones. The calibration stated "
-        f"{_number(diagnosis.problem.calibration.noise.sensor)} nT."
+        f"The noise that remains: {number(float(np.median(noise.scale)))} nT a sample, {tails}; {memory}. The calibration stated "
+        f"{number(diagnosis.problem.calibration.noise.sensor)} nT."
     )
     if rest is None:
         return f"<p>No structure is left that a slow curve, steps or a function of attitude would find. {model}</p>"
     goes = f", and goes best with <code>{escape(rest.best_channel)}</code>" if rest.best_channel else ""
     period = f" of period {rest.period_s:.4g} s" if rest.period_s else ""
     doubt = (
-        f"No name is asserted: it is likelier than every cause of the table. Within 20:1 of it stays: {_listed(rest.within)}. What would "
+        f"No name is asserted: no cause of the table is likelier by 20:1. Not ruled out: {listed(rest.within)}. What would "
         f"tell: {escape(causes[rest.within[0].cause].separated_by)}."
         if rest.within
         else "It fits no cause of the table, so it has no name."
@@ -270,33 +262,16 @@ def _left(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> str:
     return f"<p><b>{KINDS[rest.kind]}</b>{period} is left, of signal-to-noise {rest.signal_to_noise:.1f}{goes}. {doubt} {model}</p>"
 
 
-def _sizes(sizes: Mapping[str, tuple[float, str]]) -> str:
-    listed = [
-        f"{escape(name)} {_number(size)} {escape(unit)}"
-        for name, (size, unit) in sizes.items()
-        if np.isfinite(size)
-    ]
-    if len(listed) > MANY:
-        listed = [*listed[:3], f"and {len(listed) - 3} more"]
-    return ", ".join(listed) or "invisible"
-
-
-def _plain(labelled: str) -> str:
-    """Return a cause with its channel, ``cause (channel)``, as people read it."""
-    cause, bracket, channel = labelled.partition(" (")
-    return escape(cause.replace("_", " ") + bracket + channel)
-
-
 def _isolability(diagnosis: Diagnosis) -> list[str]:
     report = diagnosis.isolability
     rows = "".join(
-        f"<tr><td>{escape(figures.label(v.cause, v.channel))}</td>"
+        f"<tr><td>{escape(label(v.cause, v.channel))}</td>"
         f'<td class="n">{v.half:.1f}</td><td class="n">{v.sure:.1f}</td>'
-        f"<td>{_sizes(v.sizes)}</td></tr>"
+        f"<td>{sizes(v.sizes)}</td></tr>"
         for v in report.visible
     )
     pairs = "".join(
-        f'<tr><td>{_plain(a)}</td><td>{_plain(b)}</td><td class="n">{100 * rho:.0f} %</td></tr>'
+        f'<tr><td>{plain(a)}</td><td>{plain(b)}</td><td class="n">{100 * rho:.0f} %</td></tr>'
         for a, b, rho in report.pairs[:20]
     )
     missing = "; ".join(

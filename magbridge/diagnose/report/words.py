@@ -1,0 +1,74 @@
+"""Names and numbers as people read them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from html import escape
+from inspect import getdoc
+from itertools import groupby
+from math import floor, isfinite, log10
+from operator import itemgetter
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from magbridge.diagnose.causes import Cause
+    from magbridge.diagnose.inference.rivals import Rival
+
+__all__ = ["MANY", "chance", "label", "listed", "measured", "number", "physics", "plain", "sizes"]
+
+MANY = 24
+"""Numbers that a table lists openly."""
+
+
+def label(cause: str, channel: str | None) -> str:
+    """Return a cause as people read it."""
+    return cause.replace("_", " ") + (f" ({channel})" if channel else "")
+
+
+def plain(labelled: str) -> str:
+    """Return a cause with its channel, ``cause (channel)``, as people read it."""
+    cause, bracket, channel = labelled.partition(" (")
+    return escape(cause.replace("_", " ") + bracket + channel)
+
+
+def listed(rivals: Sequence[Rival]) -> str:
+    """Return causes in a row, the likeliest first."""
+    return ", ".join(escape(label(rival.cause, rival.channel)) for rival in rivals)
+
+
+def physics(cause: Cause) -> str:
+    """Return the first line of the cause's own text, formulas set as such."""
+    line = escape((getdoc(cause.candidates) or "").splitlines()[0])
+    parts = line.split("``")
+    return "".join(f"<code>{part}</code>" if k % 2 else part for k, part in enumerate(parts))
+
+
+def number(value: float, digits: int = 3) -> str:
+    """Write a number to so many digits, as people do: 1070, not 1.07e+03."""
+    return f"{float(f'{value:.{digits}g}'):g}"
+
+
+def measured(value: float, sigma: float | None) -> str:
+    """Write a number to the second digit of its sigma."""
+    if not sigma or not isfinite(sigma):
+        return number(value, 4)
+    places = 1 - floor(log10(sigma))
+    return f"{round(value, places):.{max(places, 0)}f}".replace("-", "\N{MINUS SIGN}")
+
+
+def chance(p_value: float) -> str:
+    """Write a probability to one digit."""
+    return f"{p_value:.1g}" if p_value > 1e-99 else "below 1e-99"
+
+
+def sizes(smallest: Mapping[str, tuple[float, str]]) -> str:
+    """Return sizes, each a value and its unit by its name; those that nothing would show are infinite and left out."""
+    seen = [(name, size, unit) for name, (size, unit) in smallest.items() if isfinite(size)]
+    shown = seen if len(seen) <= MANY else seen[:3]
+    told = [
+        ", ".join(f"{escape(name)} {number(size)}" for name, size, _ in same) + f" {escape(unit)}"
+        for unit, same in groupby(shown, key=itemgetter(2))
+    ]
+    if len(shown) < len(seen):
+        told.append(f"and {len(seen) - len(shown)} more")
+    return ", ".join(told) or "invisible"
