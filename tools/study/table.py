@@ -140,16 +140,9 @@ def _gains(rows: Sequence[Row]) -> list[Line]:
 def _harm(part: Parts) -> list[Line]:
     """Against what is there: the true field, or on another deployment what is true of the reference."""
     gain, charted = part.get("gain", []), part.get("charted", [])
-    return [
-        (f"harm: extension makes the corrected field worse{label}", "0", "0 %", share(rows, worse))
-        for label, rows in (
-            ("", gain + charted),
-            *(
-                (f"; reference is a {kind}", [r for r in charted if r["reference"] == kind])
-                for kind in CHARTS
-            ),
-        )
-    ]
+    groups = {"harm: extension makes the corrected field worse": gain + charted}
+    groups |= {f"... against a {kind}": [r for r in charted if r["reference"] == kind] for kind in CHARTS}
+    return [(label, "0", "0 %", share(rows, worse)) for label, rows in groups.items()]
 
 
 def _nameless(part: Parts) -> list[Line]:
