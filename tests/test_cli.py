@@ -136,6 +136,15 @@ def test_what_headings_are_counted_from_may_be_told(deployment: Path, tmp_path: 
     assert abs(np.degrees(offsets[0] - offsets[1])) > 5.0  # the declination off Newfoundland is 17 degrees
 
 
+def test_a_fit_can_be_looked_at(deployment: Path, tmp_path: Path) -> None:
+    """Also where the log tells of no attitude, and a parameter has no part in the fit."""
+    bare, picture = tmp_path / "bare.csv", tmp_path / "fit.png"
+    write(read(deployment).drop_vars(["roll", "pitch", "heading"]), bare)
+    fitted = ["calibrate", str(bare), "--method", "nominal", "--parameter", "battpos"]
+    assert main([*fitted, "-o", str(tmp_path / "cal.json"), "--picture", str(picture)]) == 0
+    assert picture.stat().st_size > 40_000
+
+
 def test_correct_writes_what_the_contract_names(
     deployment: Path, calibration: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -124,6 +124,7 @@ def calibrate(
     site_bias: Annotated[float, Parameter(validator=validators.Number(gte=0, lte=1e5))] = 0.0,
     filter_corner: Annotated[float, Parameter(validator=validators.Number(gte=0, lt=inf))] = 0.0,
     heading_reference: Heading = None,
+    picture: Picture = None,
     strict: bool = False,
     json: Json = False,
 ) -> None:
@@ -151,6 +152,8 @@ def calibrate(
         Hz, corner of the sensor's first-order anti-alias filter (0: none): what it takes off in turns is given back.
     heading_reference
         What headings are counted from; if not given what the log says, else true north.
+    picture
+        A PNG, PDF or SVG: what each sample is off by as read and corrected, beside time, heading and each parameter.
     strict
         Exit with 1 when the data do not support the fit.
     json
@@ -181,6 +184,10 @@ def calibrate(
     with waiting("fitting"):
         found = fit(data, method, order, site_bias=site_bias, **options)
     save(found.calibration, output)
+    if picture:
+        from magbridge.calibration.fitting.draw import draw_fit
+
+        draw_fit(found.calibration, data, picture)
     for warning in found.warnings:
         complain(warning, 0)
     result = {

@@ -1,0 +1,73 @@
+"""A picture of a fit: what the total field is off by before and after, beside whatever it may hang on."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from magbridge.calibration.fitting.data import Observations
+from magbridge.calibration.fitting.validate import in_sensor_units
+from magbridge.calibration.model import Calibration
+from magbridge.files import atomic_path
+
+__all__ = ["draw_fit"]
+
+FloatArray = NDArray[np.float64]
+POINTS = 5_000
+"""Points drawn in a panel; more only make a blot."""
+
+
+def draw_fit(calibration: Calibration, data: Observations, path: str | Path) -> None:
+    """Draw each sample's deviation from the reference, as read and corrected, a colour for each run.
+
+    Beside time, heading (where attitude is known) and each parameter: what still follows one of them in the lower row,
+    the calibration does not describe.
+
+    Raises
+    ------
+    WriteError
+        The file cannot be written.
+    """
+    assert data.runs is not None
+    read = np.linalg.norm(data.field, axis=1) - data.reference
+    left, _ = in_sensor_units(calibration, data)
+    part = slice(None, None, max(1, len(data) // POINTS))
+    _, run = np.unique(data.runs, return_inverse=True)
+    beside = _beside(data)
+    figure = Figure(figsize=(1.0 + 3.4 * len(beside), 6.4), layout="constrained")
+    axes = figure.subplots(2, len(beside), sharex="col", sharey="row", squeeze=False)
+    for values, row in zip((read, left), axes, strict=True):
+        for axis, x in zip(row, beside.values(), strict=True):
+            axis.scatter(x[part], values[part], c=run[part] % 20, cmap="tab20", vmin=0, vmax=19, s=3, lw=0)
+            axis.axhline(0.0, color="0.2", lw=0.6)
+            axis.grid(color="0.92", lw=0.6)
+            axis.set_axisbelow(True)
+            axis.spines[["top", "right"]].set_visible(False)
+    low, high = np.quantile(np.append(left, 0.0), [0.002, 0.998])  # a few wild samples do not set the scale
+    axes[1, 0].set_ylim(low - 0.2 * (high - low), high + 0.2 * (high - low))
+    noise = calibration.noise.sensor
+    for axis, name in zip(axes[1], beside, strict=True):
+        axis.axhspan(-2.0 * noise, 2.0 * noise, color="0.6", alpha=0.25, lw=0, label="2 sigma of its noise")
+        axis.set_xlabel(name)
+    axes[0, 0].set_ylabel(f"as read, nT: {_rms(read):.0f} RMS")
+    axes[1, 0].set_ylabel(f"corrected, nT: {_rms(left):.2f} RMS")
+    axes[1, 0].legend(loc="upper right", fontsize=8, frameon=False)
+    with atomic_path(path) as partial:
+        figure.savefig(partial, dpi=110)
+
+
+def _beside(data: Observations) -> dict[str, FloatArray]:
+    """Return what deviations are drawn beside, by its name and unit."""
+    assert data.time is not None
+    shown = {"hours": (data.time - data.time[0]) / 3600.0}
+    if data.attitude is not None and np.isfinite(data.attitude[:, 2]).any():
+        shown["heading, deg"] = np.degrees(data.attitude[:, 2]) % 360.0
+    units = (f", {unit}" if unit else "" for unit in data.units)
+    return shown | {f"{n}{u}": p for n, u, p in zip(data.names, units, data.parameters.T, strict=True)}
+
+
+def _rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.mean(values**2)))
