@@ -21,11 +21,12 @@ from magbridge.diagnose.compare.take import take
 from magbridge.diagnose.diagnosis import Diagnosis
 from magbridge.diagnose.extend import extend, settle, widened
 from magbridge.diagnose.gain import Gain, held_out, paired
+from magbridge.diagnose.inference.accept import accept
 from magbridge.diagnose.inference.isolability import isolability
 from magbridge.diagnose.inference.joint import Joint
 from magbridge.diagnose.inference.outliers import Outliers, outliers
 from magbridge.diagnose.inference.search import Hypothesis, search
-from magbridge.diagnose.inference.unexplained import Leftover, accept, leftover
+from magbridge.diagnose.inference.unexplained import Leftover, leftover
 from magbridge.diagnose.inference.weigh import ODDS, REMNANT
 from magbridge.errors import DataError
 from magbridge.field.grid import AnomalyGrid

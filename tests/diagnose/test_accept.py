@@ -1,4 +1,4 @@
-"""Names that a description beats: not asserted, and not ruled out below 20:1."""
+"""Names against descriptions of the whole: asserted if they beat them 20:1, possible until they lose by as much."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import numpy as np
 
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.compare.problem import Problem
+from magbridge.diagnose.inference.accept import _within, accept
 from magbridge.diagnose.inference.search import search
-from magbridge.diagnose.inference.unexplained import _within
 from magbridge.diagnose.inference.weigh import ODDS
 
 ROWS = 300
@@ -35,3 +35,19 @@ def test_names_within_20_to_1_of_a_description_stay(right: Callable[[int], Probl
         assert all(
             value < ODDS and np.isclose(value - behind, sets[0][cause]) for cause, value in within.items()
         )
+
+
+def test_a_name_is_asserted_possible_or_ruled_out(right: Callable[[int], Problem]) -> None:
+    """The more hypotheses a name was chosen from, the less it is worth: between 20:1 either way it is only possible."""
+    problem = right(ROWS)
+    bent = 8.0 * (problem.survey.field / 5e4).prod(axis=1)
+    problem = replace(problem, residual=bent + np.random.default_rng(9).normal(size=ROWS))
+    name = Candidate("a", None, lambda rows: bent[rows, None], np.ones(1), ("b",), ("nT",))
+    outcome = search(problem, [name], 1)
+    said = []
+    for price in np.arange(7.0, 15.0) * ODDS:
+        stands, rest = accept(problem, replace(outcome, trials={"a": float(np.exp(price))}), None)
+        said.append("asserted" if stands else "possible" if rest is not None and rest.within else "ruled out")
+    assert said == sorted(said)
+    assert said.count("possible") == 2
+    assert {"asserted", "ruled out"} < set(said)

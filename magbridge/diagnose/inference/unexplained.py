@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from magbridge.diagnose.causes.candidates import Candidate
+from magbridge.diagnose.compare.derivatives import CHUNK
 from magbridge.diagnose.compare.problem import Columns, Problem
 from magbridge.diagnose.inference.fit_noise import fit_noise
 from magbridge.diagnose.inference.free import Description, descriptions
@@ -26,11 +27,10 @@ from magbridge.diagnose.inference.information import information
 from magbridge.diagnose.inference.joint import Joint
 from magbridge.diagnose.inference.noise import Noise
 from magbridge.diagnose.inference.rivals import Rival
-from magbridge.diagnose.inference.search import Hypothesis, Outcome
 from magbridge.diagnose.inference.statistic import Ridge, Statistic
-from magbridge.diagnose.inference.weigh import LEVEL, ODDS, REMNANT, slack, worth
+from magbridge.diagnose.inference.weigh import LEVEL
 
-__all__ = ["Leftover", "accept", "leftover"]
+__all__ = ["Leftover", "leftover"]
 
 FloatArray = NDArray[np.float64]
 
@@ -42,7 +42,6 @@ TURNS = 6
 """Alternations between a curve and its direction."""
 CALM = 2
 """Rounds in which slow curves and noise take from each other."""
-CHUNK = 8192
 
 
 class Leftover(NamedTuple):
@@ -144,50 +143,6 @@ def leftover(
     return Leftover(kind, size, p_value, evidence, one.period, channel, one, count)
 
 
-def accept(problem: Problem, outcome: Outcome, tone: Candidate | None) -> tuple[bool, Leftover | None]:
-    """Say whether the names stand, and what is left beside them or, if they do not, at all.
-
-    Names and a free description of the whole have equal odds, and pay for what they were chosen from; what a name's regressor
-    may miss is forgiven, and what it did leave, told by a description beside it, is counted with it. If more is left than an
-    idealised regressor leaves, and of another sort than the names are, the burden of proof is theirs: they and what is left must
-    beat it 20:1.
-
-    Names that a description beats by less than 20:1 are not asserted, nor are they ruled out.
-    """
-    model = [h.candidate for h in outcome.chosen]
-    rest = leftover(problem, model, outcome.fit, outcome.order, tone)
-    if not model:
-        return False, rest
-    remnant = 0.0
-    if rest is not None and rest.signal_to_noise < REMNANT * max(h.signal_to_noise for h in outcome.chosen):
-        remnant, rest = rest.among, None
-    other = None if rest is None or _same(outcome.chosen, rest) else rest
-    # what holds the names' own regressors and finds nothing else beside them is no other explanation
-    free = leftover(problem, [], outcome.null, outcome.order, tone, but=() if other else model)
-    ratio = 2.0 * (outcome.fit.log_likelihood - outcome.null.log_likelihood)
-    names = worth(ratio, model, outcome.trials) - float(np.log(len(outcome.trials)))
-    names += other.among if other else max(slack(ratio), remnant)
-    if free is None or names - (ODDS if other else 0.0) >= free.among:
-        return True, rest
-    return False, free._replace(within=tuple(_within(outcome, free.among - names)))
-
-
-def _within(outcome: Outcome, behind: float) -> Iterator[Rival]:
-    """Yield the names that found no belief, and their rivals, as far as what beat them by `behind` does so by less than 20:1."""
-    for hypothesis, rivals in zip(outcome.chosen, outcome.rivals, strict=True):
-        for one in (Rival(hypothesis.candidate, 0.0), *rivals):
-            if one.behind + behind < ODDS:
-                yield replace(one, behind=one.behind + behind)
-
-
-def _same(chosen: Sequence[Hypothesis], rest: Leftover) -> bool:
-    """Say whether what is left is more of what a louder name says: its regressor is idealised."""
-    told = rest.description
-    return told is not None and any(
-        told.retells([h.candidate]) and h.signal_to_noise > rest.signal_to_noise for h in chosen
-    )
-
-
 def _scored(
     problem: Problem, noise: Noise, fit: Joint, model: Sequence[Columns], listed: Sequence[Description]
 ) -> Iterator[tuple[float, str, Description, Ridge, FloatArray]]:
@@ -244,7 +199,7 @@ def _taken(
     out = np.empty(len(problem))
     every = np.append(moved, c)
     for start in range(0, len(problem), CHUNK):
-        rows = slice(start, min(start + CHUNK, len(problem)))
+        rows = slice(start, start + CHUNK)
         X = np.hstack([problem.free[rows], *(column(rows) for column in (*model, *columns))])
         out[rows] = -X @ every
     return out

@@ -1,0 +1,57 @@
+"""Whether the names that were found stand, against a description of the same without a name."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from magbridge.diagnose.causes.candidates import Candidate
+from magbridge.diagnose.compare.problem import Problem
+from magbridge.diagnose.inference.rivals import Rival
+from magbridge.diagnose.inference.search import Hypothesis, Outcome
+from magbridge.diagnose.inference.unexplained import Leftover, leftover
+from magbridge.diagnose.inference.weigh import ODDS, REMNANT, slack, worth
+
+__all__ = ["accept"]
+
+
+def accept(problem: Problem, outcome: Outcome, tone: Candidate | None) -> tuple[bool, Leftover | None]:
+    """Say whether the names stand, and what is left beside them or, if they do not, at all.
+
+    Names and free descriptions of the whole pay for what they were chosen from. What a name's regressor may miss is forgiven;
+    what it did leave, told by a description beside it, counts with it. A cause that the table lacks is a rival like any other:
+    names are asserted if they beat every description 20:1, and ruled out if one beats them 20:1. In between they stay possible.
+    """
+    model = [h.candidate for h in outcome.chosen]
+    rest = leftover(problem, model, outcome.fit, outcome.order, tone)
+    if not model:
+        return False, rest
+    ratio = 2.0 * (outcome.fit.log_likelihood - outcome.null.log_likelihood)
+    missed = slack(ratio) if rest is None else max(slack(ratio), rest.among)
+    if rest is not None and rest.signal_to_noise < REMNANT * max(h.signal_to_noise for h in outcome.chosen):
+        rest = None
+    # what holds the names' own regressors and finds nothing else beside them is no other explanation
+    alone = rest is None or _same(outcome.chosen, rest)
+    free = leftover(problem, [], outcome.null, outcome.order, tone, but=model if alone else ())
+    names = worth(ratio, model, outcome.trials) - float(np.log(len(outcome.trials))) + missed
+    if free is None or names - free.among >= ODDS:
+        return True, rest
+    return False, free._replace(within=tuple(_within(outcome, free.among - names)))
+
+
+def _same(chosen: Sequence[Hypothesis], rest: Leftover) -> bool:
+    """Say whether what is left is more of what a louder name says: its regressor is idealised."""
+    told = rest.description
+    return told is not None and any(
+        told.retells([h.candidate]) and h.signal_to_noise > rest.signal_to_noise for h in chosen
+    )
+
+
+def _within(outcome: Outcome, behind: float) -> Iterator[Rival]:
+    """Yield the names that are not asserted, and their rivals, as far as none is 20:1 behind a description of the whole."""
+    for hypothesis, rivals in zip(outcome.chosen, outcome.rivals, strict=True):
+        for one in (Rival(hypothesis.candidate, 0.0), *rivals):
+            if one.behind + behind < ODDS:
+                yield replace(one, behind=one.behind + behind)
