@@ -33,9 +33,9 @@ def outliers(fit: Joint, causes: int) -> Outliers | None:
     """
     v = fit.noise.innovations
     n = len(v)
-    alone = max(_mixture(v, nu, 0.0)[0] for nu in TAILS)
     if np.abs(v).max() < 5.0:
         return None
+    alone = max(_mixture(v, nu, 0.0)[0] for nu in TAILS)
     value, member = max((_mixture(v, nu, 3.0 / n) for nu in TAILS[1:]), key=lambda found: found[0])
     ratio = 2.0 * (value - alone)
     p_value = min(1.0, causes * float(chi2.sf(ratio, 2)))
@@ -49,19 +49,13 @@ def outliers(fit: Joint, causes: int) -> Outliers | None:
 
 def _mixture(v: FloatArray, nu: float, eps: float) -> tuple[float, FloatArray]:
     """Log likelihood of the mixture after expectation maximisation, and each sample's chance to be wrong."""
-    s, wide, member = (
-        1.4826 * float(np.median(np.abs(v))),
-        3.0 * float(np.abs(v).max()) / 3.0,
-        np.zeros(len(v)),
-    )
+    s, wide = 1.4826 * float(np.median(np.abs(v))), float(np.abs(v).max())
+    at_zero = gammaln(0.5 * (nu + 1.0)) - gammaln(0.5 * nu) - 0.5 * np.log(np.pi * nu)
+    member = np.zeros(len(v))
     value = -np.inf
     for _ in range(25):
         x = v / s
-        if nu > 1e5:
-            log_t = -0.5 * (x * x + np.log(2 * np.pi)) - np.log(s)
-        else:
-            c = gammaln((nu + 1) / 2) - gammaln(nu / 2) - 0.5 * np.log(nu * np.pi)
-            log_t = c - 0.5 * (nu + 1) * np.log1p(x * x / nu) - np.log(s)
+        log_t = at_zero - np.log(s) - 0.5 * (nu + 1.0) * np.log1p(x * x / nu)
         inside = np.exp(log_t) * (1.0 - eps)
         outside = eps * np.exp(-0.5 * (v / wide) ** 2) / (wide * np.sqrt(2 * np.pi))
         value = float(np.log(inside + outside + 1e-300).sum())
