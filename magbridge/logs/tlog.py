@@ -40,7 +40,7 @@ QUEUE = 100_000
 RETRY_US = 2_000_000
 """µs of the events' time after which a log that failed is tried again, in a new file."""
 SYNC_US = 5_000_000
-"""µs of the events' time between two syncs: a power cut costs no more."""
+"""µs of the events' time between two syncs: a power cut costs no more, nor does a hand that removes the file."""
 
 
 class TlogWriter:
@@ -212,6 +212,7 @@ class TlogWriter:
                 rest = rest[os.write(self._file, rest) :]
             if not 0 <= time_us - self._synced_us < SYNC_US:
                 os.fdatasync(self._file)
+                self._name.stat()  # removed, it would go on being written and be nowhere
                 self._synced_us = time_us
         except OSError as error:
             self._dropped += len(records)

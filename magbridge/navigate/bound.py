@@ -133,9 +133,10 @@ def told(bound: Bound, grid: AnomalyGrid) -> xr.Dataset:
     }
     off = np.isnan(grid.evaluate(bound.longitude, bound.latitude).anomaly)
     best = int(bound.sigma.argmin())
-    hours = (bound.time - bound.time[0]) / 3600.0
+    hours = (bound.time[best] - bound.time[0]) / 3600.0
+    when = f"after {hours:.1f} h" if best else "at the start"
     findings = (
-        f"at best {bound.sigma[best]:.0f} m after {hours[best]:.1f} h, at the end {bound.sigma[-1]:.0f} m;"
+        f"at best {bound.sigma[best]:.0f} m {when}, at the end {bound.sigma[-1]:.0f} m;"
         f" dead reckoning alone {bound.unaided[-1]:.0f} m"
     )
     if off.any():

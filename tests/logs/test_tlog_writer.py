@@ -120,6 +120,28 @@ def test_directory_that_vanishes_stops_the_log(tmp_path: Path) -> None:
     assert (log.records, log.lost, log.failure) == (0, 1, "No such file or directory")
 
 
+def test_a_log_that_is_removed_is_missed(tmp_path: Path) -> None:
+    """It can still be written to, as any file that is open; whoever looks for it later finds nothing."""
+
+    def write(time_us: int) -> tuple[int, int, str]:
+        done = log.records + log.lost
+        log.write(time_us, Channel.SENT, FRAME)
+        deadline = time.monotonic() + 5.0
+        while log.records + log.lost == done:
+            assert time.monotonic() < deadline
+            time.sleep(0.001)
+        time.sleep(0.01)  # the reason is told last
+        return log.records, log.lost, log.failure
+
+    with TlogWriter(tmp_path) as log:
+        assert write(T0) == (1, 0, "")
+        (path,) = tmp_path.iterdir()
+        path.unlink()
+        assert write(T0 + tlog.SYNC_US) == (1, 1, "No such file or directory")
+        assert write(T0 + tlog.SYNC_US + tlog.RETRY_US) == (2, 1, "")
+    assert [path.name[-9:] for path in tmp_path.iterdir()] == ["0002.tlog"]
+
+
 def test_stalled_disk_drops_and_counts_and_never_blocks(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

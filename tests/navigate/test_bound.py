@@ -8,6 +8,7 @@ import pytest
 from magbridge.errors import OutOfRange
 from magbridge.field.grid import AnomalyGrid
 from magbridge.navigate import Options, position_bound
+from magbridge.navigate.bound import told
 from magbridge.navigate.draw import draw_bound
 
 TRACK = ([1.4e9, 1.4e9 + 7200, 1.4e9 + 14400], [49.48, 49.5, 49.5], [-57.95, -57.9, -57.85])
@@ -64,6 +65,15 @@ def test_time_must_increase(grid):
         position_bound(grid, TRACK[0][::-1], *TRACK[1:])
     with pytest.raises(OutOfRange, match="corners = 1: a track has at least two"):
         position_bound(grid, *([one[0]] for one in TRACK))
+
+
+def test_its_sentence_says_when_it_is_best(grid, options):
+    bound = position_bound(grid, *TRACK, options)
+    for sigma, words in (
+        (np.linspace(50.0, 90.0, bound.time.size), "at best 50 m at the start, at the end 90 m"),
+        (np.linspace(90.0, 50.0, bound.time.size), f"at best 50 m after {np.ptp(bound.time) / 3600.0:.1f} h"),
+    ):
+        assert told(bound._replace(sigma=sigma), grid).attrs["findings"].startswith(words)
 
 
 def test_its_picture(grid, options, tmp_path):
