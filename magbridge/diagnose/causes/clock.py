@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from magbridge.calibration.instrument import TimeEffect
 from magbridge.diagnose.causes.candidates import AXES, Candidate, of_effect
+from magbridge.diagnose.causes.regressors import powers
 from magbridge.diagnose.compare.problem import Problem
 
 __all__ = ["interference_tone", "offset_drift", "offset_step"]
@@ -32,17 +33,19 @@ def offset_step(problem: Problem) -> list[Candidate]:
 
 
 def offset_drift(problem: Problem) -> list[Candidate]:
-    """The offset creeps with ageing and relaxing stress: ``T += b_1 x + b_2 x^2``, ``x = (t - t_0) / duration``."""
+    """The offset creeps with ageing and relaxing stress: ``T += b_1 x + b_2 x^2``, ``x = (t - t_0) / period``."""
     t = problem.survey.time
     span = float(t[-1] - t[0])
     made = []
-    for order, start in ((1, t[0]), (1, 0.5 * (t[0] + t[-1])), (2, t[0])):
-        effect = TimeEffect(cause="offset_drift", shape="drift", start=float(start), period=span, order=order)
+    for order, start, period in ((1, t[0], span), (1, 0.5 * (t[0] + t[-1]), 0.5 * span), (2, t[0], span)):
+        effect = TimeEffect(
+            cause="offset_drift", shape="drift", start=float(start), period=period, order=order
+        )
 
-        def phi(rows: slice, order: int = order, start: float = float(start)) -> FloatArray:
-            return np.stack([((t[rows] - start) / span) ** (k + 1) for k in range(order)])
+        def phi(rows: slice, order: int = order, effect: TimeEffect = effect) -> FloatArray:
+            return powers((t[rows] - effect.start) / effect.period, order)
 
-        made.append(of_effect(problem, effect, 50.0, f"nT in {span / 3600:.3g} h", phi=phi))
+        made.append(of_effect(problem, effect, 50.0, f"nT in {period / 3600:.3g} h", phi=phi))
     return made
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import wraps
+from typing import TypeVar
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -15,16 +16,17 @@ from magbridge.diagnose.compare.problem import Problem
 __all__ = ["lagged", "once", "play", "powers"]
 
 FloatArray = NDArray[np.float64]
+T = TypeVar("T")
 
 
-def once(regressor: Callable[[Problem], FloatArray]) -> Callable[[Problem], FloatArray]:
-    """Evaluate a regressor once for a problem: of a month it is 50 MB, and causes share it."""
-    known: WeakKeyDictionary[Problem, FloatArray] = WeakKeyDictionary()
+def once(made: Callable[[Problem], T]) -> Callable[[Problem], T]:
+    """Make something once for a problem: of a month a regressor is 50 MB, and causes share it."""
+    known: WeakKeyDictionary[Problem, T] = WeakKeyDictionary()
 
-    @wraps(regressor)
-    def of(problem: Problem) -> FloatArray:
+    @wraps(made)
+    def of(problem: Problem) -> T:
         if problem not in known:
-            known[problem] = regressor(problem)
+            known[problem] = made(problem)
         return known[problem]
 
     return of

@@ -12,12 +12,13 @@ from numpy.typing import NDArray
 from magbridge.calibration.effects import ChannelEffect
 from magbridge.diagnose.causes.candidates import Candidate, of_effect
 from magbridge.diagnose.causes.channels import channels_of, extent
-from magbridge.diagnose.causes.regressors import lagged
+from magbridge.diagnose.causes.regressors import lagged, once
 from magbridge.diagnose.compare.problem import Problem
 
 __all__ = ["current_field", "pressure_offset", "temperature_offset", "temperature_scale"]
 
 FloatArray = NDArray[np.float64]
+Way = Literal["offset", "scale", "gain"]
 
 LAGS = (0.0, 700.0, 1700.0, 4000.0, 10000.0)
 """s, so close that a lag between two of them is missed by a fifth at most (RMS)."""
@@ -34,32 +35,37 @@ def _origins(problem: Problem, name: str) -> list[float]:
     return [middle, 2 * low - high, 2 * high - low]
 
 
-def _thermal(problem: Problem, on: Literal["offset", "scale"]) -> list[Candidate]:
+@once
+def _levels(problem: Problem) -> Callable[[str, float], FloatArray]:
+    """Temperatures behind their lags: of a month each is 5 MB, and origins and causes share it."""
+    survey = problem.survey  # what is kept for a problem must not keep the problem
+
+    @lru_cache(len(LAGS) * len(channels_of(problem, "temperature")))
+    def level(name: str, lag: float) -> FloatArray:
+        return lagged(survey.time, survey.channels[name].values, lag, STAGES)
+
+    return level
+
+
+def _thermal(problem: Problem, cause: str, *ways: Way) -> list[Candidate]:
     longest = 2.0 * float(np.ptp(problem.survey.time))
     lags = [lag for lag in LAGS if lag <= longest]
-    return [c for name in channels_of(problem, "temperature") for c in _warmed(problem, on, name, lags)]
+    names = channels_of(problem, "temperature")
+    return [c for name in names for on in ways for c in _warmed(problem, cause, on, name, lags)]
 
 
-def _warmed(
-    problem: Problem, on: Literal["offset", "scale"], name: str, lags: Sequence[float]
-) -> list[Candidate]:
-    """One temperature's."""
+def _warmed(problem: Problem, cause: str, on: Way, name: str, lags: Sequence[float]) -> list[Candidate]:
+    """One temperature's, in one way."""
     field = problem.calibration.reference.field
     unit = "nT/degC" if on == "offset" else f"nT/degC at {field:.0f} nT"
 
-    @lru_cache(len(LAGS))  # of a month each is 5 MB
-    def level(lag: float) -> FloatArray:
-        return lagged(problem.survey.time, problem.survey.channels[name].values, lag, STAGES)
-
     def again(origin: float, lag: float) -> Candidate:
         lag = max(lag, 0.0)
-        effect = ChannelEffect(
-            cause=f"temperature_{on}", channel=name, origin=origin, lag=lag, stages=STAGES, on=on
-        )
-        phi = level(lag)
+        effect = ChannelEffect(cause=cause, channel=name, origin=origin, lag=lag, stages=STAGES, on=on)
+        phi = _levels(problem)(name, lag)
         return of_effect(
             problem, effect, 5.0, unit, channel=name, shape={"origin": (origin, "degC"), "lag": (lag, "s")},
-            again=again, phi=lambda rows: phi[None, rows] - origin,
+            again=again, names=("all",) if on == "gain" else (), phi=lambda rows: phi[None, rows] - origin,
         )  # fmt: skip
 
     return [again(origin, lag) for origin in _origins(problem, name) for lag in lags]
@@ -72,12 +78,15 @@ def temperature_offset(problem: Problem) -> list[Candidate]:
     Typically 0.1 nT/degC for a good fluxgate, several for a low-power one (Primdahl 1979, J. Phys. E 12:241). Separated from
     depth by the thermal hysteresis of dive and climb.
     """
-    return _thermal(problem, "offset")
+    return _thermal(problem, "temperature_offset", "offset")
 
 
 def temperature_scale(problem: Problem) -> list[Candidate]:
-    """Coil constant and resistances follow temperature: ``A += diag(b) (theta_2 - theta_0)``, 10-100 ppm/degC."""
-    return _thermal(problem, "scale")
+    """Coil constant and resistances follow temperature: ``A += diag(b) (theta_2 - theta_0)``, 10-100 ppm/degC.
+
+    Three coils of one copper expand alike, ``b (1, 1, 1)``; their resistances each for itself.
+    """
+    return _thermal(problem, "temperature_scale", "gain", "scale")
 
 
 def _level(problem: Problem, name: str) -> Callable[[slice], FloatArray]:
