@@ -12,7 +12,7 @@ from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.rivals import Rival
 from magbridge.diagnose.inference.search import Hypothesis, Outcome
 from magbridge.diagnose.inference.unexplained import Leftover, leftover
-from magbridge.diagnose.inference.weigh import ODDS, REMNANT, slack, worth
+from magbridge.diagnose.inference.weigh import IDEAL, ODDS, REMNANT, weigh, worth
 
 __all__ = ["accept"]
 
@@ -20,18 +20,21 @@ __all__ = ["accept"]
 def accept(problem: Problem, outcome: Outcome, tone: Candidate | None) -> tuple[bool, Leftover | None]:
     """Say whether the names stand, and what is left beside them or, if they do not, at all.
 
-    Names and free descriptions of the whole pay for what they were chosen from. What a name's regressor may miss is forgiven;
-    what it did leave, told by a description beside it, counts with it. A cause that the table lacks is a rival like any other:
-    names are asserted if they beat every description 20:1, and ruled out if one beats them 20:1. In between they stay possible.
+    Names and free descriptions of the whole pay for what they were chosen from. What a name's regressor may miss, told by one
+    number at least, is forgiven; what it did leave, told by a description beside it, counts with it. A cause that the table lacks
+    is a rival like any other: names are asserted if they beat every description 20:1, and ruled out if one beats them 20:1. In
+    between they stay possible.
     """
     model = [h.candidate for h in outcome.chosen]
     rest = leftover(problem, model, outcome.fit, outcome.order, tone)
     if not model:
         return False, rest
     ratio = 2.0 * (outcome.fit.log_likelihood - outcome.null.log_likelihood)
-    missed = slack(ratio) if rest is None else max(slack(ratio), rest.among)
-    if rest is not None and rest.signal_to_noise < REMNANT * max(h.signal_to_noise for h in outcome.chosen):
-        rest = None
+    missed = weigh(IDEAL**2 * ratio + 1.0, 1)
+    if rest is not None:
+        missed = max(missed, rest.among)
+        if rest.signal_to_noise < REMNANT * max(h.signal_to_noise for h in outcome.chosen):
+            rest = None
     # what holds the names' own regressors and finds nothing else beside them is no other explanation
     alone = rest is None or _same(outcome.chosen, rest)
     free = leftover(problem, [], outcome.null, outcome.order, tone, but=model if alone else ())

@@ -3,9 +3,8 @@
 Notes
 -----
 A free description has more numbers than anyone believes in, so they have one common free size (:mod:`.statistic`).
-Noise that was fitted without the effect may have swallowed it. So a description is
-found under the noise that stands and under the one that is left when slow curves take what they can, and then weighed by the
-whole likelihood, with a noise of its own.
+Noise that was fitted without the effect may have swallowed it. So a description is found under the noise that stands and under
+the one that is left when slow curves take what they can, and then weighed by the whole likelihood, with a noise of its own.
 """
 
 from __future__ import annotations
@@ -63,7 +62,7 @@ class Leftover(NamedTuple):
     choice : int
         How many it was chosen from.
     within : tuple of Rival
-        The names that it beats by less than 20:1.
+        The names that stay possible: neither do they beat it 20:1, nor it them.
     """
 
     kind: str
