@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -41,7 +41,7 @@ def accept(problem: Problem, outcome: Outcome, tone: Candidate | None) -> tuple[
     names = worth(ratio, model, outcome.trials) - float(np.log(len(outcome.trials))) + missed
     if free is None or names - free.among >= ODDS:
         return True, rest
-    return False, free._replace(within=tuple(_within(outcome, free.among - names)))
+    return False, free._replace(within=_within(outcome, free.among - names))
 
 
 def _same(chosen: Sequence[Hypothesis], rest: Leftover) -> bool:
@@ -52,9 +52,12 @@ def _same(chosen: Sequence[Hypothesis], rest: Leftover) -> bool:
     )
 
 
-def _within(outcome: Outcome, behind: float) -> Iterator[Rival]:
-    """Yield the names that are not asserted, and their rivals, as far as none is 20:1 behind a description of the whole."""
+def _within(outcome: Outcome, behind: float) -> tuple[Rival, ...]:
+    """Return the names, which a description beats by `behind`, and their rivals: those that it does not beat 20:1, the likeliest first."""
+    found: dict[tuple[str, str | None], Rival] = {}
     for hypothesis, rivals in zip(outcome.chosen, outcome.rivals, strict=True):
         for one in (Rival(hypothesis.candidate, 0.0), *rivals):
-            if one.behind + behind < ODDS:
-                yield replace(one, behind=one.behind + behind)
+            known = found.get((one.cause, one.channel))
+            if one.behind + behind < ODDS and (known is None or one.behind + behind < known.behind):
+                found[one.cause, one.channel] = replace(one, behind=one.behind + behind)
+    return tuple(sorted(found.values(), key=lambda one: one.behind))
