@@ -185,6 +185,13 @@ def test_correct_gives_the_same_in_pieces(deployment: Path, calibration: Path, t
         (["fly"], 2, "fly"),
         (["replay", "{d}", "--speed", "fast"], 2, "--speed fast: expected a positive number"),
         (["replay", "{d}", "--speed", "-1"], 2, "expected a positive number"),
+        (["replay", "{d}", "--speed", "1e-300"], 2, "0.001 or more, or max"),
+        (["plan", "--calibration", "{d}", "--mission", "{d}", "--runs", "101"], 2, "--runs. Must be <= 100"),
+        (
+            ["calibrate", "{d}", "--parameter", "heading", "-o", "x.json"],
+            1,
+            "parameter 'heading' is heading, clockwise from north: it moves no mass",
+        ),
         (["run", "--config", "none.toml"], 2, "none.toml: No such file"),
         (
             ["simulate", "none", "-o", "x.csv"],
@@ -195,7 +202,11 @@ def test_correct_gives_the_same_in_pieces(deployment: Path, calibration: Path, t
         (["correct", "{d}", "--calibration", "none.json", "-o", "x.csv"], 1, "none.json: cannot be read"),
         (["correct", "{d}", "--calibration", "{d}", "-o", "x.csv"], 1, "not a calibration"),
         (["calibrate", "{d}", "--parameter", "nose", "-o", "x.json"], 1, "column 'nose'"),
-        (["calibrate", "{d}", "--parameter", "mag_x", "-o", "x.json"], 1, "'mag_x' is a channel"),
+        (
+            ["calibrate", "{d}", "--parameter", "mag_x", "-o", "x.json"],
+            1,
+            "'mag_x' is raw magnetic field, sensor x (forward): it moves no mass",
+        ),
         (["calibrate", "{d}", "--filter-corner", "1e-9", "-o", "x.json"], 1, "filter corner = 1e-09 Hz"),
         (["calibrate", "{d}", "--method", "magic", "-o", "x.json"], 2, f"Choose from: {METHOD_NAMES}"),
         (["calibrate", "{d}", "--method", "cubic", "--vehicle", "v.toml", "-o", "x.json"], 2, "--vehicle: "),

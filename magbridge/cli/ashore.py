@@ -225,7 +225,7 @@ def plan(
     *,
     calibration: Path,
     mission: Path,
-    runs: Annotated[Whole, Parameter(validator=validators.Number(gte=1))] = 10,
+    runs: Annotated[Whole, Parameter(validator=validators.Number(gte=1, lte=100))] = 10,
     roll: Annotated[float, Parameter(validator=validators.Number(gte=0, lte=90))] = 10.0,
     heading_reference: Heading = None,
     json: Json = False,

@@ -12,6 +12,9 @@ from cyclopts import Parameter, validators
 from magbridge.cli.common import Folder, Json, Whole, app, folder_to_write, some, tell
 from magbridge.errors import DataError, WrongUse
 
+SLOWEST = 1e-3
+"""Times real time: below, a log of an hour takes months."""
+
 
 @app.command
 def demo(
@@ -129,6 +132,6 @@ def speed_of(text: str) -> float:
         speed = inf if text == "max" else float(text)
     except ValueError:
         speed = nan
-    if not speed > 0.0:
-        raise WrongUse(f"--speed {text}: expected a positive number, or max")
+    if not speed >= SLOWEST:
+        raise WrongUse(f"--speed {text}: expected a positive number, {SLOWEST:g} or more, or max")
     return speed

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from magbridge.calibration.model import Parameter
 from magbridge.calibration.residual import Samples
 from magbridge.calibration.terms import Exponents
-from magbridge.columns import CHANNELS
+from magbridge.columns import CHANNELS, COLUMNS
 from magbridge.errors import CalibrationError
 from magbridge.records import BEYOND
 
@@ -25,6 +25,8 @@ __all__ = ["Observations", "monomials", "observations", "polynomial_samples"]
 FloatArray = NDArray[np.float64]
 COMMON, FAR = 0.005, 10.0
 """A position is no position when it is farther from the median than FAR times what all but 2 COMMON of them span."""
+FOLLOWED = ("sensor_temperature", "depth")
+"""What moves no mass, either, but may be followed as if it did."""
 _PER_SAMPLE = ("field", "reference", "parameters", "runs", "time", "attitude", "reference_ned")
 
 
@@ -220,12 +222,10 @@ def observations(
     Raises
     ------
     CalibrationError
-        A column is missing or does not hold numbers.
+        A column is missing or does not hold numbers; a parameter is a column that says something else.
     """
-    if channels := [name for name in parameters if name in CHANNELS]:
-        raise CalibrationError(
-            f"parameter {channels[0]!r} is a channel of the magnetometer: it moves no mass"
-        )
+    if others := [name for name in parameters if name in COLUMNS and name not in FOLLOWED]:
+        raise CalibrationError(f"parameter {others[0]!r} is {COLUMNS[others[0]].long_name}: it moves no mass")
     names = (*CHANNELS, *parameters)
     columns = {name: _column(ds, name) for name in names}
     vector: FloatArray | None = None
