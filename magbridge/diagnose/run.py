@@ -24,6 +24,7 @@ from magbridge.diagnose.gain import Gain, held_out, paired
 from magbridge.diagnose.inference.accept import accept
 from magbridge.diagnose.inference.isolability import isolability
 from magbridge.diagnose.inference.joint import Joint
+from magbridge.diagnose.inference.loosen import loosened
 from magbridge.diagnose.inference.outliers import Outliers, outliers
 from magbridge.diagnose.inference.search import Hypothesis, search
 from magbridge.diagnose.inference.unexplained import Leftover, leftover
@@ -113,7 +114,7 @@ def _examine(
         wrong = None  # a few samples that the loudest cause's regressor has left
     progress("extending the calibration")
     settled, columns, fit = settle(problem, model, fit, outcome.order)
-    fit = widened(model, fit)
+    fit = widened(model, loosened(settled, model, columns, fit))
     extended = extend(settled, model, fit) if model else calibration
     progress("measuring the gain")
     counts = _counted(problem, wrong)

@@ -46,6 +46,8 @@ class Candidate:
         Its coefficients cannot be negative.
     narrow : float
         Log of how much narrower than their grid's cells the data hold its nonlinear parameters.
+    cells : tuple of float
+        How far apart its grid's points are, in each nonlinear parameter.
     parts : tuple of Candidate
         Those that it was put together from, one after the other.
     spectra : (l, k) array or None
@@ -65,6 +67,7 @@ class Candidate:
     trials: float = 1.0
     positive: bool = False
     narrow: float = 0.0
+    cells: tuple[float, ...] = ()
     parts: tuple[Candidate, ...] = ()
     spectra: FloatArray | None = None
 

@@ -39,7 +39,9 @@ def sharpen(state: State, model: list[Candidate], hypothesis: Hypothesis, base: 
         if gain > 0.0:
             ratio, evidence = best.ratio + gain, best.evidence + 0.5 * gain
             best = replace(best, candidate=candidate, fit=fit, ratio=ratio, evidence=evidence)
-    return replace(best, candidate=replace(best.candidate, narrow=narrow))
+    brackets = [_bracket(state, best.candidate, name) for name in best.candidate.shape]
+    cells = tuple(0.5 * (high - low) for low, high in brackets)
+    return replace(best, candidate=replace(best.candidate, narrow=narrow, cells=cells))
 
 
 def _profiled(
