@@ -1,11 +1,10 @@
-"""Commands ashore: convert, simulate, calibrate, plan, map, correct."""
+"""Commands ashore: convert, simulate, map, correct."""
 
 from __future__ import annotations
 
-from dataclasses import replace
 from math import inf
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated
 
 from cyclopts import Parameter, validators
 
@@ -14,18 +13,14 @@ from magbridge.cli.common import (
     Heading,
     Json,
     Log,
-    Output,
     Picture,
     Whole,
     app,
-    complain,
-    digest,
     file_to_write,
     note_losses,
     some,
     tell,
 )
-from magbridge.errors import DataError, WrongUse
 from magbridge.progress import track, waiting
 
 
@@ -110,155 +105,6 @@ def simulate(
         Twin.draw(chosen, seed).anomaly_map().save(map_output)
     rows = deployment.sizes["time"]
     tell({"file": str(output), "rows": rows, "seed": seed}, f"{output}: {rows} rows", json)
-
-
-@app.command(usage="Usage: magbridge calibrate FILE... --parameter NAME... -o cal.json [OPTIONS]")
-def calibrate(
-    *files: Path,
-    output: Output,
-    parameter: tuple[str, ...] = (),
-    order: Annotated[Whole, Parameter(validator=validators.Number(gte=1, lte=6))] = 3,
-    method: Literal["auto", "nominal", "cubic", "runs", "horizontal"] = "auto",
-    vehicle: Path | None = None,
-    grid: Path | None = None,
-    site_bias: Annotated[float, Parameter(validator=validators.Number(gte=0, lte=1e5))] = 0.0,
-    filter_corner: Annotated[float, Parameter(validator=validators.Number(gte=0, lt=inf))] = 0.0,
-    heading_reference: Heading = None,
-    picture: Picture = None,
-    strict: bool = False,
-    json: Json = False,
-) -> None:
-    """Fit a calibration to logs of calibration runs.
-
-    Parameters
-    ----------
-    files
-        Logs.
-    output
-        The cal.json to write.
-    parameter
-        A column that moves a mass; once for each.
-    order
-        Highest total degree of the polynomials in the parameters.
-    method
-        auto, or what it is compared with.
-    vehicle
-        A vehicle.toml that says where the moving masses sit, seen from the sensor (method auto).
-    grid
-        An anomaly grid, added to the IGRF.
-    site_bias
-        nT, 1-sigma of what the reference may be wrong by all over the site.
-    filter_corner
-        Hz, corner of the sensor's first-order anti-alias filter (0: none): what it takes off in turns is given back.
-    heading_reference
-        What headings are counted from; if not given what the log says, else true north.
-    picture
-        A PNG, PDF or SVG: what each sample is off by as read and corrected, beside time, heading and each parameter.
-    strict
-        Exit with 1 when the data do not support the fit.
-    json
-        Print the result for machines.
-    """
-    from magbridge.calibration.file import save
-    from magbridge.calibration.fitting.data import observations
-    from magbridge.calibration.fitting.fit import fit
-    from magbridge.calibration.fitting.geometry import read_vehicle
-    from magbridge.calibration.fitting.lowpass import unfiltered
-    from magbridge.columns import CHANNELS
-    from magbridge.field.declination import with_true_heading
-    from magbridge.field.read import read_grid
-    from magbridge.field.reference import earth_field
-    from magbridge.logs import read
-
-    some(files, output, vehicle, grid)
-    if vehicle and method != "auto":
-        raise WrongUse(f"--vehicle: method {method} does not ask where masses sit; auto does")
-    anomalies = read_grid(grid) if grid else None
-    deployment = with_true_heading(read(files, required=(*CHANNELS, *parameter)), heading_reference)
-    note_losses(deployment.attrs)
-    data = observations(deployment, parameter, reference=lambda ds: earth_field(ds, anomalies))
-    data = replace(data, inputs=_digests(files))
-    if filter_corner:
-        data = unfiltered(data, filter_corner)
-    options: dict[str, Any] = {"vehicle": read_vehicle(vehicle)} if vehicle else {}
-    with waiting("fitting"):
-        found = fit(data, method, order, site_bias=site_bias, **options)
-    save(found.calibration, output)
-    if picture:
-        from magbridge.calibration.fitting.draw import draw_fit
-
-        draw_fit(found.calibration, data, picture)
-    for warning in found.warnings:
-        complain(warning, 0)
-    result = {
-        "file": str(output),
-        "method": method,
-        "samples": len(data),
-        "rms_nT": found.rms,
-        "supported": found.supported,
-        "scales": found.scales,
-        "noise_nT": found.calibration.noise.sensor,
-        "warnings": found.warnings,
-    }
-    low, high = found.scales
-    left = f"{found.rms:.2f} nT RMS in the sensor's own units"
-    summary = (
-        f"{output}: {method}, {len(data)} samples, {left}, bought with scales of {low:.3f} to {high:.3f}"
-    )
-    tell(result, summary, json)
-    if strict and not found.supported:
-        raise DataError("the data do not support this fit, and --strict: see the warnings")
-
-
-def _digests(files: tuple[Path, ...]) -> dict[str, str]:
-    """Return each file's name and digest; tell of one that is there twice."""
-    seen: dict[str, Path] = {}
-    for file in files:
-        first = seen.setdefault(digest(file), file)
-        if first is not file:
-            complain(f"{file}: the same as {first}: its samples are counted once", 0)
-    return {file.name: key for key, file in seen.items()}
-
-
-@app.command(usage="Usage: magbridge plan --calibration cal.json --mission FILE [OPTIONS]")
-def plan(
-    *,
-    calibration: Path,
-    mission: Path,
-    runs: Annotated[Whole, Parameter(validator=validators.Number(gte=1, lte=100))] = 10,
-    roll: Annotated[float, Parameter(validator=validators.Number(gte=0, lte=90))] = 10.0,
-    heading_reference: Heading = None,
-    json: Json = False,
-) -> None:
-    """Tell which calibration runs to fly next: those after which the mission's worst error is smallest.
-
-    Parameters
-    ----------
-    calibration
-        What is known so far.
-    mission
-        A log or a simulated deployment that flies as the mission will: attitude, position, moving masses.
-    runs
-        How many spirals.
-    roll
-        deg that the vehicle can bank in a spiral, either way.
-    heading_reference
-        What headings are counted from; if not given what the log says, else true north.
-    json
-        Print the result for machines.
-    """
-    from magbridge.calibration.file import load
-    from magbridge.calibration.planning import flight_plan
-    from magbridge.field.declination import with_true_heading
-    from magbridge.field.reference import earth_field
-    from magbridge.logs import read
-
-    deployment = with_true_heading(read(mission), heading_reference)
-    note_losses(deployment.attrs)
-    known = load(calibration)
-    with waiting("planning"):
-        found = flight_plan.flight_plan(known, deployment, earth_field(deployment)[1], runs=runs, roll=roll)
-    tell(flight_plan.facts(found, known), flight_plan.tell(found, known), json)
 
 
 @app.command(usage="Usage: magbridge map GRID... -o grid.nc [OPTIONS]")
