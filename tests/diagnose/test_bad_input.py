@@ -16,7 +16,7 @@ from magbridge.calibration.model import Calibration, Sensor
 from magbridge.cli import main
 from magbridge.diagnose.compare.take import take
 from magbridge.diagnose.run import diagnose
-from magbridge.errors import DataError
+from magbridge.errors import DataError, WriteError
 from magbridge.logs import write
 from sitl import load, segments, simulate
 
@@ -35,6 +35,17 @@ def some(ds: xr.Dataset, count: int) -> xr.DataArray:
 
 def test_the_demonstrations_survey_is_plain(plain: tuple[xr.Dataset, Calibration]) -> None:
     assert diagnose([plain[0]], plain[1]).verdict == "nothing_found"
+
+
+def test_where_one_file_cannot_be_written_none_is(
+    plain: tuple[xr.Dataset, Calibration], tmp_path: Path
+) -> None:
+    (tmp_path / "report.html").mkdir()
+    (tmp_path / "findings.json").write_text("of an earlier diagnosis")
+    with pytest.raises(WriteError, match=r"report\.html: cannot be written: Is a directory"):
+        diagnose([plain[0]], plain[1], tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} == {"report.html", "findings.json"}
+    assert (tmp_path / "findings.json").read_text() == "of an earlier diagnosis"
 
 
 def test_a_number_beyond_all_measure_is_no_reading(plain: tuple[xr.Dataset, Calibration]) -> None:

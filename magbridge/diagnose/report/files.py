@@ -19,11 +19,20 @@ __all__ = ["write"]
 def write(
     diagnosis: Diagnosis, out_dir: str | os.PathLike[str], causes: Mapping[str, Cause] = CAUSES
 ) -> None:
-    """Write ``findings.json``, ``calibration.json`` and ``report.html``, each whole or not at all."""
+    """Write ``findings.json``, ``calibration.json`` and ``report.html``: all three, or none.
+
+    Raises
+    ------
+    WriteError
+        One of them cannot be written; what was there before is as it was.
+    """
     folder = Path(out_dir)
     folder.mkdir(parents=True, exist_ok=True)
-    save(diagnosis.calibration, folder / "calibration.json")
-    with atomic_path(folder / "findings.json") as beside:
-        beside.write_bytes(findings_json(diagnosis, causes))
-    with atomic_path(folder / "report.html") as beside:
-        beside.write_text(report_html(diagnosis, causes), encoding="utf-8")
+    with (
+        atomic_path(folder / "calibration.json") as extended,
+        atomic_path(folder / "findings.json") as found,
+        atomic_path(folder / "report.html") as report,
+    ):
+        save(diagnosis.calibration, extended)
+        found.write_bytes(findings_json(diagnosis, causes))
+        report.write_text(report_html(diagnosis, causes), encoding="utf-8")
