@@ -8,7 +8,7 @@ The instrument reads ``H_r = D(p) H + T(p)``. Corrected is::
 
 The paper's eq. 2 puts the rotation M where it drops out of the magnitude, its eq. 3 puts it where
 the vector ends in the ellipsoid's own axes. We take ``A = M S^-1 M^T``, **symmetric**: the same
-ellipsoid, six numbers, and a vector that stays in sensor axes (see :mod:`.planning.paper`). Each of the nine
+ellipsoid, six numbers, and a vector that stays in sensor axes (see :mod:`.paper`). Each of the nine
 coefficients is a polynomial in the positions scaled to the range seen, ``x = (p - centre) / scale``.
 All are kept in nT: ``A = I + a / F_0``, with F_0 the field at calibration.
 """

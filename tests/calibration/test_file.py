@@ -26,7 +26,7 @@ from magbridge.calibration.file import (
     save,
 )
 from magbridge.calibration.model import Boresight, Calibration, Noise, Parameter, Reference, Run, Sensor
-from magbridge.calibration.planning.paper import from_paper, to_paper
+from magbridge.calibration.paper import from_paper, to_paper
 from magbridge.calibration.terms import Polynomial, full_order
 from magbridge.errors import CalibrationError, FormatError
 
