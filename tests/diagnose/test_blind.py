@@ -58,6 +58,7 @@ def test_a_hidden_effect_is_found_and_named(name: str) -> None:
     row = blind("named", (name,), 12.0)
     (theory,) = row["theory"]
     named = {found[0] for found in row["found"]} | {other for found in row["found"] for other in found[3]}
+    named |= {one["cause"] for one in (row["unexplained"] or {"alternatives": []})["alternatives"]}
     assert row["verdict"] != "nothing_found"
     assert name in named or theory["inside"] < SAFE, row
     assert {cause for cause in named if theory["apart"].get(cause, 0.0) > FAR} == set(), row
