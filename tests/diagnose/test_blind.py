@@ -12,7 +12,8 @@ import pytest
 import xarray as xr
 from study import stage
 from study.cases import case
-from study.noise import LOSSES, NOISES
+from study.noise import GLIDER, LOSSES, NOISES
+from study.rates import worse
 from threadpoolctl import threadpool_limits
 
 from magbridge.calibration.correct import correct
@@ -45,11 +46,10 @@ def blind(
     wanted: float,
     noise: str = "white",
     number: int = 24,
-    losses: str = "",
+    **more: str,
 ) -> dict[str, Any]:
-    return case(
-        {"part": part, "names": names, "wanted": wanted, "noise": noise, "number": number, "losses": losses}
-    )
+    entry = {"part": part, "names": names, "wanted": wanted, "noise": noise, "number": number, "losses": ""}
+    return case(entry | more)
 
 
 @pytest.mark.parametrize("name", list(CAUSES))
@@ -84,6 +84,13 @@ def test_samples_that_are_lost_hide_nothing() -> None:
     row = blind("named", ("current_field",), 25.0, "mixed", losses="single")
     assert [found[0] for found in row["found"]] == ["current_field"]
     assert row["unexplained"] is None
+
+
+def test_an_extension_against_a_map_does_no_harm() -> None:
+    """To the true field, on its own log and on another day; the offset has settled anew."""
+    row = blind("charted", ("current_field",), 40.0, GLIDER, losses="surfacing", reference="map at its depth")
+    assert row["gain"]["after"] < 0.5 * row["gain"]["before"], row
+    assert not worse(row), row
 
 
 def test_two_at_once() -> None:
