@@ -128,6 +128,7 @@ def _again(
     L = np.vstack([problem.directions, np.zeros((len(selector) - K, len(problem.centre)))])
     own = derivatives(extended, samples, g, -np.hstack([L, selector[:, K:]]))
     free, effects, at = own[:, : len(problem.centre)], own[:, len(problem.centre) :], 0
+    free[:, -3:] = problem.free[:, -3:]  # the delays
     # what the residual would be at the first point, were it linear about this one; the reference was not mended in it
     residual = e + free @ fit.z
     blocks, place = [], 0

@@ -118,7 +118,7 @@ def _examine(
     extended = extend(settled, model, fit) if model else calibration
     progress("measuring the gain")
     counts = _counted(problem, wrong)
-    before, after = problem.residual, problem.residual
+    before = after = problem.straight(outcome.null.z)
     if model:
         after, score = held_out(settled, columns, fit)
         if score < held_out(problem, [], outcome.null).score - ODDS:
@@ -179,11 +179,9 @@ def _gains(
 
 def _loud(problem: Problem, after: FloatArray, counts: NDArray[np.bool_]) -> Leftover | None:
     """Describe what has no structure, but is more than the calibration states of its noise and of its coefficients."""
-    noise, free = problem.calibration.noise, problem.free
-    variance = noise.sensor**2 + noise.reference**2 + np.einsum("ij,ij->i", free, free)
-    power = float(np.sum(after[counts] ** 2 / np.maximum(variance[counts], 1e-12)))
+    power = float(np.sum(after[counts] ** 2 / np.maximum(problem.stated[counts], 1e-12)))
     n = int(counts.sum())
-    if noise.sensor <= 0.0 or power < LOUD**2 * n:
+    if problem.calibration.noise.sensor <= 0.0 or power < LOUD**2 * n:
         return None
     return Leftover("broadband", float(np.sqrt(power - n)), float(chi2.sf(power, n)), 0.0, None, None)
 

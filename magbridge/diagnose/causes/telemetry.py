@@ -68,7 +68,10 @@ def _warmed(problem: Problem, cause: str, on: Way, name: str, lags: Sequence[flo
             again=again, names=("all",) if on == "gain" else (), phi=lambda rows: phi[None, rows] - origin,
         )  # fmt: skip
 
-    return [again(origin, lag) for origin in _origins(problem, name) for lag in lags]
+    origins = _origins(problem, name)
+    if on == "gain":  # from two origins it would be a constant, which is the reference's
+        origins = origins[:1]
+    return [again(origin, lag) for origin in origins for lag in lags]
 
 
 def temperature_offset(problem: Problem) -> list[Candidate]:

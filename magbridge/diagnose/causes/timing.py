@@ -4,46 +4,26 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
 
 from magbridge.calibration.followers import ClockEffect
 from magbridge.calibration.instrument import RateEffect
 from magbridge.diagnose.causes.candidates import AXES, Candidate, of_effect
 from magbridge.diagnose.causes.regressors import once
+from magbridge.diagnose.compare.interpolation import LOST, rates
 from magbridge.diagnose.compare.problem import Problem
 
 __all__ = ["channel_skew", "clock_offset", "eddy_current", "field_rates", "filter_lag", "mass_rates"]
 
 FloatArray = NDArray[np.float64]
 
-LOST = 3
-"""Samples between two that may be lost: the rate beside them still holds 98 % of the true one's power."""
 MOMENT = 0.01
 """s by which masses are moved on and back, to see what the coefficients do."""
 
 
 @once
 def field_rates(problem: Problem) -> FloatArray:
-    r"""(3, n) dH_r/dt, nT/s: of the cubic spline through a leg's samples; zero at its ends.
-
-    Notes
-    -----
-    Of a turn of angular frequency w, sampled every h, a difference both ways holds ``sin(wh)/wh = 1 - (wh)^2/6 + ...``, and
-    its coefficient would be too large by as much; the spline ``3 sin(wh)/(wh (2 + cos(wh))) = 1 - (wh)^4/180 + ...``.
-
-    Rates ``D e`` of noise e have the inner product :math:`E[(D e)^T \Sigma^{-1} e] = \mathrm{tr} D` with itself, whatever its
-    covariance. That of a one-sided difference would pass for an effect; a spline has nothing, being the same backwards.
-    """
-    survey = problem.survey
-    H, t = survey.field.T, survey.time
-    out = np.zeros_like(H)
-    starts = np.flatnonzero(~survey.follows(LOST))
-    for start, end in zip(starts, np.append(starts[1:], len(t)), strict=True):
-        if end - start > 2:
-            for axis in range(3):  # a month's at a time
-                slopes = CubicSpline(t[start:end], H[axis, start:end]).c[2]
-                out[axis, start + 1 : end - 1] = slopes[1:]
-    return out
+    """(3, n) dH_r/dt, nT/s (:func:`~.compare.interpolation.rates`)."""
+    return rates(problem.survey, problem.survey.field.T)
 
 
 @once

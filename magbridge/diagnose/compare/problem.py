@@ -11,6 +11,9 @@ and a coefficient that is really there, but not in the calibration, leaves minus
 passes through the forward model by the one rule. The calibration stays free, with its posterior
 as prior: ``c = c_0 + L z``, ``z ~ N(m, 1)``, where L holds only the directions that these data can see.
 
+Free are also three delays with which the channels may have been interpolated to their rows (:mod:`.interpolation`): a fault of
+the log, not of the vehicle, so they move no coefficient. Unseen, it is an error that a pair of large causes which cancel can mimic.
+
 Derivatives are taken where the reading would have had no residual, ``H_r - e w / |w|^2``: at the reading itself they hold
 its noise, and scales could grow against offsets until the noise is gone (errors in variables).
 """
@@ -28,6 +31,7 @@ from magbridge.calibration.model import Calibration
 from magbridge.calibration.residual import Samples, residuals
 from magbridge.calibration.terms import Effect
 from magbridge.diagnose.compare.derivatives import CHUNK, derivatives
+from magbridge.diagnose.compare.interpolation import bent
 from magbridge.diagnose.compare.prior import level, loosened, prior
 from magbridge.diagnose.compare.survey import Survey
 
@@ -45,6 +49,8 @@ FloatArray = NDArray[np.float64]
 Columns = Callable[[slice], FloatArray]
 """Rows -> (m, k): what one unit of each of k coefficients leaves in the residual."""
 
+DELAY = 0.3
+"""s, 1-sigma of a channel's, after its row."""
 SEEN = 0.01
 """Share of a prior's information that data must add for its direction to be kept."""
 
@@ -66,9 +72,9 @@ class Problem:
     gain : (n,) array
         1/s: what one nT of error in the reference does to e.
     free : (n, q) array
-        ``-de/dz``.
+        ``-de/dz``; the last three are of the delays, in units of :data:`DELAY`.
     directions : (K, q) array
-        L.
+        L; zero for the delays.
     centre : (q,) array
         m, prior mean of z.
     unseen : (K, K) array
@@ -88,6 +94,16 @@ class Problem:
 
     def __len__(self) -> int:
         return len(self.residual)
+
+    @property
+    def stated(self) -> FloatArray:
+        """(n,) nT², variance of the residual by the calibration: its noise, and what its coefficients may be off by."""
+        noise, free = self.calibration.noise, self.free[:, :-3]
+        return np.asarray(noise.sensor**2 + noise.reference**2 + np.einsum("ij,ij->i", free, free))
+
+    def straight(self, z: FloatArray) -> FloatArray:
+        """(n,) residual without what the delays of z (q,) have left in it."""
+        return np.asarray(self.residual - self.free[:, -3:] @ z[-3:])
 
 
 def add_effects(calibration: Calibration, effects: tuple[Effect, ...]) -> Calibration:
@@ -173,8 +189,10 @@ def pose(survey: Survey, calibration: Calibration) -> Problem:
     values, vectors = np.linalg.eigh(seen / level(calibration, e) ** 2)
     keep = values > SEEN
     V, rest = vectors[:, keep], L @ vectors[:, ~keep]
-    free = derivatives(calibration, samples, g, -L @ V)
-    return Problem(survey, calibration, reading, e, g, gain, free, L @ V, V.T @ centre, rest @ rest.T)
+    free = derivatives(calibration, samples, g, np.hstack([-L @ V, np.zeros((len(L), 3))]))
+    free[:, -3:] = -DELAY * g[:, 6:] * bent(survey, reading.T).T
+    directions, centre = np.hstack([L @ V, np.zeros((len(L), 3))]), np.append(V.T @ centre, np.zeros(3))
+    return Problem(survey, calibration, reading, e, g, gain, free, directions, centre, rest @ rest.T)
 
 
 def _terms(calibration: Calibration) -> int:

@@ -71,19 +71,16 @@ def _sides(diagnosis: Diagnosis) -> dict[str, tuple[FloatArray, str]]:
     return {"before": (diagnosis.before, BEFORE), "after, dives left out": (diagnosis.after, AFTER)}
 
 
-def _stated(diagnosis: Diagnosis) -> FloatArray:
-    """(n,) 1-sigma of the difference, nT, by the calibration: its noise, and what its coefficients may be off by."""
-    noise, free = diagnosis.problem.calibration.noise, diagnosis.problem.free
-    return np.asarray(np.sqrt(noise.sensor**2 + noise.reference**2 + (free * free).sum(axis=1)))
-
-
 def measured(diagnosis: Diagnosis) -> str:
     """Draw the total field measured and simulated, and their difference before and after, over time."""
     survey, part = diagnosis.problem.survey, _thin(len(diagnosis.problem))
     figure, axes = _figure(10, 5.2, 2, 1, sharex=True, height_ratios=[1, 1.5])
     top, low = axes[:, 0]
     hours, total, reference, stated = _curves(
-        diagnosis, survey.reference + diagnosis.before, survey.reference, 2.0 * _stated(diagnosis)
+        diagnosis,
+        survey.reference + diagnosis.before,
+        survey.reference,
+        2.0 * np.sqrt(diagnosis.problem.stated),
     )
     top.plot(hours, total, color=BEFORE, linewidth=0.7, label="measured, corrected as calibrated")
     top.plot(hours, reference, color=INK, linewidth=1.0, label="simulated (reference)")

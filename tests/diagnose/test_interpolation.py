@@ -1,0 +1,65 @@
+"""Channels that a log has interpolated linearly to its rows, of a vehicle that sways from sample to sample."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from magbridge.diagnose.compare.interpolation import bent
+from magbridge.diagnose.compare.problem import DELAY, Problem, pose
+from magbridge.diagnose.compare.survey import Survey
+from magbridge.diagnose.inference.joint import fit_joint
+
+DELAYS = np.array([0.0, 0.16, 0.32])
+"""s, of a converter that takes the channels in turn."""
+
+
+def swaying(time: np.ndarray) -> np.ndarray:
+    """(n, 3) nT of 50,000, on a course that turns slowly, with a sway of six samples and one of seventeen."""
+    t = time - 1.7e9
+    heading = 1e-3 * t + 0.02 * np.sin(2.0 * np.pi * t / 24.7)
+    pitch = 0.3 + 0.015 * np.sin(2.0 * np.pi * t / 23.1 + 1.0) + 0.05 * np.sin(2.0 * np.pi * t / 68.0)
+    return 5e4 * np.stack(
+        [np.cos(pitch) * np.cos(heading), np.cos(pitch) * np.sin(heading), np.sin(pitch)], axis=1
+    )
+
+
+def interpolated(time: np.ndarray) -> np.ndarray:
+    """What a logger makes of it that lays a line between the samples of each channel."""
+    taken = time[:, None] + DELAYS
+    field = np.stack([swaying(taken[:, k])[:, k] for k in range(3)], axis=1)
+    return np.stack([np.interp(time, taken[:, k], field[:, k]) for k in range(3)], axis=1)
+
+
+def made(whole: Problem, field: np.ndarray, seed: int) -> Survey:
+    noise = np.random.default_rng(seed).normal(size=field.shape)
+    return replace(whole.survey, field=field + noise, reference=np.full(len(field), 5e4))
+
+
+def test_a_line_leaves_its_delay_times_what_it_is_bent_by(right: Callable[[int], Problem]) -> None:
+    survey = right(400).survey
+    error = interpolated(survey.time) - swaying(survey.time)
+    told = DELAYS * bent(survey, swaying(survey.time).T).T
+    inside = slice(10, -10)
+    for k in (1, 2):
+        assert np.sum((error - told)[inside, k] ** 2) < 0.02 * np.sum(error[inside, k] ** 2)
+
+
+def test_the_delays_are_found(right: Callable[[int], Problem]) -> None:
+    """All but what they share: a field of one size does not see a vector that is late."""
+    whole = right(3000)
+    time = whole.survey.time
+    fit = fit_joint(pose(made(whole, interpolated(time), 1), whole.calibration), [], 1)
+    found = DELAY * (fit.z[-3:] - fit.z[-3])
+    np.testing.assert_allclose(found, DELAYS, atol=0.03)
+
+
+def test_channels_taken_at_once_have_none(right: Callable[[int], Problem]) -> None:
+    whole = right(3000)
+    problem = pose(made(whole, swaying(whole.survey.time), 2), whole.calibration)
+    fit = fit_joint(problem, [], 1)
+    spread = fit.z[-3:] - np.mean(fit.z[-3:])
+    assert np.all(np.abs(DELAY * spread) < 0.03)
+    assert np.std(problem.straight(fit.z) - problem.residual) < 0.2
