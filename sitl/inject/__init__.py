@@ -61,6 +61,10 @@ FOREIGN: dict[str, Effect] = {
     "contact": vehicle.contact,
     "strobe": vehicle.strobe,
     "storm": surroundings.storm,
+    "rotor": vehicle.rotor,
+    "viscous": vehicle.viscous,
+    "brownout": sensor.brownout,
+    "mains": surroundings.mains,
 }
 """Effects that the contract has no name for."""
 

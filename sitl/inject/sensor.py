@@ -133,3 +133,15 @@ def staircase(scene: Scene, size: float, rng: Generator) -> None:
         return np.asarray(H + size * own)
 
     scene.bend.append(bend)
+
+
+def brownout(scene: Scene, size: float, rng: Generator) -> None:
+    """The converter's reference follows a supply that sags under every load and as the cells run down; size in 1e-5 of the field at 1 A."""
+    step, load = (
+        scene.track.step,
+        scene.logged["amps_a"][0] + scene.logged["amps_b"][0] + rng.uniform(0.1, 0.3),
+    )
+    drawn = np.cumsum(load) / np.sum(load)
+    slow = first_order(load, step, float(rng.uniform(100.0, 400.0)))  # ions that have to get there
+    sag = 0.6 * load + 0.4 * slow + rng.uniform(0.3, 1.0) * drawn**3
+    scene.field = scene.field * (1.0 + 1e-5 * size * sag[:, None])

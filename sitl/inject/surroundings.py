@@ -97,3 +97,20 @@ def storm(scene: Scene, size: float, rng: Generator) -> None:
     shock = np.where(since > 0.0, 1.0 - np.exp(-np.maximum(since, 0.0) / 120.0), 0.0)
     total = ring / max(float(ring.max()), 1e-9) - rng.uniform(0.15, 0.35) * shock
     scene.earth = scene.earth + size * np.outer(total, [-0.5, 0.05, 0.45])
+
+
+def mains(scene: Scene, size: float, rng: Generator) -> None:
+    """A three-phase cable on the bottom: 50 Hz as its grid keeps them, seen through the sampling, louder the nearer; size in nT at 100 m."""
+    track, t = scene.track, scene.t
+    north, east = track.local(track.latitude, track.longitude)
+    k, course = rng.integers(len(t)), rng.uniform(0.0, np.pi)
+    aside = (east - east[k]) * np.cos(course) - (north - north[k]) * np.sin(course)
+    above = track.depth.max() + rng.uniform(20.0, 60.0) - track.depth
+    drift = np.cumsum(autoregressive(rng, (len(t),), 0.02, 300.0 / track.step)) * track.step
+    phase = 2 * np.pi * (50.0 * t + drift)
+    bearing = np.arctan2(aside, above)
+    across = np.array([-np.sin(course), np.cos(course), 0.0])
+    turning = np.outer(np.cos(phase + 2 * bearing), across) + np.outer(
+        np.sin(phase + 2 * bearing), [0.0, 0.0, 1.0]
+    )
+    scene.earth = scene.earth + size * 1e4 / (aside**2 + above**2)[:, None] * turning

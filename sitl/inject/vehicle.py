@@ -181,3 +181,29 @@ def strobe(scene: Scene, size: float, rng: Generator) -> None:
     on = (turns % 1.0 < rng.uniform(0.1, 0.4)).astype(float)
     drawn = first_order(on, scene.track.step, 2.0) * (1.0 - 0.15 * along)
     scene.field = scene.field + size * direction(rng) * drawn[:, None]
+
+
+def rotor(scene: Scene, size: float, rng: Generator) -> None:
+    """A brushless motor's rotor comes to rest in another of its dozen cogs after each run; as it spins it averages out; size in nT."""
+    name = str(rng.choice(["ballast", "battpos"]))
+    runs = np.abs(np.gradient(scene.track.parameters[name])) > 1e-6
+    turn = np.cumsum(np.diff(runs, prepend=runs[0]) & runs)
+    angle = rng.integers(0, 12, turn[-1] + 1)[turn] * np.pi / 6.0
+    shaft = direction(rng)
+    a = np.cross(shaft, direction(rng))
+    a /= np.linalg.norm(a)
+    rests = np.outer(np.cos(angle), a) + np.outer(np.sin(angle), np.cross(shaft, a))
+    still = 1.0 - first_order(runs.astype(float), scene.track.step, 1.0)
+    scene.field = scene.field + size * rests * still[:, None]
+
+
+def viscous(scene: Scene, size: float, rng: Generator) -> None:
+    """Steel plate creeps after the field that it lies in, by minutes to hours (magnetic viscosity), mostly in its plane; size in nT."""
+    lags = 120.0 * 3.0 ** np.arange(5)
+    unit = scene.field / np.linalg.norm(scene.field[0])
+    crept = np.mean([first_order(unit, scene.track.step, float(lag)) for lag in lags], axis=0)
+    normal, place = direction(rng), direction(rng)
+    moment = crept - 0.9 * np.outer(crept @ normal, normal)
+    scene.field = (
+        scene.field + size * dipole_field(np.broadcast_to(place, moment.shape), moment) / MU_0_OVER_4_PI
+    )
