@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -11,6 +12,7 @@ from magbridge.diagnose.compare.interpolation import bent
 from magbridge.diagnose.compare.problem import DELAY, Problem, pose
 from magbridge.diagnose.compare.survey import Survey
 from magbridge.diagnose.inference.joint import fit_joint
+from magbridge.diagnose.report.page import _late
 
 DELAYS = np.array([0.0, 0.16, 0.32])
 """s, of a converter that takes the channels in turn."""
@@ -51,9 +53,12 @@ def test_the_delays_are_found(right: Callable[[int], Problem]) -> None:
     """All but what they share: a field of one size does not see a vector that is late."""
     whole = right(3000)
     time = whole.survey.time
-    fit = fit_joint(pose(made(whole, interpolated(time), 1), whole.calibration), [], 1)
+    problem = pose(made(whole, interpolated(time), 1), whole.calibration)
+    fit = fit_joint(problem, [], 1)
     found = DELAY * (fit.z[-3:] - fit.z[-3])
     np.testing.assert_allclose(found, DELAYS, atol=0.03)
+    told = [float(x) for x in re.findall(r"([\d.]+) ± [\d.]+ s", _late(problem, fit))]
+    np.testing.assert_allclose(told, found[1:], atol=1e-3)
 
 
 def test_channels_taken_at_once_have_none(right: Callable[[int], Problem]) -> None:
@@ -63,3 +68,4 @@ def test_channels_taken_at_once_have_none(right: Callable[[int], Problem]) -> No
     spread = fit.z[-3:] - np.mean(fit.z[-3:])
     assert np.all(np.abs(DELAY * spread) < 0.03)
     assert np.std(problem.straight(fit.z) - problem.residual) < 0.2
+    assert not _late(problem, fit)

@@ -9,7 +9,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import chi2
 
+from magbridge.diagnose.compare.problem import DELAY, Problem
+from magbridge.diagnose.inference.joint import Joint
+from magbridge.diagnose.inference.weigh import LEVEL
 from magbridge.diagnose.report import figures
 from magbridge.diagnose.report.findings import parameters, told
 from magbridge.diagnose.report.words import (
@@ -73,6 +77,7 @@ def report_html(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> str:
                 "reference says it should be; below, their difference"
                 + (" before, and with the extended calibration on dives that its fit had not seen." if diagnosis.named else
                    ", and what is left of it when the calibration may move within its own uncertainty.")),
+        _late(diagnosis.problem, diagnosis.fit),
         '<div class="pair">',
         _figure(figures.spectrum(diagnosis), "Spectral density of the difference; dashed, the noise model."),
         _figure(figures.evidence(diagnosis), "The likeliest causes, each tried alone, with calibration and "
@@ -133,6 +138,25 @@ def _verdict(diagnosis: Diagnosis) -> str:
         "partly_explained": f"Found: {', '.join(causes)}. {gained} Something else is left that no cause explains.",
         "unexplained": f"Something is there ({number(total.before)} nT RMS), but {name}.",
     }[diagnosis.verdict]
+
+
+def _late(problem: Problem, fit: Joint) -> str:
+    """Say so when the log has interpolated its channels, which no calibration can mend."""
+    q, to_x = len(problem.centre), np.array([[-1.0, 1.0, 0.0], [-1.0, 0.0, 1.0]])
+    late = DELAY * to_x @ fit.z[-3:]
+    covariance = DELAY**2 * to_x @ fit.covariance[q - 3 : q, q - 3 : q] @ to_x.T
+    if chi2.sf(late @ np.linalg.solve(covariance, late), late.size) >= LEVEL:
+        return ""
+    y, z = (
+        f"{measured(x, s)} ± {measured(s, s)} s"
+        for x, s in zip(late, np.sqrt(np.diag(covariance)), strict=True)
+    )
+    taken = float(np.std(problem.straight(fit.z) - problem.residual))
+    return (
+        f"<p>The channels look as if they had been taken in turn and interpolated to their rows: y {y} and z {z} later than x (one "
+        f"that is noisier than the others looks like that, too). The {number(taken)} nT RMS that this makes are taken out of what "
+        "follows. Channels as they were read, beside mag_time_x, mag_time_y and mag_time_z, would not have it.</p>"
+    )
 
 
 def _found(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> list[str]:
