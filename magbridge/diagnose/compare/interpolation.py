@@ -50,9 +50,8 @@ def bent(survey: Survey, H: FloatArray) -> FloatArray:
     .. math:: H(t + \tau) - \frac{\tau}{h} \left(H(t + \tau) - H(t - h + \tau)\right)
               \approx H + \tau \left(\dot H - \frac{H_0 - H_-}{h}\right)
     """
-    out = rates(survey, H)
-    at = np.flatnonzero(survey.follows())
-    straight = (H[:, at] - H[:, at - 1]) / (survey.time[at] - survey.time[at - 1])
-    out[:, at] = np.where(out[:, at] != 0.0, out[:, at] - straight, 0.0)
-    out[:, ~survey.follows()] = 0.0
+    rate, follows = rates(survey, H), survey.follows()
+    at = np.flatnonzero(follows & rate.any(axis=0))
+    out = np.zeros_like(H)
+    out[:, at] = rate[:, at] - (H[:, at] - H[:, at - 1]) / (survey.time[at] - survey.time[at - 1])
     return out
