@@ -13,15 +13,17 @@ from numpy.typing import NDArray
 from magbridge.calibration.followers import ClockEffect
 from magbridge.calibration.instrument import RateEffect
 from magbridge.calibration.model import Calibration
-from magbridge.calibration.residual import residuals
+from magbridge.calibration.residual import residuals, residuals_of
+from magbridge.calibration.terms import Effect
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.compare.derivatives import derivatives
 from magbridge.diagnose.compare.problem import Columns, Problem, samples_of
+from magbridge.diagnose.compare.survey import Survey
 from magbridge.diagnose.inference.joint import Joint, fit_joint
 from magbridge.diagnose.inference.weigh import IDEAL
 from magbridge.version import __version__
 
-__all__ = ["extend", "settle", "widened"]
+__all__ = ["extend", "flown", "settle", "widened"]
 
 STEPS = 4
 """Linearisations at most; a second one is rarely needed."""
@@ -66,6 +68,38 @@ def extend(problem: Problem, model: Sequence[Candidate], fit: Joint) -> Calibrat
         reference=reference,
         noise=noise,
         software=f"magbridge {__version__}",
+    )
+
+
+def flown(survey: Survey, calibration: Calibration) -> Calibration:
+    """Return the calibration without those rates of change that live, on this survey, bring in more than they take away.
+
+    Live there is no sample after, and a rate is a difference backwards: of a vehicle that sways from sample to sample, noise.
+    """
+    for effect in calibration.effects:
+        if isinstance(effect, RateEffect):
+            without = _without(calibration, effect)
+            if _power(survey, without) < _power(survey, calibration):
+                calibration = without
+    return calibration
+
+
+def _power(survey: Survey, calibration: Calibration) -> float:
+    """nT², what is left of a survey as a bridge would correct it."""
+    return float(np.mean(residuals_of(*samples_of(survey, calibration))[~survey.learned] ** 2))
+
+
+def _without(calibration: Calibration, effect: Effect) -> Calibration:
+    """Return the calibration without one of its effects."""
+    effects = calibration.effects
+    sizes = [*(term.size for term in calibration.terms), *(other.size for other in effects)]
+    at = sum(sizes[: len(calibration.terms) + effects.index(effect)])
+    own = np.arange(at, at + effect.size)
+    return replace(
+        calibration,
+        effects=tuple(other for other in effects if other is not effect),
+        coefficients=np.delete(calibration.coefficients, own),
+        covariance=np.delete(np.delete(calibration.covariance, own, 0), own, 1),
     )
 
 

@@ -19,7 +19,7 @@ from magbridge.diagnose.compare.problem import Problem, pose
 from magbridge.diagnose.compare.survey import Survey
 from magbridge.diagnose.compare.take import take
 from magbridge.diagnose.diagnosis import Diagnosis
-from magbridge.diagnose.extend import extend, settle, widened
+from magbridge.diagnose.extend import extend, flown, settle, widened
 from magbridge.diagnose.gain import Gain, held_out, paired
 from magbridge.diagnose.inference.accept import accept
 from magbridge.diagnose.inference.isolability import isolability
@@ -115,7 +115,7 @@ def _examine(
     progress("extending the calibration")
     settled, columns, fit = settle(problem, model, fit, outcome.order)
     fit = widened(model, loosened(settled, model, columns, fit))
-    extended = extend(settled, model, fit) if model else calibration
+    extended = flown(problem.survey, extend(settled, model, fit)) if model else calibration
     progress("measuring the gain")
     counts = _counted(problem, wrong)
     before = after = problem.straight(outcome.null.z)

@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
+
 import numpy as np
 
+from magbridge.calibration.instrument import RateEffect, TimeEffect
+from magbridge.calibration.model import Calibration
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.compare.past import Past
-from magbridge.diagnose.extend import MODES, widened
+from magbridge.diagnose.compare.problem import Problem
+from magbridge.diagnose.compare.survey import Survey
+from magbridge.diagnose.extend import MODES, flown, widened
 from magbridge.diagnose.inference.fit_noise import fit_noise
 from magbridge.diagnose.inference.joint import Joint
 from magbridge.diagnose.inference.weigh import IDEAL
@@ -60,3 +67,37 @@ def test_two_causes_are_widened_each_by_its_own() -> None:
     np.testing.assert_allclose(
         after.covariance[5:, 5:] @ np.ones(3), widened([candidate(1)], before).covariance[5:, 5:] @ np.ones(3)
     )
+
+
+def skewed(whole: Problem, period: float) -> tuple[Survey, Calibration]:
+    """A vehicle that sways with this period, one channel 0.3 s late, and a calibration that knows it, and of a step."""
+    angle = 2.0 * np.pi * (whole.survey.time - whole.survey.time[0]) / period
+    theta, rate = 0.3 + 0.1 * np.sin(angle), 0.1 * np.cos(angle) * 2.0 * np.pi / period
+    field = 5e4 * np.stack([np.cos(theta), np.sin(theta), np.zeros_like(theta)], axis=1)
+    field[:, 1] += 0.3 * 5e4 * np.cos(theta) * rate
+    survey = replace(whole.survey, field=field, reference=np.full(len(field), 5e4))
+    effects = (
+        RateEffect(cause="channel_skew", on="skew"),
+        TimeEffect(cause="offset_step", shape="step", start=1.8e9),
+    )
+    calibration = replace(
+        whole.calibration,
+        effects=effects,
+        coefficients=np.append(whole.calibration.coefficients, [0.0, 0.3, 0.0, 1.0, 2.0, 3.0]),
+        covariance=np.diag(np.append(np.diag(whole.calibration.covariance), np.arange(1.0, 7.0))),
+    )
+    return survey, calibration
+
+
+def test_a_rate_is_flown_with_where_a_difference_backwards_tells_it(right: Callable[[int], Problem]) -> None:
+    survey, calibration = skewed(right(300), 200.0)
+    assert flown(survey, calibration) is calibration
+
+
+def test_a_rate_that_is_noise_live_is_left_out(right: Callable[[int], Problem]) -> None:
+    """A sway of two and a half samples."""
+    survey, calibration = skewed(right(300), 10.0)
+    calm = flown(survey, calibration)
+    assert [effect.kind for effect in calm.effects] == ["time"]
+    np.testing.assert_array_equal(calm.coefficients[-3:], [1.0, 2.0, 3.0])
+    np.testing.assert_array_equal(np.diag(calm.covariance)[-3:], [4.0, 5.0, 6.0])

@@ -196,6 +196,7 @@ def _found(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> list[str]:
             _several(candidate.names),
             _implausible(candidate, diagnosis.fit.coefficients[start : start + candidate.size]),
             _in_motion(diagnosis, start, candidate),
+            _grounded(diagnosis, candidate),
             doubt
             + f"<p>In a log like this one, theory gives it a chance of {100 * told(diagnosis, hypothesis):.0f} % to be named alone"
             + ("; here it was not.</p>" if rivals else ".</p>"),
@@ -233,6 +234,16 @@ def _implausible(candidate: Candidate, b: NDArray[np.float64]) -> str:
     return (
         f"<p>This is {number(times, 2)} times what such a cause usually amounts to. Two causes that cancel each other can grow like "
         "that: hold the extended field against another reference before it is flown.</p>"
+    )
+
+
+def _grounded(diagnosis: Diagnosis, candidate: Candidate) -> str:
+    """Say so when a cause is named but not flown with."""
+    if all(effect in diagnosis.calibration.effects for effect in candidate.effects):
+        return ""
+    return (
+        "<p>It is not in the extended calibration: live, where a rate is a difference backwards, it would bring in more than it takes "
+        "away.</p>"
     )
 
 
