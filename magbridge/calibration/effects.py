@@ -40,9 +40,9 @@ class ChannelEffect(Effect, frozen=True, kw_only=True):
         s, by how much it is behind in all, of a number of equal first-order lags ``dy/dt = (x - y) / (lag / stages)``; 0: at once.
     stages : int
         How many stand in series, each following the one before: 1, a single store of heat; 2, what heat reaches through another.
-    on : {"offset", "scale", "gain"}
+    on : {"offset", "scale"}
         ``offset``: three coefficients, nT per unit of the channel, added to T. ``scale``: three,
-        added to the diagonal of ``a``, nT at F_0 per unit; ``gain``: one, added to all of the diagonal.
+        added to the diagonal of ``a``, nT at F_0 per unit.
     """
 
     kind: ClassVar[str] = "channel"
@@ -51,12 +51,12 @@ class ChannelEffect(Effect, frozen=True, kw_only=True):
     origin: float = 0.0
     lag: float = 0.0
     stages: Annotated[int, Meta(ge=1)] = 1
-    on: Literal["offset", "scale", "gain"] = "offset"
+    on: Literal["offset", "scale"] = "offset"
 
     @property
     def size(self) -> int:
-        """One for each axis, or for all."""
-        return 1 if self.on == "gain" else 3
+        """One for each axis."""
+        return 3
 
     def channels(self) -> tuple[str, ...]:
         """Name the one that it follows."""
@@ -64,9 +64,9 @@ class ChannelEffect(Effect, frozen=True, kw_only=True):
 
     def columns(self, field: float) -> FloatArray:  # noqa: ARG002  (others need it)
         """One regressor, one slot for each axis."""
-        columns = np.zeros((self.size, 1, 9))
-        first = 6 if self.on == "offset" else 0
-        columns[:, 0, first : first + 3] = 1.0 if self.on == "gain" else np.eye(3)
+        columns = np.zeros((3, 1, 9))
+        columns[:, 0, 6:9] = np.eye(3) * (self.on == "offset")
+        columns[:, 0, 0:3] = np.eye(3) * (self.on == "scale")
         return columns
 
     def begin(self, calibration: Calibration) -> Step:

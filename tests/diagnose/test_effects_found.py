@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import msgspec
 import numpy as np
 import pytest
 
@@ -25,7 +24,6 @@ T0 = 1.7e9
 EFFECTS: list[Effect] = [
     ChannelEffect(cause="temperature_offset", channel="heat", origin=3.0, lag=200.0, stages=2),
     ChannelEffect(cause="temperature_scale", channel="heat", origin=3.0, lag=50.0, on="scale"),
-    ChannelEffect(cause="temperature_scale", channel="heat", origin=3.0, lag=50.0, on="gain"),
     PowersEffect(cause="unmodelled_actuator", channel="heat", centre=3.0, scale=2.0, order=3),
     MonomialEffect(cause="actuator_order", exponents=(4,)),
     PlayEffect(cause="hysteresis", channel="p", width=0.3),
@@ -149,19 +147,6 @@ def test_a_drift_is_held_beyond_what_it_was_learned_from(survey: Survey, calibra
     x = np.clip((survey.time - T0 - 600.0) / 300.0, -1.0, 1.0)
     np.testing.assert_allclose(first, x)
     np.testing.assert_allclose(second, x**2)
-
-
-def test_three_coils_of_one_copper_are_one_number(survey: Survey, calibration: Calibration) -> None:
-    """One gain does what three scales of its size do."""
-    alike = ChannelEffect(cause="temperature_scale", channel="heat", origin=3.0, lag=50.0, on="gain")
-    each = msgspec.structs.replace(alike, on="scale")
-    totals = [
-        correct(
-            with_values(calibration, effect, values), survey.field, survey.values(["p", "heat"]), survey.time
-        ).total
-        for effect, values in ((alike, np.array([4.0])), (each, np.full(3, 4.0)))
-    ]
-    np.testing.assert_allclose(totals[0], totals[1], rtol=1e-12)
 
 
 def test_play_remembers_the_side(survey: Survey, calibration: Calibration) -> None:

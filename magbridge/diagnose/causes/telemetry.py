@@ -18,7 +18,6 @@ from magbridge.diagnose.compare.problem import Problem
 __all__ = ["current_field", "pressure_offset", "temperature_offset", "temperature_scale"]
 
 FloatArray = NDArray[np.float64]
-Way = Literal["offset", "scale", "gain"]
 
 LAGS = (0.0, 700.0, 1700.0, 4000.0, 10000.0)
 """s, so close that a lag between two of them is missed by a fifth at most (RMS)."""
@@ -47,31 +46,31 @@ def _levels(problem: Problem) -> Callable[[str, float], FloatArray]:
     return level
 
 
-def _thermal(problem: Problem, cause: str, *ways: Way) -> list[Candidate]:
+def _thermal(problem: Problem, on: Literal["offset", "scale"]) -> list[Candidate]:
     longest = 2.0 * float(np.ptp(problem.survey.time))
     lags = [lag for lag in LAGS if lag <= longest]
-    names = channels_of(problem, "temperature")
-    return [c for name in names for on in ways for c in _warmed(problem, cause, on, name, lags)]
+    return [c for name in channels_of(problem, "temperature") for c in _warmed(problem, on, name, lags)]
 
 
-def _warmed(problem: Problem, cause: str, on: Way, name: str, lags: Sequence[float]) -> list[Candidate]:
-    """One temperature's, in one way."""
+def _warmed(
+    problem: Problem, on: Literal["offset", "scale"], name: str, lags: Sequence[float]
+) -> list[Candidate]:
+    """One temperature's."""
     field = problem.calibration.reference.field
     unit = "nT/degC" if on == "offset" else f"nT/degC at {field:.0f} nT"
 
     def again(origin: float, lag: float) -> Candidate:
         lag = max(lag, 0.0)
-        effect = ChannelEffect(cause=cause, channel=name, origin=origin, lag=lag, stages=STAGES, on=on)
+        effect = ChannelEffect(
+            cause=f"temperature_{on}", channel=name, origin=origin, lag=lag, stages=STAGES, on=on
+        )
         phi = _levels(problem)(name, lag)
         return of_effect(
             problem, effect, 5.0, unit, channel=name, shape={"origin": (origin, "degC"), "lag": (lag, "s")},
-            again=again, names=("all",) if on == "gain" else (), phi=lambda rows: phi[None, rows] - origin,
+            again=again, phi=lambda rows: phi[None, rows] - origin,
         )  # fmt: skip
 
-    origins = _origins(problem, name)
-    if on == "gain":  # from two origins it would be a constant, which is the reference's
-        origins = origins[:1]
-    return [again(origin, lag) for origin in origins for lag in lags]
+    return [again(origin, lag) for origin in _origins(problem, name) for lag in lags]
 
 
 def temperature_offset(problem: Problem) -> list[Candidate]:
@@ -81,15 +80,12 @@ def temperature_offset(problem: Problem) -> list[Candidate]:
     Typically 0.1 nT/degC for a good fluxgate, several for a low-power one (Primdahl 1979, J. Phys. E 12:241). Separated from
     depth by the thermal hysteresis of dive and climb.
     """
-    return _thermal(problem, "temperature_offset", "offset")
+    return _thermal(problem, "offset")
 
 
 def temperature_scale(problem: Problem) -> list[Candidate]:
-    """Coil constant and resistances follow temperature: ``A += diag(b) (theta_2 - theta_0)``, 10-100 ppm/degC.
-
-    Three coils of one copper expand alike, ``b (1, 1, 1)``; their resistances each for itself.
-    """
-    return _thermal(problem, "temperature_scale", "gain", "scale")
+    """Coil constant and resistances follow temperature: ``A += diag(b) (theta_2 - theta_0)``, 10-100 ppm/degC."""
+    return _thermal(problem, "scale")
 
 
 def _level(problem: Problem, name: str) -> Callable[[slice], FloatArray]:

@@ -81,8 +81,7 @@ def _bracket(state: State, candidate: Candidate, name: str) -> tuple[float, floa
     if name == "period":  # a resolved line is a thousandth wide, the grid is one of peaks
         share = 0.6 * here / float(np.ptp(state.problem.survey.time))
         return here / (1.0 + share), here * (1.0 + share)
-    members = (state.candidates[k] for k in state.groups[key(candidate)])
-    grid = sorted({member.shape[name][0] for member in members if member.names == candidate.names})
+    grid = sorted({state.candidates[k].shape[name][0] for k in state.groups[key(candidate)]})
     width = 0.5 * (grid[-1] - grid[0])
     low = max((v for v in grid if v < here), default=here - width)
     return low, min((v for v in grid if v > here), default=here + width)
