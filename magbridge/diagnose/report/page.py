@@ -73,11 +73,11 @@ def report_html(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> str:
         ("<p>The calibration knows what the vehicle's own magnetism and the sensor's errors do to every reading. What is left "
          "after it has corrected them should be the Earth's field, and should differ from the reference by noise alone. "
          "Whatever else is in the difference is something that the calibration does not know.</p>"),
+        _late(diagnosis.problem, diagnosis.fit),
         _figure(figures.measured(diagnosis), "The total field as measured and corrected by the calibration, and as the "
                 "reference says it should be; below, their difference"
                 + (" before, and with the extended calibration on dives that its fit had not seen." if diagnosis.named else
                    ", and what is left of it when the calibration may move within its own uncertainty.")),
-        _late(diagnosis.problem, diagnosis.fit),
         '<div class="pair">',
         _figure(figures.spectrum(diagnosis), "Spectral density of the difference; dashed, the noise model."),
         _figure(figures.evidence(diagnosis), "The likeliest causes, each tried alone, with calibration and "
