@@ -17,7 +17,7 @@ from magbridge.calibration.residual import residuals, residuals_of
 from magbridge.calibration.terms import Effect
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.compare.derivatives import derivatives
-from magbridge.diagnose.compare.problem import Columns, Problem, samples_of
+from magbridge.diagnose.compare.problem import DELAYS, Columns, Problem, samples_of
 from magbridge.diagnose.compare.survey import Survey
 from magbridge.diagnose.inference.joint import Joint, fit_joint
 from magbridge.diagnose.inference.weigh import IDEAL
@@ -162,7 +162,7 @@ def _again(
     L = np.vstack([problem.directions, np.zeros((len(selector) - K, len(problem.centre)))])
     own = derivatives(extended, samples, g, -np.hstack([L, selector[:, K:]]))
     free, effects, at = own[:, : len(problem.centre)], own[:, len(problem.centre) :], 0
-    free[:, -3:] = problem.free[:, -3:]  # the delays
+    free[:, DELAYS] = problem.free[:, DELAYS]
     # what the residual would be at the first point, were it linear about this one; the reference was not mended in it
     residual = e + free @ fit.z
     blocks, place = [], 0

@@ -9,12 +9,12 @@ from dataclasses import replace
 import numpy as np
 
 from magbridge.diagnose.compare.interpolation import bent
-from magbridge.diagnose.compare.problem import DELAY, Problem, pose
+from magbridge.diagnose.compare.problem import DELAY, DELAYS, Problem, pose
 from magbridge.diagnose.compare.survey import Survey
 from magbridge.diagnose.inference.joint import fit_joint
 from magbridge.diagnose.report.page import _late
 
-DELAYS = np.array([0.0, 0.16, 0.32])
+TAKEN = np.array([0.0, 0.16, 0.32])
 """s, of a converter that takes the channels in turn."""
 
 
@@ -30,7 +30,7 @@ def swaying(time: np.ndarray) -> np.ndarray:
 
 def interpolated(time: np.ndarray) -> np.ndarray:
     """What a logger makes of it that lays a line between the samples of each channel."""
-    taken = time[:, None] + DELAYS
+    taken = time[:, None] + TAKEN
     field = np.stack([swaying(taken[:, k])[:, k] for k in range(3)], axis=1)
     return np.stack([np.interp(time, taken[:, k], field[:, k]) for k in range(3)], axis=1)
 
@@ -43,7 +43,7 @@ def made(whole: Problem, field: np.ndarray, seed: int) -> Survey:
 def test_a_line_leaves_its_delay_times_what_it_is_bent_by(right: Callable[[int], Problem]) -> None:
     survey = right(400).survey
     error = interpolated(survey.time) - swaying(survey.time)
-    told = DELAYS * bent(survey, swaying(survey.time).T).T
+    told = TAKEN * bent(survey, swaying(survey.time).T).T
     inside = slice(10, -10)
     for k in (1, 2):
         assert np.sum((error - told)[inside, k] ** 2) < 0.02 * np.sum(error[inside, k] ** 2)
@@ -55,8 +55,8 @@ def test_the_delays_are_found(right: Callable[[int], Problem]) -> None:
     time = whole.survey.time
     problem = pose(made(whole, interpolated(time), 1), whole.calibration)
     fit = fit_joint(problem, [], 1)
-    found = DELAY * (fit.z[-3:] - fit.z[-3])
-    np.testing.assert_allclose(found, DELAYS, atol=0.03)
+    found = DELAY * (fit.z[DELAYS] - fit.z[DELAYS][0])
+    np.testing.assert_allclose(found, TAKEN, atol=0.03)
     told = [float(x) for x in re.findall(r"([\d.]+) ± [\d.]+ s", _late(problem, fit))]
     np.testing.assert_allclose(told, found[1:], atol=1e-3)
 
@@ -65,7 +65,7 @@ def test_channels_taken_at_once_have_none(right: Callable[[int], Problem]) -> No
     whole = right(3000)
     problem = pose(made(whole, swaying(whole.survey.time), 2), whole.calibration)
     fit = fit_joint(problem, [], 1)
-    spread = fit.z[-3:] - np.mean(fit.z[-3:])
+    spread = fit.z[DELAYS] - np.mean(fit.z[DELAYS])
     assert np.all(np.abs(DELAY * spread) < 0.03)
     assert np.std(problem.straight(fit.z) - problem.residual) < 0.2
     assert not _late(problem, fit)

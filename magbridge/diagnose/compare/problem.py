@@ -51,6 +51,8 @@ Columns = Callable[[slice], FloatArray]
 
 DELAY = 0.3
 """s, 1-sigma of a channel's, after its row."""
+DELAYS = slice(-3, None)
+"""Places of the channels' delays among what is free."""
 SEEN = 0.01
 """Share of a prior's information that data must add for its direction to be kept."""
 
@@ -72,7 +74,7 @@ class Problem:
     gain : (n,) array
         1/s: what one nT of error in the reference does to e.
     free : (n, q) array
-        ``-de/dz``; the last three are of the delays, in units of :data:`DELAY`.
+        ``-de/dz``; those at :data:`DELAYS` in units of :data:`DELAY`.
     directions : (K, q) array
         L; zero for the delays.
     centre : (q,) array
@@ -98,12 +100,12 @@ class Problem:
     @property
     def stated(self) -> FloatArray:
         """(n,) nT², variance of the residual by the calibration: its noise, and what its coefficients may be off by."""
-        noise, free = self.calibration.noise, self.free[:, :-3]
+        noise, free = self.calibration.noise, self.free[:, : DELAYS.start]
         return np.asarray(noise.sensor**2 + noise.reference**2 + np.einsum("ij,ij->i", free, free))
 
     def straight(self, z: FloatArray) -> FloatArray:
         """(n,) residual without what the delays of z (q,) have left in it."""
-        return np.asarray(self.residual - self.free[:, -3:] @ z[-3:])
+        return np.asarray(self.residual - self.free[:, DELAYS] @ z[DELAYS])
 
 
 def add_effects(calibration: Calibration, effects: tuple[Effect, ...]) -> Calibration:
@@ -190,7 +192,7 @@ def pose(survey: Survey, calibration: Calibration) -> Problem:
     keep = values > SEEN
     V, rest = vectors[:, keep], L @ vectors[:, ~keep]
     free = derivatives(calibration, samples, g, np.hstack([-L @ V, np.zeros((len(L), 3))]))
-    free[:, -3:] = -DELAY * g[:, 6:] * bent(survey, reading.T).T
+    free[:, DELAYS] = -DELAY * g[:, 6:] * bent(survey, reading.T).T
     directions, centre = np.hstack([L @ V, np.zeros((len(L), 3))]), np.append(V.T @ centre, np.zeros(3))
     return Problem(survey, calibration, reading, e, g, gain, free, directions, centre, rest @ rest.T)
 

@@ -250,7 +250,7 @@ def evidence(diagnosis: Diagnosis) -> str:
     named = {h.candidate.cause for h in diagnosis.named}
     bars = axis.barh(
         [label(name, None) for name in order],
-        [np.sqrt(tested[name][1]) for name in order],
+        [np.sqrt(max(tested[name][1], 0.0)) for name in order],
         color=[AFTER if name in named else FAINT for name in order],
     )
     chances = [tested[name][0] for name in order]

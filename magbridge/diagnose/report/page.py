@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from magbridge.diagnose.compare.problem import DELAY, Problem
+from magbridge.diagnose.compare.problem import DELAY, DELAYS, Problem
 from magbridge.diagnose.inference.joint import Joint
 from magbridge.diagnose.inference.weigh import LEVEL
 from magbridge.diagnose.report import figures
@@ -142,9 +142,9 @@ def _verdict(diagnosis: Diagnosis) -> str:
 
 def _late(problem: Problem, fit: Joint) -> str:
     """Say so when the log has interpolated its channels, which no calibration can mend."""
-    q, to_x = len(problem.centre), np.array([[-1.0, 1.0, 0.0], [-1.0, 0.0, 1.0]])
-    late = DELAY * to_x @ fit.z[-3:]
-    covariance = DELAY**2 * to_x @ fit.covariance[q - 3 : q, q - 3 : q] @ to_x.T
+    own, to_x = np.arange(len(fit.z))[DELAYS], np.array([[-1.0, 1.0, 0.0], [-1.0, 0.0, 1.0]])
+    late = DELAY * to_x @ fit.z[own]
+    covariance = DELAY**2 * to_x @ fit.covariance[np.ix_(own, own)] @ to_x.T
     if chi2.sf(late @ np.linalg.solve(covariance, late), late.size) >= LEVEL:
         return ""
     y, z = (
