@@ -17,6 +17,7 @@ from checks import Row, first_difference, replays
 from rig import Rig
 
 from magbridge.bridge.events import Clock
+from magbridge.logs import read
 from magbridge.mavlink import Codec, LogReader, Signing
 from magbridge.records import Channel
 
@@ -232,6 +233,29 @@ def test_disk_full(make_rig: MakeRig, small_disk: Path | None, table: Row) -> No
         f'the field goes on, no flag; STATUSTEXT "{said}", `log_state` failed',
         f"{mended:.1f} s, in a new file",
         f"the log meanwhile: `log_lost` {lost} records; what was written before reads to its end",
+    )
+
+
+def test_a_log_that_is_removed(make_rig: MakeRig, table: Row) -> None:
+    rig = make_rig()
+    rig.start()
+    mark = rig.mark
+    (gone,) = rig.logs
+    gone.unlink()
+    rig.until_status(lambda status: status["log_state"] == LOG_FAILED)
+    mended = rig.until(lambda: rig.status["log_state"] == LOG_OK)
+    rig.until_said("log: being written", mark)
+    assert rig.flags(mark) == ""
+    assert rig.stop() == 0
+    (anew,) = rig.logs
+    assert anew != gone
+    assert read(anew).sizes["time"] > 0
+    (said,) = {line for line in rig.said(mark) if line.startswith("log: ") and "written" not in line}
+    table(
+        "somebody removes the log while it is written",
+        f'the field goes on, no flag; STATUSTEXT "{said}", `log_state` failed',
+        f"{mended:.1f} s, in a new file",
+        f"what was in it, and what came until then: `log_lost` {rig.status['log_lost']} records; the new one reads, but is no start to replay from",
     )
 
 

@@ -12,7 +12,7 @@ from magbridge.diagnose.compare.interpolation import bent
 from magbridge.diagnose.compare.problem import DELAY, DELAYS, Problem, pose
 from magbridge.diagnose.compare.survey import Survey
 from magbridge.diagnose.inference.joint import fit_joint
-from magbridge.diagnose.report.page import _late
+from magbridge.diagnose.report.doubts import late
 
 TAKEN = np.array([0.0, 0.16, 0.32])
 """s, of a converter that takes the channels in turn."""
@@ -57,7 +57,7 @@ def test_the_delays_are_found(right: Callable[[int], Problem]) -> None:
     fit = fit_joint(problem, [], 1)
     found = DELAY * (fit.z[DELAYS] - fit.z[DELAYS][0])
     np.testing.assert_allclose(found, TAKEN, atol=0.03)
-    told = [float(x) for x in re.findall(r"([\d.]+) ± [\d.]+ s", _late(problem, fit))]
+    told = [float(x) for x in re.findall(r"([\d.]+) ± [\d.]+ s", late(problem, fit))]
     np.testing.assert_allclose(told, found[1:], atol=1e-3)
 
 
@@ -68,4 +68,4 @@ def test_channels_taken_at_once_have_none(right: Callable[[int], Problem]) -> No
     spread = fit.z[DELAYS] - np.mean(fit.z[DELAYS])
     assert np.all(np.abs(DELAY * spread) < 0.03)
     assert np.std(problem.straight(fit.z) - problem.residual) < 0.2
-    assert not _late(problem, fit)
+    assert not late(problem, fit)

@@ -7,7 +7,10 @@ import pytest
 
 from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.causes.candidates import Candidate
-from magbridge.diagnose.report.page import IMPLAUSIBLE, _implausible
+from magbridge.diagnose.compare.problem import Problem
+from magbridge.diagnose.inference.rivals import Rival
+from magbridge.diagnose.inference.unexplained import Leftover
+from magbridge.diagnose.report.doubts import IMPLAUSIBLE, implausible, nameless
 from magbridge.diagnose.report.words import measured, number, physics, sizes
 
 
@@ -57,5 +60,32 @@ def test_sizes_of_one_unit_name_it_once() -> None:
 def test_a_cause_that_is_larger_than_such_causes_are_is_doubted() -> None:
     """A constant of 360 nT where main-field models are 30 nT off."""
     bias = Candidate("reference_bias", None, lambda _: np.ones((1, 1)), np.array([30.0]), ("bias",), ("nT",))
-    assert "12 times" in _implausible(bias, np.array([-12.0]))
-    assert not _implausible(bias, np.array([0.99 * IMPLAUSIBLE]))
+    assert "12 times" in implausible(bias, np.array([-12.0]))
+    assert not implausible(bias, np.array([0.99 * IMPLAUSIBLE]))
+
+
+def test_names_that_something_unexplained_keeps_are_told() -> None:
+    """With what would tell the likeliest of them; what fits no cause has no names."""
+    drift, current = (
+        Rival(Candidate(cause, channel, lambda _: np.ones((1, 1)), np.ones(1), ("x",), ("nT",)), behind)
+        for cause, channel, behind in (("offset_drift", None, 0.0), ("current_field", "motor<1>", 1.0))
+    )
+    rest = Leftover("drift", 9.0, 1e-9, 12.0, None, None, within=(drift, current))
+    said = nameless(rest, CAUSES)
+    assert "Not ruled out: offset drift, current field (motor&lt;1&gt;)." in said
+    assert CAUSES["offset_drift"].separated_by in said
+    assert nameless(rest._replace(within=()), CAUSES) == "It fits no cause of the table, so it has no name."
+
+
+def test_powers_have_units_of_their_own(problem: Problem) -> None:
+    """A number per (12 deg)^2 is none per 12 deg."""
+    bent = CAUSES["nonlinearity"].candidates(problem)[-1]
+    unit = f"{problem.calibration.reference.field:.0f} nT"
+    assert dict(zip(bent.names, bent.units, strict=True)) == {
+        **{f"{axis}2": f"nT per ({unit})^2" for axis in "xyz"},
+        **{f"{axis}3": f"nT per ({unit})^3" for axis in "xyz"},
+    }
+    drift = CAUSES["offset_drift"].candidates(problem)[-1]
+    assert [unit.partition(")")[2] for unit in drift.units] == [""] * 3 + ["^2"] * 3
+    clipped = CAUSES["saturation"].candidates(problem)[0]
+    assert clipped.units == ("nT", f"nT per {unit}")

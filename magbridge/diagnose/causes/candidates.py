@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from magbridge.calibration.terms import Effect
 from magbridge.diagnose.compare.problem import Columns, Problem, effect_columns, history
 
-__all__ = ["AXES", "Candidate", "of_effect", "of_reference"]
+__all__ = ["AXES", "Candidate", "of_effect", "of_reference", "per"]
 
 FloatArray = NDArray[np.float64]
 AXES = ("x", "y", "z")
@@ -106,18 +106,26 @@ class Candidate:
         )
 
 
+def per(step: str, power: int = 1) -> str:
+    """Return the unit of what a power of so many steps is multiplied with."""
+    return f"nT per {step}" if power == 1 else f"nT per ({step})^{power}"
+
+
 def of_effect(
     problem: Problem,
     effect: Effect,
     width: float | FloatArray,
-    unit: str,
+    unit: str | Sequence[str],
     *,
     channel: str | None = None,
     names: tuple[str, ...] = (),
     phi: FloatArray | Callable[[slice], FloatArray] | None = None,
     **more: Any,
 ) -> Candidate:
-    """Make a candidate of an effect; its regressors are stepped through where `phi` does not give them."""
+    """Make a candidate of an effect; its regressors are stepped through where `phi` does not give them.
+
+    `unit` is that of all its numbers, or one for each of as many equal parts.
+    """
     if phi is None:
         phi = history(problem.survey, problem.calibration, effect)
     widths = np.broadcast_to(np.asarray(width, float), effect.size)
@@ -128,8 +136,10 @@ def of_effect(
         names = tuple(
             axis + (str(power + 1) if powers > 1 else "") for power in range(powers) for axis in AXES
         )
+    parts = (unit,) if isinstance(unit, str) else unit
+    units = tuple(part for part in parts for _ in range(effect.size // len(parts)))
     return Candidate(
-        cause, channel, lambda rows: bare(rows) * widths, widths, names, (unit,) * effect.size, (effect,), **more
+        cause, channel, lambda rows: bare(rows) * widths, widths, names, units, (effect,), **more
     )  # fmt: skip
 
 

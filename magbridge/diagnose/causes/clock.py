@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magbridge.calibration.instrument import TimeEffect
-from magbridge.diagnose.causes.candidates import AXES, Candidate, of_effect
+from magbridge.diagnose.causes.candidates import AXES, Candidate, of_effect, per
 from magbridge.diagnose.causes.regressors import powers
 from magbridge.diagnose.compare.problem import Problem
 
@@ -45,7 +45,8 @@ def offset_drift(problem: Problem) -> list[Candidate]:
         def phi(rows: slice, order: int = order, effect: TimeEffect = effect) -> FloatArray:
             return powers((t[rows] - effect.start) / effect.period, order)
 
-        made.append(of_effect(problem, effect, 50.0, f"nT in {period / 3600:.3g} h", phi=phi))
+        units = [per(f"{period / 3600:.3g} h", power) for power in range(1, order + 1)]
+        made.append(of_effect(problem, effect, 50.0, units, phi=phi))
     return made
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from magbridge.calibration.followers import MonomialEffect, PlayEffect, PowersEffect
 from magbridge.calibration.terms import Polynomial, full_order
-from magbridge.diagnose.causes.candidates import AXES, Candidate, of_effect
+from magbridge.diagnose.causes.candidates import AXES, Candidate, of_effect, per
 from magbridge.diagnose.causes.channels import channels_of, extent
 from magbridge.diagnose.causes.regressors import play, powers
 from magbridge.diagnose.compare.problem import Problem
@@ -40,6 +40,7 @@ def unmodelled_actuator(problem: Problem) -> list[Candidate]:
     for name in channels_of(problem, "position"):
         low, high = extent(problem, name)
         scale = 0.5 * (high - low)
+        step = f"{scale:.3g} {problem.survey.channels[name].unit}".rstrip()
         centres = [0.5 * (low + high)] if problem.survey.learned.any() else [0.5 * (low + high), low, high]
         for order, centre in product((1, 2, 3), centres):
             effect = PowersEffect(
@@ -51,7 +52,7 @@ def unmodelled_actuator(problem: Problem) -> list[Candidate]:
                     problem,
                     effect,
                     width,
-                    f"nT per {scale:.3g} {problem.survey.channels[name].unit}",
+                    [per(step, power) for power in range(1, order + 1)],
                     channel=name,
                     phi=partial(_powers, problem.survey.channels[name].values, centre, scale, order),
                 )

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magbridge.calibration.instrument import ResponseEffect
-from magbridge.diagnose.causes.candidates import AXES, Candidate, of_effect
+from magbridge.diagnose.causes.candidates import AXES, Candidate, of_effect, per
 from magbridge.diagnose.causes.regressors import powers
 from magbridge.diagnose.compare.problem import Problem
 
@@ -26,9 +26,8 @@ def nonlinearity(problem: Problem) -> list[Candidate]:
     for power in (2, 3):
         effect = ResponseEffect(cause="nonlinearity", unit=unit, power=power)
         phi = lambda rows, power=power: powers(H[rows].T / unit, power)[-1]  # noqa: E731
-        made.append(
-            of_effect(problem, effect, 50.0, f"nT at {unit:.0f} nT", phi=phi, shape={"power": (power, "1")})
-        )
+        names = tuple(f"{axis}{power}" for axis in AXES)
+        made.append(of_effect(problem, effect, 50.0, per(f"{unit:.0f} nT", power), names=names, phi=phi))
     return [*made, replace(made[0].with_(made[1]), parts=())]
 
 
@@ -57,7 +56,7 @@ def _clipped(problem: Problem, axis: int, knees: Sequence[float]) -> list[Candid
             return np.stack([way * (over >= 0), way * np.maximum(over, 0.0) / unit])
 
         return of_effect(
-            problem, effect, np.array([100.0, 0.1 * unit]), "nT", names=names, phi=phi,
+            problem, effect, np.array([100.0, 0.1 * unit]), ("nT", per(f"{unit:.0f} nT")), names=names, phi=phi,
             shape={"knee": (knee, "nT")}, again=again,
         )  # fmt: skip
 

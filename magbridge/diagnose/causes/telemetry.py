@@ -57,7 +57,7 @@ def _warmed(
 ) -> list[Candidate]:
     """One temperature's."""
     field = problem.calibration.reference.field
-    unit = "nT/degC" if on == "offset" else f"nT/degC at {field:.0f} nT"
+    unit = "nT/degC" if on == "offset" else f"nT/degC per {field:.0f} nT"
 
     def again(origin: float, lag: float) -> Candidate:
         lag = max(lag, 0.0)

@@ -8,13 +8,19 @@ from html import escape
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.stats import chi2
 
-from magbridge.diagnose.compare.problem import DELAY, DELAYS, Problem
-from magbridge.diagnose.inference.joint import Joint
-from magbridge.diagnose.inference.weigh import LEVEL
 from magbridge.diagnose.report import figures
+from magbridge.diagnose.report.doubts import (
+    grounded,
+    implausible,
+    in_motion,
+    late,
+    nameless,
+    no_gain,
+    outshone,
+    rivalled,
+    several,
+)
 from magbridge.diagnose.report.findings import parameters, told
 from magbridge.diagnose.report.words import (
     MANY,
@@ -30,9 +36,7 @@ from magbridge.diagnose.report.words import (
 
 if TYPE_CHECKING:
     from magbridge.diagnose.causes import Cause
-    from magbridge.diagnose.causes.candidates import Candidate
     from magbridge.diagnose.diagnosis import Diagnosis
-    from magbridge.diagnose.gain import Gain
     from magbridge.diagnose.inference.search import Hypothesis
 
 __all__ = ["report_html"]
@@ -45,8 +49,6 @@ table{border-collapse:collapse;font-size:.9rem;margin:.6rem 0}td,th{padding:.22r
 th{white-space:nowrap}td.n{text-align:right;font-variant-numeric:tabular-nums}.verdict{font-size:1.1rem;background:#f2f6f8;border-left:4px solid #1f6f8b;padding:.8rem 1.1rem}
 .pair{display:flex;gap:1rem;flex-wrap:wrap;align-items:flex-start}.pair figure{flex:1 1 24rem}code{background:#f2f4f6;padding:0 .25em}
 """
-IMPLAUSIBLE = 5.0
-"""Times its plausible size: a cause that is larger is doubted."""
 KINDS = {
     "switching": "An offset that switches",
     "drift": "A slow drift",
@@ -73,7 +75,7 @@ def report_html(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> str:
         ("<p>The calibration knows what the vehicle's own magnetism and the sensor's errors do to every reading. What is left "
          "after it has corrected them should be the Earth's field, and should differ from the reference by noise alone. "
          "Whatever else is in the difference is something that the calibration does not know.</p>"),
-        _late(diagnosis.problem, diagnosis.fit),
+        late(diagnosis.problem, diagnosis.fit),
         _figure(figures.measured(diagnosis), "The total field as measured and corrected by the calibration, and as the "
                 "reference says it should be; below, their difference"
                 + (" before, and with the extended calibration on dives that its fit had not seen." if diagnosis.named else
@@ -140,25 +142,6 @@ def _verdict(diagnosis: Diagnosis) -> str:
     }[diagnosis.verdict]
 
 
-def _late(problem: Problem, fit: Joint) -> str:
-    """Say so when the log has interpolated its channels, which no calibration can mend."""
-    own, to_x = np.arange(len(fit.z))[DELAYS], np.array([[-1.0, 1.0, 0.0], [-1.0, 0.0, 1.0]])
-    late = DELAY * to_x @ fit.z[own]
-    covariance = DELAY**2 * to_x @ fit.covariance[np.ix_(own, own)] @ to_x.T
-    if chi2.sf(late @ np.linalg.solve(covariance, late), late.size) >= LEVEL:
-        return ""
-    y, z = (
-        f"{measured(x, s)} ± {measured(s, s)} s"
-        for x, s in zip(late, np.sqrt(np.diag(covariance)), strict=True)
-    )
-    taken = float(np.std(problem.straight(fit.z) - problem.residual))
-    return (
-        f"<p>The channels look as if they had been taken in turn and interpolated to their rows: y {y} and z {z} later than x (one "
-        f"that is noisier than the others looks like that, too). The {number(taken)} nT RMS that this makes are taken out of what "
-        "follows. Channels as they were read, beside mag_time_x, mag_time_y and mag_time_z, would not have it.</p>"
-    )
-
-
 def _found(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> list[str]:
     if not diagnosis.named and diagnosis.wrong is None:
         if diagnosis.unexplained is not None:
@@ -176,11 +159,6 @@ def _found(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> list[str]:
             for name, value in numbers.items()
         )
         start, at = at - len(diagnosis.problem.centre), at + candidate.size
-        doubt = (
-            f"<p>The data cannot tell it from {listed(rivals)} (odds below 20:1). What would: {escape(causes[candidate.cause].separated_by)}.</p>"
-            if rivals
-            else "<p>No other cause of the table comes within 20:1.</p>"
-        )
         parts += [
             f"<h3>{_name(hypothesis)}</h3>",
             f'<p class="faint">{physics(causes[candidate.cause])}</p>',
@@ -193,14 +171,13 @@ def _found(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> list[str]:
                 f"<table><tr><th>term</th><th>value</th><th>1 sigma</th><th>unit</th></tr>{rows}</table>",
                 len(numbers),
             ),
-            _several(candidate.names),
-            _implausible(candidate, diagnosis.fit.coefficients[start : start + candidate.size]),
-            _in_motion(diagnosis, start, candidate),
-            _grounded(diagnosis, candidate),
-            doubt
-            + f"<p>In a log like this one, theory gives it a chance of {100 * told(diagnosis, hypothesis):.0f} % to be named alone"
-            + ("; here it was not.</p>" if rivals else ".</p>"),
-            _no_gain(gain),
+            several(candidate.names),
+            implausible(candidate, diagnosis.fit.coefficients[start : start + candidate.size]),
+            in_motion(diagnosis, start, candidate),
+            grounded(diagnosis, candidate),
+            rivalled(causes[candidate.cause], rivals, told(diagnosis, hypothesis)),
+            no_gain(gain),
+            outshone(hypothesis, diagnosis.unexplained),
         ]
     if diagnosis.wrong is not None:
         rows_at = ", ".join(
@@ -217,58 +194,6 @@ def _found(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> list[str]:
 def _folded(table: str, size: int) -> str:
     """Fold a table that nobody reads line by line."""
     return table if size <= MANY else f"<details><summary>{size} terms</summary>{table}</details>"
-
-
-def _several(names: tuple[str, ...]) -> str:
-    """Say what a number in brackets means."""
-    if not any(name.endswith(")") for name in names):
-        return ""
-    return '<p class="faint">A number in brackets: the cause took more than one such term to describe; they act together.</p>'
-
-
-def _implausible(candidate: Candidate, b: NDArray[np.float64]) -> str:
-    """Say so when a cause is larger than such causes are: two that cancel each other grow together."""
-    times = float(np.abs(b).max())
-    if candidate.spectra is not None or times < IMPLAUSIBLE:
-        return ""
-    return (
-        f"<p>This is {number(times, 2)} times what such a cause usually amounts to. Two causes that cancel each other can grow like "
-        "that: hold the extended field against another reference before it is flown.</p>"
-    )
-
-
-def _grounded(diagnosis: Diagnosis, candidate: Candidate) -> str:
-    """Say so when a cause is named but not flown with."""
-    if all(effect in diagnosis.calibration.effects for effect in candidate.effects):
-        return ""
-    return (
-        "<p>It is not in the extended calibration: live, where a rate is a difference backwards, it would bring in more than it takes "
-        "away.</p>"
-    )
-
-
-def _in_motion(diagnosis: Diagnosis, at: int, candidate: Candidate) -> str:
-    """Say so when a cause acts while masses move: a mass that moved between two rows, unseen, looks like that, too."""
-    survey = diagnosis.problem.survey
-    p = survey.values([parameter.name for parameter in diagnosis.problem.calibration.parameters])
-    steps = np.any(np.diff(p, axis=0) != 0.0, axis=1)
-    moving = np.append(steps, False) | np.append(False, steps)
-    b = diagnosis.fit.coefficients[at : at + candidate.size]
-    power = (candidate.columns(slice(0, len(survey))) @ b) ** 2
-    share, usual = float(power[moving].sum() / power.sum()), float(moving.mean())
-    if usual > 0.5 or share < 0.8:
-        return ""
-    interval = float(np.median(np.diff(survey.time)))
-    return (
-        f"<p>{100 * share:.0f} % of its trace lies in the {100 * usual:.0f} % of the samples next to which a mass moved. With "
-        f"{interval:.3g} s from row to row, a mass that was elsewhere than its row says would look like that, too.</p>"
-    )
-
-
-def _no_gain(gain: Gain) -> str:
-    if gain.interval[1] < 1.0:
-        return ""
-    return "<p>The dives that were left out do not show that it gains anything: it may be what another effect leaves.</p>"
 
 
 def _left(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> str:
@@ -288,13 +213,7 @@ def _left(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> str:
         return f"<p>No structure is left that a slow curve, steps or a function of attitude would find. {model}</p>"
     goes = f", and goes best with <code>{escape(rest.best_channel)}</code>" if rest.best_channel else ""
     period = f" of period {rest.period_s:.4g} s" if rest.period_s else ""
-    doubt = (
-        f"No name is asserted: no cause of the table is likelier by 20:1. Not ruled out: {listed(rest.within)}. What would "
-        f"tell: {escape(causes[rest.within[0].cause].separated_by)}."
-        if rest.within
-        else "It fits no cause of the table, so it has no name."
-    )
-    return f"<p><b>{KINDS[rest.kind]}</b>{period} is left, of signal-to-noise {rest.signal_to_noise:.1f}{goes}. {doubt} {model}</p>"
+    return f"<p><b>{KINDS[rest.kind]}</b>{period} is left, of signal-to-noise {rest.signal_to_noise:.1f}{goes}. {nameless(rest, causes)} {model}</p>"
 
 
 def _isolability(diagnosis: Diagnosis) -> list[str]:
