@@ -54,40 +54,35 @@ def _followed(time: FloatArray, values: FloatArray, lag: float) -> FloatArray:
     """(n,) y with ``dy/dt = (x - y) / lag``."""
     share = -np.expm1(-np.diff(time) / lag)
     usual = float(np.median(share))
-    odd = np.flatnonzero(np.abs(share - usual) > 1e-6 * usual) + 1  # gaps, and clocks that tremble
-    if odd.size > 0.05 * len(time):
-        return _one_by_one(values, share)
-    out = np.empty_like(values)
-    out[0] = values[0]
-    for first, end in zip(np.append(1, odd + 1), np.append(odd, len(time)), strict=True):
-        if end > first:
-            piece, _ = lfilter(
-                [usual], [1.0, usual - 1.0], values[first:end], zi=[(1.0 - usual) * out[first - 1]]
-            )
-            out[first:end] = piece
-        if end < len(time):
-            out[end] = out[end - 1] + (values[end] - out[end - 1]) * share[end - 1]
-    return out
+    if np.abs(share - usual).max() > 1e-6 * usual:  # gaps, and clocks that tremble
+        return _stepped(values, share)
+    return np.asarray(lfilter([usual], [1.0, usual - 1.0], values, zi=[(1.0 - usual) * values[0]])[0])
 
 
-def _one_by_one(values: FloatArray, share: FloatArray) -> FloatArray:
-    level = float(values[0])
-    out = [level]
-    for x, s in zip(values[1:].tolist(), share.tolist(), strict=True):
-        level += (x - level) * s
-        out.append(level)
-    return np.array(out)
+def _stepped(values: FloatArray, share: FloatArray) -> FloatArray:
+    """(n,) ``y_t = y_(t-1) + s_t (x_t - y_(t-1))``; two rows' steps are one, so are those of four, of eight."""
+    y, kept = np.append(values[0], share * values[1:]), np.append(0.0, 1.0 - share)
+    step = 1
+    while step < len(y):
+        y[step:] = y[step:] + kept[step:] * y[:-step]
+        kept[step:] = kept[step:] * kept[:-step]
+        step *= 2
+    return y
 
 
 def play(values: FloatArray, width: float) -> FloatArray:
-    """(n,) play operator of `values` (:class:`~magbridge.calibration.followers.PlayEffect`); only changes are stepped through."""
-    half, y = 0.5 * width, float(values[0])
-    changed = np.append(0, np.flatnonzero(np.diff(values)) + 1)
-    out = []
-    for p in values[changed].tolist():
-        y = min(max(y, p - half), p + half)
-        out.append(y)
-    return np.repeat(np.array(out), np.diff(np.append(changed, len(values))))
+    """(n,) play operator of `values` (:class:`~magbridge.calibration.followers.PlayEffect`).
+
+    Each row clips what was before it; clipped twice is clipped once, so two rows are one, so are four, and eight.
+    """
+    low, high = values - 0.5 * width, values + 0.5 * width
+    low[0] = high[0] = values[0]
+    step = 1
+    while step < len(values):
+        bounds = low[step:].copy(), high[step:].copy()
+        low[step:], high[step:] = (np.clip(x[:-step], *bounds) for x in (low, high))
+        step *= 2
+    return low
 
 
 def powers(x: FloatArray, order: int) -> FloatArray:

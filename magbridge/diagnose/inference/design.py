@@ -11,20 +11,31 @@ from numpy.typing import NDArray
 from magbridge.diagnose.compare.problem import Columns, Problem
 from magbridge.diagnose.inference.noise import Noise
 
-__all__ = ["Design", "normal"]
+__all__ = ["Design", "kept", "normal"]
 
 FloatArray = NDArray[np.float64]
 
 CHUNK = 2048
 """Rows that are whitened at a time, to stay near the processor."""
 KEPT = 25_000_000
-"""Numbers of a hypothesis' own columns that are kept: 200 MB."""
+"""Numbers that are kept of columns: 200 MB."""
 THREADS, LONG = 2, 16
 """Threads that share the pieces of a log, and pieces from which on it is worth the while."""
 
 
+def kept(n: int, columns: Sequence[Columns]) -> list[Columns]:
+    """Return the columns of n rows made once for all; what would fill the memory is made anew each time."""
+    if n * sum(column(slice(0, 1)).shape[1] for column in columns) > KEPT:
+        return list(columns)
+    return [np.concatenate([column(rows) for rows in _pieces(n)]).__getitem__ for column in columns]
+
+
+def _pieces(n: int) -> list[slice]:
+    return [slice(start, min(start + CHUNK, n)) for start in range(0, n, CHUNK)]
+
+
 class Design:
-    """The columns of a hypothesis, the calibration's and the effects'; what would fill the memory is made anew each time.
+    """The columns of a hypothesis, the calibration's and the effects'.
 
     Parameters
     ----------
@@ -34,25 +45,16 @@ class Design:
     """
 
     def __init__(self, problem: Problem, columns: Sequence[Columns]) -> None:
-        self.free, self.columns = problem.free, columns
-        n = len(problem)
-        self.pieces = [slice(start, min(start + CHUNK, n)) for start in range(0, n, CHUNK)]
-        sizes = [column(self.pieces[0]).shape[1] for column in columns]
+        self.free, self.columns = problem.free, kept(len(problem), columns)
+        self.pieces = _pieces(len(problem))
+        sizes = [column(slice(0, 1)).shape[1] for column in self.columns]
         ends = self.free.shape[1] + np.cumsum([0, *sizes]).astype(int)
         self.at = [slice(*own) for own in zip(ends.tolist(), ends.tolist()[1:], strict=False)]
         self.effects = sum(sizes)
-        self.kept: FloatArray | None = None
-        if n * self.effects <= KEPT:
-            self.kept = np.empty((n, self.effects))
-            for rows in self.pieces:
-                self.kept[rows] = self._made(rows)
-
-    def _made(self, rows: slice) -> FloatArray:
-        return np.hstack([column(rows) for column in self.columns]) if self.columns else self.free[rows, :0]
 
     def rows(self, rows: slice) -> FloatArray:
         """(m, q + k) rows of all columns."""
-        return np.hstack([self.free[rows], self._made(rows) if self.kept is None else self.kept[rows]])
+        return np.hstack([self.free[rows], *(column(rows) for column in self.columns)])
 
     def times(self, c: FloatArray) -> FloatArray:
         """(n,) what the coefficients c (q + k,) leave."""

@@ -11,6 +11,7 @@ from scipy.special import fdtrc
 
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.compare.problem import Problem
+from magbridge.diagnose.inference.design import kept
 from magbridge.diagnose.inference.fit_noise import certainty
 from magbridge.diagnose.inference.information import Information, information
 from magbridge.diagnose.inference.joint import RIDGE, Joint, fit_joint, volume_of
@@ -75,7 +76,7 @@ class State:
     def __init__(self, problem: Problem, candidates: Sequence[Candidate], order: int, causes: int) -> None:
         self.problem, self.candidates, self.order, self.causes = problem, list(candidates), order, causes
         self.at = slices(self.candidates)
-        self.columns = [candidate.columns for candidate in self.candidates]
+        self.columns = kept(len(problem), [candidate.columns for candidate in self.candidates])
         self.trials: dict[str, float] = {}
         self.blocks: bool | None = None
         self.certain: dict[tuple[str, str | None], float] = {}

@@ -20,6 +20,7 @@ from scipy.stats import chi2
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.compare.derivatives import CHUNK
 from magbridge.diagnose.compare.problem import Columns, Problem
+from magbridge.diagnose.inference.design import kept
 from magbridge.diagnose.inference.fit_noise import fit_noise
 from magbridge.diagnose.inference.free import Description, descriptions
 from magbridge.diagnose.inference.information import information
@@ -122,6 +123,8 @@ def leftover(
         Causes that are not to be told again with more numbers.
     """
     listed = [one for one in descriptions(problem, fit, tone) if not one.retells(but)]
+    made = kept(len(problem), [one.columns for one in listed])
+    listed = [one._replace(columns=columns) for one, columns in zip(listed, made, strict=True)]
     columns = [candidate.columns for candidate in model]
     found: list[tuple[float, str, Description, float]] = []
     for noise in (fit.noise, _calm(problem, columns, fit, order, listed[:2])):
