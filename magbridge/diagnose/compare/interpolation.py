@@ -31,9 +31,7 @@ def rates(survey: Survey, H: FloatArray) -> FloatArray:
     starts = np.flatnonzero(~survey.follows(LOST))
     for start, end in zip(starts, np.append(starts[1:], len(t)), strict=True):
         if end - start > 2:
-            for axis in range(3):  # a month's at a time
-                slopes = CubicSpline(t[start:end], H[axis, start:end]).c[2]
-                out[axis, start + 1 : end - 1] = slopes[1:]
+            out[:, start + 1 : end - 1] = CubicSpline(t[start:end], H[:, start:end], axis=1).c[2, 1:].T
     return out
 
 
