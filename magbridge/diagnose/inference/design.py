@@ -45,7 +45,7 @@ class Design:
     """
 
     def __init__(self, problem: Problem, columns: Sequence[Columns]) -> None:
-        self.free, self.columns = problem.free, kept(len(problem), columns)
+        self.free, self.columns = problem.free, columns
         self.pieces = _pieces(len(problem))
         sizes = [column(slice(0, 1)).shape[1] for column in self.columns]
         ends = self.free.shape[1] + np.cumsum([0, *sizes]).astype(int)
@@ -58,11 +58,16 @@ class Design:
 
     def times(self, c: FloatArray) -> FloatArray:
         """(n,) what the coefficients c (q + k,) leave."""
-        return np.concatenate([self.rows(rows) @ c for rows in self.pieces])
+        out = np.asarray(self.free @ c[: self.free.shape[1]])
+        for own, column in zip(self.at, self.columns, strict=True):
+            for rows in self.pieces:
+                out[rows] += column(rows) @ c[own]
+        return out
 
     def against(self, y: FloatArray) -> FloatArray:
         """(q + k,) ``X^T y``."""
-        return np.asarray(sum(self.rows(rows).T @ y[rows] for rows in self.pieces))
+        effects = [sum(column(rows).T @ y[rows] for rows in self.pieces) for column in self.columns]
+        return np.concatenate([self.free.T @ y, *effects])
 
 
 def normal(X: Columns, y: FloatArray, noise: Noise | None = None) -> tuple[FloatArray, FloatArray]:

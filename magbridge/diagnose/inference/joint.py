@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magbridge.diagnose.compare.problem import Columns, Problem
-from magbridge.diagnose.inference.design import Design, normal
+from magbridge.diagnose.inference.design import Design, kept, normal
 from magbridge.diagnose.inference.fit_noise import fit_noise
 from magbridge.diagnose.inference.noise import Noise
 from magbridge.diagnose.inference.statistic import Statistic
@@ -95,7 +95,7 @@ def fit_joint(
     rounds : int
         At most.
     """
-    X = Design(problem, columns)
+    X = Design(problem, kept(len(problem), columns))
     q, k = X.free.shape[1], X.effects
     prior = np.append(np.ones(q), np.broadcast_to(ridge, k))
     common = [(own, spectrum) for own, spectrum in zip(X.at, spectra, strict=False) if spectrum is not None]

@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from magbridge.diagnose.causes.candidates import Candidate
-from magbridge.diagnose.compare.derivatives import CHUNK
 from magbridge.diagnose.compare.problem import Columns, Problem
-from magbridge.diagnose.inference.design import kept
+from magbridge.diagnose.inference.design import Design, kept
 from magbridge.diagnose.inference.fit_noise import fit_noise
 from magbridge.diagnose.inference.free import Description, descriptions
 from magbridge.diagnose.inference.information import information
@@ -176,7 +175,8 @@ def _calm(
     for _ in range(CALM):
         info = information(problem, noise, fit, model, [one.columns for one in slow])
         c = Statistic(info.matrix, width[None] ** 2).best(info.score).estimate
-        left = fit.left + _taken(problem, model, -info.shift @ c, [one.columns for one in slow], c)
+        X = Design(problem, [*model, *(one.columns for one in slow)])
+        left = fit.left - X.times(np.append(-info.shift @ c, c))
         noise = fit_noise(left, past, blocks=blocks)
     return noise
 
@@ -186,25 +186,12 @@ def _weighed(
 ) -> float:  # fmt: skip
     """Log evidence of a description against the model, the noise fitted anew with it (Laplace's approximation)."""
     moved = -shift @ best.estimate
-    left = fit.left + _taken(problem, model, moved, [one.columns], best.estimate)
+    left = fit.left - Design(problem, [*model, one.columns]).times(np.append(moved, best.estimate))
     noise = fit_noise(left, problem.survey.past(order), blocks=bool(np.ptp(fit.noise.scale)), like=fit.noise)
     z = fit.z + moved[: len(fit.z)]
     pull = float(np.sum((z - problem.centre) ** 2) - np.sum((fit.z - problem.centre) ** 2))
     gained = noise.log_likelihood - fit.noise.log_likelihood - 0.5 * pull
     return gained - best.price - float(np.log(one.trials))
-
-
-def _taken(
-    problem: Problem, model: Sequence[Columns], moved: FloatArray, columns: Sequence[Columns], c: FloatArray
-) -> FloatArray:
-    """(n,) by how much the residual changes when a description takes c, and calibration and model move by `moved`."""
-    out = np.empty(len(problem))
-    every = np.append(moved, c)
-    for start in range(0, len(problem), CHUNK):
-        rows = slice(start, start + CHUNK)
-        X = np.hstack([problem.free[rows], *(column(rows) for column in (*model, *columns))])
-        out[rows] = -X @ every
-    return out
 
 
 def _goes_with(problem: Problem, fit: Joint) -> str | None:
