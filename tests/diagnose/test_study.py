@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from study.both import held, named, weighed
+from study.both import by_causes, held, named, weighed
 from study.cases import PARTS, plan
 from study.draws import SHOWN, Draws, Span, evidence, weigh, with_another
 from study.nameless import against, allowed, nameless
@@ -156,7 +156,7 @@ def test_two_are_named_unless_another_whole_says_the_same() -> None:
     def chances(*columns: tuple[str, np.ndarray]) -> tuple[float, float]:
         X = np.column_stack([*(column for _, column in columns), one + two])
         spans = [Span(name, None, slice(k, k + 1)) for k, (name, _) in enumerate(columns)]
-        wholes = weighed(Draws.of(X.T @ X), spans, spans, trials)
+        wholes = by_causes(weighed(Draws.of(X.T @ X), spans, spans, trials))
         return named(wholes, frozenset("ab")), held(wholes, frozenset("ab"))
 
     truth = (("a", one), ("b", two))

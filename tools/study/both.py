@@ -30,7 +30,7 @@ Wholes = dict[frozenset[str], Array]
 def both(hidden: Sequence[Found], stall: Stall, ds: xr.Dataset, setting: Setting) -> dict[str, float]:
     """Chances of the module's notes; see :func:`study.theory.ideal`."""
     spans, S = information(hidden, stall, ds, setting)
-    draws, table = Draws.of(S), [span for span in spans if span.channel != SHOWN]
+    draws, table = Draws.of(S), {span for span in spans if span.channel != SHOWN}
     truth = frozenset(one.hidden.name for one in hidden)
     likely, last = [*best_of(S, spans).values()], len(S) - 1 - len(hidden)
     shown = []
@@ -41,8 +41,9 @@ def both(hidden: Sequence[Found], stall: Stall, ds: xr.Dataset, setting: Setting
             return dict.fromkeys(("both", "inside", "regressed"), 0.0)
         likely.append(own)
         shown.append(true_span(alone, own, one.hidden.name, k))
-    regressed = weighed(draws, table, [one for one in likely if one in table], setting.trials)
-    known = weighed(draws, [*spans, *shown], [*likely, *shown], setting.trials)
+    values = weighed(draws, [*spans, *shown], [*likely, *shown], setting.trials)
+    known = by_causes(values)
+    regressed = by_causes({some: value for some, value in values.items() if table.issuperset(some)})
     return {
         "both": named(known, truth),
         "inside": held(known, truth),
@@ -52,27 +53,28 @@ def both(hidden: Sequence[Found], stall: Stall, ds: xr.Dataset, setting: Setting
 
 def weighed(
     draws: Draws, spans: Sequence[Span], firsts: Sequence[Span], trials: Mapping[str, float]
-) -> Wholes:
-    """Log evidence of every cause, and of every two of which one of `firsts` is one."""
+) -> dict[tuple[Span, ...], Array]:
+    """Log evidence of every span, and of every two of different causes of which one of `firsts` is the first."""
 
     def own(draws: Draws, span: Span) -> Array:
         return np.asarray(evidence(span, *draws.ratio(span)) - np.log(trials.get(span.cause, 1.0)))
 
-    def best(draws: Draws, but: str = "") -> dict[str, Array]:
-        found: dict[str, Array] = {}
-        for span in spans:
-            if span.cause != but:
-                value = own(draws, span)
-                found[span.cause] = np.maximum(found.get(span.cause, value), value)
-        return found
-
-    wholes = {frozenset((cause,)): value for cause, value in best(draws).items()}
+    values: dict[tuple[Span, ...], Array] = {(span,): own(draws, span) for span in spans}
     price = ODDS + np.log(max(len(trials), 1))
     for first in firsts:
-        for cause, value in best(draws.beside(first), first.cause).items():
-            whole = frozenset((first.cause, cause))
-            two = own(draws, first) + value - price
-            wholes[whole] = np.maximum(wholes.get(whole, two), two)
+        beside = draws.beside(first)
+        for span in spans:
+            if span.cause != first.cause:
+                values[first, span] = values[first,] + own(beside, span) - price
+    return values
+
+
+def by_causes(values: Mapping[tuple[Span, ...], Array]) -> Wholes:
+    """Of every whole of causes the best value."""
+    wholes: Wholes = {}
+    for spans, value in values.items():
+        whole = frozenset(span.cause for span in spans)
+        wholes[whole] = np.maximum(wholes.get(whole, value), value)
     return wholes
 
 
