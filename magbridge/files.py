@@ -38,7 +38,8 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     except MagbridgeError:
         raise
     except OSError as error:
-        raise WriteError(target, error.strerror or str(error)) from error
+        reason = os.strerror(error.errno) if error.errno else str(error)  # not a library's words around it
+        raise WriteError(target, reason) from error
     finally:
         with suppress(OSError):  # it was renamed, or never made
             beside.unlink()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import resource
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.model import Calibration, Sensor
 from magbridge.cli import main
 from magbridge.diagnose.compare.take import take
+from magbridge.diagnose.report import files
 from magbridge.diagnose.run import diagnose
 from magbridge.errors import DataError, WriteError
 from magbridge.logs import write
@@ -46,6 +48,22 @@ def test_where_one_file_cannot_be_written_none_is(
         diagnose([plain[0]], plain[1], tmp_path)
     assert {path.name for path in tmp_path.iterdir()} == {"report.html", "findings.json"}
     assert (tmp_path / "findings.json").read_text() == "of an earlier diagnosis"
+
+
+def test_a_full_disk_names_the_file_that_has_no_room(
+    plain: tuple[xr.Dataset, Calibration], tmp_path: Path
+) -> None:
+    """The limit of a file's size stands for the disk's end."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    found = diagnose([plain[0]], plain[1])
+    for room, name in ((0, "calibration.json"), (300_000, "report.html")):
+        resource.setrlimit(resource.RLIMIT_FSIZE, (room, limits[1]))
+        try:
+            with pytest.raises(WriteError, match=rf"doubt/{name}: cannot be written: File too large"):
+                files.write(found, tmp_path / "doubt")
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        assert not list((tmp_path / "doubt").iterdir())
 
 
 def test_a_number_beyond_all_measure_is_no_reading(plain: tuple[xr.Dataset, Calibration]) -> None:
@@ -99,6 +117,28 @@ def test_telemetry_that_stands_still_is_no_telemetry(plain: tuple[xr.Dataset, Ca
     still = ds.assign({name: 0.0 * ds[name] + ds[name].mean() for name in ("sensor_temperature", "depth")})
     found = diagnose([still], plain[1])
     assert {"temperature_offset", "pressure_offset"} <= set(found.isolability.untestable)
+
+
+def test_attitude_and_position_may_be_lacking_in_some_rows_or_all(
+    plain: tuple[xr.Dataset, Calibration],
+) -> None:
+    """An autopilot's log begins before its first attitude; a reference is there without a position."""
+    ds, calibration = plain
+    late = {name: ds[name].where(some(ds, 9)) for name in ("roll", "pitch", "heading")}
+    never = {name: np.nan * ds[name] for name in ("latitude", "longitude", "depth")}
+    survey = take([ds.assign(late | never)], calibration)
+    assert survey.attitude is not None
+    assert np.isfinite(survey.attitude).all()
+    assert survey.place is None
+    assert take([ds.assign(roll=np.nan * ds["roll"])], calibration).attitude is None
+    assert diagnose([ds.assign(late | never)], calibration).verdict == "nothing_found"
+
+
+def test_another_magnetometer_is_no_telemetry(plain: tuple[xr.Dataset, Calibration]) -> None:
+    """It would explain whatever the Earth's field does."""
+    ds, calibration = plain
+    both = ds.assign(second=ds["mag_x"].assign_attrs(units="nT"))
+    assert "second" not in take([both], calibration).channels
 
 
 def test_the_command_line_says_it_in_one_line(

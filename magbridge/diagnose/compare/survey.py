@@ -29,6 +29,8 @@ KINDS = {
 HINTS = (("temp", "temperature"), ("current", "current"), ("press", "pressure"))
 """Where a channel declares no unit, its name may help; else it is tried as everything."""
 OURS = ("mag_", "truth_")
+FIELDS = {"nT", "uT", "\N{MICRO SIGN}T", "mG", "G", "T"}
+"""Units of another magnetometer: it follows all that this one does, and explains nothing."""
 NOT_TELEMETRY = {
     "time", "learned", "reference_field", "roll", "pitch", "heading", "latitude", "longitude", "run", "dive", "quality",
     "total_field", "total_field_sigma", "field_x", "field_y", "field_z", "anomaly", "power_cycle",
@@ -155,6 +157,8 @@ def assemble(
         if name in NOT_TELEMETRY or name.startswith(OURS):
             continue
         values, unit = table[name], units.get(name, "")
+        if unit in FIELDS and name not in needed:
+            continue
         known = values[np.isfinite(values)]
         if known.size < FEWEST or np.ptp(known) <= 1e-9 * (np.abs(known).max() + 1e-30):
             still.append(name)
@@ -162,6 +166,7 @@ def assemble(
                 channels[name] = Channel(_held(values), unit, ())
             continue
         channels[name] = Channel(_held(values), unit, _kinds(name, unit))
+    table = {name: column for name, column in table.items() if np.isfinite(column).any()}
     cycles = np.empty(0)
     if "power_cycle" in table:
         cycles = time[1:][np.diff(table["power_cycle"]) > 0]
@@ -177,7 +182,7 @@ def assemble(
         place = np.stack([north, east], axis=1)
     attitude = None
     if {"roll", "pitch", "heading"} <= set(table):
-        attitude = np.stack([table[name] for name in ("roll", "pitch", "heading")], axis=1)
+        attitude = np.stack([_held(table[name]) for name in ("roll", "pitch", "heading")], axis=1)
     return Survey(
         time=time,
         field=np.stack([table[f"mag_{axis}"] for axis in "xyz"], axis=1),

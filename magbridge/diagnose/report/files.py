@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from contextlib import ExitStack
 from pathlib import Path
 
-from magbridge.calibration.file import save
+from magbridge.calibration.file import encode_calibration
 from magbridge.diagnose.causes import CAUSES, Cause
 from magbridge.diagnose.diagnosis import Diagnosis
 from magbridge.diagnose.report.findings import findings_json
@@ -26,13 +27,13 @@ def write(
     WriteError
         One of them cannot be written; what was there before is as it was.
     """
+    contents = {
+        "calibration.json": encode_calibration(diagnosis.calibration),
+        "findings.json": findings_json(diagnosis, causes),
+        "report.html": report_html(diagnosis, causes).encode(),
+    }
     folder = Path(out_dir)
     folder.mkdir(parents=True, exist_ok=True)
-    with (
-        atomic_path(folder / "calibration.json") as extended,
-        atomic_path(folder / "findings.json") as found,
-        atomic_path(folder / "report.html") as report,
-    ):
-        save(diagnosis.calibration, extended)
-        found.write_bytes(findings_json(diagnosis, causes))
-        report.write_text(report_html(diagnosis, causes), encoding="utf-8")
+    with ExitStack() as written:
+        for name, content in contents.items():
+            written.enter_context(atomic_path(folder / name)).write_bytes(content)
