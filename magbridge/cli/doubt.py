@@ -37,7 +37,7 @@ def diagnose(
     Parameters
     ----------
     files
-        Logs that the calibration has not seen; each file, and each pause, is a dive of its own.
+        Logs that the calibration has not seen. Whole dives are left out to measure the gain; of a log with fewer than four, eighths.
     calibration
         The cal.json.
     output

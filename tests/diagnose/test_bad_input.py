@@ -134,6 +134,14 @@ def test_attitude_and_position_may_be_lacking_in_some_rows_or_all(
     assert diagnose([ds.assign(late | never)], calibration).verdict == "nothing_found"
 
 
+def test_where_there_are_no_dives_it_is_not_said_that_dives_were_left_out(
+    plain: tuple[xr.Dataset, Calibration],
+) -> None:
+    ds, calibration = plain
+    assert take([ds], calibration).parts == "dives"
+    assert take([ds.drop_vars(["depth", "run"])], calibration).parts == "eighths of the log"
+
+
 def test_another_magnetometer_is_no_telemetry(plain: tuple[xr.Dataset, Calibration]) -> None:
     """It would explain whatever the Earth's field does."""
     ds, calibration = plain

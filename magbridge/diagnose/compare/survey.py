@@ -108,6 +108,11 @@ class Survey:
         apart = np.diff(self.time, prepend=np.inf)
         return np.asarray((apart > 0.0) & (apart < (lost + 1.5) * np.median(apart)) & (self.steps < FAR))
 
+    @property
+    def parts(self) -> str:
+        """What is left out in turn."""
+        return "eighths of the log" if np.array_equal(self.dive, _eighths(len(self))) else "dives"
+
     def past(self, order: int) -> Past:
         """Return what came before each sample, as far back as a noise of this order remembers."""
         if order not in self._pasts:
@@ -226,5 +231,8 @@ def _dives(table: dict[str, FloatArray]) -> NDArray[np.int64]:
         start = shallow & ~np.append(False, shallow[:-1])
         if 4 <= start.sum() <= 0.05 * len(depth):
             return np.cumsum(start)
-    n = len(table["time"])
+    return _eighths(len(table["time"]))
+
+
+def _eighths(n: int) -> NDArray[np.int64]:
     return np.arange(n) * 8 // n

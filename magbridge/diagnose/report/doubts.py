@@ -107,10 +107,10 @@ def in_motion(diagnosis: Diagnosis, at: int, candidate: Candidate) -> str:
 
 
 def no_gain(gain: Gain) -> str:
-    """Say so when the dives that were left out show nothing of it."""
+    """Say so when what was left out shows nothing of it."""
     if gain.interval[1] < 1.0:
         return ""
-    return "<p>The dives that were left out do not show that it gains anything: it may be what another effect leaves.</p>"
+    return "<p>What was left out of the fit does not show that it gains anything: it may be what another effect leaves.</p>"
 
 
 def outshone(hypothesis: Hypothesis, rest: Leftover | None) -> str:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogFormatter
+from matplotlib.ticker import LogFormatter, MaxNLocator
 from numpy.typing import NDArray
 from scipy.signal import periodogram
 
@@ -53,12 +53,17 @@ def _thin(n: int) -> slice:
 
 
 def _curves(diagnosis: Diagnosis, *values: FloatArray) -> tuple[FloatArray, ...]:
-    """Return the hours since the start and each of `values`, thinned, with no line across a gap."""
+    """Return the time since the start and each of `values`, thinned, with no line across a gap."""
     t, part = diagnosis.problem.survey.time, _thin(len(diagnosis.problem))
-    hours = (t[part] - t[0]) / 3600.0
-    steps = np.diff(hours)
+    since = (t[part] - t[0]) / _clock(diagnosis)[0]
+    steps = np.diff(since)
     gap = np.append(steps > GAP * np.median(steps), False)
-    return hours, *(np.where(gap, np.nan, value[part]) for value in values)
+    return since, *(np.where(gap, np.nan, value[part]) for value in values)
+
+
+def _clock(diagnosis: Diagnosis) -> tuple[float, str]:
+    """Return the unit in which a log of this length is told: its seconds and its name."""
+    return (3600.0, "hours") if np.ptp(diagnosis.problem.survey.time) > 7200.0 else (60.0, "minutes")
 
 
 def _sides(diagnosis: Diagnosis) -> dict[str, tuple[FloatArray, str]]:
@@ -68,7 +73,7 @@ def _sides(diagnosis: Diagnosis) -> dict[str, tuple[FloatArray, str]]:
             "as calibrated": (diagnosis.before, BEFORE),
             "calibration refitted": (diagnosis.fit.left, AFTER),
         }
-    return {"before": (diagnosis.before, BEFORE), "after, dives left out": (diagnosis.after, AFTER)}
+    return {"before": (diagnosis.before, BEFORE), "after, held out": (diagnosis.after, AFTER)}
 
 
 def measured(diagnosis: Diagnosis) -> str:
@@ -76,24 +81,25 @@ def measured(diagnosis: Diagnosis) -> str:
     survey, part = diagnosis.problem.survey, _thin(len(diagnosis.problem))
     figure, axes = _figure(10, 5.2, 2, 1, sharex=True, height_ratios=[1, 1.5])
     top, low = axes[:, 0]
-    hours, total, reference, stated = _curves(
+    unit, clock = _clock(diagnosis)
+    since, total, reference, stated = _curves(
         diagnosis,
         survey.reference + diagnosis.before,
         survey.reference,
         2.0 * np.sqrt(diagnosis.problem.stated),
     )
-    top.plot(hours, total, color=BEFORE, linewidth=0.7, label="measured, corrected as calibrated")
-    top.plot(hours, reference, color=INK, linewidth=1.0, label="simulated (reference)")
+    top.plot(since, total, color=BEFORE, linewidth=0.7, label="measured, corrected as calibrated")
+    top.plot(since, reference, color=INK, linewidth=1.0, label="simulated (reference)")
     top.set_ylabel("total field (nT)", fontsize=9)
     ends = np.nanquantile(np.append(total, reference), [0.002, 0.998])
     top.set_ylim(ends[0] - 0.1 * np.ptp(ends), ends[1] + 0.35 * np.ptp(ends))
     ends = np.zeros(2)
     for name, (left, colour) in _sides(diagnosis).items():
-        low.plot(hours, left[part], ".", color=colour, markersize=2, label=name)
+        low.plot(since, left[part], ".", color=colour, markersize=2, label=name)
         some = np.quantile(left, [0.002, 0.998])
         ends = np.array([min(ends[0], some[0]), max(ends[1], some[1])])
     low.fill_between(
-        hours,
+        since,
         -stated,
         stated,
         color=FAINT,
@@ -103,12 +109,13 @@ def measured(diagnosis: Diagnosis) -> str:
     )
     dives = survey.time[np.flatnonzero(np.diff(survey.dive)) + 1]
     for start in dives if dives.size < MANY else ():
-        low.axvline((start - survey.time[0]) / 3600.0, color=FAINT, linewidth=0.4)
+        low.axvline((start - survey.time[0]) / unit, color=FAINT, linewidth=0.4)
     low.axhline(0.0, color=INK, linewidth=0.6)
     low.set_ylim(ends[0] - 0.25 * np.ptp(ends), ends[1] + 0.4 * np.ptp(ends))
     low.set_ylabel("measured − simulated (nT)", fontsize=9)
     low.set_xlabel(
-        "hours since the start" + ("; grey lines part the dives" if dives.size < MANY else ""), fontsize=9
+        f"{clock} since the start" + (f"; grey lines part the {survey.parts}" if dives.size < MANY else ""),
+        fontsize=9,
     )
     for axis in (top, low):
         axis.legend(fontsize=8, frameon=False, loc="upper right", markerscale=4, ncols=3)
@@ -177,6 +184,7 @@ def channels(diagnosis: Diagnosis) -> str:
             axis.plot(middle, mean, "o-", color=colour, markersize=2.5, linewidth=1)
             ends += [mean - spread, mean + spread]
         axis.set_xlabel(f"{name} ({unit or '1'})", fontsize=8)
+        axis.xaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
     for axis in axes.flat[len(names) :]:
         axis.set_visible(False)
     for axis in axes[:, 0]:
@@ -195,6 +203,7 @@ def track(diagnosis: Diagnosis) -> str | None:
     part = _thin(len(place))
     sides = _sides(diagnosis)
     north, east = np.ptp(place, axis=0)[:2]
+    scale, unit = (1e3, "km") if max(north, east) > 2e3 else (1.0, "m")
     if east > 2.0 * north:  # a long track lies better above the other one
         height = 0.4 + 2.0 * (0.35 + 8.0 * max(float(north / east), 0.1))
         figure, axes = _figure(10, height, 2, 1, sharex=True, sharey=True)
@@ -204,8 +213,8 @@ def track(diagnosis: Diagnosis) -> str | None:
     dots = None
     for axis, (title, (values, _)) in zip(axes.flat, sides.items(), strict=True):
         dots = axis.scatter(
-            place[part, 1] / 1e3,
-            place[part, 0] / 1e3,
+            place[part, 1] / scale,
+            place[part, 0] / scale,
             c=values[part],
             s=5,
             cmap="RdBu_r",
@@ -213,11 +222,12 @@ def track(diagnosis: Diagnosis) -> str | None:
             vmax=limit,
         )
         axis.set_aspect("equal", adjustable="box")
+        axis.xaxis.set_major_locator(MaxNLocator(4))
         axis.set_title(title, fontsize=9)
     for axis in axes[-1]:
-        axis.set_xlabel("east (km)", fontsize=9)
+        axis.set_xlabel(f"east ({unit})", fontsize=9)
     for axis in axes[:, 0]:
-        axis.set_ylabel("north (km)", fontsize=9)
+        axis.set_ylabel(f"north ({unit})", fontsize=9)
     assert dots is not None
     figure.colorbar(dots, ax=axes, label="nT", shrink=0.8)
     return _png(figure)
@@ -237,7 +247,7 @@ def terms(diagnosis: Diagnosis) -> str | None:
         axis.plot(*_curves(diagnosis, share), color=AFTER, linewidth=0.8)
         axis.set_ylabel("nT", fontsize=8)
         axis.set_title(label(candidate.cause, candidate.channel), fontsize=9, loc="left")
-    axes[-1, 0].set_xlabel("hours since the start", fontsize=9)
+    axes[-1, 0].set_xlabel(f"{_clock(diagnosis)[1]} since the start", fontsize=9)
     return _png(figure)
 
 

@@ -149,6 +149,7 @@ def _wrong(diagnosis: Diagnosis) -> dict[str, Any]:
         "signal_to_noise": _round(float(np.sqrt(wrong.ratio))),
         "p_value": _round(wrong.p_value),
         "alternatives": [],
+        "isolability": None,
         "separated_by": None,
         "parameters": {
             "count": {"value": int(wrong.rows.size), "sigma": None, "unit": "1"},

@@ -67,7 +67,7 @@ def report_html(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> str:
     )
     body = [
         f"<h1>Diagnosis of {escape(survey.source)}</h1>",
-        (f'<p class="faint">{first} to {last} UTC · {len(survey)} samples in {np.unique(survey.dive).size} dives · '
+        (f'<p class="faint">{first} to {last} UTC · {len(survey)} samples in {np.unique(survey.dive).size} {survey.parts} · '
         f"calibration: {escape(diagnosis.problem.calibration.method or 'unnamed')}, "
         f"{diagnosis.problem.calibration.coefficients.size} coefficients</p>"),
         f'<p class="verdict">{_verdict(diagnosis)}</p>',
@@ -78,7 +78,7 @@ def report_html(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> str:
         late(diagnosis.problem, diagnosis.fit),
         _figure(figures.measured(diagnosis), "The total field as measured and corrected by the calibration, and as the "
                 "reference says it should be; below, their difference"
-                + (" before, and with the extended calibration on dives that its fit had not seen." if diagnosis.named else
+                + (f" before, and with the extended calibration on {survey.parts} that its fit had not seen." if diagnosis.named else
                    ", and what is left of it when the calibration may move within its own uncertainty.")),
         '<div class="pair">',
         _figure(figures.spectrum(diagnosis), "Spectral density of the difference; dashed, the noise model."),
@@ -124,7 +124,7 @@ def _verdict(diagnosis: Diagnosis) -> str:
     if diagnosis.wrong is not None:
         causes.append(f"<b>outliers</b> ({diagnosis.wrong.rows.size} wrong samples)")
     gained = (
-        f"On dives left out, {number(total.before)} nT RMS became {number(total.after)} nT (ratio {total.ratio:.2f}, 95 % interval "
+        f"On {diagnosis.problem.survey.parts} left out, {number(total.before)} nT RMS became {number(total.after)} nT (ratio {total.ratio:.2f}, 95 % interval "
         f"{total.interval[0]:.2f} to {total.interval[1]:.2f})."
     )
     withheld = diagnosis.unexplained.within if diagnosis.unexplained else ()
