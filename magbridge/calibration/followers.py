@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import accumulate, repeat
-from math import isnan
+from math import isnan, tanh
 from operator import mul
 from typing import TYPE_CHECKING, ClassVar
 
@@ -38,27 +38,24 @@ def powers(x: float, order: int) -> tuple[float, ...]:
 
 
 class Follower(Effect, frozen=True, kw_only=True):
-    """Offsets in powers of what one channel makes of its position.
+    """Offsets by what one channel makes of its position.
 
     Attributes
     ----------
     cause, channel : str
     centre, scale : float
         In the channel's unit.
-    order : int
-        Highest power; three coefficients (nT) for each.
     """
 
     cause: str
     channel: str
     centre: float
     scale: float
-    order: int = 1
 
     @property
     def size(self) -> int:
-        """Three for each power."""
-        return 3 * self.order
+        """One for each axis, nT."""
+        return 3
 
     def channels(self) -> tuple[str, ...]:
         """Name the one that it follows."""
@@ -66,16 +63,27 @@ class Follower(Effect, frozen=True, kw_only=True):
 
     def columns(self, field: float) -> FloatArray:  # noqa: ARG002  (others need it)
         """Offsets."""
-        return offsets(self.order)
+        return offsets(self.size // 3)
 
 
 class PowersEffect(Follower, frozen=True, kw_only=True):
     """A mass that another channel moves: ``T += sum_k c_k x^k``, ``x = (p - centre) / scale``.
 
     A permanent moment on a mass at ``r(p)`` gives ``G(r(p)) m`` (see :mod:`.dipole`), a power series in p.
+
+    Attributes
+    ----------
+    order : int
+        Highest power.
     """
 
     kind: ClassVar[str] = "powers"
+    order: int = 1
+
+    @property
+    def size(self) -> int:
+        """Three for each power, nT."""
+        return 3 * self.order
 
     def begin(self, calibration: Calibration) -> Step:
         """Return a stepper; a missing value leaves the last one standing."""
@@ -137,39 +145,38 @@ class MonomialEffect(Effect, frozen=True, kw_only=True):
 
 
 class PlayEffect(Follower, frozen=True, kw_only=True):
-    """Backlash or remanence: ``T += sum_k c_k (v^k - x^k)``, y the play operator of the channel p.
+    """Backlash or remanence: ``T += c (S(y) - S(p)) / width``, y the play operator of the channel p.
 
     ``y = min(max(y, p - width / 2), p + width / 2)``: the last position drags behind by half the width, on the
-    side that the mass came from; ``v = (y - centre) / scale``, ``x = (p - centre) / scale``. Higher powers are those of
-    the generalised play, a curve on either branch: relays of one width at many places
-    (Brokate & Sprekels 1996, *Hysteresis and Phase Transitions*, sec. 2.1 and 2.4).
+    side that the mass came from. A drive's backlash is straight. Steel that the mass passes by is turned where it
+    is near, relays of one width about one place, so the loop closes beyond: ``S(v) = scale tanh((v - centre) / scale)``, a
+    generalised play (Brokate & Sprekels 1996, *Hysteresis and Phase Transitions*, sec. 2.1 and 2.4).
 
     Attributes
     ----------
     width : float
         In the channel's unit.
     centre, scale : float
-        In the channel's unit; a scale of 0 stands for the width.
+        Where the steel is, and how far it reaches; the loop is straight where the scale is far beyond the travel.
     """
 
     kind: ClassVar[str] = "play"
     width: float
-    centre: float = 0.0
-    scale: float = 0.0
 
     def begin(self, calibration: Calibration) -> Step:
         """Return a stepper that starts in the middle of its play."""
-        index, centre, scale = calibration.channels.index(self.channel), self.centre, self.scale or self.width
-        half, y, p, first, order = 0.5 * self.width, 0.0, 0.0, True, self.order
+        index, centre, scale, width = (
+            calibration.channels.index(self.channel), self.centre, self.scale, self.width
+        )  # fmt: skip
+        half, y, p, first = 0.5 * width, 0.0, 0.0, True
 
-        def step(time_us: int, hx: float, hy: float, hz: float, values: Sequence[float]) -> tuple[float, ...]:
+        def step(time_us: int, hx: float, hy: float, hz: float, values: Sequence[float]) -> tuple[float]:
             nonlocal y, p, first
             if not isnan(values[index]):
                 p = values[index]
                 y = p if first else min(max(y, p - half), p + half)
                 first = False
-            dragged, here = ((at - centre) / scale for at in (y, p))
-            return tuple(v - x for v, x in zip(powers(dragged, order), powers(here, order), strict=True))
+            return (scale * (tanh((y - centre) / scale) - tanh((p - centre) / scale)) / width,)
 
         return step
 

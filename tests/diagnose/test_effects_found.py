@@ -26,7 +26,7 @@ EFFECTS: list[Effect] = [
     ChannelEffect(cause="temperature_scale", channel="heat", origin=3.0, lag=50.0, on="scale"),
     PowersEffect(cause="unmodelled_actuator", channel="heat", centre=3.0, scale=2.0, order=3),
     MonomialEffect(cause="actuator_order", exponents=(4,)),
-    PlayEffect(cause="hysteresis", channel="p", width=0.3),
+    PlayEffect(cause="hysteresis", channel="p", width=0.3, centre=0.1, scale=0.5),
     ClockEffect(),
     ClockEffect(cause="filter_lag", sign=-1.0),
     TimeEffect(cause="offset_step", shape="step", start=T0 + 200.0),
@@ -149,11 +149,19 @@ def test_a_drift_is_held_beyond_what_it_was_learned_from(survey: Survey, calibra
     np.testing.assert_allclose(second, x**2)
 
 
-def test_play_remembers_the_side(survey: Survey, calibration: Calibration) -> None:
-    effect = PlayEffect(cause="hysteresis", channel="p", width=0.4)
+@pytest.mark.parametrize(("centre", "scale"), [(0.0, 1e3), (0.2, 0.3)])
+def test_play_remembers_the_side(
+    survey: Survey, calibration: Calibration, centre: float, scale: float
+) -> None:
+    """Half of the loop's width is on either side, all the way where it is straight, only near the steel where it is not."""
+    effect = PlayEffect(cause="hysteresis", channel="p", width=0.4, centre=centre, scale=scale)
     phi = history(survey, calibration, effect)[0]
     p = survey.channels["p"].values
     rising = np.gradient(p) > 0.01
     steady = np.arange(len(p)) > 100
-    assert phi[rising & steady & (np.abs(p) < 0.3)] == pytest.approx(-0.5)
-    assert phi[~rising & steady & (np.abs(p) < 0.3)] == pytest.approx(0.5)
+    middle = steady & (np.abs(p) < 0.3)
+    lower, here, upper = (np.tanh((p + side - centre) / scale) for side in (-0.2, 0.0, 0.2))
+    lower, upper = scale / 0.4 * (lower - here), scale / 0.4 * (upper - here)
+    np.testing.assert_allclose(phi[rising & middle], lower[rising & middle])
+    np.testing.assert_allclose(phi[~rising & middle], upper[~rising & middle])
+    assert phi[rising & middle].max() < 0.0 < phi[~rising & middle].min()

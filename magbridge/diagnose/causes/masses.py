@@ -27,8 +27,8 @@ POWERS = 4
 """Of one mass, beyond those that its polynomial has, that are tried together."""
 FALLS = (1.0, 0.3)
 """Of a field's series, from order to order."""
-BRANCH = 3
-"""Order of a curved branch: what lies beyond the polynomial's own is a function of the position."""
+STRAIGHT = 4.0
+"""Of half the travel, over which a branch of hysteresis bends: it does not."""
 
 
 def unmodelled_actuator(problem: Problem) -> list[Candidate]:
@@ -121,38 +121,39 @@ def _monomial(problem: Problem, exponents: tuple[int, ...]) -> Candidate:
 
 
 def hysteresis(problem: Problem) -> list[Candidate]:
-    """Backlash of the drive, or steel remagnetised by its own motion: ``T += b (y - p) / width``, y the play of p.
+    """Backlash of the drive, or steel remagnetised by its own motion: ``T += b (S(y) - S(p)) / width``, y the play of p.
 
-    Steel follows a curve on either branch: higher powers of y and p (generalised play).
+    A drive's is straight, steel's is where the steel is: see :class:`~magbridge.calibration.followers.PlayEffect`.
     """
-    made = []
+    drives = product((0.05, 0.15, 0.3), (0.0,), (STRAIGHT,))
+    steel = product((0.15, 0.3), (-1.0 / 3.0, 0.0, 1.0 / 3.0), (0.5,))
     # only of masses that are modelled: a wide play of another is that other itself
-    for name in (parameter.name for parameter in problem.calibration.parameters):
-        low, high = extent(problem, name)
-        if high > low:
-            made += _play(problem, name, 1, [share * (high - low) for share in (0.05, 0.15, 0.3)])
-            made += _play(problem, name, BRANCH, [share * (high - low) for share in (0.15, 0.3, 0.5)])
-    return made
+    names = [parameter.name for parameter in problem.calibration.parameters]
+    shapes = [*drives, *steel]
+    return [
+        made
+        for name in names
+        if np.ptp(extent(problem, name)) > 0.0
+        for made in _plays(problem, name, shapes)
+    ]
 
 
-def _play(problem: Problem, name: str, order: int, widths: Sequence[float]) -> list[Candidate]:
-    """One mass', on branches of one order."""
+def _plays(problem: Problem, name: str, shapes: Sequence[tuple[float, float, float]]) -> list[Candidate]:
+    """One mass' plays: widths in its whole travel, centres from its middle and scales in half of it."""
     low, high = extent(problem, name)
-    centre, half = 0.5 * (low + high), 0.5 * (high - low)
+    middle, half = 0.5 * (low + high), 0.5 * (high - low)
     channel = problem.survey.channels[name]
+    p, unit = channel.values, channel.unit
 
-    def again(width: float) -> Candidate:
-        scale = width if order == 1 else half
-        effect = PlayEffect(
-            cause="hysteresis", channel=name, width=width, order=order, centre=centre, scale=scale
-        )
-        p = channel.values
+    def again(width: float, centre: float, scale: float) -> Candidate:
+        effect = PlayEffect(cause="hysteresis", channel=name, width=width, centre=centre, scale=scale)
         y = play(p, width)
 
         def phi(rows: slice) -> FloatArray:
-            return powers((y[rows] - centre) / scale, order) - powers((p[rows] - centre) / scale, order)
+            curved = np.tanh((y[rows] - centre) / scale) - np.tanh((p[rows] - centre) / scale)
+            return scale / width * curved[None]
 
-        shape = {"width": (width, channel.unit)}
+        shape = {"width": (width, unit), "centre": (centre, unit), "scale": (scale, unit)}
         return of_effect(problem, effect, 50.0, "nT", channel=name, shape=shape, phi=phi, again=again)
 
-    return [again(width) for width in widths]
+    return [again(2.0 * half * w, middle + half * c, half * s) for w, c, s in shapes]

@@ -83,7 +83,10 @@ def _bracket(state: State, candidate: Candidate, name: str) -> tuple[float, floa
         return here / (1.0 + share), here * (1.0 + share)
     grid = sorted({state.candidates[k].shape[name][0] for k in state.groups[key(candidate)]})
     width = 0.5 * (grid[-1] - grid[0])
-    low = max((v for v in grid if v < here), default=here - width)
+    # what is positive stays so
+    low = max(
+        (v for v in grid if v < here), default=max(here - width, 0.5 * here if grid[0] > 0.0 else -np.inf)
+    )
     return low, min((v for v in grid if v > here), default=here + width)
 
 
