@@ -223,6 +223,7 @@ def test_correct_gives_the_same_in_pieces(deployment: Path, calibration: Path, t
         (["map", "none.nc", "-o", "x.nc", "--picture", "x.foo"], 2, "must end in .png or .pdf or .svg"),
         (["convert", "{d}", "-o", "nowhere/x.csv"], 2, "There is no folder nowhere"),
         (["convert", "{d}", "-o", "."], 2, "It is a folder"),
+        (["simulate", "demo", "--like", "{d}", "b.nc", "-o", "x.nc"], 2, "b.nc: one too many"),
         (["convert", "{d}", "-o", "/proc/self/x.csv"], 2, "The folder /proc/self cannot be written to"),
         (["diagnose", "{d}", "--calibration", "{d}", "-o", "{d}"], 2, "It is a file"),
         (["demo", "--out", "{d}"], 2, "It is a file"),

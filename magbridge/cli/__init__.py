@@ -9,7 +9,7 @@ import signal
 import sys
 from contextlib import suppress
 
-from cyclopts import CycloptsError
+from cyclopts import CycloptsError, UnusedCliTokensError
 
 from magbridge.cli import ashore, doubt, learn, onboard, way
 from magbridge.cli.common import app, complain
@@ -45,6 +45,9 @@ def main(arguments: list[str] | None = None) -> int:
         signal.signal(signal.SIGTERM, _terminated)
     try:
         app(arguments, exit_on_error=False, print_error=False, result_action="return_value")
+    except UnusedCliTokensError as error:
+        unused = " ".join(error.unused_tokens or ())
+        return complain(f"{unused}: one too many; an option that takes several is given once for each", 2)
     except CycloptsError as error:
         return complain(str(error), 2)
     except MagbridgeError as error:

@@ -77,7 +77,7 @@ def simulate(
     seed
         Draws everything that the scenario leaves open; the same seed gives the same deployment.
     like
-        Logs whose attitude, position and masses drive the simulation instead of the scenario's mission.
+        A log whose attitude, position and masses drive the simulation instead of the scenario's mission; again for each further one.
     map_output
         Where to write the anomaly grid that an aeromagnetic survey of the simulated world would have made.
     json

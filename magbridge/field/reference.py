@@ -60,7 +60,7 @@ def reference_field(deployment: xr.Dataset, grid: AnomalyGrid | None = None, sit
     unknown = np.isnan(given)
     if not unknown.any():
         return given
-    if not {"latitude", "longitude"} <= set(deployment.variables):
+    if not all(name in deployment and deployment[name].notnull().any() for name in ("latitude", "longitude")):
         if not unknown.all():
             return given
         source = deployment.attrs.get("source", "deployment")
