@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 from magbridge.diagnose.causes.candidates import Candidate
-from magbridge.diagnose.inference.weigh import evidence_of, weigh, worth
+from magbridge.diagnose.inference.information import Information
+from magbridge.diagnose.inference.weigh import LEVEL, evidence_of, slices, trials, weigh, worth
 
 
 def candidate(
@@ -40,3 +42,26 @@ def test_a_second_regressor_pays_for_its_choice_and_for_the_odds() -> None:
     model = [candidate("clock_offset"), candidate("reference_bias")]
     trials = {"clock_offset": 1.0, "reference_bias": 3.0}
     assert weigh(200.0, 2) - worth(200.0, model, trials) == pytest.approx(np.log(20.0 * 2.0 * 3.0))
+
+
+def counted(S: np.ndarray, sizes: list[int]) -> float:
+    """Independent hypotheses behind one cause."""
+    grid = [candidate("hysteresis", size) for size in sizes]
+    info = Information(S, np.zeros(len(S)), np.zeros((0, len(S))))
+    return trials(info, grid, slices(grid))["hysteresis"]
+
+
+def test_hypotheses_count_as_often_as_one_of_them_passes() -> None:
+    """Against a million draws at the level at which a cause that is asked about alone is tested."""
+    apart = np.abs(np.subtract.outer(np.arange(12.0), np.arange(12.0)))
+    S = np.kron(0.9**apart, np.eye(2))
+    draws = np.linalg.cholesky(S) @ np.random.default_rng(4).standard_normal((24, 1_000_000))
+    level = LEVEL / 12.0
+    passed = (draws.reshape(12, 2, -1) ** 2).sum(axis=1).max(axis=0) > chi2.isf(level, 2)
+    assert counted(S, [2] * 12) == pytest.approx(passed.mean() / level, rel=0.1)
+
+
+def test_the_same_hypothesis_counts_once_and_strangers_each() -> None:
+    S = np.diag([4.0, 9.0, 1.0])
+    assert counted(np.tile(S, (5, 5)), [3] * 5) == pytest.approx(1.0)
+    assert counted(np.kron(np.eye(5), S), [3] * 5) == pytest.approx(5.0, rel=0.01)
