@@ -12,7 +12,7 @@ from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.rivals import Rival
 from magbridge.diagnose.inference.search import Hypothesis, Outcome
 from magbridge.diagnose.inference.unexplained import Leftover, leftover
-from magbridge.diagnose.inference.weigh import IDEAL, ODDS, REMNANT, weigh, worth
+from magbridge.diagnose.inference.weigh import ODDS, REMNANT, worth
 
 __all__ = ["accept"]
 
@@ -20,26 +20,27 @@ __all__ = ["accept"]
 def accept(problem: Problem, outcome: Outcome, tone: Candidate | None) -> tuple[bool, Leftover | None]:
     """Say whether the names stand, and what is left beside them or, if they do not, at all.
 
-    Names and free descriptions of the whole pay for what they were chosen from. What a name's regressor may miss, told by one
-    number at least, is forgiven; what it did leave, told by a description beside it, counts with it. A cause that the table lacks
-    is a rival like any other: names are asserted if they beat every description 20:1, and ruled out if one beats them 20:1. In
-    between they stay possible.
+    Names and free descriptions of the whole pay for what they were chosen from. What the names did leave, told by a description
+    beside them, counts with them; where it is another thing than they are, they pay for that as for one more cause. A cause that
+    the table lacks is a rival like any other: names are asserted if they are likelier than every description, and stay possible
+    until one beats them 20:1.
     """
     model = [h.candidate for h in outcome.chosen]
     rest = leftover(problem, model, outcome.fit, outcome.order, tone)
     if not model:
         return False, rest
     ratio = 2.0 * (outcome.fit.log_likelihood - outcome.null.log_likelihood)
-    missed = weigh(IDEAL**2 * ratio + 1.0, 1)
+    names = worth(ratio, model, outcome.trials) - float(np.log(len(outcome.trials)))
     if rest is not None:
-        missed = max(missed, rest.among)
+        names += rest.among
         if rest.signal_to_noise < REMNANT * max(h.signal_to_noise for h in outcome.chosen):
             rest = None
     # what holds the names' own regressors and finds nothing else beside them is no other explanation
     alone = rest is None or _same(outcome.chosen, rest)
     free = leftover(problem, [], outcome.null, outcome.order, tone, but=model if alone else ())
-    names = worth(ratio, model, outcome.trials) - float(np.log(len(outcome.trials))) + missed
-    if free is None or names - free.among >= ODDS:
+    if not alone:
+        names -= ODDS
+    if free is None or names >= free.among:
         return True, rest
     return False, free._replace(within=_within(outcome, free.among - names))
 

@@ -62,7 +62,7 @@ class Leftover(NamedTuple):
     choice : int
         How many it was chosen from.
     within : tuple of Rival
-        The names that stay possible: neither do they beat it 20:1, nor it them.
+        The names that stay possible: it is likelier than they are, but not 20:1.
     """
 
     kind: str

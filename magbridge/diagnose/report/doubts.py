@@ -138,6 +138,6 @@ def nameless(rest: Leftover, causes: Mapping[str, Cause]) -> str:
     if not rest.within:
         return "It fits no cause of the table, so it has no name."
     return (
-        f"No name is asserted: no cause of the table is likelier by 20:1. Not ruled out: {listed(rest.within)}. What would "
+        f"No name is asserted: it is likelier than any cause of the table, by less than 20:1. Not ruled out: {listed(rest.within)}. What would "
         f"tell: {escape(causes[rest.within[0].cause].separated_by)}."
     )
