@@ -54,6 +54,19 @@ class Information:
             self.matrix - self.matrix[:, index] @ K, self.score - K.T @ self.score[index], self.shift
         )
 
+    def fitted(self, base: Joint) -> Information:
+        """Project out the model of `base`, whose columns are the last: calibration and model give way."""
+        m = len(self.score) - base.coefficients.size
+        prior = base.prior[len(base.z) :]
+        K: FloatArray = np.asarray(
+            np.linalg.solve(self.matrix[m:, m:] + np.diag(prior), self.matrix[m:, :m]), float
+        )
+        return Information(
+            self.matrix[:m, :m] - self.matrix[:m, m:] @ K,
+            self.score[:m] - K.T @ (self.score[m:] - prior * base.coefficients),
+            np.vstack([self.shift[:, :m] - self.shift[:, m:] @ K, K]),
+        )
+
 
 def information(
     problem: Problem, noise: Noise, base: Joint, model: Sequence[Columns], candidates: Sequence[Columns]

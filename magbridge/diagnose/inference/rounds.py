@@ -128,8 +128,7 @@ class State:
 
     def round(self, model: list[Candidate], base: Joint) -> list[Hypothesis]:
         """Every cause beside `model`, the likeliest first."""
-        model_columns = [candidate.columns for candidate in model]
-        own = information(self.problem, base.noise, base, model_columns, self.columns)
+        own = self.beside(model, base).fitted(base)
         if not self.trials:
             self.trials = trials(own, self.candidates, self.at)
         under: dict[tuple[str, str | None], list[tuple[int, float, Score, Information]]] = {}
