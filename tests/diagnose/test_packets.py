@@ -39,7 +39,7 @@ def test_two_packets_are_found_where_they_are_in_noise_of_any_memory(problem: Pr
     base = fit_joint(given, [], 1)
     found = packets(given, base)
     assert found is not None
-    info = information(given, base.noise, base, [], [found.columns])
+    info = information(given, base.noise, base, [found.columns])
     best = Statistic(info.matrix, np.ones((1, 2 * found.number))).best(info.score)
     estimate = found.columns(slice(None)) @ best.estimate
     planted *= problem.gain
@@ -79,7 +79,7 @@ def test_a_packet_keeps_its_period_and_place_where_samples_are_lost(
     base = fit_joint(given, [], 1)
     found = packets(given, base)
     assert found is not None
-    info = information(given, base.noise, base, [], [found.columns])
+    info = information(given, base.noise, base, [found.columns])
     best = Statistic(info.matrix, np.ones((1, 2 * found.number))).best(info.score)
     assert np.sum((found.columns(slice(None)) @ best.estimate - planted) ** 2) < 0.2 * np.sum(planted**2)
     assert found.period == pytest.approx(4.0 * 41.0, rel=0.1)

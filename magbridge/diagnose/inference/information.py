@@ -55,7 +55,7 @@ class Information:
         )
 
     def fitted(self, base: Joint) -> Information:
-        """Project out the model of `base`, whose columns are the last: calibration and model give way."""
+        """Project out the model of `base`, too, whose columns are the last."""
         m = len(self.score) - base.coefficients.size
         prior = base.prior[len(base.z) :]
         K: FloatArray = np.asarray(
@@ -68,21 +68,14 @@ class Information:
         )
 
 
-def information(
-    problem: Problem, noise: Noise, base: Joint, model: Sequence[Columns], candidates: Sequence[Columns]
-) -> Information:
-    """Sum up the candidates' information at the hypothesis `base`, whose effects are `model`, under `noise`."""
+def information(problem: Problem, noise: Noise, base: Joint, columns: Sequence[Columns]) -> Information:
+    """Sum up the information of columns at the hypothesis `base` under `noise`, only the calibration projected out."""
     q = problem.free.shape[1]
-    nuisance = q + base.coefficients.size
     G, b = normal(
-        lambda rows: np.hstack([problem.free[rows], *(column(rows) for column in (*model, *candidates))]),
+        lambda rows: np.hstack([problem.free[rows], *(column(rows) for column in columns)]),
         noise.response(base.left),
         noise,
     )
-    pull = base.prior * np.append(problem.centre - base.z, -base.coefficients)
-    K: FloatArray = np.asarray(
-        np.linalg.solve(G[:nuisance, :nuisance] + np.diag(base.prior), G[:nuisance, nuisance:]), float
-    )
-    return Information(
-        G[nuisance:, nuisance:] - G[nuisance:, :nuisance] @ K, b[nuisance:] - K.T @ (b[:nuisance] + pull), K
-    )
+    pull = base.prior[:q] * (problem.centre - base.z)
+    K: FloatArray = np.asarray(np.linalg.solve(G[:q, :q] + np.diag(base.prior[:q]), G[:q, q:]), float)
+    return Information(G[q:, q:] - G[q:, :q] @ K, b[q:] - K.T @ (b[:q] + pull), K)

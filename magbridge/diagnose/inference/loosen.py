@@ -48,7 +48,7 @@ def loosened(problem: Problem, model: Sequence[Candidate], columns: Sequence[Col
         at += piece.size
     if not slopes:
         return fit
-    info = information(problem, fit.noise, fit, columns, slopes)
+    info = information(problem, fit.noise, fit, [*slopes, *columns]).fitted(fit)
     K = info.shift
     given: FloatArray = np.asarray(np.linalg.solve(info.matrix + np.eye(len(slopes)), K.T), float)
     more = K @ given

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ from magbridge.diagnose.inference.design import kept
 from magbridge.diagnose.inference.fit_noise import certainty
 from magbridge.diagnose.inference.information import Information, information
 from magbridge.diagnose.inference.joint import RIDGE, Joint, fit_joint, volume_of
+from magbridge.diagnose.inference.noise import Noise
 from magbridge.diagnose.inference.weigh import Score, evidence_of, score, slack, slices, trials, worth
 
 __all__ = ["Hypothesis", "State", "key"]
@@ -147,9 +148,7 @@ class State:
         """Information of all candidates, those of `model` at the end, under its noise; only the calibration projected out."""
         known, info = self.last
         if known is not base:
-            bare = replace(base, coefficients=np.empty(0), prior=base.prior[: len(base.z)])
-            columns = [*self.columns, *(candidate.columns for candidate in model)]
-            info = information(self.problem, base.noise, bare, [], columns)
+            info = self._under(base.noise, model, base)
             self.last = base, info
         assert info is not None
         return info
@@ -178,7 +177,11 @@ class State:
             middle = [self.columns[members[len(members) // 2]] for members in self.groups.values()]
             certain = certainty(everything.left, everything.noise, middle)
             self.certain = dict(zip(self.groups, certain, strict=True))
-        return information(self.problem, everything.noise, base, [c.columns for c in model], self.columns)
+        return self._under(everything.noise, model, base).fitted(base)
+
+    def _under(self, noise: Noise, model: Sequence[Candidate], base: Joint) -> Information:
+        """Information of all candidates and of `model` under a noise."""
+        return information(self.problem, noise, base, [*self.columns, *(c.columns for c in model)])
 
     def _joint(
         self, model: list[Candidate], base: Joint, entries: list[tuple[int, float, Score, Information]]

@@ -60,7 +60,9 @@ def _profiled(
             shape = [v for v, _ in best.candidate.shape.values()]
             shape[position] = float(value)
             made.append(again(*shape))
-        info = information(state.problem, best.fit.noise, base, columns, [c.columns for c in made])
+        info = information(
+            state.problem, best.fit.noise, base, [*(c.columns for c in made), *columns]
+        ).fitted(base)
         at = slices(made)
         scores = [score(info, own, made[0]) for own in at]
         ratios = np.array([s.ratio for s in scores])

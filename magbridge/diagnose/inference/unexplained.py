@@ -150,7 +150,7 @@ def _scored(
     """Yield each description with each of its widths: log evidence under `noise`, and by how much the model gives way."""
     for first in range(0, len(listed), TOGETHER):
         some = listed[first : first + TOGETHER]
-        info = information(problem, noise, fit, model, [one.columns for one in some])
+        info = information(problem, noise, fit, [*(one.columns for one in some), *model]).fitted(fit)
         ends = np.cumsum([0, *(one.widths[0][1].size for one in some)]).tolist()
         for one, start, end in zip(some, ends, ends[1:], strict=False):
             at = slice(start, end)
@@ -173,7 +173,7 @@ def _calm(
     width = np.concatenate([one.widths[1][1] for one in slow])
     past, blocks = problem.survey.past(order), bool(np.ptp(fit.noise.scale))
     for _ in range(CALM):
-        info = information(problem, noise, fit, model, [one.columns for one in slow])
+        info = information(problem, noise, fit, [*(one.columns for one in slow), *model]).fitted(fit)
         c = Statistic(info.matrix, width[None] ** 2).best(info.score).estimate
         X = Design(problem, [*model, *(one.columns for one in slow)])
         left = fit.left - X.times(np.append(-info.shift @ c, c))
