@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.compare.problem import Problem
-from magbridge.diagnose.inference.exchange import _separate, exchanged
+from magbridge.diagnose.inference.exchange import _more, _separate, exchanged
 from magbridge.diagnose.inference.pairs import pairs_of
 from magbridge.diagnose.inference.rounds import State
 from magbridge.diagnose.inference.sets import sets_of
@@ -92,3 +92,10 @@ def test_numbers_of_one_common_size_stay_a_whole(state: State) -> None:
     series, other = state.candidates[5], replace(state.candidates[4], cause="series")
     assert not _separate([other], [series, state.candidates[0]], [1])
     assert _separate([other], [series, state.candidates[0]], [0])
+
+
+def test_numbers_of_one_common_size_are_neither_more_nor_fewer(state: State) -> None:
+    a, other, series = state.candidates[0], state.candidates[4], state.candidates[5]
+    assert _more([other], [a]) == 1.0
+    assert _more([a], [other]) == -1.0
+    assert _more([a], [series]) == _more([series, a], [other]) == 0.0

@@ -34,7 +34,7 @@ def exchanged(state: State, model: list[Candidate], base: Joint) -> tuple[list[C
         for new, at in _changes(state, pieces, base):
             rest = [piece for n, piece in enumerate(pieces) if n not in at]
             changed, fit = refined(state, [*new, *rest], state.fit([*new, *rest], like=base), len(new))
-            more = float(np.sign(sum(c.size for c in new) - sum(pieces[n].size for n in at)))
+            more = _more(new, [pieces[n] for n in at])
             if len({c.cause for c in changed}) > len({piece.cause for piece in pieces}):
                 more = max(more, 0.0)  # another cause is never the simpler
             lent = slack(state.ratio(state.fit(rest, like=base))) if rest and more else 0.0
@@ -45,6 +45,13 @@ def exchanged(state: State, model: list[Candidate], base: Joint) -> tuple[list[C
             break
         _, pieces, base = better
     return _gathered(state, pieces, base)
+
+
+def _more(new: list[Candidate], old: list[Candidate]) -> float:
+    """Sign of how many more free numbers are `new`; where some have one common size, the data say how many they are."""
+    if any(c.spectra is not None for c in (*new, *old)):
+        return 0.0
+    return float(np.sign(sum(c.size for c in new) - sum(c.size for c in old)))
 
 
 def _changes(state: State, pieces: list[Candidate], base: Joint) -> list[tuple[list[Candidate], list[int]]]:
