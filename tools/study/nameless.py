@@ -2,17 +2,17 @@ r"""Whether an ideal analyst whose table lacks the cause would be misled by its 
 
 Notes
 -----
-He weighs the names of M causes, one or two of them, against N descriptions without a name. Each pays for its choice; a name is
-granted what its regressor may miss of the truth. With the likelihood ratios R and free numbers k of names m and log evidence
+He weighs the names of M causes, one or two of them, against N descriptions without a name, at even odds, as the detector does. Each
+pays for its choice. With the likelihood ratios R and free numbers k of names m and log evidence
 ``E(R, k) = (R - k)/2 - (k/2) ln(R/k)`` (a variance component of k freedoms) something without a name needs
 
-.. math:: T = \max_m \left(E(R_m, k_m) + \tfrac12 \epsilon^2 R_m - c_m\right) - \ln M
+.. math:: T = \max_m \left(E(R_m, k_m) - c_m\right) - \ln M
 
 c is the price of a name's grid and, of a pair, 20:1 and its choice among the causes.
 
 *unnamed*: at best one of the descriptions has the very shape of the truth, and as many numbers as its cause would have:
 ``P(E(R_d, k) - ln N > T)``. No description that could have been anything else does better: a bound for all analysts. (Of a
-cause of three numbers at S/N 10, N = 20, it is 95 % where the best name of three numbers leaves 5.2.)
+cause of three numbers at S/N 10, N = 20, it is 95 % where the best name of three numbers leaves 4.8.)
 
 *described*: the chance with the descriptions that there are, ``P(max_j E_j - ln N > T)``: each has numbers of one common size,
 which is the likeliest, and pays for all the shapes that it could have taken, and for its choice.
@@ -26,15 +26,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magbridge.diagnose.inference.free import Description
-from magbridge.diagnose.inference.weigh import IDEAL, ODDS
+from magbridge.diagnose.inference.weigh import ODDS
 from study.draws import Draws, Span, weigh
 
 Array = NDArray[np.float64]
-
-
-def allowed(evidence: Array, ratio: Array) -> Array:
-    """Log evidence of a name of a likelihood ratio, with what its regressor may have missed."""
-    return evidence + 0.5 * IDEAL**2 * ratio
 
 
 def against(
@@ -46,8 +41,7 @@ def against(
         one, other = draws.ratio(first), draws.beside(first).ratio(second)
         grids = sum(np.log(trials.get(span.cause, 1.0)) for span in (first, second))
         ratio = one[0] + other[0]
-        value = allowed(weigh(ratio, one[1] + other[1]), ratio)
-        found.append(value - grids - ODDS - np.log(max(len(trials), 1)))
+        found.append(weigh(ratio, one[1] + other[1]) - grids - ODDS - np.log(max(len(trials), 1)))
     return np.asarray(np.max(found, axis=0) - np.log(max(len(trials), 1)))
 
 

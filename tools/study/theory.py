@@ -29,7 +29,7 @@ from magbridge.diagnose.compare.take import take
 from magbridge.diagnose.inference.free import Description
 from magbridge.diagnose.inference.weigh import LEVEL, ODDS
 from study.draws import DRAWS, SHOWN, Draws, Span, by_cause, evidence, explained, numbers, weigh, with_another
-from study.nameless import against, allowed, nameless
+from study.nameless import against, nameless
 from study.noise import whiten
 from study.stage import Found, Stall, project
 
@@ -107,7 +107,7 @@ def ideal(one: Found, stall: Stall, ds: xr.Dataset, setting: Setting) -> dict[st
     if not setting.free:
         return answers
     pairs = [(best[c], min(found.values(), key=lambda entry: entry[0])[1]) for c, found in left.items()]
-    rival = by_cause({span: allowed(evidence(span, *given[span]), given[span][0]) for span in rivals})
+    rival = by_cause({span: evidence(span, *given[span]) for span in rivals})
     needed = against(draws, rival, pairs, setting.trials)
     two = min(value for found in left.values() for value, _ in found.values())
     return answers | {"two": two} | nameless(draws, truth, needed, setting.free)
