@@ -187,7 +187,7 @@ def test_what_has_no_name_must_beat_the_names() -> None:
     chances = [nameless_chances(apart) for apart in (0.0, 3.0, 4.5, 6.0, 8.0, 9.9)]
     unnamed, described = ([chance[key] for chance in chances] for key in ("unnamed", "described"))
     assert unnamed == sorted(unnamed)
-    assert unnamed[0] < 0.02
+    assert unnamed[0] < 0.05
     assert unnamed[1] < 0.8
     assert unnamed[-1] == 1.0
     assert all(a <= b for a, b in zip(described, unnamed, strict=True))
