@@ -65,6 +65,10 @@ FOREIGN: dict[str, Effect] = {
     "viscous": vehicle.viscous,
     "brownout": sensor.brownout,
     "mains": surroundings.mains,
+    "slip": vehicle.slip,
+    "motional": vehicle.motional,
+    "leak": vehicle.leak,
+    "ranges": sensor.ranges,
 }
 """Effects that the contract has no name for."""
 

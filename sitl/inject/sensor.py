@@ -145,3 +145,17 @@ def brownout(scene: Scene, size: float, rng: Generator) -> None:
     slow = first_order(load, step, float(rng.uniform(100.0, 400.0)))  # ions that have to get there
     sag = 0.6 * load + 0.4 * slow + rng.uniform(0.3, 1.0) * drawn**3
     scene.field = scene.field * (1.0 + 1e-5 * size * sag[:, None])
+
+
+def ranges(scene: Scene, size: float, rng: Generator) -> None:
+    """Each channel has a second range for large readings, left only when it must be, with another gain; size in nT at full scale."""
+    changes, gains = rng.uniform(0.3, 0.6, 3), rng.choice([-1.0, 1.0], 3)
+
+    def bend(H: Array) -> Array:
+        x = np.abs(H) / np.abs(H).max(axis=0)
+        up, down = x > changes + 0.05, x < changes - 0.05
+        last = np.maximum.accumulate(np.where(up | down, np.arange(len(H))[:, None], 0), axis=0)
+        upper = np.take_along_axis(up, last, axis=0)
+        return np.asarray(H + size * gains * upper * x * np.sign(H))
+
+    scene.bend.append(bend)

@@ -207,3 +207,37 @@ def viscous(scene: Scene, size: float, rng: Generator) -> None:
     scene.field = (
         scene.field + size * dipole_field(np.broadcast_to(place, moment.shape), moment) / MU_0_OVER_4_PI
     )
+
+
+def slip(scene: Scene, size: float, rng: Generator) -> None:
+    """The battery's encoder miscounts in every move, until an end stop sets it right, every dozen or so; size in inches a move."""
+    place = scene.track.parameters["battpos"]
+    way = np.abs(np.diff(place, prepend=place[0]))
+    runs = np.cumsum(np.diff(way > 1e-6, prepend=False) & (way > 1e-6))
+    missed = rng.normal(size=runs[-1] + 1)
+    missed[rng.random(len(missed)) < 1.0 / 12.0] = np.nan
+    lost = np.zeros(len(missed))
+    for k in range(1, len(missed)):
+        lost[k] = 0.0 if np.isnan(missed[k]) else lost[k - 1] + missed[k]
+    scene.logged["battpos"] = (place + size * lost[runs], "in")
+
+
+def motional(scene: Scene, size: float, rng: Generator) -> None:
+    """Two metals on the hull short the field that its own way through the Earth's induces, v x B; size in nT at 0.3 m/s across it."""
+    track = scene.track
+    north, east = track.local(track.latitude, track.longitude)
+    v = np.gradient(np.column_stack([north, east, track.depth]), track.step, axis=0)
+    ahead = rotation(track.roll, track.pitch, track.heading).apply(v, inverse=True)
+    driven = np.cross(ahead, scene.field / np.linalg.norm(scene.field[0])) @ direction(rng) / 0.3
+    scene.field = scene.field + size * direction(rng) * first_order(driven, track.step, 5.0)[:, None]
+
+
+def leak(scene: Scene, size: float, rng: Generator) -> None:
+    """A seal weeps below a depth; what it lets in leads a current, and takes its time to dry; size in nT."""
+    deep = np.maximum(scene.track.depth / scene.track.depth.max() - rng.uniform(0.5, 0.8), 0.0)
+    dries, wets = (scene.track.step / lag for lag in (rng.uniform(2000.0, 6000.0), rng.uniform(100.0, 300.0)))
+    wet, leads = 0.0, np.empty(len(scene.t))
+    for k, head in enumerate(deep):
+        wet += 3.0 * wets * head - dries * wet
+        leads[k] = wet
+    scene.field = scene.field + size * direction(rng) * (leads / max(leads.max(), 1e-9))[:, None]

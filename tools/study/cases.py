@@ -40,11 +40,11 @@ NAMELESS = ("unknown", "seen", "foreign")
 """Parts in which nothing in the table is what is hidden."""
 TOLD = ("named", "ladder", "pair", *NAMELESS)
 """Parts of which theory says what comes out."""
-STRANGE = ("rotor", "viscous", "brownout", "mains")
+STRANGE = ("slip", "motional", "leak", "ranges")
 """Of the foreign ones those that were made after the detector: it has no description for them either."""
 SEEN = (
     "pan", "loose", "corrosion", "pulsation", "needle", "thermostat", "perming", "staircase", "swell", "cargo", "contact",
-    "strobe", "storm",
+    "strobe", "storm", "rotor", "viscous", "brownout", "mains",
 )  # fmt: skip
 """Those that were so once, before the detector was last mended."""
 GOLDEN = 0.6180339887498949
