@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from magbridge.errors import MagbridgeError, WriteError
 
-__all__ = ["atomic_path", "systems_reason"]
+__all__ = ["atomic_path", "new_folder", "systems_reason"]
 
 ROOM = 1 << 20
 """Bytes, more than a library writes at a time."""
@@ -43,6 +44,23 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     finally:
         with suppress(OSError):  # it was renamed, or never made
             beside.unlink()
+
+
+@contextmanager
+def new_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """Yield a folder to write to, made where it is not there.
+
+    When the block raises, the folders that were made for it go, with what is in them; one that was there stays.
+    """
+    folder = Path(path)
+    missing = [one for one in (folder, *folder.parents) if not one.exists()]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        yield folder
+    except BaseException:
+        if missing:
+            shutil.rmtree(missing[-1], ignore_errors=True)
+        raise
 
 
 @contextmanager

@@ -11,11 +11,11 @@ from pathlib import Path
 import pytest
 
 from magbridge.errors import WriteError
-from magbridge.files import atomic_path
+from magbridge.files import atomic_path, new_folder
 
 WRITER = """
 import sys, time
-from magbridge.files import atomic_path
+from magbridge.files import atomic_path, new_folder
 with atomic_path(sys.argv[1]) as beside:
     beside.write_text("half")
     print(beside.name, flush=True)
@@ -63,3 +63,12 @@ def test_a_block_that_raises_leaves_everything_as_it_was(tmp_path: Path) -> None
 def test_no_folder_is_one_line(tmp_path: Path) -> None:
     with pytest.raises(WriteError, match=os.strerror(2)), atomic_path(tmp_path / "no" / "a.json") as beside:
         beside.write_text("")
+
+
+@pytest.mark.parametrize(("name", "left"), [("new/doubt", []), (".", ["half"])])
+def test_a_folder_that_was_made_goes_with_what_raised_and_one_that_was_there_stays(
+    tmp_path: Path, name: str, left: list[str]
+) -> None:
+    with pytest.raises(ZeroDivisionError), new_folder(tmp_path / name) as folder:
+        (folder / "whole").write_text(str(1 // (folder / "half").write_text("")))
+    assert [path.name for path in tmp_path.iterdir()] == left

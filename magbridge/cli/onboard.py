@@ -11,6 +11,7 @@ from cyclopts import Parameter, validators
 
 from magbridge.cli.common import Folder, Json, Whole, app, folder_to_write, some, tell
 from magbridge.errors import DataError, WrongUse
+from magbridge.files import new_folder
 
 SLOWEST = 1e-3
 """Times real time: below, a log of an hour takes months."""
@@ -39,7 +40,8 @@ def demo(
     """
     from sitl import demo as demonstration
 
-    result = demonstration.demo(out, seed, say=lambda text: print(text, file=sys.stderr))
+    with new_folder(out):
+        result = demonstration.demo(out, seed, say=lambda text: print(text, file=sys.stderr))
     tell(result, demonstration.tell(result), json)
 
 

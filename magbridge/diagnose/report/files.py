@@ -5,14 +5,13 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from contextlib import ExitStack
-from pathlib import Path
 
 from magbridge.calibration.file import encode_calibration
 from magbridge.diagnose.causes import CAUSES, Cause
 from magbridge.diagnose.diagnosis import Diagnosis
 from magbridge.diagnose.report.findings import findings_json
 from magbridge.diagnose.report.page import report_html
-from magbridge.files import atomic_path
+from magbridge.files import atomic_path, new_folder
 
 __all__ = ["write"]
 
@@ -32,8 +31,6 @@ def write(
         "findings.json": findings_json(diagnosis, causes),
         "report.html": report_html(diagnosis, causes).encode(),
     }
-    folder = Path(out_dir)
-    folder.mkdir(parents=True, exist_ok=True)
-    with ExitStack() as written:
+    with new_folder(out_dir) as folder, ExitStack() as written:
         for name, content in contents.items():
             written.enter_context(atomic_path(folder / name)).write_bytes(content)
