@@ -9,6 +9,7 @@ from pathlib import Path
 from magbridge.bridge.events import Event
 from magbridge.bridge.pipeline import Start
 from magbridge.errors import FormatError
+from magbridge.link.component import TIMESYNC_US
 from magbridge.mavlink import LogReader, Record, TapeReader, spec
 from magbridge.records import Channel
 
@@ -50,6 +51,9 @@ class Recorded:
     ----------
     start : Start
         What the run started from.
+    late : float
+        s of the run before the log begins: a log that was begun anew after a loss. What the bridge knew by then is not
+        in it, so it starts from nothing, but at a whole s of the run's: what it asks the autopilot the log answers.
     config_digest : str
         Of the configuration that it ran with.
     published : bytearray
@@ -78,7 +82,10 @@ class Recorded:
                 break
             parameters[record.message["param_id"]] = record.message["param_value"]
         self.config_digest = first.message["config_digest"].hex()
-        self.start = Start(first.time_us, parameters, first.message["signing_timestamp"])
+        late_us = first.time_us - first.message["time_usec"]
+        self.late = late_us * 1e-6
+        start_us = first.time_us - late_us % TIMESYNC_US
+        self.start = Start(start_us, parameters, first.message["signing_timestamp"])
 
     def _records(self) -> Iterator[Record]:
         for path in self._paths:

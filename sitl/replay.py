@@ -27,7 +27,7 @@ from sitl.own_log import Recorded, is_own_log, runs
 from sitl.rehearsal import Part, prepare, rows_of
 from sitl.stage import Stage
 
-__all__ = ["replay", "tell"]
+__all__ = ["alike", "replay", "tell"]
 
 Result = dict[str, Any]
 UNKNOWN = 50_000.0
@@ -85,7 +85,7 @@ def _again(files: Sequence[Path], config: Path, speed: float, log: Path | None) 
     begun = time.monotonic()
     stage.play(recorded.start, track(recorded.events(), "replaying"), speed)
     first = _first_difference(published, recorded.published)
-    return {
+    return alike(published, recorded) | {
         "files": [str(file) for file in files],
         "messages": recorded.messages,
         "bytes": len(recorded.published),
@@ -96,6 +96,30 @@ def _again(files: Sequence[Path], config: Path, speed: float, log: Path | None) 
         "damages": recorded.damages,
         "seconds": time.monotonic() - begun,
     }
+
+
+def alike(published: bytearray, recorded: Recorded) -> Result:
+    """Return how far a log that begins late is the same; the fields of one that does not are in its bytes."""
+    if not recorded.late:
+        return {"late_s": 0.0}
+    ours, theirs = (_heard(stream) for stream in (published, recorded.published))
+    count = len(theirs["time"]) if len(ours["time"]) else 0
+    off = np.zeros(0)
+    if count:
+        off = ours["total_field"][_nearest(ours["time"], theirs["time"])] - theirs["total_field"]
+    known = np.abs(off[np.isfinite(off)])
+    return {
+        "late_s": recorded.late,
+        "samples": count,
+        "same_samples": int(np.count_nonzero(known == 0.0)),
+        "worst_nT": float(known.max()) if len(known) else None,
+    }
+
+
+def _heard(stream: bytearray) -> dict[str, Floats]:
+    listener = Listener()
+    listener.hear(bytes(stream))
+    return listener.field()
 
 
 def _first_difference(one: bytearray, other: bytearray) -> int | None:
@@ -219,6 +243,13 @@ def _tell_again(result: Result) -> str:
             f"published again, bit for bit as far as the log goes, and {result['beyond']} bytes that it does not hold: "
             "it breaks off, or the bridge said less"
         )
+    elif result["late_s"]:
+        verdict = (
+            f"published, but not the same: the log begins {result['late_s']:.1f} s into the run, without what the bridge knew by "
+            f"then; the total field of {result['same_samples']} of {result['samples']} samples is the same"
+        )
+        if result["worst_nT"]:
+            verdict += f", others are off by up to {result['worst_nT']:.2g} nT"
     else:
         verdict = f"published, but not the same: the first difference is at byte {result['first_difference']}"
     size = f"{result['messages']} messages ({result['bytes']} bytes)"

@@ -21,7 +21,7 @@ from magbridge.bridge.run import drive, set_up
 from magbridge.bridge.serial_port import SerialPort
 from magbridge.bridge.sockets import open_link
 from magbridge.config import Log, load
-from magbridge.errors import MagbridgeError
+from magbridge.errors import MagbridgeError, WriteError
 from magbridge.logs.tlog import TlogWriter, declarations
 from magbridge.records import Channel
 from sitl.timetable import read_entries
@@ -105,6 +105,8 @@ def main() -> int:
         drive(pipeline, edge, log, lambda _: None)
         if log is not None:
             log.close(timeout=60.0)
+            if log.failure:
+                raise WriteError(chosen.log, log.failure)
     except MagbridgeError as error:
         print(error, file=sys.stderr)
         return error.exit_code

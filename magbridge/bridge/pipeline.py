@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Mapping
 from math import nan
 from typing import TYPE_CHECKING
 
@@ -97,7 +98,7 @@ class Pipeline:
     def __init__(
         self, config: Config, calibration: Calibration | None, start: Start, key: bytes | None = None
     ) -> None:
-        self._config = config
+        self._config, self._start = config, start
         self._driver = open_driver(config.sensor.driver, config.sensor.options, config.path)
         self._clock = DeviceClock.of(self._driver)
         self._telemetry = TelemetryMap(config.telemetry, config.link.autopilot, config.path)
@@ -242,24 +243,8 @@ class Pipeline:
 
     def _begin(self, start: Start, calibration: Calibration | None, *, foreign: bool) -> None:
         """Write down what a replay needs, and say with what the bridge works."""
-        self.journal.note(
-            start.time_us,
-            "MAG_BRIDGE_START",
-            time_usec=start.time_us,
-            signing_timestamp=start.signing_timestamp,
-            calibration_id=self._calibration_id,
-            config_digest=bytes.fromhex(self._config.digest),
-            version=__version__,
-            driver=self._config.sensor.driver,
-        )
-        for name, value in start.parameters.items():
-            self.journal.note(
-                start.time_us,
-                "PARAM_VALUE",
-                param_id=name,
-                param_value=value,
-                param_type=MAV_PARAM_TYPE.REAL32,
-            )
+        for frame in self.beginning(start.parameters):
+            self.journal.state(start.time_us, frame)
         say = self.component.announcer.say
         if foreign:
             say(f"calibration is not of a {self._config.sensor.driver}: not used", MAV_SEVERITY.ERROR)
@@ -267,6 +252,27 @@ class Pipeline:
             say("no calibration: raw field", MAV_SEVERITY.WARNING)
         else:
             say(f"calibration {self._calibration_id:08x}, {calibration.method}")
+
+    def beginning(self, parameters: Mapping[str, float]) -> list[bytes]:
+        """Return the frames that say from what the run started, with these parameters."""
+        codec = Codec(self._config.link.system, self._config.link.component)
+        start = codec.pack(
+            "MAG_BRIDGE_START",
+            time_usec=self._start.time_us,
+            signing_timestamp=self._start.signing_timestamp,
+            calibration_id=self._calibration_id,
+            config_digest=bytes.fromhex(self._config.digest),
+            version=__version__,
+            driver=self._config.sensor.driver,
+        )
+        real = MAV_PARAM_TYPE.REAL32
+        return [
+            start,
+            *(
+                codec.pack("PARAM_VALUE", param_id=name, param_value=value, param_type=real)
+                for name, value in parameters.items()
+            ),
+        ]
 
     def _status(self) -> Condition:
         """Return what MAG_STATUS says of the sensor, the samples and the log."""

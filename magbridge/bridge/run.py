@@ -117,7 +117,7 @@ def run(path: Path, *, aloud: bool = False) -> None:
     sys.setswitchinterval(SWITCH)
     gc.collect()
     gc.freeze()  # what is here now stays: the collector need not look at it again
-    watch = LogWatch(log, edge)
+    watch = LogWatch(log, edge, pipeline)
 
     def after(time_us: int) -> None:
         keeper.look(pipeline, time_us)
@@ -156,10 +156,11 @@ def _open_log(config: Config, edge: LiveEdge) -> TlogWriter | None:
 
 
 class LogWatch:
-    """Tells the pipeline when the log fails and is well again, and what it lost."""
+    """Tells the pipeline when the log fails and is well again, and what it lost; and the log with what to begin anew."""
 
-    def __init__(self, log: TlogWriter | None, edge: LiveEdge) -> None:
-        self._log, self._edge = log, edge
+    def __init__(self, log: TlogWriter | None, edge: LiveEdge, pipeline: Pipeline) -> None:
+        self._log, self._edge, self._pipeline = log, edge, pipeline
+        self._revision = -1
         self._told = ("", 0)
         self._look_us = 0
 
@@ -168,6 +169,10 @@ class LogWatch:
         if self._log is None or time_us < self._look_us:
             return
         self._look_us = time_us + LOG_LOOK_US
+        parameters = self._pipeline.component.parameters
+        if parameters.revision != self._revision:
+            self._revision = parameters.revision
+            self._log.beginning = self._pipeline.beginning(parameters.changed())
         state = self._log.failure, self._log.lost
         if state != self._told:
             self._told = state

@@ -158,6 +158,12 @@ def map(  # noqa: A001 - the command's name
 def correct(*files: Path, calibration: Path, output: Log, json: Json = False) -> None:
     """Correct a log with a calibration, as the bridge would have done live.
 
+    The arithmetic and the state (lags, backlash) are the bridge's own; the input is what the log's rows hold. Of a bridge's own log
+    that is MAG_RAW, in which a channel is a float32 (to 0.002 nT of 50,000 nT), and the telemetry last said before it: while a mass
+    moves, the bridge itself reads its position off between messages, by their own times. Nor is [align] of bridge.toml known here.
+    What the bridge would have published with this calibration, bit for bit, a replay writes: magbridge replay LOG --config
+    bridge.toml --log DIR, with the calibration in that bridge.toml; that it is not what was published it then says, too.
+
     Parameters
     ----------
     files

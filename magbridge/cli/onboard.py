@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from contextlib import nullcontext
 from math import inf, nan
 from pathlib import Path
 from typing import Annotated
@@ -74,7 +75,8 @@ def replay(
 ) -> None:
     """Replay logs through the unmodified bridge: real bytes through a pty, real MAVLink through a socket.
 
-    A bridge's own log is published again bit for bit. Any other log is spoken by an emulated fluxgate and an
+    A bridge's own log is published again bit for bit; of one that was begun anew in the middle of a run (it was removed, or the
+    disk was full) it is said in how many samples the field is the same. Any other log is spoken by an emulated fluxgate and an
     emulated autopilot, and the corrected field is compared with the reference field.
 
     Parameters
@@ -92,7 +94,8 @@ def replay(
     """
     from sitl import replay as replaying
 
-    result = replaying.replay(some(files), config, speed_of(speed), log)
+    with new_folder(log) if log else nullcontext():
+        result = replaying.replay(some(files), config, speed_of(speed), log)
     tell(result, replaying.tell(result), json)
     if not all(run["identical"] for run in result.get("runs", ())):
         raise DataError("what was published is not what the log holds")

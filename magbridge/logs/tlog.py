@@ -6,7 +6,8 @@ multiple of 4, plus the :class:`~magbridge.records.Channel` in its low two bits.
 The live thread only appends to a queue (about 0.3 µs an event); a thread of its own writes whole records. The first
 record after a pause is written at once, those that follow within `WINDOW` together: after ``kill -9`` the
 file holds everything but the last group and reads to its end. A disk that stalls fills the queue, a disk that is
-full stops the log; either way records are dropped and counted, and the live thread never waits.
+full stops the log; either way records are dropped and counted, and the live thread never waits. The file that follows
+a log that failed begins with the start of the run, whose time is before its own: a replay knows that something is missing.
 """
 
 from __future__ import annotations
@@ -56,9 +57,13 @@ class TlogWriter:
         h of the events' time after which a new file begins.
     head : sequence of bytes
         Frames that stand in every file after its first record: what a reader of that file alone must know.
+    beginning : sequence of bytes
+        Frames with which a file begins that goes on after a loss: from what the run started.
 
     Attributes
     ----------
+    beginning : sequence of bytes
+        As given; the live thread may put another in its place.
     records : int
         Written so far.
     lost : int
@@ -79,6 +84,7 @@ class TlogWriter:
         max_size: float = 64.0,
         max_age: float = 24.0,
         head: Sequence[bytes] = (),
+        beginning: Sequence[bytes] = (),
     ) -> None:
         self._directory = Path(directory)
         try:
@@ -86,7 +92,7 @@ class TlogWriter:
         except OSError as error:
             raise PortError(str(directory), error.strerror or str(error)) from error
         self._max_size, self._max_age_us = round(max_size * 1e6), round(max_age * 3.6e9)
-        self._head = tuple(head)
+        self._head, self.beginning = tuple(head), beginning
         self.records, self.failure = 0, ""
         # of the live thread
         self._queue: deque[Sequence[Record]] = deque()
@@ -96,6 +102,7 @@ class TlogWriter:
         self._taken = self._dropped = 0
         self._file, self._name = -1, self._directory
         self._size = self._index = 0
+        self._torn = False
         self._start_us = self._synced_us = self._failed_us = 0
         self._thread = Thread(target=self._run, name="log writer", daemon=True)
         self._thread.start()
@@ -204,8 +211,10 @@ class TlogWriter:
     def _put_down(self, data: bytes, records: list[Record]) -> None:
         """Write whole records; when that fails, leave none half-written."""
         if not self._size:
-            first, *others = records
-            data = _packed([first, *((first[0], Channel.STATE, frame) for frame in self._head), *others])
+            first = 0 if self._torn else 1
+            told = (*self.beginning, *self._head) if self._torn else self._head
+            declared = [(records[0][0], Channel.STATE, frame) for frame in told]
+            data = _packed([*records[:first], *declared, *records[first:]])
         rest, time_us = memoryview(data), records[-1][0]
         try:
             while rest:
@@ -219,10 +228,12 @@ class TlogWriter:
             self._fail(error, time_us)
             return
         self._size += len(data)
+        self._torn = False
         self.records += len(records)
         self.failure = ""
 
     def _fail(self, error: OSError, time_us: int) -> None:
+        self._torn = True
         if self._file >= 0:
             with suppress(OSError):  # the reader skips a torn record
                 os.ftruncate(self._file, self._size)

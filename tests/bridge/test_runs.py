@@ -20,6 +20,7 @@ from magbridge.bridge.events import Clock
 from magbridge.logs import read
 from magbridge.mavlink import Codec, LogReader, Signing
 from magbridge.records import Channel
+from sitl.replay import alike
 
 MakeRig = Callable[..., Rig]
 KEY = bytes(range(32))
@@ -240,38 +241,44 @@ def test_a_log_that_is_removed(make_rig: MakeRig, table: Row) -> None:
     rig = make_rig()
     rig.start()
     mark = rig.mark
+    set_parameter(rig)
     (gone,) = rig.logs
     gone.unlink()
     rig.until_status(lambda status: status["log_state"] == LOG_FAILED)
     mended = rig.until(lambda: rig.status["log_state"] == LOG_OK)
     rig.until_said("log: being written", mark)
+    rig.run(1.0)
     assert rig.flags(mark) == ""
     assert rig.stop() == 0
     (anew,) = rig.logs
     assert anew != gone
     assert read(anew).sizes["time"] > 0
+    recorded, published = rig.replay([anew])
+    assert recorded.late > 5.0
+    assert recorded.start.parameters == {"MB_GAP_FACTOR": 3.0}
+    again = alike(bytearray(published), recorded)
+    assert again["samples"] > 50
     (said,) = {line for line in rig.said(mark) if line.startswith("log: ") and "written" not in line}
     table(
         "somebody removes the log while it is written",
         f'the field goes on, no flag; STATUSTEXT "{said}", `log_state` failed',
         f"{mended:.1f} s, in a new file",
-        f"what was in it, and what came until then: `log_lost` {rig.status['log_lost']} records; the new one reads, but is no start to replay from",
+        f"what was in it, and what came until then: `log_lost` {rig.status['log_lost']} records; the new one reads, but what the bridge knew by then is not in it: its replay says so, and in how many samples the field is the same",
     )
+
+
+def set_parameter(rig: Rig) -> None:
+    """Set a parameter as a station would."""
+    mark = rig.mark
+    to = {"target_system": 1, "target_component": 191}
+    rig.autopilot.say("PARAM_SET", **to, param_id="MB_GAP_FACTOR", param_value=3.0, param_type=9)
+    rig.until(lambda: rig.of("PARAM_VALUE", mark))
 
 
 def test_killed_without_warning(make_rig: MakeRig, table: Row) -> None:
     rig = make_rig()
     rig.start()
-    mark = rig.mark
-    rig.autopilot.say(
-        "PARAM_SET",
-        target_system=1,
-        target_component=191,
-        param_id="MB_GAP_FACTOR",
-        param_value=3.0,
-        param_type=9,
-    )
-    rig.until(lambda: rig.of("PARAM_VALUE", mark))
+    set_parameter(rig)
     rig.run(1.0)
     assert rig.process is not None
     rig.process.kill()

@@ -142,6 +142,26 @@ def test_a_log_that_is_removed_is_missed(tmp_path: Path) -> None:
     assert [path.name[-9:] for path in tmp_path.iterdir()] == ["0002.tlog"]
 
 
+def test_a_file_after_a_loss_begins_with_the_beginning_and_one_in_turn_does_not(tmp_path: Path) -> None:
+    head, begin = bytes([0xFD]) * len(FRAME), bytes([0xFE]) * len(FRAME)
+    folder, aside = tmp_path / "logs", tmp_path / "aside"
+    with TlogWriter(folder, head=[head], beginning=[begin], max_age=1e-3) as log:
+        for k in (0, 1, 2):
+            log.write(T0 + k * 4_000_000, 0, FRAME)
+        log._wake.set()
+        while log.records < 3:
+            time.sleep(0.001)
+        folder.rename(aside)
+        log.write(T0 + 12_000_000, 0, FRAME)
+        while not log.failure:
+            time.sleep(0.001)
+        aside.rename(folder)
+        for k in (4, 5):
+            log.write(T0 + k * 4_000_000, 0, FRAME)
+    told = [[frame for _, frame in records(path)] for path in sorted(folder.iterdir())]
+    assert told == [[FRAME, head]] * 3 + [[begin, head, FRAME], [FRAME, head]]
+
+
 def test_stalled_disk_drops_and_counts_and_never_blocks(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -1,0 +1,121 @@
+"""A log that is begun anew after a loss: what the bridge knew by then is not in it, and its replay says so."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from math import cos, pi, sin
+from pathlib import Path
+
+import numpy as np
+
+from magbridge.bridge.events import Event
+from magbridge.bridge.pipeline import Pipeline, Start
+from magbridge.bridge.run import set_up
+from magbridge.calibration.file import save
+from magbridge.calibration.model import Calibration, Noise, Parameter, Reference
+from magbridge.calibration.terms import Polynomial, full_order
+from magbridge.config import load
+from magbridge.logs.tlog import TlogWriter
+from magbridge.mavlink import Codec
+from magbridge.records import Channel
+from sitl.own_log import Recorded, is_own_log, runs
+from sitl.replay import alike, tell
+
+START = 1_780_000_000_000_000
+BOOT = START - 77_000_000
+CONFIG = """
+[sensor]
+driver = "ascii"
+port = "/dev/null"
+options = {columns = ["x", "y", "z", "temperature", "time", "sequence"]}
+[link]
+url = "udpout:127.0.0.1:14550"
+[calibration]
+file = "cal.json"
+[telemetry.battpos]
+message = "NAMED_VALUE_FLOAT"
+match = {name = "battpos"}
+field = "value"
+[publish]
+MAG_FIELD = 0
+[log]
+directory = "logs"
+"""
+
+
+def bridge(folder: Path, start: Start) -> Pipeline:
+    size = 4 * 9
+    cal = Calibration(
+        parameters=(Parameter("battpos", "", -1.0, 1.0, 0.0, 1.0),),
+        terms=(Polynomial(exponents=full_order(1, 3)),),
+        coefficients=np.random.default_rng(1).normal(size=size) * 300.0,
+        covariance=np.eye(size),
+        noise=Noise(1.0),
+        reference=Reference(50_000.0),
+        method="auto",
+    )
+    save(cal, folder / "cal.json")
+    (folder / "bridge.toml").write_text(CONFIG)
+    return set_up(load(folder / "bridge.toml"), start)
+
+
+def events(pipeline: Pipeline, begin: int, end: int) -> Iterator[Event]:
+    """20 samples/s, each 30 ms old when it comes; a mass that moves all the time, told at 5 Hz with the boot clock."""
+    autopilot = Codec(1, 1)
+    for k in range(begin, end):
+        t_us = START + 50_000 * k
+        turn = 2 * pi * k / 400
+        line = f"{20_000 * cos(turn):.2f} {20_000 * sin(turn):.2f} 45000 4.0 {(50 * k - 30) / 1e3} {k}\n"
+        yield Event(t_us, Channel.SENSOR, line.encode())
+        if k % 4 == 0:
+            told = {"time_boot_ms": (t_us - BOOT) // 1000 - 25, "value": sin(k / 90), "name": "battpos"}
+            yield Event(t_us + 4_000, Channel.LINK, autopilot.pack("NAMED_VALUE_FLOAT", **told))
+        while asked := [
+            ts1 for ts1 in pipeline.component.vehicle.clock._asked if ts1 // 1000 > t_us - 50_000
+        ]:
+            answer = {"tc1": (t_us + 5_000 - BOOT) * 1000, "ts1": asked[0]}
+            yield Event(t_us + 8_000, Channel.LINK, autopilot.pack("TIMESYNC", **answer))
+
+
+def test_a_log_after_a_loss_is_replayed_as_far_as_it_can_be(tmp_path: Path) -> None:
+    pipeline = bridge(tmp_path, Start(START, {"MB_GAP_FACTOR": 2.0}))
+    folder, aside = tmp_path / "logs", tmp_path / "aside"
+    now = {"MB_GAP_FACTOR": 3.0}
+    with TlogWriter(folder, beginning=pipeline.beginning(now), max_size=0.05) as log:
+
+        def play(begin: int, end: int) -> None:
+            for event in events(pipeline, begin, end):
+                pipeline.feed(event)
+                log.extend(pipeline.journal.drain())
+            while log._taken < log._put or not log._idle:
+                time.sleep(0.002)
+
+        play(0, 400)
+        whole = sorted(folder.iterdir())
+        folder.rename(aside)
+        folder.write_text("no folder")
+        play(400, 800)
+        folder.unlink()
+        aside.rename(folder)
+        play(800, 1600)
+    assert log.lost
+    files = sorted(folder.iterdir())
+    first, second = runs(files)
+    assert is_own_log(second[0])
+    assert first[: len(whole)] == whole
+
+    recorded = Recorded(second)
+    assert recorded.start.parameters == now
+    assert 15.0 < recorded.late < 45.0
+    again = bridge(tmp_path, recorded.start)
+    published = bytearray(b"".join(f for event in recorded.events() for _, f in again.feed(event)))
+    result = alike(published, recorded)
+    assert result["samples"] > 500
+    assert result["same_samples"] > 0.9 * result["samples"]
+    assert alike(published, Recorded(first)) == {"late_s": 0.0}
+    more = {"files": second, "messages": recorded.messages, "bytes": 1, "seconds": 1.0, "same_config": True}
+    said = tell(
+        {"runs": [result | more | {"identical": False, "first_difference": 0, "beyond": 0, "damages": 0}]}
+    )
+    assert f"begins {recorded.late:.1f} s into the run" in said
