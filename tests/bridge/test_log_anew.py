@@ -7,57 +7,22 @@ from collections.abc import Iterator
 from math import cos, pi, sin
 from pathlib import Path
 
-import numpy as np
+from small import START, small_bridge
 
 from magbridge.bridge.events import Event
 from magbridge.bridge.pipeline import Pipeline, Start
-from magbridge.bridge.run import set_up
-from magbridge.calibration.file import save
-from magbridge.calibration.model import Calibration, Noise, Parameter, Reference
-from magbridge.calibration.terms import Polynomial, full_order
-from magbridge.config import load
+from magbridge.calibration.model import Parameter
 from magbridge.logs.tlog import TlogWriter
 from magbridge.mavlink import Codec
 from magbridge.records import Channel
 from sitl.own_log import Recorded, is_own_log, runs
 from sitl.replay import alike, tell
 
-START = 1_780_000_000_000_000
 BOOT = START - 77_000_000
-CONFIG = """
-[sensor]
-driver = "ascii"
-port = "/dev/null"
-options = {columns = ["x", "y", "z", "temperature", "time", "sequence"]}
-[link]
-url = "udpout:127.0.0.1:14550"
-[calibration]
-file = "cal.json"
-[telemetry.battpos]
-message = "NAMED_VALUE_FLOAT"
-match = {name = "battpos"}
-field = "value"
-[publish]
-MAG_FIELD = 0
-[log]
-directory = "logs"
-"""
 
 
 def bridge(folder: Path, start: Start) -> Pipeline:
-    size = 4 * 9
-    cal = Calibration(
-        parameters=(Parameter("battpos", "", -1.0, 1.0, 0.0, 1.0),),
-        terms=(Polynomial(exponents=full_order(1, 3)),),
-        coefficients=np.random.default_rng(1).normal(size=size) * 300.0,
-        covariance=np.eye(size),
-        noise=Noise(1.0),
-        reference=Reference(50_000.0),
-        method="auto",
-    )
-    save(cal, folder / "cal.json")
-    (folder / "bridge.toml").write_text(CONFIG)
-    return set_up(load(folder / "bridge.toml"), start)
+    return small_bridge(folder, start, Parameter("battpos", "", -1.0, 1.0, 0.0, 1.0), ["MAG_FIELD"])
 
 
 def events(pipeline: Pipeline, begin: int, end: int) -> Iterator[Event]:

@@ -5,42 +5,15 @@ from __future__ import annotations
 from math import inf, isfinite, isnan, nan
 from pathlib import Path
 
-import numpy as np
 import pytest
+from small import START, small_bridge
 
 from magbridge.bridge.events import Event
 from magbridge.bridge.pipeline import Pipeline, Start
-from magbridge.bridge.run import set_up
-from magbridge.calibration.file import save
-from magbridge.calibration.model import Calibration, Noise, Parameter, Reference
-from magbridge.calibration.terms import Polynomial, full_order
-from magbridge.config import load
+from magbridge.calibration.model import Parameter
 from magbridge.mavlink import Codec, Message
 from magbridge.records import Channel, Quality
 
-START = 1_780_000_000_000_000
-CONFIG = """
-[sensor]
-driver = "ascii"
-port = "/dev/null"
-options = {columns = ["x", "y", "z", "temperature", "time", "sequence"]}
-[link]
-url = "udpout:127.0.0.1:14550"
-[calibration]
-file = "cal.json"
-[telemetry.battpos]
-message = "NAMED_VALUE_FLOAT"
-match = {name = "battpos"}
-field = "value"
-[publish]
-MAG_RAW = 0
-MAG_FIELD = 0
-HIGHRES_IMU = 0
-NAMED_VALUE_FLOAT = 0
-DEBUG_VECT = 0
-[log]
-directory = "logs"
-"""
 WILD = ("1e300", "-1e39", "1e20", "99999999999999999999", "3e9", "-32768", "0", "1e-320", "nan", "inf", "x")
 DOUBTFUL = int(Quality.STALE_TELEMETRY | Quality.EXTRAPOLATED | Quality.MOVING)
 TELEMETRY = (-9999.0, 65535.0, 1e9, 1e15, 3.4e38, -3.4e38, nan, inf)
@@ -48,19 +21,9 @@ TELEMETRY = (-9999.0, 65535.0, 1e9, 1e15, 3.4e38, -3.4e38, nan, inf)
 
 @pytest.fixture
 def pipeline(tmp_path: Path) -> Pipeline:
-    size = 4 * 9
-    cal = Calibration(
-        parameters=(Parameter("battpos", "", -0.4, 0.6, 0.1, 0.5),),
-        terms=(Polynomial(exponents=full_order(1, 3)),),
-        coefficients=np.random.default_rng(1).normal(size=size) * 300.0,
-        covariance=np.eye(size),
-        noise=Noise(1.0),
-        reference=Reference(50_000.0),
-        method="auto",
-    )
-    save(cal, tmp_path / "cal.json")
-    (tmp_path / "bridge.toml").write_text(CONFIG, encoding="utf-8")
-    return set_up(load(tmp_path / "bridge.toml"), Start(START))
+    battery = Parameter("battpos", "", -0.4, 0.6, 0.1, 0.5)
+    published = ["MAG_RAW", "MAG_FIELD", "HIGHRES_IMU", "NAMED_VALUE_FLOAT", "DEBUG_VECT"]
+    return small_bridge(tmp_path, Start(START), battery, published)
 
 
 @pytest.mark.parametrize("column", range(6))

@@ -1,0 +1,54 @@
+"""A bridge without ports: a line protocol, one mass, a calibration of random coefficients; events are fed by hand."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from magbridge.bridge.pipeline import Pipeline, Start
+from magbridge.bridge.run import set_up
+from magbridge.calibration.file import save
+from magbridge.calibration.model import Calibration, Noise, Parameter, Reference
+from magbridge.calibration.terms import Polynomial, full_order
+from magbridge.config import load
+
+__all__ = ["START", "small_bridge"]
+
+START = 1_780_000_000_000_000
+CONFIG = """
+[sensor]
+driver = "ascii"
+port = "/dev/null"
+options = {columns = ["x", "y", "z", "temperature", "time", "sequence"]}
+[link]
+url = "udpout:127.0.0.1:14550"
+[calibration]
+file = "cal.json"
+[telemetry.battpos]
+message = "NAMED_VALUE_FLOAT"
+match = {name = "battpos"}
+field = "value"
+[log]
+directory = "logs"
+[publish]
+"""
+
+
+def small_bridge(folder: Path, start: Start, battery: Parameter, publish: Sequence[str]) -> Pipeline:
+    """Set one up in a folder; the messages of `publish` come with every sample."""
+    size = 4 * 9
+    cal = Calibration(
+        parameters=(battery,),
+        terms=(Polynomial(exponents=full_order(1, 3)),),
+        coefficients=np.random.default_rng(1).normal(size=size) * 300.0,
+        covariance=np.eye(size),
+        noise=Noise(1.0),
+        reference=Reference(50_000.0),
+        method="auto",
+    )
+    save(cal, folder / "cal.json")
+    config = folder / "bridge.toml"
+    config.write_text(CONFIG + "".join(f"{message} = 0\n" for message in publish), encoding="utf-8")
+    return set_up(load(config), start)
