@@ -14,7 +14,7 @@ ROWS: list[tuple[str, str, str, str]] = []
 
 @pytest.fixture(scope="module")
 def table() -> Iterator[Callable[[str, str, str, str], None]]:
-    """Take rows of the table of faults; MAGBRIDGE_FAULTS names the file that it is written to."""
+    """Take rows of the table of faults; MAGBRIDGE_FAULTS names the file to write it to (with ``-n 0``)."""
 
     def row(fault: str, meanwhile: str, well: str, lost: str) -> None:
         ROWS.append((fault, meanwhile, well, lost))
@@ -24,7 +24,7 @@ def table() -> Iterator[Callable[[str, str, str, str], None]]:
         head = (
             "fault",
             "what the bridge publishes meanwhile",
-            "well again after",
+            "recovers after",
             "what is lost, and where it is counted",
         )
         lines = [head, ("---",) * 4, *ROWS]

@@ -31,9 +31,9 @@ def test_garbage_from_the_link(rig: Rig, table: Row) -> None:
     assert rig.flags(mark) == ""
     table(
         "3,300 bytes of noise and half frames from the link",
-        "nothing: the field goes on, without a flag",
+        "no change and no flag",
         seconds(back),
-        f"no frame beside the half one: `link_frames_lost` {lost}, `link_bytes_skipped` {skipped}",
+        f"only the half frame: `link_frames_lost` {lost}, `link_bytes_skipped` {skipped}",
     )
     assert lost <= 2
 
@@ -61,8 +61,8 @@ def test_telemetry_stale(rig: Rig, table: Row, how: str) -> None:
     assert 0.4 < noticed < 1.5
     assert rig.flags(mark) in ("stale_telemetry", "stale_telemetry moving")
     table(
-        f"telemetry {'frozen: the same message again and again' if how == 'frozen' else 'stops, while the autopilot goes on'}",
-        f"after `max_age` (0.5 s; seen after {noticed:.2f} s) `stale_telemetry`, sigma grows, `telemetry_age`, its bit in `telemetry_stale`, STATUSTEXT",
+        f"telemetry {'frozen: the same message over and over' if how == 'frozen' else 'stops while the autopilot carries on'}",
+        f"after `max_age` (0.5 s; seen after {noticed:.2f} s) `stale_telemetry`, a growing sigma and `telemetry_age`, the parameter's bit in `telemetry_stale`, STATUSTEXT",
         seconds(back),
         "nothing",
     )
@@ -79,7 +79,7 @@ def test_telemetry_duplicated(rig: Rig, table: Row) -> None:
     after = rig.fresh_status()
     assert rig.flags(mark) == ""
     assert after["link_frames_lost"] == before["link_frames_lost"]
-    table("telemetry, every message three times", "nothing: the copies are passed over", "at once", "nothing")
+    table("every telemetry message arrives three times", "no change: the copies are ignored", "at once", "nothing")
 
 
 def test_telemetry_out_of_order(rig: Rig, table: Row) -> None:
@@ -105,10 +105,10 @@ def test_telemetry_out_of_order(rig: Rig, table: Row) -> None:
     assert after["vehicle_reboots"] == before["vehicle_reboots"]
     assert not any("two autopilots" in line for line in rig.said(mark))
     table(
-        "telemetry out of order, four messages shuffled",
-        "nothing: what is older than what is known is passed over",
+        "telemetry out of order: four messages shuffled",
+        "no change: a value older than the newest is ignored",
         "at once",
-        "the values that came too late; what only came late does not count as lost",
+        "the values that came too late; they are not counted as lost",
     )
 
 
@@ -139,8 +139,8 @@ def test_second_system_on_the_link(rig: Rig, table: Row) -> None:
     assert len([line for line in rig.said(mark) if "vehicle 2" in line]) == 1
     assert shouted
     table(
-        "a second vehicle on the link, with the same names in its telemetry",
-        f"STATUSTEXT once (after {told:.2f} s); nothing of it is taken",
+        "a second vehicle on the link whose telemetry has the same names",
+        f"STATUSTEXT once (after {told:.2f} s); its telemetry is ignored",
         "at once",
         "nothing",
     )
@@ -165,7 +165,7 @@ def test_two_autopilots_answer(rig: Rig, table: Row) -> None:
         "two programs answer as the autopilot (1:1)",
         f"STATUSTEXT after {told:.2f} s; flags: {rig.flags(mark) or 'none'}",
         seconds(back),
-        "nothing; `link_frames_lost` says little while their numbers interleave",
+        "nothing; `link_frames_lost` grows because their sequence numbers interleave",
     )
     assert back < 6.0
 
@@ -178,8 +178,8 @@ def test_another_bridge_answers(rig: Rig, table: Row) -> None:
     back = rig.until_well()
     assert rig.flags(mark) == ""
     table(
-        "another program speaks as the bridge itself (1:191)",
-        f"STATUSTEXT after {told:.2f} s; what it says is not taken for telemetry",
+        "another program uses the bridge's own address (1:191)",
+        f"STATUSTEXT after {told:.2f} s; its messages are not taken for telemetry",
         "at once",
         "nothing",
     )
@@ -199,10 +199,10 @@ def test_parameter_out_of_range(rig: Rig, table: Row) -> None:
     assert rig.flags(mark) == ""
     assert not (rig.folder / "parameters.json").exists()
     table(
-        "a parameter write out of range (also NaN, infinite)",
-        "PARAM_VALUE with the value that still holds, STATUSTEXT with the limits",
+        "a parameter write out of range (also NaN or infinite)",
+        "PARAM_VALUE with the value still in force, STATUSTEXT with the limits",
         "at once",
-        "the write: refused",
+        "the write, which is refused",
     )
 
 
@@ -216,7 +216,7 @@ def test_autopilot_reboots(rig: Rig, table: Row) -> None:
     assert after["vehicle_reboots"] == before["vehicle_reboots"] + 1
     assert rig.flags(mark) in ("", "stale_telemetry")
     table(
-        "autopilot reboots: its clock begins anew",
+        "autopilot reboots: its clock starts over",
         f"STATUSTEXT, `vehicle_reboots`; flags: {rig.flags(mark) or 'none'}",
         seconds(back),
         "nothing",
@@ -241,9 +241,9 @@ def test_udp_peer_gone_and_back(rig: Rig, table: Row) -> None:
     assert after["samples_lost"] == rig.until_status(lambda _: True)["samples_lost"]
     table(
         "autopilot link down (UDP: the port closes), up again after 5.7 s",
-        'nothing can be heard; into the log, `stale_telemetry` after `max_age`, "autopilot 1:1 is silent" after 5 s',
+        'nothing gets through; in the log, `stale_telemetry` after `max_age`, "autopilot 1:1 is silent" after 5 s',
         seconds(back),
-        f"messages to the autopilot, seen by MAG_FIELD's `sequence` ({lost} here); the log has them all",
+        f"messages to the autopilot, visible in MAG_FIELD's `sequence` ({lost} here); the log has them all",
     )
     assert back < 1.5
 

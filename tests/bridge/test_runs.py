@@ -66,10 +66,10 @@ def test_tcp_server_gone_and_back(make_rig: MakeRig, table: Row) -> None:
     lost = next(number for number in sequences if number > last + 20) - last - 1
     assert sequences == sorted(sequences)
     table(
-        "autopilot link down (TCP: the server goes), up again after 1.2 s",
-        '"link: closed by the other end" into the log, then over the link "link: open"; `stale_telemetry` meanwhile',
+        "autopilot link down (TCP: the server closes), up again after 1.2 s",
+        '"link: closed by the other end" in the log, then "link: open" over the link; `stale_telemetry` in between',
         f"{back:.2f} s",
-        f"messages to the autopilot, seen by MAG_FIELD's `sequence` ({lost} here); the log has them all",
+        f"messages to the autopilot, visible in MAG_FIELD's `sequence` ({lost} here); the log has them all",
     )
     assert back < 2.0
     replays(rig)
@@ -90,9 +90,9 @@ def test_autopilot_on_a_serial_line_pulled_out_and_back(make_rig: MakeRig, table
     lost = rig.of("MAG_FIELD", mark)[0]["sequence"] - last - 1
     table(
         "autopilot on a serial line: pulled out, back after 1.0 s",
-        '"link: No such file or directory" into the log, then over the link "link: open"; `stale_telemetry` meanwhile',
+        '"link: No such file or directory" in the log, then "link: open" over the link; `stale_telemetry` in between',
         f"{back:.2f} s",
-        f"messages to the autopilot, seen by MAG_FIELD's `sequence` ({lost} here); the log has them all",
+        f"messages to the autopilot, visible in MAG_FIELD's `sequence` ({lost} here); the log has them all",
     )
     assert back < 2.0
     assert 25 <= lost <= 100
@@ -125,9 +125,9 @@ def test_host_clock_set_forward_and_back(make_rig: MakeRig, table: Row) -> None:
     assert times == sorted(times)
     table(
         "host clock set 1 h forward, then 2 h back",
-        f"STATUSTEXT ({noticed:.2f} s after the step); from then on the published UNIX times follow; no flag, because no interval is measured with that clock",
+        f"STATUSTEXT ({noticed:.2f} s after the step), and from then on the published UNIX times follow; no flag, because no interval is measured with that clock",
         "at once",
-        "nothing; between the step and the STATUSTEXT samples carry the old UNIX time",
+        "nothing; samples between the step and the STATUSTEXT carry the old UNIX time",
     )
     replays(rig)
 
@@ -156,10 +156,10 @@ def test_forged_signed_packets(make_rig: MakeRig, table: Row) -> None:
     assert rig.flags(mark) == ""
     assert all(message.frame[2] & 1 for _, message in rig.heard)
     table(
-        "forged packets: a time stamp far in the future, another key, no signature, a genuine one sent again",
-        "nothing; the genuine ones that follow are taken",
+        "forged packets: a time stamp far in the future, another key, no signature, a replayed genuine packet",
+        "no change; the genuine packets that follow are accepted",
         "at once",
-        f"the forged ones: `link_refused` {len(wrong)}",
+        f"the forged packets: `link_refused` {len(wrong)}",
     )
     replays(rig)
 
@@ -231,9 +231,9 @@ def test_disk_full(make_rig: MakeRig, small_disk: Path | None, table: Row) -> No
     assert said == ("log: No space left on device" if small_disk is not None else "log: File too large")
     table(
         "disk full, then room again",
-        f'the field goes on, no flag; STATUSTEXT "{said}", `log_state` failed',
+        f'the field goes on without a flag; STATUSTEXT "{said}", `log_state` failed',
         f"{mended:.1f} s, in a new file",
-        f"the log meanwhile: `log_lost` {lost} records; what was written before reads to its end",
+        f"the log in between: `log_lost` {lost} records; what was written before can be read to its end",
     )
 
 
@@ -260,10 +260,10 @@ def test_a_log_that_is_removed(make_rig: MakeRig, table: Row) -> None:
     assert again["samples"] > 50
     (said,) = {line for line in rig.said(mark) if line.startswith("log: ") and "written" not in line}
     table(
-        "somebody removes the log while it is written",
-        f'the field goes on, no flag; STATUSTEXT "{said}", `log_state` failed',
+        "somebody deletes the log while it is being written",
+        f'the field goes on without a flag; STATUSTEXT "{said}", `log_state` failed',
         f"{mended:.1f} s, in a new file",
-        f"what was in it, and what came until then: `log_lost` {rig.status['log_lost']} records; the new one reads, but what the bridge knew by then is not in it: its replay says so, and in how many samples the field is the same",
+        f"the deleted log and the records until the new one: `log_lost` {rig.status['log_lost']} records; the new one lacks what the bridge knew when it began; its replay says so, and in how many samples the field is the same",
     )
 
 
@@ -306,9 +306,9 @@ def test_killed_without_warning(make_rig: MakeRig, table: Row) -> None:
     assert rig.of("PARAM_VALUE", mark)[-1]["param_value"] == 3.0
     table(
         "`kill -9`, started again",
-        "nothing; then as at every start. Parameters set over the link hold",
+        "nothing, then a normal start. Parameters set over the link are kept",
         f"{back:.1f} s after the start",
-        f"of the log at most the last event: {len(missing)} messages here; the rest reads, and replays to the same bytes",
+        f"at most the last event of the log: {len(missing)} messages here; the rest replays to the same bytes",
     )
 
 

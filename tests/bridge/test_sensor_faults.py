@@ -40,10 +40,10 @@ def test_sensor_unplugged_in_the_middle_of_a_frame(rig: Rig, table: Row) -> None
     came = after["samples"] - before["samples"]
     assert came + lost == pytest.approx(rig.fluxgate.encoder.sequence - sent, abs=10)
     table(
-        "sensor unplugged in the middle of a frame, plugged in again",
+        "sensor unplugged in mid-frame, plugged in again",
         "heartbeat critical, `sensor_state` lost, STATUSTEXT with the reason; first sample back: `gap`",
         seconds(back),
-        f"the readings meanwhile and one frame: `samples_lost` {lost}, `sensor_bytes_skipped`",
+        f"the readings in between and one frame: `samples_lost` {lost}, `sensor_bytes_skipped`",
     )
     assert told < 1.5
     assert back < 2.0
@@ -62,9 +62,9 @@ def test_sensor_silent(rig: Rig, table: Row) -> None:
     assert lost > 20
     table(
         "sensor silent on an open line",
-        "heartbeat critical, `sensor_state` silent and STATUSTEXT after `sensor.timeout`; start-up commands again, every `timeout`",
+        "heartbeat critical, `sensor_state` silent and STATUSTEXT after `sensor.timeout`; the start-up commands are repeated every `timeout`",
         seconds(back),
-        f"what it did not send: `samples_lost` {lost}",
+        f"what the sensor did not send: `samples_lost` {lost}",
     )
     assert noticed < 2.0
     assert back < 1.0
@@ -84,9 +84,9 @@ def test_garbage_from_the_sensor(rig: Rig, table: Row) -> None:
     assert set(rig.flags(mark).split()) <= {"gap"}
     table(
         "3,000 bytes of noise from the sensor",
-        f"`{rig.flags(mark) or 'no flag'}` on the sample after it",
+        f"`{rig.flags(mark) or 'no flag'}` on the next sample",
         seconds(back),
-        f"the frame that the noise ran into: `samples_lost` {lost}, `sensor_frames_bad` {bad}, `sensor_bytes_skipped` {skipped}",
+        f"the frame hit by the noise: `samples_lost` {lost}, `sensor_frames_bad` {bad}, `sensor_bytes_skipped` {skipped}",
     )
     assert back < 0.5
 
@@ -128,7 +128,7 @@ def test_second_bridge_on_the_same_sensor(rig: Rig, table: Row) -> None:
     reason = next(text for text in told if "digitizer lost" in text)
     table(
         "a second `magbridge run` on the same serial port",
-        f'the first: nothing. The second: heartbeat critical, STATUSTEXT "{reason}"; it waits for the port',
+        f'the first: no change. The second: heartbeat critical, STATUSTEXT "{reason}"; it waits for the port',
         "at once; the second tries again every 0.25 s",
         "nothing",
     )
@@ -146,10 +146,10 @@ def test_sensor_back_under_another_name_and_powered_anew(rig: Rig, table: Row) -
     sigma = rig.of("MAG_FIELD")[-1]["total_field_sigma"]
     assert sigma > 20
     table(
-        "sensor unplugged, back under another name, powered on anew",
-        f"as above; then `offset_suspect` with sigma {sigma:.0f} nT (`turn_on_sigma`) for the rest of the run: its offset may have settled elsewhere",
+        "sensor unplugged, back under another name after a power cycle",
+        f"as above; then `offset_suspect` with sigma {sigma:.0f} nT (`turn_on_sigma`) for the rest of the run, because its offset may have settled elsewhere",
         seconds(back),
-        "the readings meanwhile; how many, the sensor no longer knows: its numbers began anew",
+        "the readings in between; their number is unknown, because the sensor's counter started over",
     )
     assert back < 2.0
 
