@@ -112,8 +112,8 @@ def test_what_is_read_is_not_written_over(
         (folder, ["diagnose", deployment, "--calibration", folder, "-o", tmp_path]),
     ):
         line = complaint(capsys, *arguments, code=2)
-        assert line.endswith(": expected another file to write than those to read")
-        assert Path(line.partition(": expected")[0]).resolve() == written.resolve()
+        assert line.endswith(": is among the files to read; choose another file to write")
+        assert Path(line.partition(": is among")[0]).resolve() == written.resolve()
     assert log.read_bytes() == deployment.read_bytes()
     loop = tmp_path / "loop.csv"
     loop.symlink_to(loop)
@@ -223,7 +223,7 @@ def test_correct_gives_the_same_in_pieces(deployment: Path, calibration: Path, t
         (["map", "none.nc", "-o", "x.nc", "--picture", "x.foo"], 2, "must end in .png or .pdf or .svg"),
         (["convert", "{d}", "-o", "nowhere/x.csv"], 2, "There is no folder nowhere"),
         (["convert", "{d}", "-o", "."], 2, "It is a folder"),
-        (["simulate", "demo", "--like", "{d}", "b.nc", "-o", "x.nc"], 2, "b.nc: one too many"),
+        (["simulate", "demo", "--like", "{d}", "b.nc", "-o", "x.nc"], 2, "b.nc: unexpected argument"),
         (["convert", "{d}", "-o", "/proc/self/x.csv"], 2, "The folder /proc/self cannot be written to"),
         (["diagnose", "{d}", "--calibration", "{d}", "-o", "{d}"], 2, "It is a file"),
         (["demo", "--out", "{d}"], 2, "It is a file"),
@@ -323,7 +323,7 @@ def test_numbers_that_may_say_not_known_are_told(
     write(rows, tmp_path / "log.csv")
     assert main(["diagnose", str(tmp_path / "log.csv"), *diagnosed]) == 1
     told, refused = capsys.readouterr().err.splitlines()
-    assert f"log.csv, column 'pump_current': -9999 in 2 of {FEW} rows is taken for a number" in told
+    assert f"log.csv, column 'pump_current': -9999 in 2 of {FEW} rows is read as a number" in told
     assert refused.endswith(f"{FEW} samples, at least 60 needed")
     declared = tmp_path / "declared.csv"
     declared.write_text("# fill_value = -9999\n" + (tmp_path / "log.csv").read_text())
@@ -340,7 +340,7 @@ def test_a_log_that_the_calibration_was_made_from_is_told(
     assert main(["calibrate", str(log), "--method", "nominal", "-o", str(cal)]) == 0
     capsys.readouterr()
     assert main(["diagnose", str(log), "--calibration", str(cal), "-o", str(tmp_path / "doubt")]) == 1
-    assert f"{log}: the calibration was made from it" in capsys.readouterr().err
+    assert f"{log}: the calibration was fitted to this log" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("names", [(), ("battpos", "ballast")], ids=["nominal", "two masses"])

@@ -47,7 +47,9 @@ def main(arguments: list[str] | None = None) -> int:
         app(arguments, exit_on_error=False, print_error=False, result_action="return_value")
     except UnusedCliTokensError as error:
         unused = " ".join(error.unused_tokens or ())
-        return complain(f"{unused}: one too many; an option that takes several is given once for each", 2)
+        return complain(
+            f"{unused}: unexpected argument; an option with several values is repeated for each", 2
+        )
     except CycloptsError as error:
         return complain(str(error), 2)
     except MagbridgeError as error:

@@ -26,18 +26,18 @@ from magbridge.progress import track, waiting
 
 @app.command(usage="Usage: magbridge convert FILE... -o FILE [OPTIONS]")
 def convert(*files: Path, output: Log, heading_reference: Heading = None, json: Json = False) -> None:
-    """Convert logs of any readable format to any writable one; several are joined in time.
+    """Convert logs from any readable format to any writable one; several logs are merged in time order.
 
     Parameters
     ----------
     files
-        Logs.
+        The logs to convert.
     output
-        The file to write; its suffix says the format: .csv .nc .parquet .tlog.
+        The file to write; its suffix sets the format: .csv .nc .parquet .tlog.
     heading_reference
-        What headings are counted from; if not given what the log says, else true north.
+        What headings refer to. If not given: what the log says, else true north.
     json
-        Print the result for machines.
+        Print the result as JSON.
     """
     from magbridge.logs import Writer, read_chunks
 
@@ -70,18 +70,18 @@ def simulate(
     Parameters
     ----------
     scenario
-        A scenario file, or the name of one that comes with magbridge: demo, survey, bonne_bay,
-        random_glider; comet and seaglider are driven by a log (--like).
+        A scenario file, or one of the built-in demo, survey, bonne_bay, random_glider, comet and seaglider; the last two
+        need a log to drive them (--like).
     output
         The file to write.
     seed
-        Draws everything that the scenario leaves open; the same seed gives the same deployment.
+        Determines everything that the scenario leaves open; the same seed gives the same deployment.
     like
-        A log whose attitude, position and masses drive the simulation instead of the scenario's mission; again for each further one.
+        A log whose attitude, position and masses drive the simulation instead of the scenario's mission; may be repeated.
     map_output
-        Where to write the anomaly grid that an aeromagnetic survey of the simulated world would have made.
+        Also write the anomaly grid that an aeromagnetic survey of the simulated world would have produced.
     json
-        Print the result for machines.
+        Print the result as JSON.
     """
     from magbridge.logs import read, write
     from sitl.like import simulate_like, where
@@ -118,26 +118,26 @@ def map(  # noqa: A001 - the command's name
     picture: Picture = None,
     json: Json = False,
 ) -> None:
-    """Make one anomaly map from the grids of several surveys: continue upward, merge, mask, smooth.
+    """Combine the grids of several surveys into one anomaly map: continue upward, merge, mask, smooth.
 
     Parameters
     ----------
     grids
-        Grids: netCDF, Surfer, Geosoft, ESRI ASCII, GeoTIFF, XYZ.
+        The grids: netCDF, Surfer, Geosoft, ESRI ASCII, GeoTIFF or XYZ.
     output
         The map to write, netCDF.
     altitude
-        m to which every grid is continued upward; the highest of theirs if not given.
+        Altitude in m to which every grid is continued upward; by default that of the highest.
     passes
-        How often the 3x3 Hanning kernel is applied.
+        Number of passes of the 3x3 Hanning smoothing kernel.
     mask
-        A CSV of longitude,latitude (deg): the polygon at which the map ends.
+        A CSV of longitude,latitude (deg): the polygon outside which the map is blank.
     spacing
-        deg; the finest of the grids' if not given.
+        Node spacing in deg; by default that of the finest grid.
     picture
-        A PNG, PDF or SVG with every step.
+        A PNG, PDF or SVG to draw, with every step.
     json
-        Print the result for machines.
+        Print the result as JSON.
     """
     from magbridge.field.prepare import draw_steps, prepare
     from magbridge.field.read import read_grid, read_polygon
@@ -158,22 +158,22 @@ def map(  # noqa: A001 - the command's name
 def correct(*files: Path, calibration: Path, output: Log, json: Json = False) -> None:
     """Correct a log with a calibration, as the bridge would have done live.
 
-    The arithmetic and the state (lags, backlash) are the bridge's own; the input is what the log's rows hold. Of a bridge's own log
-    that is MAG_RAW, in which a channel is a float32 (to 0.002 nT of 50,000 nT), and the telemetry last said before it: while a mass
-    moves, the bridge itself reads its position off between messages, by their own times. Nor is [align] of bridge.toml known here.
-    What the bridge would have published with this calibration, bit for bit, a replay writes: magbridge replay LOG --config
-    bridge.toml --log DIR, with the calibration in that bridge.toml; that it is not what was published it then says, too.
+    The arithmetic and the state (lags, backlash) are the bridge's own, but the input is the log's rows. In a bridge's own log these
+    are MAG_RAW, whose channels are float32 (to 0.002 nT of 50,000 nT), with the latest telemetry before each; the bridge itself
+    interpolates the position of a moving mass between messages. [align] of bridge.toml is not known here either. For what the bridge
+    would have published bit for bit, put the calibration into a bridge.toml and run: magbridge replay LOG --config bridge.toml
+    --log DIR. The replay also reports that this differs from what was published at the time.
 
     Parameters
     ----------
     files
-        Logs of one deployment.
+        The logs of one deployment.
     calibration
-        The cal.json.
+        The calibration (cal.json).
     output
-        The file to write: total field with its sigma, vector, anomaly and quality.
+        The file to write: total field with its sigma, vector, anomaly and quality flags.
     json
-        Print the result for machines.
+        Print the result as JSON.
     """
     from magbridge.calibration.file import load
     from magbridge.columns import CHANNELS

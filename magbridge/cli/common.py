@@ -47,7 +47,7 @@ app = App(
     version=__version__,
     suppress_keyboard_interrupt=False,  # main says it
     help_format="markdown",  # so that paragraphs are wrapped as wide as the terminal is
-    help_epilogue="Ends with 0: done, 1: the data do not allow it, 2: wrong use.",
+    help_epilogue="Exit codes: 0 done, 1 the data do not allow it, 2 wrong usage.",
     default_parameter=Parameter(negative=(), show_default=_default),
 )
 
@@ -109,7 +109,7 @@ def some(files: tuple[Path, ...], output: Path | None = None, *others: Path | No
         raise WrongUse("expected at least one FILE")
     read = [os.path.realpath(path) for path in (*files, *others) if path is not None]
     if output is not None and os.path.realpath(output) in read:
-        raise WrongUse(f"{output}: expected another file to write than those to read")
+        raise WrongUse(f"{output}: is among the files to read; choose another file to write")
     return files
 
 

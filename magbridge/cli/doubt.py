@@ -14,10 +14,10 @@ if TYPE_CHECKING:
     import xarray as xr
 
 NOTHING = (-9999.0, -99999.0)
-"""What often says "not known", in any unit."""
+"""Common codes for "not known", in any unit."""
 ITSELF = (
-    "the calibration was made from it, and follows its errors where it can; calibrate on calibration runs of their own,"
-    " with --filter-corner where the sensor has an anti-alias filter"
+    "the calibration was fitted to this log and has absorbed part of its errors; calibrate on separate calibration runs,"
+    " with --filter-corner if the sensor has an anti-alias filter"
 )
 
 
@@ -30,24 +30,24 @@ def diagnose(
     grid: Path | None = None,
     json: Json = False,
 ) -> None:
-    """Say what the simulation gets wrong, why, and what mending it gains.
+    """Find what the calibration model gets wrong, why, and what extending it gains.
 
-    Writes report.html, findings.json and calibration.json, the extended model, which correct, run and replay take.
+    Writes report.html, findings.json and calibration.json. The latter is the extended model, for use by correct, run and replay.
 
     Parameters
     ----------
     files
-        Logs that the calibration has not seen. Whole dives are left out to measure the gain; of a log with fewer than four, eighths.
+        Logs that the calibration was not fitted to. The gain is measured on whole dives left out in turn, or on eighths of a log with fewer than four dives.
     calibration
-        The cal.json.
+        The calibration (cal.json).
     output
         The folder to write to.
     learned_from
-        A log that the calibration was made from; again for each further one.
+        A log that the calibration was fitted to; may be repeated.
     grid
-        An anomaly grid, added to the IGRF.
+        An anomaly grid to add to the IGRF.
     json
-        Print the findings for machines.
+        Print the findings as JSON.
     """
     from magbridge.calibration.file import load
     from magbridge.diagnose.causes import CAUSES
@@ -94,14 +94,14 @@ def _plain(one: dict[str, Any]) -> str:
 
 
 def _suspect(log: xr.Dataset) -> None:
-    """Tell of numbers that would be taken for an effect: they stand alone, and may stand for 'not known'."""
+    """Warn of isolated numbers that may mean 'not known' and would otherwise be taken for an effect."""
     for name, column in log.data_vars.items():
         values = column.to_numpy()
         for nothing in NOTHING:
             alone = values == nothing
             if alone.any() and not (values[~alone] < 0.1 * nothing).any():
                 complain(
-                    f"{log.attrs['source']}, column {str(name)!r}: {nothing:g} in {alone.sum()} of {len(values)} rows is taken"
-                    f" for a number; if it says 'not known', leave it empty, or write # fill_value = {nothing:g} above a CSV's header",
+                    f"{log.attrs['source']}, column {str(name)!r}: {nothing:g} in {alone.sum()} of {len(values)} rows is read as"
+                    f" a number; if it means 'not known', leave it empty, or write # fill_value = {nothing:g} above the CSV's header",
                     0,
                 )

@@ -47,31 +47,31 @@ def calibrate(
     Parameters
     ----------
     files
-        Logs.
+        The logs of the calibration runs.
     output
-        The cal.json to write.
+        The calibration to write (cal.json).
     parameter
-        A column that moves a mass; once for each.
+        A column that gives the position of a moving mass; may be repeated.
     order
         Highest total degree of the polynomials in the parameters.
     method
-        auto, or what it is compared with.
+        auto is the one to use; the others are for comparison.
     vehicle
-        A vehicle.toml that says where the moving masses sit, seen from the sensor (method auto).
+        A vehicle.toml with the positions of the moving masses relative to the sensor (method auto).
     grid
-        An anomaly grid, added to the IGRF.
+        An anomaly grid to add to the IGRF.
     site_bias
-        nT, 1-sigma of what the reference may be wrong by all over the site.
+        1-sigma in nT of a constant error of the reference field over the whole site.
     filter_corner
-        Hz, corner of the sensor's first-order anti-alias filter (0: none): what it takes off in turns is given back.
+        Corner frequency in Hz of the sensor's first-order anti-alias filter, whose attenuation in turns is undone; 0: no filter.
     heading_reference
-        What headings are counted from; if not given what the log says, else true north.
+        What headings refer to. If not given: what the log says, else true north.
     picture
-        A PNG, PDF or SVG: what each sample is off by as read and corrected, beside time, heading and each parameter.
+        A PNG, PDF or SVG to draw: the error of each sample, raw and corrected, against time, heading and each parameter.
     strict
         Exit with 1 when the data do not support the fit.
     json
-        Print the result for machines.
+        Print the result as JSON.
     """
     from magbridge.calibration.file import save
     from magbridge.calibration.fitting.data import observations
@@ -86,7 +86,7 @@ def calibrate(
 
     some(files, output, vehicle, grid)
     if vehicle and method != "auto":
-        raise WrongUse(f"--vehicle: method {method} does not ask where masses sit; auto does")
+        raise WrongUse(f"--vehicle: method {method} does not use the positions of the masses; auto does")
     anomalies = read_grid(grid) if grid else None
     deployment = with_true_heading(read(files, required=(*CHANNELS, *parameter)), heading_reference)
     note_losses(deployment.attrs)
@@ -116,12 +116,10 @@ def calibrate(
     }
     low, high = found.scales
     left = f"{found.rms:.2f} nT RMS in the sensor's own units"
-    summary = (
-        f"{output}: {method}, {len(data)} samples, {left}, bought with scales of {low:.3f} to {high:.3f}"
-    )
+    summary = f"{output}: {method}, {len(data)} samples, {left}, with scales of {low:.3f} to {high:.3f}"
     tell(result, summary, json)
     if strict and not found.supported:
-        raise DataError("the data do not support this fit, and --strict: see the warnings")
+        raise DataError("the data do not support this fit (see the warnings), and --strict was given")
 
 
 def _digests(files: tuple[Path, ...]) -> dict[str, str]:
@@ -130,7 +128,7 @@ def _digests(files: tuple[Path, ...]) -> dict[str, str]:
     for file in files:
         first = seen.setdefault(digest(file), file)
         if first is not file:
-            complain(f"{file}: the same as {first}: its samples are counted once", 0)
+            complain(f"{file}: identical to {first}; its samples are counted once", 0)
     return {file.name: key for key, file in seen.items()}
 
 
@@ -144,22 +142,22 @@ def plan(
     heading_reference: Heading = None,
     json: Json = False,
 ) -> None:
-    """Tell which calibration runs to fly next: those after which the mission's worst error is smallest.
+    """Choose the calibration runs to fly next: those that make the mission's worst error smallest.
 
     Parameters
     ----------
     calibration
-        What is known so far.
+        The calibration so far (cal.json).
     mission
-        A log or a simulated deployment that flies as the mission will: attitude, position, moving masses.
+        A log, real or simulated, that flies as the mission will: attitude, position, moving masses.
     runs
-        How many spirals.
+        Number of spirals.
     roll
-        deg that the vehicle can bank in a spiral, either way.
+        Largest bank angle in deg that the vehicle can fly in a spiral, either way.
     heading_reference
-        What headings are counted from; if not given what the log says, else true north.
+        What headings refer to. If not given: what the log says, else true north.
     json
-        Print the result for machines.
+        Print the result as JSON.
     """
     from magbridge.calibration.file import load
     from magbridge.calibration.planning import flight_plan

@@ -27,17 +27,17 @@ def demo(
 ) -> None:
     """Do the main job end to end on a simulated glider: no hardware, no network, under a minute.
 
-    Simulates a small deployment, fits a calibration to its spirals, replays the survey through a pty and a
-    socket into the bridge, listens as a ground station would, and draws raw, corrected and true field.
+    Simulates a small deployment, fits a calibration to its spirals, replays the survey into the bridge through a pty and a
+    socket, listens as a ground station would, and draws the raw, corrected and true field.
 
     Parameters
     ----------
     out
-        The folder for what it makes.
+        The folder to write to.
     seed
-        Another glider.
+        Which random glider.
     json
-        Print the result for machines.
+        Print the result as JSON.
     """
     from sitl import demo as demonstration
 
@@ -53,15 +53,13 @@ def run(*, config: Path) -> None:
     Parameters
     ----------
     config
-        The bridge.toml.
+        The configuration (bridge.toml).
     """
     from magbridge.bridge.run import run as attach
 
     aloud = sys.stderr.isatty()
     if aloud:
-        print(
-            f"{config}: running until Ctrl-C; what is said over the link is said here, too", file=sys.stderr
-        )
+        print(f"{config}: running until Ctrl-C; announcements on the link are repeated here", file=sys.stderr)
     attach(config, aloud=aloud)
 
 
@@ -75,22 +73,22 @@ def replay(
 ) -> None:
     """Replay logs through the unmodified bridge: real bytes through a pty, real MAVLink through a socket.
 
-    A bridge's own log is published again bit for bit; of one that was begun anew in the middle of a run (it was removed, or the
-    disk was full) it is said in how many samples the field is the same. Any other log is spoken by an emulated fluxgate and an
-    emulated autopilot, and the corrected field is compared with the reference field.
+    A bridge's own log is published again bit for bit. For a log that was restarted in the middle of a run (the file was deleted, or
+    the disk was full) it reports in how many samples the field is the same. Any other log is played through an emulated fluxgate and
+    an emulated autopilot, and the corrected field is compared with the reference field.
 
     Parameters
     ----------
     files
-        The log, or the files of it in order.
+        The log, or its files in order.
     config
-        The bridge.toml; without one a nominal calibration is fitted on all files but the last.
+        The configuration (bridge.toml). Without one, a nominal calibration is fitted to all files but the last.
     speed
-        Times real time, or max: as fast as it goes.
+        A multiple of real time, or max: as fast as possible.
     log
-        A folder for the bridge's own log of the replay.
+        A folder for the log that the bridge writes during the replay.
     json
-        Print the result for machines.
+        Print the result as JSON.
     """
     from sitl import replay as replaying
 
@@ -98,7 +96,7 @@ def replay(
         result = replaying.replay(some(files), config, speed_of(speed), log)
     tell(result, replaying.tell(result), json)
     if not all(run["identical"] for run in result.get("runs", ())):
-        raise DataError("what was published is not what the log holds")
+        raise DataError("the replay did not publish what the log holds")
 
 
 @app.command(usage="Usage: magbridge monitor [LINK] [OPTIONS]")
@@ -111,18 +109,18 @@ def monitor(
     baudrate: Annotated[Whole, Parameter(validator=validators.Number(gt=0))] = 57600,
     show: bool = False,
 ) -> None:
-    """Serve the ground station's page: what a bridge measures and says, as it comes over MAVLink.
+    """Serve the ground station's page, which shows live what a bridge measures and announces over MAVLink.
 
     Parameters
     ----------
     link
-        Where the bridge is heard: udpin:HOST:PORT, udpout, tcp, tcpin, or a serial device.
+        The link to the bridge: udpin:HOST:PORT, udpout, tcp, tcpin, or a serial device.
     host
-        The address at which the page is served; others than this machine see it at 0.0.0.0.
+        The address to serve the page at; 0.0.0.0 makes it visible to other machines.
     port
-        Its port.
+        The port to serve the page at.
     baudrate
-        Of a serial device.
+        Baud rate of a serial link.
     show
         Open the page in a browser.
     """

@@ -30,31 +30,33 @@ def navigate(
     heading_reference: Heading = None,
     json: Json = False,
 ) -> None:
-    """Match the corrected field to an anomaly map: track, covariance, innovations, smoothed track.
+    """Find the track by matching the corrected field to an anomaly map.
 
-    With --bound FILE is a planned track (time, latitude, longitude: its corners are enough), and the result is
-    the smallest error that anyone could have along it, before the dive.
+    Writes the filtered and the smoothed track with covariance and innovations.
+
+    With --bound, FILE is a planned track (time, latitude, longitude; its corners suffice), and the result is the smallest
+    position error that any filter could reach along it.
 
     Parameters
     ----------
     files
-        Logs of one deployment, with telemetry from which motion can be reckoned; or the plan.
+        The logs of one deployment, with telemetry for dead reckoning; or the plan.
     map
         The anomaly grid.
     output
         The file to write.
     calibration
-        The cal.json; for a plan it says how good a sample is, 1 nT without.
+        The calibration (cal.json). For a plan it gives the sensor noise; without it 1 nT.
     config
-        A bridge.toml, for its [navigation.options]: how well the start, the current and the map are known.
+        A bridge.toml whose [navigation.options] say how well start, current and map are known.
     bound
-        Draw what the map is worth along a plan.
+        Compute what the map is worth along a planned track.
     picture
-        A PNG, PDF or SVG: the tracks on the map, errors and innovations; the bound on the map.
+        A PNG, PDF or SVG to draw: the tracks on the map, errors and innovations; or the bound on the map.
     heading_reference
-        What headings are counted from; if not given what the log says, else true north.
+        What headings refer to. If not given: what the log says, else true north.
     json
-        Print the result for machines.
+        Print the result as JSON.
     """
     from magbridge.calibration.file import load
     from magbridge.errors import WrongUse
@@ -65,7 +67,7 @@ def navigate(
         _bound(files, map, output, options, known, picture, json)
         return
     if known is None:
-        raise WrongUse("expected --calibration; or --bound, which does without")
+        raise WrongUse("expected --calibration, which only --bound can do without")
 
     from magbridge.columns import CHANNELS
     from magbridge.correction import Correction, correct_rows

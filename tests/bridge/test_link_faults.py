@@ -79,7 +79,12 @@ def test_telemetry_duplicated(rig: Rig, table: Row) -> None:
     after = rig.fresh_status()
     assert rig.flags(mark) == ""
     assert after["link_frames_lost"] == before["link_frames_lost"]
-    table("every telemetry message arrives three times", "no change: the copies are ignored", "at once", "nothing")
+    table(
+        "every telemetry message arrives three times",
+        "no change: the copies are ignored",
+        "at once",
+        "nothing",
+    )
 
 
 def test_telemetry_out_of_order(rig: Rig, table: Row) -> None:

@@ -117,7 +117,7 @@ def test_a_run_given_twice_counts_once(
     again.write_bytes(good[0].read_bytes())
     capsys.readouterr()
     assert main(["calibrate", str(good[0]), str(again), *PARAMETERS, "-o", str(tmp_path / "cal.json")]) == 0
-    assert f"{again}: the same as {good[0]}: its samples are counted once" in capsys.readouterr().err
+    assert f"{again}: identical to {good[0]}; its samples are counted once" in capsys.readouterr().err
     once, twice = (json.loads(path.read_text()) for path in (good[1], tmp_path / "cal.json"))
     assert once["coefficients"] == twice["coefficients"]
 
