@@ -15,7 +15,7 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from magbridge.calibration.terms import Effect, Step
+from magbridge.calibration.terms import Effect, Power, Step
 
 if TYPE_CHECKING:
     from magbridge.calibration.model import Calibration
@@ -49,8 +49,8 @@ class ChannelEffect(Effect, frozen=True, kw_only=True):
     cause: str
     channel: str
     origin: float = 0.0
-    lag: float = 0.0
-    stages: Annotated[int, Meta(ge=1)] = 1
+    lag: Annotated[float, Meta(ge=0.0)] = 0.0
+    stages: Power = 1
     on: Literal["offset", "scale"] = "offset"
 
     @property

@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from itertools import accumulate, repeat
 from math import isnan, tanh
-from operator import mul
-from typing import TYPE_CHECKING, ClassVar
+from operator import mul, sub
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
-from magbridge.calibration.terms import Effect, Exponents, Step
+from magbridge.calibration.terms import HIGHEST, Effect, Exponents, Power, Step, Width
 from magbridge.errors import CalibrationError
 
 if TYPE_CHECKING:
@@ -50,7 +51,7 @@ class Follower(Effect, frozen=True, kw_only=True):
     cause: str
     channel: str
     centre: float
-    scale: float
+    scale: Width
 
     @property
     def size(self) -> int:
@@ -78,7 +79,7 @@ class PowersEffect(Follower, frozen=True, kw_only=True):
     """
 
     kind: ClassVar[str] = "powers"
-    order: int = 1
+    order: Power = 1
 
     @property
     def size(self) -> int:
@@ -122,6 +123,8 @@ class MonomialEffect(Effect, frozen=True, kw_only=True):
         """Require one exponent for each parameter."""
         if len(self.exponents) != len(parameters):
             raise CalibrationError(f"monomial: expected {len(parameters)} exponents, one for each parameter")
+        if min(self.exponents, default=0) < 0 or sum(self.exponents) > HIGHEST:
+            raise CalibrationError(f"monomial: expected exponents >= 0, together at most {HIGHEST}")
 
     def columns(self, field: float) -> FloatArray:  # noqa: ARG002  (others need it)
         """Offsets."""
@@ -158,24 +161,36 @@ class PlayEffect(Follower, frozen=True, kw_only=True):
         In the channel's unit.
     centre, scale : float
         Where the steel is, and how far it reaches; the loop is straight where the scale is far beyond the travel.
+    order : int
+        0: a branch as above. Older files have polynomials up to this power, ``sum_k c_k (v^k - x^k)`` with
+        ``v = (y - centre) / scale`` and ``x = (p - centre) / scale``.
     """
 
     kind: ClassVar[str] = "play"
-    width: float
+    width: Width
+    order: Annotated[int, Meta(ge=0, le=HIGHEST)] = 0
+
+    @property
+    def size(self) -> int:
+        """One for each axis, nT, and power."""
+        return 3 * max(self.order, 1)
 
     def begin(self, calibration: Calibration) -> Step:
         """Return a stepper that starts in the middle of its play."""
-        index, centre, scale, width = (
-            calibration.channels.index(self.channel), self.centre, self.scale, self.width
+        index, centre, scale, width, order = (
+            calibration.channels.index(self.channel), self.centre, self.scale, self.width, self.order
         )  # fmt: skip
         half, y, p, first = 0.5 * width, 0.0, 0.0, True
 
-        def step(time_us: int, hx: float, hy: float, hz: float, values: Sequence[float]) -> tuple[float]:
+        def step(time_us: int, hx: float, hy: float, hz: float, values: Sequence[float]) -> tuple[float, ...]:
             nonlocal y, p, first
             if not isnan(values[index]):
                 p = values[index]
                 y = p if first else min(max(y, p - half), p + half)
                 first = False
+            if order:
+                dragged, here = (powers((at - centre) / scale, order) for at in (y, p))
+                return tuple(map(sub, dragged, here))
             return (scale * (tanh((y - centre) / scale) - tanh((p - centre) / scale)) / width,)
 
         return step

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from math import cos, pi, sin
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
 from magbridge.calibration.followers import MAX_INTERVAL, offsets, powers
-from magbridge.calibration.terms import Effect, Step
+from magbridge.calibration.terms import HIGHEST, Effect, Power, Step, Width
 
 if TYPE_CHECKING:
     from magbridge.calibration.model import Calibration
@@ -40,9 +41,9 @@ class TimeEffect(Effect, frozen=True, kw_only=True):
     kind: ClassVar[str] = "time"
     cause: str
     shape: Literal["step", "drift", "tone"]
-    start: float
-    period: float = 86_400.0
-    order: int = 1
+    start: Annotated[float, Meta(ge=-1e12, le=1e12)]
+    period: Width = 86_400.0
+    order: Power = 1
 
     @property
     def regressors(self) -> int:
@@ -151,9 +152,9 @@ class ResponseEffect(Effect, frozen=True, kw_only=True):
 
     kind: ClassVar[str] = "response"
     cause: str
-    unit: float
-    power: int = 0
-    axis: int = 0
+    unit: Annotated[float, Meta(ge=1.0, le=1e9)]
+    power: Annotated[int, Meta(ge=0, le=HIGHEST)] = 0
+    axis: Annotated[int, Meta(ge=0, le=2)] = 0
     knee: float = 0.0
 
     @property

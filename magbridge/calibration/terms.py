@@ -13,10 +13,11 @@ from collections.abc import Callable, Sequence
 from importlib import import_module
 from importlib.metadata import entry_points
 from itertools import combinations_with_replacement
-from typing import TYPE_CHECKING, Any, ClassVar, cast
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, cast
 
 import msgspec
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
 from magbridge.errors import CalibrationError
@@ -43,6 +44,9 @@ Step = Callable[[int, float, float, float, Sequence[float]], tuple[float, ...]]
 """One sample into an effect: time (µs), the raw channels (nT), the values -> its regressors."""
 
 HIGHEST = 30  # total degree: beyond, powers are noise
+Power = Annotated[int, Meta(ge=1, le=HIGHEST)]
+Width = Annotated[float, Meta(ge=1e-9, le=1e12)]
+"""What something is divided by, in whatever unit."""
 
 SLOTS = ("a_xx", "a_yy", "a_zz", "a_xy", "a_xz", "a_yz", "t_x", "t_y", "t_z")
 """Six of the symmetric ``A`` (as ``a = (A - I) F_0``, nT) and three of ``T`` (nT)."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -18,6 +19,7 @@ from magbridge.calibration.terms import Effect, Polynomial
 from magbridge.diagnose.compare.past import FAR
 from magbridge.diagnose.compare.problem import add_effects, effect_columns, history, pose, samples_of
 from magbridge.diagnose.compare.survey import Channel, Survey
+from magbridge.errors import FormatError
 
 FIELD = 50_000.0
 T0 = 1.7e9
@@ -27,6 +29,7 @@ EFFECTS: list[Effect] = [
     PowersEffect(cause="unmodelled_actuator", channel="heat", centre=3.0, scale=2.0, order=3),
     MonomialEffect(cause="actuator_order", exponents=(4,)),
     PlayEffect(cause="hysteresis", channel="p", width=0.3, centre=0.1, scale=0.5),
+    PlayEffect(cause="hysteresis", channel="p", width=0.3, centre=0.1, scale=0.5, order=3),
     ClockEffect(),
     ClockEffect(cause="filter_lag", sign=-1.0),
     TimeEffect(cause="offset_step", shape="step", start=T0 + 200.0),
@@ -165,3 +168,36 @@ def test_play_remembers_the_side(
     np.testing.assert_allclose(phi[rising & middle], lower[rising & middle])
     np.testing.assert_allclose(phi[~rising & middle], upper[~rising & middle])
     assert phi[rising & middle].max() < 0.0 < phi[~rising & middle].min()
+
+
+def test_a_play_of_an_older_file_is_read(survey: Survey, calibration: Calibration) -> None:
+    """Its branches are polynomials: the key ``order`` says so."""
+    effect = PlayEffect(cause="hysteresis", channel="p", width=0.4, centre=0.1, scale=0.5, order=3)
+    phi = history(survey, calibration, effect)
+    straight = PlayEffect(cause="hysteresis", channel="p", width=0.4, centre=0.0, scale=0.5, order=1)
+    p = survey.channels["p"].values
+    y = p + 0.5 * history(survey, calibration, straight)[0]
+    for k in range(3):
+        naive = ((y - 0.1) / 0.5) ** (k + 1) - ((p - 0.1) / 0.5) ** (k + 1)
+        np.testing.assert_allclose(phi[k], naive, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("effect", "line"),
+    [
+        (PlayEffect(cause="hysteresis", channel="p", width=0.3, centre=0.1, scale=0.0), "scale: Expected `float` >= 1e-09"),
+        (PlayEffect(cause="hysteresis", channel="p", width=0.0, centre=0.1, scale=0.5), "width: Expected `float` >= 1e-09"),
+        (PowersEffect(cause="unmodelled_actuator", channel="p", centre=0.0, scale=1.0, order=31), "order: Expected `int` <= 30"),
+        (TimeEffect(cause="interference_tone", shape="tone", start=T0, period=0.0), "period: Expected `float` >= 1e-09"),
+        (TimeEffect(cause="offset_step", shape="step", start=1e308), "start: Expected `float` <= 1000000000000"),
+        (ResponseEffect(cause="saturation", unit=FIELD, axis=3, knee=3e4), "axis: Expected `int` <= 2"),
+        (ResponseEffect(cause="nonlinearity", unit=0.0, power=2), "unit: Expected `float` >= 1"),
+        (ChannelEffect(cause="temperature_offset", channel="p", lag=-1.0), "lag: Expected `float` >= 0"),
+    ],
+    ids=lambda v: v.cause if isinstance(v, Effect) else v,
+)  # fmt: skip
+def test_a_number_that_cannot_be_is_one_line(effect: Effect, line: str, calibration: Calibration) -> None:
+    """Edited by hand; a division by it would end the bridge in a traceback."""
+    extended = with_values(calibration, effect, np.zeros(effect.size))
+    with pytest.raises(FormatError, match=re.escape(line)):
+        decode_calibration(encode_calibration(extended))
