@@ -100,7 +100,9 @@ def main() -> int:
         link.open()
         edge = ScriptedEdge({Channel.SENSOR: sensor, Channel.LINK: link}, chosen.timetable)
         pipeline = set_up(config, edge.start())
-        head = declarations(config.link.system, config.link.component, config.telemetry)
+        head = declarations(
+            config.link.system, config.link.component, config.telemetry, pipeline.nt_per_count
+        )
         log = TlogWriter(chosen.log, head=head) if chosen.log else None
         drive(pipeline, edge, log, lambda _: None)
         if log is not None:

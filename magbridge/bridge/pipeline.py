@@ -141,6 +141,11 @@ class Pipeline:
         self._begin(start, used, foreign=foreign)
 
     @property
+    def nt_per_count(self) -> float:
+        """nT, of one of the sensor's counts; 0 where it speaks none."""
+        return self._driver.nt_per_count
+
+    @property
     def deadline(self) -> int:
         """µs since 1970 UTC: feed something by then, if only time."""
         return self.component.next_deadline

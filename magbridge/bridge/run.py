@@ -111,7 +111,7 @@ def run(path: Path, *, aloud: bool = False) -> None:
     # the link first: that the sensor's port does not open must find somebody to be told to
     edge = LiveEdge({Channel.LINK: link, Channel.SENSOR: sensor}, clock)
     keeper.attach(edge)
-    log = _open_log(config, edge)
+    log = _open_log(config, edge, pipeline.nt_per_count)
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: edge.stop())
     sys.setswitchinterval(SWITCH)
@@ -140,13 +140,13 @@ def _say(texts: deque[str]) -> None:
         time.sleep(TELL)
 
 
-def _open_log(config: Config, edge: LiveEdge) -> TlogWriter | None:
+def _open_log(config: Config, edge: LiveEdge, nt_per_count: float) -> TlogWriter | None:
     """Open the log; a folder that cannot be made is told over the link, and does not stop the bridge."""
     if config.log is None:
         return None
     directory = config.resolve(config.log.directory)
     try:
-        head = declarations(config.link.system, config.link.component, config.telemetry)
+        head = declarations(config.link.system, config.link.component, config.telemetry, nt_per_count)
         log = TlogWriter(directory, max_size=config.log.max_size, max_age=config.log.max_age, head=head)
     except PortError as error:
         edge.tell(states.log_state(error.reason, 0))

@@ -4,8 +4,8 @@ A row is a magnetometer message of the best kind that the log holds (:data:`~mag
 from the sender of most of them; every other column is the last value that this vehicle said before it (NaN once
 older than :data:`~magbridge.logs.resample.MAX_AGE`).
 
-- ``MAG_RAW`` (ours): nT as float32 (0.004 nT at 50,000 nT), time to the µs, channel times, temperature, supply,
-  power cycles. The ``MAG_FIELD`` that follows it becomes the columns of ``magbridge correct``.
+- ``MAG_RAW`` (ours): nT as the driver made them of its counts, where the log declares what a count is, else as float32
+  (0.004 nT at 50,000 nT); time to the µs, channel times, temperature, supply, power cycles. The ``MAG_FIELD`` that follows it becomes the columns of ``magbridge correct``.
 - ``HIGHRES_IMU`` (gauss), ``RAW_IMU`` and ``SCALED_IMU*`` (mgauss, so steps of 100 nT): in the autopilot's axes,
   its own offsets already in them; time is the record's stamp. Further magnetometers become ``mag1_x`` ... ``mag3_z``.
 - Without any of these, ``ATTITUDE`` or position makes the rows, and there is no ``mag_x``.
@@ -19,7 +19,7 @@ is passed over and counted in the attributes ``bytes_skipped`` and ``damages``, 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from math import inf, isnan, nan
+from math import inf, isclose, isnan, nan
 from pathlib import Path
 
 import numpy as np
@@ -38,6 +38,8 @@ __all__ = ["FileWriter", "chunks"]
 
 MAX_AGE_US = round(MAX_AGE * 1e6)
 NEVER = -(1 << 62)
+SINGLE = 1e-7
+"""Of a number, by which its float32 may be off: counts that are not that number belong to another sensor's log."""
 FIELD, NAMED = spec("MAG_FIELD").id, spec("NAMED_VALUE_FLOAT")
 
 
@@ -90,8 +92,10 @@ class Rows:
             ]
             for number, values in TELEMETRY.items()
         }
+        self._counted = [one for one in survey.declared if one.message == self._source]
         for one in survey.declared:
-            self._tables.setdefault(one.message, []).append((self._slot[one.column], one.get))
+            if one.message != self._source:
+                self._tables.setdefault(one.message, []).append((self._slot[one.column], one.get))
         self._last = -inf
         self._dropped = self._skipped = self._damages = 0
 
@@ -110,7 +114,12 @@ class Rows:
                 if (known := get(payload)) is not None:
                     self._note(record.time_us, slot, known)
         if number == self._source and message.component == self._survey.component:
-            self._row(record.time_us, self._make(payload))
+            columns = self._make(payload)
+            for one in self._counted:
+                exact = one.get(payload)
+                if exact is not None and isclose(exact, columns.get(one.column, nan), rel_tol=SINGLE):
+                    columns[one.column] = exact
+            self._row(record.time_us, columns)
         elif number == FIELD and self.rows:
             self._correct(correction(payload))
 

@@ -255,19 +255,43 @@ def _packed(records: Sequence[Record]) -> bytes:
     return b"".join([pack_record(*record) for record in records])
 
 
-def declarations(system: int, component: int, telemetry: Mapping[str, Telemetry]) -> list[bytes]:
-    """Return the frames that tell a reader of the log which field of which message a parameter is."""
+def declarations(
+    system: int, component: int, telemetry: Mapping[str, Telemetry], nt_per_count: float = 0.0
+) -> list[bytes]:
+    """Return the frames that tell a reader of the log which field of which message a column is.
+
+    Parameters
+    ----------
+    system, component : int
+        The bridge's own.
+    telemetry : mapping of str to Telemetry
+        By parameter.
+    nt_per_count : float
+        nT, of one count of the sensor: float32, as MAG_RAW tells a channel, is less than what was corrected; 0 for a
+        sensor without counts.
+    """
     codec = Codec(system, component)
-    return [
-        codec.pack(
-            "MAG_COLUMN",
-            column=name,
-            unit=one.unit,
-            message=one.message,
-            field=one.field,
-            match=",".join(f"{field}={value}" for field, value in one.match.items()),
-            scale=one.scale,
-            offset=one.offset,
-        )
+    columns = [
+        {
+            "column": name,
+            "unit": one.unit,
+            "message": one.message,
+            "field": one.field,
+            "match": ",".join(f"{field}={value}" for field, value in one.match.items()),
+            "scale": one.scale,
+            "offset": one.offset,
+        }
         for name, one in telemetry.items()
     ]
+    if nt_per_count:
+        columns += [
+            {
+                "column": f"mag_{axis}",
+                "unit": "nT",
+                "message": "MAG_RAW",
+                "field": f"count_{axis}",
+                "scale": nt_per_count,
+            }
+            for axis in "xyz"
+        ]
+    return [codec.pack("MAG_COLUMN", **column) for column in columns]

@@ -39,6 +39,8 @@ class Driver(Protocol):
         A msgspec struct: the keys that ``[sensor.options]`` may have.
     range_nt : float
         nT, at which a channel saturates; infinite where unknown.
+    nt_per_count : float
+        nT, of one of ``Reading.counts``; 0 where it speaks none.
     sequence_modulo : int
         ``Reading.sequence`` wraps here; 0: never, or there is none.
     time_modulo : float
@@ -49,6 +51,7 @@ class Driver(Protocol):
 
     Options: ClassVar[Any]
     range_nt: float
+    nt_per_count: float
     sequence_modulo: int
     time_modulo: float
     period: float

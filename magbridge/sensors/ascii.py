@@ -163,6 +163,7 @@ class Ascii:
         self._separator = options.separator.encode(ENCODING) or None
         self._counts = options.unit == "counts"
         self._scale = options.scale * NT_PER_UNIT.get(options.unit, 1.0)
+        self.nt_per_count = self._scale if self._counts else 0.0
         self._seconds = SECONDS[options.time_unit]
         self.range_nt = options.range or inf
         self.sequence_modulo = options.sequence_modulo

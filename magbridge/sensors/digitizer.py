@@ -104,11 +104,11 @@ class Digitizer:
     period = 0.0
 
     def __init__(self, options: DigitizerOptions) -> None:
-        self._scale = options.nt_per_count
+        self.nt_per_count = options.nt_per_count
         self._limit = FULL_SCALE - 1
         if options.full_scale is not None:
-            self._limit = min(self._limit, int(options.full_scale / self._scale))
-        self.range_nt = self._limit * self._scale
+            self._limit = min(self._limit, int(options.full_scale / self.nt_per_count))
+        self.range_nt = self._limit * self.nt_per_count
         self._framer = Framer(b"\0", 254)
         self._skipped = 0
         self.frames_bad = 0
@@ -140,7 +140,7 @@ class Digitizer:
             x_low, x_high, y_low, y_high, z_low, z_high,
         ) = BODY.unpack_from(message)  # fmt: skip
         x, y, z = x_low | x_high << 16, y_low | y_high << 16, z_low | z_high << 16
-        scale, limit = self._scale, self._limit
+        scale, limit = self.nt_per_count, self._limit
         inside = -limit < x < limit and -limit < y < limit and -limit < z < limit
         return Reading(
             (x * scale, y * scale, z * scale),

@@ -70,6 +70,7 @@ class Hmr2300:
 
     Options: ClassVar = Hmr2300Options
     range_nt = LIMIT * NT_PER_COUNT
+    nt_per_count = NT_PER_COUNT
     sequence_modulo = 0
     time_modulo = 0.0
 

@@ -83,6 +83,7 @@ class Twinleaf:
     sequence_modulo = WRAP_1
     time_modulo = 0.0
     period = 0.0
+    nt_per_count = 0.0
 
     def __init__(self, options: TwinleafOptions) -> None:
         self._options = options

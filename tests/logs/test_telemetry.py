@@ -269,6 +269,28 @@ def test_every_file_of_a_live_log_says_what_its_parameters_are(tmp_path: Path) -
         assert back["servo2"].attrs["units"] == "deg"
 
 
+def test_channels_are_what_the_driver_made_of_its_counts(tmp_path: Path) -> None:
+    """Bit for bit, where MAG_RAW's own float32 is off by up to 0.002 nT; counts that are another number are none."""
+    nt_per_count = 0.0119209  # of a digitizer at 100,000 nT
+    counts = np.random.default_rng(1).integers(-(2**22), 2**22, (100, 3))
+    field = counts * nt_per_count
+    codec = Codec(1, 191)
+    with TlogWriter(tmp_path, head=declarations(1, 191, {}, nt_per_count)) as log:
+        log.write(T0, Channel.STATE, codec.pack("MAG_BRIDGE_START"))
+        for k, (channels, numbers) in enumerate(zip(field, counts.tolist(), strict=True)):
+            told = dict(
+                zip(("x", "y", "z", "count_x", "count_y", "count_z"), (*channels, *numbers), strict=True)
+            )
+            if k == 99:
+                told |= {"count_x": 0, "count_y": 0, "count_z": 0}
+            log.write(T0 + k * S, Channel.SENT, codec.pack("MAG_RAW", time_usec=T0 + k * S, **told))
+    back = logs.read(sorted(tmp_path.iterdir()))
+    for axis, exact in zip("xyz", field.T, strict=True):
+        single = exact.astype(np.float32).astype(float)
+        np.testing.assert_array_equal(back[f"mag_{axis}"], [*exact[:-1], single[-1]])
+        assert np.abs(single - exact).max() > 1e-4
+
+
 def test_names_longer_than_ten_letters(tmp_path: Path) -> None:
     """Cut for the message, whole again in the deployment; any MAVLink tool plots the short one."""
     from magbridge.logs.deployment import deployment  # noqa: PLC0415 - only here
