@@ -59,7 +59,7 @@ def main() -> None:
             found = diagnose([parts["survey"]], calibration, learned_from=[parts["trial 1"]])
             named = ", ".join(
                 f"{h.candidate.cause} ({h.candidate.channel})" if h.candidate.channel else h.candidate.cause
-                for h in found.named
+                for h in found.findings
             )
             floor = load("bonne_bay").instrument.noise_sigma
             print(

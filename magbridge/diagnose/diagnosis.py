@@ -1,4 +1,4 @@
-"""What a diagnosis ends with."""
+"""The result of a diagnosis."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magbridge.calibration.model import Calibration
+from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.gain import Gain
 from magbridge.diagnose.inference.isolability import Isolability
@@ -17,9 +18,43 @@ from magbridge.diagnose.inference.rivals import Rival
 from magbridge.diagnose.inference.search import Hypothesis, Outcome
 from magbridge.diagnose.inference.unexplained import Leftover
 
-__all__ = ["Diagnosis"]
+__all__ = ["Diagnosis", "Finding"]
 
 FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Finding:
+    """A cause that is named, as it stands in the joint fit of all of them.
+
+    Attributes
+    ----------
+    hypothesis : Hypothesis
+        Against the model without it.
+    rivals : tuple of Rival
+        The causes that could take its place, the likeliest first.
+    gain : Gain
+        Of this cause beside the others.
+    coefficients : (k,) array
+        In units of their prior width.
+    covariance : (k, k) array
+    """
+
+    hypothesis: Hypothesis
+    rivals: tuple[Rival, ...]
+    gain: Gain
+    coefficients: FloatArray
+    covariance: FloatArray
+
+    @property
+    def candidate(self) -> Candidate:
+        """Its effects and columns."""
+        return self.hypothesis.candidate
+
+    @property
+    def signal_to_noise(self) -> float:
+        """With the calibration refitted."""
+        return self.hypothesis.signal_to_noise
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,9 +65,8 @@ class Diagnosis:
     ----------
     problem : Problem
     outcome : Outcome
-    named : tuple of Hypothesis
-        The causes that stand; their rivals in `rivals`.
-    rivals : tuple of tuple of Rival
+    findings : tuple of Finding
+        The causes that are named.
     wrong : Outliers or None
         Isolated wrong samples.
     unexplained : Leftover or None
@@ -43,16 +77,14 @@ class Diagnosis:
     before, after : (n,) array
         nT, residuals with the calibration as it was, and extended, held out.
     total : Gain
-    gains : tuple of Gain
-        Of each named cause beside the others.
+        Of all findings together.
     isolability : Isolability
     verdict : str
     """
 
     problem: Problem
     outcome: Outcome
-    named: tuple[Hypothesis, ...]
-    rivals: tuple[tuple[Rival, ...], ...]
+    findings: tuple[Finding, ...]
     wrong: Outliers | None
     unexplained: Leftover | None
     calibration: Calibration
@@ -60,6 +92,5 @@ class Diagnosis:
     before: FloatArray
     after: FloatArray
     total: Gain
-    gains: tuple[Gain, ...]
     isolability: Isolability
     verdict: str

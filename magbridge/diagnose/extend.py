@@ -15,7 +15,7 @@ from magbridge.calibration.instrument import RateEffect
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.residual import residuals, residuals_of
 from magbridge.calibration.terms import Effect
-from magbridge.diagnose.causes.candidates import Candidate
+from magbridge.diagnose.causes.candidates import Candidate, places
 from magbridge.diagnose.compare.derivatives import derivatives
 from magbridge.diagnose.compare.problem import DELAYS, Columns, Problem, samples_of
 from magbridge.diagnose.compare.survey import Survey
@@ -49,14 +49,14 @@ def extend(problem: Problem, model: Sequence[Candidate], fit: Joint) -> Calibrat
     M[K:, q:] = np.diag(widths)[kept]
     covariance = M @ fit.covariance @ M.T
     covariance[:K, :K] += problem.unseen
-    reference, at = calibration.reference, 0
-    for candidate in model:
+    reference = calibration.reference
+    for candidate, own in zip(model, places(model), strict=True):
         if candidate.cause == "reference_bias":
+            at = own.start
             sigma = float(np.sqrt(fit.covariance[q + at, q + at]) * widths[at])
             reference = msgspec.structs.replace(
                 reference, bias=reference.bias + float(b[at]), bias_sigma=sigma
             )
-        at += candidate.size
     noise = msgspec.structs.replace(
         calibration.noise, sensor=min(calibration.noise.sensor, level(fit)) or level(fit)
     )
@@ -139,14 +139,12 @@ def widened(model: Sequence[Candidate], fit: Joint) -> Joint:
 
     .. math:: C \leftarrow C + \frac{IDEAL^2 W}{MODES}\, C_{:b} C_{bb}^{-1} C_{b:}
     """
-    C, at = fit.covariance.copy(), len(fit.z)
-    for candidate in model:
-        own = slice(at, at + candidate.size)
-        b = fit.coefficients[at - len(fit.z) :][: candidate.size]
+    C, q = fit.covariance.copy(), len(fit.z)
+    for place in places(model):
+        own, b = slice(q + place.start, q + place.stop), fit.coefficients[place]
         given = np.linalg.solve(fit.covariance[own, own], np.column_stack([b, fit.covariance[own]]))
         power = IDEAL**2 * float(b @ given[:, 0]) / MODES
         C += power * fit.covariance[:, own] @ given[:, 1:]
-        at += candidate.size
     return replace(fit, covariance=0.5 * (C + C.T))
 
 
@@ -165,15 +163,14 @@ def _again(
     free[:, DELAYS] = problem.free[:, DELAYS]
     # what the residual would be at the first point, were it linear about this one; the reference was not mended in it
     residual = e + free @ fit.z
-    blocks, place = [], 0
-    for candidate in model:
+    blocks = []
+    for candidate, place in zip(model, places(model), strict=True):
         if not candidate.effects:
             blocks.append(candidate.columns(slice(0, len(problem))))
         else:
             blocks.append(effects[:, at : at + candidate.size] * candidate.width)
-            residual += blocks[-1] @ fit.coefficients[place : place + candidate.size]
+            residual += blocks[-1] @ fit.coefficients[place]
             at += candidate.size
-        place += candidate.size
     c = np.append(fit.z, fit.coefficients)
     again = replace(problem, residual=residual, free=free, slopes=g)
     columns: list[Columns] = [partial(_rows, block) for block in blocks]

@@ -14,18 +14,19 @@ from threadpoolctl import threadpool_limits
 
 from magbridge.calibration.model import Calibration
 from magbridge.diagnose.causes import CAUSES, Cause
-from magbridge.diagnose.causes.candidates import Candidate
+from magbridge.diagnose.causes.candidates import Candidate, places
 from magbridge.diagnose.compare.problem import Problem, pose
 from magbridge.diagnose.compare.survey import Survey
 from magbridge.diagnose.compare.take import take
-from magbridge.diagnose.diagnosis import Diagnosis
+from magbridge.diagnose.diagnosis import Diagnosis, Finding
 from magbridge.diagnose.extend import extend, flown, settle, widened
-from magbridge.diagnose.gain import Gain, held_out, paired
+from magbridge.diagnose.gain import held_out, paired
 from magbridge.diagnose.inference.accept import accept
 from magbridge.diagnose.inference.isolability import isolability
 from magbridge.diagnose.inference.joint import Joint
 from magbridge.diagnose.inference.loosen import loosened
 from magbridge.diagnose.inference.outliers import Outliers, outliers
+from magbridge.diagnose.inference.rivals import Rival
 from magbridge.diagnose.inference.search import Hypothesis, search
 from magbridge.diagnose.inference.unexplained import Leftover, leftover
 from magbridge.diagnose.inference.weigh import ODDS, REMNANT
@@ -127,9 +128,9 @@ def _examine(
             rest = leftover(problem, [], outcome.null, outcome.order, tone)
     rest = rest or _loud(problem, after, counts)
     return Diagnosis(
-        problem=problem, outcome=outcome, named=named, rivals=rivals, wrong=wrong, unexplained=rest,
-        calibration=extended, fit=fit, before=before, after=after,
-        total=paired(before, after, problem.survey.dive, counts), gains=_gains(problem, model, fit, after, counts),
+        problem=problem, outcome=outcome, findings=_findings(problem, named, rivals, fit, after, counts),
+        wrong=wrong, unexplained=rest, calibration=extended, fit=fit, before=before, after=after,
+        total=paired(before, after, problem.survey.dive, counts),
         isolability=isolability(candidates, outcome.info, outcome.trials, len(causes), untestable),
         verdict=_verdict(named, wrong, rest),
     )  # fmt: skip
@@ -165,16 +166,25 @@ def _counted(problem: Problem, wrong: Outliers | None) -> NDArray[np.bool_]:
     return counts if counts.any() else ~counts
 
 
-def _gains(
-    problem: Problem, model: Sequence[Candidate], fit: Joint, after: FloatArray, counts: NDArray[np.bool_]
-) -> tuple[Gain, ...]:
-    """Measure each cause beside the others: they, and the calibration, are fitted anew; only the cause is missing."""
-    gains = []
-    for k in range(len(model)):
-        others = [candidate.columns for i, candidate in enumerate(model) if i != k]
-        without = held_out(problem, others, _without(fit, model, k)).left
-        gains.append(paired(without, after, problem.survey.dive, counts))
-    return tuple(gains)
+def _findings(
+    problem: Problem,
+    named: Sequence[Hypothesis],
+    rivals: Sequence[tuple[Rival, ...]],
+    fit: Joint,
+    after: FloatArray,
+    counts: NDArray[np.bool_],
+) -> tuple[Finding, ...]:
+    """Put together what belongs to each cause; its gain is that over a fit of the others without it."""
+    found, q = [], len(fit.z)
+    for k, (own, (hypothesis, others)) in enumerate(
+        zip(places([h.candidate for h in named]), zip(named, rivals, strict=True), strict=True)
+    ):
+        columns = [h.candidate.columns for i, h in enumerate(named) if i != k]
+        without = held_out(problem, columns, _without(fit, own)).left
+        gain = paired(without, after, problem.survey.dive, counts)
+        covariance = fit.covariance[q:, q:][own, own]
+        found.append(Finding(hypothesis, others, gain, fit.coefficients[own], covariance))
+    return tuple(found)
 
 
 def _loud(problem: Problem, after: FloatArray, counts: NDArray[np.bool_]) -> Leftover | None:
@@ -186,13 +196,11 @@ def _loud(problem: Problem, after: FloatArray, counts: NDArray[np.bool_]) -> Lef
     return Leftover("broadband", float(np.sqrt(power - n)), float(chi2.sf(power, n)), 0.0, None, None)
 
 
-def _without(fit: Joint, model: Sequence[Candidate], k: int) -> Joint:
-    """Return the fit with the k-th effect's coefficients taken out."""
-    start = sum(candidate.size for candidate in model[:k])
-    own = np.arange(start, start + model[k].size)
-    return replace(
-        fit, coefficients=np.delete(fit.coefficients, own), prior=np.delete(fit.prior, own + len(fit.z))
-    )
+def _without(fit: Joint, own: slice) -> Joint:
+    """Return the fit without the coefficients at `own`."""
+    q = len(fit.z)
+    prior = np.delete(fit.prior, slice(q + own.start, q + own.stop))
+    return replace(fit, coefficients=np.delete(fit.coefficients, own), prior=prior)
 
 
 def _verdict(named: Sequence[Hypothesis], wrong: Outliers | None, rest: Leftover | None) -> str:

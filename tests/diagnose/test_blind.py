@@ -118,7 +118,7 @@ def written(warm: tuple[xr.Dataset, object], tmp_path_factory: pytest.TempPathFa
     """The folder of a diagnosis and the channel that it names."""
     ds, calibration = warm
     out = tmp_path_factory.mktemp("diagnosis")
-    return out, diagnose([ds], calibration, out / "out").named[0].candidate.channel
+    return out, diagnose([ds], calibration, out / "out").findings[0].candidate.channel
 
 
 def test_what_is_written(warm: tuple[xr.Dataset, object], written: tuple[Path, str]) -> None:
@@ -145,8 +145,8 @@ def test_a_maps_error_is_told_by_its_size(short: None) -> None:
     here = stage.Stall.of(stage.vehicle(0), 24, "white")
     hidden = here.hide("map_error", 40.0, 24)
     diagnosis = diagnose([here.log(hidden.ds)], here.stage.calibration)
-    (named,) = [h for h in diagnosis.named if h.candidate.cause == "map_error"]
-    told = parameters(diagnosis, named, len(diagnosis.problem.centre))
+    (named,) = [one for one in diagnosis.findings if one.candidate.cause == "map_error"]
+    told = parameters(named, len(diagnosis.problem))
     assert set(told) == {"rms"}
     assert told["rms"]["value"] == pytest.approx(np.std(hidden.signature), rel=0.2)
     assert 0.0 < told["rms"]["sigma"] < 0.2 * told["rms"]["value"]
@@ -155,7 +155,7 @@ def test_a_maps_error_is_told_by_its_size(short: None) -> None:
 def test_a_channels_name_does_not_decide(warm: tuple[xr.Dataset, object], written: tuple[Path, str]) -> None:
     ds, calibration = warm
     renamed = ds.rename({written[1]: "zz"})
-    assert diagnose([renamed], calibration).named[0].candidate.channel == "zz"
+    assert diagnose([renamed], calibration).findings[0].candidate.channel == "zz"
 
 
 def test_bad_input_is_one_line(warm: tuple[xr.Dataset, object]) -> None:

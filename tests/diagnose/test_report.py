@@ -74,7 +74,7 @@ def test_names_that_something_unexplained_keeps_are_told() -> None:
     said = nameless(rest, CAUSES)
     assert "Not ruled out: offset drift, current field (motor&lt;1&gt;)." in said
     assert CAUSES["offset_drift"].separated_by in said
-    assert nameless(rest._replace(within=()), CAUSES) == "It fits no cause of the table, so it has no name."
+    assert nameless(rest._replace(within=()), CAUSES) == "It fits no known cause, so it has no name."
 
 
 def test_powers_have_units_of_their_own(problem: Problem) -> None:

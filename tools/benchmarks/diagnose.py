@@ -30,7 +30,7 @@ from magbridge.diagnose.run import diagnose
 survey, calibration = long_survey(float(sys.argv[1]), int(sys.argv[2]), float(sys.argv[3]))
 begun, used = time.monotonic(), time.process_time()
 found = diagnose([survey], calibration)
-causes = [h.candidate.cause for h in found.named]
+causes = [h.candidate.cause for h in found.findings]
 print(json.dumps([time.monotonic() - begun, time.process_time() - used, len(found.problem), found.verdict, causes,
                   resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3]))
 """

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from magbridge.calibration.terms import Effect
 from magbridge.diagnose.compare.problem import Columns, Problem, effect_columns, history
 
-__all__ = ["AXES", "Candidate", "of_effect", "of_reference", "per"]
+__all__ = ["AXES", "Candidate", "of_effect", "of_reference", "per", "places"]
 
 FloatArray = NDArray[np.float64]
 AXES = ("x", "y", "z")
@@ -104,6 +104,14 @@ class Candidate:
             narrow=self.narrow + other.narrow,
             parts=(*self.pieces, *other.pieces),
         )
+
+
+def places(model: Sequence[Candidate]) -> Iterator[slice]:
+    """Yield where the coefficients of each candidate of a model are among those of all."""
+    at = 0
+    for candidate in model:
+        yield slice(at, at + candidate.size)
+        at += candidate.size
 
 
 def per(step: str, power: int = 1) -> str:

@@ -1,1 +1,1 @@
-"""What was found, written down: for machines and for people."""
+"""The findings, written down for programs and for people."""

@@ -1,4 +1,4 @@
-"""Figures of the report: what was measured against what was simulated, before and after."""
+"""Figures of the report: measured against simulated, before and after."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ FloatArray = NDArray[np.float64]
 
 BEFORE, AFTER, INK, FAINT = "#c8553d", "#1f6f8b", "#22303c", "#9aa5b1"
 POINTS = 4000
-"""Points drawn of a curve; more only make the page heavy."""
+"""Points drawn per curve; more only make the page heavy."""
 GAP = 20.0
-"""Usual steps between two points that no line joins any more."""
+"""Median steps between two points beyond which no line joins them."""
 MANY = 60
-"""Dives that are not parted by lines any more."""
+"""Dives from which on no lines separate them."""
 
 
 def _figure(width: float, height: float, rows: int = 1, columns: int = 1, **more: Any) -> tuple[Figure, Any]:
@@ -62,13 +62,13 @@ def _curves(diagnosis: Diagnosis, *values: FloatArray) -> tuple[FloatArray, ...]
 
 
 def _clock(diagnosis: Diagnosis) -> tuple[float, str]:
-    """Return the unit in which a log of this length is told: its seconds and its name."""
+    """Return the unit of time that suits the length of the log: its seconds and its name."""
     return (3600.0, "hours") if np.ptp(diagnosis.problem.survey.time) > 7200.0 else (60.0, "minutes")
 
 
 def _sides(diagnosis: Diagnosis) -> dict[str, tuple[FloatArray, str]]:
-    """Return what is compared, with its colour; where nothing was mended, what the calibration's own uncertainty takes."""
-    if not diagnosis.named:
+    """Return the two residuals to compare, each with its colour; without findings, the second is that of the refitted calibration."""
+    if not diagnosis.findings:
         return {
             "as calibrated": (diagnosis.before, BEFORE),
             "calibration refitted": (diagnosis.fit.left, AFTER),
@@ -105,7 +105,7 @@ def measured(diagnosis: Diagnosis) -> str:
         color=FAINT,
         alpha=0.25,
         linewidth=0,
-        label="what the calibration states, 2 sigma",
+        label="the calibration's own 2 sigma",
     )
     dives = survey.time[np.flatnonzero(np.diff(survey.dive)) + 1]
     for start in dives if dives.size < MANY else ():
@@ -114,7 +114,8 @@ def measured(diagnosis: Diagnosis) -> str:
     low.set_ylim(ends[0] - 0.25 * np.ptp(ends), ends[1] + 0.4 * np.ptp(ends))
     low.set_ylabel("measured − simulated (nT)", fontsize=9)
     low.set_xlabel(
-        f"{clock} since the start" + (f"; grey lines part the {survey.parts}" if dives.size < MANY else ""),
+        f"{clock} since the start"
+        + (f"; grey lines separate the {survey.parts}" if dives.size < MANY else ""),
         fontsize=9,
     )
     for axis in (top, low):
@@ -235,15 +236,13 @@ def track(diagnosis: Diagnosis) -> str | None:
 
 def terms(diagnosis: Diagnosis) -> str | None:
     """Draw what each found cause adds to the total field, over time."""
-    if not diagnosis.named:
+    if not diagnosis.findings:
         return None
-    figure, axes = _figure(10, 1.9 * len(diagnosis.named), len(diagnosis.named), 1, sharex=True)
-    at = 0
-    for axis, hypothesis in zip(axes[:, 0], diagnosis.named, strict=True):
-        candidate = hypothesis.candidate
-        own = diagnosis.fit.coefficients[at : at + candidate.size]
-        at += candidate.size
-        share = candidate.columns(slice(0, len(diagnosis.problem))) @ own
+    count = len(diagnosis.findings)
+    figure, axes = _figure(10, 1.9 * count, count, 1, sharex=True)
+    for axis, finding in zip(axes[:, 0], diagnosis.findings, strict=True):
+        candidate = finding.candidate
+        share = candidate.columns(slice(0, len(diagnosis.problem))) @ finding.coefficients
         axis.plot(*_curves(diagnosis, share), color=AFTER, linewidth=0.8)
         axis.set_ylabel("nT", fontsize=8)
         axis.set_title(label(candidate.cause, candidate.channel), fontsize=9, loc="left")
@@ -257,7 +256,7 @@ def evidence(diagnosis: Diagnosis) -> str:
     order = sorted(tested, key=lambda name: tested[name][1])
     figure, axes = _figure(5.6, 0.6 + 0.24 * max(len(order), 1))
     axis = axes[0, 0]
-    named = {h.candidate.cause for h in diagnosis.named}
+    named = {finding.candidate.cause for finding in diagnosis.findings}
     bars = axis.barh(
         [label(name, None) for name in order],
         [np.sqrt(max(tested[name][1], 0.0)) for name in order],

@@ -1,4 +1,4 @@
-"""``findings.json``: what was found, for machines. Its names are public."""
+"""``findings.json``: the findings for other programs. Its names are public."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from magbridge.diagnose.inference.search import Hypothesis
 if TYPE_CHECKING:
     from magbridge.diagnose.causes import Cause
     from magbridge.diagnose.causes.candidates import Candidate
-    from magbridge.diagnose.diagnosis import Diagnosis
+    from magbridge.diagnose.diagnosis import Diagnosis, Finding
     from magbridge.diagnose.gain import Gain
 
 __all__ = ["findings", "findings_json", "parameters"]
@@ -27,25 +27,8 @@ LEVEL = 0.95
 
 
 def findings(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> dict[str, Any]:
-    """Return the contract's table as plain Python."""
-    listed = []
-    at = len(diagnosis.problem.centre)
-    for hypothesis, rivals, gain in zip(diagnosis.named, diagnosis.rivals, diagnosis.gains, strict=True):
-        candidate = hypothesis.candidate
-        listed.append(
-            {
-                "cause": candidate.cause,
-                "channel": candidate.channel,
-                "signal_to_noise": _round(hypothesis.signal_to_noise),
-                "p_value": _round(hypothesis.p_value),
-                "alternatives": alternatives(rivals),
-                "isolability": _round(told(diagnosis, hypothesis)),
-                "separated_by": causes[candidate.cause].separated_by if rivals else None,
-                "parameters": parameters(diagnosis, hypothesis, at),
-                "gain": _gain(gain),
-            }
-        )
-        at += candidate.size
+    """Return what ``findings.json`` holds, as plain Python."""
+    listed = [_finding(diagnosis, finding, causes) for finding in diagnosis.findings]
     if diagnosis.wrong is not None:
         listed.append(_wrong(diagnosis))
     rest = diagnosis.unexplained
@@ -72,27 +55,37 @@ def findings_json(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> bytes:
     return msgspec.json.format(msgspec.json.encode(findings(diagnosis, causes)), indent=2) + b"\n"
 
 
+def _finding(diagnosis: Diagnosis, finding: Finding, causes: Mapping[str, Cause]) -> dict[str, Any]:
+    candidate, rivals = finding.candidate, finding.rivals
+    return {
+        "cause": candidate.cause,
+        "channel": candidate.channel,
+        "signal_to_noise": _round(finding.signal_to_noise),
+        "p_value": _round(finding.hypothesis.p_value),
+        "alternatives": alternatives(rivals),
+        "isolability": _round(told(diagnosis, finding.hypothesis)),
+        "separated_by": causes[candidate.cause].separated_by if rivals else None,
+        "parameters": parameters(finding, len(diagnosis.problem)),
+        "gain": _gain(finding.gain),
+    }
+
+
 def alternatives(rivals: tuple[Rival, ...]) -> list[dict[str, Any]]:
     """List the others within 20:1, the likeliest first."""
     return [{"cause": rival.cause, "channel": rival.channel} for rival in rivals]
 
 
-def parameters(diagnosis: Diagnosis, hypothesis: Hypothesis, at: int) -> dict[str, dict[str, Any]]:
-    """Value, sigma and unit of every coefficient, from place `at` of the joint fit, and of the nonlinear ones.
+def parameters(finding: Finding, samples: int) -> dict[str, dict[str, Any]]:
+    """Value, sigma and unit of every coefficient, and of the nonlinear parameters.
 
-    Where one channel acts with several lags, or an offset jumps more than once, a coefficient is what they do in all; its
-    parts stand beside it. Where all numbers have one common size, that is what there is to tell: the RMS of what they do.
+    Where one channel acts with several lags, or an offset jumps more than once, the sum is given and its parts beside it.
+    Coefficients with one common size are summed up as the RMS of their effect over the log's `samples`.
     """
-    candidate, q = hypothesis.candidate, len(diagnosis.problem.centre)
-    rows = slice(at, at + candidate.size)
+    candidate = finding.candidate
     if candidate.spectra is not None:
-        return {
-            "rms": _rms(
-                diagnosis, candidate, diagnosis.fit.coefficients[rows.start - q : rows.stop - q], rows
-            )
-        }
-    covariance = diagnosis.fit.covariance[rows, rows] * np.outer(candidate.width, candidate.width)
-    value = diagnosis.fit.coefficients[at - q : at - q + candidate.size] * candidate.width
+        return {"rms": _rms(finding, samples)}
+    covariance = finding.covariance * np.outer(candidate.width, candidate.width)
+    value = finding.coefficients * candidate.width
     parts: dict[str, list[int]] = {}
     for k, name in enumerate(candidate.names):
         parts.setdefault(name.partition(" (")[0] if _adds_up(candidate) else name, []).append(k)
@@ -112,17 +105,18 @@ def parameters(diagnosis: Diagnosis, hypothesis: Hypothesis, at: int) -> dict[st
     return found | shape
 
 
-def _rms(diagnosis: Diagnosis, candidate: Candidate, b: FloatArray, rows: slice) -> dict[str, Any]:
+def _rms(finding: Finding, samples: int) -> dict[str, Any]:
     """RMS over the log of ``X b``, nT, and its sigma: ``f = sqrt(b^T M b)``, ``M = X^T X / n``, ``df/db = M b / f``."""
-    M = normal(candidate.columns, diagnosis.problem.residual)[0] / len(diagnosis.problem)
+    b = finding.coefficients
+    M = normal(finding.candidate.columns, np.zeros(samples))[0] / samples
     f = float(np.sqrt(b @ M @ b))
     slope = M @ b / max(f, 1e-12)
-    sigma = float(np.sqrt(slope @ diagnosis.fit.covariance[rows, rows] @ slope))
+    sigma = float(np.sqrt(slope @ finding.covariance @ slope))
     return {"value": _round(f), "sigma": _round(sigma), "unit": "nT"}
 
 
 def _adds_up(candidate: Candidate) -> bool:
-    """Tell whether parts of one name are one effect's: later than each other, of one channel."""
+    """Tell whether coefficients of one name add up: those of one channel at several lags or onsets."""
     channels = {getattr(effect, "channel", None) for effect in candidate.effects}
     return len(channels) == 1 and not candidate.shape.keys().isdisjoint(("lag", "onset"))
 

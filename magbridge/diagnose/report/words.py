@@ -1,4 +1,4 @@
-"""Names and numbers as people read them."""
+"""Names and numbers for people to read."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 __all__ = ["MANY", "chance", "label", "listed", "measured", "number", "physics", "plain", "sizes"]
 
 MANY = 24
-"""Numbers that a table lists openly."""
+"""Numbers that a table shows unfolded."""
 
 
 def label(cause: str, channel: str | None) -> str:
@@ -32,19 +32,19 @@ def plain(labelled: str) -> str:
 
 
 def listed(rivals: Sequence[Rival]) -> str:
-    """Return causes in a row, the likeliest first."""
+    """Return causes as a list in words, the likeliest first."""
     return ", ".join(escape(label(rival.cause, rival.channel)) for rival in rivals)
 
 
 def physics(cause: Cause) -> str:
-    """Return the first line of the cause's own text, formulas set as such."""
+    """Return the first line of the cause's docstring, with its formulas marked up."""
     line = escape((getdoc(cause.candidates) or "").splitlines()[0])
     parts = line.split("``")
     return "".join(f"<code>{part}</code>" if k % 2 else part for k, part in enumerate(parts))
 
 
 def number(value: float, digits: int = 3) -> str:
-    """Write a number to so many digits, as people do: 1070, not 1.07e+03."""
+    """Write a number to so many digits without an exponent: 1070, not 1.07e+03."""
     return f"{float(f'{value:.{digits}g}'):g}"
 
 
@@ -62,7 +62,7 @@ def chance(p_value: float) -> str:
 
 
 def sizes(smallest: Mapping[str, tuple[float, str]]) -> str:
-    """Return sizes, each a value and its unit by its name; those that nothing would show are infinite and left out."""
+    """Return sizes in words from their values and units by name; infinite ones, which nothing would show, are left out."""
     seen = [(name, size, unit) for name, (size, unit) in smallest.items() if isfinite(size)]
     shown = seen if len(seen) <= MANY else seen[:3]
     told = [
