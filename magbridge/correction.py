@@ -16,7 +16,7 @@ import numpy as np
 from magbridge.align import Aligner, Input, Sample
 from magbridge.calibration.correct import Corrector
 from magbridge.calibration.model import Calibration, identity
-from magbridge.columns import COLUMNS
+from magbridge.columns import COLUMNS, CORRECTED
 from magbridge.config import Align
 from magbridge.field.igrf import magnitude
 from magbridge.field.reference import main_field
@@ -115,17 +115,16 @@ def correct_rows(correction: Correction, deployment: xr.Dataset) -> xr.Dataset:
     Returns
     -------
     Dataset (time)
-        ``total_field total_field_sigma field_x field_y field_z quality anomaly``; ``time`` as in the input.
+        ``total_field total_field_sigma field_x field_y field_z anomaly quality``; ``time`` as in the input.
         The anomaly is the total field minus the IGRF, NaN where there is no position.
     """
     import xarray as xr  # noqa: PLC0415 - the live path runs without it
 
     rows = [correction.reading(*row)[1] for row in _readings(correction, deployment)]
     results = np.array(
-        [(row.total_field, row.total_field_sigma, *row.field, row.quality) for row in rows], dtype=float
-    ).reshape(-1, 6)
-    names = ("total_field", "total_field_sigma", "field_x", "field_y", "field_z", "quality")
-    columns = dict(zip(names, results.T, strict=True))
+        [(row.total_field, row.total_field_sigma, *row.field, nan, row.quality) for row in rows], dtype=float
+    ).reshape(-1, len(CORRECTED))
+    columns = dict(zip(CORRECTED, results.T, strict=True))
     columns["anomaly"] = columns["total_field"] - magnitude(main_field(deployment))
     return xr.Dataset(
         {
