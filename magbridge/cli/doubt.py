@@ -77,10 +77,13 @@ def diagnose(
     causes = [_plain(one) for one in facts["findings"]]
     if facts["verdict"] == "unexplained" and (within := facts["unexplained"]["alternatives"]):
         causes = [f"no name asserted; within 20:1: {', '.join(_plain(one) for one in within)}"]
+    said = ", ".join(causes) or "no cause"
+    if rest := facts["unexplained"]:
+        said += f"; left without a name: {rest['kind']}, S/N {rest['signal_to_noise']:.3g}"
     rms = f"{facts['rms_before_nT']:.2f} -> {facts['rms_after_nT']:.2f} nT RMS held out"
-    tell(
-        facts, f"{facts['verdict']}: {', '.join(causes) or 'no cause'}; {rms}; {output / 'report.html'}", json
-    )
+    if found.findings and not found.total.shown:
+        rms += ", no gain shown (95 %: {:.2f} to {:.2f} times)".format(*found.total.interval)
+    tell(facts, f"{facts['verdict']}: {said}; {rms}; {output / 'report.html'}", json)
 
 
 def _named(path: Path, log: xr.Dataset) -> xr.Dataset:

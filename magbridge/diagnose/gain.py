@@ -43,6 +43,11 @@ class Gain:
     ratio: float
     interval: tuple[float, float]
 
+    @property
+    def shown(self) -> bool:
+        """Whether what was left out shows it: the interval lies below 1."""
+        return self.interval[1] < 1.0
+
 
 class HeldOut(NamedTuple):
     """(n,) residual, nT, of every sample under a fit that never saw its dive; and the model's score."""

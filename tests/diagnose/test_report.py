@@ -8,9 +8,10 @@ import pytest
 from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.compare.problem import Problem
+from magbridge.diagnose.gain import Gain
 from magbridge.diagnose.inference.rivals import Rival
 from magbridge.diagnose.inference.unexplained import Leftover
-from magbridge.diagnose.report.doubts import IMPLAUSIBLE, implausible, nameless
+from magbridge.diagnose.report.doubts import IMPLAUSIBLE, gained, implausible, nameless, no_gain
 from magbridge.diagnose.report.words import measured, number, physics, sizes
 
 
@@ -62,6 +63,17 @@ def test_a_cause_that_is_larger_than_such_causes_are_is_doubted() -> None:
     bias = Candidate("reference_bias", None, lambda _: np.ones((1, 1)), np.array([30.0]), ("bias",), ("nT",))
     assert "12 times" in implausible(bias, np.array([-12.0]))
     assert not implausible(bias, np.array([0.99 * IMPLAUSIBLE]))
+
+
+def test_a_gain_that_does_not_show_is_said_to_be_none() -> None:
+    """As on a log of a compass in steps of 100 nT: a name, and 588 nT that became 587."""
+    none, much = Gain(588.1, 587.3, 0.999, (0.863, 1.021)), Gain(117.0, 75.8, 0.65, (0.48, 0.83))
+    assert gained(none, "eighths of the log") == (
+        "On eighths of the log left out of the fit, 588 nT RMS became 587 nT (ratio 1.00, 95 % interval 0.86 to 1.02: no gain is shown)."
+    )
+    assert gained(much, "dives").endswith("(ratio 0.65, 95 % interval 0.48 to 0.83).")
+    assert no_gain(none)
+    assert not no_gain(much)
 
 
 def test_names_that_something_unexplained_keeps_are_told() -> None:

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from magbridge.diagnose.inference.unexplained import Leftover
 
 __all__ = [
+    "gained",
     "grounded",
     "implausible",
     "in_motion",
@@ -104,11 +105,20 @@ def in_motion(diagnosis: Diagnosis, finding: Finding) -> str:
     )
 
 
+def gained(gain: Gain, parts: str) -> str:
+    """Tell what all findings together gain on what was left out, and say so when that shows no gain."""
+    low, high = gain.interval
+    return (
+        f"On {parts} left out of the fit, {number(gain.before)} nT RMS became {number(gain.after)} nT (ratio {gain.ratio:.2f}, "
+        f"95 % interval {low:.2f} to {high:.2f}{'' if gain.shown else ': no gain is shown'})."
+    )
+
+
 def no_gain(gain: Gain) -> str:
-    """Say so when the dives left out show no gain."""
-    if gain.interval[1] < 1.0:
+    """Say so when what was left out of the fit shows no gain."""
+    if gain.shown:
         return ""
-    return "<p>It shows no gain on the dives left out of the fit: it may be a remnant of another effect.</p>"
+    return "<p>It shows no gain on what was left out of the fit: it may be a remnant of another effect.</p>"
 
 
 def outshone(finding: Finding, rest: Leftover | None) -> str:

@@ -36,7 +36,7 @@ def findings(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> dict[str, Any
         "verdict": diagnosis.verdict,
         "rms_before_nT": _round(diagnosis.total.before),
         "rms_after_nT": _round(diagnosis.total.after),
-        "gain": _gain(diagnosis.total),
+        "gain": _gain(diagnosis.total, diagnosis),
         "findings": listed,
         "unexplained": None
         if rest is None
@@ -66,7 +66,7 @@ def _finding(diagnosis: Diagnosis, finding: Finding, causes: Mapping[str, Cause]
         "isolability": _round(told(diagnosis, finding.hypothesis)),
         "separated_by": causes[candidate.cause].separated_by if rivals else None,
         "parameters": parameters(finding, len(diagnosis.problem)),
-        "gain": _gain(finding.gain),
+        "gain": _gain(finding.gain, diagnosis),
     }
 
 
@@ -153,12 +153,12 @@ def _wrong(diagnosis: Diagnosis) -> dict[str, Any]:
     }
 
 
-def _gain(gain: Gain) -> dict[str, Any]:
+def _gain(gain: Gain, diagnosis: Diagnosis) -> dict[str, Any]:
     return {
         "rms_ratio": _round(gain.ratio),
         "interval": [_round(gain.interval[0]), _round(gain.interval[1])],
         "level": LEVEL,
-        "held_out": "dives",
+        "held_out": diagnosis.problem.survey.parts,
     }
 
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from magbridge.diagnose.report import figures
 from magbridge.diagnose.report.doubts import (
+    gained,
     grounded,
     implausible,
     in_motion,
@@ -138,11 +139,10 @@ def _verdict(diagnosis: Diagnosis) -> str:
     ]
     if diagnosis.wrong is not None:
         causes.append(f"<b>outliers</b> ({diagnosis.wrong.rows.size} wrong samples)")
-    gained = (
-        f"On {diagnosis.problem.survey.parts} left out of the fit, {number(total.before)} nT RMS became {number(total.after)} nT "
-        f"(ratio {total.ratio:.2f}, 95 % interval {total.interval[0]:.2f} to {total.interval[1]:.2f})."
-    )
-    withheld = diagnosis.unexplained.within if diagnosis.unexplained else ()
+    found = f"Found: {', '.join(causes)}. {gained(total, diagnosis.problem.survey.parts)}"
+    rest = diagnosis.unexplained
+    withheld = rest.within if rest else ()
+    louder = rest and all(rest.signal_to_noise > one.signal_to_noise for one in diagnosis.findings)
     name = (
         f"no name is asserted; not ruled out: {listed(withheld)}"
         if withheld
@@ -151,8 +151,8 @@ def _verdict(diagnosis: Diagnosis) -> str:
     return {
         "nothing_found": f"Nothing was found: {number(total.before)} nT RMS is consistent with noise "
         f"({number(float(np.std(diagnosis.fit.left)))} nT) and the calibration's stated uncertainty.",
-        "explained": f"Found: {', '.join(causes)}. {gained} Nothing else stands out of the noise.",
-        "partly_explained": f"Found: {', '.join(causes)}. {gained} Something else is left that no known cause explains.",
+        "explained": f"{found} Nothing else stands out of the noise.",
+        "partly_explained": f"{found} Something {'stronger' if louder else 'else'} is left that no known cause explains.",
         "unexplained": f"An effect is present ({number(total.before)} nT RMS), but {name}.",
     }[diagnosis.verdict]
 
