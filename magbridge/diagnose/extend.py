@@ -15,7 +15,7 @@ from magbridge.calibration.instrument import RateEffect
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.residual import residuals, residuals_of
 from magbridge.calibration.terms import Effect
-from magbridge.diagnose.causes.candidates import Candidate, places
+from magbridge.diagnose.causes.candidates import Candidate, slices
 from magbridge.diagnose.compare.derivatives import derivatives
 from magbridge.diagnose.compare.problem import DELAYS, Columns, Problem, samples_of
 from magbridge.diagnose.compare.survey import Survey
@@ -50,7 +50,7 @@ def extend(problem: Problem, model: Sequence[Candidate], fit: Joint) -> Calibrat
     covariance = M @ fit.covariance @ M.T
     covariance[:K, :K] += problem.unseen
     reference = calibration.reference
-    for candidate, own in zip(model, places(model), strict=True):
+    for candidate, own in zip(model, slices(model), strict=True):
         if candidate.cause == "reference_bias":
             at = own.start
             sigma = float(np.sqrt(fit.covariance[q + at, q + at]) * widths[at])
@@ -140,7 +140,7 @@ def widened(model: Sequence[Candidate], fit: Joint) -> Joint:
     .. math:: C \leftarrow C + \frac{IDEAL^2 W}{MODES}\, C_{:b} C_{bb}^{-1} C_{b:}
     """
     C, q = fit.covariance.copy(), len(fit.z)
-    for place in places(model):
+    for place in slices(model):
         own, b = slice(q + place.start, q + place.stop), fit.coefficients[place]
         given = np.linalg.solve(fit.covariance[own, own], np.column_stack([b, fit.covariance[own]]))
         power = IDEAL**2 * float(b @ given[:, 0]) / MODES
@@ -164,7 +164,7 @@ def _again(
     # what the residual would be at the first point, were it linear about this one; the reference was not mended in it
     residual = e + free @ fit.z
     blocks = []
-    for candidate, place in zip(model, places(model), strict=True):
+    for candidate, place in zip(model, slices(model), strict=True):
         if not candidate.effects:
             blocks.append(candidate.columns(slice(0, len(problem))))
         else:

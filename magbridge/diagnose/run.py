@@ -14,7 +14,7 @@ from threadpoolctl import threadpool_limits
 
 from magbridge.calibration.model import Calibration
 from magbridge.diagnose.causes import CAUSES, Cause
-from magbridge.diagnose.causes.candidates import Candidate, places
+from magbridge.diagnose.causes.candidates import Candidate, slices
 from magbridge.diagnose.compare.problem import Problem, pose
 from magbridge.diagnose.compare.survey import Survey
 from magbridge.diagnose.compare.take import take
@@ -177,7 +177,7 @@ def _findings(
     """Put together what belongs to each cause; its gain is that over a fit of the others without it."""
     found, q = [], len(fit.z)
     for k, (own, (hypothesis, others)) in enumerate(
-        zip(places([h.candidate for h in named]), zip(named, rivals, strict=True), strict=True)
+        zip(slices([h.candidate for h in named]), zip(named, rivals, strict=True), strict=True)
     ):
         columns = [h.candidate.columns for i, h in enumerate(named) if i != k]
         without = held_out(problem, columns, _without(fit, own)).left

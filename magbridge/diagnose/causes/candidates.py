@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from magbridge.calibration.terms import Effect
 from magbridge.diagnose.compare.problem import Columns, Problem, effect_columns, history
 
-__all__ = ["AXES", "Candidate", "of_effect", "of_reference", "per", "places"]
+__all__ = ["AXES", "Candidate", "of_effect", "of_reference", "per", "slices"]
 
 FloatArray = NDArray[np.float64]
 AXES = ("x", "y", "z")
@@ -106,12 +106,12 @@ class Candidate:
         )
 
 
-def places(model: Sequence[Candidate]) -> Iterator[slice]:
-    """Yield where the coefficients of each candidate of a model are among those of all."""
-    at = 0
-    for candidate in model:
-        yield slice(at, at + candidate.size)
-        at += candidate.size
+def slices(candidates: Sequence[Candidate]) -> list[slice]:
+    """Return where the coefficients of each candidate are among those of all."""
+    ends = np.cumsum([candidate.size for candidate in candidates])
+    return [
+        slice(int(end) - candidate.size, int(end)) for end, candidate in zip(ends, candidates, strict=True)
+    ]
 
 
 def per(step: str, power: int = 1) -> str:

@@ -18,19 +18,19 @@ __all__ = ["FEWEST", "Channel", "Survey", "assemble"]
 FloatArray = NDArray[np.float64]
 
 FEWEST = 60
-"""Samples below which nothing can be said about noise and effect at once."""
+"""Samples below which noise and effect cannot both be estimated."""
 SHORT = 0.25
-"""Share of the steps that may be shorter than what counts as an interval: some gliders sample faster near the surface."""
+"""Quantile of the time steps that is taken for the sampling interval: some gliders sample faster near the surface."""
 KINDS = {
     "degC": "temperature", "K": "temperature", "A": "current", "mA": "current", "m": "pressure", "dbar": "pressure",
     "bar": "pressure", "Pa": "pressure", "hPa": "pressure", "kPa": "pressure", "mbar": "pressure",
 }  # fmt: skip
-"""What a channel is, by its unit. Anything else is taken for the position of something that moves."""
+"""Kind of a channel by its unit. Any other unit is taken for the position of something that moves."""
 HINTS = (("temp", "temperature"), ("current", "current"), ("press", "pressure"))
-"""Where a channel declares no unit, its name may help; else it is tried as everything."""
+"""Kind by name for a channel without a unit; without a hint it is tried as every kind."""
 OURS = ("mag_", "truth_")
 FIELDS = {"nT", "uT", "\N{MICRO SIGN}T", "mG", "G", "T"}
-"""Units of another magnetometer: it follows all that this one does, and explains nothing."""
+"""Units of another magnetometer, which follows everything that this one does and so explains nothing."""
 NOT_TELEMETRY = {
     "time", "learned", "reference_field", "roll", "pitch", "heading", "latitude", "longitude", "run", "dive", "quality",
     "total_field", "total_field_sigma", "field_x", "field_y", "field_z", "anomaly", "power_cycle",
@@ -47,7 +47,7 @@ class Channel(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Survey:
-    """A deployment as arrays; rows without field, reference or position of a modelled mass are gone.
+    """A deployment as arrays, of the rows that have field, reference and the positions of all modelled masses.
 
     Attributes
     ----------
@@ -58,21 +58,21 @@ class Survey:
     reference : (n,) array
         nT.
     channels : dict of Channel
-        Everything that varies, and what the calibration needs.
+        All telemetry that varies, and what the calibration needs.
     still : tuple of str
-        Telemetry that never changes: nothing can be learned from it.
+        Telemetry that never changes.
     steps : (n,) int array
-        Intervals since the sample before, :data:`~.past.FAR` where that tells nothing of this one's noise.
+        Intervals since the previous sample; :data:`~.past.FAR` where that is too long ago to predict this one's noise.
     dive : (n,) int array
-        Whole dives, for leaving out.
+        Number of the dive, the unit that is left out in turn.
     place : (n, 2) array or None
         m north and east of the middle.
     attitude : (n, 3) array or None
         deg, roll, pitch, heading.
     learned : (n,) bool array
-        The calibration was made from this sample.
+        The calibration was fitted to this sample.
     cycles : (c,) array
-        s, when the instrument was switched on again, as the log says.
+        s, when the instrument was power-cycled, as the log says.
     source : str
     """
 
@@ -94,27 +94,27 @@ class Survey:
 
     @property
     def interval(self) -> float:
-        """s, of one step."""
+        """s, the sampling interval."""
         known = self.steps[1:] < FAR
         return float(np.median(np.diff(self.time)[known] / self.steps[1:][known])) if known.any() else 1.0
 
     @cached_property
     def slots(self) -> NDArray[np.int64]:
-        """(n,) intervals since the first sample; a gap of which nothing is known counts :data:`~.past.FAR`."""
+        """(n,) intervals since the first sample; a gap counts at most :data:`~.past.FAR`."""
         return np.asarray(np.cumsum(self.steps) - self.steps[0])
 
     def follows(self, lost: int = 0) -> NDArray[np.bool_]:
-        """(n,) the sample comes as soon after the one before as most do; or with so many between them lost."""
+        """(n,) the sample follows the previous one at the median interval, or with at most `lost` missing between them."""
         apart = np.diff(self.time, prepend=np.inf)
         return np.asarray((apart > 0.0) & (apart < (lost + 1.5) * np.median(apart)) & (self.steps < FAR))
 
     @property
     def parts(self) -> str:
-        """What is left out in turn."""
+        """What is left out in turn, in words."""
         return "eighths of the log" if np.array_equal(self.dive, _eighths(len(self))) else "dives"
 
     def past(self, order: int) -> Past:
-        """Return what came before each sample, as far back as a noise of this order remembers."""
+        """Return the samples before each one, as far back as autoregressive noise of this order depends on them."""
         if order not in self._pasts:
             self._pasts[order] = Past(self.steps, order)
         return self._pasts[order]
@@ -140,12 +140,12 @@ class Survey:
 def assemble(
     table: dict[str, FloatArray], units: dict[str, str], source: str, needed: Sequence[str]
 ) -> Survey:
-    """Make a survey of columns that are whole: find the channels, the dives, the gaps.
+    """Make a survey from complete columns: find channels, dives and gaps.
 
     Parameters
     ----------
     table : dict of (n,) arrays
-        In order of time; ``learned`` is 1 where the calibration was made from the sample.
+        In order of time; ``learned`` is 1 where the calibration was fitted to the sample.
     units : dict
         Column -> unit.
     source : str
@@ -157,6 +157,34 @@ def assemble(
     interval = float(np.nanquantile(step, SHORT))
     steps = np.where(step > 0.5 * interval, np.minimum(np.rint(step / interval), FAR), FAR).astype(np.int64)
     steps[1:][table["learned"][1:] != table["learned"][:-1]] = FAR
+    channels, still = _channels(table, units, needed)
+    table = {name: column for name, column in table.items() if np.isfinite(column).any()}
+    cycles = np.empty(0)
+    if "power_cycle" in table:
+        cycles = time[1:][np.diff(table["power_cycle"]) > 0]
+    attitude = None
+    if {"roll", "pitch", "heading"} <= set(table):
+        attitude = np.stack([_held(table[name]) for name in ("roll", "pitch", "heading")], axis=1)
+    return Survey(
+        time=time,
+        field=np.stack([table[f"mag_{axis}"] for axis in "xyz"], axis=1),
+        reference=table["reference_field"],
+        channels=channels,
+        still=still,
+        steps=steps,
+        dive=_dives(table),
+        place=_place(table),
+        attitude=attitude,
+        learned=table["learned"] > 0.5,
+        cycles=cycles,
+        source=source,
+    )
+
+
+def _channels(
+    table: dict[str, FloatArray], units: dict[str, str], needed: Sequence[str]
+) -> tuple[dict[str, Channel], tuple[str, ...]]:
+    """Return the telemetry, and the names of what never changes."""
     channels, still = {}, []
     for name in sorted(table):
         if name in NOT_TELEMETRY or name.startswith(OURS):
@@ -171,37 +199,19 @@ def assemble(
                 channels[name] = Channel(_held(values), unit, ())
             continue
         channels[name] = Channel(_held(values), unit, _kinds(name, unit))
-    table = {name: column for name, column in table.items() if np.isfinite(column).any()}
-    cycles = np.empty(0)
-    if "power_cycle" in table:
-        cycles = time[1:][np.diff(table["power_cycle"]) > 0]
-    place = None
-    if {"latitude", "longitude"} <= set(table):
-        middle = np.median(table["latitude"])
-        north = np.radians(table["latitude"] - middle) * 6.3712e6
-        east = (
-            np.radians(table["longitude"] - np.median(table["longitude"]))
-            * 6.3712e6
-            * np.cos(np.radians(middle))
-        )
-        place = np.stack([north, east], axis=1)
-    attitude = None
-    if {"roll", "pitch", "heading"} <= set(table):
-        attitude = np.stack([_held(table[name]) for name in ("roll", "pitch", "heading")], axis=1)
-    return Survey(
-        time=time,
-        field=np.stack([table[f"mag_{axis}"] for axis in "xyz"], axis=1),
-        reference=table["reference_field"],
-        channels=channels,
-        still=tuple(still),
-        steps=steps,
-        dive=_dives(table),
-        place=place,
-        attitude=attitude,
-        learned=table["learned"] > 0.5,
-        cycles=cycles,
-        source=source,
+    return channels, tuple(still)
+
+
+def _place(table: dict[str, FloatArray]) -> FloatArray | None:
+    """(n, 2) m north and east of the middle; None without positions."""
+    if not {"latitude", "longitude"} <= set(table):
+        return None
+    middle = np.median(table["latitude"])
+    north = np.radians(table["latitude"] - middle) * 6.3712e6
+    east = (
+        np.radians(table["longitude"] - np.median(table["longitude"])) * 6.3712e6 * np.cos(np.radians(middle))
     )
+    return np.stack([north, east], axis=1)
 
 
 def _kinds(name: str, unit: str) -> tuple[str, ...]:
@@ -214,14 +224,14 @@ def _kinds(name: str, unit: str) -> tuple[str, ...]:
 
 
 def _held(values: FloatArray) -> FloatArray:
-    """Return the last value known, and the first one before it."""
+    """Fill gaps with the last known value, and the beginning with the first."""
     known = np.flatnonzero(np.isfinite(values))
     last = np.maximum.accumulate(np.where(np.isfinite(values), np.arange(len(values)), known[0]))
     return np.asarray(values[np.maximum(last, known[0])])
 
 
 def _dives(table: dict[str, FloatArray]) -> NDArray[np.int64]:
-    """Count the dives: as the log does, or from surface to surface, or pieces of an eighth of the log."""
+    """Count the dives: as the log does, else from surface to surface, else eighths of the log."""
     for name in ("dive", "run"):
         if name in table and np.unique(table[name]).size > 3:
             return np.unique(table[name], return_inverse=True)[1].astype(np.int64)

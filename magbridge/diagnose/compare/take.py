@@ -1,4 +1,4 @@
-"""From deployments to a survey: every column at the rows' times, the reference from wherever it is."""
+"""From deployments to a survey: every column at the times of the rows, with the reference field."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ __all__ = ["take"]
 FloatArray = NDArray[np.float64]
 
 TRUSTED = 0.5
-"""Of the noise: how far a channel may be from where it is interpolated to."""
+"""Of the noise: largest cubic term in the interpolation of a channel to the time of its row."""
 FAR = 10.0
-"""Half ranges of a calibration from its middle: no position of a mass, but a number that stands for "not known"."""
+"""Half ranges from the middle of the calibration's: beyond, it is no position of a mass but a code for "not known"."""
 
 
 def take(
@@ -43,43 +43,62 @@ def take(
         To be diagnosed.
     calibration : Calibration
     learned_from : sequence of Dataset
-        The logs that the calibration was made from, if they are at hand.
+        The logs that the calibration was fitted to, if available.
     grid : AnomalyGrid, optional
         Added to the main field where a log has no reference of its own.
 
     Raises
     ------
     DataError
-        A column is missing, too few samples have all they need, or a position is none: one line that says which.
+        A column is missing, too few samples are complete, or a parameter is out of all range: one line that says which.
     """
-    parts = [
-        _columns(ds, calibration, grid, learned)
-        for learned, group in ((False, datasets), (True, learned_from))
-        for ds in group
-    ]
-    names = {name for part in parts for name in part}
-    sizes = [part["time"].size for part in parts]
-    table = {
-        name: np.concatenate(
-            [part.get(name, np.full(n, np.nan)) for part, n in zip(parts, sizes, strict=True)]
-        )
-        for name in names
-    }
-    order = np.argsort(table["time"], kind="stable")
-    table = {name: column[order] for name, column in table.items()}
-    source = ", ".join(
-        dict.fromkeys(str(ds.attrs.get("source", "deployment")) for ds in (*datasets, *learned_from))
+    logs = (*datasets, *learned_from)
+    source = ", ".join(dict.fromkeys(str(ds.attrs.get("source", "deployment")) for ds in logs))
+    table = _joined(
+        [
+            _columns(ds, calibration, grid, learned)
+            for learned, group in ((False, datasets), (True, learned_from))
+            for ds in group
+        ]
     )
     twice = int(np.sum(np.diff(table["time"]) == 0.0))
     if twice > 0.1 * table["time"].size:
         raise DataError(
             f"{source}: {twice} samples are given twice: a log is either diagnosed or learned from"
         )
-    parameters = [parameter.name for parameter in calibration.parameters]
-    needed = [*(f"mag_{axis}" for axis in "xyz"), "reference_field", *parameters]
-    if sum(sizes) < FEWEST:
-        raise DataError(f"{source}: {sum(sizes)} samples, at least {FEWEST} needed")
-    for name in needed[:3]:
+    table = _comparable(table, calibration, source)
+    for parameter in calibration.parameters:
+        far = np.abs(table[parameter.name] - parameter.centre) > FAR * parameter.scale
+        if far.any():
+            raise DataError(
+                f"{source}: {parameter.name!r} is {table[parameter.name][far][0]:g} in {int(far.sum())} of {far.size} samples, and "
+                f"{parameter.low:g} to {parameter.high:g} in the calibration: expected its unit, and nothing where it is not known"
+            )
+    if not any(np.ptp(table[f"mag_{axis}"]) for axis in "xyz"):
+        raise DataError(f"{source}: columns mag_x, mag_y, mag_z never change: nothing was measured")
+    units = {str(k): str(v.attrs.get("units", "")) for ds in logs for k, v in ds.data_vars.items()}
+    return assemble(table, units, source, calibration.channels)
+
+
+def _joined(parts: Sequence[dict[str, FloatArray]]) -> dict[str, FloatArray]:
+    """Return the columns of all logs in order of time; NaN where a log lacks one."""
+    names = {name for part in parts for name in part}
+    table = {
+        name: np.concatenate([part.get(name, np.full(part["time"].size, np.nan)) for part in parts])
+        for name in names
+    }
+    order = np.argsort(table["time"], kind="stable")
+    return {name: column[order] for name, column in table.items()}
+
+
+def _comparable(table: dict[str, FloatArray], calibration: Calibration, source: str) -> dict[str, FloatArray]:
+    """Return the rows that have channels, reference and parameters, each instant once."""
+    channels = [f"mag_{axis}" for axis in "xyz"]
+    needed = [*channels, "reference_field", *(parameter.name for parameter in calibration.parameters)]
+    size = table["time"].size
+    if size < FEWEST:
+        raise DataError(f"{source}: {size} samples, at least {FEWEST} needed")
+    for name in channels:
         table[name][~(np.abs(table[name]) < BEYOND)] = np.nan
     whole = np.all([np.isfinite(table[name]) for name in needed], axis=0)
     if whole.sum() < FEWEST:
@@ -90,28 +109,13 @@ def take(
         )
     table = {name: column[whole] for name, column in table.items()}
     once = np.diff(table["time"], prepend=-np.inf) > 0.0  # what two logs share is there once
-    table = {name: column[once] for name, column in table.items()}
-    for parameter in calibration.parameters:
-        far = np.abs(table[parameter.name] - parameter.centre) > FAR * parameter.scale
-        if far.any():
-            raise DataError(
-                f"{source}: {parameter.name!r} is {table[parameter.name][far][0]:g} in {int(far.sum())} of {far.size} samples, and "
-                f"{parameter.low:g} to {parameter.high:g} in the calibration: expected its unit, and nothing where it is not known"
-            )
-    if not any(np.ptp(table[f"mag_{axis}"]) for axis in "xyz"):
-        raise DataError(f"{source}: columns mag_x, mag_y, mag_z never change: nothing was measured")
-    units = {
-        str(k): str(v.attrs.get("units", ""))
-        for ds in (*datasets, *learned_from)
-        for k, v in ds.data_vars.items()
-    }
-    return assemble(table, units, source, calibration.channels)
+    return {name: column[once] for name, column in table.items()}
 
 
 def _columns(
     ds: xr.Dataset, calibration: Calibration, grid: AnomalyGrid | None, learned: bool
 ) -> dict[str, FloatArray]:
-    """Return every column that counts; the channels at the row's time, the reference from wherever it is."""
+    """Return every numeric column; the channels at the times of the rows, the reference added."""
     source = str(ds.attrs.get("source", "deployment"))
     sensor = str(ds.attrs.get("sensor", ""))
     if sensor and calibration.sensor.name and sensor != calibration.sensor.name:
@@ -149,8 +153,8 @@ def _columns(
 def _at(time: FloatArray, own: FloatArray, values: FloatArray, trusted: float) -> FloatArray:
     """Return a channel at the row's time: the cubic through its sample, the one after and the two before.
 
-    A line between two is off by the turn's curvature, tenths of a nanotesla, always the same way. Where it matters
-    whether it is a cubic or a parabola, nobody knows what the channel was: NaN.
+    Linear interpolation is off by the curvature of a turn: tenths of a nanotesla, always with the same sign. Where the cubic
+    term itself exceeds `trusted`, nT, the channel is not known well enough: NaN.
     """
     out = np.full(time.size, np.nan)
     if time.size < 4:
@@ -167,10 +171,10 @@ def _at(time: FloatArray, own: FloatArray, values: FloatArray, trusted: float) -
 
 
 def _moving(table: dict[str, FloatArray], calibration: Calibration) -> NDArray[np.bool_]:
-    """Say about which samples a mass is on its way, by the bridge's own criterion.
+    """(n,) samples next to which a mass moves, by the bridge's own criterion.
 
-    There each channel saw another vehicle, and no vector is common to them. A converter that takes all three at once
-    keeps such samples: only they tell a clock that is off.
+    There the channels, sampled in turn, saw the mass at different places and form no vector. With simultaneous sampling
+    such samples are kept: only they reveal an offset of the clocks.
     """
     moving = np.zeros(table["time"].size, bool)
     elapsed = np.maximum(np.diff(table["time"]), 1.0)

@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 from scipy.special import chdtri, chndtrinc
 from scipy.stats import norm
 
-from magbridge.diagnose.causes.candidates import Candidate
+from magbridge.diagnose.causes.candidates import Candidate, slices
 from magbridge.diagnose.inference.information import Information
 from magbridge.diagnose.inference.telling import Telling
-from magbridge.diagnose.inference.weigh import LEVEL, score, slices
+from magbridge.diagnose.inference.weigh import LEVEL, score
 
 __all__ = ["Isolability", "Visible", "confusion", "isolability", "threshold"]
 
@@ -101,28 +101,10 @@ def isolability(
 ) -> Isolability:
     """Evaluate what `info` holds; of a cause's grid the candidate that is seen best stands for all."""
     at = slices(candidates)
-    best: dict[tuple[str, str | None], tuple[float, int]] = {}
-    for k, candidate in enumerate(candidates):
-        total = float(np.trace(info.matrix[at[k], at[k]])) / candidate.size
-        if total > best.get((candidate.cause, candidate.channel), (-1.0, 0))[0]:
-            best[candidate.cause, candidate.channel] = (total, k)
-    picked = [k for _, k in best.values()]
-    visible = []
-    for k in picked:
-        candidate, s = candidates[k], score(info, at[k], candidates[k])
-        hypotheses = causes * trials.get(candidate.cause, 1.0)
-        freedom = max(s.freedom, 1)
-        half, sure = threshold(freedom, hypotheses, 0.5), threshold(freedom, hypotheses, 0.95)
-        own = np.diag(info.matrix[at[k], at[k]])
-        size = sure / np.sqrt(np.maximum(own, 1e-300))
-        sizes = {
-            name: (float(x * w) if x < 50.0 else float("inf"), unit)
-            for name, x, w, unit in zip(candidate.names, size, candidate.width, candidate.units, strict=True)
-        }
-        if candidate.spectra is not None:  # what counts is what all of them do together
-            x = sure / float(np.sqrt(max(own.sum(), 1e-300)))
-            sizes = {"size": (x if x < 50.0 else float("inf"), "of a plausible one")}
-        visible.append(Visible(candidate.cause, candidate.channel, half, sure, sizes))
+    picked = _most_visible(candidates, info, at)
+    visible = [
+        _visible(candidates[k], info, at[k], causes * trials.get(candidates[k].cause, 1.0)) for k in picked
+    ]
     R = np.eye(len(picked))
     for i, a in enumerate(picked):
         for j, b in enumerate(picked[:i]):
@@ -141,6 +123,38 @@ def isolability(
         R,
         Telling(candidates, info, trials, causes),
     )
+
+
+def _most_visible(candidates: Sequence[Candidate], info: Information, at: Sequence[slice]) -> list[int]:
+    """Return which candidate of each cause and channel the log shows best: it stands for their whole grid."""
+    best: dict[tuple[str, str | None], tuple[float, int]] = {}
+    for k, candidate in enumerate(candidates):
+        total = float(np.trace(info.matrix[at[k], at[k]])) / candidate.size
+        if total > best.get((candidate.cause, candidate.channel), (-1.0, 0))[0]:
+            best[candidate.cause, candidate.channel] = (total, k)
+    return [k for _, k in best.values()]
+
+
+def _visible(candidate: Candidate, info: Information, own: slice, hypotheses: float) -> Visible:
+    """Return the signal-to-noise and the sizes at which a candidate is found among so many hypotheses."""
+    freedom = max(score(info, own, candidate).freedom, 1)
+    half, sure = threshold(freedom, hypotheses, 0.5), threshold(freedom, hypotheses, 0.95)
+    power = np.diag(info.matrix[own, own])
+    if candidate.spectra is not None:  # what counts is what all of them do together
+        x = sure / float(np.sqrt(max(power.sum(), 1e-300)))
+        sizes = {"size": (_seen(x), "of a plausible one")}
+    else:
+        size = sure / np.sqrt(np.maximum(power, 1e-300))
+        sizes = {
+            name: (_seen(float(x)) * float(w), unit)
+            for name, x, w, unit in zip(candidate.names, size, candidate.width, candidate.units, strict=True)
+        }
+    return Visible(candidate.cause, candidate.channel, half, sure, sizes)
+
+
+def _seen(size: float) -> float:
+    """Return a size in units of a plausible one; infinite where nothing plausible would show."""
+    return size if size < 50.0 else float("inf")
 
 
 def _alike(info: Information, one: Candidate, a: slice, other: Candidate, b: slice) -> float:

@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2, ncx2, norm
 
-from magbridge.diagnose.causes.candidates import Candidate
+from magbridge.diagnose.causes.candidates import Candidate, slices
 from magbridge.diagnose.inference.information import Information
 from magbridge.diagnose.inference.statistic import Statistic
-from magbridge.diagnose.inference.weigh import LEVEL, lead, slices, weigh
+from magbridge.diagnose.inference.weigh import LEVEL, lead, weigh
 
 __all__ = ["Telling"]
 

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from scipy.special import log_ndtr
 from scipy.stats import chi2
 
-from magbridge.diagnose.causes.candidates import Candidate
+from magbridge.diagnose.causes.candidates import Candidate, slices
 from magbridge.diagnose.inference.information import Information
 from magbridge.diagnose.inference.joint import FLAT
 from magbridge.diagnose.inference.statistic import Statistic
@@ -44,7 +44,6 @@ __all__ = [
     "lead",
     "score",
     "slack",
-    "slices",
     "trials",
     "weigh",
     "worth",
@@ -116,14 +115,6 @@ def lead(ratio: float) -> float:
 def slack(ratio: float) -> float:
     """Log evidence that regressors' errors may lend to another cause, of a model of this likelihood ratio."""
     return 0.5 * IDEAL**2 * ratio
-
-
-def slices(candidates: Sequence[Candidate]) -> list[slice]:
-    """Where each candidate's columns stand."""
-    ends = np.cumsum([candidate.size for candidate in candidates])
-    return [
-        slice(int(end) - candidate.size, int(end)) for end, candidate in zip(ends, candidates, strict=True)
-    ]
 
 
 def trials(info: Information, candidates: Sequence[Candidate], at: Sequence[slice]) -> dict[str, float]:
