@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import xarray as xr
+from scipy.interpolate import CubicSpline
 from study import stage
-from study.cases import case
+from study.cases import alike, case
 from study.noise import GLIDER, LOSSES, NOISES
 from study.rates import worse
 from threadpoolctl import threadpool_limits
@@ -22,6 +24,7 @@ from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.report.findings import parameters
 from magbridge.diagnose.run import diagnose
 from magbridge.errors import DataError
+from sitl.inject import Hidden, disturb
 
 SAFE = 0.97
 """Theory's chance that the set holds the truth, from which on it must."""
@@ -62,6 +65,42 @@ def test_a_hidden_effect_is_found_and_named(name: str) -> None:
     assert row["verdict"] != "nothing_found"
     assert name in named or theory["inside"] < SAFE, row
     assert {cause for cause in named if theory["apart"].get(cause, 0.0) > FAR} == set(), row
+
+
+def test_a_lag_imitates_an_early_clock_beside_the_telemetry_that_is_there() -> None:
+    """By a vehicle whose masses are where that telemetry has them, on a grid that a delay does not slip through."""
+    own = stage.vehicle(0)
+    stall = stage.Stall.of(own, 24, "white")
+    late, finer = 0.1, 20
+    clock = next(
+        one for seed in range(9) if _delay(one := stall.show(Hidden("clock_offset", late, seed))) < 0.0
+    )
+    lag = Hidden("filter_lag", late, 0)
+    t = own.track.elapsed
+    fine = np.linspace(0.0, t[-1], finer * (len(t) - 1) + 1)
+    way = ("latitude", "longitude", "depth", "roll", "pitch", "heading")
+    track = replace(
+        own.track,
+        step=own.track.step / finer,
+        run=None,
+        parameters={k: np.interp(fine + late, t, values) for k, values in own.track.parameters.items()},
+        **{name: CubicSpline(t, getattr(own.track, name))(fine) for name in way},
+    )
+    e = [stage.compare(disturb(own.twin, one, track, own.when), own.calibration)[0] for one in ((lag,), ())]
+    true = stage.whiten(e[0] - e[1], "white", stall.rows)
+    off = {
+        name: np.linalg.norm(shape - true) / np.linalg.norm(true)
+        for name, shape in (
+            ("alike", alike("filter_lag", clock, stall)),
+            ("the clock's own", clock.signature),
+            ("beside another telemetry", stall.show(lag).signature),
+        )
+    }
+    assert off.pop("alike") < 0.05 < 0.08 < min(off.values())
+
+
+def _delay(one: stage.Found) -> float:
+    return float(json.loads(one.ds.attrs["truth"])["delay"])
 
 
 def test_outliers_are_found() -> None:

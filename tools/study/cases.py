@@ -190,7 +190,7 @@ def _theory(
         return []
     late = next((one for one in hidden if one.hidden.name in DELAYS), hidden[0])
     others = {
-        other: _alike(other, late, stall)
+        other: alike(other, late, stall)
         for other in DELAYS
         if late.hidden.name in DELAYS and other not in names
     }
@@ -202,11 +202,15 @@ def _theory(
     return [both(hidden, stall, ds, setting) if len(hidden) > 1 else ideal(hidden[0], stall, ds, setting)]
 
 
-def _alike(other: str, one: Found, stall: Stall) -> Array:
-    """Signature of another delay with the sign of what is hidden.
+def alike(other: str, late: Found, stall: Stall) -> Array:
+    """Signature of another delay of the same length in the log that hides `late`, of the sign that it can have.
 
-    The table's rates are differences, and the delays' own signatures are more alike than those: a late field is an early
-    clock, but for a mass that starts or stops within the delay of a sample.
+    A late field is an early clock, but for a mass that starts or stops within the delay of a sample. The telemetry of an early
+    clock shows it to have done so a delay before, when a filter has ``1 - 1/e`` of the way behind it: of what the two
+    differ by beside one telemetry, 1/e is left. That of a log whose filter lags fits an early clock just as well.
     """
-    shown = [stall.show(Hidden(other, size, stall.number)).signature for size in (0.1, -0.1)]
-    return max(shown, key=lambda d: float(d @ one.signature))
+    d = late.signature
+    if other == "clock_offset":
+        return d
+    f = stall.show(Hidden(other, late.hidden.size, stall.number)).signature
+    return d + (f - d) / np.e if f @ d > 0.0 else f
