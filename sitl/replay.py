@@ -218,7 +218,7 @@ def tell(result: Result) -> str:
         lines.append(f"calibration: {result['calibration']}")
     lines.append(f"flags: {_counted(result['flags'])}")
     if result["navigation"]:
-        lines.append(f"updates of the position: {_counted(result['navigation'])}")
+        lines.append(f"position updates: {_counted(result['navigation'])}")
     lines.append("")
     lines.append(
         f"{'against the reference field, nT RMS':36} {'samples':>8} {'raw':>9} {'corrected':>10} {'sigma':>7}"
@@ -237,25 +237,27 @@ def _counted(counts: dict[str, int]) -> str:
 
 def _tell_again(result: Result) -> str:
     if result["identical"]:
-        verdict = "published again, bit for bit"
+        verdict = "republished bit for bit"
     elif result["first_difference"] == result["bytes"] and result["beyond"]:
         verdict = (
-            f"published again, bit for bit as far as the log goes, and {result['beyond']} bytes that it does not hold: "
-            "it breaks off, or the bridge said less"
+            f"republished bit for bit to the end of the log, and {result['beyond']} bytes beyond it: "
+            "the log is truncated, or the bridge sent less"
         )
     elif result["late_s"]:
         verdict = (
-            f"published, but not the same: the log begins {result['late_s']:.1f} s into the run, without what the bridge knew by "
-            f"then; the total field of {result['same_samples']} of {result['samples']} samples is the same"
+            f"republished, but not identical: the log begins {result['late_s']:.1f} s into the run, without what the bridge knew by "
+            f"then; the total field is the same in {result['same_samples']} of {result['samples']} samples"
         )
         if result["worst_nT"]:
-            verdict += f", others are off by up to {result['worst_nT']:.2g} nT"
+            verdict += f", the others differ by up to {result['worst_nT']:.2g} nT"
     else:
-        verdict = f"published, but not the same: the first difference is at byte {result['first_difference']}"
+        verdict = (
+            f"republished, but not identical: the first difference is at byte {result['first_difference']}"
+        )
     size = f"{result['messages']} messages ({result['bytes']} bytes)"
     lines = [f"{result['files'][0]}: {size} {verdict}, in {result['seconds']:.1f} s"]
     if not result["same_config"]:
-        lines.append("the configuration is not the one that the log was made with")
+        lines.append("the configuration is not the one the log was recorded with")
     if result["damages"]:
-        lines.append(f"{result['damages']} damaged places in the log were passed over")
+        lines.append(f"{result['damages']} damaged places in the log were skipped")
     return "\n".join(lines)

@@ -31,10 +31,10 @@ FIX_3D = 3
 UNKNOWN_SPEED = 0.0
 """VFR_HUD.airspeed of a vehicle that has no log for its speed through the water."""
 WORDS = {
-    State.OFF: "waits for a first position",
-    State.SEARCHING: "searches",
-    State.TRACKING: "tracks",
-    State.DEAD_RECKONING: "dead reckoning: the field says nothing here",
+    State.OFF: "waiting for a first position",
+    State.SEARCHING: "searching",
+    State.TRACKING: "tracking",
+    State.DEAD_RECKONING: "dead reckoning: no information in the field here",
     State.LOST: "lost: the field and the map disagree",
 }
 

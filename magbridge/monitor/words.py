@@ -14,12 +14,12 @@ SILENT, SLOW = 3.0, 30.0
 """s; a bridge speaks every second, a slow sensor less often: three of its intervals, but no more than `SLOW`."""
 FLAGS = {
     "stale_telemetry": "A parameter of the calibration is old, missing or NaN",
-    "extrapolated": "A parameter is outside the range that the calibration has seen",
+    "extrapolated": "A parameter is outside the calibrated range",
     "moving": "A mass is moving",
     "saturated": "A channel is at the end of its range",
-    "uncalibrated": "No calibration, or not one of this sensor",
-    "offset_suspect": "The sensor was powered on anew since its calibration",
-    "no_boresight": "The vector is in sensor axes; its magnitude is right",
+    "uncalibrated": "No calibration, or one of another sensor",
+    "offset_suspect": "The sensor was power-cycled since its calibration",
+    "no_boresight": "The vector is in sensor axes; only its magnitude is calibrated",
     "gap": "Samples are missing",
 }
 LOSSES = {
@@ -70,13 +70,13 @@ def health(state: State) -> dict[str, tuple[str, bool]]:
         "Log": (log.name.lower(), log != MAG_LOG_STATE.FAILED),
         "Sample rate": (_number(get("sample_rate", nan), ".2f", unit="Hz")[0], True),
         "Latency": (_number(1e3 * field("latency", nan), ".1f", unit="ms")[0], True),
-        "Age of the telemetry": (
+        "Telemetry age": (
             _number(field("telemetry_age", nan), ".1f", unit="s")[0],
             "stale_telemetry" not in state.flags,
         ),
         "Calibration": (f"{field('calibration_id', 0):08x}".replace("0" * 8, "none"), True),
         "Uptime": (ago(get("uptime", 0)), True),
-        "Messages lost on the way here": (
+        "Messages lost on the link": (
             f"{_count(state.lost)} of {_count(state.lost + state.received)}",
             not state.lost,
         ),
@@ -94,7 +94,7 @@ def whereabouts(state: State) -> dict[str, tuple[str, bool]]:
     return {
         "State": (mode.name.lower().replace("_", " "), mode != MAG_NAVIGATION_STATE.LOST),
         "Position": (f"{get('lat', 0) * 1e-7:.5f}, {get('lon', 0) * 1e-7:.5f}", True),
-        "1σ of the worse axis": (_number(sigma, ".0f", unit="m")[0], True),
+        "1σ of the longer axis": (_number(sigma, ".0f", unit="m")[0], True),
         "Innovation ± 2σ": (
             " ".join(_number(innovation, "+.1f", 2.0 * sqrt(max(variance, 0.0)))),
             bool(get("accepted", 1)),

@@ -57,15 +57,15 @@ def judge(
     if off.any():
         findings.append(
             f"off the map for {100.0 * off.mean():.0f} % of the track, first after {hours[off][0]:.1f} h:"
-            " dead reckoning there"
+            " dead reckoning only"
         )
     silent = (state == State.DEAD_RECKONING) & ~off
     if silent.mean() > 0.5:
         known = hypot(options.bias_sigma, options.map_sigma)
         findings.append(
-            f"the field says nothing for {100.0 * silent.mean():.0f} % of the track: "
+            f"the field carries no information for {100.0 * silent.mean():.0f} % of the track: "
             + (
-                f"the map is flat there ({grid.rms:.1f} nT rms, where calibration and map are known to {known:.1f} nT)"
+                f"the map is flat there ({grid.rms:.1f} nT RMS, where calibration and map are known only to {known:.1f} nT)"
                 if grid.rms < FLAT * known
                 else f"dead reckoning is as good as this map can be ({_sigma(result, silent):.0f} m)"
             )
@@ -100,7 +100,7 @@ def _told_by_jumps(jumps: Sequence[Jump], start: float) -> list[str]:
             )
         said.append(sentence)
     if len(jumps) > TOLD:
-        said.append(f"moved {len(jumps) - TOLD} times more, the last time after {hours[-1]:.1f} h")
+        said.append(f"moved another {len(jumps) - TOLD} times, the last time after {hours[-1]:.1f} h")
     return said
 
 
@@ -114,8 +114,8 @@ def _told_by_level(result: xr.Dataset, options: Options) -> list[str]:
     if abs(bias) < LEVEL * max(options.bias_sigma, sigma):
         return []
     said = (
-        f"the measured level is {bias:+.0f} nT from the map's, where the calibration leaves"
-        f" {options.bias_sigma:.1f} nT: the map's main field may be of another epoch, or its altitude another"
+        f"the measured level differs from the map's by {bias:+.0f} nT, where the calibration allows"
+        f" {options.bias_sigma:.1f} nT: the map's main field may be of another epoch, or at another altitude"
     )
     return [said]
 
@@ -175,7 +175,7 @@ def _told_by_positions(grid: AnomalyGrid, yardstick: xr.Dataset, options: Option
     if abs(level) > LEVEL * options.bias_sigma + here:
         findings.append(
             f"at the known positions the field is {abs(level):.0f} nT {'above' if level > 0 else 'below'} the map's"
-            " level: its main field may be of another epoch, or its altitude another"
+            " level: its main field may be of another epoch, or at another altitude"
         )
     expected = DOUBLE * hypot(options.bias_sigma, options.map_sigma)
     if there < min(BETTER * here, expected) and hypot(north, east) > step:
@@ -185,8 +185,8 @@ def _told_by_positions(grid: AnomalyGrid, yardstick: xr.Dataset, options: Option
         )
     elif here > max(sqrt(1.0 - EXPLAINED) * float(np.std(measured)), expected):
         findings.append(
-            f"at the known positions the map leaves {here:.1f} nT of the field's {np.std(measured):.1f} nT:"
-            " it does not describe this field"
+            f"at the known positions the map leaves {here:.1f} nT of the field's {np.std(measured):.1f} nT unexplained:"
+            " it is not a map of this field"
         )
     return findings
 

@@ -145,7 +145,7 @@ def test_the_field_finds_what_dead_reckoning_lost(folder: Path, fix: str, messag
         begun = next(one for one in messages["MAG_NAVIGATION"] if one["state"] == TRACKING)["time_usec"]
         assert messages[message][0]["time_usec"] >= begun, "and not before"
         assert sent["pose_covariance"][0] >= last["covariance_nn"] * (1 - 1e-6), "it grows between updates"
-    assert any(re.match("navigation: tracks", text["text"]) for text in messages["STATUSTEXT"])
+    assert any(re.match("navigation: tracking", text["text"]) for text in messages["STATUSTEXT"])
 
 
 def test_odometry_goes_on_between_updates(folder: Path) -> None:

@@ -279,7 +279,7 @@ def test_runs_given_twice_count_once(glider: Gliders) -> None:
     twice = {name: np.concatenate([getattr(runs, name)] * 2) for name in (
         "field", "reference", "parameters", "runs", "time", "attitude", "reference_ned")}  # fmt: skip
     found = fit(replace(runs, **twice), "nominal")
-    assert "2250 samples stand in the data twice" in found.warnings[0]
+    assert "2250 samples occur twice in the data" in found.warnings[0]
     np.testing.assert_array_equal(
         found.calibration.coefficients, fit(runs, "nominal").calibration.coefficients
     )

@@ -97,8 +97,8 @@ def test_warnings_are_in_a_pilot_s_words(glider: Gliders) -> None:
     words = "\n".join(fit(glider(0, 2).runs).warnings)
     assert "ballast was only ever at 2 positions (-200 and 200 cm3)" in words
     assert "battpos and ballast always moved together" in words
-    assert "roll never left" in words
-    assert "the vertical offset is known to" in words
+    assert "roll stayed within" in words
+    assert "the vertical offset is known only to" in words
     dives = glider(0, 2).runs.part(np.degrees(glider(0, 2).runs.attitude[:, 1]) < 0.0)
     words = "\n".join(
         fit(replace(dives, parameters=dives.parameters[:, :1], names=("battpos",), units=("in",))).warnings

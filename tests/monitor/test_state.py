@@ -86,7 +86,7 @@ def test_the_position_by_the_field(air: Air) -> None:
     told = whereabouts(air.state)
     assert told["State"] == ("lost", False)
     assert told["Position"][0] == "49.50000, -57.90000"
-    assert told["1σ of the worse axis"][0] == "30 m"
+    assert told["1σ of the longer axis"][0] == "30 m"
     assert told["Innovation ± 2σ"] == ("+2.5 ± 2.0", False)
 
 

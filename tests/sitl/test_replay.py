@@ -109,7 +109,7 @@ def test_another_configuration_is_told_apart(survey: Path, tmp_path: Path) -> No
     (run,) = result["runs"]
     assert not run["identical"]
     assert not run["same_config"]
-    assert "not the same" in tell(result)
+    assert "not identical" in tell(result)
 
 
 @pytest.mark.parametrize("motion", ["glide", "position"])

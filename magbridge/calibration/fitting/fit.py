@@ -125,7 +125,7 @@ def _without_doubles(data: Observations) -> tuple[Observations, tuple[str, ...]]
     same[order[1:]] = (time[1:] == time[:-1]) & (field[1:] == field[:-1]).all(axis=1)
     if not same.any():
         return data, ()
-    return data.part(~same), (f"{int(same.sum())} samples stand in the data twice: they were counted once",)
+    return data.part(~same), (f"{int(same.sum())} samples occur twice in the data and were counted once",)
 
 
 def _biased(found: Fit, sigma: float) -> Fit:
@@ -152,7 +152,7 @@ def _refuse_one_attitude(data: Observations) -> None:
     off = np.degrees(np.arccos(np.clip(unit @ middle / np.linalg.norm(middle), -1.0, 1.0)))
     if np.quantile(off, 0.95) < ONE_ATTITUDE:
         raise CalibrationError(
-            f"all samples stand within {np.quantile(off, 0.95):.1f} degrees of one attitude: "
+            f"all samples lie within {np.quantile(off, 0.95):.1f} degrees of one attitude: "
             "fly turns (full circles, dives and climbs)"
         )
 
@@ -166,19 +166,19 @@ def _judged(found: Fit, data: Observations, doubled: tuple[str, ...]) -> Fit:
     warnings = [*doubled, *found.warnings, *warnings_for(calibration, data)]
     outliers = found.details.get("outliers", 0)
     if outliers > 0.02 * len(data):
-        warnings.append(f"{outliers} of {len(data)} samples are outliers and took no part")
+        warnings.append(f"{outliers} of {len(data)} samples are outliers and were left out of the fit")
     gap = heading_gap(data)
     if gap > UNSEEN:
         warnings.insert(
             0,
-            f"the data do not support this fit: all headings lie within {360.0 - gap:.0f} degrees, and on others "
-            "iron cannot be told from field",
+            f"the data do not support this fit: all headings lie within {360.0 - gap:.0f} degrees, and on other "
+            "headings the vehicle's field cannot be told from the Earth's",
         )
     if ratio > UNSUPPORTED:
         warnings.insert(
             0,
-            f"the data do not support this fit: at these pitches and positions, on any heading and rolled 10 degrees "
-            f"further, expect {ratio * calibration.noise.sensor:.0f} nT of error",
+            f"the data do not support this fit: at these pitches and positions, on any heading and with 10 degrees more "
+            f"roll, expect {ratio * calibration.noise.sensor:.0f} nT of error",
         )
     seen = combinations(found.samples, calibration.coefficients, max(calibration.noise.sensor, 1e-9))
     details = {

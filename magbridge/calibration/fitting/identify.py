@@ -90,8 +90,8 @@ def _positions(calibration: Calibration, data: Observations) -> Iterator[str]:
             yield (
                 f"{parameter.name} was only ever at {len(groups)} position{'s' * (len(groups) != 1)} "
                 f"({places} {parameter.unit}".rstrip()
-                + "): between and beyond, the correction is what physics "
-                "expects, not what was measured; fly a run with it somewhere else"
+                + "): elsewhere the correction rests on the physical model, "
+                "not on measurements; fly a run with it at another position"
             )
 
 
@@ -104,8 +104,8 @@ def _together(calibration: Calibration, data: Observations) -> Iterator[str]:
         for j, other in enumerate(names[:i]):
             if abs(together[i, j]) > 0.9:
                 yield (
-                    f"{other} and {one} always moved together (correlation {together[i, j]:.2f}): which of the two "
-                    "does what cannot be told; fly a run that moves only one of them"
+                    f"{other} and {one} always moved together (correlation {together[i, j]:.2f}): their "
+                    "effects cannot be told apart; fly a run that moves only one of them"
                 )
 
 
@@ -120,12 +120,12 @@ def _attitudes(calibration: Calibration, data: Observations) -> Iterator[str]:
     theta = calibration.covariance[8, 8]
     if high - low < 10.0 and theta > (5.0 * calibration.noise.sensor) ** 2:
         yield (
-            f"roll never left {low:.0f} to {high:.0f} degrees: the vertical offset is known to "
+            f"roll stayed within {low:.0f} to {high:.0f} degrees: the vertical offset is known only to "
             f"{np.sqrt(theta):.0f} nT; fly a run banked the other way"
         )
     if pitch.min() > -5.0 and pitch.max() < 5.0:
         yield (
-            f"pitch never left {pitch.min():.0f} to {pitch.max():.0f} degrees: steeper, nothing was measured; "
+            f"pitch stayed within {pitch.min():.0f} to {pitch.max():.0f} degrees: nothing steeper was measured; "
             "fly dives and climbs"
         )
     elif pitch.min() > -5.0 or pitch.max() < 5.0:
@@ -156,7 +156,7 @@ def _widest_gap(heading: FloatArray) -> tuple[float, float]:
 def _runs(calibration: Calibration, data: Observations) -> Iterator[str]:
     count = len(np.unique(data.runs)) if data.runs is not None else 1
     if calibration.parameters and count < 4:
-        yield f"only {count} run{'s' * (count != 1)}: nothing can be left out to see whether the fit holds"
+        yield f"only {count} run{'s' * (count != 1)}: too few to validate the fit on runs left out"
 
 
 CHECKS: tuple[Callable[[Calibration, Observations], Iterator[str]], ...] = (

@@ -38,7 +38,7 @@ def unfiltered(data: Observations, corner: float) -> Observations:
     Raises
     ------
     CalibrationError
-        The filter would remember more than the data tell.
+        The time constant of the filter is longer than the data.
     """
     assert data.time is not None
     if len(data) < 3:
@@ -47,7 +47,7 @@ def unfiltered(data: Observations, corner: float) -> Observations:
     told = float(np.ptp(data.time))
     if tau > told:
         raise CalibrationError(
-            f"filter corner = {corner:g} Hz: that is a time constant of {tau:.3g} s, and the data are {told:.3g} s long"
+            f"filter corner = {corner:g} Hz: its time constant of {tau:.3g} s is longer than the data ({told:.3g} s)"
         )
     reach = max(int(np.ceil(0.5 * REACH * tau / np.median(np.diff(data.time)))), 1)
     stretch = np.cumsum(data.steps != 1)

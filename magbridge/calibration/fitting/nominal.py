@@ -146,5 +146,5 @@ def check_scales(samples: Samples, coefficients: FloatArray) -> None:
         listed = ", ".join(f"{value:.3g}" for value in scales[worst])
         raise CalibrationError(
             f"the fit collapsed: scales {listed} (expected near 1), offset {T[worst]:.0f} nT in a field of "
-            f"{samples.unit:.0f} nT; the attitudes are too few to tell scale from offset"
+            f"{samples.unit:.0f} nT; there are too few attitudes to tell scale from offset"
         )

@@ -65,7 +65,7 @@ def flight_plan(
 
 
 def facts(found: Plan, calibration: Calibration) -> dict[str, Any]:
-    """Return a plan for machines."""
+    """Return a plan as plain values."""
     names = [parameter.name for parameter in calibration.parameters]
     return {
         "expected_rms_nT": found.rms,
@@ -78,15 +78,15 @@ def facts(found: Plan, calibration: Calibration) -> dict[str, Any]:
 
 
 def tell(found: Plan, calibration: Calibration) -> str:
-    """Return a plan for pilots: the runs in order of worth, and what each is expected to bring."""
+    """Return a plan as a table: the runs in order of worth, and the error expected after each."""
     names = [f"{one.name} [{one.unit}]" if one.unit else one.name for one in calibration.parameters]
     head = f"{'run':>4} {'pitch':>7} {'roll':>7} {' '.join(f'{name:>14}' for name in names)}"
     lines = [
-        f"{head}  {'error over the mission after it, nT: RMS':>40} {'worst':>8}",
+        f"{head}  {'error over the mission afterwards, nT: RMS':>40} {'worst':>8}",
         f"{'none yet':>{len(head)}}  {found.rms[0]:40.2f} {found.worst[0]:8.2f}",
     ]
     for number, run in enumerate(found.runs, 1):
         positions = " ".join(f"{value:14.3f}" for value in run.parameters)
         flown = f"{number:4} {run.pitch:7.1f} {run.roll:7.1f} {positions}"
         lines.append(f"{flown}  {found.rms[number]:40.2f} {found.worst[number]:8.2f}")
-    return "\n".join([*lines, "each run: all headings, as in a spiral; angles in degrees"])
+    return "\n".join([*lines, "each run covers all headings, as a spiral does; angles in degrees"])

@@ -34,9 +34,9 @@ class Cause(NamedTuple):
     candidates : callable
         ``Problem -> list of Candidate``.
     needs : str
-        What a log must have for it to be tested at all.
+        What a log must contain for it to be tested.
     separated_by : str
-        The manoeuvre that tells it from what it hides behind.
+        The manoeuvre that tells it from its rivals.
     """
 
     candidates: Callable[[Problem], list[Candidate]]
@@ -45,7 +45,7 @@ class Cause(NamedTuple):
 
 
 CAUSES: dict[str, Cause] = {
-    "temperature_offset": Cause(temperature_offset, "a temperature that varies", "dive and climb through one depth with a thermal lag between; or hold one depth for an hour after launch"),
+    "temperature_offset": Cause(temperature_offset, "a temperature that varies", "pass one depth at two temperatures of the sensor, diving and climbing; or hold one depth for an hour after launch"),
     "temperature_scale": Cause(temperature_scale, "a temperature that varies", "roll about the field at two temperatures: a scale follows the channel's reading, an offset does not"),
     "offset_step": Cause(offset_step, "time", "log the power-cycle counter; fly one attitude before and after"),
     "offset_drift": Cause(offset_drift, "time", "return to one place and attitude hours later"),
@@ -55,13 +55,13 @@ CAUSES: dict[str, Cause] = {
     "hysteresis": Cause(hysteresis, "a calibration with parameters", "approach one position from both sides"),
     "eddy_current": Cause(eddy_current, "turns", "reverse the turn"),
     "channel_skew": Cause(channel_skew, "turns", "reverse the turn; roll about the axis that all channels share"),
-    "filter_lag": Cause(filter_lag, "masses that move while sampled", "the filter's corner is known: switch it, or move an actuator by a step"),
-    "clock_offset": Cause(clock_offset, "a calibration with parameters, which move while sampled", "move an actuator at constant attitude"),
-    "nonlinearity": Cause(nonlinearity, "attitudes that take a channel over its range", "turn every channel through the whole field"),
-    "saturation": Cause(saturation, "a channel near its end", "turn the channel away from the field: only near full scale does it stay"),
-    "pressure_offset": Cause(pressure_offset, "depth or pressure that varies", "hold one depth for an hour: temperature settles, pressure stays"),
+    "filter_lag": Cause(filter_lag, "masses that move while sampled", "change the corner of the filter, or step an actuator"),
+    "clock_offset": Cause(clock_offset, "a calibration with parameters that move while sampled", "move an actuator at constant attitude"),
+    "nonlinearity": Cause(nonlinearity, "attitudes that take a channel through its range", "turn every channel through the whole field"),
+    "saturation": Cause(saturation, "a channel near its end", "turn the channel away from the field: saturation occurs only near full scale"),
+    "pressure_offset": Cause(pressure_offset, "depth or pressure that varies", "hold one depth for an hour: the temperature settles, the pressure effect stays"),
     "diurnal_variation": Cause(diurnal_variation, "at least six hours", "a base station ashore"),
-    "map_error": Cause(map_error, "positions over some hundred metres", "cross the track: a map's error is the same on every pass"),
-    "reference_bias": Cause(reference_bias, "a reference", "calibrate and survey at one place; a proton magnetometer beside"),
-    "interference_tone": Cause(interference_tone, "even sampling", "change the sampling rate: an alias moves"),
+    "map_error": Cause(map_error, "positions over some hundred metres", "cross the track again: an error of the map is the same on every pass"),
+    "reference_bias": Cause(reference_bias, "a reference", "calibrate and survey at one place, next to a proton magnetometer"),
+    "interference_tone": Cause(interference_tone, "even sampling", "change the sampling rate: an alias changes its frequency"),
 }  # fmt: skip

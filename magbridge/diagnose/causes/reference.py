@@ -42,7 +42,7 @@ def diurnal_variation(problem: Problem) -> list[Candidate]:
 
 
 def map_error(problem: Problem) -> list[Candidate]:
-    r"""The anomaly map is wrong: smooth in place, the same on every pass; a Gaussian process (Matern 3/2) where the track went.
+    r"""The anomaly map is wrong: its error is a smooth function of place, the same on every pass: a Gaussian process (Matern 3/2) along the track.
 
     In the functions of Karhunen and Loeve at the cells that were visited, ``K(x, Z) V / lambda`` of ``K(Z, Z) = V lambda V^T``:
     as many as there are, whatever the box. Lengths are told by the functions' variances ``diag(V^T K_l V)``.
@@ -109,6 +109,6 @@ def _matern(a: FloatArray, b: FloatArray, length: float) -> FloatArray:
 
 
 def reference_bias(problem: Problem) -> list[Candidate]:
-    """The reference is off by a constant: the main-field model at this site, some tens of nT."""
+    """The reference is off by a constant, such as the error of the main-field model at this site, some tens of nT."""
     ones = (~problem.survey.learned[:, None]).astype(np.float64)
     return [of_reference(problem, "reference_bias", lambda rows: ones[rows], np.array([30.0]), ("bias",))]
