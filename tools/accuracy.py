@@ -265,7 +265,28 @@ def show(rows: list[Row], console: Console) -> None:
         console.print(table)
 
 
-def main() -> None:
+def measure(cases: list[Case], jobs: int) -> list[Row]:
+    """Run all cases, `jobs` at a time; the rows come back in the order of the cases."""
+    rows: list[Row] = []
+    os.environ |= {
+        "OMP_NUM_THREADS": "1",
+        "OPENBLAS_NUM_THREADS": "1",
+    }  # one core for each process spawned below
+    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
+        waiting = [pool.submit(run, case) for case in cases]
+        progress = Console(stderr=True)
+        for count, done in enumerate(
+            track(as_completed(waiting), "gliders", len(waiting), console=progress), 1
+        ):
+            rows += done.result()
+            if not progress.is_terminal and count % 10 == 0:
+                print(f"{count} of {len(waiting)}", file=sys.stderr, flush=True)
+    order = {(case.masses, case.noise): k for k, case in enumerate(cases)}
+    return sorted(rows, key=lambda row: (order[row.masses, row.noise], row.seed))
+
+
+def arguments() -> argparse.Namespace:
+    """Return what the command line asks for."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -288,7 +309,11 @@ def main() -> None:
     )
     parser.add_argument("--jobs", type=int, default=2, choices=(1, 2), help="processes")
     parser.add_argument("--out", type=Path, help="folder for accuracy.csv and accuracy.txt")
-    chosen = parser.parse_args()
+    return parser.parse_args()
+
+
+def main() -> None:
+    chosen = arguments()
     console = Console(width=150, record=True)
     if not chosen.peers:
         console.print(
@@ -304,22 +329,7 @@ def main() -> None:
         )
         for masses, noise, seed in product(chosen.masses, chosen.noise, range(chosen.seeds))
     ]
-    rows: list[Row] = []
-    os.environ |= {
-        "OMP_NUM_THREADS": "1",
-        "OPENBLAS_NUM_THREADS": "1",
-    }  # a process a core, for those spawned below
-    with ProcessPoolExecutor(chosen.jobs, mp_context=get_context("spawn")) as pool:
-        waiting = [pool.submit(run, case) for case in cases]
-        progress = Console(stderr=True)
-        for count, done in enumerate(
-            track(as_completed(waiting), "gliders", len(waiting), console=progress), 1
-        ):
-            rows += done.result()
-            if not progress.is_terminal and count % 10 == 0:
-                print(f"{count} of {len(waiting)}", file=sys.stderr, flush=True)
-    order = {(case.masses, case.noise): k for k, case in enumerate(cases)}
-    rows.sort(key=lambda row: (order[row.masses, row.noise], row.seed))
+    rows = measure(cases, chosen.jobs)
     show(rows, console)
     if chosen.out:
         chosen.out.mkdir(parents=True, exist_ok=True)

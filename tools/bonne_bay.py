@@ -29,8 +29,8 @@ from sitl.mission import TABLE_1
 SEED = 29
 
 
-def tables(flights: list[Trials], console: Console) -> None:
-    """Print the paper's tables beside the twin's."""
+def table_1(flight: Trials) -> Table:
+    """Return the paper's calibration runs beside the twin's."""
     one = Table(title="Table 1: calibration runs, paper and twin", title_justify="left")
     for heading in (
         "run",
@@ -45,7 +45,7 @@ def tables(flights: list[Trials], console: Console) -> None:
     ):
         one.add_column(heading, justify="right")
     for number, pitch, *battery in TABLE_1:
-        legs = [_leg(flights[0].parts[trial], number) for trial in TRIALS]
+        legs = [_leg(flight.parts[trial], number) for trial in TRIALS]
         one.add_row(
             str(number),
             "dive" if pitch < 0 else "climb",
@@ -58,7 +58,11 @@ def tables(flights: list[Trials], console: Console) -> None:
                 for text in (f"{p:.3f}", f"{leg['battpos'].mean():.3f}")
             ),
         )
-    console.print(one)
+    return one
+
+
+def table_2(flights: list[Trials]) -> Table:
+    """Return each method's RMS on runs and survey, in the paper and in the twin."""
     many = f", median of {len(flights)} worlds" if len(flights) > 1 else ""
     two = Table(title=f"Table 2: RMS nT against the IGRF and the map{many}", title_justify="left")
     for heading in (
@@ -82,28 +86,35 @@ def tables(flights: list[Trials], console: Console) -> None:
                 two.add_row(name, flights[0].failed[trial, method])
                 continue
             runs, survey = (f"{value}" for value in PAPER.get((trial, method), ("", "")))
-            errors = [flight.error("survey", trial, method, "truth_total_field") for flight in good]
-            two.add_row(
-                name,
-                runs,
-                f"{np.median([flight.rms(trial, trial, method) for flight in good]):.1f}",
-                survey,
-                f"{np.median([flight.rms('survey', trial, method) for flight in good]):.1f}",
-                f"{np.median([np.sqrt(np.mean(error**2)) for error in errors]):.1f}",
-                f"{np.median([np.std(error) for error in errors]):.1f}",
-                " to ".join(
-                    f"{np.median([flight.scales[trial, method][end] for flight in good]):.2f}"
-                    for end in (0, 1)
-                ),
-            )
+            on_runs, on_survey, error, spread, scales = _medians(good, trial, method)
+            two.add_row(name, runs, on_runs, survey, on_survey, error, spread, scales)
         two.add_section()
-    console.print(two)
+    return two
+
+
+def _medians(good: list[Trials], trial: str, method: str) -> tuple[str, ...]:
+    """Return RMS on runs and survey, the error's RMS and standard deviation, and the range of the scales."""
+    errors = [flight.error("survey", trial, method, "truth_total_field") for flight in good]
+    figures = (
+        [flight.rms(trial, trial, method) for flight in good],
+        [flight.rms("survey", trial, method) for flight in good],
+        [np.sqrt(np.mean(error**2)) for error in errors],
+        [np.std(error) for error in errors],
+    )
+    ends = [np.median([flight.scales[trial, method][end] for flight in good]) for end in (0, 1)]
+    return *(f"{np.median(values):.1f}" for values in figures), " to ".join(f"{end:.2f}" for end in ends)
+
+
+def tables(flights: list[Trials], console: Console) -> None:
+    """Print the paper's tables beside the twin's."""
+    console.print(table_1(flights[0]))
+    console.print(table_2(flights))
     surveys = [flight.parts["survey"] for flight in flights]
     off = np.median([np.sqrt(np.mean((s["truth_total_field"] - s["reference_field"]) ** 2)) for s in surveys])
     console.print(
-        f"The reference itself is {off:.0f} nT RMS off on the survey: the map was made from 90 m up. What it is off where the\n"
-        "spirals were flown, a calibration takes for the field: the mean of its error. Scales are A's on the runs: a\n"
-        "fit that shrinks the field shrinks its errors, and every anomaly with them."
+        f"The reference itself is {off:.0f} nT RMS off on the survey, because the map was made from 90 m up. A calibration\n"
+        "takes the map's mean error over the spirals for field. Scales are those of A on the runs: a fit that shrinks\n"
+        "the field shrinks its errors, and every anomaly with them."
     )
 
 

@@ -17,6 +17,7 @@ from threadpoolctl import threadpool_limits
 from magbridge.calibration.correct import CHUNK, Corrector, correct
 from magbridge.calibration.fitting.data import Observations, observations, polynomial_samples
 from magbridge.calibration.fitting.fit import fit
+from magbridge.calibration.kernel import Kernel
 from magbridge.calibration.residual import residuals_of
 from magbridge.calibration.terms import full_order
 from sitl import load, segments, simulate
@@ -62,82 +63,90 @@ def fitting(folder: Path, repetitions: int) -> list[Row]:  # noqa: ARG001  (the 
     ]  # fmt: skip
 
 
+class Floors:
+    """The products within `correct`, without anything around them.
+
+    Parameters
+    ----------
+    kernel : Kernel
+    positions : (n, k) array
+        Of the masses.
+    """
+
+    def __init__(self, kernel: Kernel, positions: np.ndarray) -> None:
+        self.kernel = kernel
+        self.phi = np.ascontiguousarray(kernel.monomials_of(positions).T)
+        self.table = np.ascontiguousarray((kernel.coarse + kernel.fine).T)
+
+    def product(self, piece: int) -> None:
+        """One product of monomials and table, in pieces of so many samples."""
+        kernel = self.kernel
+        for start in range(0, len(self.phi), piece):
+            part = self.phi[start : start + piece]
+            (part[:, kernel.first] * part[:, kernel.second]) @ self.table
+
+    def contained(self) -> None:
+        """The products as `correct` has them: three, because coarse and fine parts make them exact."""
+        kernel = self.kernel
+        for start in range(0, len(self.phi), CHUNK):
+            part = self.phi[start : start + CHUNK]
+            psi = (part[:, kernel.first] * part[:, kernel.second]).T
+            for table in (kernel.fine, kernel.coarse, kernel.coarse):
+                table @ psi
+
+
 def correcting(folder: Path, repetitions: int) -> list[Row]:  # noqa: ARG001
     """Time `correct` where every sample has other positions, where they stand still, and one by one."""
     data = table_1()
     calibration = fit(data).calibration
-    kernel = calibration.kernel
     rng = np.random.default_rng(1)
-    n = 200_000
+    n, few = 200_000, 2000
     field = data.field[rng.integers(0, len(data), n)]
     moving = rng.uniform(data.parameters.min(axis=0), data.parameters.max(axis=0), (n, 2))
     still = np.repeat(moving[::200], 200, axis=0)
     when = np.arange(n) * 4.0
-    phi = np.ascontiguousarray(kernel.monomials_of(moving).T)
-    table = np.ascontiguousarray((kernel.coarse + kernel.fine).T)
-    values = moving[:2000].tolist()
-    readings = [(x, y, z) for x, y, z in field[:2000].tolist()]
+    floors = Floors(calibration.kernel, moving)
+    values = moving[:few].tolist()
+    readings = [(x, y, z) for x, y, z in field[:few].tolist()]
 
-    def product(piece: int) -> None:
-        for start in range(0, n, piece):
-            part = phi[start : start + piece]
-            (part[:, kernel.first] * part[:, kernel.second]) @ table
-
-    def contained() -> None:
-        """The products as `correct` has them: three, because coarse and fine parts make them exact."""
-        for start in range(0, n, CHUNK):
-            part = phi[start : start + CHUNK]
-            psi = (part[:, kernel.first] * part[:, kernel.second]).T
-            for table_part in (kernel.fine, kernel.coarse, kernel.coarse):
-                table_part @ psi
-
-    def live(held: bool) -> None:
+    def live(positions: list[list[float]]) -> None:
         corrector = Corrector(calibration)
-        for reading, value in zip(readings, [values[0]] * len(values) if held else values, strict=True):
+        for reading, value in zip(readings, positions, strict=True):
             corrector.step(0, reading, value)
 
-    found: dict[str, list[float]] = {
-        "bare": [],
-        "pieces": [],
-        "contained": [],
-        "moving": [],
-        "still": [],
-        "live": [],
-        "live held": [],
+    work: dict[str, tuple[Callable[[], object], int]] = {
+        "bare": (lambda: floors.product(n), n),
+        "pieces": (lambda: floors.product(CHUNK), n),
+        "contained": (floors.contained, n),
+        "moving": (lambda: correct(calibration, field, moving, when), n),
+        "still": (lambda: correct(calibration, field, still, when), n),
+        "live": (lambda: live(values), few),
+        "live held": (lambda: live([values[0]] * few), few),
     }
+    found: dict[str, list[float]] = {name: [] for name in work}
     with threadpool_limits(1):
         for _ in range(repetitions):
-            found["bare"].append(1e6 * processor_time(lambda: product(n)) / n)
-            found["pieces"].append(1e6 * processor_time(lambda: product(CHUNK)) / n)
-            found["contained"].append(1e6 * processor_time(contained) / n)
-            found["moving"].append(
-                1e6 * processor_time(lambda: correct(calibration, field, moving, when)) / n
-            )
-            found["still"].append(1e6 * processor_time(lambda: correct(calibration, field, still, when)) / n)
-            found["live"].append(1e6 * processor_time(lambda: live(held=False)) / len(values))
-            found["live held"].append(1e6 * processor_time(lambda: live(held=True)) / len(values))
-    floor = (
-        f"{table.shape[0]} products of monomials @ {table.shape[0]} x {table.shape[1]} table, on whole arrays"
-    )
+            for name, (job, samples) in work.items():
+                found[name].append(1e6 * processor_time(job) / samples)
+
+    def beside(what: str, floor: str, said: str, **target: float) -> Row:
+        ratio = median(b / a for a, b in zip(found["moving"], found[floor], strict=True))
+        return Row(what, median(found["moving"]), "us", median(found[floor]), said, ratio=ratio, **target)
+
+    rows, columns = floors.table.shape
+    bare = f"{rows} products of monomials @ {rows} x {columns} table, on whole arrays"
     return [
-        Row("correct, sigmas and all, positions new with every sample", median(found["moving"]), "us",
-            median(found["bare"]), floor, least=0.5,
-            ratio=median(b / a for a, b in zip(found["moving"], found["bare"], strict=True))),
-        Row(
-            "the same, the product in pieces that stay in the cache",
-            median(found["moving"]),
-            "us",
-            median(found["pieces"]),
-            "as above, in pieces",
-            ratio=median(b / a for a, b in zip(found["moving"], found["pieces"], strict=True)),
+        beside("correct, sigmas and all, positions new with every sample", "bare", bare, least=0.5),
+        beside("the same, the product in pieces that stay in the cache", "pieces", "as above, in pieces"),
+        beside(
+            "the same, beside all three products that it contains",
+            "contained",
+            "coarse and fine parts, in pieces",
         ),
-        Row("the same, beside all three products that it contains", median(found["moving"]), "us",
-            median(found["contained"]), "coarse and fine parts, in pieces",
-            ratio=median(b / a for a, b in zip(found["moving"], found["contained"], strict=True))),
         Row("correct, positions held", median(found["still"]), "us"),
         Row("one sample live, positions held", median(found["live held"]), "us"),
         Row("one sample live, positions new", median(found["live"]), "us"),
-    ]  # fmt: skip
+    ]
 
 
 def table_1(noise: float = 1.0) -> Observations:
