@@ -93,7 +93,9 @@ def test_a_flat_map_is_recognised(study, options):
         "findings"
     ]
     assert "the field carries no information for" in findings
-    assert "the map is flat there (0.2 nT rms, where calibration and map are known to 1.4 nT)" in findings
+    assert (
+        "the map is flat there (0.2 nT RMS, where calibration and map are known only to 1.4 nT)" in findings
+    )
 
 
 def test_a_map_that_the_vehicle_leaves_is_said(ds, grid, options):

@@ -98,7 +98,7 @@ def test_a_log_that_breaks_off_is_the_same_as_far_as_it_goes_and_no_further(
         assert run["first_difference"] in (None, run["bytes"])
         assert run["beyond"] < 1000
         assert run["identical"] == (not run["beyond"])
-        assert ("as far as the log goes" in tell({"runs": [run]})) == bool(run["beyond"])
+        assert ("to the end of the log" in tell({"runs": [run]})) == bool(run["beyond"])
 
 
 def test_another_configuration_is_told_apart(survey: Path, tmp_path: Path) -> None:
@@ -131,7 +131,7 @@ def test_a_replay_finds_its_way_by_the_field(tmp_path: Path, motion: str) -> Non
     result = replay([tmp_path / "log.nc"], path)
     assert sum(result["navigation"].values()) > 100
     assert not {"off", "lost"} & set(result["navigation"])
-    assert "updates of the position" in tell(result)
+    assert "position updates" in tell(result)
 
 
 def test_a_velocity_is_told_as_a_track() -> None:
