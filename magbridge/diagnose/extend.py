@@ -16,8 +16,9 @@ from magbridge.calibration.model import Calibration
 from magbridge.calibration.residual import residuals, residuals_of
 from magbridge.calibration.terms import Effect
 from magbridge.diagnose.causes.candidates import Candidate, slices
+from magbridge.diagnose.compare.columns import Columns
 from magbridge.diagnose.compare.derivatives import derivatives
-from magbridge.diagnose.compare.problem import DELAYS, Columns, Problem, samples_of
+from magbridge.diagnose.compare.problem import DELAYS, Problem, samples_of
 from magbridge.diagnose.compare.survey import Survey
 from magbridge.diagnose.inference.joint import Joint, fit_joint
 from magbridge.diagnose.inference.weigh import IDEAL

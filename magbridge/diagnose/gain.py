@@ -23,7 +23,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from magbridge.diagnose.compare.problem import Columns, Problem
+from magbridge.diagnose.compare.columns import Columns
+from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.design import Design, kept
 from magbridge.diagnose.inference.joint import Joint
 

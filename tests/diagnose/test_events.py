@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magbridge.diagnose.causes.masses import actuator_order, hysteresis
-from magbridge.diagnose.compare.problem import Columns, Problem
+from magbridge.diagnose.compare.columns import Columns
+from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.events import MOMENTS, passage, step
 from magbridge.diagnose.inference.free import descriptions
 from magbridge.diagnose.inference.joint import fit_joint

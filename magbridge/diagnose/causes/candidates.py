@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magbridge.calibration.terms import Effect
-from magbridge.diagnose.compare.problem import Columns, Problem, effect_columns, history
+from magbridge.diagnose.compare.columns import Columns, together
+from magbridge.diagnose.compare.problem import Problem, effect_columns, history
 
 __all__ = ["AXES", "Candidate", "of_effect", "of_reference", "per", "slices"]
 
@@ -94,7 +95,7 @@ class Candidate:
         mark = "" if set(taken).isdisjoint(other.names) else f" ({number})"
         return replace(
             self,
-            columns=lambda rows: np.hstack([part.columns(rows) for part in parts]),
+            columns=together([part.columns for part in parts]),
             width=np.concatenate([part.width for part in parts]),
             names=self.names + tuple(name + mark for name in other.names),
             units=self.units + other.units,
@@ -128,16 +129,17 @@ def of_effect(
     channel: str | None = None,
     names: tuple[str, ...] = (),
     phi: FloatArray | Callable[[slice], FloatArray] | None = None,
+    origin: float = 0.0,
     **more: Any,
 ) -> Candidate:
-    """Make a candidate of an effect; its regressors are stepped through where `phi` does not give them.
+    """Make a candidate of an effect; its regressors are stepped through where `phi`, less `origin`, does not give them.
 
     `unit` is that of all its numbers, or one for each of as many equal parts.
     """
     if phi is None:
         phi = history(problem.survey, problem.calibration, effect)
     widths = np.broadcast_to(np.asarray(width, float), effect.size)
-    bare = effect_columns(problem, effect, phi)
+    columns = effect_columns(problem, effect, phi, origin).times(widths)
     cause: str = effect.cause  # type: ignore[attr-defined]
     if not names:
         powers = effect.size // 3
@@ -146,9 +148,7 @@ def of_effect(
         )
     parts = (unit,) if isinstance(unit, str) else unit
     units = tuple(part for part in parts for _ in range(effect.size // len(parts)))
-    return Candidate(
-        cause, channel, lambda rows: bare(rows) * widths, widths, names, units, (effect,), **more
-    )  # fmt: skip
+    return Candidate(cause, channel, columns, widths, names, units, (effect,), **more)
 
 
 def of_reference(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import wraps
+from itertools import pairwise
 from typing import TypeVar
 from weakref import WeakKeyDictionary
 
@@ -17,6 +18,7 @@ __all__ = ["lagged", "once", "play", "powers"]
 
 FloatArray = NDArray[np.float64]
 T = TypeVar("T")
+Number = TypeVar("Number", np.float64, np.complex128)
 
 
 def once(made: Callable[[Problem], T]) -> Callable[[Problem], T]:
@@ -85,6 +87,10 @@ def play(values: FloatArray, width: float) -> FloatArray:
     return low
 
 
-def powers(x: FloatArray, order: int) -> FloatArray:
+def powers(x: NDArray[Number], order: int) -> NDArray[Number]:
     """(order, n) x, x^2, ... by multiplication: beyond a square numpy asks ``pow()``, a hundred times as slow."""
-    return np.multiply.accumulate(np.broadcast_to(x, (order, *np.shape(x))))
+    out = np.empty((order, *np.shape(x)), x.dtype)
+    out[0] = x
+    for lower, higher in pairwise(out):
+        np.multiply(lower, x, out=higher)
+    return out

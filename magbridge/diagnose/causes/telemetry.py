@@ -35,13 +35,14 @@ def _origins(problem: Problem, name: str) -> list[float]:
 
 
 @once
-def _levels(problem: Problem) -> Callable[[str, float], FloatArray]:
+def _levels(problem: Problem) -> Callable[[str, float], Callable[[slice], FloatArray]]:
     """Temperatures behind their lags: of a month each is 5 MB, and origins and causes share it."""
     survey = problem.survey  # what is kept for a problem must not keep the problem
 
     @lru_cache(len(LAGS) * len(channels_of(problem, "temperature")))
-    def level(name: str, lag: float) -> FloatArray:
-        return lagged(survey.time, survey.channels[name].values, lag, STAGES)
+    def level(name: str, lag: float) -> Callable[[slice], FloatArray]:
+        values = lagged(survey.time, survey.channels[name].values, lag, STAGES)
+        return lambda rows: values[None, rows]
 
     return level
 
@@ -64,10 +65,9 @@ def _warmed(
         effect = ChannelEffect(
             cause=f"temperature_{on}", channel=name, origin=origin, lag=lag, stages=STAGES, on=on
         )
-        phi = _levels(problem)(name, lag)
         return of_effect(
             problem, effect, 5.0, unit, channel=name, shape={"origin": (origin, "degC"), "lag": (lag, "s")},
-            again=again, phi=lambda rows: phi[None, rows] - origin,
+            again=again, phi=_levels(problem)(name, lag), origin=origin,
         )  # fmt: skip
 
     return [again(origin, lag) for origin in _origins(problem, name) for lag in lags]

@@ -20,12 +20,12 @@ def derivatives(calibration: Calibration, samples: Samples, g: FloatArray, L: Fl
     """(n, q): derivatives of the residual by all the calibration's coefficients, times L (K, q), in bounded memory."""
     tensor = _tensor(calibration)
     M = np.tensordot(L.T, tensor, 1).reshape(L.shape[1], -1).T
-    out = np.empty((len(g), L.shape[1]))
+    out = np.empty((L.shape[1], len(g)))
     for start in range(0, len(g), CHUNK):
         rows = slice(start, start + CHUNK)
         outer = samples.phi[rows, :, None] * g[rows, None, :]
-        out[rows] = outer.reshape(len(outer), -1) @ M
-    return out
+        out[:, rows] = (outer.reshape(len(outer), -1) @ M).T
+    return out.T
 
 
 def _tensor(calibration: Calibration) -> FloatArray:

@@ -30,13 +30,13 @@ from magbridge.calibration.correct import regressors
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.residual import Samples, residuals
 from magbridge.calibration.terms import Effect
+from magbridge.diagnose.compare.columns import Mixture
 from magbridge.diagnose.compare.derivatives import CHUNK, derivatives
 from magbridge.diagnose.compare.interpolation import bent
 from magbridge.diagnose.compare.prior import level, loosened, prior
 from magbridge.diagnose.compare.survey import Survey
 
 __all__ = [
-    "Columns",
     "Problem",
     "add_effects",
     "effect_columns",
@@ -46,8 +46,6 @@ __all__ = [
 ]
 
 FloatArray = NDArray[np.float64]
-Columns = Callable[[slice], FloatArray]
-"""Rows -> (m, k): what one unit of each of k coefficients leaves in the residual."""
 
 DELAY = 0.3
 """s, 1-sigma of a channel's, after its row."""
@@ -140,20 +138,45 @@ def history(survey: Survey, calibration: Calibration, effect: Effect) -> FloatAr
     return np.array([step(*row) for row in rows]).T
 
 
+@dataclass(frozen=True)
+class Products:
+    """Functions of time times slopes: what columns of effects are made of.
+
+    Attributes
+    ----------
+    problem : Problem
+    phi : callable or None
+        Rows -> (r, m) functions; 1 if there is none.
+    pairs : tuple of (int, int)
+        Of each column its function, and the slope's slot.
+    """
+
+    problem: Problem
+    phi: Callable[[slice], FloatArray] | None
+    pairs: tuple[tuple[int, int], ...]
+
+    def __call__(self, rows: slice) -> FloatArray:
+        """(m, pairs) these rows."""
+        functions, slots = (list(own) for own in zip(*self.pairs, strict=True))
+        slopes = self.problem.slopes.T[slots, rows]
+        return np.asarray(slopes if self.phi is None else self.phi(rows)[functions] * slopes).T
+
+
 def effect_columns(
-    problem: Problem, effect: Effect, phi: FloatArray | Callable[[slice], FloatArray]
-) -> Columns:
-    """Return what an effect's coefficients leave, from its regressors (r, n) or a function of the rows."""
-    tensor = effect.columns(problem.calibration.reference.field)
-    slots = np.flatnonzero(np.abs(tensor).sum(axis=(0, 1)))
-    tensor = tensor[:, :, slots]
+    problem: Problem, effect: Effect, phi: FloatArray | Callable[[slice], FloatArray], origin: float = 0.0
+) -> Mixture:
+    """Return what an effect's coefficients leave, from its regressors less `origin`: (r, n), or a function of the rows."""
+    tensor = -effect.columns(problem.calibration.reference.field)
+    pairs = [(int(r), int(s)) for r, s in np.argwhere(tensor.any(axis=0))]
+    M = np.stack([tensor[:, r, s] for r, s in pairs])
+    made = Products(problem, phi if callable(phi) else _rows(phi), tuple(pairs))
+    if not origin:
+        return Mixture(((made, M),))
+    return Mixture(((made, M), (Products(problem, None, tuple(pairs)), -origin * M)))
 
-    def columns(rows: slice) -> FloatArray:
-        part = phi(rows) if callable(phi) else phi[:, rows]
-        slopes = problem.slopes[rows][:, slots]
-        return np.asarray(-sum((phi_r[:, None] * slopes) @ tensor[:, r].T for r, phi_r in enumerate(part)))
 
-    return columns
+def _rows(phi: FloatArray) -> Callable[[slice], FloatArray]:
+    return lambda rows: phi[:, rows]
 
 
 def samples_of(survey: Survey, calibration: Calibration) -> tuple[Samples, FloatArray]:
@@ -172,7 +195,7 @@ def pose(survey: Survey, calibration: Calibration) -> Problem:
     """Linearise the comparison about `calibration`."""
     samples, coefficients = samples_of(survey, calibration)
     n = len(survey)
-    e, g, gain, reading = np.empty(n), np.empty((n, 9)), np.empty(n), np.empty((n, 3))
+    e, g, gain, reading = np.empty(n), np.empty((9, n)).T, np.empty(n), np.empty((n, 3))
     for start in range(0, n, CHUNK):
         rows = slice(start, start + CHUNK)
         part = samples.part(rows)

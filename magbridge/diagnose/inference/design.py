@@ -2,32 +2,40 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from magbridge.diagnose.compare.problem import Columns, Problem
+from magbridge.diagnose.compare.columns import Columns, beside
+from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.noise import Noise
 
-__all__ = ["Design", "kept", "normal"]
+__all__ = ["Design", "in_threads", "kept", "normal"]
 
 FloatArray = NDArray[np.float64]
+S = TypeVar("S")
+T = TypeVar("T")
 
 CHUNK = 2048
 """Rows that are whitened at a time, to stay near the processor."""
 KEPT = 25_000_000
 """Numbers that are kept of columns: 200 MB."""
-THREADS, LONG = 2, 16
-"""Threads that share the pieces of a log, and pieces from which on it is worth the while."""
+THREADS, LONG = 2, 32768
+"""Threads that share what is done to a log, and rows beyond which it is worth the while."""
 
 
 def kept(n: int, columns: Sequence[Columns]) -> list[Columns]:
     """Return the columns of n rows made once for all; what would fill the memory is made anew each time."""
     if n * sum(column(slice(0, 1)).shape[1] for column in columns) > KEPT:
         return list(columns)
-    return [np.concatenate([column(rows) for rows in _pieces(n)]).__getitem__ for column in columns]
+
+    def whole(column: Columns) -> FloatArray:
+        return np.concatenate([column(rows).T for rows in _pieces(n)], axis=1).T
+
+    return [made.__getitem__ for made in in_threads(n, whole, columns)]
 
 
 def _pieces(n: int) -> list[slice]:
@@ -54,20 +62,22 @@ class Design:
 
     def rows(self, rows: slice) -> FloatArray:
         """(m, q + k) rows of all columns."""
-        return np.hstack([self.free[rows], *(column(rows) for column in self.columns)])
+        return beside([self.free[rows], *(column(rows) for column in self.columns)])
 
     def times(self, c: FloatArray) -> FloatArray:
         """(n,) what the coefficients c (q + k,) leave."""
-        out = np.asarray(self.free @ c[: self.free.shape[1]])
-        for own, column in zip(self.at, self.columns, strict=True):
-            for rows in self.pieces:
-                out[rows] += column(rows) @ c[own]
-        return out
+
+        def piece(rows: slice) -> FloatArray:
+            out = np.asarray(self.free[rows] @ c[: self.free.shape[1]])
+            for own, column in zip(self.at, self.columns, strict=True):
+                out += column(rows) @ c[own]
+            return out
+
+        return np.concatenate(in_threads(len(self.free), piece, self.pieces))
 
     def against(self, y: FloatArray) -> FloatArray:
         """(q + k,) ``X^T y``."""
-        effects = [sum(column(rows).T @ y[rows] for rows in self.pieces) for column in self.columns]
-        return np.concatenate([self.free.T @ y, *effects])
+        return np.asarray(sum(in_threads(len(y), lambda rows: self.rows(rows).T @ y[rows], self.pieces)))
 
 
 def normal(X: Columns, y: FloatArray, noise: Noise | None = None) -> tuple[FloatArray, FloatArray]:
@@ -91,9 +101,14 @@ def normal(X: Columns, y: FloatArray, noise: Noise | None = None) -> tuple[Float
         return P, b
 
     starts = range(0, len(y), CHUNK)
-    if len(starts) < LONG:
-        return share(starts)
-    each = -(-len(starts) // THREADS)
-    with ThreadPoolExecutor(THREADS) as pool:
-        parts = list(pool.map(share, [starts[k : k + each] for k in range(0, len(starts), each)]))
+    each = -(-len(starts) // THREADS) if len(y) > LONG else len(starts)
+    parts = in_threads(len(y), share, [starts[k : k + each] for k in range(0, len(starts), each)])
     return sum((P for P, _ in parts), start=np.zeros(())), sum((b for _, b in parts), start=np.zeros(()))
+
+
+def in_threads(n: int, function: Callable[[S], T], given: Iterable[S]) -> list[T]:
+    """Return what a function of all rows makes of each that is given; of a long log's n rows in threads."""
+    if n <= LONG:
+        return [function(one) for one in given]
+    with ThreadPoolExecutor(THREADS) as pool:
+        return list(pool.map(function, given))

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from magbridge.diagnose.compare.problem import Columns, Problem
+from magbridge.diagnose.compare.columns import Columns, beside
+from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.joint import Joint
 
 __all__ = ["passage", "step"]
@@ -41,7 +42,7 @@ def step(problem: Problem, fit: Joint) -> tuple[Columns, float]:
     G, b = np.zeros((pieces, q + 3, q + 3)), np.zeros((pieces, 3))
     for k, (start, end) in enumerate(pairwise(edges)):
         first = max(start - past, 0)
-        X = np.hstack([problem.free[first:end], body[first:end]])
+        X = beside([problem.free[first:end], body[first:end]])
         X = fit.noise.filter(X, first, start - first)
         G[k], b[k] = X.T @ X, X[:, q:].T @ y[start:end]
     # sums from each moment on; the first is that of the whole log
@@ -70,7 +71,7 @@ def passage(problem: Problem, fit: Joint) -> tuple[Columns, float]:
     Actuators A 102:67).
     """
     t = problem.survey.time - problem.survey.time[0]
-    gain = fit.noise.filter(problem.gain[:, None])[:, 0]
+    gain = fit.noise.whiten(problem.gain)
     with_y, own = gain * fit.noise.response(fit.left), gain * gain
     shape = _passing(QUARTERS / 4.0)
     pairs = np.einsum("ik,jk->ijk", shape, shape).reshape(9, -1)

@@ -9,9 +9,9 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from scipy.special import gammaln
 
+from magbridge.diagnose.compare.columns import Columns
 from magbridge.diagnose.compare.derivatives import CHUNK
 from magbridge.diagnose.compare.past import Past
-from magbridge.diagnose.compare.problem import Columns
 from magbridge.diagnose.inference.noise import Noise, Predictors
 
 __all__ = ["LONGEST", "TAILS", "certainty", "fit_noise", "memory_order"]
@@ -139,9 +139,8 @@ def fit_noise(
     for _ in range(rounds):
         if whole.sum() > 2 * order:
             memory = _stable(_regressed(lags, residual, whole * weight / scale**2))
-        v = residual - lags @ memory
         beside_gaps = Predictors(past, memory)
-        v[past.rows] = beside_gaps.whitened(residual)[1]
+        v = beside_gaps.innovations(residual)
         if blocks is None:
             blocks = _uneven(v, count)
         before = log_likelihood

@@ -12,7 +12,8 @@ from magbridge.calibration.followers import ClockEffect
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.causes.regressors import play, powers
 from magbridge.diagnose.causes.timing import field_rates, mass_rates
-from magbridge.diagnose.compare.problem import Columns, Problem, effect_columns
+from magbridge.diagnose.compare.columns import Columns
+from magbridge.diagnose.compare.problem import Problem, effect_columns
 from magbridge.diagnose.inference.events import passage, step
 from magbridge.diagnose.inference.joint import Joint
 from magbridge.diagnose.inference.packets import packets
@@ -88,7 +89,7 @@ def descriptions(problem: Problem, fit: Joint, tone: Candidate | None = None) ->
     """
     body = -problem.slopes[:, 6:]
     u = problem.survey.time - problem.survey.time[0]
-    u = np.pi * u / max(float(u[-1]), 1.0)
+    turning = np.exp(1j * np.pi * u / max(float(u[-1]), 1.0))
     rates, fresh = field_rates(problem), ~problem.survey.learned
 
     def projected(basis: Columns) -> Columns:
@@ -96,12 +97,12 @@ def descriptions(problem: Problem, fit: Joint, tone: Candidate | None = None) ->
 
         def columns(rows: slice) -> FloatArray:
             part = basis(rows)
-            return np.asarray((part[:, :, None] * body[rows, None, :]).reshape(len(part), -1))
+            return (part.T[:, None] * body.T[:, rows]).reshape(-1, len(part)).T
 
         return columns
 
     def waves(count: int) -> Columns:
-        return lambda rows: np.cos(u[rows, None] * np.arange(1, count + 1))
+        return lambda rows: powers(turning[rows], count).real.T
 
     since, moments = step(problem, fit)
     passing, times = passage(problem, fit)
@@ -171,18 +172,19 @@ def _direction(body: FloatArray) -> Columns:
     def columns(rows: slice) -> FloatArray:
         part = unit[rows].T
         table = np.concatenate([np.ones((1, *part.shape)), powers(part, 4)])
-        return np.stack([table[i, 0] * table[j, 1] * table[k, 2] for i, j, k in exponents], axis=1)
+        return np.stack([table[i, 0] * table[j, 1] * table[k, 2] for i, j, k in exponents]).T
 
     return columns
 
 
 def _response(reading: FloatArray, slopes: FloatArray) -> Columns:
     """Each channel's error as any smooth function of its own reading: Chebyshev polynomials."""
-    angle = np.stack([np.arccos(np.clip(_scaled(x), -1.0, 1.0)) for x in reading.T], axis=1)
+    x = np.clip([_scaled(channel) for channel in reading.T], -1.0, 1.0)
+    turning = x + 1j * np.sqrt(1.0 - x**2)  # by the angle whose cosine is x
 
     def columns(rows: slice) -> FloatArray:
-        waves = np.cos(angle[rows, :, None] * np.arange(1, BEND + 1))
-        return np.asarray((slopes[rows, :, None] * waves).reshape(len(waves), -1))
+        waves = powers(turning[:, rows], BEND).real.swapaxes(0, 1)
+        return (slopes.T[:, None, rows] * waves).reshape(3 * BEND, -1).T
 
     return columns
 
@@ -224,7 +226,8 @@ def _repeated(problem: Problem) -> Columns:
     # a long last one is no reason to stretch the others
     usual = max(float(np.median([since[end - 1] for end in [*start[1:], len(dive)]])), 1.0)
     u = np.minimum(since / usual, 1.0)
-    return _centred(lambda rows: np.cos(np.pi * u[rows, None] * np.arange(1, REPEATED + 1)))
+    turning = np.exp(1j * np.pi * u)
+    return _centred(lambda rows: powers(turning[rows], REPEATED).real.T)
 
 
 def _ends(down: FloatArray) -> Columns:
@@ -234,7 +237,7 @@ def _ends(down: FloatArray) -> Columns:
     for slope in SLOPES:
         last = np.maximum.accumulate(np.where(np.abs(down) > slope, place, 0))
         ends.append(np.sign(down[last]))
-    return _centred(lambda rows: np.stack([end[rows] for end in ends], axis=1))
+    return _centred(lambda rows: np.stack([end[rows] for end in ends]).T)
 
 
 def _centred(columns: Columns) -> Columns:

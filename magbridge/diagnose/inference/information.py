@@ -14,8 +14,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 
-from magbridge.diagnose.compare.problem import Columns, Problem
+from magbridge.diagnose.compare.columns import Columns, beside, together
+from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.design import normal
 from magbridge.diagnose.inference.joint import Joint
 from magbridge.diagnose.inference.noise import Noise
@@ -70,12 +72,15 @@ class Information:
 
 def information(problem: Problem, noise: Noise, base: Joint, columns: Sequence[Columns]) -> Information:
     """Sum up the information of columns at the hypothesis `base` under `noise`, only the calibration projected out."""
-    q = problem.free.shape[1]
+    q, own = problem.free.shape[1], together(columns).parts
     G, b = normal(
-        lambda rows: np.hstack([problem.free[rows], *(column(rows) for column in columns)]),
+        lambda rows: beside([problem.free[rows], *(X(rows) for X, _ in own)]),
         noise.response(base.left),
         noise,
     )
     pull = base.prior[:q] * (problem.centre - base.z)
-    K: FloatArray = np.asarray(np.linalg.solve(G[:q, :q] + np.diag(base.prior[:q]), G[:q, q:]), float)
-    return Information(G[q:, q:] - G[q:, :q] @ K, b[q:] - K.T @ (b[:q] + pull), K)
+    K = np.linalg.solve(G[:q, :q] + np.diag(base.prior[:q]), G[:q, q:])
+    M = csr_array(np.concatenate([M for _, M in own]))
+    return Information(
+        M.T @ (G[q:, q:] - G[q:, :q] @ K) @ M, M.T @ (b[q:] - K.T @ (b[:q] + pull)), np.asarray(K @ M)
+    )

@@ -14,7 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from magbridge.diagnose.compare.problem import Columns, Problem
+from magbridge.diagnose.compare.columns import Columns
+from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.design import Design, kept, normal
 from magbridge.diagnose.inference.fit_noise import fit_noise
 from magbridge.diagnose.inference.noise import Noise

@@ -18,7 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magbridge.diagnose.causes.candidates import Candidate
-from magbridge.diagnose.compare.problem import Columns, Problem
+from magbridge.diagnose.compare.columns import Columns
+from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.information import information
 from magbridge.diagnose.inference.joint import Joint
 

@@ -26,10 +26,9 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.lib.stride_tricks import as_strided
+from numpy.lib.stride_tricks import as_strided, sliding_window_view
 from numpy.typing import NDArray
 from scipy.signal import lfilter, lfiltic
-from scipy.sparse import csr_array
 
 from magbridge.diagnose.compare.past import FAR, Past
 
@@ -85,12 +84,12 @@ class Noise:
         return Predictors(self.past, self.memory)
 
     def filter(self, values: FloatArray, start: int = 0, skip: int = 0) -> FloatArray:
-        """Whiten columns for least squares.
+        """Whiten columns for least squares: they times a band matrix, band by band.
 
         Parameters
         ----------
         values : (m, k) array
-            Rows `start` and on of the whole.
+            Rows `start` and on of the whole, best stored column by column.
         start : int
         skip : int
             Rows at the beginning that serve as the past only.
@@ -98,13 +97,40 @@ class Noise:
         Returns
         -------
         (m - skip, k) array
+            Stored column by column.
         """
-        rows = slice(start + skip, start + len(values))
-        out = _filtered(values, self.memory, skip)
-        own, whitened = self.beside_gaps.whitened(values, start, skip)
-        out[own] = whitened
-        out *= (np.sqrt(self.kappa) / self.scale[rows])[:, None]
-        return out
+        p, k, own = len(self.memory), values.shape[1], len(values) - skip
+        count = -(-own // BAND)
+        V = np.asfortranarray(values).T[:, max(skip - p, 0) :]
+        lacking = max(p - skip, 0), BAND * count - own
+        if any(lacking):
+            V = np.pad(V, ((0, 0), lacking))
+        weights = np.zeros((BAND * count, p + 1))
+        weights[:own] = self._weights(slice(start + skip, start + len(values)))
+        bands = np.zeros((count, BAND + p, BAND))
+        band, row, each = bands.strides
+        diagonals = as_strided(bands, (count, BAND, p + 1), (band, row + each, row))
+        diagonals[...] = weights[:, ::-1].reshape(diagonals.shape)
+        out = np.empty((k, BAND * count))
+        pieces, filtered = (
+            as_strided(x, (count, k, wide), (BAND * each, x.strides[0], each))
+            for x, wide in ((V, BAND + p), (out, BAND))
+        )
+        np.matmul(pieces, bands, out=filtered)
+        return out[:, :own].T
+
+    def _weights(self, rows: slice) -> FloatArray:
+        """(m, p + 1) what :meth:`filter` gives to each of `rows` and to those before it."""
+        past, gaps = self.past, self.beside_gaps
+        weights = np.tile(np.append(1.0, -self.memory), (rows.stop - rows.start, 1))
+        some = slice(*np.searchsorted(past.rows, [rows.start, rows.stop]))
+        weights[past.rows[some] - rows.start] = gaps.weights[past.pattern[some]]
+        weights *= (np.sqrt(self.kappa) / self.scale[rows])[:, None]
+        return weights
+
+    def whiten(self, y: FloatArray) -> FloatArray:
+        """(n,) of y (n,): :meth:`filter` of a single column, the whole."""
+        return np.asarray(np.sqrt(self.kappa) * self.beside_gaps.innovations(y) / self.scale)
 
     def back(self, y: FloatArray) -> FloatArray:
         """(n,) of y (n,), filtered backwards: the transpose of :meth:`filter`."""
@@ -122,7 +148,7 @@ class Noise:
     def response(self, residual: FloatArray) -> FloatArray:
         """(n,) y of the module's notes; far from where the noise was fitted, with its weights from there."""
         weight = (self.nu + 1.0) / (self.nu + self.innovations**2)
-        return np.asarray(weight * self.filter(residual[:, None])[:, 0] / self.kappa)
+        return np.asarray(weight * self.whiten(residual) / self.kappa)
 
 
 class Predictors:
@@ -135,7 +161,7 @@ class Predictors:
 
     Attributes
     ----------
-    past : Past
+    past, memory
     a : (l, p) array
         Of each of the patterns of lags.
     f : (l,) array
@@ -144,8 +170,7 @@ class Predictors:
     """
 
     def __init__(self, past: Past, memory: FloatArray) -> None:
-        self.past = past
-        lags = past.lags
+        self.past, self.memory, lags = past, memory, past.lags
         here = lags < FAR
         C = autocovariance(memory, int(lags[here].max(initial=0)))
         self.a, self.f = np.zeros(lags.shape), np.ones(len(lags))
@@ -161,24 +186,16 @@ class Predictors:
             self.f[part] = 1.0 / np.sqrt(np.maximum(C[0] - np.sum(a * c, axis=1), 1.0))
         self.weights = self.f[:, None] * np.hstack([np.ones((len(lags), 1)), -self.a])
 
-    def whitened(
-        self, values: FloatArray, start: int = 0, skip: int = 0
-    ) -> tuple[NDArray[np.intp], FloatArray]:
-        """Rows beside gaps, counted after the first `skip`, and v of each.
-
-        Parameters
-        ----------
-        values : (m, ...) array
-            Rows `start` and on of the whole.
-        start, skip : int
-        """
-        rows, lags = self.past.rows, np.arange(self.past.order + 1)
-        some = slice(*np.searchsorted(rows, [start + skip, start + len(values)]))
-        at, pattern = rows[some] - start, self.past.pattern[some]
-        before = np.maximum(at[:, None] - lags, 0)  # of samples that are not there a is 0
-        ends = lags.size * np.arange(at.size + 1)
-        W = csr_array((self.weights[pattern].ravel(), before.ravel(), ends), (at.size, len(values)))
-        return at - skip, W @ values
+    def innovations(self, residual: FloatArray) -> FloatArray:
+        """(n,) v of a residual (n,)."""
+        past, p = self.past, len(self.memory)
+        # a view of the p samples before each, which takes no memory
+        lags = sliding_window_view(np.append(np.zeros(p), residual), p)[:-1, ::-1]
+        v = np.asarray(residual - lags @ self.memory)
+        # of samples that are not there a is 0
+        own = residual[np.maximum(past.rows[:, None] - np.arange(p + 1), 0)]
+        v[past.rows] = np.einsum("ij,ij->i", self.weights[past.pattern], own)
+        return v
 
 
 def autocovariance(memory: FloatArray, reach: int) -> FloatArray:
@@ -200,23 +217,3 @@ def autocovariance(memory: FloatArray, reach: int) -> FloatArray:
         tail = lfiltic([1.0], np.append(1.0, -memory), C[p:0:-1])
         C[p + 1 :] = lfilter([1.0], np.append(1.0, -memory), np.zeros(reach - p), zi=tail)[0]
     return C[: reach + 1]
-
-
-def _filtered(values: FloatArray, memory: FloatArray, skip: int) -> FloatArray:
-    """``x_t - sum_k a_k x_(t-k)`` of the rows from `skip` on, zero before the first: a band matrix, band by band."""
-    p, k = len(memory), values.shape[1]
-    m = len(values) - skip
-    if skip < p:
-        values, skip = np.vstack([np.zeros((p - skip, k)), values]), p
-    values = np.ascontiguousarray(values[skip - p :])
-    count = m // BAND
-    band = np.zeros((BAND, BAND + p))
-    for lag, a in enumerate(np.append(-1.0, memory)):
-        band[np.arange(BAND), np.arange(BAND) + p - lag] = -a
-    step, each = values.strides
-    pieces = as_strided(values, (count, BAND + p, k), (BAND * step, step, each), writeable=False)
-    out = np.empty((m, k))
-    np.matmul(band, pieces, out=out[: count * BAND].reshape(count, BAND, k))
-    rest = m - count * BAND
-    out[count * BAND :] = band[:rest, : rest + p] @ values[count * BAND :]
-    return out

@@ -18,14 +18,15 @@ evidence, averaged over all places that it could have had, is above one.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.fft import ifft, next_fast_len, rfft
+from scipy.fft import ifft, irfft, next_fast_len, rfft
 
-from magbridge.diagnose.compare.problem import Columns, Problem
+from magbridge.diagnose.compare.columns import Columns
+from magbridge.diagnose.compare.problem import Problem
+from magbridge.diagnose.inference.design import in_threads
 from magbridge.diagnose.inference.joint import Joint
 from magbridge.diagnose.inference.noise import Noise
 from magbridge.diagnose.inference.weigh import weigh
@@ -33,7 +34,6 @@ from magbridge.diagnose.inference.weigh import weigh
 __all__ = ["Packets", "packets"]
 
 FloatArray = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 CYCLES = (0.75, 2.25, 6.75)
 """Q."""
@@ -75,7 +75,7 @@ def packets(problem: Problem, fit: Joint) -> Packets | None:
     slots = problem.survey.slots
     if slots[-1] > SPARSE * len(slots):
         return None
-    places = list(_places(problem, fit))
+    places = _Spectra(problem, fit).places()
     found: list[tuple[float, Places]] = []
     price = 0.0
     while len(found) < MOST:
@@ -118,50 +118,52 @@ def _columns(problem: Problem, found: list[tuple[float, Places]]) -> Columns:
     return columns
 
 
-def _places(problem: Problem, fit: Joint) -> Iterator[Places]:
-    """Yield the places of each period and length where anything is heard."""
-    noise, slots = fit.noise, problem.survey.slots
-    n = int(slots[-1]) + 1
-    finest = 2 ** max(int(np.log2(n)) - 6, 0)
-    whole = finest * next_fast_len(int((1.0 + 3.0 * LONGEST) * n / finest) + 1)
-    G = rfft(np.bincount(slots, problem.gain * noise.back(noise.response(fit.left))), whole)
-    h = problem.gain**2 * noise.kappa / noise.scale**2
-    H = np.array(
-        [rfft(np.bincount(slots, h * some), whole) for some in (noise.past.whole, ~noise.past.whole)]
-    )
-    for Q in CYCLES:
-        # one bandwidth 1 / (2 pi Q) apart
-        count = max(int(2.0 * np.pi * Q * np.log(LONGEST * n / Q / SHORTEST)), 0)
-        for period in SHORTEST * np.exp(np.arange(count) / (2.0 * np.pi * Q)):
-            length = Q * period
-            # so few samples still hold all frequencies below twice its own
-            every = min(2 ** int(np.log2(period / SHORTEST)), finest)
-            f = np.arange(whole // every // 2 + 1) / whole
-            kernel = np.exp(-0.5 * (2.0 * np.pi * length * (f - 1.0 / period)) ** 2)
-            B = _smooth(G, kernel, whole // every) / every
-            # of a packet's own band: Gauss and Hermite's nodes
-            near = 1.0 / period + np.array([-1.0, 0.0, 1.0]) * np.sqrt(1.5) / (2.0 * np.pi * length)
-            seen = _passed(noise, near) @ np.array([1.0, 4.0, 1.0]) / 6.0
-            # real, so the negative frequencies' half is the positive ones'
-            half = np.where(f > 0.0, 1.0, 0.5) * np.exp(-0.25 * (2.0 * np.pi * length * f) ** 2)
-            S = 2.0 * _smooth(seen @ H[:, : len(half)], half, whole // every).real / every
-            # the kernels' own sums: sqrt(2 pi) length, and sqrt(pi) length
-            known = 0.5 * np.sqrt(np.pi) * length * S
-            moment = every * np.arange(-(-n // every))
-            ratio = (2.0 * np.pi * length**2 * np.abs(B) ** 2 / np.maximum(known, 1e-3 * known.max()))[
-                : len(moment)
-            ]
-            heard = np.flatnonzero(ratio > HEARD)
-            if heard.size:
-                share = -float(np.log(len(CYCLES) * count * len(moment)))
-                yield Places(period, length, moment[heard].astype(float), ratio[heard], share)
+class _Spectra:
+    """What a log says of packets: transforms over `whole` intervals, of which the first n are the log's."""
 
+    def __init__(self, problem: Problem, fit: Joint) -> None:
+        noise, slots = fit.noise, problem.survey.slots
+        self.noise, self.n = noise, int(slots[-1]) + 1
+        self.finest = 2 ** max(int(np.log2(self.n)) - 6, 0)
+        self.whole = self.finest * next_fast_len(int((1.0 + 3.0 * LONGEST) * self.n / self.finest) + 1)
+        g = problem.gain * noise.back(noise.response(fit.left))
+        self.G = rfft(np.bincount(slots, g), self.whole)
+        h = problem.gain**2 * noise.kappa / noise.scale**2
+        parts = (noise.past.whole, ~noise.past.whole)
+        self.H = np.array([rfft(np.bincount(slots, h * some), self.whole) for some in parts])
 
-def _smooth(spectrum: ComplexArray, kernel: FloatArray, count: int) -> ComplexArray:
-    """(count,) convolution with a `kernel`, given at the lowest frequencies that are not negative."""
-    out = np.zeros(count, complex)
-    out[: len(kernel)] = spectrum[: len(kernel)] * kernel
-    return np.asarray(ifft(out))
+    def places(self) -> list[Places]:
+        """List the places of each period and length where anything is heard."""
+        asked = []
+        for Q in CYCLES:
+            # one bandwidth 1 / (2 pi Q) apart
+            count = max(int(2.0 * np.pi * Q * np.log(LONGEST * self.n / Q / SHORTEST)), 0)
+            periods = SHORTEST * np.exp(np.arange(count) / (2.0 * np.pi * Q))
+            asked += [(Q, float(period), count) for period in periods]
+        found = in_threads(self.n, lambda one: self._heard(*one), asked)
+        return [own for own in found if own.moment.size]
+
+    def _heard(self, Q: float, period: float, count: int) -> Places:
+        """Places of one period and length; `count` periods are asked for with this Q."""
+        length = Q * period
+        # so few samples still hold all frequencies below twice its own
+        every = min(2 ** int(np.log2(period / SHORTEST)), self.finest)
+        samples = self.whole // every
+        f = np.arange(samples // 2 + 1) / self.whole
+        kernel = np.exp(-0.5 * (2.0 * np.pi * length * (f - 1.0 / period)) ** 2)
+        B = ifft(self.G[: len(f)] * kernel, samples) / every
+        # of a packet's own band: Gauss and Hermite's nodes
+        near = 1.0 / period + np.array([-1.0, 0.0, 1.0]) * np.sqrt(1.5) / (2.0 * np.pi * length)
+        seen = _passed(self.noise, near) @ np.array([1.0, 4.0, 1.0]) / 6.0
+        kernel = np.exp(-0.25 * (2.0 * np.pi * length * f) ** 2)
+        S = irfft(seen @ self.H[:, : len(f)] * kernel, samples) / every
+        # the kernels' own sums: sqrt(2 pi) length, and sqrt(pi) length
+        known = 0.5 * np.sqrt(np.pi) * length * S
+        ratio = 2.0 * np.pi * length**2 * np.abs(B) ** 2 / np.maximum(known, 1e-3 * known.max())
+        moments = -(-self.n // every)
+        heard = np.flatnonzero(ratio[:moments] > HEARD)
+        share = -float(np.log(len(CYCLES) * count * moments))
+        return Places(period, length, (every * heard).astype(float), ratio[heard], share)
 
 
 def _passed(noise: Noise, frequency: FloatArray) -> FloatArray:

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import fdtrc
 
 from magbridge.diagnose.causes.candidates import Candidate, slices
+from magbridge.diagnose.compare.columns import Columns, Mixture, parts, together
 from magbridge.diagnose.compare.problem import Problem
-from magbridge.diagnose.inference.design import kept
+from magbridge.diagnose.inference.design import in_threads, kept
 from magbridge.diagnose.inference.fit_noise import certainty
 from magbridge.diagnose.inference.information import Information, information
 from magbridge.diagnose.inference.joint import RIDGE, Joint, fit_joint, volume_of
@@ -77,7 +79,7 @@ class State:
     def __init__(self, problem: Problem, candidates: Sequence[Candidate], order: int, causes: int) -> None:
         self.problem, self.candidates, self.order, self.causes = problem, list(candidates), order, causes
         self.at = slices(self.candidates)
-        self.columns = kept(len(problem), [candidate.columns for candidate in self.candidates])
+        self.columns = _made_once(len(problem), [candidate.columns for candidate in self.candidates])
         self.trials: dict[str, float] = {}
         self.blocks: bool | None = None
         self.certain: dict[tuple[str, str | None], float] = {}
@@ -141,7 +143,7 @@ class State:
             for group, (k, average) in self.best(scores).items():
                 under.setdefault(group, []).append((k, average, scores[k], info))
         listed = sorted(under.values(), key=lambda entries: -max(entry[2].evidence for entry in entries))
-        found = [self._joint(model, base, entries) for entries in listed[:SHORT_LIST]]
+        found = in_threads(len(self.problem), partial(self._joint, model, base), listed[:SHORT_LIST])
         return sorted(found, key=lambda h: -h.evidence)
 
     def beside(self, model: Sequence[Candidate], base: Joint) -> Information:
@@ -213,6 +215,13 @@ class State:
         tests = self.trials.get(candidate.cause, 1.0) * self.causes
         freedom, certain = max(freedom, 1), self.certain.get(key(candidate), np.inf)
         return min(1.0, tests * float(fdtrc(freedom, certain, ratio / freedom)))
+
+
+def _made_once(n: int, columns: Sequence[Columns]) -> list[Columns]:
+    """Return `columns` made of what is kept of all that they are made of."""
+    shared = [X for X, _ in together(columns).parts]
+    known = dict(zip(shared, kept(n, shared), strict=True))
+    return [Mixture(tuple((known[X], M) for X, M in parts(own))) for own in columns]
 
 
 def _ridge(model: Sequence[Candidate]) -> FloatArray:

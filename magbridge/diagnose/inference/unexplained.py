@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from magbridge.diagnose.causes.candidates import Candidate
-from magbridge.diagnose.compare.problem import Columns, Problem
-from magbridge.diagnose.inference.design import Design, kept
+from magbridge.diagnose.compare.columns import Columns
+from magbridge.diagnose.compare.problem import Problem
+from magbridge.diagnose.inference.design import Design, in_threads, kept
 from magbridge.diagnose.inference.fit_noise import fit_noise
 from magbridge.diagnose.inference.free import Description, descriptions
 from magbridge.diagnose.inference.information import information
@@ -128,10 +129,13 @@ def leftover(
     found: list[tuple[float, str, Description, float]] = []
     for noise in (fit.noise, _calm(problem, columns, fit, order, listed[:2])):
         scored = _scored(problem, noise, fit, columns, listed)
-        for own, kind, one, best, shift in sorted(scored, key=lambda entry: -entry[0])[:LOUD]:
+        loud = sorted(scored, key=lambda entry: -entry[0])[:LOUD]
+        weighed = in_threads(
+            len(problem), lambda entry: _weighed(problem, columns, fit, order, *entry[2:]), loud
+        )
+        for (own, kind, one, best, _), evidence in zip(loud, weighed, strict=True):
             # a gain beyond the formula's is that of a noise which found another optimum beside the description
-            evidence = min(own, _weighed(problem, columns, fit, order, one, best, shift))
-            found.append((evidence, kind, one, best.signal_to_noise))
+            found.append((min(own, evidence), kind, one, best.signal_to_noise))
     evidence, kind, one, size = max(found, key=lambda entry: entry[0])
     # half of a chi-square's tail: a size that cannot be negative is zero as often as not (Self & Liang 1987)
     tail = 0.5 * float(chi2.sf(2.0 * max(evidence, 0.0), 1))

@@ -1,0 +1,64 @@
+"""Columns of the linear problem, and what several of them are made of."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["Columns", "Mixture", "beside", "parts", "together"]
+
+FloatArray = NDArray[np.float64]
+Columns = Callable[[slice], FloatArray]
+"""Rows -> (m, k): what one unit of each of k coefficients leaves in the residual; best stored column by column."""
+
+
+@dataclass(frozen=True, eq=False)
+class Mixture:
+    r"""Columns that are made of others': :math:`\sum_i X_i M_i`.
+
+    Hypotheses are many, and what they are made of is less: a temperature behind a lag serves wherever its origin was. So
+    sums over a log are those of the different ``X_i``.
+
+    Attributes
+    ----------
+    parts : tuple of (Columns, (k_i, k) array)
+        X_i, and M_i.
+    """
+
+    parts: tuple[tuple[Columns, FloatArray], ...]
+
+    def __call__(self, rows: slice) -> FloatArray:
+        """(m, k) these rows."""
+        return np.asarray(sum(M.T @ X(rows).T for X, M in self.parts)).T
+
+    def times(self, widths: FloatArray) -> Mixture:
+        """Return the columns in units of `widths` (k,)."""
+        return Mixture(tuple((X, M * widths) for X, M in self.parts))
+
+
+def parts(columns: Columns) -> tuple[tuple[Columns, FloatArray], ...]:
+    """Return what columns are made of: of themselves, if they are no mixture."""
+    if isinstance(columns, Mixture):
+        return columns.parts
+    return ((columns, np.eye(columns(slice(0, 1)).shape[1])),)
+
+
+def together(columns: Sequence[Columns]) -> Mixture:
+    """Return all as one mixture, in which nothing is twice."""
+    listed = [parts(own) for own in columns]
+    ends = np.cumsum([0, *(own[0][1].shape[1] for own in listed)])
+    found: dict[Columns, FloatArray] = {}
+    for own, start, end in zip(listed, ends, ends[1:], strict=False):
+        for X, M in own:
+            whole = found.setdefault(X, np.zeros((len(M), ends[-1])))
+            whole[:, start:end] += M
+    return Mixture(tuple(found.items()))
+
+
+def beside(blocks: Sequence[FloatArray]) -> FloatArray:
+    """(m, k) blocks of columns side by side, stored column by column."""
+    out = np.empty((sum(block.shape[1] for block in blocks), len(blocks[0])))
+    return np.concatenate([block.T for block in blocks], out=out).T
