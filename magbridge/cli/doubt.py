@@ -59,7 +59,7 @@ def diagnose(
     some(files, output / "calibration.json", calibration)
     known = load(calibration)
     with waiting("reading") as step:
-        logs = [_named(path, read(path)) for path in files]
+        logs = [read(path) for path in files]
         note_losses(*(log.attrs for log in logs))
         for path, log in zip(files, logs, strict=True):
             if digest(path) in known.inputs.values():
@@ -69,7 +69,7 @@ def diagnose(
             logs,
             known,
             output,
-            learned_from=[_named(path, read(path)) for path in learned_from],
+            learned_from=[read(path) for path in learned_from],
             grid=read_grid(grid) if grid else None,
             progress=step,
         )
@@ -84,12 +84,6 @@ def diagnose(
     if found.findings and not found.total.shown:
         rms += ", no gain shown (95 %: {:.2f} to {:.2f} times)".format(*found.total.interval)
     tell(facts, f"{facts['verdict']}: {said}; {rms}; {output / 'report.html'}", json)
-
-
-def _named(path: Path, log: xr.Dataset) -> xr.Dataset:
-    """Return a log that is known by its file, of several with one source, too."""
-    source = str(log.attrs["source"])
-    return log if path.name in source else log.assign_attrs(source=f"{path.name} ({source})")
 
 
 def _plain(one: dict[str, Any]) -> str:

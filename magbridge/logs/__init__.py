@@ -96,7 +96,9 @@ def _chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
     if not path.stat().st_size:
         raise FormatError(path, "expected a log, the file is empty")
     try:
-        yield from _format(path)(path, rows)
+        for part in _format(path)(path, rows):
+            source = str(part.attrs["source"])
+            yield part if path.name in source else part.assign_attrs(source=f"{path.name} ({source})")
     except OSError as error:
         raise FormatError(path, f"cannot be read: {error.strerror or error}") from error
 
@@ -123,7 +125,7 @@ def read(paths: Paths, *, required: Iterable[str] = ()) -> xr.Dataset:
     Returns
     -------
     xarray.Dataset
-        On ``time``; each variable float64 with ``units`` and ``long_name``. Attributes: ``source`` (file names),
+        On ``time``; each variable float64 with ``units`` and ``long_name``. Attributes: ``source`` (the file's name, and what it says of its own source),
         ``heading_reference`` where it is not true north, and counts of what was passed over (``duplicate_rows`` ...).
 
     Raises

@@ -69,7 +69,7 @@ def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
                 yield from _chunks(path, file, rows)
             else:
                 raise FormatError(path, f"expected the dimension {DIMENSION} (OG1.0) or a Seaglider's file")
-    except (OSError, RuntimeError) as error:
+    except (OSError, RuntimeError, UnicodeDecodeError) as error:
         raise FormatError(path, f"expected a whole netCDF file: {error}") from None
 
 

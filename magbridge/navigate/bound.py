@@ -86,7 +86,7 @@ def position_bound(
     o = options or Options()
     corners = np.asarray(time, float)
     if corners.size < 2:
-        raise OutOfRange("corners", corners.size, "a track has at least two")
+        raise OutOfRange("track", f"{corners.size} positions", "at least two are needed")
     if (np.diff(corners) <= 0.0).any():
         raise OutOfRange("time", "the track's", "it must increase from corner to corner")
     lat, lon = np.asarray(latitude, float), np.unwrap(np.asarray(longitude, float), period=360.0)
@@ -95,6 +95,10 @@ def position_bound(
     speed = along[-1] / (corners[-1] - corners[0])
     interval = max(every, min(o.interval, block_length(grid) / max(speed, 1e-9)))
     at = np.arange(corners[0] + 0.5 * interval, corners[-1], interval)
+    if not at.size:
+        raise OutOfRange(
+            "track", f"{corners[-1] - corners[0]:g} s", f"at least {0.5 * interval:.0f} s are needed"
+        )
     lat, lon = np.interp(at, corners, lat), wrap(np.interp(at, corners, lon))
     metres = np.diff(np.interp(at, corners, along), prepend=0.0)
     local = grid.evaluate(lon, lat)

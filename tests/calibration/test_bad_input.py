@@ -66,6 +66,10 @@ BAD: dict[str, tuple[Callable[[xr.Dataset], xr.Dataset], str]] = {
         lambda ds: changed(ds, **{f"mag_{axis}": 0.0 for axis in "xyz"}),
         "have every value ('mag_x' has 0, 'mag_y' has 0, 'mag_z' has 0 numbers)",
     ),
+    "gauss": (
+        lambda ds: changed(ds, **{f"mag_{axis}": 1e-5 * ds[f"mag_{axis}"].to_numpy() for axis in "xyz"}),
+        "the length of the vector is 0.478 (median)",
+    ),
     "a parameter that never moves": (
         lambda ds: changed(ds, battpos=0.3),
         "'battpos' never moves (it is 0.3 throughout)",
@@ -85,6 +89,15 @@ def test_bad_data(case: str, runs: xr.Dataset, tmp_path: Path, capsys: pytest.Ca
         capsys, "calibrate", tmp_path / "bad.csv", *PARAMETERS, "-o", tmp_path / "cal.json"
     )
     assert not (tmp_path / "cal.json").exists()
+
+
+def test_a_log_is_known_by_its_file(
+    runs: xr.Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Beside what it says of its own source."""
+    write(runs.drop_vars("mag_x"), tmp_path / "bad.nc")
+    said = one_line(capsys, "calibrate", tmp_path / "bad.nc", *PARAMETERS, "-o", tmp_path / "cal.json")
+    assert said.startswith("magbridge: bad.nc (simulated: demo): column 'mag_x': expected this column")
 
 
 def test_a_column_of_strings(

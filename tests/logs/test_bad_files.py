@@ -193,6 +193,17 @@ def test_netcdf_of_another_shape(tmp_path: Path) -> None:
         logs.read(path)
 
 
+def test_netcdf_whose_names_are_no_text(tmp_path: Path) -> None:
+    netCDF4 = pytest.importorskip("netCDF4")
+    path = tmp_path / "log.nc"
+    with netCDF4.Dataset(path, "w", format="NETCDF3_CLASSIC") as file:
+        file.createDimension("N_MEASUREMENTS", 2)
+        file.createVariable("BATTPOS", "f8", ("N_MEASUREMENTS",))
+    path.write_bytes(path.read_bytes().replace(b"BATTPOS", b"BAT\x96POS"))
+    with pytest.raises(FormatError, match=r"log\.nc: expected a whole netCDF file: "):
+        logs.read(path)
+
+
 def test_parquet_of_text(tmp_path: Path) -> None:
     pa = pytest.importorskip("pyarrow")
     parquet = pytest.importorskip("pyarrow.parquet")

@@ -63,8 +63,10 @@ def test_across_the_date_line(grid, options, way):
 def test_time_must_increase(grid):
     with pytest.raises(OutOfRange, match="must increase"):
         position_bound(grid, TRACK[0][::-1], *TRACK[1:])
-    with pytest.raises(OutOfRange, match="corners = 1: a track has at least two"):
+    with pytest.raises(OutOfRange, match="track = 1 positions: at least two are needed"):
         position_bound(grid, *([one[0]] for one in TRACK))
+    with pytest.raises(OutOfRange, match=r"track = 3 s: at least \d+ s are needed"):
+        position_bound(grid, [0.0, 3.0], *([one[0]] * 2 for one in TRACK[1:]))
 
 
 def test_its_sentence_says_when_it_is_best(grid, options):
