@@ -24,7 +24,7 @@ from magbridge.records import Quality
 from sitl.columns import segments
 from sitl.emulation import emulate, start_us
 from sitl.listener import Listener
-from sitl.rehearsal import bridge_toml
+from sitl.replay_setup import bridge_toml
 from sitl.scenario import load
 from sitl.stage import Stage
 from sitl.twin import simulate

@@ -24,7 +24,7 @@ from magbridge.progress import track
 from sitl.emulation import emulate, start_us
 from sitl.listener import Listener
 from sitl.own_log import Recorded, is_own_log, runs
-from sitl.rehearsal import Part, prepare, rows_of
+from sitl.replay_setup import Part, prepare, rows_of
 from sitl.stage import Stage
 
 __all__ = ["alike", "replay", "tell"]
@@ -70,10 +70,10 @@ def replay(
         parts = [Part("all", float(times[0]), float(times[-1]))]
         return _play(deployment, config, parts, speed, log)
     with tempfile.TemporaryDirectory() as folder:
-        rehearsal = prepare(files, Path(folder))
-        result = _play(rehearsal.deployment, rehearsal.config, rehearsal.parts, speed, log)
-    result |= {"calibration": rehearsal.calibration, "simulated_field": rehearsal.simulated}
-    result["parts"][-1]["held_out"] = rehearsal.calibration.startswith("nominal")
+        setup = prepare(files, Path(folder))
+        result = _play(setup.deployment, setup.config, setup.parts, speed, log)
+    result |= {"calibration": setup.calibration, "simulated_field": setup.simulated}
+    result["parts"][-1]["held_out"] = setup.calibration.startswith("nominal")
     return result
 
 

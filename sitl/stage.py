@@ -56,7 +56,7 @@ class Stage:
         server.settimeout(CONNECT_TIMEOUT)
         times_out, self._times = os.pipe()
         command = [
-            sys.executable, "-m", "sitl.understudy", str(config),
+            sys.executable, "-m", "sitl.replayed_bridge", str(config),
             "--sensor", os.ttyname(self._slave),
             "--link", f"tcp:127.0.0.1:{server.getsockname()[1]}",
             "--timetable", str(times_out),

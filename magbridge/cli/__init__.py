@@ -11,11 +11,11 @@ from contextlib import suppress
 
 from cyclopts import CycloptsError, UnusedCliTokensError
 
-from magbridge.cli import ashore, doubt, learn, onboard, way
+from magbridge.cli import ashore, bridge, calibrate, diagnose, navigate
 from magbridge.cli.common import app, complain
 from magbridge.errors import MagbridgeError, MissingExtra
 
-__all__ = ["app", "ashore", "doubt", "learn", "main", "onboard", "way"]
+__all__ = ["app", "ashore", "bridge", "calibrate", "diagnose", "main", "navigate"]
 
 EXTRAS = {
     **dict.fromkeys(

@@ -19,7 +19,7 @@ from magbridge.config import Align
 from magbridge.errors import PortError
 from magbridge.link import alignment
 from magbridge.mavlink.dialect import MAV_SEVERITY
-from magbridge.monitor.ear import Ear
+from magbridge.monitor.link import StationLink
 from magbridge.monitor.state import Point
 from magbridge.monitor.words import FLAGS, ago, health, measured, silence, whereabouts
 
@@ -56,23 +56,23 @@ def serve(link: str, baudrate: int, host: str, port: int, *, show: bool) -> None
     ConfigError, PortError
         `link` is no address, or it or the page's own port cannot be opened.
     """
-    ear = Ear(open_link(link, baudrate, "magbridge monitor"))
+    station = StationLink(open_link(link, baudrate, "magbridge monitor"))
     try:
         socket.create_server((host, port)).close()  # the web server itself would only log it
     except OSError as error:
         raise PortError(f"{host}:{port}", error.strerror or str(error)) from error
-    ear.start()
+    station.start()
     print(f"listening on {link}; the page is http://{host}:{port}", file=sys.stderr)
     options: dict[str, Any] = {"title": "magbridge", "favicon": "🧲", "show_welcome_message": False}
     with suppress(KeyboardInterrupt):  # as it is told: until interrupted
-        ui.run(partial(Page, ear), host=host, port=port, show=show, reload=False, **options)
+        ui.run(partial(Page, station), host=host, port=port, show=show, reload=False, **options)
 
 
 class Page:
-    """One browser's view of what the ear has heard."""
+    """One browser's view of what the station has heard."""
 
-    def __init__(self, ear: Ear) -> None:
-        self._ear, self._state = ear, ear.state
+    def __init__(self, station: StationLink) -> None:
+        self._station, self._state = station, station.state
         self._shown: dict[str, Any] = {}
         self._inputs: dict[str, ui.number] = {}
         ui.query("body").classes("bg-slate-100").style(f"color: {INK}")
@@ -113,8 +113,8 @@ class Page:
 
     def _refresh(self) -> None:
         now = time.time()
-        with self._ear.lock:
-            self._tell_stream(self._ear.trouble or silence(self._state, now))
+        with self._station.lock:
+            self._tell_stream(self._station.trouble or silence(self._state, now))
             self._tell_figures()
             self._tell_flags(now)
             self._tell_texts()
@@ -123,7 +123,7 @@ class Page:
 
     def _tell_stream(self, trouble: str) -> None:
         who = "vehicle {}, component {}".format(*self._state.bridge) if self._state.bridge else ""
-        self._from.set_text(f"{self._ear.port.name} \N{EN SPACE} {who}")
+        self._from.set_text(f"{self._station.port.name} \N{EN SPACE} {who}")
         self._stream.set_text(trouble or "live")
         self._stream.style(f"background: {RED if trouble else GREEN}")
         self._body.style(f"opacity: {0.45 if trouble else 1}")
@@ -197,7 +197,7 @@ class Page:
         return box
 
     def _set(self, name: str) -> None:
-        with self._ear.lock:
+        with self._station.lock:
             if name in self._state.parameters:
                 value = self._inputs[name].value
                 self._state.set(name, nan if value is None else value)

@@ -14,11 +14,11 @@ from magbridge.errors import FormatError
 from magbridge.field.earth import offset
 from magbridge.field.grid import AnomalyGrid
 from magbridge.navigate.deadreckoning import GLIDE
-from magbridge.navigate.judge import judge
+from magbridge.navigate.findings import findings_of
 from magbridge.navigate.model import Options
 from magbridge.navigate.navigator import UNUSABLE, Navigator
 from magbridge.navigate.record import Record
-from magbridge.navigate.yardstick import YARDSTICKS, with_errors, yardstick
+from magbridge.navigate.reference_track import REFERENCES, reference_track, with_errors
 from magbridge.progress import track
 
 __all__ = ["MOTIONS", "first_position", "motion_of", "navigate"]
@@ -70,14 +70,14 @@ def navigate(
     start : (latitude, longitude), optional
         deg; default the log's first position.
     fixes : bool, optional
-        Take in ``gps_latitude gps_longitude`` all along; default only the first, the others are the yardstick.
+        Take in ``gps_latitude gps_longitude`` all along; default only the first, the others are the reference_track.
 
     Returns
     -------
     Dataset
         On ``time`` of the updates: every field of :class:`~magbridge.navigate.record.Record`,
         ``smoothed_*`` from the backward pass, ``error_*`` where the log has a better position. Attributes:
-        ``findings``, sentences one a line; ``motion``; ``yardstick``.
+        ``findings``, sentences one a line; ``motion``; ``reference_track``.
 
     Raises
     ------
@@ -117,9 +117,9 @@ def navigate(
         raise FormatError(source, "expected samples of the total field at known times: none was usable")
     result = _dataset(records, _smooth(states))
     result.attrs = {"source": source, "map": grid.name, "motion": motion}
-    known = yardstick(deployment, frozenset(MOTIONS[motion]))
+    known = reference_track(deployment, frozenset(MOTIONS[motion]))
     result = with_errors(result, known)
-    findings = judge(result, grid, options, navigator.jumps, known)
+    findings = findings_of(result, grid, options, navigator.jumps, known)
     return result.assign_attrs(findings="\n".join(findings))
 
 
@@ -175,7 +175,7 @@ def _columns(deployment: xr.Dataset, names: Mapping[str, str], source: str) -> d
 
 def first_position(deployment: xr.Dataset, source: str) -> tuple[float, float]:
     """Return the log's first latitude and longitude, deg; else raise FormatError."""
-    for pair in (*YARDSTICKS[1:], ("dr_latitude", "dr_longitude")):
+    for pair in (*REFERENCES[1:], ("dr_latitude", "dr_longitude")):
         if all(name in deployment for name in pair):
             known = deployment[list(pair)].to_dataframe().dropna()
             if len(known):

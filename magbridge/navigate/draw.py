@@ -18,7 +18,7 @@ from magbridge.field.grid import AnomalyGrid
 from magbridge.files import atomic_path
 from magbridge.navigate.bound import Bound
 from magbridge.navigate.record import State
-from magbridge.navigate.yardstick import errors
+from magbridge.navigate.reference_track import errors
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -173,7 +173,7 @@ def _tracks(axis: Axes, result: xr.Dataset) -> list[Array]:
     tracks = [reckoned, sure, smoothed]
     if "error_north" in result:
         known = back("error_north", "error_east")
-        name = result.attrs["yardstick"].rstrip("_")
+        name = result.attrs["reference_track"].rstrip("_")
         axis.plot(*known, color="C3", lw=1.2, ls=(0, (4, 2)), label=f"known position ({name})")
         tracks.append(known)
     axis.legend(loc="upper right", fontsize=8)

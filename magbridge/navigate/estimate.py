@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from magbridge.field.earth import offset
 from magbridge.field.grid import AnomalyGrid
 from magbridge.navigate.bank import Bank, widest
+from magbridge.navigate.integrity import IntegrityMonitor, Unmapped, Verdict, distance
 from magbridge.navigate.model import Block, Options, any_level, prior, resolution, transition
 from magbridge.navigate.record import Jump, State
 from magbridge.navigate.tracker import Innovation, Tracker
-from magbridge.navigate.watch import Unmapped, Verdict, Watch, distance
 
 __all__ = ["Estimate"]
 
@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 
 CONTRADICTION = 25.0  # squared distance of a fix, two degrees of freedom: 4e-6 by chance
 UNINFORMED = 0.8  # of what dead reckoning alone would have: the field has said nothing
-REACH = 300.0  # m, the least that the watch looks around
+REACH = 300.0  # m, smallest radius in which the integrity monitor searches
 JOIN, SPLIT = 1.2, 1.5  # of the map's resolution: below one hypothesis will do, above it will not
 FINER = 0.8  # of the resolution: so much better a measurement must be to be worth a finer one
 DOUBTFUL = 1.0  # log odds: another place explains the field better, if not yet beyond doubt
@@ -60,7 +60,7 @@ class Estimate:
         self._time_us, self._travelled = 0, 0.0
         self._reported = False
         self._filter: Tracker | Bank | None = None
-        self._watch: Watch | None = None
+        self._monitor: IntegrityMonitor | None = None
         self._unmapped = Unmapped(grid, options)
         self._nowhere = 0.0
         self._resolution = inf
@@ -73,7 +73,7 @@ class Estimate:
     @property
     def odds(self) -> float:
         """Natural logarithm of the odds of another place against this one."""
-        return self._watch.odds if self._watch else 0.0
+        return self._monitor.odds if self._monitor else 0.0
 
     @property
     def hypotheses(self) -> int:
@@ -99,7 +99,7 @@ class Estimate:
         else:
             self._filter.update_position(float(there[0]), float(there[1]), sigma)
             self._read()
-        self._watch, self._lost = None, False
+        self._monitor, self._lost = None, False
         self._alone = np.diag([sigma**2, sigma**2, *np.diag(self.P)[2:4]])
 
     def update(self, block: Block, travelled: float) -> Innovation:
@@ -171,7 +171,7 @@ class Estimate:
     def _jump(self, x: Array, cause: str) -> None:
         north, east = (x[:2] - self.x[:2]).tolist()
         self.jumps.append(Jump(self._time_us, north, east, widest(self._alone), cause))
-        self._watch, self._confirmed = None, False
+        self._monitor, self._confirmed = None, False
 
     def _judge(self, block: Block, seconds: float, metres: float, likelihood: float) -> None:
         """Compare the filter with its rivals; leave it where one of them has won."""
@@ -184,19 +184,19 @@ class Estimate:
         self._described |= self._nowhere <= -log(self.options.doubt)
         if not self._compact(widest(self.P)):
             return
-        if self._watch is None:
+        if self._monitor is None:
             reach, level = self._reach() * (2.0 if self._lost else 1.0), self._claimed.bias_sigma
-            self._watch = Watch(
+            self._monitor = IntegrityMonitor(
                 self.grid, self.options, self.x, self.P, block.time_us, reach, self._resolution, level
             )
             return
-        verdict = self._watch.step(block, metres, self.x, self.P)
+        verdict = self._monitor.step(block, metres, self.x, self.P)
         if verdict is Verdict.ELSEWHERE:
-            self._filter, self._lost = self._watch.surrender(block.time_us), True
+            self._filter, self._lost = self._monitor.surrender(block.time_us), True
             self._jump(self._filter.moments()[0], verdict.value)
             self._read()
         elif verdict is Verdict.HOLDS:
-            self._watch, self._confirmed = None, True
+            self._monitor, self._confirmed = None, True
             if self._described:
                 self._lost, self._searches = False, 0
 
@@ -230,7 +230,7 @@ class Estimate:
             self._filter = Tracker(self.grid, self.x, self.P, self.options.gate)
         elif isinstance(self._filter, Tracker) and width > SPLIT * self._resolution:
             self._filter = Bank(self.grid, self.x, self.P, self._resolution, self.options.gate)
-            self._watch = None
+            self._monitor = None
         if self._lost:
             self.state = State.LOST
         elif not self._compact(width):

@@ -36,7 +36,7 @@ def rms(result: xr.Dataset, prefix: str = "") -> float:
 
 def test_the_track_and_the_backward_pass(result):
     assert result.attrs["motion"] == "velocity"
-    assert result.attrs["yardstick"] == "truth_"
+    assert result.attrs["reference_track"] == "truth_"
     assert result.attrs["findings"] == ""
     assert rms(result, "smoothed_") < rms(result) < 200.0
     sigma = np.hypot(result["smoothed_sigma_north"], result["smoothed_sigma_east"])

@@ -22,8 +22,8 @@ from sitl.autopilot import Autopilot
 from sitl.demo import demo
 from sitl.motion import with_motion
 from sitl.own_log import Recorded, is_own_log
-from sitl.rehearsal import bridge_toml, short_names
 from sitl.replay import replay, tell
+from sitl.replay_setup import bridge_toml, short_names
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-"""Diagnose: what the simulation gets wrong, and why."""
+"""Diagnose: what the calibration model gets wrong, and why."""
 
 from __future__ import annotations
 

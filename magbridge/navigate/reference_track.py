@@ -1,4 +1,4 @@
-"""What an estimate is held against: the best position that the log has, and that it did not use."""
+"""The reference for an estimate: the best position that the log has and that the estimate did not use."""
 
 from __future__ import annotations
 
@@ -10,31 +10,32 @@ from numpy.typing import NDArray
 
 from magbridge.field.earth import separation
 
-__all__ = ["YARDSTICKS", "errors", "with_errors", "yardstick"]
+__all__ = ["REFERENCES", "errors", "reference_track", "with_errors"]
 
 Floats = NDArray[np.floating[Any]]
 
-YARDSTICKS = (
+REFERENCES = (
     ("truth_latitude", "truth_longitude"),
     ("gps_latitude", "gps_longitude"),
     ("latitude", "longitude"),
 )
+"""Columns of a position, the best first."""
 
 
-def yardstick(deployment: xr.Dataset, used: frozenset[str]) -> xr.Dataset | None:
+def reference_track(deployment: xr.Dataset, used: frozenset[str]) -> xr.Dataset | None:
     """Return the best position that the estimate has not used, with the field there; None if there is none."""
-    for pair in YARDSTICKS:
+    for pair in REFERENCES:
         if pair[0] not in used and all(name in deployment for name in pair):
             wanted = [*pair, "total_field", *(["depth"] if "depth" in deployment else [])]
             known = deployment[wanted].rename(dict(zip(pair, ("latitude", "longitude"), strict=True)))
             known = known.dropna("time", subset=["latitude", "longitude"])
             if known.sizes["time"]:
-                return known.assign_attrs(yardstick=pair[0].removesuffix("latitude") or "log")
+                return known.assign_attrs(reference_track=pair[0].removesuffix("latitude") or "log")
     return None
 
 
 def with_errors(result: xr.Dataset, truth: xr.Dataset | None) -> xr.Dataset:
-    """Add metres from the yardstick to the track, where there is one within the log's own spacing."""
+    """Add the errors against the reference track, m, where it has a position within the log's own spacing."""
     if truth is None:
         return result
     time = result["time"].to_numpy()
@@ -55,7 +56,7 @@ def with_errors(result: xr.Dataset, truth: xr.Dataset | None) -> xr.Dataset:
         name: ("time", values, {"units": "m", "long_name": name.replace("_", " ")})
         for name, values in added.items()
     }
-    return result.assign(named).assign_attrs(yardstick=truth.attrs["yardstick"])
+    return result.assign(named).assign_attrs(reference_track=truth.attrs["reference_track"])
 
 
 def errors(result: xr.Dataset) -> tuple[xr.DataArray, xr.DataArray]:

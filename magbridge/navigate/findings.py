@@ -1,4 +1,4 @@
-"""What to tell a user who sees only the result: was the map left, flat, wrong; was the filter ever lost."""
+"""Findings about a track, in words: was the map left, flat or wrong; was the filter ever lost."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from magbridge.field.igrf import total_field
 from magbridge.navigate.model import Options
 from magbridge.navigate.record import Jump, State
 
-__all__ = ["Shift", "best_shift", "judge"]
+__all__ = ["Shift", "best_shift", "findings_of"]
 
 Array = NDArray[np.floating[Any]]
 
@@ -31,12 +31,12 @@ TOLD = 3  # jumps of the filter that are told one by one: a map of elsewhere mak
 EXPLAINED = 0.5  # of the field's variance along the track, below which the map does not describe it
 
 
-def judge(
+def findings_of(
     result: xr.Dataset,
     grid: AnomalyGrid,
     options: Options,
     jumps: Sequence[Jump],
-    yardstick: xr.Dataset | None,
+    reference_track: xr.Dataset | None,
 ) -> list[str]:
     """Return the findings, one sentence each; empty when there is nothing to remark.
 
@@ -47,7 +47,7 @@ def judge(
     grid, options
         What it was made with.
     jumps : sequence of Jump
-    yardstick : Dataset or None
+    reference_track : Dataset or None
         ``latitude longitude total_field`` at known positions.
     """
     hours = (result["time"].to_numpy() - float(result["time"][0])) / 3600.0
@@ -76,8 +76,8 @@ def judge(
             f"lost for {100.0 * lost.mean():.0f} % of the track, first after {hours[lost][0]:.1f} h"
         )
     findings += _told_by_level(result, options)
-    if yardstick is not None:
-        findings += _told_by_positions(grid, yardstick, options)
+    if reference_track is not None:
+        findings += _told_by_positions(grid, reference_track, options)
     if state[-1] == State.SEARCHING:
         findings.append("several positions still explain the field at the end of the log")
     return findings
@@ -157,12 +157,16 @@ def best_shift(grid: AnomalyGrid, latitude: Array, longitude: Array, depth: Arra
     return Shift(*best, origin)
 
 
-def _told_by_positions(grid: AnomalyGrid, yardstick: xr.Dataset, options: Options) -> list[str]:
+def _told_by_positions(grid: AnomalyGrid, reference_track: xr.Dataset, options: Options) -> list[str]:
     """Compare the map with the field at known positions: its place, and whether it is this field's map."""
-    latitude, longitude = yardstick["latitude"].to_numpy(), yardstick["longitude"].to_numpy()
-    depth = yardstick["depth"].fillna(0.0).to_numpy() if "depth" in yardstick else np.zeros(latitude.size)
-    time = yardstick["time"].to_numpy()
-    measured = yardstick["total_field"].to_numpy() - total_field(longitude, latitude, depth, time)
+    latitude, longitude = reference_track["latitude"].to_numpy(), reference_track["longitude"].to_numpy()
+    depth = (
+        reference_track["depth"].fillna(0.0).to_numpy()
+        if "depth" in reference_track
+        else np.zeros(latitude.size)
+    )
+    time = reference_track["time"].to_numpy()
+    measured = reference_track["total_field"].to_numpy() - total_field(longitude, latitude, depth, time)
     known = np.isfinite(measured + grid.evaluate(longitude, latitude, depth).anomaly)
     if known.sum() < SPARSE:
         return []

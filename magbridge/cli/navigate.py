@@ -1,4 +1,4 @@
-"""Navigate: find the way by the field, or say beforehand what a map is worth."""
+"""Navigate: the track by the field, or beforehand what a map is worth."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def navigate(
 
 def _judged(track: xr.Dataset) -> tuple[dict[str, Any], str]:
     """Return how good a track is: by what the filter claims, and by the truth where the log tells it."""
-    from magbridge.navigate.yardstick import errors
+    from magbridge.navigate.reference_track import errors
 
     vouched, rows = float(track["vouched"].mean()), track.sizes["time"]
     sigma = float((track["covariance_nn"] + track["covariance_ee"])[-1]) ** 0.5

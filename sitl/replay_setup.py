@@ -1,4 +1,4 @@
-"""What a replay needs when all there is is a log: a configuration, and a calibration fitted on part of it.
+"""Set up a replay from nothing but a log: a configuration, and a calibration fitted to part of it.
 
 Of several files (or, of one, of its three thirds) the last is left out of the fit: its error is the one that
 tells something.
@@ -25,7 +25,7 @@ from magbridge.logs import read
 from sitl.like import simulate_like
 from sitl.scenario import load
 
-__all__ = ["Part", "Rehearsal", "bridge_toml", "prepare", "rows_of"]
+__all__ = ["Part", "ReplaySetup", "bridge_toml", "prepare", "rows_of"]
 
 FULL_SCALE = 100_000.0
 """nT that the emulated fluxgate can read."""
@@ -52,7 +52,7 @@ class Part(NamedTuple):
     end: float
 
 
-class Rehearsal(NamedTuple):
+class ReplaySetup(NamedTuple):
     """What is ready to be replayed.
 
     Attributes
@@ -75,7 +75,7 @@ class Rehearsal(NamedTuple):
     simulated: bool
 
 
-def prepare(files: Sequence[Path], folder: Path) -> Rehearsal:
+def prepare(files: Sequence[Path], folder: Path) -> ReplaySetup:
     """Read logs, fit a nominal calibration on all but the last part, and write the bridge's files to `folder`.
 
     Raises
@@ -92,7 +92,7 @@ def prepare(files: Sequence[Path], folder: Path) -> Rehearsal:
     config = folder / "bridge.toml"
     text = bridge_toml(deployment, telemetry_of(deployment), calibrated=summary.startswith("nominal"))
     config.write_text(text, encoding="utf-8")
-    return Rehearsal(config, deployment, parts, summary, simulated)
+    return ReplaySetup(config, deployment, parts, summary, simulated)
 
 
 def _parts(files: Sequence[Path], deployment: xr.Dataset) -> list[Part]:

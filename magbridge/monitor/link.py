@@ -1,4 +1,4 @@
-"""The link on a thread of its own: what comes goes to the state, what the state asks goes out."""
+"""The link, on a thread of its own: it feeds the state with messages and sends the state's requests."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from magbridge.errors import PortError
 from magbridge.mavlink import Codec
 from magbridge.monitor.state import State
 
-__all__ = ["Ear"]
+__all__ = ["StationLink"]
 
 
-class Ear:
+class StationLink:
     """Listens to `port`, as ground station 255:190, until the process ends.
 
     Attributes

@@ -1,4 +1,4 @@
-"""Commands on the vehicle, and those that show what happens there: demo, run, replay, monitor."""
+"""Commands that run the bridge, or listen to it: demo, run, replay, monitor."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The process in which a bridge plays under replay: its real ports, and the timetable's clock.
+"""The process in which the bridge runs during a replay: its real ports, and the timetable's clock.
 
 Run by :class:`sitl.stage.Stage`; not a command of its own.
 """

@@ -1,4 +1,4 @@
-"""Commands that learn what the vehicle does to the field: calibrate, and plan, which says what to fly for it."""
+"""Calibrate, and plan the runs to calibrate with."""
 
 from __future__ import annotations
 

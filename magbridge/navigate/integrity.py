@@ -1,4 +1,4 @@
-"""Whether the filter should still be believed: it is compared with the other things that could be true.
+"""Integrity: whether the filter should still be believed, by comparison with what else could be true.
 
 A filter on the wrong hill is content: its innovations fit, because it has moved to where they do. What shows
 it is that another explanation predicts the same measurements better. Two are kept beside it: *elsewhere*, a bank
@@ -22,7 +22,7 @@ from magbridge.field.grid import AnomalyGrid
 from magbridge.navigate.bank import Bank, widest
 from magbridge.navigate.model import Block, Options, block_length, transition
 
-__all__ = ["Unmapped", "Verdict", "Watch"]
+__all__ = ["IntegrityMonitor", "Unmapped", "Verdict"]
 
 Array = NDArray[np.float64]
 
@@ -88,7 +88,7 @@ class Unmapped:
         return -0.5 * (y * y / s + log(2.0 * pi * s))
 
 
-class Watch:
+class IntegrityMonitor:
     """The filter's rival since the filter was last confirmed, and the filter's own second at equal terms.
 
     Both take in the blocks together, several to one, because a bank costs more than a filter and a rival can
