@@ -95,7 +95,6 @@ class Observations:
         whole = np.isfinite(field).all(axis=1) & np.isfinite(reference)
         whole &= np.isfinite(parameters).all(axis=1) & np.isfinite(time)
         _enough(n, whole, field, parameters, self.names, reference)
-        _in_nt(field[whole], reference[whole])
         _plausible(self.names, parameters[whole])
         put(self, "field", field[whole])
         put(self, "reference", reference[whole])
@@ -173,15 +172,6 @@ def _enough(
     raise CalibrationError(
         f"only {int(whole.sum())} of {n} samples have every value{because}: at least 10 needed"
     )
-
-
-def _in_nt(field: FloatArray, reference: FloatArray) -> None:
-    """Refuse gauss or µT called nT: no iron makes ten fields of one, and no fit would settle."""
-    read, true = float(np.median(np.linalg.norm(field, axis=1))), float(np.median(reference))
-    if not 0.1 * true < read < 10.0 * true:
-        raise CalibrationError(
-            f"mag_x mag_y mag_z: the length of the vector is {read:.3g} (median), where the reference is {true:.0f} nT: expected nT"
-        )
 
 
 def _plausible(names: Sequence[str], positions: FloatArray) -> None:

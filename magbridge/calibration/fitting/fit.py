@@ -110,6 +110,7 @@ def fit(
     chosen: Callable[..., Fit] = getattr(import_module(module), name)
     # one thread: matrices this small only wait for each other, and sums keep one order on any machine
     with threadpool_limits(1, "blas"):
+        _refuse_other_units(data)
         _refuse_one_attitude(data)
         data, doubled = _without_doubles(data)
         found = _biased(chosen(data, order, **options), site_bias)
@@ -143,6 +144,15 @@ def _biased(found: Fit, sigma: float) -> Fit:
             reference=Reference(field, calibration.reference.model, 0.0, sigma),
         ),
     )
+
+
+def _refuse_other_units(data: Observations) -> None:
+    """Refuse gauss or µT called nT: no iron makes ten fields of one, and no fit would settle."""
+    read, true = float(np.median(np.linalg.norm(data.field, axis=1))), float(np.median(data.reference))
+    if not 0.1 * true < read < 10.0 * true:
+        raise CalibrationError(
+            f"mag_x mag_y mag_z: the length of the vector is {read:.3g} (median), where the reference is {true:.0f} nT: expected nT"
+        )
 
 
 def _refuse_one_attitude(data: Observations) -> None:
