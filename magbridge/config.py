@@ -36,7 +36,7 @@ __all__ = [
 T = TypeVar("T")
 Positive = Annotated[float, Meta(gt=0, le=1e9)]
 NotNegative = Annotated[float, Meta(ge=0, le=1e9)]
-"""With an end: TOML knows ``inf``, and deadlines and sizes are whole numbers inside."""
+"""Bounded, because TOML has ``inf``, while deadlines and sizes are integers inside."""
 Rate = Annotated[float, Meta(ge=-1e9, le=1e9)]
 Name = Annotated[str, Meta(min_length=1)]
 SystemId = Annotated[int, Meta(ge=1, le=255)]

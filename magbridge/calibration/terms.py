@@ -46,7 +46,7 @@ Step = Callable[[int, float, float, float, Sequence[float]], tuple[float, ...]]
 HIGHEST = 30  # total degree: beyond, powers are noise
 Power = Annotated[int, Meta(ge=1, le=HIGHEST)]
 Width = Annotated[float, Meta(ge=1e-9, le=1e12)]
-"""What something is divided by, in whatever unit."""
+"""A divisor, in any unit."""
 
 SLOTS = ("a_xx", "a_yy", "a_zz", "a_xy", "a_xz", "a_yz", "t_x", "t_y", "t_z")
 """Six of the symmetric ``A`` (as ``a = (A - I) F_0``, nT) and three of ``T`` (nT)."""

@@ -41,9 +41,9 @@ __all__ = ["diagnose"]
 FloatArray = NDArray[np.float64]
 
 LOUD = 2.0
-"""Times what the calibration states of itself: noise half as loud again is still noise, of twice that something is wrong."""
+"""Multiple of the calibration's stated noise: 1.5 times is still noise, at twice something is wrong."""
 ABSURD = 0.5
-"""Of the field: when the corrected one is off by more, no cause of the table is looked for."""
+"""Fraction of the field; when the corrected field is off by more, no diagnosis is attempted."""
 
 
 def diagnose(
@@ -112,7 +112,7 @@ def _examine(
     named, rivals, fit = (outcome.chosen, outcome.rivals, outcome.fit) if stand else ((), (), outcome.null)
     model = [h.candidate for h in named]
     if wrong is not None and named and wrong.ratio < (REMNANT * max(h.signal_to_noise for h in named)) ** 2:
-        wrong = None  # a few samples that the loudest cause's regressor has left
+        wrong = None  # a remnant of the strongest cause's idealised regressor
     progress("extending the calibration")
     settled, columns, fit = settle(problem, model, fit, outcome.order)
     fit = widened(model, loosened(settled, model, columns, fit))
@@ -123,7 +123,7 @@ def _examine(
     if model:
         after, score = held_out(settled, columns, fit)
         if score < held_out(problem, [], outcome.null).score - ODDS:
-            # dives that were left out do without these names: they are no explanation
+            # the dives left out speak 20:1 against these names
             named, rivals, model, fit, after, extended = (), (), [], outcome.null, before, calibration
             rest = leftover(problem, [], outcome.null, outcome.order, tone)
     rest = rest or _loud(problem, after, counts)
@@ -137,7 +137,7 @@ def _examine(
 
 
 def _posed(survey: Survey, calibration: Calibration) -> Problem:
-    """Compare; a vehicle or a unit that is not the calibration's is no case for a search."""
+    """Compare; refuse another vehicle's data, or data in another unit."""
     problem = pose(survey, calibration)
     off, field = float(np.median(np.abs(problem.residual))), float(np.median(survey.reference))
     if off > ABSURD * field:
@@ -174,7 +174,7 @@ def _findings(
     after: FloatArray,
     counts: NDArray[np.bool_],
 ) -> tuple[Finding, ...]:
-    """Put together what belongs to each cause; its gain is that over a fit of the others without it."""
+    """Collect each cause's results; its gain is that over a fit of the others without it."""
     found, q = [], len(fit.z)
     for k, (own, (hypothesis, others)) in enumerate(
         zip(slices([h.candidate for h in named]), zip(named, rivals, strict=True), strict=True)
@@ -188,7 +188,7 @@ def _findings(
 
 
 def _loud(problem: Problem, after: FloatArray, counts: NDArray[np.bool_]) -> Leftover | None:
-    """Describe what has no structure, but is more than the calibration states of its noise and of its coefficients."""
+    """Describe a residual without structure that exceeds the calibration's stated noise and coefficient errors."""
     power = float(np.sum(after[counts] ** 2 / np.maximum(problem.stated[counts], 1e-12)))
     n = int(counts.sum())
     if problem.calibration.noise.sensor <= 0.0 or power < LOUD**2 * n:

@@ -39,7 +39,7 @@ __all__ = ["FileWriter", "chunks"]
 MAX_AGE_US = round(MAX_AGE * 1e6)
 NEVER = -(1 << 62)
 SINGLE = 1e-7
-"""Of a number, by which its float32 may be off: counts that are not that number belong to another sensor's log."""
+"""Relative error of a float32; counts that differ from the channel by more belong to another sensor."""
 FIELD, NAMED = spec("MAG_FIELD").id, spec("NAMED_VALUE_FLOAT")
 
 

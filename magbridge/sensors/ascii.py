@@ -45,7 +45,7 @@ __all__ = ["CHECKSUMS", "Ascii", "AsciiOptions"]
 LIMIT = 512
 """Longest line, in bytes."""
 COUNTS = 2**31
-"""What no converter counts to, and no message holds."""
+"""A count that no converter reaches and no message can hold."""
 ENCODING = "latin-1"
 SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6}
 Positive = Annotated[float, Meta(gt=0)]

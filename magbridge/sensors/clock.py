@@ -27,7 +27,7 @@ SIGMA_CLOCK, SIGMA_PERIOD = 1e3, 1e4
 RESTART = 1e6
 """µs by which an instrument's time that fell back may miss the host's, and still have wrapped."""
 HALF = 0.6
-"""Of a period: a delay that is longer is a missing reading."""
+"""Fraction of a period; a longer delay is a missing reading."""
 KEEP_PHASE = 3
 """Readings that may be missing before the instrument is no longer trusted to have kept its beat."""
 

@@ -33,7 +33,7 @@ __all__ = ["latency", "started"]
 ECHO = Path(__file__).with_name("echo.py")
 RATES = (100, 1000)
 SECONDS = 5.0
-"""Of one repetition."""
+"""Duration of one repetition."""
 GRACE = 1.0
 """s in which the last samples may still come."""
 WARM_UP = 0.5

@@ -70,7 +70,7 @@ def weighed(
 
 
 def by_causes(values: Mapping[tuple[Span, ...], Array]) -> Wholes:
-    """Of every whole of causes the best value."""
+    """Best value of every set of causes."""
     wholes: Wholes = {}
     for spans, value in values.items():
         whole = frozenset(span.cause for span in spans)

@@ -35,13 +35,13 @@ LASTING = (
     "temperature_offset", "temperature_scale", "current_field", "unmodelled_actuator", "actuator_order", "hysteresis",
     "eddy_current", "channel_skew", "filter_lag", "clock_offset", "nonlinearity", "pressure_offset", "reference_bias",
 )  # fmt: skip
-"""What is the same on another deployment: the rest has its moment or its place, or its range in one log."""
+"""Causes that last to another deployment; the others are tied to a moment, a place or the range of one log."""
 NAMELESS = ("unknown", "seen", "foreign")
 """Parts in which nothing in the table is what is hidden."""
 TOLD = ("named", "ladder", "pair", *NAMELESS)
 """Parts of which theory says what comes out."""
 STRANGE = ("slip", "motional", "leak", "ranges")
-"""Of the foreign ones those that were made after the detector: it has no description for them either."""
+"""Foreign effects made after the detector, which has no description for them either."""
 SEEN = (
     "pan", "loose", "corrosion", "pulsation", "needle", "thermostat", "perming", "staircase", "swell", "cargo", "contact",
     "strobe", "storm", "rotor", "viscous", "brownout", "mains",

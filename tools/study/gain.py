@@ -76,7 +76,7 @@ def _oracle(name: str, result: Diagnosis) -> Calibration:
 
 
 def error(ds: xr.Dataset, calibration: Calibration) -> Array:
-    """Of the corrected total field, (n,) nT, against the reference."""
+    """Error of the corrected total field against the reference, (n,) nT."""
     return corrected(ds, calibration) - ds["reference_field"].to_numpy() - calibration.reference.bias
 
 

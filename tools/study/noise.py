@@ -17,7 +17,7 @@ NOISES = ("white", "ar", "mixed", "heavy", "uneven", "half", "map")
 """White; with a memory; white upon a longer one; heavy-tailed; louder at times; half as loud again as calibrated; over
 rock that is rough."""
 GLIDER = "glider"
-"""As in the paper's twin: eight times as loud, with a memory."""
+"""The noise of the paper's twin: eight times as large, and correlated."""
 LOSSES = ("single", "bursts", "hole", "surfacing")
 """One sample in twenty; a dozen times some two minutes; a sixth of the log at once; 44 s of every dive."""
 
@@ -53,7 +53,7 @@ def add_noise(ds: xr.Dataset, kind: str, seed: int) -> xr.Dataset:
 
 
 def left(losses: str, n: int, seed: int) -> Rows:
-    """Of a log's n rows those that are left, all of them where `losses` is empty."""
+    """Rows of a log that are left; all of its n rows where `losses` is empty."""
     rng = np.random.default_rng([seed, 98])
     there = np.ones(n, bool)
     if losses == "single":

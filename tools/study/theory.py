@@ -143,7 +143,7 @@ def information(
 
 
 def own_span(S: Array, spans: Sequence[Span], name: str) -> Span | None:
-    """Of the true cause the hypothesis of most evidence; what the log cannot test has none."""
+    """Most evident hypothesis of the true cause; None if the log cannot test it."""
     return max((span for span in spans if span.cause == name), key=lambda span: _worth(S, span), default=None)
 
 
@@ -156,7 +156,7 @@ def true_span(S: Array, own: Span | None, name: str, at: int) -> Span:
 
 
 def best_of(S: Array, spans: Sequence[Span]) -> dict[str, Span]:
-    """Of each cause the hypothesis that explains most of the truth."""
+    """Hypothesis of each cause that explains most of the truth."""
     found: dict[str, tuple[float, Span]] = {}
     for span in spans:
         found[span.cause] = max(

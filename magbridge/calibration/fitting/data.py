@@ -1,4 +1,4 @@
-"""From a deployment, or plain arrays, to what a fit compares."""
+"""From a deployment, or plain arrays, to the observations of a fit."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ __all__ = ["Observations", "monomials", "observations", "polynomial_samples"]
 
 FloatArray = NDArray[np.float64]
 COMMON, FAR = 0.005, 10.0
-"""A position is no position when it is farther from the median than FAR times what all but 2 COMMON of them span."""
+"""A position is implausible when it is farther from the median than FAR times the span of all but 2 COMMON of them."""
 FOLLOWED = ("sensor_temperature", "depth")
-"""What moves no mass, either, but may be followed as if it did."""
+"""Columns that move no mass but may be fitted as if they did."""
 _PER_SAMPLE = ("field", "reference", "parameters", "runs", "time", "attitude", "reference_ned")
 
 
@@ -74,7 +74,7 @@ class Observations:
 
     def __post_init__(self) -> None:
         n = len(self.field)
-        put = object.__setattr__  # the one moment in which a frozen thing is made
+        put = object.__setattr__  # frozen from here on
         parameters = np.asarray(self.parameters, float).reshape(n, -1 if n else len(self.names))
         k = parameters.shape[1]
         put(self, "names", tuple(self.names) or tuple(f"p{i + 1}" for i in range(k)))
@@ -90,7 +90,7 @@ class Observations:
         time = np.arange(n, dtype=float) if self.time is None else np.asarray(self.time, float)
         runs = np.zeros(n, int) if self.runs is None else np.asarray(self.runs)
         field = np.asarray(self.field, float)
-        absent = (field == 0.0).all(axis=1, keepdims=True)  # what a sensor says that is not there
+        absent = (field == 0.0).all(axis=1, keepdims=True)  # what an absent sensor reads
         field = np.where((np.abs(field) < BEYOND) & ~absent, field, np.nan)
         whole = np.isfinite(field).all(axis=1) & np.isfinite(reference)
         whole &= np.isfinite(parameters).all(axis=1) & np.isfinite(time)
@@ -116,9 +116,9 @@ class Observations:
 
     @property
     def steps(self) -> FloatArray:
-        """(n,) whole intervals since the sample before, infinite where that belongs to another run or came no earlier.
+        """(n,) whole intervals since the previous sample, infinite where that belongs to another run or is no earlier.
 
-        What came sooner counts as one interval: how noise hangs together is known for one, and not guessed for less.
+        A shorter step counts as one interval: the correlation of the noise is known for one, and not guessed for less.
         """
         assert self.time is not None
         assert self.runs is not None
@@ -156,7 +156,7 @@ def _enough(
     names: Sequence[str],
     reference: FloatArray,
 ) -> None:
-    """Refuse what cannot be fitted, saying which column is to blame."""
+    """Refuse data that cannot be fitted, naming the column to blame."""
     if whole.sum() >= 10:
         if not (reference[whole] > 0).all():
             raise CalibrationError("reference field: expected positive numbers (nT)")
@@ -261,8 +261,8 @@ def observations(
 def _at_common_time(ds: xr.Dataset, axis: str, values: FloatArray) -> FloatArray:
     """Interpolate a channel of a multiplexed converter to the row's time, as :mod:`magbridge.align` does live.
 
-    In a spiral a delay of 0.3 s is a rotation of a degree, always the same way: left in, it would be
-    calibrated into the coefficients, and stay there when the vehicle flies straight.
+    In a spiral a delay of 0.3 s is a rotation by a degree, always the same way. Left in, it would be absorbed by the
+    coefficients, and remain there when the vehicle flies straight.
     """
     if f"mag_time_{axis}" not in ds:
         return values

@@ -1,4 +1,4 @@
-"""Fit a calibration: one door, and a table of methods behind it."""
+"""Fit a calibration: one function, and a table of methods behind it."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ UNSEEN = 270.0  # deg of the compass: what is seen in less than a quarter of it 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """What a fit gives back.
+    """The result of a fit.
 
     Attributes
     ----------
@@ -49,14 +49,14 @@ class Fit:
     residual : (n,) array
         nT in the sensor's own units: ``(F - H_e) / |A^T u|``.
     warnings : tuple of str
-        What the data could not tell, in a pilot's words.
+        What the data could not determine, in words for a pilot.
     details : dict
         Numbers of the method: evidence, widths, what was determined; rank and how well each estimable
         combination is known from the data alone (nT).
     samples : Samples
-        What was compared, for a closer look (:mod:`.identify`).
+        The data as fitted, for :mod:`.identify`.
     supported : bool
-        The data hold the fit: what it leaves open is small against the noise (``--strict``).
+        The data support the fit: the error expected elsewhere is not large against the noise (``--strict``).
     """
 
     calibration: Calibration
@@ -68,7 +68,7 @@ class Fit:
 
     @property
     def scales(self) -> tuple[float, float]:
-        """Smallest and largest scale of A where the samples are: what the residual was bought with."""
+        """Smallest and largest scale of A at the samples: a fit can shrink its residual by shrinking these."""
         step = max(len(self.samples.phi) // 1000, 1)
         scales, _ = scales_and_offsets(
             self.samples.part(slice(None, None, step)), self.calibration.coefficients
@@ -94,8 +94,8 @@ def fit(
     order : int
         Highest total degree of the polynomials.
     site_bias : float
-        nT, 1-sigma of what the reference may be wrong by all over the site. No scalar fit at one site
-        can tell it from the gain: it goes into the covariance.
+        nT, 1-sigma of a constant error of the reference over the site. No scalar fit at one site can tell
+        it from the gain, so it goes into the covariance.
     **options
         The method's own.
 
@@ -118,7 +118,7 @@ def fit(
 
 
 def _without_doubles(data: Observations) -> tuple[Observations, tuple[str, ...]]:
-    """Count samples once that stand there twice: a run given in two files."""
+    """Count duplicated samples once, as of a run given in two files."""
     assert data.time is not None
     order = np.argsort(data.time, kind="stable")
     time, field = data.time[order], data.field[order]
@@ -156,7 +156,7 @@ def _refuse_other_units(data: Observations) -> None:
 
 
 def _refuse_one_attitude(data: Observations) -> None:
-    """Refuse samples that all point the same way: nothing in them turns the sensor's errors."""
+    """Refuse samples of one attitude: they cannot separate the sensor's errors from the field."""
     unit = data.field / np.linalg.norm(data.field, axis=1)[:, None]
     middle = unit.mean(axis=0)
     off = np.degrees(np.arccos(np.clip(unit @ middle / np.linalg.norm(middle), -1.0, 1.0)))
@@ -168,7 +168,7 @@ def _refuse_one_attitude(data: Observations) -> None:
 
 
 def _judged(found: Fit, data: Observations, doubled: tuple[str, ...]) -> Fit:
-    """Add the boresight, and say what the data could not tell."""
+    """Add the boresight, and warnings of what the data could not determine."""
     calibration = found.calibration
     if calibration.boresight is None:
         calibration = with_boresight(calibration, find_boresight(calibration, data))

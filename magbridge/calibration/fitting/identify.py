@@ -1,4 +1,4 @@
-"""What the data can tell, and what they cannot: rank, estimable combinations, words for a pilot."""
+"""What the data determine and what they do not: rank, estimable combinations, warnings for a pilot."""
 
 from __future__ import annotations
 
@@ -165,4 +165,4 @@ CHECKS: tuple[Callable[[Calibration, Observations], Iterator[str]], ...] = (
     _attitudes,
     _runs,
 )
-"""What may be wrong with a set of runs; each yields a sentence for each fault it finds."""
+"""Checks of a set of runs; each yields a sentence for each fault that it finds."""

@@ -24,11 +24,11 @@ FloatArray = NDArray[np.float64]
 MANY = 12
 """Monomials that are tried together."""
 POWERS = 4
-"""Of one mass, beyond those that its polynomial has, that are tried together."""
+"""Powers of one mass, beyond those of its polynomial, that are tried together."""
 FALLS = (1.0, 0.3)
-"""Of a field's series, from order to order."""
+"""Ratios by which the series of a field falls from order to order."""
 STRAIGHT = 4.0
-"""Of half the travel, over which a branch of hysteresis bends: it does not."""
+"""Scale, in half travels, of a branch of hysteresis that is practically straight."""
 
 
 def unmodelled_actuator(problem: Problem) -> list[Candidate]:

@@ -23,7 +23,7 @@ BROADEST = 1e-3
 SOFT, HARD = 0.02, 2000.0
 """Soft iron, of the field, and hard iron, nT: 1-sigma of what vehicles have."""
 STABLE = 2e-5
-"""Of the field: no fluxgate's scale, axes and offset hold better than twenty parts per million between days."""
+"""Stability between days, as a fraction of the field: no fluxgate's scales, axes and offsets do better than 20 ppm."""
 
 
 def level(calibration: Calibration, e: FloatArray) -> float:

@@ -1,1 +1,1 @@
-"""What the data say: likelihood and noise, the search for causes, what is left, what could be told apart."""
+"""Inference: likelihood and noise, the search for causes, the unexplained rest, and which causes can be told apart."""

@@ -1,4 +1,4 @@
-"""Whether the names that were found stand, against a description of the same without a name."""
+"""Decide whether names are asserted, against descriptions of the same signal without a name."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ __all__ = ["accept"]
 
 
 def accept(problem: Problem, outcome: Outcome, tone: Candidate | None) -> tuple[bool, Leftover | None]:
-    """Say whether the names stand, and what is left beside them or, if they do not, at all.
+    """Say whether the names are asserted, and describe what is left beside them or, if they are not, the whole signal.
 
-    Names and free descriptions of the whole pay for what they were chosen from. What the names did leave, told by a description
-    beside them, counts with them; where it is another thing than they are, they pay for that as for one more cause. A cause that
-    the table lacks is a rival like any other: names are asserted if they are likelier than every description, and stay possible
-    until one beats them 20:1.
+    Names and free descriptions both pay for the number of alternatives they were chosen from. A description of what the names
+    leave counts with them; if it is something else than they are, they pay for it as for a further cause. A cause that the table
+    lacks is a rival like any other: names are asserted if they are likelier than every description, and remain possible until
+    one beats them 20:1.
     """
     model = [h.candidate for h in outcome.chosen]
     rest = leftover(problem, model, outcome.fit, outcome.order, tone)
@@ -35,7 +35,7 @@ def accept(problem: Problem, outcome: Outcome, tone: Candidate | None) -> tuple[
         names += rest.among
         if rest.signal_to_noise < REMNANT * max(h.signal_to_noise for h in outcome.chosen):
             rest = None
-    # what holds the names' own regressors and finds nothing else beside them is no other explanation
+    # a description that contains the names' own regressors, with nothing else beside them, is no alternative
     alone = rest is None or _same(outcome.chosen, rest)
     free = leftover(problem, [], outcome.null, outcome.order, tone, but=model if alone else ())
     if not alone:
@@ -46,7 +46,7 @@ def accept(problem: Problem, outcome: Outcome, tone: Candidate | None) -> tuple[
 
 
 def _same(chosen: Sequence[Hypothesis], rest: Leftover) -> bool:
-    """Say whether what is left is more of what a louder name says: its regressor is idealised."""
+    """Say whether the rest is a remnant of a stronger named cause, whose regressor is idealised."""
     told = rest.description
     return told is not None and any(
         told.retells([h.candidate]) and h.signal_to_noise > rest.signal_to_noise for h in chosen

@@ -1,4 +1,4 @@
-"""What has a moment: since when the body's own field is another, and what passed by."""
+"""Events: the moment at which the body's own field changed, and the passage of a distant source."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ __all__ = ["passage", "step"]
 FloatArray = NDArray[np.float64]
 
 MOMENTS = 96
-"""At which a step is looked for."""
+"""Moments at which a step is tried."""
 DURATIONS, SHORTEST, LONGEST = 12, 8.0, 0.125
-"""Of a passage: how many are tried, from so many samples to this share of the log."""
+"""Durations of a passage: how many are tried, from so many samples to this share of the log."""
 QUARTERS = np.arange(-12, 13)
-"""Of its duration, over which a passage is looked for."""
+"""Quarters of its duration over which a passage is evaluated."""
 
 
 def step(problem: Problem, fit: Joint) -> tuple[Columns, float]:
-    """Find since when the offsets are most surely other ones, the calibration free.
+    """Find the most likely moment of a change of the offsets, with the calibration free.
 
     Returns
     -------
     Columns
-        Of the three offsets since then.
+        The three offsets from then on.
     trials : float
         Moments that were tried.
     """
@@ -55,7 +55,7 @@ def step(problem: Problem, fit: Joint) -> tuple[Columns, float]:
 
 
 def passage(problem: Problem, fit: Joint) -> tuple[Columns, float]:
-    r"""Find when, and for how long, a distant source most surely passed: all durations T, at every half of one.
+    r"""Find the most likely passage of a distant source, over all durations T, in steps of half a duration.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""Exchange: what was found first was chosen without what was found later."""
+"""Exchange causes for their rivals, since those found first were chosen without those found later."""
 
 from __future__ import annotations
 
@@ -18,15 +18,16 @@ from magbridge.diagnose.inference.weigh import slack
 __all__ = ["exchanged"]
 
 CHANGES = 6
-"""At most."""
+"""Exchanges at most."""
 TRIED = 3
-"""Of what could stand there, at a time."""
+"""Alternatives tried for each place."""
 
 
 def exchanged(state: State, model: list[Candidate], base: Joint) -> tuple[list[Candidate], Joint]:
-    """Put others in the place of one cause or of two, profiled there, as long as the evidence of the whole grows.
+    """Replace one cause or two by others, profiled there, while the evidence of the whole model grows.
 
-    More numbers must win by what the errors of the rest's regressors may lend them, fewer may lose by that.
+    A replacement with more coefficients must win by what the errors of the other regressors may lend it; one with fewer may
+    lose by as much.
     """
     pieces = [piece for candidate in model for piece in candidate.pieces]
     for _ in range(CHANGES):
@@ -36,7 +37,7 @@ def exchanged(state: State, model: list[Candidate], base: Joint) -> tuple[list[C
             changed, fit = refined(state, [*new, *rest], state.fit([*new, *rest], like=base), len(new))
             more = _more(new, [pieces[n] for n in at])
             if len({c.cause for c in changed}) > len({piece.cause for piece in pieces}):
-                more = max(more, 0.0)  # another cause is never the simpler
+                more = max(more, 0.0)  # a further cause never makes a model simpler
             lent = slack(state.ratio(state.fit(rest, like=base))) if rest and more else 0.0
             gain = state.value(changed, fit) - own - more * lent
             if gain > better[0]:  # a month's fit is large: only one is kept
@@ -48,14 +49,14 @@ def exchanged(state: State, model: list[Candidate], base: Joint) -> tuple[list[C
 
 
 def _more(new: list[Candidate], old: list[Candidate]) -> float:
-    """Sign of how many more free numbers are `new`; where some have one common size, the data say how many they are."""
+    """Sign of the difference in free coefficients; 0 where some have one common size, since the data then decide how many count."""
     if any(c.spectra is not None for c in (*new, *old)):
         return 0.0
     return float(np.sign(sum(c.size for c in new) - sum(c.size for c in old)))
 
 
 def _changes(state: State, pieces: list[Candidate], base: Joint) -> list[tuple[list[Candidate], list[int]]]:
-    """List what could stand in which places, the likeliest first."""
+    """List replacements and the places they would take, the likeliest first."""
     info = state.beside(pieces, base)
     found = []
     if len(pieces) == 1:
@@ -70,14 +71,14 @@ def _changes(state: State, pieces: list[Candidate], base: Joint) -> list[tuple[l
 
 
 def _separate(new: list[Candidate], pieces: list[Candidate], at: list[int]) -> bool:
-    """Say whether numbers of one common size stay a whole: they are no part of a cause's others."""
+    """Say whether coefficients of one common size remain a candidate of their own, apart from the cause's others."""
     changed = [*new, *(piece for n, piece in enumerate(pieces) if n not in at)]
     causes = [candidate.cause for candidate in changed]
     return all(candidate.spectra is None or causes.count(candidate.cause) == 1 for candidate in changed)
 
 
 def _gathered(state: State, pieces: list[Candidate], base: Joint) -> tuple[list[Candidate], Joint]:
-    """Make each cause's pieces one candidate."""
+    """Join the pieces of each cause into one candidate."""
     causes = list(dict.fromkeys(piece.cause for piece in pieces))
     if len(causes) == len(pieces):
         return pieces, base

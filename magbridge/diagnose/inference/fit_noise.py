@@ -26,13 +26,13 @@ LONGEST = ORDERS[-1]
 GAUSSIAN = 1e5
 """Degrees of freedom from which on the tails are taken for Gaussian."""
 ALTERNATIONS = 6
-"""Between the weights of the samples and the level, at most."""
+"""Alternations between the weights of the samples and the level, at most."""
 SETTLED = 0.01
-"""Log likelihood: less is no gain."""
+"""Gain in log likelihood below which the fit has converged."""
 LOSS = 0.02
 """Of the prediction, at most: what p coefficients lose that are fitted to samples with a whole past, p for each of those."""
 NEAR = 0.9999
-"""Partial correlation, at most."""
+"""Largest partial correlation."""
 PIECE, PIECES = 600, 64
 """Samples by which a column's frequencies are told: pieces this long, so many at most."""
 

@@ -1,4 +1,4 @@
-r"""What the data say of every candidate at once.
+r"""The information that the data hold on every candidate at once.
 
 Notes
 -----

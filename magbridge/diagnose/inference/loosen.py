@@ -1,4 +1,4 @@
-r"""The nonlinear parameters of what was found are estimates, too: what that adds to the covariance of all numbers.
+r"""The uncertainty of nonlinear parameters, and what it adds to the covariance of all coefficients.
 
 Notes
 -----
@@ -28,11 +28,11 @@ __all__ = ["loosened"]
 FloatArray = NDArray[np.float64]
 
 SHARE = 0.05
-"""Of a cell, by which a parameter is moved for its derivative."""
+"""Fraction of a grid cell by which a parameter is moved for its derivative."""
 
 
 def loosened(problem: Problem, model: Sequence[Candidate], columns: Sequence[Columns], fit: Joint) -> Joint:
-    """Return the fit with the covariance that its numbers have when nonlinear parameters are free, too.
+    """Return the fit with the covariance that its coefficients have when the nonlinear parameters are free, too.
 
     Parameters
     ----------

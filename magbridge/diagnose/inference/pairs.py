@@ -1,9 +1,9 @@
-r"""Two causes at once: every pair of candidates in the place of two regressors of a model.
+r"""Two causes at once: every pair of candidates in place of two regressors of a model.
 
 Notes
 -----
-A cause that was found may hold another's place only because the one beside it holds a third's: neither gives way alone. So
-what could stand there is weighed in pairs, all others of the model projected out (:mod:`.information`):
+A wrong cause may persist only because the one beside it is wrong, too, and neither gives way alone. So replacements are weighed
+in pairs, with all others of the model projected out (:mod:`.information`):
 
 .. math:: E_{ab} = E_a + E_{b \mid a}, \qquad
           E_{AB} = \ln \frac{1}{|A| |B|} \sum_{a \in A, b \in B} e^{E_{ab}}

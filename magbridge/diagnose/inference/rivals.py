@@ -1,4 +1,4 @@
-"""What could stand in a cause's place: the other names that these data do not rule out."""
+"""Rivals of a cause: the other names that the data do not rule out."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ __all__ = ["Rival", "rivals_of"]
 
 @dataclass(frozen=True)
 class Rival:
-    """What could stand in a cause's place: the best of its name and channel.
+    """A rival of a cause: the best candidate of its own cause and channel.
 
     Attributes
     ----------
@@ -43,13 +43,13 @@ class Rival:
 def rivals_of(
     state: State, info: Information, model: list[Candidate], base: Joint, k: int
 ) -> tuple[Rival, ...]:
-    """Return what could stand in the place of the k-th of `model`, whose columns are the last of `info`."""
+    """Return the rivals of the k-th cause of `model`, whose columns are the last of `info`."""
     ends = state.at[-1].stop + np.cumsum([0, *(candidate.size for candidate in model)])
     own = np.arange(ends[k], ends[k + 1])
     others = np.setdiff1d(np.arange(ends[0], ends[-1]), own)
     c = base.coefficients[own - ends[0]]
     alone = info.without(others, base.prior[len(base.z) + others - ends[0]])
-    # what the data say when this cause is taken out of the fit
+    # the scores with this cause taken out of the fit
     alone = replace(alone, score=alone.score + alone.matrix[:, own] @ c)
     mine = score(alone, slice(int(own[0]), int(own[-1]) + 1), model[k])
     scores = state.scores(alone)

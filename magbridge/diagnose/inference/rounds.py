@@ -1,4 +1,4 @@
-"""One round of the search: every cause scored and the likeliest fitted, beside a model that stands already."""
+"""One round of the search: score every cause beside the model so far, and fit the likeliest."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class Hypothesis:
 
     @property
     def signal_to_noise(self) -> float:
-        """Whitened norm of what is the effect's own under the noise that is left, less what noise alone gives."""
+        """Whitened norm of the effect under the remaining noise, projected, less what noise alone would give."""
         size = self.candidate.size
         known = self.fit.prior[-size:] * np.diag(self.fit.covariance)[-size:]
         power = wald(self.fit, size) - float(np.sum(1.0 - known))
@@ -121,7 +121,7 @@ class State:
         return [score(info, at, candidate) for at, candidate in zip(self.at, self.candidates, strict=True)]
 
     def best(self, scores: Sequence[Score]) -> dict[tuple[str, str | None], tuple[int, float]]:
-        """Of each group its best member, and log of the grid's average against it: what the nonlinear parameters cost."""
+        """Best member of each group, and the log of the grid's average over its peak: the price of the nonlinear parameters."""
         found = {}
         for group, members in self.groups.items():
             evidences = np.array([scores[k].evidence for k in members])
@@ -156,7 +156,7 @@ class State:
         return info
 
     def _bare(self, model: list[Candidate], base: Joint, info: Information) -> Information:
-        """Score again under the noise that is left when the best of every cause takes what it can."""
+        """Score again under the noise that remains when the best candidate of every cause is fitted."""
         top: dict[str, tuple[float, int]] = {}
         scores = self.scores(info)
         for k, s in enumerate(scores):
@@ -188,7 +188,7 @@ class State:
     def _joint(
         self, model: list[Candidate], base: Joint, entries: list[tuple[int, float, Score, Information]]
     ) -> Hypothesis:
-        """Fit one cause jointly, at the grid's points that won under either noise."""
+        """Fit one cause jointly at the grid points that won under either noise."""
         found = []
         for k in {entry[0] for entry in entries}:
             candidate = self.candidates[k]
@@ -208,7 +208,7 @@ class State:
         return max(found, key=lambda h: h.evidence)
 
     def p_value(self, candidate: Candidate, ratio: float, freedom: int) -> float:
-        """Of a likelihood ratio, times the hypotheses behind its cause, times the causes.
+        """P-value of a likelihood ratio, times the hypotheses behind its cause, times the causes.
 
         The noise's level is an estimate, so the distribution is Fisher's F.
         """

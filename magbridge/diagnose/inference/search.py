@@ -1,4 +1,4 @@
-r"""The search: which causes the data speak for, one after the other.
+r"""The search for the causes that the data support, one after the other.
 
 Notes
 -----
@@ -41,7 +41,7 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """What a search ends with.
+    """The result of a search.
 
     Attributes
     ----------

@@ -18,7 +18,7 @@ __all__ = ["sets_of"]
 def sets_of(
     state: State, info: Information, model: list[Candidate], base: Joint
 ) -> tuple[tuple[Rival, ...], ...]:
-    """For each of `model`, the others that could stand in its place, be it that another place is then taken otherwise, too."""
+    """Return the rivals of each cause of `model`, including those that need another cause to be replaced as well."""
     pieces = [(piece, place) for place, candidate in enumerate(model) for piece in candidate.pieces]
     own = [{key(piece) for piece in candidate.pieces} for candidate in model]
     found: list[dict[tuple[str, str | None], Rival]] = [{} for _ in model]

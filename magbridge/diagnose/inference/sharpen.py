@@ -1,4 +1,4 @@
-"""Nonlinear parameters between the points of their grid: profiled, beside the other causes of a model."""
+"""Profile nonlinear parameters between the points of their grid, beside the other causes of a model."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ __all__ = ["refined", "sharpen"]
 FloatArray = NDArray[np.float64]
 
 COLUMNS, STAGES = 144, 2
-"""Of the values that are tried between the ends of a nonlinear parameter's bracket, and how often it is narrowed to the
-neighbours of the best."""
+"""Columns of the values tried within a nonlinear parameter's bracket, and how often that is narrowed to the neighbours
+of the best value."""
 
 
 def sharpen(state: State, model: list[Candidate], hypothesis: Hypothesis, base: Joint) -> Hypothesis:
     """Profile the nonlinear parameters of a cause beside `model`, whose fit is `base`, one after the other.
 
-    Under the noise that stands, where many values are scored at once: a likelihood has more than one peak in an onset.
-    What the evidence's average over the bracket lacks to its peak is what knowing them better costs.
+    Many values are scored at once under the present noise, because the likelihood of an onset has several peaks. The evidence
+    pays for the choice: the average over the bracket counts, not the peak.
     """
     best, narrow = hypothesis, 0.0
     if best.candidate.again is None:

@@ -1,4 +1,4 @@
-r"""What a candidate's numbers say: each of them free, or all of one common free size.
+r"""Likelihood ratio of a candidate whose coefficients are each free, or have one common free size.
 
 Notes
 -----

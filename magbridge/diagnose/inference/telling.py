@@ -1,4 +1,4 @@
-r"""The chance that a cause, were it there, would be named alone: from telemetry, attitude and noise, not from the residual.
+r"""The chance that a cause, if present, would be named alone: from telemetry, attitude and noise, not from the residual.
 
 Notes
 -----

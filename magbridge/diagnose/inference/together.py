@@ -15,11 +15,11 @@ from magbridge.diagnose.inference.weigh import LEVEL, REMNANT, score, slack
 __all__ = ["MOST", "enough", "together"]
 
 MOST = 6
-"""Regressors in one log."""
+"""Regressors chosen in one log, at most."""
 
 
 def together(state: State) -> list[Candidate]:
-    """Choose causes one beside the other, each measured with the calibration and those before it free."""
+    """Choose causes one after the other, each scored with the calibration and the earlier ones free."""
     info = state.bare
     picked: list[int] = []
     loudest, ratio = 0.0, 0.0
@@ -47,7 +47,7 @@ def together(state: State) -> list[Candidate]:
 
 
 def enough(state: State, first: list[Hypothesis]) -> Hypothesis | None:
-    """Return the best single cause, if there is one, beside which nothing else would be found."""
+    """Return the best single cause beside which nothing else would be found, if there is one."""
     members = {(id(c.columns)): k for k, c in enumerate(state.candidates)}
     for h in first:
         k = members[id(h.candidate.columns)]

@@ -35,17 +35,17 @@ __all__ = ["Leftover", "leftover"]
 FloatArray = NDArray[np.float64]
 
 LOUD = 3
-"""Descriptions under each noise that are weighed by the whole likelihood."""
+"""Best descriptions under each noise that are then weighed by the full likelihood."""
 TOGETHER = 4
-"""Descriptions whose columns are whitened in one go."""
+"""Descriptions whose columns are whitened together."""
 TURNS = 6
 """Alternations between a curve and its direction."""
 CALM = 2
-"""Rounds in which slow curves and noise take from each other."""
+"""Rounds of fitting slow curves and noise in turn."""
 
 
 class Leftover(NamedTuple):
-    """Unexplained structure: its kind, size, and what it goes with.
+    """Unexplained structure: its kind, its size, and the channel it correlates with.
 
     Attributes
     ----------
@@ -57,7 +57,7 @@ class Leftover(NamedTuple):
     period_s : float or None
         Of a tone.
     best_channel : str or None
-        The telemetry that goes with it best.
+        The telemetry that correlates with it best.
     description : Description, optional
         What told it.
     choice : int

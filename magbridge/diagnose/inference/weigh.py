@@ -1,4 +1,4 @@
-r"""How strongly the data speak for a candidate, and what it would have to say to be believed.
+r"""How strongly the data speak for a candidate, and how strongly they must.
 
 Notes
 -----
@@ -54,12 +54,11 @@ FloatArray = NDArray[np.float64]
 LEVEL = 0.01
 """Family-wise false-alarm rate."""
 ODDS = float(np.log(20.0))
-"""Log evidence by which a cause must win to be named alone, had its regressor no error."""
+"""Log evidence by which a cause with an exact regressor must win to be named alone."""
 IDEAL = 0.2
-"""How far from the truth an idealised regressor may be, as a share of its norm: one that does not explain that much less
-is a rival."""
+"""Error of an idealised regressor, as a share of its norm: a cause that explains less by no more than that is a rival."""
 REMNANT = 0.3
-"""Of the strongest cause's signal-to-noise: less is what its idealised regressor has left, not another cause.
+"""Share of the strongest cause's signal-to-noise; anything weaker is a remnant of its idealised regressor, not another cause.
 
 The price: a second cause that weak is not named beside it.
 """
@@ -68,7 +67,7 @@ SIMULATIONS = 400
 
 @dataclass(frozen=True, eq=False)
 class Score:
-    """Of one candidate under one noise: likelihood ratio, its degrees of freedom, log evidence, estimate, prior precision."""
+    """Score of one candidate under one noise: likelihood ratio, its degrees of freedom, log evidence, estimate, prior precision."""
 
     ratio: float
     freedom: int
