@@ -65,3 +65,12 @@ def test_a_reader_who_has_read_enough_is_no_error(arguments: list[str]) -> None:
     ended = subprocess.run(command, stdout=writing, stderr=subprocess.PIPE, check=False)
     os.close(writing)
     assert (ended.returncode, ended.stderr) == (0, b"")
+
+
+@pytest.mark.parametrize("closed", ["2>&-", "<&- >&- 2>&-"])
+def test_streams_that_whoever_started_it_has_closed(tmp_path: Path, closed: str) -> None:
+    """As a service's may be: what is to be said goes nowhere, and into no file that takes the free descriptor."""
+    (tmp_path / "a.csv").write_text("time,mag_x\n1,2\n")
+    command = f'exec "{sys.executable}" -m magbridge convert a.csv -o b.csv {closed}'
+    assert subprocess.run(["sh", "-c", command], cwd=tmp_path, check=False).returncode == 0
+    assert (tmp_path / "b.csv").read_text().startswith("time,mag_x\n1.0,2.0\n")

@@ -5,9 +5,11 @@ Exit codes: 0 done, 1 the data do not allow it, 2 wrong use. What is wrong goes 
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 from contextlib import suppress
+from pathlib import Path
 
 from cyclopts import CycloptsError, UnusedCliTokensError
 
@@ -41,6 +43,11 @@ EXTRAS = {
 
 def main(arguments: list[str] | None = None) -> int:
     """Run a command; return its exit code."""
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if (
+            getattr(sys, name) is None
+        ):  # closed by whoever started us; in this order each gets its own descriptor
+            setattr(sys, name, Path(os.devnull).open(mode))  # noqa: SIM115 - as long as the process
     with suppress(ValueError):  # on another thread than the first: signals are another's business
         signal.signal(signal.SIGTERM, _terminated)
     try:
