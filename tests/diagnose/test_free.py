@@ -9,7 +9,7 @@ from scipy.stats import multivariate_normal
 from magbridge.calibration.fitting.data import observations
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.lowpass import unfiltered
-from magbridge.diagnose.inference.free import _bends, _response
+from magbridge.diagnose.inference.shapes import bends, response
 from magbridge.diagnose.inference.statistic import SIZES, Statistic
 from magbridge.diagnose.run import diagnose
 from sitl import load, simulate
@@ -58,6 +58,6 @@ def test_a_converter_whose_steps_differ_is_described() -> None:
     code = np.round(reading / 4000.0).astype(int)
     bent = np.sum(slopes * np.take_along_axis(rng.normal(size=(26, 3)), code % 26, axis=0), axis=1)
     given = 10.0 * bent / np.linalg.norm(bent) + rng.normal(size=4000)
-    X = _response(reading, slopes)(slice(None))
+    X = response(reading, slopes)(slice(None))
     S, b = X.T @ X, X.T @ given
-    assert Statistic(S, np.array([width**2 for _, width in _bends()])).best(b).ratio > 2.0 * 10.0
+    assert Statistic(S, np.array([width**2 for _, width in bends()])).best(b).ratio > 2.0 * 10.0

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from magbridge.diagnose.compare.problem import Problem, pose
 from magbridge.diagnose.compare.survey import Survey
-from magbridge.diagnose.inference.free import _ends, _repeated
 from magbridge.diagnose.inference.information import information
 from magbridge.diagnose.inference.joint import fit_joint
 from magbridge.diagnose.inference.packets import packets
+from magbridge.diagnose.inference.shapes import ends, repeated
 from magbridge.diagnose.inference.statistic import Statistic
 
 
@@ -87,8 +87,8 @@ def test_a_packet_keeps_its_period_and_place_where_samples_are_lost(
 
 def test_what_lies_loose_changes_ends_when_it_is_tipped_far_enough() -> None:
     down = np.sin(np.radians([0.0, 4.0, 8.0, 4.0, -4.0, -8.0, -4.0, 4.0, 30.0]))
-    ends = _ends(down)(slice(None))
-    steps = np.diff(ends, axis=0)
+    sides = ends(down)(slice(None))
+    steps = np.diff(sides, axis=0)
     assert (steps[:, 1] != 0.0).tolist() == [False, True, False, False, True, False, False, True]
 
 
@@ -96,6 +96,6 @@ def test_what_each_dive_repeats_holds_a_decay_from_its_start(problem: Problem) -
     survey = problem.survey
     start = np.flatnonzero(np.diff(survey.dive, prepend=survey.dive[0] - 1))
     since = survey.time - np.repeat(survey.time[start], np.diff([*start, len(survey.dive)]))
-    X, decay = _repeated(problem)(slice(None)), np.exp(-since / 60.0)
+    X, decay = repeated(problem)(slice(None)), np.exp(-since / 60.0)
     left = decay - decay.mean() - X @ np.linalg.lstsq(X, decay - decay.mean(), rcond=None)[0]
     assert left @ left < 0.1 * np.sum((decay - decay.mean()) ** 2)

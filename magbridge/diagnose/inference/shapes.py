@@ -1,0 +1,125 @@
+"""The functions of which descriptions without a name are made, and their prior widths."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magbridge.diagnose.causes.regressors import play, powers
+from magbridge.diagnose.compare.columns import Columns
+from magbridge.diagnose.compare.problem import Problem
+
+__all__ = [
+    "REPEATED",
+    "SLOPES",
+    "bends",
+    "curve",
+    "direction",
+    "ends",
+    "memory",
+    "repeated",
+    "response",
+    "spectra",
+]
+
+FloatArray = NDArray[np.float64]
+
+BEND = 32
+"""Order of a channel's free response: fine enough for a converter's coarsest steps."""
+PLAYS = (0.3, 0.8)
+"""Widths of the play operators that describe a channel's past, in half ranges."""
+REPEATED = 8
+"""Half waves per dive of what repeats with every dive."""
+SLOPES = (0.0, 0.1, 0.2)
+"""Sines of the angles at which a loose object in the hull starts to slide."""
+
+
+def spectra(count: int, axes: int) -> tuple[tuple[str, FloatArray], ...]:
+    """Widths of an exponential memory's half waves (a relaxation, a telegraph): ``1 / sqrt(1 + (k / k_0)^2)``."""
+    k = np.repeat(np.arange(1, count + 1), axes)
+    return tuple((kind, 10.0 / np.sqrt(1.0 + (k / corner) ** 2)) for kind, corner in (("drift", 1.0), ("switching", 8.0)))  # fmt: skip
+
+
+def direction(body: FloatArray) -> Columns:
+    """Functions up to quartic of the field's direction in the body."""
+    unit = body / np.linalg.norm(body, axis=1)[:, None]
+    exponents = [(i, j, d - i - j) for d in (1, 2, 3, 4) for i in range(d + 1) for j in range(d + 1 - i)]
+
+    def columns(rows: slice) -> FloatArray:
+        part = unit[rows].T
+        table = np.concatenate([np.ones((1, *part.shape)), powers(part, 4)])
+        return np.stack([table[i, 0] * table[j, 1] * table[k, 2] for i, j, k in exponents]).T
+
+    return columns
+
+
+def response(reading: FloatArray, slopes: FloatArray) -> Columns:
+    """Each channel's error as any smooth function of its own reading: Chebyshev polynomials."""
+    x = np.clip([_scaled(channel) for channel in reading.T], -1.0, 1.0)
+    turning = x + 1j * np.sqrt(1.0 - x**2)  # by the angle whose cosine is x
+
+    def columns(rows: slice) -> FloatArray:
+        waves = powers(turning[:, rows], BEND).real.swapaxes(0, 1)
+        return (slopes.T[:, None, rows] * waves).reshape(3 * BEND, -1).T
+
+    return columns
+
+
+def bends() -> tuple[tuple[str, FloatArray], ...]:
+    """Widths of a response's polynomials: with steps, with a corner, or without."""
+    k = np.arange(1.0, BEND + 1.0)
+    return tuple(
+        ("broadband", np.tile(30.0 / width, 3)) for width in (np.sqrt(1.0 + (k / 8.0) ** 2), k**2, k**3)
+    )
+
+
+def curve(values: FloatArray) -> Columns:
+    """Powers of a channel."""
+    y = _scaled(values)
+    return _centred(lambda rows: powers(y[rows], 4).T)
+
+
+def memory(values: FloatArray) -> Columns:
+    """Functions of a channel's past: curved branches of hysteresis, narrow and wide, and its direction of motion."""
+    y = _scaled(values)
+    plays = [play(y, width) for width in PLAYS]
+    change = np.diff(y, prepend=y[0])
+    way = np.where(np.abs(change) > 1e-3, np.sign(change), 0.0)
+
+    def columns(rows: slice) -> FloatArray:
+        v, w = y[rows], way[rows]
+        branches = [powers(x[rows], 3) - powers(v, 3) for x in plays]
+        return np.concatenate([*branches, [w, w * v]]).T
+
+    return _centred(columns)
+
+
+def repeated(problem: Problem) -> Columns:
+    """Half waves in the course of a dive, the same in all."""
+    dive, time = problem.survey.dive, problem.survey.time
+    start = np.flatnonzero(np.diff(dive, prepend=dive[0] - 1))
+    since = time - np.repeat(time[start], np.diff([*start, len(dive)]))
+    # the median: a long last dive must not stretch the others
+    usual = max(float(np.median([since[end - 1] for end in [*start[1:], len(dive)]])), 1.0)
+    u = np.minimum(since / usual, 1.0)
+    turning = np.exp(1j * np.pi * u)
+    return _centred(lambda rows: powers(turning[rows], REPEATED).real.T)
+
+
+def ends(down: FloatArray) -> Columns:
+    """Return the end of the hull at which a loose object lies: it slides to the lower one, once tilted by so much."""
+    place = np.arange(len(down))
+    sides = []
+    for slope in SLOPES:
+        last = np.maximum.accumulate(np.where(np.abs(down) > slope, place, 0))
+        sides.append(np.sign(down[last]))
+    return _centred(lambda rows: np.stack([side[rows] for side in sides]).T)
+
+
+def _centred(columns: Columns) -> Columns:
+    mean = columns(slice(None)).mean(axis=0)
+    return lambda rows: columns(rows) - mean
+
+
+def _scaled(values: FloatArray) -> FloatArray:
+    return np.asarray(2.0 * (values - values.min()) / max(float(np.ptp(values)), 1e-12) - 1.0)
