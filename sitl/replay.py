@@ -150,22 +150,8 @@ def _play(
     raw = np.hypot.reduce([deployment[name].to_numpy() for name in CHANNELS])
     reference = _reference(deployment)
     nearest = _nearest(times, field["time"])
-    told = []
-    for part in parts:
-        rows = rows_of(part, times[nearest])
-        error = field["total_field"][rows] - reference[nearest][rows]
-        known = np.isfinite(error)
-        told.append(
-            {
-                "name": part.name,
-                "samples": int(rows.sum()),
-                "raw_rms_nT": _rms((raw - reference)[nearest][rows]),
-                "corrected_rms_nT": _rms(error),
-                "corrected_mean_nT": float(error[known].mean()) if known.any() else None,
-                "sigma_nT": _rms(field["sigma"][rows]),
-                "held_out": False,
-            }
-        )
+    error, uncorrected = field["total_field"] - reference[nearest], (raw - reference)[nearest]
+    compared = [_compared(part, times[nearest], uncorrected, error, field["sigma"]) for part in parts]
     return {
         "samples": len(field["time"]),
         "rows": len(times),
@@ -175,8 +161,24 @@ def _play(
         "navigation": dict(listener.navigation),
         "span_s": float(times[-1] - times[0]),
         "seconds": seconds,
-        "parts": told,
+        "parts": compared,
         "skipped": passed_over(deployment.attrs),
+    }
+
+
+def _compared(part: Part, times: Floats, raw: Floats, corrected: Floats, sigma: Floats) -> Result:
+    """Return the errors (n,) nT against the reference, raw and corrected, over one part of a replay."""
+    rows = rows_of(part, times)
+    error = corrected[rows]
+    known = np.isfinite(error)
+    return {
+        "name": part.name,
+        "samples": int(rows.sum()),
+        "raw_rms_nT": _rms(raw[rows]),
+        "corrected_rms_nT": _rms(error),
+        "corrected_mean_nT": float(error[known].mean()) if known.any() else None,
+        "sigma_nT": _rms(sigma[rows]),
+        "held_out": False,
     }
 
 

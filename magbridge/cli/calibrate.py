@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from math import inf
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter, validators
 
@@ -24,6 +24,9 @@ from magbridge.cli.common import (
 )
 from magbridge.errors import DataError, WrongUse
 from magbridge.progress import waiting
+
+if TYPE_CHECKING:
+    from magbridge.calibration.fitting.fit import Fit
 
 
 @app.command(usage="Usage: magbridge calibrate FILE... --parameter NAME... -o cal.json [OPTIONS]")
@@ -104,22 +107,32 @@ def calibrate(
         draw_fit(found.calibration, data, picture)
     for warning in found.warnings:
         complain(warning, 0)
-    result = {
-        "file": str(output),
-        "method": method,
-        "samples": len(data),
+    tell(
+        {"file": str(output), "method": method, **_facts(found, len(data))},
+        f"{output}: {method}, {_summary(found, len(data))}",
+        json,
+    )
+    if strict and not found.supported:
+        raise DataError("the data do not support this fit (see the warnings), and --strict was given")
+
+
+def _facts(found: Fit, samples: int) -> dict[str, Any]:
+    return {
+        "samples": samples,
         "rms_nT": found.rms,
         "supported": found.supported,
         "scales": found.scales,
         "noise_nT": found.calibration.noise.sensor,
         "warnings": found.warnings,
     }
+
+
+def _summary(found: Fit, samples: int) -> str:
     low, high = found.scales
-    left = f"{found.rms:.2f} nT RMS in the sensor's own units"
-    summary = f"{output}: {method}, {len(data)} samples, {left}, with scales of {low:.3f} to {high:.3f}"
-    tell(result, summary, json)
-    if strict and not found.supported:
-        raise DataError("the data do not support this fit (see the warnings), and --strict was given")
+    return (
+        f"{samples} samples, {found.rms:.2f} nT RMS in the sensor's own units, "
+        f"with scales of {low:.3f} to {high:.3f}"
+    )
 
 
 def _digests(files: tuple[Path, ...]) -> dict[str, str]:

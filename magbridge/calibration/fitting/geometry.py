@@ -124,19 +124,7 @@ def mounted_structure(
         `vehicle` names a mass that no parameter moves, or one so near that no series stands for it.
     """
     names = [parameter.name for parameter in parameters]
-    masses = []
-    for name, found in vehicle.items():
-        mounting = found if isinstance(found, Mounting) else msgspec.convert(found, Mounting)
-        if name not in names:
-            raise CalibrationError(f"vehicle: mass {name!r}: the fit's parameters are {', '.join(names)}")
-        k = names.index(name)
-        order = max(powers[k] for powers in exponents)
-        rows = [exponents.index(tuple(n * (i == k) for i in range(len(names)))) for n in range(1, order + 1)]
-        parameter, travel = parameters[k], np.array(mounting.travel)
-        middle = np.linalg.norm(np.array(mounting.at) + parameter.centre * travel)
-        if middle < 3.0 * parameter.scale * np.linalg.norm(travel) or middle == 0.0:
-            raise CalibrationError(f"vehicle: mass {name!r} passes within three half-travels of the sensor")
-        masses.append(_Mass(np.array(rows), np.array(mounting.at), travel, mounting.at_sigma, parameter))
+    masses = [_mass(name, found, exponents, parameters) for name, found in vehicle.items()]
     labels = tuple(f"{name} {kind}" for name in vehicle for kind in ("moment", "induced"))
     q, h, extra = free.design.shape[0], free.design.shape[1], len(labels)
     design = np.zeros((q + LATENT * len(masses), h + extra))
@@ -164,6 +152,27 @@ def mounted_structure(
         names=free.names + labels,
     )
     return _linearised(whole, free.E, masses, np.zeros((len(masses), LATENT)))
+
+
+def _mass(
+    name: str,
+    found: Mounting | Mapping[str, Any],
+    exponents: tuple[Exponents, ...],
+    parameters: tuple[Parameter, ...],
+) -> _Mass:
+    """Return a mass with the rows of its parameter's pure powers; refuse one that is unknown or too near."""
+    mounting = found if isinstance(found, Mounting) else msgspec.convert(found, Mounting)
+    names = [parameter.name for parameter in parameters]
+    if name not in names:
+        raise CalibrationError(f"vehicle: mass {name!r}: the fit's parameters are {', '.join(names)}")
+    k = names.index(name)
+    order = max(powers[k] for powers in exponents)
+    rows = [exponents.index(tuple(n * (i == k) for i in range(len(names)))) for n in range(1, order + 1)]
+    parameter, travel = parameters[k], np.array(mounting.travel)
+    middle = np.linalg.norm(np.array(mounting.at) + parameter.centre * travel)
+    if middle < 3.0 * parameter.scale * np.linalg.norm(travel) or middle == 0.0:
+        raise CalibrationError(f"vehicle: mass {name!r} passes within three half-travels of the sensor")
+    return _Mass(np.array(rows), np.array(mounting.at), travel, mounting.at_sigma, parameter)
 
 
 def _linearised(whole: Structure, E: FloatArray, masses: list[_Mass], latent: FloatArray) -> Structure:
