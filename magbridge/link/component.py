@@ -46,10 +46,10 @@ def check_publish(publish: Mapping[str, float], path: Path) -> None:
     """
     for name, rate in publish.items():
         if name not in LIMITS:
-            raise ConfigError(path, f"publish.{name}", f"one of {', '.join(sorted(LIMITS))}")
+            raise ConfigError(path, f"publish.{name}", f"expected one of {', '.join(sorted(LIMITS))}")
         low, high = LIMITS[name]
         if not low <= rate <= high:
-            raise ConfigError(path, f"publish.{name}", f"a rate from {low:g} to {high:g} Hz, not {rate:g}")
+            raise ConfigError(path, f"publish.{name}", f"expected a rate from {low:g} to {high:g} Hz, not {rate:g}")
 
 
 class Component:

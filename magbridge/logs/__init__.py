@@ -49,6 +49,9 @@ FORMATS: dict[str, tuple[str, str, str]] = {
     ),
 }
 
+FLIGHT = {".ebd": ".dbd", ".nbd": ".mbd", ".tbd": ".sbd", ".ecd": ".dcd", ".ncd": ".mcd", ".tcd": ".scd"}
+"""A Slocum's science file to the flight file of the same name: whoever reads one reads both."""
+
 Paths = str | os.PathLike[str] | Sequence[str | os.PathLike[str]]
 
 
@@ -89,7 +92,13 @@ def _paths(paths: Paths) -> list[Path]:
         if not path.is_file():
             raise FormatError(path, "expected a file, there is none")
         _format(path)
-    return checked
+    return [path for path in checked if not _with_flight(path, checked)]
+
+
+def _with_flight(path: Path, given: Sequence[Path]) -> bool:
+    """Tell whether a science file's flight file is given, too."""
+    flight = FLIGHT.get(path.suffix.lower())
+    return flight is not None and any(path.with_suffix(name) in given for name in (flight, flight.upper()))
 
 
 def _chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:

@@ -22,6 +22,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from magbridge.errors import FormatError, MissingExtra
+from magbridge.logs import FLIGHT
 from magbridge.logs.deployment import deployment, increasing, sliced
 from magbridge.logs.resample import linear
 
@@ -31,7 +32,7 @@ Floats = NDArray[np.float64]
 
 MAX_GAP = 300.0
 """s between two updates of a sensor across which nothing is interpolated."""
-SCIENCE = {".dbd": ".ebd", ".mbd": ".nbd", ".sbd": ".tbd", ".dcd": ".ecd", ".mcd": ".ncd", ".scd": ".tcd"}
+SCIENCE = {flight: science for science, flight in FLIGHT.items()}
 SENSORS = {
     # theirs: (ours, unit, factor)
     "m_roll": ("roll", "deg", 180.0 / np.pi),
@@ -103,9 +104,8 @@ def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
 
 def _pair(path: Path) -> tuple[Path | None, Path | None]:
     """Return the flight and the science file that belong together; None for one that is not there."""
-    suffixes = {**SCIENCE, **{science: flight for flight, science in SCIENCE.items()}}
     suffix = path.suffix
-    other = suffixes[suffix.lower()]
+    other = (SCIENCE | FLIGHT)[suffix.lower()]
     partner = path.with_suffix(other.upper() if suffix.isupper() else other)
     both = path, (partner if partner.is_file() else None)
     return both if suffix.lower() in SCIENCE else both[::-1]

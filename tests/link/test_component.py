@@ -141,8 +141,8 @@ def test_signed_both_ways(make_link):
 def test_publish_is_checked():
     check_publish({"MAG_FIELD": 0, "NAMED_VALUE_FLOAT": 1, "DEBUG_VECT": -1}, Path("b.toml"))
     for publish, complaint in (
-        ({"MAG_FILED": 0}, r"b.toml: publish.MAG_FILED: one of .*MAG_FIELD"),
-        ({"MAG_FIELD": 1e6}, r"publish.MAG_FIELD: a rate from -1 to 1000 Hz"),
+        ({"MAG_FILED": 0}, r"b.toml: publish.MAG_FILED: expected one of .*MAG_FIELD"),
+        ({"MAG_FIELD": 1e6}, r"publish.MAG_FIELD: expected a rate from -1 to 1000 Hz"),
         ({"HEARTBEAT": -1}, r"publish.HEARTBEAT"),
         ({"MAG_FIELD": float("nan")}, r"publish.MAG_FIELD"),
     ):

@@ -65,6 +65,7 @@ def test_slocum(real_data: Path) -> None:
         back["battpos"], flight_only["battpos"]
     )  # a pair is one deployment, however named
     assert back.sizes["time"] == flight_only.sizes["time"] > 3000
+    assert not back.attrs.get("duplicate_rows")  # nor is one read twice
     assert not set(CHANNELS) & set(back.data_vars)
     assert back["battpos"].attrs["units"] == "in"
     for name, low, high in (
