@@ -49,7 +49,9 @@ def check_publish(publish: Mapping[str, float], path: Path) -> None:
             raise ConfigError(path, f"publish.{name}", f"expected one of {', '.join(sorted(LIMITS))}")
         low, high = LIMITS[name]
         if not low <= rate <= high:
-            raise ConfigError(path, f"publish.{name}", f"expected a rate from {low:g} to {high:g} Hz, not {rate:g}")
+            raise ConfigError(
+                path, f"publish.{name}", f"expected a rate from {low:g} to {high:g} Hz, not {rate:g}"
+            )
 
 
 class Component:
