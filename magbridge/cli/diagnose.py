@@ -51,6 +51,7 @@ def diagnose(
     """
     from magbridge.calibration.file import load
     from magbridge.diagnose.causes import CAUSES
+    from magbridge.diagnose.report.doubts import unsettled
     from magbridge.diagnose.report.findings import findings
     from magbridge.diagnose.run import diagnose as examine
     from magbridge.field.read import read_grid
@@ -73,6 +74,8 @@ def diagnose(
             grid=read_grid(grid) if grid else None,
             progress=step,
         )
+    if doubt := unsettled(found.problem, found.named, found.calibration):
+        complain(doubt, 0)
     facts = findings(found, CAUSES)
     causes = [_plain(one) for one in facts["findings"]]
     if facts["verdict"] == "unexplained" and (within := facts["unexplained"]["alternatives"]):

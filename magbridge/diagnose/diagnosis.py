@@ -94,3 +94,8 @@ class Diagnosis:
     total: Gain
     isolability: Isolability
     verdict: str
+
+    @property
+    def named(self) -> list[Candidate]:
+        """The causes of the findings."""
+        return [one.candidate for one in self.findings]

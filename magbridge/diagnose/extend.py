@@ -18,13 +18,15 @@ from magbridge.calibration.terms import Effect
 from magbridge.diagnose.causes.candidates import Candidate, slices
 from magbridge.diagnose.compare.columns import Columns
 from magbridge.diagnose.compare.derivatives import derivatives
+from magbridge.diagnose.compare.prior import isotropic
 from magbridge.diagnose.compare.problem import DELAYS, Problem, samples_of
 from magbridge.diagnose.compare.survey import Survey
+from magbridge.diagnose.inference.design import normal
 from magbridge.diagnose.inference.joint import Joint, fit_joint
 from magbridge.diagnose.inference.weigh import IDEAL
 from magbridge.version import __version__
 
-__all__ = ["extend", "flown", "settle", "widened"]
+__all__ = ["extend", "flown", "leveled", "settle", "widened"]
 
 STEPS = 4
 """Linearisations at most; a second one is rarely needed."""
@@ -104,6 +106,28 @@ def _without(calibration: Calibration, effect: Effect) -> Calibration:
     )
 
 
+def leveled(problem: Problem, model: Sequence[Candidate], fit: Joint, extended: Calibration) -> Calibration:
+    r"""Return the extended calibration with a map's error in its covariance.
+
+    Notes
+    -----
+    The logs that the calibration was fitted to have the same map as their reference. Its error may be as large where they were
+    flown as it is along the track, and is then in the calibration's scale, where no log shows it. With s the coefficients
+    that raise the corrected field by 1 nT everywhere, and m the error of the map that was found,
+
+    .. math:: C \leftarrow C + \overline{m^2}\, s s^T
+    """
+    if not problem.survey.learned.any():
+        return extended
+    power = 0.0
+    for candidate, own in zip(model, slices(model), strict=True):
+        if candidate.cause == "map_error":
+            b = fit.coefficients[own]
+            power += float(b @ normal(candidate.columns, problem.residual)[0] @ b) / len(problem)
+    s = isotropic(extended)
+    return replace(extended, covariance=extended.covariance + power * np.outer(s, s))
+
+
 def level(fit: Joint) -> float:
     """Return the 1-sigma of what is left, nT: that of the bulk, not of outliers."""
     return 1.4826 * float(np.median(np.abs(fit.left - np.median(fit.left))))
@@ -155,6 +179,7 @@ def _again(
     """One step of Gauss and Newton on the whole model."""
     extended = extend(problem, model, fit)
     samples, coefficients = samples_of(problem.survey, extended)
+    samples.phi[np.ix_(problem.survey.learned, _since(extended, model))] = 0.0
     e, g = residuals(samples, coefficients)
     K = problem.calibration.coefficients.size
     selector = np.eye(extended.coefficients.size)
@@ -177,6 +202,14 @@ def _again(
     columns: list[Columns] = [partial(_rows, block) for block in blocks]
     uneven = bool(np.ptp(fit.noise.scale))  # likelihoods that are compared have one kind of noise
     return again, columns, fit_joint(again, columns, order, c, blocks=uneven, ridge=fit.prior[len(fit.z) :])
+
+
+def _since(extended: Calibration, model: Sequence[Candidate]) -> NDArray[np.intp]:
+    """Return which regressors are those of causes that have appeared since the calibration."""
+    late = {id(e) for c in model for piece in c.pieces if piece.since for e in piece.effects}
+    counts = [effect.columns(extended.reference.field).shape[1] for effect in extended.effects]
+    marks = np.repeat([id(effect) in late for effect in extended.effects], counts)
+    return len(extended.kernel.weights) - len(marks) + np.flatnonzero(marks)
 
 
 def _rows(block: FloatArray, rows: slice) -> FloatArray:

@@ -12,14 +12,15 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 from threadpoolctl import threadpool_limits
 
+from magbridge.calibration.instrument import TimeEffect
 from magbridge.calibration.model import Calibration
 from magbridge.diagnose.causes import CAUSES, Cause
-from magbridge.diagnose.causes.candidates import Candidate, slices
+from magbridge.diagnose.causes.candidates import Candidate, since, slices
 from magbridge.diagnose.compare.problem import Problem, pose
 from magbridge.diagnose.compare.survey import Survey
 from magbridge.diagnose.compare.take import take
 from magbridge.diagnose.diagnosis import Diagnosis, Finding
-from magbridge.diagnose.extend import extend, flown, settle, widened
+from magbridge.diagnose.extend import extend, flown, leveled, settle, widened
 from magbridge.diagnose.gain import held_out, paired
 from magbridge.diagnose.inference.accept import accept
 from magbridge.diagnose.inference.isolability import isolability
@@ -116,7 +117,9 @@ def _examine(
     progress("extending the calibration")
     settled, columns, fit = settle(problem, model, fit, outcome.order)
     fit = widened(model, loosened(settled, model, columns, fit))
-    extended = flown(problem.survey, extend(settled, model, fit)) if model else calibration
+    extended = calibration
+    if model:
+        extended = leveled(settled, model, fit, flown(problem.survey, extend(settled, model, fit)))
     progress("measuring the gain")
     counts = _counted(problem, wrong)
     before = after = problem.straight(outcome.null.z)
@@ -155,7 +158,20 @@ def _put_forward(problem: Problem, causes: Mapping[str, Cause]) -> tuple[list[Ca
     if len(untestable) == len(causes):
         needs = "; ".join(sorted(set(untestable.values())))
         raise DataError(f"{problem.survey.source}: nothing can be tested here; it would take {needs}")
-    return [candidate for made in candidates.values() for candidate in made], untestable
+    every = [candidate for made in candidates.values() for candidate in made]
+    return _whenever(every, problem.survey.learned), untestable
+
+
+def _whenever(candidates: Sequence[Candidate], learned: NDArray[np.bool_]) -> list[Candidate]:
+    """Return the candidates and, where the calibration's own logs are given, each once more as appeared since.
+
+    Steps, drifts and tones have a time of their own.
+    """
+    if not learned.any():
+        return list(candidates)
+    timed = [any(isinstance(effect, TimeEffect) for effect in candidate.effects) for candidate in candidates]
+    lasting = [c for c, own in zip(candidates, timed, strict=True) if c.effects and not own]
+    return [*candidates, *(since(candidate, learned) for candidate in lasting)]
 
 
 def _counted(problem: Problem, wrong: Outliers | None) -> NDArray[np.bool_]:

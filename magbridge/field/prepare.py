@@ -161,7 +161,7 @@ def draw_steps(steps: Sequence[Step], path: str | Path) -> None:
         axis.locator_params(axis="x", nbins=4)
     for axis in axes[len(steps) :]:
         axis.set_axis_off()
-    figure.colorbar(image, ax=axes, label="anomaly, nT", shrink=0.8, extend="both")
+    figure.colorbar(image, ax=axes, label="anomaly, nT", shrink=0.8)
     figure.supxlabel("longitude, deg")
     figure.supylabel("latitude, deg")
     with atomic_path(path) as beside:

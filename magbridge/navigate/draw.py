@@ -145,7 +145,7 @@ def _map(axis: Axes, grid: AnomalyGrid, longitude: Any, latitude: Any) -> None:
     axis.set_xlabel("longitude, deg")
     axis.set_ylabel("latitude, deg")
     scale = axis.inset_axes((0.04, 0.05, 0.3, 0.02))
-    axis.figure.colorbar(drawn, cax=scale, orientation="horizontal", extend="both")
+    axis.figure.colorbar(drawn, cax=scale, orientation="horizontal")
     scale.set_title("anomaly, nT", fontsize=8)
     scale.tick_params(labelsize=8)
 

@@ -125,9 +125,11 @@ def test_samples_that_are_lost_hide_nothing() -> None:
     assert row["unexplained"] is None
 
 
-def test_an_extension_against_a_map_does_no_harm() -> None:
-    """To the true field, on its own log and on another day; the offset has settled anew."""
-    row = blind("charted", ("current_field",), 40.0, GLIDER, losses="surfacing", reference="map at its depth")
+@pytest.mark.parametrize("name", ["current_field", "nonlinearity"])
+def test_an_extension_against_a_map_does_no_harm(name: str) -> None:
+    """To the true field, on its own log and on another day; the offset has settled anew, and the cause has come since."""
+    row = blind("charted", (name,), 40.0, GLIDER, losses="surfacing", reference="map at its depth")
+    assert name in {found[0] for found in row["found"]}, row
     assert row["gain"]["after"] < 0.5 * row["gain"]["before"], row
     assert not worse(row), row
 

@@ -7,15 +7,17 @@ from dataclasses import replace
 
 import numpy as np
 
+from magbridge.calibration.correct import correct
+from magbridge.calibration.followers import PowersEffect
 from magbridge.calibration.instrument import RateEffect, TimeEffect
 from magbridge.calibration.model import Calibration
-from magbridge.diagnose.causes.candidates import Candidate
+from magbridge.diagnose.causes.candidates import Candidate, of_effect, since
 from magbridge.diagnose.compare.past import Past
-from magbridge.diagnose.compare.problem import Problem
+from magbridge.diagnose.compare.problem import Problem, pose
 from magbridge.diagnose.compare.survey import Survey
-from magbridge.diagnose.extend import MODES, flown, widened
+from magbridge.diagnose.extend import MODES, extend, flown, leveled, settle, widened
 from magbridge.diagnose.inference.fit_noise import fit_noise
-from magbridge.diagnose.inference.joint import Joint
+from magbridge.diagnose.inference.joint import Joint, fit_joint
 from magbridge.diagnose.inference.weigh import IDEAL
 
 
@@ -101,3 +103,42 @@ def test_a_rate_that_is_noise_live_is_left_out(right: Callable[[int], Problem]) 
     assert [effect.kind for effect in calm.effects] == ["time"]
     np.testing.assert_array_equal(calm.coefficients[-3:], [1.0, 2.0, 3.0])
     np.testing.assert_array_equal(np.diag(calm.covariance)[-3:], [4.0, 5.0, 6.0])
+
+
+def test_what_has_come_since_is_not_in_the_calibrations_logs(right: Callable[[int], Problem]) -> None:
+    """A field that bends the magnitude, in the second half alone: linearised anew, it is what it is."""
+    whole = right(300)
+    learned, there = np.arange(300) < 150, np.array([900.0, -600.0, 300.0])
+    survey = replace(whole.survey, learned=learned, field=whole.survey.field + there * ~learned[:, None])
+    problem = pose(survey, whole.calibration)
+    effect = PowersEffect(cause="unmodelled_actuator", channel="p", centre=-1e9, scale=1e9, order=1)
+    lasting = of_effect(problem, effect, 100.0, "nT", channel="p")
+    late = since(lasting, learned)
+    assert not late.columns(slice(0, 150)).any()
+    np.testing.assert_array_equal(late.columns(slice(150, 300)), lasting.columns(slice(150, 300)))
+    fit = fit_joint(problem, [late.columns], 1)
+    _, _, settled = settle(problem, [late], fit, 1)
+    np.testing.assert_allclose(settled.coefficients * late.width, there, atol=0.5)
+    np.testing.assert_allclose(settled.left, 0.0, atol=0.5)
+
+
+def test_a_maps_error_is_in_the_level_of_what_was_fitted_to_the_same_map(
+    right: Callable[[int], Problem],
+) -> None:
+    """A map that is 30 nT off along the track: nobody knows the whole field any better."""
+    whole = right(300)
+    wave = 30.0 * np.sqrt(2.0) * np.sin(0.1 * np.arange(300))
+    chart = Candidate("map_error", None, lambda rows: wave[rows, None], np.ones(1), ("function 1",), ("nT",))
+    found = fit_joint(replace(whole, residual=whole.residual + wave), [chart.columns], 1)
+    new, seen = (
+        replace(whole, survey=replace(whole.survey, learned=np.full(300, learned)))
+        for learned in (False, True)
+    )
+    extended = extend(whole, [chart], found)
+    assert leveled(new, [chart], found, extended) is extended
+    told = leveled(seen, [chart], found, extended)
+    before, after = (
+        correct(c, whole.survey.field, whole.survey.values(c.channels), whole.survey.time).sigma
+        for c in (extended, told)
+    )
+    np.testing.assert_allclose(np.sqrt(after**2 - before**2), 30.0, rtol=0.02)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -11,7 +14,7 @@ from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.gain import Gain
 from magbridge.diagnose.inference.rivals import Rival
 from magbridge.diagnose.inference.unexplained import Leftover
-from magbridge.diagnose.report.doubts import IMPLAUSIBLE, gained, implausible, nameless, no_gain
+from magbridge.diagnose.report.doubts import IMPLAUSIBLE, gained, implausible, nameless, no_gain, unsettled
 from magbridge.diagnose.report.words import measured, number, physics, sizes
 
 
@@ -74,6 +77,17 @@ def test_a_gain_that_does_not_show_is_said_to_be_none() -> None:
     assert gained(much, "dives").endswith("(ratio 0.65, 95 % interval 0.48 to 0.83).")
     assert no_gain(none)
     assert not no_gain(much)
+
+
+def test_a_shift_of_the_whole_field_beside_a_wrong_reference_is_told(right: Callable[[int], Problem]) -> None:
+    """A constant may belong to either; beside a true reference it is the vehicle's."""
+    problem = right(100)
+    grown = problem.calibration.coefficients + np.repeat([20.0, 0.0], [3, 6])
+    louder = replace(problem.calibration, coefficients=grown)
+    bias, order = (CAUSES[cause].candidates(problem)[0] for cause in ("reference_bias", "actuator_order"))
+    assert "the whole corrected field by +20.0 nT" in unsettled(problem, [order, bias], louder)
+    assert not unsettled(problem, [order], louder)
+    assert not unsettled(problem, [bias], problem.calibration)
 
 
 def test_names_that_something_unexplained_keeps_are_told() -> None:

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magbridge.calibration.terms import Effect
-from magbridge.diagnose.compare.columns import Columns, together
+from magbridge.diagnose.compare.columns import Columns, Mixture, Since, parts, together
 from magbridge.diagnose.compare.problem import Problem, effect_columns, history
 
-__all__ = ["AXES", "Candidate", "of_effect", "of_reference", "per", "slices"]
+__all__ = ["AXES", "Candidate", "of_effect", "of_reference", "per", "since", "slices"]
 
 FloatArray = NDArray[np.float64]
 AXES = ("x", "y", "z")
@@ -54,6 +54,8 @@ class Candidate:
     spectra : (l, k) array or None
         Where its numbers have one common free size (:mod:`~magbridge.diagnose.inference.statistic`): their prior variances, in
         units of the widths squared and up to a common factor; each is tried.
+    since : bool
+        It is absent from the logs that the calibration was fitted to.
     """
 
     cause: str
@@ -71,6 +73,7 @@ class Candidate:
     cells: tuple[float, ...] = ()
     parts: tuple[Candidate, ...] = ()
     spectra: FloatArray | None = None
+    since: bool = False
 
     @property
     def size(self) -> int:
@@ -113,6 +116,17 @@ def slices(candidates: Sequence[Candidate]) -> list[slice]:
     return [
         slice(int(end) - candidate.size, int(end)) for end, candidate in zip(ends, candidates, strict=True)
     ]
+
+
+def since(candidate: Candidate, learned: NDArray[np.bool_]) -> Candidate:
+    """Return the same cause, appeared since the calibration: absent from the samples (n,) that this has `learned` from."""
+    again, fresh = candidate.again, ~learned
+    return replace(
+        candidate,
+        columns=Mixture(tuple((Since(X, fresh), M) for X, M in parts(candidate.columns))),
+        again=again and (lambda *shape: since(again(*shape), learned)),
+        since=True,
+    )
 
 
 def per(step: str, power: int = 1) -> str:

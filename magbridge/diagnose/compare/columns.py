@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Columns", "Mixture", "beside", "parts", "together"]
+__all__ = ["Columns", "Mixture", "Since", "beside", "parts", "together"]
 
 FloatArray = NDArray[np.float64]
 Columns = Callable[[slice], FloatArray]
@@ -37,6 +37,18 @@ class Mixture:
     def times(self, widths: FloatArray) -> Mixture:
         """Return the columns in units of `widths` (k,)."""
         return Mixture(tuple((X, M * widths) for X, M in self.parts))
+
+
+@dataclass(frozen=True)
+class Since:
+    """Columns that are zero where `fresh` (n,) is not set."""
+
+    columns: Columns
+    fresh: NDArray[np.bool_] = field(compare=False)
+
+    def __call__(self, rows: slice) -> FloatArray:
+        """(m, k) these rows."""
+        return (self.columns(rows).T * self.fresh[rows]).T
 
 
 def parts(columns: Columns) -> tuple[tuple[Columns, FloatArray], ...]:

@@ -14,7 +14,7 @@ from magbridge.calibration.terms import Polynomial
 from magbridge.diagnose.compare.derivatives import derivatives
 from magbridge.diagnose.compare.survey import Survey
 
-__all__ = ["floor", "level", "loosened", "prior"]
+__all__ = ["floor", "isotropic", "level", "loosened", "prior"]
 
 FloatArray = NDArray[np.float64]
 
@@ -37,13 +37,29 @@ def floor(calibration: Calibration) -> FloatArray:
     Its posterior knows only the noise of its samples, and a few thousand of them make that a hundredth of it. What
     the runs' turns did to the filtered channels, and what nobody holds constant, is more.
     """
-    spread, k = np.zeros(calibration.coefficients.size), 0
-    for term in calibration.terms:
-        if isinstance(term, Polynomial) and (0,) * len(calibration.parameters) in term.exponents:
-            first = k + 9 * term.exponents.index((0,) * len(calibration.parameters))
-            spread[first : first + 9] = STABLE * calibration.reference.field
-        k += term.size
+    spread = np.zeros(calibration.coefficients.size)
+    for own in _constants(calibration):
+        spread[own] = STABLE * calibration.reference.field
     return np.diag(spread**2)
+
+
+def isotropic(calibration: Calibration) -> FloatArray:
+    """(K,) what makes every corrected field 1 nT larger, whatever the attitude: equal scales of all channels."""
+    scale = np.zeros(calibration.coefficients.size)
+    for own in _constants(calibration)[:1]:
+        scale[own.start : own.start + 3] = 1.0
+    return scale
+
+
+def _constants(calibration: Calibration) -> list[slice]:
+    """Return where the nine constants of each polynomial that has them are among the coefficients."""
+    found, k, none = [], 0, (0,) * len(calibration.parameters)
+    for term in calibration.terms:
+        if isinstance(term, Polynomial) and none in term.exponents:
+            first = k + 9 * term.exponents.index(none)
+            found.append(slice(first, first + 9))
+        k += term.size
+    return found
 
 
 def loosened(calibration: Calibration, L: FloatArray, centre: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -10,12 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from magbridge.diagnose.compare.problem import DELAY, DELAYS, Problem
+from magbridge.calibration.residual import residuals_of
+from magbridge.diagnose.compare.problem import DELAY, DELAYS, Problem, samples_of
 from magbridge.diagnose.inference.joint import Joint
 from magbridge.diagnose.inference.weigh import LEVEL
 from magbridge.diagnose.report.words import listed, measured, number
 
 if TYPE_CHECKING:
+    from magbridge.calibration.model import Calibration
     from magbridge.diagnose.causes import Cause
     from magbridge.diagnose.causes.candidates import Candidate
     from magbridge.diagnose.diagnosis import Diagnosis, Finding
@@ -32,8 +34,10 @@ __all__ = [
     "nameless",
     "no_gain",
     "outshone",
+    "recent",
     "rivalled",
     "several",
+    "unsettled",
 ]
 
 IMPLAUSIBLE = 5.0
@@ -114,6 +118,13 @@ def gained(gain: Gain, parts: str) -> str:
     )
 
 
+def recent(candidate: Candidate) -> str:
+    """Say so when a cause is best described as absent from the logs that the calibration was fitted to."""
+    if not any(piece.since for piece in candidate.pieces):
+        return ""
+    return "<p>It is best described as absent from the logs that the calibration was fitted to: it may have appeared since.</p>"
+
+
 def no_gain(gain: Gain) -> str:
     """Say so when what was left out of the fit shows no gain."""
     if gain.shown:
@@ -138,6 +149,24 @@ def rivalled(cause: Cause, rivals: Sequence[Rival], chance: float) -> str:
     return (
         f"<p>The data cannot tell it from {listed(rivals)} (odds below 20:1). To tell them apart: {escape(cause.separated_by)}.</p>"
         f"<p>In a log like this one, theory gives it a {100 * chance:.0f} % chance of being named alone; here it was not.</p>"
+    )
+
+
+def unsettled(problem: Problem, named: Sequence[Candidate], extended: Calibration) -> str:
+    """Say so when the corrected field is shifted as a whole beside an error of the reference: a constant may belong to either."""
+    if all(candidate.effects for candidate in named):
+        return ""
+    fresh = ~problem.survey.learned
+    before, after = (
+        residuals_of(*samples_of(problem.survey, calibration))[fresh].mean()
+        for calibration in (problem.calibration, extended)
+    )
+    shift = float(after - before)
+    if abs(shift) < extended.noise.sensor:
+        return ""
+    return (
+        f"the extended calibration shifts the whole corrected field by {shift:+.1f} nT, and the reference is in error, too; a log cannot "
+        "tell for sure which of them a constant belongs to: check the extended field against another reference before using it"
     )
 
 

@@ -230,7 +230,7 @@ def track(diagnosis: Diagnosis) -> str | None:
     for axis in axes[:, 0]:
         axis.set_ylabel(f"north ({unit})", fontsize=9)
     assert dots is not None
-    figure.colorbar(dots, ax=axes, label="nT", shrink=0.8, extend="both")
+    figure.colorbar(dots, ax=axes, label="nT", shrink=0.8)
     return _png(figure)
 
 

@@ -19,8 +19,10 @@ from magbridge.diagnose.report.doubts import (
     nameless,
     no_gain,
     outshone,
+    recent,
     rivalled,
     several,
+    unsettled,
 )
 from magbridge.diagnose.report.findings import parameters, told
 from magbridge.diagnose.report.words import (
@@ -103,6 +105,7 @@ def _compared(diagnosis: Diagnosis) -> list[str]:
         f"calibration: {escape(diagnosis.problem.calibration.method or 'unnamed')}, "
         f"{diagnosis.problem.calibration.coefficients.size} coefficients</p>"),
         f'<p class="verdict">{_verdict(diagnosis)}</p>',
+        f"<p><b>Note:</b> {doubt}.</p>" if (doubt := unsettled(diagnosis.problem, diagnosis.named, diagnosis.calibration)) else "",
         "<h2>Measured against simulated</h2>",
         ("<p>The calibration describes what the vehicle's own magnetism and the sensor's errors do to every reading. The corrected "
          "field should therefore differ from the reference by noise alone. Any other structure in the difference is an effect that "
@@ -202,6 +205,7 @@ def _cause(diagnosis: Diagnosis, finding: Finding, cause: Cause) -> list[str]:
         ),
         several(candidate.names),
         implausible(candidate, finding.coefficients),
+        recent(candidate),
         in_motion(diagnosis, finding),
         grounded(diagnosis, candidate),
         rivalled(cause, finding.rivals, told(diagnosis, finding.hypothesis)),
