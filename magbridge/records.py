@@ -28,7 +28,7 @@ class Quality(IntFlag):
     STALE_TELEMETRY = 1
     """A parameter the calibration needs is older than its ``max_age``, missing or NaN."""
     EXTRAPOLATED = 2
-    """A parameter lies outside the range that the calibration has seen."""
+    """A parameter lies outside the calibrated range."""
     MOVING = 4
     """A mass moved between the telemetry around the sample."""
     SATURATED = 8
@@ -36,7 +36,7 @@ class Quality(IntFlag):
     UNCALIBRATED = 16
     """No calibration, or one that does not belong to this sensor."""
     OFFSET_SUSPECT = 32
-    """The sensor was powered on anew since the calibration: its offset settled elsewhere."""
+    """The sensor was power-cycled since the calibration, so its offset may have changed."""
     NO_BORESIGHT = 64
     """The vector is known only up to one rotation; its magnitude is right."""
     GAP = 128
