@@ -42,7 +42,7 @@ def diurnal_variation(problem: Problem) -> list[Candidate]:
 
 
 def map_error(problem: Problem) -> list[Candidate]:
-    r"""The anomaly map is wrong: its error is a smooth function of place, the same on every pass: a Gaussian process (Matern 3/2) along the track.
+    r"""The anomaly map is wrong by a smooth function of place, the same on every pass: a Gaussian process (Matern 3/2) along the track.
 
     In the functions of Karhunen and Loeve at the cells that were visited, ``K(x, Z) V / lambda`` of ``K(Z, Z) = V lambda V^T``:
     as many as there are, whatever the box. Lengths are told by the functions' variances ``diag(V^T K_l V)``.
