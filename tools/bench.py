@@ -86,7 +86,7 @@ def main() -> int:
     )
     parser.add_argument("names", nargs="*", metavar="NAME", help=", ".join(BENCHMARKS))
     parser.add_argument("--json", action="store_true")
-    parser.add_argument("--factor", type=float, default=1.0, help="so many times the repetitions")
+    parser.add_argument("--factor", type=float, default=1.0, help="multiplies the number of repetitions")
     chosen = parser.parse_args()
     if unknown := set(chosen.names) - set(BENCHMARKS):
         parser.error(f"no benchmark {', '.join(sorted(unknown))}; there are {', '.join(BENCHMARKS)}")

@@ -73,12 +73,10 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument(
-        "--cases", type=int, default=800, help="of the whole study; parts have their shares of it"
+        "--cases", type=int, default=800, help="cases of the whole study, shared among its parts"
     )
-    parser.add_argument("--part", default=",".join(PARTS), help=f"some of {', '.join(PARTS)}")
-    parser.add_argument(
-        "--seed", type=int, default=0, help="another one has other vehicles, and draws all else anew"
-    )
+    parser.add_argument("--part", default=",".join(PARTS), help=f"parts to run, of {', '.join(PARTS)}")
+    parser.add_argument("--seed", type=int, default=0, help="draws other vehicles, and everything else anew")
     parser.add_argument("--out", type=Path, default=Path("study"))
     parser.add_argument(
         "--scheduler", default="", help="address of a dask scheduler; a local cluster if not given"
