@@ -14,7 +14,6 @@ from magbridge.calibration.followers import ClockEffect
 from magbridge.calibration.instrument import RateEffect
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.residual import residuals, residuals_of
-from magbridge.calibration.terms import Effect
 from magbridge.diagnose.causes.candidates import Candidate, slices
 from magbridge.diagnose.compare.columns import Columns
 from magbridge.diagnose.compare.derivatives import derivatives
@@ -79,11 +78,13 @@ def flown(survey: Survey, calibration: Calibration) -> Calibration:
 
     Live there is no sample after, and a rate is a difference backwards: of a vehicle that sways from sample to sample, noise.
     """
+    place = 0
     for effect in calibration.effects:
-        if isinstance(effect, RateEffect):
-            without = _without(calibration, effect)
-            if _power(survey, without) < _power(survey, calibration):
-                calibration = without
+        without = _without(calibration, place)
+        if isinstance(effect, RateEffect) and _power(survey, without) < _power(survey, calibration):
+            calibration = without
+        else:
+            place += 1
     return calibration
 
 
@@ -92,15 +93,14 @@ def _power(survey: Survey, calibration: Calibration) -> float:
     return float(np.mean(residuals_of(*samples_of(survey, calibration))[~survey.learned] ** 2))
 
 
-def _without(calibration: Calibration, effect: Effect) -> Calibration:
-    """Return the calibration without one of its effects."""
-    effects = calibration.effects
-    sizes = [*(term.size for term in calibration.terms), *(other.size for other in effects)]
-    at = sum(sizes[: len(calibration.terms) + effects.index(effect)])
+def _without(calibration: Calibration, place: int) -> Calibration:
+    """Return the calibration without the effect at a place; another may be its equal."""
+    before, (effect, *after) = calibration.effects[:place], calibration.effects[place:]
+    at = sum(term.size for term in (*calibration.terms, *before))
     own = np.arange(at, at + effect.size)
     return replace(
         calibration,
-        effects=tuple(other for other in effects if other is not effect),
+        effects=(*before, *after),
         coefficients=np.delete(calibration.coefficients, own),
         covariance=np.delete(np.delete(calibration.covariance, own, 0), own, 1),
     )

@@ -142,3 +142,20 @@ def test_a_maps_error_is_in_the_level_of_what_was_fitted_to_the_same_map(
         for c in (extended, told)
     )
     np.testing.assert_allclose(np.sqrt(after**2 - before**2), 30.0, rtol=0.02)
+
+
+def test_a_rate_that_is_there_twice_is_left_out_twice(right: Callable[[int], Problem]) -> None:
+    """A cause may need more than one term, and two rates are equal: each takes its own coefficients along."""
+    survey, calibration = skewed(right(300), 10.0)
+    skew, step = calibration.effects
+    plain = calibration.coefficients[:-6]
+    twice = replace(
+        calibration,
+        effects=(skew, skew, step),
+        coefficients=np.append(plain, [0.0, 0.3, 0.0, 0.0, 0.3, 0.0, 1.0, 2.0, 3.0]),
+        covariance=np.diag(np.append(np.diag(calibration.covariance)[:-6], np.arange(1.0, 10.0))),
+    )
+    calm = flown(survey, twice)
+    assert calm.effects == (step,)
+    np.testing.assert_array_equal(calm.coefficients, [*plain, 1.0, 2.0, 3.0])
+    np.testing.assert_array_equal(np.diag(calm.covariance)[-3:], [7.0, 8.0, 9.0])
