@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 
 import msgspec
 import numpy as np
@@ -177,6 +176,14 @@ def _again(
     problem: Problem, model: Sequence[Candidate], fit: Joint, order: int
 ) -> tuple[Problem, list[Columns], Joint]:
     """One step of Gauss and Newton on the whole model."""
+    again, columns = _about(problem, model, fit)
+    c, ridge = np.append(fit.z, fit.coefficients), fit.prior[len(fit.z) :]
+    uneven = bool(np.ptp(fit.noise.scale))  # likelihoods that are compared have one kind of noise
+    return again, columns, fit_joint(again, columns, order, c, blocks=uneven, ridge=ridge)
+
+
+def _about(problem: Problem, model: Sequence[Candidate], fit: Joint) -> tuple[Problem, list[Columns]]:
+    """Return the problem, and the columns of the model, linear about the calibration that `fit` extends."""
     extended = extend(problem, model, fit)
     samples, coefficients = samples_of(problem.survey, extended)
     samples.phi[np.ix_(problem.survey.learned, _since(extended, model))] = 0.0
@@ -188,20 +195,16 @@ def _again(
     free, effects, at = own[:, : len(problem.centre)], own[:, len(problem.centre) :], 0
     free[:, DELAYS] = problem.free[:, DELAYS]
     # what the residual would be at the first point, were it linear about this one; the reference was not mended in it
-    residual = e + free @ fit.z
-    blocks = []
+    residual, columns = e + free @ fit.z, []
     for candidate, place in zip(model, slices(model), strict=True):
         if not candidate.effects:
-            blocks.append(candidate.columns(slice(0, len(problem))))
+            columns.append(candidate.columns)
         else:
-            blocks.append(effects[:, at : at + candidate.size] * candidate.width)
-            residual += blocks[-1] @ fit.coefficients[place]
+            block = effects[:, at : at + candidate.size] * candidate.width
+            residual += block @ fit.coefficients[place]
+            columns.append(block.__getitem__)
             at += candidate.size
-    c = np.append(fit.z, fit.coefficients)
-    again = replace(problem, residual=residual, free=free, slopes=g)
-    columns: list[Columns] = [partial(_rows, block) for block in blocks]
-    uneven = bool(np.ptp(fit.noise.scale))  # likelihoods that are compared have one kind of noise
-    return again, columns, fit_joint(again, columns, order, c, blocks=uneven, ridge=fit.prior[len(fit.z) :])
+    return replace(problem, residual=residual, free=free, slopes=g), columns
 
 
 def _since(extended: Calibration, model: Sequence[Candidate]) -> NDArray[np.intp]:
@@ -210,7 +213,3 @@ def _since(extended: Calibration, model: Sequence[Candidate]) -> NDArray[np.intp
     counts = [effect.columns(extended.reference.field).shape[1] for effect in extended.effects]
     marks = np.repeat([id(effect) in late for effect in extended.effects], counts)
     return len(extended.kernel.weights) - len(marks) + np.flatnonzero(marks)
-
-
-def _rows(block: FloatArray, rows: slice) -> FloatArray:
-    return block[rows]

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+from threading import current_thread
 from typing import TypeVar
 
 import numpy as np
@@ -21,10 +23,10 @@ T = TypeVar("T")
 
 CHUNK = 2048
 """Rows that are whitened at a time, to stay near the processor."""
-KEPT = 25_000_000
-"""Numbers that are kept of columns: 200 MB."""
-THREADS, LONG = 2, 32768
-"""Threads that share what is done to a log, and rows beyond which it is worth the while."""
+KEPT = 12_500_000
+"""Numbers that are kept of columns: 100 MB."""
+THREADS, LONG, POOL = 2, 32768, "diagnose"
+"""Threads that share what is done to a log, rows beyond which it is worth the while, and the threads' name."""
 
 
 def kept(n: int, columns: Sequence[Columns]) -> list[Columns]:
@@ -77,7 +79,12 @@ class Design:
 
     def against(self, y: FloatArray) -> FloatArray:
         """(q + k,) ``X^T y``."""
-        return np.asarray(sum(in_threads(len(y), lambda rows: self.rows(rows).T @ y[rows], self.pieces)))
+
+        def piece(rows: slice) -> FloatArray:
+            blocks = [self.free[rows], *(column(rows) for column in self.columns)]
+            return np.concatenate([block.T @ y[rows] for block in blocks])
+
+        return np.asarray(sum(in_threads(len(y), piece, self.pieces)))
 
 
 def normal(X: Columns, y: FloatArray, noise: Noise | None = None) -> tuple[FloatArray, FloatArray]:
@@ -107,8 +114,13 @@ def normal(X: Columns, y: FloatArray, noise: Noise | None = None) -> tuple[Float
 
 
 def in_threads(n: int, function: Callable[[S], T], given: Iterable[S]) -> list[T]:
-    """Return what a function of all rows makes of each that is given; of a long log's n rows in threads."""
-    if n <= LONG:
+    """Return what a function of all rows makes of each that is given; of a long log's n rows in threads, but in none of those."""
+    if n <= LONG or current_thread().name.startswith(POOL):
         return [function(one) for one in given]
-    with ThreadPoolExecutor(THREADS) as pool:
-        return list(pool.map(function, given))
+    return list(_pool().map(function, given))
+
+
+@cache
+def _pool() -> ThreadPoolExecutor:
+    # the same threads all the time: new ones would leave their memory behind
+    return ThreadPoolExecutor(THREADS, POOL)
