@@ -15,7 +15,7 @@ from magbridge.diagnose.compare.columns import Columns, beside
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.noise import Noise
 
-__all__ = ["Design", "in_threads", "kept", "normal"]
+__all__ = ["Design", "in_threads", "kept", "normal", "pieces"]
 
 FloatArray = NDArray[np.float64]
 S = TypeVar("S")
@@ -35,12 +35,13 @@ def kept(n: int, columns: Sequence[Columns]) -> list[Columns]:
         return list(columns)
 
     def whole(column: Columns) -> FloatArray:
-        return np.concatenate([column(rows).T for rows in _pieces(n)], axis=1).T
+        return np.concatenate([column(rows).T for rows in pieces(n)], axis=1).T
 
     return [made.__getitem__ for made in in_threads(n, whole, columns)]
 
 
-def _pieces(n: int) -> list[slice]:
+def pieces(n: int) -> list[slice]:
+    """Return the pieces in which n rows are gone through."""
     return [slice(start, min(start + CHUNK, n)) for start in range(0, n, CHUNK)]
 
 
@@ -56,7 +57,7 @@ class Design:
 
     def __init__(self, problem: Problem, columns: Sequence[Columns]) -> None:
         self.free, self.columns = problem.free, columns
-        self.pieces = _pieces(len(problem))
+        self.pieces = pieces(len(problem))
         sizes = [column(slice(0, 1)).shape[1] for column in self.columns]
         ends = self.free.shape[1] + np.cumsum([0, *sizes]).astype(int)
         self.at = [slice(*own) for own in zip(ends.tolist(), ends.tolist()[1:], strict=False)]

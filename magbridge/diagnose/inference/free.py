@@ -194,11 +194,10 @@ def _body(problem: Problem) -> FloatArray:
 
 def _along_axes(problem: Problem, basis: Columns) -> Columns:
     """Each function of `basis` along each axis of the body."""
-    body = _body(problem)
 
     def columns(rows: slice) -> FloatArray:
         part = basis(rows)
-        return (part.T[:, None] * body.T[:, rows]).reshape(-1, len(part)).T
+        return (part.T[:, None] * -problem.slopes.T[6:, rows]).reshape(-1, len(part)).T
 
     return columns
 

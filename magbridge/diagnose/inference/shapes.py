@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from magbridge.diagnose.causes.regressors import play, powers
 from magbridge.diagnose.compare.columns import Columns
 from magbridge.diagnose.compare.problem import Problem
+from magbridge.diagnose.inference.design import pieces
 
 __all__ = [
     "REPEATED",
@@ -76,7 +77,7 @@ def bends() -> tuple[tuple[str, FloatArray], ...]:
 def curve(values: FloatArray) -> Columns:
     """Powers of a channel."""
     y = _scaled(values)
-    return _centred(lambda rows: powers(y[rows], 4).T)
+    return _centred(lambda rows: powers(y[rows], 4).T, len(y))
 
 
 def memory(values: FloatArray) -> Columns:
@@ -91,7 +92,7 @@ def memory(values: FloatArray) -> Columns:
         branches = [powers(x[rows], 3) - powers(v, 3) for x in plays]
         return np.concatenate([*branches, [w, w * v]]).T
 
-    return _centred(columns)
+    return _centred(columns, len(y))
 
 
 def repeated(problem: Problem) -> Columns:
@@ -103,7 +104,7 @@ def repeated(problem: Problem) -> Columns:
     usual = max(float(np.median([since[end - 1] for end in [*start[1:], len(dive)]])), 1.0)
     u = np.minimum(since / usual, 1.0)
     turning = np.exp(1j * np.pi * u)
-    return _centred(lambda rows: powers(turning[rows], REPEATED).real.T)
+    return _centred(lambda rows: powers(turning[rows], REPEATED).real.T, len(u))
 
 
 def ends(down: FloatArray) -> Columns:
@@ -113,11 +114,11 @@ def ends(down: FloatArray) -> Columns:
     for slope in SLOPES:
         last = np.maximum.accumulate(np.where(np.abs(down) > slope, place, 0))
         sides.append(np.sign(down[last]))
-    return _centred(lambda rows: np.stack([side[rows] for side in sides]).T)
+    return _centred(lambda rows: np.stack([side[rows] for side in sides]).T, len(down))
 
 
-def _centred(columns: Columns) -> Columns:
-    mean = columns(slice(None)).mean(axis=0)
+def _centred(columns: Columns, n: int) -> Columns:
+    mean = sum(columns(rows).sum(axis=0) for rows in pieces(n)) / n
     return lambda rows: columns(rows) - mean
 
 
