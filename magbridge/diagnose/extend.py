@@ -20,8 +20,8 @@ from magbridge.diagnose.compare.prior import isotropic
 from magbridge.diagnose.compare.problem import DELAYS, Problem, samples_of
 from magbridge.diagnose.compare.survey import Survey
 from magbridge.diagnose.inference.design import normal
+from magbridge.diagnose.inference.evidence import IDEAL
 from magbridge.diagnose.inference.joint import Joint, fit_joint
-from magbridge.diagnose.inference.weigh import IDEAL
 from magbridge.version import __version__
 
 __all__ = ["extend", "flown", "leveled", "settle", "widened"]
@@ -157,7 +157,7 @@ def widened(model: Sequence[Candidate], fit: Joint) -> Joint:
     Notes
     -----
     A cause of Wald's statistic ``W = b^T C_bb^-1 b`` has a signal of the whitened norm ``sqrt(W)``. A regressor that is off by
-    :data:`~.inference.weigh.IDEAL` of it leaves a misfit that nobody knows the shape of: one more noise, of the power
+    :data:`~.inference.evidence.IDEAL` of it leaves a misfit that nobody knows the shape of: one more noise, of the power
     ``IDEAL^2 W / MODES`` in every direction, where the data's has 1. The cause's coefficients, and what the calibration
     gives way to them, get that much more variance:
 

@@ -23,14 +23,14 @@ from magbridge.diagnose.diagnosis import Diagnosis, Finding
 from magbridge.diagnose.extend import extend, flown, leveled, settle, widened
 from magbridge.diagnose.gain import held_out, paired
 from magbridge.diagnose.inference.accept import accept
+from magbridge.diagnose.inference.evidence import ODDS, REMNANT
 from magbridge.diagnose.inference.isolability import isolability
 from magbridge.diagnose.inference.joint import Joint
-from magbridge.diagnose.inference.loosen import loosened
+from magbridge.diagnose.inference.nonlinear_uncertainty import loosened
 from magbridge.diagnose.inference.outliers import Outliers, outliers
 from magbridge.diagnose.inference.rivals import Rival
 from magbridge.diagnose.inference.search import Hypothesis, search
 from magbridge.diagnose.inference.unexplained import Leftover, leftover
-from magbridge.diagnose.inference.weigh import ODDS, REMNANT
 from magbridge.errors import DataError
 from magbridge.field.grid import AnomalyGrid
 

@@ -10,8 +10,8 @@ import numpy as np
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.accept import _within, accept
+from magbridge.diagnose.inference.evidence import ODDS
 from magbridge.diagnose.inference.search import search
-from magbridge.diagnose.inference.weigh import ODDS
 
 ROWS = 300
 

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from magbridge.diagnose.causes.masses import actuator_order, hysteresis
 from magbridge.diagnose.compare.columns import Columns
 from magbridge.diagnose.compare.problem import Problem
+from magbridge.diagnose.inference.descriptions import descriptions
 from magbridge.diagnose.inference.events import MOMENTS, passage, step
-from magbridge.diagnose.inference.free import descriptions
 from magbridge.diagnose.inference.joint import fit_joint
 
 
@@ -52,15 +52,15 @@ def test_a_dipole_that_passes_is_told_by_three_numbers(problem: Problem) -> None
     assert 100 < trials < 10 * len(problem)
 
 
-def test_a_curve_through_a_mass_position_retells_its_order_and_its_memory_the_hysteresis(
+def test_a_curve_through_a_mass_position_covers_its_order_and_its_memory_the_hysteresis(
     problem: Problem,
 ) -> None:
     listed = descriptions(problem, fit_joint(problem, [], 1))
     order = actuator_order(problem)[0]
     back = next(one for one in hysteresis(problem) if one.channel == "battpos")
     curve, memory = (one for one in listed if one.channel == "battpos")
-    assert (curve.retells([order]), curve.retells([back])) == (True, False)
-    assert (memory.retells([order]), memory.retells([back])) == (False, True)
+    assert (curve.covers([order]), curve.covers([back])) == (True, False)
+    assert (memory.covers([order]), memory.covers([back])) == (False, True)
 
 
 def test_every_description_has_as_many_columns_as_widths(problem: Problem) -> None:

@@ -16,9 +16,9 @@ from magbridge.diagnose.compare.past import Past
 from magbridge.diagnose.compare.problem import Problem, pose
 from magbridge.diagnose.compare.survey import Survey
 from magbridge.diagnose.extend import MODES, extend, flown, leveled, settle, widened
+from magbridge.diagnose.inference.evidence import IDEAL
 from magbridge.diagnose.inference.fit_noise import fit_noise
 from magbridge.diagnose.inference.joint import Joint, fit_joint
-from magbridge.diagnose.inference.weigh import IDEAL
 
 
 def candidate(size: int) -> Candidate:

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.compare.problem import Problem
+from magbridge.diagnose.inference.evidence import score
 from magbridge.diagnose.inference.exchange import _more, _separate, exchanged
 from magbridge.diagnose.inference.pairs import pairs_of
 from magbridge.diagnose.inference.rounds import State
 from magbridge.diagnose.inference.sets import sets_of
-from magbridge.diagnose.inference.weigh import score
 
 ROWS = 600
 Array = NDArray[np.float64]

@@ -23,7 +23,7 @@ from study.rates import efficiency, share
 from study.stage import CHARTS, charted, drawn, project
 from study.table import lines
 
-from magbridge.diagnose.inference.free import Description
+from magbridge.diagnose.inference.descriptions import Description
 from sitl import Twin, load
 
 TOOLS = Path(__file__).parents[2] / "tools"

@@ -18,7 +18,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from magbridge.diagnose.inference.weigh import ODDS
+from magbridge.diagnose.inference.evidence import ODDS
 from study.draws import SHOWN, Draws, Span, evidence
 from study.stage import Found, Stall
 from study.theory import Setting, best_of, information, own_span, true_span

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.diagnosis import Diagnosis
-from magbridge.diagnose.inference.free import Description, descriptions
+from magbridge.diagnose.inference.descriptions import Description, descriptions
 from magbridge.diagnose.report.findings import findings
 from magbridge.diagnose.run import diagnose
 from sitl.inject import EFFECTS, FOREIGN, Hidden

@@ -25,8 +25,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from magbridge.diagnose.inference.free import Description
-from magbridge.diagnose.inference.weigh import ODDS
+from magbridge.diagnose.inference.descriptions import Description
+from magbridge.diagnose.inference.evidence import ODDS
 from study.draws import Draws, Span, weigh
 
 Array = NDArray[np.float64]

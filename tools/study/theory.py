@@ -26,8 +26,8 @@ from scipy.special import chdtri
 from magbridge.diagnose.causes import Cause
 from magbridge.diagnose.compare.problem import pose
 from magbridge.diagnose.compare.take import take
-from magbridge.diagnose.inference.free import Description
-from magbridge.diagnose.inference.weigh import LEVEL, ODDS
+from magbridge.diagnose.inference.descriptions import Description
+from magbridge.diagnose.inference.evidence import LEVEL, ODDS
 from study.draws import DRAWS, SHOWN, Draws, Span, by_cause, evidence, explained, numbers, weigh, with_another
 from study.nameless import against, nameless
 from study.noise import whiten

@@ -10,7 +10,6 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from magbridge.diagnose.causes.candidates import Candidate
-from magbridge.diagnose.causes.clock import interference_tone, offset_drift, offset_step
 from magbridge.diagnose.causes.masses import actuator_order, hysteresis, unmodelled_actuator
 from magbridge.diagnose.causes.reference import diurnal_variation, map_error, reference_bias
 from magbridge.diagnose.causes.response import nonlinearity, saturation
@@ -20,6 +19,7 @@ from magbridge.diagnose.causes.telemetry import (
     temperature_offset,
     temperature_scale,
 )
+from magbridge.diagnose.causes.time_dependent import interference_tone, offset_drift, offset_step
 from magbridge.diagnose.causes.timing import channel_skew, clock_offset, eddy_current, filter_lag
 from magbridge.diagnose.compare.problem import Problem
 

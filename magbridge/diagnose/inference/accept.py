@@ -9,10 +9,10 @@ import numpy as np
 
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.compare.problem import Problem
+from magbridge.diagnose.inference.evidence import ODDS, REMNANT, worth
 from magbridge.diagnose.inference.rivals import Rival
 from magbridge.diagnose.inference.search import Hypothesis, Outcome
 from magbridge.diagnose.inference.unexplained import Leftover, leftover
-from magbridge.diagnose.inference.weigh import ODDS, REMNANT, worth
 
 __all__ = ["accept"]
 
@@ -49,7 +49,7 @@ def _same(chosen: Sequence[Hypothesis], rest: Leftover) -> bool:
     """Say whether the rest is a remnant of a stronger named cause, whose regressor is idealised."""
     told = rest.description
     return told is not None and any(
-        told.retells([h.candidate]) and h.signal_to_noise > rest.signal_to_noise for h in chosen
+        told.covers([h.candidate]) and h.signal_to_noise > rest.signal_to_noise for h in chosen
     )
 
 

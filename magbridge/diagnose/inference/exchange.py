@@ -8,12 +8,12 @@ from itertools import combinations
 import numpy as np
 
 from magbridge.diagnose.causes.candidates import Candidate
+from magbridge.diagnose.inference.evidence import slack
 from magbridge.diagnose.inference.joint import Joint
 from magbridge.diagnose.inference.pairs import pairs_of
+from magbridge.diagnose.inference.profile_likelihood import refined
 from magbridge.diagnose.inference.rivals import rivals_of
 from magbridge.diagnose.inference.rounds import State
-from magbridge.diagnose.inference.sharpen import refined
-from magbridge.diagnose.inference.weigh import slack
 
 __all__ = ["exchanged"]
 

@@ -19,9 +19,9 @@ from scipy.special import chdtri, chndtrinc
 from scipy.stats import norm
 
 from magbridge.diagnose.causes.candidates import Candidate, slices
+from magbridge.diagnose.inference.evidence import LEVEL, score
 from magbridge.diagnose.inference.information import Information
-from magbridge.diagnose.inference.telling import Telling
-from magbridge.diagnose.inference.weigh import LEVEL, score
+from magbridge.diagnose.inference.naming import NamingTheory
 
 __all__ = ["Isolability", "Visible", "confusion", "isolability", "threshold"]
 
@@ -71,7 +71,7 @@ class Isolability:
         Cause -> what a log would need for it.
     correlation : (m, m) array
         Between the causes of `visible`.
-    telling : Telling
+    naming : NamingTheory
         The chance of each cause to be named alone.
     """
 
@@ -79,11 +79,11 @@ class Isolability:
     pairs: tuple[tuple[str, str, float], ...]
     untestable: dict[str, str]
     correlation: FloatArray
-    telling: Telling
+    naming: NamingTheory
 
     def alone(self, cause: str, signal_to_noise: float) -> float:
         """Chance that `cause`, at this signal-to-noise, is named and nothing beside it."""
-        return self.telling.alone(cause, signal_to_noise)
+        return self.naming.alone(cause, signal_to_noise)
 
 
 def threshold(freedom: int, hypotheses: float, chance: float) -> float:
@@ -121,7 +121,7 @@ def isolability(
         tuple(sorted(pairs, key=lambda p: -p[2])),
         dict(untestable),
         R,
-        Telling(candidates, info, trials, causes),
+        NamingTheory(candidates, info, trials, causes),
     )
 
 

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from scipy.special import gammaln
 from scipy.stats import chi2
 
+from magbridge.diagnose.inference.evidence import LEVEL
 from magbridge.diagnose.inference.fit_noise import TAILS
 from magbridge.diagnose.inference.joint import Joint
-from magbridge.diagnose.inference.weigh import LEVEL
 
 __all__ = ["Outliers", "outliers"]
 

@@ -27,9 +27,9 @@ from scipy.fft import ifft, irfft, next_fast_len, rfft
 from magbridge.diagnose.compare.columns import Columns
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.design import in_threads
+from magbridge.diagnose.inference.evidence import weigh
 from magbridge.diagnose.inference.joint import Joint
 from magbridge.diagnose.inference.noise import Noise
-from magbridge.diagnose.inference.weigh import weigh
 
 __all__ = ["Packets", "packets"]
 

@@ -22,11 +22,11 @@ from numpy.typing import NDArray
 from scipy.special import log_ndtr, logsumexp
 
 from magbridge.diagnose.causes.candidates import Candidate
+from magbridge.diagnose.inference.evidence import LEVEL, REMNANT, lead, score
 from magbridge.diagnose.inference.information import Information
 from magbridge.diagnose.inference.joint import Joint
 from magbridge.diagnose.inference.rounds import State, key
 from magbridge.diagnose.inference.statistic import VISIBLE
-from magbridge.diagnose.inference.weigh import LEVEL, REMNANT, lead, score
 
 __all__ = ["Pair", "pairs_of"]
 
@@ -66,7 +66,7 @@ class _Stack:
     def beside(
         self, rows: FloatArray, K: FloatArray, taken: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """(m,) log evidences, likelihood ratios and freedoms (:func:`~.weigh.score`) beside another.
+        """(m,) log evidences, likelihood ratios and freedoms (:func:`~.evidence.score`) beside another.
 
         Parameters
         ----------
@@ -184,7 +184,7 @@ class _Table:
         return _average(self.evidence[np.ix_(self.state.groups[A], self.state.groups[B])])
 
     def pair(self, A: Group, B: Group) -> Pair | None:
-        """Return the best of two grids, if it is no worse than what stands there by more than :func:`~.weigh.lead`."""
+        """Return the best of two grids, if it is no worse than what stands there by more than :func:`~.evidence.lead`."""
         own = [key(candidate) for candidate in self.standing]
         block = self.evidence[np.ix_(self.members[A], self.members[B])]
         top = float(block.max())

@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from magbridge.diagnose.causes.candidates import Candidate
+from magbridge.diagnose.inference.evidence import LEVEL, lead, score
 from magbridge.diagnose.inference.information import Information
 from magbridge.diagnose.inference.joint import Joint
 from magbridge.diagnose.inference.rounds import State, key
-from magbridge.diagnose.inference.weigh import LEVEL, lead, score
 
 __all__ = ["Rival", "rivals_of"]
 

@@ -14,11 +14,11 @@ from magbridge.diagnose.causes.candidates import Candidate, slices
 from magbridge.diagnose.compare.columns import Columns, Mixture, parts, together
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.design import in_threads, kept
+from magbridge.diagnose.inference.evidence import Score, evidence_of, score, slack, trials, worth
 from magbridge.diagnose.inference.fit_noise import certainty
 from magbridge.diagnose.inference.information import Information, information
 from magbridge.diagnose.inference.joint import RIDGE, Joint, fit_joint, volume_of
 from magbridge.diagnose.inference.noise import Noise
-from magbridge.diagnose.inference.weigh import Score, evidence_of, score, slack, trials, worth
 
 __all__ = ["Hypothesis", "State", "key"]
 

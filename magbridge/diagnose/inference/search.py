@@ -2,11 +2,11 @@ r"""The search for the causes that the data support, one after the other.
 
 Notes
 -----
-Candidates are scored (:mod:`.weigh`) under two noises, since the noise of the model so far may have swallowed an effect:
+Candidates are scored (:mod:`.evidence`) under two noises, since the noise of the model so far may have swallowed an effect:
 that one, and the noise that is left when every cause may take what it can. The best of each cause are then fitted
 jointly with noise and calibration. The best that passes the test is added; so on while one does. A cause that is found
 again is not another cause but needs more than one of its regressors: they become one candidate. Then causes change places
-with their rivals (:mod:`.exchange`); another start is a choice of all at once (:mod:`.together`); and what later findings
+with their rivals (:mod:`.exchange`); another start is a choice of all at once (:mod:`.simultaneous`); and what later findings
 have made needless is dropped.
 
 What a cause's place could be taken by is read off one matrix at the end: the information of all candidates under the
@@ -23,16 +23,16 @@ from numpy.typing import NDArray
 
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.compare.problem import Problem
+from magbridge.diagnose.inference.evidence import LEVEL, REMNANT, evidence_of, lead, slack
 from magbridge.diagnose.inference.exchange import exchanged
 from magbridge.diagnose.inference.fit_noise import memory_order
 from magbridge.diagnose.inference.information import Information
 from magbridge.diagnose.inference.joint import Joint, fit_joint
+from magbridge.diagnose.inference.profile_likelihood import refined, sharpen
 from magbridge.diagnose.inference.rivals import Rival
 from magbridge.diagnose.inference.rounds import Hypothesis, State, key
 from magbridge.diagnose.inference.sets import sets_of
-from magbridge.diagnose.inference.sharpen import refined, sharpen
-from magbridge.diagnose.inference.together import MOST, enough, together
-from magbridge.diagnose.inference.weigh import LEVEL, REMNANT, evidence_of, lead, slack
+from magbridge.diagnose.inference.simultaneous import MOST, enough, together
 
 __all__ = ["Hypothesis", "Outcome", "search"]
 
@@ -48,7 +48,7 @@ class Outcome:
     chosen : tuple of Hypothesis
         In the order found; each against the model without it.
     rivals : tuple of tuple of Rival
-        For each chosen one, all others that it does not beat by :func:`~.weigh.lead`, the best first.
+        For each chosen one, all others that it does not beat by :func:`~.evidence.lead`, the best first.
     null, fit : Joint
         Without any cause, and with the chosen ones.
     order : int

@@ -20,15 +20,15 @@ from scipy.stats import chi2
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.compare.columns import Columns
 from magbridge.diagnose.compare.problem import Problem
+from magbridge.diagnose.inference.descriptions import Description, descriptions
 from magbridge.diagnose.inference.design import Design, in_threads, kept
+from magbridge.diagnose.inference.evidence import LEVEL
 from magbridge.diagnose.inference.fit_noise import fit_noise
-from magbridge.diagnose.inference.free import Description, descriptions
 from magbridge.diagnose.inference.information import information
 from magbridge.diagnose.inference.joint import Joint
 from magbridge.diagnose.inference.noise import Noise
 from magbridge.diagnose.inference.rivals import Rival
 from magbridge.diagnose.inference.statistic import Ridge, Statistic
-from magbridge.diagnose.inference.weigh import LEVEL
 
 __all__ = ["Leftover", "leftover"]
 
@@ -86,7 +86,7 @@ def lone(S: FloatArray, b: FloatArray, width: FloatArray, whole: Ridge) -> Ridge
     """One curve along one direction of the body: ``c = f d^T`` has a third of the numbers of three curves, and two more.
 
     f by the ridge along d, d by least squares with f, from the `whole` estimate on; the direction's two numbers cost what
-    :func:`~.weigh.weigh` asks for them.
+    :func:`~.evidence.weigh` asks for them.
     """
     count = len(width) // 3
     own = np.linalg.svd(whole.estimate.reshape(count, 3), full_matrices=False)[2][0]
@@ -122,7 +122,7 @@ def leftover(
     but : sequence of Candidate
         Causes that are not to be told again with more numbers.
     """
-    listed = [one for one in descriptions(problem, fit, tone) if not one.retells(but)]
+    listed = [one for one in descriptions(problem, fit, tone) if not one.covers(but)]
     made = kept(len(problem), [one.columns for one in listed])
     listed = [one._replace(columns=columns) for one, columns in zip(listed, made, strict=True)]
     columns = [candidate.columns for candidate in model]

@@ -12,8 +12,8 @@ from scipy.stats import chi2
 
 from magbridge.calibration.residual import residuals_of
 from magbridge.diagnose.compare.problem import DELAY, DELAYS, Problem, samples_of
+from magbridge.diagnose.inference.evidence import LEVEL
 from magbridge.diagnose.inference.joint import Joint
-from magbridge.diagnose.inference.weigh import LEVEL
 from magbridge.diagnose.report.words import listed, measured, number
 
 if TYPE_CHECKING:

@@ -128,9 +128,7 @@ def told(diagnosis: Diagnosis, hypothesis: Hypothesis) -> float:
     first = len(info.score) - sum(one.candidate.size for one in chosen[k:])
     own = np.arange(first, first + hypothesis.candidate.size)
     b = hypothesis.fit.coefficients[-hypothesis.candidate.size :]
-    return diagnosis.isolability.telling.chance(
-        hypothesis.candidate.cause, own, b, hypothesis.signal_to_noise
-    )
+    return diagnosis.isolability.naming.chance(hypothesis.candidate.cause, own, b, hypothesis.signal_to_noise)
 
 
 def _wrong(diagnosis: Diagnosis) -> dict[str, Any]:

@@ -70,7 +70,7 @@ class Description(NamedTuple):
     turned: bool = False
     remembers: bool = False
 
-    def retells(self, model: Sequence[Candidate]) -> bool:
+    def covers(self, model: Sequence[Candidate]) -> bool:
         """Say whether it says the same as a cause of `model`, with more coefficients."""
         return any(
             candidate.cause in self.holds

@@ -7,8 +7,8 @@ import pytest
 from scipy.stats import chi2
 
 from magbridge.diagnose.causes.candidates import Candidate, slices
+from magbridge.diagnose.inference.evidence import LEVEL, evidence_of, trials, weigh, worth
 from magbridge.diagnose.inference.information import Information
-from magbridge.diagnose.inference.weigh import LEVEL, evidence_of, trials, weigh, worth
 
 
 def candidate(

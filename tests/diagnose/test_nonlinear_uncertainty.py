@@ -12,7 +12,7 @@ from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.design import normal
 from magbridge.diagnose.inference.joint import Joint, fit_joint
-from magbridge.diagnose.inference.loosen import loosened
+from magbridge.diagnose.inference.nonlinear_uncertainty import loosened
 
 ROWS, LAG, CELL = 300, 60.0, 40.0
 

@@ -6,7 +6,7 @@ With the information S of all candidates, a cause's coefficients b of signal-to-
 the ratio ``R_i = s^T S_ii^-1 s``, ``s = S_ij b``: what the rival can imitate. The difference of the two ratios is
 normal about ``a^2 - R_i = delta^2`` with standard deviation ``2 delta`` (two subspaces in Gaussian noise), so the
 log evidence by which the truth wins has the standard deviation delta, and the chance to be above
-:func:`~.weigh.lead` is a normal integral. Rivals are taken as independent.
+:func:`~.evidence.lead` is a normal integral. Rivals are taken as independent.
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ from numpy.typing import NDArray
 from scipy.stats import chi2, ncx2, norm
 
 from magbridge.diagnose.causes.candidates import Candidate, slices
+from magbridge.diagnose.inference.evidence import LEVEL, lead, weigh
 from magbridge.diagnose.inference.information import Information
 from magbridge.diagnose.inference.statistic import Statistic
-from magbridge.diagnose.inference.weigh import LEVEL, lead, weigh
 
-__all__ = ["Telling"]
+__all__ = ["NamingTheory"]
 
 FloatArray = NDArray[np.float64]
 DRAWS = 12
 
 
-class Telling:
-    """The theory of one log.
+class NamingTheory:
+    """The theory of one log: which causes it would let be named alone.
 
     Parameters
     ----------

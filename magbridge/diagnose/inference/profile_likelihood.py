@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magbridge.diagnose.causes.candidates import Candidate, slices
+from magbridge.diagnose.inference.evidence import score
 from magbridge.diagnose.inference.information import information
 from magbridge.diagnose.inference.joint import Joint
 from magbridge.diagnose.inference.rounds import Hypothesis, State, key
-from magbridge.diagnose.inference.weigh import score
 
 __all__ = ["refined", "sharpen"]
 

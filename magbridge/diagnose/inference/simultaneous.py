@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 
 from magbridge.diagnose.causes.candidates import Candidate
+from magbridge.diagnose.inference.evidence import LEVEL, REMNANT, score, slack
 from magbridge.diagnose.inference.rounds import Hypothesis, State
-from magbridge.diagnose.inference.weigh import LEVEL, REMNANT, score, slack
 
 __all__ = ["MOST", "enough", "together"]
 
