@@ -34,11 +34,26 @@ CHECKS = (
 )
 
 
+def call(*command: str | Path, **variables: str) -> int:
+    """Run a command in the checkout; return its exit code."""
+    return subprocess.call([str(part) for part in command], cwd=ROOT, env={**os.environ, **variables})
+
+
 def run(*command: str | Path, **variables: str) -> None:
     """Run a command in the checkout; end with its exit code when it fails."""
-    code = subprocess.call([str(part) for part in command], cwd=ROOT, env={**os.environ, **variables})
-    if code:
+    if code := call(*command, **variables):
         sys.exit(code)
+
+
+def run_tests(python: Path, *arguments: str, **variables: str) -> None:
+    """Run the tests, and those that fail once more, one at a time: their sensors and links keep real time.
+
+    A machine that stands still for half a second makes telemetry stale, as it should.
+    """
+    pytest = (python, "-m", "pytest")
+    if call(*pytest, "-n", "2", "--dist", "loadfile", *arguments, **variables) == 1:
+        print("\nOnce more, one at a time, what failed beside others:", flush=True)
+        run(*pytest, "--last-failed", *arguments, **variables)
 
 
 def install(extra: str, place: Path = BIN, *options: str) -> None:
@@ -53,10 +68,10 @@ def install(extra: str, place: Path = BIN, *options: str) -> None:
     )  # fmt: skip
 
 
-def run_compiled(*command: str | Path) -> None:
-    """Run Python with the package that is installed, and not with the checkout around it."""
+def install_compiled() -> dict[str, str]:
+    """Install the package as a user would; return the variables with which it is found, and not the checkout around it."""
     install("dev", COMPILED, "--no-editable", "--reinstall-package", "magbridge")
-    run(COMPILED / "python", *command, PYTHONSAFEPATH="1", PYTHONPATH=str(ROOT / "tools"))
+    return {"PYTHONSAFEPATH": "1", "PYTHONPATH": str(ROOT / "tools")}
 
 
 def main() -> None:
@@ -69,15 +84,15 @@ def main() -> None:
         run(BIN / "magbridge", "demo", *arguments)
     elif what == "test":
         install("dev")
-        run(BIN / "python", "-m", "pytest", "-n", "2", "--dist", "loadfile", *arguments)
+        run_tests(BIN / "python", *arguments)
     elif what == "check":
         install("dev")
         for command in CHECKS:
             run(BIN / command[0], *command[1:])
     elif what == "compiled":
-        run_compiled("-m", "pytest", "-n", "2", "--dist", "loadfile", *(arguments or LIVE))
+        run_tests(COMPILED / "python", *(arguments or LIVE), **install_compiled())
     elif what == "bench":
-        run_compiled("tools/bench.py", *arguments)
+        run(COMPILED / "python", "tools/bench.py", *arguments, **install_compiled())
     else:
         sys.exit(__doc__)
 
