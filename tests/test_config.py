@@ -81,8 +81,3 @@ def test_one_clear_line_names_the_key(tmp_path: Path, old: str, new: str, line: 
     assert line in str(caught.value)
     assert str(caught.value).startswith(str(path))
     assert "\n" not in str(caught.value)
-
-
-def test_a_missing_file_is_one_line(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"none\.toml: No such file"):
-        load(tmp_path / "none.toml")

@@ -12,6 +12,11 @@ import pytest
 import magbridge as mb
 from sitl import load, simulate
 
+ASHORE = {
+    "filterpy", "harmonica", "matplotlib", "netCDF4", "pandas", "ppigrf", "pyarrow", "pymavlink", "scipy", "xarray",
+}  # fmt: skip
+"""Packages that no payload computer needs to have, nor the memory for."""
+
 
 def test_every_public_name_is_there() -> None:
     assert len(mb.__all__) <= 15
@@ -20,9 +25,18 @@ def test_every_public_name_is_there() -> None:
         mb.nothing  # noqa: B018 - it is the look-up that fails
 
 
-def test_importing_it_brings_nothing_else() -> None:
-    heavy = "{'numpy', 'scipy', 'xarray', 'msgspec'} & set(sys.modules)"
-    script = f"import sys, magbridge; print(sorted({heavy}))"
+@pytest.mark.parametrize(
+    ("imports", "heavy"),
+    [
+        ("import magbridge", {"numpy", "msgspec", *ASHORE}),
+        ("import magbridge.bridge.run", ASHORE),
+        ("from magbridge.field.igrf import igrf; igrf(0, 0, 0, 0)", ASHORE),
+        ("from magbridge.field import grid, nearby, prepare, read, reference", ASHORE),
+    ],
+    ids=["the package", "the live path", "the main field", "maps"],
+)
+def test_importing_brings_nothing_heavy(imports: str, heavy: set[str]) -> None:
+    script = f"{imports}\nimport sys; print(sorted({heavy} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
 

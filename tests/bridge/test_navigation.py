@@ -182,7 +182,6 @@ def test_the_same_events_give_the_same_fixes(folder: Path) -> None:
     ("old", "new", "line"),
     [
         ('"FIX"', '"TELEPATHY"', "navigation.fix: expected one of EXTERNAL_POSITION_ESTIMATE"),
-        ('"grid.nc"', '"none.nc"', "navigation.map: no such file"),
         ("start_sigma", "start_sgma", "navigation.options.start_sgma: unknown key"),
     ],
 )

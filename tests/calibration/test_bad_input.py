@@ -130,7 +130,9 @@ def test_a_run_given_twice_counts_once(
     again.write_bytes(good[0].read_bytes())
     capsys.readouterr()
     assert main(["calibrate", str(good[0]), str(again), *PARAMETERS, "-o", str(tmp_path / "cal.json")]) == 0
-    assert f"{again}: identical to {good[0]}; its samples are counted once" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert f"{again}: identical to {good[0]}; its samples are counted once" in said
+    assert "in the logs: duplicate rows 563" in said
     once, twice = (json.loads(path.read_text()) for path in (good[1], tmp_path / "cal.json"))
     assert once["coefficients"] == twice["coefficients"]
 

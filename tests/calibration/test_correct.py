@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from dataclasses import replace
 
 import numpy as np
@@ -241,16 +239,6 @@ def test_wrong_number_of_channels_is_one_clear_line() -> None:
         correct(cal, np.zeros((1, 3)), np.zeros((1, 1)), np.zeros(1))
     with pytest.raises(CalibrationError, match="expected 2 values"):
         Corrector(cal).step(0, (0.0, 0.0, 0.0), (1.0,))
-
-
-def test_the_live_path_imports_no_heavy_packages() -> None:
-    heavy = "scipy", "xarray", "pandas", "matplotlib", "filterpy", "ppigrf"
-    code = (
-        "import sys, magbridge.calibration.correct, magbridge.calibration.file;"
-        f"print([m for m in {heavy!r} if m in sys.modules])"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
 
 
 def test_what_if_at_other_positions_is_the_total_there() -> None:

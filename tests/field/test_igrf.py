@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 import time
 from datetime import UTC, datetime
 
@@ -122,14 +120,3 @@ def test_a_million_samples_in_ten_seconds(places):
     started = time.process_time()
     igrf(lon, lat, depth, np.linspace(at(2020, 1, 1), at(2020, 2, 1), n))
     assert time.process_time() - started < 1.0
-
-
-def test_the_live_path_needs_numpy_alone():
-    code = (
-        "import sys; from magbridge.field.igrf import igrf; igrf(0, 0, 0, 0)\n"
-        "import magbridge.field.grid, magbridge.field.nearby, magbridge.field.prepare, magbridge.field.read\n"
-        "import magbridge.field.reference\n"
-        "print(sorted({'pandas', 'scipy', 'xarray', 'matplotlib', 'harmonica'} & set(sys.modules)))"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"

