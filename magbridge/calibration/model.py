@@ -15,7 +15,7 @@ All are kept in nT: ``A = I + a / F_0``, with F_0 the field at calibration.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import msgspec
@@ -35,7 +35,6 @@ __all__ = [
     "Run",
     "Sensor",
     "identity",
-    "with_boresight",
 ]
 
 FloatArray = NDArray[np.float64]
@@ -216,8 +215,3 @@ def identity(parameters: tuple[Parameter, ...] = (), field: float = 50_000.0) ->
         reference=Reference(field),
         method="none",
     )
-
-
-def with_boresight(calibration: Calibration, boresight: Boresight | None) -> Calibration:
-    """Return the same calibration with another boresight."""
-    return replace(calibration, boresight=boresight)

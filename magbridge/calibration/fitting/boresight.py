@@ -11,13 +11,15 @@ are no independent witnesses: the covariance is that between whole runs (sandwic
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from magbridge.calibration.correct import correct
 from magbridge.calibration.fitting.data import Observations
-from magbridge.calibration.model import Boresight, Calibration, with_boresight
+from magbridge.calibration.model import Boresight, Calibration
 
 __all__ = ["field_body", "find_boresight"]
 
@@ -59,7 +61,7 @@ def find_boresight(calibration: Calibration, data: Observations) -> Boresight | 
     assert part.time is not None
     assert part.runs is not None
     k = len(calibration.parameters)
-    b = correct(with_boresight(calibration, None), part.field, part.parameters[:, :k], part.time).vector
+    b = correct(replace(calibration, boresight=None), part.field, part.parameters[:, :k], part.time).vector
     v = field_body(part.attitude, part.reference_ned)
     rotation, _ = Rotation.align_vectors(v, b)
     score = np.cross(v, rotation.apply(b) - v)

@@ -19,6 +19,7 @@ __all__ = ["Mission", "expected_error", "nearby_mission"]
 
 FloatArray = NDArray[np.float64]
 POINTS = 600  # of a mission are enough to know it by
+ROLL = 10.0  # deg either way, by which a survey rolls further than the runs did
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,25 +55,18 @@ class Mission:
         return cls(field_body(data.attitude[rows], data.reference_ned[rows]), data.parameters[rows])
 
 
-def nearby_mission(calibration: Calibration, data: Observations, roll: float = 10.0) -> Mission:
+def nearby_mission(calibration: Calibration, data: Observations) -> Mission:
     """Return the calibration's own attitudes and positions, rolled a little further either way, and on all headings.
 
     That is what a survey after these runs meets at least. The corrected vectors themselves tell the attitude up to
     a turn about the field; where the vertical is, attitude telemetry must tell: without it, headings stay.
-
-    Parameters
-    ----------
-    calibration : Calibration
-    data : Observations
-    roll : float
-        deg either way.
     """
     rows = np.arange(0, len(data), max(3 * len(data) // POINTS, 1))
     k = len(calibration.parameters)
     positions = data.parameters[rows, :k]
     assert data.time is not None
     b = correct(calibration, data.field[rows], positions, data.time[rows]).vector
-    met = [Rotation.from_euler("X", angle, degrees=True).apply(b) for angle in (-roll, 0.0, roll)]
+    met = [Rotation.from_euler("X", angle, degrees=True).apply(b) for angle in (-ROLL, 0.0, ROLL)]
     places = [positions] * len(met)
     if data.attitude is not None:
         known = np.isfinite(data.attitude[rows]).all(axis=1)

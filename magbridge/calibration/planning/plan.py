@@ -36,6 +36,8 @@ __all__ = ["Plan", "evaluate_runs", "expected_calibration", "plan"]
 
 FloatArray = NDArray[np.float64]
 HEADINGS = 24
+SAMPLES = 225  # of a run: a quarter of an hour at the paper's 0.25 Hz
+LEVELS = 7  # of each position that are tried
 POWER = 4  # of the variance: the eighth power mean of sigma
 
 
@@ -86,16 +88,14 @@ def expected_calibration(
 class _Design:
     """The linear algebra of candidates about one calibration."""
 
-    def __init__(
-        self, calibration: Calibration, mission: Mission, field_ned: FloatArray, samples: int
-    ) -> None:
+    def __init__(self, calibration: Calibration, mission: Mission, field_ned: FloatArray) -> None:
         if (
             len(calibration.terms) != 1
             or not isinstance(calibration.terms[0], Polynomial)
             or calibration.effects
         ):
             raise CalibrationError("plan: needs a calibration of polynomials only")
-        self.calibration, self.field_ned, self.samples = calibration, field_ned, samples
+        self.calibration, self.field_ned = calibration, field_ned
         self.exponents = calibration.terms[0].exponents
         phi, g = self.derivative(mission.field_body, mission.parameters)
         self.points = (phi[:, :, None] * g[:, None, :]).reshape(len(g), -1)
@@ -116,7 +116,7 @@ class _Design:
         truth = field_body(attitude, np.tile(self.field_ned, (HEADINGS, 1)))
         phi, g = self.derivative(truth, np.tile(run.parameters, (HEADINGS, 1)))
         noise, memory = self.calibration.noise.sensor, self.calibration.noise.memory
-        weight = self.samples / HEADINGS / noise**2 * (1.0 - memory) / (1.0 + memory)
+        weight = SAMPLES / HEADINGS / noise**2 * (1.0 - memory) / (1.0 + memory)
         values, vectors = np.linalg.eigh(g.T @ g * weight)
         return np.kron(phi[:1].T, vectors * np.sqrt(np.maximum(values, 0.0)))
 
@@ -145,10 +145,9 @@ def evaluate_runs(
     mission: Mission,
     field_ned: FloatArray,
     runs: Sequence[PlannedRun],
-    samples: int = 225,
 ) -> Plan:
     """Return what given runs are expected to bring, one after the other; arguments as for :func:`plan`."""
-    design = _Design(calibration, mission, field_ned, samples)
+    design = _Design(calibration, mission, field_ned)
     C = calibration.covariance
     course = [design.variances(C)]
     for run in runs:
@@ -168,8 +167,6 @@ def plan(
     limits: Limits,
     *,
     runs: int = 10,
-    samples: int = 225,
-    levels: int = 7,
 ) -> Plan:
     """Choose the runs to fly next.
 
@@ -182,10 +179,8 @@ def plan(
     field_ned : (3,) array
         nT, where the runs will be flown.
     limits : Limits
-    runs, samples : int
-        How many spirals, and samples in each.
-    levels : int
-        Of each position that are tried.
+    runs : int
+        How many spirals.
 
     Raises
     ------
@@ -193,38 +188,26 @@ def plan(
         The limits leave nothing to fly.
     """
     with threadpool_limits(1, "blas"):  # matrices this small only wait for each other
-        return _plan(calibration, mission, field_ned, limits, runs, samples, levels)
-
-
-def _plan(
-    calibration: Calibration,
-    mission: Mission,
-    field_ned: FloatArray,
-    limits: Limits,
-    runs: int,
-    samples: int,
-    levels: int,
-) -> Plan:
-    design = _Design(calibration, mission, field_ned, samples)
-    candidates = list(candidate_runs(limits, calibration.parameters, levels))
-    if not candidates:
-        raise CalibrationError("plan: no pitch, roll and position lie within the vehicle's limits")
-    factors = [design.factor(run) for run in candidates]
-    chosen: list[int] = []
-    C = calibration.covariance
-    for _ in range(runs):
-        chosen.append(int(np.argmin(design.scores(C, factors))))
-        C = design.after(C, factors[chosen[-1]])
-    for _ in range(3):  # exchanges: each run against all others, given the rest
-        changed = False
-        for i in range(len(chosen)):
-            C = calibration.covariance
-            for j in chosen[:i] + chosen[i + 1 :]:
-                C = design.after(C, factors[j])
-            scores = design.scores(C, factors)
-            best = int(np.argmin(scores))
-            if scores[best] < (1.0 - 1e-6) * scores[chosen[i]]:
-                chosen[i], changed = best, True
-        if not changed:
-            break
-    return evaluate_runs(calibration, mission, field_ned, [candidates[i] for i in chosen], samples)
+        design = _Design(calibration, mission, field_ned)
+        candidates = candidate_runs(limits, calibration.parameters, LEVELS)
+        if not candidates:
+            raise CalibrationError("plan: no pitch, roll and position lie within the vehicle's limits")
+        factors = [design.factor(run) for run in candidates]
+        chosen: list[int] = []
+        C = calibration.covariance
+        for _ in range(runs):
+            chosen.append(int(np.argmin(design.scores(C, factors))))
+            C = design.after(C, factors[chosen[-1]])
+        for _ in range(3):  # exchanges: each run against all others, given the rest
+            changed = False
+            for i in range(len(chosen)):
+                C = calibration.covariance
+                for j in chosen[:i] + chosen[i + 1 :]:
+                    C = design.after(C, factors[j])
+                scores = design.scores(C, factors)
+                best = int(np.argmin(scores))
+                if scores[best] < (1.0 - 1e-6) * scores[chosen[i]]:
+                    chosen[i], changed = best, True
+            if not changed:
+                break
+        return evaluate_runs(calibration, mission, field_ned, [candidates[i] for i in chosen])
