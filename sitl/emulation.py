@@ -60,7 +60,8 @@ def emulate(deployment: xr.Dataset, config: Config) -> Iterator[Event]:
     autopilot = Autopilot(config, begin_us)
     times = deployment["time"].to_numpy().astype(float)
     fluxgate = open_encoder(config.sensor.driver, config.sensor.options, _rate(times), config.path)
-    answers = b"".join(fluxgate.feed(command) for command in _commands(config))
+    driver = open_driver(config.sensor.driver, config.sensor.options, config.path)
+    answers = b"".join(fluxgate.feed(command) for command in driver.start())
     for port in (MAG_PORT_NAME.SENSOR, MAG_PORT_NAME.LINK):
         yield Event(begin_us, Channel.STATE, states.opened(port))
     if answers:
@@ -78,11 +79,6 @@ def emulate(deployment: xr.Dataset, config: Config) -> Iterator[Event]:
         if data:
             last_us = max(told_us, time_us + delay_us + LINE_DELAY_US & ~3)
             yield Event(last_us, Channel.SENSOR, data)
-
-
-def _commands(config: Config) -> tuple[bytes, ...]:
-    """Return what the bridge's driver tells the sensor at the start."""
-    return open_driver(config.sensor.driver, config.sensor.options, config.path).start()
 
 
 def _rows(deployment: xr.Dataset) -> Iterator[tuple[int, dict[str, float]]]:

@@ -59,10 +59,6 @@ class Journal:
         """Write a MAG_RAW that is not published: without it, nothing could be calibrated from the log."""
         self._add([(time_us, STATE, self._scribe.frame(RAW, payload))])
 
-    def note(self, time_us: int, name: str, **fields: object) -> None:
-        """Write a state record of our own."""
-        self.state(time_us, self._scribe.pack(name, **fields))
-
     def drain(self) -> list[tuple[int, Channel, bytes]]:
         """Return what was collected, in order (event time in µs, channel, frame), and forget it."""
         records, self._records = self._records, []

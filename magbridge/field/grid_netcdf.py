@@ -21,7 +21,7 @@ SIGMA = ("sigma", "error", "uncertainty", "std")
 PROJECTED = ("easting", "northing", "projection_x_coordinate", "projection_y_coordinate", "utm_x", "utm_y")
 
 
-def netcdf(path: Path, variable: str | None = None) -> Parts:
+def netcdf(path: Path) -> Parts:
     """CF or GMT netCDF: one two-dimensional variable on geographic axes."""
     import xarray as xr  # noqa: PLC0415  the live path runs without xarray
 
@@ -36,17 +36,16 @@ def netcdf(path: Path, variable: str | None = None) -> Parts:
     flat = {name: da for name, da in flat.items() if da.ndim == 2 and da.dtype.kind in "fiu"}
     named = [name for name in ANOMALY if name in {n.lower() for n in flat}]
     sigmas = [name for name in flat if name.lower() in SIGMA]
-    choice = variable or next((n for n in flat if named and n.lower() == named[0]), None)
-    if choice is None and len(rest := [n for n in flat if n not in sigmas]) == 1:
-        choice = rest[0]
-    if choice is None or choice not in flat:
-        raise FormatError(path, f"expected one grid, found {' '.join(flat) or 'none'}: name the variable")
-    grid = flat[choice]
+    choices = [n for n in flat if named and n.lower() == named[0]] or [n for n in flat if n not in sigmas]
+    if len(choices) != 1:
+        found = " ".join(flat) or "none"
+        raise FormatError(path, f"expected one grid, found {found}: call the one to use anomaly")
+    grid = flat[choices[0]]
     x, y = (
         _coordinate(path, grid, names, kind) for names, kind in ((LONGITUDE, "east"), (LATITUDE, "north"))
     )
     options: dict[str, Any] = {"unit": grid.attrs.get("units")}
-    if sigmas and variable not in sigmas:
+    if sigmas:
         options["sigma"] = flat[sigmas[0]].transpose(y, x).to_numpy()
     for where in (grid.attrs, data.attrs):
         if "altitude" in where:

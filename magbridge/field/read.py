@@ -39,7 +39,7 @@ READERS: dict[str, Callable[..., Parts]] = {
 }
 
 
-def read_grid(path: str | Path, *, variable: str | None = None, unit: str | None = None) -> AnomalyGrid:
+def read_grid(path: str | Path) -> AnomalyGrid:
     """Return the anomaly grid that a file holds.
 
     Parameters
@@ -47,10 +47,6 @@ def read_grid(path: str | Path, *, variable: str | None = None, unit: str | None
     path : path
         netCDF (CF, GMT), Surfer or Geosoft ``.grd``, ESRI ASCII ``.asc``, GeoTIFF, ``.csv`` or ``.xyz`` of
         longitude, latitude, anomaly; or a folder of ``xx.csv yy.csv alt.csv map.csv`` as MagNav's example has.
-    variable : str, optional
-        Of a netCDF file with several; default the one whose name tells it.
-    unit : str, optional
-        Of the values, where the file does not say or says it wrongly; default nT.
 
     Raises
     ------
@@ -63,12 +59,10 @@ def read_grid(path: str | Path, *, variable: str | None = None, unit: str | None
     reader = folder if path.is_dir() else READERS.get(path.suffix.lower())
     if reader is None:
         raise FormatError(path, f"expected a grid: one of {' '.join(READERS)} or a folder")
-    if reader is netcdf or (reader is grd and begins(path) in (b"CDF\x01", b"CDF\x02", b"\x89HDF")):
-        longitude, latitude, values, options = netcdf(path, variable)
-    else:
-        longitude, latitude, values, options = reader(path)
-    stated = options.pop("unit", None)
-    scale = _scale(path, unit or stated)
+    if reader is grd and begins(path) in (b"CDF\x01", b"CDF\x02", b"\x89HDF"):
+        reader = netcdf
+    longitude, latitude, values, options = reader(path)
+    scale = _scale(path, options.pop("unit", None))
     if "sigma" in options:
         options["sigma"] = options["sigma"] * scale
     return AnomalyGrid(longitude, latitude, values * scale, name=str(path), **options)

@@ -14,7 +14,6 @@ __all__ = ["Commands"]
 OURS = 60100
 """The first message id of our dialect: what nobody else on the vehicle can mean."""
 AUTOPILOT_VERSION = spec("AUTOPILOT_VERSION").id
-Answer = Callable[[int], bool]
 
 
 class Commands:
@@ -28,8 +27,8 @@ class Commands:
     ----------
     outbox : Outbox
     messages : mapping of int to callable
-        What can be requested, by message id; called with the second parameter of the request, sends the
-        message, and returns False where there is nothing to send yet.
+        What can be requested, by message id; sends the message, and returns False where there is nothing to
+        send yet.
     interval_us : callable
         Interval of a message id in us: -1 off, 0 unknown; KeyError where it has none.
     set_rate : callable
@@ -40,7 +39,7 @@ class Commands:
     def __init__(
         self,
         outbox: Outbox,
-        messages: Mapping[int, Answer],
+        messages: Mapping[int, Callable[[], bool]],
         interval_us: Callable[[int], int],
         set_rate: Callable[[int, float | None], bool],
     ) -> None:
@@ -85,7 +84,7 @@ class Commands:
         answer = self._messages.get(whole(values[0]))
         if answer is None:
             return MAV_RESULT.DENIED
-        return MAV_RESULT.ACCEPTED if answer(whole(values[1])) else MAV_RESULT.TEMPORARILY_REJECTED
+        return MAV_RESULT.ACCEPTED if answer() else MAV_RESULT.TEMPORARILY_REJECTED
 
     def _set_interval(self, values: list[float]) -> MAV_RESULT:
         interval = values[1]
@@ -112,7 +111,7 @@ class Commands:
     def _capabilities(self, values: list[float]) -> MAV_RESULT:
         if values[0] != 1:
             return MAV_RESULT.DENIED
-        return self._request([AUTOPILOT_VERSION, 0.0])
+        return self._request([AUTOPILOT_VERSION])
 
 
 def whole(value: float) -> int:

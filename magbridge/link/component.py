@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 from pathlib import Path
 
 from magbridge.config import Link
@@ -31,8 +32,6 @@ LIMITS = {
 }
 """The messages whose rate (Hz) can be set, and within which limits."""
 DEFAULTS = {"HEARTBEAT": 1.0, "MAG_STATUS": 1.0, "MAG_NAVIGATION": 0.0}
-BY_CLOCK = ("HEARTBEAT", "MAG_STATUS")
-"""Those that follow the clock and not the samples; a rate of 0 is off."""
 TIMESYNC_US = 1_000_000
 
 
@@ -119,6 +118,11 @@ class Component:
         self._reports = Reports(
             self.outbox, self.vehicle, start_us, version, calibration_id, status, speaking
         )
+        # they follow the clock and not the samples, and a rate of 0 is off
+        self._by_clock: dict[str, Callable[[], None]] = {
+            "HEARTBEAT": self._reports.heartbeat,
+            "MAG_STATUS": self._reports.status,
+        }
         self._service = ParameterService(
             self.parameters, self.outbox, self.timers, self.announcer, self._changed
         )
@@ -131,11 +135,7 @@ class Component:
             spec("COMMAND_INT").id: self._command,
             TIMESYNC.id: self._timesync,
         }
-        self._reporters: dict[str, Callable[[], None]] = {
-            "HEARTBEAT": self._reports.heartbeat,
-            "MAG_STATUS": self._reports.status,
-        }
-        for name in BY_CLOCK:
+        for name in self._by_clock:
             self._start_timer(name, start_us)
         self.timers.every("TIMESYNC", TIMESYNC_US, self._ask_time, start_us + TIMESYNC_US // 2)
 
@@ -205,7 +205,7 @@ class Component:
     def _start_timer(self, name: str, first_us: int) -> None:
         hertz = self.rates[name].hertz
         if hertz > 0:
-            report = self._reporters[name]
+            report = self._by_clock[name]
             self.timers.every(name, round(1e6 / hertz), lambda _: report(), first_us)
         else:
             self.timers.cancel(name)
@@ -215,27 +215,15 @@ class Component:
         for name, rate in self.rates.items():
             if rate_name(name) == parameter:
                 rate.set(self.parameters[parameter])
-                if name in BY_CLOCK:
+                if name in self._by_clock:
                     self._start_timer(name, self.codec.now_us)
 
-    def _requestable(self) -> dict[int, Callable[[int], bool]]:
+    def _requestable(self) -> dict[int, Callable[[], bool]]:
         """Return what REQUEST_MESSAGE can ask for; each says whether there was something to send."""
-
-        def always(report: Callable[[], None]) -> Callable[[int], bool]:
-            def answer(_: int) -> bool:
-                report()
-                return True
-
-            return answer
-
-        def sample(name: str) -> Callable[[int], bool]:
-            return lambda _: self.publisher.repeat(name)
-
+        reports = {**self._by_clock, "AUTOPILOT_VERSION": self._reports.version}
         return {
-            spec("HEARTBEAT").id: always(self._reports.heartbeat),
-            spec("MAG_STATUS").id: always(self._reports.status),
-            spec("AUTOPILOT_VERSION").id: always(self._reports.version),
-            **{spec(name).id: sample(name) for name in PUBLISHED},
+            **{spec(name).id: partial(always, report) for name, report in reports.items()},
+            **{spec(name).id: partial(self.publisher.repeat, name) for name in PUBLISHED},
         }
 
     def _interval_us(self, number: int) -> int:
@@ -252,6 +240,12 @@ class Component:
         self._changed(parameter)
         self._service.send(parameter)
         return True
+
+
+def always(report: Callable[[], None]) -> bool:
+    """Send a report, for which there is always something to tell."""
+    report()
+    return True
 
 
 def name_of(number: int) -> str:

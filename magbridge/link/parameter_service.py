@@ -42,17 +42,14 @@ class ParameterService:
 
     def send(self, name: str) -> None:
         """Send the value of a parameter."""
-        self._outbox.send("PARAM_VALUE", **self.fields(name))
-
-    def fields(self, name: str) -> dict[str, object]:
-        """Return the fields of the PARAM_VALUE of a parameter."""
-        return {
-            "param_id": name,
-            "param_value": self._parameters[name],
-            "param_type": MAV_PARAM_TYPE.REAL32,
-            "param_count": len(self._parameters.names),
-            "param_index": self._parameters.names.index(name),
-        }
+        self._outbox.send(
+            "PARAM_VALUE",
+            param_id=name,
+            param_value=self._parameters[name],
+            param_type=MAV_PARAM_TYPE.REAL32,
+            param_count=len(self._parameters.names),
+            param_index=self._parameters.names.index(name),
+        )
 
     def list(self, message: Message) -> None:  # noqa: ARG002 - every handler takes its message
         """Begin to send all, one every `PACE_US`; a list already under way begins anew."""

@@ -24,7 +24,7 @@ from functools import cache, partial
 from importlib import import_module
 from importlib.metadata import entry_points
 from pathlib import Path
-from types import ModuleType, TracebackType
+from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
 from magbridge.errors import FormatError
@@ -35,50 +35,44 @@ if TYPE_CHECKING:
 
 __all__ = ["FORMATS", "Writer", "read", "read_chunks", "suffixes", "write"]
 
-FORMATS: dict[str, tuple[str, str, str]] = {
-    # suffix: (module, reader, writer or "")
-    ".csv": ("magbridge.logs.text", "chunks", "FileWriter"),
-    ".nc": ("magbridge.logs.netcdf", "chunks", "FileWriter"),
-    ".parquet": ("magbridge.logs.parquet", "chunks", "FileWriter"),
-    ".tlog": ("magbridge.logs.telemetry", "chunks", "FileWriter"),
-    ".bin": ("magbridge.logs.ardupilot", "chunks", ""),
-    ".ulg": ("magbridge.logs.px4", "chunks", ""),
-    **dict.fromkeys(
-        (".dbd", ".ebd", ".sbd", ".tbd", ".mbd", ".nbd", ".dcd", ".ecd", ".scd", ".tcd", ".mcd", ".ncd"),
-        ("magbridge.logs.slocum", "chunks", ""),
-    ),
-}
-
 FLIGHT = {".ebd": ".dbd", ".nbd": ".mbd", ".tbd": ".sbd", ".ecd": ".dcd", ".ncd": ".mcd", ".tcd": ".scd"}
 """A Slocum's science file to the flight file of the same name: whoever reads one reads both."""
+
+READ_ONLY = {
+    ".bin": "magbridge.logs.ardupilot",
+    ".ulg": "magbridge.logs.px4",
+    **dict.fromkeys((*FLIGHT, *FLIGHT.values()), "magbridge.logs.slocum"),
+}
+FORMATS = {
+    ".csv": "magbridge.logs.text",
+    ".nc": "magbridge.logs.netcdf",
+    ".parquet": "magbridge.logs.parquet",
+    ".tlog": "magbridge.logs.telemetry",
+    **READ_ONLY,
+}
+"""Suffix to module."""
 
 Paths = str | os.PathLike[str] | Sequence[str | os.PathLike[str]]
 
 
 @cache
-def _formats() -> dict[str, tuple[str, str, str]]:
+def _formats() -> dict[str, str]:
     """Return :data:`FORMATS`, and what packages add."""
-    plugins = {
-        f".{point.name.lower()}": (point.value, "chunks", "FileWriter")
-        for point in entry_points(group="magbridge.formats")
-    }
+    plugins = {f".{point.name.lower()}": point.value for point in entry_points(group="magbridge.formats")}
     return {**plugins, **FORMATS}
 
 
 def suffixes(*, write: bool = False) -> list[str]:
     """Return the endings of the file names that can be read, or written."""
-    return sorted(suffix for suffix, (_, _, writer) in _formats().items() if writer or not write)
+    return sorted(suffix for suffix in _formats() if not (write and suffix in READ_ONLY))
 
 
-def _format(path: Path, *, write: bool = False) -> Any:
-    """Return the reader or the writer for the suffix of `path`."""
-    module, reader, writer = _formats().get(path.suffix.lower(), ("", "", ""))
-    name = writer if write else reader
-    if not name:
-        known = " ".join(suffixes(write=write))
-        raise FormatError(path, f"expected a file name that ends in one of {known}")
-    loaded: ModuleType = import_module(module)
-    return getattr(loaded, name)
+def _module(path: Path, *, write: bool = False) -> Any:
+    """Return the module for the suffix of `path`."""
+    suffix, known = path.suffix.lower(), suffixes(write=write)
+    if suffix not in known:
+        raise FormatError(path, f"expected a file name that ends in one of {' '.join(known)}")
+    return import_module(_formats()[suffix])
 
 
 def _paths(paths: Paths) -> list[Path]:
@@ -91,7 +85,7 @@ def _paths(paths: Paths) -> list[Path]:
             raise FormatError(path, "expected a file, not a directory")
         if not path.is_file():
             raise FormatError(path, "expected a file, there is none")
-        _format(path)
+        _module(path)
     return [path for path in checked if not _with_flight(path, checked)]
 
 
@@ -105,7 +99,7 @@ def _chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
     if not path.stat().st_size:
         raise FormatError(path, "expected a log, the file is empty")
     try:
-        for part in _format(path)(path, rows):
+        for part in _module(path).chunks(path, rows):
             source = str(part.attrs["source"])
             yield part if path.name in source else part.assign_attrs(source=f"{path.name} ({source})")
     except OSError as error:
@@ -196,7 +190,7 @@ class Writer:
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self._path = Path(path)
-        self._open = _format(self._path, write=True)
+        self._open = _module(self._path, write=True).FileWriter
         self._columns: dict[str, dict[str, Any]] = {}
 
     def __enter__(self) -> Self:

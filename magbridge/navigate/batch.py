@@ -52,7 +52,6 @@ def navigate(
     grid: AnomalyGrid,
     options: Options | None = None,
     *,
-    motion: str | None = None,
     start: tuple[float, float] | None = None,
     fixes: bool = False,
 ) -> xr.Dataset:
@@ -65,8 +64,6 @@ def navigate(
         :data:`MOTIONS`.
     grid : AnomalyGrid
     options : Options, optional
-    motion : str, optional
-        Key of :data:`MOTIONS`; default the first that the log has.
     start : (latitude, longitude), optional
         deg; default the log's first position.
     fixes : bool, optional
@@ -89,11 +86,11 @@ def navigate(
     source = str(deployment.attrs.get("source", "deployment"))
     options = options or Options()
     time, field, sigma = _samples(deployment, source)
-    motion = motion or motion_of(deployment, source)
+    motion = motion_of(deployment, source)
     navigator = Navigator(grid, options)
     latitude, longitude = start if start is not None else first_position(deployment, source)
-    moves = _columns(deployment, MOTIONS[motion] | {"depth": "depth"}, source)
-    surfaced = _columns(deployment, {"gps_latitude": "a", "gps_longitude": "o"}, source) if fixes else {}
+    moves = _columns(deployment, MOTIONS[motion] | {"depth": "depth"})
+    surfaced = _columns(deployment, {"gps_latitude": "a", "gps_longitude": "o"}) if fixes else {}
     records: list[Record] = []
     states: list[tuple[Array, Array, Array, Array, int]] = []
 
@@ -162,10 +159,8 @@ def _glides(deployment: xr.Dataset) -> bool:
     return steep.mean() > 0.5 and bool(agree.mean() > 0.8) if steep.size else False
 
 
-def _columns(deployment: xr.Dataset, names: Mapping[str, str], source: str) -> dict[str, Floats]:
-    missing = [name for name in names if name not in deployment and name != "depth"]
-    if missing:
-        raise FormatError(source, f"expected the column {missing[0]!r}")
+def _columns(deployment: xr.Dataset, names: Mapping[str, str]) -> dict[str, Floats]:
+    """Return the columns that the log has, under their other names."""
     return {
         name: deployment[column].to_numpy().astype(float)
         for column, name in names.items()

@@ -90,11 +90,6 @@ class DeviceClock:
         """How much faster the host's clock runs than the instrument's, in µs/s."""
         return self._floor.slope
 
-    @property
-    def jitter_us(self) -> float:
-        """Mean delay of an arrival, in µs beyond the shortest."""
-        return self._floor.delay
-
     def stamp(self, readings: Sequence[Reading], arrival_us: int) -> list[Stamp]:
         """Return when each reading of a chunk was taken, the chunk having arrived at `arrival_us` (µs).
 

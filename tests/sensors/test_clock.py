@@ -60,7 +60,6 @@ def test_drift_is_learned_and_jitter_removed(
     assert np.abs(settled).max() < bound
     assert settled.std() < bound / 5
     assert clock.drift_ppm == pytest.approx(drift_ppm, abs=5.0)
-    assert clock.jitter_us == pytest.approx(5_000, rel=0.6)
     assert flags(made) == (0, 0, 0)
 
 
