@@ -14,14 +14,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.stats import norm
 from study.both import by_causes, held, named, weighed
 from study.cases import PARTS, plan
 from study.draws import SHOWN, Draws, Span, evidence, weigh, with_another
 from study.nameless import against, nameless
 from study.noise import LOSSES, MEMORY, autoregression, left, whiten
-from study.rates import efficiency, share
+from study.rates import beside_ideal, efficiency, share
 from study.stage import CHARTS, charted, drawn, project
 from study.table import lines
+from study.theory import SIZES
 
 from magbridge.diagnose.inference.descriptions import Description
 from sitl import Twin, load
@@ -208,6 +210,19 @@ def test_the_point_of_half_detection_is_read_off_a_ladder() -> None:
     factor, low, high = efficiency(rows) or (0.0, 0.0, 0.0)
     assert factor == pytest.approx(1.2, abs=0.03)
     assert low < factor < high < low + 0.06
+
+
+def test_a_detector_that_needs_more_is_told_by_its_p_values() -> None:
+    """One that hears 10 % less than theory's in every log, whose noise is as large as what it lacks."""
+    rng = np.random.default_rng(4)
+    rows = []
+    for a in rng.uniform(4.0, 8.0, 20):
+        noise = rng.normal()
+        here = [2.0 * norm.sf(size + noise) for size in SIZES]
+        rows.append({"wanted": a, "p_value": 2.0 * norm.sf(a / 1.1 + noise), "theory": [{"here": here}]})
+    factor, low, high = beside_ideal(rows) or (0.0, 0.0, 0.0)
+    assert factor == pytest.approx(1.1, abs=0.005)
+    assert low <= factor <= high < low + 0.02
 
 
 def test_evidence_asks_its_price() -> None:

@@ -29,7 +29,7 @@ Wholes = dict[frozenset[str], Array]
 
 def both(hidden: Sequence[Found], stall: Stall, ds: xr.Dataset, setting: Setting) -> dict[str, float]:
     """Chances of the module's notes; see :func:`study.theory.ideal`."""
-    spans, S = information(hidden, stall, ds, setting)
+    spans, S, _ = information(hidden, stall, ds, setting)
     draws, table = Draws.of(S), {span for span in spans if span.channel != SHOWN}
     truth = frozenset(one.hidden.name for one in hidden)
     likely, last = [*best_of(S, spans).values()], len(S) - 1 - len(hidden)

@@ -10,9 +10,9 @@ from sitl.inject import EFFECTS
 from study.rates import (
     Row,
     asserted,
+    beside_ideal,
     chance,
     count,
-    efficiency,
     found,
     gained,
     holds,
@@ -62,7 +62,7 @@ def _line(name: str, part: Mapping[str, Sequence[Row]]) -> list[str]:
 
 def _half(known: Sequence[Row]) -> str:
     """Point of half detection."""
-    half, factor = [t["half"] for t in told(known) if "half" in t], efficiency(known)
+    half, factor = [t["half"] for t in told(known)], beside_ideal(known)
     if not half or factor is None:
         return "-"
     return f"{np.mean(half):.1f} / {np.mean(half) * factor[0]:.1f} ({off(factor)})"

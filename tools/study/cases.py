@@ -158,6 +158,7 @@ def case(entry: Row) -> Row:
     row = entry | {
         "sizes": [one.hidden.size for one in hidden], "verdict": found["verdict"], "unexplained": found["unexplained"],
         "found": [[f["cause"], f["channel"], f["signal_to_noise"], [a["cause"] for a in f["alternatives"]]] for f in found["findings"]],
+        "p_value": min((p for p, _ in result.outcome.tested.values()), default=1.0),
         "scores": _scores(found, names, whole),
         "theory": _theory(entry["part"], hidden, stall, ds, result),
     }  # fmt: skip

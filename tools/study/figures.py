@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.stats import binomtest
 
 from study.cases import KNOWN
-from study.rates import Row, curve, efficiency, found, told
+from study.rates import Row, beside_ideal, curve, found, told
 
 NEITHER = "no name"
 
@@ -88,7 +88,7 @@ def plot_detection(rows: Sequence[Row], path: Path) -> None:
 def _halves(axis: Axes, rows: Sequence[Row]) -> None:
     """By how much each cause's point of half detection is off theory's, with its 68 % interval."""
     own = {
-        name: efficiency([r for r in rows if list(r["names"]) == [name] and r["theory"]]) for name in KNOWN
+        name: beside_ideal([r for r in rows if list(r["names"]) == [name] and r["theory"]]) for name in KNOWN
     }
     off = {name: 100.0 * (np.array(each) - 1.0) for name, each in own.items() if each}
     for place, (middle, low, high) in enumerate(off.values()):
@@ -99,4 +99,4 @@ def _halves(axis: Axes, rows: Sequence[Row]) -> None:
     axis.axvline(0.0, color="0.4")
     axis.set_yticks(range(len(off)), [name.replace("_", " ") for name in off])
     axis.invert_yaxis()
-    axis.set_xlabel("point of half detection, % beyond theory's (grey: asked)")
+    axis.set_xlabel("signal-to-noise needed, % beyond theory's on the same logs (grey: asked)")

@@ -10,10 +10,14 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 from scipy.stats import binomtest, norm
 
+from study.theory import SIZES
+
 Row = dict[str, Any]
 SURE = norm.ppf(0.95)
 ALLOWED = 0.95
 """Theory's chance to name the truth alone, or to name nothing, from which on a detector is held to it."""
+SEEN = 0.1
+"""Theory's p-value in a log, up to which the diagnosis' is compared with it: p-values end at one."""
 
 
 def found(row: Row) -> bool:
@@ -126,6 +130,25 @@ def efficiency(rows: Sequence[Row]) -> tuple[float, float, float] | None:
     grid = np.linspace(-1.0, 1.2, 441)
     inside = grid[np.array([cost(g) for g in grid]) < best.fun + 0.5]
     return float(np.exp(best.x)), float(np.exp(inside.min())), float(np.exp(inside.max()))
+
+
+def equal(row: Row) -> float:
+    """Signal-to-noise at which theory's detector would have had the p-value of the diagnosis, with the noise of the same log."""
+    surprise = -np.log(np.minimum.accumulate(row["theory"][0]["here"]))
+    return float(np.interp(-np.log(row["p_value"]), surprise, SIZES))
+
+
+def beside_ideal(rows: Sequence[Row]) -> tuple[float, float, float] | None:
+    """By how much more signal-to-noise the detector needs than theory's: factor with its 68 % interval.
+
+    Both see the same noise, which cancels: a log says as much as dozens that are counted as found or not.
+    """
+    rows = [r for r in rows if r["theory"] and np.interp(r["wanted"], SIZES, r["theory"][0]["here"]) < SEEN]
+    if len(rows) < 3:
+        return None
+    logs = np.log([r["wanted"] / equal(r) for r in rows])
+    middle, error = float(np.mean(logs)), float(np.std(logs, ddof=1) / np.sqrt(len(logs)))
+    return float(np.exp(middle)), float(np.exp(middle - error)), float(np.exp(middle + error))
 
 
 def share(rows: Sequence[Row], good: Callable[[Row], bool]) -> str:

@@ -12,6 +12,7 @@ from study.noise import LOSSES, NOISES
 from study.rates import (
     Row,
     beside,
+    beside_ideal,
     chance,
     curve,
     efficiency,
@@ -35,6 +36,8 @@ from study.rates import (
 from study.stage import CHARTS
 
 Parts = dict[str, list[Row]]
+OFF = 0.15
+"""By which the point of half detection may be off."""
 Line = tuple[str, str, str, str]
 """Figure, target, what an ideal detector does, what was measured | in how many cases."""
 
@@ -84,9 +87,15 @@ def _detection(part: Parts) -> list[Line]:
             rare = percent(float(curve(least, size)))
             label = f"... each cause; least often {least[0]['names'][0]}"
             out.append((label, "at least 95 %", rare, share(least, found)))
-    if factor := efficiency(known):
-        label = "point of half detection, against theory's (68 % interval)"
-        out.append((label, "within 15 %", "0 %", f"{off(factor)} | {len(known)}"))
+    for label, factor in (
+        ("point of half detection, against theory's (68 % interval): by what is found", efficiency(known)),
+        ("... by p-values, theory's with the same noise", beside_ideal(known)),
+    ):
+        if factor:
+            out.append((label, "within 15 %", "0 %", f"{off(factor)} | {len(known)}"))
+    own = [beside_ideal([r for r in known if list(r["names"]) == [name]]) for name in EFFECTS]
+    if each := [abs(factor[0] - 1.0) <= OFF for factor in own if factor]:
+        out.append(("... causes within 15 %", "all", "all", f"{sum(each)} | {len(each)}"))
     return out
 
 

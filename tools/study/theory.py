@@ -21,20 +21,20 @@ from typing import Any, NamedTuple
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
-from scipy.special import chdtri
+from scipy.special import chdtrc
 
 from magbridge.diagnose.causes import Cause
 from magbridge.diagnose.compare.problem import pose
 from magbridge.diagnose.compare.take import take
 from magbridge.diagnose.inference.descriptions import Description
 from magbridge.diagnose.inference.evidence import LEVEL, ODDS
-from study.draws import DRAWS, SHOWN, Draws, Span, by_cause, evidence, explained, numbers, weigh, with_another
+from study.draws import SHOWN, Draws, Span, by_cause, evidence, explained, numbers, weigh, with_another
 from study.nameless import against, nameless
 from study.noise import whiten
-from study.stage import Found, Stall, project
+from study.stage import Found, Stall, compare, project
 
 Array = NDArray[np.float64]
-SIZES = np.linspace(1.0, 10.0, 37)
+SIZES = np.linspace(1.0, 12.0, 45)
 """Signal-to-noise at which the chance to be found is evaluated."""
 
 
@@ -77,11 +77,11 @@ def ideal(one: Found, stall: Stall, ds: xr.Dataset, setting: Setting) -> dict[st
     dict
         ``alone``: chance to name the truth alone; ``inside``: that the set holds it; ``size``: the set's mean size;
         ``first``: cause -> chance to be named first; ``half``, ``sure``: signal-to-noise at which 50 and 95 % are found;
-        ``apart``: cause -> signal-to-noise that its best imitation leaves. Where the setting has descriptions, ``two``: what
+        ``here``: p-value with the noise of this very log, were the truth of the sizes :data:`SIZES`; ``apart``: cause -> signal-to-noise that its best imitation leaves. Where the setting has descriptions, ``two``: what
         the best two of any causes leave; ``unnamed`` and ``described``: see :mod:`study.nameless`.
     """
     name = one.hidden.name
-    spans, S = information([one], stall, ds, setting)
+    spans, S, noise = information([one], stall, ds, setting)
     draws, rivals = Draws.of(S), [span for span in spans if span.cause != name]
     best = best_of(S, rivals)
     own = own_span(S, spans, name)
@@ -101,7 +101,8 @@ def ideal(one: Found, stall: Stall, ds: xr.Dataset, setting: Setting) -> dict[st
         "inside": float(np.mean(inside[me])) * bool(own),
         "size": float(np.mean(inside.sum(axis=0))),
         "first": {cause: float(np.mean(first == j)) for j, cause in enumerate(names) if (first == j).any()},
-        **_found(draws, [true, *rivals], setting),
+        **_found(p_values(draws, [true, *rivals], setting)),
+        "here": np.median(p_values(Draws(S, noise), [true, *rivals], setting), axis=1).tolist(),
         "apart": {c: left[c][c][0] if c in left else draws.wanted for c in best},
     }
     if not setting.free:
@@ -115,8 +116,11 @@ def ideal(one: Found, stall: Stall, ds: xr.Dataset, setting: Setting) -> dict[st
 
 def information(
     hidden: Sequence[Found], stall: Stall, ds: xr.Dataset, setting: Setting
-) -> tuple[list[Span], Array]:
-    """Fisher's information of every hypothesis' columns; what is hidden stands last, one by one and, of several, their sum."""
+) -> tuple[list[Span], Array, Array]:
+    """Fisher's information (m, m) of every hypothesis' columns, and scores (m, 1) of the log's own noise.
+
+    What is hidden stands last, one by one and, of several, their sum.
+    """
     problem = pose(take([ds], stall.stage.calibration), stall.stage.calibration)
     candidates = [c for cause in setting.causes.values() for c in cause.candidates(problem)]
     table = whiten(
@@ -139,7 +143,9 @@ def information(
         Span(cause, SHOWN, slice(k, k + 1), positive=cause == "filter_lag")
         for k, cause in enumerate(setting.others, first + table.shape[1])
     ]
-    return spans, X.T @ project(X, stall.columns, stall.stage.prior)
+    projected = project(X, stall.columns, stall.stage.prior)
+    measured = whiten(compare(ds, stall.stage.calibration)[0], stall.noise, stall.rows)
+    return spans, X.T @ projected, projected.T @ (measured - sum(truth))[:, None]
 
 
 def own_span(S: Array, spans: Sequence[Span], name: str) -> Span | None:
@@ -171,14 +177,18 @@ def _worth(S: Array, span: Span) -> float:
     return float(weigh(np.array(explained(S, span) + freedom), freedom))
 
 
-def _found(draws: Draws, spans: Sequence[Span], setting: Setting) -> dict[str, float]:
-    """Half point and 95 % point of detection."""
-    scale = SIZES / draws.wanted
-    found = np.zeros((len(SIZES), DRAWS), bool)
+def p_values(draws: Draws, spans: Sequence[Span], setting: Setting) -> Array:
+    """Smallest p-value of the tests, at every one of :data:`SIZES` in every draw; what is looked for elsewhere is counted."""
+    scale, least = SIZES / draws.wanted, np.ones((len(SIZES), 1))
     for span in spans:
         ratio, freedom = draws.ratio(span, scale)
         if freedom:
-            level = LEVEL / len(setting.causes) / setting.trials.get(span.cause, 1.0)
-            found |= ratio > chdtri(freedom, level)
-    chance = np.maximum.accumulate(found.mean(axis=1))
+            tests = len(setting.causes) * setting.trials.get(span.cause, 1.0)
+            least = np.minimum(least, tests * chdtrc(freedom, np.maximum(ratio, 0.0)))
+    return least
+
+
+def _found(p: Array) -> dict[str, float]:
+    """Half point and 95 % point of detection."""
+    chance = np.maximum.accumulate(np.mean(p < LEVEL, axis=1))
     return {"half": float(np.interp(0.5, chance, SIZES)), "sure": float(np.interp(0.95, chance, SIZES))}
