@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 
-from magbridge.diagnose.compare.columns import Mixture, beside, parts, together
+from magbridge.diagnose.compare.columns import Interpolated, Mixture, beside, parts, times, together
+from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference import design
+from magbridge.diagnose.inference.information import information
+from magbridge.diagnose.inference.joint import fit_joint
 
 FloatArray = NDArray[np.float64]
 ROWS = slice(3, 20)
@@ -37,6 +43,26 @@ def test_blocks_beside_each_other_are_stored_column_by_column(table: FloatArray)
     whole = beside([table[:, :1], np.asfortranarray(table[:, 1:])])
     np.testing.assert_array_equal(whole, table)
     assert whole.flags.f_contiguous
+
+
+def test_coefficients_leave_the_same_without_their_columns(table: FloatArray) -> None:
+    weights, c = csr_array(np.maximum(table[:, 1:], 0.0)), np.array([0.5, -2.0])
+    whole = Mixture(((Interpolated(weights, table[5:8]), table[:4, :2]), (table.__getitem__, table[4:8, :2])))
+    shown = weights.toarray() @ table[5:8] @ table[:4, :2] + table @ table[4:8, :2]
+    np.testing.assert_allclose(whole(ROWS), shown[ROWS])
+    np.testing.assert_allclose(times(whole, ROWS, c), shown[ROWS] @ c)
+
+
+def test_strangers_say_what_they_say_among_others(right: Callable[[int], Problem]) -> None:
+    problem, made = right(400), np.random.default_rng(2).normal(size=(400, 7))
+    one, other, model = (made[:, own].__getitem__ for own in (slice(3), slice(3, 5), slice(5, 7)))
+    columns = [Mixture(((one, np.eye(3)[:, :2]), (other, np.eye(2)))), made[:, 1:3].__getitem__, model]
+    fit = fit_joint(problem, [model], 1)
+    apart, whole = (information(problem, fit.noise, fit, columns, k).fitted(fit) for k in (2, 0))
+    for own in (slice(2), slice(2, 4)):
+        np.testing.assert_allclose(apart.matrix[own, own], whole.matrix[own, own])
+    np.testing.assert_allclose(apart.score, whole.score)
+    np.testing.assert_allclose(apart.shift, whole.shift)
 
 
 def test_threads_give_the_same_in_the_same_order() -> None:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
+from scipy.sparse import csr_array, diags_array
 
 from magbridge.diagnose.causes.candidates import Candidate, of_reference
+from magbridge.diagnose.compare.columns import Interpolated
 from magbridge.diagnose.compare.problem import Problem
 
 __all__ = ["diurnal_variation", "map_error", "reference_bias"]
@@ -61,16 +62,9 @@ def map_error(problem: Problem) -> list[Candidate]:
     spectra = np.array([np.einsum("ik,ij,jk->k", V, _matern(Z, Z, length), V) for length in lengths])
     width = ERROR * np.sqrt(values)
     names = tuple(f"function {k + 1}" for k in range(len(width)))
-    return [
-        of_reference(
-            problem,
-            "map_error",
-            lambda rows: between[rows] @ at_corners,
-            width,
-            names,
-            spectra=spectra / values,
-        )
-    ]
+    columns = Interpolated(diags_array(problem.gain) @ between, at_corners * width)
+    units = ("nT",) * len(width)
+    return [Candidate("map_error", None, columns, width, names, units, spectra=spectra / values)]
 
 
 def _cells(place: FloatArray) -> tuple[FloatArray, float]:

@@ -7,8 +7,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 
-__all__ = ["Columns", "Mixture", "Since", "beside", "parts", "together"]
+__all__ = ["Columns", "Interpolated", "Mixture", "Since", "beside", "parts", "times", "together"]
 
 FloatArray = NDArray[np.float64]
 Columns = Callable[[slice], FloatArray]
@@ -39,6 +40,26 @@ class Mixture:
         return Mixture(tuple((X, M * widths) for X, M in self.parts))
 
 
+@dataclass(frozen=True, eq=False)
+class Interpolated:
+    """Columns that are interpolated between few nodes: ``W V``.
+
+    Attributes
+    ----------
+    weights : (n, c) sparse array
+        W, of each row's nodes.
+    values : (c, k) array
+        V, at the nodes.
+    """
+
+    weights: csr_array
+    values: FloatArray
+
+    def __call__(self, rows: slice) -> FloatArray:
+        """(m, k) these rows."""
+        return np.asarray(self.weights[rows] @ self.values)
+
+
 @dataclass(frozen=True)
 class Since:
     """Columns that are zero where `fresh` (n,) is not set."""
@@ -56,6 +77,15 @@ def parts(columns: Columns) -> tuple[tuple[Columns, FloatArray], ...]:
     if isinstance(columns, Mixture):
         return columns.parts
     return ((columns, np.eye(columns(slice(0, 1)).shape[1])),)
+
+
+def times(columns: Columns, rows: slice, c: FloatArray) -> FloatArray:
+    """(m,) what coefficients c (k,) leave in these rows; quicker than to make all columns, where they are made of few."""
+    if isinstance(columns, Mixture):
+        return np.asarray(sum(times(X, rows, M @ c) for X, M in columns.parts))
+    if isinstance(columns, Interpolated):
+        return np.asarray(columns.weights[rows] @ (columns.values @ c))
+    return np.asarray(columns(rows) @ c)
 
 
 def together(columns: Sequence[Columns]) -> Mixture:

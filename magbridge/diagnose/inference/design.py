@@ -11,11 +11,11 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from magbridge.diagnose.compare.columns import Columns, beside
+from magbridge.diagnose.compare.columns import Columns, beside, times
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.noise import Noise
 
-__all__ = ["Design", "in_threads", "kept", "normal", "pieces"]
+__all__ = ["ALL", "Design", "in_threads", "kept", "normal", "pieces"]
 
 FloatArray = NDArray[np.float64]
 S = TypeVar("S")
@@ -25,6 +25,8 @@ CHUNK = 2048
 """Rows that are whitened at a time, to stay near the processor."""
 KEPT = 12_500_000
 """Numbers that are kept of columns: 100 MB."""
+ALL = ((slice(None), slice(None)),)
+"""Each column by each."""
 THREADS, LONG, POOL = 2, 32768, "diagnose"
 """Threads that share what is done to a log, rows beyond which it is worth the while, and the threads' name."""
 
@@ -69,11 +71,12 @@ class Design:
 
     def times(self, c: FloatArray) -> FloatArray:
         """(n,) what the coefficients c (q + k,) leave."""
+        asked = [(own, column) for own, column in zip(self.at, self.columns, strict=True) if c[own].any()]
 
         def piece(rows: slice) -> FloatArray:
             out = np.asarray(self.free[rows] @ c[: self.free.shape[1]])
-            for own, column in zip(self.at, self.columns, strict=True):
-                out += column(rows) @ c[own]
+            for own, column in asked:
+                out += times(column, rows, c[own])
             return out
 
         return np.concatenate(in_threads(len(self.free), piece, self.pieces))
@@ -88,10 +91,13 @@ class Design:
         return np.asarray(sum(in_threads(len(y), piece, self.pieces)))
 
 
-def normal(X: Columns, y: FloatArray, noise: Noise | None = None) -> tuple[FloatArray, FloatArray]:
+def normal(
+    X: Columns, y: FloatArray, noise: Noise | None = None, asked: Sequence[tuple[slice, slice]] = ALL
+) -> tuple[FloatArray, FloatArray]:
     """Return ``X^T X`` and ``X^T y``, X whitened if a noise is given; summed up in pieces that stay near the processor.
 
-    Long logs are shared out among threads, always in the same way: the same numbers on any machine.
+    Long logs are shared out among threads, always in the same way: the same numbers on any machine. Of ``X^T X`` only the
+    columns by columns that are `asked` for are not zero.
     """
     past = 0 if noise is None else len(noise.memory)
 
@@ -104,14 +110,18 @@ def normal(X: Columns, y: FloatArray, noise: Noise | None = None) -> tuple[Float
                 A = noise.filter(A, first, start - first)
             if not b.size:
                 P, b = np.zeros((A.shape[1],) * 2), np.zeros(A.shape[1])
-            P += A.T @ A
+            for own, others in asked:
+                P[own, others] += A[:, own].T @ A[:, others]
             b += A.T @ y[start:end]
         return P, b
 
     starts = range(0, len(y), CHUNK)
     each = -(-len(starts) // THREADS) if len(y) > LONG else len(starts)
     parts = in_threads(len(y), share, [starts[k : k + each] for k in range(0, len(starts), each)])
-    return sum((P for P, _ in parts), start=np.zeros(())), sum((b for _, b in parts), start=np.zeros(()))
+    P = np.asarray(sum(P for P, _ in parts))
+    for own, others in asked:
+        P[others, own] = P[own, others].T
+    return P, np.asarray(sum(b for _, b in parts))
 
 
 def in_threads(n: int, function: Callable[[S], T], given: Iterable[S]) -> list[T]:

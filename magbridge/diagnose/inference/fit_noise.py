@@ -127,12 +127,12 @@ def fit_noise(
     """
     n, order, whole = len(residual), past.order, past.whole
     count = _counts(n)
-    typical = float(np.median(np.abs(residual)))
     # a view of the p samples before each, which takes no memory
     lags = sliding_window_view(np.append(np.zeros(order), residual), order)[:n, ::-1]
     memory, nu = np.zeros(order), 12.0
-    weight, scale = np.ones(n), np.full(n, 1.4826 * typical + 1e-12)
-    if like is not None:
+    if like is None:
+        weight, scale = np.ones(n), np.full(n, 1.4826 * float(np.median(np.abs(residual))) + 1e-12)
+    else:
         nu, scale = like.nu, like.scale
         weight = (nu + 1.0) / (nu + ((residual - lags @ like.memory) / scale) ** 2)
     v, log_likelihood = residual, -np.inf

@@ -11,14 +11,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from magbridge.diagnose.compare.columns import Columns, beside, together
+from magbridge.diagnose.compare.columns import Columns, beside, parts, together
 from magbridge.diagnose.compare.problem import Problem
-from magbridge.diagnose.inference.design import normal
+from magbridge.diagnose.inference.design import ALL, normal
 from magbridge.diagnose.inference.joint import Joint
 from magbridge.diagnose.inference.noise import Noise
 
@@ -70,13 +71,23 @@ class Information:
         )
 
 
-def information(problem: Problem, noise: Noise, base: Joint, columns: Sequence[Columns]) -> Information:
-    """Sum up the information of columns at the hypothesis `base` under `noise`, only the calibration projected out."""
+def information(
+    problem: Problem, noise: Noise, base: Joint, columns: Sequence[Columns], strangers: int = 0
+) -> Information:
+    """Sum up the information of columns at the hypothesis `base` under `noise`, only the calibration projected out.
+
+    The first so many are `strangers`, made of nothing that another is made of: what they say of each other is not asked for.
+    """
     q, own = problem.free.shape[1], together(columns).parts
+    sizes = [sum(len(M) for _, M in parts(one)) for one in columns[:strangers]]
+    ends = (q + np.cumsum([0, *sizes])).tolist()
+    alone = [(slice(*pair), slice(*pair)) for pair in pairwise(ends)]
+    asked = [(slice(q), slice(None)), *alone, (slice(ends[-1], None), slice(q, None))]
     G, b = normal(
         lambda rows: beside([problem.free[rows], *(X(rows) for X, _ in own)]),
         noise.response(base.left),
         noise,
+        asked if strangers else ALL,
     )
     pull = base.prior[:q] * (problem.centre - base.z)
     K = np.linalg.solve(G[:q, :q] + np.diag(base.prior[:q]), G[:q, q:])

@@ -154,14 +154,11 @@ def _sized(P: FloatArray, h: FloatArray, prior: FloatArray, own: slice, spectra:
 def _plain(X: Design, residual: FloatArray, prior: FloatArray, centre: FloatArray) -> FloatArray:
     """Least squares as if the noise were white, outliers cut off."""
     level = 1.4826 * float(np.median(np.abs(residual - np.median(residual)))) + 1e-12
-    c = centre
-    P, _ = normal(X.rows, residual)
+    P, b = normal(X.rows, residual)
+    c = centre + np.linalg.solve(P / level**2 + np.diag(prior), (b - P @ centre) / level**2)
     left = residual - X.times(c)
-    for step in range(2):
-        cut = np.clip(left, *(np.median(left) + np.array([-8.0, 8.0]) * level)) if step else left
-        c = c + np.linalg.solve(
-            P / level**2 + np.diag(prior), X.against(cut) / level**2 - prior * (c - centre)
-        )
-        left = residual - X.times(c)
-        level = 1.4826 * float(np.median(np.abs(left))) + 1e-12
-    return c
+    level = 1.4826 * float(np.median(np.abs(left))) + 1e-12
+    cut = np.clip(left, *(np.median(left) + np.array([-8.0, 8.0]) * level))
+    return np.asarray(
+        c + np.linalg.solve(P / level**2 + np.diag(prior), X.against(cut) / level**2 - prior * (c - centre))
+    )

@@ -36,8 +36,6 @@ FloatArray = NDArray[np.float64]
 
 LOUD = 3
 """Best descriptions under each noise that are then weighed by the full likelihood."""
-TOGETHER = 4
-"""Descriptions whose columns are whitened together."""
 TURNS = 6
 """Alternations between a curve and its direction."""
 CALM = 2
@@ -152,18 +150,17 @@ def _scored(
     problem: Problem, noise: Noise, fit: Joint, model: Sequence[Columns], listed: Sequence[Description]
 ) -> Iterator[tuple[float, str, Description, Ridge, FloatArray]]:
     """Yield each description with each of its widths: log evidence under `noise`, and by how much the model gives way."""
-    for first in range(0, len(listed), TOGETHER):
-        some = listed[first : first + TOGETHER]
-        info = information(problem, noise, fit, [*(one.columns for one in some), *model]).fitted(fit)
-        ends = np.cumsum([0, *(one.widths[0][1].size for one in some)]).tolist()
-        for one, start, end in zip(some, ends, ends[1:], strict=False):
-            at = slice(start, end)
-            for kind, width in one.widths:
-                S, b = info.matrix[at, at], info.score[at]
-                best = Statistic(S, width[None] ** 2).best(b)
-                if one.turned:
-                    best = max(best, lone(S, b, width, best), key=lambda found: found.ratio)
-                yield 0.5 * best.ratio - float(np.log(one.trials)), kind, one, best, info.shift[:, at]
+    columns = [*(one.columns for one in listed), *model]
+    info = information(problem, noise, fit, columns, strangers=len(listed)).fitted(fit)
+    ends = np.cumsum([0, *(one.widths[0][1].size for one in listed)]).tolist()
+    for one, start, end in zip(listed, ends, ends[1:], strict=False):
+        at = slice(start, end)
+        for kind, width in one.widths:
+            S, b = info.matrix[at, at], info.score[at]
+            best = Statistic(S, width[None] ** 2).best(b)
+            if one.turned:
+                best = max(best, lone(S, b, width, best), key=lambda found: found.ratio)
+            yield 0.5 * best.ratio - float(np.log(one.trials)), kind, one, best, info.shift[:, at]
 
 
 def _calm(
