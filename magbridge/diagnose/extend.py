@@ -17,7 +17,7 @@ from magbridge.diagnose.causes.candidates import Candidate, slices
 from magbridge.diagnose.compare.columns import Columns
 from magbridge.diagnose.compare.derivatives import derivatives
 from magbridge.diagnose.compare.prior import isotropic
-from magbridge.diagnose.compare.problem import DELAYS, Problem, samples_of
+from magbridge.diagnose.compare.problem import Problem, samples_of
 from magbridge.diagnose.compare.survey import Survey
 from magbridge.diagnose.inference.design import normal
 from magbridge.diagnose.inference.evidence import IDEAL
@@ -144,8 +144,9 @@ def settle(
         return problem, columns, fit
     settled = problem
     for _ in range(STEPS):
-        before, settled, columns = fit.log_likelihood, problem, []  # the last one's arrays are free again
-        settled, columns, fit = _again(settled, model, fit, order)
+        before, columns = fit.log_likelihood, []
+        settled.let_go()  # one at a time
+        settled, columns, fit = _again(problem, model, fit, order)
         if abs(fit.log_likelihood - before) < 0.5:
             break
     return settled, columns, fit
@@ -188,23 +189,20 @@ def _about(problem: Problem, model: Sequence[Candidate], fit: Joint) -> tuple[Pr
     samples, coefficients = samples_of(problem.survey, extended)
     samples.phi[np.ix_(problem.survey.learned, _since(extended, model))] = 0.0
     e, g = residuals(samples, coefficients)
-    K = problem.calibration.coefficients.size
-    selector = np.eye(extended.coefficients.size)
-    L = np.vstack([problem.directions, np.zeros((len(selector) - K, len(problem.centre)))])
-    own = derivatives(extended, samples, g, -np.hstack([L, selector[:, K:]]))
-    free, effects, at = own[:, : len(problem.centre)], own[:, len(problem.centre) :], 0
-    free[:, DELAYS] = problem.free[:, DELAYS]
+    selector = np.eye(extended.coefficients.size)[:, problem.calibration.coefficients.size :]
+    effects, at, columns = derivatives(extended, samples, g, -selector), 0, []
+    again = replace(problem, residual=e, slopes=g)
     # what the residual would be at the first point, were it linear about this one; the reference was not mended in it
-    residual, columns = e + free @ fit.z, []
+    again.residual[:] += again.free @ fit.z
     for candidate, place in zip(model, slices(model), strict=True):
         if not candidate.effects:
             columns.append(candidate.columns)
         else:
             block = effects[:, at : at + candidate.size] * candidate.width
-            residual += block @ fit.coefficients[place]
+            again.residual[:] += block @ fit.coefficients[place]
             columns.append(block.__getitem__)
             at += candidate.size
-    return replace(problem, residual=residual, free=free, slopes=g), columns
+    return again, columns
 
 
 def _since(extended: Calibration, model: Sequence[Candidate]) -> NDArray[np.intp]:

@@ -125,6 +125,7 @@ def _examine(
     before = after = problem.straight(outcome.null.z)
     if model:
         after, score = held_out(settled, columns, fit)
+        settled.let_go()
         if score < held_out(problem, [], outcome.null).score - ODDS:
             # the dives left out speak 20:1 against these names
             named, rivals, model, fit, after, extended = (), (), [], outcome.null, before, calibration

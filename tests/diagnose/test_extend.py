@@ -105,6 +105,13 @@ def test_a_rate_that_is_noise_live_is_left_out(right: Callable[[int], Problem]) 
     np.testing.assert_array_equal(np.diag(calm.covariance)[-3:], [4.0, 5.0, 6.0])
 
 
+def test_what_was_let_go_is_made_again(problem: Problem) -> None:
+    before = problem.free
+    problem.let_go()
+    assert problem.free is not before
+    np.testing.assert_array_equal(problem.free, before)
+
+
 def test_what_has_come_since_is_not_in_the_calibrations_logs(right: Callable[[int], Problem]) -> None:
     """A field that bends the magnitude, in the second half alone: linearised anew, it is what it is."""
     whole = right(300)

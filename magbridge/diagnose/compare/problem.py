@@ -20,8 +20,9 @@ its noise, and scales could grow against offsets until the noise is gone (errors
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,8 +72,8 @@ class Problem:
         g.
     gain : (n,) array
         1/s: what one nT of error in the reference does to e.
-    free : (n, q) array
-        ``-de/dz``; those at :data:`DELAYS` in units of :data:`DELAY`.
+    late : (n, 3) array
+        ``-de/dz`` of the delays, in units of :data:`DELAY`.
     directions : (K, q) array
         L; zero for the delays.
     centre : (q,) array
@@ -87,13 +88,25 @@ class Problem:
     residual: FloatArray
     slopes: FloatArray
     gain: FloatArray
-    free: FloatArray
+    late: FloatArray
     directions: FloatArray
     centre: FloatArray
     unseen: FloatArray
 
     def __len__(self) -> int:
         return len(self.residual)
+
+    @cached_property
+    def free(self) -> FloatArray:
+        """(n, q) ``-de/dz``; the delays' are :attr:`late`."""
+        samples, _ = samples_of(self.survey, self.calibration)
+        free = derivatives(self.calibration, samples, self.slopes, -self.directions)
+        free[:, DELAYS] = self.late
+        return free
+
+    def let_go(self) -> None:
+        """Give back the memory of :attr:`free`, of a month 300 MB; it is made anew when it is asked for."""
+        self.__dict__.pop("free", None)
 
     @property
     def stated(self) -> FloatArray:
@@ -103,7 +116,7 @@ class Problem:
 
     def straight(self, z: FloatArray) -> FloatArray:
         """(n,) residual without what the delays of z (q,) have left in it."""
-        return np.asarray(self.residual - self.free[:, DELAYS] @ z[DELAYS])
+        return np.asarray(self.residual - self.late @ z[DELAYS])
 
 
 def add_effects(calibration: Calibration, effects: tuple[Effect, ...]) -> Calibration:
@@ -157,9 +170,18 @@ class Products:
 
     def __call__(self, rows: slice) -> FloatArray:
         """(m, pairs) these rows."""
-        functions, slots = (list(own) for own in zip(*self.pairs, strict=True))
-        slopes = self.problem.slopes.T[slots, rows]
-        return np.asarray(slopes if self.phi is None else self.phi(rows)[functions] * slopes).T
+        functions, slots = zip(*self.pairs, strict=True)
+        slopes = self.problem.slopes.T[_run(slots), rows]
+        if self.phi is None:
+            return np.asarray(slopes).T
+        shared = len(set(functions)) == 1
+        return np.asarray(self.phi(rows)[_run(functions[:1] if shared else functions)] * slopes).T
+
+
+def _run(places: Sequence[int]) -> slice | list[int]:
+    """Return places that follow each other as a slice, which copies nothing."""
+    run = range(places[0], places[0] + len(places))
+    return slice(run.start, run.stop) if tuple(run) == tuple(places) else list(places)
 
 
 def effect_columns(
@@ -214,10 +236,9 @@ def pose(survey: Survey, calibration: Calibration) -> Problem:
     values, vectors = np.linalg.eigh(seen / level(calibration, e) ** 2)
     keep = values > SEEN
     V, rest = vectors[:, keep], L @ vectors[:, ~keep]
-    free = derivatives(calibration, samples, g, np.hstack([-L @ V, np.zeros((len(L), 3))]))
-    free[:, DELAYS] = -DELAY * g[:, 6:] * bent(survey, reading.T).T
+    late = -DELAY * g[:, 6:] * bent(survey, reading.T).T
     directions, centre = np.hstack([L @ V, np.zeros((len(L), 3))]), np.append(V.T @ centre, np.zeros(3))
-    return Problem(survey, calibration, reading, e, g, gain, free, directions, centre, rest @ rest.T)
+    return Problem(survey, calibration, reading, e, g, gain, late, directions, centre, rest @ rest.T)
 
 
 def _terms(calibration: Calibration) -> int:
