@@ -1,4 +1,4 @@
-"""A log that is begun anew after a loss: what the bridge knew by then is not in it, and its replay says so."""
+"""A log in several files: cut anywhere it replays as one; after a loss its replay says what is missing."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from small import START, small_bridge
 from magbridge.bridge.events import Event
 from magbridge.bridge.pipeline import Pipeline, Start
 from magbridge.calibration.model import Parameter
-from magbridge.logs.tlog import TlogWriter
+from magbridge.logs.tlog import TlogWriter, declarations
 from magbridge.mavlink import Codec
 from magbridge.records import Channel
 from sitl.own_log import Recorded, is_own_log, runs
@@ -84,3 +84,20 @@ def test_a_log_after_a_loss_is_replayed_as_far_as_it_can_be(tmp_path: Path) -> N
         {"runs": [result | more | {"identical": False, "first_difference": 0, "beyond": 0, "damages": 0}]}
     )
     assert f"begins {recorded.late:.1f} s into the run" in said
+
+
+def test_a_file_may_end_in_the_middle_of_what_came_at_once(tmp_path: Path) -> None:
+    """As after a bridge stood still: the sensor's bytes of a second, in one read, are many records."""
+    pipeline = bridge(tmp_path, Start(START))
+    told = list(events(pipeline, 0, 60))
+    lines = b"".join(event.data for event in told if event.channel == Channel.SENSOR)
+    head = declarations(1, 191, pipeline._config.telemetry, 0.0)
+    with TlogWriter(tmp_path / "logs", head=head, max_size=1e-3) as log:
+        sent = pipeline.feed(Event(told[-1].time_us, Channel.SENSOR, lines))
+        log.extend(pipeline.journal.drain())
+    files = sorted((tmp_path / "logs").iterdir())
+    assert len(files) > 2
+    recorded = Recorded(files)
+    assert [event.data for event in recorded.events() if event.data] == [lines]
+    again = bridge(tmp_path, recorded.start)
+    assert [frame for event in recorded.events() for frame in again.feed(event)] == sent
