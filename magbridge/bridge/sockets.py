@@ -57,18 +57,25 @@ class UdpPort(Port):
         return [self._socket.fileno()] if self._socket is not None else []
 
     def read(self) -> bytes:
-        """Return one datagram; an unreachable peer is nothing, not an error."""
+        """Return the datagrams that have come; an unreachable peer is nothing, not an error.
+
+        All of them, as a stream gives: the samples that waited while the bridge stood still find the telemetry that
+        waited with them.
+        """
         assert self._socket is not None
-        try:
-            data, peer = self._socket.recvfrom(CHUNK)
-        except BlockingIOError:
-            return b""
-        except OSError as error:
-            if error.errno in AWAY:
-                return b""
-            raise self.lost(error.strerror) from error
-        if self._listen:
-            self._peers[peer] = time.monotonic()
+        data = b""
+        while len(data) < CHUNK:
+            try:
+                datagram, peer = self._socket.recvfrom(CHUNK)
+            except BlockingIOError:
+                break
+            except OSError as error:
+                if error.errno in AWAY:
+                    break
+                raise self.lost(error.strerror) from error
+            if self._listen:
+                self._peers[peer] = time.monotonic()
+            data += datagram
         return data
 
     def write(self, data: bytes) -> None:

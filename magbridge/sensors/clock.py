@@ -93,7 +93,8 @@ class DeviceClock:
     def stamp(self, readings: Sequence[Reading], arrival_us: int) -> list[Stamp]:
         """Return when each reading of a chunk was taken, the chunk having arrived at `arrival_us` (µs).
 
-        The last one was delayed the least; the others were already waiting.
+        The last one was delayed the least; the others were already waiting, and tell nothing more of the delay: what
+        waited while the host stood still may come in several chunks, of which only the last ends with a fresh reading.
         """
         last = len(readings) - 1
         if not last:
@@ -107,10 +108,13 @@ class DeviceClock:
                     waited = (last - index) * self._period
                 elif not 0.0 <= waited < 60.0:  # a restart or a wrap between them
                     waited = 0.0
-            stamps.append(self.update(reading.device_time, arrival_us - int(waited * 1e6), reading.sequence))
+            arrived_us = arrival_us - int(waited * 1e6)
+            stamps.append(self.update(reading.device_time, arrived_us, reading.sequence, index == last))
         return stamps
 
-    def update(self, device_time: float, arrival_us: int, sequence: int | None = None) -> Stamp:
+    def update(
+        self, device_time: float, arrival_us: int, sequence: int | None = None, tells: bool = True
+    ) -> Stamp:
         """Return when a reading was taken.
 
         Parameters
@@ -121,6 +125,8 @@ class DeviceClock:
             µs on the host's clock.
         sequence : int or None
             The instrument's count of readings.
+        tells : bool
+            Whether its delay is its own, so that the relation between the clocks is learned from it.
         """
         missing = self._hole(sequence)
         restarted = stepped = False
@@ -130,9 +136,9 @@ class DeviceClock:
             self._begin(device_time, arrival_us)
             time_us = float(arrival_us)
         elif timed:
-            time_us, restarted, stepped = self._by_time(device_time, arrival_us, self._origin_us)
+            time_us, restarted, stepped = self._by_time(device_time, arrival_us, self._origin_us, tells)
         elif self._period:
-            time_us, stepped, unseen = self._by_count(arrival_us, self._origin_us, missing)
+            time_us, stepped, unseen = self._by_count(arrival_us, self._origin_us, missing, tells)
             missing += unseen
         else:
             time_us = float(arrival_us)
@@ -161,7 +167,9 @@ class DeviceClock:
         self._zero, self._turned, self._count = device_time, 0.0, 0
         self._floor.restart(0.0, 0.0)
 
-    def _by_time(self, device_time: float, arrival_us: int, origin_us: int) -> tuple[float, bool, bool]:
+    def _by_time(
+        self, device_time: float, arrival_us: int, origin_us: int, tells: bool
+    ) -> tuple[float, bool, bool]:
         """Return the host time (µs), and whether the instrument was restarted, or a clock set."""
         step = device_time - self._device_time
         if self._time_modulo:
@@ -178,12 +186,14 @@ class DeviceClock:
         if restarted or step < 0.0 or above < -tolerance:
             self._begin(device_time, arrival_us)
             return float(arrival_us), restarted, not restarted
-        late = floor.add(x, y, above, tolerance)
+        late = floor.add(x, y, above, tolerance) if tells else 0.0
         if late:
             floor.restart(*floor.lowest)
         return origin_us + 1e6 * x + floor.at(x), False, late > 0.0
 
-    def _by_count(self, arrival_us: int, origin_us: int, missing: int) -> tuple[float, bool, int]:
+    def _by_count(
+        self, arrival_us: int, origin_us: int, missing: int, tells: bool
+    ) -> tuple[float, bool, int]:
         """Return the host time (µs), whether it stepped back, and how many readings are missing unseen."""
         floor, period_us = self._floor, 1e6 * self._period
         self._count += 1 + missing
@@ -192,7 +202,7 @@ class DeviceClock:
         above = y - floor.at(x)
         limit = max(HALF * period_us, TOLERANCE)
         if -limit <= above <= limit + 10.0 * floor.delay:
-            above = floor.add(x, y, above, HALF * period_us + 20.0 * floor.scatter)
+            above = floor.add(x, y, above, HALF * period_us + 20.0 * floor.scatter) if tells else 0.0
         beats = round(above / period_us)
         if beats:
             self._count += beats

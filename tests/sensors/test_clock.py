@@ -214,6 +214,19 @@ def test_readings_of_one_chunk_are_as_good_as_one_by_one(device: bool) -> None:
     assert np.abs(error_us(made, true) - 2_000).max() < 10
 
 
+@pytest.mark.parametrize("piece", [30, 107, 200])
+def test_a_backlog_in_pieces_is_dated_as_before(piece: int) -> None:
+    """What waited while the host stood still: a terminal line hands it on in pieces, each late to its very end."""
+    true = np.arange(0.0, 10.0, 0.01)
+    readings = [Reading((0.0, 0.0, 0.0), device_time=float(t)) for t in true]
+    clock = DeviceClock()
+    made = [clock.stamp([reading], EPOCH + int(reading.device_time * 1e6))[0] for reading in readings[:600]]
+    for begin in range(600, 1000, piece):
+        made += clock.stamp(readings[begin : begin + piece], EPOCH + 10_000_000 + begin)
+    assert flags(made) == (0, 0, 0)
+    assert np.abs(error_us(made, true)).max() < 10
+
+
 def test_the_clock_of_a_driver() -> None:
     clock = DeviceClock.of(open_driver("hmr2300", {"rate": 10}))
     assert [clock.update(nan, EPOCH + k * 100_000 + 7_000 * (k % 2)).time_us - EPOCH for k in range(4)] == [
