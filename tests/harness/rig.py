@@ -16,6 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 from devices import TRUTH, TURN, Autopilot, Fluxgate
+from standstill import standstill
 
 from magbridge.calibration.file import save
 from magbridge.calibration.model import Boresight, Calibration, Noise, Parameter, Reference, Sensor
@@ -57,6 +58,10 @@ directory = "logs"
 """
 
 
+STALE_BY = 0.2
+"""s that the machine may stand still, of the last second, before telemetry can be stale for it: 0.5 s is `max_age`."""
+
+
 class Heard(NamedTuple):
     """A message of the bridge, and when it came (s, monotonic)."""
 
@@ -91,6 +96,7 @@ class Rig:
         more: str = "",
     ) -> None:
         self.folder, self.normal = folder, 0
+        self.machine = standstill()
         self.heard: list[Heard] = []
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
             probe.bind(("127.0.0.1", 0))
@@ -127,7 +133,7 @@ class Rig:
         """Start the bridge; return the s until all is well."""
         begun, self.process = time.monotonic(), self.spawn(self.config)
         self.until_well()
-        return time.monotonic() - begun
+        return self.since(begun)
 
     def spawn(self, config: Path) -> subprocess.Popen[bytes]:
         """Start a bridge."""
@@ -157,23 +163,28 @@ class Rig:
         """Here, in the stream of what is heard."""
         return len(self.heard)
 
+    def since(self, begun: float, end: float | None = None) -> float:
+        """Return the s from `begun` to `end` or now (monotonic) in which this machine did not stand still."""
+        end = time.monotonic() if end is None else end
+        return end - begun - self.machine.seconds(begun, end)
+
     def until(self, condition: Callable[[], object], timeout: float = 15.0) -> float:
-        """Play sensor and autopilot until `condition` holds; return the s that it took."""
+        """Play sensor and autopilot until `condition` holds; return the s that it took, as :meth:`since` counts."""
         begun = time.monotonic()
         while not condition():
-            if time.monotonic() > begun + timeout:
+            if self.since(begun) > timeout:
                 told = "; ".join(self.said())[-1500:]
                 raise AssertionError(f"not within {timeout} s; said: {told}; {self.status}")
             self.fluxgate.turn()
             now = time.monotonic()
             self.heard += [Heard(now, message) for message in self.autopilot.turn()]
             time.sleep(TURN)
-        return time.monotonic() - begun
+        return self.since(begun)
 
     def run(self, seconds: float) -> None:
         """Let time pass."""
-        end = time.monotonic() + seconds
-        self.until(lambda: time.monotonic() >= end, seconds + 5)
+        begun = time.monotonic()
+        self.until(lambda: self.since(begun) >= seconds, seconds + 5)
 
     def until_well(self) -> float:
         """Wait for a run of good samples, a sensor and an autopilot; return the s to the first of them."""
@@ -194,7 +205,7 @@ class Rig:
         good = len(fields)
         while good and fields[good - 1].message["flags"] == self.normal:
             good -= 1
-        return fields[good].when - begun
+        return self.since(begun, fields[good].when)
 
     def until_status(self, condition: Callable[[Message], object], timeout: float = 15.0) -> Message:
         """Wait for a MAG_STATUS from now on for which `condition` holds; return it."""
@@ -225,6 +236,15 @@ class Rig:
         seen = 0
         for message in self.of("MAG_FIELD", mark):
             seen |= message["flags"]
+        return Quality(seen & ~self.normal).names()
+
+    def undue_flags(self, mark: int) -> str:
+        """Return the same without `stale_telemetry` where the machine stood still, and none came."""
+        seen = 0
+        for when, message in self.heard[mark:]:
+            if message.name == "MAG_FIELD":
+                late = self.machine.seconds(when - 1.0, when) > STALE_BY
+                seen |= message["flags"] & ~(Quality.STALE_TELEMETRY if late else 0)
         return Quality(seen & ~self.normal).names()
 
     @property

@@ -44,7 +44,9 @@ heard, ready = {}, threading.Event()
 
 def hear(message: object, _: object) -> None:
     heard[message.message_name] = json.loads(message.fields_json)
-    if {"MAG_FIELD", "MAG_RAW", "MAG_STATUS"} <= heard.keys():
+    # where the machine stands still, the sensor is silent for a moment
+    speaks = heard.get("MAG_STATUS", {}).get("sensor_state") == 1
+    if speaks and {"MAG_FIELD", "MAG_RAW"} <= heard.keys():
         ready.set()
 
 

@@ -36,7 +36,8 @@ const socket = net.connect(Number(port), '127.0.0.1', () => {
       parameters[data.paramId] = data.paramValue
       total = data.paramCount
     }
-    if (!told && Object.keys(parameters).length === total && counts.MAG_FIELD > 50 && counts.MAG_STATUS && counts.HEARTBEAT) {
+    const speaks = latest.MAG_STATUS?.sensor_state === 1 // it may be silent for a moment where the machine stands still
+    if (!told && speaks && Object.keys(parameters).length === total && counts.MAG_FIELD > 50 && counts.HEARTBEAT) {
       told = true
       tell('result', { counts, latest, parameters, bad })
     }
