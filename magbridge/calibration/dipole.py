@@ -23,7 +23,7 @@ import numpy as np
 from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
 
-from magbridge.calibration.terms import Expansion, PositionTerm
+from magbridge.calibration.terms import PAIRS, Expansion, PositionTerm
 from magbridge.errors import CalibrationError
 
 if TYPE_CHECKING:
@@ -36,8 +36,6 @@ Vector = tuple[float, float, float]
 
 ORDER = 8
 """Travel of a fifth of the distance either way is then good to 1e-4 of the moment; a tenth to 1e-7."""
-
-SYMMETRIC = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 
 def dipole_tensor(r: FloatArray) -> FloatArray:
@@ -80,7 +78,7 @@ def dipole_columns(r: FloatArray, moment: FloatArray, induced: FloatArray, r_0: 
     def put(rows: FloatArray, G: FloatArray, moments: FloatArray, chi: FloatArray) -> None:
         rows[:, 6:] = G @ moments
         pulled = G * chi  # G diag(chi); of an unsymmetric A only the symmetric part shows in the magnitude
-        rows[:, :6] = np.stack([-0.5 * (pulled[:, i, j] + pulled[:, j, i]) for i, j in SYMMETRIC], axis=1)
+        rows[:, :6] = np.stack([-0.5 * (pulled[:, i, j] + pulled[:, j, i]) for i, j in PAIRS], axis=1)
 
     G = dipole_tensor(r) * r_0**3
     nothing = np.zeros(3)

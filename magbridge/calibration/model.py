@@ -22,20 +22,12 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from magbridge.calibration.kernel import Kernel, compile_kernel
+from magbridge.calibration.compilation import compile_kernel
+from magbridge.calibration.kernel import Kernel
 from magbridge.calibration.terms import Effect, Polynomial, PositionTerm, symmetric
 from magbridge.errors import CalibrationError
 
-__all__ = [
-    "Boresight",
-    "Calibration",
-    "Noise",
-    "Parameter",
-    "Reference",
-    "Run",
-    "Sensor",
-    "identity",
-]
+__all__ = ["Boresight", "Calibration", "Noise", "Parameter", "Reference", "Run", "Sensor", "identity"]
 
 FloatArray = NDArray[np.float64]
 

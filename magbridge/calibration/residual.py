@@ -24,7 +24,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from magbridge.calibration.terms import symmetric
+from magbridge.calibration.terms import PAIRS, symmetric
 
 __all__ = [
     "NormalEquations",
@@ -106,7 +106,7 @@ def residuals(samples: Samples, coefficients: FloatArray) -> tuple[FloatArray, F
     k = (e / s2)[:, None]
     z = u / s[:, None] - k * y  # de = z^T dA d - (A z)^T dT - k w^T dA u
     g = np.empty((len(e), 9))
-    for slot, (i, j) in enumerate(((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))):
+    for slot, (i, j) in enumerate(PAIRS):
         g[:, slot] = z[:, i] * d[:, j] - k[:, 0] * w[:, i] * u[:, j]
         if i != j:
             g[:, slot] += z[:, j] * d[:, i] - k[:, 0] * w[:, j] * u[:, i]
@@ -137,10 +137,7 @@ def _times(A: FloatArray, x: FloatArray) -> FloatArray:
 
 
 def normal_equations(
-    samples: Samples,
-    coefficients: FloatArray,
-    weight: FloatArray | None = None,
-    memory: float = 0.0,
+    samples: Samples, coefficients: FloatArray, weight: FloatArray | None = None, memory: float = 0.0
 ) -> NormalEquations:
     """Sum up the normal equations of the whitened residual, in bounded memory.
 

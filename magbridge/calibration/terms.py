@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from magbridge.calibration.model import Calibration
 
 __all__ = [
+    "PAIRS",
     "SLOTS",
     "TERMS",
     "Effect",
@@ -50,6 +51,8 @@ Width = Annotated[float, Meta(ge=1e-9, le=1e12)]
 
 SLOTS = ("a_xx", "a_yy", "a_zz", "a_xy", "a_xz", "a_yz", "t_x", "t_y", "t_z")
 """Six of the symmetric ``A`` (as ``a = (A - I) F_0``, nT) and three of ``T`` (nT)."""
+PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+"""Row and column of the six."""
 
 TERMS: dict[str, str] = {
     "polynomial": "magbridge.calibration.terms:Polynomial",

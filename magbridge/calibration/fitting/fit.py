@@ -27,7 +27,7 @@ FloatArray = NDArray[np.float64]
 
 METHODS: dict[str, str] = {
     "auto": "magbridge.calibration.fitting.auto:fit_auto",
-    "nominal": "magbridge.calibration.fitting.fit:fit_nominal",
+    "nominal": "magbridge.calibration.fitting.nominal:fit_nominal",
     "cubic": "magbridge.calibration.fitting.cubic:fit_cubic",
     "runs": "magbridge.calibration.fitting.per_run:fit_per_run",
     "horizontal": "magbridge.calibration.fitting.horizontal:fit_horizontal",
@@ -190,14 +190,6 @@ def _judged(found: Fit, data: Observations) -> Fit:
         details=details,
         supported=ratio <= UNSUPPORTED and gap <= UNSEEN,
     )
-
-
-def fit_nominal(data: Observations, order: int = 0, **options: Any) -> Fit:  # noqa: ARG001  (one ellipsoid has none)
-    """:func:`~magbridge.calibration.fitting.nominal.nominal` as a calibration without parameters."""
-    from magbridge.calibration.fitting.nominal import nominal, nominal_samples  # noqa: PLC0415  (a cycle else)
-
-    coefficients, covariance, noise = nominal(data, **options)
-    return assemble(data, nominal_samples(data), (), ((),), coefficients, covariance, noise, "nominal")
 
 
 def assemble(

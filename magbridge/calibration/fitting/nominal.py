@@ -10,17 +10,19 @@ the sensor's own nT, and an answer that shrank all the same is refused.
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from magbridge.calibration.fitting.data import Observations
+from magbridge.calibration.fitting.fit import Fit, assemble
 from magbridge.calibration.fitting.noise import NoiseModel, estimate_noise
 from magbridge.calibration.fitting.solve import Prior, covariance_of, gauss_newton
 from magbridge.calibration.residual import Samples, residuals_of, scales_and_offsets
 from magbridge.errors import CalibrationError
 
-__all__ = ["SCALE_SIGMA", "check_scales", "nominal", "nominal_samples"]
+__all__ = ["SCALE_SIGMA", "check_scales", "fit_nominal", "nominal", "nominal_samples"]
 
 FloatArray = NDArray[np.float64]
 
@@ -30,6 +32,12 @@ GAIN_SIGMA = 0.02
 """Prior 1-sigma of the gain that the three axes share: data of all attitudes overrule it."""
 HARD_IRON_SIGMA = 0.6
 """Prior 1-sigma of the hard iron, as a fraction of the field."""
+
+
+def fit_nominal(data: Observations, order: int = 0, **options: Any) -> Fit:  # noqa: ARG001  (one ellipsoid has none)
+    """:func:`nominal` as a calibration without parameters."""
+    coefficients, covariance, noise = nominal(data, **options)
+    return assemble(data, nominal_samples(data), (), ((),), coefficients, covariance, noise, "nominal")
 
 
 def nominal_samples(data: Observations) -> Samples:

@@ -141,10 +141,7 @@ class _Design:
 
 
 def evaluate_runs(
-    calibration: Calibration,
-    mission: Mission,
-    field_ned: FloatArray,
-    runs: Sequence[PlannedRun],
+    calibration: Calibration, mission: Mission, field_ned: FloatArray, runs: Sequence[PlannedRun]
 ) -> Plan:
     """Return what given runs are expected to bring, one after the other; arguments as for :func:`plan`."""
     design = _Design(calibration, mission, field_ned)
@@ -161,12 +158,7 @@ def evaluate_runs(
 
 
 def plan(
-    calibration: Calibration,
-    mission: Mission,
-    field_ned: FloatArray,
-    limits: Limits,
-    *,
-    runs: int = 10,
+    calibration: Calibration, mission: Mission, field_ned: FloatArray, limits: Limits, *, runs: int = 10
 ) -> Plan:
     """Choose the runs to fly next.
 
