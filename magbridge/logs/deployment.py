@@ -95,9 +95,7 @@ def deployment(
             _describe(name, unit, long_names.get(name)),
         )
     return xr.Dataset(
-        variables,
-        coords={"time": variables.pop("time")},
-        attrs={"source": Path(file).name, **(attrs or {})},
+        variables, coords={"time": variables.pop("time")}, attrs={"source": Path(file).name, **(attrs or {})}
     )
 
 

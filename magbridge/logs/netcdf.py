@@ -167,13 +167,7 @@ class FileWriter:
             taken.add(capitals)
             attrs = dict(dataset[name].attrs) | ATTRIBUTES.get(name, {})
             variable = file.createVariable(
-                capitals,
-                "f8",
-                (DIMENSION,),
-                fill_value=np.nan,
-                zlib=True,
-                complevel=1,
-                chunksizes=(CHUNK,),
+                capitals, "f8", (DIMENSION,), fill_value=np.nan, zlib=True, complevel=1, chunksizes=(CHUNK,)
             )
             variable.setncatts(attrs | {"column": name})
             self._variables[name] = variable

@@ -95,7 +95,7 @@ class Rows:
         self._counted = [one for one in survey.declared if one.message == self._source]
         for one in survey.declared:
             if one.message != self._source:
-                self._tables.setdefault(one.message, []).append((self._slot[one.column], one.get))
+                self._tables.setdefault(one.message, []).append((self._slot[one.column], one.find))
         self._last = -inf
         self._dropped = self._skipped = self._damages = 0
 
@@ -116,7 +116,7 @@ class Rows:
         if number == self._source and message.component == self._survey.component:
             columns = self._make(payload)
             for one in self._counted:
-                exact = one.get(payload)
+                exact = one.find(payload)
                 if exact is not None and isclose(exact, columns.get(one.column, nan), rel_tol=SINGLE):
                     columns[one.column] = exact
             self._row(record.time_us, columns)

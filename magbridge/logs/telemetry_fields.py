@@ -62,62 +62,52 @@ UNKNOWN: dict[str, tuple[int, ...]] = {
 
 
 class Value:
-    """How one column comes out of a message.
-
-    Attributes
-    ----------
-    column, unit : str
-    """
+    """How one column comes out of a message: ``scale * field + offset``, in `unit`."""
 
     def __init__(self, column: str, message: str, field: str) -> None:
         name, self._index = split_index(field)
         self._field = spec(message).fields[name]
         self._unknown = UNKNOWN.get(name, ())
         self.column = column
-        self.unit, self._factor = UNITS.get(self._field.unit, (self._field.unit or "1", 1.0))
+        self.unit, self.scale = UNITS.get(self._field.unit, (self._field.unit or "1", 1.0))
         if name == "relative_alt":
-            self._factor = -self._factor  # depth
+            self.scale = -self.scale  # depth
+        self.offset = 0.0
 
     def get(self, payload: bytes) -> float:
-        """Return the value in `unit`; NaN where the sender does not know."""
+        """Return the value; NaN where the sender does not know."""
         value: Any = self._field.get(payload)
         if self._index is not None:
             value = value[self._index]
         unknown = value == self._field.invalid or value in self._unknown
-        return nan if unknown else float(value * self._factor)
+        return nan if unknown else float(value * self.scale + self.offset)
 
 
-class Declared:
+class Declared(Value):
     """A column that the log itself declares, by a ``MAG_COLUMN``.
 
     Attributes
     ----------
-    column, unit : str
     message : int
         Id of the message that it stands in.
-    scale, offset : float
-        To the column's unit.
     match : dict of str to str
         What other fields must be.
     """
 
     def __init__(self, said: Message) -> None:
-        self.column, self.unit = said["column"], said["unit"] or "1"
-        self.scale, self.offset = said["scale"], said["offset"]
-        self.message = spec(said["message"]).id
-        name, self._index = split_index(said["field"])
-        self._field = spec(self.message).fields[name]
+        super().__init__(said["column"], said["message"], said["field"])
+        self.unit, self.scale, self.offset = said["unit"] or "1", said["scale"], said["offset"]
+        self._unknown = ()
+        layout = spec(said["message"])
+        self.message = layout.id
         self.match = dict(part.split("=", 1) for part in said["match"].split(",") if part)
-        self._others = [(spec(self.message).fields[name], text) for name, text in self.match.items()]
+        self._others = [(layout.fields[name], text) for name, text in self.match.items()]
 
-    def get(self, payload: bytes) -> float | None:
-        """Return the value in `unit`; None where the message is about something else."""
+    def find(self, payload: bytes) -> float | None:
+        """Return the value, as :meth:`get`; None where the message is about something else."""
         if any(str(field.get(payload)) != text for field, text in self._others):
             return None
-        value: Any = self._field.get(payload)
-        if self._index is not None:
-            value = value[self._index]
-        return nan if value == self._field.invalid else float(value * self.scale + self.offset)
+        return self.get(payload)
 
 
 TELEMETRY = {
