@@ -11,14 +11,13 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from magbridge.calibration.correct import correct
 from magbridge.calibration.fitting.data import observations
 from magbridge.calibration.fitting.fit import fit
 from magbridge.columns import CHANNEL_TIMES, CHANNELS
 from magbridge.errors import CalibrationError
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.reference import reference_field
-from sitl.columns import segments
+from sitl.columns import at_rest, corrected, segments
 from sitl.scenario import load
 from sitl.twin import Twin
 
@@ -87,7 +86,7 @@ def measure(twin: Twin, *, at_depth: bool = False) -> dict[str, xr.Dataset]:
     track = twin.fly()
     instrument = twin.scenario.instrument
     when = np.arange(0.0, track.elapsed[-1] - max(instrument.channel_delay), 1 / instrument.rate)
-    parts = segments(resting(one_time_base(twin.measure(track, when))))
+    parts = segments(at_rest(one_time_base(twin.measure(track, when)), MASSES))
     if not at_depth:
         return parts
     grid = twin.anomaly_map()
@@ -101,7 +100,7 @@ def fly(seed: int, methods: Sequence[str] = tuple(METHODS), *, at_depth: bool = 
     """Simulate the deployment and calibrate it both times with each of the methods, against :func:`measure`'s reference."""
     twin = Twin.draw(load("bonne_bay"), seed)
     parts = measure(twin, at_depth=at_depth)
-    corrected, failed, scales = {}, {}, {}
+    total, failed, scales = {}, {}, {}
     for trial, method in product(TRIALS, methods):
         used = () if method == "nominal" else MASSES
         try:
@@ -109,20 +108,10 @@ def fly(seed: int, methods: Sequence[str] = tuple(METHODS), *, at_depth: bool = 
         except CalibrationError as error:
             failed[trial, method] = str(error)
             continue
-        found, scales[trial, method] = fitted.calibration, fitted.scales
+        scales[trial, method] = fitted.scales
         for part in (trial, "survey"):
-            ds = parts[part]
-            raw, masses = columns(ds, CHANNELS), columns(ds, used)
-            corrected[part, trial, method] = correct(found, raw, masses, ds["time"].to_numpy()).total
-    return Trials(parts, corrected, failed, scales, twin.anomaly_map())
-
-
-def columns(deployment: xr.Dataset, names: Sequence[str]) -> Array:
-    """Return columns side by side, (n, k)."""
-    out = np.empty((deployment.sizes["time"], len(names)))
-    for k, name in enumerate(names):
-        out[:, k] = deployment[name]
-    return out
+            total[part, trial, method] = corrected(parts[part], fitted.calibration).total
+    return Trials(parts, total, failed, scales, twin.anomaly_map())
 
 
 def one_time_base(deployment: xr.Dataset) -> xr.Dataset:
@@ -130,13 +119,3 @@ def one_time_base(deployment: xr.Dataset) -> xr.Dataset:
     time = deployment["time"].to_numpy()
     moved = {n: ("time", np.interp(time, deployment[f"mag_time_{n[-1]}"], deployment[n])) for n in CHANNELS}
     return deployment.assign(moved).drop_vars(CHANNEL_TIMES)
-
-
-def resting(deployment: xr.Dataset) -> xr.Dataset:
-    """Leave out the samples about which a mass is on its way."""
-    moving = np.zeros(deployment.sizes["time"], bool)
-    for name in MASSES:
-        step = np.abs(np.diff(deployment[name])) > 1e-9
-        moving[:-1] |= step
-        moving[1:] |= step
-    return deployment.isel(time=~moving)

@@ -1,19 +1,21 @@
-"""A simulated deployment as a Dataset: names, units, and the mission's parts."""
+"""A simulated deployment as a Dataset: names, units, the mission's parts; and its columns as a calibration takes them."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from magbridge.columns import COLUMNS, Column
+from magbridge.calibration.correct import CorrectedArrays, correct
+from magbridge.calibration.model import Calibration
+from magbridge.columns import CHANNELS, COLUMNS, Column
 from sitl.platform import MOUNTINGS
 from sitl.trajectory import Track
 
-__all__ = ["dataset", "segments"]
+__all__ = ["at_rest", "corrected", "dataset", "segments", "side_by_side"]
 
 Array = NDArray[np.float64]
 
@@ -59,3 +61,27 @@ def segments(deployment: xr.Dataset) -> dict[str, xr.Dataset]:
         name: deployment.sel(time=slice(first, np.nextafter(last, first)))
         for name, first, last in json.loads(deployment.attrs["segments"])
     }
+
+
+def at_rest(deployment: xr.Dataset, masses: Iterable[str]) -> xr.Dataset:
+    """Leave out the samples about which a mass is on its way."""
+    still = np.ones(deployment.sizes["time"], bool)
+    for name in masses:
+        moved = np.abs(np.diff(deployment[name])) > 1e-9
+        still[:-1] &= ~moved
+        still[1:] &= ~moved
+    return deployment.isel(time=still)
+
+
+def side_by_side(deployment: xr.Dataset, names: Sequence[str]) -> Array:
+    """Return columns side by side, (n, k)."""
+    out = np.empty((deployment.sizes["time"], len(names)))
+    for k, name in enumerate(names):
+        out[:, k] = deployment[name]
+    return out
+
+
+def corrected(deployment: xr.Dataset, calibration: Calibration) -> CorrectedArrays:
+    """Correct a deployment's channels as they stand, row by row."""
+    H, p = (side_by_side(deployment, names) for names in (CHANNELS, calibration.channels))
+    return correct(calibration, H, p, deployment["time"].to_numpy())

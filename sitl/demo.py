@@ -13,7 +13,6 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from magbridge.bridge.pipeline import Start
-from magbridge.calibration.correct import correct
 from magbridge.calibration.file import save
 from magbridge.calibration.fitting.data import observations
 from magbridge.calibration.fitting.fit import Fit, fit
@@ -21,7 +20,7 @@ from magbridge.calibration.fitting.lowpass import unfiltered
 from magbridge.config import load as load_config
 from magbridge.logs import write
 from magbridge.records import Quality
-from sitl.columns import segments
+from sitl.columns import corrected, segments
 from sitl.emulation import emulate, start_us
 from sitl.listener import Listener
 from sitl.replay_setup import bridge_toml
@@ -75,7 +74,7 @@ def demo(folder: Path, seed: int = 1, say: Callable[[str], None] = print) -> dic
     picture = folder / "demo.png"
     from sitl.demo_picture import draw  # noqa: PLC0415 - matplotlib takes a second, and comes last
 
-    draw(survey, _nominal_field(survey, nominal), heard, picture)
+    draw(survey, corrected(survey, nominal.calibration).total, heard, picture)
     step(f"drew {picture}")
     files = [str(folder / name) for name in ("deployment.nc", "cal.json", "bridge.toml", "logs", "demo.png")]
     return {**result, "calibration_rms_nT": found.rms, "said": listener.said, "files": files}
@@ -90,12 +89,6 @@ def _align(field: dict[str, Floats], survey: xr.Dataset) -> xr.Dataset:
     return xr.Dataset({name: ("time", column) for name, column in columns.items()}, coords={"time": when})
 
 
-def _nominal_field(survey: xr.Dataset, nominal: Fit) -> Floats:
-    channels = np.stack([survey[f"mag_{axis}"].to_numpy() for axis in "xyz"], axis=1)
-    empty = np.empty((len(channels), 0))
-    return correct(nominal.calibration, channels, empty, survey["time"].to_numpy()).total
-
-
 def _compare(survey: xr.Dataset, nominal: Fit, heard: xr.Dataset) -> dict[str, Any]:
     truth = survey["truth_total_field"].to_numpy()
     raw = np.sqrt(sum(survey[f"mag_{axis}"].to_numpy() ** 2 for axis in "xyz"))
@@ -103,16 +96,17 @@ def _compare(survey: xr.Dataset, nominal: Fit, heard: xr.Dataset) -> dict[str, A
     good = (heard["quality"].to_numpy().astype(int) & ~int(Quality.NO_BORESIGHT)) == 0
     return {
         "samples": heard.sizes["time"],
-        "raw_rms_nT": _rms(raw - truth),
-        "nominal_rms_nT": _rms(_nominal_field(survey, nominal) - truth),
-        "corrected_rms_nT": _rms(error),
-        "unflagged_rms_nT": _rms(error[good]),
-        "unflagged_sigma_nT": _rms(heard["sigma"].to_numpy()[good]),
+        "raw_rms_nT": rms(raw - truth),
+        "nominal_rms_nT": rms(corrected(survey, nominal.calibration).total - truth),
+        "corrected_rms_nT": rms(error),
+        "unflagged_rms_nT": rms(error[good]),
+        "unflagged_sigma_nT": rms(heard["sigma"].to_numpy()[good]),
         "flagged": int((~good).sum()),
     }
 
 
-def _rms(error: Floats) -> float:
+def rms(error: Floats) -> float:
+    """Return the root mean square."""
     return float(np.sqrt(np.mean(error**2)))
 
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from magbridge.files import atomic_path
 from magbridge.records import Quality
+from sitl.demo import rms
 
 mpl.use("agg")
 import matplotlib.pyplot as plt
@@ -93,9 +94,9 @@ def _levels(axes: Axes, title: str, *lines: tuple[Floats, Floats, str, str]) -> 
 def _errors(axes: Axes, hours: Floats, nominal: Floats, received: Floats, heard: xr.Dataset) -> None:
     error = (heard["total_field"] - heard["truth"]).to_numpy()
     flagged = (heard["quality"].to_numpy().astype(int) & ~int(Quality.NO_BORESIGHT)) != 0
-    good = _rms(error[~flagged])
+    good = rms(error[~flagged])
     axes.set_title("Error")
-    axes.plot(hours, nominal, color=NOMINAL, lw=1, label=f"one ellipsoid: {_rms(nominal):.0f} nT RMS")
+    axes.plot(hours, nominal, color=NOMINAL, lw=1, label=f"one ellipsoid: {rms(nominal):.0f} nT RMS")
     axes.plot(received, error, color=CORRECTED, lw=1, label=f"magbridge: {good:.1f} nT RMS where not flagged")
     axes.plot(received[flagged], error[flagged], ".", color=FLAGGED, ms=4, label="flagged: a mass in motion")
     axes.axhline(0.0, color=TRUE, lw=0.6)
@@ -103,7 +104,3 @@ def _errors(axes: Axes, hours: Floats, nominal: Floats, received: Floats, heard:
     axes.set_ylim(-3e3, 1.5e4)
     axes.set_ylabel("nT (linear within ±10)")
     axes.legend(loc="upper right", frameon=False, ncols=3)
-
-
-def _rms(error: Floats) -> float:
-    return float(np.sqrt(np.mean(error**2)))

@@ -67,9 +67,7 @@ def where(log: xr.Dataset, scenario: Scenario) -> Scenario:
     """Return the scenario with the log's median position as its place and the log's first time as its start."""
     latitude, longitude = (_column(log, name) for name in ("latitude", "longitude"))
     place = msgspec.structs.replace(
-        scenario.world,
-        latitude=float(np.nanmedian(latitude)),
-        longitude=wrap(float(np.nanmedian(longitude))),
+        scenario.world, latitude=float(np.nanmedian(latitude)), longitude=wrap(float(np.nanmedian(longitude)))
     )
     start = datetime.fromtimestamp(float(log["time"][0]), UTC)
     return msgspec.structs.replace(scenario, world=place, start=start)

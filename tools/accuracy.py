@@ -20,7 +20,7 @@ import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from itertools import product
 from multiprocessing import get_context
@@ -32,16 +32,18 @@ import numpy as np
 import xarray as xr
 from rich.console import Console
 from rich.progress import track
-from rich.table import Table
 from scipy.optimize import least_squares
+from terminal import command_line, table
 
-from magbridge.calibration.correct import correct
 from magbridge.calibration.fitting.data import observations
 from magbridge.calibration.fitting.fit import fit
+from magbridge.columns import CHANNELS
 from magbridge.errors import CalibrationError
 from magbridge.field.igrf import igrf
 from sitl import Twin, load, segments, simulate
+from sitl.bonne_bay import METHODS
 from sitl.bound import information_bound, informed_error, oracle
+from sitl.columns import at_rest, corrected, side_by_side
 from sitl.instrument import rotation
 from sitl.platform import Vehicle
 
@@ -119,20 +121,12 @@ def calibrate(
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """Return the survey's error and predicted sigma (n,), and the RMS on the calibration runs, nT."""
     used = () if method == "nominal" else names
-    options = {}
-    if method == "nominal":
-        options = {"axes_fixed": True, "equal_xz": True}  # as the paper does
-    elif method == "auto, positions to 5 cm":
-        options = {"vehicle": tape(vehicle, seed)}
+    options = (
+        {"vehicle": tape(vehicle, seed)} if method == "auto, positions to 5 cm" else METHODS.get(method, {})
+    )
     fitted = fit(observations(runs, used), method.partition(",")[0], **options).calibration
-    left_over = []
-    for part in (runs, survey):
-        channels = (
-            np.column_stack([part[name] for name in used]) if used else np.empty((part.sizes["time"], 0))
-        )
-        corrected = correct(fitted, raw(part), channels, part["time"].to_numpy())
-        left_over.append((corrected.total - total(part), corrected.sigma))
-    return *left_over[1], rms(left_over[0][0])
+    before, after = (corrected(part, fitted) for part in (runs, survey))
+    return after.total - total(survey), after.sigma, rms(before.total - total(runs))
 
 
 def tape(vehicle: Vehicle, seed: int) -> dict[str, dict[str, object]]:
@@ -161,9 +155,9 @@ def strangers(runs: xr.Dataset, peers: str) -> Iterator[tuple[str, tuple[np.ndar
         file = Path(folder) / "runs.npz"
         np.savez(
             file,
-            field=raw(runs),
+            field=side_by_side(runs, CHANNELS),
             reference=total(runs),
-            attitude=np.column_stack([runs[name] for name in ("roll", "pitch", "heading")]),
+            attitude=side_by_side(runs, ("roll", "pitch", "heading")),
             rates=np.vstack([turned, turned[-1:]]),
             reference_ned=igrf(*place)[0],
             time=time,
@@ -193,26 +187,12 @@ def ellipsoid(runs: xr.Dataset) -> tuple[np.ndarray, np.ndarray]:
     return unpack(found.x)
 
 
-def at_rest(part: xr.Dataset, names: Iterable[str]) -> xr.Dataset:
-    """Return the samples about which no mass is on its way."""
-    still = np.ones(part.sizes["time"], bool)
-    for name in names:
-        moved = np.abs(np.diff(part[name])) > 1e-9
-        still[:-1] &= ~moved
-        still[1:] &= ~moved
-    return part.isel(time=still)
-
-
-def raw(part: xr.Dataset) -> np.ndarray:
-    return np.column_stack([part[f"mag_{axis}"] for axis in "xyz"])
-
-
 def total(part: xr.Dataset) -> np.ndarray:
     return part["truth_total_field"].to_numpy()
 
 
 def left(A: np.ndarray, T: np.ndarray, part: xr.Dataset) -> np.ndarray:
-    return np.linalg.norm((raw(part) - T) @ A.T, axis=1) - total(part)
+    return np.linalg.norm((side_by_side(part, CHANNELS) - T) @ A.T, axis=1) - total(part)
 
 
 def rms(error: np.ndarray) -> float:
@@ -224,31 +204,20 @@ def show(rows: list[Row], console: Console) -> None:
     for noise, masses in dict.fromkeys((row.noise, row.masses) for row in rows):
         chosen = [row for row in rows if (row.noise, row.masses) == (noise, masses)]
         gliders = len({row.seed for row in chosen})
-        table = Table(
-            title=f"{noise}, {masses} moving mass{'es' * (masses > 1)}, {gliders} gliders",
-            title_justify="left",
-        )
-        for heading in (
-            "",
-            "over the floor: median",
-            "95 %",
-            "worst",
-            "runs nT",
-            "survey nT",
-            "sigma: median",
-            "0.8 to 1.25",
-        ):
-            table.add_column(heading, justify="left" if not heading else "right")
+        shown = table(
+            f"{noise}, {masses} moving mass{'es' * (masses > 1)}, {gliders} gliders",
+            "", "over the floor: median", "95 %", "worst", "runs nT", "survey nT", "sigma: median", "0.8 to 1.25",
+        )  # fmt: skip
         for method in dict.fromkeys(row.method for row in chosen):
             mine = [row for row in chosen if row.method == method]
             good = [row for row in mine if np.isfinite(row.survey)]
             if not good:
-                table.add_row(method, f"failed: {mine[0].failed}")
+                shown.add_row(method, f"failed: {mine[0].failed}")
                 continue
             ratio = np.array([row.survey / row.floor for row in good])
             sigma = np.array([row.sigma for row in good])
             known = np.isfinite(sigma).any()
-            table.add_row(
+            shown.add_row(
                 method
                 + (f" ({len(mine) - len(good)} of {len(mine)} failed)" if len(good) < len(mine) else ""),
                 *(
@@ -262,7 +231,7 @@ def show(rows: list[Row], console: Console) -> None:
                 f"{np.median(sigma):.2f}" if known else "",
                 f"{np.mean((sigma > 0.8) & (sigma < 1.25)):.0%}" if known else "",
             )
-        console.print(table)
+        console.print(shown)
 
 
 def measure(cases: list[Case], jobs: int) -> list[Row]:
@@ -287,9 +256,7 @@ def measure(cases: list[Case], jobs: int) -> list[Row]:
 
 def arguments() -> argparse.Namespace:
     """Return what the command line asks for."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_line(__doc__)
     parser.add_argument("--seeds", type=int, default=40, help="gliders")
     parser.add_argument("--masses", type=int, nargs="+", default=[2, 1, 3], choices=sorted(MASSES))
     parser.add_argument("--noise", nargs="+", default=list(NOISES), choices=list(NOISES))

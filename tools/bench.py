@@ -11,7 +11,6 @@ floor's own tail says how far to believe them.
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import platform
@@ -24,6 +23,7 @@ from typing import Any
 from benchmarks.row import Row
 from rich.console import Console
 from rich.table import Table
+from terminal import command_line, table
 
 from magbridge import align
 
@@ -55,18 +55,13 @@ def measure(name: str, factor: float) -> dict[str, Any]:
 
 def show(results: list[dict[str, Any]]) -> Table:
     """Return the table for people."""
-    table = Table(
-        title=f"{platform.processor() or platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}, "
-        f"live path {'in plain Python' if align.__file__.endswith('.py') else 'compiled'}"
-    )
-    for heading, justify in (
-        ("what", "left"), ("measured", "right"), ("floor", "right"), ("ratio", "right"), ("asked", "right"), ("", "left"),
-    ):  # fmt: skip
-        table.add_column(heading, justify=justify)  # type: ignore[arg-type]
+    machine = f"{platform.processor() or platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}"
+    path = f"live path {'in plain Python' if align.__file__.endswith('.py') else 'compiled'}"
+    shown = table(f"{machine}, {path}", "what", "measured", "floor", "ratio", "asked", "", left=("what", ""))
     for result in results:
         for row in result["rows"]:
             asked = f"<= {row.most:g}" if row.most is not None else f">= {row.least:g}" if row.least else ""
-            table.add_row(
+            shown.add_row(
                 row.what,
                 f"{row.value:.3g} {row.unit}",
                 f"{row.floor:.3g} {row.unit} ({row.floor_is})" if row.floor is not None else "",
@@ -74,16 +69,14 @@ def show(results: list[dict[str, Any]]) -> Table:
                 asked,
                 {True: "holds", False: "FALLS SHORT", None: ""}[row.holds],
             )
-        table.add_row(
+        shown.add_row(
             f"[dim]load average {result['load'][0]:.1f} to {result['load'][1]:.1f}", end_section=True
         )
-    return table
+    return shown
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_line(__doc__)
     parser.add_argument("names", nargs="*", metavar="NAME", help=", ".join(BENCHMARKS))
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--factor", type=float, default=1.0, help="multiplies the number of repetitions")

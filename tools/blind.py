@@ -7,7 +7,6 @@ that is there (its workers start in a checkout); otherwise a local one is made. 
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import sys
@@ -22,6 +21,7 @@ from distributed import Client, LocalCluster, as_completed
 from study.cases import PARTS, plan
 from study.figures import plot_confusion, plot_detection
 from study.table import lines
+from terminal import command_line
 
 Row = dict[str, Any]
 
@@ -69,9 +69,7 @@ def run(client: Client, todo: list[Row], log: Path) -> list[str]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_line(__doc__)
     parser.add_argument(
         "--cases", type=int, default=800, help="cases of the whole study, shared among its parts"
     )

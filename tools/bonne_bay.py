@@ -12,7 +12,6 @@ between them is corrected with either. Nothing here was fitted to the paper but 
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -22,6 +21,7 @@ from bonne_bay_figures import draw
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
+from terminal import command_line, table
 
 from sitl.bonne_bay import METHODS, PAPER, TRIALS, Trials, fly
 from sitl.mission import TABLE_1
@@ -31,19 +31,10 @@ SEED = 29
 
 def table_1(flight: Trials) -> Table:
     """Return the paper's calibration runs beside the twin's."""
-    one = Table(title="Table 1: calibration runs, paper and twin", title_justify="left")
-    for heading in (
-        "run",
-        "",
-        "ballast cm³",
-        "pitch deg: paper",
-        "twin",
-        "battery in: trial 1",
-        "twin",
-        "trial 2",
-        "twin",
-    ):
-        one.add_column(heading, justify="right")
+    one = table(
+        "Table 1: calibration runs, paper and twin",
+        "run", "", "ballast cm³", "pitch deg: paper", "twin", "battery in: trial 1", "twin", "trial 2", "twin",
+    )  # fmt: skip
     for number, pitch, *battery in TABLE_1:
         legs = [_leg(flight.parts[trial], number) for trial in TRIALS]
         one.add_row(
@@ -64,18 +55,10 @@ def table_1(flight: Trials) -> Table:
 def table_2(flights: list[Trials]) -> Table:
     """Return each method's RMS on runs and survey, in the paper and in the twin."""
     many = f", median of {len(flights)} worlds" if len(flights) > 1 else ""
-    two = Table(title=f"Table 2: RMS nT against the IGRF and the map{many}", title_justify="left")
-    for heading in (
-        "",
-        "runs: paper",
-        "twin",
-        "survey: paper",
-        "twin",
-        "to the truth",
-        "without its mean",
-        "scales",
-    ):
-        two.add_column(heading, justify="left" if not heading else "right")
+    two = table(
+        f"Table 2: RMS nT against the IGRF and the map{many}",
+        "", "runs: paper", "twin", "survey: paper", "twin", "to the truth", "without its mean", "scales",
+    )  # fmt: skip
     for trial in TRIALS:
         for method in METHODS:
             good = [flight for flight in flights if (trial, method) not in flight.failed]
@@ -120,18 +103,13 @@ def tables(flights: list[Trials], console: Console) -> None:
 
 def by_world(flights: list[Trials], seeds: Iterable[int], console: Console) -> None:
     """Print every world's RMS on runs and survey, and whether it bears the paper's signature."""
-    table = Table(title="World by world: RMS nT on the runs / on the survey", title_justify="left")
-    for heading in (
-        "seed",
-        *(f"{trial[-1]}, {method}" for trial in TRIALS for method in METHODS),
-        "signature",
-    ):
-        table.add_column(heading, justify="right")
+    columns = (f"{trial[-1]}, {method}" for trial in TRIALS for method in METHODS)
+    shown = table("World by world: RMS nT on the runs / on the survey", "seed", *columns, "signature")
     borne = 0
     for seed, flight in zip(seeds, flights, strict=True):
         lacking = signature(flight)
         borne += not lacking
-        table.add_row(
+        shown.add_row(
             str(seed),
             *(
                 "refused"
@@ -142,7 +120,7 @@ def by_world(flights: list[Trials], seeds: Iterable[int], console: Console) -> N
             ),
             lacking or "yes",
         )
-    console.print(table)
+    console.print(shown)
     console.print(
         f"the paper's signature (nominal far off; a parameterised fit at least twice as good on its runs as on the "
         f"survey; trial 1's survey worse than trial 2's): {borne} of {len(flights)} worlds"
@@ -165,9 +143,7 @@ def _leg(part: xr.Dataset, number: int) -> xr.Dataset:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_line(__doc__)
     parser.add_argument(
         "--seed", type=int, default=SEED, help="the world that is drawn, and the first of --seeds"
     )

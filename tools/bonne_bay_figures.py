@@ -155,10 +155,7 @@ def _figure_6(flight: Trials) -> Figure:
     mapped = survey["reference_field"] - main
     limit = float(np.quantile(np.abs(mapped), 0.995)) * 1.2
     for panel, anomaly, title in zip(
-        panels,
-        (measured, mapped),
-        (f"Measured ({method}, trial 2)", "Map under the track"),
-        strict=True,
+        panels, (measured, mapped), (f"Measured ({method}, trial 2)", "Map under the track"), strict=True
     ):
         shade = panel.scatter(
             survey["longitude"],

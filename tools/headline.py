@@ -16,7 +16,6 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "2")
 import msgspec
 import numpy as np
 import xarray as xr
-from study.gain import corrected
 from study.stage import CHARTS
 
 from magbridge.calibration.fitting.data import observations
@@ -24,6 +23,7 @@ from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.model import Calibration
 from magbridge.diagnose.run import diagnose
 from sitl.bonne_bay import MASSES, PAPER, measure
+from sitl.columns import corrected
 from sitl.scenario import load
 from sitl.twin import Twin
 
@@ -41,7 +41,7 @@ def fly(seed: int, reference: str) -> dict[str, xr.Dataset]:
 
 def rms(calibration: Calibration, ds: xr.Dataset, against: str = "truth_total_field") -> float:
     """Error of the corrected total field, nT."""
-    return float(np.sqrt(np.mean((corrected(ds, calibration) - ds[against].to_numpy()) ** 2)))
+    return float(np.sqrt(np.mean((corrected(ds, calibration).total - ds[against].to_numpy()) ** 2)))
 
 
 def main() -> None:

@@ -48,6 +48,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from msgspec.structs import replace as with_options
 from scipy.stats import chi2
+from terminal import command_line
 from voyages.beside import magnav, stone_soup
 from voyages.calibrated import METHODS, flown
 from voyages.dived import dived
@@ -290,9 +291,7 @@ PARTS = {
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_line(__doc__)
     parser.add_argument("--runs", type=int, default=100)
     parser.add_argument("--part", choices=sorted(PARTS), action="append")
     parser.add_argument("--workers", type=int, default=2)

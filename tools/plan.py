@@ -10,18 +10,16 @@ mission, and the survey's RMS over the noise floor as it came.
 
 from __future__ import annotations
 
-import argparse
 from dataclasses import replace
 
 import msgspec
 import numpy as np
 import xarray as xr
-from accuracy import at_rest, raw, rms, total
+from accuracy import rms, total
 from rich.console import Console
 from rich.progress import track
-from rich.table import Table
+from terminal import command_line, table
 
-from magbridge.calibration.correct import correct
 from magbridge.calibration.fitting.data import Observations, observations
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.mission import Mission
@@ -30,6 +28,7 @@ from magbridge.calibration.planning.plan import Plan, evaluate_runs, expected_ca
 from magbridge.field.igrf import igrf
 from sitl import Twin, load, segments, simulate
 from sitl.bound import oracle
+from sitl.columns import at_rest, corrected
 from sitl.mission import TABLE_1, Run, Spirals
 from sitl.platform import Vehicle
 from sitl.scenario import Scenario
@@ -71,15 +70,11 @@ def flown(scenario: Scenario, seed: int) -> float:
     parts = {name: at_rest(part, MASSES) for name, part in segments(simulate(scenario, seed)).items()}
     found = fit(observations(parts["calibration"], MASSES)).calibration
     survey = parts["survey"]
-    channels = np.column_stack([survey[name] for name in MASSES])
-    corrected = correct(found, raw(survey), channels, survey["time"].to_numpy()).total
-    return rms(corrected - total(survey)) / rms(oracle(vehicle, survey) - total(survey))
+    return rms(corrected(survey, found).total - total(survey)) / rms(oracle(vehicle, survey) - total(survey))
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_line(__doc__)
     parser.add_argument("--seeds", type=int, default=12, help="gliders")
     parser.add_argument("--noise", type=float, default=1.0, help="nT, white")
     given = parser.parse_args()
@@ -106,40 +101,29 @@ def main() -> None:
         name: np.array([flown(how, seed) for seed in track(seeds, name, console=Console(stderr=True))])
         for name, how in (("Table 1", scenario), ("planned", planned))
     }
-    table = Table(
-        title=f"{given.seeds} gliders, noise {given.noise:g} nT, ten spirals of 15 minutes",
-        title_justify="left",
-    )
-    for heading in (
-        "",
-        "expected nT: RMS",
-        "worst",
-        "survey over the floor: median",
-        "95 %",
-        "worst",
-        "better on",
-    ):
-        table.add_column(heading, justify="left" if not heading else "right")
+    shown = table(
+        f"{given.seeds} gliders, noise {given.noise:g} nT, ten spirals of 15 minutes",
+        "", "expected nT: RMS", "worst", "survey over the floor: median", "95 %", "worst", "better on",
+    )  # fmt: skip
     for (name, ratio), expected in zip(ratios.items(), (paper, ours), strict=True):
-        table.add_row(
+        shown.add_row(
             name,
             f"{expected.rms[-1]:.2f}",
             f"{expected.worst[-1]:.2f}",
             *(f"{value:.3f}" for value in (*np.quantile(ratio, [0.5, 0.95]), ratio.max())),
             f"{(ratio < ratios['Table 1' if name == 'planned' else 'planned']).sum()} of {given.seeds}",
         )
-    console.print(table)
+    console.print(shown)
 
 
 def show_runs(found: Plan, console: Console) -> None:
     """Print the plan."""
-    table = Table(title="The plan", title_justify="left")
-    for heading in ("run", "pitch deg", "bank deg", "battery in", "ballast cm³", "expected nT: RMS", "worst"):
-        table.add_column(heading, justify="right")
+    headings = ("run", "pitch deg", "bank deg", "battery in", "ballast cm³", "expected nT: RMS", "worst")
+    shown = table("The plan", *headings)
     for number, run in enumerate(found.runs, 1):
         values = (run.pitch, run.roll, *run.parameters, found.rms[number], found.worst[number])
-        table.add_row(str(number), *(f"{value:.2f}" for value in values))
-    console.print(table)
+        shown.add_row(str(number), *(f"{value:.2f}" for value in values))
+    console.print(shown)
 
 
 if __name__ == "__main__":

@@ -9,12 +9,11 @@ alone leave, dive by dive.
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
 
 import numpy as np
 from rich.console import Console
-from rich.table import Table
+from terminal import command_line, table
 
 from magbridge.calibration.fitting.data import observations
 from magbridge.calibration.fitting.validate import HeldOut, leave_runs_out
@@ -40,26 +39,25 @@ CHOICES: tuple[tuple[str, tuple[str, ...], int], ...] = (
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_line(__doc__)
     parser.add_argument("files", nargs="+", type=Path, help="a Seaglider's dives, netCDF")
     files = parser.parse_args().files
     deployment = with_true_heading(read(sorted(files)))
-    table = Table(title=f"{len(files)} dives, each left out of its calibration", title_justify="left")
-    for heading in ("method", "order", "masses", "left out, nT", "over nominal: by dive", "sigma"):
-        table.add_column(heading, justify="left" if heading in {"method", "masses"} else "right")
+    shown = table(
+        f"{len(files)} dives, each left out of its calibration",
+        "method", "order", "masses", "left out, nT", "over nominal: by dive", "sigma", left=("method", "masses"),
+    )  # fmt: skip
     nominal: HeldOut | None = None
     for method, masses, order in CHOICES:
         data = observations(deployment, list(masses), reference=earth_field)
         try:
             found = leave_runs_out(data, method, order)
         except CalibrationError as refusal:
-            table.add_row(method, str(order), ", ".join(masses), "refused", str(refusal).partition(";")[0])
+            shown.add_row(method, str(order), ", ".join(masses), "refused", str(refusal).partition(";")[0])
             continue
         nominal = nominal or found
         ratios = [found.by_run()[dive] / rms for dive, rms in nominal.by_run().items()]
-        table.add_row(
+        shown.add_row(
             method,
             str(order),
             ", ".join(masses) or "none",
@@ -68,7 +66,7 @@ def main() -> None:
             f"{np.nanstd(found.standardised):.2f}",
         )
     console = Console(width=140)
-    console.print(table)
+    console.print(shown)
     console.print(
         f"a step of the sensor is {COUNT:.0f} nT: {COUNT / np.sqrt(12):.0f} nT RMS a channel, if nothing else were wrong"
     )

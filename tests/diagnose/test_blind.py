@@ -44,12 +44,7 @@ def short() -> Iterator[None]:
 
 
 def blind(
-    part: str,
-    names: tuple[str, ...],
-    wanted: float,
-    noise: str = "white",
-    number: int = 24,
-    **more: str,
+    part: str, names: tuple[str, ...], wanted: float, noise: str = "white", number: int = 24, **more: str
 ) -> dict[str, Any]:
     entry = {"part": part, "names": names, "wanted": wanted, "noise": noise, "number": number, "losses": ""}
     return case(entry | more)

@@ -13,9 +13,7 @@ from magbridge.diagnose.inference.joint import fit_joint
 ROWS = 300
 
 
-def test_numbers_of_one_size_that_say_the_same_share_what_they_say(
-    right: Callable[[int], Problem],
-) -> None:
+def test_numbers_of_one_size_that_say_the_same_share_what_they_say(right: Callable[[int], Problem]) -> None:
     """Two causes of one common size each, with a column twice or of nothing: their own sizes are what keeps them apart."""
     rng = np.random.default_rng(4)
     a, b = np.sin(np.arange(ROWS) / 7.0), np.sign(np.sin(np.arange(ROWS) / 40.0))

@@ -1,14 +1,16 @@
-"""Measured in a process of its own: what it takes at most is then of nothing else."""
+"""Measured in a process of its own, where what it takes at most is of nothing else; and by processor time."""
 
 from __future__ import annotations
 
 import json
 import subprocess
 import sys
+import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-__all__ = ["apart"]
+__all__ = ["apart", "spent"]
 
 
 def apart(script: str, *arguments: object) -> Any:
@@ -17,3 +19,10 @@ def apart(script: str, *arguments: object) -> Any:
     place = Path(__file__).parents[1]
     done = subprocess.run(command, cwd=place, capture_output=True, text=True, check=True)
     return json.loads(done.stdout)
+
+
+def spent(work: Callable[[], object]) -> float:
+    """Return the processor time, in s, of all threads."""
+    begun = time.process_time()
+    work()
+    return time.process_time() - begun

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from pathlib import Path
 from statistics import median
 
 import msgspec
 import numpy as np
-from benchmarks.apart import apart
+from benchmarks.apart import apart, spent
 from benchmarks.row import Row
 from scipy.optimize import least_squares
 from threadpoolctl import threadpool_limits
@@ -47,11 +46,9 @@ def fitting(folder: Path, repetitions: int) -> list[Row]:  # noqa: ARG001  (the 
     fit(data)
     with threadpool_limits(1):
         for _ in range(repetitions):
-            ours.append(processor_time(lambda: fit(data)))
+            ours.append(spent(lambda: fit(data)))
             theirs.append(
-                processor_time(
-                    lambda: least_squares(lambda c: residuals_of(samples, c), np.zeros(90), method="lm")
-                )
+                spent(lambda: least_squares(lambda c: residuals_of(samples, c), np.zeros(90), method="lm"))
             )
     (few, _), (all_, memory) = (apart(IN_ANOTHER, count) for count in LARGE)
     return [
@@ -127,7 +124,7 @@ def correcting(folder: Path, repetitions: int) -> list[Row]:  # noqa: ARG001
     with threadpool_limits(1):
         for _ in range(repetitions):
             for name, (job, samples) in work.items():
-                found[name].append(1e6 * processor_time(job) / samples)
+                found[name].append(1e6 * spent(job) / samples)
 
     def beside(what: str, floor: str, said: str, **target: float) -> Row:
         ratio = median(b / a for a, b in zip(found["moving"], found[floor], strict=True))
@@ -172,10 +169,3 @@ def many(count: int) -> Observations:
         runs=runs.runs[pick].astype(int) + 10 * (np.arange(count) // len(runs)),
         time=np.arange(count) * 4.0,
     )
-
-
-def processor_time(work: Callable[[], object]) -> float:
-    """Return the s of processor time that `work` takes."""
-    begun = time.process_time()
-    work()
-    return time.process_time() - begun

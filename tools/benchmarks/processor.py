@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from statistics import median
 
+from benchmarks.apart import spent
 from benchmarks.peer import Peer
 from benchmarks.row import Row
 from benchmarks.workload import BEGIN_US, Feed, write_config
@@ -47,13 +48,6 @@ class Edge:
         """Keep what goes to the link."""
         if channel is Channel.LINK:
             self.sent += data
-
-
-def spent(work: Callable[[], object]) -> float:
-    """Return the processor time, in s, of all threads."""
-    begun = time.process_time()
-    work()
-    return time.process_time() - begun
 
 
 def processor(folder: Path, repetitions: int) -> list[Row]:

@@ -44,11 +44,7 @@ def both(hidden: Sequence[Found], stall: Stall, ds: xr.Dataset, setting: Setting
     values = weighed(draws, [*spans, *shown], [*likely, *shown], setting.trials)
     known = by_causes(values)
     regressed = by_causes({some: value for some, value in values.items() if table.issuperset(some)})
-    return {
-        "both": named(known, truth),
-        "inside": held(known, truth),
-        "regressed": named(regressed, truth),
-    }
+    return {"both": named(known, truth), "inside": held(known, truth), "regressed": named(regressed, truth)}
 
 
 def weighed(

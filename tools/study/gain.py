@@ -6,14 +6,12 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from magbridge.calibration.correct import correct
 from magbridge.calibration.model import Calibration
-from magbridge.columns import CHANNELS
 from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.diagnosis import Diagnosis
 from magbridge.diagnose.extend import extend, settle, widened
 from magbridge.diagnose.inference.search import search
-from sitl.bonne_bay import columns
+from sitl.columns import corrected
 from sitl.inject import Hidden
 from study.noise import add_noise
 from study.stage import DAY, Stall, again
@@ -47,7 +45,7 @@ def harm(hidden: tuple[Hidden, ...], stall: Stall, ds: xr.Dataset, result: Diagn
     for log, where in ((ds, ""), (add_noise(other, stall.noise, stall.number + 1), " elsewhere")):
         truth = log["truth_total_field"].to_numpy()
         tried = {"before": calibration, "after": result.calibration}
-        errors = {name: corrected(log, c) - truth for name, c in tried.items()}
+        errors = {name: corrected(log, c).total - truth for name, c in tried.items()}
         seen = np.isfinite(errors["after"]) & _inside(log, ds, calibration)
         found |= {name + where: float(np.mean(e[seen] ** 2)) for name, e in errors.items()}
     return found
@@ -77,10 +75,4 @@ def _oracle(name: str, result: Diagnosis) -> Calibration:
 
 def error(ds: xr.Dataset, calibration: Calibration) -> Array:
     """Error of the corrected total field against the reference, (n,) nT."""
-    return corrected(ds, calibration) - ds["reference_field"].to_numpy() - calibration.reference.bias
-
-
-def corrected(ds: xr.Dataset, calibration: Calibration) -> Array:
-    """Total field, (n,) nT."""
-    H, p = columns(ds, CHANNELS), columns(ds, calibration.channels)
-    return np.asarray(correct(calibration, H, p, ds["time"].to_numpy()).total)
+    return corrected(ds, calibration).total - ds["reference_field"].to_numpy() - calibration.reference.bias

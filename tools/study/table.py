@@ -175,10 +175,7 @@ def _nameless(part: Parts) -> list[Line]:
 
 def _pairs(pairs: Sequence[Row]) -> list[Line]:
     out: list[Line] = []
-    for label, rows in (
-        ("where theory names both in 95 %", [*filter(nameable, pairs)]),
-        ("any", pairs),
-    ):
+    for label, rows in (("where theory names both in 95 %", [*filter(nameable, pairs)]), ("any", pairs)):
         at_best, so, inside = (percent(chance(rows, key)) for key in ("both", "regressed", "inside"))
         ideal = f"{at_best}; with these regressors {so}"
         out += [

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from accuracy import at_rest, rms, total
+from accuracy import rms, total
 from msgspec.structs import replace as with_options
 
 from magbridge.calibration.fitting.data import observations
@@ -14,11 +14,9 @@ from magbridge.correction import Correction, correct_rows
 from magbridge.field.earth import separation
 from magbridge.navigate.model import informed
 from sitl import load, segments, simulate
+from sitl.bonne_bay import MASSES, METHODS
+from sitl.columns import at_rest
 from voyages.sail import GLIDER, PLACE, Map, Score, adrift, sail, synthetic
-
-METHODS = {"nominal": {"axes_fixed": True, "equal_xz": True}, "cubic": {}, "auto": {}}
-"""With the options of the paper."""
-MASSES = ("battpos", "ballast")
 
 
 class Flown(NamedTuple):
