@@ -39,12 +39,7 @@ def test_multiplexed_channels_of_a_ramp_come_out_equal() -> None:
         assert sample.time_us == START + round(t * SECOND)
 
 
-@given(
-    st.tuples(*[st.floats(0, 2)] * 3),
-    st.floats(-1e3, 1e3),
-    st.floats(-50, 50),
-    st.floats(0.0, 3.0),
-)
+@given(st.tuples(*[st.floats(0, 2)] * 3), st.floats(-1e3, 1e3), st.floats(-50, 50), st.floats(0.0, 3.0))
 def test_any_order_of_channels_and_any_filter_delay(
     delays: tuple[float, float, float], level: float, slope: float, filter_delay: float
 ) -> None:

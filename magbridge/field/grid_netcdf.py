@@ -65,9 +65,7 @@ def _coordinate(path: Path, grid: Any, names: tuple[str, ...], kind: str) -> str
         metres = str(attrs.get("units", "")).lower() in ("m", "metre", "meter", "km")
         if called & set(PROJECTED) or (metres and called & set(names)):
             raise FormatError(
-                path,
-                "projected coordinates: reproject the grid to longitude and latitude",
-                column=dimension,
+                path, "projected coordinates: reproject the grid to longitude and latitude", column=dimension
             )
         if str(attrs.get("units", "")).lower().startswith(f"degrees_{kind}") or called & set(names):
             return dimension

@@ -165,10 +165,7 @@ def _block(model: Model, lon: Array, lat: Array, depth: Array, time: Array) -> A
     up, south, east = (np.einsum("kn,kn->n", weights, part) for part in (up, south, east))
     tilt = geodetic - geocentric  # the ellipsoid's normal leans this far north of the radius
     sin_tilt, cos_tilt = np.sin(tilt), np.cos(tilt)
-    return np.stack(
-        [-south * cos_tilt - up * sin_tilt, east, -up * cos_tilt + south * sin_tilt],
-        axis=1,
-    )
+    return np.stack([-south * cos_tilt - up * sin_tilt, east, -up * cos_tilt + south * sin_tilt], axis=1)
 
 
 def _weights(epochs: Array, time: Array) -> tuple[int, Array]:

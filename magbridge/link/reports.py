@@ -10,12 +10,7 @@ from typing import NamedTuple
 from magbridge.link.outbox import Outbox
 from magbridge.link.vehicle import Vehicle
 from magbridge.mavlink import spec
-from magbridge.mavlink.dialect import (
-    MAV_AUTOPILOT,
-    MAV_PROTOCOL_CAPABILITY,
-    MAV_STATE,
-    MAV_TYPE,
-)
+from magbridge.mavlink.dialect import MAV_AUTOPILOT, MAV_PROTOCOL_CAPABILITY, MAV_STATE, MAV_TYPE
 
 __all__ = ["Condition", "Reports"]
 

@@ -66,9 +66,7 @@ class Vehicle:
             return False
         if message.component == self.component:
             self._announcer.state(
-                "twin",
-                f"another program speaks as {self.system}:{self.component}",
-                MAV_SEVERITY.WARNING,
+                "twin", f"another program speaks as {self.system}:{self.component}", MAV_SEVERITY.WARNING
             )
             return False
         if message.component == self.autopilot:

@@ -180,11 +180,7 @@ def scattered(path):
         ("a.asc", lambda p: p.write_text("ncols 3\nnrows 2\n1 2 3"), "expected an ESRI ASCII grid"),
         ("a.tif", lambda p: p.write_bytes(b"II*\0"), "expected a GeoTIFF"),
         ("a.csv", lambda p: p.write_text("lon,lat,depth\n1,2,3\n"), "row 1: expected the columns"),
-        (
-            "a.csv",
-            lambda p: p.write_text("lon,lat,mag\n1,2,x\n"),
-            "row 2, column '3': expected numbers",
-        ),
+        ("a.csv", lambda p: p.write_text("lon,lat,mag\n1,2,x\n"), "row 2, column '3': expected numbers"),
         ("a.xyz", scattered, "50 scattered points"),
         ("dir", lambda p: p.mkdir(), "expected xx.csv"),
     ],

@@ -30,15 +30,7 @@ def free(kind: socket.SocketKind) -> int:
 @pytest.fixture
 def page() -> Iterator[tuple[str, tuple[str, int]]]:
     link, port = free(socket.SOCK_DGRAM), free(socket.SOCK_STREAM)
-    command = [
-        sys.executable,
-        "-m",
-        "magbridge",
-        "monitor",
-        f"udpin:127.0.0.1:{link}",
-        "--port",
-        str(port),
-    ]
+    command = [sys.executable, "-m", "magbridge", "monitor", f"udpin:127.0.0.1:{link}", "--port", str(port)]
     alone = {
         name: value for name, value in os.environ.items() if "PYTEST" not in name
     }  # NiceGUI looks at them

@@ -95,10 +95,7 @@ def test_a_plan_is_told_what_the_map_is_worth(folder, capsys):
 
 @pytest.mark.parametrize(
     ("text", "answer"),
-    [
-        (PLAN.replace("1386216000", "1386201000"), "time"),
-        (PLAN.replace("longitude", "x"), "longitude"),
-    ],
+    [(PLAN.replace("1386216000", "1386201000"), "time"), (PLAN.replace("longitude", "x"), "longitude")],
 )
 def test_a_plan_that_cannot_be_flown_is_one_line(folder, capsys, text, answer):
     (folder / "bad.csv").write_text(text)

@@ -37,10 +37,7 @@ def test_the_tracker_is_the_second_order_filter(grid, correlated):
     tracker = Tracker(grid, x, P, gate=25.0)
     local = around(grid, x[0], x[1])
     hessian = np.array(
-        [
-            [local.north_north[0], local.north_east[0]],
-            [local.north_east[0], local.east_east[0]],
-        ]
+        [[local.north_north[0], local.north_east[0]], [local.north_east[0], local.east_east[0]]]
     )
     h = np.array([local.north[0], local.east[0], 0, 0, 1, 1])
     curve = hessian @ P[:2, :2]
