@@ -144,10 +144,11 @@ def _plays(problem: Problem, name: str, shapes: Sequence[tuple[float, float, flo
     middle, half = 0.5 * (low + high), 0.5 * (high - low)
     channel = problem.survey.channels[name]
     p, unit = channel.values, channel.unit
+    grid = {width: play(p, width) for width in {2.0 * half * w for w, _, _ in shapes}}
 
     def again(width: float, centre: float, scale: float) -> Candidate:
         effect = PlayEffect(cause="hysteresis", channel=name, width=width, centre=centre, scale=scale)
-        y = play(p, width)
+        y = grid[width] if width in grid else play(p, width)
 
         def phi(rows: slice) -> FloatArray:
             curved = np.tanh((y[rows] - centre) / scale) - np.tanh((p[rows] - centre) / scale)

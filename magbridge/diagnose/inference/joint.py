@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from magbridge.diagnose.compare.columns import Columns
 from magbridge.diagnose.compare.problem import Problem
-from magbridge.diagnose.inference.design import Design, kept, normal
+from magbridge.diagnose.inference.design import Design, in_threads, kept, normal
 from magbridge.diagnose.inference.fit_noise import fit_noise
 from magbridge.diagnose.inference.noise import Noise
 from magbridge.diagnose.inference.statistic import Statistic
@@ -115,10 +115,11 @@ def fit_joint(
     first = [*(starts or [centre])]
     if plain:
         first.append(_plain(X, problem.residual, prior, centre))
-    found = [(c, *at(c)) for c in first]
     for own, _ in common:
         prior[own] = FLAT  # no size is known yet
-    c, left, noise = max(found, key=lambda entry: value(entry[0], entry[2]))
+    tries = in_threads(len(problem), lambda c: (c, *at(c)), first)
+    c, left, noise = max(tries, key=lambda entry: value(entry[0], entry[2]))
+    del tries  # of a month each is 15 MB
     for step in range(rounds + 1):
         P, b = normal(X.rows, noise.response(left), noise)
         for own, spectrum in common:

@@ -143,7 +143,9 @@ class State:
             for group, (k, average) in self.best(scores).items():
                 under.setdefault(group, []).append((k, average, scores[k], info))
         listed = sorted(under.values(), key=lambda entries: -max(entry[2].evidence for entry in entries))
-        found = in_threads(len(self.problem), partial(self._joint, model, base), listed[:SHORT_LIST])
+        # what takes longest first: the threads end together
+        tried = sorted(listed[:SHORT_LIST], key=lambda entries: -self.candidates[entries[0][0]].size)
+        found = in_threads(len(self.problem), partial(self._joint, model, base), tried)
         return sorted(found, key=lambda h: -h.evidence)
 
     def beside(self, model: Sequence[Candidate], base: Joint) -> Information:
