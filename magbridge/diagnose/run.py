@@ -116,7 +116,7 @@ def _examine(
         wrong = None  # a remnant of the strongest cause's idealised regressor
     progress("extending the calibration")
     settled, columns, fit = settle(problem, model, fit, outcome.order)
-    fit = widened(model, loosened(settled, model, columns, fit))
+    fit = widened(model, loosened(settled, model, columns, fit, candidates))
     extended = calibration
     if model:
         extended = leveled(settled, model, fit, flown(problem.survey, extend(settled, model, fit)))

@@ -11,6 +11,7 @@ import pytest
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.design import normal
+from magbridge.diagnose.inference.evidence import weigh
 from magbridge.diagnose.inference.joint import Joint, fit_joint
 from magbridge.diagnose.inference.nonlinear_uncertainty import loosened
 
@@ -65,3 +66,44 @@ def test_parts_of_one_cause_have_each_their_own(problem: Problem) -> None:
     free = loosened(problem, [both], [both.columns], fit)
     assert np.all(np.diag(free.covariance)[-2:] > np.diag(fit.covariance)[-2:])
     np.linalg.cholesky(free.covariance)
+
+
+def step(onset: float) -> Candidate:
+    """What begins, nobody knows when."""
+    x = (np.arange(ROWS) >= onset).astype(float)
+    return Candidate(
+        "made", None, lambda rows: x[rows, None], np.ones(1), ("size",), ("nT",),
+        shape={"onset": (onset, "s")}, again=step, cells=(4.0,),
+    )  # fmt: skip
+
+
+def test_other_peaks_of_the_likelihood_count_by_their_evidence(right: Callable[[int], Problem]) -> None:
+    """Against the mixture of fits at every onset: a small one early or a large one late explain the same.
+
+    Beside them is another cause, which gives way to each by as much as it must.
+    """
+    t = np.arange(ROWS)
+    signal = 0.25 * (t >= 60) + 0.5 * (t >= 240)
+    problem = replace(right(ROWS), residual=signal + np.random.default_rng(6).normal(size=ROWS))
+    beside = replace(decay(LAG), cause="other", shape={}, again=None, cells=())
+    grid = [step(float(onset)) for onset in range(10, ROWS, 10)]
+    fits = [fitted(problem, beside, one) for one in grid]
+    null = fitted(problem, beside).log_likelihood
+    weight = np.exp([weigh(2.0 * (one.log_likelihood - null), 1) for one in fits])
+    best = int(np.argmax(weight))
+    fit = fits[best]
+    apart = np.array([np.append(one.z, one.coefficients) for one in fits]) - np.append(
+        fit.z, fit.coefficients
+    )
+    weight /= weight.sum() + weight[best]  # the estimate is a point of the grid as well
+    more = sum(
+        w * (np.outer(d, d) + one.covariance - fit.covariance)
+        for w, d, one in zip(weight, apart, fits, strict=True)
+    )
+    model = [beside, grid[best]]
+    found = loosened(problem, model, [candidate.columns for candidate in model], fit, grid).covariance
+    # each of those fits has noise of its own, so that weights differ a little
+    units = np.sqrt(np.outer(np.diag(found), np.diag(found)))
+    np.testing.assert_allclose(found / units, (fit.covariance + more) / units, atol=0.15)
+    assert found[-1, -1] > 1.3 * fit.covariance[-1, -1]
+    np.linalg.cholesky(found)

@@ -2,11 +2,21 @@ r"""The uncertainty of nonlinear parameters, and what it adds to the covariance 
 
 Notes
 -----
-With the parameters' derivatives ``J_s = d(X b)/ds`` beside the columns of calibration and effects, their information is the
-matrix M of what is left of ``J_s`` when those are projected out, and these give way to a unit of each by K
-(:mod:`.information`). So with a prior of a cell of their grid, N(0, 1) in its units, all others' covariance is
+*Within a cell of their grid* the likelihood has one peak. With the parameters' derivatives ``J_s = d(X b)/ds`` beside the
+columns of calibration and effects, their information is the matrix M of what is left of ``J_s`` when those are projected
+out, and these give way to a unit of each by K (:mod:`.information`). So with a prior of a cell, N(0, 1) in its units, all
+others' covariance is
 
 .. math:: C + K (M + 1)^{-1} K^T
+
+*Beyond it* there are other peaks: those of an onset lie hours apart, each with a size of its own. With d_k by how much all
+coefficients differ at the other points of the grid, C_k their covariance there, and w_k these points' posterior weights, the
+mixture of all has the moments
+
+.. math:: C + \sum_k w_k \left(d_k d_k^T + C_k - C\right)
+
+A point weighs as much as its evidence; the estimate, which was profiled, by its share of a cell less
+(:attr:`~magbridge.diagnose.causes.candidates.Candidate.narrow`).
 """
 
 from __future__ import annotations
@@ -17,21 +27,31 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from magbridge.diagnose.causes.candidates import Candidate
+from magbridge.diagnose.causes.candidates import Candidate, slices
 from magbridge.diagnose.compare.columns import Columns
 from magbridge.diagnose.compare.problem import Problem
-from magbridge.diagnose.inference.information import information
+from magbridge.diagnose.inference.evidence import score
+from magbridge.diagnose.inference.information import Information, information
 from magbridge.diagnose.inference.joint import Joint
+from magbridge.diagnose.inference.rounds import key
 
 __all__ = ["loosened"]
 
 FloatArray = NDArray[np.float64]
+Placed = tuple[Candidate, slice]
+"""A candidate, and where its columns are."""
 
 SHARE = 0.05
 """Fraction of a grid cell by which a parameter is moved for its derivative."""
 
 
-def loosened(problem: Problem, model: Sequence[Candidate], columns: Sequence[Columns], fit: Joint) -> Joint:
+def loosened(
+    problem: Problem,
+    model: Sequence[Candidate],
+    columns: Sequence[Columns],
+    fit: Joint,
+    grid: Sequence[Candidate] = (),
+) -> Joint:
     """Return the fit with the covariance that its coefficients have when the nonlinear parameters are free, too.
 
     Parameters
@@ -41,19 +61,30 @@ def loosened(problem: Problem, model: Sequence[Candidate], columns: Sequence[Col
     columns : sequence of Columns
         Theirs, in this problem.
     fit : Joint
+    grid : sequence of Candidate
+        All that were searched.
     """
-    slopes: list[Columns] = []
-    at = 0
-    for piece in (piece for candidate in model for piece in candidate.pieces):
-        slopes += _slopes(piece, fit.coefficients[at : at + piece.size])
-        at += piece.size
-    if not slopes:
+    pieces = [piece for candidate in model for piece in candidate.pieces]
+    if all(piece.again is None for piece in pieces):
         return fit
+    more = _within(problem, pieces, columns, fit) + _beyond(problem, pieces, columns, fit, grid)
+    return replace(fit, covariance=fit.covariance + 0.5 * (more + more.T))
+
+
+def _within(
+    problem: Problem, pieces: Sequence[Candidate], columns: Sequence[Columns], fit: Joint
+) -> FloatArray:
+    """(q + k, q + k) what is added by the cells that the parameters are in."""
+    slopes = [
+        slope
+        for piece, own in zip(pieces, slices(pieces), strict=True)
+        for slope in _slopes(piece, fit.coefficients[own])
+    ]
+    if not slopes:
+        return np.zeros_like(fit.covariance)
     info = information(problem, fit.noise, fit, [*slopes, *columns]).fitted(fit)
     K = info.shift
-    given: FloatArray = np.asarray(np.linalg.solve(info.matrix + np.eye(len(slopes)), K.T), float)
-    more = K @ given
-    return replace(fit, covariance=fit.covariance + 0.5 * (more + more.T))
+    return np.asarray(K @ np.linalg.solve(info.matrix + np.eye(len(slopes)), K.T))
 
 
 def _slopes(piece: Candidate, b: FloatArray) -> Iterator[Columns]:
@@ -69,3 +100,60 @@ def _slopes(piece: Candidate, b: FloatArray) -> Iterator[Columns]:
             return np.asarray((moved.columns(rows) - piece.columns(rows)) @ b / SHARE)[:, None]
 
         yield columns
+
+
+def _beyond(
+    problem: Problem,
+    pieces: Sequence[Candidate],
+    columns: Sequence[Columns],
+    fit: Joint,
+    grid: Sequence[Candidate],
+) -> FloatArray:
+    """(q + k, q + k) what is added by all other cells."""
+    more = np.zeros_like(fit.covariance)
+    points = [[c for c in grid if piece.again and _alike(c, piece)] for piece in pieces]
+    every = [candidate for some in points for candidate in some]
+    if not every:
+        return more
+    info = information(problem, fit.noise, fit, [*(candidate.columns for candidate in every), *columns])
+    places = iter(placed := list(zip([*every, *pieces], slices([*every, *pieces]), strict=True)))
+    for mine, some in zip(placed[len(every) :], points, strict=True):
+        if some:
+            more += _elsewhere(info, fit, mine, [next(places) for _ in some])
+    return more
+
+
+def _alike(one: Candidate, other: Candidate) -> bool:
+    """Tell whether two candidates are points of one grid, with the same numbers."""
+    return key(one) == key(other) and one.names == other.names
+
+
+def _elsewhere(info: Information, fit: Joint, mine: Placed, points: Sequence[Placed]) -> FloatArray:
+    """(q + k, q + k) what is added by the points of one piece's grid."""
+    piece, own = mine
+    q, first = len(fit.z), len(info.score) - fit.coefficients.size
+    here = slice(own.start - first, own.stop - first)
+    rest = np.setdiff1d(np.arange(first, len(info.score)), np.arange(own.start, own.stop))
+    prior = fit.prior[q + rest - first]
+    K = np.linalg.solve(info.matrix[np.ix_(rest, rest)] + np.diag(prior), info.matrix[rest])
+    alone = info.without(rest, prior)
+    # the scores with this piece taken out of the fit
+    alone = replace(alone, score=alone.score + alone.matrix[:, own] @ fit.coefficients[here])
+
+    def moments(candidate: Candidate, place: slice) -> tuple[float, FloatArray, FloatArray]:
+        """Return evidence, all coefficients, and their covariance, but for what does not depend on the candidate."""
+        s = score(alone, place, candidate)
+        # the other causes give way to it, and the calibration to all
+        way = np.zeros((len(fit.covariance), candidate.size))
+        way[:q] = info.shift[:, rest] @ K[:, place] - info.shift[:, place]
+        way[q + rest - first] = -K[:, place]
+        way[q + here.start : q + here.stop] = np.eye(candidate.size)
+        spread = np.linalg.inv(alone.matrix[place, place] + np.diag(fit.prior[q:][here]))
+        return s.evidence, way @ s.estimate, way @ spread @ way.T
+
+    evidence, c, C = moments(piece, own)
+    others = [moments(candidate, place) for candidate, place in points]
+    logs = np.array([evidence - piece.narrow, *(e for e, _, _ in others)])
+    weight = np.exp(logs - logs.max())
+    apart = zip(weight[1:] / weight.sum(), others, strict=True)
+    return np.asarray(sum(w * (np.outer(c_k - c, c_k - c) + C_k - C) for w, (_, c_k, C_k) in apart))
