@@ -20,7 +20,10 @@ FloatArray = NDArray[np.float64]
 
 
 def nonlinearity(problem: Problem) -> list[Candidate]:
-    """The response bends: ``T_i += b_i (H_i / H_0)^p``, p = 2 (an even harmonic's leak), 3 (a saturating core), or both."""
+    """The response bends: ``T_i += b_i (H_i / H_0)^p``, p = 2 (an even harmonic's leak), 3 (a saturating core), or both.
+
+    Both are six numbers of one common size: the three channels are of one make.
+    """
     unit, H = problem.calibration.reference.field, problem.reading
     made = []
     for power in (2, 3):
@@ -28,7 +31,7 @@ def nonlinearity(problem: Problem) -> list[Candidate]:
         phi = lambda rows, power=power: powers(H[rows].T / unit, power)[-1]  # noqa: E731
         names = tuple(f"{axis}{power}" for axis in AXES)
         made.append(of_effect(problem, effect, 50.0, per(f"{unit:.0f} nT", power), names=names, phi=phi))
-    return [*made, replace(made[0].with_(made[1]), parts=())]
+    return [*made, replace(made[0].with_(made[1]), parts=(), spectra=np.ones((1, 6)))]
 
 
 def saturation(problem: Problem) -> list[Candidate]:
