@@ -69,6 +69,10 @@ FOREIGN: dict[str, Effect] = {
     "motional": vehicle.motional,
     "leak": vehicle.leak,
     "ranges": sensor.ranges,
+    "sag": sensor.sag,
+    "crossover": sensor.crossover,
+    "popcorn": sensor.popcorn,
+    "discharge": vehicle.discharge,
 }
 """Effects that the contract has no name for."""
 

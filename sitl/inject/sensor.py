@@ -159,3 +159,33 @@ def ranges(scene: Scene, size: float, rng: Generator) -> None:
         return np.asarray(H + size * gains * upper * x * np.sign(H))
 
     scene.bend.append(bend)
+
+
+def sag(scene: Scene, size: float, rng: Generator) -> None:
+    """A core on a bracket leans under its own weight, towards a neighbour and into its field; size in 2e-5 rad at 1 g."""
+    leaning = int(rng.integers(0, 3))
+    neighbour = (leaning + int(rng.integers(1, 3))) % 3
+    roll, pitch = np.radians(scene.track.roll), np.radians(scene.track.pitch)
+    weight = np.column_stack([-np.sin(pitch), np.cos(pitch) * np.sin(roll), np.cos(pitch) * np.cos(roll)])
+    swing = first_order(weight[:, neighbour] - weight[0, neighbour], scene.track.step, 1.0)
+    out = scene.field.copy()
+    out[:, leaning] += 2e-5 * size * swing * scene.field[:, neighbour]
+    scene.field = out
+
+
+def crossover(scene: Scene, size: float, rng: Generator) -> None:
+    """Where a feedback current changes its sign two transistors take turns, and for a while neither does; size in nT."""
+    widths, gaps = rng.uniform(600.0, 2500.0, 3), rng.lognormal(0.0, 0.5, 3) * rng.choice([-1.0, 1.0], 3)
+
+    def bend(H: Array) -> Array:
+        x = H / widths
+        return np.asarray(H - size * gaps * 2.0 * x / (1.0 + x**4))
+
+    scene.bend.append(bend)
+
+
+def popcorn(scene: Scene, size: float, rng: Generator) -> None:
+    """A defect in the voltage reference traps a charge and lets it go again, at random: two gains; size in 1e-5 of the field."""
+    dwell = rng.exponential(1.0, len(scene.t)) * np.resize(rng.uniform(200.0, 1800.0, 2), len(scene.t))
+    trapped = np.searchsorted(np.cumsum(dwell), scene.t) % 2
+    scene.field = scene.field * (1.0 + 1e-5 * size * trapped[:, None])

@@ -241,3 +241,12 @@ def leak(scene: Scene, size: float, rng: Generator) -> None:
         wet += 3.0 * wets * head - dries * wet
         leads[k] = wet
     scene.field = scene.field + size * direction(rng) * (leads / max(leads.max(), 1e-9))[:, None]
+
+
+def discharge(scene: Scene, size: float, rng: Generator) -> None:
+    """What cells are made of becomes more magnetic as charge is drawn, and they hang on the mass that moves; size in nT at the end."""
+    load = scene.logged["amps_a"][0] + scene.logged["amps_b"][0] + rng.uniform(0.05, 0.2)
+    drawn = (np.cumsum(load) / np.sum(load)) ** rng.uniform(1.0, 2.0)
+    place = scene.track.parameters["battpos"]
+    nearer = 1.0 + rng.uniform(0.05, 0.15) * (place - place[0])
+    scene.field = scene.field + size * direction(rng) * (drawn * nearer**3)[:, None]
