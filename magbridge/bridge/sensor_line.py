@@ -63,8 +63,9 @@ class SensorLine:
             self._announcer.state("sensor", f"{self._name} speaks")
 
     def opened(self, time_us: int) -> None:
-        """Take note that the port opened: it is silent until the sensor speaks."""
-        self._silent(time_us)
+        """Begin to tell the sensor what it must know, after it may have been without power: silent until it speaks."""
+        self.state, self._heard_us = MAG_PORT_STATE.SILENT, time_us
+        self._command(time_us, self._commands())
 
     def lost(self, reason: str) -> None:
         """Take note that the port is gone."""
@@ -76,12 +77,7 @@ class SensorLine:
         if time_us - self._heard_us < self._timeout_us or self.state == MAG_PORT_STATE.LOST:
             return
         self._announcer.state("sensor", f"{self._name} is silent", MAV_SEVERITY.ERROR)
-        self._silent(time_us)
-
-    def _silent(self, time_us: int) -> None:
-        """Begin to tell the sensor what it must know; it may have been without power."""
-        self.state, self._heard_us = MAG_PORT_STATE.SILENT, time_us
-        self._command(time_us, self._commands())
+        self.opened(time_us)  # as a port that opened anew
 
     def _command(self, time_us: int, commands: tuple[bytes, ...]) -> None:
         if commands:

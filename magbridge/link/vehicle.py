@@ -40,8 +40,6 @@ class Vehicle:
         Reset when the autopilot reboots.
     reboots, frames_lost : int
         Times that the boot clock began anew; frames missing by the autopilot's sequence numbers.
-    others : dict of int to int
-        Frames from other vehicles, by system id.
     """
 
     def __init__(
@@ -50,7 +48,6 @@ class Vehicle:
         self.system, self.component, self.autopilot = system, component, autopilot
         self.clock = VehicleClock()
         self.reboots = self.frames_lost = 0
-        self.others: dict[int, int] = {}
         self.state = MAG_PORT_STATE.ABSENT
         self._announcer, self._timers = announcer, timers
         self._sequence: int | None = None
@@ -78,19 +75,15 @@ class Vehicle:
         return True
 
     def _stranger(self, message: Message) -> None:
-        if message.id != HEARTBEAT and message.system not in self.others:
+        """Tell of another vehicle; a ground station is none."""
+        if message.id != HEARTBEAT:
             return
-        station = message.id == HEARTBEAT and (
-            message["type"] == MAV_TYPE.GCS or message["autopilot"] == MAV_AUTOPILOT.INVALID
-        )
-        if station:
-            return
-        self.others[message.system] = self.others.get(message.system, 0) + 1
-        self._announcer.state(
-            f"system {message.system}",
-            f"vehicle {message.system} is on the link too: ignored",
-            MAV_SEVERITY.NOTICE,
-        )
+        if message["type"] != MAV_TYPE.GCS and message["autopilot"] != MAV_AUTOPILOT.INVALID:
+            self._announcer.state(
+                f"system {message.system}",
+                f"vehicle {message.system} is on the link too: ignored",
+                MAV_SEVERITY.NOTICE,
+            )
 
     def _count(self, sequence: int) -> None:
         """Count what is missing; a packet that comes late, out of order, is not, and one sent twice is nothing."""

@@ -70,12 +70,10 @@ def test_a_second_vehicle_is_told_once_and_ignored(link):
         link.give(other.pack("ATTITUDE", roll=1))
         assert link.telemetry == []
     assert said == ["vehicle 2 is on the link too: ignored"]
-    assert link.component.vehicle.others == {2: 10}
 
 
 def test_a_ground_station_is_no_vehicle(link):
     assert link.texts(link.say("heartbeat", 6, 8, 0, 0, 0, 3)) == []
-    assert link.component.vehicle.others == {}
 
 
 def test_another_program_with_our_address(link):
