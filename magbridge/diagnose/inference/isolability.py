@@ -52,11 +52,6 @@ class Visible:
     sure: float
     sizes: dict[str, tuple[float, str]]
 
-    @property
-    def invisible(self) -> bool:
-        """No coefficient can be seen at fifty times its plausible size."""
-        return all(not np.isfinite(size) for size, _ in self.sizes.values())
-
 
 @dataclass(frozen=True)
 class Isolability:

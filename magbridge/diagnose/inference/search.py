@@ -32,7 +32,7 @@ from magbridge.diagnose.inference.profile_likelihood import refined, sharpen
 from magbridge.diagnose.inference.rivals import Rival
 from magbridge.diagnose.inference.rounds import Hypothesis, State, key
 from magbridge.diagnose.inference.sets import sets_of
-from magbridge.diagnose.inference.simultaneous import MOST, enough, together
+from magbridge.diagnose.inference.simultaneous import MOST, chosen_at_once, enough
 
 __all__ = ["Hypothesis", "Outcome", "search"]
 
@@ -102,7 +102,7 @@ def search(problem: Problem, candidates: Sequence[Candidate], causes: int) -> Ou
 
 def _likeliest(state: State, null: Joint, first: list[Hypothesis]) -> tuple[list[Candidate], Joint]:
     """Return what is worth most: causes found one after the other, chosen together, or a single one, if that is enough."""
-    one_by_one, at_once = _chain(state, null, first), together(state)
+    one_by_one, at_once = _chain(state, null, first), chosen_at_once(state)
     found = [exchanged(state, *one_by_one) if one_by_one[0] else one_by_one]
     before = {key(candidate) for candidate in one_by_one[0]}
     if at_once and (before or len(at_once) > 1) and {key(candidate) for candidate in at_once} != before:

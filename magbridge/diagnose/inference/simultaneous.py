@@ -12,13 +12,13 @@ from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.inference.evidence import LEVEL, REMNANT, score, slack
 from magbridge.diagnose.inference.rounds import Hypothesis, State
 
-__all__ = ["MOST", "enough", "together"]
+__all__ = ["MOST", "chosen_at_once", "enough"]
 
 MOST = 6
 """Regressors chosen in one log, at most."""
 
 
-def together(state: State) -> list[Candidate]:
+def chosen_at_once(state: State) -> list[Candidate]:
     """Choose causes one after the other, each scored with the calibration and the earlier ones free."""
     info = state.bare
     picked: list[int] = []

@@ -99,13 +99,7 @@ def measured(diagnosis: Diagnosis) -> str:
         some = np.quantile(left, [0.002, 0.998])
         ends = np.array([min(ends[0], some[0]), max(ends[1], some[1])])
     low.fill_between(
-        since,
-        -stated,
-        stated,
-        color=FAINT,
-        alpha=0.25,
-        linewidth=0,
-        label="the calibration's own 2 sigma",
+        since, -stated, stated, color=FAINT, alpha=0.25, linewidth=0, label="the calibration's own 2 sigma"
     )
     dives = survey.time[np.flatnonzero(np.diff(survey.dive)) + 1]
     for start in dives if dives.size < MANY else ():
