@@ -95,7 +95,9 @@ def _detection(part: Parts) -> list[Line]:
             out.append((label, "within 15 %", "0 %", f"{off(factor)} | {len(known)}"))
     own = [beside_ideal([r for r in known if list(r["names"]) == [name]]) for name in EFFECTS]
     if each := [abs(factor[0] - 1.0) <= OFF for factor in own if factor]:
-        out.append(("... cause by cause: within 15 %", "all", "all", f"{sum(each)} of {len(each)} | {len(known)}"))
+        out.append(
+            ("... cause by cause: within 15 %", "all", "all", f"{sum(each)} of {len(each)} | {len(known)}")
+        )
     return out
 
 
