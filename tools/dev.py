@@ -13,6 +13,7 @@ last two install the package as a user would, compiled where there is a C compil
 from __future__ import annotations
 
 import os
+import ssl
 import subprocess
 import sys
 import venv
@@ -62,9 +63,11 @@ def install(extra: str, place: Path = BIN, *options: str) -> None:
         venv.create(BIN.parent, with_pip=True)
     if not (BIN / "uv").exists():
         run(BIN / "python", "-m", "pip", "install", "--quiet", "--disable-pip-version-check", UV)
+    known = ssl.get_default_verify_paths()  # a network's own proxy is known to the system only, not to uv
     run(
         BIN / "uv", "sync", "--quiet", "--locked", "--inexact", "--extra", extra, *options,
         UV_PROJECT_ENVIRONMENT=str(place.parent), VIRTUAL_ENV="", UV_PYTHON_DOWNLOADS="never",
+        UV_SYSTEM_CERTS=str(bool(known.cafile or known.capath)).lower(),
     )  # fmt: skip
 
 
