@@ -17,6 +17,7 @@ from magbridge.calibration.file import load as load_calibration
 from magbridge.calibration.file import save as save_calibration
 from magbridge.calibration.fitting.data import observations
 from magbridge.calibration.fitting.fit import METHODS
+from magbridge.calibration.model import identity
 from magbridge.calibration.planning.plan import expected_calibration
 from magbridge.cli import main
 from magbridge.correction import Correction, correct_rows
@@ -172,6 +173,17 @@ def test_correct_gives_the_same_in_pieces(deployment: Path, calibration: Path, t
         if name == "anomaly":
             continue  # positions between known ones are found piece by piece
         np.testing.assert_array_equal(whole[name], np.concatenate([part[name] for part in parts]))
+
+
+def test_a_log_without_a_whole_reading_is_not_corrected(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log, calibration, output = (tmp_path / name for name in ("log.csv", "cal.json", "x.csv"))
+    log.write_text("time,mag_x,mag_y,mag_z\n1,,2,3\n2,1,,\n")
+    save_calibration(identity(), calibration)
+    line = complaint(capsys, "correct", log, "--calibration", calibration, "-o", output, code=1)
+    assert line == f"{log}: no row has all of mag_x mag_y mag_z"
+    assert not output.exists()
 
 
 @pytest.mark.parametrize(

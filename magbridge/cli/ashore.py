@@ -178,20 +178,26 @@ def correct(*files: Path, calibration: Path, output: Log, json: Json = False) ->
     from magbridge.calibration.file import load
     from magbridge.columns import CHANNELS
     from magbridge.correction import Correction, correct_rows
+    from magbridge.errors import DataError
     from magbridge.logs import Writer, read_chunks
     from magbridge.records import Quality
 
     some(files, output, calibration)
     correction = Correction(load(calibration))
-    rows, flagged, pieces = 0, 0, []
+    rows, flagged, whole, pieces = 0, 0, False, []
     with Writer(output) as writer:
         for part in track(read_chunks(files, required=CHANNELS), "correcting"):
             pieces.append(part.attrs)
             corrected = correct_rows(correction, part)
             writer.append(corrected)
             rows += part.sizes["time"]
+            whole |= bool(part[list(CHANNELS)].to_array().notnull().all("variable").any())
             flagged += int(
                 (corrected["quality"].to_numpy().astype(int) & ~int(Quality.NO_BORESIGHT) != 0).sum()
+            )
+        if not whole:
+            raise DataError(
+                f"{', '.join(str(file) for file in files)}: no row has all of {' '.join(CHANNELS)}"
             )
     note_losses(*pieces)
     summary = f"{output}: {rows} samples, {flagged} of them flagged"

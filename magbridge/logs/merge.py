@@ -48,4 +48,6 @@ def merge(sources: Sequence[Open], rows: int) -> Iterator[xr.Dataset]:
                 advance(k, pieces)
             else:
                 active[k] = uncounted(piece.isel(time=slice(n, None))), pieces
-        yield same_columns(join([part for part in parts if part.sizes["time"]]), columns)
+        piece = join([part for part in parts if part.sizes["time"]])
+        # a file is begun with the first piece, and is to name all that went into it
+        yield same_columns(piece, columns).assign_attrs(source=whole.attrs["source"])

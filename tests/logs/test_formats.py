@@ -204,6 +204,7 @@ def test_several_files_are_one_deployment(tmp_path: Path) -> None:
     np.testing.assert_array_equal(back["ballast"], np.r_[-np.arange(40.0), np.full(20, np.nan)])
     for rows in (1, 7, 1000):
         pieces = list(logs.read_chunks(paths, rows))
+        assert {piece.attrs["source"] for piece in pieces} == {back.attrs["source"]}
         for name in back.variables:
             streamed = np.concatenate([piece[name].values for piece in pieces])
             np.testing.assert_array_equal(streamed, back[name].values, err_msg=str(name))
