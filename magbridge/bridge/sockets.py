@@ -70,12 +70,14 @@ class UdpPort(Port):
             except BlockingIOError:
                 break
             except OSError as error:
-                if error.errno in AWAY:
-                    break
+                if data or error.errno in AWAY:
+                    break  # what has come is not lost with the socket
                 raise self.lost(error.strerror) from error
             if self._listen:
                 self._peers[peer] = time.monotonic()
             data += datagram
+            if not datagram:
+                break  # else empty ones could keep us here
         return data
 
     def write(self, data: bytes) -> None:

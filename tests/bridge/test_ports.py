@@ -123,6 +123,9 @@ def test_datagrams_that_waited_come_at_once() -> None:
         for k in range(200):
             peer.sendto(bytes((k,)) * 600, bridge)
         heard = [port.read() for _ in range(3)]
+        for data in (b"first", b"", b"after an empty one"):
+            peer.sendto(data, bridge)
+        assert [port.read(), port.read()] == [b"first", b"after an empty one"]
         port.close()
     assert [len(data) for data in heard] == [66_000, 54_000, 0]
     assert b"".join(heard)[::600] == bytes(range(200))
