@@ -1,4 +1,4 @@
-"""A picture of a fit: what the total field is off by before and after, beside whatever it may hang on."""
+"""A picture of a fit: what the total field is off by before and after, against whatever it may depend on."""
 
 from __future__ import annotations
 
@@ -18,12 +18,14 @@ __all__ = ["draw_fit"]
 FloatArray = NDArray[np.float64]
 POINTS = 5_000
 """Points drawn in a panel; more only make a blot."""
+WIDE = 6.0
+"""Standard deviations (robust) up to which the lower row's scale goes; what is beyond stands at its edge."""
 
 
 def draw_fit(calibration: Calibration, data: Observations, path: str | Path) -> None:
     """Draw each sample's deviation from the reference, as read and corrected, a colour for each run.
 
-    Beside time, heading (where attitude is known) and each parameter: what still follows one of them in the lower row,
+    Against time, heading (where attitude is known) and each parameter: what still follows one of them in the lower row,
     the calibration does not describe.
 
     Raises
@@ -36,31 +38,40 @@ def draw_fit(calibration: Calibration, data: Observations, path: str | Path) -> 
     left, _ = in_sensor_units(calibration, data)
     part = slice(None, None, max(1, len(data) // POINTS))
     _, run = np.unique(data.runs, return_inverse=True)
-    beside = _beside(data)
-    figure = Figure(figsize=(1.0 + 3.4 * len(beside), 6.4), layout="constrained")
-    axes = figure.subplots(2, len(beside), sharex="col", sharey="row", squeeze=False)
-    for values, row in zip((read, left), axes, strict=True):
-        for axis, x in zip(row, beside.values(), strict=True):
-            axis.scatter(x[part], values[part], c=run[part] % 20, cmap="tab20", vmin=0, vmax=19, s=3, lw=0)
+    abscissae = _abscissae(data)
+    figure = Figure(figsize=(1.0 + 3.4 * len(abscissae), 6.4), layout="constrained")
+    axes = figure.subplots(2, len(abscissae), sharex="col", sharey="row", squeeze=False)
+    noise = calibration.noise.sensor
+    edge = WIDE * max(noise, float(np.median(np.abs(left))) / 0.6745)  # masses in motion do not set the scale
+    beyond = np.abs(left) > edge
+    for values, row in ((read, axes[0]), (np.where(beyond, np.nan, left), axes[1])):
+        for axis, x in zip(row, abscissae.values(), strict=True):
+            dots = axis.scatter(
+                x[part], values[part], c=run[part] % 20, cmap="tab20", vmin=0, vmax=19, s=3, lw=0
+            )
             axis.axhline(0.0, color="0.2", lw=0.6)
             axis.grid(color="0.92", lw=0.6)
             axis.set_axisbelow(True)
             axis.spines[["top", "right"]].set_visible(False)
-    low, high = np.quantile(np.append(left, 0.0), [0.002, 0.998])  # a few wild samples do not set the scale
-    axes[1, 0].set_ylim(low - 0.2 * (high - low), high + 0.2 * (high - low))
-    noise = calibration.noise.sensor
-    for axis, name in zip(axes[1], beside, strict=True):
-        axis.axhspan(-2.0 * noise, 2.0 * noise, color="0.6", alpha=0.25, lw=0, label="2 sigma of its noise")
+    axes[1, 0].set_ylim(-1.1 * edge, 1.1 * edge)
+    for axis, (name, x) in zip(axes[1], abscissae.items(), strict=True):
+        band = axis.axhspan(-2.0 * noise, 2.0 * noise, color="0.6", alpha=0.25, lw=0)
+        up, down = x[beyond & (left > 0.0)], x[beyond & (left < 0.0)]
+        (above,) = axis.plot(up, np.full(len(up), 1.05 * edge), "^", c="0.3", ms=3, mew=0)
+        axis.plot(down, np.full(len(down), -1.05 * edge), "v", c="0.3", ms=3, mew=0)
         axis.set_xlabel(name)
     axes[0, 0].set_ylabel(f"as read, nT: {_rms(read):.0f} RMS")
     axes[1, 0].set_ylabel(f"corrected, nT: {_rms(left):.2f} RMS")
-    axes[1, 0].legend(loc="upper right", fontsize=8, frameon=False)
+    told = {"a colour for each run": dots, "2 sigma of the sensor's noise": band}
+    if beyond.any():
+        told[f"beyond the scale: {beyond.sum()} of {len(data)}, up to {np.abs(left).max():.0f} nT"] = above
+    figure.legend(told.values(), told, loc="outside upper right", ncols=len(told), fontsize=8, frameon=False)
     with atomic_path(path) as partial:
         figure.savefig(partial, dpi=110)
 
 
-def _beside(data: Observations) -> dict[str, FloatArray]:
-    """Return what deviations are drawn beside, by its name and unit."""
+def _abscissae(data: Observations) -> dict[str, FloatArray]:
+    """Return what deviations are drawn against, by its name and unit."""
     assert data.time is not None
     shown = {"hours": (data.time - data.time[0]) / 3600.0}
     if data.attitude is not None and np.isfinite(data.attitude[:, 2]).any():
