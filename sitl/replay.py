@@ -59,12 +59,15 @@ def replay(
     WrongUse
         A bridge's own log without its configuration, or a log of a bridge together with other logs.
     """
-    if is_own_log(files[0]):
-        if config is None:
-            raise WrongUse(f"{files[0]} is a bridge's own log: name its configuration with --config")
-        return {"runs": [_again(run, config, speed, log) for run in runs(files)]}
     if config is not None:
         load(config)  # what is wrong with it is told before anything begins
+    if own := next((file for file in files if is_own_log(file)), None):
+        if other := next((file for file in files if file.suffix.lower() != own.suffix.lower()), None):
+            raise WrongUse(f"{other}: cannot be replayed together with {own}, a bridge's own log")
+        if config is None:
+            raise WrongUse(f"{own} is a bridge's own log: name its configuration with --config")
+        return {"runs": [_again(run, config, speed, log) for run in runs(files)]}
+    if config is not None:
         deployment = read(files, required=CHANNELS)
         times = deployment["time"].to_numpy()
         parts = [Part("all", float(times[0]), float(times[-1]))]

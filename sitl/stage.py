@@ -21,7 +21,7 @@ import msgspec
 
 from magbridge.bridge.events import Event
 from magbridge.bridge.pipeline import Start
-from magbridge.errors import PortError
+from magbridge.errors import MagbridgeError, PortError, WrongUse
 from magbridge.records import Channel
 from sitl.timetable import Entry, pace
 
@@ -31,6 +31,8 @@ BATCH = 2048
 """Bytes sent at once when nothing has to wait: below what a pty holds."""
 CONNECT_TIMEOUT = 30.0
 """s for the bridge to start and connect."""
+PATIENCE = 1.0
+"""s for a bridge that failed to say why and end."""
 
 
 class Stage:
@@ -67,7 +69,7 @@ class Stage:
         try:
             self._link, _ = server.accept()
         except TimeoutError as error:
-            raise PortError("replay", self._last_words() or "the bridge did not connect") from error
+            raise self._failure("the bridge did not connect") from error
         finally:
             server.close()
         self._link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -82,11 +84,17 @@ class Stage:
         except ConnectionResetError:
             return  # the bridge ended before its time; whoever plays to it tells why
 
-    def _last_words(self) -> str:
-        """Return the bridge's last line on stderr, after it has ended."""
-        self._bridge.kill()
-        lines = self._bridge.communicate()[1].decode(errors="replace").strip().splitlines()
-        return lines[-1] if lines else ""
+    def _failure(self, otherwise: str) -> MagbridgeError:
+        """End the bridge; return why it failed: its last line on stderr, in the error that its exit code stands for."""
+        try:
+            _, said = self._bridge.communicate(timeout=PATIENCE)
+        except subprocess.TimeoutExpired:
+            self._bridge.kill()
+            _, said = self._bridge.communicate()
+        words = said.decode(errors="replace").strip().rpartition("\n")[2]
+        if words and self._bridge.returncode == WrongUse.exit_code:
+            return WrongUse(words)
+        return PortError("replay", words or otherwise)
 
     def play(self, start: Start, events: Iterable[Event], speed: float = float("inf")) -> None:
         """Play events in order, and wait until the bridge has dealt with all of them.
@@ -101,8 +109,10 @@ class Stage:
 
         Raises
         ------
+        WrongUse
+            The bridge refused its configuration.
         PortError
-            The bridge ended before its time; tells its last words.
+            It ended before its time; tells its last words.
         """
         times = self._buffers[Channel.STATE]
         begin = msgspec.json.encode(start)
@@ -124,11 +134,9 @@ class Stage:
             self._flush()
             os.close(self._times)
             if self._bridge.wait() != 0:
-                raise PortError(
-                    "replay", self._last_words() or f"the bridge ended with {self._bridge.returncode}"
-                )
+                raise self._failure(f"the bridge ended with {self._bridge.returncode}")
         except (BrokenPipeError, ConnectionResetError) as error:
-            raise PortError("replay", self._last_words() or "the bridge ended") from error
+            raise self._failure("the bridge ended") from error
         finally:
             self._ear.join(timeout=10.0)
             self._close()

@@ -13,7 +13,7 @@ import xarray as xr
 from magbridge.calibration.file import save
 from magbridge.calibration.model import Noise, identity
 from magbridge.config import load as load_config
-from magbridge.errors import DataError, FormatError, PortError, WrongUse
+from magbridge.errors import DataError, FormatError, WrongUse
 from magbridge.field.earth import offset
 from magbridge.logs import read, write
 from magbridge.mavlink import Codec
@@ -167,9 +167,18 @@ def test_speed_is_kept(survey: Path, tmp_path: Path) -> None:
 
 
 def test_a_bridge_s_own_log_needs_its_configuration(survey: Path, tmp_path: Path) -> None:
-    replay([survey], config(tmp_path), log=tmp_path / "logs")
+    path = config(tmp_path)
+    replay([survey], path, log=tmp_path / "logs")
+    (log,) = (tmp_path / "logs").glob("*.tlog")
     with pytest.raises(WrongUse, match="--config"):
-        replay(sorted((tmp_path / "logs").glob("*.tlog")))
+        replay([log])
+    for files in ([log, survey], [survey, log]):
+        with pytest.raises(
+            WrongUse, match=r"survey\.nc: cannot be replayed together with .*\.tlog, a bridge"
+        ):
+            replay(files, path)
+    with pytest.raises(WrongUse, match=r"^\S*none\.toml: No such file"):
+        replay([log], tmp_path / "none.toml")
 
 
 def test_a_log_that_does_not_begin_a_run_is_refused(survey: Path, tmp_path: Path) -> None:
@@ -200,7 +209,7 @@ def test_a_log_of_which_nothing_comes_is_one_line(
 def test_a_bridge_that_cannot_start_says_why(survey: Path, tmp_path: Path) -> None:
     path = config(tmp_path)
     path.write_text(path.read_text().replace("MAG_RAW = 0", "MAG_RAW = 0\nNO_SUCH = 1"))
-    with pytest.raises(PortError, match=r"publish\.NO_SUCH"):
+    with pytest.raises(WrongUse, match=r"^\S*bridge\.toml: publish\.NO_SUCH"):
         replay([survey], path)
 
 
