@@ -9,7 +9,7 @@ from scipy.stats import multivariate_normal
 from magbridge.calibration.fitting.data import observations
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.lowpass import unfiltered
-from magbridge.diagnose.inference.shapes import bends, response
+from magbridge.diagnose.inference.shapes import bends, crossing, response
 from magbridge.diagnose.inference.statistic import SIZES, Statistic
 from magbridge.diagnose.run import diagnose
 from sitl import load, simulate
@@ -61,3 +61,17 @@ def test_a_converter_whose_steps_differ_is_described() -> None:
     X = response(reading, slopes)(slice(None))
     S, b = X.T @ X, X.T @ given
     assert Statistic(S, np.array([width**2 for _, width in bends()])).best(b).ratio > 2.0 * 10.0
+
+
+@pytest.mark.parametrize("width", [600.0, 2500.0])
+def test_a_feedback_that_falters_at_zero_is_described(width: float) -> None:
+    """A dead zone, rounded, with whatever gain and offset a calibration would take of it taken."""
+    rng = np.random.default_rng(4)
+    reading = rng.uniform(-5e4, 5e4, (20_000, 3))
+    x = reading[:, :1] / width
+    dead = np.tanh(x) * np.exp(-np.abs(x))
+    X = crossing(reading, np.eye(3)[np.zeros(len(x), dtype=int)])(slice(None))
+    gain = np.column_stack([np.ones_like(x), x])
+    X, y = (a - gain @ np.linalg.lstsq(gain, a, rcond=None)[0] for a in (X, dead[:, 0]))
+    left = y - X @ np.linalg.lstsq(X, y, rcond=None)[0]
+    assert left @ left < 0.1 * y @ y

@@ -21,6 +21,7 @@ from magbridge.diagnose.inference.shapes import (
     REPEATED,
     SLOPES,
     bends,
+    crossing,
     curve,
     direction,
     ends,
@@ -136,6 +137,7 @@ def _of_reading(problem: Problem) -> list[Description]:
             holds=("eddy_current", "channel_skew"), turned=True,
         ),
         Description(response(problem.reading, body), bends()),
+        _of("broadband", crossing(problem.reading, body), 9),
     ]  # fmt: skip
     if problem.calibration.parameters:
         late = effect_columns(problem, ClockEffect(), mass_rates(problem))

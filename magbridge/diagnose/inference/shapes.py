@@ -14,6 +14,7 @@ __all__ = [
     "REPEATED",
     "SLOPES",
     "bends",
+    "crossing",
     "curve",
     "direction",
     "ends",
@@ -31,6 +32,8 @@ PLAYS = (0.3, 0.8)
 """Widths of the play operators that describe a channel's past, in half ranges."""
 REPEATED = 8
 """Half waves per dive of what repeats with every dive."""
+ZERO = (500.0, 1000.0, 2000.0)
+"""Widths, nT, of what happens where a channel reads zero."""
 SLOPES = (0.0, 0.1, 0.2)
 """Sines of the angles at which a loose object in the hull starts to slide."""
 
@@ -72,6 +75,17 @@ def bends() -> tuple[tuple[str, FloatArray], ...]:
     return tuple(
         ("broadband", np.tile(30.0 / width, 3)) for width in (np.sqrt(1.0 + (k / 8.0) ** 2), k**2, k**3)
     )
+
+
+def crossing(reading: FloatArray, slopes: FloatArray) -> Columns:
+    """Each channel's error where it passes zero: a feedback current turns, a converter's first bit flips (Hermite's functions)."""
+
+    def columns(rows: slice) -> FloatArray:
+        x = reading[rows].T[:, None] / np.array(ZERO)[:, None]
+        odd = x * np.exp(-0.5 * x * x)
+        return (slopes.T[:, None, rows] * odd).reshape(3 * len(ZERO), -1).T
+
+    return columns
 
 
 def curve(values: FloatArray) -> Columns:
