@@ -5,9 +5,25 @@ These names are public (files, command line, the link). Any other name is teleme
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, NamedTuple
 
-__all__ = ["CHANNELS", "CHANNEL_TIMES", "COLUMNS", "CORRECTED", "NT_PER_UNIT", "Column", "factor", "usual"]
+from magbridge.errors import FormatError
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+__all__ = [
+    "CHANNELS",
+    "CHANNEL_TIMES",
+    "COLUMNS",
+    "CORRECTED",
+    "NT_PER_UNIT",
+    "Column",
+    "factor",
+    "require",
+    "usual",
+]
 
 
 class Column(NamedTuple):
@@ -112,3 +128,18 @@ def factor(unit: str, column: str) -> float | None:
 def usual(unit: str) -> str:
     """Return the unit as it is written here: ``degC`` for ``Celsius``."""
     return _SAME.get(unit, unit)
+
+
+def require(deployment: xr.Dataset, names: Iterable[str]) -> None:
+    """Check that a deployment has these columns.
+
+    Raises
+    ------
+    FormatError
+        It lacks one: names the file, the column, and the columns that are there.
+    """
+    for name in names:
+        if name not in deployment:
+            there = " ".join(str(column) for column in deployment.data_vars)
+            source = deployment.attrs.get("source", "the deployment")
+            raise FormatError(source, f"expected this column; there are: {there}", column=name)

@@ -17,7 +17,7 @@ from magbridge.calibration.file import load as load_calibration
 from magbridge.calibration.file import save as save_calibration
 from magbridge.calibration.fitting.data import observations
 from magbridge.calibration.fitting.fit import METHODS
-from magbridge.calibration.model import identity
+from magbridge.calibration.model import Parameter, identity
 from magbridge.calibration.planning.plan import expected_calibration
 from magbridge.cli import main
 from magbridge.correction import Correction, correct_rows
@@ -184,6 +184,24 @@ def test_a_log_without_a_whole_reading_is_not_corrected(
     line = complaint(capsys, "correct", log, "--calibration", calibration, "-o", output, code=1)
     assert line == f"{log}: no row has all of mag_x mag_y mag_z"
     assert not output.exists()
+
+
+def test_a_column_that_the_calibration_needs_is_missed_aloud(
+    deployment: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    known, bare, out = tmp_path / "cal.json", tmp_path / "bare.csv", tmp_path / "x.csv"
+    save_calibration(identity((Parameter("battpos", "in", low=0.0, high=0.1, centre=0.0, scale=1.0),)), known)
+    log = read(deployment).isel(time=slice(0, 50))
+    write(log.drop_vars("battpos"), bare)
+    assert main(["correct", str(bare), "--calibration", str(known), "-o", str(out), "--json"]) == 0
+    said = capsys.readouterr()
+    assert "no column 'battpos', which the calibration needs: every sample is flagged" in said.err
+    assert json.loads(said.out)["flags"]["stale_telemetry"] == json.loads(said.out)["flagged"] == 50
+    assert main(["correct", str(deployment), "--calibration", str(known), "-o", str(out)]) == 0
+    said = capsys.readouterr()
+    assert not said.err
+    assert "stale" not in said.out
+    assert "extrapolated " in said.out
 
 
 @pytest.mark.parametrize(

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from math import inf
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from cyclopts import Parameter, validators
 
@@ -18,6 +19,7 @@ from magbridge.cli.common import (
     app,
     file_to_write,
     note_losses,
+    note_missing,
     some,
     tell,
 )
@@ -158,11 +160,12 @@ def map(  # noqa: A001 - the command's name
 def correct(*files: Path, calibration: Path, output: Log, json: Json = False) -> None:
     """Correct a log with a calibration, as the bridge would have done live.
 
-    The arithmetic and the state (lags, backlash) are the bridge's own, but the input is the log's rows. In a bridge's own log these
-    are MAG_RAW with the latest telemetry before each: the bridge itself interpolates the position of a moving mass between messages,
-    and the channels of a sensor that has no counts are float32 (to 0.002 nT of 50,000 nT). [align] of bridge.toml is not known here either. For what the bridge
-    would have published bit for bit, put the calibration into a bridge.toml and run: magbridge replay LOG --config bridge.toml
-    --log DIR. The replay also reports that this differs from what was published at the time.
+    The arithmetic and the state (lags, backlash) are the bridge's own, but the input is the log's rows. In a bridge's own
+    log these are MAG_RAW with the latest telemetry before each: the bridge itself interpolates the position of a moving
+    mass between messages, and the channels of a sensor that has no counts are float32 (to 0.002 nT of 50,000 nT). [align]
+    of bridge.toml is not known here either. For what the bridge would have published bit for bit, put the calibration
+    into a bridge.toml and run: magbridge replay LOG --config bridge.toml --log DIR. The replay also reports that this
+    differs from what was published at the time.
 
     Parameters
     ----------
@@ -183,22 +186,30 @@ def correct(*files: Path, calibration: Path, output: Log, json: Json = False) ->
     from magbridge.records import Quality
 
     some(files, output, calibration)
-    correction = Correction(load(calibration))
-    rows, flagged, whole, pieces = 0, 0, False, []
+    known = load(calibration)
+    correction = Correction(known)
+    rows, flagged, whole = 0, 0, False
+    pieces: list[dict[str, Any]] = []
+    flags: Counter[str] = Counter()
+    doubtful = ~Quality.NO_BORESIGHT  # without it, the total field is as good
     with Writer(output) as writer:
         for part in track(read_chunks(files, required=CHANNELS), "correcting"):
+            if not pieces:
+                note_missing(known, part)
             pieces.append(part.attrs)
             corrected = correct_rows(correction, part)
             writer.append(corrected)
             rows += part.sizes["time"]
             whole |= bool(part[list(CHANNELS)].to_array().notnull().all("variable").any())
-            flagged += int(
-                (corrected["quality"].to_numpy().astype(int) & ~int(Quality.NO_BORESIGHT) != 0).sum()
-            )
+            quality = corrected["quality"].to_numpy().astype(int)
+            flagged += int((quality & doubtful != 0).sum())
+            flags.update({flag.names(): int((quality & flag != 0).sum()) for flag in doubtful})
         if not whole:
             raise DataError(
                 f"{', '.join(str(file) for file in files)}: no row has all of {' '.join(CHANNELS)}"
             )
     note_losses(*pieces)
-    summary = f"{output}: {rows} samples, {flagged} of them flagged"
-    tell({"file": str(output), "rows": rows, "flagged": flagged}, summary, json)
+    facts = {"file": str(output), "rows": rows, "flagged": flagged, "flags": +flags}
+    named = ", ".join(f"{name} {count}" for name, count in (+flags).items())
+    summary = f"{output}: {rows} samples, {flagged} of them flagged" + (f" ({named})" if named else "")
+    tell(facts, summary, json)

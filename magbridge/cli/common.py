@@ -7,7 +7,7 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from hashlib import file_digest
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import msgspec
 from cyclopts import App, Parameter, Token
@@ -15,6 +15,11 @@ from cyclopts import App, Parameter, Token
 from magbridge import __version__
 from magbridge.errors import WrongUse
 from magbridge.logs import suffixes
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from magbridge.calibration.model import Calibration
 
 __all__ = [
     "Folder",
@@ -31,6 +36,7 @@ __all__ = [
     "file_to_write",
     "folder_to_write",
     "note_losses",
+    "note_missing",
     "some",
     "tell",
 ]
@@ -126,6 +132,14 @@ def note_losses(*pieces: Mapping[str, Any]) -> None:
     if counts := passed_over(*pieces):
         told = ", ".join(f"{name.replace('_', ' ')} {count}" for name, count in counts.items())
         complain(f"in the logs: {told}", 0)
+
+
+def note_missing(calibration: Calibration, deployment: xr.Dataset) -> None:
+    """Say on stderr which columns the calibration needs and a log does not have."""
+    for name in calibration.channels:
+        if name not in deployment:
+            lacking = f"{deployment.attrs['source']}: no column {name!r}, which the calibration needs"
+            complain(f"{lacking}: every sample is flagged, with a sigma to match", 0)
 
 
 def tell(result: dict[str, Any], sentence: str, as_json: bool) -> None:

@@ -6,7 +6,18 @@ from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from magbridge.cli.common import Heading, Json, Log, Picture, app, complain, note_losses, some, tell
+from magbridge.cli.common import (
+    Heading,
+    Json,
+    Log,
+    Picture,
+    app,
+    complain,
+    note_losses,
+    note_missing,
+    some,
+    tell,
+)
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -80,6 +91,7 @@ def navigate(
 
     deployment = with_true_heading(read(files, required=CHANNELS), heading_reference)
     note_losses(deployment.attrs)
+    note_missing(known, deployment)
     corrected = correct_rows(Correction(known), deployment)
     if options is None:
         options = informed(Options(), known, float(corrected["total_field_sigma"].median()))

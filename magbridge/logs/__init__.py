@@ -27,6 +27,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
+from magbridge.columns import require
 from magbridge.errors import FormatError
 from magbridge.files import atomic_path
 
@@ -106,15 +107,6 @@ def _chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
         raise FormatError(path, f"cannot be read: {error.strerror or error}") from error
 
 
-def _require(dataset: xr.Dataset, required: Iterable[str]) -> None:
-    for name in required:
-        if name not in dataset:
-            there = " ".join(str(name) for name in dataset.data_vars)
-            raise FormatError(
-                dataset.attrs["source"], f"expected this column; there are: {there}", column=name
-            )
-
-
 def read(paths: Paths, *, required: Iterable[str] = ()) -> xr.Dataset:
     """Return one deployment from one file or several, sorted in time.
 
@@ -141,7 +133,7 @@ def read(paths: Paths, *, required: Iterable[str] = ()) -> xr.Dataset:
     from magbridge.logs.deployment import join  # noqa: PLC0415 - xarray is for ashore
 
     dataset = join([part for path in _paths(paths) for part in _chunks(path, 1 << 40)])
-    _require(dataset, required)
+    require(dataset, required)
     return dataset
 
 
@@ -161,7 +153,7 @@ def read_chunks(paths: Paths, rows: int = 65536, *, required: Iterable[str] = ()
     sources = [partial(_chunks, path) for path in _paths(paths)]
     required = tuple(required)
     for dataset in sources[0](rows) if len(sources) == 1 else merge(sources, rows):
-        _require(dataset, required)
+        require(dataset, required)
         yield dataset
 
 

@@ -70,7 +70,8 @@ def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
             else:
                 raise FormatError(path, f"expected the dimension {DIMENSION} (OG1.0) or a Seaglider's file")
     except (OSError, RuntimeError, UnicodeDecodeError) as error:
-        raise FormatError(path, f"expected a whole netCDF file: {error}") from None
+        reason = getattr(error, "strerror", None) or error
+        raise FormatError(path, f"expected a whole netCDF file: {reason}") from None
 
 
 def _chunks(path: Path, file: Any, rows: int) -> Iterator[xr.Dataset]:

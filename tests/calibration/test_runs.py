@@ -23,7 +23,7 @@ from magbridge.calibration.model import Calibration, Noise, Parameter, Reference
 from magbridge.calibration.planning.limits import Limits, PlannedRun, settled, trim_of
 from magbridge.calibration.planning.plan import evaluate_runs, expected_calibration, plan
 from magbridge.calibration.terms import Effect, full_order
-from magbridge.errors import CalibrationError, ConfigError
+from magbridge.errors import CalibrationError, ConfigError, FormatError
 from sitl.mission import TABLE_1
 
 Gliders = Callable[..., Any]
@@ -191,7 +191,7 @@ def test_a_deployment_s_columns_become_observations() -> None:
     assert data.names == ("battpos",)
     assert data.units == ("in",)
     assert len(data) == n
-    with pytest.raises(CalibrationError, match="column 'fin' is missing: the deployment has battpos"):
+    with pytest.raises(FormatError, match=r"column 'fin': expected .*; there are: .* battpos"):
         observations(ds, ["fin"])
     with pytest.raises(CalibrationError, match="'battpos': expected numbers"):
         observations(ds.assign(battpos=("time", np.array(["a"] * n))), ["battpos"])

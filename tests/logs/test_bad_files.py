@@ -200,7 +200,7 @@ def test_netcdf_whose_names_are_no_text(tmp_path: Path) -> None:
         file.createDimension("N_MEASUREMENTS", 2)
         file.createVariable("BATTPOS", "f8", ("N_MEASUREMENTS",))
     path.write_bytes(path.read_bytes().replace(b"BATTPOS", b"BAT\x96POS"))
-    with pytest.raises(FormatError, match=r"log\.nc: expected a whole netCDF file: "):
+    with pytest.raises(FormatError, match=r"log\.nc: expected a whole netCDF file: NetCDF: "):
         logs.read(path)
 
 

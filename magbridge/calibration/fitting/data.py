@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from magbridge.calibration.model import Parameter
 from magbridge.calibration.residual import Samples
 from magbridge.calibration.terms import Exponents
-from magbridge.columns import CHANNELS, COLUMNS
+from magbridge.columns import CHANNELS, COLUMNS, require
 from magbridge.errors import CalibrationError
 from magbridge.records import BEYOND
 
@@ -221,8 +221,10 @@ def observations(
 
     Raises
     ------
+    FormatError
+        A column is missing.
     CalibrationError
-        A column is missing or does not hold numbers; a parameter is a column that says something else.
+        A column does not hold numbers; a parameter is a column that says something else.
     """
     if others := [name for name in parameters if name in COLUMNS and name not in FOLLOWED]:
         raise CalibrationError(f"parameter {others[0]!r} is {COLUMNS[others[0]].long_name}: it moves no mass")
@@ -275,9 +277,7 @@ def _at_common_time(ds: xr.Dataset, axis: str, values: FloatArray) -> FloatArray
 
 
 def _column(ds: xr.Dataset, name: str) -> FloatArray:
-    if name not in ds:
-        known = ", ".join(sorted(str(column) for column in ds.data_vars))
-        raise CalibrationError(f"column {name!r} is missing: the deployment has {known}")
+    require(ds, [name])
     values = np.asarray(ds[name].values)
     if values.dtype.kind not in "fiub":
         raise CalibrationError(f"column {name!r}: expected numbers, found {values.dtype}")
