@@ -193,6 +193,15 @@ def test_netcdf_of_another_shape(tmp_path: Path) -> None:
         logs.read(path)
 
 
+def test_netcdf_that_is_cut_short_is_told_in_the_library_s_words_alone(tmp_path: Path) -> None:
+    path = tmp_path / "log.nc"
+    logs.write(deployment(path, np.arange(100.0), {"mag_x": np.ones(100)}), path)
+    path.write_bytes(path.read_bytes()[:-1000])
+    with pytest.raises(FormatError) as refused:
+        logs.read(path)
+    assert str(refused.value) == f"{path}: expected a whole netCDF file: NetCDF: HDF error"
+
+
 def test_netcdf_whose_names_are_no_text(tmp_path: Path) -> None:
     netCDF4 = pytest.importorskip("netCDF4")
     path = tmp_path / "log.nc"
@@ -200,7 +209,7 @@ def test_netcdf_whose_names_are_no_text(tmp_path: Path) -> None:
         file.createDimension("N_MEASUREMENTS", 2)
         file.createVariable("BATTPOS", "f8", ("N_MEASUREMENTS",))
     path.write_bytes(path.read_bytes().replace(b"BATTPOS", b"BAT\x96POS"))
-    with pytest.raises(FormatError, match=r"log\.nc: expected a whole netCDF file: NetCDF: "):
+    with pytest.raises(FormatError, match=r"log\.nc: expected a whole netCDF file: 'utf-8'"):
         logs.read(path)
 
 
