@@ -77,16 +77,21 @@ def diagnose(
     if doubt := unsettled(found.problem, found.named, found.calibration):
         complain(doubt, 0)
     facts = findings(found, CAUSES)
-    causes = [_plain(one) for one in facts["findings"]]
-    if facts["verdict"] == "unexplained" and (within := facts["unexplained"]["alternatives"]):
-        causes = [f"no name asserted; within 20:1: {', '.join(_plain(one) for one in within)}"]
-    said = ", ".join(causes) or "no cause"
-    if rest := facts["unexplained"]:
-        said += f"; left without a name: {rest['kind']}, S/N {rest['signal_to_noise']:.3g}"
     rms = f"{facts['rms_before_nT']:.2f} -> {facts['rms_after_nT']:.2f} nT RMS held out"
     if found.findings and not found.total.shown:
         rms += ", no gain shown (95 %: {:.2f} to {:.2f} times)".format(*found.total.interval)
-    tell(facts, f"{facts['verdict']}: {said}; {rms}; {output / 'report.html'}", json)
+    tell(facts, f"{facts['verdict']}: {causes_of(facts)}; {rms}; {output / 'report.html'}", json)
+
+
+def causes_of(facts: dict[str, Any]) -> str:
+    """Return the causes found, each with those that the data cannot tell from it, and what is left, in one line."""
+    causes = [" or ".join(map(_plain, [one, *one["alternatives"]])) for one in facts["findings"]]
+    if facts["verdict"] == "unexplained" and (within := facts["unexplained"]["alternatives"]):
+        causes = [f"no name asserted; within 20:1: {', '.join(map(_plain, within))}"]
+    said = ", ".join(causes) or "no cause"
+    if rest := facts["unexplained"]:
+        said += f"; left without a name: {rest['kind']}, S/N {rest['signal_to_noise']:.3g}"
+    return said
 
 
 def _plain(one: dict[str, Any]) -> str:

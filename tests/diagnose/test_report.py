@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from magbridge.cli.diagnose import causes_of
 from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.compare.problem import Problem
@@ -15,7 +16,7 @@ from magbridge.diagnose.gain import Gain
 from magbridge.diagnose.inference.rivals import Rival
 from magbridge.diagnose.inference.unexplained import Leftover
 from magbridge.diagnose.report.doubts import IMPLAUSIBLE, gained, implausible, nameless, no_gain, unsettled
-from magbridge.diagnose.report.words import measured, number, physics, sizes
+from magbridge.diagnose.report.words import chance, measured, number, physics, sizes
 
 
 @pytest.mark.parametrize("cause", CAUSES)
@@ -47,6 +48,26 @@ def test_a_number_is_written_to_two_digits_of_its_sigma(value: float, sigma: flo
 )
 def test_a_size_is_written_without_an_exponent(value: float, told: str) -> None:
     assert number(value) == told
+
+
+@pytest.mark.parametrize(
+    ("p_value", "told"),
+    [(0.5, "0.5"), (0.00231, "0.002"), (3.4e-8, "3·10⁻⁸"), (9.7e-10, "1·10⁻⁹"), (0.0, "below 1·10⁻⁹⁹")],
+)
+def test_a_chance_is_written_to_one_digit(p_value: float, told: str) -> None:
+    assert chance(p_value) == told
+
+
+def test_the_command_s_line_names_every_cause_that_may_be_it() -> None:
+    clock = {"cause": "clock_offset", "channel": None}
+    current = {"cause": "current_field", "channel": "pitch_current"}
+    rest = {"kind": "drift", "signal_to_noise": 7.04, "alternatives": [clock, current]}
+    found = {"verdict": "explained", "findings": [clock | {"alternatives": [current]}], "unexplained": None}
+    assert causes_of(found) == "clock_offset or current_field (pitch_current)"
+    nameless = {"verdict": "unexplained", "findings": [], "unexplained": rest}
+    words = "no name asserted; within 20:1: clock_offset, current_field (pitch_current)"
+    assert causes_of(nameless) == f"{words}; left without a name: drift, S/N 7.04"
+    assert causes_of(nameless | {"unexplained": None, "verdict": "nothing_found"}) == "no cause"
 
 
 def test_sizes_of_one_unit_name_it_once() -> None:

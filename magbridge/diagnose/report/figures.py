@@ -13,7 +13,7 @@ from matplotlib.ticker import LogFormatter, MaxNLocator
 from numpy.typing import NDArray
 from scipy.signal import periodogram
 
-from magbridge.diagnose.report.words import label
+from magbridge.diagnose.report.words import chance, label
 
 if TYPE_CHECKING:
     from magbridge.diagnose.diagnosis import Diagnosis
@@ -256,9 +256,7 @@ def evidence(diagnosis: Diagnosis) -> str:
         [np.sqrt(max(tested[name][1], 0.0)) for name in order],
         color=[AFTER if name in named else FAINT for name in order],
     )
-    chances = [tested[name][0] for name in order]
-    told = [f" p = {p:.1g}" if p > 1e-99 else " p < 1e-99" for p in chances]
-    axis.bar_label(bars, told, fontsize=7, color=INK)
+    axis.bar_label(bars, [f" p: {chance(tested[name][0])}" for name in order], fontsize=7, color=INK)
     axis.margins(x=0.2)
     axis.set_xlabel("root of the likelihood ratio; p: chance of a false alarm", fontsize=8)
     return _png(figure)

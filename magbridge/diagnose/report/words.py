@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 __all__ = ["MANY", "chance", "label", "listed", "measured", "number", "physics", "plain", "sizes"]
 
+RAISED = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
 MANY = 24
 """Numbers that a table shows unfolded."""
 
@@ -57,8 +58,11 @@ def measured(value: float, sigma: float | None) -> str:
 
 
 def chance(p_value: float) -> str:
-    """Write a probability to one digit."""
-    return f"{p_value:.1g}" if p_value > 1e-99 else "below 1e-99"
+    """Write a probability to one digit, without a place where a line could break: 0.002, 3·10⁻⁸."""
+    if p_value > 1e-4:
+        return f"{p_value:.1g}"
+    digit, power = f"{max(p_value, 1e-99):.0e}".split("e-")
+    return ("" if p_value > 1e-99 else "below ") + f"{digit}·10⁻{power.lstrip('0').translate(RAISED)}"
 
 
 def sizes(smallest: Mapping[str, tuple[float, str]]) -> str:
