@@ -22,7 +22,7 @@ from magbridge.version import __version__
 if TYPE_CHECKING:
     from magbridge.calibration.correct import Corrector, correct
     from magbridge.calibration.file import load, save
-    from magbridge.calibration.fitting.data import observations
+    from magbridge.calibration.fitting.columns import observations
     from magbridge.calibration.fitting.fit import fit
     from magbridge.calibration.model import Calibration
     from magbridge.correction import Correction, correct_rows
@@ -58,7 +58,7 @@ _HOMES = {
     "correct_rows": "correction",
     "fit": "calibration.fitting.fit",
     "load": "calibration.file",
-    "observations": "calibration.fitting.data",
+    "observations": "calibration.fitting.columns",
     "read": "logs",
     "read_grid": "field.read",
     "reference_field": "field.reference",

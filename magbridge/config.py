@@ -6,17 +6,15 @@ Everything is checked before anything is opened. Paths in the file are relative 
 from __future__ import annotations
 
 import hashlib
-import re
-import tomllib
-from collections.abc import Mapping
 from math import inf, isfinite
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any
 
 import msgspec
 from msgspec import Meta
 
 from magbridge.errors import ConfigError
+from magbridge.toml import Table, check_entries, convert, load_toml
 
 __all__ = [
     "Align",
@@ -27,23 +25,15 @@ __all__ = [
     "Navigation",
     "Sensor",
     "Telemetry",
-    "check_entries",
-    "convert",
     "load",
-    "load_toml",
 ]
 
-T = TypeVar("T")
 Positive = Annotated[float, Meta(gt=0, le=1e9)]
 NotNegative = Annotated[float, Meta(ge=0, le=1e9)]
 """Bounded, because TOML has ``inf``, while deadlines and sizes are integers inside."""
 Rate = Annotated[float, Meta(ge=-1e9, le=1e9)]
 Name = Annotated[str, Meta(min_length=1)]
 SystemId = Annotated[int, Meta(ge=1, le=255)]
-
-
-class Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A table of the file: its fields are the only keys it may have."""
 
 
 class Sensor(Table, frozen=True):
@@ -246,49 +236,3 @@ def load(path: str | Path) -> Config:
         if name is not None and not config.resolve(name).exists():
             raise ConfigError(path, key, f"no such file: {config.resolve(name)}")
     return config
-
-
-def load_toml(path: str | Path) -> dict[str, Any]:
-    """Read a TOML file; raise :class:`ConfigError` where it is missing or not TOML."""
-    try:
-        return tomllib.loads(Path(path).read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ConfigError(path, "", error.strerror or str(error)) from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigError(path, "", f"not TOML: {error}") from error
-
-
-def check_entries(table: Mapping[str, Any], key: str, kind: Any, path: str | Path, prefix: str = "") -> None:
-    """Check each entry of the table `key` under its own name, which :func:`convert` of the whole does not tell.
-
-    Raises
-    ------
-    ConfigError
-        As :func:`convert`.
-    """
-    entries = table.get(key)
-    for name, value in entries.items() if isinstance(entries, dict) else ():
-        convert(value, kind, path, f"{prefix}{key}.{name}.")
-
-
-def convert(table: Any, kind: type[T], path: str | Path, prefix: str = "") -> T:
-    """Convert what stands in a TOML file to `kind`, a struct or a plain type.
-
-    Raises
-    ------
-    ConfigError
-        Names the key (`prefix` before it) and what was expected.
-    """
-    try:
-        return msgspec.convert(table, kind)
-    except msgspec.ValidationError as error:
-        sentence, _, where = str(error).partition(" - at ")
-        keys = where.strip("`").removeprefix("$").lstrip(".")
-        for pattern in (
-            r"Object contains unknown field `(?P<key>[^`]*)`",
-            r"Object missing required field `(?P<key>[^`]*)`",
-        ):
-            if match := re.match(pattern, sentence):
-                keys = f"{keys}.{match['key']}".lstrip(".")
-                sentence = "unknown key" if "unknown" in sentence else "missing key"
-        raise ConfigError(path, f"{prefix}{keys}".rstrip("."), sentence[0].lower() + sentence[1:]) from error

@@ -12,9 +12,9 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from magbridge.bridge.pipeline import Start
+from magbridge.bridge.events import Start
 from magbridge.calibration.file import save
-from magbridge.calibration.fitting.data import observations
+from magbridge.calibration.fitting.columns import observations
 from magbridge.calibration.fitting.fit import Fit, fit
 from magbridge.calibration.fitting.lowpass import unfiltered
 from magbridge.config import load as load_config

@@ -10,7 +10,8 @@ from msgspec import Meta
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from magbridge.config import NotNegative, Positive, Table
+from magbridge.config import NotNegative, Positive
+from magbridge.toml import Table
 from sitl.signals import autoregressive, first_order, first_order_at
 
 __all__ = ["Instrument", "Samples"]

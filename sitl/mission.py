@@ -9,7 +9,8 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from magbridge.config import NotNegative, Positive, Table
+from magbridge.config import NotNegative, Positive
+from magbridge.toml import Table
 from sitl.platform import MOUNTINGS
 
 __all__ = ["LIMITS", "TABLE_1", "CrissCross", "Leg", "Legs", "Limit", "Part", "Run", "Spirals"]

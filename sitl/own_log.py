@@ -6,8 +6,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from itertools import groupby
 from pathlib import Path
 
-from magbridge.bridge.events import Event
-from magbridge.bridge.pipeline import Start
+from magbridge.bridge.events import Event, Start
 from magbridge.errors import FormatError
 from magbridge.link.component import TIMESYNC_US
 from magbridge.mavlink import LogReader, Record, TapeReader, spec

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from magbridge.calibration.forward import forward
 from magbridge.calibration.model import Calibration
-from magbridge.config import Table
+from magbridge.toml import Table
 from sitl.world import MU_0_OVER_4_PI, dipole_field
 
 __all__ = ["MOUNTINGS", "Calibrated", "Mass", "Mounting", "Vehicle", "draw_vehicle"]

@@ -13,7 +13,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from magbridge.bridge.pipeline import Start
+from magbridge.bridge.events import Start
 from magbridge.columns import CHANNELS
 from magbridge.config import load
 from magbridge.errors import DataError, WrongUse

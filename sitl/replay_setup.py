@@ -16,7 +16,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from magbridge.calibration.file import save
-from magbridge.calibration.fitting.data import observations
+from magbridge.calibration.fitting.columns import observations
 from magbridge.calibration.fitting.fit import fit
 from magbridge.columns import CHANNELS, COLUMNS
 from magbridge.errors import CalibrationError, FormatError

@@ -14,15 +14,15 @@ from pathlib import Path
 
 import msgspec
 
-from magbridge.bridge.events import Event
-from magbridge.bridge.pipeline import Start
+from magbridge.bridge.events import Event, Start
+from magbridge.bridge.journal import declarations
 from magbridge.bridge.port import Port
 from magbridge.bridge.run import drive, set_up
 from magbridge.bridge.serial_port import SerialPort
 from magbridge.bridge.sockets import open_link
 from magbridge.config import Log, load
 from magbridge.errors import MagbridgeError, WriteError
-from magbridge.logs.tlog import TlogWriter, declarations
+from magbridge.logs.tlog import TlogWriter
 from magbridge.records import Channel
 from sitl.timetable import read_entries
 

@@ -9,8 +9,9 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from magbridge.config import NotNegative, Table, check_entries, convert, load_toml
+from magbridge.config import NotNegative
 from magbridge.errors import ConfigError
+from magbridge.toml import Table, check_entries, convert, load_toml
 from sitl.instrument import Instrument
 from sitl.mission import LIMITS, Limit, Part
 from sitl.platform import MOUNTINGS, Mass, Vehicle

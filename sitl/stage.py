@@ -19,8 +19,7 @@ from pathlib import Path
 
 import msgspec
 
-from magbridge.bridge.events import Event
-from magbridge.bridge.pipeline import Start
+from magbridge.bridge.events import Event, Start
 from magbridge.errors import MagbridgeError, PortError, WrongUse
 from magbridge.records import Channel
 from sitl.timetable import Entry, pace

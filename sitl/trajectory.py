@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from magbridge.config import NotNegative, Positive, Table
+from magbridge.config import NotNegative, Positive
 from magbridge.errors import OutOfRange
 from magbridge.field.earth import offset, separation
+from magbridge.toml import Table
 from sitl.mission import LIMITS, Leg, Limit
 from sitl.signals import autoregressive, first_order
 

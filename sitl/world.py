@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from magbridge.config import Table
 from magbridge.field.earth import offset, separation
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.igrf import igrf, total_field
+from magbridge.toml import Table
 
 __all__ = ["Geology", "Rock", "Water", "World", "dipole_field"]
 

@@ -35,7 +35,7 @@ from rich.progress import track
 from scipy.optimize import least_squares
 from terminal import command_line, table
 
-from magbridge.calibration.fitting.data import observations
+from magbridge.calibration.fitting.columns import observations
 from magbridge.calibration.fitting.fit import fit
 from magbridge.columns import CHANNELS
 from magbridge.errors import CalibrationError

@@ -18,7 +18,7 @@ import numpy as np
 import xarray as xr
 from study.stage import CHARTS
 
-from magbridge.calibration.fitting.data import observations
+from magbridge.calibration.fitting.columns import observations
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.model import Calibration
 from magbridge.diagnose.run import diagnose

@@ -20,7 +20,8 @@ from rich.console import Console
 from rich.progress import track
 from terminal import command_line, table
 
-from magbridge.calibration.fitting.data import Observations, observations
+from magbridge.calibration.fitting.columns import observations
+from magbridge.calibration.fitting.data import Observations
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.mission import Mission
 from magbridge.calibration.planning.limits import Limits, PlannedRun, settled, trim_of

@@ -8,7 +8,25 @@ import msgspec
 
 from magbridge.records import Channel
 
-__all__ = ["Clock", "Event"]
+__all__ = ["Clock", "Event", "Start"]
+
+
+class Start(msgspec.Struct, frozen=True):
+    """All that a run depends on beside its configuration, its calibration and its events.
+
+    Attributes
+    ----------
+    time_us : int
+        µs since 1970 UTC, a multiple of 4.
+    parameters : dict of str to float
+        Values that a station set in earlier runs.
+    signing_timestamp : int
+        The last one that was used.
+    """
+
+    time_us: int
+    parameters: dict[str, float] = {}
+    signing_timestamp: int = 0
 
 
 class Event(msgspec.Struct, frozen=True, gc=False):

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from struct import Struct
 
+from magbridge.config import Telemetry
 from magbridge.mavlink import Codec, spec
 from magbridge.records import Channel
 
-__all__ = ["Journal"]
+__all__ = ["Journal", "declarations"]
 
 BYTES, RAW = spec("MAG_SENSOR_BYTES"), spec("MAG_RAW")
 HEAD = Struct("<BB")
@@ -68,3 +69,45 @@ class Journal:
         if self.active:
             self._records += records
             self.count += len(records)
+
+
+def declarations(
+    system: int, component: int, telemetry: Mapping[str, Telemetry], nt_per_count: float = 0.0
+) -> list[bytes]:
+    """Return the frames that tell a reader of the log which field of which message a column is.
+
+    Parameters
+    ----------
+    system, component : int
+        The bridge's own.
+    telemetry : mapping of str to Telemetry
+        By parameter.
+    nt_per_count : float
+        nT, of one count of the sensor: float32, as MAG_RAW tells a channel, is less than what was corrected; 0 for a
+        sensor without counts.
+    """
+    codec = Codec(system, component)
+    columns = [
+        {
+            "column": name,
+            "unit": one.unit,
+            "message": one.message,
+            "field": one.field,
+            "match": ",".join(f"{field}={value}" for field, value in one.match.items()),
+            "scale": one.scale,
+            "offset": one.offset,
+        }
+        for name, one in telemetry.items()
+    ]
+    if nt_per_count:
+        columns += [
+            {
+                "column": f"mag_{axis}",
+                "unit": "nT",
+                "message": "MAG_RAW",
+                "field": f"count_{axis}",
+                "scale": nt_per_count,
+            }
+            for axis in "xyz"
+        ]
+    return [codec.pack("MAG_COLUMN", **column) for column in columns]

@@ -8,7 +8,7 @@ from math import degrees, nan
 import numpy as np
 
 from magbridge.calibration.model import Calibration
-from magbridge.config import Config, convert
+from magbridge.config import Config
 from magbridge.errors import ConfigError
 from magbridge.field.earth import separation
 from magbridge.field.grid import AnomalyGrid
@@ -23,6 +23,7 @@ from magbridge.navigate.depth import at_depth
 from magbridge.navigate.model import informed
 from magbridge.navigate.record import Reckoned
 from magbridge.records import Corrected
+from magbridge.toml import convert
 
 __all__ = ["Navigation", "open_navigation"]
 

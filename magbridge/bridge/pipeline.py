@@ -7,9 +7,7 @@ from collections.abc import Mapping
 from math import nan
 from typing import TYPE_CHECKING
 
-import msgspec
-
-from magbridge.bridge.events import Event
+from magbridge.bridge.events import Event, Start
 from magbridge.bridge.journal import Journal
 from magbridge.bridge.position import Position
 from magbridge.bridge.sensor_line import SensorLine
@@ -39,31 +37,13 @@ from magbridge.version import __version__
 if TYPE_CHECKING:
     from magbridge.bridge.navigation import Navigation  # it brings filterpy, which few vehicles carry
 
-__all__ = ["Pipeline", "Start"]
+__all__ = ["Pipeline"]
 
 LATELY = 64
 """Samples over which the sample rate is told."""
 DOUBTS = int(Quality.STALE_TELEMETRY | Quality.SATURATED | Quality.UNCALIBRATED | Quality.OFFSET_SUSPECT)
 """Flags whose coming and going is told; the others come and go with every manoeuvre."""
 CLOCK_STEP, NOTICE, PORT = (spec(name).id for name in ("MAG_CLOCK_STEP", "STATUSTEXT", "MAG_PORT"))
-
-
-class Start(msgspec.Struct, frozen=True):
-    """All that a run depends on beside its configuration, its calibration and its events.
-
-    Attributes
-    ----------
-    time_us : int
-        µs since 1970 UTC, a multiple of 4.
-    parameters : dict of str to float
-        Values that a station set in earlier runs.
-    signing_timestamp : int
-        The last one that was used.
-    """
-
-    time_us: int
-    parameters: dict[str, float] = {}
-    signing_timestamp: int = 0
 
 
 class Pipeline:

@@ -13,16 +13,17 @@ from threading import Thread
 from typing import Protocol
 
 from magbridge.bridge import states
-from magbridge.bridge.events import Clock, Event
+from magbridge.bridge.events import Clock, Event, Start
+from magbridge.bridge.journal import declarations
 from magbridge.bridge.live import LiveEdge
-from magbridge.bridge.pipeline import Pipeline, Start
+from magbridge.bridge.pipeline import Pipeline
 from magbridge.bridge.serial_port import SerialPort
 from magbridge.bridge.sockets import open_link
 from magbridge.calibration import file as calibration_file
 from magbridge.config import Config, load
 from magbridge.errors import PortError
 from magbridge.link import store
-from magbridge.logs.tlog import TlogWriter, declarations
+from magbridge.logs.tlog import TlogWriter
 from magbridge.mavlink import load_key
 from magbridge.records import Channel
 

@@ -77,7 +77,7 @@ def calibrate(
         Print the result as JSON.
     """
     from magbridge.calibration.file import save
-    from magbridge.calibration.fitting.data import observations
+    from magbridge.calibration.fitting.columns import observations
     from magbridge.calibration.fitting.fit import fit
     from magbridge.calibration.fitting.geometry import read_vehicle
     from magbridge.calibration.fitting.lowpass import unfiltered

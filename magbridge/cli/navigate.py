@@ -174,9 +174,9 @@ def _where_it_swims(
 
 def _options(config: Path | None) -> Options | None:
     """Return the options of a bridge's configuration; None where it has none."""
-    from magbridge.config import convert, load_toml
     from magbridge.errors import ConfigError
     from magbridge.navigate import Options
+    from magbridge.toml import convert, load_toml
 
     if config is None:
         return None

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import os
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
@@ -22,12 +22,11 @@ from threading import Event, Thread
 from types import TracebackType
 from typing import Self
 
-from magbridge.config import Telemetry
 from magbridge.errors import PortError
-from magbridge.mavlink import Codec, pack_record
+from magbridge.mavlink import pack_record
 from magbridge.records import Channel
 
-__all__ = ["TlogWriter", "declarations"]
+__all__ = ["TlogWriter"]
 
 Record = tuple[int, int, bytes]
 """µs of the event, channel, frame."""
@@ -253,45 +252,3 @@ class TlogWriter:
 
 def _packed(records: Sequence[Record]) -> bytes:
     return b"".join([pack_record(*record) for record in records])
-
-
-def declarations(
-    system: int, component: int, telemetry: Mapping[str, Telemetry], nt_per_count: float = 0.0
-) -> list[bytes]:
-    """Return the frames that tell a reader of the log which field of which message a column is.
-
-    Parameters
-    ----------
-    system, component : int
-        The bridge's own.
-    telemetry : mapping of str to Telemetry
-        By parameter.
-    nt_per_count : float
-        nT, of one count of the sensor: float32, as MAG_RAW tells a channel, is less than what was corrected; 0 for a
-        sensor without counts.
-    """
-    codec = Codec(system, component)
-    columns = [
-        {
-            "column": name,
-            "unit": one.unit,
-            "message": one.message,
-            "field": one.field,
-            "match": ",".join(f"{field}={value}" for field, value in one.match.items()),
-            "scale": one.scale,
-            "offset": one.offset,
-        }
-        for name, one in telemetry.items()
-    ]
-    if nt_per_count:
-        columns += [
-            {
-                "column": f"mag_{axis}",
-                "unit": "nT",
-                "message": "MAG_RAW",
-                "field": f"count_{axis}",
-                "scale": nt_per_count,
-            }
-            for axis in "xyz"
-        ]
-    return [codec.pack("MAG_COLUMN", **column) for column in columns]

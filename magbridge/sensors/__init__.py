@@ -11,9 +11,9 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, ClassVar, Protocol
 
-from magbridge.config import convert
 from magbridge.errors import ConfigError
 from magbridge.records import Reading
+from magbridge.toml import convert
 
 __all__ = ["DRIVERS", "Driver", "open_driver"]
 

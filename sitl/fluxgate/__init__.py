@@ -10,8 +10,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from magbridge.config import convert
 from magbridge.errors import ConfigError
+from magbridge.toml import convert
 from sitl.fluxgate.ascii import AsciiEncoder
 from sitl.fluxgate.digitizer import DigitizerEncoder
 from sitl.fluxgate.encoder import Encoder

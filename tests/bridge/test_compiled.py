@@ -18,7 +18,7 @@ from pathlib import Path
 from benchmarks.processor import Edge
 from benchmarks.workload import BEGIN_US, Feed, write_config
 from magbridge import align
-from magbridge.bridge.pipeline import Start
+from magbridge.bridge.events import Start
 from magbridge.bridge.run import drive, set_up
 from magbridge.config import load
 

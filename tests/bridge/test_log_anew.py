@@ -9,10 +9,11 @@ from pathlib import Path
 
 from small import START, small_bridge
 
-from magbridge.bridge.events import Event
-from magbridge.bridge.pipeline import Pipeline, Start
+from magbridge.bridge.events import Event, Start
+from magbridge.bridge.journal import declarations
+from magbridge.bridge.pipeline import Pipeline
 from magbridge.calibration.model import Parameter
-from magbridge.logs.tlog import TlogWriter, declarations
+from magbridge.logs.tlog import TlogWriter
 from magbridge.mavlink import Codec
 from magbridge.records import Channel
 from sitl.own_log import Recorded, is_own_log, runs

@@ -11,8 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from magbridge.bridge.events import Event
-from magbridge.bridge.pipeline import Start
+from magbridge.bridge.events import Event, Start
 from magbridge.bridge.run import set_up
 from magbridge.calibration.file import save
 from magbridge.calibration.model import Noise, identity

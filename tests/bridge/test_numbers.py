@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 from small import START, small_bridge
 
-from magbridge.bridge.events import Event
-from magbridge.bridge.pipeline import Pipeline, Start
+from magbridge.bridge.events import Event, Start
+from magbridge.bridge.pipeline import Pipeline
 from magbridge.calibration.model import Parameter
 from magbridge.mavlink import Codec, Message
 from magbridge.records import Channel, Quality

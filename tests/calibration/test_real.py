@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from magbridge.calibration.fitting.data import observations
+from magbridge.calibration.fitting.columns import observations
 from magbridge.calibration.fitting.validate import leave_runs_out
 from magbridge.errors import CalibrationError
 from magbridge.field.declination import with_true_heading

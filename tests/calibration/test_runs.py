@@ -14,7 +14,8 @@ from scipy.spatial.transform import Rotation
 from magbridge.calibration.correct import correct
 from magbridge.calibration.dipole import Dipole, dipole_tensor
 from magbridge.calibration.fitting.boresight import field_body, find_boresight
-from magbridge.calibration.fitting.data import Observations, observations, polynomial_samples
+from magbridge.calibration.fitting.columns import observations
+from magbridge.calibration.fitting.data import Observations, polynomial_samples
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.geometry import read_vehicle
 from magbridge.calibration.fitting.identify import combinations

@@ -11,7 +11,7 @@ import pytest
 import xarray as xr
 
 from magbridge.calibration.file import save
-from magbridge.calibration.fitting.data import observations
+from magbridge.calibration.fitting.columns import observations
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.model import Calibration, Sensor
 from magbridge.cli import main

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from magbridge.bridge.pipeline import Pipeline, Start
+from magbridge.bridge.events import Start
+from magbridge.bridge.pipeline import Pipeline
 from magbridge.bridge.run import set_up
 from magbridge.calibration.file import save
 from magbridge.calibration.model import Calibration, Noise, Parameter, Reference

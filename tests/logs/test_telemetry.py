@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from magbridge import logs
+from magbridge.bridge.journal import declarations
 from magbridge.config import Telemetry
 from magbridge.errors import FormatError
-from magbridge.logs.tlog import TlogWriter, declarations
+from magbridge.logs.tlog import TlogWriter
 from magbridge.mavlink import Codec, pack_record
 from magbridge.records import Channel, Quality
 

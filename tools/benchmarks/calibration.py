@@ -14,7 +14,8 @@ from scipy.optimize import least_squares
 from threadpoolctl import threadpool_limits
 
 from magbridge.calibration.correct import CHUNK, Corrector, correct
-from magbridge.calibration.fitting.data import Observations, observations, polynomial_samples
+from magbridge.calibration.fitting.columns import observations
+from magbridge.calibration.fitting.data import Observations, polynomial_samples
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.kernel import Kernel
 from magbridge.calibration.residual import residuals_of

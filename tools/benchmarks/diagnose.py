@@ -10,7 +10,7 @@ import xarray as xr
 from benchmarks.apart import apart
 from benchmarks.row import Row
 
-from magbridge.calibration.fitting.data import observations
+from magbridge.calibration.fitting.columns import observations
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.model import Calibration
 from sitl import load, segments, simulate

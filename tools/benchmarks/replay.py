@@ -18,7 +18,7 @@ from benchmarks.peer import Peer
 from benchmarks.row import Row
 from benchmarks.workload import write_config
 
-from magbridge.bridge.pipeline import Start
+from magbridge.bridge.events import Start
 from magbridge.config import load
 from magbridge.records import Channel
 from sitl.emulation import emulate, start_us

@@ -14,7 +14,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from magbridge.calibration.correct import regressors
-from magbridge.calibration.fitting.data import observations
+from magbridge.calibration.fitting.columns import observations
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.residual import Samples, residuals

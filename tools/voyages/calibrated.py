@@ -8,7 +8,7 @@ import numpy as np
 from accuracy import rms, total
 from msgspec.structs import replace as with_options
 
-from magbridge.calibration.fitting.data import observations
+from magbridge.calibration.fitting.columns import observations
 from magbridge.calibration.fitting.fit import fit
 from magbridge.correction import Correction, correct_rows
 from magbridge.field.earth import separation

@@ -1,11 +1,11 @@
-"""From a deployment, or plain arrays, to the observations of a fit."""
+"""The observations of a fit, and their monomials."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from dataclasses import field as attribute
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,20 +13,14 @@ from numpy.typing import NDArray
 from magbridge.calibration.model import Parameter
 from magbridge.calibration.residual import Samples
 from magbridge.calibration.terms import Exponents
-from magbridge.columns import CHANNELS, COLUMNS, require
 from magbridge.errors import CalibrationError
 from magbridge.records import BEYOND
 
-if TYPE_CHECKING:
-    import xarray as xr
-
-__all__ = ["Observations", "monomials", "observations", "polynomial_samples"]
+__all__ = ["Observations", "monomials", "polynomial_samples"]
 
 FloatArray = NDArray[np.float64]
 COMMON, FAR = 0.005, 10.0
 """A position is implausible when it is farther from the median than FAR times the span of all but 2 COMMON of them."""
-FOLLOWED = ("sensor_temperature", "depth")
-"""Columns that move no mass but may be fitted as if they did."""
 _PER_SAMPLE = ("field", "reference", "parameters", "runs", "time", "attitude", "reference_ned")
 
 
@@ -199,95 +193,3 @@ def polynomial_samples(data: Observations, exponents: tuple[Exponents, ...], kap
     ranges = data.ranges()
     phi = monomials(data.parameters, ranges, exponents)
     return Samples(data.field, data.reference, phi, data.steps, float(data.reference.mean()), kappa)
-
-
-def observations(
-    ds: xr.Dataset,
-    parameters: Sequence[str],
-    *,
-    reference: Callable[[xr.Dataset], tuple[FloatArray, FloatArray | None, str]] | None = None,
-) -> Observations:
-    """Take a deployment's columns.
-
-    Parameters
-    ----------
-    ds : Dataset
-        A deployment (columns as in the contract).
-    parameters : sequence of str
-        Columns that move masses.
-    reference : callable, optional
-        ``ds -> (total (n,) nT, vector (n, 3) NED nT or None, name)``. If not given, or where the
-        deployment has it, the column ``reference_field`` counts.
-
-    Raises
-    ------
-    FormatError
-        A column is missing.
-    CalibrationError
-        A column does not hold numbers; a parameter is a column that says something else.
-    """
-    if others := [name for name in parameters if name in COLUMNS and name not in FOLLOWED]:
-        raise CalibrationError(f"parameter {others[0]!r} is {COLUMNS[others[0]].long_name}: it moves no mass")
-    names = (*CHANNELS, *parameters)
-    columns = {name: _column(ds, name) for name in names}
-    vector: FloatArray | None = None
-    model = "reference_field"
-    if reference is not None:
-        total, vector, model = reference(ds)
-        if "reference_field" in ds:
-            own = _column(ds, "reference_field")
-            total = np.where(np.isfinite(own), own, total)
-    else:
-        total = _column(ds, "reference_field")
-    attitude = None
-    if all(name in ds for name in ("roll", "pitch", "heading")):
-        attitude = np.radians(np.stack([_column(ds, name) for name in ("roll", "pitch", "heading")], axis=1))
-    time = np.asarray(ds["time"].values, float)
-    return Observations(
-        field=np.stack([_at_common_time(ds, axis, columns[f"mag_{axis}"]) for axis in "xyz"], axis=1),
-        reference=total,
-        parameters=np.stack([columns[name] for name in parameters], axis=1)
-        if parameters
-        else np.empty((len(time), 0)),
-        names=tuple(parameters),
-        units=tuple(str(ds[name].attrs.get("units", "")) for name in parameters),
-        runs=_runs(ds, time),
-        time=time,
-        attitude=attitude,
-        reference_ned=vector,
-        sensor=str(ds.attrs.get("sensor", "")),
-        model=model,
-    )
-
-
-def _at_common_time(ds: xr.Dataset, axis: str, values: FloatArray) -> FloatArray:
-    """Interpolate a channel of a multiplexed converter to the row's time, as :mod:`magbridge.align` does live.
-
-    In a spiral a delay of 0.3 s is a rotation by a degree, always the same way. Left in, it would be absorbed by the
-    coefficients, and remain there when the vehicle flies straight.
-    """
-    if f"mag_time_{axis}" not in ds:
-        return values
-    time, sampled = np.asarray(ds["time"].values, float), _column(ds, f"mag_time_{axis}")
-    known = np.isfinite(sampled) & np.isfinite(values)
-    if not known.any():
-        return values
-    common = np.interp(time, sampled[known], values[known])
-    return np.where(known, common, np.nan)
-
-
-def _column(ds: xr.Dataset, name: str) -> FloatArray:
-    require(ds, [name])
-    values = np.asarray(ds[name].values)
-    if values.dtype.kind not in "fiub":
-        raise CalibrationError(f"column {name!r}: expected numbers, found {values.dtype}")
-    return values.astype(float)
-
-
-def _runs(ds: xr.Dataset, time: FloatArray) -> NDArray[np.generic]:
-    """Take the column ``run`` or ``dive``, or a new run after every gap of ten intervals."""
-    for name in ("run", "dive"):
-        if name in ds:
-            return np.asarray(ds[name].values)
-    step = np.diff(time, prepend=time[:1])
-    return np.cumsum(step > 10 * np.median(step[1:])) if len(time) > 1 else np.zeros(len(time), int)

@@ -26,8 +26,8 @@ from magbridge.calibration.dipole import dipole_columns, expand_dipole
 from magbridge.calibration.fitting.prior import FACTOR_MASS, Structure, gain_rotation
 from magbridge.calibration.model import Parameter
 from magbridge.calibration.terms import Exponents
-from magbridge.config import check_entries, convert, load_toml
 from magbridge.errors import CalibrationError
+from magbridge.toml import check_entries, convert, load_toml
 
 __all__ = ["Mounting", "mounted_structure", "read_vehicle"]
 

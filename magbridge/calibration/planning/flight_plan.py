@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from magbridge.calibration.fitting.data import observations
+from magbridge.calibration.fitting.columns import observations
 from magbridge.calibration.fitting.mission import Mission
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.planning.limits import Limits, settled, trim_of
