@@ -8,7 +8,7 @@ between two 3x4 matrices of weights: value, gradient and Hessian in one product.
 from __future__ import annotations
 
 from functools import cached_property
-from math import inf, isfinite, nan, sqrt
+from math import inf, nan, sqrt
 from pathlib import Path
 from typing import Generic, NamedTuple, TypeVar
 
@@ -18,7 +18,6 @@ from numpy.typing import ArrayLike, NDArray
 from magbridge.errors import FormatError, OutOfRange
 from magbridge.field.earth import metres_per_degree
 from magbridge.field.spline import WEIGHTS, coefficients, weights
-from magbridge.files import atomic_path, systems_reason
 
 __all__ = ["AnomalyGrid", "Local"]
 
@@ -193,9 +192,7 @@ class AnomalyGrid:
         if self._vertical is not None:
             below = np.asarray(depth, float) + self.altitude
             patch = patch + np.where(np.isnan(below), 0.0, below) * self._vertical.ravel()[window]
-        lines = (across[:, None] * patch).sum(
-            axis=2
-        )  # (3, 4, n): each row of the patch at s, with its slopes
+        lines = (across[:, None] * patch).sum(axis=2)  # (3, 4, n): the patch's rows at s, with their slopes
         if self._even_sigma:
             variance = np.full(s.shape, self._variance[0, 0])
         else:
@@ -260,27 +257,9 @@ class AnomalyGrid:
         WriteError
             The file cannot be written; it is as it was before.
         """
-        import xarray as xr  # noqa: PLC0415  the live path runs without xarray
+        from magbridge.field.grid_netcdf import write  # noqa: PLC0415  the live path runs without xarray
 
-        axes = {
-            "latitude": ("latitude", self.latitude, {"units": "degrees_north", "standard_name": "latitude"}),
-            "longitude": (
-                "longitude",
-                self.longitude,
-                {"units": "degrees_east", "standard_name": "longitude"},
-            ),
-        }
-        over = ("latitude", "longitude")
-        fields = {
-            "anomaly": (over, self.anomaly, {"units": "nT", "long_name": "magnetic anomaly"}),
-            "sigma": (over, self.sigma, {"units": "nT", "long_name": "1-sigma of the magnetic anomaly"}),
-        }
-        attrs: dict[str, object] = {"Conventions": "CF-1.8", "title": "magnetic anomaly"}
-        if isfinite(self.altitude):
-            attrs |= {"altitude": self.altitude, "altitude_units": "m above the ellipsoid"}
-        packed = {name: {"zlib": True, "dtype": "float32"} for name in fields}
-        with atomic_path(path) as beside, systems_reason(beside):
-            xr.Dataset(fields, axes, attrs).to_netcdf(beside, engine="netcdf4", encoding=packed)
+        write(self, path)
 
     def __repr__(self) -> str:
         return (

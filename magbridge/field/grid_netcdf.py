@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+from math import isfinite
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from magbridge.errors import FormatError
+from magbridge.files import atomic_path, systems_reason
 
-__all__ = ["ANOMALY", "LATITUDE", "LONGITUDE", "Parts", "netcdf"]
+if TYPE_CHECKING:
+    from magbridge.field.grid import AnomalyGrid
+
+__all__ = ["ANOMALY", "LATITUDE", "LONGITUDE", "Parts", "netcdf", "write"]
 
 Array = NDArray[np.floating[Any]]
 Parts = tuple[Array, Array, Array, dict[str, Any]]
@@ -51,6 +56,37 @@ def netcdf(path: Path) -> Parts:
         if "altitude" in where:
             options.setdefault("altitude", float(where["altitude"]))
     return grid[x].to_numpy(), grid[y].to_numpy(), grid.transpose(y, x).to_numpy().astype(float), options
+
+
+def write(grid: AnomalyGrid, path: str | Path) -> None:
+    """Write a grid as CF netCDF.
+
+    Raises
+    ------
+    WriteError
+        The file cannot be written; it is as it was before.
+    """
+    import xarray as xr  # noqa: PLC0415  the live path runs without xarray
+
+    axes = {
+        "latitude": ("latitude", grid.latitude, {"units": "degrees_north", "standard_name": "latitude"}),
+        "longitude": (
+            "longitude",
+            grid.longitude,
+            {"units": "degrees_east", "standard_name": "longitude"},
+        ),
+    }
+    over = ("latitude", "longitude")
+    fields = {
+        "anomaly": (over, grid.anomaly, {"units": "nT", "long_name": "magnetic anomaly"}),
+        "sigma": (over, grid.sigma, {"units": "nT", "long_name": "1-sigma of the magnetic anomaly"}),
+    }
+    attrs: dict[str, object] = {"Conventions": "CF-1.8", "title": "magnetic anomaly"}
+    if isfinite(grid.altitude):
+        attrs |= {"altitude": grid.altitude, "altitude_units": "m above the ellipsoid"}
+    packed = {name: {"zlib": True, "dtype": "float32"} for name in fields}
+    with atomic_path(path) as beside, systems_reason(beside):
+        xr.Dataset(fields, axes, attrs).to_netcdf(beside, engine="netcdf4", encoding=packed)
 
 
 def _coordinate(path: Path, grid: Any, names: tuple[str, ...], kind: str) -> str:

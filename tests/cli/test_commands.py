@@ -1,11 +1,10 @@
-"""The command line: exit codes, one clear line for bad input, nothing half-written."""
+"""What each command does and says."""
 
 from __future__ import annotations
 
 import json
 import os
 import pty
-import resource
 import select
 import time
 from pathlib import Path
@@ -16,7 +15,6 @@ import pytest
 from magbridge.calibration.file import load as load_calibration
 from magbridge.calibration.file import save as save_calibration
 from magbridge.calibration.fitting.columns import observations
-from magbridge.calibration.fitting.fit import METHODS
 from magbridge.calibration.model import Parameter, identity
 from magbridge.calibration.planning.plan import expected_calibration
 from magbridge.cli import main
@@ -25,34 +23,8 @@ from magbridge.field.igrf import total_field
 from magbridge.field.read import read_grid
 from magbridge.logs import read, write
 from magbridge.progress import waiting
-from sitl import load, simulate
 
 FEW = 40  # rows, which a diagnosis refuses: what it says before is said all the same
-METHOD_NAMES = ", ".join(f'"{name}"' for name in METHODS)
-
-
-@pytest.fixture(scope="module")
-def deployment(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("deployment") / "deployment.csv"
-    write(simulate(load("demo"), 5), path)
-    return path
-
-
-@pytest.fixture(scope="module")
-def calibration(deployment: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("calibration") / "cal.json"
-    assert main(["calibrate", str(deployment), "--method", "nominal", "-o", str(path)]) == 0
-    return path
-
-
-def complaint(capsys: pytest.CaptureFixture[str], *arguments: object, code: int) -> str:
-    """Run a command that must fail; return its one line."""
-    assert main([str(argument) for argument in arguments]) == code
-    captured = capsys.readouterr()
-    assert captured.err.count("\n") == 1, captured.err
-    assert captured.err.startswith("magbridge: ")
-    assert "Traceback" not in captured.err
-    return captured.err.removeprefix("magbridge: ").rstrip()
 
 
 @pytest.mark.parametrize("like", [False, True], ids=["mission", "like a log"])
@@ -93,34 +65,6 @@ def test_what_was_passed_over_is_told(
     assert ", damages 1, duplicate rows 50" in told
     assert main(["convert", str(both), "-o", str(tmp_path / "again.csv")]) == 0
     assert not capsys.readouterr().err
-
-
-def test_what_is_read_is_not_written_over(
-    deployment: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    log, link, folder = tmp_path / "log.csv", tmp_path / "link.csv", tmp_path / "calibration.json"
-    log.write_bytes(deployment.read_bytes())
-    link.symlink_to(log)
-    for written, arguments in (
-        (log, ["convert", log, "-o", log]),
-        (link, ["convert", log, "-o", link]),
-        (log, ["correct", deployment, "--calibration", log, "-o", log]),
-        (log, ["calibrate", deployment, "--grid", log, "-o", log]),
-        (log, ["calibrate", deployment, "--vehicle", log, "-o", link]),
-        (log, ["simulate", "demo", "--like", log, "-o", log]),
-        (log, ["simulate", log, "-o", log]),
-        (log, ["navigate", deployment, "--map", log, "--bound", "-o", log]),
-        (folder, ["diagnose", deployment, "--calibration", folder, "-o", tmp_path]),
-    ):
-        line = complaint(capsys, *arguments, code=2)
-        assert line.endswith(": is among the files to read; choose another file to write")
-        assert Path(line.partition(": is among")[0]).resolve() == written.resolve()
-    assert log.read_bytes() == deployment.read_bytes()
-    loop = tmp_path / "loop.csv"
-    loop.symlink_to(loop)
-    assert "expected a file, there is none" in complaint(
-        capsys, "convert", loop, "-o", tmp_path / "x.csv", code=1
-    )
 
 
 def test_what_headings_are_counted_from_may_be_told(deployment: Path, tmp_path: Path) -> None:
@@ -175,17 +119,6 @@ def test_correct_gives_the_same_in_pieces(deployment: Path, calibration: Path, t
         np.testing.assert_array_equal(whole[name], np.concatenate([part[name] for part in parts]))
 
 
-def test_a_log_without_a_whole_reading_is_not_corrected(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    log, calibration, output = (tmp_path / name for name in ("log.csv", "cal.json", "x.csv"))
-    log.write_text("time,mag_x,mag_y,mag_z\n1,,2,3\n2,1,,\n")
-    save_calibration(identity(), calibration)
-    line = complaint(capsys, "correct", log, "--calibration", calibration, "-o", output, code=1)
-    assert line == f"{log}: no row has all of mag_x mag_y mag_z"
-    assert not output.exists()
-
-
 def test_a_column_that_the_calibration_needs_is_missed_aloud(
     deployment: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -202,144 +135,6 @@ def test_a_column_that_the_calibration_needs_is_missed_aloud(
     assert not said.err
     assert "stale" not in said.out
     assert "extrapolated " in said.out
-
-
-@pytest.mark.parametrize(
-    ("arguments", "code", "words"),
-    [
-        (["convert", "-o", "x.csv"], 2, "expected at least one FILE"),
-        (["convert", "none.csv", "-o", "x.csv"], 1, "none.csv: expected a file"),
-        (["convert", "{d}", "-o", "x.foo"], 2, "must end in .csv or .nc or .parquet or .tlog"),
-        (["simulate", "demo", "-o", "x.bin"], 2, "must end in .csv"),
-        (["convert", "{d}"], 2, "--output"),
-        (["fly"], 2, "fly"),
-        (["replay", "{d}", "--speed", "fast"], 2, "--speed fast: expected a positive number"),
-        (["replay", "{d}", "--speed", "-1"], 2, "expected a positive number"),
-        (["replay", "{d}", "--speed", "1e-300"], 2, "0.001 or more, or max"),
-        (["plan", "--calibration", "{d}", "--mission", "{d}", "--runs", "101"], 2, "--runs. Must be <= 100"),
-        (
-            ["calibrate", "{d}", "--parameter", "heading", "-o", "x.json"],
-            1,
-            "parameter 'heading' is heading, clockwise from north: it moves no mass",
-        ),
-        (["run", "--config", "none.toml"], 2, "none.toml: No such file"),
-        (
-            ["simulate", "none", "-o", "x.csv"],
-            2,
-            "none: expected a scenario file (.toml), or one of bonne_bay, ",
-        ),
-        (["simulate", "none.toml", "-o", "x.csv"], 2, "none.toml: No such file"),
-        (["correct", "{d}", "--calibration", "none.json", "-o", "x.csv"], 1, "none.json: cannot be read"),
-        (["correct", "{d}", "--calibration", "{d}", "-o", "x.csv"], 1, "not a calibration"),
-        (["calibrate", "{d}", "--parameter", "nose", "-o", "x.json"], 1, "column 'nose'"),
-        (
-            ["calibrate", "{d}", "--parameter", "mag_x", "-o", "x.json"],
-            1,
-            "'mag_x' is raw magnetic field, sensor x (forward): it moves no mass",
-        ),
-        (["calibrate", "{d}", "--filter-corner", "1e-9", "-o", "x.json"], 1, "filter corner = 1e-09 Hz"),
-        (["calibrate", "{d}", "--method", "magic", "-o", "x.json"], 2, f"Choose from: {METHOD_NAMES}"),
-        (["calibrate", "{d}", "--method", "cubic", "--vehicle", "v.toml", "-o", "x.json"], 2, "--vehicle: "),
-        (["calibrate", "{d}", "--order", "0", "-o", "x.json"], 2, "order"),
-        (
-            ["calibrate", "{d}", "--parameter", "run", "--parameter", "run", "-o", "x.json"],
-            1,
-            "'run' is named twice",
-        ),
-        (["calibrate", "{d}", "--site-bias", "1e300", "-o", "x.json"], 2, "--site-bias. Must be <= 100000"),
-        (["map", "none.nc", "-o", "x.nc"], 1, "none.nc"),
-        (["map", "none.nc", "-o", "x.foo"], 2, "must end in .nc"),
-        (["map", "none.nc", "-o", "x.nc", "--altitude", "1e308"], 2, "Must be <= 1000000"),
-        (["map", "none.nc", "-o", "x.nc", "--picture", "x.foo"], 2, "must end in .png or .pdf or .svg"),
-        (["convert", "{d}", "-o", "nowhere/x.csv"], 2, "There is no folder nowhere"),
-        (["convert", "{d}", "-o", "."], 2, "It is a folder"),
-        (["simulate", "demo", "--like", "{d}", "b.nc", "-o", "x.nc"], 2, "b.nc: unexpected argument"),
-        (["convert", "{d}", "-o", "/proc/self/x.csv"], 2, "The folder /proc/self cannot be written to"),
-        (["diagnose", "{d}", "--calibration", "{d}", "-o", "{d}"], 2, "It is a file"),
-        (["demo", "--out", "{d}"], 2, "It is a file"),
-        (["replay", "{d}", "--log", "/proc/self/new"], 2, "The folder /proc/self cannot be written to"),
-        (["demo", "--out", "/proc/self/new/demo"], 2, "The folder /proc/self cannot be written to"),
-        (["simulate", "demo", "-o", "x.nc", "--seed", "-1"], 2, "--seed"),
-        (["simulate", "demo", "-o", "x.nc", "--seed", "1.5"], 2, "--seed: expected a whole number, not 1.5"),
-        (["replay", "{d}", "--config", "none.toml"], 2, "none.toml: No such file"),
-        (["demo", "--out", "/dev/null/demo"], 1, "/dev/null/demo: Not a directory"),
-    ],
-)
-def test_bad_input_gets_one_line_and_leaves_nothing(
-    deployment: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    arguments: list[str],
-    code: int,
-    words: str,
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    line = complaint(capsys, *(argument.format(d=deployment) for argument in arguments), code=code)
-    assert words in line
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize("room", [0, 20_000])
-@pytest.mark.parametrize("suffix", [".csv", ".nc", ".parquet", ".tlog"])
-def test_a_full_disk_gets_one_line_and_leaves_nothing(
-    suffix: str, room: int, deployment: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """The limit of a file's size stands for the disk's end: the reason told is the system's own."""
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (room, limits[1]))
-    try:
-        line = complaint(capsys, "convert", deployment, "-o", tmp_path / f"x{suffix}", code=1)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-    assert line == f"{tmp_path / f'x{suffix}'}: cannot be written: File too large"
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize(
-    ("column", "value", "words"),
-    [
-        ("time", 1.78e12, "row 12, column 'time': expected seconds since 1970"),
-        ("latitude", 4952.3, "row 12, column 'latitude': expected deg, at most 90"),
-        ("mag_time_z", 12.0, "row 12, column 'mag_time_z': expected a time within 60 s"),
-    ],
-)
-def test_what_would_be_another_place_or_moment(
-    deployment: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    column: str,
-    value: float,
-    words: str,
-) -> None:
-    lines = deployment.read_text().splitlines()
-    cells = lines[11].split(",")
-    cells[lines[0].split(",").index(column)] = repr(value)
-    bad = tmp_path / "bad.csv"
-    bad.write_text("\n".join([*lines[:11], ",".join(cells), *lines[12:]]))
-    assert words in complaint(capsys, "convert", bad, "-o", tmp_path / "x.nc", code=1)
-
-
-def test_one_position_that_is_none(
-    deployment: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    rows = read(deployment)
-    rows["battpos"][7] = -9999.0
-    bad = tmp_path / "bad.nc"
-    write(rows, bad)
-    line = complaint(
-        capsys,
-        "calibrate",
-        bad,
-        "--parameter",
-        "battpos",
-        "--parameter",
-        "ballast",
-        "-o",
-        tmp_path / "c.json",
-        code=1,
-    )
-    assert "'battpos' is -9999 in 1 of 3600 samples" in line
 
 
 def test_numbers_that_may_say_not_known_are_told(

@@ -1,0 +1,25 @@
+"""A deployment and a calibration for every command."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from magbridge.cli import main
+from magbridge.logs import write
+from sitl import load, simulate
+
+
+@pytest.fixture(scope="session")
+def deployment(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("deployment") / "deployment.csv"
+    write(simulate(load("demo"), 5), path)
+    return path
+
+
+@pytest.fixture(scope="session")
+def calibration(deployment: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("calibration") / "cal.json"
+    assert main(["calibrate", str(deployment), "--method", "nominal", "-o", str(path)]) == 0
+    return path
