@@ -9,6 +9,10 @@ from scipy.stats import multivariate_normal
 from magbridge.calibration.fitting.columns import observations
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.lowpass import unfiltered
+from magbridge.diagnose.causes import CAUSES
+from magbridge.diagnose.compare.problem import Problem
+from magbridge.diagnose.inference.descriptions import descriptions
+from magbridge.diagnose.inference.joint import fit_joint
 from magbridge.diagnose.inference.shapes import bends, crossing, response
 from magbridge.diagnose.inference.statistic import SIZES, Statistic
 from magbridge.diagnose.run import diagnose
@@ -75,3 +79,24 @@ def test_a_feedback_that_falters_at_zero_is_described(width: float) -> None:
     X, y = (a - gain @ np.linalg.lstsq(gain, a, rcond=None)[0] for a in (X, dead[:, 0]))
     left = y - X @ np.linalg.lstsq(X, y, rcond=None)[0]
     assert left @ left < 0.1 * y @ y
+
+
+def test_functions_of_the_direction_and_of_the_reading_hold_a_bend(problem: Problem) -> None:
+    """To one in a hundred of what the constants of a calibration do not hold themselves: the field hardly changes its size."""
+    rows = slice(0, len(problem))
+    (bend, more, _), (step, *_) = (
+        CAUSES[name].candidates(problem) for name in ("nonlinearity", "offset_step")
+    )
+    bent = np.hstack([bend.columns(rows), more.columns(rows)])
+    held = [one for one in descriptions(problem, fit_joint(problem, [], 1)) if "nonlinearity" in one.holds]
+    assert len(held) == 2
+
+    def left(X: np.ndarray) -> float:
+        scale = np.linalg.norm(X, axis=0)
+        return float(np.linalg.norm(bent - X / scale @ np.linalg.lstsq(X / scale, bent, rcond=1e-12)[0]))
+
+    for one in held:
+        assert left(np.hstack([problem.slopes, one.columns(rows)])) < 0.01 * left(problem.slopes)
+        assert one.covers([bend])
+        assert not one.covers([bend, step])
+        assert not one.covers([])

@@ -48,9 +48,9 @@ def accept(problem: Problem, outcome: Outcome, tone: Candidate | None) -> tuple[
 def _same(chosen: Sequence[Hypothesis], rest: Leftover) -> bool:
     """Say whether the rest is a remnant of a stronger named cause, whose regressor is idealised."""
     told = rest.description
-    return told is not None and any(
-        told.covers([h.candidate]) and h.signal_to_noise > rest.signal_to_noise for h in chosen
-    )
+    if told is None or told.wider:
+        return False
+    return any(told.covers([h.candidate]) and h.signal_to_noise > rest.signal_to_noise for h in chosen)
 
 
 def _within(outcome: Outcome, behind: float) -> tuple[Rival, ...]:

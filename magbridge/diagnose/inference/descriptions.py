@@ -60,6 +60,9 @@ class Description(NamedTuple):
         The columns are functions along each of the body's axes.
     remembers : bool
         It follows the past of the channel, not its value.
+    wider : bool
+        It says much more than a cause that it holds: what it finds beside that is no remnant, and it is an alternative to that
+        and another.
     """
 
     columns: Columns
@@ -70,10 +73,11 @@ class Description(NamedTuple):
     holds: tuple[str, ...] = ()
     turned: bool = False
     remembers: bool = False
+    wider: bool = False
 
     def covers(self, model: Sequence[Candidate]) -> bool:
-        """Say whether it says the same as a cause of `model`, with more coefficients."""
-        return any(
+        """Say whether it says the same as a cause of `model`, with more coefficients; a wider one, as all of it."""
+        same = [
             candidate.cause in self.holds
             or (
                 candidate.channel is not None
@@ -81,7 +85,8 @@ class Description(NamedTuple):
                 and (candidate.cause == "hysteresis") == self.remembers
             )
             for candidate in model
-        )
+        ]
+        return any(same) and (all(same) or not self.wider)
 
 
 def descriptions(problem: Problem, fit: Joint, tone: Candidate | None = None) -> list[Description]:
@@ -131,12 +136,12 @@ def _of_reading(problem: Problem) -> list[Description]:
     """Functions of the field's direction, of its rates of change and of each channel's reading; one delay of everything."""
     body, rates = _body(problem), field_rates(problem)
     listed = [
-        _of("broadband", direction(body), 34),
+        _of("broadband", direction(body), 34, holds=("nonlinearity",), wider=True),
         _of(
             "broadband", _along_axes(problem, lambda rows: rates[:, rows].T), 9, 1.0,
             holds=("eddy_current", "channel_skew"), turned=True,
         ),
-        Description(response(problem.reading, body), bends()),
+        Description(response(problem.reading, body), bends(), holds=("nonlinearity",), wider=True),
         _of("broadband", crossing(problem.reading, body), 9),
     ]  # fmt: skip
     if problem.calibration.parameters:
