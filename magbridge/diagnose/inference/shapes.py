@@ -83,7 +83,7 @@ def crossing(reading: FloatArray, slopes: FloatArray) -> Columns:
     def columns(rows: slice) -> FloatArray:
         x = reading[rows].T[:, None] / np.array(ZERO)[:, None]
         odd = x * np.exp(-0.5 * x * x)
-        return (slopes.T[:, None, rows] * odd).reshape(3 * len(ZERO), -1).T
+        return np.asarray((slopes.T[:, None, rows] * odd).reshape(3 * len(ZERO), -1).T)
 
     return columns
 
