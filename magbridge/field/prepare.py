@@ -6,7 +6,7 @@ The pictures show every step, because a map is looked at before it is used.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import isfinite
+from math import isfinite, nan, sqrt
 from pathlib import Path
 from typing import NamedTuple
 
@@ -70,9 +70,10 @@ def prepare(
             steps.append(Step(f"continued {up:+.0f} m: {Path(grid.name).name}", lifted[-1]))
         else:
             lifted.append(grid)
-    result = merge(lifted, spacing)
+    result, apart = _merged(lifted, spacing)
     if len(grids) > 1:
-        steps.append(Step("merged", result))
+        differ = f", {apart:.1f} nT RMS apart where they overlap" if isfinite(apart) else ""
+        steps.append(Step(f"merged{differ}", result))
     if mask is not None:
         result = _masked(result, np.asarray(mask, float))
         steps.append(Step("masked", result))
@@ -95,23 +96,33 @@ def continue_upward(grid: AnomalyGrid, height: float) -> AnomalyGrid:
 
 def merge(grids: Sequence[AnomalyGrid], spacing: float | None = None) -> AnomalyGrid:
     """Return the mean of the grids wherever at least one of them is; on the finest of their spacings."""
+    return _merged(grids, spacing)[0]
+
+
+def _merged(grids: Sequence[AnomalyGrid], spacing: float | None) -> tuple[AnomalyGrid, float]:
+    """:func:`merge`, and by how many nT RMS two of the grids differ where they overlap; NaN where none do."""
     first = grids[0]
     if len(grids) == 1 and spacing is None:
-        return first
+        return first, nan
     step = spacing or min(float(np.diff(axis[:2])[0]) for g in grids for axis in (g.longitude, g.latitude))
     near = [(g, 360.0 * round((float(first.longitude[0]) - float(g.longitude[0])) / 360.0)) for g in grids]
     longitude = _cover([g.longitude + turn for g, turn in near], step)
     latitude = _cover([g.latitude for g in grids], step)
     x, y = (axis.ravel() for axis in np.meshgrid(longitude, latitude))
     shape = (latitude.size, longitude.size)
-    total, variance, count = np.zeros(shape), np.zeros(shape), np.zeros(shape)
+    total, squares, variance, count = np.zeros((4, *shape))
     for grid in grids:
         local = grid.evaluate(x, y)
-        total += np.nan_to_num(local.anomaly).reshape(shape)
+        anomaly = np.nan_to_num(local.anomaly).reshape(shape)
+        total += anomaly
+        squares += anomaly**2
         variance += np.nan_to_num(local.variance).reshape(shape)
         count += np.isfinite(local.anomaly).reshape(shape)
+    shared = count > 1
+    differences = 2.0 * (squares - total**2 / np.maximum(count, 1.0))[shared] / (count[shared] - 1.0)
+    apart = sqrt(max(float(differences.mean()), 0.0)) if shared.any() else nan
     with np.errstate(invalid="ignore"):
-        return AnomalyGrid(
+        merged = AnomalyGrid(
             longitude,
             latitude,
             total / np.where(count > 0, count, np.nan),
@@ -119,6 +130,7 @@ def merge(grids: Sequence[AnomalyGrid], spacing: float | None = None) -> Anomaly
             first.altitude,
             " + ".join(Path(grid.name).name for grid in grids),
         )
+    return merged, apart
 
 
 def hanning(grid: AnomalyGrid, passes: int) -> AnomalyGrid:
