@@ -1,4 +1,4 @@
-"""Effects that follow the telemetry of moving masses: more powers, backlash, a clock that is off."""
+"""Effects that follow the telemetry of moving masses: more powers, what they pass, backlash, a clock that is off."""
 
 from __future__ import annotations
 
@@ -18,11 +18,13 @@ from magbridge.errors import CalibrationError
 if TYPE_CHECKING:
     from magbridge.calibration.model import Calibration
 
-__all__ = ["ClockEffect", "MonomialEffect", "PlayEffect", "PowersEffect"]
+__all__ = ["ClockEffect", "MonomialEffect", "PlayEffect", "PowersEffect", "SourcesEffect"]
 
 FloatArray = NDArray[np.float64]
 MAX_INTERVAL = 60_000_000
 """µs; over a longer gap a rate of change means nothing."""
+APART = 1.5
+"""How far apart sources are, in their distance from the way: closer ones make the same field."""
 
 
 def offsets(regressors: int) -> FloatArray:
@@ -96,6 +98,42 @@ class PowersEffect(Follower, frozen=True, kw_only=True):
             if not isnan(values[index]):
                 x = (values[index] - centre) / scale
             return powers(x, order)
+
+        return step
+
+
+class SourcesEffect(Follower, frozen=True, kw_only=True):
+    """What a mass passes on its way: ``T += sum_k c_k (1 + x_k^2)^(-3/2)``, ``x_k = (p - centre) / scale - 3 k / 2``.
+
+    Iron that a mass magnetises, or is magnetised by, has a field that falls with the cube of their distance. Wherever it
+    is, sources in a row beside the way make the same field: an equivalent layer (Dampney 1969, Geophysics 34:39).
+
+    Attributes
+    ----------
+    centre, scale : float
+        Where the first source is, and how far all are from the way.
+    count : int
+        Sources.
+    """
+
+    kind: ClassVar[str] = "sources"
+    count: Power = 1
+
+    @property
+    def size(self) -> int:
+        """Three for each source, nT."""
+        return 3 * self.count
+
+    def begin(self, calibration: Calibration) -> Step:
+        """Return a stepper; a missing value leaves the last one standing."""
+        index, count = calibration.channels.index(self.channel), self.count
+        centre, scale, x = self.centre, self.scale, 0.0
+
+        def step(time_us: int, hx: float, hy: float, hz: float, values: Sequence[float]) -> tuple[float, ...]:
+            nonlocal x
+            if not isnan(values[index]):
+                x = (values[index] - centre) / scale
+            return tuple((1.0 + (x - APART * k) ** 2) ** -1.5 for k in range(count))
 
         return step
 

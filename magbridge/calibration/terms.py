@@ -59,6 +59,7 @@ TERMS: dict[str, str] = {
     "dipole": "magbridge.calibration.dipole:Dipole",
     "channel": "magbridge.calibration.effects:ChannelEffect",
     "powers": "magbridge.calibration.followers:PowersEffect",
+    "sources": "magbridge.calibration.followers:SourcesEffect",
     "monomial": "magbridge.calibration.followers:MonomialEffect",
     "play": "magbridge.calibration.followers:PlayEffect",
     "clock": "magbridge.calibration.followers:ClockEffect",

@@ -11,7 +11,13 @@ import pytest
 from magbridge.calibration.correct import Corrector, correct
 from magbridge.calibration.effects import ChannelEffect
 from magbridge.calibration.file import decode_calibration, encode_calibration
-from magbridge.calibration.followers import ClockEffect, MonomialEffect, PlayEffect, PowersEffect
+from magbridge.calibration.followers import (
+    ClockEffect,
+    MonomialEffect,
+    PlayEffect,
+    PowersEffect,
+    SourcesEffect,
+)
 from magbridge.calibration.instrument import RateEffect, ResponseEffect, TimeEffect
 from magbridge.calibration.model import Calibration, Noise, Parameter, Reference
 from magbridge.calibration.residual import residuals
@@ -27,6 +33,7 @@ EFFECTS: list[Effect] = [
     ChannelEffect(cause="temperature_offset", channel="heat", origin=3.0, lag=200.0, stages=2),
     ChannelEffect(cause="temperature_scale", channel="heat", origin=3.0, lag=50.0, on="scale"),
     PowersEffect(cause="unmodelled_actuator", channel="heat", centre=3.0, scale=2.0, order=3),
+    SourcesEffect(cause="actuator_order", channel="p", centre=-1.1, scale=0.2, count=12),
     MonomialEffect(cause="actuator_order", exponents=(4,)),
     PlayEffect(cause="hysteresis", channel="p", width=0.3, centre=0.1, scale=0.5),
     PlayEffect(cause="hysteresis", channel="p", width=0.3, centre=0.1, scale=0.5, order=3),

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 from magbridge.calibration.effects import ChannelEffect
-from magbridge.calibration.followers import MonomialEffect, PlayEffect, PowersEffect
+from magbridge.calibration.followers import MonomialEffect, PlayEffect, PowersEffect, SourcesEffect
 from magbridge.calibration.model import Calibration, Noise, Parameter, Reference
 from magbridge.calibration.terms import Polynomial
 from magbridge.diagnose.causes import CAUSES
+from magbridge.diagnose.causes.masses import actuator_order
 from magbridge.diagnose.causes.regressors import lagged
 from magbridge.diagnose.causes.timing import field_rates, mass_rates
 from magbridge.diagnose.compare.past import FAR
@@ -53,7 +54,7 @@ def problem() -> Problem:
     return pose(survey, calibration)
 
 
-FOLLOWERS = (ChannelEffect, PowersEffect, MonomialEffect, PlayEffect)
+FOLLOWERS = (ChannelEffect, PowersEffect, MonomialEffect, PlayEffect, SourcesEffect)
 
 
 def test_columns_are_those_of_the_stepped_effect(problem: Problem) -> None:
@@ -196,3 +197,28 @@ def test_lags_in_series_follow_conduction_more_closely_than_one() -> None:
         return min(float(np.sum((heard - y * (y @ heard) / (y @ y)) ** 2)) for y in shapes)
 
     assert missed(2) < 0.25 * missed(1)
+
+
+def test_sources_along_its_way_hold_the_field_of_iron_that_a_mass_passes(problem: Problem) -> None:
+    """A dipole beside the way, anywhere and of any direction: of what a cubic lacks the next power leaves far more."""
+    rng, t = np.random.default_rng(8), np.linspace(0.0, 1.0, len(problem))
+    channels = problem.survey.channels | {"p": problem.survey.channels["p"]._replace(values=np.sin(12.0 * t))}
+    problem = replace(problem, survey=replace(problem.survey, channels=channels))
+    p, slopes = channels["p"].values, problem.slopes[:, 6:]
+    powers = (p[:, None, None] ** np.arange(4)[:, None] * slopes[:, None, :]).reshape(len(p), -1)
+    listed = [c.columns(slice(0, len(p))) for c in actuator_order(problem) if c.spectra is not None]
+
+    def missed(columns: np.ndarray, field: np.ndarray) -> float:
+        def beyond(X: np.ndarray, y: np.ndarray) -> float:
+            return float(np.sum((y - X @ np.linalg.lstsq(X, y, rcond=1e-9)[0]) ** 2))
+
+        return beyond(np.hstack([powers, columns]), field) / beyond(powers, field)
+
+    for _ in range(5):
+        r = np.column_stack(
+            [p - rng.uniform(-1.0, 1.0), np.full_like(p, rng.uniform(0.3, 0.8)), np.zeros_like(p)]
+        )
+        far, m = np.linalg.norm(r, axis=1)[:, None], rng.normal(size=3)
+        field = np.sum(slopes * (3.0 * r * (r @ m)[:, None] / far**2 - m) / far**3, axis=1)
+        next_power = missed(p[:, None] ** 4 * slopes, field)
+        assert min(missed(columns, field) for columns in listed) < min(0.2, 0.4 * next_power)

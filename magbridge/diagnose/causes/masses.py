@@ -10,7 +10,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from magbridge.calibration.followers import MonomialEffect, PlayEffect, PowersEffect
+from magbridge.calibration.followers import APART, MonomialEffect, PlayEffect, PowersEffect, SourcesEffect
 from magbridge.calibration.terms import Polynomial, full_order
 from magbridge.diagnose.causes.candidates import AXES, Candidate, of_effect, per
 from magbridge.diagnose.causes.channels import channels_of, extent
@@ -23,10 +23,8 @@ FloatArray = NDArray[np.float64]
 
 MANY = 12
 """Monomials that are tried together."""
-POWERS = 4
-"""Powers of one mass, beyond those of its polynomial, that are tried together."""
-FALLS = (1.0, 0.3)
-"""Ratios by which the series of a field falls from order to order."""
+NEAR = (0.25, 0.5)
+"""How near to its way a mass may pass what it magnetises, in half travels; nearer iron would be struck."""
 STRAIGHT = 4.0
 """Scale, in half travels, of a branch of hysteresis that is practically straight."""
 
@@ -67,37 +65,36 @@ def _powers(values: FloatArray, centre: float, scale: float, order: int, rows: s
 def actuator_order(problem: Problem) -> list[Candidate]:
     """A modelled mass needs a power or a cross term that its polynomial lacks: ``T += b prod x_k^e_k`` (paper, eq. 8).
 
-    One term; or all of the next order, or a curve of one mass, its next powers and across them the others: those are more
-    numbers than anyone believes in, and have one common size, which falls from order to order as a field's series does.
+    One term, or all of the next order; or what no polynomial of a low order follows, for the mass passes iron that is near:
+    :class:`~magbridge.calibration.followers.SourcesEffect`. Those sources have one common size.
     """
     calibration = problem.calibration
-    k = len(calibration.parameters)
-    if not k:
+    if not calibration.parameters:
         return []
     present = {e for term in calibration.terms if isinstance(term, Polynomial) for e in term.exponents}
     highest = max(sum(e) for e in present)
-    missing = [e for e in full_order(k, highest + 1) if e not in present]
-    own = [
-        [tuple(power * (i == j) for j in range(k)) for power in range(highest + 1, highest + POWERS + 1)]
-        for i in range(k)
-    ]
-    curves = [[*powers_, *(e for e in missing if e[i] == highest)] for i, powers_ in enumerate(own)]
-    next_ = [e for e in full_order(k, highest + 2) if e not in present]
-    series = sorted({*(next_ if len(next_) <= MANY else missing), *(e for curve in own for e in curve)})
-    made = {e: _monomial(problem, e) for e in series}
-    groups = [[made[e] for e in group] for group in ([missing] if 1 < len(missing) <= MANY else []) + curves]
-    return [
-        *(made[e] for e in missing),
-        *(replace(reduce(Candidate.with_, group), parts=()) for group in groups),
-        _series([made[e] for e in series], series),
-    ]
+    missing = [e for e in full_order(len(calibration.parameters), highest + 1) if e not in present]
+    made = [_monomial(problem, e) for e in missing]
+    whole = [replace(reduce(Candidate.with_, made), parts=())] if 1 < len(missing) <= MANY else []
+    moved = [p.name for p in calibration.parameters if np.ptp(extent(problem, p.name)) > 0.0]
+    return [*made, *whole, *(_sources(problem, name, near) for name in moved for near in NEAR)]
 
 
-def _series(terms: list[Candidate], exponents: list[tuple[int, ...]]) -> Candidate:
-    """Terms of one series, three numbers each."""
-    orders = np.repeat([float(sum(e)) for e in exponents], 3)
-    spectra = np.array([fall ** (2.0 * (orders - orders.min())) for fall in FALLS])
-    return replace(reduce(Candidate.with_, terms), parts=(), spectra=spectra)
+def _sources(problem: Problem, name: str, near: float) -> Candidate:
+    """Sources all along one mass' way, and a little beyond its ends."""
+    low, high = extent(problem, name)
+    channel, scale = problem.survey.channels[name], 0.5 * near * (high - low)
+    gaps = int(np.ceil(2.0 / (APART * near)))
+    centre = 0.5 * (low + high - gaps * APART * scale)
+    effect = SourcesEffect(cause="actuator_order", channel=name, centre=centre, scale=scale, count=gaps + 1)
+    at = centre + APART * scale * np.arange(gaps + 1)
+    names = tuple(f"{axis} {name} {x:.3g}" for x in at for axis in AXES)
+
+    def phi(rows: slice) -> FloatArray:
+        squared = 1.0 / (1.0 + ((channel.values[rows] - at[:, None]) / scale) ** 2)
+        return np.asarray(squared * np.sqrt(squared))
+
+    return of_effect(problem, effect, 50.0, "nT", names=names, phi=phi, spectra=np.ones((1, effect.size)))
 
 
 def _monomial(problem: Problem, exponents: tuple[int, ...]) -> Candidate:
