@@ -78,7 +78,7 @@ def findings_of(
     findings += _told_by_level(result, options)
     if reference_track is not None:
         findings += _told_by_positions(grid, reference_track, options)
-    if state[-1] == State.SEARCHING:
+    if state[-1] == State.SEARCHING and not off[-1]:
         findings.append("several positions still explain the field at the end of the log")
     return findings
 

@@ -105,6 +105,13 @@ def test_a_map_that_the_vehicle_leaves_is_said(ds, grid, options):
     assert "off the map for" in findings
 
 
+def test_of_a_map_of_elsewhere_nothing_else_is_said(ds, grid, options):
+    elsewhere = AnomalyGrid(grid.longitude + 5.0, grid.latitude, grid.anomaly)
+    unsure = replace(options, start_sigma=5_000.0)
+    findings = navigate(ds.isel(time=slice(0, 50)), elsewhere, unsure, start=PLACE).attrs["findings"]
+    assert findings == "off the map for 100 % of the track, first after 0.0 h: dead reckoning only"
+
+
 def test_motion_from_what_the_log_has(ds, grid, options):
     inertial = ds.drop_vars(["velocity_north", "velocity_east"]).assign(
         dr_latitude=ds["truth_latitude"] - ds["away_north"] / 111_200,
