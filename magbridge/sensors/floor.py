@@ -14,7 +14,8 @@ BLOCK = 8
 POINTS = 16
 """Lowest points that the line is fitted to."""
 SPAN = 4.0
-"""s that a block grows to."""
+"""s that a block grows to, and for which every point is late before the line is believed to be another: a computer
+that is busy with something else delays them for a second."""
 TOLERANCE = 20_000.0
 """µs by which an arrival may contradict the line."""
 DELAY = 5_000.0
@@ -57,6 +58,7 @@ class Floor:
         self._size = BLOCK
         self._count = 0
         self._began, self._least, self.lowest = x, inf, (x, y)
+        self._late_from = inf
 
     def at(self, x: float) -> float:
         """Return the line at `x`, in µs."""
@@ -72,7 +74,7 @@ class Floor:
         return TOLERANCE + 3.0 * self._sigma * abs(x - self._x)
 
     def add(self, x: float, y: float, above: float, limit: float) -> float:
-        """Take a point, `above` the line; where a whole block was more than `limit` above, return how far (else 0).
+        """Take a point, `above` the line; where blocks of `SPAN` were more than `limit` above, return how far (else 0).
 
         Such a block is not taken; `lowest` is its lowest point until the next one is added.
         """
@@ -87,7 +89,9 @@ class Floor:
             return 0.0
         self._count = 0
         if self._least > limit:
-            return self._least
+            self._late_from = min(self._late_from, self._began)
+            return self._least if x - self._late_from >= SPAN else 0.0
+        self._late_from = inf
         self._points.append(self.lowest)
         if len(self._points) == POINTS:
             self._thin(x - self._began)
@@ -105,11 +109,14 @@ class Floor:
 
     def _fit(self) -> None:
         points = self._points
-        n = len(points)
-        x = sum(point[0] for point in points) / n
-        y = sum(point[1] for point in points) / n
-        sxx = sum((point[0] - x) ** 2 for point in points)
-        sxy = sum((point[0] - x) * (point[1] - y) for point in points)
+        x = y = sxx = sxy = 0.0
+        for x_k, y_k in points:  # in loops: sum() adds differently in Python 3.12 than before, and compiled
+            x += x_k
+            y += y_k
+        x, y = x / len(points), y / len(points)
+        for x_k, y_k in points:
+            sxx += (x_k - x) ** 2
+            sxy += (x_k - x) * (y_k - y)
         information = sxx + (self.scatter / self._prior_sigma) ** 2
         slope = self._prior + (sxy - self._prior * sxx) / information
         self.slope = max(-BOUND * self._prior_sigma, min(slope, BOUND * self._prior_sigma))
