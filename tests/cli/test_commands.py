@@ -203,16 +203,21 @@ def test_help_names_every_command(capsys: pytest.CaptureFixture[str]) -> None:
 def test_what_takes_long_says_that_it_is_at_work(monkeypatch: pytest.MonkeyPatch) -> None:
     """On a real terminal, a pty: nothing at first, then the step and a clock; and it leaves the line clean."""
     master, slave = pty.openpty()
+    os.set_blocking(master, False)
     with os.fdopen(slave, "w") as terminal:
         monkeypatch.setattr("sys.stderr", terminal)
-        monkeypatch.setattr("magbridge.progress.PATIENCE", 0.3)
         monkeypatch.setenv("TERM", "xterm")
-        with waiting("fitting") as step:
-            assert not select.select([master], [], [], 0.1)[0] or b"fitting" not in os.read(master, 4096)
-            step("judging")
-            time.sleep(0.5)
+        for patience, wanted in ((1000.0, ()), (0.0, (b"judging", b"0:00:"))):
+            monkeypatch.setattr("magbridge.progress.PATIENCE", patience)
+            shown, deadline = b"", time.monotonic() + (20.0 if wanted else 0.3)
+            with waiting("fitting") as step:
+                step("judging")
+                while time.monotonic() < deadline and not (wanted and all(word in shown for word in wanted)):
+                    if select.select([master], [], [], 0.05)[0]:
+                        shown += os.read(master, 65536)
+            assert (b"judging" in shown) == bool(wanted)
+            assert all(word in shown for word in wanted)
         terminal.flush()
-        shown = os.read(master, 65536)
+        shown += os.read(master, 65536)
     os.close(master)
-    assert b"judging" in shown
-    assert b"0:00:0" in shown
+    assert b"\x1b[2K" in shown.rpartition(b"judging")[2]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import subprocess
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from threading import Thread
@@ -75,6 +76,14 @@ class Peer:
         except AssertionError:
             raise AssertionError(f"never said {text!r}, but: " + "\n".join(self.lines[-60:])) from None
         return next(line for line in self.lines[since:] if text in line)
+
+    def ask_until(self, line: str, text: str, timeout: float = 30.0) -> None:
+        """Type a line again and again until the program says `text`: at first it may not have done what it was told before."""
+        since, begun = len(self.lines), time.monotonic()
+        while not any(text in said for said in self.lines[since:]):
+            assert time.monotonic() - begun < timeout, "\n".join(self.lines[-60:])
+            self.ask(line)
+            self._rig.run(0.5)
 
     def answer(self, name: str) -> dict[str, object]:
         """Return what a script of ours tells of `name`: a line of JSON."""

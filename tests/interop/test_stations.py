@@ -44,11 +44,9 @@ def test_mavproxy(make_rig: MakeRig, start_peer: Start, python: Path) -> None:
     peer.until("Received 15 parameters")
     peer.ask("param show MB_*")
     peer.until("MB_GAP_FACTOR")
-    since = len(peer.lines)
     peer.ask("param set MB_GAP_FACTOR 4.5")
     rig.until((rig.folder / "parameters.json").exists)
-    peer.ask("param show MB_GAP_FACTOR")
-    peer.until("MB_GAP_FACTOR    4.5", since)
+    peer.ask_until("param show MB_GAP_FACTOR", "MB_GAP_FACTOR    4.5")
     rig.fluxgate.speaks = False
     peer.until("digitizer is silent")  # a STATUSTEXT
     rig.fluxgate.speaks = True
