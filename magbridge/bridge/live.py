@@ -88,9 +88,10 @@ class LiveEdge:
         os.write(self._waker, b"!")
 
     def stop(self) -> None:
-        """End :meth:`events` at the next turn; from any thread or signal handler."""
-        self._stopping = True
-        os.write(self._waker, b"!")
+        """End :meth:`events` at the next turn; from any thread or signal handler, and as often as anybody likes."""
+        if not self._stopping:
+            self._stopping = True
+            os.write(self._waker, b"!")
 
     def close(self) -> None:
         """Close the ports."""

@@ -5,7 +5,9 @@ from __future__ import annotations
 import errno
 import glob
 import os
+import select
 import threading
+from contextlib import suppress
 from typing import Any
 
 import serial
@@ -14,6 +16,11 @@ from magbridge.bridge.port import CHUNK, Port
 from magbridge.errors import PortError
 
 __all__ = ["SerialPort"]
+
+PIECE = 4095
+"""Bytes that a terminal line hands on at once, of however many wait."""
+SOON = 0.002
+"""s within which the next piece of a backlog is there."""
 
 
 class SerialPort(Port):
@@ -63,7 +70,10 @@ class SerialPort(Port):
         return [self._fd] if self._serial is not None else []
 
     def read(self) -> bytes:
-        """Return what has come; an end of file or an error on the line is a lost port."""
+        """Return what has come; an end of file or an error on the line is a lost port.
+
+        A backlog as a whole: of an instrument without a clock, only what came last says when it was sent.
+        """
         try:
             data = os.read(self._fd, CHUNK)
         except BlockingIOError:
@@ -72,6 +82,16 @@ class SerialPort(Port):
             raise self.lost(error.strerror) from error
         if not data:
             raise self.lost("hung up")
+        return data if len(data) < PIECE else data + self._backlog()
+
+    def _backlog(self) -> bytes:
+        """Return what waits behind a first piece; the next :meth:`read` meets what ends it."""
+        data = b""
+        with suppress(OSError):
+            for _ in range(CHUNK // PIECE):
+                if not select.select([self._fd], [], [], SOON)[0]:
+                    break
+                data += os.read(self._fd, CHUNK)
         return data
 
     def write(self, data: bytes) -> None:

@@ -12,8 +12,13 @@ import tty
 import pytest
 from standstill import standstill
 
+from magbridge.bridge.events import Clock
+from magbridge.bridge.live import LiveEdge
+from magbridge.bridge.serial_port import SerialPort
 from magbridge.bridge.sockets import PENDING, TcpServer, open_link
 from magbridge.errors import ConfigError, PortError
+from magbridge.sensors import open_driver
+from magbridge.sensors.clock import DeviceClock, Stamp
 
 FRAME = bytes(range(200)) * 5
 
@@ -75,6 +80,28 @@ def test_a_slow_line_loses_whole_messages() -> None:
     assert 0 < port.dropped < 70_000
     pieces = [received[i : i + 700] for i in range(0, len(received), 700)]
     assert all(piece in frames for piece in pieces)
+
+
+def test_a_backlog_of_a_line_is_read_at_once() -> None:
+    """Of an instrument without a clock only the last reading of a backlog tells when it was sent: none is missing."""
+    driver = open_driver("ascii", {"columns": ["x", "y", "z"], "rate": 100.0})
+    clock = DeviceClock.of(driver)
+    master, slave = pty.openpty()
+    tty.setraw(slave)
+    port = SerialPort(os.ttyname(slave), 9600)
+    port.open()
+    stamps: list[Stamp] = []
+    for count in [1] * 200 + [320] + [1] * 200:  # 3.2 s and 10 kB, as when the bridge stood still
+        os.write(master, b"+20000.000 +1000.000 +40000.000\n" * count)
+        taken = len(stamps) + count
+        while len(stamps) < taken:
+            assert select.select(port.fds(), [], [], 5.0)[0]
+            stamps += clock.stamp(driver.feed(port.read()), taken * 10_000)
+    port.close()
+    os.close(slave)
+    os.close(master)
+    assert {(stamp.missing, stamp.stepped) for stamp in stamps} == {(0, False)}
+    assert max(abs(stamp.time_us - 10_000 * (k + 1)) for k, stamp in enumerate(stamps)) <= 4
 
 
 def test_a_server_takes_the_next_client() -> None:
@@ -147,3 +174,12 @@ def test_a_port_that_cannot_be_opened_says_why(tmp_path) -> None:
     for name in (str(tmp_path / "ttyUSB*"), str(tmp_path / "ttyUSB0")):
         with pytest.raises(PortError, match=r"[Nn]o such (device|file)"):
             open_link(name, 9600).open()
+
+
+def test_an_impatient_user_stops_it_twice() -> None:
+    """The second Ctrl-C may come while the log is being closed."""
+    edge = LiveEdge({}, Clock())
+    edge.stop()
+    assert list(edge.events(lambda: 0)) == []
+    edge.close()
+    edge.stop()
