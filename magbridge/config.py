@@ -79,7 +79,8 @@ class Link(Table, frozen=True):
     signing_key : str or None
         File of 32 bytes; packets are signed and unsigned ones refused.
     parameters : str
-        File that keeps parameters changed over the link.
+        File that keeps parameters changed over the link; ``bridge.parameters.json`` beside a ``bridge.toml``, where
+        nothing else is said.
     """
 
     url: Name
@@ -88,7 +89,7 @@ class Link(Table, frozen=True):
     autopilot: SystemId = 1
     baudrate: Annotated[int, Meta(gt=0)] = 57600
     signing_key: str | None = None
-    parameters: Name = "parameters.json"
+    parameters: Name | None = None
 
     def __post_init__(self) -> None:
         if self.component == self.autopilot:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import gc
+import os
 import signal
 import sys
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from threading import Thread
 from typing import Protocol
@@ -134,11 +136,15 @@ def run(path: Path, *, aloud: bool = False) -> None:
 
 
 def _say(texts: deque[str]) -> None:
-    """Tell a terminal; on a thread of its own, because one that hangs must not hold up the bridge."""
-    while True:
-        while texts:
-            print(f"magbridge: {texts.popleft()}", file=sys.stderr, flush=True)
-        time.sleep(TELL)
+    """Tell a terminal; on a thread of its own, because one that hangs must not hold up the bridge.
+
+    Nor its end, where Python would wait for a file in which something is still being written.
+    """
+    with suppress(OSError):  # the terminal is gone
+        while True:
+            while texts:
+                os.write(sys.stderr.fileno(), f"magbridge: {texts.popleft()}\n".encode())
+            time.sleep(TELL)
 
 
 def _open_log(config: Config, edge: LiveEdge, nt_per_count: float) -> TlogWriter | None:
@@ -188,7 +194,8 @@ class Keeper:
 
     def __init__(self, config: Config) -> None:
         self._tell: Callable[[bytes], None] = lambda _: None
-        self._path = config.resolve(config.link.parameters)
+        # of a name of its own: there may be another bridge's configuration beside it
+        self._path = config.resolve(config.link.parameters or f"{config.path.stem}.parameters.json")
         self._kept = store.load(self._path)
         self._signs = config.link.signing_key is not None
         self._saved_us = self._retry_us = self._revision = 0

@@ -46,6 +46,9 @@ SYNC_US = 5_000_000
 class TlogWriter:
     """Writes records to ``UTC-start_index.tlog`` files in a directory.
 
+    The start is the run's, so that the files of one run stand together, whoever else writes to the directory; it is a
+    few seconds late where another run has taken the name.
+
     Parameters
     ----------
     directory : path
@@ -100,7 +103,7 @@ class TlogWriter:
         # of the writing thread
         self._taken = self._dropped = 0
         self._file, self._name = -1, self._directory
-        self._size = self._index = 0
+        self._size = self._index = self._begin_s = 0
         self._torn = False
         self._start_us = self._synced_us = self._failed_us = 0
         self._thread = Thread(target=self._run, name="log writer", daemon=True)
@@ -192,18 +195,19 @@ class TlogWriter:
     def _begin_file(self, time_us: int) -> bool:
         if self.failure and 0 <= time_us - self._failed_us < RETRY_US:
             return False
-        begin = datetime.fromtimestamp(time_us // 1_000_000, UTC)
+        begin_s = self._begin_s or time_us // 1_000_000
         try:
             while self._file < 0:
-                self._index += 1
-                self._name = self._directory / f"{begin:%Y%m%dT%H%M%SZ}_{self._index:04d}.tlog"
+                begin = datetime.fromtimestamp(begin_s, UTC)
+                self._name = self._directory / f"{begin:%Y%m%dT%H%M%SZ}_{self._index + 1:04d}.tlog"
                 try:
                     self._file = os.open(self._name, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644)
                 except FileExistsError:
-                    continue  # an earlier run whose clock began at the same second
+                    begin_s += 1  # another run, whose clock began at the same second
         except OSError as error:
             self._fail(error, time_us)
             return False
+        self._begin_s, self._index = begin_s, self._index + 1
         self._size, self._start_us, self._synced_us = 0, time_us, time_us
         return True
 

@@ -45,7 +45,7 @@ def test_mavproxy(make_rig: MakeRig, start_peer: Start, python: Path) -> None:
     peer.ask("param show MB_*")
     peer.until("MB_GAP_FACTOR")
     peer.ask("param set MB_GAP_FACTOR 4.5")
-    rig.until((rig.folder / "parameters.json").exists)
+    rig.until((rig.folder / "bridge.parameters.json").exists)
     peer.ask_until("param show MB_GAP_FACTOR", "MB_GAP_FACTOR    4.5")
     rig.fluxgate.speaks = False
     peer.until("digitizer is silent")  # a STATUSTEXT

@@ -49,6 +49,20 @@ def test_first_record_after_a_pause_is_on_disk_at_once(tmp_path: Path) -> None:
         assert len(records(path)) == 3
 
 
+def test_two_runs_in_one_folder_keep_apart(tmp_path: Path) -> None:
+    """By name, so that each replays although both began in the same second."""
+    frames = FRAME, FRAME[::-1]
+    with TlogWriter(tmp_path, max_size=1e-3) as one, TlogWriter(tmp_path, max_size=1e-3) as other:
+        for k in range(60):
+            for log, frame in zip((one, other), frames, strict=True):
+                log.write(T0 + 4_000_000 * k, 0, frame)
+                while log.records <= k:
+                    time.sleep(0.001)
+    files = sorted(tmp_path.iterdir())
+    assert [path.name[13:] for path in files] == [f"{s}Z_000{k}.tlog" for s in (20, 21) for k in (1, 2, 3)]
+    assert [frame for path in files for _, frame in records(path)] == [frames[0]] * 60 + [frames[1]] * 60
+
+
 def test_new_file_by_size_and_by_age_loses_nothing(tmp_path: Path) -> None:
     step = 4_000_000
     with TlogWriter(tmp_path, max_size=1e-3, max_age=0.01) as log:  # 20 records, 36 s
