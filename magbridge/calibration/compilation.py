@@ -18,7 +18,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from magbridge.calibration.kernel import COARSE, COLUMNS, FINE, Kernel
+from magbridge.calibration.arithmetic import COARSE, FINE
+from magbridge.calibration.kernel import COLUMNS, Kernel
 from magbridge.calibration.terms import PAIRS, Exponents
 
 if TYPE_CHECKING:

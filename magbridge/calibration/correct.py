@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from magbridge.calibration.arithmetic import Prepared, apply, for_arrays, prepare
+from magbridge.calibration.arithmetic import Prepared, apply, combined, for_arrays, prepare
 from magbridge.calibration.kernel import FARTHEST, Kernel
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.terms import Step
@@ -28,8 +28,8 @@ from magbridge.records import BEYOND, Corrected, Quality
 __all__ = ["CorrectedArrays", "Corrector", "correct", "regressors"]
 
 FloatArray = NDArray[np.float64]
+Span = tuple[int, float, float]
 CHUNK = 4096  # samples: enough to outweigh a call, few enough for a core's cache
-ASKED = 16  # positions whose coefficients are remembered for what-ifs
 GAP, STALE_TELEMETRY = int(Quality.GAP), int(Quality.STALE_TELEMETRY)
 EXTRAPOLATED = int(Quality.EXTRAPOLATED)
 MARGIN = 0.02  # of the half range: telemetry that shakes at its end is not extrapolated
@@ -86,7 +86,10 @@ class Corrector:
         self._flags = self._base
         self._last: list[float] = []
         self._prepared: Prepared = [], []
-        self._asked: dict[tuple[float, ...], list[float]] = {}
+        self._weights: list[list[float]] = self._kernel.weights.T.tolist()
+        self._positions = len(calibration.parameters)
+        self._asked: tuple[tuple[float, ...], list[Span]] = (), []
+        self._ends: list[tuple[list[float], list[float]]] = []
 
     def step(
         self, time_us: int, field: tuple[float, float, float], values: Sequence[float], quality: int = 0
@@ -139,31 +142,46 @@ class Corrector:
                 flags |= STALE_TELEMETRY if isnan(value) else EXTRAPOLATED
         return flags
 
-    def total_at(self, field: tuple[float, float, float], positions: tuple[float, ...]) -> float:
-        """Return the total field (nT) that `field` would mean at other positions; effects are left aside.
+    def changes(
+        self, field: tuple[float, float, float], values: tuple[float, ...], spans: Sequence[Span]
+    ) -> list[float]:
+        """Return by how much (nT) the total field changes over each span of a position; effects are left aside.
 
         Parameters
         ----------
         field : tuple of 3 float
             nT, raw, sensor axes.
-        positions : tuple of float
-            Of the calibration's parameters, in that order.
+        values : tuple of float
+            ``calibration.channels``, in that order.
+        spans : sequence of (int, float, float)
+            Which of them, and the two ends between which it lies; a channel that is no position changes nothing.
         """
-        coefficients = self._asked.get(positions)
-        if coefficients is None:
-            if len(self._asked) == ASKED:
-                self._asked.clear()
-            phi = self._kernel.powers(positions, 1.0)
-            if not max(map(abs, phi)) < FARTHEST:
-                return nan
-            terms = np.array(phi)[:, None] * self._kernel.weights[: len(phi)]
-            coefficients = self._asked[positions] = np.add.reduce(terms, axis=0).tolist()
-        xx, yy, zz, xy, xz, yz, tx, ty, tz = coefficients
-        dx, dy, dz = field[0] - tx, field[1] - ty, field[2] - tz
-        bx = xx * dx + xy * dy + xz * dz
-        by = xy * dx + yy * dy + yz * dz
-        bz = xz * dx + yz * dy + zz * dz
-        return sqrt(bx * bx + by * by + bz * bz)
+        asked = values[: self._positions], [span for span in spans if span[0] < self._positions]
+        if asked != self._asked:
+            self._asked = positions, moved = asked
+            self._ends = [
+                (self._linear(positions, index, low), self._linear(positions, index, high))
+                for index, low, high in moved
+            ]
+        return [_total(field, high) - _total(field, low) for low, high in self._ends]
+
+    def _linear(self, positions: tuple[float, ...], index: int, value: float) -> list[float]:
+        """Return A's six entries and T where position `index` has another value; NaN where that is too far."""
+        phi = self._kernel.powers((*positions[:index], value, *positions[index + 1 :]), 1.0)
+        if not max(map(abs, phi)) < FARTHEST:
+            return [nan] * len(self._weights)
+        return [combined(phi, column) for column in self._weights]
+
+
+def _total(field: tuple[float, float, float], linear: list[float]) -> float:
+    """Return ``|A (H_r - T)|``."""
+    xx, yy, zz, xy, xz, yz, tx, ty, tz = linear
+    hx, hy, hz = field
+    dx, dy, dz = hx - tx, hy - ty, hz - tz
+    bx = xx * dx + xy * dy + xz * dz
+    by = xy * dx + yy * dy + yz * dz
+    bz = xz * dx + yz * dy + zz * dz
+    return sqrt(bx * bx + by * by + bz * bz)
 
 
 def correct(

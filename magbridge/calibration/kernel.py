@@ -29,13 +29,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["COARSE", "COLUMNS", "FARTHEST", "FINE", "Kernel"]
+from magbridge.calibration.arithmetic import BITS, COARSE, FINE, powers, split
+
+__all__ = ["COLUMNS", "FARTHEST", "Kernel"]
 
 FloatArray = NDArray[np.float64]
 
-BITS = 21
-COARSE, FINE = 1.5 * 2.0 ** (52 - BITS), 1.5 * 2.0 ** (52 - 2 * BITS)
-"""Adding and taking away rounds to a multiple of 2^-21, of 2^-42."""
 EXPONENT = 3
 """psi is kept below 2^3, by a power of two where positions lie far outside the range seen: then
 2^24 . 2^21 . 256 products still fit 53 bits."""
@@ -101,20 +100,16 @@ class Kernel:
         return np.asarray(found if scale is None else found / scale)
 
     def sums_of_one(self, phi: list[float]) -> list[float]:
-        """Return the same 81 sums of one sample's regressors: one product, so that it is quick."""
+        """Return the same 81 sums of one sample's regressors: few calls of numpy, so that it is quick."""
         if self.units is not None:
             phi = [value * unit for value, unit in zip(phi, self.units, strict=True)]
         largest = max(*phi, -min(phi))
         scale = ldexp(1.0, min(EXPONENT - frexp(largest * largest)[1], 0)) if largest < FARTHEST else nan
-        psi = np.array([phi[i] * phi[j] * scale for i, j in self.pairs])
-        parts = np.empty((len(psi), 2))
-        coarse = np.add(psi, COARSE, out=parts[:, 0])
-        coarse -= COARSE
-        fine = np.subtract(psi, coarse, out=parts[:, 1])
-        fine += FINE
-        fine -= FINE
-        found = self.both @ parts
-        sums: list[float] = ((found[COLUMNS:, 0] + found[:COLUMNS, 1] + found[:COLUMNS, 0]) / scale).tolist()
+        parts = np.array(split(phi, self.pairs, scale))
+        found = self.crossed.dot(parts)
+        found += self.coarse.dot(parts[len(self.pairs) :])
+        found /= scale
+        sums: list[float] = found.tolist()
         return sums
 
     @cached_property
@@ -123,20 +118,13 @@ class Kernel:
         return list(zip(self.first.tolist(), self.second.tolist(), strict=True))
 
     @cached_property
-    def both(self) -> FloatArray:
-        """(162, q) `coarse` above `fine`."""
-        return np.concatenate([self.coarse, self.fine])
+    def crossed(self) -> FloatArray:
+        """(81, 2 q) `coarse` beside `fine`: for the products of a fine part with a coarse one."""
+        return np.concatenate([self.coarse, self.fine], axis=1)
 
     def powers(self, values: Sequence[Any], one: Any) -> list[Any]:
         """Return the monomials, of floats or of arrays: the same multiplications in the same order."""
-        x = [
-            (value - centre) / scale
-            for value, centre, scale in zip(values, self.centre, self.scale, strict=False)
-        ]
-        phi = [one]
-        for parent, k in self.parents:
-            phi.append(phi[parent] * x[k])
-        return phi
+        return powers(values, self.centre, self.scale, self.parents, one)
 
     def monomials_of(self, positions: FloatArray) -> FloatArray:
         """(m, n) monomials of (n, k) positions."""

@@ -108,15 +108,21 @@ class Publisher:
             flags |= SEQUENCE
         if reading.power_cycle is not None:
             flags |= POWER_CYCLE
-        x, y, z = reading.channel_delay
+        x, y, z = reading.field
+        x_count, y_count, z_count = reading.counts or NO_COUNTS
+        x_late, y_late, z_late = reading.channel_delay
         return RAW.struct.pack(
             sample.reading_us + self.utc_offset_us,
             (reading.sequence or 0) & MASK,
-            *reading.field,
-            *(reading.counts or NO_COUNTS),
-            round(x * 1e6),
-            round(y * 1e6),
-            round(z * 1e6),
+            x,
+            y,
+            z,
+            x_count,
+            y_count,
+            z_count,
+            round(x_late * 1e6),
+            round(y_late * 1e6),
+            round(z_late * 1e6),
             reading.temperature,
             reading.supply,
             (reading.power_cycle or 0) & 0xFFFF,
@@ -126,14 +132,20 @@ class Publisher:
 
     def _field(self, sample: Sample) -> tuple[bytes]:
         corrected = sample.corrected
+        x, y, z = corrected.field
+        x_sigma, y_sigma, z_sigma = corrected.field_sigma
         payload = FIELD.struct.pack(
             sample.time_us + self.utc_offset_us,
             corrected.total_field,
             self.samples & MASK,
             self._calibration_id,
             corrected.total_field_sigma,
-            *corrected.field,
-            *corrected.field_sigma,
+            x,
+            y,
+            z,
+            x_sigma,
+            y_sigma,
+            z_sigma,
             sample.anomaly,
             sample.telemetry_age,
             (self._codec.now_us - sample.time_us) * 1e-6,

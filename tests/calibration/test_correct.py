@@ -241,11 +241,14 @@ def test_wrong_number_of_channels_is_one_clear_line() -> None:
         Corrector(cal).step(0, (0.0, 0.0, 0.0), (1.0,))
 
 
-def test_what_if_at_other_positions_is_the_total_there() -> None:
+def test_a_change_of_position_is_the_difference_of_the_totals() -> None:
     cal = random_calibration(3, boresight=True)
     field, positions, _ = random_samples(4, 40, 2)
     corrector = Corrector(cal)
     for h, p in zip(field.tolist(), positions.tolist(), strict=True):
-        told = corrector.step(0, tuple(h), p).total_field
-        assert corrector.total_at(tuple(h), tuple(p)) == pytest.approx(told, rel=1e-11)
-        assert corrector.total_at(tuple(h), tuple(p)) == corrector.total_at(tuple(h), tuple(p))
+        there, spans = corrector.step(0, tuple(h), p).total_field, [(0, 0.0, p[0]), (1, -0.5, p[1])]
+        elsewhere = [corrector.step(0, tuple(h), at).total_field for at in ((0.0, p[1]), (p[0], -0.5))]
+        told = corrector.changes(tuple(h), tuple(p), spans)
+        assert told == pytest.approx([there - value for value in elsewhere], abs=1e-11 * there)
+        assert corrector.changes(tuple(h), tuple(p), spans) == told
+        assert corrector.changes(tuple(h), (*p, 3.0), [*spans, (2, 0.0, 1.0)]) == told
