@@ -79,9 +79,11 @@ def deployment(
     Raises
     ------
     FormatError
-        A declared unit that does not fit the column.
+        A declared unit that does not fit the column; a ``heading_reference`` that is none.
     """
-    units, long_names = units or {}, long_names or {}
+    units, attrs, long_names = units or {}, attrs or {}, long_names or {}
+    if (reference := attrs.get("heading_reference", "true")) not in ("true", "magnetic"):
+        raise FormatError(file, f"heading_reference: expected true or magnetic, not {reference!r}")
     variables = {}
     for name, values in {"time": time, **columns}.items():
         unit = units.get(name, "")
@@ -95,7 +97,7 @@ def deployment(
             _describe(name, unit, long_names.get(name)),
         )
     return xr.Dataset(
-        variables, coords={"time": variables.pop("time")}, attrs={"source": Path(file).name, **(attrs or {})}
+        variables, coords={"time": variables.pop("time")}, attrs={"source": Path(file).name, **attrs}
     )
 
 
