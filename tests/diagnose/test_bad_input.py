@@ -90,7 +90,7 @@ def test_a_sample_that_is_given_twice_is_one(plain: tuple[xr.Dataset, Calibratio
             lambda ds: ds.drop_vars("reference_field").assign(latitude=np.nan * ds["latitude"]),
             "latitude and longitude, or reference_field",
         ),
-        (lambda ds: ds.drop_vars("battpos"), "'battpos' is missing"),
+        (lambda ds: ds.drop_vars("battpos"), "column 'battpos': expected this column"),
         (lambda ds: ds.isel(time=slice(0, 3)), "3 samples, at least 60"),
         (lambda ds: ds.assign(mag_y=ds["mag_y"] * np.nan), "'mag_y' has 0 numbers"),
         (lambda ds: ds.assign({f"mag_{axis}": 0.0 * ds[f"mag_{axis}"] for axis in "xyz"}), "never change"),

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magbridge.calibration.model import Calibration
+from magbridge.columns import CHANNELS, require
 from magbridge.config import Align
 from magbridge.diagnose.compare.survey import FEWEST, Survey, assemble
 from magbridge.errors import DataError
@@ -120,11 +121,7 @@ def _columns(
     sensor = str(ds.attrs.get("sensor", ""))
     if sensor and calibration.sensor.name and sensor != calibration.sensor.name:
         raise DataError(f"{source}: sensor {sensor!r}, but the calibration is of {calibration.sensor.name!r}")
-    for name in ("mag_x", "mag_y", "mag_z", *(parameter.name for parameter in calibration.parameters)):
-        if name not in ds:
-            raise DataError(
-                f"{source}: column {name!r} is missing; there are {', '.join(map(str, ds.data_vars))}"
-            )
+    require(ds, (*CHANNELS, *(parameter.name for parameter in calibration.parameters)))
     once = np.unique(ds["time"], return_index=True)[1]
     if once.size < ds.sizes["time"]:
         ds = ds.isel(time=once)
