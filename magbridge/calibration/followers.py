@@ -23,8 +23,6 @@ __all__ = ["ClockEffect", "MonomialEffect", "PlayEffect", "PowersEffect", "Sourc
 FloatArray = NDArray[np.float64]
 MAX_INTERVAL = 60_000_000
 """µs; over a longer gap a rate of change means nothing."""
-APART = 1.5
-"""How far apart sources are, in their distance from the way: closer ones make the same field."""
 
 
 def offsets(regressors: int) -> FloatArray:
@@ -103,7 +101,7 @@ class PowersEffect(Follower, frozen=True, kw_only=True):
 
 
 class SourcesEffect(Follower, frozen=True, kw_only=True):
-    """What a mass passes on its way: ``T += sum_k c_k (1 + x_k^2)^(-3/2)``, ``x_k = (p - centre) / scale - 3 k / 2``.
+    """What a mass passes on its way: ``T += sum_k c_k (1 + x_k^2)^(-3/2)``, ``x_k = (p - centre) / scale - k apart``.
 
     Iron that a mass magnetises, or is magnetised by, has a field that falls with the cube of their distance. Wherever it
     is, sources in a row beside the way make the same field: an equivalent layer (Dampney 1969, Geophysics 34:39).
@@ -112,11 +110,14 @@ class SourcesEffect(Follower, frozen=True, kw_only=True):
     ----------
     centre, scale : float
         Where the first source is, and how far all are from the way.
+    apart : float
+        How far from each other, in `scale`.
     count : int
         Sources.
     """
 
     kind: ClassVar[str] = "sources"
+    apart: Width
     count: Power = 1
 
     @property
@@ -126,14 +127,14 @@ class SourcesEffect(Follower, frozen=True, kw_only=True):
 
     def begin(self, calibration: Calibration) -> Step:
         """Return a stepper; a missing value leaves the last one standing."""
-        index, count = calibration.channels.index(self.channel), self.count
+        index, count, apart = calibration.channels.index(self.channel), self.count, self.apart
         centre, scale, x = self.centre, self.scale, 0.0
 
         def step(time_us: int, hx: float, hy: float, hz: float, values: Sequence[float]) -> tuple[float, ...]:
             nonlocal x
             if not isnan(values[index]):
                 x = (values[index] - centre) / scale
-            return tuple((1.0 + (x - APART * k) ** 2) ** -1.5 for k in range(count))
+            return tuple((1.0 + (x - apart * k) ** 2) ** -1.5 for k in range(count))
 
         return step
 

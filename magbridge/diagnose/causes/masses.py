@@ -10,7 +10,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from magbridge.calibration.followers import APART, MonomialEffect, PlayEffect, PowersEffect, SourcesEffect
+from magbridge.calibration.followers import MonomialEffect, PlayEffect, PowersEffect, SourcesEffect
 from magbridge.calibration.terms import Polynomial, full_order
 from magbridge.diagnose.causes.candidates import AXES, Candidate, of_effect, per
 from magbridge.diagnose.causes.channels import channels_of, extent
@@ -25,6 +25,8 @@ MANY = 12
 """Monomials that are tried together."""
 NEAR = (0.25, 0.5)
 """How near to its way a mass may pass what it magnetises, in half travels; nearer iron would be struck."""
+APART = 1.25
+"""How far apart sources in a row are, in their distance from the way: closer ones make the same field."""
 STRAIGHT = 4.0
 """Scale, in half travels, of a branch of hysteresis that is practically straight."""
 
@@ -86,7 +88,9 @@ def _sources(problem: Problem, name: str, near: float) -> Candidate:
     channel, scale = problem.survey.channels[name], 0.5 * near * (high - low)
     gaps = int(np.ceil(2.0 / (APART * near)))
     centre = 0.5 * (low + high - gaps * APART * scale)
-    effect = SourcesEffect(cause="actuator_order", channel=name, centre=centre, scale=scale, count=gaps + 1)
+    effect = SourcesEffect(
+        cause="actuator_order", channel=name, centre=centre, scale=scale, apart=APART, count=gaps + 1
+    )
     at = centre + APART * scale * np.arange(gaps + 1)
     names = tuple(f"{axis} {name} {x:.3g}" for x in at for axis in AXES)
 
