@@ -73,6 +73,10 @@ FOREIGN: dict[str, Effect] = {
     "crossover": sensor.crossover,
     "popcorn": sensor.popcorn,
     "discharge": vehicle.discharge,
+    "towed": vehicle.towed,
+    "sunlit": vehicle.sunlit,
+    "eccentric": vehicle.eccentric,
+    "astray": surroundings.astray,
 }
 """Effects that the contract has no name for."""
 

@@ -114,3 +114,12 @@ def mains(scene: Scene, size: float, rng: Generator) -> None:
         np.sin(phase + 2 * bearing), [0.0, 0.0, 1.0]
     )
     scene.earth = scene.earth + size * 1e4 / (aside**2 + above**2)[:, None] * turning
+
+
+def astray(scene: Scene, size: float, rng: Generator) -> None:
+    """Under water nobody knows the current, so the map is read beside the way until the next fix; size in nT after half an hour."""
+    top = scene.track.depth < scene.track.depth.min() + 0.1 * np.ptp(scene.track.depth)
+    fixed = scene.t[np.maximum.accumulate(np.where(top, np.arange(len(top)), 0))]
+    current = autoregressive(rng, (len(top),), 1.0, 7200.0 / scene.track.step) + rng.choice([-1.0, 1.0])
+    off = current * (scene.t - fixed) / 1800.0
+    scene.reference = scene.reference + size * np.interp(scene.when, scene.t, off)

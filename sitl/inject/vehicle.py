@@ -250,3 +250,27 @@ def discharge(scene: Scene, size: float, rng: Generator) -> None:
     place = scene.track.parameters["battpos"]
     nearer = 1.0 + rng.uniform(0.05, 0.15) * (place - place[0])
     scene.field = scene.field + size * direction(rng) * (drawn * nearer**3)[:, None]
+
+
+def towed(scene: Scene, size: float, rng: Generator) -> None:
+    """Something magnetic on a line astern swings out in turns, and back when they end; size in nT at 1 deg/s."""
+    rate = np.gradient(scene.track.heading, scene.track.step)
+    swung = first_order(
+        first_order(rate, scene.track.step, 8.0), scene.track.step, float(rng.uniform(5.0, 30.0))
+    )
+    aside, astern = direction(rng), direction(rng)
+    scene.field = scene.field + size * (swung[:, None] * aside - 0.5 * (swung**2)[:, None] * astern)
+
+
+def sunlit(scene: Scene, size: float, rng: Generator) -> None:
+    """The sun warms a dark housing near the surface, and water cools it; no thermometer is there; size in nT at its warmest."""
+    shines = np.exp(-scene.track.depth / rng.uniform(3.0, 10.0))
+    warm = first_order(shines, scene.track.step, float(rng.uniform(200.0, 900.0)))
+    scene.field = scene.field + size * direction(rng) * ((warm - warm[0]) / np.ptp(warm))[:, None]
+
+
+def eccentric(scene: Scene, size: float, rng: Generator) -> None:
+    """The gear of the battery's encoder runs out of true: what it tells is off by a wave at each turn; size in inches."""
+    place = scene.track.parameters["battpos"]
+    turn = 2.0 * np.pi * place / rng.uniform(0.2, 0.5) + rng.uniform(0.0, 2.0 * np.pi)
+    scene.logged["battpos"] = (place + size * np.sin(turn), "in")
