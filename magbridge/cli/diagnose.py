@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -62,10 +63,10 @@ def diagnose(
     with waiting("reading") as step:
         logs = [read(path) for path in files]
         note_losses(*(log.attrs for log in logs))
-        for path, log in zip(files, logs, strict=True):
-            if digest(path) in known.inputs.values():
-                complain(f"{path}: {ITSELF}", 0)
-            _suspect(log)
+        remarks = [f"{path}: {ITSELF}" for path in files if digest(path) in known.inputs.values()]
+        remarks += [remark for log in logs for remark in _suspect(log)]
+        for remark in remarks:
+            complain(remark, 0)
         found = examine(
             logs,
             known,
@@ -73,6 +74,7 @@ def diagnose(
             learned_from=[read(path) for path in learned_from],
             grid=read_grid(grid) if grid else None,
             progress=step,
+            remarks=remarks,
         )
     if doubt := unsettled(found.problem, found.named, found.calibration):
         complain(doubt, 0)
@@ -98,15 +100,14 @@ def _plain(one: dict[str, Any]) -> str:
     return f"{one['cause']} ({one['channel']})" if one["channel"] else str(one["cause"])
 
 
-def _suspect(log: xr.Dataset) -> None:
-    """Warn of isolated numbers that may mean 'not known' and would otherwise be taken for an effect."""
+def _suspect(log: xr.Dataset) -> Iterator[str]:
+    """Yield warnings of isolated numbers that may mean 'not known' and would otherwise be taken for an effect."""
     for name, column in log.data_vars.items():
         values = column.to_numpy()
         for nothing in NOTHING:
             alone = values == nothing
             if alone.any() and not (values[~alone] < 0.1 * nothing).any():
-                complain(
+                yield (
                     f"{log.attrs['source']}, column {str(name)!r}: {nothing:g} in {alone.sum()} of {len(values)} rows is read as"
-                    f" a number; if it means 'not known', leave it empty, or write # fill_value = {nothing:g} above the CSV's header",
-                    0,
+                    f" a number; if it means 'not known', leave it empty, or write # fill_value = {nothing:g} above the CSV's header"
                 )

@@ -56,6 +56,7 @@ def diagnose(
     grid: AnomalyGrid | None = None,
     causes: Mapping[str, Cause] = CAUSES,
     progress: Callable[[str], object] = str,
+    remarks: Sequence[str] = (),
 ) -> Diagnosis:
     """Find what the forward model gets wrong in these deployments.
 
@@ -74,6 +75,8 @@ def diagnose(
         The table of causes.
     progress : callable, optional
         Told each step's name.
+    remarks : sequence of str, optional
+        What the report's reader must know of the logs.
 
     Raises
     ------
@@ -87,7 +90,7 @@ def diagnose(
         from magbridge.diagnose.report.files import write  # noqa: PLC0415  (matplotlib only where a report is wanted)
 
         progress("writing the report")
-        write(diagnosis, out_dir, causes)
+        write(diagnosis, out_dir, causes, remarks)
     return diagnosis
 
 

@@ -35,8 +35,11 @@ def some(ds: xr.Dataset, count: int) -> xr.DataArray:
     return ds["time"] >= ds["time"][count]
 
 
-def test_the_demonstrations_survey_is_plain(plain: tuple[xr.Dataset, Calibration]) -> None:
-    assert diagnose([plain[0]], plain[1]).verdict == "nothing_found"
+def test_the_demonstrations_survey_is_plain(plain: tuple[xr.Dataset, Calibration], tmp_path: Path) -> None:
+    """And the report says what its reader must know of the log."""
+    found = diagnose([plain[0]], plain[1], tmp_path, remarks=["a<b>.csv: fitted to this log"])
+    assert found.verdict == "nothing_found"
+    assert "a&lt;b&gt;.csv: fitted to this log.</p>" in (tmp_path / "report.html").read_text()
 
 
 def test_where_one_file_cannot_be_written_none_is(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 
 from magbridge.calibration.file import encode_calibration
@@ -17,7 +17,10 @@ __all__ = ["write"]
 
 
 def write(
-    diagnosis: Diagnosis, out_dir: str | os.PathLike[str], causes: Mapping[str, Cause] = CAUSES
+    diagnosis: Diagnosis,
+    out_dir: str | os.PathLike[str],
+    causes: Mapping[str, Cause] = CAUSES,
+    remarks: Sequence[str] = (),
 ) -> None:
     """Write ``findings.json``, ``calibration.json`` and ``report.html``: all three, or none.
 
@@ -29,7 +32,7 @@ def write(
     contents = {
         "calibration.json": encode_calibration(diagnosis.calibration),
         "findings.json": findings_json(diagnosis, causes),
-        "report.html": report_html(diagnosis, causes).encode(),
+        "report.html": report_html(diagnosis, causes, remarks).encode(),
     }
     with new_folder(out_dir) as folder, ExitStack() as written:
         for name, content in contents.items():

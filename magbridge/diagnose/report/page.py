@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from html import escape
 from typing import TYPE_CHECKING
@@ -62,7 +62,7 @@ KINDS = {
 """What is left, as the subject of a sentence."""
 
 
-def report_html(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> str:
+def report_html(diagnosis: Diagnosis, causes: Mapping[str, Cause], remarks: Sequence[str] = ()) -> str:
     """Return the page.
 
     Parameters
@@ -70,11 +70,13 @@ def report_html(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> str:
     diagnosis : Diagnosis
     causes : mapping
         The table of causes that were asked about.
+    remarks : sequence of str
+        What a reader must know of the logs, each without its full stop.
     """
     title = f"Diagnosis of {escape(diagnosis.problem.survey.source)}"
     body = [
         f"<h1>{title}</h1>",
-        *_compared(diagnosis),
+        *_compared(diagnosis, remarks),
         "<h2>What was found, and why it is believed</h2>",
         *_found(diagnosis, causes),
         "<h2>What is left</h2>",
@@ -89,7 +91,7 @@ def report_html(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> str:
     )
 
 
-def _compared(diagnosis: Diagnosis) -> list[str]:
+def _compared(diagnosis: Diagnosis, remarks: Sequence[str]) -> list[str]:
     """Show the verdict, and the difference between measured and simulated field in five figures."""
     survey = diagnosis.problem.survey
     first, last = (
@@ -105,6 +107,7 @@ def _compared(diagnosis: Diagnosis) -> list[str]:
         f"calibration: {escape(diagnosis.problem.calibration.method or 'unnamed')}, "
         f"{diagnosis.problem.calibration.coefficients.size} coefficients</p>"),
         f'<p class="verdict">{_verdict(diagnosis)}</p>',
+        *(f"<p><b>Note:</b> {escape(remark)}.</p>" for remark in remarks),
         f"<p><b>Note:</b> {doubt}.</p>" if (doubt := unsettled(diagnosis.problem, diagnosis.named, diagnosis.calibration)) else "",
         "<h2>Measured against simulated</h2>",
         ("<p>The calibration describes what the vehicle's own magnetism and the sensor's errors do to every reading. The corrected "
