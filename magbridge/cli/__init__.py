@@ -11,7 +11,7 @@ import sys
 from contextlib import suppress
 from pathlib import Path
 
-from cyclopts import CycloptsError, UnusedCliTokensError
+from cyclopts import CycloptsError, MissingArgumentError, UnusedCliTokensError
 
 from magbridge.cli import ashore, bridge, calibrate, diagnose, navigate
 from magbridge.cli.common import app, complain
@@ -52,13 +52,8 @@ def main(arguments: list[str] | None = None) -> int:
         signal.signal(signal.SIGTERM, _terminated)
     try:
         app(arguments, exit_on_error=False, print_error=False, result_action="return_value")
-    except UnusedCliTokensError as error:
-        unused = " ".join(error.unused_tokens or ())
-        return complain(
-            f"{unused}: unexpected argument; an option with several values is repeated for each", 2
-        )
     except CycloptsError as error:
-        return complain(str(error), 2)
+        return complain(_misuse(error), 2)
     except MagbridgeError as error:
         return complain(str(error), error.exit_code)
     except ImportError as error:
@@ -77,6 +72,15 @@ def main(arguments: list[str] | None = None) -> int:
         if not isinstance(end.__context__, BrokenPipeError):
             raise
     return 0
+
+
+def _misuse(error: CycloptsError) -> str:
+    if isinstance(error, UnusedCliTokensError):
+        unused = " ".join(error.unused_tokens or ())
+        return f"{unused}: unexpected argument; an option with several values is repeated for each"
+    if isinstance(error, MissingArgumentError) and error.keyword is None:  # the option itself is not there
+        return str(error).replace("requires an argument", "is required")
+    return str(error)
 
 
 class _Terminated(SystemExit):
