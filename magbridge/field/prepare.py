@@ -95,7 +95,10 @@ def continue_upward(grid: AnomalyGrid, height: float) -> AnomalyGrid:
 
 
 def merge(grids: Sequence[AnomalyGrid], spacing: float | None = None) -> AnomalyGrid:
-    """Return the mean of the grids wherever at least one of them is; on the finest of their spacings."""
+    """Return the mean of the grids wherever at least one of them is; on the finest of their spacings.
+
+    What they differ by where they overlap is an error of each: sigma is no less than that.
+    """
     return _merged(grids, spacing)[0]
 
 
@@ -121,6 +124,7 @@ def _merged(grids: Sequence[AnomalyGrid], spacing: float | None) -> tuple[Anomal
     shared = count > 1
     differences = 2.0 * (squares - total**2 / np.maximum(count, 1.0))[shared] / (count[shared] - 1.0)
     apart = sqrt(max(float(differences.mean()), 0.0)) if shared.any() else nan
+    variance = np.fmax(variance, 0.5 * apart**2 * count)
     with np.errstate(invalid="ignore"):
         merged = AnomalyGrid(
             longitude,

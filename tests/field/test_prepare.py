@@ -79,14 +79,23 @@ def test_nothing_is_prepared_downward():
 
 def test_merge_is_the_mean_in_the_overlap():
     west = AnomalyGrid(LON[:50], LAT, np.full((61, 50), 10.0), sigma=3.0)
-    east = AnomalyGrid(LON[30:], LAT[10:], np.full((51, 51), 20.0), sigma=4.0)
+    east = AnomalyGrid(LON[30:], LAT[10:], np.full((51, 51), 12.0), sigma=4.0)
     both = merge([west, east])
     assert both.look_up(-58.09, 49.5).anomaly == pytest.approx(10.0)
-    assert both.look_up(-57.91, 49.5).anomaly == pytest.approx(20.0)
+    assert both.look_up(-57.91, 49.5).anomaly == pytest.approx(12.0)
     overlap = both.look_up(-58.0, 49.5)
-    assert overlap.anomaly == pytest.approx(15.0)
+    assert overlap.anomaly == pytest.approx(11.0)
     assert np.sqrt(overlap.variance) == pytest.approx(2.5)
     assert np.isnan(both.look_up(-57.91, 49.455).anomaly)
+
+
+def test_surveys_that_disagree_are_not_exact():
+    """Each of two that differ by 10 nT is off by 7 nT, alone; their mean is off by 5."""
+    west = AnomalyGrid(LON[:50], LAT, np.full((61, 50), 10.0))
+    east = AnomalyGrid(LON[30:], LAT, np.full((61, 51), 20.0), sigma=8.0)
+    both = merge([west, east])
+    sigma = [float(np.sqrt(both.look_up(place, 49.5).variance)) for place in (-58.09, -58.0, -57.91)]
+    assert sigma == pytest.approx([10.0 / np.sqrt(2.0), 5.0, 8.0])
 
 
 def test_it_is_told_how_far_surveys_are_apart():
