@@ -19,8 +19,8 @@ __all__ = ["SerialPort"]
 
 PIECE = 4095
 """Bytes that a terminal line hands on at once, of however many wait."""
-SOON = 0.002
-"""s within which the next piece of a backlog is there."""
+SOON = 0.02
+"""s within which the next piece of a backlog is there, on a busy computer, too."""
 
 
 class SerialPort(Port):
