@@ -65,10 +65,10 @@ def _powers(values: FloatArray, centre: float, scale: float, order: int, rows: s
 
 
 def actuator_order(problem: Problem) -> list[Candidate]:
-    """A modelled mass needs a power or a cross term that its polynomial lacks: ``T += b prod x_k^e_k`` (paper, eq. 8).
+    """A mass needs what its polynomial lacks: a term ``T += b prod x_k^e_k``, or sources near its way, ``(1 + x_k^2)^(-3/2)``.
 
-    One term, or all of the next order; or what no polynomial of a low order follows, for the mass passes iron that is near:
-    :class:`~magbridge.calibration.followers.SourcesEffect`. Those sources have one common size.
+    One term, or all of the next order (paper, eq. 8); or what no polynomial of a low order follows, for the mass passes iron
+    that is near: :class:`~magbridge.calibration.followers.SourcesEffect`. Those sources have one common size.
     """
     calibration = problem.calibration
     if not calibration.parameters:
