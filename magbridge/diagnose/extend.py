@@ -1,4 +1,4 @@
-"""From a finding to a calibration: the found effects as terms, with the calibration's own numbers refitted."""
+"""From a finding to a calibration: found effects become terms, and its own numbers are fitted anew."""
 
 from __future__ import annotations
 
@@ -73,9 +73,10 @@ def extend(problem: Problem, model: Sequence[Candidate], fit: Joint) -> Calibrat
 
 
 def flown(survey: Survey, calibration: Calibration) -> Calibration:
-    """Return the calibration without those rates of change that live, on this survey, bring in more than they take away.
+    """Return the calibration without those rates of change that, live, would cost more than they mend.
 
-    Live there is no sample after, and a rate is a difference backwards: of a vehicle that sways from sample to sample, noise.
+    Live there is no sample after, and a rate is a difference backwards: of a vehicle that sways from sample
+    to sample, noise.
     """
     place = 0
     for effect in calibration.effects:
@@ -110,9 +111,10 @@ def leveled(problem: Problem, model: Sequence[Candidate], fit: Joint, extended: 
 
     Notes
     -----
-    The logs that the calibration was fitted to have the same map as their reference. Its error may be as large where they were
-    flown as it is along the track, and is then in the calibration's scale, where no log shows it. With s the coefficients
-    that raise the corrected field by 1 nT everywhere, and m the error of the map that was found,
+    The logs that the calibration was fitted to have the same map as their reference. Its error may be as
+    large where they were flown as it is along the track, and is then in the calibration's scale, where no log
+    shows it. With s the coefficients that raise the corrected field by 1 nT everywhere, and m the error of
+    the map that was found,
 
     .. math:: C \leftarrow C + \overline{m^2}\, s s^T
     """
@@ -135,9 +137,10 @@ def level(fit: Joint) -> float:
 def settle(
     problem: Problem, model: Sequence[Candidate], fit: Joint, order: int
 ) -> tuple[Problem, list[Columns], Joint]:
-    """Linearise anew about the extended calibration, where a large effect has bent the magnitude, and fit again.
+    """Linearise anew about the extended calibration, and fit again.
 
-    Rates of change keep the columns of the search: a live effect's backward differences hold the sample's own noise.
+    A large effect has bent the magnitude. Rates of change keep the columns of the search: a live effect's
+    backward differences hold the sample's own noise.
     """
     columns = [candidate.columns for candidate in model]
     if not model or any(isinstance(effect, (RateEffect, ClockEffect)) for c in model for effect in c.effects):
@@ -157,10 +160,10 @@ def widened(model: Sequence[Candidate], fit: Joint) -> Joint:
 
     Notes
     -----
-    A cause of Wald's statistic ``W = b^T C_bb^-1 b`` has a signal of the whitened norm ``sqrt(W)``. A regressor that is off by
-    :data:`~.inference.evidence.IDEAL` of it leaves a misfit that nobody knows the shape of: one more noise, of the power
-    ``IDEAL^2 W / MODES`` in every direction, where the data's has 1. The cause's coefficients, and what the calibration
-    gives way to them, get that much more variance:
+    A cause of Wald's statistic ``W = b^T C_bb^-1 b`` has a signal of the whitened norm ``sqrt(W)``. A
+    regressor that is off by :data:`~.inference.evidence.IDEAL` of it leaves a misfit that nobody knows the
+    shape of: one more noise, of the power ``IDEAL^2 W / MODES`` in every direction, where the data's has 1.
+    The cause's coefficients, and what the calibration gives way to them, get that much more variance:
 
     .. math:: C \leftarrow C + \frac{IDEAL^2 W}{MODES}\, C_{:b} C_{bb}^{-1} C_{b:}
     """
@@ -192,7 +195,8 @@ def _about(problem: Problem, model: Sequence[Candidate], fit: Joint) -> tuple[Pr
     selector = np.eye(extended.coefficients.size)[:, problem.calibration.coefficients.size :]
     effects, at, columns = derivatives(extended, samples, g, -selector), 0, []
     again = replace(problem, residual=e, slopes=g)
-    # what the residual would be at the first point, were it linear about this one; the reference was not mended in it
+    # what the residual would be at the first point, were it linear about this one; the reference was not
+    # mended in it
     again.residual[:] += again.free @ fit.z
     for candidate, place in zip(model, slices(model), strict=True):
         if not candidate.effects:

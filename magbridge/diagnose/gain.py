@@ -2,16 +2,16 @@ r"""What mending gains: on dives that were left out, dive by dive against the ca
 
 Notes
 -----
-The *score* of a model is the log predictive density of every fold of dives, given the others. With the log likelihood l of the
-noise at the fit c to all, the folds' information ``A_f^T A_f`` and P all of it with the prior's, Laplace's approximation
-(exact for Gaussian noise, by Woodbury's identity) is
+The *score* of a model is the log predictive density of every fold of dives, given the others. With the log
+likelihood l of the noise at the fit c to all, the folds' information ``A_f^T A_f`` and P all of it with the
+prior's, Laplace's approximation (exact for Gaussian noise, by Woodbury's identity) is
 
 .. math:: S = l - \tfrac12 \sum_f \left[ (c - c_{-f})^T (P - A_f^T A_f) (c - c_{-f})
               + \log\det P - \log\det (P - A_f^T A_f) \right]
 
-what the data say, less what it took to learn each fold's coefficients from the others. The difference of two models'
-scores is the log of the odds that the left-out dives give one against the other: the pseudo-Bayes factor (Geisser &
-Eddy 1979, JASA 74:153).
+what the data say, less what it took to learn each fold's coefficients from the others. The difference of two
+models' scores is the log of the odds that the left-out dives give one against the other: the pseudo-Bayes
+factor (Geisser & Eddy 1979, JASA 74:153).
 """
 
 from __future__ import annotations

@@ -87,7 +87,8 @@ def diagnose(
     with threadpool_limits(1, "blas"):
         diagnosis = _examine(datasets, calibration, learned_from, grid, causes, progress)
     if out_dir is not None:
-        from magbridge.diagnose.report.files import write  # noqa: PLC0415  (matplotlib only where a report is wanted)
+        # matplotlib only where a report is wanted
+        from magbridge.diagnose.report.files import write  # noqa: PLC0415
 
         progress("writing the report")
         write(diagnosis, out_dir, causes, remarks)
@@ -149,8 +150,8 @@ def _posed(survey: Survey, calibration: Calibration) -> Problem:
     off, field = float(np.median(np.abs(problem.residual))), float(np.median(survey.reference))
     if off > ABSURD * field:
         raise DataError(
-            f"{survey.source}: the corrected field is off by {off:.0f} nT of {field:.0f}: mag_x, mag_y, mag_z or a "
-            "parameter in other units than the calibration's, or of another vehicle"
+            f"{survey.source}: the corrected field is off by {off:.0f} nT of {field:.0f}: mag_x, mag_y, "
+            "mag_z or a parameter in other units than the calibration's, or of another vehicle"
         )
     return problem
 
@@ -167,7 +168,7 @@ def _put_forward(problem: Problem, causes: Mapping[str, Cause]) -> tuple[list[Ca
 
 
 def _whenever(candidates: Sequence[Candidate], learned: NDArray[np.bool_]) -> list[Candidate]:
-    """Return the candidates and, where the calibration's own logs are given, each once more as appeared since.
+    """Return the candidates and, if there are the calibration's own logs, each as appeared since.
 
     Steps, drifts and tones have a time of their own.
     """
@@ -208,7 +209,7 @@ def _findings(
 
 
 def _loud(problem: Problem, after: FloatArray, counts: NDArray[np.bool_]) -> Leftover | None:
-    """Describe a residual without structure that exceeds the calibration's stated noise and coefficient errors."""
+    """Describe a structureless residual beyond the calibration's stated noise and coefficient errors."""
     power = float(np.sum(after[counts] ** 2 / np.maximum(problem.stated[counts], 1e-12)))
     n = int(counts.sum())
     if problem.calibration.noise.sensor <= 0.0 or power < LOUD**2 * n:

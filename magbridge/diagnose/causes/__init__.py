@@ -1,7 +1,7 @@
 """The causes: one small function each, with its physics, equation and source, and one row in a table.
 
-Each takes the problem and returns candidates over a grid of its nonlinear parameters. Widths are plausible sizes
-(1-sigma of a Gaussian prior): they set Occam's factor, not what can be found.
+Each takes the problem and returns candidates over a grid of its nonlinear parameters. Widths are plausible
+sizes (1-sigma of a Gaussian prior): they set Occam's factor, not what can be found.
 """
 
 from __future__ import annotations

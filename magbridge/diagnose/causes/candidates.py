@@ -1,4 +1,4 @@
-"""What a cause puts forward: effects with their nonlinear parameters set, their columns, their plausible size."""
+"""What a cause puts forward: effects with their nonlinear parameters set, columns, and plausible size."""
 
 from __future__ import annotations
 
@@ -52,8 +52,8 @@ class Candidate:
     parts : tuple of Candidate
         Those that it was put together from, one after the other.
     spectra : (l, k) array or None
-        Where its numbers have one common free size (:mod:`~magbridge.diagnose.inference.statistic`): their prior variances, in
-        units of the widths squared and up to a common factor; each is tried.
+        Where its numbers have one common free size (:mod:`~magbridge.diagnose.inference.statistic`): their
+        prior variances, in units of the widths squared and up to a common factor; each is tried.
     since : bool
         It is absent from the logs that the calibration was fitted to.
     """
@@ -119,7 +119,7 @@ def slices(candidates: Sequence[Candidate]) -> list[slice]:
 
 
 def since(candidate: Candidate, learned: NDArray[np.bool_]) -> Candidate:
-    """Return the same cause, appeared since the calibration: absent from the samples (n,) that this has `learned` from."""
+    """Return the same cause, absent from the samples (n,) that the calibration has `learned` from."""
     again, fresh = candidate.again, ~learned
     return replace(
         candidate,
@@ -146,9 +146,10 @@ def of_effect(
     origin: float = 0.0,
     **more: Any,
 ) -> Candidate:
-    """Make a candidate of an effect; its regressors are stepped through where `phi`, less `origin`, does not give them.
+    """Make a candidate of an effect.
 
-    `unit` is that of all its numbers, or one for each of as many equal parts.
+    Its regressors are stepped through where `phi`, less `origin`, does not give them. `unit` is that of all
+    its numbers, or one for each of as many equal parts.
     """
     if phi is None:
         phi = history(problem.survey, problem.calibration, effect)

@@ -1,4 +1,4 @@
-"""What moves carries iron: masses that the model lacks, has too few terms for, or that remember where they were."""
+"""Masses carry iron: those that the model lacks, has too few terms for, or that remember where they were."""
 
 from __future__ import annotations
 
@@ -65,10 +65,11 @@ def _powers(values: FloatArray, centre: float, scale: float, order: int, rows: s
 
 
 def actuator_order(problem: Problem) -> list[Candidate]:
-    """A mass needs what its polynomial lacks: a term ``T += b prod x_k^e_k``, or sources near its way, ``(1 + x_k^2)^(-3/2)``.
+    """A mass needs what its polynomial lacks: a term ``T += b prod x_k^e_k``, or sources near its way.
 
-    One term, or all of the next order (paper, eq. 8); or what no polynomial of a low order follows, for the mass passes iron
-    that is near: :class:`~magbridge.calibration.followers.SourcesEffect`. Those sources have one common size.
+    One term, or all of the next order (paper, eq. 8); or what no polynomial of a low order follows, for the
+    mass passes iron that is near: :class:`~magbridge.calibration.followers.SourcesEffect`. Those sources have
+    one common size.
     """
     calibration = problem.calibration
     if not calibration.parameters:
@@ -122,9 +123,10 @@ def _monomial(problem: Problem, exponents: tuple[int, ...]) -> Candidate:
 
 
 def hysteresis(problem: Problem) -> list[Candidate]:
-    """Backlash of the drive, or steel remagnetised by its own motion: ``T += b (S(y) - S(p)) / width``, y the play of p.
+    """Backlash of a drive, or moving steel remagnetised: ``T += b (S(y) - S(p)) / width``, y the play of p.
 
-    A drive's is straight, steel's is where the steel is: see :class:`~magbridge.calibration.followers.PlayEffect`.
+    A drive's is straight, steel's is where the steel is: see
+    :class:`~magbridge.calibration.followers.PlayEffect`.
     """
     drives = product((0.05, 0.15, 0.3), (0.0,), (STRAIGHT,))
     steel = product((0.15, 0.3), (-1.0 / 3.0, 0.0, 1.0 / 3.0), (0.5,))

@@ -25,7 +25,7 @@ ERROR = 20.0
 
 
 def diurnal_variation(problem: Problem) -> list[Candidate]:
-    """The Earth's field itself varies: the Sq system's harmonics of the day, along the field (Chulliat et al. 2016)."""
+    """The Earth's field itself varies: harmonics of the day along the field (Chulliat et al. 2016)."""
     t = problem.survey.time
     span = float(t[-1] - t[0])
     harmonics = [h for h in (1, 2, 3) if 86400.0 / h < 4.0 * span]
@@ -43,10 +43,11 @@ def diurnal_variation(problem: Problem) -> list[Candidate]:
 
 
 def map_error(problem: Problem) -> list[Candidate]:
-    r"""The anomaly map is wrong by a smooth function of place, the same on every pass: a Gaussian process (Matern 3/2) along the track.
+    r"""The anomaly map is wrong by a smooth function of place, a Gaussian process (Matern 3/2).
 
-    In the functions of Karhunen and Loeve at the cells that were visited, ``K(x, Z) V / lambda`` of ``K(Z, Z) = V lambda V^T``:
-    as many as there are, whatever the box. Lengths are told by the functions' variances ``diag(V^T K_l V)``.
+    It is the same on every pass. In the functions of Karhunen and Loeve at the cells that were visited,
+    ``K(x, Z) V / lambda`` of ``K(Z, Z) = V lambda V^T``: as many as there are, whatever the box. Lengths are
+    told by the functions' variances ``diag(V^T K_l V)``.
     """
     place = problem.survey.place
     if place is None or np.ptp(place, axis=0).max() < 200.0:
@@ -85,7 +86,7 @@ def _each(corners: FloatArray) -> tuple[FloatArray, NDArray[np.intp]]:
 
 
 def _between(place: FloatArray, side: float) -> tuple[csr_array, FloatArray]:
-    """(n, c) weights of linear interpolation between the corners (c, 2), m, of the cells that were visited."""
+    """(n, c) weights of linear interpolation between the corners (c, 2), m, of the visited cells."""
     low = np.floor(place / side)
     high = place / side - low
     steps = list(np.ndindex(2, 2))
@@ -103,6 +104,6 @@ def _matern(a: FloatArray, b: FloatArray, length: float) -> FloatArray:
 
 
 def reference_bias(problem: Problem) -> list[Candidate]:
-    """The reference is off by a constant, such as the error of the main-field model at this site, some tens of nT."""
+    """The reference is off by a constant: the main-field model, say, by some tens of nT at this site."""
     ones = (~problem.survey.learned[:, None]).astype(np.float64)
     return [of_reference(problem, "reference_bias", lambda rows: ones[rows], np.array([30.0]), ("bias",))]

@@ -1,4 +1,4 @@
-"""Regressors of effects along a whole survey at once: the same numbers as the steppers of a live correction give."""
+"""Regressors of effects along a whole survey at once, the same numbers as the live steppers give."""
 
 from __future__ import annotations
 
@@ -35,15 +35,10 @@ def once(made: Callable[[Problem], T]) -> Callable[[Problem], T]:
 
 
 def lagged(time: FloatArray, values: FloatArray, lag: float, stages: int = 1) -> FloatArray:
-    """(n,) y that follows x through equal lags in series, stepped as :class:`~magbridge.calibration.effects.ChannelEffect` does.
+    """(n,) y that follows x through equal lags in series.
 
-    Parameters
-    ----------
-    time, values : (n,) array
-        s, and x.
-    lag : float
-        s, of all stages; 0: x itself.
-    stages : int
+    Stepped as :class:`~magbridge.calibration.effects.ChannelEffect` does. Parameters ---------- time, values
+    : (n,) array s, and x. lag : float s, of all stages; 0: x itself. stages : int
     """
     if lag <= 0.0 or len(time) < 2:
         return values
@@ -62,7 +57,7 @@ def _followed(time: FloatArray, values: FloatArray, lag: float) -> FloatArray:
 
 
 def _stepped(values: FloatArray, share: FloatArray) -> FloatArray:
-    """(n,) ``y_t = y_(t-1) + s_t (x_t - y_(t-1))``; two rows' steps are one, so are those of four, of eight."""
+    """(n,) ``y_t = y_(t-1) + s_t (x_t - y_(t-1))``: two rows' steps are one, so are four's, and eight's."""
     y, kept = np.append(values[0], share * values[1:]), np.append(0.0, 1.0 - share)
     step = 1
     while step < len(y):
@@ -75,7 +70,8 @@ def _stepped(values: FloatArray, share: FloatArray) -> FloatArray:
 def play(values: FloatArray, width: float) -> FloatArray:
     """(n,) play operator of `values` (:class:`~magbridge.calibration.followers.PlayEffect`).
 
-    Each row clips what was before it; clipped twice is clipped once, so two rows are one, so are four, and eight.
+    Each row clips what was before it; clipped twice is clipped once, so two rows are one, so are
+    four, and eight.
     """
     low, high = values - 0.5 * width, values + 0.5 * width
     low[0] = high[0] = values[0]
@@ -88,7 +84,7 @@ def play(values: FloatArray, width: float) -> FloatArray:
 
 
 def powers(x: NDArray[Number], order: int) -> NDArray[Number]:
-    """(order, n) x, x^2, ... by multiplication: beyond a square numpy asks ``pow()``, a hundred times as slow."""
+    """(order, n) x, x^2, ... by multiplication: above a square ``pow()`` is a hundred times as slow."""
     out = np.empty((order, *np.shape(x)), x.dtype)
     out[0] = x
     for lower, higher in pairwise(out):

@@ -20,9 +20,10 @@ FloatArray = NDArray[np.float64]
 
 
 def nonlinearity(problem: Problem) -> list[Candidate]:
-    """The response bends: ``T_i += b_i (H_i / H_0)^p``, p = 2 (an even harmonic's leak), 3 (a saturating core), or both.
+    """The response bends: ``T_i += b_i (H_i / H_0)^p``, p = 2 (a leak), 3 (a saturating core), or both.
 
-    Both are six numbers of one common size: the three channels are of one make.
+    What leaks is an even harmonic. Both are six numbers of one common size: the three channels are of one
+    make.
     """
     unit, H = problem.calibration.reference.field, problem.reading
     made = []
@@ -59,8 +60,8 @@ def _clipped(problem: Problem, axis: int, knees: Sequence[float]) -> list[Candid
             return np.stack([way * (over >= 0), way * np.maximum(over, 0.0) / unit])
 
         return of_effect(
-            problem, effect, np.array([100.0, 0.1 * unit]), ("nT", per(f"{unit:.0f} nT")), names=names, phi=phi,
-            shape={"knee": (knee, "nT")}, again=again,
+            problem, effect, np.array([100.0, 0.1 * unit]), ("nT", per(f"{unit:.0f} nT")), names=names,
+            phi=phi, shape={"knee": (knee, "nT")}, again=again,
         )  # fmt: skip
 
     return [again(knee) for knee in knees]

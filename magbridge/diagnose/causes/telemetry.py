@@ -22,7 +22,8 @@ FloatArray = NDArray[np.float64]
 LAGS = (0.0, 700.0, 1700.0, 4000.0, 10000.0)
 """s, so close that a lag between two of them is missed by a fifth at most (RMS)."""
 STAGES = 2
-"""Heat that is conducted does not set in at once: hull, then core. Of a slab's centre one lag misses 10 to 30 %, two 4 to 9."""
+"""Heat that is conducted does not set in at once: hull, then core. Of a slab's centre one lag misses 10 to
+30 %, two 4 to 9."""
 
 
 def _origins(problem: Problem, name: str) -> list[float]:
@@ -76,15 +77,16 @@ def _warmed(
 def temperature_offset(problem: Problem) -> list[Candidate]:
     """Core and electronics have an offset that follows temperature: ``T += b (theta_2 - theta_0)``.
 
-    Through the hull's store of heat: ``dtheta_1/dt = 2 (theta - theta_1) / lag``, ``dtheta_2/dt = 2 (theta_1 - theta_2) / lag``.
-    Typically 0.1 nT/degC for a good fluxgate, several for a low-power one (Primdahl 1979, J. Phys. E 12:241). Separated from
-    depth by the thermal hysteresis of dive and climb.
+    Through the hull's store of heat: ``dtheta_1/dt = 2 (theta - theta_1) / lag``,
+    ``dtheta_2/dt = 2 (theta_1 - theta_2) / lag``. Typically 0.1 nT/degC for a good fluxgate, several for a
+    low-power one (Primdahl 1979, J. Phys. E 12:241). Separated from depth by the thermal hysteresis of
+    dive and climb.
     """
     return _thermal(problem, "offset")
 
 
 def temperature_scale(problem: Problem) -> list[Candidate]:
-    """Coil constant and resistances follow temperature: ``A += diag(b) (theta_2 - theta_0)``, 10-100 ppm/degC."""
+    """Coil and resistances follow temperature: ``A += diag(b) (theta_2 - theta_0)``, 10-100 ppm/degC."""
     return _thermal(problem, "scale")
 
 
@@ -99,7 +101,7 @@ def current_field(problem: Problem) -> list[Candidate]:
 
 
 def pressure_offset(problem: Problem) -> list[Candidate]:
-    """Pressure strains the hull and its magnetisation follows (Villari effect), and the sensor's mount: ``T += b p``."""
+    """Pressure strains the hull and its magnetisation (Villari effect), and the mount: ``T += b p``."""
     return _proportional(problem, "pressure_offset", "pressure", 50.0)
 
 

@@ -18,7 +18,7 @@ ONSETS = 40
 
 
 def offset_step(problem: Problem) -> list[Candidate]:
-    """The offset jumps: a power cycle settles it anew, a shock or a magnet remagnetises: ``T += b H(t - t_0)``."""
+    """The offset jumps, by a power cycle, a shock or a magnet: ``T += b H(t - t_0)``."""
     survey = problem.survey
     t = survey.time
     fresh = t[~survey.learned]
@@ -33,7 +33,7 @@ def offset_step(problem: Problem) -> list[Candidate]:
 
 
 def offset_drift(problem: Problem) -> list[Candidate]:
-    """The offset creeps with ageing and relaxing stress: ``T += b_1 x + b_2 x^2``, ``x = (t - t_0) / period``."""
+    """The offset creeps (ageing, relaxing stress): ``T += b_1 x + b_2 x^2``, ``x = (t - t_0) / period``."""
     t = problem.survey.time
     span = float(t[-1] - t[0])
     made = []
@@ -53,7 +53,8 @@ def offset_drift(problem: Problem) -> list[Candidate]:
 def interference_tone(problem: Problem) -> list[Candidate]:
     """Machinery at a fixed frequency, seen through the sampling: ``T += b cos + c sin (2 pi t / period)``.
 
-    Frequencies are those where the differenced residual, seen through each channel's projection, has its highest peaks.
+    Frequencies are those where the differenced residual, seen through each channel's projection, has its
+    highest peaks.
     """
     survey = problem.survey
     t = survey.time

@@ -28,11 +28,11 @@ def field_rates(problem: Problem) -> FloatArray:
 
 @once
 def mass_rates(problem: Problem) -> FloatArray:
-    """(9, n) rates of the nine coefficients as the masses move, each mass at the larger of its speeds before and after.
+    """(9, n) rates of the nine coefficients, each mass at the larger of its speeds before and after.
 
-    A drive starts and stops between samples and runs evenly meanwhile: a sample is in motion where that mass has moved
-    both before and after it, and the interval that it moved all through tells the speed. Telemetry has no noise that
-    a one-sided difference would bring in.
+    A drive starts and stops between samples and runs evenly meanwhile: a sample is in motion where that mass
+    has moved both before and after it, and the interval that it moved all through tells the speed. Telemetry
+    has no noise that a one-sided difference would bring in.
     """
     survey, calibration = problem.survey, problem.calibration
     kernel = calibration.kernel
@@ -61,11 +61,11 @@ def channel_skew(problem: Problem) -> list[Candidate]:
 
 
 def filter_lag(problem: Problem) -> list[Candidate]:
-    """The anti-alias filter holds the field back against the telemetry: ``T += -tau dH/dt`` (paper, section 3).
+    """The anti-alias filter holds the field back, not the telemetry: ``T += -tau dH/dt`` (paper, section 3).
 
-    In a uniform field ``|H|`` does not see it but where masses move: ``u^T A dH_r/dt = -dF/dtheta dtheta/dt``, the
-    signature of a clock that is off the other way, and mended by the same. What tells them apart is that no filter runs
-    ahead.
+    In a uniform field ``|H|`` does not see it but where masses move:
+    ``u^T A dH_r/dt = -dF/dtheta dtheta/dt``, the signature of a clock that is off the other way, and mended
+    by the same. What tells them apart is that no filter runs ahead.
     """
     return _delay(problem, ClockEffect(cause="filter_lag", sign=-1.0), 2.0, positive=True)
 

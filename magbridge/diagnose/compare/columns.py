@@ -13,15 +13,16 @@ __all__ = ["Columns", "Interpolated", "Mixture", "Since", "beside", "parts", "ti
 
 FloatArray = NDArray[np.float64]
 Columns = Callable[[slice], FloatArray]
-"""Rows -> (m, k): what one unit of each of k coefficients leaves in the residual; best stored column by column."""
+"""Rows -> (m, k): what one unit of each of k coefficients leaves in the residual; best stored
+column by column."""
 
 
 @dataclass(frozen=True, eq=False)
 class Mixture:
     r"""Columns that are made of others': :math:`\sum_i X_i M_i`.
 
-    Hypotheses are many, and what they are made of is less: a temperature behind a lag serves wherever its origin was. So
-    sums over a log are those of the different ``X_i``.
+    Hypotheses are many, and what they are made of is less: a temperature behind a lag serves wherever its
+    origin was. So sums over a log are those of the different ``X_i``.
 
     Attributes
     ----------
@@ -80,7 +81,7 @@ def parts(columns: Columns) -> tuple[tuple[Columns, FloatArray], ...]:
 
 
 def times(columns: Columns, rows: slice, c: FloatArray) -> FloatArray:
-    """(m,) what coefficients c (k,) leave in these rows; quicker than to make all columns, where they are made of few."""
+    """(m,) what coefficients c (k,) leave in these rows, without making all columns where that is quicker."""
     if isinstance(columns, Mixture):
         return np.asarray(sum(times(X, rows, M @ c) for X, M in columns.parts))
     if isinstance(columns, Interpolated):

@@ -17,7 +17,7 @@ CHUNK = 8192
 
 
 def derivatives(calibration: Calibration, samples: Samples, g: FloatArray, L: FloatArray) -> FloatArray:
-    """(n, q): derivatives of the residual by all the calibration's coefficients, times L (K, q), in bounded memory."""
+    """(n, q): derivatives of the residual by all coefficients, times L (K, q), in bounded memory."""
     tensor = _tensor(calibration)
     M = np.tensordot(L.T, tensor, 1).reshape(L.shape[1], tensor[0].size).T
     out = np.empty((L.shape[1], len(g)))

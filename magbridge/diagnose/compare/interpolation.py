@@ -1,4 +1,4 @@
-"""What lies between a log's samples: rates of change along its legs, and what channels lost that were interpolated there."""
+"""Between a log's samples: rates of change along its legs, and what interpolated channels lost there."""
 
 from __future__ import annotations
 
@@ -21,11 +21,13 @@ def rates(survey: Survey, H: FloatArray) -> FloatArray:
 
     Notes
     -----
-    Of a turn of angular frequency w, sampled every h, a difference both ways holds ``sin(wh)/wh = 1 - (wh)^2/6 + ...``, and
-    its coefficient would be too large by as much; the spline ``3 sin(wh)/(wh (2 + cos(wh))) = 1 - (wh)^4/180 + ...``.
+    Of a turn of angular frequency w, sampled every h, a difference both ways holds
+    ``sin(wh)/wh = 1 - (wh)^2/6 + ...``, and its coefficient would be too large by as much; the spline
+    ``3 sin(wh)/(wh (2 + cos(wh))) = 1 - (wh)^4/180 + ...``.
 
-    Rates ``D e`` of noise e have the inner product :math:`E[(D e)^T \Sigma^{-1} e] = \mathrm{tr} D` with itself, whatever its
-    covariance. That of a one-sided difference would pass for an effect; a spline has nothing, being the same backwards.
+    Rates ``D e`` of noise e have the inner product :math:`E[(D e)^T \Sigma^{-1} e] = \mathrm{tr} D` with
+    itself, whatever its covariance. That of a one-sided difference would pass for an effect; a spline has
+    nothing, being the same backwards.
     """
     t, out = survey.time, np.zeros_like(H)
     starts = np.flatnonzero(~survey.follows(LOST))
@@ -36,10 +38,10 @@ def rates(survey: Survey, H: FloatArray) -> FloatArray:
 
 
 def bent(survey: Survey, H: FloatArray) -> FloatArray:
-    r"""(3, n) nT/s of H (3, n): what a second's delay leaves in a channel that was interpolated linearly to its row.
+    r"""(3, n) nT/s of H (3, n): what a second's delay leaves in a channel interpolated linearly to its row.
 
-    A vehicle that sways from sample to sample is not where a line has it. `H` must not hold the noise: the difference is
-    one-sided, and would find its own.
+    A vehicle that sways from sample to sample is not where a line has it. `H` must not hold the noise: the
+    difference is one-sided, and would find its own.
 
     Notes
     -----

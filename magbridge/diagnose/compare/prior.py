@@ -23,7 +23,8 @@ BROADEST = 1e-3
 SOFT, HARD = 0.02, 2000.0
 """Soft iron, of the field, and hard iron, nT: 1-sigma of what vehicles have."""
 STABLE = 2e-5
-"""Stability between days, as a fraction of the field: no fluxgate's scales, axes and offsets do better than 20 ppm."""
+"""Stability between days, as a fraction of the field: no fluxgate's scales, axes and offsets do better
+than 20 ppm."""
 
 
 def level(calibration: Calibration, e: FloatArray) -> float:
@@ -34,8 +35,8 @@ def level(calibration: Calibration, e: FloatArray) -> float:
 def floor(calibration: Calibration) -> FloatArray:
     """(K, K) covariance, nT²: what the nine constants may have changed by since the calibration.
 
-    Its posterior knows only the noise of its samples, and a few thousand of them make that a hundredth of it. What
-    the runs' turns did to the filtered channels, and what nobody holds constant, is more.
+    Its posterior knows only the noise of its samples, and a few thousand of them make that a hundredth of it.
+    What the runs' turns did to the filtered channels, and what nobody holds constant, is more.
     """
     spread = np.zeros(calibration.coefficients.size)
     for own in _constants(calibration):
@@ -44,7 +45,7 @@ def floor(calibration: Calibration) -> FloatArray:
 
 
 def isotropic(calibration: Calibration) -> FloatArray:
-    """(K,) what makes every corrected field 1 nT larger, whatever the attitude: equal scales of all channels."""
+    """(K,) what makes every corrected field 1 nT larger at any attitude: equal scales of all channels."""
     scale = np.zeros(calibration.coefficients.size)
     for own in _constants(calibration)[:1]:
         scale[own.start : own.start + 3] = 1.0
@@ -80,10 +81,10 @@ def _factor(covariance: FloatArray) -> FloatArray:
 def prior(
     survey: Survey, calibration: Calibration, samples: Samples, e: FloatArray, g: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return L and m. What the calibration learned from samples that are here again is taken out of its posterior.
+    """Return L and m; of the posterior, what was learned from samples that are here again is taken out.
 
-    In the posterior's own units, ``P_0 = 1 - H`` with H the information of those samples, and since the gradient
-    vanished at c_0, ``P_0 m = L^T J^T W e``.
+    In the posterior's own units, ``P_0 = 1 - H`` with H the information of those samples, and since the
+    gradient vanished at c_0, ``P_0 m = L^T J^T W e``.
     """
     L = _factor(calibration.covariance)
     centre = np.zeros(L.shape[1])
@@ -106,10 +107,10 @@ def prior(
 
 
 def _physical(calibration: Calibration) -> FloatArray:
-    """(K,) nT: how large coefficients are on any vehicle, soft iron of percents and hard iron of thousands of nanotesla.
+    """(K,) nT: how large coefficients are on any vehicle.
 
-    Less at every order. On a glider's attitudes scale and offset can grow against each other without end, and take the
-    noise with them.
+    Soft iron is percents, hard iron thousands of nanotesla. Less at every order. On a glider's attitudes
+    scale and offset can grow against each other without end, and take the noise with them.
     """
     width, k = np.full(calibration.coefficients.size, np.inf), 0
     for term in calibration.terms:

@@ -1,4 +1,4 @@
-r"""The comparison as a linear problem: residuals of a calibration, and what every coefficient would have left in them.
+r"""The comparison as a linear problem: a calibration's residuals, and what each coefficient leaves in them.
 
 Notes
 -----
@@ -7,15 +7,17 @@ coefficients at every sample, a term or an effect that adds ``sum_rs phi_r C_krs
 
 .. math:: \partial e_t / \partial c_k = \sum_{rs} \phi_r(t)\, C_{krs}\, g_s(t)
 
-and a coefficient that is really there, but not in the calibration, leaves minus that in the residual. So every cause
-passes through the forward model by the one rule. The calibration stays free, with its posterior
+and a coefficient that is really there, but not in the calibration, leaves minus that in the residual. So
+every cause passes through the forward model by the one rule. The calibration stays free, with its posterior
 as prior: ``c = c_0 + L z``, ``z ~ N(m, 1)``, where L holds only the directions that these data can see.
 
-Free are also three delays with which the channels may have been interpolated to their rows (:mod:`.interpolation`): a fault of
-the log, not of the vehicle, so they move no coefficient. Unseen, it is an error that a pair of large causes which cancel can mimic.
+Free are also three delays with which the channels may have been interpolated to their rows
+(:mod:`.interpolation`): a fault of the log, not of the vehicle, so they move no coefficient. Unseen, it is an
+error that a pair of large causes which cancel can mimic.
 
-Derivatives are taken where the reading would have had no residual, ``H_r - e w / |w|^2``: at the reading itself they hold
-its noise, and scales could grow against offsets until the noise is gone (errors in variables).
+Derivatives are taken where the reading would have had no residual, ``H_r - e w / |w|^2``: at the
+reading itself they hold its noise, and scales could grow against offsets until the noise is gone
+(errors in variables).
 """
 
 from __future__ import annotations
@@ -103,7 +105,7 @@ class Problem:
 
     @property
     def stated(self) -> FloatArray:
-        """(n,) nT², variance of the residual by the calibration: its noise, and what its coefficients may be off by."""
+        """(n,) nT², variance of the residual by the calibration: noise, and errors of its coefficients."""
         noise, free = self.calibration.noise, self.free[:, : DELAYS.start]
         return np.asarray(noise.sensor**2 + noise.reference**2 + np.einsum("ij,ij->i", free, free))
 
@@ -180,7 +182,10 @@ def _run(places: Sequence[int]) -> slice | list[int]:
 def effect_columns(
     problem: Problem, effect: Effect, phi: FloatArray | Callable[[slice], FloatArray], origin: float = 0.0
 ) -> Mixture:
-    """Return what an effect's coefficients leave, from its regressors less `origin`: (r, n), or a function of the rows."""
+    """Return what an effect's coefficients leave, from its regressors less `origin`.
+
+    These are (r, n), or a function of the rows.
+    """
     tensor = -effect.columns(problem.calibration.reference.field)
     pairs = [(int(r), int(s)) for r, s in np.argwhere(tensor.any(axis=0))]
     M = np.stack([tensor[:, r, s] for r, s in pairs])

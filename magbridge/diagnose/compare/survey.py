@@ -20,10 +20,12 @@ FloatArray = NDArray[np.float64]
 FEWEST = 60
 """Samples below which noise and effect cannot both be estimated."""
 SHORT = 0.25
-"""Quantile of the time steps that is taken for the sampling interval: some gliders sample faster near the surface."""
+"""Quantile of the time steps that is taken for the sampling interval: some gliders sample faster near
+the surface."""
 KINDS = {
-    "degC": "temperature", "K": "temperature", "A": "current", "mA": "current", "m": "pressure", "dbar": "pressure",
-    "bar": "pressure", "Pa": "pressure", "hPa": "pressure", "kPa": "pressure", "mbar": "pressure",
+    "degC": "temperature", "K": "temperature", "A": "current", "mA": "current",
+    "m": "pressure", "dbar": "pressure", "bar": "pressure",
+    "Pa": "pressure", "hPa": "pressure", "kPa": "pressure", "mbar": "pressure",
 }  # fmt: skip
 """Kind of a channel by its unit. Any other unit is taken for the position of something that moves."""
 HINTS = (("temp", "temperature"), ("current", "current"), ("press", "pressure"))
@@ -32,8 +34,8 @@ OURS = ("mag_", "truth_")
 FIELDS = {"nT", "uT", "\N{MICRO SIGN}T", "mG", "G", "T"}
 """Units of another magnetometer, which follows everything that this one does and so explains nothing."""
 NOT_TELEMETRY = {
-    "time", "learned", "reference_field", "roll", "pitch", "heading", "latitude", "longitude", "run", "dive", "quality",
-    "total_field", "total_field_sigma", "field_x", "field_y", "field_z", "anomaly", "power_cycle",
+    "time", "learned", "reference_field", "roll", "pitch", "heading", "latitude", "longitude", "run", "dive",
+    "quality", "total_field", "total_field_sigma", "field_x", "field_y", "field_z", "anomaly", "power_cycle",
 }  # fmt: skip
 
 
@@ -47,7 +49,7 @@ class Channel(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Survey:
-    """A deployment as arrays, of the rows that have field, reference and the positions of all modelled masses.
+    """A deployment as arrays, of the rows that have field, reference and the position of every mass.
 
     Attributes
     ----------
@@ -62,7 +64,8 @@ class Survey:
     still : tuple of str
         Telemetry that never changes.
     steps : (n,) int array
-        Intervals since the previous sample; :data:`~.past.FAR` where that is too long ago to predict this one's noise.
+        Intervals since the previous sample; :data:`~.past.FAR` where that is too long ago to predict
+        this one's noise.
     dive : (n,) int array
         Number of the dive, the unit that is left out in turn.
     place : (n, 2) array or None
@@ -104,7 +107,7 @@ class Survey:
         return np.asarray(np.cumsum(self.steps) - self.steps[0])
 
     def follows(self, lost: int = 0) -> NDArray[np.bool_]:
-        """(n,) the sample follows the previous one at the median interval, or with at most `lost` missing between them."""
+        """(n,) the sample follows the previous one at the median interval, with at most `lost` missing."""
         apart = np.diff(self.time, prepend=np.inf)
         return np.asarray((apart > 0.0) & (apart < (lost + 1.5) * np.median(apart)) & (self.steps < FAR))
 
@@ -114,7 +117,7 @@ class Survey:
         return "eighths of the log" if np.array_equal(self.dive, _eighths(len(self))) else "dives"
 
     def past(self, order: int) -> Past:
-        """Return the samples before each one, as far back as autoregressive noise of this order depends on them."""
+        """Return the samples before each one that autoregressive noise of this order depends on."""
         if order not in self._pasts:
             self._pasts[order] = Past(self.steps, order)
         return self._pasts[order]

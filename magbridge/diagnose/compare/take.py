@@ -27,7 +27,8 @@ FloatArray = NDArray[np.float64]
 TRUSTED = 0.5
 """Of the noise: largest cubic term in the interpolation of a channel to the time of its row."""
 FAR = 10.0
-"""Half ranges from the middle of the calibration's: beyond, it is no position of a mass but a code for "not known"."""
+"""Half ranges from the middle of the calibration's: beyond, it is no position of a mass but a code for
+"not known"."""
 
 
 def take(
@@ -51,7 +52,8 @@ def take(
     Raises
     ------
     DataError
-        A column is missing, too few samples are complete, or a parameter is out of all range: one line that says which.
+        A column is missing, too few samples are complete, or a parameter is out of all range: one line
+        that says which.
     """
     logs = (*datasets, *learned_from)
     source = ", ".join(dict.fromkeys(str(ds.attrs.get("source", "deployment")) for ds in logs))
@@ -72,8 +74,9 @@ def take(
         far = np.abs(table[parameter.name] - parameter.centre) > FAR * parameter.scale
         if far.any():
             raise DataError(
-                f"{source}: {parameter.name!r} is {table[parameter.name][far][0]:g} in {int(far.sum())} of {far.size} samples, and "
-                f"{parameter.low:g} to {parameter.high:g} in the calibration: expected its unit, and nothing where it is not known"
+                f"{source}: {parameter.name!r} is {table[parameter.name][far][0]:g} in {int(far.sum())} of "
+                f"{far.size} samples, and {parameter.low:g} to {parameter.high:g} in the calibration: "
+                "expected its unit, and nothing where it is not known"
             )
     if not any(np.ptp(table[f"mag_{axis}"]) for axis in "xyz"):
         raise DataError(f"{source}: columns mag_x, mag_y, mag_z never change: nothing was measured")
@@ -105,8 +108,8 @@ def _comparable(table: dict[str, FloatArray], calibration: Calibration, source: 
     if whole.sum() < FEWEST:
         worst = min(needed, key=lambda name: int(np.isfinite(table[name]).sum()))
         raise DataError(
-            f"{source}: only {int(whole.sum())} of {whole.size} samples can be compared, at least {FEWEST} needed "
-            f"(column {worst!r} has {int(np.isfinite(table[worst]).sum())} numbers)"
+            f"{source}: only {int(whole.sum())} of {whole.size} samples can be compared, at least {FEWEST} "
+            f"needed (column {worst!r} has {int(np.isfinite(table[worst]).sum())} numbers)"
         )
     table = {name: column[whole] for name, column in table.items()}
     once = np.diff(table["time"], prepend=-np.inf) > 0.0  # what two logs share is there once
@@ -150,8 +153,8 @@ def _columns(
 def _at(time: FloatArray, own: FloatArray, values: FloatArray, trusted: float) -> FloatArray:
     """Return a channel at the row's time: the cubic through its sample, the one after and the two before.
 
-    Linear interpolation is off by the curvature of a turn: tenths of a nanotesla, always with the same sign. Where the cubic
-    term itself exceeds `trusted`, nT, the channel is not known well enough: NaN.
+    Linear interpolation is off by the curvature of a turn: tenths of a nanotesla, always with the same sign.
+    Where the cubic term itself exceeds `trusted`, nT, the channel is not known well enough: NaN.
     """
     out = np.full(time.size, np.nan)
     if time.size < 4:
@@ -170,8 +173,8 @@ def _at(time: FloatArray, own: FloatArray, values: FloatArray, trusted: float) -
 def _moving(table: dict[str, FloatArray], calibration: Calibration) -> NDArray[np.bool_]:
     """(n,) samples next to which a mass moves, by the bridge's own criterion.
 
-    There the channels, sampled in turn, saw the mass at different places and form no vector. With simultaneous sampling
-    such samples are kept: only they reveal an offset of the clocks.
+    There the channels, sampled in turn, saw the mass at different places and form no vector. With
+    simultaneous sampling such samples are kept: only they reveal an offset of the clocks.
     """
     moving = np.zeros(table["time"].size, bool)
     elapsed = np.maximum(np.diff(table["time"]), 1.0)

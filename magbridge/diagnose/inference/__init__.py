@@ -1,1 +1,1 @@
-"""Inference: likelihood and noise, the search for causes, the unexplained rest, and which causes can be told apart."""
+"""Inference: likelihood and noise, the search for causes, the unexplained rest, what can be told apart."""

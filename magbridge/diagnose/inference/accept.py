@@ -18,12 +18,12 @@ __all__ = ["accept"]
 
 
 def accept(problem: Problem, outcome: Outcome, tone: Candidate | None) -> tuple[bool, Leftover | None]:
-    """Say whether the names are asserted, and describe what is left beside them or, if they are not, the whole signal.
+    """Say whether the names are asserted, and describe what is left beside them, or else the whole signal.
 
-    Names and free descriptions both pay for the number of alternatives they were chosen from. A description of what the names
-    leave counts with them; if it is something else than they are, they pay for it as for a further cause. A cause that the table
-    lacks is a rival like any other: names are asserted if they are likelier than every description, and remain possible until
-    one beats them 20:1.
+    Names and free descriptions both pay for the number of alternatives they were chosen from. A description
+    of what the names leave counts with them; if it is something else than they are, they pay for it as for a
+    further cause. A cause that the table lacks is a rival like any other: names are asserted if they are
+    likelier than every description, and remain possible until one beats them 20:1.
     """
     model = [h.candidate for h in outcome.chosen]
     rest = leftover(problem, model, outcome.fit, outcome.order, tone)
@@ -54,7 +54,10 @@ def _same(chosen: Sequence[Hypothesis], rest: Leftover) -> bool:
 
 
 def _within(outcome: Outcome, behind: float) -> tuple[Rival, ...]:
-    """Return the names, which a description beats by `behind`, and their rivals: those that it does not beat 20:1, the likeliest first."""
+    """Return the names, and their rivals, the likeliest first.
+
+    A description beats the names by `behind`; rivals are those that it does not beat 20:1.
+    """
     found: dict[tuple[str, str | None], Rival] = {}
     for hypothesis, rivals in zip(outcome.chosen, outcome.rivals, strict=True):
         for one in (Rival(hypothesis.candidate, 0.0), *rivals):

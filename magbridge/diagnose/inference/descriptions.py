@@ -61,8 +61,8 @@ class Description(NamedTuple):
     remembers : bool
         It follows the past of the channel, not its value.
     wider : bool
-        It says much more than a cause that it holds: what it finds beside that is no remnant, and it is an alternative to that
-        and another.
+        It says much more than a cause that it holds: what it finds beside that is no remnant, and it is an
+        alternative to that and another.
     """
 
     columns: Columns
@@ -76,7 +76,7 @@ class Description(NamedTuple):
     wider: bool = False
 
     def covers(self, model: Sequence[Candidate]) -> bool:
-        """Say whether it says the same as a cause of `model`, with more coefficients; a wider one, as all of it."""
+        """Say whether it says what a cause of `model` does, with more numbers; a wider one, what all do."""
         same = [
             candidate.cause in self.holds
             or (
@@ -110,7 +110,7 @@ def descriptions(problem: Problem, fit: Joint, tone: Candidate | None = None) ->
 
 
 def _in_time(problem: Problem, fit: Joint) -> list[Description]:
-    """Slow curves along the axes of the body and along the field, a constant, a step of the offsets, a passing source."""
+    """Slow curves in body axes and along the field, a constant, a step of offsets, a passing source."""
     u = problem.survey.time - problem.survey.time[0]
     turning = np.exp(1j * np.pi * u / max(float(u[-1]), 1.0))
     fresh = ~problem.survey.learned
@@ -133,7 +133,7 @@ def _in_time(problem: Problem, fit: Joint) -> list[Description]:
 
 
 def _of_reading(problem: Problem) -> list[Description]:
-    """Functions of the field's direction, of its rates of change and of each channel's reading; one delay of everything."""
+    """Functions of the field's direction, its rates of change, each channel's reading; one delay of all."""
     body, rates = _body(problem), field_rates(problem)
     listed = [
         _of("broadband", direction(body), 34, holds=("nonlinearity",), wider=True),

@@ -28,7 +28,8 @@ KEPT = 12_500_000
 ALL = ((slice(None), slice(None)),)
 """Each column by each."""
 THREADS, LONG, POOL = 2, 32768, "diagnose"
-"""Threads that share what is done to a log, rows beyond which it is worth the while, and the threads' name."""
+"""Threads that share what is done to a log, rows beyond which it is worth the while, and the
+threads' name."""
 
 
 def kept(n: int, columns: Sequence[Columns]) -> list[Columns]:
@@ -94,10 +95,11 @@ class Design:
 def normal(
     X: Columns, y: FloatArray, noise: Noise | None = None, asked: Sequence[tuple[slice, slice]] = ALL
 ) -> tuple[FloatArray, FloatArray]:
-    """Return ``X^T X`` and ``X^T y``, X whitened if a noise is given; summed up in pieces that stay near the processor.
+    """Return ``X^T X`` and ``X^T y``, X whitened if a noise is given.
 
-    Long logs are shared out among threads, always in the same way: the same numbers on any machine. Of ``X^T X`` only the
-    columns by columns that are `asked` for are not zero.
+    Summed up in pieces that stay near the processor. Long logs are shared out among threads, always in the
+    same way: the same numbers on any machine. Of ``X^T X`` only the columns by columns that are `asked`
+    for are not zero.
     """
     past = 0 if noise is None else len(noise.memory)
 
@@ -125,7 +127,10 @@ def normal(
 
 
 def in_threads(n: int, function: Callable[[S], T], given: Iterable[S]) -> list[T]:
-    """Return what a function of all rows makes of each that is given; of a long log's n rows in threads, but in none of those."""
+    """Return what a function of all rows makes of each that is given.
+
+    A long log's n rows are shared out among threads, but not within one of those.
+    """
     if n <= LONG or current_thread().name.startswith(POOL):
         return [function(one) for one in given]
     return list(_pool().map(function, given))

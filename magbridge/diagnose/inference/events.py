@@ -66,9 +66,9 @@ def passage(problem: Problem, fit: Joint) -> tuple[Columns, float]:
 
     Notes
     -----
-    Along a straight course a dipole adds to the field :math:`(b_0 + b_1 s + b_2 s^2) / (1 + s^2)^{5/2}`, s the time from
-    its nearest point in units of T, distance over speed (Anderson's functions: Ginzburg, Frumkis & Kaplan 2002, Sens.
-    Actuators A 102:67).
+    Along a straight course a dipole adds to the field :math:`(b_0 + b_1 s + b_2 s^2) / (1 + s^2)^{5/2}`, s
+    the time from its nearest point in units of T, distance over speed (Anderson's functions: Ginzburg,
+    Frumkis & Kaplan 2002, Sens. Actuators A 102:67).
     """
     t = problem.survey.time - problem.survey.time[0]
     gain = fit.noise.whiten(problem.gain)

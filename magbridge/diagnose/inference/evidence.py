@@ -2,20 +2,22 @@ r"""How strongly the data speak for a candidate, and how strongly they must.
 
 Notes
 -----
-*Score.* For a candidate with projected information S and score b (:mod:`.joint`), ``R = b^T S^-1 b`` is what its
-likelihood ratio would be. Nobody knows beforehand how large an effect is, so its k coefficients have Zellner's prior
-``N(0, g S^-1)`` with the g that the data like best: log evidence ``(R - k)/2 - (k/2) log(R/k)``, 0 below ``R = k``
-(Liang et al. 2008, JASA 103:410, sec. 2.4). It asks the same price of every cause, whatever its unit.
+*Score.* For a candidate with projected information S and score b (:mod:`.joint`), ``R = b^T S^-1 b`` is what
+its likelihood ratio would be. Nobody knows beforehand how large an effect is, so its k coefficients have
+Zellner's prior ``N(0, g S^-1)`` with the g that the data like best: log evidence
+``(R - k)/2 - (k/2) log(R/k)``, 0 below ``R = k`` (Liang et al. 2008, JASA 103:410, sec. 2.4). It asks the
+same price of every cause, whatever its unit.
 
-*Test.* A cause's p-value is that of its likelihood ratio, times the number of independent hypotheses N behind it, times the number
-of causes; below 1 %: found. Under no effect scores are ``N(0, S)``, and N is ``P(any of its n hypotheses passes) / a`` at the level
-a where they are tested: hypotheses that are much the same by chance become strangers far out in the tail. That far no plain
-simulation comes, so one hypothesis after the other is made to pass, and with m that pass then ``N = n E[1 / m]`` (Owen, Maximov &
-Chertkov 2019, Electron. J. Statist. 13:231).
+*Test.* A cause's p-value is that of its likelihood ratio, times the number of independent hypotheses N behind
+it, times the number of causes; below 1 %: found. Under no effect scores are ``N(0, S)``, and N is
+``P(any of its n hypotheses passes) / a`` at the level a where they are tested: hypotheses that are much the
+same by chance become strangers far out in the tail. That far no plain simulation comes, so one hypothesis
+after the other is made to pass, and with m that pass then ``N = n E[1 / m]`` (Owen, Maximov & Chertkov 2019,
+Electron. J. Statist. 13:231).
 
-Two kinds have a prior of their own. Numbers of one common size (:mod:`.statistic`) have had theirs in the ratio: the evidence
-is R / 2, less the log of how many spectra it was chosen from. A number that cannot be negative has half a Gaussian, twice
-as dense: ``log 2 Phi(sqrt(R))`` more.
+Two kinds have a prior of their own. Numbers of one common size (:mod:`.statistic`) have had theirs in the
+ratio: the evidence is R / 2, less the log of how many spectra it was chosen from. A number that cannot be
+negative has half a Gaussian, twice as dense: ``log 2 Phi(sqrt(R))`` more.
 """
 
 from __future__ import annotations
@@ -56,9 +58,11 @@ LEVEL = 0.01
 ODDS = float(np.log(20.0))
 """Log evidence by which a cause with an exact regressor must win to be named alone."""
 IDEAL = 0.2
-"""Error of an idealised regressor, as a share of its norm: a cause that explains less by no more than that is a rival."""
+"""Error of an idealised regressor, as a share of its norm: a cause that explains less by no more than that
+is a rival."""
 REMNANT = 0.3
-"""Share of the strongest cause's signal-to-noise; anything weaker is a remnant of its idealised regressor, not another cause.
+"""Share of the strongest cause's signal-to-noise; anything weaker is a remnant of its idealised regressor,
+not another cause.
 
 The price: a second cause that weak is not named beside it.
 """
@@ -67,7 +71,7 @@ SIMULATIONS = 400
 
 @dataclass(frozen=True, eq=False)
 class Score:
-    """Score of one candidate under one noise: likelihood ratio, its degrees of freedom, log evidence, estimate, prior precision."""
+    """Score of a candidate under a noise: likelihood ratio, freedoms, log evidence, estimate, prior."""
 
     ratio: float
     freedom: int
@@ -77,7 +81,7 @@ class Score:
 
 
 def score(info: Information, at: slice, candidate: Candidate) -> Score:
-    """Score the candidate whose columns stand at `at`; one that must be positive and is not has nothing to say."""
+    """Score the candidate whose columns stand at `at`; one of the wrong sign has nothing to say."""
     b, statistic = info.score[at], Statistic(info.matrix[at, at], candidate.spectra)
     freedom = statistic.freedom
     if not freedom or (candidate.positive and b.min() < 0.0):
@@ -107,7 +111,10 @@ def weigh(ratio: float, freedom: int) -> float:
 
 
 def lead(ratio: float) -> float:
-    """Log evidence by which a cause of this likelihood ratio must win to be named alone, its regressor's error allowed for."""
+    """Log evidence by which a cause of this likelihood ratio must win to be named alone.
+
+    The error of its regressor is allowed for.
+    """
     return ODDS + slack(ratio)
 
 
@@ -132,7 +139,7 @@ def trials(info: Information, candidates: Sequence[Candidate], at: Sequence[slic
 
 
 def _independent(S: FloatArray, places: Sequence[slice], level: float) -> float:
-    """Return how many independent hypotheses pass as often as any of those at `places`, tested at `level` in all."""
+    """Return how many independent hypotheses pass as often as any at `places`, tested at `level` in all."""
     rng = np.random.default_rng(20131212)  # the same answer every time
     values, vectors = np.linalg.eigh(S)
     draws = (vectors * np.sqrt(np.maximum(values, 0.0))) @ rng.standard_normal((len(S), SIMULATIONS))
@@ -157,9 +164,10 @@ def _independent(S: FloatArray, places: Sequence[slice], level: float) -> float:
 def worth(ratio: float, model: Sequence[Candidate], trials: Mapping[str, float]) -> float:
     """Log evidence of a whole model of this likelihood ratio.
 
-    Every regressor pays for the hypotheses behind it that it was chosen from, and those after the first for the odds that
-    so much goes wrong in one log, and for their choice among the causes. How narrowly the data then hold the nonlinear
-    parameters counts between names alone: a free description is profiled, too, and pays nothing for it.
+    Every regressor pays for the hypotheses behind it that it was chosen from, and those after the first for
+    the odds that so much goes wrong in one log, and for their choice among the causes. How narrowly the data
+    then hold the nonlinear parameters counts between names alone: a free description is profiled, too, and
+    pays nothing for it.
     """
     further = max(sum(len(candidate.pieces) for candidate in model) - 1, 0) * (
         ODDS + float(np.log(len(trials)))

@@ -30,7 +30,8 @@ ALTERNATIONS = 6
 SETTLED = 0.01
 """Gain in log likelihood below which the fit has converged."""
 LOSS = 0.02
-"""Of the prediction, at most: what p coefficients lose that are fitted to samples with a whole past, p for each of those."""
+"""Of the prediction, at most: what p coefficients lose that are fitted to samples with a whole past, p for
+each of those."""
 NEAR = 0.9999
 """Largest partial correlation."""
 PIECE, PIECES = 600, 64
@@ -38,13 +39,14 @@ PIECE, PIECES = 600, 64
 
 
 def memory_order(residual: FloatArray, slots: NDArray[np.int64]) -> int:
-    r"""Choose p by Akaike's criterion, on a residual clipped against outliers; `slots` (n,) count the intervals.
+    r"""Choose p by Akaike's criterion on a residual clipped against outliers; `slots` (n,) count intervals.
 
     To whiten with too long a memory costs little, with too short a one it makes structure out of noise.
 
     Notes
     -----
-    Autocovariances c_k from all pairs that are there (Dunsmuir & Robinson 1981, J. Am. Stat. Assoc. 76:560), then Levinson's recursion:
+    Autocovariances c_k from all pairs that are there (Dunsmuir & Robinson 1981, J. Am. Stat. Assoc. 76:560),
+    then Levinson's recursion:
 
     .. math:: \kappa_p = \frac{c_p - \sum_k a_k c_{p-k}}{v_{p-1}}, \qquad v_p = v_{p-1} (1 - \kappa_p^2)
     """
@@ -73,13 +75,15 @@ def certainty(residual: FloatArray, noise: Noise, columns: Sequence[Columns]) ->
 
     Notes
     -----
-    Coefficients a that were fitted have the covariance ``C = (L^T L)^-1`` of their regression, L the residuals before in units
-    of s; a column x has the information ``|w|^2``, ``w_t = x_t - sum_k a_k x_(t-k)``:
+    Coefficients a that were fitted have the covariance ``C = (L^T L)^-1`` of their regression, L the
+    residuals before in units of s; a column x has the information ``|w|^2``,
+    ``w_t = x_t - sum_k a_k x_(t-k)``:
 
     .. math:: D_k = \frac{\partial \ln |w|^2}{\partial a_k} = -\frac{2 \sum_t w_t x_{t-k}}{|w|^2}, \qquad
               \operatorname{var} \ln |w|^2 = \frac{2}{n} + D^T C D
 
-    An estimate of f degrees of freedom has the variance 2 / f. What is slow sees the level that is known worst.
+    An estimate of f degrees of freedom has the variance 2 / f. What is slow sees the level that
+    is known worst.
     """
     n, p = len(residual), len(noise.memory)
     rows = np.flatnonzero(noise.past.whole)
@@ -217,7 +221,10 @@ def _tails(v: FloatArray, count: NDArray[np.int64], nu: float) -> tuple[float, F
 def _levels(
     square: FloatArray, count: NDArray[np.int64], nu: float, level: FloatArray
 ) -> tuple[float, FloatArray]:
-    """Log likelihood and level of each block, from a first guess; drawn towards the common one by as much as ten samples."""
+    """Log likelihood and level of each block, from a first guess.
+
+    A level is drawn towards the common one by as much as ten samples.
+    """
     n = len(square)
     power = level**2
     for _ in range(ALTERNATIONS):

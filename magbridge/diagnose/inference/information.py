@@ -2,9 +2,9 @@ r"""The information that the data hold on every candidate at once.
 
 Notes
 -----
-The whole search's arithmetic in one matrix: the whitened columns of *all* candidates against each other, summed up in
-chunks, linear in samples. From it come scores, Occam factors, what is confounded with what, and the distribution of the
-largest score under no effect.
+The whole search's arithmetic in one matrix: the whitened columns of *all* candidates against each other,
+summed up in chunks, linear in samples. From it come scores, Occam factors, what is confounded with what, and
+the distribution of the largest score under no effect.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class Information:
     shift: FloatArray
 
     def moved(self, base: Joint, index: NDArray[np.intp], taken: FloatArray) -> FloatArray:
-        """Return calibration and model (q + k,) where they are best when the coefficients at `index` are `taken`."""
+        """Return calibration and model (q + k,) at their best when those at `index` are `taken`."""
         return np.append(base.z, base.coefficients) - self.shift[:, index] @ taken
 
     def without(self, index: NDArray[np.intp], prior: FloatArray) -> Information:
@@ -74,9 +74,10 @@ class Information:
 def information(
     problem: Problem, noise: Noise, base: Joint, columns: Sequence[Columns], strangers: int = 0
 ) -> Information:
-    """Sum up the information of columns at the hypothesis `base` under `noise`, only the calibration projected out.
+    """Sum up the information of columns at `base` under `noise`, only the calibration projected out.
 
-    The first so many are `strangers`, made of nothing that another is made of: what they say of each other is not asked for.
+    The first so many are `strangers`, made of nothing that another is made of: what they say of each other is
+    not asked for.
     """
     q, own = problem.free.shape[1], together(columns).parts
     sizes = [sum(len(M) for _, M in parts(one)) for one in columns[:strangers]]

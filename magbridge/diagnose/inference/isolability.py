@@ -2,10 +2,11 @@ r"""Before any data: what this log, with this calibration, could show, and what 
 
 Notes
 -----
-The information S of a cause's coefficients needs telemetry, attitude and the noise level, but no residual. An effect
-of signal-to-noise a is found with the chance that a noncentral chi-square of k freedoms and noncentrality ``a^2``
-passes the threshold. Between two causes whose signatures, whitened and projected, correlate by rho, the wrong one wins
-with the chance ``Phi(-a sqrt(1 - rho^2) / 2)`` (two points in Gaussian noise).
+The information S of a cause's coefficients needs telemetry, attitude and the noise level, but no residual.
+An effect of signal-to-noise a is found with the chance that a noncentral chi-square of k freedoms and
+noncentrality ``a^2`` passes the threshold. Between two causes whose signatures, whitened and projected,
+correlate by rho, the wrong one wins with the chance ``Phi(-a sqrt(1 - rho^2) / 2)`` (two points in
+Gaussian noise).
 """
 
 from __future__ import annotations
@@ -30,7 +31,8 @@ CONFOUNDED = 0.85
 """Correlation beyond which two causes are listed as a pair: at signal-to-noise 6 they part in 95 of 100."""
 
 FREE = 1e-3
-"""Prior precision, of a plausible size's, of numbers that are each free; those of one common size are held to it."""
+"""Prior precision, of a plausible size's, of numbers that are each free; those of one common size are
+held to it."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +84,7 @@ class Isolability:
 
 
 def threshold(freedom: int, hypotheses: float, chance: float) -> float:
-    """Signal-to-noise at which an effect of `freedom` numbers is found with `chance`, among so many hypotheses."""
+    """Signal-to-noise at which an effect of `freedom` numbers, among so many, is found with `chance`."""
     limit = chdtri(freedom, LEVEL / hypotheses)
     return float(np.sqrt(chndtrinc(limit, freedom, 1.0 - chance)))
 
@@ -153,7 +155,7 @@ def _seen(size: float) -> float:
 
 
 def _alike(info: Information, one: Candidate, a: slice, other: Candidate, b: slice) -> float:
-    """Share of the one's signature, of a typical direction, that the other can imitate: root of the larger mean."""
+    """Share of one's typical signature that the other can imitate: root of the larger mean."""
     A, B, C = info.matrix[a, a], info.matrix[b, b], info.matrix[a, b]
     p, q = (FREE if candidate.spectra is None else 1.0 for candidate in (one, other))
     M = C @ np.linalg.solve(B + q * np.eye(len(B)), C.T)

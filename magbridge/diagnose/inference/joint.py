@@ -2,8 +2,8 @@ r"""The joint likelihood: calibration free, effects free, the noise fitted anew 
 
 Notes
 -----
-Noise that is fitted without an effect swallows a large slow one, so two hypotheses are compared only after each
-has had its own noise.
+Noise that is fitted without an effect swallows a large slow one, so two hypotheses are compared only after
+each has had its own noise.
 """
 
 from __future__ import annotations
@@ -25,8 +25,9 @@ __all__ = ["FLAT", "RIDGE", "Joint", "fit_joint"]
 
 FloatArray = NDArray[np.float64]
 RIDGE = 0.1
-"""Prior precision of an effect, of a plausible size's: ten times that size is hardly believed, a hundred times not at
-all. Without it a bend of the channels and the calibration's scales grow against each other until the noise is gone."""
+"""Prior precision of an effect, of a plausible size's: ten times that size is hardly believed, a hundred
+times not at all. Without it a bend of the channels and the calibration's scales grow against each other until
+the noise is gone."""
 FLAT = 1e-6
 """Prior precision of numbers that are free, or of no known size."""
 
@@ -38,8 +39,8 @@ class Joint:
     Attributes
     ----------
     log_likelihood : float
-        Of the noise model, with the prior of the calibration and of the effects; numbers of one common size are integrated
-        out (Laplace's approximation).
+        Of the noise model, with the prior of the calibration and of the effects; numbers of one common size
+        are integrated out (Laplace's approximation).
     z : (q,) array
     coefficients : (k,) array
         Of the effects, in units of their prior width.
@@ -86,7 +87,8 @@ def fit_joint(
     plain : bool
         Begin where plain least squares ends, too.
     spectra : sequence of (l, k) array or None
-        For each of `columns` whose numbers have one common free size (:mod:`.statistic`): their prior variances.
+        For each of `columns` whose numbers have one common free size (:mod:`.statistic`): their
+        prior variances.
     like : Joint, optional
         A fit whose noise this one's will resemble: saves time.
     blocks : bool, optional
@@ -145,7 +147,7 @@ def volume_of(covariance: FloatArray, prior: FloatArray) -> float:
 
 
 def _sized(P: FloatArray, h: FloatArray, prior: FloatArray, own: slice, spectra: FloatArray) -> FloatArray:
-    """Prior precision of the numbers at `own`, of the common size and spectrum that data of information P and h like best."""
+    """Prior precision of the numbers at `own`: the common size and spectrum that the data like best."""
     others = np.delete(np.arange(len(h)), own)
     K = np.linalg.solve(P[np.ix_(others, others)] + np.diag(prior[others]), P[others, own])
     S, b = P[own, own] - P[own, others] @ K, h[own] - K.T @ h[others]

@@ -1,12 +1,14 @@
-r"""The chance that a cause, if present, would be named alone: from telemetry, attitude and noise, not from the residual.
+r"""The chance that a cause, if present, would be named alone: by telemetry, attitude and noise.
+
+The residual tells nothing of it.
 
 Notes
 -----
-With the information S of all candidates, a cause's coefficients b of signal-to-noise ``a^2 = b^T S_jj b`` lend a rival i
-the ratio ``R_i = s^T S_ii^-1 s``, ``s = S_ij b``: what the rival can imitate. The difference of the two ratios is
-normal about ``a^2 - R_i = delta^2`` with standard deviation ``2 delta`` (two subspaces in Gaussian noise), so the
-log evidence by which the truth wins has the standard deviation delta, and the chance to be above
-:func:`~.evidence.lead` is a normal integral. Rivals are taken as independent.
+With the information S of all candidates, a cause's coefficients b of signal-to-noise ``a^2 = b^T S_jj b``
+lend a rival i the ratio ``R_i = s^T S_ii^-1 s``, ``s = S_ij b``: what the rival can imitate. The difference
+of the two ratios is normal about ``a^2 - R_i = delta^2`` with standard deviation ``2 delta`` (two subspaces
+in Gaussian noise), so the log evidence by which the truth wins has the standard deviation delta, and the
+chance to be above :func:`~.evidence.lead` is a normal integral. Rivals are taken as independent.
 """
 
 from __future__ import annotations
@@ -88,7 +90,7 @@ class NamingTheory:
         return float(np.prod(list(chances.values())))
 
     def alone(self, cause: str, signal_to_noise: float) -> float:
-        """Chance that `cause`, of no known direction or channel, is named alone: the mean over what is plausible.
+        """Chance that `cause` is named alone: the mean over its plausible directions and channels.
 
         Parameters
         ----------

@@ -7,8 +7,9 @@ change from block to block::
 
     v_t = f_t (r_t - sum_k a_k r_(t-k)),   v_t / s_t ~ t_nu
 
-Beside a gap the p samples before a sample were at other lags: there a are the best coefficients for those, and f is
-how much less surely they predict, both from the autocovariance C of the memory a (Vecchia 1988, JRSS B 50:297),
+Beside a gap the p samples before a sample were at other lags: there a are the best coefficients for those,
+and f is how much less surely they predict, both from the autocovariance C of the memory a (Vecchia 1988,
+JRSS B 50:297),
 
     a = G^-1 c,   G_ij = C(|l_i - l_j|),   c_i = C(l_i),   f^-2 = C(0) - c^T a   in units of s^2
 
@@ -201,7 +202,8 @@ class Predictors:
 def autocovariance(memory: FloatArray, reach: int) -> FloatArray:
     """(reach + 1,) C of an autoregression whose innovations have variance 1.
 
-    Levinson's recursion backwards gives the best coefficients for 0, 1, ... p samples (Brockwell & Davis 1991, sec. 5.2).
+    Levinson's recursion backwards gives the best coefficients for 0, 1, ... p samples (Brockwell & Davis
+    1991, sec. 5.2).
     """
     p, shorter, variance = len(memory), [memory], 1.0
     while shorter[-1].size:

@@ -2,16 +2,16 @@ r"""The uncertainty of nonlinear parameters, and what it adds to the covariance 
 
 Notes
 -----
-*Within a cell of their grid* the likelihood has one peak. With the parameters' derivatives ``J_s = d(X b)/ds`` beside the
-columns of calibration and effects, their information is the matrix M of what is left of ``J_s`` when those are projected
-out, and these give way to a unit of each by K (:mod:`.information`). So with a prior of a cell, N(0, 1) in its units, all
-others' covariance is
+*Within a cell of their grid* the likelihood has one peak. With the parameters' derivatives
+``J_s = d(X b)/ds`` beside the columns of calibration and effects, their information is the matrix M of what
+is left of ``J_s`` when those are projected out, and these give way to a unit of each by K
+(:mod:`.information`). So with a prior of a cell, N(0, 1) in its units, all others' covariance is
 
 .. math:: C + K (M + 1)^{-1} K^T
 
-*Beyond it* there are other peaks: those of an onset lie hours apart, each with a size of its own. With d_k by how much all
-coefficients differ at the other points of the grid, C_k their covariance there, and w_k these points' posterior weights, the
-mixture of all has the moments
+*Beyond it* there are other peaks: those of an onset lie hours apart, each with a size of its own. With d_k by
+how much all coefficients differ at the other points of the grid, C_k their covariance there, and w_k these
+points' posterior weights, the mixture of all has the moments
 
 .. math:: C + \sum_k w_k \left(d_k d_k^T + C_k - C\right)
 
@@ -52,7 +52,7 @@ def loosened(
     fit: Joint,
     grid: Sequence[Candidate] = (),
 ) -> Joint:
-    """Return the fit with the covariance that its coefficients have when the nonlinear parameters are free, too.
+    """Return the fit, its coefficients' covariance that with the nonlinear parameters free, too.
 
     Parameters
     ----------
@@ -141,7 +141,7 @@ def _elsewhere(info: Information, fit: Joint, mine: Placed, points: Sequence[Pla
     alone = replace(alone, score=alone.score + alone.matrix[:, own] @ fit.coefficients[here])
 
     def moments(candidate: Candidate, place: slice) -> tuple[float, FloatArray, FloatArray]:
-        """Return evidence, all coefficients, and their covariance, but for what does not depend on the candidate."""
+        """Return evidence, all coefficients and their covariance, less what all candidates share."""
         s = score(alone, place, candidate)
         # the other causes give way to it, and the calibration to all
         way = np.zeros((len(fit.covariance), candidate.size))

@@ -29,7 +29,8 @@ class Outliers(NamedTuple):
 def outliers(fit: Joint, causes: int) -> Outliers | None:
     """Test for isolated wrong samples: a few innovations from a wide distribution of their own.
 
-    Heavy tails alone are no outliers: the mixture ``(1 - eps) t_nu + eps N(0, S^2)`` must beat the best ``t_nu``.
+    Heavy tails alone are no outliers: the mixture ``(1 - eps) t_nu + eps N(0, S^2)`` must beat the
+    best ``t_nu``.
     """
     v = fit.noise.innovations
     n = len(v)

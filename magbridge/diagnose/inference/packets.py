@@ -2,18 +2,21 @@ r"""Oscillations of limited duration: what rings, surges or bursts for a while.
 
 Notes
 -----
-A packet is a wave along the field under a Gaussian, with an amplitude and a phase of its own (Gabor 1946, J. IEE 93:429):
+A packet is a wave along the field under a Gaussian, with an amplitude and a phase of its own (Gabor 1946,
+J. IEE 93:429):
 
-.. math:: e^{-(t - t_0)^2 / 2 (Q P)^2} \left(a \cos \tfrac{2 \pi (t - t_0)}{P} + b \sin \tfrac{2 \pi (t - t_0)}{P}\right)
+.. math:: e^{-(t - t_0)^2 / 2 (Q P)^2}
+          \left(a \cos \tfrac{2 \pi (t - t_0)}{P} + b \sin \tfrac{2 \pi (t - t_0)}{P}\right)
 
-Its moment t_0 is as likely as any other; its period P and its cycles Q are uniform in their logarithms. With g the score of
-each single sample and h its information at that frequency, the likelihood ratio of a and b is ``R = |B|^2 / S``,
+Its moment t_0 is as likely as any other; its period P and its cycles Q are uniform in their logarithms. With
+g the score of each single sample and h its information at that frequency, the likelihood ratio of a and b is
+``R = |B|^2 / S``,
 
 .. math:: B(t_0) = \sum_t g_t e^{-(t - t_0)^2 / 2 (Q P)^2 + 2 \pi i (t - t_0) / P}, \qquad
           S(t_0) = \tfrac12 \sum_t h_t e^{-(t - t_0)^2 / (Q P)^2}
 
-so all moments are two convolutions, over intervals: those without a sample have g = h = 0. A packet is worth its place if the
-evidence, averaged over all places that it could have had, is above one.
+so all moments are two convolutions, over intervals: those without a sample have g = h = 0. A packet is worth
+its place if the evidence, averaged over all places that it could have had, is above one.
 """
 
 from __future__ import annotations
@@ -52,7 +55,10 @@ SPARSE = 8
 
 
 class Places(NamedTuple):
-    """Where packets of one period and length, in intervals, may be: moments (m,), likelihood ratios (m,), log of a place's share."""
+    """Where packets of one period and length, in intervals, may be.
+
+    Moments (m,), likelihood ratios (m,), and the log of a place's share.
+    """
 
     period: float
     length: float
@@ -62,7 +68,10 @@ class Places(NamedTuple):
 
 
 class Packets(NamedTuple):
-    """Packets that are worth their places: two columns each, how many, the number of sets of so many, the loudest's period (s)."""
+    """Packets that are worth their places.
+
+    Their two columns each, how many, the number of sets of so many, and the loudest's period (s).
+    """
 
     columns: Columns
     number: int
@@ -167,7 +176,7 @@ class _Spectra:
 
 
 def _passed(noise: Noise, frequency: FloatArray) -> FloatArray:
-    """(2, k) power that whitening lets pass of waves of so many turns a sample: of whole pasts, and on average beside gaps."""
+    """(2, k) power that whitening passes, by turns a sample: of whole pasts, and on average by gaps."""
     past, gaps = noise.past, noise.beside_gaps
     lags = np.arange(1, past.order + 1)
     whole = np.abs(1.0 - np.exp(-2j * np.pi * np.outer(frequency, lags)) @ noise.memory) ** 2

@@ -2,14 +2,14 @@ r"""Two causes at once: every pair of candidates in place of two regressors of a
 
 Notes
 -----
-A wrong cause may persist only because the one beside it is wrong, too, and neither gives way alone. So replacements are weighed
-in pairs, with all others of the model projected out (:mod:`.information`):
+A wrong cause may persist only because the one beside it is wrong, too, and neither gives way alone. So
+replacements are weighed in pairs, with all others of the model projected out (:mod:`.information`):
 
 .. math:: E_{ab} = E_a + E_{b \mid a}, \qquad
           E_{AB} = \ln \frac{1}{|A| |B|} \sum_{a \in A, b \in B} e^{E_{ab}}
 
-with A, B the grids of two causes' nonlinear parameters. A candidate whose numbers have one common size is only ever the first
-of its pair, at the size that it would have alone.
+with A, B the grids of two causes' nonlinear parameters. A candidate whose numbers have one common size is
+only ever the first of its pair, at the size that it would have alone.
 """
 
 from __future__ import annotations
@@ -160,7 +160,7 @@ class _Table:
         np.fill_diagonal(self.evidence, -np.inf)
 
     def _own(self) -> tuple[float, float]:
-        """Log evidence of what stands there, as an average over its grids, and by how much of that it must win."""
+        """Log evidence of what stands there, an average over its grids, and by how much of it must win."""
         m, groups = len(self.state.candidates), [key(candidate) for candidate in self.standing]
         # under the noise that is left all ratios are larger than what the models gain
         whole = self.state.ratio(self.base)
@@ -184,7 +184,7 @@ class _Table:
         return _average(self.evidence[np.ix_(self.state.groups[A], self.state.groups[B])])
 
     def pair(self, A: Group, B: Group) -> Pair | None:
-        """Return the best of two grids, if it is no worse than what stands there by more than :func:`~.evidence.lead`."""
+        """Return the best of two grids, unless what stands is better by more than :func:`~.evidence.lead`."""
         own = [key(candidate) for candidate in self.standing]
         block = self.evidence[np.ix_(self.members[A], self.members[B])]
         top = float(block.max())
@@ -203,7 +203,10 @@ class _Table:
         return Pair(two, one, behind) if self._swapped(a, b) else Pair(one, two, behind)
 
     def _heard(self, a: int, b: int) -> bool:
-        """Say whether each passes its test beside the other; where one cause stood, neither may be what the other leaves."""
+        """Say whether each passes its test beside the other.
+
+        Where one cause stood, neither may be what the other leaves.
+        """
         ratios = []
         for n, other in ((a, b), (b, a)):
             one, alone = self.candidates[n], self.scores[n]
@@ -217,7 +220,7 @@ class _Table:
         return not same or min(ratios) >= REMNANT**2 * max(ratios)
 
     def _swapped(self, a: int, b: int) -> bool:
-        """Say whether a rather stands in the second's place: by name, else by what it can take of that one's signal."""
+        """Say whether a rather stands in the second's place, by name, else by what it takes of its signal."""
         if len(self.standing) == 1:
             return False
         names = [candidate.cause for candidate in self.standing]

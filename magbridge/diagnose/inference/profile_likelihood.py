@@ -18,15 +18,15 @@ __all__ = ["refined", "sharpen"]
 FloatArray = NDArray[np.float64]
 
 COLUMNS, STAGES = 144, 2
-"""Columns of the values tried within a nonlinear parameter's bracket, and how often that is narrowed to the neighbours
-of the best value."""
+"""Columns of the values tried within a nonlinear parameter's bracket, and how often that is narrowed to the
+neighbours of the best value."""
 
 
 def sharpen(state: State, model: list[Candidate], hypothesis: Hypothesis, base: Joint) -> Hypothesis:
     """Profile the nonlinear parameters of a cause beside `model`, whose fit is `base`, one after the other.
 
-    Many values are scored at once under the present noise, because the likelihood of an onset has several peaks. The evidence
-    pays for the choice: the average over the bracket counts, not the peak.
+    Many values are scored at once under the present noise, because the likelihood of an onset has several
+    peaks. The evidence pays for the choice: the average over the bracket counts, not the peak.
     """
     best, narrow = hypothesis, 0.0
     if best.candidate.again is None:
@@ -47,7 +47,7 @@ def sharpen(state: State, model: list[Candidate], hypothesis: Hypothesis, base: 
 def _profiled(
     state: State, model: list[Candidate], best: Hypothesis, base: Joint, position: int, name: str
 ) -> tuple[Candidate, FloatArray, float]:
-    """Return the best value's candidate, coefficients to begin from, and how much narrower than the bracket it is held."""
+    """Return the best value's candidate, coefficients to begin from, and its share of the bracket."""
     again = best.candidate.again
     assert again is not None
     columns = [candidate.columns for candidate in model]
@@ -95,7 +95,7 @@ def _bracket(state: State, candidate: Candidate, name: str) -> tuple[float, floa
 def refined(
     state: State, model: list[Candidate], base: Joint, members: int | None = None
 ) -> tuple[list[Candidate], Joint]:
-    """Profile the nonlinear parameters of the first `members` of a model beside the others; they end up last."""
+    """Profile the nonlinear parameters of the first `members` beside the others; they end up last."""
     for _ in range(len(model) if members is None else members):
         own, others = model[0], model[1:]
         c = np.append(base.coefficients[own.size :], base.coefficients[: own.size])

@@ -53,7 +53,7 @@ class Hypothesis:
 
     @property
     def signal_to_noise(self) -> float:
-        """Whitened norm of the effect under the remaining noise, projected, less what noise alone would give."""
+        """Whitened norm of the effect under the remaining noise, projected, less what noise alone gives."""
         size = self.candidate.size
         known = self.fit.prior[-size:] * np.diag(self.fit.covariance)[-size:]
         power = wald(self.fit, size) - float(np.sum(1.0 - known))
@@ -121,7 +121,10 @@ class State:
         return [score(info, at, candidate) for at, candidate in zip(self.at, self.candidates, strict=True)]
 
     def best(self, scores: Sequence[Score]) -> dict[tuple[str, str | None], tuple[int, float]]:
-        """Best member of each group, and the log of the grid's average over its peak: the price of the nonlinear parameters."""
+        """Best member of each group, and the log of its grid's average over the peak.
+
+        That is the price of the nonlinear parameters.
+        """
         found = {}
         for group, members in self.groups.items():
             evidences = np.array([scores[k].evidence for k in members])
@@ -149,7 +152,7 @@ class State:
         return sorted(found, key=lambda h: -h.evidence)
 
     def beside(self, model: Sequence[Candidate], base: Joint) -> Information:
-        """Information of all candidates, those of `model` at the end, under its noise; only the calibration projected out."""
+        """Information of all candidates, `model`'s last, under its noise, the calibration projected out."""
         known, info = self.last
         if known is not base:
             info = self._under(base.noise, model, base)

@@ -2,15 +2,15 @@ r"""The search for the causes that the data support, one after the other.
 
 Notes
 -----
-Candidates are scored (:mod:`.evidence`) under two noises, since the noise of the model so far may have swallowed an effect:
-that one, and the noise that is left when every cause may take what it can. The best of each cause are then fitted
-jointly with noise and calibration. The best that passes the test is added; so on while one does. A cause that is found
-again is not another cause but needs more than one of its regressors: they become one candidate. Then causes change places
-with their rivals (:mod:`.exchange`); another start is a choice of all at once (:mod:`.simultaneous`); and what later findings
-have made needless is dropped.
+Candidates are scored (:mod:`.evidence`) under two noises, since the noise of the model so far may have
+swallowed an effect: that one, and the noise that is left when every cause may take what it can. The best of
+each cause are then fitted jointly with noise and calibration. The best that passes the test is added; so on
+while one does. A cause that is found again is not another cause but needs more than one of its regressors:
+they become one candidate. Then causes change places with their rivals (:mod:`.exchange`); another start is a
+choice of all at once (:mod:`.simultaneous`); and what later findings have made needless is dropped.
 
-What a cause's place could be taken by is read off one matrix at the end: the information of all candidates under the
-noise that is left, the other causes projected out.
+What a cause's place could be taken by is read off one matrix at the end: the information of all candidates
+under the noise that is left, the other causes projected out.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ def search(problem: Problem, candidates: Sequence[Candidate], causes: int) -> Ou
 
 
 def _likeliest(state: State, null: Joint, first: list[Hypothesis]) -> tuple[list[Candidate], Joint]:
-    """Return what is worth most: causes found one after the other, chosen together, or a single one, if that is enough."""
+    """Return what is worth most: causes found one by one, chosen together, or a single one that is enough."""
     one_by_one, at_once = _chain(state, null, first), chosen_at_once(state)
     found = [exchanged(state, *one_by_one) if one_by_one[0] else one_by_one]
     before = {key(candidate) for candidate in one_by_one[0]}
@@ -141,12 +141,12 @@ def _chain(state: State, null: Joint, first: list[Hypothesis]) -> tuple[list[Can
 
 
 def _next(found: list[Hypothesis], heard: Mapping[str, float], ratio: float) -> Hypothesis | None:
-    """Pick the best that passes the test; of what idealised regressors may have left, only more of the same cause.
+    """Pick the best that passes; of what idealised regressors may have left, only more of the same cause.
 
     `heard` holds the signal-to-noise of the causes that are in the model, `ratio` is its likelihood ratio.
 
-    More of a cause that is there already comes before another that explains hardly more; and fewer numbers before more,
-    where what the model has left may be what makes the difference.
+    More of a cause that is there already comes before another that explains hardly more; and fewer numbers
+    before more, where what the model has left may be what makes the difference.
     """
 
     def left(cause: str) -> float:

@@ -1,4 +1,4 @@
-"""The sets: for each cause that was found, every other that the data do not rule out, alone or together with another."""
+"""The sets: for each cause found, every other that is not ruled out, alone or together with another."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ __all__ = ["sets_of"]
 def sets_of(
     state: State, info: Information, model: list[Candidate], base: Joint
 ) -> tuple[tuple[Rival, ...], ...]:
-    """Return the rivals of each cause of `model`, including those that need another cause to be replaced as well."""
+    """Return the rivals of each cause of `model`, also those that need another cause replaced as well."""
     pieces = [(piece, place) for place, candidate in enumerate(model) for piece in candidate.pieces]
     own = [{key(piece) for piece in candidate.pieces} for candidate in model]
     found: list[dict[tuple[str, str | None], Rival]] = [{} for _ in model]

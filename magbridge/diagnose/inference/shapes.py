@@ -39,9 +39,10 @@ SLOPES = (0.0, 0.1, 0.2)
 
 
 def spectra(count: int, axes: int) -> tuple[tuple[str, FloatArray], ...]:
-    """Widths of an exponential memory's half waves (a relaxation, a telegraph): ``1 / sqrt(1 + (k / k_0)^2)``."""
+    """Widths of an exponential memory's half waves (relaxation, telegraph): ``1 / sqrt(1 + (k / k_0)^2)``."""
     k = np.repeat(np.arange(1, count + 1), axes)
-    return tuple((kind, 10.0 / np.sqrt(1.0 + (k / corner) ** 2)) for kind, corner in (("drift", 1.0), ("switching", 8.0)))  # fmt: skip
+    corners = {"drift": 1.0, "switching": 8.0}
+    return tuple((kind, 10.0 / np.sqrt(1.0 + (k / corner) ** 2)) for kind, corner in corners.items())
 
 
 def direction(body: FloatArray) -> Columns:
@@ -78,7 +79,10 @@ def bends() -> tuple[tuple[str, FloatArray], ...]:
 
 
 def crossing(reading: FloatArray, slopes: FloatArray) -> Columns:
-    """Each channel's error where it passes zero: a feedback current turns, a converter's first bit flips (Hermite's functions)."""
+    """Each channel's error where it passes zero (Hermite's functions).
+
+    There a feedback current turns, or a converter's first bit flips.
+    """
 
     def columns(rows: slice) -> FloatArray:
         x = reading[rows].T[:, None] / np.array(ZERO)[:, None]
@@ -95,7 +99,7 @@ def curve(values: FloatArray) -> Columns:
 
 
 def memory(values: FloatArray) -> Columns:
-    """Functions of a channel's past: curved branches of hysteresis, narrow and wide, and its direction of motion."""
+    """Functions of a channel's past: curved branches of hysteresis, narrow and wide; its way of motion."""
     y = _scaled(values)
     plays = [play(y, width) for width in PLAYS]
     change = np.diff(y, prepend=y[0])
@@ -122,7 +126,7 @@ def repeated(problem: Problem) -> Columns:
 
 
 def ends(down: FloatArray) -> Columns:
-    """Return the end of the hull at which a loose object lies: it slides to the lower one, once tilted by so much."""
+    """Return the end of the hull at which a loose object lies: the lower one, once tilted by so much."""
     place = np.arange(len(down))
     sides = []
     for slope in SLOPES:

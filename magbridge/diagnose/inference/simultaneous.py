@@ -1,7 +1,7 @@
 """Another start of the search: all causes chosen at once, in the one matrix of the first round.
 
-There the noise has swallowed nothing: it is what is left when every cause takes what it can. Causes that were found one after
-the other may have gone astray where several act.
+There the noise has swallowed nothing: it is what is left when every cause takes what it can. Causes that were
+found one after the other may have gone astray where several act.
 """
 
 from __future__ import annotations

@@ -5,14 +5,14 @@ Notes
 With projected information S and score b of k columns in units of their widths, numbers that are free have the
 likelihood ratio ``R = b^T S^-1 b``, of as many freedoms as the data see directions.
 
-Where there are more numbers than anyone believes in (a smooth function of the place, a slow curve), they have a Gaussian
-prior of a common size g and of a spectrum w, both the ones that the data like best: a Gaussian process. With
-``w^1/2 S w^1/2 = V diag(lambda) V^T``, ``y = V^T w^1/2 b`` the log evidence is
+Where there are more numbers than anyone believes in (a smooth function of the place, a slow curve), they have
+a Gaussian prior of a common size g and of a spectrum w, both the ones that the data like best: a Gaussian
+process. With ``w^1/2 S w^1/2 = V diag(lambda) V^T``, ``y = V^T w^1/2 b`` the log evidence is
 
 .. math:: E = \max_{g, w} \tfrac12 \sum_i \left(\frac{g y_i^2}{1 + g \lambda_i} - \ln(1 + g \lambda_i)\right)
 
-which is a variance component's likelihood ratio: under no effect ``R = 2 E`` is at most a chi-square of one freedom
-(Self & Liang 1987), whatever the number of columns.
+which is a variance component's likelihood ratio: under no effect ``R = 2 E`` is at most a chi-square of one
+freedom (Self & Liang 1987), whatever the number of columns.
 """
 
 from __future__ import annotations
@@ -102,6 +102,5 @@ class Statistic:
         values, g = self.values[k], SIZES[at]
         c = g * (self.vectors[k].T @ b) / (1.0 + g * values)
         price = 0.5 * float(c @ c / g + np.log1p(g * values).sum())
-        return Ridge(
-            2.0 * float(tables[k][at]), self.vectors[k] @ c, g * self.spectra[k], price, float(np.sqrt(c**2 @ values))
-        )  # fmt: skip
+        ratio, norm = 2.0 * float(tables[k][at]), float(np.sqrt(c**2 @ values))
+        return Ridge(ratio, self.vectors[k] @ c, g * self.spectra[k], price, norm)

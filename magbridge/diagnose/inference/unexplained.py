@@ -2,9 +2,10 @@
 
 Notes
 -----
-A free description has more numbers than anyone believes in, so they have one common free size (:mod:`.statistic`).
-Noise that was fitted without the effect may have swallowed it. So a description is found under the noise that stands and under
-the one that is left when slow curves take what they can, and then weighed by the whole likelihood, with a noise of its own.
+A free description has more numbers than anyone believes in, so they have one common free size
+(:mod:`.statistic`). Noise that was fitted without the effect may have swallowed it. So a description is found
+under the noise that stands and under the one that is left when slow curves take what they can, and then
+weighed by the whole likelihood, with a noise of its own.
 """
 
 from __future__ import annotations
@@ -81,10 +82,10 @@ class Leftover(NamedTuple):
 
 
 def lone(S: FloatArray, b: FloatArray, width: FloatArray, whole: Ridge) -> Ridge:
-    """One curve along one direction of the body: ``c = f d^T`` has a third of the numbers of three curves, and two more.
+    """One curve along one direction of the body, ``c = f d^T``: a third of three curves' numbers, and two.
 
-    f by the ridge along d, d by least squares with f, from the `whole` estimate on; the direction's two numbers cost what
-    :func:`~.evidence.weigh` asks for them.
+    f by the ridge along d, d by least squares with f, from the `whole` estimate on; the direction's two
+    numbers cost what :func:`~.evidence.weigh` asks for them.
     """
     count = len(width) // 3
     own = np.linalg.svd(whole.estimate.reshape(count, 3), full_matrices=False)[2][0]
@@ -132,7 +133,8 @@ def leftover(
             len(problem), lambda entry: _weighed(problem, columns, fit, order, *entry[2:]), loud
         )
         for (own, kind, one, best, _), evidence in zip(loud, weighed, strict=True):
-            # a gain beyond the formula's is that of a noise which found another optimum beside the description
+            # a gain beyond the formula's is that of a noise which found another optimum beside
+            # the description
             found.append((min(own, evidence), kind, one, best.signal_to_noise))
     evidence, kind, one, size = max(found, key=lambda entry: entry[0])
     # half of a chi-square's tail: a size that cannot be negative is zero as often as not (Self & Liang 1987)
@@ -149,7 +151,7 @@ def leftover(
 def _scored(
     problem: Problem, noise: Noise, fit: Joint, model: Sequence[Columns], listed: Sequence[Description]
 ) -> Iterator[tuple[float, str, Description, Ridge, FloatArray]]:
-    """Yield each description with each of its widths: log evidence under `noise`, and by how much the model gives way."""
+    """Yield each description at each width: log evidence under `noise`, and how the model gives way."""
     columns = [*(one.columns for one in listed), *model]
     info = information(problem, noise, fit, columns, strangers=len(listed)).fitted(fit)
     ends = np.cumsum([0, *(one.widths[0][1].size for one in listed)]).tolist()
@@ -166,7 +168,7 @@ def _scored(
 def _calm(
     problem: Problem, model: Sequence[Columns], fit: Joint, order: int, slow: Sequence[Description]
 ) -> Noise:
-    """Return the noise that is left when slow curves take what they can, beginning with one that has no memory."""
+    """Return the noise that is left when slow curves take what they can, from one without memory on."""
     jumps = np.abs(np.diff(fit.left))
     level = 1.4826 * float(np.median(jumps)) / np.sqrt(2.0) + 1e-12
     white = np.full(len(problem), level)
@@ -183,9 +185,10 @@ def _calm(
 
 
 def _weighed(
-    problem: Problem, model: Sequence[Columns], fit: Joint, order: int, one: Description, best: Ridge, shift: FloatArray
+    problem: Problem, model: Sequence[Columns], fit: Joint, order: int, one: Description, best: Ridge,
+    shift: FloatArray,
 ) -> float:  # fmt: skip
-    """Log evidence of a description against the model, the noise fitted anew with it (Laplace's approximation)."""
+    """Log evidence of a description against the model, its noise fitted anew (Laplace's approximation)."""
     moved = -shift @ best.estimate
     left = fit.left - Design(problem, [*model, one.columns]).times(np.append(moved, best.estimate))
     noise = fit_noise(left, problem.survey.past(order), blocks=bool(np.ptp(fit.noise.scale)), like=fit.noise)

@@ -1,4 +1,4 @@
-"""What a reader should know before believing a finding: a paragraph each, empty where there is nothing to say."""
+"""What to know before believing a finding: a paragraph each, empty where there is nothing to say."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ IMPLAUSIBLE = 5.0
 
 
 def late(problem: Problem, fit: Joint) -> str:
-    """Say so when the channels look interpolated from other times: no calibration can undo the noise that this makes."""
+    """Say so when the channels look interpolated, which adds a noise that no calibration can undo."""
     own, to_x = np.arange(len(fit.z))[DELAYS], np.array([[-1.0, 1.0, 0.0], [-1.0, 0.0, 1.0]])
     later = DELAY * to_x @ fit.z[own]
     covariance = DELAY**2 * to_x @ fit.covariance[np.ix_(own, own)] @ to_x.T
@@ -57,10 +57,12 @@ def late(problem: Problem, fit: Joint) -> str:
     )
     taken = float(np.std(problem.straight(fit.z) - problem.residual))
     return (
-        f"<p>The channels look as if they were sampled in turn and interpolated to the time of each row: y {y} and z {z} later than x (a "
-        f"channel that is noisier than the others would look the same). The {number(taken)} nT RMS that this causes is removed from what "
-        "follows. To avoid it, sample all three channels at once, or faster than the vehicle sways; or log the channels as read, each with "
-        "its own time (mag_time_x, mag_time_y, mag_time_z), which loses less than the log's interpolation.</p>"
+        "<p>The channels look as if they were sampled in turn and interpolated to the time of each row: y "
+        f"{y} and z {z} later than x (a channel that is noisier than the others would look the same). The "
+        f"{number(taken)} nT RMS that this causes is removed from what follows. To avoid it, sample all "
+        "three channels at once, or faster than the vehicle sways; or log the channels as read, each with "
+        "its own time (mag_time_x, mag_time_y, mag_time_z), which loses less than the log's "
+        "interpolation.</p>"
     )
 
 
@@ -68,7 +70,10 @@ def several(names: tuple[str, ...]) -> str:
     """Explain the numbers in brackets."""
     if not any(name.endswith(")") for name in names):
         return ""
-    return '<p class="faint">A number in brackets: several such terms were needed to describe the cause; they act together.</p>'
+    return (
+        '<p class="faint">A number in brackets: several such terms were needed to describe the cause; they '
+        "act together.</p>"
+    )
 
 
 def implausible(candidate: Candidate, b: NDArray[np.float64]) -> str:
@@ -77,8 +82,9 @@ def implausible(candidate: Candidate, b: NDArray[np.float64]) -> str:
     if candidate.spectra is not None or times < IMPLAUSIBLE:
         return ""
     return (
-        f"<p>This is {number(times, 2)} times the usual size of such a cause. Two causes that cancel each other can grow this "
-        "large: check the extended calibration against another reference before it is flown.</p>"
+        f"<p>This is {number(times, 2)} times the usual size of such a cause. Two causes that cancel each "
+        "other can grow this large: check the extended calibration against another reference before it is "
+        "flown.</p>"
     )
 
 
@@ -87,13 +93,13 @@ def grounded(diagnosis: Diagnosis, candidate: Candidate) -> str:
     if all(effect in diagnosis.calibration.effects for effect in candidate.effects):
         return ""
     return (
-        "<p>It is not in the extended calibration: live, a rate of change is a backward difference, whose noise would exceed what "
-        "the correction gains.</p>"
+        "<p>It is not in the extended calibration: live, a rate of change is a backward difference, whose "
+        "noise would exceed what the correction gains.</p>"
     )
 
 
 def in_motion(diagnosis: Diagnosis, finding: Finding) -> str:
-    """Say so when a cause acts while masses move: a mass that moved unseen between two rows looks the same."""
+    """Say so when a cause acts while masses move: one that moved unseen between rows looks the same."""
     survey = diagnosis.problem.survey
     p = survey.values([parameter.name for parameter in diagnosis.problem.calibration.parameters])
     steps = np.any(np.diff(p, axis=0) != 0.0, axis=1)
@@ -104,8 +110,9 @@ def in_motion(diagnosis: Diagnosis, finding: Finding) -> str:
         return ""
     interval = float(np.median(np.diff(survey.time)))
     return (
-        f"<p>{100 * share:.0f} % of its power lies in the {100 * usual:.0f} % of samples next to which a mass moved. With "
-        f"{interval:.3g} s between rows, a mass that was not where its row says would look the same.</p>"
+        f"<p>{100 * share:.0f} % of its power lies in the {100 * usual:.0f} % of samples next to which a "
+        f"mass moved. With {interval:.3g} s between rows, a mass that was not where its row says would look "
+        "the same.</p>"
     )
 
 
@@ -113,8 +120,9 @@ def gained(gain: Gain, parts: str) -> str:
     """Tell what all findings together gain on what was left out, and say so when that shows no gain."""
     low, high = gain.interval
     return (
-        f"On {parts} left out of the fit, {number(gain.before)} nT RMS became {number(gain.after)} nT (ratio {gain.ratio:.2f}, "
-        f"95 % interval {low:.2f} to {high:.2f}{'' if gain.shown else ': no gain is shown'})."
+        f"On {parts} left out of the fit, {number(gain.before)} nT RMS became {number(gain.after)} nT "
+        f"(ratio {gain.ratio:.2f}, 95 % interval {low:.2f} to "
+        f"{high:.2f}{'' if gain.shown else ': no gain is shown'})."
     )
 
 
@@ -122,7 +130,10 @@ def recent(candidate: Candidate) -> str:
     """Say so when a cause is best described as absent from the logs that the calibration was fitted to."""
     if not any(piece.since for piece in candidate.pieces):
         return ""
-    return "<p>It is best described as absent from the logs that the calibration was fitted to: it may have appeared since.</p>"
+    return (
+        "<p>It is best described as absent from the logs that the calibration was fitted to: it may have "
+        "appeared since.</p>"
+    )
 
 
 def no_gain(gain: Gain) -> str:
@@ -144,16 +155,22 @@ def rivalled(cause: Cause, rivals: Sequence[Rival], chance: float) -> str:
     if not rivals:
         return (
             "<p>No other known cause comes within odds of 20:1.</p>"
-            f"<p>In a log like this one, theory gives it a {100 * chance:.0f} % chance of being named alone.</p>"
+            f"<p>In a log like this one, theory gives it a {100 * chance:.0f} % chance of being named "
+            "alone.</p>"
         )
     return (
-        f"<p>The data cannot tell it from {listed(rivals)} (odds below 20:1). To tell them apart: {escape(cause.separated_by)}.</p>"
-        f"<p>In a log like this one, theory gives it a {100 * chance:.0f} % chance of being named alone; here it was not.</p>"
+        f"<p>The data cannot tell it from {listed(rivals)} (odds below 20:1). To tell them apart: "
+        f"{escape(cause.separated_by)}.</p>"
+        f"<p>In a log like this one, theory gives it a {100 * chance:.0f} % chance of being named alone; "
+        "here it was not.</p>"
     )
 
 
 def unsettled(problem: Problem, named: Sequence[Candidate], extended: Calibration) -> str:
-    """Say so when the corrected field is shifted as a whole beside an error of the reference: a constant may belong to either."""
+    """Say so when the corrected field is shifted as a whole beside an error of the reference.
+
+    A constant may belong to either.
+    """
     if all(candidate.effects for candidate in named):
         return ""
     fresh = ~problem.survey.learned
@@ -165,8 +182,9 @@ def unsettled(problem: Problem, named: Sequence[Candidate], extended: Calibratio
     if abs(shift) < extended.noise.sensor:
         return ""
     return (
-        f"the extended calibration shifts the whole corrected field by {shift:+.1f} nT, and the reference is in error, too; a log cannot "
-        "tell for sure which of them a constant belongs to: check the extended field against another reference before using it"
+        f"the extended calibration shifts the whole corrected field by {shift:+.1f} nT, and the reference "
+        "is in error, too; a log cannot tell for sure which of them a constant belongs to: check the "
+        "extended field against another reference before using it"
     )
 
 
@@ -175,6 +193,7 @@ def nameless(rest: Leftover, causes: Mapping[str, Cause]) -> str:
     if not rest.within:
         return "It fits no known cause, so it has no name."
     return (
-        f"No name is asserted: a description without a cause is likelier than any known cause, but by less than 20:1. Not ruled out: "
-        f"{listed(rest.within)}. To tell: {escape(causes[rest.within[0].cause].separated_by)}."
+        "No name is asserted: a description without a cause is likelier than any known cause, but by less "
+        f"than 20:1. Not ruled out: {listed(rest.within)}. To tell: "
+        f"{escape(causes[rest.within[0].cause].separated_by)}."
     )

@@ -67,7 +67,10 @@ def _clock(diagnosis: Diagnosis) -> tuple[float, str]:
 
 
 def _sides(diagnosis: Diagnosis) -> dict[str, tuple[FloatArray, str]]:
-    """Return the two residuals to compare, each with its colour; without findings, the second is that of the refitted calibration."""
+    """Return the two residuals to compare, each with its colour.
+
+    Without findings, the second is that of the refitted calibration.
+    """
     if not diagnosis.findings:
         return {
             "as calibrated": (diagnosis.before, BEFORE),
@@ -137,10 +140,8 @@ def spectrum(diagnosis: Diagnosis) -> str:
     frequency = np.geomspace(1.0 / float(np.ptp(survey.time)), 0.5 / interval, 200)
     lags = np.exp(-2j * np.pi * frequency[:, None] * interval * np.arange(1, len(noise.memory) + 1))
     spread = float(np.median(noise.scale)) * (np.sqrt(noise.nu / (noise.nu - 2.0)) if noise.nu < 1e5 else 1.0)
-    axis.loglog(
-        frequency, spread * np.sqrt(2.0 * interval) / np.abs(1.0 - lags @ noise.memory), "--", color=INK, linewidth=1,
-        label="noise model",
-    )  # fmt: skip
+    density = spread * np.sqrt(2.0 * interval) / np.abs(1.0 - lags @ noise.memory)
+    axis.loglog(frequency, density, "--", color=INK, linewidth=1, label="noise model")
     axis.yaxis.set_major_formatter(LogFormatter())
     axis.yaxis.set_minor_formatter(LogFormatter(minor_thresholds=(1.5, 0.6)))
     axis.tick_params(which="minor", labelsize=8, colors=INK)
@@ -151,7 +152,7 @@ def spectrum(diagnosis: Diagnosis) -> str:
 
 
 def channels(diagnosis: Diagnosis) -> str:
-    """Draw the difference against each channel: means over twenty bins with their scatter, all at one scale."""
+    """Draw the difference against each channel: mean and scatter in twenty bins, all at one scale."""
     survey = diagnosis.problem.survey
     shown = {
         name: (channel.values, channel.unit)

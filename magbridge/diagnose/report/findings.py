@@ -78,8 +78,9 @@ def alternatives(rivals: tuple[Rival, ...]) -> list[dict[str, Any]]:
 def parameters(finding: Finding, samples: int) -> dict[str, dict[str, Any]]:
     """Value, sigma and unit of every coefficient, and of the nonlinear parameters.
 
-    Where one channel acts with several lags, or an offset jumps more than once, the sum is given and its parts beside it.
-    Coefficients with one common size are summed up as the RMS of their effect over the log's `samples`.
+    Where one channel acts with several lags, or an offset jumps more than once, the sum is given and its
+    parts beside it. Coefficients with one common size are summed up as the RMS of their effect over the
+    log's `samples`.
     """
     candidate = finding.candidate
     if candidate.spectra is not None:
@@ -106,7 +107,10 @@ def parameters(finding: Finding, samples: int) -> dict[str, dict[str, Any]]:
 
 
 def _rms(finding: Finding, samples: int) -> dict[str, Any]:
-    """RMS over the log of ``X b``, nT, and its sigma: ``f = sqrt(b^T M b)``, ``M = X^T X / n``, ``df/db = M b / f``."""
+    """RMS over the log of ``X b``, nT, and its sigma.
+
+    ``f = sqrt(b^T M b)``, ``M = X^T X / n``, ``df/db = M b / f``.
+    """
     b = finding.coefficients
     M = normal(finding.candidate.columns, np.zeros(samples))[0] / samples
     f = float(np.sqrt(b @ M @ b))

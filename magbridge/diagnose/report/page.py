@@ -45,12 +45,22 @@ if TYPE_CHECKING:
 __all__ = ["report_html"]
 
 STYLE = """
-:root{color-scheme:light}body{font:15px/1.55 system-ui,sans-serif;color:#22303c;max-width:62rem;margin:2.5rem auto;padding:0 1.2rem}
-h1{font-size:1.6rem;margin-bottom:.2rem}h2{font-size:1.15rem;margin-top:2.4rem;border-bottom:1px solid #dde2e6;padding-bottom:.3rem}
-h3{font-size:1rem;margin-bottom:.2rem}figure{margin:1rem 0}img{max-width:100%}figcaption,.faint{color:#66727e;font-size:.88rem}
-table{border-collapse:collapse;font-size:.9rem;margin:.6rem 0}td,th{padding:.22rem .8rem .22rem 0;text-align:left;border-bottom:1px solid #eceff1}
-th{white-space:nowrap}td.n{text-align:right;font-variant-numeric:tabular-nums}.verdict{font-size:1.1rem;background:#f2f6f8;border-left:4px solid #1f6f8b;padding:.8rem 1.1rem}
-.pair{display:flex;gap:1rem;flex-wrap:wrap;align-items:flex-start}.pair figure{flex:1 1 24rem}code{background:#f2f4f6;padding:0 .25em}
+:root{color-scheme:light}
+body{font:15px/1.55 system-ui,sans-serif;color:#22303c;max-width:62rem;margin:2.5rem auto;padding:0 1.2rem}
+h1{font-size:1.6rem;margin-bottom:.2rem}
+h2{font-size:1.15rem;margin-top:2.4rem;border-bottom:1px solid #dde2e6;padding-bottom:.3rem}
+h3{font-size:1rem;margin-bottom:.2rem}
+figure{margin:1rem 0}
+img{max-width:100%}
+figcaption,.faint{color:#66727e;font-size:.88rem}
+table{border-collapse:collapse;font-size:.9rem;margin:.6rem 0}
+td,th{padding:.22rem .8rem .22rem 0;text-align:left;border-bottom:1px solid #eceff1}
+th{white-space:nowrap}
+td.n{text-align:right;font-variant-numeric:tabular-nums}
+.verdict{font-size:1.1rem;background:#f2f6f8;border-left:4px solid #1f6f8b;padding:.8rem 1.1rem}
+.pair{display:flex;gap:1rem;flex-wrap:wrap;align-items:flex-start}
+.pair figure{flex:1 1 24rem}
+code{background:#f2f4f6;padding:0 .25em}
 """
 KINDS = {
     "switching": "An offset that switches",
@@ -76,7 +86,9 @@ def report_html(diagnosis: Diagnosis, causes: Mapping[str, Cause], remarks: Sequ
     title = f"Diagnosis of {escape(diagnosis.problem.survey.source)}"
     body = [
         f"<h1>{title}</h1>",
-        *_compared(diagnosis, remarks),
+        *_verdict(diagnosis, remarks),
+        "<h2>Measured against simulated</h2>",
+        *_compared(diagnosis),
         "<h2>What was found, and why it is believed</h2>",
         *_found(diagnosis, causes),
         "<h2>What is left</h2>",
@@ -91,45 +103,75 @@ def report_html(diagnosis: Diagnosis, causes: Mapping[str, Cause], remarks: Sequ
     )
 
 
-def _compared(diagnosis: Diagnosis, remarks: Sequence[str]) -> list[str]:
-    """Show the verdict, and the difference between measured and simulated field in five figures."""
+def _verdict(diagnosis: Diagnosis, remarks: Sequence[str]) -> list[str]:
+    """Say what was compared, the verdict, and what a reader must know of both."""
     survey = diagnosis.problem.survey
     first, last = (
         datetime.fromtimestamp(float(t), UTC).strftime("%Y-%m-%d %H:%M") for t in survey.time[[0, -1]]
     )
+    doubt = unsettled(diagnosis.problem, diagnosis.named, diagnosis.calibration)
+    return [
+        (
+            f'<p class="faint">{first} to {last} UTC · '
+            f"{len(survey)} samples in {np.unique(survey.dive).size} {survey.parts} · "
+            f"calibration: {escape(diagnosis.problem.calibration.method or 'unnamed')}, "
+            f"{diagnosis.problem.calibration.coefficients.size} coefficients</p>"
+        ),
+        f'<p class="verdict">{_sentence(diagnosis)}</p>',
+        *(f"<p><b>Note:</b> {escape(remark)}.</p>" for remark in remarks),
+        f"<p><b>Note:</b> {doubt}.</p>" if doubt else "",
+    ]
+
+
+def _compared(diagnosis: Diagnosis) -> list[str]:
+    """Show the difference between measured and simulated field in five figures."""
+    parts = diagnosis.problem.survey.parts
     sides = (
-        f"before, and with the extended calibration on {survey.parts} that its fit had not seen"
+        f"before, and with the extended calibration on {parts} that its fit had not seen"
         if diagnosis.findings
         else "as calibrated, and with the calibration refitted within its own uncertainty"
     )
     return [
-        (f'<p class="faint">{first} to {last} UTC · {len(survey)} samples in {np.unique(survey.dive).size} {survey.parts} · '
-        f"calibration: {escape(diagnosis.problem.calibration.method or 'unnamed')}, "
-        f"{diagnosis.problem.calibration.coefficients.size} coefficients</p>"),
-        f'<p class="verdict">{_verdict(diagnosis)}</p>',
-        *(f"<p><b>Note:</b> {escape(remark)}.</p>" for remark in remarks),
-        f"<p><b>Note:</b> {doubt}.</p>" if (doubt := unsettled(diagnosis.problem, diagnosis.named, diagnosis.calibration)) else "",
-        "<h2>Measured against simulated</h2>",
-        ("<p>The calibration describes what the vehicle's own magnetism and the sensor's errors do to every reading. The corrected "
-         "field should therefore differ from the reference by noise alone. Any other structure in the difference is an effect that "
-         "the calibration does not describe.</p>"),
+        (
+            "<p>The calibration describes what the vehicle's own magnetism and the sensor's errors do to "
+            "every reading. The corrected field should therefore differ from the reference by noise alone. "
+            "Any other structure in the difference is an effect that the calibration does not describe.</p>"
+        ),
         late(diagnosis.problem, diagnosis.fit),
-        _figure(figures.measured(diagnosis), f"The total field, measured and corrected, and the reference; below, their difference {sides}."),
+        _figure(
+            figures.measured(diagnosis),
+            f"The total field, measured and corrected, and the reference; below, their difference {sides}.",
+        ),
         '<div class="pair">',
-        _figure(figures.spectrum(diagnosis), "Spectral density of the difference; dashed: the noise model."),
-        _figure(figures.evidence(diagnosis), "The likeliest causes, each tried alone with calibration and noise refitted. A cause is "
-                "detected below p = 0.01" + ("; blue: named in the end." if diagnosis.findings else ".")),
+        _figure(
+            figures.spectrum(diagnosis),
+            "Spectral density of the difference; dashed: the noise model.",
+        ),
+        _figure(
+            figures.evidence(diagnosis),
+            "The likeliest causes, each tried alone with calibration and noise refitted. A cause is "
+            "detected below p = 0.01" + ("; blue: named in the end." if diagnosis.findings else "."),
+        ),
         "</div>",
-        _figure(figures.channels(diagnosis), "The difference against each channel: mean and scatter in twenty bins. A "
-                "line that is not flat is an effect that the model lacks."),
-        _figure(figures.track(diagnosis), "The difference along the track. An error of the map looks the same on every pass."),
-    ]  # fmt: skip
+        _figure(
+            figures.channels(diagnosis),
+            "The difference against each channel: mean and scatter in twenty bins. A line that is not flat "
+            "is an effect that the model lacks.",
+        ),
+        _figure(
+            figures.track(diagnosis),
+            "The difference along the track. An error of the map looks the same on every pass.",
+        ),
+    ]
 
 
 def _figure(png: str | None, caption: str) -> str:
     if png is None:
         return ""
-    return f'<figure><img alt="{escape(caption)}" src="data:image/png;base64,{png}"><figcaption>{caption}</figcaption></figure>'
+    return (
+        f'<figure><img alt="{escape(caption)}" src="data:image/png;base64,{png}">'
+        f"<figcaption>{caption}</figcaption></figure>"
+    )
 
 
 def _name(candidate: Candidate) -> str:
@@ -137,7 +179,7 @@ def _name(candidate: Candidate) -> str:
     return f"<b>{candidate.cause.replace('_', ' ')}</b>" + (f" ({escape(channel)})" if channel else "")
 
 
-def _verdict(diagnosis: Diagnosis) -> str:
+def _sentence(diagnosis: Diagnosis) -> str:
     total = diagnosis.total
     causes = [
         _name(one.candidate) + (f" <span class=faint>or {listed(one.rivals)}</span>" if one.rivals else "")
@@ -158,7 +200,8 @@ def _verdict(diagnosis: Diagnosis) -> str:
         "nothing_found": f"Nothing was found: {number(total.before)} nT RMS is consistent with noise "
         f"({number(float(np.std(diagnosis.fit.left)))} nT) and the calibration's stated uncertainty.",
         "explained": f"{found} Nothing else stands out of the noise.",
-        "partly_explained": f"{found} Something {'stronger' if louder else 'else'} is left that no known cause explains.",
+        "partly_explained": f"{found} {'Something stronger' if louder else 'Something else'} is left that no "
+        "known cause explains.",
         "unexplained": f"An effect is present ({number(total.before)} nT RMS), but {name}.",
     }[diagnosis.verdict]
 
@@ -177,8 +220,8 @@ def _found(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> list[str]:
             for t in diagnosis.problem.survey.time[diagnosis.wrong.rows[:12]]
         )
         parts.append(
-            f"<h3><b>outliers</b></h3><p>{diagnosis.wrong.rows.size} isolated samples are wrong, the first at {rows_at} UTC; "
-            "the figures above leave them out.</p>"
+            f"<h3><b>outliers</b></h3><p>{diagnosis.wrong.rows.size} isolated samples are wrong, "
+            f"the first at {rows_at} UTC; the figures above leave them out.</p>"
         )
     return parts
 
@@ -197,8 +240,9 @@ def _cause(diagnosis: Diagnosis, finding: Finding, cause: Cause) -> list[str]:
         f"<h3>{_name(candidate)}</h3>",
         f'<p class="faint">{physics(cause)}</p>',
         (
-            f"<p>Signal-to-noise {finding.signal_to_noise:.1f} with the calibration refitted. The chance that any of the causes "
-            f"tried would look this strong by noise alone is {chance(finding.hypothesis.p_value)}. Without this cause the held-out RMS is "
+            f"<p>Signal-to-noise {finding.signal_to_noise:.1f} with the calibration refitted. The chance "
+            "that any of the causes tried would look this strong by noise alone is "
+            f"{chance(finding.hypothesis.p_value)}. Without this cause the held-out RMS is "
             f"{1 / max(gain.ratio, 1e-9):.2f} times as large (95 %: {1 / max(gain.interval[1], 1e-9):.2f} to "
             f"{1 / max(gain.interval[0], 1e-9):.2f}).</p>"
         ),
@@ -227,19 +271,26 @@ def _left(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> str:
     tails = "Gaussian" if noise.nu > 1e5 else f"tails like Student's t with {noise.nu:g} degrees of freedom"
     samples = len(noise.scale)
     memory = (
-        f"correlated in time, so that {samples} samples determine a constant as well as {noise.independent:.0f} independent ones would"
+        f"correlated in time, so that {samples} samples determine a constant as well as "
+        f"{noise.independent:.0f} independent ones would"
         if noise.independent < 0.95 * samples
         else "practically uncorrelated in time"
     )
     model = (
-        f"The remaining noise: {number(float(np.median(noise.scale)))} nT per sample, {tails}; {memory}. The calibration states "
-        f"{number(diagnosis.problem.calibration.noise.sensor)} nT."
+        f"The remaining noise: {number(float(np.median(noise.scale)))} nT per sample, {tails}; {memory}. "
+        f"The calibration states {number(diagnosis.problem.calibration.noise.sensor)} nT."
     )
     if rest is None:
-        return f"<p>No further structure was found: no slow curve, no steps, no function of attitude. {model}</p>"
+        return (
+            "<p>No further structure was found: no slow curve, no steps, no function of attitude. "
+            f"{model}</p>"
+        )
     goes = f", and correlates best with <code>{escape(rest.best_channel)}</code>" if rest.best_channel else ""
     period = f" of period {rest.period_s:.4g} s" if rest.period_s else ""
-    return f"<p><b>{KINDS[rest.kind]}</b>{period} is left, with signal-to-noise {rest.signal_to_noise:.1f}{goes}. {nameless(rest, causes)} {model}</p>"
+    return (
+        f"<p><b>{KINDS[rest.kind]}</b>{period} is left, with signal-to-noise "
+        f"{rest.signal_to_noise:.1f}{goes}. {nameless(rest, causes)} {model}</p>"
+    )
 
 
 def _isolability(diagnosis: Diagnosis) -> list[str]:
@@ -259,12 +310,17 @@ def _isolability(diagnosis: Diagnosis) -> list[str]:
     )
     return [
         (
-            '<p class="faint">Computed from telemetry, attitude and noise alone: how large each effect must be to be found in 95 of 100 '
-            "deployments like this one, and which causes look alike in it. Signal-to-noise (S/N) is the size of an effect over the "
-            "whole log, in units of the noise, less the part that the calibration can imitate.</p>"
+            '<p class="faint">Computed from telemetry, attitude and noise alone: how large each effect must '
+            "be to be found in 95 of 100 deployments like this one, and which causes look alike in it. "
+            "Signal-to-noise (S/N) is the size of an effect over the whole log, in units of the noise, less "
+            "the part that the calibration can imitate.</p>"
         ),
-        f"<table><tr><th>cause</th><th>50 % at S/N</th><th>95 % at S/N</th><th>smallest visible size</th></tr>{rows}</table>",
-        f"<h3>Causes that look alike</h3><table><tr><th>one</th><th>another</th><th>correlation</th></tr>{pairs}</table>"
+        (
+            "<table><tr><th>cause</th><th>50 % at S/N</th><th>95 % at S/N</th>"
+            f"<th>smallest visible size</th></tr>{rows}</table>"
+        ),
+        "<h3>Causes that look alike</h3>"
+        f"<table><tr><th>one</th><th>another</th><th>correlation</th></tr>{pairs}</table>"
         if pairs
         else "",
         f"<p>Not testable in this log, with what it would take: {missing}.</p>" if missing else "",

@@ -66,7 +66,7 @@ def chance(p_value: float) -> str:
 
 
 def sizes(smallest: Mapping[str, tuple[float, str]]) -> str:
-    """Return sizes in words from their values and units by name; infinite ones, which nothing would show, are left out."""
+    """Return sizes in words from values and units by name, without infinite ones: nothing would show them."""
     seen = [(name, size, unit) for name, (size, unit) in smallest.items() if isfinite(size)]
     shown = seen if len(seen) <= MANY else seen[:3]
     told = [
