@@ -112,7 +112,7 @@ class SerialPort(Port):
         except BlockingIOError:
             self.dropped += len(data)
         except (serial.SerialException, OSError) as error:
-            raise self.lost(error) from error
+            raise self.lost(_reason(error)) from error
 
     def close(self) -> None:
         """Close the device."""
@@ -126,10 +126,10 @@ class SerialPort(Port):
 
 def _reason(error: Exception) -> str:
     """Return why a port did not open, short enough for a STATUSTEXT: pyserial's own words repeat its name."""
-    number = error.errno if isinstance(error, OSError) else None
-    if number == errno.EAGAIN:
+    beneath = error.__context__ if isinstance(error.__context__, OSError) else error
+    if isinstance(beneath, OSError) and beneath.errno == errno.EAGAIN:
         return "in use by another program"
-    return os.strerror(number) if number else str(error)
+    return getattr(beneath, "strerror", None) or str(error)
 
 
 class _Pump:

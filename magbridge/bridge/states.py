@@ -25,9 +25,12 @@ def notice(text: str) -> bytes:
 
 
 def port(channel: Channel, what: Port, reason: str) -> bytes:
-    """Return the frame that says that a port opened (no `reason`) or why it is not open."""
+    """Return the frame that says that a port opened (no `reason`) or which one is not open, and why."""
     state = MAG_PORT_STATE.LOST if reason else MAG_PORT_STATE.OK
-    return _frame("MAG_PORT", port=int(channel), state=int(state), dropped=what.dropped, reason=reason)
+    why = (
+        f"{reason}: {what.name}" if reason else ""
+    )  # of a long name the end is cut off, and not of the reason
+    return _frame("MAG_PORT", port=int(channel), state=int(state), dropped=what.dropped, reason=why)
 
 
 def opened(name: MAG_PORT_NAME) -> bytes:

@@ -127,10 +127,10 @@ def digest(path: Path) -> str:
 
 def note_losses(*pieces: Mapping[str, Any]) -> None:
     """Say on stderr what reading passed over, as the attributes of a deployment or of its pieces count it."""
-    from magbridge.logs.deployment import passed_over
+    from magbridge.logs.deployment import COUNTERS, passed_over
 
     if counts := passed_over(*pieces):
-        told = ", ".join(f"{name.replace('_', ' ')} {count}" for name, count in counts.items())
+        told = ", ".join(f"{count} {COUNTERS[name][count > 1]}" for name, count in counts.items())
         complain(f"in the logs: {told}", 0)
 
 

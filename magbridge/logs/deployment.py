@@ -47,8 +47,15 @@ LEAST = {
 """No temperature is lower, and no pressure, also one that counts from the surface's: -9999 says "not known"."""
 APART = 60.0
 """s that a channel may be sampled before or after its row."""
-COUNTERS = ("bytes_skipped", "damages", "dropouts", "duplicate_rows", "rows_dropped")
-"""Attributes that count what reading passed over: they add up, and are not of the file that is written next."""
+COUNTERS = {
+    "bytes_skipped": ("byte skipped", "bytes skipped"),
+    "damages": ("damaged place", "damaged places"),
+    "dropouts": ("dropout", "dropouts"),
+    "duplicate_rows": ("duplicate row", "duplicate rows"),
+    "rows_dropped": ("row dropped", "rows dropped"),
+}
+"""Attributes that count what reading passed over, and how one and several are called: they add up, and are not of the
+file that is written next."""
 
 
 def deployment(

@@ -104,6 +104,24 @@ def test_a_backlog_of_a_line_is_read_at_once() -> None:
     assert max(abs(stamp.time_us - 10_000 * (k + 1)) for k, stamp in enumerate(stamps)) <= 4
 
 
+def test_a_serial_line_behind_a_socket() -> None:
+    """Read in pieces as they come; why it does not open is told in a few words, without the name once more."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = SerialPort(f"socket://127.0.0.1:{server.getsockname()[1]}", 9600)
+        port.open()
+        device = server.accept()[0]
+    device.sendall(FRAME)
+    assert select.select(port.fds(), [], [], 5)[0]
+    assert port.read() == FRAME
+    device.close()
+    assert select.select(port.fds(), [], [], 5)[0]
+    with pytest.raises(PortError, match="hung up"):
+        port.read()
+    with pytest.raises(PortError) as refused:
+        port.open()
+    assert refused.value.reason == "Connection refused"
+
+
 def test_a_server_takes_the_next_client() -> None:
     port = open_link("tcpin:127.0.0.1:0", 0)
     assert isinstance(port, TcpServer)

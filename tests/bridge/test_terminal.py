@@ -21,7 +21,7 @@ url = "udpout:127.0.0.1:9"
 """
 
 
-WANTED = ("until Ctrl-C", "no calibration: raw field", "hmr2300 lost: No such file or directory")
+WANTED = ("until Ctrl-C", "no calibration: raw field", "hmr2300 lost: No such file or directory: ttyNone")
 
 
 def test_a_terminal_is_told_what_the_link_is(tmp_path: Path) -> None:

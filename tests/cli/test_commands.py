@@ -61,8 +61,8 @@ def test_what_was_passed_over_is_told(
     write(rows.isel(time=slice(150, 200)), other)
     assert main(["convert", str(other), str(log), "-o", str(both)]) == 0
     told = capsys.readouterr().err
-    assert told.startswith("magbridge: in the logs: bytes skipped 5")
-    assert ", damages 1, duplicate rows 50" in told
+    assert told.startswith("magbridge: in the logs: 5")
+    assert " bytes skipped, 1 damaged place, 50 duplicate rows" in told
     assert main(["convert", str(both), "-o", str(tmp_path / "again.csv")]) == 0
     assert not capsys.readouterr().err
 

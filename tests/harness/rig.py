@@ -187,25 +187,27 @@ class Rig:
         self.until(lambda: self.since(begun) >= seconds, seconds + 5)
 
     def until_well(self) -> float:
-        """Wait for a run of good samples, a sensor and an autopilot; return the s to the first of them."""
+        """Wait for a run of good samples, a sensor and an autopilot; return the s to the first of the run.
+
+        The first run counts: while the rest is waited for, a busy machine may be late with a sample.
+        """
         begun, mark = time.monotonic(), self.mark
 
-        def well() -> bool:
-            flags = [message["flags"] for message in self.of("MAG_FIELD", mark)]
-            state = self.of("MAG_STATUS", mark)
-            return (
-                len(flags) > 5
-                and set(flags[-5:]) <= {self.normal}
-                and bool(state)
-                and state[-1]["sensor_state"] == state[-1]["autopilot_state"] == 1
+        def run() -> float | None:
+            """Return when the first of five good samples on end came (s, monotonic)."""
+            fields = [one for one in self.heard[mark:] if one.message.name == "MAG_FIELD"]
+            good = [one.message["flags"] == self.normal for one in fields]
+            return next(
+                (one.when for k, one in enumerate(fields) if len(good) > k + 4 and all(good[k : k + 5])), None
             )
 
+        def well() -> bool:
+            state = self.of("MAG_STATUS", mark)
+            lines = bool(state) and state[-1]["sensor_state"] == state[-1]["autopilot_state"] == 1
+            return lines and run() is not None
+
         self.until(well)
-        fields = [one for one in self.heard[mark:] if one.message.name == "MAG_FIELD"]
-        good = len(fields)
-        while good and fields[good - 1].message["flags"] == self.normal:
-            good -= 1
-        return self.since(begun, fields[good].when)
+        return self.since(begun, run())
 
     def until_status(self, condition: Callable[[Message], object], timeout: float = 15.0) -> Message:
         """Wait for a MAG_STATUS from now on for which `condition` holds; return it."""
