@@ -8,8 +8,8 @@ From logs of calibration runs to corrected samples::
     mb.save(found.calibration, "cal.json")
     mb.write(mb.correct_rows(mb.Correction(found.calibration), mb.read("survey.nc")), "corrected.nc")
 
-:func:`magbridge.diagnose.run.diagnose` and :func:`magbridge.navigate.batch.navigate` go on from there. Each name is imported
-when it is first asked for: the bridge itself needs few of them.
+:func:`magbridge.diagnose.run.diagnose` and :func:`magbridge.navigate.batch.navigate` go on from there. Each
+name is imported when it is first asked for: the bridge itself needs few of them.
 """
 
 from __future__ import annotations

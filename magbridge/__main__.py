@@ -8,7 +8,7 @@ __all__ = ["main"]
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run a command; return its exit code. Ctrl-C is one line, also while libraries are still being loaded."""
+    """Run a command; return its exit code. Ctrl-C is one line, even while libraries are being loaded."""
     try:
         from magbridge.cli import main as command  # noqa: PLC0415 - in reach of what Ctrl-C raises
 

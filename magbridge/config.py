@@ -67,7 +67,8 @@ class Link(Table, frozen=True):
     Attributes
     ----------
     url : str
-        As in the MAVLink world: ``udpin:``, ``udpout:``, ``tcp:``, ``tcpin:`` and an address, or a serial device.
+        As in the MAVLink world: ``udpin:``, ``udpout:``, ``tcp:``, ``tcpin:`` and an address, or a
+        serial device.
     system : int
         The vehicle's system id: ours, and the only one we listen to.
     component : int
@@ -79,8 +80,8 @@ class Link(Table, frozen=True):
     signing_key : str or None
         File of 32 bytes; packets are signed and unsigned ones refused.
     parameters : str
-        File that keeps parameters changed over the link; ``bridge.parameters.json`` beside a ``bridge.toml``, where
-        nothing else is said.
+        File that keeps parameters changed over the link; ``bridge.parameters.json`` beside a ``bridge.toml``,
+        where nothing else is said.
     """
 
     url: Name
@@ -159,10 +160,11 @@ class Navigation(Table, frozen=True):
     map : str
         The anomaly grid.
     fix : str
-        In which message a fix goes to the autopilot: ``EXTERNAL_POSITION_ESTIMATE`` or ``ODOMETRY`` (ArduPilot),
-        ``GLOBAL_POSITION_SENSOR`` or ``ODOMETRY`` (PX4).
+        In which message a fix goes to the autopilot: ``EXTERNAL_POSITION_ESTIMATE`` or ``ODOMETRY``
+        (ArduPilot), ``GLOBAL_POSITION_SENSOR`` or ``ODOMETRY`` (PX4).
     rate : float
-        Hz of the fixes, dead-reckoned between updates; 0 is with each update. Default 5 for ``ODOMETRY``, else 0.
+        Hz of the fixes, dead-reckoned between updates; 0 is with each update. Default 5 for
+        ``ODOMETRY``, else 0.
     depth : float
         m, of the deepest dives; a map whose altitude is known is continued to the middle of them.
     options : dict
@@ -189,8 +191,8 @@ class Log(Table, frozen=True):
 class Config(Table, frozen=True):
     """A whole ``bridge.toml``.
 
-    `publish` holds Hz of each message: 0 is with every sample, a negative rate never. `path` is the file itself,
-    `digest` the first 8 bytes of its SHA-256 in hex.
+    `publish` holds Hz of each message: 0 is with every sample, a negative rate never. `path` is the file
+    itself, `digest` the first 8 bytes of its SHA-256 in hex.
     """
 
     sensor: Sensor
@@ -215,8 +217,8 @@ def load(path: str | Path) -> Config:
     Raises
     ------
     ConfigError
-        The file is missing or not TOML, a key is unknown or missing, a value has the wrong type or range, or a
-        file that it names does not exist.
+        The file is missing or not TOML, a key is unknown or missing, a value has the wrong type or range, or
+        a file that it names does not exist.
     """
     path = Path(path)
     table = load_toml(path)

@@ -1,8 +1,8 @@
 """From readings and telemetry to corrected samples: what the live bridge and ``magbridge correct`` share.
 
-Alignment says what is known at a sample's time and how well; the calibration turns that into the field. What is
-not known exactly (a mass in motion, telemetry that never came) is carried into the sigma: the correction is
-evaluated at both ends of what the parameter may have been.
+Alignment says what is known at a sample's time and how well; the calibration turns that into the field. What
+is not known exactly (a mass in motion, telemetry that never came) is carried into the sigma: the correction
+is evaluated at both ends of what the parameter may have been.
 """
 
 from __future__ import annotations

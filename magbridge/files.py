@@ -50,7 +50,8 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
 def new_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Yield a folder to write to, made where it is not there.
 
-    When the block raises, the folders that were made for it go, with what is in them; one that was there stays.
+    When the block raises, the folders that were made for it go, with what is in them; one that
+    was there stays.
     """
     folder = Path(path)
     missing = [one for one in (folder, *folder.parents) if not one.exists()]
@@ -67,8 +68,8 @@ def new_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
 def systems_reason(path: Path) -> Iterator[None]:
     """Raise the system's own reason where a library that writes to `path` fails.
 
-    netCDF keeps it to itself: a full disk is 'HDF error' to it, or 'Permission denied'. So one more piece is written
-    to what is spoilt already, and the system asked.
+    netCDF keeps it to itself: a full disk is 'HDF error' to it, or 'Permission denied'. So one more piece is
+    written to what is spoilt already, and the system asked.
 
     Raises
     ------

@@ -32,7 +32,7 @@ def load_toml(path: str | Path) -> dict[str, Any]:
 
 
 def check_entries(table: Mapping[str, Any], key: str, kind: Any, path: str | Path, prefix: str = "") -> None:
-    """Check each entry of the table `key` under its own name, which :func:`convert` of the whole does not tell.
+    """Check each entry of the table `key` under its own name; :func:`convert` of the whole names none.
 
     Raises
     ------

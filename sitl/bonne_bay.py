@@ -1,4 +1,4 @@
-"""The twin of the Bonne Bay trials: flown, calibrated before and after the survey, and scored as the paper does."""
+"""The twin of the Bonne Bay trials: flown, calibrated before and after, and scored as in the paper."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ class Trials:
     anomaly: AnomalyGrid
 
     def error(self, part: str, trial: str, method: str, against: str = "reference_field") -> Array:
-        """Return what `method` with the coefficients of `trial` leaves on a part, (n,) nT; NaN where it failed."""
+        """Return what `method` with the coefficients of `trial` leaves, (n,) nT; NaN where it failed."""
         known = self.parts[part][against].to_numpy()
         found: Array = self.corrected.get((part, trial, method), np.full(known.shape, np.nan))
         return np.asarray(found - known)
@@ -80,8 +80,8 @@ class Trials:
 def measure(twin: Twin, *, at_depth: bool = False) -> dict[str, xr.Dataset]:
     """Fly trial 1, survey and trial 2; return each on one time base, without the samples of masses in motion.
 
-    With `at_depth` the reference is the map continued down to the glider, as ``--grid`` makes it; else what the
-    scenario says: the map as it was flown, as the paper has it.
+    With `at_depth` the reference is the map continued down to the glider, as ``--grid`` makes it; else what
+    the scenario says: the map as it was flown, as the paper has it.
     """
     track = twin.fly()
     instrument = twin.scenario.instrument
@@ -97,7 +97,7 @@ def measure(twin: Twin, *, at_depth: bool = False) -> dict[str, xr.Dataset]:
 
 
 def fly(seed: int, methods: Sequence[str] = tuple(METHODS), *, at_depth: bool = False) -> Trials:
-    """Simulate the deployment and calibrate it both times with each of the methods, against :func:`measure`'s reference."""
+    """Simulate the deployment; calibrate it both times with each method against :func:`measure`'s field."""
     twin = Twin.draw(load("bonne_bay"), seed)
     parts = measure(twin, at_depth=at_depth)
     total, failed, scales = {}, {}, {}

@@ -20,8 +20,8 @@ Array = NDArray[np.float64]
 def oracle(vehicle: Vehicle, deployment: xr.Dataset) -> Array:
     """Return the total field (n,), nT, that a calibration which knows the vehicle makes of its readings.
 
-    Its error is the noise floor: what noise in the channels leaves in the magnitude. The instrument must have no
-    errors of its own but noise.
+    Its error is the noise floor: what noise in the channels leaves in the magnitude. The instrument must have
+    no errors of its own but noise.
     """
     D, T = _response(vehicle, deployment)
     raw = np.column_stack([deployment[f"mag_{axis}"] for axis in "xyz"])
@@ -59,11 +59,12 @@ def information_bound(
 
     Notes
     -----
-    The reading is :math:`\mathbf y = D(p) \mathbf B + \mathbf T(p) + \mathbf n`, and only :math:`|\mathbf B|` is
-    known. With :math:`\mathbf w = D^{-T} \mathbf B / |B|`, a change of the parameters θ and the noise change the
-    corrected magnitude by :math:`-\mathbf w^T (\partial \mathbf y / \partial θ) dθ + \mathbf w^T \mathbf n`. So with
-    g the first factor over :math:`σ |\mathbf w|`, whitened by the noise's memory, the information is
-    :math:`\sum \mathbf g \mathbf g^T` plus the prior's (Kay 1993, *Estimation Theory*, ch. 3 and 15).
+    The reading is :math:`\mathbf y = D(p) \mathbf B + \mathbf T(p) + \mathbf n`, and only
+    :math:`|\mathbf B|` is known. With :math:`\mathbf w = D^{-T} \mathbf B / |B|`, a change of the parameters
+    θ and the noise change the corrected magnitude by :math:`-\mathbf w^T (\partial \mathbf y / \partial θ)
+    dθ + \mathbf w^T \mathbf n`. So with g the first factor over :math:`σ |\mathbf w|`, whitened by the
+    noise's memory, the information is :math:`\sum \mathbf g \mathbf g^T` plus the prior's (Kay 1993,
+    *Estimation Theory*, ch. 3 and 15).
     """
     covariance, _, _, h, floor = _posterior(vehicle, calibration, survey, sigma, memory, at_sigma)
     return np.sqrt(np.einsum("ni,ij,nj->n", h, covariance, h) + floor**2), floor
@@ -79,14 +80,16 @@ def informed_error(
     *,
     rng: np.random.Generator,
 ) -> Array:
-    r"""Return the survey's error (n,), nT, of a fit that reaches :func:`information_bound`, on these very data.
+    r"""Return the survey's error (n,), nT, of a fit that reaches :func:`information_bound` on these data.
 
-    The bound is what such a fit leaves on average; this is what luck makes of it on one vehicle. Arguments as there.
+    The bound is what such a fit leaves on average; this is what luck makes of it on one vehicle.
+    Arguments as there.
 
     Notes
     -----
-    Linear about the truth: with :math:`\mathbf e` the whitened noise of the calibration and a prior whose centre
-    is :math:`\mathbf p` of its widths off the truth, :math:`dθ = P (\mathbf g^T \mathbf e + \mathbf p)`.
+    Linear about the truth: with :math:`\mathbf e` the whitened noise of the calibration and a prior whose
+    centre is :math:`\mathbf p` of its widths off the truth,
+    :math:`dθ = P (\mathbf g^T \mathbf e + \mathbf p)`.
     """
     covariance, g, whiten, h, _ = _posterior(vehicle, calibration, survey, sigma, memory, at_sigma)
     noise, after = (
@@ -104,7 +107,7 @@ def _posterior(
     memory: float,
     at_sigma: float,
 ) -> tuple[Array, Array, Callable[[Array], Array], Array, Array]:
-    """Return the covariance of θ in units of its prior, g and its whitening, and the survey's g and floor (nT)."""
+    """Return θ's covariance in units of its prior, g and its whitening, the survey's g and floor (nT)."""
     g, floor = _sensitivity(vehicle, calibration, sigma)
     follows = (np.diff(calibration["run"].to_numpy(), prepend=np.nan) == 0)[:, None]
     phi = np.exp(-1 / memory) if memory else 0.0
@@ -124,7 +127,7 @@ def _posterior(
 
 
 def _sensitivity(vehicle: Vehicle, deployment: xr.Dataset, sigma: float) -> tuple[Array, Array]:
-    """Return what each parameter does to the corrected magnitude (n, k), nT a unit, and the noise's share (n,)."""
+    """Return what each parameter does to the corrected magnitude (n, k), nT a unit, and the noise (n,)."""
     ambient = np.column_stack([deployment[f"truth_field_{axis}"] for axis in "xyz"])
     channels = {name: deployment[name].to_numpy() for name in vehicle.channels}
     D, _ = _response(vehicle, deployment)
@@ -149,7 +152,7 @@ def _response(vehicle: Vehicle, deployment: xr.Dataset) -> tuple[Array, Array]:
 
 
 def _neighbours(vehicle: Vehicle) -> Iterator[tuple[Vehicle, Vehicle, float]]:
-    """Yield the vehicle with one number a step up, a step down, and the step; in the order of the prior's widths."""
+    """Yield the vehicle with one number a step up, a step down, and the step; in the prior's order."""
 
     def vary(struct: Any, name: str, step: float) -> Iterator[tuple[Any, Any, float]]:
         value = np.asarray(getattr(struct, name), dtype=np.float64)

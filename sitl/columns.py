@@ -1,4 +1,4 @@
-"""A simulated deployment as a Dataset: names, units, the mission's parts; and its columns as a calibration takes them."""
+"""A simulated deployment as a Dataset: names, units, the mission's parts; and as a calibration's input."""
 
 from __future__ import annotations
 

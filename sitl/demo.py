@@ -1,4 +1,4 @@
-"""The main job end to end on a simulated glider: simulate, fit, replay through the bridge, listen, compare."""
+"""The main job on a simulated glider: simulate, fit, replay through the bridge, listen, compare."""
 
 from __future__ import annotations
 

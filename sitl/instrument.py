@@ -1,4 +1,4 @@
-"""The instrument chain of the paper's section 3: fluxgate, RC filter, one 24-bit converter for three channels."""
+"""The instrument chain of the paper's section 3: fluxgate, RC filter, one 24-bit converter for all three."""
 
 from __future__ import annotations
 
@@ -75,10 +75,10 @@ class Instrument(Table, frozen=True):
     noise_memory: NotNegative = 0.0
 
     def matrix(self) -> Array:
-        """Return the matrix (3, 3) that takes the field in body axes to the three channels, noise and offset aside.
+        """Return the matrix (3, 3) from the field in body axes to the channels, without noise and offset.
 
-        Rows are the sensing axes in sensor axes: x is the reference, y lies in the x-y plane. The rotation from
-        body to sensor follows the 3-2-1 order.
+        Rows are the sensing axes in sensor axes: x is the reference, y lies in the x-y plane. The rotation
+        from body to sensor follows the 3-2-1 order.
         """
         xy, xz, yz = np.radians(self.orthogonality)
         axes = np.array(

@@ -1,4 +1,4 @@
-"""The forward model driven by a real log: its attitude, position and masses, our world, vehicle and instrument."""
+"""The forward model driven by a real log's attitude, position and masses; the rest is simulated."""
 
 from __future__ import annotations
 
@@ -40,8 +40,9 @@ def simulate_like(log: xr.Dataset, scenario: Scenario, seed: int = 0) -> xr.Data
     Returns
     -------
     Dataset (time)
-        The log's rows and columns, with ``mag_*``, ``sensor_temperature``, ``power_cycle``, ``truth_*`` and, as
-        the scenario asks, ``reference_field`` simulated. The log's own attitude and position are the truth.
+        The log's rows and columns, with ``mag_*``, ``sensor_temperature``, ``power_cycle``, ``truth_*``
+        and, as the scenario asks, ``reference_field`` simulated. The log's own attitude and position
+        are the truth.
 
     Raises
     ------
@@ -64,7 +65,7 @@ def simulate_like(log: xr.Dataset, scenario: Scenario, seed: int = 0) -> xr.Data
 
 
 def where(log: xr.Dataset, scenario: Scenario) -> Scenario:
-    """Return the scenario with the log's median position as its place and the log's first time as its start."""
+    """Return the scenario at the log's median position, starting at the log's first time."""
     latitude, longitude = (_column(log, name) for name in ("latitude", "longitude"))
     place = msgspec.structs.replace(
         scenario.world, latitude=float(np.nanmedian(latitude)), longitude=wrap(float(np.nanmedian(longitude)))
@@ -74,7 +75,7 @@ def where(log: xr.Dataset, scenario: Scenario) -> Scenario:
 
 
 def read_track(log: xr.Dataset, scenario: Scenario, channels: Sequence[str]) -> tuple[Track, Array]:
-    """Return a log's track with these `channels` on a uniform grid, and the log's times in s after its start."""
+    """Return a log's track with these `channels` on a uniform grid, and the times in s from its start."""
     log = with_true_heading(log)
     time = log["time"].to_numpy().astype(np.float64)
     if len(time) < 2:

@@ -65,7 +65,7 @@ class Listener:
                 self.navigation[MAG_NAVIGATION_STATE(message["state"]).name.lower()] += 1
 
     def field(self) -> dict[str, NDArray[np.float64]]:
-        """Return the corrected field, (n,) each: ``time`` in s since 1970 UTC, the rest in nT, ``quality``."""
+        """Return the corrected field, (n,) each: ``time`` (s since 1970 UTC), the rest in nT, ``quality``."""
         table = np.array(self._values).reshape(-1, len(COLUMNS))
         columns = dict(zip(COLUMNS, table.T, strict=True))
         return {**columns, "time": columns["time"] * 1e-6}

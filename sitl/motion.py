@@ -1,4 +1,4 @@
-"""What a navigator needs to be told of a deployment's motion, in columns that an emulated autopilot can say."""
+"""A deployment's motion for a navigator, in columns that an emulated autopilot can send."""
 
 from __future__ import annotations
 
@@ -17,13 +17,14 @@ def with_motion(deployment: xr.Dataset) -> xr.Dataset:
     Parameters
     ----------
     deployment : Dataset (time)
-        With a first position and one of :data:`~magbridge.navigate.batch.MOTIONS`, which are tried in that order.
+        With a first position and one of :data:`~magbridge.navigate.batch.MOTIONS`, which are tried
+        in that order.
 
     Returns
     -------
     Dataset (time)
-        ``gps_latitude gps_longitude`` (deg): the log's, or its first position; ``local_north local_east`` (m) of
-        a track or a velocity. From a speed or a glide the bridge reckons for itself.
+        ``gps_latitude gps_longitude`` (deg): the log's, or its first position; ``local_north local_east`` (m)
+        of a track or a velocity. From a speed or a glide the bridge reckons for itself.
 
     Raises
     ------

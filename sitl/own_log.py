@@ -51,8 +51,9 @@ class Recorded:
     start : Start
         What the run started from.
     late : float
-        s of the run before the log begins: a log that was begun anew after a loss. What the bridge knew by then is not
-        in it, so it starts from nothing, but at a whole s of the run's: what it asks the autopilot the log answers.
+        s of the run before the log begins: a log that was begun anew after a loss. What the bridge knew by
+        then is not in it, so it starts from nothing, but at a whole s of the run's: what it asks the
+        autopilot the log answers.
     config_digest : str
         Of the configuration that it ran with.
     published : bytearray
@@ -121,7 +122,7 @@ class Recorded:
 
 
 def _is_event(record: Record) -> bool:
-    """Say whether the bridge heard it; a file's columns may stand between two pieces of what came at one time."""
+    """Say whether the bridge heard it; a file's columns may stand between two pieces that came together."""
     return record.channel != Channel.STATE or record.message.id not in NOT_EVENTS
 
 

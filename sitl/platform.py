@@ -96,8 +96,8 @@ class Mass(Table, frozen=True):
 
         Notes
         -----
-        :math:`\mathbf m = \mathbf m_0 + \chi V \mathbf B / \mu_0`, in the field that would be there without the
-        mass; with µ0/4π = 100 nT m/A, :math:`B[nT] / \mu_0 = B[nT] / (400 \pi)`.
+        :math:`\mathbf m = \mathbf m_0 + \chi V \mathbf B / \mu_0`, in the field that would be there without
+        the mass; with µ0/4π = 100 nT m/A, :math:`B[nT] / \mu_0 = B[nT] / (400 \pi)`.
         """
         r = -(np.asarray(self.at) + position[:, None] * np.asarray(self.travel))
         m = np.asarray(self.moment) + np.asarray(self.volume) * ambient / (4 * np.pi * MU_0_OVER_4_PI)
@@ -163,11 +163,12 @@ class Calibrated:
 def draw_vehicle(rng: np.random.Generator, masses: Sequence[str] = ("battpos", "ballast")) -> Vehicle:
     """Draw a vehicle with these moving masses (keys of :data:`MOUNTINGS`).
 
-    The sizes are those of a small glider. Fixed iron: 1,500 nT and 1 % an axis. A mass: 3 A m² an axis left by
-    handling (ten kilograms of alkaline cells hold two or three kilograms of steel, 3e-4 m³, at some 10 kA/m), and an
-    apparent susceptibility times volume of 2 litres along its length, half that across (cans with a demagnetising
-    factor near 0.1). It stands within centimetres of where its kind usually stands. A nominal calibration of such
-    a vehicle over the spirals of the paper's Table 1 leaves about 150 nT, as the paper's did.
+    The sizes are those of a small glider. Fixed iron: 1,500 nT and 1 % an axis. A mass: 3 A m² an axis left
+    by handling (ten kilograms of alkaline cells hold two or three kilograms of steel, 3e-4 m³, at some
+    10 kA/m), and an apparent susceptibility times volume of 2 litres along its length, half that across
+    (cans with a demagnetising factor near 0.1). It stands within centimetres of where its kind usually
+    stands. A nominal calibration of such a vehicle over the spirals of the paper's Table 1 leaves about
+    150 nT, as the paper's did.
     """
     iron = rng.normal(0, SOFT_IRON, (3, 3))
     return Vehicle(

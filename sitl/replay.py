@@ -250,8 +250,9 @@ def _tell_again(result: Result) -> str:
         )
     elif result["late_s"]:
         verdict = (
-            f"republished, but not identical: the log begins {result['late_s']:.1f} s into the run, without what the bridge knew by "
-            f"then; the total field is the same in {result['same_samples']} of {result['samples']} samples"
+            f"republished, but not identical: the log begins {result['late_s']:.1f} s into the run, without "
+            f"what the bridge knew by then; the total field is the same in {result['same_samples']} of "
+            f"{result['samples']} samples"
         )
         if result["worst_nT"]:
             verdict += f", the others differ by up to {result['worst_nT']:.2g} nT"

@@ -76,7 +76,7 @@ class ReplaySetup(NamedTuple):
 
 
 def prepare(files: Sequence[Path], folder: Path) -> ReplaySetup:
-    """Read logs, fit a nominal calibration on all but the last part, and write the bridge's files to `folder`.
+    """Read logs, fit a nominal calibration on all but the last, and write the bridge's files to `folder`.
 
     Raises
     ------

@@ -46,8 +46,8 @@ class Telemetry(Table, frozen=True):
     drift : float
         m/s an axis, standard deviation of a steady current that the logged position lacks.
     reference : str
-        What ``reference_field`` holds: ``none`` leaves it out, ``true`` is the true total field, ``map`` is the
-        IGRF with the anomaly of the map that an aeromagnetic survey would have made.
+        What ``reference_field`` holds: ``none`` leaves it out, ``true`` is the true total field, ``map`` is
+        the IGRF with the anomaly of the map that an aeromagnetic survey would have made.
     map_altitude : float
         m of that survey.
     """
@@ -68,11 +68,13 @@ class Scenario(Table, frozen=True):
     start : datetime
         With its offset from UTC (TOML: ``2013-12-11T12:00:00Z``).
     masses : tuple of str
-        Kinds of moving mass (keys of :data:`sitl.platform.MOUNTINGS`) of a vehicle that is drawn from the seed.
+        Kinds of moving mass (keys of :data:`sitl.platform.MOUNTINGS`) of a vehicle that is drawn
+        from the seed.
     vehicle : Vehicle or None
         A vehicle whose magnetism is given; nothing is drawn then.
     calibration : str or None
-        A ``cal.json`` (relative to the scenario's file) that describes vehicle and instrument in the vehicle's stead.
+        A ``cal.json`` (relative to the scenario's file) that describes vehicle and instrument in the
+        vehicle's stead.
     limits : dict of Limit
         The vehicle's limits where they differ from those of its kind of mass.
     world, motion, instrument, telemetry

@@ -80,7 +80,8 @@ def first_order_at(u: Array, y: Array, step: float, time_constant: float, when: 
 def autoregressive(rng: np.random.Generator, shape: tuple[int, ...], sigma: float, memory: float) -> Array:
     """Return stationary noise whose correlation falls by e every `memory` points of the first axis.
 
-    `sigma` is the standard deviation of the noise itself, not of its innovations; a memory of 0 is white noise.
+    `sigma` is the standard deviation of the noise itself, not of its innovations; a memory of 0
+    is white noise.
     """
     white = rng.normal(0.0, sigma, shape)
     if memory == 0:

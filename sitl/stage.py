@@ -1,7 +1,7 @@
 """The stage of a replay: a pty and a socket, and the two devices that speak on them.
 
-An emulated fluxgate speaks its real protocol into a pty, an emulated autopilot speaks MAVLink on a real socket.
-Between them stands the bridge, unmodified, in a process of its own.
+An emulated fluxgate speaks its real protocol into a pty, an emulated autopilot speaks MAVLink on a real
+socket. Between them stands the bridge, unmodified, in a process of its own.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ class Stage:
             return  # the bridge ended before its time; whoever plays to it tells why
 
     def _failure(self, otherwise: str) -> MagbridgeError:
-        """End the bridge; return why it failed: its last line on stderr, in the error that its exit code stands for."""
+        """End the bridge; return why it failed: the error for its exit code, with its last line on stderr."""
         try:
             _, said = self._bridge.communicate(timeout=PATIENCE)
         except subprocess.TimeoutExpired:

@@ -1,9 +1,9 @@
 """What happened, byte by byte, and when: the script that a replay plays through a pty and a socket.
 
 The bytes themselves go through the pty and the socket, as real devices would send them. *When* they came
-cannot: a pty keeps no time. So the times go beside them, through a pipe, as the timetable: one entry per event,
-which channel, how many bytes, at what time. The bridge under replay reads its ports in that order and takes
-those times for its clock; everything behind its ports is the same code as at sea.
+cannot: a pty keeps no time. So the times go beside them, through a pipe, as the timetable: one entry per
+event, which channel, how many bytes, at what time. The bridge under replay reads its ports in that order and
+takes those times for its clock; everything behind its ports is the same code as at sea.
 """
 
 from __future__ import annotations

@@ -182,7 +182,7 @@ class Twin:
         return seen
 
     def _map_reference(self, columns: dict[str, Array], time: Array) -> Array:
-        """Return the IGRF with the map's anomaly, nT, where the vehicle believes to be (eq. 4 of the paper)."""
+        """Return the IGRF with the map's anomaly, nT, where the vehicle believes it is (paper, eq. 4)."""
         latitude, longitude = columns["latitude"], columns["longitude"]
         main = total_field(longitude, latitude, columns["depth"], time)
         return main + self.anomaly_map().evaluate(longitude, latitude).anomaly
@@ -194,8 +194,8 @@ def simulate(scenario: Scenario, seed: int = 0) -> xr.Dataset:
     Returns
     -------
     Dataset (time)
-        Columns as in any deployment, ``truth_*`` beside them. ``attrs["segments"]`` lists the parts of the mission
-        (JSON: name, first and last time in s since 1970); :func:`sitl.segments` takes them apart.
+        Columns as in any deployment, ``truth_*`` beside them. ``attrs["segments"]`` lists the parts of the
+        mission (JSON: name, first and last time in s since 1970); :func:`sitl.segments` takes them apart.
     """
     twin = Twin.draw(scenario, seed)
     track = twin.fly()

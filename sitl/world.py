@@ -1,4 +1,4 @@
-"""The simulated world: the Earth's main field, magnetised rock below the sea floor, water with a temperature."""
+"""The simulated world: main field, magnetised rock below the sea floor, water with a temperature."""
 
 from __future__ import annotations
 
@@ -166,7 +166,7 @@ class World:
         return cls(origin, Rock.draw(geology, igrf(longitude, latitude, depth, when)[0], rng), water)
 
     def field(self, time: Array, latitude: Array, longitude: Array, depth: Array) -> Array:
-        """Return the field (n, 3) in nT, north-east-down, at times (s since 1970) and positions (deg, deg, m)."""
+        """Return the field (n, 3) in nT, north-east-down, at times (s since 1970), places (deg, deg, m)."""
         north, east = separation(*self.origin, latitude, longitude)
         return igrf(longitude, latitude, depth, time) + self.rock.field(np.column_stack([north, east, depth]))
 

@@ -19,7 +19,7 @@ from sitl import load, simulate
 
 @pytest.fixture(autouse=True)
 def heard() -> Iterator[None]:
-    """A shell's background jobs ignore Ctrl-C, and what they start does, too: also these tests, run from a script."""
+    """A shell's background jobs, and all that they start, ignore Ctrl-C: also these tests, in a script."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
@@ -69,7 +69,7 @@ def test_a_reader_who_has_read_enough_is_no_error(arguments: list[str]) -> None:
 
 @pytest.mark.parametrize("closed", ["2>&-", "<&- >&- 2>&-"])
 def test_streams_that_whoever_started_it_has_closed(tmp_path: Path, closed: str) -> None:
-    """As a service's may be: what is to be said goes nowhere, and into no file that takes the free descriptor."""
+    """As a service's may be: output goes nowhere, and into no file that takes the free descriptor."""
     (tmp_path / "a.csv").write_text("time,mag_x\n1,2\n")
     command = f'exec "{sys.executable}" -m magbridge convert a.csv -o b.csv {closed}'
     assert subprocess.run(["sh", "-c", command], cwd=tmp_path, check=False).returncode == 0

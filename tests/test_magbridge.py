@@ -1,4 +1,4 @@
-"""What a user imports: the names are there, cost nothing until they are asked for, and do what the docstring says."""
+"""What a user imports: the names exist, cost nothing until asked for, and do what the docstring says."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ import magbridge as mb
 from sitl import load, simulate
 
 ASHORE = {
-    "filterpy", "harmonica", "matplotlib", "netCDF4", "pandas", "ppigrf", "pyarrow", "pymavlink", "scipy", "xarray",
+    "filterpy", "harmonica", "matplotlib", "netCDF4", "pandas", "ppigrf", "pyarrow", "pymavlink", "scipy",
+    "xarray",
 }  # fmt: skip
 """Packages that no payload computer needs to have, nor the memory for."""
 

@@ -1,11 +1,12 @@
-"""How well each calibration does out of sample, over random simulated gliders, beside what is possible at all.
+"""How well each calibration does out of sample, over random simulated gliders, beside what is possible.
 
-Each glider has dipoles of its own, flies the paper's Table 1, is calibrated, and flies a survey on another day with
-other roll and pitch. Printed for each method: the survey's RMS error over its noise floor (the error of a calibration
-that knows the vehicle), as median, 95th percentile and worst of the gliders, the RMS in nT on calibration and survey,
-and whether the predicted sigma is right. The oracle knows that masses are dipoles, along which lines they travel, and
-how large moments, volumes and iron are on such gliders: its bound is what its fits leave on average (Cramér-Rao, with
-that prior), what they reach on these very data stands below it. Samples while a mass is on its way are left out.
+Each glider has dipoles of its own, flies the paper's Table 1, is calibrated, and flies a survey on another
+day with other roll and pitch. Printed for each method: the survey's RMS error over its noise floor (the error
+of a calibration that knows the vehicle), as median, 95th percentile and worst of the gliders, the RMS in nT
+on calibration and survey, and whether the predicted sigma is right. The oracle knows that masses are dipoles,
+along which lines they travel, and how large moments, volumes and iron are on such gliders: its bound is what
+its fits leave on average (Cramér-Rao, with that prior), what they reach on these very data stands below it.
+Samples while a mass is on its way are left out.
 
     python tools/accuracy.py --seeds 40 --out accuracy/
     python tools/accuracy.py --peers .venv-peers/bin/python        # see tools/peers.py
@@ -206,7 +207,8 @@ def show(rows: list[Row], console: Console) -> None:
         gliders = len({row.seed for row in chosen})
         shown = table(
             f"{noise}, {masses} moving mass{'es' * (masses > 1)}, {gliders} gliders",
-            "", "over the floor: median", "95 %", "worst", "runs nT", "survey nT", "sigma: median", "0.8 to 1.25",
+            "", "over the floor: median", "95 %", "worst", "runs nT", "survey nT", "sigma: median",
+            "0.8 to 1.25",
         )  # fmt: skip
         for method in dict.fromkeys(row.method for row in chosen):
             mine = [row for row in chosen if row.method == method]

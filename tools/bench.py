@@ -4,9 +4,9 @@
     python3 tools/dev.py bench processor start      some of it
     python3 tools/dev.py bench --json               for machines, with details
 
-Repetitions of the thing and of its floor alternate, and medians are told, so that a busy machine slows both alike.
-Processor time and ratios hold on a busy machine; latencies do not: the load average is told with them, and the
-floor's own tail says how far to believe them.
+Repetitions of the thing and of its floor alternate, and medians are told, so that a busy machine slows both
+alike. Processor time and ratios hold on a busy machine; latencies do not: the load average is told with them,
+and the floor's own tail says how far to believe them.
 """
 
 from __future__ import annotations
@@ -55,7 +55,10 @@ def measure(name: str, factor: float) -> dict[str, Any]:
 
 def show(results: list[dict[str, Any]]) -> Table:
     """Return the table for people."""
-    machine = f"{platform.processor() or platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}"
+    machine = (
+        f"{platform.processor() or platform.machine()}, {os.cpu_count()} cores, Python "
+        f"{platform.python_version()}"
+    )
     path = f"live path {'in plain Python' if align.__file__.endswith('.py') else 'compiled'}"
     shown = table(f"{machine}, {path}", "what", "measured", "floor", "ratio", "asked", "", left=("what", ""))
     for result in results:

@@ -1,8 +1,9 @@
-"""The blind study: effects that the detector cannot know are hidden in simulated deployments, and it must find them.
+"""The blind study: effects that the detector cannot know, hidden in simulated deployments, to be found.
 
-Run it as ``python tools/blind.py --cases 800 --out study``; a study that was interrupted goes on where it stopped, and a
-longer one holds the shorter. ``--part null,named`` runs some of its parts. ``--scheduler ADDRESS`` uses a dask cluster
-that is there (its workers start in a checkout); otherwise a local one is made. Tables go to ``table.md``, figures beside.
+Run it as ``python tools/blind.py --cases 800 --out study``; a study that was interrupted goes on where it
+stopped, and a longer one holds the shorter. ``--part null,named`` runs some of its parts.
+``--scheduler ADDRESS`` uses a dask cluster that is there (its workers start in a checkout); otherwise a local
+one is made. Tables go to ``table.md``, figures beside.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ def read(log: Path) -> dict[int, Row]:
 
 
 def case_there(folder: str, entry: Row) -> Row:
-    """Run a case on a worker; as a function of the main program it travels by value, and finds the tools there."""
+    """Run a case on a worker: a function of the main program travels by value, and finds the tools there."""
     if folder not in sys.path:
         sys.path.insert(0, folder)
     from study.cases import case  # noqa: PLC0415  (the worker's own)

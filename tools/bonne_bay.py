@@ -1,9 +1,10 @@
-"""The twin of the Bonne Bay trials beside the paper: its Tables 1 and 2, and the equivalents of its Figures 2 to 6.
+"""The twin of the Bonne Bay trials beside the paper: its Tables 1 and 2, and the like of Figures 2 to 6.
 
-The twin's glider flies the paper's runs among rock of its own, from a boat at -10 degC into water at 2 degC. Each
-trial's spirals calibrate (against the IGRF and the aeromagnetic map, which is all that anyone has), and the survey
-between them is corrected with either. Nothing here was fitted to the paper but the sizes in
-``sitl/scenarios/bonne_bay.toml``; of the worlds that could be drawn, the default seed is one that comes near it.
+The twin's glider flies the paper's runs among rock of its own, from a boat at -10 degC into water at
+2 degC. Each trial's spirals calibrate (against the IGRF and the aeromagnetic map, which is all that anyone
+has), and the survey between them is corrected with either. Nothing here was fitted to the paper but the
+sizes in ``sitl/scenarios/bonne_bay.toml``; of the worlds that could be drawn, the default seed is one that
+comes near it.
 
     python tools/bonne_bay.py --out bonne_bay/
     python tools/bonne_bay.py --seeds 20           # the same tables as medians over 20 worlds
@@ -33,7 +34,8 @@ def table_1(flight: Trials) -> Table:
     """Return the paper's calibration runs beside the twin's."""
     one = table(
         "Table 1: calibration runs, paper and twin",
-        "run", "", "ballast cm³", "pitch deg: paper", "twin", "battery in: trial 1", "twin", "trial 2", "twin",
+        "run", "", "ballast cm³", "pitch deg: paper", "twin", "battery in: trial 1", "twin", "trial 2",
+        "twin",
     )  # fmt: skip
     for number, pitch, *battery in TABLE_1:
         legs = [_leg(flight.parts[trial], number) for trial in TRIALS]
@@ -95,8 +97,10 @@ def tables(flights: list[Trials], console: Console) -> None:
     surveys = [flight.parts["survey"] for flight in flights]
     off = np.median([np.sqrt(np.mean((s["truth_total_field"] - s["reference_field"]) ** 2)) for s in surveys])
     console.print(
-        f"The reference itself is {off:.0f} nT RMS off on the survey, because the map was made from 90 m up. A calibration\n"
-        "takes the map's mean error over the spirals for field. Scales are those of A on the runs: a fit that shrinks\n"
+        f"The reference itself is {off:.0f} nT RMS off on the survey, because the map was made from 90 m "
+        "up. A calibration\n"
+        "takes the map's mean error over the spirals for field. Scales are those of A on the runs: a fit "
+        "that shrinks\n"
         "the field shrinks its errors, and every anomaly with them."
     )
 
@@ -122,13 +126,13 @@ def by_world(flights: list[Trials], seeds: Iterable[int], console: Console) -> N
         )
     console.print(shown)
     console.print(
-        f"the paper's signature (nominal far off; a parameterised fit at least twice as good on its runs as on the "
-        f"survey; trial 1's survey worse than trial 2's): {borne} of {len(flights)} worlds"
+        "the paper's signature (nominal far off; a parameterised fit at least twice as good on its runs as "
+        f"on the survey; trial 1's survey worse than trial 2's): {borne} of {len(flights)} worlds"
     )
 
 
 def signature(flight: Trials) -> str:
-    """Return which part of the paper's signature a world lacks, nothing if it has all; by cubic, or auto if refused."""
+    """Return which part of the paper's signature a world lacks, if any; by cubic, or auto if refused."""
     method = "auto" if any((trial, "cubic") in flight.failed for trial in TRIALS) else "cubic"
     runs, survey = ([flight.rms(part or trial, trial, method) for trial in TRIALS] for part in ("", "survey"))
     if min(flight.rms(trial, trial, "nominal") for trial in TRIALS) < 3.0 * max(runs):

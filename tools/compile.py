@@ -23,7 +23,8 @@ from mypyc.build import mypycify
 from setuptools import setup
 target, *modules = sys.argv.pop().split(",")
 options = ["--ignore-missing-imports", "--follow-imports=silent", "--config-file="]
-setup(name="magbridge", packages=[], ext_modules=mypycify([*options, *modules], target_dir=target, opt_level="3"))
+compiled = mypycify([*options, *modules], target_dir=target, opt_level="3")
+setup(name="magbridge", packages=[], ext_modules=compiled)
 """
 FLAGS = "-ffp-contract=off"
 """A fused multiply-add rounds once and not twice: a compiled bridge must give the bits that Python gives."""

@@ -6,8 +6,9 @@
     python3 tools/dev.py compiled [ARG ...] the live path's tests, compiled
     python3 tools/dev.py bench [ARG ...]    tools/bench.py, compiled
 
-The first call makes ``.venv`` and installs the locked dependencies into it; what is edited is what runs there. The
-last two install the package as a user would, compiled where there is a C compiler, into ``.compiled``.
+The first call makes ``.venv`` and installs the locked dependencies into it; what is edited is what runs
+there. The last two install the package as a user would, compiled where there is a C compiler, into
+``.compiled``.
 """
 
 from __future__ import annotations
@@ -72,7 +73,7 @@ def install(extra: str, place: Path = BIN, *options: str) -> None:
 
 
 def install_compiled() -> dict[str, str]:
-    """Install the package as a user would; return the variables with which it is found, and not the checkout around it."""
+    """Install the package as a user would; return the variables that find it, and not the checkout."""
     install("dev", COMPILED, "--no-editable", "--reinstall-package", "magbridge")
     return {"PYTHONSAFEPATH": "1", "PYTHONPATH": str(ROOT / "tools")}
 

@@ -1,9 +1,9 @@
-"""The paper's own mystery: calibrated at -10 degC after launch, surveyed at +2 degC, and what ``diagnose`` says.
+"""The paper's own mystery: calibrated at -10 degC, surveyed at +2 degC, and what ``diagnose`` says.
 
     python tools/headline.py --seeds 3
 
-Prints, beside the paper, the twin's survey error before and after, against the field that was really there. Nothing
-tells the detector that it is a temperature.
+Prints, beside the paper, the twin's survey error before and after, against the field that was really there.
+Nothing tells the detector that it is a temperature.
 """
 
 from __future__ import annotations
@@ -28,7 +28,8 @@ from sitl.scenario import load
 from sitl.twin import Twin
 
 REFERENCES = ("true", *CHARTS)
-"""The field that was there; the aeromagnetic map continued down to the glider, as ``--grid`` does; as it was flown."""
+"""The field that was there; the aeromagnetic map continued down to the glider, as ``--grid`` does; as
+it was flown."""
 
 
 def fly(seed: int, reference: str) -> dict[str, xr.Dataset]:
@@ -50,7 +51,8 @@ def main() -> None:
     options = parser.parse_args()
     paper = PAPER["trial 1", "cubic"][1]
     print(
-        "| world | reference | paper | twin before | twin after | noise floor | found |\n|---|---|---|---|---|---|---|"
+        "| world | reference | paper | twin before | twin after | noise floor | found |\n"
+        "|---|---|---|---|---|---|---|"
     )
     for reference in REFERENCES:
         for seed in range(21, 21 + options.seeds):
@@ -64,7 +66,8 @@ def main() -> None:
             floor = load("bonne_bay").instrument.noise_sigma
             print(
                 f"| {seed} | {reference} | {paper} nT | {rms(calibration, parts['survey']):.1f} nT | "
-                f"{rms(found.calibration, parts['survey']):.1f} nT | {floor:.1f} nT | {found.verdict}: {named or '-'} |",
+                f"{rms(found.calibration, parts['survey']):.1f} nT | {floor:.1f} nT | {found.verdict}: "
+                f"{named or '-'} |",
                 flush=True,
             )
 

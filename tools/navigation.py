@@ -1,9 +1,9 @@
-"""How well the navigator holds a position: simulated gliders on simulated maps, beside the bound and beside peers.
+"""How well the navigator holds a position: simulated gliders and maps, beside the bound and beside peers.
 
     python tools/navigation.py [--runs 100] [--part accuracy] ... [--keep DIR] [--peers PYTHON] [--data DIR]
 
-accuracy      error over the posterior Cramér-Rao bound, lost runs, consistency, for narrow and wide starts, with what
-              an auto calibration leaves
+accuracy      error over the posterior Cramér-Rao bound, lost runs, consistency, for narrow and wide starts,
+              with what an auto calibration leaves
 nominal       the same, with what a nominal calibration leaves
 watch         how long a filter that is in the wrong place vouches for it
 misinformed   whether one vouches for its position that has been told the wrong level, or half a map
@@ -12,20 +12,21 @@ calibrations  simulated gliders, each calibrated by nominal, cubic and auto, tha
 speed         one update, 100,000 samples, the start
 peers         Stone Soup (tools/voyages/stone_soup.py) on the same measurements; MagNav.jl's published flight
 
-A run takes about a second, accuracy of 100 runs a row a quarter of an hour on a free core; with ``--keep`` rows that are
-done are kept in a folder, and taken up again.
+A run takes about a second, accuracy of 100 runs a row a quarter of an hour on a free core; with ``--keep``
+rows that are done are kept in a folder, and taken up again.
 
 What the columns of the accuracy tables hold, for the errors of the second half of each run:
 
 DRMS m        median over the runs of the error's root mean square
 ratio         median over the runs of that, over the bound **of the same run** (its track, map and noise)
 90 %          the same ratio's 90th percentile
-RMS ratio     root mean square error of all runs together over that of all bounds: 1 for an efficient estimator. The median
-              is below it, because one run's errors follow each other and so scatter widely about its bound
+RMS ratio     root mean square error of all runs together over that of all bounds: 1 for an efficient
+              estimator. The median is below it, because one run's errors follow each other and so scatter
+              widely about its bound
 alone m       median of what dead reckoning alone would have
 lost %        the truth was outside the 99.99 % ellipse for half an hour on end
-NEES/2        mean of the squared error over its covariance, 1 when consistent; then how many of 4 instants have the mean
-              of the runs within its 99 % chi-square limits
+NEES/2        mean of the squared error over its covariance, 1 when consistent; then how many of 4 instants
+              have the mean of the runs within its 99 % chi-square limits
 false alarm % it said to be lost, and was not
 vouched %     of the time
 after h       median over the runs of when it first vouched for its position
@@ -83,11 +84,11 @@ class Runs(NamedTuple):
         return made
 
 
-# ---- accuracy, and what calibration buys --------------------------------------------------------------------
+# ---- accuracy, and what calibration buys -------------------------------------------------------------------
 
 HEAD = (
-    "map, start", "DRMS m", "bound m", "ratio", "90 %", "RMS ratio", "alone m", "lost %", "NEES/2", "in limits",
-    "false alarm %", "vouched %", "after h", "ms/sample",
+    "map, start", "DRMS m", "bound m", "ratio", "90 %", "RMS ratio", "alone m", "lost %", "NEES/2",
+    "in limits", "false alarm %", "vouched %", "after h", "ms/sample",
 )  # fmt: skip
 
 
@@ -139,8 +140,9 @@ def calibrations(runs: Runs, _asked: argparse.Namespace) -> None:
     """Calibrate gliders, and fly the same survey over the same map with each calibration."""
     kinds = (Map(60, 2000), Map(20, 1000))
     print(
-        f"\n## What calibration buys: {runs.count} gliders, their own calibration runs and survey of 6 h; start within a"
-        " length\n"
+        "\n"
+        f"## What calibration buys: {runs.count} gliders, their own calibration runs and survey of 6 h; "
+        "start within a length\n"
     )
     found = runs(partial(flown, kinds))
     table = [("calibration", "error nT", "claimed nT", *HEAD)]
@@ -152,14 +154,16 @@ def calibrations(runs: Runs, _asked: argparse.Namespace) -> None:
             show(table)
 
 
-# ---- whether a lost filter says so --------------------------------------------------------------------------
+# ---- whether a lost filter says so -------------------------------------------------------------------------
 
 
 def watch(runs: Runs, _asked: argparse.Namespace) -> None:
     """How soon a lost filter stops vouching for itself."""
     print(
-        f"\n## A lost filter says so: {runs.count} runs of 6 h a row. Lost: the truth is outside the 99.99 % ellipse, and a"
-        " quarter of\na correlation length away or more. Flagged: it no longer vouches for its position\n"
+        "\n"
+        f"## A lost filter says so: {runs.count} runs of 6 h a row. Lost: the truth is outside the 99.99 % "
+        "ellipse, and a quarter of\n"
+        "a correlation length away or more. Flagged: it no longer vouches for its position\n"
     )
     table = [("how, map", "lost %", "flagged in 30 min %", "95 % within min", "found in 2 h %")]
     for how in (carried, misled):
@@ -183,8 +187,10 @@ def watch(runs: Runs, _asked: argparse.Namespace) -> None:
 def misinformed(runs: Runs, _asked: argparse.Namespace) -> None:
     """Whether a filter believes itself whose map or calibration is not what it claims to be."""
     print(
-        f"\n## Told wrong: {runs.count} runs of 6 h a row, on a field {LEVEL:g} nT off, or of which the map knows half the"
-        " variance.\nShare of the time that it vouches for where it is, and for where it is not\n"
+        "\n"
+        f"## Told wrong: {runs.count} runs of 6 h a row, on a field {LEVEL:g} nT off, or of which the map "
+        "knows half the variance.\n"
+        "Share of the time that it vouches for where it is, and for where it is not\n"
     )
     table = [("how, map", "rightly %", "wrongly %", "95 % of runs, wrongly %")]
     for how in (level, half):
@@ -212,11 +218,11 @@ def dives(runs: Runs, _asked: argparse.Namespace) -> None:
         show(table)
 
 
-# ---- speed, peers -------------------------------------------------------------------------------------------
+# ---- speed, peers ------------------------------------------------------------------------------------------
 
 
 def timings() -> tuple[float, float, float, float]:
-    """Return seconds of a processor: an update; 100,000 samples, as blocks and one by one; a sample of the start."""
+    """Return processor seconds: an update; 100,000 samples, as blocks and singly; a sample of the start."""
     kind = Map(30, 1500)
     grid = synthetic(kind, 3, 40_000.0)
     options = with_options(GLIDER, start_sigma=50.0)
@@ -252,7 +258,9 @@ def peers(runs: Runs, asked: argparse.Namespace) -> None:
     if asked.peers:
         some = runs._replace(count=min(runs.count, 20))
         print(
-            f"\n## Stone Soup on the same measurements: DRMS (m) of the second half, NEES/2; medians of {some.count} runs\n"
+            "\n"
+            "## Stone Soup on the same measurements: DRMS (m) of the second half, NEES/2; medians of "
+            f"{some.count} runs\n"
         )
         head = ("bound", "ours", "NEES/2", "EKF", "NEES/2", "20,000 particles", "NEES/2", "ms/update")
         table = [("map, start", *head)]

@@ -1,4 +1,4 @@
-"""Public magnetometer calibrations on a glider's data: run by tools/accuracy.py in an interpreter that has them.
+"""Public magnetometer calibrations on a glider's data: run by tools/accuracy.py in another interpreter.
 
 magyc (PyPI) needs numpy < 2 and gtsam, MAVProxy a desktop; neither belongs into magbridge's environment. So::
 
@@ -6,10 +6,10 @@ magyc (PyPI) needs numpy < 2 and gtsam, MAVProxy a desktop; neither belongs into
     .venv-peers/bin/pip install magyc MAVProxy pymavlink
     python tools/accuracy.py --peers .venv-peers/bin/python
 
-In: an ``.npz`` with raw ``field`` (n, 3) nT, ``reference`` (n,) nT, ``attitude`` (n, 3) deg roll, pitch, heading,
-``rates`` (n, 3) rad/s (both exact, better than any vehicle knows them), ``reference_ned`` (3,) nT, ``time`` (n,) s.
-Out, on stdout: JSON, for each method ``{"A": 3x3, "T": 3}`` such that the corrected field is ``A (field - T)``, or
-``{"failed": reason}``.
+In: an ``.npz`` with raw ``field`` (n, 3) nT, ``reference`` (n,) nT, ``attitude`` (n, 3) deg roll, pitch,
+heading, ``rates`` (n, 3) rad/s (both exact, better than any vehicle knows them), ``reference_ned`` (3,) nT,
+``time`` (n,) s. Out, on stdout: JSON, for each method ``{"A": 3x3, "T": 3}`` such that the corrected field is
+``A (field - T)``, or ``{"failed": reason}``.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ MAGFIT_SAMPLES = 250
 
 
 def magfit(data: dict[str, np.ndarray]) -> np.ndarray:
-    """MAVProxy's magfit: offsets, scale, diagonals, off-diagonals against the attitude and the Earth's field."""
+    """MAVProxy's magfit: offsets, scale, diagonals, off-diagonals by attitude and the Earth's field."""
     # it imports a desktop toolkit for its window; the fit itself does not use it
     desktop = types.SimpleNamespace(Dialog=object, Panel=object, Frame=object)
     for name in ("wx_loader", "wx_processguard", "grapher", "multiproc_util"):

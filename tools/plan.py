@@ -1,9 +1,9 @@
 """Does a planned calibration beat the paper's Table 1 at the same flight time? Random gliders fly both.
 
-One plan for all, made before the first flight from the physical widths alone: ten spirals as long as the table's,
-masses and pitch within the table's own ends, trimmed as the vehicle trims itself, banked as the paper's at most. Each
-glider is then calibrated by `auto` on either, and flies the same survey. Printed: the error that was expected over the
-mission, and the survey's RMS over the noise floor as it came.
+One plan for all, made before the first flight from the physical widths alone: ten spirals as long as the
+table's, masses and pitch within the table's own ends, trimmed as the vehicle trims itself, banked as the
+paper's at most. Each glider is then calibrated by `auto` on either, and flies the same survey. Printed: the
+error that was expected over the mission, and the survey's RMS over the noise floor as it came.
 
     python tools/plan.py --seeds 12
 """

@@ -1,8 +1,8 @@
 """Do the moving masses matter on a real glider? Each dive is corrected by a calibration of all the others.
 
-A Seaglider's compass counts in steps of about 1 mG (100 nT), and knows nothing of its battery and its buoyancy engine.
-Printed for each choice of masses: the RMS error of the dives left out in the sensor's own nT, beside what its steps
-alone leave, dive by dive.
+A Seaglider's compass counts in steps of about 1 mG (100 nT), and knows nothing of its battery and its
+buoyancy engine. Printed for each choice of masses: the RMS error of the dives left out in the sensor's own
+nT, beside what its steps alone leave, dive by dive.
 
     python tools/seaglider.py ../shared/data/seaglider_sg167/*.nc
 """
@@ -45,7 +45,8 @@ def main() -> None:
     deployment = with_true_heading(read(sorted(files)))
     shown = table(
         f"{len(files)} dives, each left out of its calibration",
-        "method", "order", "masses", "left out, nT", "over nominal: by dive", "sigma", left=("method", "masses"),
+        "method", "order", "masses", "left out, nT", "over nominal: by dive", "sigma",
+        left=("method", "masses"),
     )  # fmt: skip
     nominal: HeldOut | None = None
     for method, masses, order in CHOICES:
@@ -68,7 +69,8 @@ def main() -> None:
     console = Console(width=140)
     console.print(shown)
     console.print(
-        f"a step of the sensor is {COUNT:.0f} nT: {COUNT / np.sqrt(12):.0f} nT RMS a channel, if nothing else were wrong"
+        f"a step of the sensor is {COUNT:.0f} nT: {COUNT / np.sqrt(12):.0f} nT RMS a channel, if nothing "
+        "else were wrong"
     )
 
 

@@ -37,8 +37,8 @@ class Event(msgspec.Struct, frozen=True, gc=False):
     time_us : int
         µs since 1970 UTC when it was stamped at the edge; a multiple of 4, never decreasing.
     channel : Channel
-        ``SENSOR``: bytes as read; ``LINK``: bytes as read; ``STATE``: one MAVLink frame of our own dialect that
-        says what changed at the edge, or nothing when only time has passed.
+        ``SENSOR``: bytes as read; ``LINK``: bytes as read; ``STATE``: one MAVLink frame of our own dialect
+        that says what changed at the edge, or nothing when only time has passed.
     data : bytes
     """
 
@@ -50,14 +50,16 @@ class Event(msgspec.Struct, frozen=True, gc=False):
 class Clock:
     """The one clock: begins at the host's UTC and then runs steadily, whatever happens to the host's.
 
-    A step of the host's clock is told apart (:meth:`step_us`), so that no interval is ever measured across it.
+    A step of the host's clock is told apart (:meth:`step_us`), so that no interval is ever
+    measured across it.
     """
 
     THRESHOLD_US = 50_000
     """Smaller differences are the host's own slewing, and are left alone."""
 
     AT_ONCE_US = 5_000
-    """The host's two clocks are read within this, or again: a process may be held up between any two lines."""
+    """The host's two clocks are read within this, or again: a process may be held up between
+    any two lines."""
 
     def __init__(self) -> None:
         self._offset_us = self._ahead_us()

@@ -83,8 +83,8 @@ def declarations(
     telemetry : mapping of str to Telemetry
         By parameter.
     nt_per_count : float
-        nT, of one count of the sensor: float32, as MAG_RAW tells a channel, is less than what was corrected; 0 for a
-        sensor without counts.
+        nT, of one count of the sensor: float32, as MAG_RAW tells a channel, is less than what was corrected;
+        0 for a sensor without counts.
     """
     codec = Codec(system, component)
     columns = [

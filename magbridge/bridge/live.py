@@ -88,7 +88,7 @@ class LiveEdge:
         os.write(self._waker, b"!")
 
     def stop(self) -> None:
-        """End :meth:`events` at the next turn; from any thread or signal handler, and as often as anybody likes."""
+        """End :meth:`events` at the next turn; from any thread or signal handler, as often as you like."""
         if not self._stopping:
             self._stopping = True
             os.write(self._waker, b"!")

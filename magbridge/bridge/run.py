@@ -163,7 +163,7 @@ def _open_log(config: Config, edge: LiveEdge, nt_per_count: float) -> TlogWriter
 
 
 class LogWatch:
-    """Tells the pipeline when the log fails and is well again, and what it lost; and the log with what to begin anew."""
+    """Tells the pipeline when the log fails, recovers, or loses records; and the log how to begin anew."""
 
     def __init__(self, log: TlogWriter | None, edge: LiveEdge, pipeline: Pipeline) -> None:
         self._log, self._edge, self._pipeline = log, edge, pipeline

@@ -63,7 +63,7 @@ class SensorLine:
             self._announcer.state("sensor", f"{self._name} speaks")
 
     def opened(self, time_us: int) -> None:
-        """Begin to tell the sensor what it must know, after it may have been without power: silent until it speaks."""
+        """Begin to configure a sensor that may have been without power: silent until it speaks."""
         self.state, self._heard_us = MAG_PORT_STATE.SILENT, time_us
         self._command(time_us, self._commands())
 

@@ -59,8 +59,8 @@ class UdpPort(Port):
     def read(self) -> bytes:
         """Return the datagrams that have come; an unreachable peer is nothing, not an error.
 
-        All of them, as a stream gives: the samples that waited while the bridge stood still find the telemetry that
-        waited with them.
+        All of them, as a stream gives: the samples that waited while the bridge stood still find the
+        telemetry that waited with them.
         """
         assert self._socket is not None
         data = b""

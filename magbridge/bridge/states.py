@@ -1,4 +1,4 @@
-"""What changes at the edge, as frames of our own dialect: they go into the log, and a replay feeds them back."""
+"""What changes at the edge, as frames of our own dialect: they are logged, and a replay feeds them back."""
 
 from __future__ import annotations
 

@@ -2,8 +2,8 @@
 
 Notes
 -----
-With ``A' = R A`` and T at the sample's positions, R the boresight and Omega its covariance, V the covariance of
-the corrected vector::
+With ``A' = R A`` and T at the sample's positions, R the boresight and Omega its covariance, V the covariance
+of the corrected vector::
 
     d = H_r - T,  b = A' d,  F = |b|,  u = b / F
     V_ij = Q_ij . (d d^T) + L_ij . d + O_ij         (dA', dT and the sensor's noise carried through)
@@ -13,8 +13,8 @@ Every operation is elementwise IEEE arithmetic in one written order, on floats o
 products of :class:`~magbridge.calibration.kernel.Kernel`, which are exact in any order: so a sample
 corrected live, in a batch, or replayed on another computer gives identical bits.
 
-Compiled, a float is a number of the machine, and no array can pass for one. So arrays go through :func:`for_arrays`,
-this very source left uncompiled.
+Compiled, a float is a number of the machine, and no array can pass for one. So arrays go through
+:func:`for_arrays`, this very source left uncompiled.
 """
 
 from __future__ import annotations
@@ -31,7 +31,8 @@ COARSE, FINE = 1.5 * 2.0 ** (52 - BITS), 1.5 * 2.0 ** (52 - 2 * BITS)
 """Adding and taking away rounds to a multiple of 2^-21, of 2^-42."""
 
 Prepared = tuple[list[float], list[list[float]]]
-"""What a sample needs at one set of positions: A' row by row and T (12); Q, L and O of V's six entries (10 each)."""
+"""What a sample needs at one set of positions: A' row by row and T (12); Q, L and O of V's six
+entries (10 each)."""
 Numbers = tuple[float, float, float, float, float, float, float, float]
 PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
@@ -53,7 +54,7 @@ def powers(
     parents: tuple[tuple[int, int], ...],
     one: Any,
 ) -> list[Any]:
-    """Return the monomials of positions, floats or arrays, each from its parent; what is no position is left aside."""
+    """Return the monomials of positions, floats or arrays, each from its parent; anything else is ignored."""
     x = [(value - centre) / scale for value, centre, scale in zip(values, centres, scales)]  # noqa: B905
     phi = [one]
     for parent, k in parents:
@@ -62,7 +63,7 @@ def powers(
 
 
 def split(phi: list[float], pairs: list[tuple[int, int]], scale: float) -> list[float]:
-    """Return the products of regressors, times `scale`, in two parts (:mod:`.kernel`): all fine ones, then all coarse."""
+    """Return the products of regressors, times `scale`: all fine parts (:mod:`.kernel`), then all coarse."""
     fine: list[float] = []
     coarse: list[float] = []
     for i, j in pairs:

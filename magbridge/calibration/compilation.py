@@ -2,13 +2,14 @@
 
 Notes
 -----
-Regressors that effects follow are first multiplied by a power of two: one that is large beside the constant, as a pressure
-in Pa, would leave too little of it in the split. So each is counted in what makes about 1,000 nT of difference.
+Regressors that effects follow are first multiplied by a power of two: one that is large beside the constant,
+as a pressure in Pa, would leave too little of it in the split. So each is counted in what makes about
+1,000 nT of difference.
 
-The nine coefficients become twelve in body axes: ``A' = R A`` (nine, R the boresight) and T. For the covariance V of the
-corrected vector ``b = A' d, d = H_r - T``, write ``db = dA' d - A' dT``: V is quadratic in d, and the table holds
-the covariance in just the combinations that V needs: 36 for the quadratic part Q, 27 for ``S_a'T``, 6 for
-``S_TT`` (with the sensor's own noise, which acts like T's).
+The nine coefficients become twelve in body axes: ``A' = R A`` (nine, R the boresight) and T. For the
+covariance V of the corrected vector ``b = A' d, d = H_r - T``, write ``db = dA' d - A' dT``: V is quadratic
+in d, and the table holds the covariance in just the combinations that V needs: 36 for the quadratic part Q,
+27 for ``S_a'T``, 6 for ``S_TT`` (with the sensor's own noise, which acts like T's).
 """
 
 from __future__ import annotations
@@ -95,7 +96,7 @@ def _closed(exponents: set[Exponents], calibration: Calibration) -> list[Exponen
 
 
 def _units(P: FloatArray, W: FloatArray, calibration: Calibration) -> FloatArray:
-    """(r,) powers of two near ``s / ORDINARY``, s what 1 of each effect's regressor makes, or may make, in nT."""
+    """(r,) powers of two near ``s / ORDINARY``, s what 1 of each effect's regressor may make, in nT."""
     variance = np.einsum("kri,kl,lri->ri", P, calibration.covariance, P)
     field = np.array([calibration.reference.field] * 6 + [1.0] * 3)
     s = (np.sqrt(W * W + np.abs(variance)) * field).max(axis=1)

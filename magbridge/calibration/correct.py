@@ -4,9 +4,9 @@ Notes
 -----
 The equations stand in :mod:`.arithmetic`, and are the same code for one sample and for many.
 
-What a missing value gives: a NaN channel of the field or position, or one so large that the total is beyond all
-measure, makes total and vector NaN and the sigmas infinite, flagged ``gap`` where the field is to blame and
-``stale_telemetry`` where the telemetry is; the total is never a guess.
+What a missing value gives: a NaN channel of the field or position, or one so large that the total is beyond
+all measure, makes total and vector NaN and the sigmas infinite, flagged ``gap`` where the field is to blame
+and ``stale_telemetry`` where the telemetry is; the total is never a guess.
 """
 
 from __future__ import annotations
@@ -145,7 +145,7 @@ class Corrector:
     def changes(
         self, field: tuple[float, float, float], values: tuple[float, ...], spans: Sequence[Span]
     ) -> list[float]:
-        """Return by how much (nT) the total field changes over each span of a position; effects are left aside.
+        """Return by how much (nT) the total field changes over each span of a position, effects ignored.
 
         Parameters
         ----------
@@ -154,7 +154,8 @@ class Corrector:
         values : tuple of float
             ``calibration.channels``, in that order.
         spans : sequence of (int, float, float)
-            Which of them, and the two ends between which it lies; a channel that is no position changes nothing.
+            Which of them, and the two ends between which it lies; a channel that is no position
+            changes nothing.
         """
         asked = values[: self._positions], [span for span in spans if span[0] < self._positions]
         if asked != self._asked:
@@ -166,7 +167,7 @@ class Corrector:
         return [_total(field, high) - _total(field, low) for low, high in self._ends]
 
     def _linear(self, positions: tuple[float, ...], index: int, value: float) -> list[float]:
-        """Return A's six entries and T where position `index` has another value; NaN where that is too far."""
+        """Return A's six entries and T with another value of position `index`; NaN where that is too far."""
         phi = self._kernel.powers((*positions[:index], value, *positions[index + 1 :]), 1.0)
         if not max(map(abs, phi)) < FARTHEST:
             return [nan] * len(self._weights)

@@ -3,13 +3,14 @@
 Notes
 -----
 A mass at ``r(p) = r_0 + t p``, seen from the sensor, with permanent moment m and susceptibilities chi
-along the body's axes adds to the field at the sensor (r-hat the unit vector; Blakely 1996, eq. 4.14, with mu_0/4pi in m)::
+along the body's axes adds to the field at the sensor (r-hat the unit vector; Blakely 1996, eq. 4.14, with
+mu_0/4pi in m)::
 
     G(r) = (3 r-hat r-hat^T - I) / |r|^3,   T += G(r) m,   H -> (I + G(r) chi) H
 
-so that to first order ``A -= G(r) chi``, symmetric part. What the second order leaves, ``(G chi)^2``, is constant but
-for the travel and goes into the polynomial beside. Moments are kept as the field they make at the
-sensor, in nT: ``m / |r_0|^3`` and ``chi F_0 / |r_0|^3``.
+so that to first order ``A -= G(r) chi``, symmetric part. What the second order leaves, ``(G chi)^2``, is
+constant but for the travel and goes into the polynomial beside. Moments are kept as the field they make at
+the sensor, in nT: ``m / |r_0|^3`` and ``chi F_0 / |r_0|^3``.
 
 Along a line short against the distance, G is a rapidly converging power series in p: the term *is*
 a polynomial (order :data:`ORDER`), and runs at a polynomial's cost.

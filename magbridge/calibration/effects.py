@@ -37,9 +37,11 @@ class ChannelEffect(Effect, frozen=True, kw_only=True):
     origin : float
         Where the channel does nothing (the temperature at calibration; 0 A).
     lag : float
-        s, by how much it is behind in all, of a number of equal first-order lags ``dy/dt = (x - y) / (lag / stages)``; 0: at once.
+        s, by how much it is behind in all, of a number of equal first-order lags
+        ``dy/dt = (x - y) / (lag / stages)``; 0: at once.
     stages : int
-        How many stand in series, each following the one before: 1, a single store of heat; 2, what heat reaches through another.
+        How many stand in series, each following the one before: 1, a single store of heat; 2, what heat
+        reaches through another.
     on : {"offset", "scale"}
         ``offset``: three coefficients, nT per unit of the channel, added to T. ``scale``: three,
         added to the diagonal of ``a``, nT at F_0 per unit.

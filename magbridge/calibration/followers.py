@@ -1,4 +1,4 @@
-"""Effects that follow the telemetry of moving masses: more powers, what they pass, backlash, a clock that is off."""
+"""Effects that follow the positions of masses: more powers, what they pass, backlash, a clock that is off."""
 
 from __future__ import annotations
 
@@ -101,10 +101,11 @@ class PowersEffect(Follower, frozen=True, kw_only=True):
 
 
 class SourcesEffect(Follower, frozen=True, kw_only=True):
-    """What a mass passes on its way: ``T += sum_k c_k (1 + x_k^2)^(-3/2)``, ``x_k = (p - centre) / scale - k apart``.
+    """What a mass passes on its way: ``T += sum_k c_k (1 + x_k^2)^(-3/2)``.
 
-    Iron that a mass magnetises, or is magnetised by, has a field that falls with the cube of their distance. Wherever it
-    is, sources in a row beside the way make the same field: an equivalent layer (Dampney 1969, Geophysics 34:39).
+    Here ``x_k = (p - centre) / scale - k apart``. Iron that a mass magnetises, or is magnetised by, has a
+    field that falls with the cube of their distance. Wherever it is, sources in a row beside the way make the
+    same field: an equivalent layer (Dampney 1969, Geophysics 34:39).
 
     Attributes
     ----------
@@ -189,17 +190,19 @@ class MonomialEffect(Effect, frozen=True, kw_only=True):
 class PlayEffect(Follower, frozen=True, kw_only=True):
     """Backlash or remanence: ``T += c (S(y) - S(p)) / width``, y the play operator of the channel p.
 
-    ``y = min(max(y, p - width / 2), p + width / 2)``: the last position drags behind by half the width, on the
-    side that the mass came from. A drive's backlash is straight. Steel that the mass passes by is turned where it
-    is near, relays of one width about one place, so the loop closes beyond: ``S(v) = scale tanh((v - centre) / scale)``, a
-    generalised play (Brokate & Sprekels 1996, *Hysteresis and Phase Transitions*, sec. 2.1 and 2.4).
+    ``y = min(max(y, p - width / 2), p + width / 2)``: the last position drags behind by half the width, on
+    the side that the mass came from. A drive's backlash is straight. Steel that the mass passes by is turned
+    where it is near, relays of one width about one place, so the loop closes beyond:
+    ``S(v) = scale tanh((v - centre) / scale)``, a generalised play (Brokate & Sprekels 1996, *Hysteresis and
+    Phase Transitions*, sec. 2.1 and 2.4).
 
     Attributes
     ----------
     width : float
         In the channel's unit.
     centre, scale : float
-        Where the steel is, and how far it reaches; the loop is straight where the scale is far beyond the travel.
+        Where the steel is, and how far it reaches; the loop is straight where the scale is far
+        beyond the travel.
     order : int
         0: a branch as above. Older files have polynomials up to this power, ``sum_k c_k (v^k - x^k)`` with
         ``v = (y - centre) / scale`` and ``x = (p - centre) / scale``.

@@ -23,7 +23,7 @@ FloatArray = NDArray[np.float64]
 def coefficients_at(
     calibration: Calibration, field: FloatArray, channels: FloatArray, time: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return ``A`` (n, 3, 3) and ``T`` (n, 3) of every sample, effects included; arguments as for `correct`."""
+    """Return ``A`` (n, 3, 3) and ``T`` (n, 3) of every sample, effects included; arguments as `correct`."""
     phi = regressors(calibration, np.asarray(field, float), np.asarray(channels, float), time)
     theta = phi.T @ calibration.kernel.weights
     return symmetric(theta), theta[:, 6:]

@@ -28,8 +28,8 @@ class TimeEffect(Effect, frozen=True, kw_only=True):
     ----------
     cause : str
     shape : {"step", "drift", "tone"}
-        ``H(t - t_0)``; ``(t - t_0) / period`` and its powers, held beyond -1 and 1: what is known of a drift ends with what it
-        was learned from; ``cos`` and ``sin`` of ``2 pi (t - t_0) / period``.
+        ``H(t - t_0)``; ``(t - t_0) / period`` and its powers, held beyond -1 and 1: what is known of a drift
+        ends with what it was learned from; ``cos`` and ``sin`` of ``2 pi (t - t_0) / period``.
     start : float
         t_0, s since 1970 UTC.
     period : float

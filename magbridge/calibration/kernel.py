@@ -62,7 +62,8 @@ class Kernel:
     units : tuple of float or None
         Powers of two that the regressors are multiplied by; None where all are 1.
     first, second : (q,) int arrays
-        Product q is ``phi[first] * phi[second]``, of regressors in their units; the first m are the regressors.
+        Product q is ``phi[first] * phi[second]``, of regressors in their units; the first m are
+        the regressors.
     coarse, fine : (81, q) arrays
         The table in two parts.
     """
@@ -132,7 +133,7 @@ class Kernel:
 
 
 def _scales(phi: FloatArray) -> FloatArray:
-    """(n,) power of two by which the products of each sample are made small enough, 1 for most; NaN: too far."""
+    """(n,) power of two by which each sample's products are made small enough, 1 for most; NaN: too far."""
     largest = np.abs(phi).max(axis=0)
     scales = np.ldexp(1.0, np.minimum(EXPONENT - np.frexp(largest * largest)[1], 0))
     return np.where(largest < FARTHEST, scales, np.nan)

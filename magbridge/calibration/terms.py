@@ -178,7 +178,7 @@ def full_order(parameters: int, order: int) -> tuple[Exponents, ...]:
 
 
 def symmetric(entries: FloatArray) -> FloatArray:
-    """Return (n, 3, 3) symmetric matrices of their six entries, (n, 6 or more) in the order of :data:`SLOTS`."""
+    """Return (n, 3, 3) symmetric matrices of their six entries, (n, 6 or more), ordered as :data:`SLOTS`."""
     return entries[:, [0, 3, 4, 3, 1, 5, 4, 5, 2]].reshape(-1, 3, 3)
 
 

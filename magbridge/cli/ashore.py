@@ -72,14 +72,15 @@ def simulate(
     Parameters
     ----------
     scenario
-        A scenario file, or one of the built-in demo, survey, bonne_bay, random_glider, comet and seaglider; the last two
-        need a log to drive them (--like).
+        A scenario file, or one of the built-in demo, survey, bonne_bay, random_glider, comet and seaglider;
+        the last two need a log to drive them (--like).
     output
         The file to write.
     seed
         Determines everything that the scenario leaves open; the same seed gives the same deployment.
     like
-        A log whose attitude, position and masses drive the simulation instead of the scenario's mission; may be repeated.
+        A log whose attitude, position and masses drive the simulation instead of the scenario's mission;
+        may be repeated.
     map_output
         Also write the anomaly grid that an aeromagnetic survey of the simulated world would have produced.
     json
@@ -160,12 +161,13 @@ def map(  # noqa: A001 - the command's name
 def correct(*files: Path, calibration: Path, output: Log, json: Json = False) -> None:
     """Correct a log with a calibration, as the bridge would have done live.
 
-    The arithmetic and the state (lags, backlash) are the bridge's own, but the input is the log's rows. In a bridge's own
-    log these are MAG_RAW with the latest telemetry before each: the bridge itself interpolates the position of a moving
-    mass between messages, and the channels of a sensor that has no counts are float32 (to 0.002 nT of 50,000 nT). [align]
-    of bridge.toml is not known here either. For what the bridge would have published bit for bit, put the calibration
-    into a bridge.toml and run: magbridge replay LOG --config bridge.toml --log DIR. The replay also reports that this
-    differs from what was published at the time.
+    The arithmetic and the state (lags, backlash) are the bridge's own, but the input is the log's rows. In
+    a bridge's own log these are MAG_RAW with the latest telemetry before each: the bridge itself
+    interpolates the position of a moving mass between messages, and the channels of a sensor that has no
+    counts are float32 (to 0.002 nT of 50,000 nT). [align] of bridge.toml is not known here either. For what
+    the bridge would have published bit for bit, put the calibration into a bridge.toml and run: magbridge
+    replay LOG --config bridge.toml --log DIR. The replay also reports that this differs from what was
+    published at the time.
 
     Parameters
     ----------

@@ -27,8 +27,9 @@ def demo(
 ) -> None:
     """Do the main job end to end on a simulated glider: no hardware, no network, under a minute.
 
-    Simulates a small deployment, fits a calibration to its spirals, replays the survey into the bridge through a pty and a
-    socket, listens as a ground station would, and draws the raw, corrected and true field.
+    Simulates a small deployment, fits a calibration to its spirals, replays the survey into the
+    bridge through a pty and a socket, listens as a ground station would, and draws the raw, corrected
+    and true field.
 
     Parameters
     ----------
@@ -73,16 +74,18 @@ def replay(
 ) -> None:
     """Replay logs through the unmodified bridge: real bytes through a pty, real MAVLink through a socket.
 
-    A bridge's own log is published again bit for bit. For a log that was restarted in the middle of a run (the file was deleted, or
-    the disk was full) it reports in how many samples the field is the same. Any other log is played through an emulated fluxgate and
-    an emulated autopilot, and the corrected field is compared with the reference field.
+    A bridge's own log is published again bit for bit. For a log that was restarted in the middle of a run
+    (the file was deleted, or the disk was full) it reports in how many samples the field is the same. Any
+    other log is played through an emulated fluxgate and an emulated autopilot, and the corrected field is
+    compared with the reference field.
 
     Parameters
     ----------
     files
         The log, or its files in order.
     config
-        The configuration (bridge.toml). Without one, a nominal calibration is fitted to all files but the last.
+        The configuration (bridge.toml). Without one, a nominal calibration is fitted to all
+        files but the last.
     speed
         A multiple of real time, or max: as fast as possible.
     log

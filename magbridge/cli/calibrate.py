@@ -66,11 +66,13 @@ def calibrate(
     site_bias
         1-sigma in nT of a constant error of the reference field over the whole site.
     filter_corner
-        Corner frequency in Hz of the sensor's first-order anti-alias filter, whose attenuation in turns is undone; 0: no filter.
+        Corner frequency in Hz of the sensor's first-order anti-alias filter, whose attenuation in turns is
+        undone; 0: no filter.
     heading_reference
         What headings refer to. If not given: what the log says, else true north.
     picture
-        A PNG, PDF or SVG to draw: the error of each sample, raw and corrected, against time, heading and each parameter.
+        A PNG, PDF or SVG to draw: the error of each sample, raw and corrected, against time, heading and
+        each parameter.
     strict
         Exit with 1 when the data do not support the fit.
     json

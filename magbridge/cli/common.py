@@ -110,7 +110,7 @@ Json = Annotated[bool, Parameter(name="--json")]
 
 
 def some(files: tuple[Path, ...], output: Path | None = None, *others: Path | None) -> tuple[Path, ...]:
-    """Return `files`, if there are any; what is read, they and `others`, is never written over by `output`."""
+    """Return `files`, if there are any; `output` must overwrite none of them, and none of `others`."""
     if not files:
         raise WrongUse("expected at least one FILE")
     read = [os.path.realpath(path) for path in (*files, *others) if path is not None]

@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 NOTHING = (-9999.0, -99999.0)
 """Common codes for "not known", in any unit."""
 ITSELF = (
-    "the calibration was fitted to this log and has absorbed part of its errors; calibrate on separate calibration runs,"
-    " with --filter-corner if the sensor has an anti-alias filter"
+    "the calibration was fitted to this log and has absorbed part of its errors; calibrate on separate "
+    "calibration runs, with --filter-corner if the sensor has an anti-alias filter"
 )
 
 
@@ -33,12 +33,14 @@ def diagnose(
 ) -> None:
     """Find what the calibration model gets wrong, why, and what extending it gains.
 
-    Writes report.html, findings.json and calibration.json. The latter is the extended model, for use by correct, run and replay.
+    Writes report.html, findings.json and calibration.json. The latter is the extended model, for use by
+    correct, run and replay.
 
     Parameters
     ----------
     files
-        Logs that the calibration was not fitted to. The gain is measured on whole dives left out in turn, or on eighths of a log with fewer than four dives.
+        Logs that the calibration was not fitted to. The gain is measured on whole dives left out in turn, or
+        on eighths of a log with fewer than four dives.
     calibration
         The calibration (cal.json).
     output
@@ -86,7 +88,7 @@ def diagnose(
 
 
 def causes_of(facts: dict[str, Any]) -> str:
-    """Return the causes found, each with those that the data cannot tell from it, and what is left, in one line."""
+    """Return the causes found, what the data cannot tell from them, and what is left, in one line."""
     causes = [" or ".join(map(_plain, [one, *one["alternatives"]])) for one in facts["findings"]]
     if facts["verdict"] == "unexplained" and (within := facts["unexplained"]["alternatives"]):
         causes = [f"no name asserted; within 20:1: {', '.join(map(_plain, within))}"]
@@ -101,13 +103,14 @@ def _plain(one: dict[str, Any]) -> str:
 
 
 def _suspect(log: xr.Dataset) -> Iterator[str]:
-    """Yield warnings of isolated numbers that may mean 'not known' and would otherwise be taken for an effect."""
+    """Yield warnings of isolated numbers that may mean 'not known', and would be taken for an effect."""
     for name, column in log.data_vars.items():
         values = column.to_numpy()
         for nothing in NOTHING:
             alone = values == nothing
             if alone.any() and not (values[~alone] < 0.1 * nothing).any():
                 yield (
-                    f"{log.attrs['source']}, column {str(name)!r}: {nothing:g} in {alone.sum()} of {len(values)} rows is read as"
-                    f" a number; if it means 'not known', leave it empty, or write # fill_value = {nothing:g} above the CSV's header"
+                    f"{log.attrs['source']}, column {str(name)!r}: {nothing:g} in {alone.sum()} of "
+                    f"{len(values)} rows is read as a number; if it means 'not known', leave it empty, or "
+                    f"write # fill_value = {nothing:g} above the CSV's header"
                 )

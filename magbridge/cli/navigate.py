@@ -45,8 +45,8 @@ def navigate(
 
     Writes the filtered and the smoothed track with covariance and innovations.
 
-    With --bound, FILE is a planned track (time, latitude, longitude; its corners suffice), and the result is the smallest
-    position error that any filter could reach along it.
+    With --bound, FILE is a planned track (time, latitude, longitude; its corners suffice), and the result is
+    the smallest position error that any filter could reach along it.
 
     Parameters
     ----------
@@ -165,8 +165,9 @@ def _where_it_swims(
     there, known = at_depth(grid, options, deployment["depth"].to_numpy() if "depth" in deployment else 0.0)
     if known != options:
         complain(
-            f"{grid.name}: at {grid.altitude:.0f} m; continued to {-there.altitude:.0f} m below the surface, and what"
-            f" that leaves out counts as the map's error: {known.map_sigma:.1f} nT over {known.map_length:.0f} m",
+            f"{grid.name}: at {grid.altitude:.0f} m; continued to {-there.altitude:.0f} m below the "
+            f"surface, and what that leaves out counts as the map's error: {known.map_sigma:.1f} nT over "
+            f"{known.map_length:.0f} m",
             0,
         )
     return there, known

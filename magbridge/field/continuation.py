@@ -6,8 +6,9 @@ field whose sources lie deeper decays with height (Blakely 1995, eq. 12.8),
 .. math:: \hat T(\mathbf k, z + h) = \hat T(\mathbf k, z)\, e^{-|\mathbf k| h} .
 
 Downward the inverse would blow up what the survey did not see. With p = 1 - exp(-|k| h) it is a series,
-exp(|k| h) = 1 / (1 - p) = 1 + p + p² + ...: its first three terms at most treble the map's own noise; those after
-them are what is left out. About that level the field goes on with its vertical gradient, of spectrum |k| T.
+exp(|k| h) = 1 / (1 - p) = 1 + p + p² + ...: its first three terms at most treble the map's own noise;
+those after them are what is left out. About that level the field goes on with its vertical gradient, of
+spectrum |k| T.
 """
 
 from __future__ import annotations
@@ -26,7 +27,8 @@ __all__ = ["Continued", "continued"]
 Array = NDArray[np.float64]
 
 SURE, TERMS = 3, 10
-"""Terms of the series that are believed, and that there are: those beyond are waves that no survey from above sees."""
+"""Terms of the series that are believed, and that there are: those beyond are waves that no survey from
+above sees."""
 LEVELS = (0.1, 0.3, 0.5, 0.7, 0.9)
 """Quantiles of the depth at which the error is taken."""
 
@@ -60,8 +62,8 @@ def continued(grid: AnomalyGrid, depth: ArrayLike) -> Continued:
 
     Notes
     -----
-    The cosine transform mirrors the field at its edges, so that the wrap-around joins equal values. Of the error's
-    spectrum E(k), sigma² is the mean of |E|², and length² = 2 sigma² / mean of |k E|².
+    The cosine transform mirrors the field at its edges, so that the wrap-around joins equal values. Of the
+    error's spectrum E(k), sigma² is the mean of |E|², and length² = 2 sigma² / mean of |k E|².
     """
     from scipy.fft import dctn, idctn  # noqa: PLC0415 - the live path runs without scipy
 

@@ -25,8 +25,8 @@ def with_true_heading(deployment: xr.Dataset, reference: str | None = None) -> x
 
     Notes
     -----
-    To magnetic headings the IGRF's declination at the position is added, ``D = atan2(B_east, B_north)``; any other
-    deployment comes back as it is. Without a position a magnetic heading becomes NaN: it is not known.
+    To magnetic headings the IGRF's declination at the position is added, ``D = atan2(B_east, B_north)``; any
+    other deployment comes back as it is. Without a position a magnetic heading becomes NaN: it is not known.
     """
     reference = reference or deployment.attrs.get("heading_reference")
     if reference != "magnetic" or "heading" not in deployment:

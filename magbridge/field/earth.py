@@ -41,7 +41,7 @@ def metres_per_degree(latitude: float | Array) -> tuple[float | Array, float | A
 
 
 def offset(latitude: float, longitude: float, north: Number, east: Number) -> tuple[Number, Number]:
-    """Return (latitude, longitude) `north` and `east` m from a position in deg, one or many; longitude in -180..180.
+    """Return (latitude, longitude), deg, `north` and `east` m from a position; longitude in -180..180.
 
     Both radii are those at the position one starts from, so :func:`separation` is its exact inverse;
     over 20 km at 60 degrees that bends an east-west line by 50 m at most.
@@ -68,7 +68,7 @@ def separation(latitude: Any, longitude: Any, to_latitude: Any, to_longitude: An
 
 
 def worse_axis(nn: Number, ne: Number, ee: Number) -> Number:
-    """Return a position's 1-sigma (m) along the longer axis of its ellipse; the covariance (m²) is of north and east.
+    """Return a position's 1-sigma (m) along its ellipse's longer axis; the covariance is (north, east) in m².
 
     Notes
     -----

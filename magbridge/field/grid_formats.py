@@ -109,7 +109,7 @@ def ascii_grid(path: Path) -> Parts:
 
 
 def table(path: Path) -> Parts:
-    """Longitude, latitude, anomaly in columns, with or without a header; any order of rows; gaps are holes."""
+    """Longitude, latitude, anomaly in columns, header or not; any order of rows; gaps are holes."""
     with path.open(errors="replace") as file:
         first = file.readline()
     delimiter = next((mark for mark in ",;" if mark in first), None)

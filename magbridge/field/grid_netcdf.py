@@ -19,7 +19,8 @@ __all__ = ["ANOMALY", "LATITUDE", "LONGITUDE", "Parts", "netcdf", "write"]
 
 Array = NDArray[np.floating[Any]]
 Parts = tuple[Array, Array, Array, dict[str, Any]]
-"""Longitudes and latitudes (deg) of the nodes, values, options of AnomalyGrid; and ``unit``, where it says one."""
+"""Longitudes and latitudes (deg) of the nodes, values, options of AnomalyGrid; and ``unit``, where
+it says one."""
 LONGITUDE, LATITUDE = ("longitude", "lon", "long", "x"), ("latitude", "lat", "y")
 ANOMALY = ("anomaly", "magnetic_anomaly", "mag_anomaly", "tfa", "tmi", "mag", "nt", "value", "z")
 SIGMA = ("sigma", "error", "uncertainty", "std")

@@ -1,7 +1,8 @@
 """Anomaly grids from the formats in which surveys come.
 
 A format is a function from a path to ``(longitude, latitude, anomaly, options of AnomalyGrid)``; which one
-reads a file stands in one table, by suffix, and GRD files, of which four kinds share a suffix, by how they begin.
+reads a file stands in one table, by suffix, and GRD files, of which four kinds share a suffix, by
+how they begin.
 """
 
 from __future__ import annotations
@@ -46,7 +47,8 @@ def read_grid(path: str | Path) -> AnomalyGrid:
     ----------
     path : path
         netCDF (CF, GMT), Surfer or Geosoft ``.grd``, ESRI ASCII ``.asc``, GeoTIFF, ``.csv`` or ``.xyz`` of
-        longitude, latitude, anomaly; or a folder of ``xx.csv yy.csv alt.csv map.csv`` as MagNav's example has.
+        longitude, latitude, anomaly; or a folder of ``xx.csv yy.csv alt.csv map.csv`` as
+        MagNav's example has.
 
     Raises
     ------

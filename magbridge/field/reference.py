@@ -48,8 +48,9 @@ def reference_field(deployment: xr.Dataset, grid: AnomalyGrid | None = None, sit
 
     Notes
     -----
-    ``H_e = |IGRF(φ, λ, depth, t)| + anomaly(φ, λ, depth) + site bias``: eq. 4, whose anomaly is the map's at its own
-    altitude. The depth counts, about 0.02 nT/m of the main field and far more of the anomalies of shallow rock.
+    ``H_e = |IGRF(φ, λ, depth, t)| + anomaly(φ, λ, depth) + site bias``: eq. 4, whose anomaly is the map's
+    at its own altitude. The depth counts, about 0.02 nT/m of the main field and far more of the anomalies
+    of shallow rock.
     """
     size = deployment.sizes["time"]
     given = (

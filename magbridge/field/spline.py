@@ -1,4 +1,4 @@
-"""Cubic B-splines through the nodes of a uniform grid: their coefficients, and what four nodes weigh between them."""
+"""Cubic B-splines through the nodes of a uniform grid: their coefficients, and the weights of four nodes."""
 
 from __future__ import annotations
 

@@ -20,8 +20,8 @@ class Commands:
     """Answers COMMAND_LONG and COMMAND_INT.
 
     What is addressed to component 0 means whoever can: the bridge then does what only it can do, and never
-    refuses, because a station takes the refusal for the autopilot's. Calibration of the autopilot's own compass
-    (DO_START_MAG_CAL and the like) is the autopilot's business.
+    refuses, because a station takes the refusal for the autopilot's. Calibration of the autopilot's own
+    compass (DO_START_MAG_CAL and the like) is the autopilot's business.
 
     Parameters
     ----------

@@ -104,8 +104,8 @@ class TelemetryMap:
     def values(self, message: Message, t_us: int, clock: VehicleClock) -> list[Value]:
         """Return ``(name, value, time in us)`` of every parameter that `message`, come at `t_us`, carries.
 
-        The time is the message's own where it has one and the autopilot's clock is known, else `t_us`. A value
-        that the sender marks as not known is NaN.
+        The time is the message's own where it has one and the autopilot's clock is known, else `t_us`. A
+        value that the sender marks as not known is NaN.
         """
         extractors = self._by_id.get(message.id)
         if extractors is None:
@@ -130,7 +130,7 @@ class TelemetryMap:
 
 
 def own_time(layout: Spec) -> Callable[[bytes], tuple[int, int]] | None:
-    """Return a function that reads a message's own time and after how many us it wraps; None where it has none."""
+    """Return a function that reads a message's own time, and after how many us it wraps; None without."""
     for name, unit_us in (("time_boot_ms", 1000), ("time_usec", 1)):
         field = layout.fields.get(name)
         if field is None:

@@ -86,7 +86,7 @@ class Vehicle:
             )
 
     def _count(self, sequence: int) -> None:
-        """Count what is missing; a packet that comes late, out of order, is not, and one sent twice is nothing."""
+        """Count what is missing; a packet that comes late, out of order, is not; a duplicate is nothing."""
         if self._sequence is None:
             self._sequence = sequence
         ahead = (sequence - self._sequence + 128) % 256 - 128

@@ -3,16 +3,16 @@
 A deployment is an ``xarray.Dataset`` on ``time`` (:mod:`magbridge.columns`). A row is one time of the
 magnetometer; every other column holds what was known at that time:
 
-- logs of a live link (``.tlog``, ``.BIN``, ``.ulg``): the last value received at or before the row, NaN before
-  the first and when it is older than 30 s. This is what the bridge itself would have known, so a
+- logs of a live link (``.tlog``, ``.BIN``, ``.ulg``): the last value received at or before the row, NaN
+  before the first and when it is older than 30 s. This is what the bridge itself would have known, so a
   calibration learns from a log what it will meet live;
-- logs that were put together ashore (Slocum, Seaglider): linear between neighbours, headings on the circle, NaN
-  across gaps.
+- logs that were put together ashore (Slocum, Seaglider): linear between neighbours, headings on the circle,
+  NaN across gaps.
 
 Each module has ``chunks(path, rows)``, which yields deployments of at most `rows` rows in the order of the
-file, and, where the format can be written, ``FileWriter(path)`` with ``append(dataset, first=...)`` and ``close()``.
-A package adds a format with an entry point in the group ``magbridge.formats``: the suffix without its dot, and
-such a module.
+file, and, where the format can be written, ``FileWriter(path)`` with ``append(dataset, first=...)`` and
+``close()``. A package adds a format with an entry point in the group ``magbridge.formats``: the suffix
+without its dot, and such a module.
 """
 
 from __future__ import annotations
@@ -120,8 +120,9 @@ def read(paths: Paths, *, required: Iterable[str] = ()) -> xr.Dataset:
     Returns
     -------
     xarray.Dataset
-        On ``time``; each variable float64 with ``units`` and ``long_name``. Attributes: ``source`` (the file's name, and what it says of its own source),
-        ``heading_reference`` where it is not true north, and counts of what was passed over (``duplicate_rows`` ...).
+        On ``time``; each variable float64 with ``units`` and ``long_name``. Attributes: ``source`` (the
+        file's name, and what it says of its own source), ``heading_reference`` where it is not true north,
+        and counts of what was passed over (``duplicate_rows`` ...).
 
     Raises
     ------
@@ -172,8 +173,8 @@ def write(dataset: xr.Dataset, path: str | os.PathLike[str]) -> None:
 class Writer:
     """A file that grows by deployments, one after the other in time, and appears when it is complete.
 
-    The columns are those of the first deployment; a later one that lacks a column has NaN there. When the block
-    raises, nothing is left behind.
+    The columns are those of the first deployment; a later one that lacks a column has NaN there. When the
+    block raises, nothing is left behind.
 
     >>> with Writer("out.nc") as writer:  # doctest: +SKIP
     ...     for dataset in read_chunks("in.tlog"):

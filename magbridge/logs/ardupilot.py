@@ -1,8 +1,9 @@
 """ArduPilot's own logs (``.BIN``), through pymavlink.
 
-A row is a sample of the first magnetometer that the log has; every other column is the last value before it. The log
-holds the field after the autopilot's offsets and motor compensation; both are in it too and are taken off again, so
-``mag_x`` is the raw channel (mG, so steps of 100 nT). Scale factors in ``COMPASS_DIA`` and ``COMPASS_ODI`` are not.
+A row is a sample of the first magnetometer that the log has; every other column is the last value before it.
+The log holds the field after the autopilot's offsets and motor compensation; both are in it too and are taken
+off again, so ``mag_x`` is the raw channel (mG, so steps of 100 nT). Scale factors in ``COMPASS_DIA`` and
+``COMPASS_ODI`` are not.
 
 Time is UTC once the log has a GPS fix; a log without one counts from the boot, and says so in the attribute
 ``time_reference = "boot"``. What is damaged is passed over and counted in ``bytes_skipped``.

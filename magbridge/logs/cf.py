@@ -20,9 +20,9 @@ ALL = slice(None)
 def floats(variable: Any, rows: slice = ALL) -> NDArray[np.float64]:
     """Return rows of a variable, NaN where the file has nothing.
 
-    That is a number which it declares as such, compared as it is stored, before it is unpacked; or where nothing
-    was ever written, which the library fills with a number of its own. A valid range is left aside: one that
-    begins at 0 would turn a depth of -2 cm into nothing.
+    That is a number which it declares as such, compared as it is stored, before it is unpacked; or where
+    nothing was ever written, which the library fills with a number of its own. A valid range is left aside:
+    one that begins at 0 would turn a depth of -2 cm into nothing.
     """
     variable.set_auto_maskandscale(False)
     stored = variable[rows]

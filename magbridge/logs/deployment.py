@@ -44,7 +44,8 @@ LEAST = {
     "bar": -1.01325,
     "dbar": -10.1325,
 }
-"""No temperature is lower, and no pressure, also one that counts from the surface's: -9999 says "not known"."""
+"""No temperature is lower, and no pressure, also one that counts from the surface's: -9999 says
+"not known"."""
 APART = 60.0
 """s that a channel may be sampled before or after its row."""
 COUNTERS = {
@@ -54,8 +55,8 @@ COUNTERS = {
     "duplicate_rows": ("duplicate row", "duplicate rows"),
     "rows_dropped": ("row dropped", "rows dropped"),
 }
-"""Attributes that count what reading passed over, and how one and several are called: they add up, and are not of the
-file that is written next."""
+"""Attributes that count what reading passed over, and how one and several are called: they add up, and are
+not of the file that is written next."""
 
 
 def deployment(
@@ -152,7 +153,7 @@ def increasing(
 
 
 def plausible(file: str | Path, dataset: xr.Dataset, rows: Sequence[int]) -> None:
-    """Check what would be taken for another place or another moment, or for a temperature or pressure that cannot be.
+    """Check for impossible temperatures and pressures, and what would be taken for another place or moment.
 
     Raises
     ------
@@ -212,7 +213,8 @@ def join(parts: Sequence[xr.Dataset]) -> xr.Dataset:
             if attrs.get("units") != part[name].attrs.get("units"):
                 raise FormatError(
                     part.attrs.get("source", ""),
-                    f"expected {attrs.get('units')} as in the files before, not {part[name].attrs.get('units')}",
+                    f"expected {attrs.get('units')} as in the files before, not "
+                    f"{part[name].attrs.get('units')}",
                     column=str(name),
                 )
     time = np.concatenate([part["time"].values for part in parts])
@@ -241,7 +243,7 @@ def uncounted(dataset: xr.Dataset) -> xr.Dataset:
 
 
 def passed_over(*pieces: Mapping[str, Any]) -> dict[str, int]:
-    """Return what reading passed over, from the attributes of a deployment or of its pieces; nothing where it is none."""
+    """Return what reading passed over, by the attributes of a deployment or its pieces; no zeros."""
     counts = {name: sum(int(attrs.get(name, 0)) for attrs in pieces) for name in COUNTERS}
     return {name: count for name, count in counts.items() if count}
 

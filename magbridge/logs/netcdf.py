@@ -1,10 +1,10 @@
 """netCDF in the shape of OceanGliders OG1.0: one trajectory along ``N_MEASUREMENTS``, names in capitals.
 
 ``TIME LATITUDE LONGITUDE DEPTH ROLL PITCH HEADING TEMP PRES`` are OG1.0's own names; the others are ours in
-capitals (``MAG_X``), and the attribute ``column`` keeps the exact name. A file by someone else is read by the same
-rules: any numeric variable along ``N_MEASUREMENTS`` becomes a column in small letters. What OG1.0 also demands about
-people, platform and quality control we do not know, so a file does not claim to comply. A basestation's
-Seaglider file is recognised by its dimensions and read by :mod:`magbridge.logs.seaglider`.
+capitals (``MAG_X``), and the attribute ``column`` keeps the exact name. A file by someone else is read by the
+same rules: any numeric variable along ``N_MEASUREMENTS`` becomes a column in small letters. What OG1.0 also
+demands about people, platform and quality control we do not know, so a file does not claim to comply. A
+basestation's Seaglider file is recognised by its dimensions and read by :mod:`magbridge.logs.seaglider`.
 
 References
 ----------

@@ -1,9 +1,9 @@
 """PX4's logs (``.ulg``), through pyulog.
 
-A row is a sample of the first ``sensor_mag`` (gauss, as the driver gives it: before PX4's own calibration); every other
-column is the last value before it. ``heading`` is the estimator's yaw. ``depth`` is the local position's z, down from
-where the vehicle was switched on. Time is UTC once a GPS has said it; a log without counts from the boot, and
-says so in the attribute ``time_reference = "boot"``.
+A row is a sample of the first ``sensor_mag`` (gauss, as the driver gives it: before PX4's own calibration);
+every other column is the last value before it. ``heading`` is the estimator's yaw. ``depth`` is the local
+position's z, down from where the vehicle was switched on. Time is UTC once a GPS has said it; a log without
+counts from the boot, and says so in the attribute ``time_reference = "boot"``.
 
 References
 ----------

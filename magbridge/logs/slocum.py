@@ -1,11 +1,13 @@
-"""Slocum gliders: ``.dbd .mbd .sbd`` (flight) and ``.ebd .nbd .tbd`` (science), also compressed (``.dcd`` ... ``.tcd``).
+"""Slocum gliders: flight ``.dbd .mbd .sbd``, science ``.ebd .nbd .tbd``, compressed ``.dcd`` ... ``.tcd``.
 
-A row is a cycle of the flight computer; what was not updated in a cycle lies linearly between its neighbours. The
-science file of the same name beside a flight file is joined to it, and the other way round: either name, or both,
-give the same deployment. The list of sensors is looked for in the file ``<crc>.cac`` beside the file.
+A row is a cycle of the flight computer; what was not updated in a cycle lies linearly between its
+neighbours. The science file of the same name beside a flight file is joined to it, and the other way round:
+either name, or both, give the same deployment. The list of sensors is looked for in the file ``<crc>.cac``
+beside the file.
 
-Angles become degrees; ``heading`` is what the compass says, magnetic. A Slocum logs no vector magnetometer of its own:
-there is no ``mag_x``, and the log serves to drive a simulated one, or beside the log of an instrument that rode along.
+Angles become degrees; ``heading`` is what the compass says, magnetic. A Slocum logs no vector magnetometer of
+its own: there is no ``mag_x``, and the log serves to drive a simulated one, or beside the log of an
+instrument that rode along.
 """
 
 from __future__ import annotations

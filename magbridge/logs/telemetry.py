@@ -1,19 +1,21 @@
 """MAVLink telemetry logs (``.tlog``), ours and anyone's, as deployments.
 
-A row is a magnetometer message of the best kind that the log holds (:data:`~magbridge.logs.telemetry_fields.SOURCES`),
-from the sender of most of them; every other column is the last value that this vehicle said before it (NaN once
-older than :data:`~magbridge.logs.resample.MAX_AGE`).
+A row is a magnetometer message of the best kind that the log holds
+(:data:`~magbridge.logs.telemetry_fields.SOURCES`), from the sender of most of them; every other column is the
+last value that this vehicle said before it (NaN once older than :data:`~magbridge.logs.resample.MAX_AGE`).
 
-- ``MAG_RAW`` (ours): nT as the driver made them of its counts, where the log declares what a count is, else as float32
-  (0.004 nT at 50,000 nT); time to the µs, channel times, temperature, supply, power cycles. The ``MAG_FIELD`` that follows it becomes the columns of ``magbridge correct``.
-- ``HIGHRES_IMU`` (gauss), ``RAW_IMU`` and ``SCALED_IMU*`` (mgauss, so steps of 100 nT): in the autopilot's axes,
-  its own offsets already in them; time is the record's stamp. Further magnetometers become ``mag1_x`` ... ``mag3_z``.
+- ``MAG_RAW`` (ours): nT as the driver made them of its counts, where the log declares what a count is, else
+  as float32 (0.004 nT at 50,000 nT); time to the µs, channel times, temperature, supply, power cycles. The
+  ``MAG_FIELD`` that follows it becomes the columns of ``magbridge correct``.
+- ``HIGHRES_IMU`` (gauss), ``RAW_IMU`` and ``SCALED_IMU*`` (mgauss, so steps of 100 nT): in the autopilot's
+  axes, its own offsets already in them; time is the record's stamp. Further magnetometers become ``mag1_x``
+  ... ``mag3_z``.
 - Without any of these, ``ATTITUDE`` or position makes the rows, and there is no ``mag_x``.
 
-Telemetry is what the log itself declares by ``MAG_COLUMN`` (a bridge's own, one from :mod:`magbridge.logs`), what
-:data:`~magbridge.logs.telemetry_fields.TELEMETRY` lists, and every ``NAMED_VALUE_FLOAT`` by its name. What is damaged
-is passed over and counted in the attributes ``bytes_skipped`` and ``damages``, a row whose time does not increase in
-``rows_dropped``.
+Telemetry is what the log itself declares by ``MAG_COLUMN`` (a bridge's own, one from :mod:`magbridge.logs`),
+what :data:`~magbridge.logs.telemetry_fields.TELEMETRY` lists, and every ``NAMED_VALUE_FLOAT`` by its name.
+What is damaged is passed over and counted in the attributes ``bytes_skipped`` and ``damages``, a row whose
+time does not increase in ``rows_dropped``.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
 """A deployment as a MAVLink telemetry log: what a bridge and an autopilot would have said.
 
-A row becomes, all with its time: ``ATTITUDE`` (float32), ``GLOBAL_POSITION_INT`` (1e-7 deg, mm), a ``NAMED_VALUE_FLOAT``
-(float32) for every other column, ``MAG_RAW`` (float32 nT, µs) and, where the deployment is corrected, ``MAG_FIELD``. So a
-column comes back to 6e-8 of its value, time to 1 µs; a column of integers (counts times 100, say) comes back exactly.
+A row becomes, all with its time: ``ATTITUDE`` (float32), ``GLOBAL_POSITION_INT`` (1e-7 deg, mm), a
+``NAMED_VALUE_FLOAT`` (float32) for every other column, ``MAG_RAW`` (float32 nT, µs) and, where the deployment
+is corrected, ``MAG_FIELD``. So a column comes back to 6e-8 of its value, time to 1 µs; a column of integers
+(counts times 100, say) comes back exactly.
 
 A name of more than ten letters is cut, made unique, and told in full by a ``MAG_COLUMN`` at the start, as
 are all units and the attributes that change what values mean.

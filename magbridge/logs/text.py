@@ -2,9 +2,9 @@
 
 A heading is ``name`` or ``name [unit]``: ``battpos [in]``. Columns of the public table need no unit; one in
 another unit that we know (``mag_x [uT]``, ``roll [rad]``) is converted. Before the header there may be lines
-``# heading_reference = magnetic``, and ``# fill_value = -9999`` where that stands for a value that is lacking.
-``quality`` holds the names of the flags, separated by spaces. Numbers are written with as many digits as bring
-back the same bits.
+``# heading_reference = magnetic``, and ``# fill_value = -9999`` where that stands for a value that is
+lacking. ``quality`` holds the names of the flags, separated by spaces. Numbers are written with as many
+digits as bring back the same bits.
 """
 
 from __future__ import annotations

@@ -1,13 +1,14 @@
 """The live log: everything read and sent, as a ``.tlog`` that any MAVLink tool reads.
 
-A record is an 8-byte big-endian stamp and a MAVLink frame. The stamp is the event's time in µs since 1970 UTC, a
-multiple of 4, plus the :class:`~magbridge.records.Channel` in its low two bits.
+A record is an 8-byte big-endian stamp and a MAVLink frame. The stamp is the event's time in µs since 1970
+UTC, a multiple of 4, plus the :class:`~magbridge.records.Channel` in its low two bits.
 
-The live thread only appends to a queue (about 0.3 µs an event); a thread of its own writes whole records. The first
-record after a pause is written at once, those that follow within `WINDOW` together: after ``kill -9`` the
-file holds everything but the last group and reads to its end. A disk that stalls fills the queue, a disk that is
-full stops the log; either way records are dropped and counted, and the live thread never waits. The file that follows
-a log that failed begins with the start of the run, whose time is before its own: a replay knows that something is missing.
+The live thread only appends to a queue (about 0.3 µs an event); a thread of its own writes whole records. The
+first record after a pause is written at once, those that follow within `WINDOW` together: after ``kill -9``
+the file holds everything but the last group and reads to its end. A disk that stalls fills the queue, a disk
+that is full stops the log; either way records are dropped and counted, and the live thread never waits. The
+file that follows a log that failed begins with the start of the run, whose time is before its own: a replay
+knows that something is missing.
 """
 
 from __future__ import annotations
@@ -32,22 +33,23 @@ Record = tuple[int, int, bytes]
 """µs of the event, channel, frame."""
 
 WINDOW = 0.005
-"""s between two writes: up to 200 events a second each is written at once, and ``kill -9`` costs at most the last
-one; above that, those of 5 ms. Latency does not know the difference; the writing thread takes 66 us a sample at
-100 Hz, where every event is its own write, and 19 us at 1,000 Hz."""
+"""s between two writes: up to 200 events a second each is written at once, and ``kill -9`` costs at most the
+last one; above that, those of 5 ms. Latency does not know the difference; the writing thread takes 66 us a
+sample at 100 Hz, where every event is its own write, and 19 us at 1,000 Hz."""
 QUEUE = 100_000
 """Records (some 10 MB) that wait for a stalled disk before they are dropped."""
 RETRY_US = 2_000_000
 """µs of the events' time after which a log that failed is tried again, in a new file."""
 SYNC_US = 5_000_000
-"""µs of the events' time between two syncs: a power cut costs no more, nor does a hand that removes the file."""
+"""µs of the events' time between two syncs: a power cut costs no more, nor does a hand that
+removes the file."""
 
 
 class TlogWriter:
     """Writes records to ``UTC-start_index.tlog`` files in a directory.
 
-    The start is the run's, so that the files of one run stand together, whoever else writes to the directory; it is a
-    few seconds late where another run has taken the name.
+    The start is the run's, so that the files of one run stand together, whoever else writes to the directory;
+    it is a few seconds late where another run has taken the name.
 
     Parameters
     ----------

@@ -11,7 +11,8 @@ from magbridge.mavlink.signing import Signing
 __all__ = ["WINDOW", "Codec"]
 
 WINDOW = 4096
-"""bytes without a frame after which they are given up, whatever may have begun in them: memory stays bounded."""
+"""bytes without a frame after which they are given up, whatever may have begun in them: memory
+stays bounded."""
 
 
 class Codec:
@@ -49,9 +50,10 @@ class Codec:
     def parse(self, data: bytes) -> list[Message]:
         """Take bytes as they come; return the messages that are complete with them.
 
-        Any bytes, however cut, give the same messages. Bytes that belong to no frame come back as a message of
-        id `BAD_DATA` just before the message that ended them (or every `WINDOW` bytes), so that a log which
-        keeps every ``frame`` keeps every byte. A frame whose signature is not accepted has the id `REFUSED`.
+        Any bytes, however cut, give the same messages. Bytes that belong to no frame come back as a
+        message of id `BAD_DATA` just before the message that ended them (or every `WINDOW` bytes), so
+        that a log which keeps every ``frame`` keeps every byte. A frame whose signature is not accepted
+        has the id `REFUSED`.
         """
         data = self._rest + data
         found: list[Message] = []

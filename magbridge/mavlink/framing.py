@@ -34,9 +34,9 @@ EXTRA = {number: bytes((extra,)) for number, (_, extra, _) in MESSAGES.items()}
 def frame_end(data: bytes, start: int, stop: int, gap: int = 0, *, last: bool = False) -> int:
     """Return where the frame ends that begins at ``data[start]``.
 
-    The checksum of a message outside the dialect cannot be checked; it is believed when its header is plausible
-    and another frame begins `gap` bytes after its end, or when it ends with the data. A random header hardly
-    ever is plausible, so that garbage does not hold up what follows it.
+    The checksum of a message outside the dialect cannot be checked; it is believed when its header is
+    plausible and another frame begins `gap` bytes after its end, or when it ends with the data. A random
+    header hardly ever is plausible, so that garbage does not hold up what follows it.
 
     Parameters
     ----------

@@ -186,5 +186,5 @@ def split_index(field: str) -> tuple[str, int | None]:
 
 
 def east_e7(longitude: float) -> int:
-    """Return a longitude (deg, of any turn) in 1e-7 deg from -180 to 180: beyond 214 it would not fit its 32 bits."""
+    """Return a longitude (deg, of any turn) in 1e-7 deg, -180 to 180: beyond 214, 32 bits overflow."""
     return (round(longitude * 1e7) + TURN_E7 // 2) % TURN_E7 - TURN_E7 // 2

@@ -2,10 +2,10 @@
 
 Notes
 -----
-The signature is a link id, a time stamp ``t`` (48 bit, units of 10 us since 2015-01-01) and the first 6 bytes of
-``SHA-256(key + frame + link id + t)``. Stamps of one stream (link id, system, component) must increase. A stamp
-counts only once its hash has proved right: otherwise one forged packet from the future would lock out every
-genuine one that follows, as it does in pymavlink 2.4.50.
+The signature is a link id, a time stamp ``t`` (48 bit, units of 10 us since 2015-01-01) and the first 6 bytes
+of ``SHA-256(key + frame + link id + t)``. Stamps of one stream (link id, system, component) must increase. A
+stamp counts only once its hash has proved right: otherwise one forged packet from the future would lock out
+every genuine one that follows, as it does in pymavlink 2.4.50.
 """
 
 from __future__ import annotations

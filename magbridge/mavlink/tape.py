@@ -1,9 +1,9 @@
 """Every byte of a link as frames in a log, and back again.
 
-A log must be readable by any MAVLink tool and still hold everything that came: frames go in as they are, bytes
-that belong to none wrapped in MAG_LINK_BYTES. Where the parser had to look at bytes beyond the frame that it
-gave out, to see that something before it was no frame, these go in as well, marked *ahead*: fed with them, a
-replay's parser comes to the same end at the same time.
+A log must be readable by any MAVLink tool and still hold everything that came: frames go in as they are,
+bytes that belong to none wrapped in MAG_LINK_BYTES. Where the parser had to look at bytes beyond the frame
+that it gave out, to see that something before it was no frame, these go in as well, marked *ahead*: fed with
+them, a replay's parser comes to the same end at the same time.
 """
 
 from __future__ import annotations

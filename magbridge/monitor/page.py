@@ -33,7 +33,8 @@ INK, BLUE, GREEN, AMBER, RED = "#1e293b", "#1d4ed8", "#15803d", "#b45309", "#b91
 LINE = {"type": "line", "symbol": "none", "animation": False, "color": BLUE}
 BAND = {**LINE, "stack": "band", "stackStrategy": "all", "lineStyle": {"opacity": 0}}
 ROOM, LEAST = 5.0, 50.0
-"""The band gets no more of the chart, each way, than ROOM times the curve and LEAST nT: else the curve is a line."""
+"""The band gets no more of the chart, each way, than ROOM times the curve and LEAST nT: else the
+curve is a line."""
 ROUND = {"showMinLabel": False, "showMaxLabel": False}
 """The ends of an axis are where they are, and would be written over the round number beside them."""
 APART = "value => value.toLocaleString('en').replaceAll(',', '\N{NARROW NO-BREAK SPACE}')"
@@ -221,7 +222,7 @@ class Page:
 
 
 def _curves(trace: list[Point]) -> Iterator[list[tuple[float, float]]]:
-    """Yield (ms, nT) of the band's lower edge, of its width and of the mean; NaN where the curve is interrupted."""
+    """Yield (ms, nT) of the band's lower edge, its width and the mean; NaN where the curve is interrupted."""
     last, usual = trace[0].time, 0.0
     for point in trace:
         ms, gap = 1e3 * point.time, point.time - last
@@ -232,7 +233,7 @@ def _curves(trace: list[Point]) -> Iterator[list[tuple[float, float]]]:
 
 
 def _reach(trace: list[Point]) -> dict[str, float]:
-    """Return the ends of the axis in nT, round ones: all of the curve, and as much of the band as leaves it a curve."""
+    """Return round ends of the axis in nT: all of the curve, and as much of the band as leaves it visible."""
     curve = [point.sum / point.count for point in trace if isfinite(point.sum)]
     if not curve:
         return {}

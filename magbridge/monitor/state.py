@@ -141,7 +141,7 @@ class State:
         return requests
 
     def set(self, name: str, value: float) -> None:
-        """Ask for another value of a parameter; the answer, or the refusal, comes to stand in `parameters`."""
+        """Ask for another value of a parameter; the answer, or the refusal, appears in `parameters`."""
         one = self.parameters[name]
         if abs(value) < 1e38:  # what a REAL32 takes
             one.asked, one.when, one.error = value, -inf, ""

@@ -11,7 +11,8 @@ from magbridge.monitor.state import State
 __all__ = ["FLAGS", "ago", "health", "measured", "silence", "whereabouts"]
 
 SILENT, SLOW = 3.0, 30.0
-"""s; a bridge speaks every second, a slow sensor less often: three of its intervals, but no more than `SLOW`."""
+"""s; a bridge speaks every second, a slow sensor less often: three of its intervals, but no more
+than `SLOW`."""
 FLAGS = {
     "stale_telemetry": "A parameter of the calibration is old, missing or NaN",
     "extrapolated": "A parameter is outside the calibrated range",

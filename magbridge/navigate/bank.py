@@ -1,9 +1,10 @@
 """Many hypotheses: a bank of extended Kalman filters over a position that is not known well enough for one.
 
 A Gaussian too wide for the map to be straight under it is split into many that are narrow enough; each is
-filtered as if it were alone, all in one pass of arrays; their weights follow the likelihoods (Alspach & Sorenson
-1972). Hypotheses that grow too wide are split again, those that fade are dropped, those that meet are merged.
-Nothing is drawn at random: the same samples give the same bits. With one hypothesis it is the tracker.
+filtered as if it were alone, all in one pass of arrays; their weights follow the likelihoods (Alspach &
+Sorenson 1972). Hypotheses that grow too wide are split again, those that fade are dropped, those that
+meet are merged. Nothing is drawn at random: the same samples give the same bits. With one hypothesis it
+is the tracker.
 """
 
 from __future__ import annotations
@@ -29,7 +30,8 @@ EDGE = 3.5  # sigma, as far as a start is covered
 FADED = 1e-7  # of the largest weight
 COARSER = 1.25  # at a time
 MERGE_EVERY = 4  # updates
-# One Gaussian as three narrower ones (DeMars et al. 2013, table 1), their variance such that the sum keeps its own.
+# One Gaussian as three narrower ones (DeMars et al. 2013, table 1), their variance such that the sum
+# keeps its own.
 THREE = np.array([-1.0575154615, 0.0, 1.0575154615])
 THREE_WEIGHT = np.array([0.2252246249, 0.5495507502, 0.2252246249])
 THREE_VARIANCE = 1.0 - float(THREE_WEIGHT @ THREE**2)
@@ -38,8 +40,8 @@ THREE_VARIANCE = 1.0 - float(THREE_WEIGHT @ THREE**2)
 class Bank:
     """A Gaussian mixture on the six states, each part linearised by itself.
 
-    Hypotheses come last in every array, weights ``w`` (n,), states ``x`` (6, n) and covariances ``P`` (6, 6, n):
-    each operation then runs along memory, three times as fast as on n small matrices.
+    Hypotheses come last in every array, weights ``w`` (n,), states ``x`` (6, n) and covariances ``P``
+    (6, 6, n): each operation then runs along memory, three times as fast as on n small matrices.
 
     Parameters
     ----------
@@ -51,7 +53,8 @@ class Bank:
     gate : float
         Innovation squared over variance beyond which a hypothesis does not learn from a measurement.
     level : float, optional
-        nT, 1-sigma of the bias for half of the hypotheses, at equal odds: what it is if it is not what P says.
+        nT, 1-sigma of the bias for half of the hypotheses, at equal odds: what it is if it is
+        not what P says.
     """
 
     def __init__(
@@ -79,8 +82,9 @@ class Bank:
 
         Notes
         -----
-        ``N(x, P) = ∫ N(x + g s, P - g g' (σ² - σ_k²)) N(s; 0, σ² - σ_k²) ds`` along an axis e of the position,
-        with σ² its variance and ``g = P e / σ²``: everything correlated with the position moves along.
+        ``N(x, P) = ∫ N(x + g s, P - g g' (σ² - σ_k²)) N(s; 0, σ² - σ_k²) ds`` along an axis e of
+        the position, with σ² its variance and ``g = P e / σ²``: everything correlated with the
+        position moves along.
         """
         values, axes = np.linalg.eigh(P[:2, :2])
         area = (
@@ -206,7 +210,7 @@ class Bank:
         self.P = np.concatenate([self.P[:, :, ~wide]] + [narrow] * 3, axis=2)
 
     def _merge(self) -> None:
-        """Make one of those that have come to the same cell of the position, of the same mean and covariance."""
+        """Merge those that have come to the same cell of the position, keeping mean and covariance."""
         cell = np.floor(self.x[:2] / (CELL * self.resolution)).astype(np.int64)
         order = np.lexsort(cell)
         cell = cell[:, order]

@@ -1,4 +1,4 @@
-"""A whole log against a map: the navigator over every row, a backward pass, and what there is to say about it."""
+"""A whole log against a map: the navigator over every row, a backward pass, and what can be said of it."""
 
 from __future__ import annotations
 
@@ -60,14 +60,15 @@ def navigate(
     Parameters
     ----------
     deployment : Dataset
-        On ``time``, with ``total_field`` (nT), ``total_field_sigma`` if known (else 1 nT), and the columns of one of
-        :data:`MOTIONS`.
+        On ``time``, with ``total_field`` (nT), ``total_field_sigma`` if known (else 1 nT), and the columns of
+        one of :data:`MOTIONS`.
     grid : AnomalyGrid
     options : Options, optional
     start : (latitude, longitude), optional
         deg; default the log's first position.
     fixes : bool, optional
-        Take in ``gps_latitude gps_longitude`` all along; default only the first, the others are the reference_track.
+        Take in ``gps_latitude gps_longitude`` all along; default only the first, the others are the
+        reference_track.
 
     Returns
     -------

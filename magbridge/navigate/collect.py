@@ -48,8 +48,9 @@ class Collector:
 
     Notes
     -----
-    The variance of a mean of n samples of noise σ that lasts τ, over a time T, is ``σ² max(1/n, 2τ/(T + 2τ))``. What
-    a sample's sigma holds besides does not average out; of that, the filter's bias stands for its own variance.
+    The variance of a mean of n samples of noise σ that lasts τ, over a time T, is
+    ``σ² max(1/n, 2τ/(T + 2τ))``. What a sample's sigma holds besides does not average out; of that, the
+    filter's bias stands for its own variance.
     """
 
     def __init__(self, options: Options, step: float) -> None:

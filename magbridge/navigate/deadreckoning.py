@@ -1,4 +1,4 @@
-"""Where the vehicle would be if it knew its own motion: position from heading, speed and depth, or from others."""
+"""Dead reckoning: where a vehicle has moved, by heading, speed and depth, or as others tell."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A map of another height: continued to where the vehicle is, and what that leaves out counted as the map's error."""
+"""A map of another height, continued to the vehicle; what that leaves out counts as the map's error."""
 
 from __future__ import annotations
 

@@ -80,7 +80,7 @@ def draw_navigation(result: xr.Dataset, grid: AnomalyGrid, path: str | Path) -> 
 
 
 def draw_bound(bound: Bound, grid: AnomalyGrid, path: str | Path) -> None:
-    """Draw a planned track on the map, coloured by the best position that can be had there, and both over time."""
+    """Draw a planned track on the map, coloured by the best possible position, and both over time."""
     figure = Figure(figsize=(9.0, 9.0), layout="constrained")
     panels = figure.subplot_mosaic([["map"], ["time"]], height_ratios=(3, 1))
     axis = panels["map"]

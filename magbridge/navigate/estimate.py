@@ -29,7 +29,7 @@ SPREADS = (2.0, 4.0, 2.0, 8.0)  # times its reach, of the searches after each ot
 
 
 class Estimate:
-    """Position around a dead-reckoned track, from blocks of samples and fixes that are given in the order of their time.
+    """Position around a dead-reckoned track, from blocks of samples and fixes given in order of time.
 
     Parameters
     ----------
@@ -42,8 +42,8 @@ class Estimate:
     x, P : ndarray, (6,), (6, 6)
         Estimate and covariance, of :mod:`~magbridge.navigate.model`'s states.
     vouched : bool
-        The filter stands by the position: the map describes the field, at the odds at which it would be given up, and
-        the filter began no narrower than its rivals do, or they have come to the same place since.
+        The filter stands by the position: the map describes the field, at the odds at which it would be given
+        up, and the filter began no narrower than its rivals do, or they have come to the same place since.
     moved : tuple of ndarray
         F and Q from the update before to the last one, for a smoother.
     jumps : list of Jump
@@ -89,7 +89,7 @@ class Estimate:
         self.state = State.SEARCHING
 
     def correct(self, there: Array, sigma: float) -> None:
-        """Take in a position, m from the dead-reckoned one, at the time of the last prediction; once there is a filter."""
+        """Take in a position, m from the dead-reckoned one, at the last prediction, if there is a filter."""
         assert self._filter is not None
         self._read()
         if distance(there - self.x[:2], self.P[:2, :2] + sigma**2 * np.eye(2)) > CONTRADICTION:
@@ -201,7 +201,7 @@ class Estimate:
                 self._lost, self._searches = False, 0
 
     def _search_anew(self) -> None:
-        """Look around, further each time, and at any level: where neither fits, the level may be what is wrong."""
+        """Look around, further each time, at any level: where neither fits, the level may be wrong."""
         self._nowhere, self._described, self._lost = 0.0, False, True
         self.options = any_level(self.options, self.grid)
         self._unmapped = Unmapped(self.grid, self.options)

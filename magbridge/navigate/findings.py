@@ -65,7 +65,8 @@ def findings_of(
         findings.append(
             f"the field carries no information for {100.0 * silent.mean():.0f} % of the track: "
             + (
-                f"the map is flat there ({grid.rms:.1f} nT RMS, where calibration and map are known only to {known:.1f} nT)"
+                f"the map is flat there ({grid.rms:.1f} nT RMS, where calibration and map are known only to "
+                f"{known:.1f} nT)"
                 if grid.rms < FLAT * known
                 else f"dead reckoning is as good as this map can be ({_sigma(result, silent):.0f} m)"
             )
@@ -178,8 +179,8 @@ def _told_by_positions(grid: AnomalyGrid, reference_track: xr.Dataset, options: 
     findings = []
     if abs(level) > LEVEL * options.bias_sigma + here:
         findings.append(
-            f"at the known positions the field is {abs(level):.0f} nT {'above' if level > 0 else 'below'} the map's"
-            " level: its main field may be of another epoch, or at another altitude"
+            f"at the known positions the field is {abs(level):.0f} nT {'above' if level > 0 else 'below'} "
+            "the map's level: its main field may be of another epoch, or at another altitude"
         )
     expected = DOUBLE * hypot(options.bias_sigma, options.map_sigma)
     if there < min(BETTER * here, expected) and hypot(north, east) > step:
@@ -189,8 +190,8 @@ def _told_by_positions(grid: AnomalyGrid, reference_track: xr.Dataset, options: 
         )
     elif here > max(sqrt(1.0 - EXPLAINED) * float(np.std(measured)), expected):
         findings.append(
-            f"at the known positions the map leaves {here:.1f} nT of the field's {np.std(measured):.1f} nT unexplained:"
-            " it is not a map of this field"
+            f"at the known positions the map leaves {here:.1f} nT of the field's {np.std(measured):.1f} nT "
+            "unexplained: it is not a map of this field"
         )
     return findings
 

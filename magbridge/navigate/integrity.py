@@ -1,12 +1,13 @@
 """Integrity: whether the filter should still be believed, by comparison with what else could be true.
 
 A filter on the wrong hill is content: its innovations fit, because it has moved to where they do. What shows
-it is that another explanation predicts the same measurements better. Two are kept beside it: *elsewhere*, a bank
-of hypotheses around it that has forgotten where it came from, and *nowhere*, a field as rough as the map and
-with nothing else to do with it.
+it is that another explanation predicts the same measurements better. Two are kept beside it: *elsewhere*, a
+bank of hypotheses around it that has forgotten where it came from, and *nowhere*, a field as rough as the map
+and with nothing else to do with it.
 
 The odds of each against the filter, product of predictive likelihoods, are a martingale as long as the filter
-is right, so they ever exceed c with a probability of at most 1/c (Ville 1939): the threshold is the false-alarm rate.
+is right, so they ever exceed c with a probability of at most 1/c (Ville 1939): the threshold is the
+false-alarm rate.
 """
 
 from __future__ import annotations
@@ -45,7 +46,8 @@ class Unmapped:
     """The field as a smooth random function of the distance, with the map's scatter and correlation length.
 
     What a measurement would look like if the map had nothing to say: Matérn's process of smoothness 3/2, two
-    states (value nT, slope nT/m), to which the bias and the map's error are added as what they add to each step.
+    states (value nT, slope nT/m), to which the bias and the map's error are added as what they
+    add to each step.
 
     Notes
     -----
@@ -65,8 +67,8 @@ class Unmapped:
     def update(self, block: Block, seconds: float, metres: float, blur: float) -> float:
         """Return the log-likelihood of a measurement so long after the one before, and take it in.
 
-        `blur` (nT²) is what the filter's own approximation adds to the measurement's variance: without it here, a
-        filter that still searches would lose to its own caution.
+        `blur` (nT²) is what the filter's own approximation adds to the measurement's variance: without it
+        here, a filter that still searches would lose to its own caution.
         """
         o, rate = self._options, self._rate
         kept = exp(-rate * metres)
@@ -107,7 +109,8 @@ class IntegrityMonitor:
     resolution : float
         m, of the banks.
     level : float
-        nT, 1-sigma of the bias that was claimed; where `options` have more, half of *elsewhere* may be at any level.
+        nT, 1-sigma of the bias that was claimed; where `options` have more, half of *elsewhere* may
+        be at any level.
     """
 
     def __init__(

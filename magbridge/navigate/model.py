@@ -60,7 +60,8 @@ class Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     bias_sigma, bias_time : float
         nT and s: what the calibration leaves, and how long it lasts.
     map_sigma, map_length : float
-        nT and m: the map's error, and how far it reaches. An independent error of each cell is the grid's own.
+        nT and m: the map's error, and how far it reaches. An independent error of each cell is
+        the grid's own.
     noise : float or None
         nT, the part of a sample's sigma that is white; of the rest, what goes beyond ``bias_sigma`` does not
         average out. None: all of it is white.
@@ -135,9 +136,10 @@ def informed(options: Options, calibration: Calibration, sigma: float) -> Option
 
     Notes
     -----
-    White is the noise that the calibration runs showed; one that lasted longer there than a few updates does not
-    average out, it is a bias that lasts as long, and white is what drives it, ``σ √(1 - ρ²)`` with ρ its correlation
-    from sample to sample. What else a calibration gets wrong follows attitude and masses, and lasts for a leg.
+    White is the noise that the calibration runs showed; one that lasted longer there than a few updates does
+    not average out, it is a bias that lasts as long, and white is what drives it, ``σ √(1 - ρ²)`` with ρ its
+    correlation from sample to sample. What else a calibration gets wrong follows attitude and masses, and
+    lasts for a leg.
     """
     noise = calibration.noise
     white = noise.sensor
@@ -219,14 +221,14 @@ def resolution(grid: AnomalyGrid, options: Options, variance: float) -> float:
     Parameters
     ----------
     variance : float
-        nT², of a measurement; to it comes what bias and map error change until the next, at half a spread: those
-        errors last, and so do the curvature's.
+        nT², of a measurement; to it comes what bias and map error change until the next, at half a spread:
+        those errors last, and so do the curvature's.
 
     Notes
     -----
     A spread s sees the curvature k as an error of variance ``(k s²)²/2``. With ``k = √3 σ/L²``, the rms
-    second derivative of a map of scatter σ and covariance ``exp(-r²/2L²)``, that stays below the noise r while
-    ``s² < √2 r/k``; and never more than a quarter of L, beyond which no Taylor series holds.
+    second derivative of a map of scatter σ and covariance ``exp(-r²/2L²)``, that stays below the noise r
+    while ``s² < √2 r/k``; and never more than a quarter of L, beyond which no Taylor series holds.
     """
     length = grid.correlation_length
     if not np.isfinite(length) or grid.rms == 0.0:

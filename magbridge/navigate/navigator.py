@@ -1,4 +1,4 @@
-"""The navigator: telemetry and corrected samples in, in the order of their time; a position with its doubt out.
+"""The navigator: telemetry and corrected samples in, in order of time; a position and its doubt out.
 
 Pure in event time, with nothing random in it: a replay gives the same bits. ::
 

@@ -102,7 +102,7 @@ class Reckoned(NamedTuple):
 
 
 class Jump(NamedTuple):
-    """The estimate began anew: µs, metres from where it was, 1-sigma that dead reckoning alone allowed, why."""
+    """The estimate began anew: µs, metres it jumped, 1-sigma that dead reckoning alone allowed, why."""
 
     time_us: int
     north: float

@@ -23,7 +23,7 @@ REFERENCES = (
 
 
 def reference_track(deployment: xr.Dataset, used: frozenset[str]) -> xr.Dataset | None:
-    """Return the best position that the estimate has not used, with the field there; None if there is none."""
+    """Return the best position that the estimate has not used, with the field there, or None."""
     for pair in REFERENCES:
         if pair[0] not in used and all(name in deployment for name in pair):
             wanted = [*pair, "total_field", *(["depth"] if "depth" in deployment else [])]

@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 
 
 class Innovation(NamedTuple):
-    """What a measurement said: ``value`` nT (or m), its ``variance``, its log-likelihood, whether taken in."""
+    """What a measurement said: ``value`` nT (or m), ``variance``, log-likelihood, whether taken in."""
 
     value: float
     variance: float

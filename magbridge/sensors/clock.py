@@ -1,10 +1,10 @@
 """When a reading was taken, on the host's clock.
 
-A byte arrives after it was sent, never before: ``arrival = device time + offset + drift + delay``, ``delay >= 0``.
-Serial converters and schedulers make the delay anything from nothing to many ms, but now and then it is short.
-So the relation between the two clocks is the straight line that the points (device time, arrival - device time)
-lie above: each block of readings gives its lowest point, and a line is fitted to the lowest points of the last
-blocks. What is left is the shortest delay, a constant.
+A byte arrives after it was sent, never before: ``arrival = device time + offset + drift + delay``,
+``delay >= 0``. Serial converters and schedulers make the delay anything from nothing to many ms, but now and
+then it is short. So the relation between the two clocks is the straight line that the points (device time,
+arrival - device time) lie above: each block of readings gives its lowest point, and a line is fitted to the
+lowest points of the last blocks. What is left is the shortest delay, a constant.
 
 An instrument without a clock is its own clock when it sends at a steady rate: reading n was taken at
 ``n * period``, and the line's slope is the error of its nominal period.
@@ -93,8 +93,9 @@ class DeviceClock:
     def stamp(self, readings: Sequence[Reading], arrival_us: int) -> list[Stamp]:
         """Return when each reading of a chunk was taken, the chunk having arrived at `arrival_us` (µs).
 
-        The last one was delayed the least; the others were already waiting, and tell nothing more of the delay: what
-        waited while the host stood still may come in several chunks, of which only the last ends with a fresh reading.
+        The last one was delayed the least; the others were already waiting, and tell nothing more of the
+        delay: what waited while the host stood still may come in several chunks, of which only the last ends
+        with a fresh reading.
         """
         last = len(readings) - 1
         if not last:

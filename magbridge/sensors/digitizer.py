@@ -26,17 +26,18 @@ offset type  name          meaning
 ====== ===== ============= =============================================================================
 
 COBS (Cheshire & Baker 1999) removes the zeros from the message and makes it one byte longer, so a zero on the
-line is always the end of a frame, and a receiver that lost bytes is right again at the next one. On the line a
-reading takes 38 bytes: 0.25 Hz needs nothing, 100 Hz needs 38,400 bit/s. The first byte after power-on should
-be a zero.
+line is always the end of a frame, and a receiver that lost bytes is right again at the next one. On the line
+a reading takes 38 bytes: 0.25 Hz needs nothing, 100 Hz needs 38,400 bit/s. The first byte after power-on
+should be a zero.
 
-Worked example: reading 7 after the third power-on, x sampled at 1.000000 s, y 0.1 s and z 0.2 s later, 4.25 degC,
-3.712 V, counts 2796203, -1048576, 5592405. The message::
+Worked example: reading 7 after the third power-on, x sampled at 1.000000 s, y 0.1 s and z 0.2 s later,
+4.25 degC, 3.712 V, counts 2796203, -1048576, 5592405. The message::
 
-    01 24 07 00 03 00 40 42 0F 00 E0 C8 10 00 80 4F 12 00 A9 01 80 0E 00 AB AA 2A 00 00 F0 55 55 55 CC 3B C2 3C
+    01 24 07 00 03 00 40 42 0F 00 E0 C8 10 00 80 4F 12 00 A9 01 80 0E 00 AB AA 2A 00 00 F0 55 55
+    55 CC 3B C2 3C
 
-and the frame is in :data:`EXAMPLE`. Counts become volts, ``V = counts / 2^23 * reference_voltage / gain``, and
-volts become ``B = V / sensitivity``.
+and the frame is in :data:`EXAMPLE`. Counts become volts, ``V = counts / 2^23 * reference_voltage / gain``,
+and volts become ``B = V / sensitivity``.
 """
 
 from __future__ import annotations
@@ -55,7 +56,8 @@ from magbridge.sensors.framing import CRC32_RESIDUE, Framer, cobs_decode
 __all__ = ["EXAMPLE", "Digitizer", "DigitizerOptions"]
 
 EXAMPLE = bytes.fromhex(
-    "04 01 24 07 02 03 04 40 42 0F 04 E0 C8 10 04 80 4F 12 05 A9 01 80 0E 04 AB AA 2A 01 09 F0 55 55 55 CC 3B C2 3C 00"
+    "04 01 24 07 02 03 04 40 42 0F 04 E0 C8 10 04 80 4F 12 05 A9 01 80 0E 04 AB AA 2A 01 09 F0 55 55 55 CC "
+    "3B C2 3C 00"
 )
 """The worked example as it stands on the line, delimiter included."""
 

@@ -14,8 +14,8 @@ BLOCK = 8
 POINTS = 16
 """Lowest points that the line is fitted to."""
 SPAN = 4.0
-"""s that a block grows to, and for which every point is late before the line is believed to be another: a computer
-that is busy with something else delays them for a second."""
+"""s that a block grows to, and for which every point is late before the line is believed to be another: a
+computer that is busy with something else delays them for a second."""
 TOLERANCE = 20_000.0
 """µs by which an arrival may contradict the line."""
 DELAY = 5_000.0
@@ -38,8 +38,8 @@ class Floor:
         b   = b_0 + sum (x_k - X) (y_k - Y - b_0 (x_k - X)) / S,   S = sum (x_k - X)^2 + (s / s_b)^2
         s_b = s / sqrt(S)                                          afterwards
 
-    which is least squares with a Gaussian prior of width `s_b` on the slope; s, the scatter of the lowest points,
-    is the mean delay over the number of readings in a block, as it is for exponential delays.
+    which is least squares with a Gaussian prior of width `s_b` on the slope; s, the scatter of the lowest
+    points, is the mean delay over the number of readings in a block, as it is for exponential delays.
     """
 
     def __init__(self, slope_sigma: float) -> None:
@@ -74,7 +74,7 @@ class Floor:
         return TOLERANCE + 3.0 * self._sigma * abs(x - self._x)
 
     def add(self, x: float, y: float, above: float, limit: float) -> float:
-        """Take a point, `above` the line; where blocks of `SPAN` were more than `limit` above, return how far (else 0).
+        """Take a point, `above` the line; return by how much all of `SPAN` exceeded `limit` (else 0).
 
         Such a block is not taken; `lowest` is its lowest point until the next one is added.
         """

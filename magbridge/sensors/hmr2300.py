@@ -1,10 +1,11 @@
 """``hmr2300``: Honeywell's smart digital magnetometer, its binary and its ASCII output.
 
-Facts from Honeywell's data sheet (900139): ±2 gauss as ±30,000 counts, so 15,000 counts/gauss; binary, 7 bytes,
-three 16-bit two's complement numbers, high byte first, and a carriage return; ASCII, 28 characters, three times
-sign, two digits, comma, three digits (leading zeros and their comma are blanks), two blanks between, and a
-carriage return. Neither output has a checksum, a counter or a clock. Commands begin with ``*dd`` (``dd`` the
-device's number, 99 all) and end with a carriage return; a change needs ``*ddWE`` before it.
+Facts from Honeywell's data sheet (900139): ±2 gauss as ±30,000 counts, so 15,000 counts/gauss; binary,
+7 bytes, three 16-bit two's complement numbers, high byte first, and a carriage return; ASCII, 28
+characters, three times sign, two digits, comma, three digits (leading zeros and their comma are blanks),
+two blanks between, and a carriage return. Neither output has a checksum, a counter or a clock. Commands
+begin with ``*dd`` (``dd`` the device's number, 99 all) and end with a carriage return; a change needs
+``*ddWE`` before it.
 """
 
 from __future__ import annotations
@@ -63,9 +64,10 @@ class Hmr2300:
     Notes
     -----
     A carriage return ends a binary frame but may as well be one of its data bytes, and in a steady field may
-    stay at the same place for long (a high byte of 0x0D is a field near 22 µT). So a place is taken for the end
-    of the frame only when it holds a carriage return in `CONFIRM` frames in a row; among several such places the
-    one whose numbers vary least is right, because any other takes low bytes, which are noise, for high bytes.
+    stay at the same place for long (a high byte of 0x0D is a field near 22 µT). So a place is taken for the
+    end of the frame only when it holds a carriage return in `CONFIRM` frames in a row; among several such
+    places the one whose numbers vary least is right, because any other takes low bytes, which are noise,
+    for high bytes.
     """
 
     Options: ClassVar = Hmr2300Options
@@ -141,10 +143,10 @@ def _reading(x: int, y: int, z: int) -> Reading:
 
 
 def _alignment(buffer: bytes, at: int) -> tuple[int, bool]:
-    """Return how many bytes after `at` the first frame begins, and whether one was found in the window at all.
+    """Return how many bytes after `at` the first frame begins, and whether the window has one at all.
 
-    The end of a reply to a command looks like a frame, just before the first real one; what is all text is left
-    out.
+    The end of a reply to a command looks like a frame, just before the first real one; what is all
+    text is left out.
     """
     best, least, found = SIZE, 0, False
     for offset in range(SIZE):

@@ -9,8 +9,8 @@ All numbers are little-endian. Both generations describe a stream before its sam
 
 * generation 1: TIMEBASE, SOURCE and STREAM packets; samples of stream 0 begin with a 32-bit number;
 * generation 2: METADATA packets with records (device, stream, segment, column); samples of streams 1 to 127
-  begin with a 24-bit number and the segment they belong to. A record begins with the length of its fixed part,
-  which later firmware may extend; strings follow.
+  begin with a 24-bit number and the segment they belong to. A record begins with the length of its fixed
+  part, which later firmware may extend; strings follow.
 """
 
 from __future__ import annotations
@@ -44,7 +44,8 @@ SAMPLES = 128
 DEVICE_RECORD, STREAM_RECORD, SEGMENT_RECORD, COLUMN_RECORD = 1, 2, 3, 4
 
 FORMATS = {
-    0x10: "B", 0x11: "b", 0x20: "H", 0x21: "h", 0x40: "I", 0x41: "i", 0x42: "f", 0x80: "Q", 0x81: "q", 0x82: "d",
+    0x10: "B", 0x11: "b", 0x20: "H", 0x21: "h", 0x40: "I", 0x41: "i", 0x42: "f",
+    0x80: "Q", 0x81: "q", 0x82: "d",
 }  # fmt: skip
 """Data type: format character. The high nibble of a type is its size in bytes (24 bits have no character)."""
 
@@ -54,7 +55,8 @@ FLOAT = Struct("<f")
 TIMEBASE_HEAD = Struct("<HBBQIIIf")
 """Number, source, epoch, start, numerator and denominator of the period in µs, flags, stability."""
 SOURCE_HEAD = Struct("<HHIIiHHB")
-"""Number, timebase, period, offset, format, flags, channels, type; then name, columns, title, unit by tabs."""
+"""Number, timebase, period, offset, format, flags, channels, type; then name, columns, title,
+unit by tabs."""
 STREAM_HEAD = Struct("<HHIIQHH")
 """Number, timebase, period in its ticks, offset, sample number, components, flags."""
 COMPONENT = Struct("<HHII")
@@ -80,8 +82,8 @@ class Column(NamedTuple):
 class Stream(NamedTuple):
     """What a sample holds.
 
-    `parts` are generation 1's sources in order, or, in generation 2, the numbers of the columns. `period` is in
-    ticks of the `timebase` (generation 1 only).
+    `parts` are generation 1's sources in order, or, in generation 2, the numbers of the columns. `period` is
+    in ticks of the `timebase` (generation 1 only).
     """
 
     parts: tuple[int, ...]

@@ -226,7 +226,7 @@ class Twinleaf:
         return readings
 
     def _timing(self, number: int, payload: bytes) -> tuple[int, int, int, float] | None:
-        """Return a packet's first sample number, and of its segment the start (s), its number and period (s)."""
+        """Return a packet's first sample number, and its segment's start (s), number and period (s)."""
         if len(payload) < 4:
             raise ValueError
         first = int.from_bytes(payload[:4], "little")

@@ -46,8 +46,8 @@ class Encoder(ABC):
     def encode(self, reading: Reading) -> bytes:
         """Return what it sends for one reading; nothing where it is not streaming.
 
-        Of `reading` it takes the field (nT, finite), `device_time` (s on its own clock, which begins at power-on),
-        `channel_delay`, `temperature` and `supply`, as far as it has them; it counts for itself.
+        Of `reading` it takes the field (nT, finite), `device_time` (s on its own clock, which begins at
+        power-on), `channel_delay`, `temperature` and `supply`, as far as it has them; it counts for itself.
         """
 
     def feed(self, data: bytes) -> bytes:  # noqa: ARG002 - most do not listen

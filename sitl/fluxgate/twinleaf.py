@@ -112,7 +112,9 @@ class TwinleafEncoder(Encoder):
             (tio.DEVICE_RECORD, tio.DEVICE_HEAD.pack(tio.DEVICE_HEAD.size, 0, session, 0, 0, 1)),
             (
                 tio.STREAM_RECORD,
-                tio.STREAM_RECORD_HEAD.pack(tio.STREAM_RECORD_HEAD.size, stream, len(self._columns), 1, size, 0, 0),
+                tio.STREAM_RECORD_HEAD.pack(
+                    tio.STREAM_RECORD_HEAD.size, stream, len(self._columns), 1, size, 0, 0
+                ),
             ),
             (
                 tio.SEGMENT_RECORD,

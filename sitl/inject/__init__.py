@@ -1,11 +1,11 @@
 """Hide an effect in a simulated deployment, with finer physics than anyone would fit to it.
 
-It shares nothing with the detector: heat soaks through a slab where the detector has one time constant, steel has a
-Preisach distribution where it has one backlash, currents flow in wires with a shape, filters and converters are the
-instrument's own, the ionosphere has a spectrum. Each effect is one function of the :class:`~.scene.Scene`, a size and a
-stream of random numbers that draw its direction, place and time; sizes are proportional to what they do, as far as
-physics lets them. What belongs to the vehicle or its instrument is the same on every deployment: only its
-:class:`~.scene.Hidden` draws it.
+It shares nothing with the detector: heat soaks through a slab where the detector has one time constant, steel
+has a Preisach distribution where it has one backlash, currents flow in wires with a shape, filters and
+converters are the instrument's own, the ionosphere has a spectrum. Each effect is one function of the
+:class:`~.scene.Scene`, a size and a stream of random numbers that draw its direction, place and time; sizes
+are proportional to what they do, as far as physics lets them. What belongs to the vehicle or its instrument
+is the same on every deployment: only its :class:`~.scene.Hidden` draws it.
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ def disturb(
     Returns
     -------
     Dataset (time)
-        As :meth:`~sitl.twin.Twin.measure`, with more telemetry. ``attrs["truth"]`` (JSON) holds what a perfect
-        diagnosis would print of a single effect, where physics has such numbers.
+        As :meth:`~sitl.twin.Twin.measure`, with more telemetry. ``attrs["truth"]`` (JSON) holds what a
+        perfect diagnosis would print of a single effect, where physics has such numbers.
     """
     return measure(EFFECTS | FOREIGN, twin, hidden, track, when, seed)

@@ -50,8 +50,8 @@ class _Tap(Instrument, frozen=True):
 def _between(scene: Scene) -> tuple[Array, Array, float]:
     """Field, water and step on a finer grid.
 
-    Between two points a field that turns is no straight line, and a delay would see its chord; masses start and stop
-    at once.
+    Between two points a field that turns is no straight line, and a delay would see its chord; masses start
+    and stop at once.
     """
     track, t = scene.track, scene.t
     turn = rotation(track.roll, track.pitch, track.heading)

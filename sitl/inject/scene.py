@@ -66,7 +66,7 @@ class Scene:
         return self.track.elapsed
 
     def add(self, shape: Array, vector: Array) -> None:
-        """Add ``shape(t) vector`` to the field at the sensor; `vector` (3,) in body axes is what is to be found."""
+        """Add ``shape(t) vector`` to the field at the sensor; `vector` (3,) in body axes is the truth."""
         self.field = self.field + shape[:, None] * vector
         self.truth |= dict(zip("xyz", (self.instrument.matrix() @ vector).tolist(), strict=True))
 
@@ -75,7 +75,7 @@ Effect = Callable[[Scene, float, Generator], None]
 
 
 class Hidden(msgspec.Struct, frozen=True):
-    """One hidden effect: its name in :data:`EFFECTS` or :data:`FOREIGN`, its size, and the seed of all else."""
+    """One hidden effect: name in :data:`EFFECTS` or :data:`FOREIGN`, size, and the seed of all else."""
 
     name: str
     size: float
@@ -89,7 +89,7 @@ def direction(rng: Generator) -> Array:
 
 
 def relays(x: Array, centres: Array, widths: Array) -> Array:
-    """Mean of many relays that a history x (n,) has switched (Preisach 1935), but for what depends on its present alone."""
+    """Mean of many relays that a history x (n,) has switched (Preisach 1935), less what the present tells."""
     total = np.zeros(len(x))
     for c, w in zip(centres, widths, strict=True):
         up, down = x >= c + w / 2, x <= c - w / 2
@@ -99,7 +99,7 @@ def relays(x: Array, centres: Array, widths: Array) -> Array:
 
 
 def furnish(scene: Scene, rng: Generator) -> None:
-    """Log what any vehicle logs, whether it matters or not: two motors' currents, a fin, three temperatures."""
+    """Log what any vehicle logs, needed or not: two motors' currents, a fin, three temperatures."""
     n, t, step = len(scene.t), scene.t, scene.track.step
     moving = np.abs(np.gradient(scene.track.parameters["ballast"], step)) > 1.0
     duty = (autoregressive(rng, (n,), 1.0, 400.0 / step) > 0.8) & ~moving

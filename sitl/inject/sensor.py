@@ -1,4 +1,4 @@
-"""What goes wrong inside the instrument: heat, shocks, age, its converter, its filter, its clock, its range."""
+"""What goes wrong inside the instrument: heat, shocks, age; its converter, filter, clock and range."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ CALIBRATED_AT = 4.5
 
 
 def soaked(surface: Array, step: float, lag: float) -> Array:
-    """Temperature in the middle of a slab whose faces follow `surface`: the series of Carslaw & Jaeger 1959, sec. 3.4.
+    """Temperature in the middle of a slab whose faces follow `surface` (Carslaw & Jaeger 1959, sec. 3.4).
 
     ``lag`` is the slowest mode's time constant, s.
     """
@@ -115,7 +115,7 @@ def bit_flips(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def perming(scene: Scene, size: float, rng: Generator) -> None:
-    """Cores that are never quite saturated remember the fields that they were in, each by relays of its own; size in nT."""
+    """Cores never quite saturated remember past fields, each by relays of its own; size in nT."""
     memory = [
         rng.normal() * relays(h / 2e4, rng.normal(0.0, 0.8, 80), rng.lognormal(np.log(0.6), 0.5, 80))
         for h in scene.field.T
@@ -124,7 +124,7 @@ def perming(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def staircase(scene: Scene, size: float, rng: Generator) -> None:
-    """Most of the field is cancelled in steps, the rest is measured: with another gain, by steps that differ; size in nT."""
+    """Most of the field is cancelled, by uneven steps, the rest measured with another gain; size in nT."""
     step, gain, steps = 4000.0, rng.choice([-1.0, 1.0]), 0.5 * rng.normal(size=(64, 3))
 
     def bend(H: Array) -> Array:
@@ -136,7 +136,7 @@ def staircase(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def brownout(scene: Scene, size: float, rng: Generator) -> None:
-    """The converter's reference follows a supply that sags under every load and as the cells run down; size in 1e-5 of the field at 1 A."""
+    """The converter's reference sags with its supply, by load and charge; in 1e-5 of the field at 1 A."""
     step, load = (
         scene.track.step,
         scene.logged["amps_a"][0] + scene.logged["amps_b"][0] + rng.uniform(0.1, 0.3),
@@ -148,7 +148,7 @@ def brownout(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def ranges(scene: Scene, size: float, rng: Generator) -> None:
-    """Each channel has a second range for large readings, left only when it must be, with another gain; size in nT at full scale."""
+    """Each channel has a range for large readings with another gain, left late; size in nT at full scale."""
     changes, gains = rng.uniform(0.3, 0.6, 3), rng.choice([-1.0, 1.0], 3)
 
     def bend(H: Array) -> Array:
@@ -162,7 +162,7 @@ def ranges(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def sag(scene: Scene, size: float, rng: Generator) -> None:
-    """A core on a bracket leans under its own weight, towards a neighbour and into its field; size in 2e-5 rad at 1 g."""
+    """A core's bracket leans under its weight, towards a neighbour's field; size in 2e-5 rad at 1 g."""
     leaning = int(rng.integers(0, 3))
     neighbour = (leaning + int(rng.integers(1, 3))) % 3
     roll, pitch = np.radians(scene.track.roll), np.radians(scene.track.pitch)
@@ -174,7 +174,7 @@ def sag(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def crossover(scene: Scene, size: float, rng: Generator) -> None:
-    """Where a feedback current changes its sign two transistors take turns, and for a while neither does; size in nT."""
+    """Two transistors take turns as a feedback current changes sign, and pause between; size in nT."""
     widths, gaps = rng.uniform(600.0, 2500.0, 3), rng.lognormal(0.0, 0.5, 3) * rng.choice([-1.0, 1.0], 3)
 
     def bend(H: Array) -> Array:
@@ -185,7 +185,7 @@ def crossover(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def popcorn(scene: Scene, size: float, rng: Generator) -> None:
-    """A defect in the voltage reference traps a charge and lets it go again, at random: two gains; size in 1e-5 of the field."""
+    """A defect in the voltage reference traps a charge at random: two gains; size in 1e-5 of the field."""
     dwell = rng.exponential(1.0, len(scene.t)) * np.resize(rng.uniform(200.0, 1800.0, 2), len(scene.t))
     trapped = np.searchsorted(np.cumsum(dwell), scene.t) % 2
     scene.field = scene.field * (1.0 + 1e-5 * size * trapped[:, None])

@@ -43,7 +43,7 @@ def wrong_level(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def hum(scene: Scene, size: float, rng: Generator) -> None:
-    """A machine's field at a steady frequency with a second harmonic, seen through the sampling; size in nT."""
+    """A machine's field at a steady frequency, and its second harmonic, seen by the sampling; size in nT."""
     f = rng.uniform(0.1, 0.4) * scene.instrument.rate
     phase = 2 * np.pi * f * scene.t + 0.1 * np.sin(scene.t / 3000.0)
     a, b = direction(rng), direction(rng)
@@ -59,7 +59,10 @@ def ship(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def pulsation(scene: Scene, size: float, rng: Generator) -> None:
-    """Field lines ring after a gust of solar wind: packets of Pc5, periods of 150 to 600 s (Jacobs et al. 1964); size in nT."""
+    """Field lines ring after a gust of solar wind: packets of Pc5 (Jacobs et al. 1964); size in nT.
+
+    Their periods are 150 to 600 s.
+    """
     total = np.zeros_like(scene.t)
     for _ in range(4):
         t0, length = rng.uniform(0.0, 1.0) * scene.t[-1], rng.uniform(600.0, 2400.0)
@@ -70,7 +73,7 @@ def pulsation(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def swell(scene: Scene, size: float, rng: Generator) -> None:
-    """Sea water that a swell moves through the Earth's field, the less the deeper (Weaver 1965); size in nT at the surface."""
+    """Sea water moved by a swell through the Earth's field (Weaver 1965); size in nT at the surface."""
     track, omega = scene.track, 2 * np.pi / rng.uniform(11.0, 17.0)
     wave = omega**2 / 9.81
     course = rng.uniform(0.0, 2 * np.pi)
@@ -82,7 +85,7 @@ def swell(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def storm(scene: Scene, size: float, rng: Generator) -> None:
-    """A magnetic storm: the wind's shock, then a ring current that it feeds by fits and starts (Burton et al. 1975); size in nT."""
+    """A magnetic storm: the wind's shock, then a ring current (Burton et al. 1975); size in nT."""
     t0 = rng.uniform(0.1, 0.4) * scene.t[-1]
     since = scene.t - t0
     after = since > rng.uniform(900.0, 3600.0)
@@ -100,7 +103,7 @@ def storm(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def mains(scene: Scene, size: float, rng: Generator) -> None:
-    """A three-phase cable on the bottom: 50 Hz as its grid keeps them, seen through the sampling, louder the nearer; size in nT at 100 m."""
+    """A three-phase cable on the bottom, 50 Hz as sampled, louder the nearer; size in nT at 100 m."""
     track, t = scene.track, scene.t
     north, east = track.local(track.latitude, track.longitude)
     k, course = rng.integers(len(t)), rng.uniform(0.0, np.pi)
@@ -117,7 +120,7 @@ def mains(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def astray(scene: Scene, size: float, rng: Generator) -> None:
-    """Under water nobody knows the current, so the map is read beside the way until the next fix; size in nT after half an hour."""
+    """The current under water is unknown, so the map is read off track; size in nT after half an hour."""
     top = scene.track.depth < scene.track.depth.min() + 0.1 * np.ptp(scene.track.depth)
     fixed = scene.t[np.maximum.accumulate(np.where(top, np.arange(len(top)), 0))]
     current = autoregressive(rng, (len(top),), 1.0, 7200.0 / scene.track.step) + rng.choice([-1.0, 1.0])

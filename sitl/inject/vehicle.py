@@ -1,4 +1,4 @@
-"""What goes wrong with the vehicle: currents, iron that moves, remembers or is squeezed, conductors that turn."""
+"""What goes wrong with the vehicle: currents, iron that moves, remembers or is strained, conductors."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ FIN = np.radians(12.0)
 
 
 def wires(scene: Scene, size: float, rng: Generator) -> None:
-    """A motor's supply loop: four straight wires by Biot and Savart; size times the field of a loop 30 cm away."""
+    """A motor's supply loop, four wires by Biot and Savart; size times the field of a loop 30 cm away."""
     name = str(rng.choice(["amps_a", "amps_b"]))
     centre, u = 0.3 * direction(rng), direction(rng)
     v = np.cross(u, direction(rng))
@@ -34,7 +34,7 @@ def wires(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def magnet_on_fin(scene: Scene, size: float, rng: Generator) -> None:
-    """A magnet on a lever that another actuator turns: a dipole that moves and turns; size in nT at 12 deg."""
+    """A magnet on a lever that another actuator turns moves and turns; size in nT at 12 deg."""
     arm, m = np.array([0.08, 0.0, 0.0]), direction(rng)
     place = np.array([-0.5, 0.1, 0.1]) + 0.1 * rng.normal(size=3)
 
@@ -63,9 +63,10 @@ def preisach(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def ring(scene: Scene, size: float, rng: Generator) -> None:
-    """A conducting ring with inductance, where its own field stands across its axis; size in s times the field's change.
+    """A conducting ring with inductance; size in s times the field's change.
 
-    A dipole n seen from p is ``3 p (p . n) - n``: at the magic angle, ``(p . n)^2 = 1/3``, it has nothing along n.
+    It lies where its own field stands across its axis. A dipole n seen from p is ``3 p (p . n) - n``: at the
+    magic angle, ``(p . n)^2 = 1/3``, it has nothing along n.
     """
     normal = np.eye(3)[rng.integers(3)] + 0.05 * rng.normal(size=3)
     normal /= np.linalg.norm(normal)
@@ -96,7 +97,7 @@ def relay(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def pan(scene: Scene, size: float, rng: Generator) -> None:
-    """A scanning head that nothing logs: its magnet sweeps a sector to and fro, no two sweeps of one length; size in nT."""
+    """An unlogged scanning head: its magnet sweeps a sector, no two sweeps of one length; size in nT."""
     turns = np.cumsum(rng.uniform(0.02, 0.06, 80)) * scene.t[-1]
     angle = np.radians(150.0) * np.interp(scene.t, turns, (-1.0) ** np.arange(80))
     a, b = direction(rng), direction(rng)
@@ -104,7 +105,7 @@ def pan(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def loose(scene: Scene, size: float, rng: Generator) -> None:
-    """A magnet that came loose slides to whichever end is low, and sticks until the hull tips the other way; size in nT."""
+    """A loose magnet slides to the lower end, and sticks until the hull tips the other way; size in nT."""
     tip = scene.track.pitch - rng.uniform(-5.0, 5.0)
     stick = rng.uniform(5.0, 12.0)
     last = np.maximum.accumulate(np.where(np.abs(tip) > stick, np.arange(len(tip)), 0))
@@ -113,14 +114,14 @@ def loose(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def corrosion(scene: Scene, size: float, rng: Generator) -> None:
-    """A galvanic current through the hull: paint and fouling let it wander within the hour, speed feeds it; size in nT."""
+    """A galvanic current in the hull: paint and fouling let it wander, speed feeds it; size in nT."""
     wander = autoregressive(rng, (len(scene.t),), 1.0, 2500.0 / scene.track.step)
     fed = np.sqrt(1.0 + np.abs(np.gradient(scene.track.depth, scene.track.step)))
     scene.field = scene.field + size * direction(rng) * (fed * wander)[:, None]
 
 
 def needle(scene: Scene, size: float, rng: Generator) -> None:
-    """A payload's own compass: a card that floats level and points north, but is dragged along in turns; size in nT."""
+    """A payload's compass: a card that points north, floats level, and is dragged in turns; size in nT."""
     track = scene.track
     turned = np.radians(track.heading)
     dragged = rng.uniform(0.1, 0.4) * (
@@ -133,7 +134,7 @@ def needle(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def thermostat(scene: Scene, size: float, rng: Generator) -> None:
-    """A payload that nothing logs keeps itself warm, between two temperatures: the colder the water, the longer it heats; size in nT."""
+    """An unlogged payload heats itself, the longer the colder the water, then cools; size in nT."""
     lag, band = rng.uniform(400.0, 1200.0), rng.uniform(1.0, 3.0)
     warm, heats, on = 15.0, False, np.empty(len(scene.t))
     for k, water in enumerate(scene.water):
@@ -144,7 +145,7 @@ def thermostat(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def cargo(scene: Scene, size: float, rng: Generator) -> None:
-    """Iron in a sling stays below when the hull rolls, but its bearing rubs; the Earth's field is induced in it; size in nT."""
+    """Iron in a sling stays below in a roll, but its bearing rubs; magnetised by induction; size in nT."""
     roll, rubs, held = scene.track.roll, rng.uniform(1.0, 3.0), 0.0
     hung = np.empty_like(roll)
     for k, angle in enumerate(roll):
@@ -160,7 +161,7 @@ def cargo(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def contact(scene: Scene, size: float, rng: Generator) -> None:
-    """A corroded joint that pressure closes leads part of a motor's current through the hull, each time another part; size in nT/A."""
+    """A corroded joint that pressure closes leads a varying part of a motor's current; size in nT/A."""
     name = str(rng.choice(["amps_a", "amps_b"]))
     closes = rng.uniform(0.25, 0.6) * scene.track.depth.max()
     shut, part, leads = False, 0.0, np.empty(len(scene.t))
@@ -172,7 +173,7 @@ def contact(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def strobe(scene: Scene, size: float, rng: Generator) -> None:
-    """A payload that nothing logs works a part of each cycle, and its clock slows as its cells run down; size in nT."""
+    """An unlogged payload works a part of each cycle; its clock slows with its cells; size in nT."""
     along = scene.t / scene.t[-1]
     slower = rng.uniform(0.15, 0.4) * along**2 + 0.01 * autoregressive(
         rng, (len(along),), 1.0, 900.0 / scene.track.step
@@ -184,7 +185,10 @@ def strobe(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def rotor(scene: Scene, size: float, rng: Generator) -> None:
-    """A brushless motor's rotor comes to rest in another of its dozen cogs after each run; as it spins it averages out; size in nT."""
+    """A brushless motor's rotor rests in another of a dozen cogs after each run; size in nT.
+
+    As it spins its field averages out.
+    """
     name = str(rng.choice(["ballast", "battpos"]))
     runs = np.abs(np.gradient(scene.track.parameters[name])) > 1e-6
     turn = np.cumsum(np.diff(runs, prepend=runs[0]) & runs)
@@ -198,7 +202,10 @@ def rotor(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def viscous(scene: Scene, size: float, rng: Generator) -> None:
-    """Steel plate creeps after the field that it lies in, by minutes to hours (magnetic viscosity), mostly in its plane; size in nT."""
+    """Steel plate creeps after the field that it lies in, by minutes to hours, mostly in plane; size in nT.
+
+    That is magnetic viscosity.
+    """
     lags = 120.0 * 3.0 ** np.arange(5)
     unit = scene.field / np.linalg.norm(scene.field[0])
     crept = np.mean([first_order(unit, scene.track.step, float(lag)) for lag in lags], axis=0)
@@ -210,7 +217,10 @@ def viscous(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def slip(scene: Scene, size: float, rng: Generator) -> None:
-    """The battery's encoder miscounts in every move, until an end stop sets it right, every dozen or so; size in inches a move."""
+    """The battery's encoder miscounts in every move, until an end stop sets it right; size in inches a move.
+
+    That happens every dozen moves or so.
+    """
     place = scene.track.parameters["battpos"]
     way = np.abs(np.diff(place, prepend=place[0]))
     runs = np.cumsum(np.diff(way > 1e-6, prepend=False) & (way > 1e-6))
@@ -223,7 +233,7 @@ def slip(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def motional(scene: Scene, size: float, rng: Generator) -> None:
-    """Two metals on the hull short the field that its own way through the Earth's induces, v x B; size in nT at 0.3 m/s across it."""
+    """Two metals on the hull short the field v x B of their own way; size in nT at 0.3 m/s across B."""
     track = scene.track
     north, east = track.local(track.latitude, track.longitude)
     v = np.gradient(np.column_stack([north, east, track.depth]), track.step, axis=0)
@@ -244,7 +254,7 @@ def leak(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def discharge(scene: Scene, size: float, rng: Generator) -> None:
-    """What cells are made of becomes more magnetic as charge is drawn, and they hang on the mass that moves; size in nT at the end."""
+    """Cells become more magnetic as they discharge, on the mass that moves; size in nT at the end."""
     load = scene.logged["amps_a"][0] + scene.logged["amps_b"][0] + rng.uniform(0.05, 0.2)
     drawn = (np.cumsum(load) / np.sum(load)) ** rng.uniform(1.0, 2.0)
     place = scene.track.parameters["battpos"]
@@ -253,7 +263,7 @@ def discharge(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def towed(scene: Scene, size: float, rng: Generator) -> None:
-    """Something magnetic on a line astern swings out in turns, and back when they end; size in nT at 1 deg/s."""
+    """A magnet on a line astern swings out in turns, and back when they end; size in nT at 1 deg/s."""
     rate = np.gradient(scene.track.heading, scene.track.step)
     swung = first_order(
         first_order(rate, scene.track.step, 8.0), scene.track.step, float(rng.uniform(5.0, 30.0))
@@ -263,14 +273,14 @@ def towed(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def sunlit(scene: Scene, size: float, rng: Generator) -> None:
-    """The sun warms a dark housing near the surface, and water cools it; no thermometer is there; size in nT at its warmest."""
+    """The sun warms a dark, unmeasured housing near the surface, water cools it; size in nT at most."""
     shines = np.exp(-scene.track.depth / rng.uniform(3.0, 10.0))
     warm = first_order(shines, scene.track.step, float(rng.uniform(200.0, 900.0)))
     scene.field = scene.field + size * direction(rng) * ((warm - warm[0]) / np.ptp(warm))[:, None]
 
 
 def eccentric(scene: Scene, size: float, rng: Generator) -> None:
-    """The gear of the battery's encoder runs out of true: what it tells is off by a wave at each turn; size in inches."""
+    """The gear of the battery's encoder is eccentric: an error of a wave each turn; size in inches."""
     place = scene.track.parameters["battpos"]
     turn = 2.0 * np.pi * place / rng.uniform(0.2, 0.5) + rng.uniform(0.0, 2.0 * np.pi)
     scene.logged["battpos"] = (place + size * np.sin(turn), "in")

@@ -1,4 +1,4 @@
-"""What goes wrong on the link, one fault after the other, to one bridge that must live through all of them."""
+"""What goes wrong on the link, one fault after the other, to one bridge that must survive all of them."""
 
 from __future__ import annotations
 
@@ -64,8 +64,11 @@ def test_telemetry_stale(rig: Rig, table: Row, how: str) -> None:
         assert bool(message["flags"] & Quality.STALE_TELEMETRY) == (message["telemetry_age"] > 0.5)
     assert rig.flags(mark) in ("stale_telemetry", "stale_telemetry moving")
     table(
-        f"telemetry {'frozen: the same message over and over' if how == 'frozen' else 'stops while the autopilot carries on'}",
-        f"after `max_age` (0.5 s; seen after {noticed:.2f} s) `stale_telemetry`, a growing sigma and `telemetry_age`, the parameter's bit in `telemetry_stale`, STATUSTEXT",
+        "telemetry frozen: the same message over and over"
+        if how == "frozen"
+        else "telemetry stops while the autopilot carries on",
+        f"after `max_age` (0.5 s; seen after {noticed:.2f} s) `stale_telemetry`, a growing sigma and "
+        "`telemetry_age`, the parameter's bit in `telemetry_stale`, STATUSTEXT",
         seconds(back),
         "nothing",
     )
@@ -133,7 +136,10 @@ def test_second_system_on_the_link(rig: Rig, table: Row) -> None:
             frame,
             other.pack("NAMED_VALUE_FLOAT", **fields),
             other.pack("HEARTBEAT", type=12, autopilot=3),
-            other.pack("PARAM_SET", target_system=2, target_component=191, param_id="MB_GAP_FACTOR", param_value=9, param_type=REAL32),
+            other.pack(
+                "PARAM_SET", target_system=2, target_component=191, param_id="MB_GAP_FACTOR", param_value=9,
+                param_type=REAL32,
+            ),
         ]  # fmt: skip
 
     rig.autopilot.retell = join
@@ -199,7 +205,8 @@ def test_parameter_out_of_range(rig: Rig, table: Row) -> None:
     mark = rig.mark
     for value in (0.5, float("nan"), float("inf"), -1.0):
         rig.autopilot.say(
-            "PARAM_SET", target_system=1, target_component=191, param_id="MB_GAP_FACTOR", param_value=value, param_type=REAL32,
+            "PARAM_SET", target_system=1, target_component=191, param_id="MB_GAP_FACTOR", param_value=value,
+            param_type=REAL32,
         )  # fmt: skip
     rig.until_said("MB_GAP_FACTOR: 0.5 is not within 1.01 to 1000", mark)
     rig.until(lambda: len(rig.of("PARAM_VALUE", mark)) == 4)
@@ -249,7 +256,8 @@ def test_udp_peer_gone_and_back(rig: Rig, table: Row) -> None:
     assert after["samples_lost"] == rig.until_status(lambda _: True)["samples_lost"]
     table(
         "autopilot link down (UDP: the port closes), up again after 5.7 s",
-        'nothing gets through; in the log, `stale_telemetry` after `max_age`, "autopilot 1:1 is silent" after 5 s',
+        'nothing gets through; in the log, `stale_telemetry` after `max_age`, "autopilot 1:1 is silent" '
+        "after 5 s",
         seconds(back),
         f"messages to the autopilot, visible in MAG_FIELD's `sequence` ({lost} here); the log has them all",
     )

@@ -27,7 +27,7 @@ def bridge(folder: Path, start: Start) -> Pipeline:
 
 
 def events(pipeline: Pipeline, begin: int, end: int) -> Iterator[Event]:
-    """20 samples/s, each 30 ms old when it comes; a mass that moves all the time, told at 5 Hz with the boot clock."""
+    """20 samples/s, each 30 ms old on arrival; a mass that always moves, told at 5 Hz by the boot clock."""
     autopilot = Codec(1, 1)
     for k in range(begin, end):
         t_us = START + 50_000 * k

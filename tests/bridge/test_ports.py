@@ -83,7 +83,7 @@ def test_a_slow_line_loses_whole_messages() -> None:
 
 
 def test_a_backlog_of_a_line_is_read_at_once() -> None:
-    """Of an instrument without a clock only the last reading of a backlog tells when it was sent: none is missing."""
+    """Without a clock only the last reading of a backlog tells when it was sent: none is missing."""
     driver = open_driver("ascii", {"columns": ["x", "y", "z"], "rate": 100.0})
     clock = DeviceClock.of(driver)
     master, slave = pty.openpty()
@@ -105,7 +105,7 @@ def test_a_backlog_of_a_line_is_read_at_once() -> None:
 
 
 def test_a_serial_line_behind_a_socket() -> None:
-    """Read in pieces as they come; why it does not open is told in a few words, without the name once more."""
+    """Read in pieces as they come; why it does not open is told in few words, without its name again."""
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = SerialPort(f"socket://127.0.0.1:{server.getsockname()[1]}", 9600)
         port.open()

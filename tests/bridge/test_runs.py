@@ -1,4 +1,4 @@
-"""Faults that need a bridge of their own: another link, another clock, a key, a disk, an end without warning."""
+"""Faults that need their own bridge: another link, another clock, a key, a disk, an abrupt end."""
 
 from __future__ import annotations
 
@@ -69,7 +69,8 @@ def test_tcp_server_gone_and_back(make_rig: MakeRig, table: Row) -> None:
     assert sequences == sorted(sequences)
     table(
         "autopilot link down (TCP: the server closes), up again after 1.2 s",
-        '"link: closed by the other end" in the log, then "link: open" over the link; `stale_telemetry` in between',
+        '"link: closed by the other end" in the log, then "link: open" over the link; `stale_telemetry` in '
+        "between",
         f"{back:.2f} s",
         f"messages to the autopilot, visible in MAG_FIELD's `sequence` ({lost} here); the log has them all",
     )
@@ -92,7 +93,8 @@ def test_autopilot_on_a_serial_line_pulled_out_and_back(make_rig: MakeRig, table
     lost = rig.of("MAG_FIELD", mark)[0]["sequence"] - last - 1
     table(
         "autopilot on a serial line: pulled out, back after 1.0 s",
-        '"link: No such file or directory" in the log, then "link: open" over the link; `stale_telemetry` in between',
+        '"link: No such file or directory" in the log, then "link: open" over the link; `stale_telemetry` '
+        "in between",
         f"{back:.2f} s",
         f"messages to the autopilot, visible in MAG_FIELD's `sequence` ({lost} here); the log has them all",
     )
@@ -127,7 +129,8 @@ def test_host_clock_set_forward_and_back(make_rig: MakeRig, table: Row) -> None:
     assert times == sorted(times)
     table(
         "host clock set 1 h forward, then 2 h back",
-        f"STATUSTEXT ({noticed:.2f} s after the step), and from then on the published UNIX times follow; no flag, because no interval is measured with that clock",
+        f"STATUSTEXT ({noticed:.2f} s after the step), and from then on the published UNIX times follow; no "
+        "flag, because no interval is measured with that clock",
         "at once",
         "nothing; samples between the step and the STATUSTEXT carry the old UNIX time",
     )
@@ -158,7 +161,8 @@ def test_forged_signed_packets(make_rig: MakeRig, table: Row) -> None:
     assert rig.undue_flags(mark) == ""
     assert all(message.frame[2] & 1 for _, message in rig.heard)
     table(
-        "forged packets: a time stamp far in the future, another key, no signature, a replayed genuine packet",
+        "forged packets: a time stamp far in the future, another key, no signature, a replayed genuine "
+        "packet",
         "no change; the genuine packets that follow are accepted",
         "at once",
         f"the forged packets: `link_refused` {len(wrong)}",
@@ -265,7 +269,9 @@ def test_a_log_that_is_removed(make_rig: MakeRig, table: Row) -> None:
         "somebody deletes the log while it is being written",
         f'the field goes on without a flag; STATUSTEXT "{said}", `log_state` failed',
         f"{mended:.1f} s, in a new file",
-        f"the deleted log and the records until the new one: `log_lost` {rig.status['log_lost']} records; the new one lacks what the bridge knew when it began; its replay says so, and in how many samples the field is the same",
+        f"the deleted log and the records until the new one: `log_lost` {rig.status['log_lost']} records; "
+        "the new one lacks what the bridge knew when it began; its replay says so, and in how many samples "
+        "the field is the same",
     )
 
 
@@ -310,7 +316,8 @@ def test_killed_without_warning(make_rig: MakeRig, table: Row) -> None:
         "`kill -9`, started again",
         "nothing, then a normal start. Parameters set over the link are kept",
         f"{back:.1f} s after the start",
-        f"at most the last event of the log: {len(missing)} messages here; the rest replays to the same bytes",
+        f"at most the last event of the log: {len(missing)} messages here; the rest replays to the same "
+        "bytes",
     )
 
 

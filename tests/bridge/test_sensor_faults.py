@@ -1,7 +1,7 @@
-"""What goes wrong on the sensor's line, one fault after the other, to one bridge that must live through all of them.
+"""What goes wrong on the sensor's line, one fault after the other, to one bridge that survives all of them.
 
-Every test waits until all is well, does the damage, and says what was published meanwhile, how long it took and
-what was lost. In the end the log of it all is replayed.
+Every test waits until all is well, does the damage, and says what was published meanwhile, how long it took
+and what was lost. In the end the log of it all is replayed.
 """
 
 from __future__ import annotations
@@ -63,7 +63,8 @@ def test_sensor_silent(rig: Rig, table: Row) -> None:
     assert lost > 20
     table(
         "sensor silent on an open line",
-        "heartbeat critical, `sensor_state` silent and STATUSTEXT after `sensor.timeout`; the start-up commands are repeated every `timeout`",
+        "heartbeat critical, `sensor_state` silent and STATUSTEXT after `sensor.timeout`; the start-up "
+        "commands are repeated every `timeout`",
         seconds(back),
         f"what the sensor did not send: `samples_lost` {lost}",
     )
@@ -87,7 +88,8 @@ def test_garbage_from_the_sensor(rig: Rig, table: Row) -> None:
         "3,000 bytes of noise from the sensor",
         f"`{rig.flags(mark) or 'no flag'}` on the next sample",
         seconds(back),
-        f"the frame hit by the noise: `samples_lost` {lost}, `sensor_frames_bad` {bad}, `sensor_bytes_skipped` {skipped}",
+        f"the frame hit by the noise: `samples_lost` {lost}, `sensor_frames_bad` {bad}, "
+        f"`sensor_bytes_skipped` {skipped}",
     )
     assert back < 0.5
 
@@ -148,7 +150,8 @@ def test_sensor_back_under_another_name_and_powered_anew(rig: Rig, table: Row) -
     assert sigma > 20
     table(
         "sensor unplugged, back under another name after a power cycle",
-        f"as above; then `offset_suspect` with sigma {sigma:.0f} nT (`turn_on_sigma`) for the rest of the run, because its offset may have settled elsewhere",
+        f"as above; then `offset_suspect` with sigma {sigma:.0f} nT (`turn_on_sigma`) for the rest of the "
+        "run, because its offset may have settled elsewhere",
         seconds(back),
         "the readings in between; their number is unknown, because the sensor's counter started over",
     )

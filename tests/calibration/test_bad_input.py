@@ -141,7 +141,8 @@ def test_a_run_given_twice_counts_once(
     ("edit", "words"),
     [
         (lambda text: text[:500], "truncated"),
-        (lambda text: text.replace('"format":1', '"format":99').replace('"format": 1', '"format": 99'), "newer magbridge"),
+        (lambda text: text.replace('"format":1', '"format":99').replace('"format": 1', '"format": 99'),
+         "newer magbridge"),
         (lambda text: text.replace('"coefficients":[', '"coefficients":["x",').replace(
             '"coefficients": [', '"coefficients": ["x",'), "coefficients"),
     ],

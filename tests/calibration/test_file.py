@@ -109,17 +109,21 @@ EDITS: dict[str, tuple[Callable[[dict[str, Any]], Any], type[Exception], str]] =
     "missing": (lambda c: c.pop("reference"), FormatError, "reference"),
     "unknown term": (lambda c: c["terms"][0].update(kind="warp"), FormatError, "term 'warp' is not known"),
     "no kind": (lambda c: c["terms"][0].pop("kind"), FormatError, "without its kind"),
-    "a coefficient less": (lambda c: c["coefficients"].pop(), CalibrationError, "covariance: expected 38 x 38"),
+    "a coefficient less": (
+        lambda c: c["coefficients"].pop(), CalibrationError, "covariance: expected 38 x 38"),
     "a row less": (_drop_row, CalibrationError, "covariance: expected 39"),
     "negative variance": (
         lambda c: c["covariance"][0].__setitem__(0, -1.0), CalibrationError, "a variance is negative"),
     "not symmetric": (
-        lambda c: c["covariance"][0].__setitem__(1, c["covariance"][0][1] + 0.5), CalibrationError, "symmetric"),
+        lambda c: c["covariance"][0].__setitem__(1, c["covariance"][0][1] + 0.5), CalibrationError,
+        "symmetric"),
     "no field": (lambda c: c["reference"].update(field=0.0), CalibrationError, "reference: field"),
     "no scale": (lambda c: c["parameters"][0].update(scale=0.0), CalibrationError, "scale > 0"),
-    "another parameter": (lambda c: c["parameters"][0].update(name="fin"), CalibrationError, "'battpos' is not one of"),
+    "another parameter": (
+        lambda c: c["parameters"][0].update(name="fin"), CalibrationError, "'battpos' is not one of"),
     "exponents": (
-        lambda c: c["terms"][0].update(exponents=[[0, 0], [1, 0], [2, 0]]), CalibrationError, "one for each parameter"),
+        lambda c: c["terms"][0].update(exponents=[[0, 0], [1, 0], [2, 0]]), CalibrationError,
+        "one for each parameter"),
     "an effect among terms": (
         lambda c: c["terms"].append(c["effects"].pop()), CalibrationError, "terms and effects"),
 }  # fmt: skip
@@ -154,8 +158,9 @@ def test_any_edit_is_read_or_refused_in_one_line(data: st.DataObject, cal: Calib
         key = data.draw(st.sampled_from(keys))
         if not isinstance(place[key], (dict, list)) or data.draw(st.booleans()):
             place[key] = data.draw(
-                st.none() | st.booleans() | st.floats(allow_nan=False, allow_infinity=False) | st.text(max_size=3)
-                | st.integers(-(2**70), 2**70) | st.lists(st.integers(-5, 99), max_size=3)
+                st.none() | st.booleans() | st.floats(allow_nan=False, allow_infinity=False)
+                | st.text(max_size=3) | st.integers(-(2**70), 2**70)
+                | st.lists(st.integers(-5, 99), max_size=3)
             )  # fmt: skip
             break
         place = place[key]

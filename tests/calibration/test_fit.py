@@ -154,13 +154,14 @@ def test_auto_is_near_the_noise_floor_out_of_sample(
     # under noise with memory the bound itself is 1.06, and four gliders are few
     assert np.median(ratios) < (1.13 if memory else 1.10)
     assert max(ratios) < 1.5
-    # what the fit takes out of the residuals is counted: their memory alone is 0.01 to 0.02 shorter than the noise's
+    # what the fit takes out of the residuals is counted: their memory alone is 0.01 to 0.02 shorter
+    # than the noise's
     assert np.mean(memories) == pytest.approx(np.exp(-1.0 / memory) if memory else 0.0, abs=0.01)
     assert 0.8 < np.median(spreads) < 1.25
 
 
 def test_the_paper_s_signature(glider: Gliders) -> None:
-    """Cubic looks as good as auto on its runs, and is several times worse on the survey; nominal is far off."""
+    """Cubic looks as good as auto on its runs, but is several times worse on the survey; nominal fails."""
     one = glider(0)
     by = {method: fit(one.runs, method) for method in ("nominal", "cubic", "auto")}
     assert by["cubic"].rms < 1.1

@@ -15,7 +15,7 @@ CORNER = 0.33
 
 @pytest.mark.parametrize(("step", "noise"), [(4.0, 0.0), (1.0, 0.0), (0.1, 0.5)])
 def test_a_turning_field_has_its_length_again(step: float, noise: float) -> None:
-    """A spiral of four minutes a turn through an exact RC filter: short by tau^2 |dx/dt|^2 / 2 |x|, then no more."""
+    """A spiral of four minutes a turn, RC-filtered: short by tau^2 |dx/dt|^2 / 2 |x|, then no more."""
     fine, tau, turn = 0.02, 1.0 / (2.0 * np.pi * CORNER), 2.0 * np.pi / 240.0
     t = np.arange(0.0, 2400.0, fine)
     true = np.column_stack(

@@ -108,7 +108,7 @@ def test_warnings_are_in_a_pilot_s_words(glider: Gliders) -> None:
 
 
 def test_a_fit_from_a_corner_of_the_compass_is_not_supported(glider: Gliders) -> None:
-    """Any iron fits samples that all head one way: seen on a real ArduSub, 300 nT on its own and 1,700 nT beyond."""
+    """Any iron fits samples that all head one way: a real ArduSub was 300 nT off there, 1,700 beyond."""
     runs = glider(0, 2).runs
     turned = np.degrees(runs.attitude[:, 2]) % 360.0
     found = fit(runs.part((turned > 200.0) & (turned < 260.0)), "nominal")
@@ -143,7 +143,8 @@ def test_planned_runs_beat_table_1(glider: Gliders) -> None:
     ned = one.runs.reference_ned[0]
     paper = evaluate_runs(
         before, mission, ned,
-        [PlannedRun(pitch, 6.0, (battery, float(np.copysign(200.0, pitch)))) for _, pitch, battery, _ in TABLE_1],
+        [PlannedRun(pitch, 6.0, (battery, float(np.copysign(200.0, pitch))))
+         for _, pitch, battery, _ in TABLE_1],
     )  # fmt: skip
     limits = Limits(roll=(-6.0, 6.0), pitch_at=trim_of(one.runs), flown=settled(one.runs))
     ours = plan(before, mission, ned, limits, runs=6)

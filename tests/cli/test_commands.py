@@ -201,7 +201,7 @@ def test_help_names_every_command(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_what_takes_long_says_that_it_is_at_work(monkeypatch: pytest.MonkeyPatch) -> None:
-    """On a real terminal, a pty: nothing at first, then the step and a clock; and it leaves the line clean."""
+    """On a real terminal, a pty: nothing at first, then step and clock; and it leaves the line clean."""
     master, slave = pty.openpty()
     os.set_blocking(master, False)
     with os.fdopen(slave, "w") as terminal:

@@ -43,13 +43,15 @@ def _right(rows: int) -> Problem:
     d = rng.normal(size=(rows, 3))
     survey = Survey(
         time=1.7e9 + 4.0 * np.arange(rows), field=5e4 * d / np.linalg.norm(d, axis=1)[:, None],
-        reference=np.full(rows, 5e4), still=(), steps=np.where(np.arange(rows) > 0, 1, FAR), dive=np.arange(rows) // 50, place=None,
-        attitude=None, learned=np.zeros(rows, bool), cycles=np.empty(0), source="made",
+        reference=np.full(rows, 5e4), still=(), steps=np.where(np.arange(rows) > 0, 1, FAR),
+        dive=np.arange(rows) // 50, place=None, attitude=None, learned=np.zeros(rows, bool),
+        cycles=np.empty(0), source="made",
         channels={"p": Channel(np.linspace(-1.0, 1.0, rows), "in", ("position",))},
     )  # fmt: skip
     calibration = Calibration(
         parameters=(Parameter("p", "in", -1.0, 1.0, 0.0, 1.0),), terms=(Polynomial(exponents=((0,),)),),
-        coefficients=np.zeros(9), covariance=np.diag(np.full(9, 1e-6)), noise=Noise(1.0), reference=Reference(5e4),
+        coefficients=np.zeros(9), covariance=np.diag(np.full(9, 1e-6)), noise=Noise(1.0),
+        reference=Reference(5e4),
     )  # fmt: skip
     return pose(survey, calibration)
 

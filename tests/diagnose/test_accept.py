@@ -38,7 +38,7 @@ def test_names_within_20_to_1_of_a_description_stay(right: Callable[[int], Probl
 
 
 def test_a_name_is_asserted_possible_or_ruled_out(right: Callable[[int], Problem]) -> None:
-    """The more hypotheses a name was chosen from, the less it is worth: until a description beats it 20:1 it is possible."""
+    """A name is worth less the more it was chosen from, but possible until a description beats it 20:1."""
     problem = right(ROWS)
     bent = 8.0 * (problem.survey.field / 5e4).prod(axis=1)
     problem = replace(problem, residual=bent + np.random.default_rng(9).normal(size=ROWS))

@@ -1,4 +1,4 @@
-"""What `diagnose` says about deployments that it can do nothing with: one line each, and which column it would take."""
+"""What `diagnose` says about deployments that it cannot use: one line each, naming the column it needs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Effects hidden by finer physics than the detector's: a quick sample of each; ``tools/blind.py`` is the study."""
+"""Effects hidden by finer physics than the detector's, a sample of each; ``tools/blind.py`` is the study."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def test_a_hidden_effect_is_found_and_named(name: str) -> None:
 
 
 def test_a_lag_imitates_an_early_clock_beside_the_telemetry_that_is_there() -> None:
-    """By a vehicle whose masses are where that telemetry has them, on a grid that a delay does not slip through."""
+    """By a vehicle whose masses are where telemetry has them, on a grid that a delay cannot slip through."""
     own = stage.vehicle(0)
     stall = stage.Stall.of(own, 24, "white")
     late, finer = 0.1, 20
@@ -122,7 +122,7 @@ def test_samples_that_are_lost_hide_nothing() -> None:
 
 @pytest.mark.parametrize("name", ["current_field", "nonlinearity"])
 def test_an_extension_against_a_map_does_no_harm(name: str) -> None:
-    """To the true field, on its own log and on another day; the offset has settled anew, and the cause has come since."""
+    """To the true field, on its own log and another day's: offset anew, the cause come since."""
     row = blind("charted", (name,), 40.0, GLIDER, losses="surfacing", reference="map at its depth")
     assert name in {found[0] for found in row["found"]}, row
     assert row["gain"]["after"] < 0.5 * row["gain"]["before"], row

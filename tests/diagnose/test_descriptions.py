@@ -82,7 +82,7 @@ def test_a_feedback_that_falters_at_zero_is_described(width: float) -> None:
 
 
 def test_functions_of_the_direction_and_of_the_reading_hold_a_bend(problem: Problem) -> None:
-    """To one in a hundred of what the constants of a calibration do not hold themselves: the field hardly changes its size."""
+    """To 1 % of what a calibration's constants do not hold: the field hardly changes its size."""
     rows = slice(0, len(problem))
     (bend, more, _), (step, *_) = (
         CAUSES[name].candidates(problem) for name in ("nonlinearity", "offset_step")

@@ -1,4 +1,4 @@
-"""The effects that a diagnosis adds: live and in batch the same bits, and the derivative that the search uses."""
+"""The effects that a diagnosis adds: live and in batch the same bits, and the search's derivative."""
 
 from __future__ import annotations
 
@@ -60,7 +60,8 @@ def survey() -> Survey:
     heat = 3.0 + rng.normal(size=n).cumsum() * 0.1
     steps = np.where(np.arange(n) > 0, 1, FAR)
     return Survey(
-        time=t, field=field, reference=np.full(n, FIELD), still=(), steps=steps, dive=np.arange(n) // 50, place=None,
+        time=t, field=field, reference=np.full(n, FIELD), still=(), steps=steps, dive=np.arange(n) // 50,
+        place=None,
         channels={"p": Channel(p, "in", ("position",)), "heat": Channel(heat, "degC", ("temperature",))},
         attitude=None, learned=np.zeros(n, bool), cycles=np.empty(0), source="made",
     )  # fmt: skip
@@ -163,7 +164,7 @@ def test_a_drift_is_held_beyond_what_it_was_learned_from(survey: Survey, calibra
 def test_play_remembers_the_side(
     survey: Survey, calibration: Calibration, centre: float, scale: float
 ) -> None:
-    """Half of the loop's width is on either side, all the way where it is straight, only near the steel where it is not."""
+    """Half the loop's width on either side: all the way if straight, else only near the steel."""
     effect = PlayEffect(cause="hysteresis", channel="p", width=0.4, centre=centre, scale=scale)
     phi = history(survey, calibration, effect)[0]
     p = survey.channels["p"].values
@@ -192,11 +193,16 @@ def test_a_play_of_an_older_file_is_read(survey: Survey, calibration: Calibratio
 @pytest.mark.parametrize(
     ("effect", "line"),
     [
-        (PlayEffect(cause="hysteresis", channel="p", width=0.3, centre=0.1, scale=0.0), "scale: Expected `float` >= 1e-09"),
-        (PlayEffect(cause="hysteresis", channel="p", width=0.0, centre=0.1, scale=0.5), "width: Expected `float` >= 1e-09"),
-        (PowersEffect(cause="unmodelled_actuator", channel="p", centre=0.0, scale=1.0, order=31), "order: Expected `int` <= 30"),
-        (TimeEffect(cause="interference_tone", shape="tone", start=T0, period=0.0), "period: Expected `float` >= 1e-09"),
-        (TimeEffect(cause="offset_step", shape="step", start=1e308), "start: Expected `float` <= 1000000000000"),
+        (PlayEffect(cause="hysteresis", channel="p", width=0.3, centre=0.1, scale=0.0),
+         "scale: Expected `float` >= 1e-09"),
+        (PlayEffect(cause="hysteresis", channel="p", width=0.0, centre=0.1, scale=0.5),
+         "width: Expected `float` >= 1e-09"),
+        (PowersEffect(cause="unmodelled_actuator", channel="p", centre=0.0, scale=1.0, order=31),
+         "order: Expected `int` <= 30"),
+        (TimeEffect(cause="interference_tone", shape="tone", start=T0, period=0.0),
+         "period: Expected `float` >= 1e-09"),
+        (TimeEffect(cause="offset_step", shape="step", start=1e308),
+         "start: Expected `float` <= 1000000000000"),
         (ResponseEffect(cause="saturation", unit=FIELD, axis=3, knee=3e4), "axis: Expected `int` <= 2"),
         (ResponseEffect(cause="nonlinearity", unit=0.0, power=2), "unit: Expected `float` >= 1"),
         (ChannelEffect(cause="temperature_offset", channel="p", lag=-1.0), "lag: Expected `float` >= 0"),

@@ -37,7 +37,7 @@ def test_a_step_is_found_at_the_nearest_moment(problem: Problem) -> None:
 
 
 def test_a_dipole_that_passes_is_told_by_three_numbers(problem: Problem) -> None:
-    """Against the field of a dipole on a straight course, seen along the Earth's: Anderson's functions hold it."""
+    """Against a dipole's field on a straight course, along the Earth's: Anderson's functions hold it."""
     t = problem.survey.time - problem.survey.time[0]
     speed, nearest = 900.0 / (0.02 * t[-1]), 0.6 * t[-1]
     r = np.column_stack([speed * (t - nearest), np.full(len(t), 900.0), np.full(len(t), -50.0)])

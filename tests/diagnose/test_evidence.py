@@ -15,8 +15,8 @@ def candidate(
     cause: str, size: int = 1, *, positive: bool = False, spectra: np.ndarray | None = None
 ) -> Candidate:
     return Candidate(
-        cause, None, lambda rows: np.zeros((rows.stop - rows.start, size)), np.ones(size), ("b",) * size, ("nT",) * size,
-        positive=positive, spectra=spectra,
+        cause, None, lambda rows: np.zeros((rows.stop - rows.start, size)), np.ones(size), ("b",) * size,
+        ("nT",) * size, positive=positive, spectra=spectra,
     )  # fmt: skip
 
 

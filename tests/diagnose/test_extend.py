@@ -72,7 +72,10 @@ def test_two_causes_are_widened_each_by_its_own() -> None:
 
 
 def skewed(whole: Problem, period: float) -> tuple[Survey, Calibration]:
-    """A vehicle that sways with this period, one channel 0.3 s late, and a calibration that knows it, and of a step."""
+    """A vehicle that sways with this period, and a calibration that knows a late channel and a step.
+
+    The channel is 0.3 s late.
+    """
     angle = 2.0 * np.pi * (whole.survey.time - whole.survey.time[0]) / period
     theta, rate = 0.3 + 0.1 * np.sin(angle), 0.1 * np.cos(angle) * 2.0 * np.pi / period
     field = 5e4 * np.stack([np.cos(theta), np.sin(theta), np.zeros_like(theta)], axis=1)

@@ -1,4 +1,4 @@
-"""Channels that a log has interpolated linearly to its rows, of a vehicle that sways from sample to sample."""
+"""Channels that a log interpolated linearly to its rows, of a vehicle that sways from sample to sample."""
 
 from __future__ import annotations
 

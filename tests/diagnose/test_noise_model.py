@@ -86,12 +86,15 @@ def covariance(memory: np.ndarray, reach: int) -> np.ndarray:
 
 @pytest.mark.parametrize(
     ("memory", "breaks", "lost"),
-    [((0.9, -0.5, 0.3), (0, 2, 70, 71, 150), ()), ((0.97,), (0, 90), (4, 5, 6, 30, 31, 77, 100, 150, 152, 154))],
-)  # fmt: skip
+    [
+        ((0.9, -0.5, 0.3), (0, 2, 70, 71, 150), ()),
+        ((0.97,), (0, 90), (4, 5, 6, 30, 31, 77, 100, 150, 152, 154)),
+    ],
+)
 def test_least_squares_of_the_filtered_is_generalised_least_squares(
     memory: tuple[float, ...], breaks: tuple[int, ...], lost: tuple[int, ...]
 ) -> None:
-    """Against the naive oracle, the full covariance inverted: of stretches that know nothing of each other, and beside gaps."""
+    """Against the naive oracle, the full covariance inverted: of separate stretches, and beside gaps."""
     a, p = np.array(memory), len(memory)
     place = np.setdiff1d(np.arange(200), lost)
     n, stretch = len(place), np.searchsorted(breaks, place, "right")

@@ -1,4 +1,4 @@
-"""Two causes at once: the whole table of pairs against one after the other; two that take each other's place."""
+"""Two causes at once: the whole table of pairs against one by one; two that take each other's place."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def of(cause: str, *columns: Array, **more: object) -> Candidate:
 
 @pytest.fixture(scope="module")
 def state(right: Callable[[int], Problem]) -> State:
-    """Two causes that act, one that looks like both, one like the first; another that has nothing to do with it."""
+    """Two causes that act, one that looks like both, one like the first, and a stranger."""
     rng, t = np.random.default_rng(5), np.arange(ROWS)
     a, b = np.sin(t / 7.0), np.sign(np.sin(t / 40.0))
     problem = replace(right(ROWS), residual=a + b + rng.normal(size=ROWS))

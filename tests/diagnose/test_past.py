@@ -18,7 +18,7 @@ def survey(time: np.ndarray, learned: np.ndarray | None = None) -> Survey:
 
 
 def test_a_step_is_what_a_quarter_of_the_samples_take_and_gaps_are_counted_in_it() -> None:
-    """As a glider samples: every 5 s near the surface, every 20 s below; one sample is lost, and times jitter."""
+    """As a glider samples: every 5 s near the surface, 20 s below; one sample lost, and jitter."""
     near, below = np.full(40, 5.0), np.full(60, 20.0)
     below[30] = 40.0
     jitter = np.random.default_rng(1).uniform(-0.5, 0.5, 101)

@@ -23,7 +23,7 @@ from magbridge.diagnose.compare.survey import Channel, Survey
 
 @pytest.fixture(scope="module")
 def problem() -> Problem:
-    """Half an hour of turning, with a gap, clocks that tremble, a mass that rests and moves, a temperature and a current."""
+    """Half an hour of turning: a gap, jitter, a mass that rests and moves, a temperature and a current."""
     rng = np.random.default_rng(1)
     n = 450
     t = 1.7e9 + 4.0 * np.arange(n) + np.where(np.arange(n) > 300, 500.0, 0.0)
@@ -36,8 +36,8 @@ def problem() -> Problem:
     amps = np.where(rng.uniform(size=n) > 0.7, 1.3, 0.0)
     survey = Survey(
         time=t, field=5e4 * d / np.linalg.norm(d, axis=1)[:, None], reference=np.full(n, 5e4), still=(),
-        steps=np.append(FAR, np.rint(np.diff(t) / 4.0).astype(int)), dive=np.arange(n) // 50, place=None, attitude=None,
-        learned=np.zeros(n, bool), cycles=np.empty(0), source="made",
+        steps=np.append(FAR, np.rint(np.diff(t) / 4.0).astype(int)), dive=np.arange(n) // 50, place=None,
+        attitude=None, learned=np.zeros(n, bool), cycles=np.empty(0), source="made",
         channels={
             "p": Channel(p, "in", ("position",)), "fin": Channel(p[::-1].copy(), "deg", ("position",)),
             "warm": Channel(warm, "degC", ("temperature",)), "amps": Channel(amps, "A", ("current",)),
@@ -179,7 +179,7 @@ def test_a_mass_that_stops_while_another_goes_on_has_no_rate(problem: Problem) -
 
 
 def test_lags_in_series_follow_conduction_more_closely_than_one() -> None:
-    """A slab whose faces follow the water, by finite differences: its centre against the best lag, of one stage and of two."""
+    """A slab whose faces follow the water, by finite differences: its centre against one lag and two."""
     dt, cells, rng = 4.0, 8, np.random.default_rng(4)
     t = dt * np.arange(4000)
     water = np.convolve(rng.normal(size=len(t)).cumsum(), np.ones(100) / 100.0, mode="same")
@@ -200,7 +200,7 @@ def test_lags_in_series_follow_conduction_more_closely_than_one() -> None:
 
 
 def test_sources_along_its_way_hold_the_field_of_iron_that_a_mass_passes(problem: Problem) -> None:
-    """A dipole beside the way, anywhere and of any direction: of what a cubic lacks the next power leaves far more."""
+    """A dipole beside the way, anywhere, any direction: the next power leaves far more of it than sources."""
     rng, t = np.random.default_rng(8), np.linspace(0.0, 1.0, len(problem))
     channels = problem.survey.channels | {"p": problem.survey.channels["p"]._replace(values=np.sin(12.0 * t))}
     problem = replace(problem, survey=replace(problem.survey, channels=channels))

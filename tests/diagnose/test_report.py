@@ -93,7 +93,8 @@ def test_a_gain_that_does_not_show_is_said_to_be_none() -> None:
     """As on a log of a compass in steps of 100 nT: a name, and 588 nT that became 587."""
     none, much = Gain(588.1, 587.3, 0.999, (0.863, 1.021)), Gain(117.0, 75.8, 0.65, (0.48, 0.83))
     assert gained(none, "eighths of the log") == (
-        "On eighths of the log left out of the fit, 588 nT RMS became 587 nT (ratio 1.00, 95 % interval 0.86 to 1.02: no gain is shown)."
+        "On eighths of the log left out of the fit, 588 nT RMS became 587 nT (ratio 1.00, 95 % interval "
+        "0.86 to 1.02: no gain is shown)."
     )
     assert gained(much, "dives").endswith("(ratio 0.65, 95 % interval 0.48 to 0.83).")
     assert no_gain(none)

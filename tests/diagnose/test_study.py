@@ -54,7 +54,7 @@ def test_whitened_noise_is_white() -> None:
 
 
 def test_what_the_losses_leave_is_what_theory_knows() -> None:
-    """Against the inverse of the covariance of the samples that there are; the first row is left out, as it has no past."""
+    """Against the inverse of the existing samples' covariance, but for the first row, which has no past."""
     rng = np.random.default_rng(4)
     rows = np.flatnonzero(rng.random(80) > 0.3)
     covariance = MEMORY ** np.abs(rows[:, None] - rows)
@@ -171,7 +171,7 @@ def test_two_are_named_unless_another_whole_says_the_same() -> None:
 
 
 def nameless_chances(apart: float, k: int = 3, wanted: float = 10.0) -> dict[str, float]:
-    """Of a truth of k numbers; one name of three leaves so much of it, a description of 27 holds it in twenty ways."""
+    """Of a truth of k numbers one name of three leaves so much; 27 hold it in twenty ways."""
     X = np.zeros((31, 31))
     X[:30, :30] = np.eye(30)
     X[27, 30], X[0, 30] = np.sqrt(wanted**2 - apart**2), apart
@@ -271,8 +271,8 @@ def scheduler(tmp_path: Path) -> Iterator[str]:
         address = json.loads(file.read_text())["address"]
         for _ in range(2):
             started(
-                stack, "distributed.cli.dask_worker", address, "--nworkers", "1", "--nthreads", "1", "--no-dashboard",
-                "--no-nanny", "--local-directory", str(tmp_path), cwd=tmp_path,
+                stack, "distributed.cli.dask_worker", address, "--nworkers", "1", "--nthreads", "1",
+                "--no-dashboard", "--no-nanny", "--local-directory", str(tmp_path), cwd=tmp_path,
             )  # fmt: skip
         yield address
 

@@ -34,10 +34,11 @@ def test_agrees_with_ppigrf(places, date):
 
 
 def test_agrees_with_the_published_calculator():
-    """NOAA NCEI's Geomagnetic Calculator 0.5.1.11, model IGRF2020 (13th generation), 2020-01-01, 80 N, 5 km up.
+    """NOAA NCEI's Geomagnetic Calculator 0.5.1.11, model IGRF2020, 2020-01-01, 80 N, 5 km up.
 
-    Six of the values that ppigrf's repository holds in test/data/2020-01-01; printed to 0.1 nT. Its
-    coefficients differ in the last digit from those that IAGA published: 0.5 nT, where ppigrf's own test grants 1.
+    The model is the 13th generation. Six of the values that ppigrf's repository holds in
+    test/data/2020-01-01; printed to 0.1 nT. Its coefficients differ in the last digit from those that IAGA
+    published: 0.5 nT, where ppigrf's own test grants 1.
     """
     golden = np.array(
         [  # longitude, north, east, down
@@ -58,7 +59,7 @@ def test_agrees_with_the_published_calculator():
 
 
 def test_is_a_potential_field(places):
-    """Its divergence vanishes: the sum of three central differences, on 1 km, against the field's own scale."""
+    """Its divergence vanishes: three central differences over 1 km, against the field's own scale."""
     lon, lat, depth = places
     keep = np.abs(lat) < 80
     lon, lat, depth = lon[keep], lat[keep], depth[keep]

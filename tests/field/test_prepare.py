@@ -15,7 +15,7 @@ LON, LAT = np.linspace(-58.1, -57.9, 81), np.linspace(49.45, 49.55, 61)
 
 
 def monopole(altitude: float, depth: float = 800.0) -> np.ndarray:
-    """Vertical field of a magnetic pole under the middle of the map, nT: harmonic, and known at any height."""
+    """Vertical field of a magnetic pole under the map's middle, nT: harmonic, known at any height."""
     per_lat, per_lon = metres_per_degree(49.5)
     x, y = np.meshgrid((LON + 58.0) * per_lon, (LAT - 49.5) * per_lat)
     z = altitude + depth

@@ -52,12 +52,25 @@ def surfer_7(path):
 
 
 def esri(path):
-    head = f"ncols {LON.size}\nnrows {LAT.size}\nxllcenter {LON[0]}\nyllcenter {LAT[0]}\ncellsize 0.05\nNODATA_value -9999\n"
+    head = (
+        f"ncols {LON.size}\n"
+        f"nrows {LAT.size}\n"
+        f"xllcenter {LON[0]}\n"
+        f"yllcenter {LAT[0]}\n"
+        "cellsize 0.05\n"
+        "NODATA_value -9999\n"
+    )
     path.write_text(head + "\n".join(" ".join(f"{v:.9g}" for v in row) for row in MAP[::-1]))
 
 
 def esri_corner(path):
-    head = f"NCOLS {LON.size}\nNROWS {LAT.size}\nXLLCORNER {LON[0] - 0.025}\nYLLCORNER {LAT[0] - 0.025}\nCELLSIZE 0.05\n"
+    head = (
+        f"NCOLS {LON.size}\n"
+        f"NROWS {LAT.size}\n"
+        f"XLLCORNER {LON[0] - 0.025}\n"
+        f"YLLCORNER {LAT[0] - 0.025}\n"
+        "CELLSIZE 0.05\n"
+    )
     path.write_text(head + "\n".join(" ".join(f"{v:.9g}" for v in row) for row in MAP[::-1]))
 
 
@@ -194,7 +207,10 @@ def test_one_clear_line(tmp_path, name, write, message):
     assert str(tmp_path) in str(caught.value)
 
 
-WORDS = b"DSAA DSBB DSRB GRID DATA ncols nrows xllcorner yllcenter cellsize lon lat mag 1 -9 nan inf 1e400 , ; ( ["
+WORDS = (
+    b"DSAA DSBB DSRB GRID DATA ncols nrows xllcorner yllcenter cellsize "
+    b"lon lat mag 1 -9 nan inf 1e400 , ; ( ["
+)
 
 
 @given(

@@ -30,7 +30,7 @@ def test_is_the_main_field_at_each_depth_plus_anomaly_plus_bias():
 
 
 def test_a_map_flown_above_is_continued_to_the_depth():
-    """A glider's dives over rough rock: most of what lies between the aircraft's map and the truth is height."""
+    """A glider's dives over rough rock: most of the difference between aircraft's map and truth is height."""
     twin, rng = Twin.draw(load("demo"), 5), np.random.default_rng(5)
     flown = twin.anomaly_map()
     unknown = AnomalyGrid(flown.longitude, flown.latitude, flown.anomaly)

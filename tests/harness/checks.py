@@ -21,7 +21,7 @@ def seconds(value: float) -> str:
 
 
 def replays(rig: Rig) -> None:
-    """Stop the bridge; its log, replayed, publishes the same bytes, and what was heard stands in it in order."""
+    """Stop the bridge; its log, replayed, publishes the same bytes, and holds what was heard, in order."""
     assert rig.stop() == 0
     recorded, published = rig.replay()
     assert recorded.damages == 0

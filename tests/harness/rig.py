@@ -1,7 +1,8 @@
-"""A bridge on the bench: the real ``magbridge run`` in a process of its own, between a fluxgate and an autopilot.
+"""A bridge on the bench: the real ``magbridge run`` as a process, between a fluxgate and an autopilot.
 
-The fluxgate speaks into a pty, the autopilot on a UDP or TCP socket or a pty of its own. Both are played by whoever calls
-:meth:`Rig.until`: nothing happens in the background, so a test says in plain order what goes wrong when.
+The fluxgate speaks into a pty, the autopilot on a UDP or TCP socket or a pty of its own. Both are played
+by whoever calls :meth:`Rig.until`: nothing happens in the background, so a test says in plain order what
+goes wrong when.
 """
 
 from __future__ import annotations
@@ -59,7 +60,8 @@ directory = "logs"
 
 
 STALE_BY = 0.2
-"""s that the machine may stand still, of the last second, before telemetry can be stale for it: 0.5 s is `max_age`."""
+"""s that the machine may stand still, of the last second, before telemetry can be stale for it: 0.5 s
+is `max_age`."""
 
 
 class Heard(NamedTuple):
@@ -169,7 +171,7 @@ class Rig:
         return end - begun - self.machine.seconds(begun, end)
 
     def until(self, condition: Callable[[], object], timeout: float = 15.0) -> float:
-        """Play sensor and autopilot until `condition` holds; return the s that it took, as :meth:`since` counts."""
+        """Play sensor and autopilot until `condition` holds; return the s it took, as in :meth:`since`."""
         begun = time.monotonic()
         while not condition():
             if self.since(begun) > timeout:

@@ -1,4 +1,4 @@
-"""A bridge without ports: a line protocol, one mass, a calibration of random coefficients; events are fed by hand."""
+"""A bridge without ports: line protocol, one mass, random coefficients; events are fed by hand."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whether this machine stood still: its processors may be taken away for a second, and a test must not blame a bridge for it."""
+"""Whether this machine stood still, its processors taken away: no test must blame a bridge for that."""
 
 from __future__ import annotations
 

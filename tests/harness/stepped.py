@@ -1,7 +1,8 @@
 """Run magbridge with a host clock that a test can set: ``stepped.py OFFSET_FILE ARGUMENT...``.
 
-The program is the unmodified one; only its source of UTC, ``time.time_ns``, is the host's plus the microseconds
-that a file holds. (A time namespace shifts only the monotonic clocks, and the real one belongs to everybody.)
+The program is the unmodified one; only its source of UTC, ``time.time_ns``, is the host's plus the
+microseconds that a file holds. (A time namespace shifts only the monotonic clocks, and the real one belongs
+to everybody.)
 """
 
 from __future__ import annotations

@@ -78,7 +78,7 @@ class Peer:
         return next(line for line in self.lines[since:] if text in line)
 
     def ask_until(self, line: str, text: str, timeout: float = 30.0) -> None:
-        """Type a line again and again until the program says `text`: at first it may not have done what it was told before."""
+        """Type a line again and again until the program says `text`: it may not have been ready before."""
         since, begun = len(self.lines), time.monotonic()
         while not any(text in said for said in self.lines[since:]):
             assert time.monotonic() - begun < timeout, "\n".join(self.lines[-60:])

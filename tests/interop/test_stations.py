@@ -20,7 +20,10 @@ from magbridge.records import Channel
 TOTAL = float(np.linalg.norm(TRUTH))
 HERE = Path(__file__).parent
 XML = Path(magbridge.mavlink.__file__).with_name("magbridge.xml")
-TYPES = {"Q": "uint64_t", "q": "int64_t", "d": "double", "f": "float", "I": "uint32_t", "i": "int32_t", "H": "uint16_t", "B": "uint8_t"}  # fmt: skip
+TYPES = {
+    "Q": "uint64_t", "q": "int64_t", "d": "double", "f": "float",
+    "I": "uint32_t", "i": "int32_t", "H": "uint16_t", "B": "uint8_t",
+}  # fmt: skip
 MakeRig = Callable[[str], Rig]
 Start = Callable[..., Any]
 
@@ -34,9 +37,10 @@ def test_mavproxy(make_rig: MakeRig, start_peer: Start, python: Path) -> None:
     peer = start_peer(
         rig,
         [
-            python, python.with_name("mavproxy.py"), f"--master=udpin:127.0.0.1:{port(rig)}", "--state-basedir=.",
-            "--logfile=station.tlog", "--default-modules=param,link,cmdlong,misc,calibration",
-            "--target-system=1", "--target-component=191",
+            python, python.with_name("mavproxy.py"), f"--master=udpin:127.0.0.1:{port(rig)}",
+            "--state-basedir=.", "--logfile=station.tlog",
+            "--default-modules=param,link,cmdlong,misc,calibration", "--target-system=1",
+            "--target-component=191",
         ],
     )  # fmt: skip
     peer.until("Detected vehicle 1:191")

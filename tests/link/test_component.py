@@ -84,7 +84,7 @@ def test_everything_heard_is_kept_for_the_log(link):
 
 
 def test_replaying_what_was_heard_gives_the_same_bytes(make_link):
-    """Garbage, requests, time synchronisation, all cut at random: the log's frames bring it all about again."""
+    """Garbage, requests, time synchronisation, cut at random: the log's frames bring it all back."""
     rng = random.Random(5)
     first, second, log = make_link(), make_link(), []
     for i in range(400):
@@ -151,11 +151,12 @@ def test_publish_is_checked():
 
 
 SPECIAL = [nan, inf, -inf, 0.0, -0.0, -1.0, 1e38, 3.4e38, 1e-40, 1e9, 60101.0, 511.5]
+BITS = (8, 16, 32, 64)
 VALUES = {
     "f": st.one_of(st.sampled_from(SPECIAL), st.floats(width=32)),
     "d": st.floats(),
-    **{code: st.integers(-(1 << bits - 1), (1 << bits - 1) - 1) for code, bits in zip("bhiq", (8, 16, 32, 64), strict=True)},
-    **{code: st.integers(0, (1 << bits) - 1) for code, bits in zip("BHIQ", (8, 16, 32, 64), strict=True)},
+    **{code: st.integers(-(1 << n - 1), (1 << n - 1) - 1) for code, n in zip("bhiq", BITS, strict=True)},
+    **{code: st.integers(0, (1 << n) - 1) for code, n in zip("BHIQ", BITS, strict=True)},
 }  # fmt: skip
 ANSWERED = [
     "COMMAND_INT", "COMMAND_LONG", "HEARTBEAT", "PARAM_REQUEST_LIST", "PARAM_REQUEST_READ", "PARAM_SET",

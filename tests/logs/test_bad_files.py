@@ -37,12 +37,17 @@ BAD_CSV = {
     "time,mag_x [V]\n2,2\n": "column 'mag_x': expected nT, not V",
     "time,heading\n1,-9999\n": "row 2, column 'heading': expected deg, at most 540, not -9999.0",
     "time,depth\n1,4\n2,1e300\n": "row 3, column 'depth': expected m, at most 100000, not 1e+300",
-    "time,water [Celsius]\n1,4\n2,-999\n": "row 3, column 'water': expected at least -273.15 degC, or nothing where it "
-    "is not known, not -999.0",
+    "time,water [Celsius]\n1,4\n2,-999\n": (
+        "row 3, column 'water': expected at least -273.15 degC, or nothing where it is not known, not -999.0"
+    ),
     "# fill_value = none\ntime,mag_x\n1,2\n": "row 1, column 'fill_value': expected a number, not 'none'",
     "time,quality\n2,splendid\n": "row 2, column 'quality': expected the names of flags, not 'splendid'",
-    "# heading_reference = Magnetic\ntime,heading\n1,2\n": "heading_reference: expected true or magnetic, not 'Magnetic'",
-    "# heading_reference = magnetic\ntime,mag_x\n1,2\n\n2,x\n": "row 5, column 'mag_x': expected a number, not 'x'",
+    "# heading_reference = Magnetic\ntime,heading\n1,2\n": (
+        "heading_reference: expected true or magnetic, not 'Magnetic'"
+    ),
+    "# heading_reference = magnetic\ntime,mag_x\n1,2\n\n2,x\n": (
+        "row 5, column 'mag_x': expected a number, not 'x'"
+    ),
 }
 
 

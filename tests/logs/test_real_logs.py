@@ -27,9 +27,10 @@ def test_seaglider(seaglider: list[Path]) -> None:
     assert back.attrs["heading_reference"] == "magnetic"
     assert np.all(np.diff(back["time"]) > 0)
     for name, low, high in (
-        ("mag_x", -40_000, 45_000), ("mag_y", -45_000, 37_000), ("mag_z", -39_000, 33_000), ("pitchCtl", -9, 2),
-        ("rollCtl", -40, 40), ("vbdCC", -162, 617), ("depth", 0.9, 997), ("heading", 0, 360), ("latitude", 8.1, 8.2),
-        ("longitude", 84.5, 84.9), ("water_temperature", 5, 30), ("vbd_current", 0, 3),
+        ("mag_x", -40_000, 45_000), ("mag_y", -45_000, 37_000), ("mag_z", -39_000, 33_000),
+        ("pitchCtl", -9, 2), ("rollCtl", -40, 40), ("vbdCC", -162, 617), ("depth", 0.9, 997),
+        ("heading", 0, 360), ("latitude", 8.1, 8.2), ("longitude", 84.5, 84.9), ("water_temperature", 5, 30),
+        ("vbd_current", 0, 3),
     ):  # fmt: skip
         assert low <= back[name].min(), name
         assert back[name].max() <= high, name
@@ -69,9 +70,9 @@ def test_slocum(real_data: Path) -> None:
     assert not set(CHANNELS) & set(back.data_vars)
     assert back["battpos"].attrs["units"] == "in"
     for name, low, high in (
-        ("battpos", 0.05, 1.5), ("ballast", -232, 232), ("pitch", -40, 35), ("roll", -25, 45), ("heading", 0, 360),
-        ("coulomb_current", 0.1, 3.2), ("latitude", 54.7, 54.8), ("longitude", 15, 15.2), ("depth", -0.1, 42),
-        ("water_temperature", 5, 18), ("vehicle_temperature", 14, 19),
+        ("battpos", 0.05, 1.5), ("ballast", -232, 232), ("pitch", -40, 35), ("roll", -25, 45),
+        ("heading", 0, 360), ("coulomb_current", 0.1, 3.2), ("latitude", 54.7, 54.8), ("longitude", 15, 15.2),
+        ("depth", -0.1, 42), ("water_temperature", 5, 18), ("vehicle_temperature", 14, 19),
     ):  # fmt: skip
         assert low <= back[name].min(), name
         assert back[name].max() <= high, name
@@ -128,8 +129,9 @@ def test_ardusub(real_data: Path) -> None:
     assert total.min() > 30_000
     assert total.max() < 45_000
     for name, low, high in (
-        ("roll", -4, 0), ("pitch", -4, 4), ("heading", 190, 245), ("battery_current", 0.3, 3.5), ("Lights1", 0, 1),
-        ("servo1", 1400, 1750), ("latitude", 48, 49), ("depth", -1, 1), ("pressure2_temperature", 12, 13),
+        ("roll", -4, 0), ("pitch", -4, 4), ("heading", 190, 245), ("battery_current", 0.3, 3.5),
+        ("Lights1", 0, 1), ("servo1", 1400, 1750), ("latitude", 48, 49), ("depth", -1, 1),
+        ("pressure2_temperature", 12, 13),
     ):  # fmt: skip
         assert low <= back[name].min(), name
         assert back[name].max() <= high, name

@@ -271,7 +271,7 @@ def test_every_file_of_a_live_log_says_what_its_parameters_are(tmp_path: Path) -
 
 
 def test_channels_are_what_the_driver_made_of_its_counts(tmp_path: Path) -> None:
-    """Bit for bit, where MAG_RAW's own float32 is off by up to 0.002 nT; counts that are another number are none."""
+    """Bit for bit, where MAG_RAW's float32 is off by up to 0.002 nT; counts of another number are none."""
     nt_per_count = 0.0119209  # of a digitizer at 100,000 nT
     counts = np.random.default_rng(1).integers(-(2**22), 2**22, (100, 3))
     field = counts * nt_per_count

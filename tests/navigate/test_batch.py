@@ -123,7 +123,7 @@ def test_motion_from_what_the_log_has(ds, grid, options):
 
 
 def test_a_gliders_log_is_told_from_another_vehicles(ds, grid, options):
-    """Depth, pitch and heading make a motion only where the pitch makes the depth; else the log's own track does."""
+    """Depth, pitch and heading make a motion only where pitch makes the depth; else the log's track does."""
     depth = 40.0 + 30.0 * np.sin(np.arange(900) * 4 / 150)
     pitch = np.where(np.cos(np.arange(900) * 4 / 150) > 0, -26.0, 26.0)
     log = ds.isel(time=slice(0, 900))
@@ -182,8 +182,8 @@ def test_ten_thousand_samples_in_two_seconds(study, grid, options):
 def test_magnavs_published_flight(real_data):
     """100 s at 300 km/h with an inertial track: the example that MagNav.jl navigates.
 
-    Its own filter's error on this flight is not stated with the data; asked here is that the field does no harm
-    over so short a time, and that the innovations agree with what was claimed.
+    Its own filter's error on this flight is not stated with the data; asked here is that the field does no
+    harm over so short a time, and that the innovations agree with what was claimed.
     """
     grid = read_grid(real_data / "magnav_example" / "map")
     flight = np.genfromtxt(real_data / "magnav_example" / "xyz.csv", delimiter=",", names=True)

@@ -1,4 +1,4 @@
-"""The navigator as a user has it: it finds the vehicle, says when it has not, and does the same again in replay."""
+"""The navigator as a user has it: it finds the vehicle, says when it has not, and replays alike."""
 
 from __future__ import annotations
 

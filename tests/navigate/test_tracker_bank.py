@@ -130,8 +130,8 @@ def test_splitting_and_merging_keep_mean_and_covariance(grid, correlated):
 def test_the_bank_is_bayes_on_a_wide_start(grid):
     """A million points of the prior, weighted by the likelihood, against the bank: mean, spread and evidence.
 
-    Points need no line through the map: what is left is the bank's own. Two measurements 900 m apart; tolerance
-    3 % of the posterior's spread, and 3 % of the evidence.
+    Points need no line through the map: what is left is the bank's own. Two measurements 900 m apart;
+    tolerance 3 % of the posterior's spread, and 3 % of the evidence.
     """
     x, P = prior(Options(start_sigma=600.0, bias_sigma=2.0, map_sigma=0.5))
     rng = np.random.default_rng(3)

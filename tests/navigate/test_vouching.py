@@ -1,4 +1,4 @@
-"""When the navigator stands by a position: not before the field could tell, not where it says something else."""
+"""When the navigator vouches for a position: only once the field could tell, and not against the field."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def alike(study) -> AnomalyGrid:
 
 
 def test_what_nothing_can_tell_apart_is_never_vouched_for(study, alike, options):
-    """The filter tracks, and is right; but it has nothing but its claim to know in which of the twins it is."""
+    """The filter tracks, and is right, but has only its claim to know in which of the twins it is."""
     claimed = replace(options, start_sigma=40.0)
     run = study.sail(study.voyage(alike, claimed, 3, hours=2.0), alike, claimed)
     assert np.median(run.error) < 100.0

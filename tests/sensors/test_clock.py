@@ -150,7 +150,7 @@ def test_unplugged_for_an_hour() -> None:
     assert np.abs(error_us(made, true)[3_000:]).max() < 5_000
 
 
-# -- without a clock -------------------------------------------------------------------------------------------
+# -- without a clock -----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -198,7 +198,7 @@ def test_an_irregular_instrument_is_dated_by_arrival() -> None:
     ]
 
 
-# -- sequence, chunks, records ---------------------------------------------------------------------------------
+# -- sequence, chunks, records -------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("modulo", "numbers", "missing"), [
@@ -226,7 +226,7 @@ def test_readings_of_one_chunk_are_as_good_as_one_by_one(device: bool) -> None:
 
 @pytest.mark.parametrize("piece", [30, 107, 200])
 def test_a_backlog_in_pieces_is_dated_as_before(piece: int) -> None:
-    """What waited while the host stood still: a terminal line hands it on in pieces, each late to its very end."""
+    """What waited while the host stood still: a terminal hands it on in pieces, each late to its very end."""
     true = np.arange(0.0, 10.0, 0.01)
     readings = [Reading((0.0, 0.0, 0.0), device_time=float(t)) for t in true]
     clock = DeviceClock()

@@ -45,7 +45,7 @@ def test_no_calibration_beats_the_noise_and_more_knowledge_helps(
 
 
 def test_with_only_the_hard_iron_unknown_the_bound_is_three_sines(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A bare vehicle: the information about the hard iron is the sum of the field's directions, over the variance."""
+    """A bare vehicle: the hard iron's information is the sum of the field's directions, over the variance."""
     monkeypatch.setattr("sitl.bound.SOFT_IRON", 1e-12)
     monkeypatch.setattr("sitl.bound.HARD_IRON", 1e6)
     scenario = msgspec.structs.replace(SCENARIO, vehicle=Vehicle())

@@ -81,7 +81,7 @@ def test_it_knows_nothing_of_the_detector() -> None:
 
 
 def test_a_filter_shows_a_turning_field_as_it_was(stage: Stage) -> None:
-    """Between the simulation's points a turning field is an arc: its chord, half a nanotesla off, would give a delay away."""
+    """Between simulated points a turning field is an arc: its chord, 0.5 nT off, would betray a delay."""
     twin, track, when = stage
     delay, rate = 0.05, 3.0
     still = {name: np.full_like(values, values[0]) for name, values in track.parameters.items()}

@@ -114,7 +114,7 @@ def test_another_configuration_is_told_apart(survey: Path, tmp_path: Path) -> No
 
 @pytest.mark.parametrize("motion", ["glide", "position"])
 def test_a_replay_finds_its_way_by_the_field(tmp_path: Path, motion: str) -> None:
-    """However a log tells motion, the bridge hears of it: its filter knows where it begins, and is not lost."""
+    """However a log tells motion, the bridge hears it: its filter knows where it begins, and is not lost."""
     Twin.draw(load("demo"), 3).anomaly_map().save(tmp_path / "grid.nc")
     save(
         replace(identity(), covariance=1e-4 * np.eye(9), noise=Noise(1.0), method="nominal"),

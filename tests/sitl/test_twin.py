@@ -232,7 +232,10 @@ def test_a_log_without_what_the_model_needs_is_refused(demo: xr.Dataset) -> None
 
 @pytest.mark.real
 def test_a_seagliders_own_attitude_explains_its_magnetometer(real_data: Path) -> None:
-    """The model's true field in body axes, driven by real telemetry, is what the real sensor read (1 count = 100 nT)."""
+    """The model's true field in body axes, with real telemetry, is what the real sensor read.
+
+    Its counts are of 100 nT.
+    """
     logs = pytest.importorskip("magbridge.logs")
     log = logs.read(sorted((real_data / "seaglider_sg167").glob("*.nc")))
     simulated = simulate_like(log, load("seaglider"), 1)

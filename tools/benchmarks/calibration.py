@@ -54,9 +54,10 @@ def fitting(folder: Path, repetitions: int) -> list[Row]:  # noqa: ARG001  (the 
     (few, _), (all_, memory) = (apart(IN_ANOTHER, count) for count in LARGE)
     return [
         Row(f"auto, {len(data)} samples, 2 masses, one core", median(ours), "s", most=1.0),
-        Row("the same by scipy, finite differences, no hyperparameters", median(theirs), "s", median(ours), "auto",
-            ratio=median(b / a for a, b in zip(ours, theirs, strict=True)), least=20.0),
-        Row(f"auto, {LARGE[1]:,} samples", all_, "s", few * LARGE[1] / LARGE[0], f"{LARGE[1] // LARGE[0]} times {LARGE[0]:,}"),
+        Row("the same by scipy, finite differences, no hyperparameters", median(theirs), "s", median(ours),
+            "auto", ratio=median(b / a for a, b in zip(ours, theirs, strict=True)), least=20.0),
+        Row(f"auto, {LARGE[1]:,} samples", all_, "s", few * LARGE[1] / LARGE[0],
+            f"{LARGE[1] // LARGE[0]} times {LARGE[0]:,}"),
         Row("memory of that", memory, "MB", most=1000.0),
     ]  # fmt: skip
 

@@ -31,8 +31,8 @@ survey, calibration = long_survey(float(sys.argv[1]), int(sys.argv[2]), float(sy
 begun, used = time.monotonic(), time.process_time()
 found = diagnose([survey], calibration)
 causes = [h.candidate.cause for h in found.findings]
-print(json.dumps([time.monotonic() - begun, time.process_time() - used, len(found.problem), found.verdict, causes,
-                  resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3]))
+print(json.dumps([time.monotonic() - begun, time.process_time() - used, len(found.problem), found.verdict,
+                  causes, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3]))
 """
 
 
@@ -42,16 +42,18 @@ def diagnosing(folder: Path, repetitions: int) -> list[Row]:  # noqa: ARG001  (o
         apart(IN_ANOTHER, 12, count, size)
         for size, count in ((0.0, 0), (NIGHTLY, 0), (0.0, MONTH), (MONTHLY, MONTH))
     )
-    detail = {name: [run[k] for run in (night, found, month, loud)]
-              for k, name in enumerate(("seconds", "processor seconds", "samples", "verdict", "causes", "MB"))}  # fmt: skip
+    told = ("seconds", "processor seconds", "samples", "verdict", "causes", "MB")
+    detail = {name: [run[k] for run in (night, found, month, loud)] for k, name in enumerate(told)}
     slope = float(np.log(month[1] / night[1]) / np.log(month[2] / night[2]))
     share = f"{month[2] / night[2]:.0f} times 12 h"
     return [
-        Row(f"diagnose, 12 h at 0.25 Hz ({night[2]:,} samples), every cause, plain", night[0], "s", most=20.0),
+        Row(f"diagnose, 12 h at 0.25 Hz ({night[2]:,} samples), every cause, plain", night[0], "s",
+            most=20.0),
         Row("the same with an effect hidden in it", found[0], "s", most=20.0, detail=detail),
         Row(f"diagnose, 30 days ({month[2]:,} samples), every cause, plain", month[0], "s",
             night[0] * month[2] / night[2], share, most=240.0),
-        Row("the same with an effect hidden in it", loud[0], "s", found[0] * loud[2] / found[2], share, most=240.0),
+        Row("the same with an effect hidden in it", loud[0], "s", found[0] * loud[2] / found[2], share,
+            most=240.0),
         Row("memory of that", loud[5], "MB", most=2000.0),
         Row("processor time grows as samples to the power of", slope, ""),
     ]  # fmt: skip

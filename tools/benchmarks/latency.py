@@ -1,8 +1,8 @@
 """From the last byte of a frame into the pty to the datagram out, of the real ``magbridge run``.
 
-One thread of this process is the fluxgate, the autopilot and the station: it writes a frame, and then asks the
-socket again and again until the next thing is due, so that what is measured is the bridge and not a wake-up of
-ours. The floor is measured in the same way: a process that sends whatever it reads.
+One thread of this process is the fluxgate, the autopilot and the station: it writes a frame, and then asks
+the socket again and again until the next thing is due, so that what is measured is the bridge and not a
+wake-up of ours. The floor is measured in the same way: a process that sends whatever it reads.
 """
 
 from __future__ import annotations
@@ -130,8 +130,8 @@ def _rows(hertz: int, bridge: list[Sent], echo: list[Sent]) -> list[Row]:
         "samples": sum(len(run.latency) for run in bridge),
     }
     rows = [
-        Row(f"latency at {hertz:,} Hz, {name}", quantile(bridge, q), "ms", quantile(echo, q), "echo", most=most,
-            detail=detail)
+        Row(f"latency at {hertz:,} Hz, {name}", quantile(bridge, q), "ms", quantile(echo, q), "echo",
+            most=most, detail=detail)
         for name, q, most in (("p50", 50.0, 0.5), ("p99", 99.0, 2.0))
     ]  # fmt: skip
     lost = sum(int(np.isnan(run.latency).sum()) for run in bridge)

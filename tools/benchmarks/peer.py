@@ -1,4 +1,4 @@
-"""The floor: the same MAVLink messages, decoded and encoded by the classes that pymavlink makes of our XML."""
+"""The floor: the same MAVLink messages by the classes that pymavlink generates from our XML."""
 
 from __future__ import annotations
 

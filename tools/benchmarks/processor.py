@@ -1,7 +1,7 @@
 """Processor time of the whole live path for one sample, beside that of pymavlink's codec alone.
 
-Two floors: decoding what comes over the link and encoding what goes out over it; and, because the log's frames
-are outputs too, that and encoding the message in which the log keeps the sensor's bytes.
+Two floors: decoding what comes over the link and encoding what goes out over it; and, because the log's
+frames are outputs too, that and encoding the message in which the log keeps the sensor's bytes.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """Replay as fast as it goes, against what pymavlink's codec alone would take for the same messages.
 
-Two processes play, the bridge and the stage that feeds it and listens. By wall clock that holds where both have a
-core of their own; the bridge is the slower one, so its processor time tells the same on a busy machine.
+Two processes play, the bridge and the stage that feeds it and listens. By wall clock that holds
+where both have a core of their own; the bridge is the slower one, so its processor time tells the
+same on a busy machine.
 """
 
 from __future__ import annotations
@@ -38,10 +39,11 @@ def deployment(step: float, rows: int) -> xr.Dataset:
     t = np.arange(rows) * step
     battery = np.where(t % 600.0 < 30.0, np.sin(t / 5.0), 0.3)
     columns = {
-        "mag_x": 30_000.0 * np.sin(t / 40.0), "mag_y": 30_000.0 * np.cos(t / 40.0), "mag_z": 40_000.0 + 0.0 * t,
-        "battpos": battery, "ballast": 200.0 + 150.0 * battery, "sensor_temperature": 8.0 + 0.0 * t,
-        "roll": 5.0 * np.sin(t / 9.0), "pitch": -20.0 + 0.0 * t, "heading": t / 40.0 % 360.0,
-        "latitude": 49.5 + 1e-7 * t, "longitude": -57.8 + 0.0 * t, "depth": 50.0 + 40.0 * np.sin(t / 300.0),
+        "mag_x": 30_000.0 * np.sin(t / 40.0), "mag_y": 30_000.0 * np.cos(t / 40.0),
+        "mag_z": 40_000.0 + 0.0 * t, "battpos": battery, "ballast": 200.0 + 150.0 * battery,
+        "sensor_temperature": 8.0 + 0.0 * t, "roll": 5.0 * np.sin(t / 9.0), "pitch": -20.0 + 0.0 * t,
+        "heading": t / 40.0 % 360.0, "latitude": 49.5 + 1e-7 * t, "longitude": -57.8 + 0.0 * t,
+        "depth": 50.0 + 40.0 * np.sin(t / 300.0),
     }  # fmt: skip
     return xr.Dataset(
         {name: ("time", values) for name, values in columns.items()}, {"time": 1_750_000_000.0 + t}

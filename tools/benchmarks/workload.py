@@ -91,7 +91,8 @@ class Feed:
     Parameters
     ----------
     moving : bool
-        The masses never rest; else they rest nine seconds of ten, and their telemetry trembles in its last digit.
+        The masses never rest; else they rest nine seconds of ten, and their telemetry trembles in
+        its last digit.
     """
 
     def __init__(self, *, moving: bool = False) -> None:

@@ -2,12 +2,14 @@ r"""Whether an ideal analyst would name two causes that are hidden at once.
 
 Notes
 -----
-He knows neither, and weighs every cause alone and every two of them. The log evidence of two is that of the one, and of the
-other beside it, in the order that suits them better; every cause pays for its independent hypotheses, the second 20:1 and its
-choice among the causes, too. He names the best whole; his set holds the causes of all within 20:1 of it.
+He knows neither, and weighs every cause alone and every two of them. The log evidence of two is that of the
+one, and of the other beside it, in the order that suits them better; every cause pays for its independent
+hypotheses, the second 20:1 and its choice among the causes, too. He names the best whole; his set holds the
+causes of all within 20:1 of it.
 
-*both* is his chance to name the two if he has their true shapes beside the table's columns, *inside* that his set holds them,
-*regressed* his chance with the columns alone: what those do not tell of the one may speak for another.
+*both* is his chance to name the two if he has their true shapes beside the table's columns, *inside* that
+his set holds them, *regressed* his chance with the columns alone: what those do not tell of the one may
+speak for another.
 """
 
 from __future__ import annotations
@@ -50,7 +52,7 @@ def both(hidden: Sequence[Found], stall: Stall, ds: xr.Dataset, setting: Setting
 def weighed(
     draws: Draws, spans: Sequence[Span], firsts: Sequence[Span], trials: Mapping[str, float]
 ) -> dict[tuple[Span, ...], Array]:
-    """Log evidence of every span, and of every two of different causes of which one of `firsts` is the first."""
+    """Log evidence of every span, and of each two of different causes whose first is in `firsts`."""
 
     def own(draws: Draws, span: Span) -> Array:
         return np.asarray(evidence(span, *draws.ratio(span)) - np.log(trials.get(span.cause, 1.0)))

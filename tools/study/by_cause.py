@@ -24,9 +24,9 @@ from study.rates import (
 )
 
 COLUMNS = (
-    "hidden", "found at 8", "half point, theory's / measured", "alone at 8 (theory's)", "in the set (theory's)",
-    "set size (theory's)", "loud: found, in the set", "parameters: bias, cover, n", "gain of oracle's",
-    "named or called instead",
+    "hidden", "found at 8", "half point, theory's / measured", "alone at 8 (theory's)",
+    "in the set (theory's)", "set size (theory's)", "loud: found, in the set", "parameters: bias, cover, n",
+    "gain of oracle's", "named or called instead",
 )  # fmt: skip
 
 

@@ -32,10 +32,12 @@ KNOWN = tuple(CAUSES)
 LADDER = (4.0, 3.0, 5.0, 2.0, 6.0)
 LOUD = (25.0, 100.0, 15.0, 50.0)
 LASTING = (
-    "temperature_offset", "temperature_scale", "current_field", "unmodelled_actuator", "actuator_order", "hysteresis",
-    "eddy_current", "channel_skew", "filter_lag", "clock_offset", "nonlinearity", "pressure_offset", "reference_bias",
+    "temperature_offset", "temperature_scale", "current_field", "unmodelled_actuator", "actuator_order",
+    "hysteresis", "eddy_current", "channel_skew", "filter_lag", "clock_offset", "nonlinearity",
+    "pressure_offset", "reference_bias",
 )  # fmt: skip
-"""Causes that last to another deployment; the others are tied to a moment, a place or the range of one log."""
+"""Causes that last to another deployment; the others are tied to a moment, a place or the range
+of one log."""
 NAMELESS = ("unknown", "seen", "foreign")
 """Parts in which nothing in the table is what is hidden."""
 TOLD = ("named", "ladder", "pair", *NAMELESS)
@@ -43,9 +45,9 @@ TOLD = ("named", "ladder", "pair", *NAMELESS)
 STRANGE = ("towed", "sunlit", "eccentric", "astray")
 """Foreign effects made after the detector, which has no description for them either."""
 SEEN = (
-    "pan", "loose", "corrosion", "pulsation", "needle", "thermostat", "perming", "staircase", "swell", "cargo", "contact",
-    "strobe", "storm", "rotor", "viscous", "brownout", "mains", "slip", "motional", "leak", "ranges", "sag", "crossover", "popcorn",
-    "discharge",
+    "pan", "loose", "corrosion", "pulsation", "needle", "thermostat", "perming", "staircase", "swell",
+    "cargo", "contact", "strobe", "storm", "rotor", "viscous", "brownout", "mains", "slip", "motional",
+    "leak", "ranges", "sag", "crossover", "popcorn", "discharge",
 )  # fmt: skip
 """Those that were so once, before the detector was last mended."""
 GOLDEN = 0.6180339887498949
@@ -96,7 +98,7 @@ def _gain(k: int) -> Row:
 
 
 def _charted(k: int) -> Row:
-    """As the paper's log is: the reference is a map, the vehicle surfaces; in every third nothing else is wrong."""
+    """As the paper's log: the reference is a map, the vehicle surfaces; a third have no other fault."""
     names = () if k % 3 == 0 else (LASTING[k % len(LASTING)],)
     return {
         "names": names, "wanted": LOUD[k % len(LOUD)] * bool(names), "noise": GLIDER,
@@ -119,7 +121,10 @@ PARTS: dict[str, Part] = {
 
 
 def losses(k: int) -> str:
-    """What the k-th case of a part loses: one in three does, in one way or another; the golden section keeps step with nothing."""
+    """What the k-th case of a part loses: one in three does, in one way or another.
+
+    The golden section keeps step with nothing.
+    """
     place = int(3 * len(LOSSES) * (GOLDEN * k % 1.0))
     return LOSSES[place] if place < len(LOSSES) else ""
 
@@ -127,7 +132,8 @@ def losses(k: int) -> str:
 def plan(cases: int, parts: tuple[str, ...] = tuple(PARTS), seed: int = 0) -> list[Row]:
     """The study's entries, every part's evenly among the others'; a longer study holds the shorter one.
 
-    Another `seed` hides the same causes at the same signal-to-noise, in other vehicles, and draws all else anew.
+    Another `seed` hides the same causes at the same signal-to-noise, in other vehicles, and draws
+    all else anew.
     """
     made = []
     for place, (name, part) in enumerate(PARTS.items()):
@@ -157,12 +163,17 @@ def case(entry: Row) -> Row:
     result = diagnose([ds], stage.calibration, learned_from=stage.learned, causes=table)
     found = findings(result, table)
     row = entry | {
-        "sizes": [one.hidden.size for one in hidden], "verdict": found["verdict"], "unexplained": found["unexplained"],
-        "found": [[f["cause"], f["channel"], f["signal_to_noise"], [a["cause"] for a in f["alternatives"]]] for f in found["findings"]],
+        "sizes": [one.hidden.size for one in hidden],
+        "verdict": found["verdict"],
+        "unexplained": found["unexplained"],
+        "found": [
+            [one["cause"], one["channel"], one["signal_to_noise"], [a["cause"] for a in one["alternatives"]]]
+            for one in found["findings"]
+        ],
         "p_value": min((p for p, _ in result.outcome.tested.values()), default=1.0),
         "scores": _scores(found, names, whole),
         "theory": _theory(entry["part"], hidden, stall, ds, result),
-    }  # fmt: skip
+    }
     if entry["part"] == "gain":
         row["gain"] = gain(hidden[0].hidden, stall, ds, result)
     if entry["part"] == "charted":
@@ -171,7 +182,7 @@ def case(entry: Row) -> Row:
 
 
 def _scores(found: Row, names: tuple[str, ...], whole: xr.Dataset) -> list[float]:
-    """(value - truth) / sigma of every parameter that physics knows, towards larger sizes, if the cause is named."""
+    """(value - truth) / sigma of each parameter that physics knows, towards larger sizes, if named."""
     truth = json.loads(whole.attrs["truth"])
     own = [f["parameters"] for f in found["findings"] if names == (f["cause"],)]
     if len(own) != 1:
@@ -205,11 +216,12 @@ def _theory(
 
 
 def alike(other: str, late: Found, stall: Stall) -> Array:
-    """Signature of another delay of the same length in the log that hides `late`, of the sign that it can have.
+    """Signature of another delay of this length in the log that hides `late`, of the sign that it can have.
 
-    A late field is an early clock, but for a mass that starts or stops within the delay of a sample. The telemetry of an early
-    clock shows it to have done so a delay before, when a filter has ``1 - 1/e`` of the way behind it: of what the two
-    differ by beside one telemetry, 1/e is left. That of a log whose filter lags fits an early clock just as well.
+    A late field is an early clock, but for a mass that starts or stops within the delay of a sample. The
+    telemetry of an early clock shows it to have done so a delay before, when a filter has ``1 - 1/e`` of the
+    way behind it: of what the two differ by beside one telemetry, 1/e is left. That of a log whose filter
+    lags fits an early clock just as well.
     """
     d = late.signature
     if other == "clock_offset":

@@ -1,4 +1,7 @@
-"""What every hypothesis of a table would make of a hidden effect: draws of its likelihood ratio without a deployment."""
+"""What each hypothesis of a table would make of a hidden effect: draws of likelihood ratios.
+
+No deployment is needed.
+"""
 
 from __future__ import annotations
 
@@ -20,10 +23,11 @@ SHOWN = "as shown"
 
 @dataclass(frozen=True, eq=False)
 class Span:
-    """One of a cause's hypotheses: its columns, the log of how many others it stands for, whether it has a sign.
+    """One of a cause's hypotheses: its columns, the log of how many it stands for, whether it has a sign.
 
-    Where its numbers have one common size, `spectra` (l, k) are their prior variances (:mod:`magbridge.diagnose.inference.statistic`).
-    Of a true shape `more` is how many further numbers its cause has: they fit nothing but noise.
+    Where its numbers have one common size, `spectra` (l, k) are their prior variances
+    (:mod:`magbridge.diagnose.inference.statistic`). Of a true shape `more` is how many further numbers its
+    cause has: they fit nothing but noise.
     """
 
     cause: str
@@ -36,7 +40,7 @@ class Span:
 
 
 class Draws(NamedTuple):
-    """Fisher's information S of all columns, the truth's as the last one, and draws of their scores' noise (m, DRAWS)."""
+    """Fisher's information S of all columns, the truth's last; draws of their scores' noise (m, DRAWS)."""
 
     S: Array
     noise: Array
@@ -88,7 +92,7 @@ def weigh(ratio: Array, freedom: float) -> Array:
 
 
 def evidence(span: Span, ratio: Array, freedom: float) -> Array:
-    """Log evidence of a hypothesis' likelihood ratios; those of one common size are integrated out of theirs."""
+    """Log evidence of likelihood ratios; numbers of one common size are integrated out of theirs."""
     if span.spectra is not None:
         return 0.5 * ratio - np.log(len(span.spectra))
     # a known sign: what of the posterior has it, where half of the prior had
@@ -108,7 +112,7 @@ def with_another(draws: Draws, first: Span, spans: Sequence[Span]) -> dict[str, 
 
 
 def root_of(S: Array, span: Span) -> Array:
-    """Return R (k, f): ``R R^T`` is the covariance of a hypothesis' numbers in the directions that the data see."""
+    """Return R (k, f): ``R R^T`` is the covariance of a hypothesis' numbers where the data see them."""
     own = S[span.own, span.own]
     if span.spectra is not None:  # with their prior, of the size that the truth would give them
         own = own + np.diag(1.0 / Statistic(own, span.spectra).best(S[span.own, -1]).variance)
@@ -123,7 +127,7 @@ def numbers(S: Array, span: Span) -> float:
 
 
 def by_cause(evidences: Mapping[Span, Array], name: str = "", truth: Array | None = None) -> dict[str, Array]:
-    """Each cause's evidence, averaged over its grid, of its best channel; the truth pays for its grid as the others do."""
+    """Each cause's evidence, averaged over its grid, of its best channel; the truth pays likewise."""
     groups: dict[tuple[str, str | None], list[tuple[Array, float]]] = {}
     for span, evidence in evidences.items():
         groups.setdefault((span.cause, span.channel), []).append((evidence, span.price))

@@ -18,7 +18,7 @@ NEITHER = "no name"
 
 
 def confusion(rows: Sequence[Row]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Predicted and measured shares, hidden by row, named first by column; the last column is no name at all."""
+    """Predicted and measured shares, hidden by row, named first by column; the last column is no name."""
     columns = [*KNOWN, NEITHER]
     predicted, measured = np.full((2, len(KNOWN), len(columns)), np.nan)
     for i, name in enumerate(KNOWN):
@@ -60,7 +60,7 @@ def plot_confusion(rows: Sequence[Row], path: Path) -> None:
 
 
 def plot_detection(rows: Sequence[Row], path: Path) -> None:
-    """Draw the share that was found against signal-to-noise, and each cause's point of half detection, beside theory's."""
+    """Draw the share found against signal-to-noise, and each cause's half point, beside theory's."""
     single = [r for r in rows if r["part"] in ("named", "ladder", "loud", "gain")]
     figure = Figure(figsize=(13, 5.2), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=(1.5, 1.0))
@@ -69,8 +69,8 @@ def plot_detection(rows: Sequence[Row], path: Path) -> None:
         own = [found(r) for r in single if r["wanted"] == size]
         share, ends = float(np.mean(own)), binomtest(sum(own), len(own)).proportion_ci()
         left.errorbar(
-            size, 100 * share, [[100 * (share - ends.low)], [100 * (ends.high - share)]], fmt="o", color="tab:blue",
-            capsize=2, label="measured, with 95 % interval" if size == sizes[0] else None,
+            size, 100 * share, [[100 * (share - ends.low)], [100 * (ends.high - share)]], fmt="o",
+            color="tab:blue", capsize=2, label="measured, with 95 % interval" if size == sizes[0] else None,
         )  # fmt: skip
     if told(single):
         a = np.geomspace(1.5, 100.0, 200)

@@ -1,4 +1,4 @@
-"""What a diagnosis buys: errors on another deployment of the same vehicle, beside those of who knows the cause."""
+"""What a diagnosis buys: errors on another deployment of the vehicle, beside those of who knows the cause."""
 
 from __future__ import annotations
 
@@ -22,10 +22,11 @@ DELAYS = ("filter_lag", "clock_offset")
 
 
 def gain(hidden: Hidden, stall: Stall, ds: xr.Dataset, result: Diagnosis) -> dict[str, float]:
-    """Mean square error (nT²) on another deployment: as calibrated, extended, and extended by who knows the cause.
+    """Mean square error (nT²) on another deployment: as calibrated, extended, and by who knows the cause.
 
-    Counted are the samples whose masses stand where the first deployment had them, too: elsewhere a polynomial has only
-    its own sigma to tell how little it knows. ``everywhere`` is what was extended on all samples.
+    Counted are the samples whose masses stand where the first deployment had them, too: elsewhere a
+    polynomial has only its own sigma to tell how little it knows. ``everywhere`` is what was extended
+    on all samples.
     """
     calibration = stall.stage.calibration
     other = add_noise(again(stall.stage).measure((hidden,), stall.number + 1), "white", stall.number + 1)
@@ -38,7 +39,10 @@ def gain(hidden: Hidden, stall: Stall, ds: xr.Dataset, result: Diagnosis) -> dic
 
 
 def harm(hidden: tuple[Hidden, ...], stall: Stall, ds: xr.Dataset, result: Diagnosis) -> dict[str, float]:
-    """Mean square error (nT²) against the field that is there, as calibrated and extended: of this log and of one on another day."""
+    """Mean square error (nT²) against the true field, as calibrated and extended.
+
+    Of this log, and of one on another day.
+    """
     calibration = stall.stage.calibration
     other = again(stall.stage, DAY).measure(hidden, stall.number + 1)
     found: dict[str, float] = {}
@@ -61,9 +65,10 @@ def _inside(other: xr.Dataset, ds: xr.Dataset, calibration: Calibration) -> NDAr
 
 
 def _oracle(name: str, result: Diagnosis) -> Calibration:
-    """Extend by who knows the cause: its regressors alone, profiled and fitted as a diagnosis does, and nobody doubts them.
+    """Extend by who knows the cause: its regressors alone, profiled and fitted, and nobody doubts them.
 
-    Of the two delays it takes the telemetry's: that has no noise, of which a reading's rate of change would add more.
+    Of the two delays it takes the telemetry's: that has no noise, of which a reading's rate of change
+    would add more.
     """
     problem = result.problem
     known = "clock_offset" if name in DELAYS else name

@@ -14,8 +14,8 @@ MEMORY = 0.8
 SLOWER = 0.95
 """Correlation of neighbours in the slower third of noise that is white upon something slower."""
 NOISES = ("white", "ar", "mixed", "heavy", "uneven", "half", "map")
-"""White; with a memory; white upon a longer one; heavy-tailed; louder at times; half as loud again as calibrated; over
-rock that is rough."""
+"""White; with a memory; white upon a longer one; heavy-tailed; louder at times; half as loud again as
+calibrated; over rock that is rough."""
 GLIDER = "glider"
 """The noise of the paper's twin: eight times as large, and correlated."""
 LOSSES = ("single", "bursts", "hole", "surfacing")

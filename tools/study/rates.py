@@ -133,7 +133,7 @@ def efficiency(rows: Sequence[Row]) -> tuple[float, float, float] | None:
 
 
 def equal(row: Row) -> float:
-    """Signal-to-noise at which theory's detector would have had the p-value of the diagnosis, with the noise of the same log."""
+    """Signal-to-noise at which theory's detector would have the diagnosis' p-value, in the same noise."""
     surprise = -np.log(np.minimum.accumulate(row["theory"][0]["here"]))
     return float(np.interp(-np.log(row["p_value"]), surprise, SIZES))
 

@@ -33,7 +33,8 @@ Array = NDArray[np.float64]
 HOURS = 6.0
 """Length of a deployment; the tests' are shorter."""
 VEHICLES = 23
-"""Of a seed. A prime: parts step through their causes and sizes in cycles, and each of these meets every vehicle."""
+"""Of a seed. A prime: parts step through their causes and sizes in cycles, and each of these meets
+every vehicle."""
 SEEDS = 1_000_000
 """Numbers that a study of one seed may have."""
 INERTIA = 3.0
@@ -62,8 +63,9 @@ class Remembered(World):
 class Stage(NamedTuple):
     """A vehicle with its calibration, and a deployment's track with the times of its rows.
 
-    `prior` (K, K) is what the calibration's coefficients are allowed: its covariance, and what no instrument holds;
-    `learned` the calibration's own log, where a diagnosis is given it; `chart` the map that both have for a reference.
+    `prior` (K, K) is what the calibration's coefficients are allowed: its covariance, and what no instrument
+    holds; `learned` the calibration's own log, where a diagnosis is given it; `chart` the map that both have
+    for a reference.
     """
 
     twin: Twin
@@ -82,10 +84,10 @@ class Stage(NamedTuple):
 
 @lru_cache(maxsize=VEHICLES)
 def vehicle(seed: int, rms: float = 60.0, reference: str = "true") -> Stage:
-    """Draw a vehicle, calibrate it on a log of its own, and fly its survey; `rms` (nT) is that of the rock's field.
+    """Draw a vehicle, calibrate it on a log of its own, fly its survey; `rms` (nT) is the rock's field.
 
-    Against a map, one of :data:`CHARTS`, it is a glider like the paper's: its log is louder, and its offset has settled
-    anew when it surveys.
+    Against a map, one of :data:`CHARTS`, it is a glider like the paper's: its log is louder, and its offset
+    has settled anew when it surveys.
     """
     swap = msgspec.structs.replace
     base = load("demo")
@@ -141,7 +143,8 @@ def again(stage: Stage, later: timedelta = timedelta()) -> Stage:
 def _flown(twin: Twin, calibration: Calibration) -> Stage:
     twin = replace(twin, world=Remembered(twin.world.origin, twin.world.rock, twin.world.water))
     track = twin.fly()
-    # a hull has inertia: without it the attitude has no rate, and a delay of a millisecond is a noise of its own
+    # a hull has inertia: without it the attitude has no rate, and a delay of a millisecond is a
+    # noise of its own
     smooth = {
         name: first_order(first_order(getattr(track, name), track.step, INERTIA), track.step, INERTIA)
         for name in ("roll", "pitch", "heading")
@@ -172,10 +175,10 @@ def compare(ds: xr.Dataset, calibration: Calibration) -> tuple[Array, Array]:
 
 
 def project(X: Array, A: Array, covariance: Array) -> Array:
-    """Take out of the columns X what a calibration (columns A, prior `covariance`) that is fitted with them absorbs.
+    """Take out of columns X what a calibration (columns A, prior `covariance`) fitted with them absorbs.
 
-    The inner product of the result with X is Fisher's information with the calibration free; Woodbury's identity
-    needs no inverse of the prior.
+    The inner product of the result with X is Fisher's information with the calibration free; Woodbury's
+    identity needs no inverse of the prior.
     """
     inner = np.eye(len(covariance)) + (A.T @ A) @ covariance
     return np.asarray(X - A @ (covariance @ np.linalg.solve(inner, A.T @ X)))
@@ -193,7 +196,7 @@ def size_of(name: str, d: Array, A: Array, covariance: Array) -> float:
 
 
 class Found(NamedTuple):
-    """An effect of the size that was wanted: what it is, what it leaves in the residual (whitened), the log with it."""
+    """An effect of the wanted size: what it is, what it leaves (whitened), and the log with it."""
 
     hidden: Hidden
     signature: Array
@@ -201,7 +204,10 @@ class Found(NamedTuple):
 
 
 class Stall(NamedTuple):
-    """What all sizes share: the rows that the log has, its residual without any effect, and the calibration's columns, whitened."""
+    """What all sizes share: the log's rows, its residual without an effect, the calibration's columns.
+
+    Residual and columns are whitened.
+    """
 
     stage: Stage
     number: int

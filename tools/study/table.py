@@ -1,4 +1,7 @@
-"""The study's figures against their targets, each beside an ideal detector's and with its count and a 95 % interval."""
+"""The study's figures against targets, each beside an ideal detector's, with its count and interval.
+
+Intervals are of 95 %.
+"""
 
 from __future__ import annotations
 
@@ -114,7 +117,8 @@ def _sets(named: Sequence[Row]) -> list[Line]:
             (f"S/N 8, {label}: named alone and right", targets[0], alone, share(rows, right_alone)),
             ("... the set holds the truth", targets[1], inside, share(rows, holds)),
             ("... mean size of the set", targets[2], size, _mean_size(rows, sets)),
-            ("... without what an 'unexplained' keeps: holds the truth", "", inside, share(rows, lambda r: set(r["names"]) <= beside(r))),
+            ("... without what an 'unexplained' keeps: holds the truth", "", inside,
+             share(rows, lambda r: set(r["names"]) <= beside(r))),
             ("... mean size of that", "", size, _mean_size(rows, beside)),
         ]  # fmt: skip
     return out
@@ -170,7 +174,8 @@ def _nameless(part: Parts) -> list[Line]:
         ideal = f"{percent(at_best)}; with these descriptions {percent(so)}"
         out += [
             (f"{label}: 'unexplained'", "at least 90 %", ideal, share(rows, unexplained)),
-            ("... a wrong name", "at most 5 %", percent(1.0 - at_best), share(rows, lambda r: bool(r["found"]))),
+            ("... a wrong name", "at most 5 %", percent(1.0 - at_best),
+             share(rows, lambda r: bool(r["found"]))),
         ]  # fmt: skip
     return out
 
@@ -188,7 +193,7 @@ def _pairs(pairs: Sequence[Row]) -> list[Line]:
 
 
 def _losses(rows: Sequence[Row]) -> list[str]:
-    """What it changes that samples are lost: the same figures of the cases whose logs are whole, and of the others."""
+    """What lost samples change: the same figures of the cases whose logs are whole, and of the others."""
     groups = [r for r in rows if not r["losses"]], [r for r in rows if r["losses"]]
 
     def line(figure: str, parts: tuple[str, ...], good: Callable[[Row], bool]) -> str:

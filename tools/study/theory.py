@@ -2,13 +2,15 @@ r"""What a detector could do at best that knows the noise and the true shape of 
 
 Notes
 -----
-Let d be the hidden signature and X a rival's columns, whitened, with the calibration projected out. Scores of all columns are then ``N(X^T d, X^T X)``, whatever the data were: so the ideal
-detector's answers are drawn from that distribution without a deployment. It weighs the truth, a single column d with as
-many free numbers k as the cause has in the table, against every other cause of the table by the same evidence E that the
-real one uses, and names all within 20:1.
+Let d be the hidden signature and X a rival's columns, whitened, with the calibration projected out. Scores of
+all columns are then ``N(X^T d, X^T X)``, whatever the data were: so the ideal detector's answers are drawn
+from that distribution without a deployment. It weighs the truth, a single column d with as many free numbers
+k as the cause has in the table, against every other cause of the table by the same evidence E that the real
+one uses, and names all within 20:1.
 
-*Found* is what passes one of the tests of the table, or the truth's own: ``chi2_k`` beyond its quantile at 1 % over all
-causes and their independent hypotheses. Half point and 95 % point are read off the draws with d at other sizes.
+*Found* is what passes one of the tests of the table, or the truth's own: ``chi2_k`` beyond its quantile at
+1 % over all causes and their independent hypotheses. Half point and 95 % point are read off the draws with d
+at other sizes.
 
 What has no name is :mod:`study.nameless`'s, two that are hidden at once :mod:`study.both`'s.
 """
@@ -75,10 +77,12 @@ def ideal(one: Found, stall: Stall, ds: xr.Dataset, setting: Setting) -> dict[st
     Returns
     -------
     dict
-        ``alone``: chance to name the truth alone; ``inside``: that the set holds it; ``size``: the set's mean size;
-        ``first``: cause -> chance to be named first; ``half``, ``sure``: signal-to-noise at which 50 and 95 % are found;
-        ``here``: p-value with the noise of this very log, were the truth of the sizes :data:`SIZES`; ``apart``: cause -> signal-to-noise that its best imitation leaves. Where the setting has descriptions, ``two``: what
-        the best two of any causes leave; ``unnamed`` and ``described``: see :mod:`study.nameless`.
+        ``alone``: chance to name the truth alone; ``inside``: that the set holds it; ``size``: the set's mean
+        size; ``first``: cause -> chance to be named first; ``half``, ``sure``: signal-to-noise at which 50
+        and 95 % are found; ``here``: p-value with the noise of this very log, were the truth of the sizes
+        :data:`SIZES`; ``apart``: cause -> signal-to-noise that its best imitation leaves. Where the setting
+        has descriptions, ``two``: what the best two of any causes leave; ``unnamed`` and ``described``: see
+        :mod:`study.nameless`.
     """
     name = one.hidden.name
     spans, S, noise = information([one], stall, ds, setting)
@@ -154,7 +158,7 @@ def own_span(S: Array, spans: Sequence[Span], name: str) -> Span | None:
 
 
 def true_span(S: Array, own: Span | None, name: str, at: int) -> Span:
-    """Return the true shape, which stands at `at`, with as many numbers as its cause's `own` hypothesis has."""
+    """Return the true shape, which stands at `at`, with as many numbers as its cause's `own` hypothesis."""
     shape = slice(at, at + 1)
     if own is None:
         return Span(name, SHOWN, shape)
@@ -178,7 +182,7 @@ def _worth(S: Array, span: Span) -> float:
 
 
 def p_values(draws: Draws, spans: Sequence[Span], setting: Setting) -> Array:
-    """Smallest p-value of the tests, at every one of :data:`SIZES` in every draw; what is looked for elsewhere is counted."""
+    """Smallest p-value of the tests, for each of :data:`SIZES` and draws; searches elsewhere count."""
     scale, least = SIZES / draws.wanted, np.ones((len(SIZES), 1))
     for span in spans:
         ratio, freedom = draws.ratio(span, scale)

@@ -1,1 +1,1 @@
-"""What ``tools/navigation.py`` runs: voyages over simulated maps, gone well or astray, and others on the same problem."""
+"""What ``tools/navigation.py`` runs: voyages over simulated maps, good and astray; others on the same."""

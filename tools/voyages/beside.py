@@ -1,4 +1,4 @@
-"""Others on the navigator's problem: Stone Soup's filters on our measurements, and ours on MagNav.jl's flight."""
+"""Others on the navigator's problem: Stone Soup on our measurements, and ours on MagNav.jl's flight."""
 
 from __future__ import annotations
 
@@ -70,8 +70,9 @@ def stone_soup(python: str, kind: Map, glider: Options, share: float, seed: int)
 def magnav(folder: Path) -> None:
     """Fly MagNav.jl's simple example: its map, its compensated magnetometer, its inertial track.
 
-    Its script promises 'navigation errors' of 7 m from an EKF on 18 inertial states; the inertial track that it is given is 2 m
-    off over these 100 s. Comparable is the error of the position; not its filter, which estimates the inertial unit.
+    Its script promises 'navigation errors' of 7 m from an EKF on 18 inertial states; the inertial track that
+    it is given is 2 m off over these 100 s. Comparable is the error of the position; not its filter, which
+    estimates the inertial unit.
     """
     grid = read_grid(folder / "map")
     flight = np.genfromtxt(folder / "xyz.csv", delimiter=",", names=True)

@@ -20,7 +20,7 @@ from voyages.sail import GLIDER, PLACE, Map, Score, adrift, sail, synthetic
 
 
 class Flown(NamedTuple):
-    """RMS error (nT) of the corrected field on the survey, the median sigma that was claimed, and how it navigated."""
+    """RMS error (nT) of the corrected field on the survey, the median claimed sigma, the navigation."""
 
     error: float
     claimed: float
@@ -28,7 +28,7 @@ class Flown(NamedTuple):
 
 
 def flown(kinds: tuple[Map, ...], seed: int) -> dict[tuple[int, str], Flown]:
-    """Return how one glider navigates on each map (by its number) with each calibration, all else the same."""
+    """Return how a glider navigates on each map (by number) with each calibration, all else the same."""
     parts = segments(simulate(load("random_glider"), seed))
     runs, survey = at_rest(parts["calibration"], MASSES), parts["survey"]
     places = separation(*PLACE, *(survey[f"truth_{name}"].to_numpy() for name in ("latitude", "longitude")))

@@ -1,4 +1,4 @@
-"""Voyages of a glider that dives under a map flown above the sea: the map as it is, and continued to its depth."""
+"""A glider dives under a map flown above the sea: with the map as it is, and continued to its depth."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Dived(NamedTuple):
 
 
 def dived(seed: int) -> tuple[Dived, Dived]:
-    """Fly the demo's spirals and survey over a world of its own, with the true field; without and with the depth."""
+    """Fly the demo's spirals and survey over its own world, in the true field; without and with depth."""
     scenario = load("demo")
     grid, log = Twin.draw(scenario, seed).anomaly_map(), simulate(scenario, seed)
     log = log.assign(total_field=log["truth_total_field"])

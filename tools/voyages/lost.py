@@ -51,7 +51,7 @@ def outside(run: Run) -> NDArray[np.bool_]:
 
 
 def silence(run: Run) -> tuple[float, float]:
-    """Return for how many hours on end the filter vouched for a place where it was not; and was not there at all."""
+    """Return for how many hours on end the filter vouched for a wrong place, and was elsewhere at all."""
     return longest(outside(run) & run.vouched, run.hours), longest(outside(run), run.hours)
 
 

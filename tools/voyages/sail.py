@@ -1,4 +1,4 @@
-"""Simulated gliders on simulated maps, and what the navigator made of them: what tools/navigation.py tabulates."""
+"""Simulated gliders on simulated maps, and how they navigated: what tools/navigation.py tabulates."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def voyage(
     every: float = 4.0,
     jump: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> xr.Dataset:
-    """Return a deployment drawn from the very model that the options state: legs of 45 minutes at random headings.
+    """Return a deployment drawn from the options' own model: legs of 45 minutes at random headings.
 
     Parameters
     ----------

@@ -6,11 +6,11 @@ Stone Soup (PyPI, MIT; Dstl) is a library of trackers, and brings a desktop's wo
     .venv-peers/bin/pip install stonesoup
     python tools/navigation.py --part peers --peers .venv-peers/bin/python
 
-In: an ``.npz`` with ``prior_x`` (6,), ``prior_P`` (6, 6), and for each of n measurements ``F Q`` (n, 6, 6), ``position``
-(n, 2) m north and east dead-reckoned, ``anomaly`` (n,) nT, ``variance`` (n,) nT², ``slope`` (n, 2) nT/m of the main field;
-``map`` (ny, nx) nT on ``north`` (ny,) and ``east`` (nx,) m; ``particles``, ``seed``.
-Out, to the path given second: ``.npz`` with ``{method}_x`` (n, 6), ``{method}_P`` (n, 6, 6), ``{method}_seconds`` for
-``ekf`` and ``particles``.
+In: an ``.npz`` with ``prior_x`` (6,), ``prior_P`` (6, 6), and for each of n measurements ``F Q`` (n, 6, 6),
+``position`` (n, 2) m north and east dead-reckoned, ``anomaly`` (n,) nT, ``variance`` (n,) nT², ``slope``
+(n, 2) nT/m of the main field; ``map`` (ny, nx) nT on ``north`` (ny,) and ``east`` (nx,) m; ``particles``,
+``seed``. Out, to the path given second: ``.npz`` with ``{method}_x`` (n, 6), ``{method}_P`` (n, 6, 6),
+``{method}_seconds`` for ``ekf`` and ``particles``.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ START = datetime(2013, 12, 5)
 
 
 class FieldOnMap(NonLinearGaussianMeasurement):
-    """Anomaly at the position, the main field's slope, and the two biases; the map is scipy's bicubic spline."""
+    """Anomaly at the position, the main field's slope, two biases; the map is scipy's bicubic spline."""
 
     spline: RectBivariateSpline
     position: np.ndarray

@@ -1,1 +1,1 @@
-"""From logs of calibration runs to a calibration: :func:`~magbridge.calibration.fitting.fit.fit` is the door."""
+"""From logs of calibration runs to a calibration; :func:`~magbridge.calibration.fitting.fit.fit` does it."""

@@ -81,8 +81,8 @@ def fit_auto(
     check_scales(samples, coefficients)
     E = best.structure.E
     return assemble(
-        data, samples, ranges, exponents, coefficients, E @ covariance_of(precision) @ E.T, best.noise, "auto",
-        details={
+        data, samples, ranges, exponents, coefficients, E @ covariance_of(precision) @ E.T,
+        best.noise, "auto", details={
             "log_evidence": best.score,
             "determined": best.widths.determined,
             "outliers": best.noise.rejected,

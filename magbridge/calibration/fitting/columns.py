@@ -82,10 +82,10 @@ def observations(
 
 
 def _at_common_time(ds: xr.Dataset, axis: str, values: FloatArray) -> FloatArray:
-    """Interpolate a channel of a multiplexed converter to the row's time, as :mod:`magbridge.align` does live.
+    """Interpolate a multiplexed converter's channel to the row's time, as :mod:`magbridge.align` does live.
 
-    In a spiral a delay of 0.3 s is a rotation by a degree, always the same way. Left in, it would be absorbed by the
-    coefficients, and remain there when the vehicle flies straight.
+    In a spiral a delay of 0.3 s is a rotation by a degree, always the same way. Left in, it would be absorbed
+    by the coefficients, and remain there when the vehicle flies straight.
     """
     if f"mag_time_{axis}" not in ds:
         return values

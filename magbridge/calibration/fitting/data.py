@@ -20,13 +20,14 @@ __all__ = ["Observations", "monomials", "polynomial_samples"]
 
 FloatArray = NDArray[np.float64]
 COMMON, FAR = 0.005, 10.0
-"""A position is implausible when it is farther from the median than FAR times the span of all but 2 COMMON of them."""
+"""A position is implausible when it is farther from the median than FAR times the span of all but 2
+COMMON of them."""
 _PER_SAMPLE = ("field", "reference", "parameters", "runs", "time", "attitude", "reference_ned")
 
 
 @dataclass(frozen=True, eq=False)
 class Observations:
-    """Calibration data as arrays; rows that lack a value, or hold an impossible field, are dropped when it is made.
+    """Calibration data as arrays, without the rows that lack a value or hold an impossible field.
 
     Attributes
     ----------
@@ -110,9 +111,10 @@ class Observations:
 
     @property
     def steps(self) -> FloatArray:
-        """(n,) whole intervals since the previous sample, infinite where that belongs to another run or is no earlier.
+        """(n,) whole intervals since the run's previous sample, infinite where there is none before it.
 
-        A shorter step counts as one interval: the correlation of the noise is known for one, and not guessed for less.
+        A shorter step counts as one interval: the correlation of the noise is known for one, and not
+        guessed for less.
         """
         assert self.time is not None
         assert self.runs is not None
@@ -169,7 +171,7 @@ def _enough(
 
 
 def _plausible(names: Sequence[str], positions: FloatArray) -> None:
-    """Refuse a position far from all others: one -9999 that stands for "not known" would bend the whole fit."""
+    """Refuse a position far from all others: one -9999 for "not known" would bend the whole fit."""
     for name, column in zip(names, positions.T, strict=True):
         low, middle, high = np.quantile(column, [COMMON, 0.5, 1.0 - COMMON])
         far = np.abs(column - middle) > FAR * (high - low)

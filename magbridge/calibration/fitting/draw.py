@@ -25,8 +25,8 @@ WIDE = 6.0
 def draw_fit(calibration: Calibration, data: Observations, path: str | Path) -> None:
     """Draw each sample's deviation from the reference, as read and corrected, a colour for each run.
 
-    Against time, heading (where attitude is known) and each parameter: what still follows one of them in the lower row,
-    the calibration does not describe.
+    Against time, heading (where attitude is known) and each parameter: what still follows one of them in the
+    lower row, the calibration does not describe.
 
     Raises
     ------

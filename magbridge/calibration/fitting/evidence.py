@@ -4,7 +4,8 @@ Notes
 -----
 About the best coefficients the log likelihood is quadratic in z: ``-(c_0 - 2 b.z + z^T H z) / 2 sigma^2``.
 With a Gaussian prior of widths ``w = exp(constant + design . eta)`` the evidence is known in closed form.
-With ``W = diag(w)``, ``M = I + W H W / sigma^2`` and ``y = M^-1 W b / sigma^2`` (so the posterior mean is ``W y``)::
+With ``W = diag(w)``, ``M = I + W H W / sigma^2`` and ``y = M^-1 W b / sigma^2`` (so the posterior
+mean is ``W y``)::
 
     log Z = -n log sigma - c_0 / 2 sigma^2 + y.(W b) / 2 sigma^2 - log|M| / 2 + log p(eta)
     d log Z / d log w_i = y_i^2 + (M^-1)_ii - 1                                     (MacKay 1992)

@@ -68,7 +68,7 @@ class Fit:
 
     @property
     def scales(self) -> tuple[float, float]:
-        """Smallest and largest scale of A at the samples: a fit can shrink its residual by shrinking these."""
+        """Smallest and largest scale of A at the samples: a fit can reduce its residual by shrinking them."""
         step = max(len(self.samples.phi) // 1000, 1)
         scales, _ = scales_and_offsets(
             self.samples.part(slice(None, None, step)), self.calibration.coefficients
@@ -116,7 +116,7 @@ def fit(
 
 
 def _biased(found: Fit, sigma: float) -> Fit:
-    """Carry an unknown bias of the reference into the covariance: ``dA = A dF / F`` for all positions alike."""
+    """Carry an unknown bias of the reference into the covariance: ``dA = A dF / F`` at all positions."""
     calibration = found.calibration
     field = calibration.reference.field
     v = calibration.coefficients.reshape(-1, 9) / field
@@ -137,7 +137,8 @@ def _refuse_other_units(data: Observations) -> None:
     read, true = float(np.median(np.linalg.norm(data.field, axis=1))), float(np.median(data.reference))
     if not 0.1 * true < read < 10.0 * true:
         raise CalibrationError(
-            f"mag_x mag_y mag_z: the length of the vector is {read:.3g} (median), where the reference is {true:.0f} nT: expected nT"
+            f"mag_x mag_y mag_z: the length of the vector is {read:.3g} (median), where the reference is "
+            f"{true:.0f} nT: expected nT"
         )
 
 
@@ -167,14 +168,14 @@ def _judged(found: Fit, data: Observations) -> Fit:
     if gap > UNSEEN:
         warnings.insert(
             0,
-            f"the data do not support this fit: all headings lie within {360.0 - gap:.0f} degrees, and on other "
-            "headings the vehicle's field cannot be told from the Earth's",
+            f"the data do not support this fit: all headings lie within {360.0 - gap:.0f} degrees, and on "
+            "other headings the vehicle's field cannot be told from the Earth's",
         )
     if ratio > UNSUPPORTED:
         warnings.insert(
             0,
-            f"the data do not support this fit: at these pitches and positions, on any heading and with 10 degrees more "
-            f"roll, expect {ratio * calibration.noise.sensor:.0f} nT of error",
+            "the data do not support this fit: at these pitches and positions, on any heading and with 10 "
+            f"degrees more roll, expect {ratio * calibration.noise.sensor:.0f} nT of error",
         )
     seen = combinations(found.samples, calibration.coefficients, max(calibration.noise.sensor, 1e-9))
     details = {

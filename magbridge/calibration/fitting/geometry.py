@@ -176,7 +176,7 @@ def _mass(
 
 
 def _linearised(whole: Structure, E: FloatArray, masses: list[_Mass], latent: FloatArray) -> Structure:
-    """Linearise: the structure with the dipoles' columns as they are at `latent`: ``c(l) ~ c(l_0) + J (l - l_0)``."""
+    """Linearise: the structure with the dipoles' columns at `latent`: ``c(l) ~ c(l_0) + J (l - l_0)``."""
     size, q = len(E), E.shape[1]
     J = np.zeros((size, q + LATENT * len(masses)))
     J[:, :q] = E

@@ -64,7 +64,7 @@ def combinations(samples: Samples, coefficients: FloatArray, sigma: float) -> Co
 
 
 def expected_ratio(calibration: Calibration, data: Observations) -> float:
-    """RMS error expected near the runs, on all headings, rolled 10 deg further, over the noise of a sample."""
+    """RMS error expected near the runs, at any heading, rolled 10 deg further, over a sample's noise."""
     error = expected_error(calibration, nearby_mission(calibration, data))
     return float(np.sqrt(np.mean(error**2)) / max(calibration.noise.sensor, 1e-9))
 
@@ -125,8 +125,8 @@ def _attitudes(calibration: Calibration, data: Observations) -> Iterator[str]:
         )
     if pitch.min() > -5.0 and pitch.max() < 5.0:
         yield (
-            f"pitch stayed within {pitch.min():.0f} to {pitch.max():.0f} degrees: nothing steeper was measured; "
-            "fly dives and climbs"
+            f"pitch stayed within {pitch.min():.0f} to {pitch.max():.0f} degrees: nothing steeper was "
+            "measured; fly dives and climbs"
         )
     elif pitch.min() > -5.0 or pitch.max() < 5.0:
         seen, lacking = ("climbs", "dives") if pitch.min() > -5.0 else ("dives", "climbs")
@@ -137,7 +137,7 @@ def _attitudes(calibration: Calibration, data: Observations) -> Iterator[str]:
 
 
 def heading_gap(data: Observations) -> float:
-    """Width (deg) of the widest part of the compass that no sample headed to; 0 without attitude telemetry."""
+    """Width (deg) of the widest part of the compass without a heading; 0 without attitude telemetry."""
     if data.attitude is None:
         return 0.0
     heading = np.degrees(data.attitude[:, 2])

@@ -2,13 +2,13 @@ r"""Undo an anti-alias filter before a fit: in a calibration's turns it takes a 
 
 Notes
 -----
-An RC filter of corner f_c gives y with :math:`\mathbf y + τ \dot{\mathbf y} = \mathbf x`, :math:`τ = 1/(2 π f_c)`. Of a
-field that turns with the vehicle it does not only lag; it shortens::
+An RC filter of corner f_c gives y with :math:`\mathbf y + τ \dot{\mathbf y} = \mathbf x`,
+:math:`τ = 1/(2 π f_c)`. Of a field that turns with the vehicle it does not only lag; it shortens::
 
     |y| = |x| - tau^2 |dx/dt|^2 / (2 |x|)
 
-With the paper's 0.33 Hz, in a spiral of four minutes a turn, 0.7 nT: little, but all of it goes into the gain, and from
-there into every sample of a straight survey.
+With the paper's 0.33 Hz, in a spiral of four minutes a turn, 0.7 nT: little, but all of it goes into the
+gain, and from there into every sample of a straight survey.
 """
 
 from __future__ import annotations
@@ -47,7 +47,8 @@ def unfiltered(data: Observations, corner: float) -> Observations:
     told = float(np.ptp(data.time))
     if tau > told:
         raise CalibrationError(
-            f"filter corner = {corner:g} Hz: its time constant of {tau:.3g} s is longer than the data ({told:.3g} s)"
+            f"filter corner = {corner:g} Hz: its time constant of {tau:.3g} s is longer than the data "
+            f"({told:.3g} s)"
         )
     reach = max(int(np.ceil(0.5 * REACH * tau / np.median(np.diff(data.time)))), 1)
     stretch = np.cumsum(data.steps != 1)

@@ -56,10 +56,11 @@ class Mission:
 
 
 def nearby_mission(calibration: Calibration, data: Observations) -> Mission:
-    """Return the calibration's own attitudes and positions, rolled a little further either way, and on all headings.
+    """Return the calibration's own attitudes and positions, rolled a little further, on all headings.
 
-    That is what a survey after these runs meets at least. The corrected vectors themselves tell the attitude up to
-    a turn about the field; where the vertical is, attitude telemetry must tell: without it, headings stay.
+    That is what a survey after these runs meets at least. The corrected vectors themselves tell the
+    attitude up to a turn about the field; where the vertical is, attitude telemetry must tell: without it,
+    headings stay.
     """
     rows = np.arange(0, len(data), max(3 * len(data) // POINTS, 1))
     k = len(calibration.parameters)

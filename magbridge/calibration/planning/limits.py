@@ -1,4 +1,4 @@
-"""What a vehicle can fly when it is to be calibrated: banks, pitches, and where its masses can stand with them."""
+"""What a vehicle can fly to be calibrated: banks, pitches, and where its masses can stand with them."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class Limits:
 
 
 def trim_of(data: Observations) -> Callable[[FloatArray], float] | None:
-    """Return the pitch (deg) that positions trim a vehicle to, linear in them; None if they do not tell it."""
+    """Return the pitch (deg) that positions trim a vehicle to, linear in them; None if undetermined."""
     if data.attitude is None or not data.names:
         return None
     known = np.isfinite(data.attitude[:, 1])
