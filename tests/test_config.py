@@ -46,6 +46,12 @@ def test_the_contract_s_example_is_read(tmp_path: Path) -> None:
     assert len(config.digest) == 16
 
 
+def test_a_file_from_windows_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "bridge.toml"
+    path.write_bytes(b"\xef\xbb\xbf" + GOOD.replace("\n", "\r\n").encode())
+    assert load(path).sensor == load(write(tmp_path, GOOD)).sensor
+
+
 @pytest.mark.parametrize(
     ("old", "new", "line"),
     [

@@ -1,7 +1,7 @@
 """The live edge: two ports and the one clock, turned into events.
 
-One thread reads, corrects and sends. A second opens ports that are down, so that an open that takes its time
-never holds up the other line.
+One thread reads, corrects and sends. Each port has another that opens it when it is down, so that an open that takes
+its time (a name that nobody resolves) never holds up the other line.
 """
 
 from __future__ import annotations
@@ -23,6 +23,8 @@ __all__ = ["LiveEdge"]
 
 RETRY = 0.25
 """s between attempts to open a port that is down."""
+PATIENCE = 2.0
+"""s that the end waits for an attempt under way."""
 LOOK_US = 100_000
 """µs between looks at the host's clock."""
 
@@ -33,7 +35,7 @@ class LiveEdge:
     Parameters
     ----------
     ports : dict of Channel to Port
-        The sensor's and the link's; opened here.
+        The sensor's and the link's; opened here, in their order.
     clock : Clock
     """
 
@@ -43,8 +45,15 @@ class LiveEdge:
         self._changes: queue.SimpleQueue[bytes] = queue.SimpleQueue()
         self._woken, self._waker = os.pipe()
         self._stopping = False
-        self._opener = threading.Thread(target=self._keep_open, name="port opener", daemon=True)
-        self._opener.start()
+        self._openers: dict[Channel, threading.Thread] = {}
+        for channel, port in ports.items():
+            tried = threading.Event()
+            opener = threading.Thread(
+                target=self._keep_open, args=(channel, port, tried), name="port opener", daemon=True
+            )
+            self._openers[channel] = opener
+            opener.start()
+            tried.wait(RETRY)  # what is said of the next port goes out over this one, where it can
 
     def events(self, deadline: Callable[[], int]) -> Iterator[Event]:
         """Yield events until :meth:`stop`, and an empty one whenever `deadline` (µs) has passed."""
@@ -94,13 +103,15 @@ class LiveEdge:
             os.write(self._waker, b"!")
 
     def close(self) -> None:
-        """Close the ports."""
+        """Close the ports; one that is still being opened goes with the process."""
         self._stopping = True
-        self._opener.join()
-        for port in self._ports.values():
-            port.close()
-        os.close(self._woken)
-        os.close(self._waker)
+        for channel, opener in self._openers.items():
+            opener.join(PATIENCE)
+            if not opener.is_alive():
+                self._ports[channel].close()
+        if not any(opener.is_alive() for opener in self._openers.values()):
+            os.close(self._woken)
+            os.close(self._waker)
 
     def _read(self, channel: Channel, fd: int) -> bytes:
         port = self._ports[channel]
@@ -115,19 +126,18 @@ class LiveEdge:
     def _lost(self, channel: Channel, error: PortError) -> None:
         self.tell(states.port(channel, self._ports[channel], error.reason))
 
-    def _keep_open(self) -> None:
-        """Open whatever is down, again and again; tell of each change once."""
-        told: dict[Channel, str] = {}
+    def _keep_open(self, channel: Channel, port: Port, tried: threading.Event) -> None:
+        """Open the port whenever it is down, and tell of each change once; set `tried` after the first attempt."""
+        told: str | None = None
         while not self._stopping:
-            for channel, port in self._ports.items():
-                if port.up:
-                    continue
+            if not port.up:
                 try:
                     port.open()
                     reason = ""
                 except PortError as error:
                     reason = error.reason
-                if not reason or told.get(channel) != reason:
+                if not reason or told != reason:
                     self.tell(states.port(channel, port, reason))
-                told[channel] = reason
+                told = reason
+            tried.set()
             time.sleep(RETRY)

@@ -115,8 +115,9 @@ def run(path: Path, *, aloud: bool = False) -> None:
     edge = LiveEdge({Channel.LINK: link, Channel.SENSOR: sensor}, clock)
     keeper.attach(edge)
     log = _open_log(config, edge, pipeline.nt_per_count)
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: edge.stop())
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        if number == signal.SIGINT or signal.getsignal(number) != signal.SIG_IGN:  # as SIGHUP is under nohup
+            signal.signal(number, lambda *_: edge.stop())
     sys.setswitchinterval(SWITCH)
     gc.collect()
     gc.freeze()  # what is here now stays: the collector need not look at it again

@@ -39,6 +39,8 @@ EXTRAS = {
     "nicegui": "monitor",
 }
 """Which extra brings a package."""
+ENDS = (signal.SIGTERM, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else []))
+"""What ends a command: it is told to, or its terminal is gone."""
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -49,7 +51,7 @@ def main(arguments: list[str] | None = None) -> int:
         ):  # closed by whoever started us; in this order each gets its own descriptor
             setattr(sys, name, Path(os.devnull).open(mode))  # noqa: SIM115 - as long as the process
     with suppress(ValueError):  # on another thread than the first: signals are another's business
-        signal.signal(signal.SIGTERM, _terminated)
+        _heed_signals()
     try:
         app(arguments, exit_on_error=False, print_error=False, result_action="return_value")
     except CycloptsError as error:
@@ -65,9 +67,9 @@ def main(arguments: list[str] | None = None) -> int:
         sys.stderr.close()
     except (OSError, MemoryError) as error:  # the system does not give a file, a folder, room
         return complain(_reason(error), 1)
-    except _Terminated:
-        signal.signal(signal.SIGTERM, signal.SIG_DFL)
-        signal.raise_signal(signal.SIGTERM)
+    except _Terminated as end:
+        signal.signal(end.number, signal.SIG_DFL)
+        signal.raise_signal(end.number)
     except SystemExit as end:  # what rich makes of a reader that has gone, while it prints the help
         if not isinstance(end.__context__, BrokenPipeError):
             raise
@@ -84,11 +86,21 @@ def _misuse(error: CycloptsError) -> str:
 
 
 class _Terminated(SystemExit):
-    """The process is to end; what is half-written goes first."""
+    """The process is to end by the signal `number`; what is half-written goes first."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__()
+        self.number = number
 
 
-def _terminated(*_: object) -> None:
-    raise _Terminated
+def _heed_signals() -> None:
+    for number in ENDS:
+        if signal.getsignal(number) != signal.SIG_IGN:  # as under nohup
+            signal.signal(number, _terminated)
+
+
+def _terminated(number: int, _: object) -> None:
+    raise _Terminated(number)
 
 
 def _reason(error: OSError | MemoryError) -> str:

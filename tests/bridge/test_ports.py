@@ -6,6 +6,7 @@ import os
 import pty
 import select
 import socket
+import threading
 import time
 import tty
 
@@ -17,6 +18,7 @@ from magbridge.bridge.live import LiveEdge
 from magbridge.bridge.serial_port import SerialPort
 from magbridge.bridge.sockets import PENDING, TcpServer, open_link
 from magbridge.errors import ConfigError, PortError
+from magbridge.records import Channel
 from magbridge.sensors import open_driver
 from magbridge.sensors.clock import DeviceClock, Stamp
 
@@ -192,6 +194,31 @@ def test_a_port_that_cannot_be_opened_says_why(tmp_path) -> None:
     for name in (str(tmp_path / "ttyUSB*"), str(tmp_path / "ttyUSB0")):
         with pytest.raises(PortError, match=r"[Nn]o such (device|file)"):
             open_link(name, 9600).open()
+
+
+class Unresolved(TcpServer):
+    """A link to a name that the network does not resolve, and takes its time to say so."""
+
+    asked = 0
+
+    def open(self) -> None:
+        """Open for ever."""
+        self.asked += 1
+        threading.Event().wait()
+
+
+def test_a_link_that_takes_its_time_to_open_holds_up_neither_the_sensor_nor_the_end() -> None:
+    master, slave = pty.openpty()
+    link, sensor = Unresolved("tcpin:", ("", 0)), SerialPort(os.ttyname(slave), 9600)
+    edge = LiveEdge({Channel.LINK: link, Channel.SENSOR: sensor}, Clock())
+    deadline = time.monotonic() + 10.0
+    while not sensor.up:
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    edge.close()
+    assert (link.asked, sensor.up) == (1, False)
+    os.close(slave)
+    os.close(master)
 
 
 def test_an_impatient_user_stops_it_twice() -> None:

@@ -5,12 +5,15 @@ from __future__ import annotations
 import os
 import pty
 import select
+import signal
 import subprocess
 import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+
+import pytest
 
 CONFIG = """
 [sensor]
@@ -24,10 +27,12 @@ url = "udpout:127.0.0.1:9"
 WANTED = ("until Ctrl-C", "no calibration: raw field", "hmr2300 lost: No such file or directory: ttyNone")
 
 
-def test_a_terminal_is_told_what_the_link_is(tmp_path: Path) -> None:
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_terminal_is_told_what_the_link_is(tmp_path: Path, number: signal.Signals) -> None:
+    """Until it is told to end, or the terminal is closed."""
     with on_a_terminal(tmp_path) as (process, terminal):
         read_until(terminal, WANTED)
-        process.terminate()
+        process.send_signal(number)
         assert process.wait(30.0) == 0
 
 
