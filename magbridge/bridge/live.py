@@ -1,7 +1,7 @@
 """The live edge: two ports and the one clock, turned into events.
 
-One thread reads, corrects and sends. Each port has another that opens it when it is down, so that an open that takes
-its time (a name that nobody resolves) never holds up the other line.
+One thread reads, corrects and sends. Each port has another that opens it when it is down, so that an open
+that takes its time (a name that nobody resolves) never holds up the other line.
 """
 
 from __future__ import annotations
@@ -25,6 +25,8 @@ RETRY = 0.25
 """s between attempts to open a port that is down."""
 PATIENCE = 2.0
 """s that the end waits for an attempt under way."""
+SLOW_US = 10_000_000
+"""µs between two words on a link that is too slow: one of them may be lost as well."""
 LOOK_US = 100_000
 """µs between looks at the host's clock."""
 
@@ -45,6 +47,7 @@ class LiveEdge:
         self._changes: queue.SimpleQueue[bytes] = queue.SimpleQueue()
         self._woken, self._waker = os.pipe()
         self._stopping = False
+        self._overrun = self._slow_us = 0
         self._openers: dict[Channel, threading.Thread] = {}
         for channel, port in ports.items():
             tried = threading.Event()
@@ -77,6 +80,10 @@ class LiveEdge:
                 look_us = now_us + LOOK_US
                 if step_us := self._clock.step_us():
                     yield Event(now_us, Channel.STATE, states.clock_step(now_us, step_us))
+                if self._too_slow(now_us):
+                    yield Event(
+                        now_us, Channel.STATE, states.too_slow(Channel.LINK, self._ports[Channel.LINK])
+                    )
             if now_us >= deadline():
                 yield Event(now_us, Channel.STATE, b"")
 
@@ -123,11 +130,19 @@ class LiveEdge:
             self._lost(channel, error)
             return b""
 
+    def _too_slow(self, now_us: int) -> bool:
+        """Say whether it is to be told that the link had no room for something."""
+        overrun = self._ports[Channel.LINK].overrun
+        if overrun == self._overrun or now_us < self._slow_us:
+            return False
+        self._overrun, self._slow_us = overrun, now_us + SLOW_US
+        return True
+
     def _lost(self, channel: Channel, error: PortError) -> None:
         self.tell(states.port(channel, self._ports[channel], error.reason))
 
     def _keep_open(self, channel: Channel, port: Port, tried: threading.Event) -> None:
-        """Open the port whenever it is down, and tell of each change once; set `tried` after the first attempt."""
+        """Open the port whenever it is down, tell of each change once; set `tried` after the first time."""
         told: str | None = None
         while not self._stopping:
             if not port.up:

@@ -211,6 +211,7 @@ class Pipeline:
             self._log_lost = dropped
             self.component.announcer.state("log", f"log: {reason or 'being written'}", severity)
         else:
+            severity = MAV_SEVERITY.WARNING if well and reason else severity
             self.component.announcer.state("link", f"link: {reason or 'open'}", severity)
 
     def _tune(self) -> None:

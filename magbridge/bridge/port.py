@@ -23,6 +23,8 @@ class Port(ABC):
         self.name = name
         self.dropped = 0
         """Bytes that could not be written."""
+        self.overrun = 0
+        """Bytes of these for which an open line had no room: it is too slow."""
 
     @property
     @abstractmethod
@@ -55,6 +57,11 @@ class Port(ABC):
     @abstractmethod
     def close(self) -> None:
         """Close it; harmless when it is closed."""
+
+    def overran(self, data: bytes) -> None:
+        """Count `data` as dropped because the line is too slow."""
+        self.dropped += len(data)
+        self.overrun += len(data)
 
     def lost(self, reason: object) -> PortError:
         """Close the port and return the error to raise."""

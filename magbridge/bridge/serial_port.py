@@ -106,11 +106,11 @@ class SerialPort(Port):
             if self._begun:
                 del self._begun[: os.write(self._fd, self._begun)]
             if self._begun:
-                self.dropped += len(data)
+                self.overran(data)
             else:
                 self._begun += data[os.write(self._fd, data) :]
         except BlockingIOError:
-            self.dropped += len(data)
+            self.overran(data)
         except (serial.SerialException, OSError) as error:
             raise self.lost(_reason(error)) from error
 

@@ -101,7 +101,7 @@ class UdpPort(Port):
             else:
                 self._socket.sendto(data, peer)
         except BlockingIOError:
-            self.dropped += len(data)
+            self.overran(data)
         except OSError as error:
             if error.errno not in AWAY:
                 raise self.lost(error.strerror) from error
@@ -146,7 +146,7 @@ class _Stream(Port):
             self.dropped += len(data)
             return
         if len(self._pending) + len(data) > PENDING:
-            self.dropped += len(data)
+            self.overran(data)
             data = b""
         self._pending += data
         try:

@@ -7,7 +7,7 @@ from magbridge.mavlink.codec import Codec
 from magbridge.mavlink.dialect import MAG_PORT_NAME, MAG_PORT_STATE, MAV_SEVERITY
 from magbridge.records import Channel
 
-__all__ = ["clock_step", "log_state", "notice", "opened", "port"]
+__all__ = ["clock_step", "log_state", "notice", "opened", "port", "too_slow"]
 
 
 def _frame(name: str, **fields: object) -> bytes:
@@ -31,6 +31,13 @@ def port(channel: Channel, what: Port, reason: str) -> bytes:
         f"{reason}: {what.name}" if reason else ""
     )  # of a long name the end is cut off, and not of the reason
     return _frame("MAG_PORT", port=int(channel), state=int(state), dropped=what.dropped, reason=why)
+
+
+def too_slow(channel: Channel, what: Port) -> bytes:
+    """Return the frame that says that an open port does not take all that is sent."""
+    why = f"too slow, {what.overrun} bytes not sent so far"
+    state = int(MAG_PORT_STATE.OK)
+    return _frame("MAG_PORT", port=int(channel), state=state, dropped=what.dropped, reason=why)
 
 
 def opened(name: MAG_PORT_NAME) -> bytes:

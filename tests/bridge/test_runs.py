@@ -78,6 +78,34 @@ def test_tcp_server_gone_and_back(make_rig: MakeRig, table: Row) -> None:
     replays(rig)
 
 
+def test_a_serial_line_that_is_too_slow(make_rig: MakeRig, table: Row) -> None:
+    """Nobody reads the line for as long as it takes to fill what the system keeps for it."""
+    rig = make_rig("serial")
+    rig.start()
+    mark, deadline = rig.mark, time.monotonic() + 60.0
+    while not said_in(rig.logs, "link: too slow"):
+        assert time.monotonic() < deadline
+        for _ in range(100):
+            rig.fluxgate.turn()
+            time.sleep(0.005)
+    back = rig.until_well()
+    rig.until_said("bytes not sent so far", mark, 30.0)
+    table(
+        "autopilot's serial line too slow: nobody reads it",
+        "whole messages are dropped; "
+        'STATUSTEXT "link: too slow, 1740 bytes not sent so far", again every 10 s',
+        f"{back:.2f} s",
+        "messages to the autopilot, visible in MAG_FIELD's `sequence`; the log has them all",
+    )
+    assert back < 5.0
+    replays(rig)
+
+
+def said_in(logs: list[Path], text: str) -> bool:
+    """Say whether a bridge has said `text`, as far as its log is on the disk."""
+    return any(text.encode() in path.read_bytes() for path in logs)
+
+
 def test_autopilot_on_a_serial_line_pulled_out_and_back(make_rig: MakeRig, table: Row) -> None:
     rig = make_rig("serial")
     rig.start()
