@@ -27,9 +27,8 @@ def notice(text: str) -> bytes:
 def port(channel: Channel, what: Port, reason: str) -> bytes:
     """Return the frame that says that a port opened (no `reason`) or which one is not open, and why."""
     state = MAG_PORT_STATE.LOST if reason else MAG_PORT_STATE.OK
-    why = (
-        f"{reason}: {what.name}" if reason else ""
-    )  # of a long name the end is cut off, and not of the reason
+    # the name last: of a long text the end is cut off
+    why = f"{reason}: {what.name}" if reason else ""
     return _frame("MAG_PORT", port=int(channel), state=int(state), dropped=what.dropped, reason=why)
 
 

@@ -20,13 +20,13 @@ from magbridge.calibration.terms import Effect, Power, Step
 if TYPE_CHECKING:
     from magbridge.calibration.model import Calibration
 
-__all__ = ["ChannelEffect"]
+__all__ = ["ChannelEffect", "Follower"]
 
 FloatArray = NDArray[np.float64]
 
 
-class ChannelEffect(Effect, frozen=True, kw_only=True):
-    """Offset or scale that follows a channel, at once or through lags in series.
+class Follower(Effect, frozen=True, kw_only=True):
+    """An effect of one channel.
 
     Attributes
     ----------
@@ -34,6 +34,26 @@ class ChannelEffect(Effect, frozen=True, kw_only=True):
         What it stands for, as in ``findings.json``.
     channel : str
         The telemetry that it follows.
+    """
+
+    cause: str
+    channel: str
+
+    @property
+    def size(self) -> int:
+        """One for each axis."""
+        return 3
+
+    def channels(self) -> tuple[str, ...]:
+        """Name the one that it follows."""
+        return (self.channel,)
+
+
+class ChannelEffect(Follower, frozen=True, kw_only=True):
+    """Offset or scale that follows a channel, at once or through lags in series.
+
+    Attributes
+    ----------
     origin : float
         Where the channel does nothing (the temperature at calibration; 0 A).
     lag : float
@@ -48,21 +68,10 @@ class ChannelEffect(Effect, frozen=True, kw_only=True):
     """
 
     kind: ClassVar[str] = "channel"
-    cause: str
-    channel: str
     origin: float = 0.0
     lag: Annotated[float, Meta(ge=0.0)] = 0.0
     stages: Power = 1
     on: Literal["offset", "scale"] = "offset"
-
-    @property
-    def size(self) -> int:
-        """One for each axis."""
-        return 3
-
-    def channels(self) -> tuple[str, ...]:
-        """Name the one that it follows."""
-        return (self.channel,)
 
     def columns(self, field: float) -> FloatArray:  # noqa: ARG002  (others need it)
         """One regressor, one slot for each axis."""

@@ -12,6 +12,7 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
+from magbridge.calibration.effects import Follower
 from magbridge.calibration.terms import HIGHEST, Effect, Exponents, Power, Step, Width
 from magbridge.errors import CalibrationError
 
@@ -38,36 +39,24 @@ def powers(x: float, order: int) -> tuple[float, ...]:
     return tuple(accumulate(repeat(x, order), mul))
 
 
-class Follower(Effect, frozen=True, kw_only=True):
-    """Offsets by what one channel makes of its position.
+class MassEffect(Follower, frozen=True, kw_only=True):
+    """Offsets by a mass whose position one channel tells.
 
     Attributes
     ----------
-    cause, channel : str
     centre, scale : float
         In the channel's unit.
     """
 
-    cause: str
-    channel: str
     centre: float
     scale: Width
-
-    @property
-    def size(self) -> int:
-        """One for each axis, nT."""
-        return 3
-
-    def channels(self) -> tuple[str, ...]:
-        """Name the one that it follows."""
-        return (self.channel,)
 
     def columns(self, field: float) -> FloatArray:  # noqa: ARG002  (others need it)
         """Offsets."""
         return offsets(self.size // 3)
 
 
-class PowersEffect(Follower, frozen=True, kw_only=True):
+class PowersEffect(MassEffect, frozen=True, kw_only=True):
     """A mass that another channel moves: ``T += sum_k c_k x^k``, ``x = (p - centre) / scale``.
 
     A permanent moment on a mass at ``r(p)`` gives ``G(r(p)) m`` (see :mod:`.dipole`), a power series in p.
@@ -100,7 +89,7 @@ class PowersEffect(Follower, frozen=True, kw_only=True):
         return step
 
 
-class SourcesEffect(Follower, frozen=True, kw_only=True):
+class SourcesEffect(MassEffect, frozen=True, kw_only=True):
     """What a mass passes on its way: ``T += sum_k c_k (1 + x_k^2)^(-3/2)``.
 
     Here ``x_k = (p - centre) / scale - k apart``. Iron that a mass magnetises, or is magnetised by, has a
@@ -187,7 +176,7 @@ class MonomialEffect(Effect, frozen=True, kw_only=True):
         return step
 
 
-class PlayEffect(Follower, frozen=True, kw_only=True):
+class PlayEffect(MassEffect, frozen=True, kw_only=True):
     """Backlash or remanence: ``T += c (S(y) - S(p)) / width``, y the play operator of the channel p.
 
     ``y = min(max(y, p - width / 2), p + width / 2)``: the last position drags behind by half the width, on

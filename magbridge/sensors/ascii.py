@@ -170,13 +170,12 @@ class Ascii:
         self.time_modulo = options.time_modulo
         self.period = 1.0 / options.rate if options.rate else 0.0
         self._framer = Framer(options.terminator.encode(), LIMIT)
-        self._skipped = 0
         self.frames_bad = 0
 
     @property
     def bytes_skipped(self) -> int:
         """Bytes that belonged to no valid line."""
-        return self._skipped + self._framer.skipped
+        return self._framer.skipped
 
     def start(self) -> tuple[bytes, ...]:
         """Return the configured commands."""
@@ -189,7 +188,7 @@ class Ascii:
             try:
                 readings.append(self._reading(line))
             except ValueError:
-                self._skipped += len(line)
+                self._framer.skipped += len(line)
                 self.frames_bad += line != b"\r"
         return readings
 

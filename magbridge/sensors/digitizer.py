@@ -33,8 +33,8 @@ should be a zero.
 Worked example: reading 7 after the third power-on, x sampled at 1.000000 s, y 0.1 s and z 0.2 s later,
 4.25 degC, 3.712 V, counts 2796203, -1048576, 5592405. The message::
 
-    01 24 07 00 03 00 40 42 0F 00 E0 C8 10 00 80 4F 12 00 A9 01 80 0E 00 AB AA 2A 00 00 F0 55 55
-    55 CC 3B C2 3C
+    01 24 07 00 03 00 40 42 0F 00 E0 C8 10 00 80 4F 12 00
+    A9 01 80 0E 00 AB AA 2A 00 00 F0 55 55 55 CC 3B C2 3C
 
 and the frame is in :data:`EXAMPLE`. Counts become volts, ``V = counts / 2^23 * reference_voltage / gain``,
 and volts become ``B = V / sensitivity``.
@@ -56,8 +56,8 @@ from magbridge.sensors.framing import CRC32_RESIDUE, Framer, cobs_decode
 __all__ = ["EXAMPLE", "Digitizer", "DigitizerOptions"]
 
 EXAMPLE = bytes.fromhex(
-    "04 01 24 07 02 03 04 40 42 0F 04 E0 C8 10 04 80 4F 12 05 A9 01 80 0E 04 AB AA 2A 01 09 F0 55 55 55 CC "
-    "3B C2 3C 00"
+    "04 01 24 07 02 03 04 40 42 0F 04 E0 C8 10 04 80 4F 12 05"
+    "A9 01 80 0E 04 AB AA 2A 01 09 F0 55 55 55 CC 3B C2 3C 00"
 )
 """The worked example as it stands on the line, delimiter included."""
 
@@ -112,13 +112,12 @@ class Digitizer:
             self._limit = min(self._limit, int(options.full_scale / self.nt_per_count))
         self.range_nt = self._limit * self.nt_per_count
         self._framer = Framer(b"\0", 254)
-        self._skipped = 0
         self.frames_bad = 0
 
     @property
     def bytes_skipped(self) -> int:
         """Bytes that belonged to no valid frame."""
-        return self._skipped + self._framer.skipped
+        return self._framer.skipped
 
     def start(self) -> tuple[bytes, ...]:
         """Return no commands: the instrument sends by itself."""
@@ -131,7 +130,7 @@ class Digitizer:
             message = cobs_decode(frame)
             if len(message) < LENGTH or message[1] != len(message) or crc32(message) != CRC32_RESIDUE:
                 self.frames_bad += 1
-                self._skipped += len(frame)
+                self._framer.skipped += len(frame)
             elif message[0] == READING:
                 readings.append(self._reading(message))
         return readings

@@ -17,6 +17,11 @@ class Framer:
         One byte.
     limit : int
         Longest frame, without its delimiter.
+
+    Attributes
+    ----------
+    skipped : int
+        Bytes of what was too long; who reads the frames adds those that say nothing.
     """
 
     __slots__ = ("_delimiter", "_limit", "_overlong", "_rest", "skipped")

@@ -79,7 +79,6 @@ class Hmr2300:
     def __init__(self, options: Hmr2300Options) -> None:
         self._options = options
         self.period = 1.0 / options.rate
-        self._skipped = 0
         self.frames_bad = 0
         self._rest = b""
         self._aligned = False
@@ -88,7 +87,7 @@ class Hmr2300:
     @property
     def bytes_skipped(self) -> int:
         """Bytes that belonged to no valid frame."""
-        return self._skipped + self._lines.skipped
+        return self._lines.skipped
 
     def start(self) -> tuple[bytes, ...]:
         """Return the commands: stop, set output and rate, send continuously."""
@@ -111,7 +110,7 @@ class Hmr2300:
                 if end - at < WINDOW:
                     break
                 offset, self._aligned = _alignment(buffer, at)
-                self._skipped += offset
+                self._lines.skipped += offset
                 at += offset
             elif end - at < SIZE:
                 break
@@ -131,7 +130,7 @@ class Hmr2300:
                 x, y, z = (int(number.translate(None, b" ,")) for number in match.groups())
                 readings.append(_reading(x, y, z))
             else:
-                self._skipped += len(line)
+                self._lines.skipped += len(line)
                 self.frames_bad += not line[:1].isalpha()  # a word is the reply to a command
         return readings
 

@@ -90,7 +90,6 @@ class Twinleaf:
         self._routing = bytes(reversed(options.hops()))
         self.range_nt = options.range
         self._framer = Framer(tio.END, tio.LIMIT)
-        self._skipped = 0
         self.frames_bad = 0
         self._session: int | None = None
         self._timebases: dict[int, float] = {}
@@ -104,7 +103,7 @@ class Twinleaf:
     @property
     def bytes_skipped(self) -> int:
         """Bytes that belonged to no valid frame, or to samples of the wanted stream not yet described."""
-        return self._skipped + self._framer.skipped
+        return self._framer.skipped
 
     def start(self) -> tuple[bytes, ...]:
         """Return a heartbeat, and the two generations' requests for descriptors."""
@@ -127,7 +126,7 @@ class Twinleaf:
                     self._describe(kind, payload)
             except (ValueError, IndexError, struct.error):
                 self.frames_bad += 1
-                self._skipped += len(frame)
+                self._framer.skipped += len(frame)
         return readings
 
     def _open(self, frame: bytes) -> tuple[int, bytes]:
@@ -188,7 +187,7 @@ class Twinleaf:
         if number not in self._rows:
             parts = self._described(number)
             if parts is None:
-                self._skipped += len(payload)
+                self._framer.skipped += len(payload)
                 return []
             self._rows[number] = self._compile(parts)
         row = self._rows[number]
@@ -196,7 +195,7 @@ class Twinleaf:
             return []
         timing = self._timing(number, payload)
         if timing is None:
-            self._skipped += len(payload)
+            self._framer.skipped += len(payload)
             return []
         first, begin, zero, period = timing
         count, rest = divmod(len(payload) - 4, row.size)

@@ -26,7 +26,7 @@ def read(*frames: bytes, **options: float) -> list[Reading]:
 
 def test_the_worked_example() -> None:
     assert framed(MESSAGE) == EXAMPLE
-    assert MESSAGE.hex(" ").upper() in str(digitizer.__doc__)
+    assert MESSAGE.hex(" ").upper() in " ".join(str(digitizer.__doc__).split())
     (reading,) = read(EXAMPLE)
     assert reading.counts == (2796203, -1048576, 5592405)
     # 2796203 / 2^23 * 2.5 V / 5e-5 V/nT
