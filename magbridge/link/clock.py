@@ -11,8 +11,9 @@ WINDOW = 32
 """Exchanges that count."""
 JITTER_US = 200.0
 """us that even the fastest exchange is uncertain by."""
-STEP_US = 1_000_000
-"""us; an exchange this far off, beyond its own round trip, says that the other clock was set."""
+STEP_US, DRIFT = 20_000, 500e-6
+"""us, us/us; two exchanges that differ by more than half of each round trip, this and this drift between them
+tell of a clock that was set."""
 SPAN_US = 10_000_000
 """us of exchanges before a drift is believed."""
 PENDING = 8
@@ -65,8 +66,11 @@ class VehicleClock:
         trip_us = now_us - sent_us
         middle_us = sent_us + trip_us // 2
         offset_us = tc1 // 1000 - middle_us
-        if self.known and abs(offset_us - self.offset_us(now_us)) > STEP_US + trip_us:
-            self.reset()
+        if self.known:
+            then_us, was_us, fastest_us = min(self._exchanges, key=lambda one: one[2])
+            allowed_us = STEP_US + (trip_us + fastest_us) / 2 + DRIFT * (middle_us - then_us)
+            if abs(offset_us - was_us) > allowed_us:
+                self.reset()
         self._exchanges.append((middle_us, offset_us, trip_us))
         self._fit()
 
