@@ -15,7 +15,7 @@ from collections.abc import Iterator, Sequence
 from itertools import islice
 from math import isnan, nan
 from pathlib import Path
-from typing import TextIO
+from typing import NamedTuple, TextIO
 
 import numpy as np
 import xarray as xr
@@ -50,10 +50,20 @@ def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
             raise FormatError(path, f"expected comma-separated values: {error}") from None
 
 
-def _chunks(path: Path, file: TextIO, rows: int) -> Iterator[xr.Dataset]:
+class _Header(NamedTuple):
+    """What stands above the rows, and the number of its last line."""
+
+    attrs: dict[str, str]
+    fill: float
+    names: list[str]
+    units: dict[str, str]
+    row: int
+
+
+def _header(path: Path, text: Iterator[str]) -> _Header:
+    """Take the comments and the names of the columns off the lines."""
     attrs: dict[str, str] = {}
     fill = nan
-    text = _lines(file)
     line, row = next(text, ""), 1
     while line.startswith("#"):
         if match := ATTRIBUTE.fullmatch(line.rstrip("\r\n")):
@@ -72,6 +82,12 @@ def _chunks(path: Path, file: TextIO, rows: int) -> Iterator[xr.Dataset]:
     if "time" not in names:
         there = " ".join(names)
         raise FormatError(path, f"expected this column; there are: {there}", row=row, column="time")
+    return _Header(attrs, fill, names, units, row)
+
+
+def _chunks(path: Path, file: TextIO, rows: int) -> Iterator[xr.Dataset]:
+    text = _lines(file)
+    attrs, fill, names, units, row = _header(path, text)
     reader, last, nothing = csv.reader(text), -np.inf, True
     lines = ((row + reader.line_num, fields) for fields in reader if fields)
     while block := list(islice(lines, rows)):

@@ -85,13 +85,8 @@ def position_bound(
     """
     o = options or Options()
     corners = np.asarray(time, float)
-    if corners.size < 2:
-        raise OutOfRange("track", f"{corners.size} positions", "at least two are needed")
-    if (np.diff(corners) <= 0.0).any():
-        raise OutOfRange("time", "the track's", "it must increase from corner to corner")
     lat, lon = np.asarray(latitude, float), np.unwrap(np.asarray(longitude, float), period=360.0)
-    legs = [separation(*a, *b) for a, b in pairwise(zip(lat, lon, strict=True))]
-    along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.array(legs).T))])
+    along = _along(corners, lat, lon)
     speed = along[-1] / (corners[-1] - corners[0])
     interval = max(every, min(o.interval, block_length(grid) / max(speed, 1e-9)))
     at = np.arange(corners[0] + 0.5 * interval, corners[-1], interval)
@@ -123,6 +118,16 @@ def position_bound(
         covariance[i], unaided[i] = P, np.sqrt(alone[0, 0] + alone[1, 1])
     reached = np.sqrt(covariance[:, 0, 0] + covariance[:, 1, 1])
     return Bound(at, lat, lon, covariance, reached, unaided)
+
+
+def _along(time: Array, latitude: Array, longitude: Array) -> Array:
+    """(n,) m from the first corner of a track to each."""
+    if time.size < 2:
+        raise OutOfRange("track", f"{time.size} positions", "at least two are needed")
+    if (np.diff(time) <= 0.0).any():
+        raise OutOfRange("time", "the track's", "it must increase from corner to corner")
+    legs = [separation(*a, *b) for a, b in pairwise(zip(latitude, longitude, strict=True))]
+    return np.concatenate([[0.0], np.cumsum(np.hypot(*np.array(legs).T))])
 
 
 def told(bound: Bound, grid: AnomalyGrid) -> xr.Dataset:

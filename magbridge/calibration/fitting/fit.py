@@ -206,21 +206,7 @@ def assemble(
 ) -> Fit:
     """Put a fit's numbers into a calibration with its run table."""
     e = residuals_of(samples, coefficients)
-    assert data.runs is not None
     assert data.time is not None
-    labels, which = np.unique(data.runs, return_inverse=True)
-    count = np.bincount(which)
-    squares = np.bincount(which, e * e)
-    places = [np.bincount(which, column) / count for column in data.parameters.T]
-    table = tuple(
-        Run(
-            str(label),
-            int(count[r]),
-            float(np.sqrt(squares[r] / count[r])),
-            tuple(float(p[r]) for p in places),
-        )
-        for r, label in enumerate(labels)
-    )
     steps = np.diff(data.time)
     calibration = Calibration(
         parameters=parameters,
@@ -235,9 +221,22 @@ def assemble(
         ),
         reference=Reference(samples.unit, data.model),
         sensor=Sensor(data.sensor),
-        runs=table,
+        runs=_runs(data, e),
         method=method,
         inputs=dict(data.inputs),
         software=f"magbridge {__version__}",
     )
     return Fit(calibration, e, (), details or {}, samples)
+
+
+def _runs(data: Observations, e: FloatArray) -> tuple[Run, ...]:
+    """Return each run's samples, RMS residual (nT) and mean positions."""
+    assert data.runs is not None
+    labels, which = np.unique(data.runs, return_inverse=True)
+    count = np.bincount(which)
+    squares = np.bincount(which, e * e)
+    places = [np.bincount(which, column) / count for column in data.parameters.T]
+    return tuple(
+        Run(str(label), int(n), float(np.sqrt(square / n)), tuple(map(float, place)))
+        for label, n, square, *place in zip(labels, count, squares, *places, strict=True)
+    )
