@@ -8,9 +8,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from magbridge.diagnose.causes.timing import channel_skew
 from magbridge.diagnose.compare.interpolation import bent
 from magbridge.diagnose.compare.problem import DELAY, DELAYS, Problem, pose
 from magbridge.diagnose.compare.survey import Survey
+from magbridge.diagnose.inference.information import information
 from magbridge.diagnose.inference.joint import fit_joint
 from magbridge.diagnose.report.doubts import late
 
@@ -69,3 +71,19 @@ def test_channels_taken_at_once_have_none(right: Callable[[int], Problem]) -> No
     assert np.all(np.abs(DELAY * spread) < 0.03)
     assert np.std(problem.straight(fit.z) - problem.residual) < 0.2
     assert not late(problem, fit)
+
+
+def test_delays_that_are_not_there_leave_a_skew_its_power(right: Callable[[int], Problem]) -> None:
+    """But where noise looks like them."""
+    whole = right(3000)
+
+    def power(of: Problem) -> float:
+        fit, (skew,) = fit_joint(of, [], 1), channel_skew(of)
+        return float(np.trace(information(of, fit.noise, fit, [skew.columns]).matrix))
+
+    shares = []
+    for seed in range(3, 8):
+        problem = pose(made(whole, swaying(whole.survey.time), seed), whole.calibration)
+        shares.append(power(problem) / power(replace(problem, late=np.zeros_like(problem.late))))
+    assert np.median(shares) > 0.95
+    assert max(shares) > 0.99

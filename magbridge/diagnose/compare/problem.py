@@ -13,7 +13,9 @@ as prior: ``c = c_0 + L z``, ``z ~ N(m, 1)``, where L holds only the directions 
 
 Free are also three delays with which the channels may have been interpolated to their rows
 (:mod:`.interpolation`): a fault of the log, not of the vehicle, so they move no coefficient. Unseen, it is an
-error that a pair of large causes which cancel can mimic.
+error that a pair of large causes which cancel can mimic. They have one common size
+(:mod:`~magbridge.diagnose.inference.statistic`): many logs have none, and delays that are free in vain take
+up to a tenth of a skew's power.
 
 Derivatives are taken where the reading would have had no residual, ``H_r - e w / |w|^2``: at the
 reading itself they hold its noise, and scales could grow against offsets until the noise is gone
@@ -44,7 +46,7 @@ __all__ = ["Problem", "add_effects", "effect_columns", "history", "pose", "sampl
 FloatArray = NDArray[np.float64]
 
 DELAY = 0.3
-"""s, 1-sigma of a channel's, after its row."""
+"""s, a plausible size of a channel's, after its row."""
 DELAYS = slice(-3, None)
 """Places of the channels' delays among what is free."""
 SEEN = 0.01

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magbridge.diagnose.compare.columns import Columns
-from magbridge.diagnose.compare.problem import Problem
+from magbridge.diagnose.compare.problem import DELAYS, Problem
 from magbridge.diagnose.inference.design import Design, in_threads, kept, normal
 from magbridge.diagnose.inference.fit_noise import fit_noise
 from magbridge.diagnose.inference.noise import Noise
@@ -39,8 +39,8 @@ class Joint:
     Attributes
     ----------
     log_likelihood : float
-        Of the noise model, with the prior of the calibration and of the effects; numbers of one common size
-        are integrated out (Laplace's approximation).
+        Of the noise model, with the prior of the calibration and of the effects; numbers of one common size,
+        as the channels' delays are, are integrated out (Laplace's approximation).
     z : (q,) array
     coefficients : (k,) array
         Of the effects, in units of their prior width.
@@ -101,7 +101,8 @@ def fit_joint(
     X = Design(problem, kept(len(problem), columns))
     q, k = X.free.shape[1], X.effects
     prior = np.append(np.ones(q), np.broadcast_to(ridge, k))
-    common = [(own, spectrum) for own, spectrum in zip(X.at, spectra, strict=False) if spectrum is not None]
+    common = [(slice(q + DELAYS.start, q), np.ones((1, 3)))]
+    common += [(own, spectrum) for own, spectrum in zip(X.at, spectra, strict=False) if spectrum is not None]
     centre = np.append(problem.centre, np.zeros(k))
     past = problem.survey.past(order)
 

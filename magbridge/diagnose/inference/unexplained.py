@@ -192,8 +192,9 @@ def _weighed(
     moved = -shift @ best.estimate
     left = fit.left - Design(problem, [*model, one.columns]).times(np.append(moved, best.estimate))
     noise = fit_noise(left, problem.survey.past(order), blocks=bool(np.ptp(fit.noise.scale)), like=fit.noise)
-    z = fit.z + moved[: len(fit.z)]
-    pull = float(np.sum((z - problem.centre) ** 2) - np.sum((fit.z - problem.centre) ** 2))
+    before = fit.z - problem.centre
+    after = before + moved[: len(fit.z)]
+    pull = float(fit.prior[: len(fit.z)] @ (after**2 - before**2))
     gained = noise.log_likelihood - fit.noise.log_likelihood - 0.5 * pull
     return gained - best.price - float(np.log(one.trials))
 
