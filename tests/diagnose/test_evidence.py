@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import chi2
 
 from magbridge.diagnose.causes.candidates import Candidate, slices
-from magbridge.diagnose.inference.evidence import LEVEL, evidence_of, trials, weigh, worth
+from magbridge.diagnose.inference.evidence import LEVEL, evidence_of, score, trials, weigh, worth
 from magbridge.diagnose.inference.information import Information
 
 
@@ -30,6 +30,21 @@ def test_what_cannot_be_negative_has_twice_the_prior_where_it_is() -> None:
     one_sided = evidence_of(candidate("filter_lag", positive=True), estimate**2, 1)
     assert one_sided == pytest.approx(exact, abs=0.06)
     assert one_sided - weigh(estimate**2, 1) == pytest.approx(np.log(2.0), abs=0.05)
+
+
+@pytest.mark.parametrize(
+    ("one", "least"),
+    [
+        (candidate("filter_lag", positive=True), 0.08),
+        (candidate("map_error", 6, spectra=np.array([np.ones(6), 2.0 ** -np.arange(6)])), 0.0),
+    ],
+)
+def test_a_size_that_cannot_be_negative_has_one_tail(one: Candidate, least: float) -> None:
+    """Where there is none, no more than the level is found; of a single number, no less either."""
+    S = np.diag(30.0 ** -np.linspace(0.0, 1.0, one.size)) * 100.0
+    draws = np.random.default_rng(5).standard_normal((2000, one.size)) * np.sqrt(np.diag(S))
+    ratios = [score(Information(S, b, np.zeros((0, 0))), slice(None), one).ratio for b in draws]
+    assert least <= np.mean(one.tail * chi2.sf(ratios, 1) < 0.1) < 0.12
 
 
 def test_numbers_of_one_size_are_not_weighed_twice() -> None:

@@ -38,6 +38,11 @@ class Span:
     spectra: Array | None = None
     more: float = 0.0
 
+    @property
+    def tail(self) -> float:
+        """Share of a chi-square's tail that is a test's: half, where a size cannot be negative."""
+        return 0.5 if self.positive or self.spectra is not None else 1.0
+
 
 class Draws(NamedTuple):
     """Fisher's information S of all columns, the truth's last; draws of their scores' noise (m, DRAWS)."""

@@ -187,7 +187,7 @@ def p_values(draws: Draws, spans: Sequence[Span], setting: Setting) -> Array:
     for span in spans:
         ratio, freedom = draws.ratio(span, scale)
         if freedom:
-            tests = len(setting.causes) * setting.trials.get(span.cause, 1.0)
+            tests = span.tail * len(setting.causes) * setting.trials.get(span.cause, 1.0)
             least = np.minimum(least, tests * chdtrc(freedom, np.maximum(ratio, 0.0)))
     return least
 

@@ -86,6 +86,11 @@ class Candidate:
         return self.size if self.spectra is None else 1
 
     @property
+    def tail(self) -> float:
+        """Share of a chi-square's tail that counts: half where no size is negative (Self & Liang 1987)."""
+        return 0.5 if self.positive or self.spectra is not None else 1.0
+
+    @property
     def pieces(self) -> tuple[Candidate, ...]:
         """Its parts, or itself."""
         return self.parts or (self,)

@@ -13,7 +13,8 @@ it, times the number of causes; below 1 %: found. Under no effect scores are ``N
 ``P(any of its n hypotheses passes) / a`` at the level a where they are tested: hypotheses that are much the
 same by chance become strangers far out in the tail. That far no plain simulation comes, so one hypothesis
 after the other is made to pass, and with m that pass then ``N = n E[1 / m]`` (Owen, Maximov & Chertkov 2019,
-Electron. J. Statist. 13:231).
+Electron. J. Statist. 13:231). A size that cannot be negative has one tail
+(:attr:`~magbridge.diagnose.causes.candidates.Candidate.tail`).
 
 Two kinds have a prior of their own. Numbers of one common size (:mod:`.statistic`) have had theirs in the
 ratio: the evidence is R / 2, less the log of how many spectra it was chosen from. A number that cannot be

@@ -100,7 +100,10 @@ def isolability(
     at = slices(candidates)
     picked = _most_visible(candidates, info, at)
     visible = [
-        _visible(candidates[k], info, at[k], causes * trials.get(candidates[k].cause, 1.0)) for k in picked
+        _visible(
+            candidates[k], info, at[k], candidates[k].tail * causes * trials.get(candidates[k].cause, 1.0)
+        )
+        for k in picked
     ]
     R = np.eye(len(picked))
     for i, a in enumerate(picked):

@@ -54,7 +54,7 @@ class NamingTheory:
         for k, at in enumerate(self.at):
             statistic = Statistic(self.S[at, at], candidates[k].spectra)
             self.statistics.append(statistic)
-            tests = trials.get(candidates[k].cause, 1.0) * causes
+            tests = candidates[k].tail * trials.get(candidates[k].cause, 1.0) * causes
             self.limit[k] = float(chi2.isf(LEVEL / tests, max(statistic.freedom, 1)))
 
     def chance(self, cause: str, own: NDArray[np.intp], b: FloatArray, signal_to_noise: float) -> float:

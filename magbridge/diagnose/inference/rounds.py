@@ -217,7 +217,7 @@ class State:
 
         The noise's level is an estimate, so the distribution is Fisher's F.
         """
-        tests = self.trials.get(candidate.cause, 1.0) * self.causes
+        tests = candidate.tail * self.trials.get(candidate.cause, 1.0) * self.causes
         freedom, certain = max(freedom, 1), self.certain.get(key(candidate), np.inf)
         return min(1.0, tests * float(fdtrc(freedom, certain, ratio / freedom)))
 
