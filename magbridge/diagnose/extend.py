@@ -17,7 +17,7 @@ from magbridge.diagnose.causes.candidates import Candidate, slices
 from magbridge.diagnose.compare.columns import Columns
 from magbridge.diagnose.compare.derivatives import derivatives
 from magbridge.diagnose.compare.prior import isotropic
-from magbridge.diagnose.compare.problem import Problem, samples_of
+from magbridge.diagnose.compare.problem import DELAYS, Problem, samples_of
 from magbridge.diagnose.compare.survey import Survey
 from magbridge.diagnose.inference.design import normal
 from magbridge.diagnose.inference.evidence import IDEAL
@@ -195,9 +195,9 @@ def _about(problem: Problem, model: Sequence[Candidate], fit: Joint) -> tuple[Pr
     selector = np.eye(extended.coefficients.size)[:, problem.calibration.coefficients.size :]
     effects, at, columns = derivatives(extended, samples, g, -selector), 0, []
     again = replace(problem, residual=e, slopes=g)
-    # what the residual would be at the first point, were it linear about this one; the reference was not
-    # mended in it
-    again.residual[:] += again.free @ fit.z
+    # what the residual would be at the first point, were it linear about this one; neither the reference nor
+    # the channels' delays were mended in it
+    again.residual[:] += again.free[:, : DELAYS.start] @ fit.z[: DELAYS.start]
     for candidate, place in zip(model, slices(model), strict=True):
         if not candidate.effects:
             columns.append(candidate.columns)

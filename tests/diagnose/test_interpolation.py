@@ -8,10 +8,12 @@ from dataclasses import replace
 
 import numpy as np
 
+from magbridge.diagnose.causes.time_dependent import offset_drift
 from magbridge.diagnose.causes.timing import channel_skew
 from magbridge.diagnose.compare.interpolation import bent
 from magbridge.diagnose.compare.problem import DELAY, DELAYS, Problem, pose
 from magbridge.diagnose.compare.survey import Survey
+from magbridge.diagnose.extend import settle
 from magbridge.diagnose.inference.information import information
 from magbridge.diagnose.inference.joint import fit_joint
 from magbridge.diagnose.report.doubts import late
@@ -61,6 +63,16 @@ def test_the_delays_are_found(right: Callable[[int], Problem]) -> None:
     np.testing.assert_allclose(found, TAKEN, atol=0.03)
     told = [float(x) for x in re.findall(r"([\d.]+) ± [\d.]+ s", late(problem, fit))]
     np.testing.assert_allclose(told, found[1:], atol=1e-3)
+
+
+def test_the_delays_stay_where_the_comparison_is_linearised_anew(right: Callable[[int], Problem]) -> None:
+    """A calibration that is extended by another cause has no delays."""
+    whole = right(3000)
+    time = whole.survey.time
+    problem = pose(made(whole, interpolated(time), 1), whole.calibration)
+    drift = offset_drift(problem)[0]
+    _, _, fit = settle(problem, [drift], fit_joint(problem, [drift.columns], 1), 1)
+    np.testing.assert_allclose(DELAY * (fit.z[DELAYS] - fit.z[DELAYS][0]), TAKEN, atol=0.03)
 
 
 def test_channels_taken_at_once_have_none(right: Callable[[int], Problem]) -> None:
