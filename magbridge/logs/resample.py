@@ -5,12 +5,14 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["MAX_AGE", "latest", "linear"]
+__all__ = ["CIRCLES", "MAX_AGE", "latest", "linear"]
 
 Floats = NDArray[np.float64]
 
 MAX_AGE = 30.0
 """s; what a live listener heard longer ago is not carried to a row."""
+CIRCLES = {"heading": (360.0, 0.0), "longitude": (360.0, -180.0)}
+"""Columns that begin anew, in deg: after how much, and where."""
 
 
 def latest(at: Floats, time: Floats, values: Floats) -> Floats:
@@ -37,7 +39,9 @@ def latest(at: Floats, time: Floats, values: Floats) -> Floats:
     return np.where(fresh, values[k], np.nan)
 
 
-def linear(at: Floats, time: Floats, values: Floats, max_gap: float, period: float | None = None) -> Floats:
+def linear(
+    at: Floats, time: Floats, values: Floats, max_gap: float, period: float | None = None, start: float = 0.0
+) -> Floats:
     """Return values between their neighbours in time, for what changes smoothly and was measured ashore.
 
     Parameters
@@ -50,6 +54,8 @@ def linear(at: Floats, time: Floats, values: Floats, max_gap: float, period: flo
         s; between neighbours farther apart, or beyond an end by more, it is NaN.
     period : float, optional
         The values live on a circle of this circumference: 360 for a heading in degrees.
+    start : float
+        Where they begin anew on it.
 
     Returns
     -------
@@ -65,4 +71,4 @@ def linear(at: Floats, time: Floats, values: Floats, max_gap: float, period: flo
     right = np.searchsorted(time, at)
     before, after = time[np.maximum(right - 1, 0)], time[np.minimum(right, len(time) - 1)]
     result[(after - before > max_gap) | (at - time[-1] > max_gap) | (time[0] - at > max_gap)] = np.nan
-    return result if period is None else result % period
+    return result if period is None else result - period * np.floor((result - start) / period)

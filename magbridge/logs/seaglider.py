@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from magbridge.errors import FormatError
 from magbridge.logs.cf import floats
 from magbridge.logs.deployment import deployment, increasing
-from magbridge.logs.resample import linear
+from magbridge.logs.resample import CIRCLES, linear
 
 __all__ = ["DIMENSION", "NT_PER_COUNT", "dive"]
 
@@ -91,7 +91,7 @@ def dive(path: Path, file: Any) -> xr.Dataset:
         ctd_time = floats(file["ctd_time"])
         for ours, (theirs, unit) in CTD.items():
             if theirs in file.variables:
-                columns[ours] = linear(time, ctd_time, floats(file[theirs]), MAX_GAP)
+                columns[ours] = linear(time, ctd_time, floats(file[theirs]), MAX_GAP, *CIRCLES.get(ours, ()))
                 units[ours] = unit
     for motor in MOTORS:
         if f"gc_{motor}_i" in file.variables:

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from magbridge.errors import FormatError, MissingExtra
 from magbridge.logs import FLIGHT
 from magbridge.logs.deployment import deployment, increasing, sliced
-from magbridge.logs.resample import linear
+from magbridge.logs.resample import CIRCLES, linear
 
 __all__ = ["chunks"]
 
@@ -55,7 +55,6 @@ SENSORS = {
     "sci_water_temp": ("water_temperature", "degC", 1.0),
     "sci_water_pressure": ("water_pressure", "bar", 1.0),
 }
-ANGLES = {"m_heading": 360.0}
 
 
 def _import() -> Any:
@@ -98,7 +97,7 @@ def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
     for theirs, (ours, unit, factor) in SENSORS.items():
         if theirs in tracks and len(tracks[theirs][0]):
             when, what = tracks[theirs]
-            columns[ours] = linear(time, when, what * factor, MAX_GAP, ANGLES.get(theirs))
+            columns[ours] = linear(time, when, what * factor, MAX_GAP, *CIRCLES.get(ours, ()))
             units[ours] = unit
     dataset = deployment(path, time, columns, units, {"heading_reference": "magnetic"})
     yield from sliced(dataset, rows)

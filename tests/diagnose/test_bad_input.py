@@ -19,6 +19,7 @@ from magbridge.diagnose.compare.take import take
 from magbridge.diagnose.report import files
 from magbridge.diagnose.run import diagnose
 from magbridge.errors import DataError, WriteError
+from magbridge.field.earth import wrap
 from magbridge.logs import write
 from sitl import load, segments, simulate
 
@@ -139,6 +140,14 @@ def test_attitude_and_position_may_be_lacking_in_some_rows_or_all(
     assert survey.place is None
     assert take([ds.assign(roll=np.nan * ds["roll"])], calibration).attitude is None
     assert diagnose([ds.assign(late | never)], calibration).verdict == "nothing_found"
+
+
+def test_a_track_across_the_date_line_is_one_track(plain: tuple[xr.Dataset, Calibration]) -> None:
+    ds, calibration = plain
+    moved = wrap(ds["longitude"] - float(ds["longitude"].mean()) + 180.0)
+    assert float(moved.min()) < -179.0 < 179.0 < float(moved.max())
+    there, here = (take([one], calibration).place for one in (ds.assign(longitude=moved), ds))
+    np.testing.assert_allclose(there, here, atol=1e-4)
 
 
 def test_where_there_are_no_dives_it_is_not_said_that_dives_were_left_out(

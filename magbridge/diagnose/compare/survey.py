@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from magbridge.diagnose.compare.past import FAR, Past
 from magbridge.errors import DataError
+from magbridge.field.earth import wrap
 
 __all__ = ["FEWEST", "Channel", "Survey", "assemble"]
 
@@ -211,9 +212,8 @@ def _place(table: dict[str, FloatArray]) -> FloatArray | None:
         return None
     middle = np.median(table["latitude"])
     north = np.radians(table["latitude"] - middle) * 6.3712e6
-    east = (
-        np.radians(table["longitude"] - np.median(table["longitude"])) * 6.3712e6 * np.cos(np.radians(middle))
-    )
+    along = wrap(table["longitude"] - table["longitude"][0])  # also across the date line
+    east = np.radians(along - np.median(along)) * 6.3712e6 * np.cos(np.radians(middle))
     return np.stack([north, east], axis=1)
 
 
