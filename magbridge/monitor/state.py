@@ -22,6 +22,8 @@ WINDOW, BUCKET = 600.0, 1.0
 RETRY = 1.5
 """s until what was not answered is asked again."""
 WAITING = "no answer yet"
+AWAY = 30.0
+"""s of silence after which another bridge that is heard takes its place."""
 
 
 class Text(NamedTuple):
@@ -55,7 +57,9 @@ class Parameter:
 
 
 class State:
-    """All that a page shows of the first bridge that is heard. Times are the receiver's, s since 1970.
+    """All that a page shows of a bridge: the first that is heard, until it is silent for long.
+
+    Times are the receiver's, s since 1970.
 
     Attributes
     ----------
@@ -79,6 +83,18 @@ class State:
     """
 
     def __init__(self) -> None:
+        self._begin()
+        handlers = {
+            "MAG_FIELD": self._field,
+            "MAG_STATUS": self._status,
+            "MAG_NAVIGATION": self._navigation,
+            "STATUSTEXT": self._text,
+        }
+        self._handlers = {spec(name).id: handle for name, handle in handlers.items()}
+        self._handlers[spec("PARAM_VALUE").id] = self._value
+
+    def _begin(self) -> None:
+        """Know nothing of any bridge."""
         self.bridge: tuple[int, int] | None = None
         self.heard = self.sampled = -inf
         self.interval = 0.0
@@ -94,19 +110,13 @@ class State:
         self._sequence = -1
         self._piece = (0, 0)
         self._beat = self._asked = -inf
-        handlers = {
-            "MAG_FIELD": self._field,
-            "MAG_STATUS": self._status,
-            "MAG_NAVIGATION": self._navigation,
-            "STATUSTEXT": self._text,
-        }
-        self._handlers = {spec(name).id: handle for name, handle in handlers.items()}
-        self._handlers[spec("PARAM_VALUE").id] = self._value
 
     def hear(self, message: Message, now: float) -> None:
         """Take a message that came at `now`."""
         sender = message.system, message.component
-        if self.bridge is None and message.known and message.id in BRIDGES:
+        away = sender != self.bridge and now - self.heard > AWAY
+        if away and message.known and message.id in BRIDGES:
+            self._begin()
             self.bridge, self._sequence = sender, message.sequence - 1
         if sender != self.bridge or not message.known:
             return

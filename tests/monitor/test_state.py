@@ -101,6 +101,18 @@ def test_only_the_first_bridge_is_heard(air: Air) -> None:
     assert not air.state.texts
 
 
+def test_another_bridge_takes_the_place_of_one_that_is_silent(air: Air) -> None:
+    """The vehicle was changed, or its component id: the page begins anew with what is there."""
+    air.field(NOW)
+    air.bridge = Codec(1, 192)
+    air.field(NOW + 29.0)
+    assert air.state.bridge == (1, 191)
+    air.field(NOW + 31.0, 51_000.0)
+    assert (air.state.bridge, air.state.lost, len(air.state.trace)) == ((1, 192), 0, 1)
+    assert air.state.field["total_field"] == 51_000.0
+    assert silence(air.state, NOW + 32.0) == ""
+
+
 def test_messages_lost_on_the_way_are_counted(air: Air) -> None:
     frames = [air.bridge.pack("MAG_STATUS", uptime=k) for k in range(600)]
     late = frames.pop(310)
