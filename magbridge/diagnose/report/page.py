@@ -53,7 +53,7 @@ h3{font-size:1rem;margin-bottom:.2rem}
 figure{margin:1rem 0}
 img{max-width:100%}
 figcaption,.faint{color:#66727e;font-size:.88rem}
-table{border-collapse:collapse;font-size:.9rem;margin:.6rem 0}
+table{border-collapse:collapse;font-size:.9rem;margin:.6rem 0;display:block;overflow-x:auto}
 td,th{padding:.22rem .8rem .22rem 0;text-align:left;border-bottom:1px solid #eceff1}
 th{white-space:nowrap}
 td.n{text-align:right;font-variant-numeric:tabular-nums}
