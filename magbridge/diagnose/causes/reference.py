@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array, diags_array
+from scipy.spatial.distance import cdist
 
 from magbridge.diagnose.causes.candidates import Candidate, of_reference
 from magbridge.diagnose.compare.columns import Interpolated
@@ -45,12 +46,16 @@ def diurnal_variation(problem: Problem) -> list[Candidate]:
 def map_error(problem: Problem) -> list[Candidate]:
     r"""The anomaly map is wrong by a smooth function of place, a Gaussian process (Matern 3/2).
 
-    It is the same on every pass. In the functions of Karhunen and Loeve at the cells that were visited,
-    ``K(x, Z) V / lambda`` of ``K(Z, Z) = V lambda V^T``: as many as there are, whatever the box. Lengths are
-    told by the functions' variances ``diag(V^T K_l V)``.
+    It is the same on every pass at one depth. What a map lacks comes from below, and changes downwards as
+    fast as along (a wave of wavenumber k grows as ``exp(k z)``: Laplace's equation); a map as flown, above
+    the vehicle, lacks little else.
+
+    In the functions of Karhunen and Loeve at the cells that were visited, ``K(x, Z) V / lambda`` of
+    ``K(Z, Z) = V lambda V^T``: as many as there are, whatever the box. Lengths are told by the functions'
+    variances ``diag(V^T K_l V)``.
     """
     place = problem.survey.place
-    if place is None or np.ptp(place, axis=0).max() < 200.0:
+    if place is None or np.ptp(place[:, :2], axis=0).max() < 200.0:
         return []
     Z, cell = _cells(place)
     lengths = cell * LENGTHS
@@ -69,7 +74,7 @@ def map_error(problem: Problem) -> list[Candidate]:
 
 
 def _cells(place: FloatArray) -> tuple[FloatArray, float]:
-    """(m, 2) middles of at most :data:`CELLS` square cells that hold all of the track, and their side, m."""
+    """(m, d) middles of at most :data:`CELLS` square cells that hold all of the track, and their side, m."""
     side = FINEST
     while (found := _each(np.floor(place / side)))[1].max() >= CELLS:
         side *= 1.1
@@ -78,18 +83,18 @@ def _cells(place: FloatArray) -> tuple[FloatArray, float]:
 
 
 def _each(corners: FloatArray) -> tuple[FloatArray, NDArray[np.intp]]:
-    """Return the different ones (c, 2) of whole numbers (n, 2), and which each is (n,)."""
+    """Return the different ones (c, d) of whole numbers (n, d), and which each is (n,)."""
     low = corners.min(axis=0)
-    wide = float(np.ptp(corners[:, 1])) + 1.0
-    keys, of = np.unique((corners - low) @ np.array([wide, 1.0]), return_inverse=True)
-    return np.stack([keys // wide, keys % wide], axis=1) + low, of
+    box = np.ptp(corners, axis=0).astype(int) + 1
+    keys, of = np.unique(np.ravel_multi_index((corners - low).astype(int).T, box), return_inverse=True)
+    return np.stack(np.unravel_index(keys, box), axis=1) + low, of
 
 
 def _between(place: FloatArray, side: float) -> tuple[csr_array, FloatArray]:
-    """(n, c) weights of linear interpolation between the corners (c, 2), m, of the visited cells."""
+    """(n, c) weights of linear interpolation between the corners (c, d), m, of the visited cells."""
     low = np.floor(place / side)
     high = place / side - low
-    steps = list(np.ndindex(2, 2))
+    steps = list(np.ndindex((2,) * place.shape[1]))
     share = np.concatenate([np.prod(np.where(step, high, 1.0 - high), axis=1) for step in steps])
     corners, of = _each(np.concatenate([low + step for step in steps]))
     rows = np.tile(np.arange(len(place)), len(steps))
@@ -98,7 +103,7 @@ def _between(place: FloatArray, side: float) -> tuple[csr_array, FloatArray]:
 
 def _matern(a: FloatArray, b: FloatArray, length: float) -> FloatArray:
     """(n, m) correlation between places, Matern's of order 3/2."""
-    r = np.sqrt(3.0) / length * np.hypot(*(a[:, None, axis] - b[None, :, axis] for axis in (0, 1)))
+    r = np.sqrt(3.0) / length * cdist(a, b)
     found: FloatArray = (1.0 + r) * np.exp(-r)
     return found
 

@@ -69,8 +69,8 @@ class Survey:
         this one's noise.
     dive : (n,) int array
         Number of the dive, the unit that is left out in turn.
-    place : (n, 2) array or None
-        m north and east of the middle.
+    place : (n, 2 or 3) array or None
+        m north and east of the middle, and down where the log has a depth.
     attitude : (n, 3) array or None
         deg, roll, pitch, heading.
     learned : (n,) bool array
@@ -207,14 +207,15 @@ def _channels(
 
 
 def _place(table: dict[str, FloatArray]) -> FloatArray | None:
-    """(n, 2) m north and east of the middle; None without positions."""
+    """(n, 2 or 3) m north and east of the middle, and down if the log has a depth; None without positions."""
     if not {"latitude", "longitude"} <= set(table):
         return None
     middle = np.median(table["latitude"])
     north = np.radians(table["latitude"] - middle) * 6.3712e6
     along = wrap(table["longitude"] - table["longitude"][0])  # also across the date line
     east = np.radians(along - np.median(along)) * 6.3712e6 * np.cos(np.radians(middle))
-    return np.stack([north, east], axis=1)
+    down = [_held(table["depth"])] if "depth" in table else []
+    return np.stack([north, east, *down], axis=1)
 
 
 def _kinds(name: str, unit: str) -> tuple[str, ...]:

@@ -194,11 +194,11 @@ def channels(diagnosis: Diagnosis) -> str:
 def track(diagnosis: Diagnosis) -> str | None:
     """Draw the difference along the track, before and after."""
     place = diagnosis.problem.survey.place
-    if place is None or np.ptp(place, axis=0).max() < 1.0:
+    if place is None or np.ptp(place[:, :2], axis=0).max() < 1.0:
         return None
     part = _thin(len(place))
     sides = _sides(diagnosis)
-    north, east = np.ptp(place, axis=0)[:2]
+    north, east = np.ptp(place[:, :2], axis=0)
     scale, unit = (1e3, "km") if max(north, east) > 2e3 else (1.0, "m")
     if east > 2.0 * north:  # a long track lies better above the other one
         height = 0.4 + 2.0 * (0.35 + 8.0 * max(float(north / east), 0.1))

@@ -160,7 +160,7 @@ def _compared(diagnosis: Diagnosis) -> list[str]:
         ),
         _figure(
             figures.track(diagnosis),
-            "The difference along the track. An error of the map looks the same on every pass.",
+            "The difference along the track. An error of the map looks the same on every pass at one depth.",
         ),
     ]
 
