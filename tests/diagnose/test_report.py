@@ -11,6 +11,7 @@ import pytest
 from magbridge.cli.diagnose import causes_of
 from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.causes.candidates import Candidate
+from magbridge.diagnose.compare.prior import isotropic
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.gain import Gain
 from magbridge.diagnose.inference.rivals import Rival
@@ -107,7 +108,11 @@ def test_a_shift_of_the_whole_field_beside_a_wrong_reference_is_told(right: Call
     grown = problem.calibration.coefficients + np.repeat([20.0, 0.0], [3, 6])
     louder = replace(problem.calibration, coefficients=grown)
     bias, order = (CAUSES[cause].candidates(problem)[0] for cause in ("reference_bias", "actuator_order"))
-    assert "the whole corrected field by +20.0 nT" in unsettled(problem, [order, bias], louder)
+    told = unsettled(problem, [order, bias], louder)
+    assert "the whole corrected field by +20.0 nT, to within 0.0 nT" in told
+    s = isotropic(louder)
+    charted = replace(problem.calibration, covariance=louder.covariance + 30.0**2 * np.outer(s, s))
+    assert "by +0.0 nT, to within 30.0 nT" in unsettled(problem, [order, bias], charted)
     assert not unsettled(problem, [order], louder)
     assert not unsettled(problem, [bias], problem.calibration)
 

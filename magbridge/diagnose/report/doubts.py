@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from magbridge.calibration.residual import residuals_of
+from magbridge.calibration.residual import residuals, residuals_of
+from magbridge.diagnose.compare.derivatives import CHUNK, derivatives
 from magbridge.diagnose.compare.problem import DELAY, DELAYS, Problem, samples_of
 from magbridge.diagnose.inference.evidence import LEVEL
 from magbridge.diagnose.inference.joint import Joint
@@ -167,24 +168,28 @@ def rivalled(cause: Cause, rivals: Sequence[Rival], chance: float) -> str:
 
 
 def unsettled(problem: Problem, named: Sequence[Candidate], extended: Calibration) -> str:
-    """Say so when the corrected field is shifted as a whole beside an error of the reference.
+    """Say how far the corrected field is shifted as a whole beside an error of the reference, and how surely.
 
-    A constant may belong to either.
+    A constant may belong to either. Nothing is said where shift and sigma are below the noise.
     """
     if all(candidate.effects for candidate in named):
         return ""
-    fresh = ~problem.survey.learned
-    before, after = (
-        residuals_of(*samples_of(problem.survey, calibration))[fresh].mean()
-        for calibration in (problem.calibration, extended)
-    )
-    shift = float(after - before)
-    if abs(shift) < extended.noise.sensor:
+    survey = problem.survey
+    before = residuals_of(*samples_of(survey, problem.calibration))
+    samples, coefficients = samples_of(survey, extended)
+    after, g = residuals(samples, coefficients)
+    fresh = np.flatnonzero(~survey.learned)
+    shift = float((after - before)[fresh].mean())
+    some = fresh[:: 1 + fresh.size // CHUNK]  # enough for a mean
+    every = np.eye(extended.coefficients.size)
+    slope = derivatives(extended, samples.part(some), g[some], every).mean(axis=0)
+    sigma = float(np.sqrt(slope @ extended.covariance @ slope))
+    if max(abs(shift), sigma) < extended.noise.sensor:
         return ""
     return (
-        f"the extended calibration shifts the whole corrected field by {shift:+.1f} nT, and the reference "
-        "is in error, too; a log cannot tell for sure which of them a constant belongs to: check the "
-        "extended field against another reference before using it"
+        f"the extended calibration shifts the whole corrected field by {shift:+.1f} nT, to within "
+        f"{sigma:.1f} nT (1 sigma): the reference is in error, too, and a log cannot tell for sure which of "
+        "them a constant belongs to; check the extended field against another reference before using it"
     )
 
 
