@@ -120,7 +120,7 @@ def test_samples_that_are_lost_hide_nothing() -> None:
     assert row["unexplained"] is None
 
 
-@pytest.mark.parametrize("name", ["current_field", "nonlinearity"])
+@pytest.mark.parametrize("name", ["current_field", "nonlinearity", "pressure_offset"])
 def test_an_extension_against_a_map_does_no_harm(name: str) -> None:
     """To the true field, on its own log and another day's: offset anew, the cause come since."""
     row = blind("charted", (name,), 40.0, GLIDER, losses="surfacing", reference="map at its depth")

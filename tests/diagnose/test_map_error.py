@@ -27,4 +27,5 @@ def test_what_a_map_as_flown_lacks_grows_with_depth(right: Callable[[int], Probl
         (chart,) = map_error(problem)
         fit = fit_joint(problem, [chart.columns], 1, spectra=[chart.spectra])
         left.append(float(np.std(fit.left)))
+        assert chart.shapeless
     assert left[0] < 0.1 * np.std(missing) < 0.2 * np.std(missing) < left[1], left

@@ -91,6 +91,11 @@ class Candidate:
         return 0.5 if self.positive or self.spectra is not None else 1.0
 
     @property
+    def shapeless(self) -> bool:
+        """A Gaussian process of the place: it takes any shape, and leaves no remnant of an idealised one."""
+        return self.spectra is not None and not self.effects
+
+    @property
     def pieces(self) -> tuple[Candidate, ...]:
         """Its parts, or itself."""
         return self.parts or (self,)

@@ -134,7 +134,8 @@ def _chain(state: State, null: Joint, first: list[Hypothesis]) -> tuple[list[Can
             break
         best = sharpen(state, model, best, base)
         cause = best.candidate.cause
-        heard[cause] = max(heard.get(cause, 0.0), best.signal_to_noise)
+        size = 0.0 if best.candidate.shapeless else best.signal_to_noise
+        heard[cause] = max(heard.get(cause, 0.0), size)
         model, base = _with(state, model, best)
         found = state.round(model, base)
     return model, base
