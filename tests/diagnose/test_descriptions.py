@@ -13,7 +13,7 @@ from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.descriptions import descriptions
 from magbridge.diagnose.inference.joint import fit_joint
-from magbridge.diagnose.inference.shapes import bends, crossing, response
+from magbridge.diagnose.inference.shapes import behind, bends, crossing, response, swings, top
 from magbridge.diagnose.inference.statistic import SIZES, Statistic
 from magbridge.diagnose.run import diagnose
 from sitl import load, simulate
@@ -79,6 +79,72 @@ def test_a_feedback_that_falters_at_zero_is_described(width: float) -> None:
     X, y = (a - gain @ np.linalg.lstsq(gain, a, rcond=None)[0] for a in (X, dead[:, 0]))
     left = y - X @ np.linalg.lstsq(X, y, rcond=None)[0]
     assert left @ left < 0.1 * y @ y
+
+
+def left_of(y: np.ndarray, X: np.ndarray) -> float:
+    """Share of the power of y (n,) that the columns X (n, k) and a constant do not hold."""
+    X, y = X - X.mean(axis=0), y - y.mean()
+    return float(np.sum((y - X @ np.linalg.lstsq(X, y, rcond=None)[0]) ** 2) / (y @ y))
+
+
+def followed(time: np.ndarray, x: np.ndarray, lag: float) -> np.ndarray:
+    """Return y with ``dy/dt = (x - y) / lag``, naively."""
+    y = x.copy()
+    for k in range(1, len(x)):
+        y[k] = y[k - 1] + (x[k] - y[k - 1]) * -np.expm1((time[k - 1] - time[k]) / lag)
+    return y
+
+
+def test_a_slab_that_follows_a_temperature_is_described() -> None:
+    """Its centre's two slowest modes (Carslaw & Jaeger 1959, sec. 3.4), the water as dives change it."""
+    time = 4.0 * np.arange(5400)
+    water = np.tanh(3.0 * np.sin(2.0 * np.pi * time / 5500.0)) + time / time[-1]
+    core = followed(time, water, 1800.0) - followed(time, water, 200.0) / 3.0
+    X = behind(time, water)(slice(None))
+    assert left_of(core, X) < 1e-3
+    assert left_of(core, X[:, :1]) > 0.1
+
+
+@pytest.mark.parametrize("lag", [5.0, 20.0])
+def test_what_swings_out_in_turns_is_described(lag: float) -> None:
+    time = 4.0 * np.arange(3000)
+    rate = np.where(time % 700.0 < 60.0, np.where(time % 1400.0 < 700.0, 1.0, -0.4), 0.0)
+    swung = followed(time, rate, lag)
+    assert left_of(swung - 0.5 * swung**2, swings(time, rate)(slice(None))) < 0.05
+
+
+def test_what_the_sun_warms_at_the_surface_is_described() -> None:
+    time = 4.0 * np.arange(5400)
+    depth = np.abs((time % 5000.0) - 2500.0) * 0.08
+    warm = followed(time, np.exp(-depth / 8.0), 500.0)
+    assert left_of(warm, top(time, depth)(slice(None))) < 0.02
+
+
+def test_turns_and_the_surface_are_among_the_descriptions(problem: Problem) -> None:
+    """Seen through the projection; no other description holds half of what turns do."""
+    survey, rows = problem.survey, slice(0, len(problem))
+    assert survey.attitude is not None
+    listed = [one.columns(rows) for one in descriptions(problem, fit_joint(problem, [], 1))]
+    seen = problem.slopes[:, 6:] @ [0.4, -0.8, 0.45]
+    turning = np.gradient(np.unwrap(np.radians(survey.attitude[:, 2])), survey.time)
+    best, second = sorted(left_of(followed(survey.time, turning, 15.0) * seen, X) for X in listed)[:2]
+    assert best < 0.2
+    assert second > 0.5
+    near = np.exp(-survey.channels["depth"].values / 10.0)
+    warm = followed(survey.time, near, 600.0) * seen
+    assert min(left_of(warm, X) for X in listed if X.shape[1] == 24) < 0.01
+
+
+def test_a_sensitivity_that_follows_a_channel_is_no_offset_that_does(problem: Problem) -> None:
+    offset, scale = (
+        next(c for c in CAUSES[name].candidates(problem) if c.channel == "sensor_temperature")
+        for name in ("temperature_offset", "temperature_scale")
+    )
+    listed = descriptions(problem, fit_joint(problem, [], 1))
+    of_channel = [one for one in listed if one.channel == "sensor_temperature" and not one.remembers]
+    assert [one.scales for one in of_channel] == [False, False, True]
+    assert [one.covers([offset]) for one in of_channel] == [True, True, False]
+    assert [one.covers([scale]) for one in of_channel] == [False, False, True]
 
 
 def test_functions_of_the_direction_and_of_the_reading_hold_a_bend(problem: Problem) -> None:

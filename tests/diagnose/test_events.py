@@ -58,9 +58,10 @@ def test_a_curve_through_a_mass_position_covers_its_order_and_its_memory_the_hys
     listed = descriptions(problem, fit_joint(problem, [], 1))
     order = actuator_order(problem)[0]
     back = next(one for one in hysteresis(problem) if one.channel == "battpos")
-    curve, memory = (one for one in listed if one.channel == "battpos")
+    curve, memory, *late = (one for one in listed if one.channel == "battpos")
     assert (curve.covers([order]), curve.covers([back])) == (True, False)
     assert (memory.covers([order]), memory.covers([back])) == (False, True)
+    assert not any(one.covers([order]) or one.covers([back]) for one in late)
 
 
 def test_every_description_has_as_many_columns_as_widths(problem: Problem) -> None:

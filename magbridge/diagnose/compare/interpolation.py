@@ -17,7 +17,7 @@ LOST = 3
 
 
 def rates(survey: Survey, H: FloatArray) -> FloatArray:
-    r"""(3, n) dH/dt, nT/s, of H (3, n): of the cubic spline through a leg's samples; zero at its ends.
+    r"""(k, n) dH/dt, per s, of H (k, n): of the cubic spline through a leg's samples; zero at its ends.
 
     Notes
     -----

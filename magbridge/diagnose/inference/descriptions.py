@@ -13,13 +13,16 @@ from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.causes.regressors import powers
 from magbridge.diagnose.causes.timing import field_rates, mass_rates
 from magbridge.diagnose.compare.columns import Columns
+from magbridge.diagnose.compare.interpolation import rates
 from magbridge.diagnose.compare.problem import Problem, effect_columns
+from magbridge.diagnose.compare.survey import Channel
 from magbridge.diagnose.inference.events import passage, step
 from magbridge.diagnose.inference.joint import Joint
 from magbridge.diagnose.inference.packets import packets
 from magbridge.diagnose.inference.shapes import (
     REPEATED,
     SLOPES,
+    behind,
     bends,
     crossing,
     curve,
@@ -29,6 +32,8 @@ from magbridge.diagnose.inference.shapes import (
     repeated,
     response,
     spectra,
+    swings,
+    top,
 )
 
 __all__ = ["Description", "descriptions"]
@@ -59,7 +64,9 @@ class Description(NamedTuple):
     turned : bool
         The columns are functions along each of the body's axes.
     remembers : bool
-        It follows the past of the channel, not its value.
+        It follows the side from which the channel came, not its value.
+    scales : bool
+        What follows the channel is in proportion to each reading: a sensitivity, no offset.
     wider : bool
         It says much more than a cause that it holds: what it finds beside that is no remnant, and it is an
         alternative to that and another.
@@ -73,6 +80,7 @@ class Description(NamedTuple):
     holds: tuple[str, ...] = ()
     turned: bool = False
     remembers: bool = False
+    scales: bool = False
     wider: bool = False
 
     def covers(self, model: Sequence[Candidate]) -> bool:
@@ -83,6 +91,7 @@ class Description(NamedTuple):
                 candidate.channel is not None
                 and candidate.channel == self.channel
                 and (candidate.cause == "hysteresis") == self.remembers
+                and (candidate.cause == "temperature_scale") == self.scales
             )
             for candidate in model
         ]
@@ -151,7 +160,7 @@ def _of_reading(problem: Problem) -> list[Description]:
 
 
 def _of_channels(problem: Problem) -> list[Description]:
-    """For each telemetry channel a curve of its value, and what depends on where it was before."""
+    """For each telemetry channel a curve of its value, what depends on its past, and what follows it late."""
     own = {parameter.name for parameter in problem.calibration.parameters}
     listed = []
     for name, channel in problem.survey.channels.items():
@@ -161,28 +170,46 @@ def _of_channels(problem: Problem) -> list[Description]:
             listed += [
                 _of("broadband", _along_axes(problem, now), 12, channel=name, turned=True, holds=held),
                 _of("broadband", _along_axes(problem, before), 24, channel=name, turned=True, remembers=True),
+                *_late(problem, name, channel),
             ]
     return listed
 
 
+def _late(problem: Problem, name: str, channel: Channel) -> list[Description]:
+    """Return what follows a channel late, as heat soaks into a hull: an offset, or a sensitivity."""
+    late, listed = behind(problem.survey.time, channel.values), []
+    for cause, scales in (("temperature_offset", False), ("temperature_scale", True)):
+        columns = _along_axes(problem, late, scales=scales)
+        held = (cause,) if "temperature" in channel.kinds else ()
+        listed.append(_of("broadband", columns, 15, channel=name, turned=True, scales=scales, holds=held))
+    return listed
+
+
 def _of_attitude(problem: Problem) -> list[Description]:
-    """Functions of pitch and roll: what hangs in the hull, and what slides to its lower end."""
+    """Functions of pitch, roll and turns: what hangs in the hull, slides to its lower end, swings out."""
     if problem.survey.attitude is None:
         return []
     listed = []
-    roll, pitch = np.radians(problem.survey.attitude[:, :2].T)
+    time, angles = problem.survey.time, np.unwrap(np.radians(problem.survey.attitude.T))
+    roll, pitch = angles[:2]
     for down in (-np.sin(pitch), np.sin(roll) * np.cos(pitch)):
         listed += [
             _of("broadband", _along_axes(problem, curve(down)), 12, turned=True),
             _of("switching", _along_axes(problem, ends(down)), 3 * len(SLOPES), turned=True),
         ]
+    for angle in angles:
+        swung = swings(time, rates(problem.survey, angle[None])[0])
+        listed.append(_of("broadband", _along_axes(problem, swung), 18, turned=True))
     return listed
 
 
 def _repeating(problem: Problem, fit: Joint, tone: Candidate | None) -> list[Description]:
-    """List what each dive repeats, oscillations of limited duration, and a tone."""
-    listed = []
-    if np.ptp(problem.survey.dive):
+    """List what each dive repeats, what the surface does, oscillations of limited duration, and a tone."""
+    survey, listed = problem.survey, []
+    if "depth" in survey.channels and "depth" not in survey.still:
+        above = top(survey.time, survey.channels["depth"].values)
+        listed.append(_of("broadband", _along_axes(problem, above), 24, turned=True))
+    if np.ptp(survey.dive):
         listed.append(_of("broadband", _along_axes(problem, repeated(problem)), 3 * REPEATED, turned=True))
     rings = packets(problem, fit)
     if rings is not None:
@@ -199,12 +226,15 @@ def _body(problem: Problem) -> FloatArray:
     return -problem.slopes[:, 6:]
 
 
-def _along_axes(problem: Problem, basis: Columns) -> Columns:
-    """Each function of `basis` along each axis of the body."""
+def _along_axes(problem: Problem, basis: Columns, *, scales: bool = False) -> Columns:
+    """Each function of `basis` along each axis of the body; with `scales`, times what that channel reads."""
 
     def columns(rows: slice) -> FloatArray:
         part = basis(rows)
-        return (part.T[:, None] * -problem.slopes.T[6:, rows]).reshape(-1, len(part)).T
+        axes = -problem.slopes.T[6:, rows]
+        if scales:
+            axes = axes * problem.reading.T[:, rows] / problem.calibration.reference.field
+        return (part.T[:, None] * axes).reshape(-1, len(part)).T
 
     return columns
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
-from magbridge.diagnose.causes.regressors import play, powers
+from magbridge.diagnose.causes.regressors import lagged, play, powers
 from magbridge.diagnose.compare.columns import Columns
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.design import pieces
@@ -13,6 +15,7 @@ from magbridge.diagnose.inference.design import pieces
 __all__ = [
     "REPEATED",
     "SLOPES",
+    "behind",
     "bends",
     "crossing",
     "curve",
@@ -22,6 +25,8 @@ __all__ = [
     "repeated",
     "response",
     "spectra",
+    "swings",
+    "top",
 ]
 
 FloatArray = NDArray[np.float64]
@@ -30,6 +35,12 @@ BEND = 32
 """Order of a channel's free response: fine enough for a converter's coarsest steps."""
 PLAYS = (0.3, 0.8)
 """Widths of the play operators that describe a channel's past, in half ranges."""
+LAGS = (0.0, 300.0, 1000.0, 3000.0, 10000.0)
+"""s, behind which the inside of a hull follows: heat, water that seeps, stress that relaxes."""
+SWAYS = (0.0, 10.0, 30.0)
+"""s, behind which something loose, or on a line, follows a turn."""
+SKIN = (5.0, 20.0)
+"""m, in which light, air and waves fade."""
 REPEATED = 8
 """Half waves per dive of what repeats with every dive."""
 ZERO = (500.0, 1000.0, 2000.0)
@@ -113,6 +124,25 @@ def memory(values: FloatArray) -> Columns:
     return _centred(columns, len(y))
 
 
+def behind(time: FloatArray, values: FloatArray) -> Columns:
+    """Return a channel behind each of :data:`LAGS`: in some proportion they are any smooth response."""
+    return _centred(_followed(time, _scaled(values)[None], LAGS), len(values))
+
+
+def swings(time: FloatArray, rate: FloatArray) -> Columns:
+    """Return what a turn swings out, to its own side or to the same one either way, at once or late."""
+    low, high = np.quantile(rate, (0.001, 0.999))  # telemetry that jumps is no turn
+    y = np.clip(rate, low, high) / max(high, -low, 1e-12)
+    swung = _followed(time, y[None], SWAYS)
+    return _centred(lambda rows: powers(swung(rows).T, 2).reshape(2 * len(SWAYS), -1).T, len(rate))
+
+
+def top(time: FloatArray, depth: FloatArray) -> Columns:
+    """Return what the surface does to a vehicle, and what is left of it for a while."""
+    near = np.exp(-(depth - depth.min()) / np.array(SKIN)[:, None])
+    return _centred(_followed(time, near, LAGS[:-1]), len(depth))
+
+
 def repeated(problem: Problem) -> Columns:
     """Half waves in the course of a dive, the same in all."""
     dive, time = problem.survey.dive, problem.survey.time
@@ -133,6 +163,12 @@ def ends(down: FloatArray) -> Columns:
         last = np.maximum.accumulate(np.where(np.abs(down) > slope, place, 0))
         sides.append(np.sign(down[last]))
     return _centred(lambda rows: np.stack([side[rows] for side in sides]).T, len(down))
+
+
+def _followed(time: FloatArray, values: FloatArray, lags: Sequence[float]) -> Columns:
+    """Each of `values` (k, n) behind each lag; kept in half the memory, which of a month they would fill."""
+    followed = np.stack([lagged(time, y, lag).astype(np.float32) for y in values for lag in lags])
+    return lambda rows: followed[:, rows].T.astype(float)
 
 
 def _centred(columns: Columns, n: int) -> Columns:
