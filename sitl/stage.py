@@ -50,9 +50,8 @@ class Stage:
     def __init__(self, config: Path, listener: Callable[[bytes], None], log: Path | None = None) -> None:
         self._listener = listener
         self._master, self._slave = pty.openpty()
-        tty.setraw(
-            self._slave
-        )  # what is written before the bridge opens it must not be edited as a terminal would
+        # what is written before the bridge opens it must not be edited as a terminal would
+        tty.setraw(self._slave)
         server = socket.create_server(("127.0.0.1", 0))
         server.settimeout(CONNECT_TIMEOUT)
         times_out, self._times = os.pipe()

@@ -151,9 +151,8 @@ def fly(
 
     path = np.radians(pitch + motion.angle_of_attack * np.tanh(pitch / 5))
     sink = np.cumsum(-motion.speed * np.sin(path)) * step
-    depth = np.minimum(
-        sink - np.minimum(np.minimum.accumulate(sink), 0.0), motion.max_depth
-    )  # floats at the surface
+    # floats at the surface
+    depth = np.minimum(sink - np.minimum(np.minimum.accumulate(sink), 0.0), motion.max_depth)
     ahead = motion.speed * np.cos(path)
     north = np.cumsum(ahead * np.cos(np.radians(heading)) + motion.current[0]) * step
     east = np.cumsum(ahead * np.sin(np.radians(heading)) + motion.current[1]) * step

@@ -239,10 +239,8 @@ def show(rows: list[Row], console: Console) -> None:
 def measure(cases: list[Case], jobs: int) -> list[Row]:
     """Run all cases, `jobs` at a time; the rows come back in the order of the cases."""
     rows: list[Row] = []
-    os.environ |= {
-        "OMP_NUM_THREADS": "1",
-        "OPENBLAS_NUM_THREADS": "1",
-    }  # one core for each process spawned below
+    # one core for each process spawned below
+    os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
     with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
         waiting = [pool.submit(run, case) for case in cases]
         progress = Console(stderr=True)

@@ -122,9 +122,8 @@ def main() -> None:
         affine = np.linalg.lstsq(design, corrected, rcond=None)[0]
         A, b = affine[:3].T, affine[3]
         size = np.linalg.norm(raw @ A.T + b, axis=1)
-        A, b = (
-            part * (size @ reference) / (size @ size) for part in (A, b)
-        )  # most know no scale: give them the best
+        # most know no scale: give them the best
+        A, b = (part * (size @ reference) / (size @ size) for part in (A, b))
         results[name] = {"A": A.tolist(), "T": (-np.linalg.pinv(A) @ b).tolist()}
     json.dump(results, sys.stdout)
 

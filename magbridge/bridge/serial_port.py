@@ -49,9 +49,8 @@ class SerialPort(Port):
                 opened = serial.serial_for_url(
                     name, self.baudrate, timeout=0, write_timeout=0, do_not_open=True
                 )
-                opened.exclusive = (
-                    None if "://" in name else True
-                )  # two programs on one line lose bytes to each other
+                # two programs on one line lose bytes to each other
+                opened.exclusive = None if "://" in name else True
                 opened.open()
             except (serial.SerialException, OSError, ValueError) as error:
                 reason = _reason(error)

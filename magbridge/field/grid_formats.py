@@ -92,15 +92,17 @@ def ascii_grid(path: Path) -> Parts:
     """ESRI ASCII: ``ncols``, ``nrows``, a corner or centre, ``cellsize``, then rows from the north."""
     words = path.read_text(errors="replace").split()
     head: dict[str, float] = {}
+    at = 0
     try:
-        while words[2 * len(head)][0].isalpha():
-            head[words[2 * len(head)].lower()] = float(words[2 * len(head) + 1])
+        while words[at][0].isalpha():
+            head[words[at].lower()] = float(words[at + 1])
+            at += 2
         nx, ny = int(head["ncols"]), int(head["nrows"])
         dx, dy = head.get("cellsize", head.get("dx", 0.0)), head.get("cellsize", head.get("dy", 0.0))
         x0 = head["xllcenter"] if "xllcenter" in head else head["xllcorner"] + dx / 2
         y0 = head["yllcenter"] if "yllcenter" in head else head["yllcorner"] + dy / 2
-        values = np.array(words[2 * len(head) :], float).reshape(ny, nx)[::-1]
-    except (IndexError, KeyError, ValueError) as error:
+        values = np.array(words[at:], float).reshape(ny, nx)[::-1]
+    except (IndexError, KeyError, ValueError, OverflowError) as error:
         raise FormatError(
             path, "expected an ESRI ASCII grid: ncols, nrows, corner, cellsize, rows"
         ) from error
@@ -135,9 +137,8 @@ def table(path: Path) -> Parts:
                 path, delimiter=delimiter, skiprows=int(header), usecols=columns, ndmin=2, encoding="latin-1"
             )
     except ValueError as error:
-        place = re.search(
-            r"at row (\d+), column (\d+)", str(error)
-        )  # numpy counts rows from 0 below the header
+        # numpy counts rows from 0 below the header
+        place = re.search(r"at row (\d+), column (\d+)", str(error))
         line, number = (int(place[1]) + 1 + header, place[2]) if place else (None, None)
         raise FormatError(path, "expected numbers", row=line, column=number) from error
     if not np.isfinite(table[:, :2]).all() or not len(table):
@@ -178,7 +179,7 @@ def geotiff(path: Path) -> Parts:
     from PIL import Image, UnidentifiedImageError  # noqa: PLC0415  comes with matplotlib
 
     try:
-        with Image.open(path) as image:
+        with Image.open(path, formats=["TIFF"]) as image:
             values = np.array(image, float)
             tags: dict[int, Any] = dict(image.tag_v2)  # type: ignore[attr-defined]  # only TIFF images have it
             dx, dy = tags[33550][:2]

@@ -55,9 +55,8 @@ def draw_navigation(result: xr.Dataset, grid: AnomalyGrid, path: str | Path) -> 
     axis.plot(hours[~taken], result["innovation"][~taken], "x", ms=4, color="C3", label="beyond the gate")
     reach = np.concatenate([spread, np.abs(result["innovation"])])
     if np.isfinite(reach).any():
-        limit = 1.5 * float(
-            np.nanpercentile(reach, 98)
-        )  # a wide start's first innovations are as large as the map
+        # a wide start's first innovations are as large as the map
+        limit = 1.5 * float(np.nanpercentile(reach, 98))
         axis.set_ylim(-limit, limit)
     axis.set_ylabel("innovation, nT")
 

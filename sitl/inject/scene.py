@@ -62,7 +62,7 @@ class Scene:
 
     @property
     def t(self) -> Array:
-        """S after the start, (n,)."""
+        """(n,) s after the start."""
         return self.track.elapsed
 
     def add(self, shape: Array, vector: Array) -> None:

@@ -89,9 +89,8 @@ def storm(scene: Scene, size: float, rng: Generator) -> None:
     t0 = rng.uniform(0.1, 0.4) * scene.t[-1]
     since = scene.t - t0
     after = since > rng.uniform(900.0, 3600.0)
-    south = np.repeat(rng.normal(0.6, 0.8, 60), len(since) // 60 + 1)[
-        : len(since)
-    ]  # a new wind every few minutes
+    # a new wind every few minutes
+    south = np.repeat(rng.normal(0.6, 0.8, 60), len(since) // 60 + 1)[: len(since)]
     ring = (
         7.7
         * 3600.0

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -180,8 +179,12 @@ def test_any_damage_is_read_or_refused_in_one_line(places: list[tuple[int, int]]
     content = bytearray(encode_calibration(cal))
     for place, byte in places:
         content[place % len(content)] = byte
-    with suppress(FormatError, CalibrationError):
-        decode_calibration(bytes(content), "cal.json")
+    try:
+        assert isinstance(decode_calibration(bytes(content), "cal.json"), Calibration)
+    except (FormatError, CalibrationError) as refused:
+        told = str(refused)
+        assert told.startswith("cal.json: ")
+        assert "\n" not in told
 
 
 def test_a_key_that_is_no_text(cal: Calibration) -> None:

@@ -52,9 +52,8 @@ class Fluxgate:
         """Pull it out, `after` so many bytes of a frame."""
         self.write(self._frame()[:after])
         deadline = time.monotonic() + 5.0
-        time.sleep(
-            0.05 if after else 0.0
-        )  # a pty hands on in its own time, and FIONREAD does not see what it holds
+        # a pty hands on in its own time, and FIONREAD does not see what it holds
+        time.sleep(0.05 if after else 0.0)
         while after and array("i", fcntl.ioctl(self._slave, termios.FIONREAD, bytes(4)))[0]:
             assert time.monotonic() < deadline, "nobody reads the line"
             time.sleep(TURN)
@@ -117,7 +116,6 @@ class Autopilot:
         """Whether it sends telemetry."""
         self.retell: Callable[[bytes], list[bytes]] = lambda frame: [frame]
         """What the link makes of a telemetry frame."""
-        self.bytes_heard = 0
         self._kind, _, self._at = url.partition(":")
         self._ear = Codec(0, 0)
         self._booted = self._beat = self._told = time.monotonic()
@@ -223,5 +221,4 @@ class Autopilot:
                     self._line = None
                 return
             self._peer = peer or self._peer
-            self.bytes_heard += len(data)
             yield from self._ear.parse(data)

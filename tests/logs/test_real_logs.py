@@ -62,9 +62,8 @@ def test_slocum(real_data: Path) -> None:
     files = sorted((real_data / "slocum_comet").glob("*.?bd"))
     back = logs.read(files)
     flight_only = logs.read([path for path in files if path.suffix == ".dbd"])
-    np.testing.assert_array_equal(
-        back["battpos"], flight_only["battpos"]
-    )  # a pair is one deployment, however named
+    # a pair is one deployment, however named
+    np.testing.assert_array_equal(back["battpos"], flight_only["battpos"])
     assert back.sizes["time"] == flight_only.sizes["time"] > 3000
     assert not back.attrs.get("duplicate_rows")  # nor is one read twice
     assert not set(CHANNELS) & set(back.data_vars)

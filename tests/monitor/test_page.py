@@ -31,9 +31,8 @@ def free(kind: socket.SocketKind) -> int:
 def page() -> Iterator[tuple[str, tuple[str, int]]]:
     link, port = free(socket.SOCK_DGRAM), free(socket.SOCK_STREAM)
     command = [sys.executable, "-m", "magbridge", "monitor", f"udpin:127.0.0.1:{link}", "--port", str(port)]
-    alone = {
-        name: value for name, value in os.environ.items() if "PYTEST" not in name
-    }  # NiceGUI looks at them
+    # NiceGUI looks at them
+    alone = {name: value for name, value in os.environ.items() if "PYTEST" not in name}
     with subprocess.Popen(command, stderr=subprocess.PIPE, env=alone) as process:
         assert process.stderr
         assert b"the page is" in process.stderr.readline()

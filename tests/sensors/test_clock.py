@@ -69,9 +69,8 @@ def test_even_at_first_no_error_exceeds_the_arrival_s() -> None:
     made = stamps(DeviceClock(), true * (1 - 50e-6), arrived)
     late = (arrived - true) * 1e6
     assert np.abs(error_us(made, true)).max() <= late.max() + 4
-    assert (
-        np.mean(error_us(made, true) > late + 4) < 0.01
-    )  # after its arrival only where time must not run back
+    # after its arrival only where time must not run back
+    assert np.mean(error_us(made, true) > late + 4) < 0.01
     assert np.abs(error_us(made, true)[500:]).max() < 400  # after 5 s
 
 

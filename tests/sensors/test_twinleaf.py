@@ -29,9 +29,8 @@ def generation_2(columns: list[tuple[int, str, str]], stream: int = 1, segment: 
         (3, pack("<BBBBBBIIIIfB", 27, stream, segment, 3, 1, 4, 0xABCD, 1000, 200, 4, 10.0, 1) + b"1234"),
     ]
     for index, (kind, name, unit) in enumerate(columns):
-        head = pack(
-            "<BBBBBBBB", 8, stream, index, kind, len(name), len(unit), 3, 99
-        )  # a byte more than we know
+        # a byte more than we know
+        head = pack("<BBBBBBBB", 8, stream, index, kind, len(name), len(unit), 3, 99)
         records.append((4, head + name.encode() + unit.encode() + b"any"))
     return b"".join(on_the_line(11, bytes([kind, 1]) + record) for kind, record in records)
 

@@ -118,9 +118,8 @@ def drawn(twin: Twin, reference: str) -> AnomalyGrid:
     chart = twin.anomaly_map()
     if reference == "map at its depth":
         return chart
-    return AnomalyGrid(
-        chart.longitude, chart.latitude, chart.anomaly, name=chart.name
-    )  # that knows no altitude
+    # that knows no altitude
+    return AnomalyGrid(chart.longitude, chart.latitude, chart.anomaly, name=chart.name)
 
 
 def charted(ds: xr.Dataset, chart: AnomalyGrid) -> xr.Dataset:
