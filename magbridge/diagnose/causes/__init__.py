@@ -60,7 +60,7 @@ CAUSES: dict[str, Cause] = {
     "nonlinearity": Cause(nonlinearity, "attitudes that take a channel through its range", "turn every channel through the whole field"),
     "saturation": Cause(saturation, "a channel near its end", "turn the channel away from the field: saturation occurs only near full scale"),
     "pressure_offset": Cause(pressure_offset, "depth or pressure that varies", "hold one depth for an hour: the temperature settles, the pressure effect stays"),
-    "diurnal_variation": Cause(diurnal_variation, "at least six hours", "a base station ashore"),
+    "diurnal_variation": Cause(diurnal_variation, "at least two hours", "a base station ashore"),
     "map_error": Cause(map_error, "positions over some hundred metres", "cross the track again at the same depth: an error of the map is the same on every pass"),
     "reference_bias": Cause(reference_bias, "a reference", "calibrate and survey at one place, next to a proton magnetometer"),
     "interference_tone": Cause(interference_tone, "even sampling", "change the sampling rate: an alias changes its frequency"),

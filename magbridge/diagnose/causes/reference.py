@@ -15,6 +15,10 @@ __all__ = ["diurnal_variation", "map_error", "reference_bias"]
 
 FloatArray = NDArray[np.float64]
 
+HARMONICS = np.arange(1, 5)
+"""Of a day, that the Sun makes."""
+SHORTEST = 7200.0
+"""s; in less, a day's variation is a slope."""
 CELLS, WAVES = 300, 200
 """Places of a map's error, and functions of them, at most."""
 FINEST = 125.0
@@ -26,21 +30,21 @@ ERROR = 20.0
 
 
 def diurnal_variation(problem: Problem) -> list[Candidate]:
-    """The Earth's field itself varies: harmonics of the day along the field (Chulliat et al. 2016)."""
+    """The Earth's field itself varies: harmonics of the day along the field (Chulliat et al. 2016).
+
+    Their numbers have one common size, and fall with the order: the Sun heats the ionosphere smoothly.
+    """
     t = problem.survey.time
-    span = float(t[-1] - t[0])
-    harmonics = [h for h in (1, 2, 3) if 86400.0 / h < 4.0 * span]
-    made = []
-    for some in (harmonics[k:] for k in range(len(harmonics))):
+    if t[-1] - t[0] < SHORTEST:
+        return []
 
-        def basis(rows: slice, some: list[int] = some) -> FloatArray:
-            angle = 2.0 * np.pi * t[rows, None] / 86400.0 * np.array(some)
-            return np.hstack([np.cos(angle), np.sin(angle)])
+    def basis(rows: slice) -> FloatArray:
+        angle = 2.0 * np.pi * t[rows, None] / 86400.0 * HARMONICS
+        return np.hstack([np.cos(angle), np.sin(angle)])
 
-        names = tuple(f"{f} {24 // h} h" for f in ("cos", "sin") for h in some)
-        width = np.tile(20.0 / np.array(some), 2)
-        made.append(of_reference(problem, "diurnal_variation", basis, width, names))
-    return made
+    names = tuple(f"{f} {24 // h} h" for f in ("cos", "sin") for h in HARMONICS)
+    width = np.tile(20.0 / HARMONICS, 2)
+    return [of_reference(problem, "diurnal_variation", basis, width, names, spectra=np.ones((1, len(width))))]
 
 
 def map_error(problem: Problem) -> list[Candidate]:
