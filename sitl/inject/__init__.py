@@ -77,6 +77,10 @@ FOREIGN: dict[str, Effect] = {
     "sunlit": vehicle.sunlit,
     "eccentric": vehicle.eccentric,
     "astray": surroundings.astray,
+    "trailing": vehicle.trailing,
+    "compliant": vehicle.compliant,
+    "restart": sensor.restart,
+    "whistle": sensor.whistle,
 }
 """Effects that the contract has no name for."""
 

@@ -189,3 +189,19 @@ def popcorn(scene: Scene, size: float, rng: Generator) -> None:
     dwell = rng.exponential(1.0, len(scene.t)) * np.resize(rng.uniform(200.0, 1800.0, 2), len(scene.t))
     trapped = np.searchsorted(np.cumsum(dwell), scene.t) % 2
     scene.field = scene.field * (1.0 + 1e-5 * size * trapped[:, None])
+
+
+def restart(scene: Scene, size: float, rng: Generator) -> None:
+    """The sensor rests at the surface, and its offset settles anew on each dive; size in nT."""
+    depth = scene.track.depth
+    up = depth < depth.min() + 0.1 * np.ptp(depth)
+    dive = np.cumsum(np.diff(up, prepend=up[0]) & ~up)
+    scene.field = scene.field + size * rng.normal(size=(dive[-1] + 1, 3))[dive]
+
+
+def whistle(scene: Scene, size: float, rng: Generator) -> None:
+    """The excitation beats with another oscillator, faster or slower as the electronics warm; size in nT."""
+    warm = scene.logged["sensor_temperature"][0]
+    beat = rng.uniform(0.02, 0.1) * (1.0 + rng.uniform(0.03, 0.1) * (warm - warm[0]))
+    phase = 2.0 * np.pi * np.cumsum(beat) * scene.track.step + rng.uniform(0.0, 2.0 * np.pi)
+    scene.field = scene.field + size * direction(rng) * np.cos(phase)[:, None]

@@ -284,3 +284,18 @@ def eccentric(scene: Scene, size: float, rng: Generator) -> None:
     place = scene.track.parameters["battpos"]
     turn = 2.0 * np.pi * place / rng.uniform(0.2, 0.5) + rng.uniform(0.0, 2.0 * np.pi)
     scene.logged["battpos"] = (place + size * np.sin(turn), "in")
+
+
+def trailing(scene: Scene, size: float, rng: Generator) -> None:
+    """A load's leads are drawn apart by the battery as it slides; size in nT/A an inch from its mean."""
+    name = str(rng.choice(["amps_a", "amps_b"]))
+    place = scene.track.parameters["battpos"]
+    drawn = (place - np.mean(place)) * scene.logged[name][0]
+    scene.field = scene.field + size * direction(rng) * drawn[:, None]
+
+
+def compliant(scene: Scene, size: float, rng: Generator) -> None:
+    """The battery's carriage gives way under its weight, unseen by its encoder; size in inches at 1 g."""
+    weight = np.sin(np.radians(scene.track.pitch))
+    gives = first_order(weight, scene.track.step, float(rng.uniform(1.0, 4.0)))
+    scene.logged["battpos"] = (scene.track.parameters["battpos"] - size * gives, "in")

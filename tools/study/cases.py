@@ -42,12 +42,12 @@ NAMELESS = ("unknown", "seen", "foreign")
 """Parts in which nothing in the table is what is hidden."""
 TOLD = ("named", "ladder", "pair", *NAMELESS)
 """Parts of which theory says what comes out."""
-STRANGE = ("towed", "sunlit", "eccentric", "astray")
+STRANGE = ("trailing", "compliant", "restart", "whistle")
 """Foreign effects made after the detector, which has no description for them either."""
 SEEN = (
     "pan", "loose", "corrosion", "pulsation", "needle", "thermostat", "perming", "staircase", "swell",
     "cargo", "contact", "strobe", "storm", "rotor", "viscous", "brownout", "mains", "slip", "motional",
-    "leak", "ranges", "sag", "crossover", "popcorn", "discharge",
+    "leak", "ranges", "sag", "crossover", "popcorn", "discharge", "towed", "sunlit", "eccentric", "astray",
 )  # fmt: skip
 """Those that were so once, before the detector was last mended."""
 GOLDEN = 0.6180339887498949
