@@ -1,5 +1,5 @@
 """The model of a vehicle's own magnetism: fit it, keep it, correct with it, simulate with it.
 
 The live path needs :mod:`.correct` and :mod:`.file` only; neither imports scipy or xarray. :mod:`.fitting`
-makes a calibration of logs, :mod:`.planning` says which to fly next.
+makes a calibration from logs, :mod:`.planning` says which calibration runs to fly next.
 """

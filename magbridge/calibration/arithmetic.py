@@ -1,4 +1,4 @@
-"""The arithmetic of one corrected sample: equations as code, written for floats and good for arrays.
+"""The arithmetic that corrects one sample, written so that it runs on floats and on arrays alike.
 
 Notes
 -----
@@ -13,8 +13,8 @@ Every operation is elementwise IEEE arithmetic in one written order, on floats o
 products of :class:`~magbridge.calibration.kernel.Kernel`, which are exact in any order: so a sample
 corrected live, in a batch, or replayed on another computer gives identical bits.
 
-Compiled, a float is a number of the machine, and no array can pass for one. So arrays go through
-:func:`for_arrays`, this very source left uncompiled.
+When this module is compiled by mypyc, a ``float`` is a C double and an array in its place is refused. So
+arrays go through :func:`for_arrays`, which loads this same source uncompiled.
 """
 
 from __future__ import annotations
@@ -28,17 +28,17 @@ __all__ = ["COARSE", "FINE", "Prepared", "apply", "combined", "for_arrays", "pow
 
 BITS = 21
 COARSE, FINE = 1.5 * 2.0 ** (52 - BITS), 1.5 * 2.0 ** (52 - 2 * BITS)
-"""Adding and taking away rounds to a multiple of 2^-21, of 2^-42."""
+"""Adding and then subtracting COARSE rounds a number to a multiple of 2^-21; FINE, to a multiple of 2^-42."""
 
 Prepared = tuple[list[float], list[list[float]]]
-"""What a sample needs at one set of positions: A' row by row and T (12); Q, L and O of V's six
-entries (10 each)."""
+"""What :func:`apply` needs at one set of positions: A' row by row, then T (12 numbers); and for each of V's
+six entries Q (6), L (3) and O (1)."""
 Numbers = tuple[float, float, float, float, float, float, float, float]
 PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 
 def for_arrays() -> Any:
-    """Return this module as Python reads it: the functions below, for arrays in place of floats."""
+    """Load this module's source uncompiled, so that the functions below accept arrays in place of floats."""
     spec = spec_from_file_location(f"{__name__}_for_arrays", Path(__file__).with_name("arithmetic.py"))
     assert spec is not None
     assert spec.loader is not None
@@ -54,7 +54,10 @@ def powers(
     parents: tuple[tuple[int, int], ...],
     one: Any,
 ) -> list[Any]:
-    """Return the monomials of positions, floats or arrays, each from its parent; anything else is ignored."""
+    """Return the monomials of positions (floats or arrays), each as its parent times one position.
+
+    `values` may hold more channels than there are positions: those of effects, which follow, are ignored.
+    """
     x = [(value - centre) / scale for value, centre, scale in zip(values, centres, scales)]  # noqa: B905
     phi = [one]
     for parent, k in parents:
@@ -83,7 +86,7 @@ def combined(phi: list[float], weights: list[float]) -> float:
 
 
 def prepare(t: list[float]) -> Prepared:
-    """From the table's 81 sums to what a sample needs, at one set of positions.
+    """Turn the table's 81 sums at one set of positions into what :func:`apply` needs there.
 
     ``L_ij,k = -(G_ik,j + G_jk,i)`` with ``G = S_a'T A'^T``, and ``O = A' S_TT A'^T``.
     """
@@ -110,7 +113,7 @@ def apply(
     omega: tuple[float, ...] | None,
     root: Callable[[float], float],
 ) -> Numbers:
-    """One sample (or arrays of them): total, sigma, vector, sigmas of the vector.
+    """Correct one sample (or arrays of them); return total, its sigma, the vector, and the vector's sigmas.
 
     `omega` holds xx, yy, zz, xy, xz, yz of the boresight's covariance; None where there is no boresight.
     """
@@ -120,7 +123,7 @@ def apply(
     by = yx * dx + yy * dy + yz * dz
     bz = zx * dx + zy * dy + zz * dz
     F = root(bx * bx + by * by + bz * bz)
-    over = 1.0 / (F + 1e-300)  # a vector of exactly nothing has no direction, and must not raise
+    over = 1.0 / (F + 1e-300)  # a vector of length zero has no direction, but must not raise
     ux, uy, uz = bx * over, by * over, bz * over
     exx, eyy, ezz, exy, exz, eyz = dx * dx, dy * dy, dz * dz, dx * dy, dx * dz, dy * dz
     vxx, vyy, vzz, vxy, vxz, vyz = [
@@ -131,10 +134,10 @@ def apply(
         ux * ux * vxx + uy * uy * vyy + uz * uz * vzz
         + 2.0 * (ux * uy * vxy + ux * uz * vxz + uy * uz * vyz)
     )  # fmt: skip
-    if omega is not None:  # it turns the vector, and leaves its length
+    if omega is not None:  # its error turns the vector and leaves the length, so sigma_F stays
         oxx, oyy, ozz, oxy, oxz, oyz = omega
         vxx = vxx + (bz * bz * oyy + by * by * ozz - 2.0 * by * bz * oyz)
         vyy = vyy + (bz * bz * oxx + bx * bx * ozz - 2.0 * bx * bz * oxz)
         vzz = vzz + (by * by * oxx + bx * bx * oyy - 2.0 * bx * by * oxy)
-    # abs: rounding may leave a variance of nothing at -1e-12
+    # abs: rounding may leave a variance of zero at -1e-12
     return F, root(abs(variance)), bx, by, bz, root(abs(vxx)), root(abs(vyy)), root(abs(vzz))

@@ -2,9 +2,9 @@
 
 Notes
 -----
-Regressors that effects follow are first multiplied by a power of two: one that is large beside the constant,
-as a pressure in Pa, would leave too little of it in the split. So each is counted in what makes about
-1,000 nT of difference.
+The regressors of effects are first multiplied by a power of two. One that is large beside the constant 1,
+as a pressure in Pa, would leave too few bits for the constant in the split of :mod:`.kernel`. In the unit
+chosen, a regressor of 1 makes a difference of about 1,000 nT.
 
 The nine coefficients become twelve in body axes: ``A' = R A`` (nine, R the boresight) and T. For the
 covariance V of the corrected vector ``b = A' d, d = H_r - T``, write ``db = dA' d - A' dT``: V is quadratic
@@ -31,9 +31,9 @@ __all__ = ["compile_kernel"]
 FloatArray = NDArray[np.float64]
 
 ORDINARY = 1024.0
-"""nT that a regressor of 1 makes, once it is counted as an effect's."""
+"""nT, the difference that an effect's regressor of 1 may make at most, in the unit chosen for it."""
 SLOT = ((0, 3, 4), (3, 1, 5), (4, 5, 2))
-"""Where ``A[i, k]`` stands among the nine."""
+"""Index of ``A[i, k]`` among the nine coefficients."""
 
 
 def compile_kernel(calibration: Calibration) -> Kernel:
@@ -77,13 +77,13 @@ def compile_kernel(calibration: Calibration) -> Kernel:
 
 
 def _parent(exponent: Exponents) -> tuple[Exponents, int]:
-    """Return the monomial with one power less, and of which position."""
+    """Return the monomial that is lower by one power of one position, and the index of that position."""
     k = max(i for i, power in enumerate(exponent) if power)
     return (*exponent[:k], exponent[k] - 1, *exponent[k + 1 :]), k
 
 
 def _closed(exponents: set[Exponents], calibration: Calibration) -> list[Exponents]:
-    """All `exponents` with all their parents, by degree: each can be made from one before it."""
+    """Return `exponents` and all their parents, by degree: each follows from one before it."""
     todo = [*exponents, (0,) * len(calibration.parameters)]
     closed: set[Exponents] = set()
     while todo:
@@ -96,7 +96,10 @@ def _closed(exponents: set[Exponents], calibration: Calibration) -> list[Exponen
 
 
 def _units(P: FloatArray, W: FloatArray, calibration: Calibration) -> FloatArray:
-    """(r,) powers of two near ``s / ORDINARY``, s what 1 of each effect's regressor may make, in nT."""
+    """Return (r,) powers of two near ``s / ORDINARY``; s is what a regressor of 1 may change, in nT.
+
+    That is the largest over the nine coefficients, each with its uncertainty.
+    """
     variance = np.einsum("kri,kl,lri->ri", P, calibration.covariance, P)
     field = np.array([calibration.reference.field] * 6 + [1.0] * 3)
     s = (np.sqrt(W * W + np.abs(variance)) * field).max(axis=1)
@@ -104,7 +107,7 @@ def _units(P: FloatArray, W: FloatArray, calibration: Calibration) -> FloatArray
 
 
 def _body_axes(calibration: Calibration) -> FloatArray:
-    """(9, 12): from A's six entries and T's three to those of ``R A``, row by row, and T."""
+    """Return the matrix (9, 12) from A's six entries and T to the nine of ``R A``, row by row, and T."""
     R = np.eye(3) if calibration.boresight is None else calibration.boresight.matrix()
     B = np.zeros((9, 12))
     for i in range(3):
@@ -118,7 +121,7 @@ def _body_axes(calibration: Calibration) -> FloatArray:
 def _table(
     P: FloatArray, W: FloatArray, calibration: Calibration, exponents: list[Exponents]
 ) -> tuple[NDArray[np.intp], NDArray[np.intp], FloatArray]:
-    """Return the products of regressors and what each contributes."""
+    """Return the two regressors of each product, (q,) and (q,), and each product's share of the 81 sums."""
     m, B = len(W), _body_axes(calibration)
     flat = (P @ B).reshape(len(P), -1)
     C = (flat.T @ calibration.covariance @ flat).reshape(m, 12, m, 12)
@@ -137,7 +140,7 @@ def _table(
     table[:m, :12] = W @ B
     for q, pairs in enumerate(products.values()):
         S = np.sum([C[i, :, j] + (C[j, :, i] if i != j else 0.0) for i, j in pairs], axis=0)
-        if q == 0:  # the sensor's noise adds to what it reads just as T does
+        if q == 0:  # the sensor's noise adds to the reading just as an error of T does
             S[9:, 9:] += calibration.noise.sensor**2 * np.eye(3)
         table[q, 12:] = _combinations(S)
     first, second = np.array([pairs[0] for pairs in products.values()]).T
@@ -145,7 +148,7 @@ def _table(
 
 
 def _combinations(S: FloatArray) -> FloatArray:
-    """(69,): Q of V's six entries by the six products of d, then ``S_a'T`` (9 x 3), then ``S_TT``."""
+    """Return (69,): Q (V's six entries by the six products of d), ``S_a'T`` (9 x 3), ``S_TT`` (6)."""
     Q = [
         S[3 * i + k, 3 * j + l] + (S[3 * i + l, 3 * j + k] if k != l else 0.0)
         for i, j in PAIRS

@@ -4,9 +4,9 @@ Notes
 -----
 The equations stand in :mod:`.arithmetic`, and are the same code for one sample and for many.
 
-What a missing value gives: a NaN channel of the field or position, or one so large that the total is beyond
-all measure, makes total and vector NaN and the sigmas infinite, flagged ``gap`` where the field is to blame
-and ``stale_telemetry`` where the telemetry is; the total is never a guess.
+Where a channel of the field or a position is NaN, or so large that the total field exceeds
+:data:`~magbridge.records.BEYOND`, total and vector are NaN and the sigmas infinite. The flag is ``gap`` if
+the field's channels are the reason, else ``stale_telemetry``. The total is never a guess.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ __all__ = ["CorrectedArrays", "Corrector", "correct", "regressors"]
 
 FloatArray = NDArray[np.float64]
 Span = tuple[int, float, float]
-CHUNK = 4096  # samples: enough to outweigh a call, few enough for a core's cache
+CHUNK = 4096  # samples at a time: enough to outweigh the overhead of a call, few enough for a core's cache
 GAP, STALE_TELEMETRY = int(Quality.GAP), int(Quality.STALE_TELEMETRY)
 EXTRAPOLATED = int(Quality.EXTRAPOLATED)
-MARGIN = 0.02  # of the half range: telemetry that shakes at its end is not extrapolated
+MARGIN = 0.02  # of the half range: telemetry that jitters at the end of its range is not extrapolated
 MANY = for_arrays()
 
 
@@ -71,7 +71,7 @@ class Corrector:
 
     Notes
     -----
-    While positions and effects stand still, only the sample's own arithmetic is done.
+    While positions and the regressors of effects stay the same, only :func:`.arithmetic.apply` runs anew.
     """
 
     def __init__(self, calibration: Calibration) -> None:
@@ -145,7 +145,7 @@ class Corrector:
     def changes(
         self, field: tuple[float, float, float], values: tuple[float, ...], spans: Sequence[Span]
     ) -> list[float]:
-        """Return by how much (nT) the total field changes over each span of a position, effects ignored.
+        """Return by how much (nT) the total field changes over each span of a position, without effects.
 
         Parameters
         ----------
@@ -154,8 +154,8 @@ class Corrector:
         values : tuple of float
             ``calibration.channels``, in that order.
         spans : sequence of (int, float, float)
-            Which of them, and the two ends between which it lies; a channel that is no position
-            changes nothing.
+            Index of a channel, and the two values between which it lies. Spans of channels that are no
+            positions are left out of the result.
         """
         asked = values[: self._positions], [span for span in spans if span[0] < self._positions]
         if asked != self._asked:
@@ -167,7 +167,7 @@ class Corrector:
         return [_total(field, high) - _total(field, low) for low, high in self._ends]
 
     def _linear(self, positions: tuple[float, ...], index: int, value: float) -> list[float]:
-        """Return A's six entries and T with another value of position `index`; NaN where that is too far."""
+        """Return A's six entries and T with position `index` at `value`; NaN if that is too far off."""
         phi = self._kernel.powers((*positions[:index], value, *positions[index + 1 :]), 1.0)
         if not max(map(abs, phi)) < FARTHEST:
             return [nan] * len(self._weights)
@@ -198,7 +198,7 @@ def correct(
     channels : (n, k) array
         ``calibration.channels``, in that order; NaN where unknown.
     time : (n,) array
-        s since 1970 UTC; effects follow it, so in order.
+        s since 1970 UTC, ascending: effects may have a memory.
 
     Returns
     -------
@@ -242,7 +242,7 @@ def correct(
 def _regressors(
     kernel: Kernel, steps: list[Step], field: FloatArray, channels: FloatArray, time: FloatArray
 ) -> FloatArray:
-    """(m, n): monomials vectorised, effects stepped through because they have a state."""
+    """Return (m, n) regressors: monomials vectorised; effects sample by sample, because they have a state."""
     phi = kernel.powers(list(channels.T), np.ones(len(field)))
     if steps:
         times = np.rint(np.asarray(time) * 1e6).astype(np.int64).tolist()
@@ -263,7 +263,7 @@ def regressors(
 
 
 def _stage_many(kernel: Kernel, phi: FloatArray) -> Any:
-    """Prepare (m, n) regressors; where most stand still, once for each run of equal ones."""
+    """Prepare (m, n) regressors; if most repeat the sample before, once for each stretch of equal ones."""
     new = np.ones(phi.shape[1], bool)
     new[1:] = (phi[:, 1:] != phi[:, :-1]).any(axis=0)
     if 2 * np.count_nonzero(new) > len(new):

@@ -2,18 +2,18 @@
 
 Notes
 -----
-A mass at ``r(p) = r_0 + t p``, seen from the sensor, with permanent moment m and susceptibilities chi
-along the body's axes adds to the field at the sensor (r-hat the unit vector; Blakely 1996, eq. 4.14, with
-mu_0/4pi in m)::
+A mass at ``r(p) = r_0 + t p``, seen from the sensor, with permanent moment m and susceptibilities chi along
+the body's axes adds to the field at the sensor (r-hat the unit vector; Blakely 1996, eq. 4.14; m includes
+mu_0/4pi)::
 
     G(r) = (3 r-hat r-hat^T - I) / |r|^3,   T += G(r) m,   H -> (I + G(r) chi) H
 
-so that to first order ``A -= G(r) chi``, symmetric part. What the second order leaves, ``(G chi)^2``, is
-constant but for the travel and goes into the polynomial beside. Moments are kept as the field they make at
-the sensor, in nT: ``m / |r_0|^3`` and ``chi F_0 / |r_0|^3``.
+so that to first order ``A -= G(r) chi``, symmetric part. The second order, ``(G chi)^2``, depends on p
+alone and is left to the polynomial term beside. Moments are kept as the field they make at the sensor, in
+nT: ``m / |r_0|^3`` and ``chi F_0 / |r_0|^3``.
 
-Along a line short against the distance, G is a rapidly converging power series in p: the term *is*
-a polynomial (order :data:`ORDER`), and runs at a polynomial's cost.
+Along a line that is short against the distance, G is a rapidly converging power series in p. So the term is
+expanded into a polynomial (order :data:`ORDER`) and costs no more than one.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ FloatArray = NDArray[np.float64]
 Vector = tuple[float, float, float]
 
 ORDER = 8
-"""Travel of a fifth of the distance either way is then good to 1e-4 of the moment; a tenth to 1e-7."""
+"""With a travel of a fifth of the distance either way the series is good to 1e-4; with a tenth, to 1e-7."""
 
 
 def dipole_tensor(r: FloatArray) -> FloatArray:
@@ -65,9 +65,9 @@ def dipole_columns(r: FloatArray, moment: FloatArray, induced: FloatArray, r_0: 
     r : (n, 3) array
         m, where the mass is.
     moment, induced : (3,) arrays
-        nT at the sensor, as :class:`Dipole` keeps them; their size scales the three of the position.
+        nT at the sensor, as :class:`Dipole` keeps them; the displacement's three columns are linear in them.
     r_0 : float
-        m, the distance that moments are scaled with.
+        m, the distance at which moments are given as a field.
 
     Returns
     -------
@@ -93,7 +93,7 @@ def dipole_columns(r: FloatArray, moment: FloatArray, induced: FloatArray, r_0: 
 
 
 def expand_dipole(values: FloatArray, order: int) -> FloatArray:
-    """Values at the Chebyshev nodes of [-1, 1] -> power series coefficients.
+    """Return the power series coefficients of functions given at the Chebyshev nodes of [-1, 1].
 
     Parameters
     ----------
@@ -114,7 +114,7 @@ def expand_dipole(values: FloatArray, order: int) -> FloatArray:
 
 
 class Dipole(PositionTerm, frozen=True, kw_only=True):
-    """One mass as a dipole; coefficients: moment (3), induced (3), displacement (3).
+    """One mass as a dipole; coefficients: moment (3, nT), induced moment (3, nT), displacement (3, m).
 
     Attributes
     ----------

@@ -1,7 +1,7 @@
-"""Effects: terms that follow something else than the positions, some with a memory.
+"""Effects: terms that depend on something other than the positions, some with a memory.
 
-An effect names its channels, says what its coefficients do with its regressors (`columns`), and
-steps one sample at a time (`begin` gives a stepper with a fresh state). Live and batch run the same
+An effect names its channels, says what its coefficients do with its regressors (`columns`), and computes the
+regressors sample by sample (`begin` returns a stepper with a fresh state). Live and batch run the same
 stepper, so both give the same bits.
 """
 
@@ -26,14 +26,14 @@ FloatArray = NDArray[np.float64]
 
 
 class Follower(Effect, frozen=True, kw_only=True):
-    """An effect of one channel.
+    """An effect that depends on one telemetry channel.
 
     Attributes
     ----------
     cause : str
-        What it stands for, as in ``findings.json``.
+        Name of the cause that it describes, as in ``findings.json``.
     channel : str
-        The telemetry that it follows.
+        Name of the telemetry channel.
     """
 
     cause: str
@@ -41,27 +41,26 @@ class Follower(Effect, frozen=True, kw_only=True):
 
     @property
     def size(self) -> int:
-        """One for each axis."""
+        """Three coefficients, one for each axis."""
         return 3
 
     def channels(self) -> tuple[str, ...]:
-        """Name the one that it follows."""
+        """Return the name of its channel."""
         return (self.channel,)
 
 
 class ChannelEffect(Follower, frozen=True, kw_only=True):
-    """Offset or scale that follows a channel, at once or through lags in series.
+    """Offset or scale proportional to a channel, at once or through lags in series.
 
     Attributes
     ----------
     origin : float
-        Where the channel does nothing (the temperature at calibration; 0 A).
+        Value of the channel at which the effect is zero (the temperature at calibration; 0 A).
     lag : float
-        s, by how much it is behind in all, of a number of equal first-order lags
-        ``dy/dt = (x - y) / (lag / stages)``; 0: at once.
+        s, sum of the time constants of equal first-order lags in series, each
+        ``dy/dt = (x - y) / (lag / stages)``; 0: no lag.
     stages : int
-        How many stand in series, each following the one before: 1, a single store of heat; 2, what heat
-        reaches through another.
+        Number of lags in series: 1 for a single heat store, 2 for one that is heated through another.
     on : {"offset", "scale"}
         ``offset``: three coefficients, nT per unit of the channel, added to T. ``scale``: three,
         added to the diagonal of ``a``, nT at F_0 per unit.
@@ -89,7 +88,7 @@ class ChannelEffect(Follower, frozen=True, kw_only=True):
         def step(time_us: int, hx: float, hy: float, hz: float, values: Sequence[float]) -> tuple[float]:
             nonlocal then, first
             value = values[index]
-            if not isnan(value):  # without a value the last level holds
+            if not isnan(value):  # while the value is unknown, the last level holds
                 if first or lag == 0.0:
                     levels[:], first = [value] * stages, False
                 else:

@@ -182,7 +182,7 @@ def _checked(content: _File, terms: tuple[Term, ...], effects: tuple[Term, ...])
 def _check_covariance(covariance: FloatArray) -> None:
     """Symmetric and positive semidefinite, up to rounding."""
     scale = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
-    with np.errstate(over="ignore"):  # a covariance without a variance: refused below
+    with np.errstate(over="ignore"):  # a covariance beside a variance of zero: refused below
         correlation = covariance / scale / scale[:, None]
     if (np.diag(covariance) < 0.0).any() or np.abs(correlation).max(initial=0.0) > 1.0 + 1e-6:
         raise CalibrationError("covariance: a variance is negative or a correlation above 1")

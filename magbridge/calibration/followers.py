@@ -1,4 +1,4 @@
-"""Effects that follow the positions of masses: more powers, what they pass, backlash, a clock that is off."""
+"""Effects of moving masses: further powers of a position, iron that they pass, backlash, a clock offset."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ __all__ = ["ClockEffect", "MonomialEffect", "PlayEffect", "PowersEffect", "Sourc
 
 FloatArray = NDArray[np.float64]
 MAX_INTERVAL = 60_000_000
-"""µs; over a longer gap a rate of change means nothing."""
+"""µs; over a longer gap no rate of change is computed."""
 
 
 def offsets(regressors: int) -> FloatArray:
-    """(3 r, r, 9): each regressor adds to T with three coefficients of its own, axis by axis."""
+    """Return columns (3 r, r, 9): each regressor adds to T with three coefficients of its own."""
     columns = np.zeros((3 * regressors, regressors, 9))
     for r in range(regressors):
         columns[3 * r : 3 * r + 3, r, 6:9] = np.eye(3)
@@ -35,12 +35,12 @@ def offsets(regressors: int) -> FloatArray:
 
 
 def powers(x: float, order: int) -> tuple[float, ...]:
-    """``x, x^2, ... x^order``."""
+    """Return ``x, x^2, ... x^order``."""
     return tuple(accumulate(repeat(x, order), mul))
 
 
 class MassEffect(Follower, frozen=True, kw_only=True):
-    """Offsets by a mass whose position one channel tells.
+    """Offsets from a mass whose position is one telemetry channel.
 
     Attributes
     ----------
@@ -72,11 +72,11 @@ class PowersEffect(MassEffect, frozen=True, kw_only=True):
 
     @property
     def size(self) -> int:
-        """Three for each power, nT."""
+        """Three coefficients (nT) for each power."""
         return 3 * self.order
 
     def begin(self, calibration: Calibration) -> Step:
-        """Return a stepper; a missing value leaves the last one standing."""
+        """Return a stepper; while the value is missing, the last one holds."""
         index, order = calibration.channels.index(self.channel), self.order
         centre, scale, x = self.centre, self.scale, 0.0
 
@@ -90,20 +90,20 @@ class PowersEffect(MassEffect, frozen=True, kw_only=True):
 
 
 class SourcesEffect(MassEffect, frozen=True, kw_only=True):
-    """What a mass passes on its way: ``T += sum_k c_k (1 + x_k^2)^(-3/2)``.
+    """Iron that a mass passes on its path: ``T += sum_k c_k (1 + x_k^2)^(-3/2)``.
 
-    Here ``x_k = (p - centre) / scale - k apart``. Iron that a mass magnetises, or is magnetised by, has a
-    field that falls with the cube of their distance. Wherever it is, sources in a row beside the way make the
-    same field: an equivalent layer (Dampney 1969, Geophysics 34:39).
+    Here ``x_k = (p - centre) / scale - k apart``. Iron that the mass magnetises, or that magnetises the
+    mass, makes a field that falls with the cube of their distance. Its place is unknown, but a row of
+    sources beside the path can make the same field: an equivalent layer (Dampney 1969, Geophysics 34:39).
 
     Attributes
     ----------
     centre, scale : float
-        Where the first source is, and how far all are from the way.
+        Position of the first source, and distance of all of them from the path, in the channel's unit.
     apart : float
-        How far from each other, in `scale`.
+        Distance between neighbouring sources, in units of `scale`.
     count : int
-        Sources.
+        Number of sources.
     """
 
     kind: ClassVar[str] = "sources"
@@ -112,11 +112,11 @@ class SourcesEffect(MassEffect, frozen=True, kw_only=True):
 
     @property
     def size(self) -> int:
-        """Three for each source, nT."""
+        """Three coefficients (nT) for each source."""
         return 3 * self.count
 
     def begin(self, calibration: Calibration) -> Step:
-        """Return a stepper; a missing value leaves the last one standing."""
+        """Return a stepper; while the value is missing, the last one holds."""
         index, count, apart = calibration.channels.index(self.channel), self.count, self.apart
         centre, scale, x = self.centre, self.scale, 0.0
 
@@ -179,22 +179,22 @@ class MonomialEffect(Effect, frozen=True, kw_only=True):
 class PlayEffect(MassEffect, frozen=True, kw_only=True):
     """Backlash or remanence: ``T += c (S(y) - S(p)) / width``, y the play operator of the channel p.
 
-    ``y = min(max(y, p - width / 2), p + width / 2)``: the last position drags behind by half the width, on
-    the side that the mass came from. A drive's backlash is straight. Steel that the mass passes by is turned
-    where it is near, relays of one width about one place, so the loop closes beyond:
-    ``S(v) = scale tanh((v - centre) / scale)``, a generalised play (Brokate & Sprekels 1996, *Hysteresis and
-    Phase Transitions*, sec. 2.1 and 2.4).
+    ``y = min(max(y, p - width / 2), p + width / 2)``: y lags behind p by up to half the width, on the side
+    from which the mass came. A drive's backlash makes a loop of constant width (S linear). Steel beside the
+    path is remagnetised only while the mass is near (Preisach relays of one width about one place), so its
+    loop closes farther away: ``S(v) = scale tanh((v - centre) / scale)``, a generalised play (Brokate &
+    Sprekels 1996, *Hysteresis and Phase Transitions*, sec. 2.1 and 2.4).
 
     Attributes
     ----------
     width : float
         In the channel's unit.
     centre, scale : float
-        Where the steel is, and how far it reaches; the loop is straight where the scale is far
-        beyond the travel.
+        Position of the steel, and how far its effect reaches, in the channel's unit. With a scale far beyond
+        the travel S is linear, as for backlash.
     order : int
-        0: a branch as above. Older files have polynomials up to this power, ``sum_k c_k (v^k - x^k)`` with
-        ``v = (y - centre) / scale`` and ``x = (p - centre) / scale``.
+        0: S as above. In older files, the highest power of a polynomial in its place:
+        ``sum_k c_k (v^k - x^k)`` with ``v = (y - centre) / scale`` and ``x = (p - centre) / scale``.
     """
 
     kind: ClassVar[str] = "play"
@@ -203,7 +203,7 @@ class PlayEffect(MassEffect, frozen=True, kw_only=True):
 
     @property
     def size(self) -> int:
-        """One for each axis, nT, and power."""
+        """Three coefficients (nT), one for each axis; for a polynomial, three for each power."""
         return 3 * max(self.order, 1)
 
     def begin(self, calibration: Calibration) -> Step:
@@ -228,15 +228,15 @@ class PlayEffect(MassEffect, frozen=True, kw_only=True):
 
 
 class ClockEffect(Effect, frozen=True, kw_only=True):
-    """Telemetry that is late: ``theta += delay * dtheta/dp * dp/dt``, all nine coefficients at once.
+    """Telemetry that is late: ``theta += delay * dtheta/dp * dp/dt``, for all nine coefficients theta.
 
-    One coefficient, s by which the telemetry lags behind the field's samples.
+    The only coefficient is the delay: the time (s) by which the telemetry lags behind the field's samples.
 
     Attributes
     ----------
     cause : str
     sign : float
-        -1: by which the field's samples lag behind the telemetry, as a filter's do.
+        1; or -1 if the delay is that of the field's samples behind the telemetry, as after a filter.
     """
 
     kind: ClassVar[str] = "clock"
@@ -249,11 +249,11 @@ class ClockEffect(Effect, frozen=True, kw_only=True):
         return 1
 
     def columns(self, field: float) -> FloatArray:  # noqa: ARG002  (others need it)
-        """Nine regressors, the rates of the nine coefficients, under one coefficient."""
+        """One coefficient for nine regressors: the rates of change of the nine coefficients, nT/s."""
         return self.sign * np.eye(9)[None]
 
     def begin(self, calibration: Calibration) -> Step:
-        """Return a stepper; rates are differences to the sample before."""
+        """Return a stepper; rates are differences from the previous sample over the time between."""
         kernel, field = calibration.kernel, calibration.reference.field
         W = kernel.weights[: kernel.monomials] * np.array([field] * 6 + [1.0] * 3)
         last: list[float] = []

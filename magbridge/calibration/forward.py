@@ -2,8 +2,8 @@
 
 Notes
 -----
-``H_r = A^-1 R^T H + T``, the inverse of :mod:`.correct`. Effects that follow the reading itself are
-found by iterating; all others are exact at once.
+``H_r = A^-1 R^T H + T``, the inverse of :mod:`.correct`. Effects that depend on the reading itself are
+solved for by iteration; all others are exact in the first pass.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ FloatArray = NDArray[np.float64]
 def coefficients_at(
     calibration: Calibration, field: FloatArray, channels: FloatArray, time: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return ``A`` (n, 3, 3) and ``T`` (n, 3) of every sample, effects included; arguments as `correct`."""
+    """Return ``A`` (n, 3, 3) and ``T`` (n, 3) of every sample, with effects; arguments as in `correct`."""
     phi = regressors(calibration, np.asarray(field, float), np.asarray(channels, float), time)
     theta = phi.T @ calibration.kernel.weights
     return symmetric(theta), theta[:, 6:]
@@ -53,7 +53,7 @@ def forward(
     if calibration.boresight is not None:
         truth = truth @ calibration.boresight.matrix()
     reading = truth
-    # one pass settles everything that does not look at the reading; each further one gains two digits
+    # the first pass is exact unless effects depend on the reading; each further one then gains two digits
     for _ in range(6 if calibration.effects else 1):
         A, T = coefficients_at(calibration, reading, channels, time)
         reading = np.linalg.solve(A, truth[:, :, None])[:, :, 0] + T

@@ -1,4 +1,4 @@
-"""Effects of the instrument itself: time, the rate of change of the reading, a response that bends."""
+"""Effects of the instrument itself: time, the rate of change of the reading, a nonlinear response."""
 
 from __future__ import annotations
 
@@ -22,14 +22,15 @@ FloatArray = NDArray[np.float64]
 
 
 class TimeEffect(Effect, frozen=True, kw_only=True):
-    """An offset that follows time alone.
+    """An offset that depends on time alone.
 
     Attributes
     ----------
     cause : str
     shape : {"step", "drift", "tone"}
-        ``H(t - t_0)``; ``(t - t_0) / period`` and its powers, held beyond -1 and 1: what is known of a drift
-        ends with what it was learned from; ``cos`` and ``sin`` of ``2 pi (t - t_0) / period``.
+        Step: ``H(t - t_0)``. Drift: ``x = (t - t_0) / period`` and its powers, with x held at -1 and 1 beyond
+        them, because nothing is known of a drift outside the time it was fitted to. Tone: ``cos`` and ``sin``
+        of ``2 pi (t - t_0) / period``.
     start : float
         t_0, s since 1970 UTC.
     period : float
@@ -47,12 +48,12 @@ class TimeEffect(Effect, frozen=True, kw_only=True):
 
     @property
     def regressors(self) -> int:
-        """How many functions of time."""
+        """Number of functions of time."""
         return {"step": 1, "drift": self.order, "tone": 2}[self.shape]
 
     @property
     def size(self) -> int:
-        """Three (nT) for each function of time."""
+        """Three coefficients (nT) for each function of time."""
         return 3 * self.regressors
 
     def columns(self, field: float) -> FloatArray:  # noqa: ARG002  (others need it)
@@ -75,19 +76,19 @@ class TimeEffect(Effect, frozen=True, kw_only=True):
 
 
 class RateEffect(Effect, frozen=True, kw_only=True):
-    """What follows the rate of change of the reading, ``dH_r/dt``.
+    """Offsets proportional to the rate of change of the reading, ``dH_r/dt``; coefficients in s.
 
     Attributes
     ----------
     cause : str
     on : {"skew", "eddy"}
-        ``skew``: each channel is sampled tau_i later than the log says, ``T_i = tau_i dH_i/dt``: three.
-        ``eddy``: currents that a changing field drives, ``T_i = k_ij dH_j/dt``, i != j: six, in the order
-        xy, xz, yx, yz, zx, zy (Tolles & Lawson 1950, in the notation of Leliak 1961). All in s.
+        ``skew``: each channel is sampled tau_i later than the log says, ``T_i = tau_i dH_i/dt``: three
+        coefficients. ``eddy``: currents that a changing field drives, ``T_i = k_ij dH_j/dt``, i != j: six
+        coefficients xy, xz, yx, yz, zx, zy (Tolles & Lawson 1950, in the notation of Leliak 1961).
 
     Notes
     -----
-    Live there is no future, so the rate is the second-order backward difference of three samples.
+    Live, later samples are not known, so the rate is the second-order backward difference of three samples.
     """
 
     kind: ClassVar[str] = "rate"
@@ -96,7 +97,7 @@ class RateEffect(Effect, frozen=True, kw_only=True):
 
     @property
     def size(self) -> int:
-        """How many times."""
+        """Number of coefficients (times, s)."""
         return {"skew": 3, "eddy": 6}[self.on]
 
     def columns(self, field: float) -> FloatArray:  # noqa: ARG002  (others need it)
@@ -135,19 +136,20 @@ class RateEffect(Effect, frozen=True, kw_only=True):
 
 
 class ResponseEffect(Effect, frozen=True, kw_only=True):
-    """A channel whose response bends: by a power of its reading, or beyond a knee.
+    """A nonlinear response: a power of each channel's reading, or one channel with a knee.
 
     Attributes
     ----------
     cause : str
     power : int
-        ``T_i += c_i (H_i / unit)^power``: three coefficients, nT; 0 where the knee counts.
+        ``T_i += c_i (H_i / unit)^power``: three coefficients, nT. 0: the response has a knee instead.
     unit : float
         nT.
     axis : int
-        Which channel has the knee.
+        Index of the channel that has the knee.
     knee : float
-        nT, either sign; beyond it ``T += -c_1 - c_2 (H - knee) / unit``: two coefficients, nT.
+        nT, either sign s. Where ``s H > s knee``, ``T -= s c_1 + c_2 (H - knee) / unit``: two coefficients,
+        nT.
     """
 
     kind: ClassVar[str] = "response"
@@ -159,11 +161,11 @@ class ResponseEffect(Effect, frozen=True, kw_only=True):
 
     @property
     def size(self) -> int:
-        """Three, or two beyond a knee."""
+        """Three coefficients for a power, two for a knee."""
         return 3 if self.power else 2
 
     def columns(self, field: float) -> FloatArray:  # noqa: ARG002  (others need it)
-        """Offsets of each channel by its own regressor; of one by both."""
+        """For a power, each channel has a regressor of its own; for a knee, one channel has both."""
         columns = np.zeros((self.size, self.size, 9))
         for k in range(self.size):
             columns[k, k, 6 + (k if self.power else self.axis)] = 1.0 if self.power else -1.0

@@ -36,18 +36,18 @@ __all__ = ["COLUMNS", "FARTHEST", "Kernel"]
 FloatArray = NDArray[np.float64]
 
 EXPONENT = 3
-"""psi is kept below 2^3, by a power of two where positions lie far outside the range seen: then
-2^24 . 2^21 . 256 products still fit 53 bits."""
+"""psi is kept below 2^3, scaled by a power of two where positions lie far outside the range seen. Then sums
+of up to 256 products of 24 and 21 bits still fit a double's 53 bits."""
 FARTHEST = 2.0**BITS
-"""A regressor as large is beyond use: beside its square the constant falls out of the split."""
+"""A regressor this large cannot be used: beside its square the constant 1 is below the split's last bit."""
 
 COLUMNS = 81
-"""Of the table: the twelve, then the 69 combinations of their covariance."""
+"""Sums that the table gives: A' and T (12), then the 69 combinations of their covariance."""
 
 
 @dataclass(frozen=True, eq=False)
 class Kernel:
-    """What :mod:`.correct` needs, and nothing else.
+    """A calibration compiled to what :mod:`.correct` needs.
 
     Attributes
     ----------
@@ -56,14 +56,14 @@ class Kernel:
     parents : tuple of (int, int)
         Monomial ``i + 1`` is monomial ``parents[i][0]`` times position ``parents[i][1]``.
     monomials : int
-        How many; the remaining regressors belong to effects.
+        Number of monomials; the remaining regressors belong to effects.
     weights : (m, 9) array
         W, with ``A`` itself (not ``a``) in the first six.
     units : tuple of float or None
         Powers of two that the regressors are multiplied by; None where all are 1.
     first, second : (q,) int arrays
-        Product q is ``phi[first] * phi[second]``, of regressors in their units; the first m are
-        the regressors.
+        Product q is ``phi[first[q]] * phi[second[q]]``, of regressors in their units; the first m products
+        are the regressors themselves.
     coarse, fine : (81, q) arrays
         The table in two parts.
     """
@@ -101,7 +101,7 @@ class Kernel:
         return np.asarray(found if scale is None else found / scale)
 
     def sums_of_one(self, phi: list[float]) -> list[float]:
-        """Return the same 81 sums of one sample's regressors: few calls of numpy, so that it is quick."""
+        """Return the same 81 sums for one sample's regressors, with few numpy calls for speed."""
         if self.units is not None:
             phi = [value * unit for value, unit in zip(phi, self.units, strict=True)]
         largest = max(*phi, -min(phi))
@@ -115,12 +115,12 @@ class Kernel:
 
     @cached_property
     def pairs(self) -> list[tuple[int, int]]:
-        """`first` and `second` as numbers that Python multiplies by at once."""
+        """`first` and `second` as pairs of Python integers, by which lists are indexed fastest."""
         return list(zip(self.first.tolist(), self.second.tolist(), strict=True))
 
     @cached_property
     def crossed(self) -> FloatArray:
-        """(81, 2 q) `coarse` beside `fine`: for the products of a fine part with a coarse one."""
+        """(81, 2 q) `coarse` beside `fine`, to multiply the fine parts of psi and then its coarse parts."""
         return np.concatenate([self.coarse, self.fine], axis=1)
 
     def powers(self, values: Sequence[Any], one: Any) -> list[Any]:
@@ -133,7 +133,7 @@ class Kernel:
 
 
 def _scales(phi: FloatArray) -> FloatArray:
-    """(n,) power of two by which each sample's products are made small enough, 1 for most; NaN: too far."""
+    """Return (n,) powers of two that keep each sample's products small enough; NaN: too far outside."""
     largest = np.abs(phi).max(axis=0)
     scales = np.ldexp(1.0, np.minimum(EXPONENT - np.frexp(largest * largest)[1], 0))
     return np.where(largest < FARTHEST, scales, np.nan)

@@ -1,14 +1,14 @@
-"""The model: what a strapdown magnetometer among moving masses reads, and how to take it back.
+"""The model: what a strapdown magnetometer among moving masses reads, and how to invert it.
 
 Notes
 -----
-The instrument reads ``H_r = D(p) H + T(p)``. Corrected is::
+The instrument reads ``H_r = D(p) H + T(p)``. The corrected field is::
 
     H_c = A(p) (H_r - T(p)),   |H_c| = H_e = |IGRF| + anomaly             (paper, eqs. 3, 4 and 7)
 
-The paper's eq. 2 puts the rotation M where it drops out of the magnitude, its eq. 3 puts it where
-the vector ends in the ellipsoid's own axes. We take ``A = M S^-1 M^T``, **symmetric**: the same
-ellipsoid, six numbers, and a vector that stays in sensor axes (see :mod:`.paper`). Each of the nine
+The paper's eq. 2 puts the rotation M where it drops out of the magnitude; with its eq. 3 the corrected
+vector is in the ellipsoid's own axes. We take ``A = M S^-1 M^T``, **symmetric**: the same ellipsoid, six
+numbers, and a vector that stays in sensor axes (see :mod:`.paper`). Each of the nine
 coefficients is a polynomial in the positions scaled to the range seen, ``x = (p - centre) / scale``.
 All are kept in nT: ``A = I + a / F_0``, with F_0 the field at calibration.
 """
@@ -105,7 +105,7 @@ class Boresight(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Run(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One calibration run: how many samples, what is left (nT, in the sensor's own units), where."""
+    """One calibration run: number of samples, RMS residual (nT in the sensor's own units), mean positions."""
 
     label: str
     samples: int
@@ -115,7 +115,7 @@ class Run(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """A calibration with its uncertainty. Nothing in it changes: a fit returns a new one.
+    """A calibration with its uncertainty. It is immutable: a fit returns a new one.
 
     Attributes
     ----------
@@ -167,7 +167,7 @@ class Calibration:
 
     @property
     def channels(self) -> tuple[str, ...]:
-        """Telemetry that correcting needs, in order: the parameters, then what effects follow."""
+        """Telemetry that correcting needs, in order: the parameters, then the channels of effects."""
         names = [parameter.name for parameter in self.parameters]
         for effect in self.effects:
             names += [name for name in effect.channels() if name not in names]
@@ -175,7 +175,7 @@ class Calibration:
 
     @cached_property
     def kernel(self) -> Kernel:
-        """The arithmetic of this calibration, made once."""
+        """The calibration compiled for correcting samples, made once."""
         return compile_kernel(self)
 
     def matrices(self, positions: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -197,7 +197,7 @@ class Calibration:
 
 
 def identity(parameters: tuple[Parameter, ...] = (), field: float = 50_000.0) -> Calibration:
-    """Return the calibration that changes nothing and knows nothing: every sample is flagged."""
+    """Return the calibration that changes nothing; every sample is flagged ``uncalibrated``."""
     return Calibration(
         parameters=parameters,
         terms=(Polynomial(exponents=((0,) * len(parameters),)),),

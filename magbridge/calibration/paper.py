@@ -3,9 +3,9 @@
 Notes
 -----
 The paper writes ``H_r = H_e^-1 S M H_c + T`` (eq. 2) and inverts it as ``H_c = H_e S^-1 M^-1 (H_r - T)``
-(eq. 3). With eq. 2's order M drops out of ``|H_c|``; with eq. 3's the vector ends in the ellipsoid's own
-axes. ``A = H_e M S^-1 M^T`` is the same ellipsoid and leaves the vector in sensor axes, so M are the
-ellipsoid's axes and S the lengths of its semi-axes (nT), for a field of H_e.
+(eq. 3). With eq. 2's order M drops out of ``|H_c|``; with eq. 3's the corrected vector is in the
+ellipsoid's own axes. ``A = H_e M S^-1 M^T`` is the same ellipsoid and leaves the vector in sensor axes: the
+columns of M are the ellipsoid's axes, and S the lengths of its semi-axes (nT) in a field of H_e.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ FloatArray = NDArray[np.float64]
 
 
 def to_paper(A: FloatArray, field: float) -> tuple[FloatArray, FloatArray]:
-    """Rotation M (3, 3) and scale S (3,) of a symmetric positive ``A``; `field` is H_e, nT.
+    """Return rotation M (3, 3) and scale S (3,), nT, of a symmetric positive ``A``; `field` is H_e, nT.
 
-    Axes are ordered and signed so that M is as near to I as can be.
+    The axes are ordered and signed so that M is as near to I as possible.
     """
     values, axes = np.linalg.eigh(A)
     order = max(permutations(range(3)), key=lambda p: sum(abs(axes[i, k]) for i, k in enumerate(p)))

@@ -42,7 +42,7 @@ CHUNK = 8192  # rows of the Jacobian at a time: bounded memory at any number of 
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """What a fit compares.
+    """The samples that a fit compares with their reference.
 
     Attributes
     ----------
@@ -53,11 +53,11 @@ class Samples:
     phi : (n, m) array
         Monomials of the positions.
     steps : (n,) array
-        Intervals since the sample before; infinite where that belongs to another run.
+        Sampling intervals since the previous sample; infinite where that belongs to another run.
     unit : float
         nT, F_0: ``A = I + a / F_0``.
     kappa : float
-        Noise of the reference over the sensor's.
+        Noise of the reference divided by the sensor's.
     """
 
     field: FloatArray
@@ -83,7 +83,7 @@ class NormalEquations(NamedTuple):
 
 
 def residuals(samples: Samples, coefficients: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Residual e (n,) in sensor nT, and its derivative by the nine coefficients (n, 9).
+    """Return the residual e (n,) in sensor nT, and its derivative by the nine coefficients (n, 9).
 
     Parameters
     ----------
@@ -148,7 +148,7 @@ def normal_equations(
     weight : (n,) array, optional
         Of each whitened residual (robust fits); 1 if not given.
     memory : float
-        rho, between neighbours in a run.
+        rho, the correlation of the noise of successive samples in a run.
     """
     size = coefficients.size
     hessian, gradient, cost = np.zeros((size, size)), np.zeros(size), 0.0
@@ -170,7 +170,7 @@ def normal_equations(
 
 
 def whiten(values: FloatArray, steps: FloatArray, memory: float) -> FloatArray:
-    """``(v_i - r v_(i-1)) / sqrt(1 - r^2)``, r = memory^steps: an AR(1)'s correlation also beside gaps."""
+    """Whiten AR(1) noise, across gaps too: ``(v_i - r v_(i-1)) / sqrt(1 - r^2)``, r = memory^steps."""
     white, r, gaps = values.copy(), np.full(len(values) - 1, memory), np.flatnonzero(steps[1:] != 1)
     r[gaps] = memory ** steps[1:][gaps]
     r = r.reshape(-1, *(1,) * (values.ndim - 1))

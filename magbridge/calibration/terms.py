@@ -50,9 +50,9 @@ Width = Annotated[float, Meta(ge=1e-9, le=1e12)]
 """A divisor, in any unit."""
 
 SLOTS = ("a_xx", "a_yy", "a_zz", "a_xy", "a_xz", "a_yz", "t_x", "t_y", "t_z")
-"""Six of the symmetric ``A`` (as ``a = (A - I) F_0``, nT) and three of ``T`` (nT)."""
+"""The nine coefficients: six of the symmetric ``A`` (as ``a = (A - I) F_0``, nT) and three of ``T`` (nT)."""
 PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
-"""Row and column of the six."""
+"""Row and column of A's six."""
 
 TERMS: dict[str, str] = {
     "polynomial": "magbridge.calibration.terms:Polynomial",
@@ -86,7 +86,7 @@ class Expansion(msgspec.Struct, frozen=True):
 
 
 class _Interface(msgspec.StructMeta, ABCMeta):
-    """A struct that may leave methods to those who inherit."""
+    """Metaclass of structs with abstract methods."""
 
 
 class Term(msgspec.Struct, metaclass=_Interface, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -104,7 +104,7 @@ class Term(msgspec.Struct, metaclass=_Interface, frozen=True, kw_only=True, forb
 
 
 class PositionTerm(Term, frozen=True, kw_only=True):
-    """A term that depends on the positions alone: a polynomial in them, or as good as one."""
+    """A term that depends on the positions alone: a polynomial in them, or expanded into one."""
 
     @abstractmethod
     def expand(self, calibration: Calibration) -> Expansion:
@@ -131,7 +131,7 @@ class Polynomial(PositionTerm, frozen=True, kw_only=True):
         return 9 * len(self.exponents)
 
     def check(self, parameters: tuple[str, ...]) -> None:
-        """One exponent of 0 to 30 for each parameter, no monomial twice."""
+        """Require one exponent for each parameter, a total degree of at most 30, and no monomial twice."""
         for exponent in self.exponents:
             if len(exponent) != len(parameters) or min(exponent, default=0) < 0 or sum(exponent) > HIGHEST:
                 raise CalibrationError(
@@ -148,24 +148,24 @@ class Polynomial(PositionTerm, frozen=True, kw_only=True):
 
 
 class Effect(Term, frozen=True, kw_only=True):
-    """A term that follows something else than the positions: a temperature, a current, time.
+    """A term that depends on something other than the positions: a temperature, a current, time.
 
-    It turns every sample into a few *regressors* (nT, or the unit of what it follows); `columns`
-    says what each coefficient does with them. One function steps it, live and in batch, so both
-    give the same bits. A NaN in its channel must not spoil its state: hold the last value.
+    It turns every sample into a few *regressors* (in a unit of its own); `columns` says what each
+    coefficient does with them. One function computes them sample by sample, live and in batch, so both give
+    the same bits. A NaN in its channel must not spoil its state: hold the last value.
     """
 
     def channels(self) -> tuple[str, ...]:
-        """Names of the telemetry that it needs; beyond the parameters, in the deployment's columns."""
+        """Names of the telemetry channels that it needs: parameters or other columns of a deployment."""
         return ()
 
     @abstractmethod
     def columns(self, field: float) -> FloatArray:
-        """(K, r, 9): what coefficient k makes of regressor r in each slot; `field` is F_0, nT."""
+        """(K, r, 9): what regressor r adds to each slot per unit of coefficient k; `field` is F_0, nT."""
 
     @abstractmethod
     def begin(self, calibration: Calibration) -> Step:
-        """Return a fresh stepper, with a state as at switching on."""
+        """Return a stepper with a fresh state, as at power-on."""
 
 
 def full_order(parameters: int, order: int) -> tuple[Exponents, ...]:
@@ -178,7 +178,7 @@ def full_order(parameters: int, order: int) -> tuple[Exponents, ...]:
 
 
 def symmetric(entries: FloatArray) -> FloatArray:
-    """Return (n, 3, 3) symmetric matrices of their six entries, (n, 6 or more), ordered as :data:`SLOTS`."""
+    """Return (n, 3, 3) symmetric matrices from their six entries (n, 6 or more), ordered as :data:`SLOTS`."""
     return entries[:, [0, 3, 4, 3, 1, 5, 4, 5, 2]].reshape(-1, 3, 3)
 
 
@@ -188,7 +188,7 @@ def term_class(kind: str) -> type[Term]:
     Raises
     ------
     CalibrationError
-        Nobody offers that name.
+        Neither has that name.
     """
     found: Any
     if kind in TERMS:

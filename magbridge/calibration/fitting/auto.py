@@ -2,13 +2,14 @@
 
 Notes
 -----
-Each start first comes near with the noise as large as its residuals; then it climbs alternately:
-coefficients by Gauss-Newton at fixed widths, widths and noise by the evidence of the quadratic that
-it leaves, outliers and (at last) memory of the residuals. The start
-whose evidence is largest wins, and must be a maximum; the answer must not have collapsed.
+Each start is first brought near the answer, with a noise as large as its residuals. Then three steps
+alternate: coefficients by Gauss-Newton at fixed prior widths; widths and noise by the evidence of the
+quadratic found there; outliers and, once the model has settled, the noise's autocorrelation from the
+residuals. The start with the largest evidence wins. It must be a maximum of the evidence, and its scales
+must not have collapsed.
 
-Leaving one run out at a time chooses no better widths (survey at 1.045 of the noise floor against the
-evidence's 1.036, median of 8 gliders), for hundreds of fits where the evidence needs a few.
+Choosing the widths by leaving out one run at a time is no better (survey error 1.045 times the noise floor,
+against 1.036; median of 8 gliders) and takes hundreds of fits where the evidence needs a few.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ __all__ = ["fit_auto"]
 FloatArray = NDArray[np.float64]
 
 ENOUGH, BLOCK = 6000, 50  # samples that choose the start, in blocks of neighbours
-ROUNDS = 16  # of coefficients, widths, noise; five or six usually settle
+ROUNDS = 16  # of coefficients, widths, noise, at most; five or six are usually enough
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +62,7 @@ def fit_auto(
     order : int
         Highest total degree.
     vehicle : mapping of Mounting (or of its fields), optional
-        Where masses sit, by parameter: the prior of their coefficients is then that of dipoles there.
+        Where the masses sit, by parameter: their coefficients' prior is then that of dipoles there.
 
     Raises
     ------
@@ -126,7 +127,7 @@ def _thinned(samples: Samples) -> Samples:
 def _climb(
     samples: Samples, structure: Structure, z: FloatArray, eta: FloatArray, noise: NoiseModel | None = None
 ) -> _Answer:
-    """Alternate coefficients, widths and noise until the evidence stands still; `noise` if z is near it."""
+    """Alternate coefficients, widths and noise until the evidence settles; give `noise` if z is near that."""
     score, white = -np.inf, noise is None
     if noise is None:
         z, noise = _approach(samples, _prior(structure, eta), z)
@@ -144,9 +145,9 @@ def _climb(
         still = step > 0 and abs(score - last) < 1e-2 and solution.steps <= 1
         if still and not white:
             break
-        # what a wrong model leaves looks like noise with a long memory: not before the model has settled
+        # the residuals of a wrong model look like noise with a long memory, so memory waits until it settles
         white = white and not still and step < ROUNDS // 2
-        if step < ROUNDS - 4:  # then let the noise's shape be, so that the rest can settle
+        if step < ROUNDS - 4:  # after that the noise's memory and outliers are kept, so that the rest settles
             e = residuals_of(samples, structure.coefficients(z))
             doubt = (0.0, 0.0) if white else _doubt(samples, _prior(structure, eta), solution, noise)
             shape = estimate_noise(e, np.where(white, np.inf, samples.steps), widths.determined, doubt)
@@ -166,7 +167,7 @@ def _doubt(samples: Samples, prior: Prior, solution: Solution, noise: NoiseModel
 
 
 def _approach(samples: Samples, prior: Prior, z: FloatArray) -> tuple[FloatArray, NoiseModel]:
-    """Come near the answer: noise as large as the residuals' bulk, smaller with each step."""
+    """Come near the answer: after each Gauss-Newton step the noise is set to the bulk of the residuals."""
     apart = np.full(len(samples.field), np.inf)
     noise = estimate_noise(residuals_of(samples, prior.coefficients(z)), apart, 0.0)
     for _ in range(ROUNDS):

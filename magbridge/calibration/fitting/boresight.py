@@ -3,8 +3,9 @@
 Notes
 -----
 Corrected vectors b (sensor axes) and the Earth's field in body axes ``v = R(attitude)^T H_ned`` differ by
-one rotation: ``v = R b`` (Wahba's problem; scipy solves it). Attitude errors wander slowly, so neighbours
-are no independent witnesses: the covariance is that between whole runs (sandwich estimate)::
+one rotation: ``v = R b`` (Wahba's problem; scipy solves it). Attitude errors vary slowly, so successive
+samples are not independent: the covariance is estimated from the scatter between whole runs (sandwich
+estimate)::
 
     I = sum (|v|^2 E - v v^T),   s_r = sum_(i in run r) v_i x (R b_i - v_i),   C = I^-1 (sum_r s_r s_r^T) I^-1
 """
@@ -25,7 +26,7 @@ __all__ = ["field_body", "find_boresight"]
 
 FloatArray = NDArray[np.float64]
 FEWEST = 30  # samples with attitude and direction
-COMPASS_SIGMA = np.radians(0.5)  # rad, what hangs between two runs on the same compass is not in their spread
+COMPASS_SIGMA = np.radians(0.5)  # rad, compass error common to all runs, which their scatter does not show
 
 
 def field_body(attitude: FloatArray, field_ned: FloatArray) -> FloatArray:
@@ -48,7 +49,7 @@ def find_boresight(calibration: Calibration, data: Observations) -> Boresight | 
     Returns
     -------
     Boresight or None
-        None where attitude, direction, or enough of them are lacking.
+        None if too few samples have both attitude and reference direction, or the calibration has effects.
     """
     if data.attitude is None or data.reference_ned is None or calibration.effects:
         return None

@@ -28,7 +28,7 @@ def observations(
     *,
     reference: Callable[[xr.Dataset], tuple[FloatArray, FloatArray | None, str]] | None = None,
 ) -> Observations:
-    """Take a deployment's columns.
+    """Make the observations of a fit from a deployment's columns.
 
     Parameters
     ----------
@@ -38,14 +38,14 @@ def observations(
         Columns that move masses.
     reference : callable, optional
         ``ds -> (total (n,) nT, vector (n, 3) NED nT or None, name)``. If not given, or where the
-        deployment has it, the column ``reference_field`` counts.
+        deployment has it, the column ``reference_field`` is used.
 
     Raises
     ------
     FormatError
         A column is missing.
     CalibrationError
-        A column does not hold numbers; a parameter is a column that says something else.
+        A column does not hold numbers; a parameter is a column with another meaning.
     """
     if others := [name for name in parameters if name in COLUMNS and name not in FOLLOWED]:
         raise CalibrationError(f"parameter {others[0]!r} is {COLUMNS[others[0]].long_name}: it moves no mass")
@@ -106,7 +106,7 @@ def _column(ds: xr.Dataset, name: str) -> FloatArray:
 
 
 def _runs(ds: xr.Dataset, time: FloatArray) -> NDArray[np.generic]:
-    """Take the column ``run`` or ``dive``, or a new run after every gap of ten intervals."""
+    """Return the column ``run`` or ``dive``; without them, a new run begins after a gap of ten intervals."""
     for name in ("run", "dive"):
         if name in ds:
             return np.asarray(ds[name].values)

@@ -1,8 +1,8 @@
 """The paper's own fit (section 2.2): nominal start, every coefficient a free polynomial.
 
-It is here to be compared with. On its calibration runs it looks as good as any; out of sample it
-pays for what the runs never showed, and its covariance says so: what neither runs nor physics hold
-is as uncertain as a coefficient can be.
+It is here for comparison. On its calibration runs it looks as good as any. Out of sample it errs wherever the
+runs say nothing, and its covariance says so: combinations of coefficients that the runs do not determine keep
+the width :data:`ANYTHING`.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ __all__ = ["fit_cubic"]
 PLAIN = 1e4
 """kappa at which all noise counts as the reference's: the residual is the paper's ``|A(H_r - T)| - H_e``."""
 ANYTHING = 1e4
-"""nT, the width at which a coefficient that nothing holds is left: it only keeps steps finite."""
+"""nT, prior 1-sigma of every coefficient: so wide that it only keeps steps finite."""
 
 
 def fit_cubic(data: Observations, order: int = 3) -> Fit:
@@ -51,12 +51,12 @@ def fit_cubic(data: Observations, order: int = 3) -> Fit:
     check_scales(samples, start)
     covariance = covariance_of(found.normal.hessian / noise.sigma**2 + prior.precision)
     plain = polynomial_samples(data, exponents)
-    own = NoiseModel(noise.sigma * PLAIN)  # A is near I: what the magnitude has, the sensor has
+    own = NoiseModel(noise.sigma * PLAIN)  # A is near I, so the sensor's noise is the magnitude's
     return assemble(data, plain, ranges, exponents, start, covariance, own, "cubic")
 
 
 def _start(data: Observations) -> NDArray[np.float64]:
-    """Take the nominal fit with the paper's constraints, or none at all where it collapses."""
+    """Return the nominal fit with the paper's constraints, or zeros if that fails."""
     try:
         return nominal(data, axes_fixed=True, equal_xz=True)[0]
     except CalibrationError:

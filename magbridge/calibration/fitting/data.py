@@ -20,8 +20,8 @@ __all__ = ["Observations", "monomials", "polynomial_samples"]
 
 FloatArray = NDArray[np.float64]
 COMMON, FAR = 0.005, 10.0
-"""A position is implausible when it is farther from the median than FAR times the span of all but 2
-COMMON of them."""
+"""A position is implausible if it is farther from the median than FAR times the span between the quantiles
+COMMON and 1 - COMMON."""
 _PER_SAMPLE = ("field", "reference", "parameters", "runs", "time", "attitude", "reference_ned")
 
 
@@ -40,7 +40,7 @@ class Observations:
     names, units : tuple of str
         Of the parameters.
     runs : (n,) array
-        A label for each sample: dive, spiral, file. Left-out data are whole runs.
+        A label for each sample: dive, spiral, file. Validation leaves out whole runs.
     time : (n,) array
         s since 1970 UTC; if not given, one sample a second.
     attitude : (n, 3) array, optional
@@ -51,7 +51,7 @@ class Observations:
     inputs : dict
         File name -> SHA-256.
     model : str
-        What the reference is.
+        Name of the reference.
     """
 
     field: FloatArray
@@ -111,10 +111,10 @@ class Observations:
 
     @property
     def steps(self) -> FloatArray:
-        """(n,) whole intervals since the run's previous sample, infinite where there is none before it.
+        """(n,) whole sampling intervals since the run's previous sample; infinite at the first of a run.
 
-        A shorter step counts as one interval: the correlation of the noise is known for one, and not
-        guessed for less.
+        A shorter step counts as one interval: the noise's correlation is estimated at one interval, and not
+        extrapolated to less.
         """
         assert self.time is not None
         assert self.runs is not None
@@ -185,13 +185,13 @@ def _plausible(names: Sequence[str], positions: FloatArray) -> None:
 def monomials(
     positions: FloatArray, parameters: Sequence[Parameter], exponents: Sequence[Exponents]
 ) -> FloatArray:
-    """(n, m) monomials of positions (n, k, in their units), scaled as `parameters` say."""
+    """Return (n, m) monomials of positions (n, k, in their units), scaled as `parameters` say."""
     x = (positions - [p.centre for p in parameters]) / [p.scale for p in parameters]
     return np.stack([np.prod(x ** np.array(powers), axis=1) for powers in exponents], axis=1)
 
 
 def polynomial_samples(data: Observations, exponents: tuple[Exponents, ...], kappa: float = 0.0) -> Samples:
-    """Take `data` with the monomials of its scaled positions."""
+    """Return the samples of `data` with the monomials of their scaled positions."""
     ranges = data.ranges()
     phi = monomials(data.parameters, ranges, exponents)
     return Samples(data.field, data.reference, phi, data.steps, float(data.reference.mean()), kappa)

@@ -1,4 +1,4 @@
-"""A picture of a fit: what the total field is off by before and after, against whatever it may depend on."""
+"""A picture of a fit: the error of the total field, raw and corrected, against what it may depend on."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ FloatArray = NDArray[np.float64]
 POINTS = 5_000
 """Points drawn in a panel; more only make a blot."""
 WIDE = 6.0
-"""Standard deviations (robust) up to which the lower row's scale goes; what is beyond stands at its edge."""
+"""Half the height of the lower row, in robust standard deviations; samples beyond are drawn at its edge."""
 
 
 def draw_fit(calibration: Calibration, data: Observations, path: str | Path) -> None:
     """Draw each sample's deviation from the reference, as read and corrected, a colour for each run.
 
-    Against time, heading (where attitude is known) and each parameter: what still follows one of them in the
-    lower row, the calibration does not describe.
+    The abscissae are time, heading (where attitude is known) and each parameter: a trend left in the lower
+    row is something that the calibration does not describe.
 
     Raises
     ------
@@ -42,7 +42,8 @@ def draw_fit(calibration: Calibration, data: Observations, path: str | Path) -> 
     figure = Figure(figsize=(1.0 + 3.4 * len(abscissae), 6.4), layout="constrained")
     axes = figure.subplots(2, len(abscissae), sharex="col", sharey="row", squeeze=False)
     noise = calibration.noise.sensor
-    edge = WIDE * max(noise, float(np.median(np.abs(left))) / 0.6745)  # masses in motion do not set the scale
+    # the median, because samples with masses in motion must not set the scale
+    edge = WIDE * max(noise, float(np.median(np.abs(left))) / 0.6745)
     beyond = np.abs(left) > edge
     for values, row in ((read, axes[0]), (np.where(beyond, np.nan, left), axes[1])):
         for axis, x in zip(row, abscissae.values(), strict=True):
@@ -71,7 +72,7 @@ def draw_fit(calibration: Calibration, data: Observations, path: str | Path) -> 
 
 
 def _abscissae(data: Observations) -> dict[str, FloatArray]:
-    """Return what deviations are drawn against, by its name and unit."""
+    """Return the quantities that deviations are drawn against, by name and unit."""
     assert data.time is not None
     shown = {"hours": (data.time - data.time[0]) / 3600.0}
     if data.attitude is not None and np.isfinite(data.attitude[:, 2]).any():

@@ -28,8 +28,8 @@ __all__ = ["Quadratic", "Widths", "evidence", "is_maximum", "maximise"]
 
 FloatArray = NDArray[np.float64]
 FARTHEST = 10.0  # sigmas of the prior of eta: nothing physical lies beyond, and exp must not overflow
-STILL = 0.01  # of log evidence: two answers that differ by less are one
-SIGMA_STEP = 0.1  # a step in log sigma as large as one prior sigma in eta
+STILL = 0.01  # of log evidence: two answers that differ by less count as the same
+SIGMA_STEP = 0.1  # of log sigma: scales it like a prior sigma of eta
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +64,7 @@ class Widths:
 def evidence(
     quadratic: Quadratic, structure: Structure, eta: FloatArray, log_sigma: float
 ) -> tuple[float, FloatArray, FloatArray, float]:
-    """Log evidence, its gradient by (eta, log sigma), the posterior mean, and how much is determined."""
+    """Return log evidence, its gradient by (eta, log sigma), the posterior mean, and `Widths.determined`."""
     w = structure.widths(eta)
     s2 = np.exp(2.0 * log_sigma)
     M = (w[:, None] * quadratic.H * w) / s2
@@ -109,7 +109,7 @@ def maximise(quadratic: Quadratic, structure: Structure, eta: FloatArray, sigma:
 
 
 def is_maximum(quadratic: Quadratic, structure: Structure, widths: Widths) -> bool:
-    """Check that the surface bends down in every direction, and that a Newton step would gain nothing."""
+    """Return whether the evidence curves down in every direction and a Newton step would gain nothing."""
     x = np.append(widths.eta, np.log(widths.sigma))
     scale = np.append(structure.spread, SIGMA_STEP)
 

@@ -35,8 +35,8 @@ METHODS: dict[str, str] = {
 """Name -> ``module:function``, each ``(observations, order, **options) -> Fit``."""
 
 ONE_ATTITUDE = 5.0  # deg from the mean direction
-UNSUPPORTED = 5.0  # times the noise is more than a calibration may leave
-UNSEEN = 270.0  # deg of the compass: what is seen in less than a quarter of it may be anything in the rest
+UNSUPPORTED = 5.0  # times the noise: with a larger expected error the data do not support the fit
+UNSEEN = 270.0  # deg, a gap in the headings: less than a quarter of the compass does not determine the rest
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,12 +51,13 @@ class Fit:
     warnings : tuple of str
         What the data could not determine, in words for a pilot.
     details : dict
-        Numbers of the method: evidence, widths, what was determined; rank and how well each estimable
-        combination is known from the data alone (nT).
+        Numbers of the method: evidence, widths, how many numbers were determined; rank, and the 1-sigma of
+        each estimable combination from the data alone (nT).
     samples : Samples
         The data as fitted, for :mod:`.identify`.
     supported : bool
-        The data support the fit: the error expected elsewhere is not large against the noise (``--strict``).
+        The error expected elsewhere is not large against the noise, and the headings have no wide gap
+        (``--strict`` demands it).
     """
 
     calibration: Calibration
@@ -97,7 +98,7 @@ def fit(
         nT, 1-sigma of a constant error of the reference over the site. No scalar fit at one site can tell
         it from the gain, so it goes into the covariance.
     **options
-        The method's own.
+        Options of the method.
 
     Raises
     ------
@@ -108,7 +109,7 @@ def fit(
         raise CalibrationError(f"method {method!r} is not known: one of {', '.join(METHODS)}")
     module, _, name = METHODS[method].partition(":")
     chosen: Callable[..., Fit] = getattr(import_module(module), name)
-    # one thread: matrices this small only wait for each other, and sums keep one order on any machine
+    # one thread: for matrices this small threads cost more than they gain, and the order of sums is fixed
     with threadpool_limits(1, "blas"):
         _refuse_other_units(data)
         _refuse_one_attitude(data)
@@ -133,7 +134,7 @@ def _biased(found: Fit, sigma: float) -> Fit:
 
 
 def _refuse_other_units(data: Observations) -> None:
-    """Refuse gauss or µT called nT: no iron makes ten fields of one, and no fit would settle."""
+    """Refuse gauss or µT declared as nT: no iron changes the field tenfold, and no fit would settle."""
     read, true = float(np.median(np.linalg.norm(data.field, axis=1))), float(np.median(data.reference))
     if not 0.1 * true < read < 10.0 * true:
         raise CalibrationError(
@@ -204,7 +205,7 @@ def assemble(
     method: str,
     details: dict[str, Any] | None = None,
 ) -> Fit:
-    """Put a fit's numbers into a calibration with its run table."""
+    """Return the fit: its numbers as a calibration with a table of runs, and its residuals."""
     e = residuals_of(samples, coefficients)
     assert data.time is not None
     steps = np.diff(data.time)

@@ -2,10 +2,10 @@ r"""A prior from where the masses sit: the polynomials that dipoles there would 
 
 Notes
 -----
-Latent numbers: for each mass a permanent moment (3), an induced one (3), its displacement from where
-the tape found it (3) and of its travel (3); and the free polynomials of :mod:`.prior`, now only for
-what dipoles leave (extended masses, a sensor a degree out of line), so far smaller. Coefficients are
-linear in the moments; in the displacements they are linearised, anew in each round of the fit, so
+Latent numbers of each mass: permanent moment (3), induced moment (3), error of its measured place (3) and
+of its measured travel (3). The free polynomials of :mod:`.prior` remain, with far smaller widths, for what
+dipoles do not describe (extended masses, a sensor a degree out of alignment). The coefficients are linear
+in the moments. In the errors of place and travel they are linearised, anew in each round of the fit, so
 that no place is held more certain than `at_sigma`.
 """
 
@@ -35,10 +35,10 @@ FloatArray = NDArray[np.float64]
 Vector = tuple[float, float, float]
 
 MOMENT, INDUCED = 2000.0, 30.0  # nT at the sensor: a battery pack at arm's length
-INDUCED_APART = 0.4  # of the induced moment: iron is drawn along every axis the same way, if not as much
-TRAVEL_SIGMA = 0.03  # of the travel: the sensor's axes are a degree or two out of the vehicle's
-REST_T, REST_A = 1.0, 0.25  # nT over half the range: what a dipole there does not say
-LATENT = 12  # numbers a mass
+INDUCED_APART = 0.4  # of the induced moment: by how much the susceptibilities of the three axes differ
+TRAVEL_SIGMA = 0.03  # of the travel: sensor and vehicle are a degree or two out of alignment
+REST_T, REST_A = 1.0, 0.25  # nT over half the range: what the dipole does not describe
+LATENT = 12  # latent numbers of a mass
 
 
 class Mounting(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -78,7 +78,7 @@ def read_vehicle(path: str | Path) -> dict[str, Mounting]:
 
 @dataclass(frozen=True, eq=False)
 class _Mass:
-    """A mounted mass in the fit: which rows of the coefficients it makes, and along which line."""
+    """A mounted mass in the fit: which monomials it contributes to, and the line along which it travels."""
 
     rows: NDArray[np.intp]  # of its monomials x, x^2 ...
     at: FloatArray
@@ -87,16 +87,16 @@ class _Mass:
     parameter: Parameter
 
     def columns(self, latent: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """(order, 9, 12) derivative of its coefficients by its latent numbers, and (order, 9) of them."""
+        """Return ``dc/dl`` (order, 9, 12) and c (order, 9): its coefficients c at latent numbers l."""
         moment, pulled, shift, stretch = latent.reshape(4, 3)
         induced = gain_rotation() @ pulled
         p = self.parameter.centre + self.parameter.scale * chebyshev.chebpts1(4 * len(self.rows) + 4)
         r = self.at + shift + p[:, None] * (self.travel + stretch)
-        # the scale of the moments stays that of the tape, or a shift would change them too
+        # moments stay scaled by the measured distance, or a shift would change them too
         by = dipole_columns(r, moment, induced, float(np.linalg.norm(self.at)))
         by[3:6] = np.tensordot(gain_rotation().T, by[3:6], 1)
         by = np.concatenate([by, by[6:] * p[:, None]])
-        powers = expand_dipole(by, len(self.rows))[:, 1:]  # its constant goes with the hard iron
+        powers = expand_dipole(by, len(self.rows))[:, 1:]  # the constant is absorbed by the hard iron
         return np.moveaxis(powers, 0, -1), np.tensordot(latent[:6], powers[:6], 1)
 
 
@@ -106,22 +106,22 @@ def mounted_structure(
     parameters: tuple[Parameter, ...],
     vehicle: Mapping[str, Mounting | Mapping[str, Any]],
 ) -> Structure:
-    """Add dipoles where `vehicle` has masses to the free polynomials.
+    """Add to the free polynomials a dipole for each mass of `vehicle`.
 
     Parameters
     ----------
     free : Structure
-        Of :func:`~magbridge.calibration.fitting.prior.free_structure`.
+        The result of :func:`~magbridge.calibration.fitting.prior.free_structure`.
     exponents : tuple of tuple of int
         Its monomials.
     parameters : tuple of Parameter
     vehicle : mapping of Mounting (or of its fields)
-        By parameter.
+        Keyed by the parameter's name.
 
     Raises
     ------
     CalibrationError
-        `vehicle` names a mass that no parameter moves, or one so near that no series stands for it.
+        `vehicle` names a mass that no parameter moves, or one too near the sensor for a power series.
     """
     names = [parameter.name for parameter in parameters]
     masses = [_mass(name, found, exponents, parameters) for name, found in vehicle.items()]
@@ -176,7 +176,7 @@ def _mass(
 
 
 def _linearised(whole: Structure, E: FloatArray, masses: list[_Mass], latent: FloatArray) -> Structure:
-    """Linearise: the structure with the dipoles' columns at `latent`: ``c(l) ~ c(l_0) + J (l - l_0)``."""
+    """Return the structure with the dipoles linearised about `latent`: ``c(l) ~ c(l_0) + J (l - l_0)``."""
     size, q = len(E), E.shape[1]
     J = np.zeros((size, q + LATENT * len(masses)))
     J[:, :q] = E

@@ -23,16 +23,16 @@ RANK_TOLERANCE = 1e-9  # of the largest singular value
 
 @dataclass(frozen=True, eq=False)
 class Combinations:
-    """Combinations of coefficients that the data see, best known first.
+    """Combinations of coefficients that the data determine, best known first.
 
     Attributes
     ----------
     rank : int
-        How many they see at all, whatever the noise.
+        How many are determined at all, however large the noise.
     sigma : (rank,) array
-        nT, how well each is known from the data alone.
+        nT, 1-sigma of each from the data alone.
     vectors : (rank, K) array
-        Each a unit vector over the coefficients (scaled by their monomials' size on the data).
+        Each a unit vector over the coefficients, scaled by the norms of their Jacobian columns.
     """
 
     rank: int
@@ -41,7 +41,7 @@ class Combinations:
 
 
 def combinations(samples: Samples, coefficients: FloatArray, sigma: float) -> Combinations:
-    """Singular values of the whitened Jacobian.
+    """Find the estimable combinations, from the singular values of the Jacobian over the noise.
 
     Parameters
     ----------
@@ -55,7 +55,7 @@ def combinations(samples: Samples, coefficients: FloatArray, sigma: float) -> Co
     part = samples.part(slice(None, None, step))
     _, g = residuals(part, coefficients)
     J = (part.phi[:, :, None] * g[:, None, :]).reshape(len(g), -1) * np.sqrt(step) / sigma
-    # a power that hardly moves is no less estimable for its unit
+    # columns are scaled to one norm: a coefficient's unit must not decide whether it is estimable
     size = np.linalg.norm(J, axis=0)
     scale = np.where(size > 0.0, size, 1.0)
     _, values, vectors = np.linalg.svd(J / scale * np.median(scale), full_matrices=False)
@@ -64,13 +64,13 @@ def combinations(samples: Samples, coefficients: FloatArray, sigma: float) -> Co
 
 
 def expected_ratio(calibration: Calibration, data: Observations) -> float:
-    """RMS error expected near the runs, at any heading, rolled 10 deg further, over a sample's noise."""
+    """RMS error expected near the runs, at any heading and 10 deg more roll, divided by a sample's noise."""
     error = expected_error(calibration, nearby_mission(calibration, data))
     return float(np.sqrt(np.mean(error**2)) / max(calibration.noise.sensor, 1e-9))
 
 
 def warnings_for(calibration: Calibration, data: Observations) -> tuple[str, ...]:
-    """Say in a pilot's words what the runs left open."""
+    """Return warnings, in a pilot's words: what the runs left undetermined."""
     return tuple(text for check in CHECKS for text in check(calibration, data))
 
 
@@ -146,7 +146,7 @@ def heading_gap(data: Observations) -> float:
 
 
 def _widest_gap(heading: FloatArray) -> tuple[float, float]:
-    """Where it begins, and its width, deg."""
+    """Return where the widest gap between headings begins, and its width, deg."""
     courses = np.sort(heading % 360.0)
     gaps = np.diff(np.append(courses, courses[0] + 360.0))
     widest = int(np.argmax(gaps))

@@ -1,14 +1,14 @@
-r"""Undo an anti-alias filter before a fit: in a calibration's turns it takes a little off the field.
+r"""Undo an anti-alias filter before a fit: while the vehicle turns, it attenuates the field a little.
 
 Notes
 -----
 An RC filter of corner f_c gives y with :math:`\mathbf y + τ \dot{\mathbf y} = \mathbf x`,
-:math:`τ = 1/(2 π f_c)`. Of a field that turns with the vehicle it does not only lag; it shortens::
+:math:`τ = 1/(2 π f_c)`. A field that rotates in the sensor's axes is not only delayed but also shortened::
 
     |y| = |x| - tau^2 |dx/dt|^2 / (2 |x|)
 
-With the paper's 0.33 Hz, in a spiral of four minutes a turn, 0.7 nT: little, but all of it goes into the
-gain, and from there into every sample of a straight survey.
+With the paper's 0.33 Hz, in a spiral of four minutes a turn, that is 0.7 nT: little, but all of it goes into
+the gain, and from there into every sample of a straight survey.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from magbridge.errors import CalibrationError
 
 __all__ = ["unfiltered"]
 
-REACH = 4.0  # time constants that a slope spans at least: shorter ones would be noise
+REACH = 4.0  # time constants that a slope spans at least: over shorter spans it would be noise
 
 
 def unfiltered(data: Observations, corner: float) -> Observations:

@@ -1,4 +1,4 @@
-"""How well a calibration will do on a mission: the uncertainty of its model over what the mission meets."""
+"""How well a calibration will do on a mission: its uncertainty at the attitudes and positions met there."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ from magbridge.errors import CalibrationError
 __all__ = ["Mission", "expected_error", "nearby_mission"]
 
 FloatArray = NDArray[np.float64]
-POINTS = 600  # of a mission are enough to know it by
+POINTS = 600  # samples that represent a mission
 ROLL = 10.0  # deg either way, by which a survey rolls further than the runs did
 
 
 @dataclass(frozen=True, eq=False)
 class Mission:
-    """What a mission meets.
+    """The fields and positions that a mission meets.
 
     Attributes
     ----------
     field_body : (n, 3) array
         nT, the true field in body axes.
     parameters : (n, k) array
-        Positions there, in their units.
+        Actuator positions at the same samples, in their units.
     """
 
     field_body: FloatArray
@@ -44,7 +44,7 @@ class Mission:
         Raises
         ------
         CalibrationError
-            Attitude or place are lacking.
+            Attitude or place is lacking.
         """
         if data.attitude is None or data.reference_ned is None:
             raise CalibrationError("the mission needs roll, pitch, heading, latitude and longitude")
@@ -58,9 +58,8 @@ class Mission:
 def nearby_mission(calibration: Calibration, data: Observations) -> Mission:
     """Return the calibration's own attitudes and positions, rolled a little further, on all headings.
 
-    That is what a survey after these runs meets at least. The corrected vectors themselves tell the
-    attitude up to a turn about the field; where the vertical is, attitude telemetry must tell: without it,
-    headings stay.
+    A survey after these runs meets at least those. Rolling needs only the corrected vectors. Turning to other
+    headings needs the vertical, which attitude telemetry gives: without it, only the runs' headings are used.
     """
     rows = np.arange(0, len(data), max(3 * len(data) // POINTS, 1))
     k = len(calibration.parameters)
@@ -81,7 +80,7 @@ def nearby_mission(calibration: Calibration, data: Observations) -> Mission:
 
 
 def expected_error(calibration: Calibration, mission: Mission) -> FloatArray:
-    """1-sigma of the corrected total field that the calibration itself leaves, noise apart, nT.
+    """Return the 1-sigma (nT) of the corrected total field from the position terms alone, without noise.
 
     Returns
     -------

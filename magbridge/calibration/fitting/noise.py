@@ -1,4 +1,4 @@
-"""The noise of residuals: how large, how long it remembers, and which samples are outliers."""
+"""The noise of residuals: its size, its autocorrelation, and which samples are outliers."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ __all__ = ["OUTLIER", "NoiseModel", "estimate_noise"]
 FloatArray = NDArray[np.float64]
 
 OUTLIER = 5.0
-"""A residual of more than so many (robust) sigmas takes no part; of pure noise none does."""
+"""A residual beyond this many (robust) sigmas is left out; Gaussian noise practically never gets there."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,7 +26,7 @@ class NoiseModel:
     sigma : float
         nT, in the sensor's own units, of a single sample.
     memory : float
-        Correlation of neighbours in a run (AR(1)).
+        Correlation of successive samples in a run (AR(1)).
     weight : (n,) array or None
         1 for a sample that counts, 0 for an outlier; None when all count.
     """
@@ -44,20 +44,20 @@ class NoiseModel:
 def estimate_noise(
     e: FloatArray, steps: FloatArray, free: float, doubt: tuple[float, float] = (0.0, 0.0)
 ) -> NoiseModel:
-    """Noise model from the residuals of a fit.
+    """Estimate the noise model from the residuals of a fit.
 
     Parameters
     ----------
     e : (n,) array
         Residuals, nT.
     steps : (n,) array
-        Intervals since the sample before.
+        Sampling intervals since the previous sample.
     free : float
         How many numbers the data determined.
     doubt : tuple of 2 float
-        nT², what the model's own uncertainty is at a sample, and what it shares with the next one.
-        A fit takes just so much out of the residuals, the slow part of the noise before all:
-        ``Cov e = R - J P J^T`` (R: the noise, P: posterior of the coefficients).
+        nT², the fitted model's variance at a sample, and its covariance with the next one. A fit absorbs just
+        that much of the noise, its slow part above all: ``Cov e = R - J P J^T`` (R: covariance of the noise,
+        P: posterior covariance of the coefficients).
     """
     scale = _robust(e)
     memory = _memory(np.clip(e, -3.0 * scale, 3.0 * scale), steps == 1, doubt)
@@ -69,12 +69,12 @@ def estimate_noise(
 
 
 def _robust(e: FloatArray) -> float:
-    """Scale of the bulk: 1.48 times the median size, which is sigma for a Gaussian."""
+    """Return the scale of the bulk: 1.48 times the median magnitude, which is sigma for a Gaussian."""
     return 1.4826 * float(np.median(np.abs(e))) or float(np.abs(e).mean()) or 1e-9
 
 
 def _memory(e: FloatArray, follows: NDArray[np.bool_], doubt: tuple[float, float]) -> float:
-    """Correlation of neighbours; what is within its own error of 0 is 0."""
+    """Return the correlation of successive residuals; 0 if it is below three of its standard errors."""
     late, early = e[1:][follows[1:]], e[:-1][follows[1:]]
     if len(late) < 30:
         return 0.0

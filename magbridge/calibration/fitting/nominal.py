@@ -2,9 +2,9 @@
 
 Notes
 -----
-On a glider's narrow attitudes a free ellipsoid has a way out: ``A -> 0`` with ``T -> infinity`` sends every
-residual to zero. So scale and soft iron have a prior of physical width, residuals are reported in
-the sensor's own nT, and an answer that shrank all the same is refused.
+On a glider's narrow range of attitudes a free ellipsoid fit can collapse: ``A -> 0`` with ``T -> infinity``
+makes every residual zero. So scale and soft iron have a prior of physical width, residuals are reported in
+the sensor's own nT, and a fit that collapsed all the same is refused.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ HARD_IRON_SIGMA = 0.6
 
 
 def fit_nominal(data: Observations, order: int = 0, **options: Any) -> Fit:  # noqa: ARG001  (one ellipsoid has none)
-    """:func:`nominal` as a calibration without parameters."""
+    """Return the fit of :func:`nominal` as a calibration without parameters."""
     coefficients, covariance, noise = nominal(data, **options)
     return assemble(data, nominal_samples(data), (), ((),), coefficients, covariance, noise, "nominal")
 
 
 def nominal_samples(data: Observations) -> Samples:
-    """Take `data` with the constant monomial only."""
+    """Return the samples of `data` with the constant monomial only."""
     return Samples(
         data.field, data.reference, np.ones((len(data), 1)), data.steps, float(data.reference.mean())
     )
@@ -91,18 +91,18 @@ def nominal(
     best = None
     for start in starts(samples):
         z = np.asarray(np.linalg.lstsq(E, start, rcond=None)[0], float)
-        noise = NoiseModel(1e-3 * samples.unit)  # wide at first: far from the answer nothing is noise
+        noise = NoiseModel(1e-3 * samples.unit)  # wide at first: far from the answer, residuals are not noise
         for _ in range(4):
             found = gauss_newton(samples, prior, noise, z)
             z = found.z
-            # the moving masses are still in the residual: no noise to whiten, only fewer witnesses
+            # the moving masses are still in the residual: do not whiten, but count fewer independent samples
             noise = estimate_noise(residuals_of(samples, E @ z), samples.steps, len(keep))
             memory, noise = noise.memory, replace(noise, memory=0.0)
         value = found.normal.cost
         if found.settled and (best is None or value < 0.999 * best[0]):
             best = (value, found, noise, memory)
     if best is None:
-        check_scales(samples, E @ z)  # on its way to collapse it never settles
+        check_scales(samples, E @ z)  # a fit on its way to collapse never settles: that is the better message
         raise CalibrationError("nominal: no start settled; are the samples those of one sensor?")
     _, found, noise, memory = best
     noise = replace(noise, memory=memory)
@@ -115,14 +115,14 @@ def nominal(
 
 
 def _precision(E: FloatArray, scale_sigma: float, gain_sigma: float) -> FloatArray:
-    """Prior precision in units of the field, of the numbers that E leaves."""
+    """Return the prior precision, in units of the field, of the numbers that E leaves free."""
     covariance = np.diag(np.array([scale_sigma] * 6 + [HARD_IRON_SIGMA] * 3) ** 2)
     covariance[:3, :3] += gain_sigma**2
     return np.asarray(E.T @ np.linalg.inv(covariance) @ E)
 
 
 def starts(samples: Samples) -> list[FloatArray]:
-    """No iron at all; and the sphere that is nearest by linear least squares.
+    """Return two starts: no iron at all, and the sphere that fits best by linear least squares.
 
     ``|h|^2 = 2 h^T T + (F^2 - |T|^2)`` is linear in T and one constant.
     """
@@ -130,7 +130,7 @@ def starts(samples: Samples) -> list[FloatArray]:
     design = np.column_stack([2.0 * h, np.full(len(h), samples.unit)])
     scale = np.abs(design).max(axis=0) + 1e-300
     right = (h * h).sum(axis=1) - samples.reference**2
-    # a hundredth of the field holds directions the samples never went to
+    # a weak ridge holds the directions that the samples do not determine
     damp = np.diag(np.full(4, 1e-2 * np.sqrt(len(h))))
     solved = np.linalg.lstsq(np.vstack([design / scale, damp]), np.append(right, np.zeros(4)), rcond=None)[0]
     sphere = np.concatenate([np.zeros(6), (solved / scale)[:3]])

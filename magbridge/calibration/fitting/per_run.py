@@ -2,8 +2,9 @@
 
 Notes
 -----
-A single run sees few attitudes, and its own ellipsoid is free in most directions. So each run is
-fitted about the nominal ellipsoid of all, and weighs in the polynomials by its precision::
+A single run covers few attitudes and leaves its own ellipsoid undetermined in most directions. So each run
+is fitted with a prior about the nominal ellipsoid of all runs, and weighted by its precision in the
+polynomials::
 
     c = argmin sum_r (Phi_r c - c_r)^T Lambda_r (Phi_r c - c_r),   Lambda_r = H_r / sigma_r^2 + P
 """
@@ -25,8 +26,8 @@ from magbridge.errors import CalibrationError
 __all__ = ["fit_per_run"]
 
 FEWEST = 20  # samples of a run that is fitted
-AT_REST = 0.05  # of half the range: a run is fitted where its masses stand
-WIDTHS = np.array([0.005] * 6 + [0.02] * 3)  # of the field: a run about the nominal ellipsoid
+AT_REST = 0.05  # by which monomials may differ from the run's median: samples with the masses at rest
+WIDTHS = np.array([0.005] * 6 + [0.02] * 3)  # of the field: prior of a run about the nominal ellipsoid
 
 
 def fit_per_run(data: Observations, order: int = 3) -> Fit:
@@ -35,7 +36,7 @@ def fit_per_run(data: Observations, order: int = 3) -> Fit:
     Raises
     ------
     CalibrationError
-        Fewer runs than the polynomials have orders.
+        Fewer runs than the order plus one.
     """
     ranges = data.ranges()
     exponents = full_order(len(ranges), order)

@@ -7,11 +7,11 @@ n-th power of x has the size ``(n + 1)(n + 2)/2 q^n`` of the whole: against its 
 
     w_n = w_1 (n + 1)(n + 2)/6 q^(n - 1)
 
-So each parameter has three widths, all logarithmic: the first power in T, the first power in A, and q.
-Masses do not see each other to first order: cross terms have widths of their own, expected far
-smaller. The constant terms: a gain common to all axes, soft iron, hard iron. Every width is
-``log w = constant + design . eta``; eta has a broad Gaussian prior about sizes found on vehicles, and
-its values maximise the evidence (:mod:`.evidence`), so data that want another size get it.
+So each parameter has three widths, all logarithmic: the first power in T, the first power in A, and q. To
+first order masses do not affect each other: cross terms have widths of their own, expected to be far
+smaller. The constant terms have three: the gain common to all axes, soft iron, hard iron. Every width is
+``log w = constant + design . eta``. eta has a broad Gaussian prior about sizes found on vehicles and is
+chosen to maximise the evidence (:mod:`.evidence`), so the data can overrule those sizes.
 """
 
 from __future__ import annotations
@@ -32,26 +32,26 @@ GAIN, SOFT_IRON = 0.02, 0.015  # of the field
 HARD_IRON = 3000.0  # nT
 FIRST_T, FIRST_A, RATIO = 200.0, 8.0, 0.05  # nT and nT over half the range seen; travel over distance
 CROSS_T, CROSS_A = 0.1, 0.1  # nT
-FACTOR_FIXED, FACTOR_MASS, FACTOR_RATIO = np.log(2.0), np.log(3.3), np.log(1.8)  # one sigma is a factor of
+FACTOR_FIXED, FACTOR_MASS, FACTOR_RATIO = np.log(2.0), np.log(3.3), np.log(1.8)  # 1-sigma of log widths
 
 
 @dataclass(frozen=True, eq=False)
 class Structure:
-    """How coefficients follow from latent numbers z, and how wide those are expected.
+    """How coefficients follow from latent numbers z, and the prior widths of z.
 
     Attributes
     ----------
     E : (K, q) array
-        ``c = E z + offset``; z is expected about 0.
+        ``c = E z + offset``; the prior of z is centred at 0.
     offset : (K,) array
     constant, design : (q,) array, (q, h) array
         Log widths of z are ``constant + design @ eta``.
     centre, spread : (h,) arrays
         Prior of eta.
     names : tuple of str
-        Of eta's numbers: what ``exp(eta)`` is the width of.
+        What ``exp(eta)`` is the width of, number by number.
     renew : callable, optional
-        ``z -> (Structure, z)``: the structure linearised anew at z, and the same place in it.
+        ``z -> (Structure, z)``: the structure linearised anew at z, and z in it.
     """
 
     E: FloatArray
@@ -73,12 +73,12 @@ class Structure:
 
 
 def gain_rotation() -> FloatArray:
-    """(3, 3) orthonormal: the common gain of three axes, then two differences."""
+    """Return an orthonormal matrix (3, 3): the common gain of three axes, then two differences."""
     return np.array([[1, 1, 1], [1, -1, 0], [1, 1, -2]]).T / np.sqrt([3.0, 2.0, 6.0])
 
 
 def free_structure(exponents: tuple[Exponents, ...], names: tuple[str, ...], unit: float) -> Structure:
-    """Polynomials with physical widths, nothing known about where the masses sit.
+    """Return the structure of polynomials with physical widths, the masses' places being unknown.
 
     Parameters
     ----------
@@ -116,7 +116,7 @@ def free_structure(exponents: tuple[Exponents, ...], names: tuple[str, ...], uni
 
 
 def _log_widths(powers: Exponents, constant: FloatArray, design: FloatArray) -> None:
-    """Fill one monomial's rows: which of eta's numbers make its nine widths."""
+    """Fill one monomial's rows, in place: the constants and eta's weights of its nine log widths."""
     degree = sum(powers)
     moved = [k for k, power in enumerate(powers) if power]
     if not moved:
@@ -126,7 +126,7 @@ def _log_widths(powers: Exponents, constant: FloatArray, design: FloatArray) -> 
         constant[:] = np.log((degree + 1) * (degree + 2) / 6.0)
         design[6:, k] = design[:6, k + 1] = 1.0
         design[:, k + 2] = degree - 1
-    else:  # two masses by each other: as small as their ratios beyond the first cross term
+    else:  # cross terms: each power beyond the first adds a factor of travel over distance
         design[6:, -2] = design[:6, -1] = 1.0
         for k in moved:
             design[:, 3 + 3 * k + 2] = (degree - 2) * powers[k] / degree

@@ -6,8 +6,8 @@ Minimises over z, with coefficients ``c = E z + offset``::
 
     sum_i w_i e_i(c)^2 / (2 sigma^2) + z^T P z / 2
 
-Each step is Gauss-Newton's, shortened until it goes downhill. It is small linear algebra, because the
-normal equations of all samples are summed up once per step.
+Each step is Gauss-Newton's, shortened until the sum decreases. The linear algebra is small, because the
+normal equations of all samples are summed up once for each trial.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """Gaussian on z about 0: precision (q, q); and ``c = E z + offset``, E (K, q)."""
+    """Gaussian prior of z about 0 with its precision (q, q); and ``c = E z + offset``, E (K, q)."""
 
     precision: FloatArray
     E: FloatArray
@@ -72,7 +72,7 @@ def gauss_newton(
         See the module's notes.
     start : (q,) array
     steps : int
-        At most.
+        How many at most.
     tolerance : float
         Settled when the next step would gain less than this (in units of log likelihood).
     """
@@ -96,7 +96,7 @@ def gauss_newton(
             new = _objective(tried, prior, noise, z + part * move)
             if new < value:
                 break
-            # the parabola through value, slope and new has its minimum at
+            # go to the minimum of the parabola through value, slope and new
             part *= max(0.5 * part * promise / (new - value + part * promise), 0.1)
             if part < 1e-6:
                 return Solution(z, normal, settled=False, steps=step)
@@ -113,7 +113,7 @@ def _solve(precision: FloatArray, gradient: FloatArray) -> FloatArray:
     scale = np.sqrt(np.maximum(np.diag(precision), 1e-300))
     scaled = precision / np.outer(scale, scale)
     factor, info = dpotrf(scaled)
-    if info:  # directions that neither data nor prior hold: stay there
+    if info:  # do not move along directions that neither data nor prior determine
         values, vectors = np.linalg.eigh(scaled)
         kept = values > 1e-11 * values[-1]
         inner = vectors[:, kept] @ ((vectors[:, kept].T @ (gradient / scale)) / values[kept])

@@ -76,9 +76,9 @@ def leave_runs_out(data: Observations, method: str = "auto", order: int = 3, **o
 
 
 def in_sensor_units(calibration: Calibration, data: Observations) -> tuple[FloatArray, FloatArray]:
-    """Error of the total field divided by ``|A^T u|`` (n,), nT of the sensor; and over its sigma (n,).
+    """Return the error of the total field over ``|A^T u|`` (n,), nT of the sensor; and over its sigma (n,).
 
-    A fit that shrinks A shrinks every error of the corrected field; this figure it cannot buy.
+    A fit that shrinks A shrinks every error of the corrected field, but gains nothing in the sensor's units.
     """
     k = len(calibration.parameters)
     assert data.time is not None

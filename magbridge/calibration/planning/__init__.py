@@ -1,1 +1,1 @@
-"""Which calibration runs to fly next: :func:`~magbridge.calibration.planning.plan.plan` is the door."""
+"""Which calibration runs to fly next: see :func:`~magbridge.calibration.planning.plan.plan`."""

@@ -42,7 +42,7 @@ def flight_plan(
         nT, north-east-down, the Earth's field along it.
     runs : int
     roll : float
-        deg that the vehicle can bank, either way.
+        deg, the largest bank either way.
 
     Raises
     ------
@@ -52,7 +52,7 @@ def flight_plan(
     if field_ned is None:
         raise CalibrationError("the mission needs latitude and longitude, to know the Earth's field there")
     total = np.linalg.norm(field_ned, axis=1)
-    some = ("time", np.ones(mission.sizes["time"]))  # readings that nobody looks at; zeros would be none
+    some = ("time", np.ones(mission.sizes["time"]))  # placeholder readings; zeros would count as missing
     names = tuple(parameter.name for parameter in calibration.parameters)
     data = observations(
         mission.assign({f"mag_{axis}": some for axis in "xyz"}).drop_vars("reference_field", errors="ignore"),

@@ -16,13 +16,13 @@ __all__ = ["Limits", "PlannedRun", "candidate_runs", "settled", "trim_of"]
 
 FloatArray = NDArray[np.float64]
 SLACK = 3.0  # deg, by which another trim of the vehicle changes the pitch at the same positions
-STILL = 0.01  # of half a position's range from one sample to the next
+STILL = 0.01  # of half a position's range, from one sample to the next: a mass at rest
 REACH = 0.35  # of half a position's range, by which a run may differ from positions that were flown
 
 
 @dataclass(frozen=True)
 class PlannedRun:
-    """One spiral: deg, positions in their units."""
+    """One spiral: pitch and roll in deg, positions in their units."""
 
     pitch: float
     roll: float
@@ -70,7 +70,7 @@ def trim_of(data: Observations) -> Callable[[FloatArray], float] | None:
 
 
 def settled(data: Observations) -> FloatArray:
-    """(m, k) positions that `data` fly with, those left out that masses only pass on their way."""
+    """Return the (m, k) positions at which the masses of `data` are at rest."""
     scale = [parameter.scale for parameter in data.ranges()]
     moving = np.abs(np.diff(data.parameters, axis=0) / scale).max(axis=1) > STILL
     at_rest = np.ones(len(data), bool)
@@ -80,7 +80,7 @@ def settled(data: Observations) -> FloatArray:
 
 
 def candidate_runs(limits: Limits, parameters: tuple[Parameter, ...], levels: int) -> list[PlannedRun]:
-    """Return everything the vehicle can fly, on a grid of `levels` of each position."""
+    """Return every run that the vehicle can fly, on a grid of `levels` values of each position."""
     ends = limits.parameters or tuple((p.low, p.high) for p in parameters)
     rolls = np.unique(np.append(np.linspace(*limits.roll, 5), np.clip(0.0, *limits.roll)))
     found = []

@@ -2,14 +2,14 @@
 
 Notes
 -----
-A run at one attitude and position with all headings brings the information ``phi phi^T (x) G``, ``G`` the
-sum of ``g g^T / sigma^2`` over its samples, whether or not it was flown yet: only the geometry counts. With
-the calibration's covariance C and ``F = phi (x) G^(1/2)``::
+A run at one pitch, roll and position with all headings adds the information ``phi phi^T (x) G``, with ``G``
+the sum of ``g g^T / sigma^2`` over its samples. That follows from the geometry alone, before the run is
+flown. With the calibration's covariance C and ``F = phi (x) G^(1/2)``::
 
     C' = C - C F (I + F^T C F)^-1 F^T C
 
-Runs are chosen one by one, then exchanged for better ones until none is (Fedorov's exchange), to make
-the largest error over the mission small (G-optimality, by the eighth power mean, which is smooth).
+Runs are chosen one by one, then exchanged for better ones (Fedorov's exchange), to make the largest error
+over the mission small (G-optimality, approximated by the eighth power mean, which is smooth).
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ FloatArray = NDArray[np.float64]
 HEADINGS = 24
 SAMPLES = 225  # of a run: a quarter of an hour at the paper's 0.25 Hz
 LEVELS = 7  # of each position that are tried
-POWER = 4  # of the variance: the eighth power mean of sigma
+POWER = 4  # of the variance, that is the eighth power of sigma
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class Plan:
 def expected_calibration(
     parameters: tuple[Parameter, ...], field: float, order: int = 3, noise: float = 1.0
 ) -> Calibration:
-    """Return what is known of a vehicle before its first run: nothing but the physical widths.
+    """Return what is known of a vehicle before its first run: the physical widths of its coefficients.
 
     Parameters
     ----------
@@ -86,7 +86,7 @@ def expected_calibration(
 
 
 class _Design:
-    """The linear algebra of candidates about one calibration."""
+    """The linear algebra of candidate runs, linearised about one calibration."""
 
     def __init__(self, calibration: Calibration, mission: Mission, field_ned: FloatArray) -> None:
         if (
@@ -101,7 +101,7 @@ class _Design:
         self.points = (phi[:, :, None] * g[:, None, :]).reshape(len(g), -1)
 
     def derivative(self, truth: FloatArray, positions: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Monomials and derivative of the residual at true fields in body axes."""
+        """Return monomials and the residual's derivative at true fields in body axes."""
         calibration = self.calibration
         phi = monomials(positions, calibration.parameters, self.exponents)
         reading = forward(calibration, truth, positions, np.zeros(len(truth)))
@@ -110,7 +110,7 @@ class _Design:
         return phi, residuals(samples, calibration.coefficients)[1]
 
     def factor(self, run: PlannedRun) -> FloatArray:
-        """F (K, 9) of a run through all headings."""
+        """Return F (K, 9) of a run through all headings."""
         turn = np.linspace(0.0, 2.0 * np.pi, HEADINGS, endpoint=False)
         attitude = np.column_stack([np.radians([[run.roll, run.pitch]] * HEADINGS), turn])
         truth = field_body(attitude, np.tile(self.field_ned, (HEADINGS, 1)))
@@ -121,16 +121,16 @@ class _Design:
         return np.kron(phi[:1].T, vectors * np.sqrt(np.maximum(values, 0.0)))
 
     def variances(self, C: FloatArray) -> FloatArray:
-        """(n,) variance over the mission's points."""
+        """Return the variance (n,), nT², at the mission's points."""
         return np.asarray(np.einsum("ij,jk,ik->i", self.points, C, self.points))
 
     def after(self, C: FloatArray, F: FloatArray) -> FloatArray:
-        """C' with one run more."""
+        """Return C', the covariance after one more run."""
         CF = C @ F
         return np.asarray(C - CF @ np.linalg.solve(np.eye(F.shape[1]) + F.T @ CF, CF.T))
 
     def scores(self, C: FloatArray, factors: Sequence[FloatArray]) -> FloatArray:
-        """Power mean of the variance after each of the candidates."""
+        """Return the mean power of the variance over the mission after each of the candidates."""
         PC, before = self.points @ C, self.variances(C)
         found = []
         for F in factors:
@@ -179,7 +179,7 @@ def plan(
     CalibrationError
         The limits leave nothing to fly.
     """
-    with threadpool_limits(1, "blas"):  # matrices this small only wait for each other
+    with threadpool_limits(1, "blas"):  # for matrices this small threads cost more than they gain
         design = _Design(calibration, mission, field_ned)
         candidates = candidate_runs(limits, calibration.parameters, LEVELS)
         if not candidates:
