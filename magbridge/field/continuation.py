@@ -1,14 +1,14 @@
-r"""The field at another height: upward exactly, downward as far as a map can say, with what that leaves out.
+r"""The field at another height: upward exactly, downward as far as a map allows, with an error estimate.
 
 A map is flown in the air, or continued to one altitude above the sea; the vehicle is below. Every wave of a
 field whose sources lie deeper decays with height (Blakely 1995, eq. 12.8),
 
 .. math:: \hat T(\mathbf k, z + h) = \hat T(\mathbf k, z)\, e^{-|\mathbf k| h} .
 
-Downward the inverse would blow up what the survey did not see. With p = 1 - exp(-|k| h) it is a series,
-exp(|k| h) = 1 / (1 - p) = 1 + p + p² + ...: its first three terms at most treble the map's own noise;
-those after them are what is left out. About that level the field goes on with its vertical gradient, of
-spectrum |k| T.
+Downward, the inverse would amplify waves that the survey did not resolve. With p = 1 - exp(-|k| h) it is a
+series, exp(|k| h) = 1 / (1 - p) = 1 + p + p² + ...: its first three terms, which are used, at most treble
+the map's own noise; the terms after them are counted as error. Above and below the level reached, the field
+is extrapolated by its vertical gradient, of spectrum |k| T.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ __all__ = ["Continued", "continued"]
 Array = NDArray[np.float64]
 
 SURE, TERMS = 3, 10
-"""Terms of the series that are believed, and that there are: those beyond are waves that no survey from
-above sees."""
+"""Terms of the series that are used, and terms that stand for the true field when the error is estimated:
+later ones are waves that no survey from above resolves."""
 LEVELS = (0.1, 0.3, 0.5, 0.7, 0.9)
-"""Quantiles of the depth at which the error is taken."""
+"""Quantiles of the depth at which the error is estimated."""
 
 
 class Continued(NamedTuple):
-    """A grid at another height, and how far it can be believed.
+    """A grid at another height, and the error of the continuation.
 
     Attributes
     ----------
@@ -42,7 +42,7 @@ class Continued(NamedTuple):
     sigma : float
         nT, 1-sigma of what the continuation leaves out; 0 upward to one level.
     length : float
-        m, over which that error reaches: its correlation falls as exp(-r²/length²) at first.
+        m, correlation length of that error: at short distances its correlation falls as exp(-r²/2 length²).
     """
 
     grid: AnomalyGrid
@@ -51,14 +51,14 @@ class Continued(NamedTuple):
 
 
 def continued(grid: AnomalyGrid, depth: ArrayLike) -> Continued:
-    """Return a grid as it is about a level.
+    """Return a grid continued to the mean depth, with its vertical gradient there.
 
     Parameters
     ----------
     grid : AnomalyGrid
         One of unknown altitude is returned as it is. Holes stay holes.
     depth : array_like, (n,)
-        m below the surface, all at which it will be used; negative is above. Their mean is the level.
+        m below the surface, all at which the grid will be used; negative is above. Their mean is the level.
 
     Notes
     -----

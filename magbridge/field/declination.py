@@ -15,18 +15,18 @@ __all__ = ["with_true_heading"]
 
 
 def with_true_heading(deployment: xr.Dataset, reference: str | None = None) -> xr.Dataset:
-    """Return the deployment with ``heading`` counted from true north.
+    """Return the deployment with ``heading`` measured from true north.
 
     Parameters
     ----------
     deployment : Dataset (time)
     reference : {"true", "magnetic"}, optional
-        What the headings are counted from; default what the attribute ``heading_reference`` says.
+        The north that headings are measured from; default: the attribute ``heading_reference``.
 
     Notes
     -----
     To magnetic headings the IGRF's declination at the position is added, ``D = atan2(B_east, B_north)``; any
-    other deployment comes back as it is. Without a position a magnetic heading becomes NaN: it is not known.
+    other deployment is returned unchanged. Without a position a magnetic heading becomes NaN.
     """
     reference = reference or deployment.attrs.get("heading_reference")
     if reference != "magnetic" or "heading" not in deployment:

@@ -1,8 +1,8 @@
 """A map of the magnetic anomaly, and its value, slope and curvature anywhere on it.
 
-The map is a bicubic B-spline through its nodes: continuous up to the curvature, which is what a filter
-needs that linearises the map, and knows where it may not. One look-up is a 4x4 patch of coefficients
-between two 3x4 matrices of weights: value, gradient and Hessian in one product.
+The map is a bicubic B-spline through its nodes, with continuous second derivatives: a filter needs them to
+linearise the map and to know where it cannot. One look-up is a 4x4 patch of coefficients between two 3x4
+matrices of weights: value, gradient and Hessian in one product.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ T = TypeVar("T", float, Array)
 EVEN = 1e-3  # of a step: what rounded coordinates may deviate from an even spacing
 HOLE = 9.9e4  # nT: beyond any anomaly; 99999 and 1.7e38 are how formats without NaN write a hole
 FLAT = 1e-6  # nT: what rounding leaves of a plane
-NOT_AN_ANOMALY = 15_000.0  # nT: a median this large is the whole field, not what is left of it
+NOT_AN_ANOMALY = 15_000.0  # nT: a median this large is the total field, not an anomaly
 
-DOWN, ACROSS = [0, 1, 0, 2, 1, 0], [0, 0, 1, 0, 1, 2]  # which derivative of each, for Local's six
+DOWN, ACROSS = [0, 1, 0, 2, 1, 0], [0, 0, 1, 0, 1, 2]  # orders of derivative, as in Local
 
 
 class Local(NamedTuple, Generic[T]):
     """The map around one place or n places; NaN outside the map and in its holes.
 
     ``anomaly`` nT; ``north``, ``east`` nT/m, its gradient; ``north_north``, ``north_east``, ``east_east``
-    nT/m², its Hessian; ``variance`` nT², of the map itself there.
+    nT/m², its Hessian; ``variance`` nT², of the map's own error there.
     """
 
     anomaly: T
@@ -67,9 +67,10 @@ class AnomalyGrid:
     altitude : float, optional
         m above the ellipsoid at which the map holds.
     name : str, optional
-        What errors call the grid: its file.
+        Name of the grid in error messages: its file.
     vertical : array_like, (ny, nx), optional
-        nT/m, by which the anomaly grows downward about that altitude; without, it is the same at every depth.
+        nT/m, vertical gradient at that altitude, positive if the anomaly grows downward; without it the map
+        is the same at every depth.
 
     Raises
     ------
@@ -227,7 +228,7 @@ class AnomalyGrid:
 
     @cached_property
     def rms(self) -> float:
-        """nT, scatter of the map about its best plane."""
+        """nT, RMS of the map about its best-fitting plane."""
         plane = np.stack(np.meshgrid(self.longitude, self.latitude), axis=-1)[~np.isnan(self.anomaly)]
         design = np.column_stack([plane - plane.mean(axis=0), np.ones(len(plane))])
         values = self.anomaly[~np.isnan(self.anomaly)]
@@ -236,7 +237,7 @@ class AnomalyGrid:
 
     @cached_property
     def correlation_length(self) -> float:
-        """m, over which the anomaly changes by its own scatter; infinite for a map without slopes.
+        """m, distance over which the anomaly changes by its own RMS; infinite for a map without slopes.
 
         Notes
         -----
@@ -269,7 +270,7 @@ class AnomalyGrid:
 
 
 def filled(values: Array) -> Array:
-    """Return the grid with each hole given the value of the nearest node, so that a filter can pass."""
+    """Return the values with each hole filled from the nearest node, so that a transform can be applied."""
     hole = np.isnan(values)
     if not hole.any():
         return values

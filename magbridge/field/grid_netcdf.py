@@ -19,8 +19,8 @@ __all__ = ["ANOMALY", "LATITUDE", "LONGITUDE", "Parts", "netcdf", "write"]
 
 Array = NDArray[np.floating[Any]]
 Parts = tuple[Array, Array, Array, dict[str, Any]]
-"""Longitudes and latitudes (deg) of the nodes, values, options of AnomalyGrid; and ``unit``, where
-it says one."""
+"""Longitudes and latitudes (deg) of the nodes, values, options of AnomalyGrid; among them ``unit``, where the
+file states one."""
 LONGITUDE, LATITUDE = ("longitude", "lon", "long", "x"), ("latitude", "lat", "y")
 ANOMALY = ("anomaly", "magnetic_anomaly", "mag_anomaly", "tfa", "tmi", "mag", "nt", "value", "z")
 SIGMA = ("sigma", "error", "uncertainty", "std")
@@ -34,7 +34,7 @@ def netcdf(path: Path) -> Parts:
     try:
         with xr.open_dataset(path, engine="netcdf4") as data:
             data.load()
-    except (OSError, ValueError, RuntimeError) as error:  # RuntimeError: what netCDF says of damaged data
+    except (OSError, ValueError, RuntimeError) as error:  # RuntimeError: netCDF's for damaged data
         raise FormatError(path, "expected a netCDF grid") from error
     if {"x_range", "y_range", "dimension", "z"} <= set(data.variables):
         return _old_gmt(data)

@@ -56,7 +56,7 @@ def igrf(longitude: ArrayLike, latitude: ArrayLike, depth: ArrayLike, time: Arra
     Raises
     ------
     OutOfRange
-        A time outside the model's epochs, or a position that is none.
+        A time outside the model's epochs, or an impossible position.
 
     Notes
     -----

@@ -1,4 +1,4 @@
-"""The main field near one place, for a filter that asks at every sample: a quadratic, renewed as one moves.
+"""The main field near one place, for a filter that needs it at every sample: a quadratic fit.
 
 The IGRF's shortest wave is 3,000 km, so over some tens of kilometres and a dive a quadratic is exact to a
 thousandth of a nanotesla, at a hundredth of the cost of the series.
@@ -24,7 +24,7 @@ LONG = 20 * 86_400.0  # s, before and after
 
 
 class NearbyField:
-    """Total main field around a moving place; :meth:`at` renews the fit when one has left it."""
+    """Intensity of the main field around a moving vehicle; :meth:`at` refits where the fit no longer reaches."""
 
     def __init__(self) -> None:
         self._middle = (np.nan, np.nan, np.nan)  # latitude, longitude, time

@@ -1,6 +1,6 @@
 """Several surveys to one map: continued to one altitude, merged, masked, smoothed (section 4 of the paper).
 
-The pictures show every step, because a map is looked at before it is used.
+The pictures show every step, because a map should be looked at before it is used.
 """
 
 from __future__ import annotations
@@ -48,16 +48,16 @@ def prepare(
     altitude : float, optional
         m, to which every grid is continued upward; default the highest of the grids'.
     passes : int, optional
-        Of the 3x3 Hanning kernel.
+        Number of passes of the 3x3 Hanning kernel.
     mask : array_like, (k, 2), optional
-        Longitude and latitude (deg) of a polygon; the map ends there.
+        Longitude and latitude (deg) of a polygon; nodes outside become holes.
     spacing : float, optional
         deg, of the map; default the finest of the grids'.
 
     Raises
     ------
     OutOfRange
-        An altitude below a grid's: continuing downward invents what the survey did not see.
+        An altitude below a grid's: continuing downward amplifies what the survey did not resolve.
     """
     steps = [Step(f"as surveyed: {Path(grid.name).name}", grid) for grid in grids]
     known = [grid.altitude for grid in grids if isfinite(grid.altitude)]
@@ -95,9 +95,10 @@ def continue_upward(grid: AnomalyGrid, height: float) -> AnomalyGrid:
 
 
 def merge(grids: Sequence[AnomalyGrid], spacing: float | None = None) -> AnomalyGrid:
-    """Return the mean of the grids wherever at least one of them is; on the finest of their spacings.
+    """Return the mean of the grids wherever at least one has a value; on the finest of their spacings.
 
-    What they differ by where they overlap is an error of each: sigma is no less than that.
+    Where they overlap, their differences show their errors: the mean of their variances is taken as at
+    least half of the mean squared difference.
     """
     return _merged(grids, spacing)[0]
 
@@ -138,7 +139,7 @@ def _merged(grids: Sequence[AnomalyGrid], spacing: float | None) -> tuple[Anomal
 
 
 def hanning(grid: AnomalyGrid, passes: int) -> AnomalyGrid:
-    """Return the grid after `passes` of the 3x3 Hanning kernel; at edges and holes over what there is."""
+    """Return the grid after `passes` of the 3x3 Hanning kernel; missing nodes take no part."""
     from scipy.ndimage import convolve  # noqa: PLC0415  the live path runs without scipy
 
     present = np.isfinite(grid.anomaly)

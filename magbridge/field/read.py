@@ -1,8 +1,8 @@
 """Anomaly grids from the formats in which surveys come.
 
-A format is a function from a path to ``(longitude, latitude, anomaly, options of AnomalyGrid)``; which one
-reads a file stands in one table, by suffix, and GRD files, of which four kinds share a suffix, by
-how they begin.
+A format is a function from a path to ``(longitude, latitude, anomaly, options of AnomalyGrid)``. The table
+:data:`READERS` chooses it by the file's suffix; the kinds of GRD file, which share one, are told apart by
+their first bytes.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ __all__ = ["READERS", "read_grid", "read_polygon"]
 Array = NDArray[np.floating[Any]]
 
 NANOTESLA = {unit.lower(): factor for unit, factor in NT_PER_UNIT.items()}
-"""nT in one unit, however it is written."""
+"""nT in one unit, by the unit's name in lower case."""
 
 READERS: dict[str, Callable[..., Parts]] = {
     ".nc": netcdf,
@@ -76,7 +76,7 @@ def read_polygon(path: str | Path) -> Array:
     Raises
     ------
     FormatError
-        It cannot be read, or says something else.
+        It cannot be read or is not a polygon.
     """
     try:
         polygon = np.loadtxt(path, delimiter=",", ndmin=2)

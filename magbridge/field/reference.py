@@ -27,8 +27,8 @@ def reference_field(deployment: xr.Dataset, grid: AnomalyGrid | None = None, sit
     Parameters
     ----------
     deployment : Dataset
-        On ``time``; the column ``reference_field`` counts where it holds a number, the rest comes from
-        ``latitude longitude depth``.
+        On ``time``; the column ``reference_field`` is used where it holds a number, elsewhere the field is
+        computed from ``latitude longitude depth``.
     grid : AnomalyGrid, optional
         Added to the main field; if its altitude is known, continued to the deployment's depth.
     site_bias : float, optional
@@ -49,8 +49,8 @@ def reference_field(deployment: xr.Dataset, grid: AnomalyGrid | None = None, sit
     Notes
     -----
     ``H_e = |IGRF(φ, λ, depth, t)| + anomaly(φ, λ, depth) + site bias``: eq. 4, whose anomaly is the map's
-    at its own altitude. The depth counts, about 0.02 nT/m of the main field and far more of the anomalies
-    of shallow rock.
+    at its own altitude. Depth matters: about 0.02 nT/m in the main field, and far more in the anomalies of
+    shallow rock.
     """
     size = deployment.sizes["time"]
     given = (
@@ -81,7 +81,7 @@ def reference_field(deployment: xr.Dataset, grid: AnomalyGrid | None = None, sit
 
 
 def earth_field(deployment: xr.Dataset, grid: AnomalyGrid | None = None) -> tuple[Array, Array | None, str]:
-    """Return what a calibration is fitted against: total field, vector, and what they are.
+    """Return the reference that a calibration is fitted to: total field, vector, and a name for them.
 
     Returns
     -------

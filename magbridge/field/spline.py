@@ -9,7 +9,7 @@ __all__ = ["WEIGHTS", "coefficients", "weights"]
 
 Array = NDArray[np.float64]
 
-PAD = 16  # nodes: an influence of a cubic spline's end that far in is 1e-9
+PAD = 16  # nodes: that far inside, the influence of a cubic spline's end has fallen to 1e-9
 
 # Cubic B-spline on a uniform axis: weights of four nodes as cubics in the fraction t, powers t⁰ t¹ t² t³.
 VALUE = np.array([[1, -3, 3, -1], [4, 0, -6, 3], [1, 3, 3, -3], [0, 0, 0, 1]]) / 6.0

@@ -1,10 +1,10 @@
 """Many hypotheses: a bank of extended Kalman filters over a position that is not known well enough for one.
 
-A Gaussian too wide for the map to be straight under it is split into many that are narrow enough; each is
-filtered as if it were alone, all in one pass of arrays; their weights follow the likelihoods (Alspach &
-Sorenson 1972). Hypotheses that grow too wide are split again, those that fade are dropped, those that
-meet are merged. Nothing is drawn at random: the same samples give the same bits. With one hypothesis it
-is the tracker.
+A Gaussian too wide for the map to be linear within it is split into many that are narrow enough. Each is
+filtered as if it were alone, all in one pass of arrays, and weighted by its likelihood (Alspach & Sorenson
+1972). Hypotheses that grow too wide are split again, those of negligible weight are dropped, and those at
+the same place are merged. Nothing is drawn at random: the same samples give the same bits. With one
+hypothesis the bank equals the tracker.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ MOST = 6_000  # hypotheses
 AT_FIRST = 20_000  # of them, until the first measurement has thinned them out
 CELL = 0.8  # of the resolution, within which two hypotheses are one
 SPACING = 1.2  # of two neighbours, in their own sigma: their sum is flat to 1 %
-EDGE = 3.5  # sigma, as far as a start is covered
-FADED = 1e-7  # of the largest weight
-COARSER = 1.25  # at a time
+EDGE = 3.5  # sigma: how far the hypotheses cover the Gaussian to begin with
+FADED = 1e-7  # of the largest weight: a hypothesis with less is dropped
+COARSER = 1.25  # factor by which the resolution changes at a time
 MERGE_EVERY = 4  # updates
 # One Gaussian as three narrower ones (DeMars et al. 2013, table 1), their variance such that the sum
 # keeps its own.
@@ -38,7 +38,7 @@ THREE_VARIANCE = 1.0 - float(THREE_WEIGHT @ THREE**2)
 
 
 class Bank:
-    """A Gaussian mixture on the six states, each part linearised by itself.
+    """A Gaussian mixture on the six states, each part linearised about its own mean.
 
     Hypotheses come last in every array, weights ``w`` (n,), states ``x`` (6, n) and covariances ``P``
     (6, 6, n): each operation then runs along memory, three times as fast as on n small matrices.
@@ -53,8 +53,8 @@ class Bank:
     gate : float
         Innovation squared over variance beyond which a hypothesis does not learn from a measurement.
     level : float, optional
-        nT, 1-sigma of the bias for half of the hypotheses, at equal odds: what it is if it is
-        not what P says.
+        nT. If it exceeds the bias's 1-sigma in P, half of the weight goes to copies of the hypotheses whose
+        bias has this 1-sigma.
     """
 
     def __init__(
@@ -65,7 +65,7 @@ class Bank:
         self._updates = 0
         self.resolution = self.finest = resolution
         self.blur = 0.0
-        """nT², by which the map's curvature under the hypotheses' spread has blurred the last measurement."""
+        """nT², variance that the map's curvature within the hypotheses added to the last measurement's."""
         self.w, self.x, self.P = self._cut(x, P)
         if level**2 > P[4, 4]:
             free = P.copy()
@@ -83,8 +83,8 @@ class Bank:
         Notes
         -----
         ``N(x, P) = ∫ N(x + g s, P - g g' (σ² - σ_k²)) N(s; 0, σ² - σ_k²) ds`` along an axis e of
-        the position, with σ² its variance and ``g = P e / σ²``: everything correlated with the
-        position moves along.
+        the position, with σ² its variance and ``g = P e / σ²``: states that are correlated with the
+        position shift with it.
         """
         values, axes = np.linalg.eigh(P[:2, :2])
         area = (
@@ -110,7 +110,7 @@ class Bank:
         return w / w.sum(), x[:, None] + shifts, np.repeat(part[:, :, None], w.size, axis=2)
 
     def predict(self, F: Array, Q: Array) -> None:
-        """Move every hypothesis on by one transition."""
+        """Propagate every hypothesis by one transition."""
         self.x = F @ self.x
         half = (F @ self.P.reshape(N_STATES, -1)).reshape(self.P.shape)
         self.P = F @ half + Q[:, :, None]
@@ -118,7 +118,7 @@ class Bank:
     def update(self, block: Block) -> tuple[float, float, float]:
         """Take in one measurement; return its innovation (nT), its variance and its log-likelihood.
 
-        A hypothesis off the map expects the map's mean and scatter, and learns nothing.
+        A hypothesis off the map predicts the map's mean, with the map's variance, and is not updated.
         """
         north, east = self.x[:2]
         per_latitude, per_longitude = metres_per_degree(block.latitude)
@@ -145,7 +145,7 @@ class Bank:
         return self._observe(block.anomaly - anomaly - self.x[4] - self.x[5], gain, s + v, off)
 
     def update_position(self, north: float, east: float, sigma: float) -> None:
-        """Take in a fix from elsewhere, m from the dead-reckoned position."""
+        """Take in a position fix, m from the dead-reckoned position, with its 1-sigma on each axis."""
         for axis, value in enumerate((north, east)):
             gain = self.P[axis]
             self._observe(
@@ -178,11 +178,11 @@ class Bank:
         return mean, covariance
 
     def _tidy(self) -> None:
-        """Drop what has faded, split what has grown too wide, and now and then merge what has met."""
+        """Drop hypotheses of negligible weight, split wide ones, now and then merge those at one place."""
         keep = self.w > FADED * self.w.max()
         if not keep.all():
             self._take(keep)
-        while len(self) > MOST:  # what is not known is looked at more coarsely, never cut off
+        while len(self) > MOST:  # coarsen the resolution; dropping any could lose the true place
             self.resolution *= COARSER
             self._merge()
         if self.resolution > self.finest and len(self) < MOST / 4:
@@ -199,7 +199,7 @@ class Bank:
         self.w, self.x, self.P = w / w.sum(), self.x[:, keep], self.P[:, :, keep]
 
     def _split(self, wide: NDArray[np.bool_]) -> None:
-        """Split along the widest axis of each position: the same mean and covariance."""
+        """Split each along its position's longest axis, keeping mean and covariance."""
         w, x, P = self.w[wide], self.x[:, wide], self.P[:, :, wide]
         values, axes = np.linalg.eigh(np.moveaxis(P[:2, :2], 2, 0))
         axis = axes[:, :, 1].T
@@ -210,7 +210,7 @@ class Bank:
         self.P = np.concatenate([self.P[:, :, ~wide]] + [narrow] * 3, axis=2)
 
     def _merge(self) -> None:
-        """Merge those that have come to the same cell of the position, keeping mean and covariance."""
+        """Merge hypotheses whose positions lie in the same cell, keeping mean and covariance."""
         cell = np.floor(self.x[:2] / (CELL * self.resolution)).astype(np.int64)
         order = np.lexsort(cell)
         cell = cell[:, order]

@@ -1,4 +1,4 @@
-"""A whole log against a map: the navigator over every row, a backward pass, and what can be said of it."""
+"""A whole log against a map: the navigator over every row, a smoother's backward pass, and findings."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ MOTIONS: dict[str, dict[str, str]] = {
     "glide": {"depth": "depth", "pitch": "pitch", "heading": "heading"},
     "position": {"latitude": "dr_latitude", "longitude": "dr_longitude"},
 }
-"""How a log tells motion, best first: its columns, and what the dead reckoning calls them."""
+"""Kinds of motion that a log may hold, best first: its columns, and their names in the dead reckoning."""
 
 GPS_SIGMA = 10.0  # m, each axis, of a receiver that has just surfaced
 
@@ -67,8 +67,8 @@ def navigate(
     start : (latitude, longitude), optional
         deg; default the log's first position.
     fixes : bool, optional
-        Take in ``gps_latitude gps_longitude`` all along; default only the first, the others are the
-        reference_track.
+        Take in every ``gps_latitude gps_longitude`` as a fix; by default only the first, as the start, and
+        the others are the reference track.
 
     Returns
     -------
@@ -80,7 +80,7 @@ def navigate(
     Raises
     ------
     FormatError
-        No total field, no motion, no start, time that does not increase, or nothing left of it.
+        No total field, no motion, no start, time that does not increase, or no usable sample.
     OutOfRange
         A date that the IGRF does not cover.
     """
@@ -180,7 +180,7 @@ def first_position(deployment: xr.Dataset, source: str) -> tuple[float, float]:
 
 
 def _smooth(states: list[tuple[Array, Array, Array, Array, int]]) -> tuple[Array, Array]:
-    """Return smoothed means (n, 6) and covariances (n, 6, 6), pass by pass between jumps."""
+    """Return smoothed means (n, 6) and covariances (n, 6, 6), each stretch between jumps by itself."""
     x, P, F, Q = (np.stack([state[k] for state in states]) for k in range(4))
     jumps = np.array([state[4] for state in states])
     for piece in np.split(np.arange(jumps.size), np.flatnonzero(np.diff(jumps)) + 1):

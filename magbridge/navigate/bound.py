@@ -27,8 +27,8 @@ STEP = 0.005  # deg, over which the main field's slope is taken
 class Bound(NamedTuple):
     """Along the track: time s, position deg, smallest covariance (n, 6, 6), and 1-sigma of the position, m.
 
-    ``sigma`` is ``sqrt(P_nn + P_ee)``, what an error's root mean square is compared with; ``unaided`` is the
-    same for dead reckoning alone.
+    ``sigma`` is ``sqrt(P_nn + P_ee)``, to compare with the RMS of an error; ``unaided`` is the same for dead
+    reckoning alone.
     """
 
     time: Array
@@ -59,7 +59,7 @@ def position_bound(
     latitude, longitude : array_like, (n,)
         deg.
     options : Options, optional
-        How well everything is known.
+        How well start, current, calibration and map are known.
     sigma : float, optional
         nT, of one sample.
     depth : float, optional
@@ -81,7 +81,7 @@ def position_bound(
     -----
     Tichavský, Muravchik & Nehorai 1998, eq. 21; with linear motion and the map's slope at the true position
     it is the covariance of a Kalman filter that knows where to linearise,
-    ``J_k+1 = (Q + F J_k^-1 F')^-1 + H' R^-1 H``. Off the map nothing is learnt.
+    ``J_k+1 = (Q + F J_k^-1 F')^-1 + H' R^-1 H``. Off the map there is no measurement.
     """
     o = options or Options()
     corners = np.asarray(time, float)
@@ -121,7 +121,7 @@ def position_bound(
 
 
 def _along(time: Array, latitude: Array, longitude: Array) -> Array:
-    """(n,) m from the first corner of a track to each."""
+    """Return the distance along a track, (n,) m, from its first corner to each."""
     if time.size < 2:
         raise OutOfRange("track", f"{time.size} positions", "at least two are needed")
     if (np.diff(time) <= 0.0).any():

@@ -1,4 +1,4 @@
-"""Samples to blocks: what is measured within a step of the map is one measurement, of its mean."""
+"""Samples to blocks: samples between which the map is practically linear become one measurement, their mean."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from magbridge.navigate.model import Block, Options
 
 __all__ = ["Collector"]
 
-LEAST = 1e-3  # nT: what claims less is not believed
+LEAST = 1e-3  # nT: a smaller sigma is not believed
 
 
 class Sums(NamedTuple):
-    """What the samples of the block so far add up to, each by its weight, relative to the first of them."""
+    """Weighted sums over the block's samples so far; time and position relative to the first sample."""
 
     start_us: int
     latitude: float
@@ -38,7 +38,7 @@ class Sums(NamedTuple):
 class Collector:
     """Subtract the main field where dead reckoning puts the vehicle, and average until the block is full.
 
-    A sample counts by its precision: one in ten that was taken with a mass in motion spoils nothing.
+    Samples are weighted by their precision, so that one in ten taken with a mass in motion does no harm.
 
     Parameters
     ----------
@@ -48,9 +48,9 @@ class Collector:
 
     Notes
     -----
-    The variance of a mean of n samples of noise σ that lasts τ, over a time T, is
-    ``σ² max(1/n, 2τ/(T + 2τ))``. What a sample's sigma holds besides does not average out; of that, the
-    filter's bias stands for its own variance.
+    The mean of n samples over a time T, of noise σ with correlation time τ, has the variance
+    ``σ² max(1/n, 2τ/(T + 2τ))``. The rest of a sample's variance does not average out; the part of it that is
+    the filter's bias is subtracted, because the filter has a state for it.
     """
 
     def __init__(self, options: Options, step: float) -> None:
@@ -91,7 +91,7 @@ class Collector:
         return self.flush() if full else None
 
     def flush(self) -> Block | None:
-        """Return the block of the samples that wait for more to join them; None if none wait."""
+        """Return the block of the samples collected so far; None if there are none."""
         s, self._sums = self._sums, None
         if s is None:
             return None

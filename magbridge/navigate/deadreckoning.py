@@ -1,4 +1,4 @@
-"""Dead reckoning: where a vehicle has moved, by heading, speed and depth, or as others tell."""
+"""Dead reckoning: how a vehicle has moved, from heading, speed and depth, or from a velocity or position."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ __all__ = ["DeadReckoning"]
 
 GLIDE = 8.0  # deg, of pitch; a glider flatter than that is turning between dive and climb
 DEPTH_BASE = 10.0  # s, over which the depth's rate is taken
-FASTEST = 3.0  # m/s, through the water; beyond, a depth that jumped was taken for a dive
-LONGEST = 3600.0  # s without telemetry, after which nobody knows where the vehicle went
+FASTEST = 3.0  # m/s, through the water; a higher speed comes from a jump in the depth
+LONGEST = 3600.0  # s without telemetry, after which the motion is unknown
 
 
 class DeadReckoning:
-    """A position carried along by telemetry; each kind of telemetry as good as a vehicle has it.
+    """A position moved along by telemetry, of whichever kind the vehicle has.
 
     Attributes
     ----------
@@ -33,7 +33,7 @@ class DeadReckoning:
         self._time = nan
         self._velocity = (0.0, 0.0)
         self._heading = self._pitch = self._speed = nan
-        self._dive = (nan, nan)  # time and depth from which the depth's rate counts
+        self._dive = (nan, nan)  # time and depth since when the rate of depth is taken
         self._rate = nan
         self._local: tuple[float, float] | None = None
         self._carrier: tuple[float, float] | None = None
@@ -65,9 +65,10 @@ class DeadReckoning:
         ----------
         values : dict
             Any of ``depth`` m, ``heading`` deg true, ``pitch`` deg, ``speed`` m/s through the water;
-            ``velocity_north velocity_east`` m/s; ``north east`` m, a local position of which only the changes
-            count; ``dr_latitude dr_longitude`` deg, a dead-reckoned position of which only the changes count.
-            NaN is nothing. The depth's rate and the pitch stand in for a glider's speed.
+            ``velocity_north velocity_east`` m/s; ``north east`` m, a local position of which only the
+            changes count; ``dr_latitude dr_longitude`` deg, a dead-reckoned position of which only the
+            changes count. NaN counts as missing. Without a speed, it is computed from the rate of depth and
+            the pitch, as for a glider.
         """
         self.advance(time)
         values = {name: value for name, value in values.items() if isfinite(value)}
@@ -104,7 +105,7 @@ class DeadReckoning:
             self._dive = time, self.depth
 
     def _glide(self) -> float:
-        """Return a glider's speed over ground from its sink rate and pitch; the last one through a turn."""
+        """Return a glider's horizontal speed from sink rate and pitch; NaN between dive and climb."""
         if not isfinite(self._pitch) or abs(self._pitch) < GLIDE:
             return nan
         speed = abs(self._rate / tan(radians(self._pitch)))

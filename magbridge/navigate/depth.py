@@ -1,4 +1,4 @@
-"""A map of another height, continued to the vehicle; what that leaves out counts as the map's error."""
+"""A map continued to the vehicle's depth; the error of the continuation counts as map error."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["at_depth"]
 
 
 def at_depth(grid: AnomalyGrid, options: Options, depth: ArrayLike) -> tuple[AnomalyGrid, Options]:
-    """Return the map where the vehicle is, and options that know how far it can be believed there.
+    """Return the map at the vehicle's depth, and options whose map error includes the continuation's.
 
     Parameters
     ----------
@@ -24,12 +24,12 @@ def at_depth(grid: AnomalyGrid, options: Options, depth: ArrayLike) -> tuple[Ano
         One of unknown altitude is returned as it is.
     options : Options
     depth : array_like, (n,)
-        m, the vehicle's, at any times; NaN is passed over, and nothing known is the surface.
+        m, the vehicle's; NaN is ignored, and without any depth the map is continued to the surface.
 
     Notes
     -----
-    Independent errors of the map add their variances σᵢ² and their steepnesses σᵢ²/Lᵢ², so that together
-    1/L² = Σ(σᵢ²/Lᵢ²) / Σσᵢ².
+    Independent errors of the map add their variances σᵢ² and the mean squares of their slopes, σᵢ²/Lᵢ², so
+    that together 1/L² = Σ(σᵢ²/Lᵢ²) / Σσᵢ².
     """
     known = np.asarray(depth, float)
     known = known[np.isfinite(known)]

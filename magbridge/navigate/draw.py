@@ -1,4 +1,4 @@
-"""Pictures: a track on its map, what the filter said on the way, and where a fix can be had."""
+"""Pictures: a track on its map with the filter's innovations and sigma, and the bound of a planned track."""
 
 from __future__ import annotations
 
@@ -150,7 +150,7 @@ def _map(axis: Axes, grid: AnomalyGrid, longitude: Any, latitude: Any) -> None:
 
 
 def _tracks(axis: Axes, result: xr.Dataset) -> list[Array]:
-    """Draw what was reckoned, filtered, smoothed and known; return the tracks, (2, n) each."""
+    """Draw the dead-reckoned, filtered, smoothed and known tracks; return those to fit in, (2, n) each."""
     latitude = result["latitude"].to_numpy()
     longitude = np.unwrap(result["longitude"].to_numpy(), period=360.0)
     per_latitude, per_longitude = metres_per_degree(latitude)
@@ -192,7 +192,7 @@ def _shade(axis: Axes, hours: Any, state: Any) -> None:
 
 
 def _legend_above(axis: Axes) -> None:
-    """Explain the lines where none can be hidden by it."""
+    """Put the legend above the axes, where it hides no line."""
     entries = axis.get_legend_handles_labels()[1]
     axis.legend(
         loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=min(len(entries), 3), fontsize=8, frameon=False

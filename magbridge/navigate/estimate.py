@@ -1,4 +1,4 @@
-"""The estimate: one hypothesis or as many as it takes, and whether to believe them."""
+"""The estimate: one hypothesis or as many as are needed, and whether to trust it."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ __all__ = ["Estimate"]
 
 Array = NDArray[np.float64]
 
-CONTRADICTION = 25.0  # squared distance of a fix, two degrees of freedom: 4e-6 by chance
-UNINFORMED = 0.8  # of what dead reckoning alone would have: the field has said nothing
+CONTRADICTION = 25.0  # squared distance of a fix in sigmas, two degrees of freedom: by chance in 4e-6
+UNINFORMED = 0.8  # of the sigma of dead reckoning alone: above it the field has added no information
 REACH = 300.0  # m, smallest radius in which the integrity monitor searches
-JOIN, SPLIT = 1.2, 1.5  # of the map's resolution: below one hypothesis will do, above it will not
-FINER = 0.8  # of the resolution: so much better a measurement must be to be worth a finer one
-DOUBTFUL = 1.0  # log odds: another place explains the field better, if not yet beyond doubt
-SPREADS = (2.0, 4.0, 2.0, 8.0)  # times its reach, of the searches after each other
+JOIN, SPLIT = 1.2, 1.5  # of the resolution: below the first, one hypothesis; above the second, several
+FINER = 0.8  # of the resolution: it changes only if a measurement asks for one finer than this
+DOUBTFUL = 1.0  # log odds: another place explains the field better, though not yet beyond doubt
+SPREADS = (2.0, 4.0, 2.0, 8.0)  # times the reach: 1-sigma of successive searches
 
 
 class Estimate:
@@ -42,12 +42,13 @@ class Estimate:
     x, P : ndarray, (6,), (6, 6)
         Estimate and covariance, of :mod:`~magbridge.navigate.model`'s states.
     vouched : bool
-        The filter stands by the position: the map describes the field, at the odds at which it would be given
-        up, and the filter began no narrower than its rivals do, or they have come to the same place since.
+        The position can be trusted: the map has described the field at odds of ``options.doubt``; the
+        filter began as wide as its rivals do, or they have since come to the same place; and nothing speaks
+        against it now.
     moved : tuple of ndarray
-        F and Q from the update before to the last one, for a smoother.
+        F and Q from the previous update to the last one, for a smoother.
     jumps : list of Jump
-        Where the estimate began anew; a smoother must not look across.
+        Restarts of the estimate, across which a smoother must not look.
     """
 
     def __init__(self, grid: AnomalyGrid, options: Options) -> None:
@@ -67,8 +68,8 @@ class Estimate:
         self._alone = self.P[:4, :4].copy()  # covariance of dead reckoning alone
         self._lost = False
         self._searches = 0
-        self._confirmed = False  # by rivals that began wider
-        self._described = False  # is the field by the map
+        self._confirmed = False  # rivals that began wider have come to the same place
+        self._described = False  # the map has described the field
 
     @property
     def odds(self) -> float:
@@ -77,7 +78,7 @@ class Estimate:
 
     @property
     def hypotheses(self) -> int:
-        """How many there are."""
+        """Number of hypotheses."""
         return len(self._filter) if isinstance(self._filter, Bank) else 1
 
     def start(self, time_us: int, sigma: float) -> None:
@@ -89,7 +90,7 @@ class Estimate:
         self.state = State.SEARCHING
 
     def correct(self, there: Array, sigma: float) -> None:
-        """Take in a position, m from the dead-reckoned one, at the last prediction, if there is a filter."""
+        """Take in a fix, m from the dead-reckoned position, at the time of the last prediction."""
         assert self._filter is not None
         self._read()
         if distance(there - self.x[:2], self.P[:2, :2] + sigma**2 * np.eye(2)) > CONTRADICTION:
@@ -103,10 +104,10 @@ class Estimate:
         self._alone = np.diag([sigma**2, sigma**2, *np.diag(self.P)[2:4]])
 
     def update(self, block: Block, travelled: float) -> Innovation:
-        """Take in a measurement, `travelled` m after the start; return what it said, NaN off the map."""
+        """Take in a measurement, `travelled` m after the start; return its innovation, NaN off the map."""
         seconds, metres = self.predict(block.time_us, travelled)
         finer = resolution(self.grid, self.options, block.variance)
-        if finer < FINER * self._resolution:  # a first block may be a bad one, and says nothing of the rest
+        if finer < FINER * self._resolution:  # never coarser: a first block may have been a poor one
             self._resolution = finer
             if isinstance(self._filter, Bank):
                 self._filter.finest = finer
@@ -125,7 +126,7 @@ class Estimate:
         return seen
 
     def predict(self, time_us: int, travelled: float) -> tuple[float, float]:
-        """Move on to `time_us`, `travelled` m after the start; return the seconds and metres that it took."""
+        """Propagate to `time_us`, `travelled` m after the start; return the seconds and metres passed."""
         seconds, metres = (time_us - self._time_us) * 1e-6, travelled - self._travelled
         self._time_us, self._travelled = time_us, travelled
         F, Q = transition(self.options, seconds, metres)
@@ -158,7 +159,7 @@ class Estimate:
     # ---- one hypothesis or many, and whether to believe them -----------------------------------------
 
     def _estimator(self, x: Array, P: Array) -> Tracker | Bank:
-        """Return one hypothesis, or as many as it takes."""
+        """Return one tracker if the position is narrow enough for it, else a bank."""
         if widest(P) < SPLIT * self._resolution:
             return Tracker(self.grid, x, P, self.options.gate)
         return Bank(self.grid, x, P, self._resolution, self.options.gate)
@@ -174,7 +175,7 @@ class Estimate:
         self._monitor, self._confirmed = None, False
 
     def _judge(self, block: Block, seconds: float, metres: float, likelihood: float) -> None:
-        """Compare the filter with its rivals; leave it where one of them has won."""
+        """Compare the filter with its rivals, and replace it if one of them has won."""
         assert self._filter is not None
         unmapped = self._unmapped.update(block, seconds, metres, self._filter.blur)
         self._nowhere = max(self._nowhere + unmapped - likelihood, -log(self.options.doubt))
@@ -201,7 +202,7 @@ class Estimate:
                 self._lost, self._searches = False, 0
 
     def _search_anew(self) -> None:
-        """Look around, further each time, at any level: where neither fits, the level may be wrong."""
+        """Search around dead reckoning, by the next of SPREADS, at any bias: the level may be wrong."""
         self._nowhere, self._described, self._lost = 0.0, False, True
         self.options = any_level(self.options, self.grid)
         self._unmapped = Unmapped(self.grid, self.options)
@@ -215,16 +216,16 @@ class Estimate:
         self.x, self.P = x, P
 
     def _compact(self, width: float) -> bool:
-        """Return whether a position of this spread is one place, seen on the scale of the map."""
+        """Return whether a position of this 1-sigma (m) counts as one place on the scale of the map."""
         return width <= max(SPLIT * self._resolution, 0.25 * self.grid.correlation_length)
 
     def _reach(self) -> float:
-        """Return how far around itself the filter is doubted: m."""
+        """Return the 1-sigma (m) of the places around the filter that its rivals start from."""
         length = self.grid.correlation_length * (0.5 if self._confirmed else 1.0)
         return max(REACH, widest(self._alone), min(length, 5.0 * REACH))
 
     def _choose(self, on_the_map: bool) -> None:
-        """Hand over from the bank to one filter, or back; and say what holds."""
+        """Change between a bank and one tracker if the width demands it; set the state."""
         width = widest(self.P)
         if isinstance(self._filter, Bank) and width < JOIN * self._resolution:
             self._filter = Tracker(self.grid, self.x, self.P, self.options.gate)

@@ -21,13 +21,13 @@ __all__ = ["Shift", "best_shift", "findings_of"]
 Array = NDArray[np.floating[Any]]
 
 SPARSE = 40  # positions, below which a map's place cannot be judged
-SEARCH = 1_500.0  # m, how far a map may have been put wrong
+SEARCH = 1_500.0  # m, the largest displacement of a map that is tried, on each axis
 LATTICE = 31  # shifts on each axis
-FLAT = 3.0  # times what is known of the field: a map with less relief has nothing to say
-DOUBLE = 2.0  # of what bias and map error allow: a scatter beyond is another field
-BETTER = 0.6  # of the scatter at the map's own place: what a shift must reach to be believed
-LEVEL = 4.0  # sigma of the calibration's bias: beyond, it is not the calibration
-TOLD = 3  # jumps of the filter that are told one by one: a map of elsewhere makes dozens
+FLAT = 3.0  # times the sigma of bias and map error: a map with less relief carries no information
+DOUBLE = 2.0  # times the sigma of bias and map error: a larger scatter is that of another field
+BETTER = 0.6  # of the scatter at the map's own place: a shift must do at least as well to be believed
+LEVEL = 4.0  # sigmas of the calibration's bias: a larger difference in level has another reason
+TOLD = 3  # jumps of the filter that are reported one by one: the map of another place causes dozens
 EXPLAINED = 0.5  # of the field's variance along the track, below which the map does not describe it
 
 
@@ -45,7 +45,7 @@ def findings_of(
     result : Dataset
         The records, as :func:`~magbridge.navigate.batch.navigate` has them.
     grid, options
-        What it was made with.
+        What `result` was made with.
     jumps : sequence of Jump
     reference_track : Dataset or None
         ``latitude longitude total_field`` at known positions.
@@ -122,7 +122,7 @@ def _told_by_level(result: xr.Dataset, options: Options) -> list[str]:
 
 
 class Shift(NamedTuple):
-    """Metres (north, east) by which a map fits best, scatter (nT) there and at the map's own place."""
+    """Shift of a map (m north, east) with which it fits best; scatter (nT) with it and without it."""
 
     north: float
     east: float

@@ -1,13 +1,13 @@
-"""Integrity: whether the filter should still be believed, by comparison with what else could be true.
+"""Integrity: whether the filter should still be trusted, by comparison with other explanations of the field.
 
-A filter on the wrong hill is content: its innovations fit, because it has moved to where they do. What shows
-it is that another explanation predicts the same measurements better. Two are kept beside it: *elsewhere*, a
-bank of hypotheses around it that has forgotten where it came from, and *nowhere*, a field as rough as the map
-and with nothing else to do with it.
+A filter at the wrong place has innocent innovations, because it has moved to where they are small. The error
+shows only when another explanation predicts the same measurements better. Two are kept beside the filter:
+*elsewhere*, a bank of hypotheses spread around it; and *nowhere*, a random field as rough as the map but
+unrelated to it.
 
-The odds of each against the filter, product of predictive likelihoods, are a martingale as long as the filter
-is right, so they ever exceed c with a probability of at most 1/c (Ville 1939): the threshold is the
-false-alarm rate.
+The odds of each against the filter, ratios of the products of predictive likelihoods, are a martingale as
+long as the filter is right, so they ever exceed c with a probability of at most 1/c (Ville 1939): a
+threshold of c limits false alarms to 1/c.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ __all__ = ["IntegrityMonitor", "Unmapped", "Verdict"]
 
 Array = NDArray[np.float64]
 
-AGREES = 9.0  # squared distance in sigma, within which two estimates are the same place
-ELSEWHERE = 16.0  # squared distance beyond which they are not
-PATIENCE_US = 45_000_000  # µs of blocks that the rivals take in as one,
-STRIDES = 3.0  # or so many times the distance after which the filter makes a block
+AGREES = 9.0  # squared distance in sigmas within which two estimates are the same place
+ELSEWHERE = 16.0  # squared distance in sigmas beyond which they are not
+PATIENCE_US = 45_000_000  # µs over which blocks are averaged to one measurement of the rivals,
+STRIDES = 3.0  # or, if that comes sooner, so many times the distance that a block covers
 
 
 class Verdict(Enum):
-    """What the comparison says."""
+    """Result of the comparison."""
 
     OPEN = "not yet decided"
     HOLDS = "the filter holds"
@@ -45,9 +45,9 @@ class Verdict(Enum):
 class Unmapped:
     """The field as a smooth random function of the distance, with the map's scatter and correlation length.
 
-    What a measurement would look like if the map had nothing to say: Matérn's process of smoothness 3/2, two
-    states (value nT, slope nT/m), to which the bias and the map's error are added as what they
-    add to each step.
+    It predicts measurements as if the map were unrelated to the field: a Matérn process of smoothness 3/2
+    with two states (value nT, slope nT/m). Bias and map error enter by the variance that they add in each
+    step.
 
     Notes
     -----
@@ -65,10 +65,10 @@ class Unmapped:
         self._p = self._value, 0.0, self._slope
 
     def update(self, block: Block, seconds: float, metres: float, blur: float) -> float:
-        """Return the log-likelihood of a measurement so long after the one before, and take it in.
+        """Take in a measurement so long and so far after the previous one; return its log-likelihood.
 
-        `blur` (nT²) is what the filter's own approximation adds to the measurement's variance: without it
-        here, a filter that still searches would lose to its own caution.
+        `blur` (nT²) is the variance that the filter adds to the measurement's for the map's curvature. It is
+        added here too; else a filter that is still searching would lose by its larger variance alone.
         """
         o, rate = self._options, self._rate
         kept = exp(-rate * metres)
@@ -91,10 +91,11 @@ class Unmapped:
 
 
 class IntegrityMonitor:
-    """The filter's rival since the filter was last confirmed, and the filter's own second at equal terms.
+    """Two banks compared on equal terms: *here* begins at the filter, *elsewhere* is spread around it.
 
-    Both take in the blocks together, several to one, because a bank costs more than a filter and a rival can
-    wait a minute: *here* begins where the filter was, *elsewhere* anywhere around it.
+    Both take in the same measurements, several blocks averaged to one, because a bank costs more than a
+    filter and the comparison can wait a minute. The filter starts a new monitor once it is confirmed or
+    begins anew.
 
     Parameters
     ----------
@@ -105,12 +106,12 @@ class IntegrityMonitor:
     time_us : int
         µs, its time.
     reach : float
-        m, 1-sigma of where else the vehicle might be.
+        m, 1-sigma by which *elsewhere* is spread around the filter.
     resolution : float
         m, of the banks.
     level : float
-        nT, 1-sigma of the bias that was claimed; where `options` have more, half of *elsewhere* may
-        be at any level.
+        nT, 1-sigma of the bias as first claimed; where that of `options` is larger, half of *elsewhere* has
+        it.
     """
 
     def __init__(
@@ -138,7 +139,7 @@ class IntegrityMonitor:
         """Natural logarithm of the odds of *elsewhere* against *here*."""
 
     def step(self, block: Block, metres: float, x: Array, P: Array) -> Verdict:
-        """Take in a block `metres` after the one before, and the filter's estimate after it."""
+        """Take in a block `metres` after the previous one; compare with the filter's estimate after it."""
         self._waiting.append(block)
         self._metres += metres
         first = self._waiting[0]
@@ -154,7 +155,7 @@ class IntegrityMonitor:
         return self._compare(x, P)
 
     def surrender(self, time_us: int) -> Bank:
-        """Return *elsewhere*, moved on to `time_us`, to be the filter from now on."""
+        """Return *elsewhere*, propagated to `time_us`, to replace the filter."""
         self.elsewhere.predict(*transition(self._options, (time_us - self._time_us) * 1e-6, 0.0))
         return self.elsewhere
 
@@ -166,12 +167,12 @@ class IntegrityMonitor:
             return Verdict.OPEN
         if distance(there - x, spread + P) < AGREES:
             return Verdict.HOLDS
-        here, narrow = self.here.moments()  # where the filter would be, were it not for its one straight line
+        here, narrow = self.here.moments()  # where the filter would be without its single linearisation
         return Verdict.ELSEWHERE if distance(there - here, spread + narrow) < AGREES else Verdict.OPEN
 
 
 def distance(apart: Array, P: Array) -> float:
-    """Return the squared distance of two positions in units of a covariance."""
+    """Return the squared Mahalanobis distance of two positions under a covariance."""
     return float(apart[:2] @ np.linalg.solve(P[:2, :2], apart[:2]))
 
 

@@ -1,6 +1,6 @@
-"""What the filters estimate, how it moves, and what a block of samples says about it.
+"""The state that the filters estimate, its transition, and its relation to a block of samples.
 
-The state is what dead reckoning and the instruments do not know, so that it moves linearly whatever the
+The state holds the errors of dead reckoning and of the instruments, so its transition is linear whatever the
 vehicle does, and one model serves every estimator, the smoother and the bound:
 
 ==  =========================================  =====================================================
@@ -41,9 +41,9 @@ __all__ = [
 Array = NDArray[np.float64]
 
 N_STATES = 6
-LASTING = 3.0  # intervals
+LASTING = 3.0  # intervals: noise with a longer correlation time becomes a bias
 LEG = 1_800.0  # s, between turns or from dive to climb
-FINE = 0.35  # of the spread that one measurement allows: errors of neighbours follow each other and add up
+FINE = 0.35  # of the spread that one measurement allows: errors of successive ones are alike and add up
 
 
 class Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -54,28 +54,28 @@ class Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     start_sigma : float
         m, of the first position, each axis.
     current_sigma, current_time : float
-        m/s and s: the current, and how long it lasts.
+        m/s and s: the current, and its correlation time.
     drift : float
         m/sqrt(s), random walk of the dead reckoning.
     bias_sigma, bias_time : float
-        nT and s: what the calibration leaves, and how long it lasts.
+        nT and s: the error that the calibration leaves, and its correlation time.
     map_sigma, map_length : float
-        nT and m: the map's error, and how far it reaches. An independent error of each cell is
-        the grid's own.
+        nT and m: the map's error, and its correlation length. Independent errors of single nodes are the
+        grid's own sigma.
     noise : float or None
         nT, the part of a sample's sigma that is white; of the rest, what goes beyond ``bias_sigma`` does not
         average out. None: all of it is white.
     memory : float
-        s, over which the correlation of that noise falls by e; longer ones than a few intervals are a bias.
+        s, correlation time of that noise; noise that lasts longer than a few intervals belongs to the bias.
     gate : float
         Largest innovation squared over its variance that is taken in.
     interval : float
         s, samples within are averaged to one update; sooner if the vehicle has moved 2 % of the map's
         correlation length.
     vouch_sigma : float
-        m, no fix is vouched for that is worse.
+        m, the largest 1-sigma of a position that is vouched for.
     doubt : float
-        Odds at which another hypothesis ends the filter's trust in itself.
+        Odds at which another explanation of the field replaces the filter's.
     """
 
     start_sigma: float = 50.0
@@ -124,22 +124,22 @@ class Block(NamedTuple):
 
 
 def informed(options: Options, calibration: Calibration, sigma: float) -> Options:
-    """Return options that know what a calibration says of its own errors.
+    """Return options that include a calibration's own errors.
 
     Parameters
     ----------
     options : Options
-        Its bias is what there is besides: the map's level, the Earth's variation.
+        Their bias is that of all other sources: the map's level, the field's variation in time.
     calibration : Calibration
     sigma : float
-        nT, that it claims for a typical sample.
+        nT, 1-sigma that the calibration claims for a typical sample.
 
     Notes
     -----
-    White is the noise that the calibration runs showed; one that lasted longer there than a few updates does
-    not average out, it is a bias that lasts as long, and white is what drives it, ``σ √(1 - ρ²)`` with ρ its
-    correlation from sample to sample. What else a calibration gets wrong follows attitude and masses, and
-    lasts for a leg.
+    The white part is the noise of the calibration runs. If that noise was correlated for longer than a few
+    updates, it does not average out: it becomes a bias with the same correlation time, and the white part
+    is what drives it, ``σ √(1 - ρ²)`` with ρ the correlation from sample to sample. A calibration's other
+    errors depend on attitude and masses, and last for a leg.
     """
     noise = calibration.noise
     white = noise.sensor
@@ -158,11 +158,12 @@ def informed(options: Options, calibration: Calibration, sigma: float) -> Option
 
 
 def any_level(options: Options, grid: AnomalyGrid) -> Options:
-    """Return options to which the field's level says nothing any more, and its changes as much as before.
+    """Return options with which the field's level carries no information, and its changes as much as before.
 
     Notes
     -----
-    A Gauss-Markov process wanders by ``2σ²/τ`` a second: σ grows to the map's own scatter, τ with σ².
+    The driving noise of a Gauss-Markov process is ``2σ²/τ`` (nT²/s). σ is raised to the map's RMS, and τ in
+    proportion to σ², so that it stays the same.
     """
     o = options
     if o.bias_sigma >= grid.rms:
@@ -206,23 +207,23 @@ def transition(options: Options, seconds: float, metres: float) -> tuple[Array, 
 
 
 def measurement_row(north: float, east: float) -> Array:
-    """Return H (1, 6): the field's slope at the position, and both biases in full."""
+    """Return H (1, 6): the field's slopes at the position, and 1 for calibration bias and map error."""
     return np.array([[north, east, 0.0, 0.0, 1.0, 1.0]])
 
 
 def block_length(grid: AnomalyGrid) -> float:
-    """Return the distance over which a map is as good as straight: m, 2 % of its correlation length."""
+    """Return the distance (m) over which a map is practically linear: 2 % of its correlation length."""
     return 0.02 * grid.correlation_length
 
 
 def resolution(grid: AnomalyGrid, options: Options, variance: float) -> float:
-    """Return the position spread, m, within which the map is straight to the noise of one measurement.
+    """Return the position spread, m, within which the map is linear to the noise of one measurement.
 
     Parameters
     ----------
     variance : float
-        nT², of a measurement; to it comes what bias and map error change until the next, at half a spread:
-        those errors last, and so do the curvature's.
+        nT², of a measurement. A sixteenth of what bias and map error gain until the next is added (as for
+        half the spread): those errors persist, and so do the curvature's.
 
     Notes
     -----

@@ -1,4 +1,4 @@
-"""The navigator: telemetry and corrected samples in, in order of time; a position and its doubt out.
+"""The navigator: telemetry and corrected samples in, in order of time; a position with its uncertainty out.
 
 Pure in event time, with nothing random in it: a replay gives the same bits. ::
 
@@ -28,7 +28,7 @@ from magbridge.records import Corrected, Quality
 __all__ = ["UNUSABLE", "Navigator"]
 
 UNUSABLE = int(Quality.SATURATED | Quality.UNCALIBRATED)
-FRESH = 3.0  # intervals: an update older than that is not followed by others
+FRESH = 3.0  # intervals: no position is dead-reckoned from an update older than that
 
 
 class Navigator(Estimate):
@@ -42,7 +42,7 @@ class Navigator(Estimate):
     Attributes
     ----------
     dropped : int
-        Samples that came out of the order of their time.
+        Number of samples that were dropped because they came out of time order.
     """
 
     def __init__(self, grid: AnomalyGrid, options: Options | None = None) -> None:
@@ -55,7 +55,7 @@ class Navigator(Estimate):
     def fix(
         self, time_us: int, latitude: float, longitude: float, sigma: float | None = None
     ) -> Record | None:
-        """Take in a position from elsewhere: the start, or a GPS fix; return the update that it completes.
+        """Take in a position: the start, or a GPS fix; return the update that it completes.
 
         Parameters
         ----------
@@ -68,7 +68,7 @@ class Navigator(Estimate):
         self._reckoning.advance(time_us * 1e-6)
         if self._filter is None:
             self._reckoning.place(latitude, longitude)
-            self._collector.flush()  # of samples that were taken at another place
+            self._collector.flush()  # drops samples that were taken at another place
             self.start(time_us, sigma)
             return None
         record = self.finish()
@@ -90,7 +90,7 @@ class Navigator(Estimate):
     def measure(self, time_us: int, total_field: float, sigma: float) -> Record | None:
         """Take in a total field and its 1-sigma, nT; return the update that it completes, if it does.
 
-        What is NaN, older than the sample before, or comes before any position is passed over.
+        A sample that is NaN, not later than the previous one, or before any position is ignored.
         """
         if self.state is State.OFF or not isfinite(total_field + sigma):
             return None
@@ -104,12 +104,12 @@ class Navigator(Estimate):
         return None if block is None else self._update(block)
 
     def finish(self) -> Record | None:
-        """Return the update of the samples that wait for more to join them; None if none wait."""
+        """Return the update from the samples collected so far; None if there are none."""
         block = self._collector.flush()
         return None if block is None else self._update(block)
 
     def reckon(self, time_us: int) -> Reckoned | None:
-        """Return the position at a time since the last update, dead-reckoned from there; nothing is changed.
+        """Return the position at a time after the last update, dead-reckoned from there; nothing is changed.
 
         None if the filter does not vouch for it: the last update was not vouched for, or is too long ago.
         """

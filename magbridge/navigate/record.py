@@ -1,4 +1,4 @@
-"""What the navigator says: its state, one record for each update, and where it had to begin anew."""
+"""The navigator's output: its state, one record for each update, and its restarts."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ __all__ = ["Jump", "Reckoned", "Record", "State"]
 
 
 class State(IntEnum):
-    """What the filter says of itself; the values are those of the link."""
+    """State of the filter; the values are those sent over the link."""
 
     OFF = 0
     """No start yet."""
@@ -20,7 +20,7 @@ class State(IntEnum):
     TRACKING = 2
     """One hypothesis holds."""
     DEAD_RECKONING = 3
-    """Off the map, or the field says nothing here."""
+    """Off the map, or the field adds no information here."""
     LOST = 4
     """The field and the map disagree, or agree better elsewhere."""
 
@@ -34,7 +34,7 @@ class Record(msgspec.Struct, frozen=True, gc=False):
         µs since 1970 UTC, at which the rest holds: the mean time of the samples that went in.
     state : State
     vouched : bool
-        The filter stands by this position: it may be sent as a fix.
+        The position can be trusted: it may be sent as a fix.
     latitude, longitude : float
         deg.
     covariance_nn, covariance_ne, covariance_ee : float
@@ -102,7 +102,7 @@ class Reckoned(NamedTuple):
 
 
 class Jump(NamedTuple):
-    """The estimate began anew: µs, metres it jumped, 1-sigma that dead reckoning alone allowed, why."""
+    """A restart of the estimate: µs, metres jumped, 1-sigma (m) of dead reckoning alone, and the cause."""
 
     time_us: int
     north: float

@@ -35,7 +35,7 @@ def reference_track(deployment: xr.Dataset, used: frozenset[str]) -> xr.Dataset 
 
 
 def with_errors(result: xr.Dataset, truth: xr.Dataset | None) -> xr.Dataset:
-    """Add the errors against the reference track, m, where it has a position within the log's own spacing."""
+    """Add the errors against the reference track, m, where that has a position near in time."""
     if truth is None:
         return result
     time = result["time"].to_numpy()
@@ -60,7 +60,7 @@ def with_errors(result: xr.Dataset, truth: xr.Dataset | None) -> xr.Dataset:
 
 
 def errors(result: xr.Dataset) -> tuple[xr.DataArray, xr.DataArray]:
-    """(n,) m each: how far off the estimate is, and how far dead reckoning alone; NaN where nobody knows."""
+    """Return the errors (n,), m, of the estimate and of dead reckoning alone; NaN where unknown."""
     if "error_north" not in result:
         nobody = result["north"] * np.nan
         return nobody, nobody

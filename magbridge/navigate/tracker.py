@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 
 
 class Innovation(NamedTuple):
-    """What a measurement said: ``value`` nT (or m), ``variance``, log-likelihood, whether taken in."""
+    """Innovation of a measurement: ``value`` nT (or m), ``variance``, log-likelihood, whether it was used."""
 
     value: float
     variance: float
@@ -31,7 +31,7 @@ class Innovation(NamedTuple):
 class Tracker:
     """Extended Kalman filter on the six states of :mod:`~magbridge.navigate.model`.
 
-    ``x`` is (6,), because filterpy's default (6, 1) broadcasts a scalar innovation to (6, 6) without a word.
+    ``x`` is (6,), because filterpy's default (6, 1) silently broadcasts a scalar innovation to (6, 6).
     filterpy's update is Joseph's form: the covariance stays symmetric and positive.
     """
 
@@ -40,7 +40,7 @@ class Tracker:
         self._filter = ExtendedKalmanFilter(dim_x=N_STATES, dim_z=1)
         self._filter.x, self._filter.P = x.copy(), P.copy()
         self.blur = 0.0
-        """nT², by which the map's curvature under the position's spread has blurred the last measurement."""
+        """nT², variance that the map's curvature within the spread added to the last measurement's."""
 
     @property
     def x(self) -> Array:
@@ -55,7 +55,7 @@ class Tracker:
         return covariance
 
     def predict(self, F: Array, Q: Array) -> None:
-        """Move on by one transition."""
+        """Propagate by one transition."""
         self._filter.F, self._filter.Q = F, Q
         self._filter.predict()
 
@@ -90,7 +90,7 @@ class Tracker:
         return innovation._replace(anomaly=local.anomaly)
 
     def update_position(self, north: float, east: float, sigma: float) -> None:
-        """Take in a fix from elsewhere, m from the dead-reckoned position."""
+        """Take in a position fix, m from the dead-reckoned position, with its 1-sigma on each axis."""
         for axis, value in enumerate((north, east)):
             row = np.zeros((1, N_STATES))
             row[0, axis] = 1.0
