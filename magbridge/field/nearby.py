@@ -24,7 +24,7 @@ LONG = 20 * 86_400.0  # s, before and after
 
 
 class NearbyField:
-    """Intensity of the main field around a moving vehicle; :meth:`at` refits where the fit no longer reaches."""
+    """Intensity of the main field around a moving vehicle; :meth:`at` refits it on the way."""
 
     def __init__(self) -> None:
         self._middle = (np.nan, np.nan, np.nan)  # latitude, longitude, time

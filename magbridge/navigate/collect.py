@@ -1,4 +1,4 @@
-"""Samples to blocks: samples between which the map is practically linear become one measurement, their mean."""
+"""Samples to blocks: samples between which the map is linear become one measurement, their mean."""
 
 from __future__ import annotations
 
