@@ -8,9 +8,9 @@ __all__ = ["main"]
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run a command; return its exit code. Ctrl-C is one line, even while libraries are being loaded."""
+    """Run a command; return its exit code. Ctrl-C prints one line, even while libraries are being loaded."""
     try:
-        from magbridge.cli import main as command  # noqa: PLC0415 - in reach of what Ctrl-C raises
+        from magbridge.cli import main as command  # noqa: PLC0415 - inside the try: importing takes time
 
         return command(arguments)
     except KeyboardInterrupt:

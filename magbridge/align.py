@@ -1,9 +1,9 @@
-"""One time base for three channels and the telemetry, causally.
+"""Puts the three channels and the telemetry on one time base, causally.
 
-A multiplexed converter samples channel k at ``t + delay_k``. All three are interpolated to the time of the
-earliest one, between the frame before and this one, so nothing from the future is needed and the latency is
-``max(delay) - min(delay)``. The anti-alias filter holds the field back by ``filter_delay``; the sample's time
-is corrected for it, and the telemetry is looked up at that time.
+A multiplexed converter samples channel k at ``t + delay_k``. All channels are interpolated to the time of the
+earliest one, between the previous reading and this one, so no future data are needed and the latency is
+``max(delay) - min(delay)``. The anti-alias filter delays the field by ``filter_delay``; the sample's time is
+corrected for that, and the telemetry is looked up at the corrected time.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ OFFSET_SUSPECT = int(Quality.OFFSET_SUSPECT)
 GAP = int(Quality.GAP)
 NEVER = -(1 << 62)
 HISTORY = 64
-"""Telemetry values kept of one parameter: enough for 3 s at 20 Hz."""
+"""Telemetry values kept for each parameter: enough for 3 s at 20 Hz."""
 
 
 class Input(NamedTuple):
-    """A parameter that the calibration needs: its name, the range it has seen, and the oldest age in s."""
+    """A parameter that the calibration needs: name, calibrated range, and age (s) from which it is stale."""
 
     name: str
     low: float
@@ -55,9 +55,10 @@ class Sample(msgspec.Struct, frozen=True, gc=False):
     quality : int
         :class:`~magbridge.records.Quality` bits.
     sigma : float
-        nT, what the flags add to the uncertainty (in quadrature).
+        nT, 1-sigma that the flags add in quadrature to the uncertainty of the corrected field.
     spans : tuple of (int, float, float)
-        Parameters that are not known exactly: index, and the two ends between which the value lies.
+        Parameters that are not known exactly: index in `values`, and the two ends of the interval in which
+        the value lies.
     """
 
     time_us: int
@@ -70,10 +71,12 @@ class Sample(msgspec.Struct, frozen=True, gc=False):
 
 
 class Track:
-    """The recent past of one parameter.
+    """The recent telemetry of one parameter.
 
-    It moves when it has changed by more than ``moving_rate`` (fraction of its range per second) since an
-    anchor at least a second ago; over shorter times the telemetry's own noise would look like motion.
+    The parameter is moving when it differs from an anchor, an earlier value, by more than ``moving_rate``
+    (fraction of its calibrated range per second) times the time elapsed, which counts as at least 1 s: over
+    shorter times the noise of the telemetry would look like motion. The first value that comes 1 s or more
+    after the anchor becomes the next anchor.
     """
 
     __slots__ = ("anchor", "history", "input", "lacking", "moved_us")
@@ -86,7 +89,7 @@ class Track:
         self.moved_us = NEVER
 
     def update(self, time_us: int, value: float, moving_rate: float) -> None:
-        """Take a telemetry value; NaN says that it is not known now, a time gone back is ignored."""
+        """Take a telemetry value; NaN means unknown from now on. One older than the last is ignored."""
         self.lacking = not isfinite(value)
         if self.lacking:
             return
@@ -103,19 +106,20 @@ class Track:
             self.anchor = time_us, value
 
     def stale(self, time_us: int) -> bool:
-        """Say whether the value is not known, or older than it may be, at `time_us`."""
+        """Say whether the value is unknown, or older than ``max_age``, at `time_us`."""
         if self.lacking or not self.history:
             return True
         return time_us - self.history[-1][0] > self.input.max_age * 1e6
 
     def moving(self, time_us: int, settle_time: float) -> bool:
-        """Say whether it moved up to its latest value, or less than `settle_time` s before `time_us`."""
+        """Say whether the parameter is moving, or stopped less than `settle_time` s before `time_us`."""
         return self.moved_us == self.history[-1][0] or time_us - self.moved_us <= settle_time * 1e6
 
     def at(self, time_us: int) -> tuple[float, float, float]:
         """Return the value at `time_us`, its age in s, and the value before it.
 
-        Between two values it is interpolated (age 0); after the last it is held.
+        Between two values it is interpolated (age 0); after the last it is held; before the first, the first
+        is taken, and the age is the time until then.
         """
         history = self.history
         after_us, after = history[-1]
@@ -136,10 +140,10 @@ class Aligner:
     Parameters
     ----------
     inputs : sequence of Input
-        What the calibration needs, in its order.
+        The parameters that the calibration needs, in the calibration's order.
     settings : Align
     power_cycle : int or None
-        The instrument's power-on counter when it was calibrated, where known.
+        The instrument's power-on counter at the time of its calibration; None where unknown.
     """
 
     def __init__(self, inputs: tuple[Input, ...], settings: Align, power_cycle: int | None = None) -> None:
@@ -152,7 +156,7 @@ class Aligner:
         self._period_us, self._step_us = 0.0, 0
 
     def tune(self, settings: Align, ages: Mapping[str, float]) -> None:
-        """Replace the settings, and the ages (s) after which telemetry is stale, by name."""
+        """Replace the settings, and the ages (s) after which the parameters named in `ages` are stale."""
         self.settings = settings
         for name, track in self.by_name.items():
             track.input = track.input._replace(max_age=ages.get(name, track.input.max_age))
@@ -169,13 +173,13 @@ class Aligner:
         Parameters
         ----------
         reading : Reading
-            As the driver gave it.
+            As the driver returned it.
         time_us : int
             µs, host time of ``reading.device_time``.
         restarted : bool
-            The instrument's clock began anew.
+            The instrument's clock restarted: it was powered on again.
         missing : int
-            Readings that the sequence number says are missing before this one.
+            Number of readings lost just before this one.
         """
         settings = self.settings
         if reading.power_cycle is not None:
@@ -221,7 +225,7 @@ class Aligner:
         return Sample(sample_us - sample_us % 4, field, tuple(values), oldest, quality, sigma, tuple(spans))
 
     def _common_time(self, reading: Reading, time_us: int) -> tuple[Vector, int]:
-        """Interpolate the channels to the earliest one's time: field in nT and that time in µs."""
+        """Interpolate all channels to the time of the earliest; return the field (nT) and that time (µs)."""
         x_late, y_late, z_late = reading.channel_delay
         earliest = min(x_late, y_late, z_late)
         first_us = time_us + round(earliest * 1e6)
@@ -243,8 +247,8 @@ class Aligner:
     def _is_gap(self, time_us: int) -> bool:
         """Say whether samples are missing before `time_us`.
 
-        A step counts as one when it is long against the usual period and against the step before it: an
-        instrument that is told to sample less often is flagged once, not for ever.
+        The time since the last reading is a gap when it exceeds ``gap_factor`` times both the mean period and
+        the interval before it: an instrument that is set to sample less often is flagged once, not for ever.
         """
         if self._before is None:
             return False

@@ -115,9 +115,9 @@ _SAME = {
 
 
 def factor(unit: str, column: str) -> float | None:
-    """Return what turns a value in `unit` into the unit of `column`; None where nothing does.
+    """Return the factor from `unit` to the unit of `column`; None where there is no conversion.
 
-    A column that is not in the table stays in the unit it declares: 1.
+    A column that is not in :data:`COLUMNS` keeps the unit it declares: its factor is 1.
     """
     if column not in COLUMNS or not unit:
         return 1.0
@@ -126,7 +126,7 @@ def factor(unit: str, column: str) -> float | None:
 
 
 def usual(unit: str) -> str:
-    """Return the unit as it is written here: ``degC`` for ``Celsius``."""
+    """Return a unit in the spelling of :data:`COLUMNS`: ``degC`` for ``Celsius``."""
     return _SAME.get(unit, unit)
 
 

@@ -30,7 +30,7 @@ __all__ = [
 
 Positive = Annotated[float, Meta(gt=0, le=1e9)]
 NotNegative = Annotated[float, Meta(ge=0, le=1e9)]
-"""Bounded, because TOML has ``inf``, while deadlines and sizes are integers inside."""
+"""Bounded, because TOML allows ``inf``, but deadlines and sizes are converted to integers."""
 Rate = Annotated[float, Meta(ge=-1e9, le=1e9)]
 Name = Annotated[str, Meta(min_length=1)]
 SystemId = Annotated[int, Meta(ge=1, le=255)]
@@ -80,8 +80,8 @@ class Link(Table, frozen=True):
     signing_key : str or None
         File of 32 bytes; packets are signed and unsigned ones refused.
     parameters : str
-        File that keeps parameters changed over the link; ``bridge.parameters.json`` beside a ``bridge.toml``,
-        where nothing else is said.
+        File that keeps parameters changed over the link; by default ``bridge.parameters.json`` beside a
+        configuration called ``bridge.toml``.
     """
 
     url: Name
@@ -126,7 +126,7 @@ class CalibrationFile(Table, frozen=True):
 
 
 class Align(Table, frozen=True):
-    """``[align]``: one time base for channels and telemetry; each is also a parameter on the link.
+    """``[align]``: one time base for channels and telemetry; each key is also a MAVLink parameter.
 
     Attributes
     ----------
@@ -141,7 +141,7 @@ class Align(Table, frozen=True):
     stale_growth : float
         nT/s by which the sigma grows with the age of stale telemetry.
     turn_on_sigma : float
-        nT by which the offset settles differently at every power-on.
+        nT, 1-sigma, by which the sensor's offset changes at every power-on.
     """
 
     filter_delay: NotNegative = 0.0
@@ -166,9 +166,9 @@ class Navigation(Table, frozen=True):
         Hz of the fixes, dead-reckoned between updates; 0 is with each update. Default 5 for
         ``ODOMETRY``, else 0.
     depth : float
-        m, of the deepest dives; a map whose altitude is known is continued to the middle of them.
+        m, of the deepest dives; a map whose altitude is known is continued to half this depth.
     options : dict
-        How well things are known beforehand: :class:`magbridge.navigate.Options`.
+        Prior uncertainties and settings of the position filter: :class:`magbridge.navigate.Options`.
     """
 
     map: str

@@ -1,8 +1,8 @@
 """From readings and telemetry to corrected samples: what the live bridge and ``magbridge correct`` share.
 
-Alignment says what is known at a sample's time and how well; the calibration turns that into the field. What
-is not known exactly (a mass in motion, telemetry that never came) is carried into the sigma: the correction
-is evaluated at both ends of what the parameter may have been.
+Alignment gives the channels and the parameters at the sample's time; the calibration turns them into the
+corrected field. A parameter that is not known exactly (a mass in motion, telemetry that never came) widens
+the sigma: the correction is evaluated at both ends of the interval in which the parameter lies.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ if TYPE_CHECKING:
 __all__ = ["TEMPERATURE", "Correction", "correct_rows"]
 
 TEMPERATURE = "sensor_temperature"
-"""The one channel that comes with the reading itself."""
+"""The one parameter that comes with the reading itself, not as telemetry."""
 MAX_AGE = 30.0
-"""s after which telemetry is stale where nothing else is said."""
+"""s after which telemetry is stale, by default."""
 
 
 class Correction:
@@ -79,10 +79,10 @@ class Correction:
         return sample, corrected
 
     def _widen(self, sample: Sample, corrected: Corrected) -> Corrected:
-        """Add to the sigmas what the flags say: ``sigma^2 + s^2 + sum ((F(hi) - F(lo)) / 2)^2``."""
+        """Widen each sigma: ``sigma^2 + s^2 + sum ((F(hi) - F(lo)) / 2)^2``, s and spans the sample's."""
         changes = self._corrector.changes(sample.field, sample.values, sample.spans)
         more = hypot(sample.sigma, *[0.5 * change for change in changes])
-        if not more < BEYOND:  # also NaN: positions that are no positions
+        if not more < BEYOND:  # also NaN, as where a parameter has neither value nor range
             more = inf
         x, y, z = corrected.field_sigma
         return Corrected(
@@ -95,12 +95,12 @@ class Correction:
 
 
 def correct_rows(correction: Correction, deployment: xr.Dataset) -> xr.Dataset:
-    """Correct the rows of a deployment (a piece of one, in order), exactly as the bridge would live.
+    """Correct the rows of a deployment, or of its pieces in order, exactly as the live bridge would.
 
     Parameters
     ----------
     correction : Correction
-        Its state goes on from piece to piece.
+        Keeps its state from one piece to the next.
     deployment : Dataset (time)
         With ``mag_x mag_y mag_z``, and the parameters that the calibration needs.
 
@@ -129,7 +129,7 @@ def correct_rows(correction: Correction, deployment: xr.Dataset) -> xr.Dataset:
 
 
 def _readings(correction: Correction, deployment: xr.Dataset) -> Iterator[tuple[Reading, int]]:
-    """Yield each row as a reading, after its telemetry has been told."""
+    """Yield each row as a reading and its time (µs), after passing the row's telemetry to `correction`."""
 
     def column(name: str) -> list[float]:
         if name in deployment:
@@ -145,7 +145,7 @@ def _readings(correction: Correction, deployment: xr.Dataset) -> Iterator[tuple[
     rows = zip(stamps, channels, zip(*delays, strict=True), column(TEMPERATURE), cycles, strict=True)
     for row, (stamp, field, delay, temperature, cycle) in enumerate(rows):
         for name, values in telemetry:
-            if isfinite(values[row]):  # a row that lacks a value is not news that it is lost
+            if isfinite(values[row]):  # an empty cell is not a message that the value is unknown
                 correction.telemetry(name, values[row], stamp)
         power_cycle = int(cycle) if isfinite(cycle) else None
         yield Reading(field, channel_delay=delay, temperature=temperature, power_cycle=power_cycle), stamp

@@ -4,12 +4,12 @@ Every error carries values and builds its own one-line sentence from them; each 
 the built-in that a caller who does not know magbridge would catch::
 
     MagbridgeError
-    ├── WrongUse                          exit 2: the request itself cannot be meant
+    ├── WrongUse                          exit 2: the request itself is wrong
     │   └── ConfigError (ValueError)      a key of a configuration or scenario file
     ├── DataError                         exit 1: the data do not allow it
-    │   ├── FormatError (ValueError)      a file that does not say what it should, with row and column
+    │   ├── FormatError (ValueError)      a file whose content is wrong, with row and column
     │   ├── CalibrationError (ValueError) a calibration that cannot be fitted, read or used
-    │   └── OutOfRange (ValueError)       a date, position or grid cell that nothing covers
+    │   └── OutOfRange (ValueError)       a date, position or grid cell outside the data
     ├── PortError (OSError)               exit 1: a port that cannot be opened, read or written
     ├── WriteError (OSError)              exit 1: a file that cannot be written; it is as it was before
     └── MissingExtra (ImportError)        exit 2: an optional dependency that is not installed
@@ -40,7 +40,7 @@ class MagbridgeError(Exception):
 
 
 class WrongUse(MagbridgeError):
-    """The request cannot be meant as it stands."""
+    """The request itself is wrong, whatever the data."""
 
     exit_code = 2
 
@@ -58,7 +58,7 @@ class DataError(MagbridgeError):
 
 
 class FormatError(DataError, ValueError):
-    """A file that does not say what it should: ``file: row 3, column 'mag_x': what was expected``."""
+    """A file whose content is wrong: ``file: row 3, column 'mag_x': what was expected``."""
 
     def __init__(
         self, file: str | Path, expected: str, *, row: int | None = None, column: str | None = None
@@ -77,7 +77,7 @@ class CalibrationError(DataError, ValueError):
 
 
 class OutOfRange(DataError, ValueError):
-    """A date, position or grid cell that nothing covers: ``what = value: what is covered``."""
+    """A date, position or grid cell outside the data: ``what = value: what is covered``."""
 
     def __init__(self, what: str, value: object, covered: str) -> None:
         self.what, self.value, self.covered = what, value, covered

@@ -14,15 +14,16 @@ from magbridge.errors import MagbridgeError, WriteError
 __all__ = ["atomic_path", "new_folder", "systems_reason"]
 
 ROOM = 1 << 20
-"""Bytes, more than a library writes at a time."""
+"""Bytes written to learn why a write failed: more than a library writes at a time."""
 
 
 @contextmanager
 def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Yield a path beside `path` to write to; rename it onto `path` when the block succeeds.
 
-    When the block raises, what was written is removed and `path` is as it was. What a process that was killed
-    left beside it goes with the next write. The suffix is kept, because some writers choose the format by it.
+    When the block raises, what was written is removed and `path` is as it was. The partial file of a process
+    that was killed is removed at the next write. The suffix is kept, because some writers choose the format
+    by it.
 
     Raises
     ------
@@ -31,7 +32,7 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     """
     target = Path(path)
     beside = target.with_name(f".{target.stem}.{os.getpid()}.partial{target.suffix}")
-    with suppress(OSError):  # a folder that cannot be read, or is not there: the write itself will tell
+    with suppress(OSError):  # a folder that cannot be read, or is not there: the write itself will fail
         _clear(target)
     try:
         yield beside
@@ -39,7 +40,7 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     except MagbridgeError:
         raise
     except OSError as error:
-        reason = os.strerror(error.errno) if error.errno else str(error)  # not a library's words around it
+        reason = os.strerror(error.errno) if error.errno else str(error)  # not the library's wording
         raise WriteError(target, reason) from error
     finally:
         with suppress(OSError):  # it was renamed, or never made
@@ -50,8 +51,8 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
 def new_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Yield a folder to write to, made where it is not there.
 
-    When the block raises, the folders that were made for it go, with what is in them; one that
-    was there stays.
+    When the block raises, the folders that were made for it are removed with their contents; one that
+    existed before stays.
     """
     folder = Path(path)
     missing = [one for one in (folder, *folder.parents) if not one.exists()]
@@ -66,10 +67,10 @@ def new_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 @contextmanager
 def systems_reason(path: Path) -> Iterator[None]:
-    """Raise the system's own reason where a library that writes to `path` fails.
+    """Raise the operating system's reason where a library that writes to `path` fails.
 
-    netCDF keeps it to itself: a full disk is 'HDF error' to it, or 'Permission denied'. So one more piece is
-    written to what is spoilt already, and the system asked.
+    netCDF hides that reason: it reports a full disk as 'HDF error' or 'Permission denied'. So `ROOM` bytes
+    are appended to the file, which is spoilt already, and the system raises its own error.
 
     Raises
     ------
@@ -85,7 +86,7 @@ def systems_reason(path: Path) -> Iterator[None]:
 
 
 def _clear(target: Path) -> None:
-    """Remove what processes that are no more left beside `target`."""
+    """Remove partial files beside `target` whose processes no longer run."""
     partial = re.compile(rf"\.{re.escape(target.stem)}\.(\d+)\.partial{re.escape(target.suffix)}")
     for path in target.parent.iterdir():
         found = partial.fullmatch(path.name)
@@ -94,8 +95,8 @@ def _clear(target: Path) -> None:
 
 
 def _runs(process: int) -> bool:
-    """Say whether a process is there, as far as can be told."""
-    if os.name != "posix":  # where to ask is to end it
+    """Say whether a process runs; True where that cannot be found out."""
+    if os.name != "posix":  # elsewhere, os.kill(process, 0) may end the process
         return True
     try:
         os.kill(process, 0)

@@ -15,7 +15,7 @@ T = TypeVar("T")
 PATIENCE = 2.0
 """s before a bar appears."""
 PAUSE = 0.1
-"""s between two looks at it: drawing takes longer than most items do."""
+"""s between two updates of the bar: drawing takes longer than most items do."""
 
 
 def track(items: Iterable[T], what: str, total: float | None = None) -> Iterator[T]:
@@ -23,7 +23,7 @@ def track(items: Iterable[T], what: str, total: float | None = None) -> Iterator
     if not sys.stderr.isatty():
         yield from items
         return
-    from rich.console import Console  # noqa: PLC0415 - only where there is somebody to look
+    from rich.console import Console  # noqa: PLC0415 - needed on a terminal only
     from rich.progress import Progress  # noqa: PLC0415 - likewise
 
     begun = told = time.monotonic()
@@ -39,14 +39,14 @@ def track(items: Iterable[T], what: str, total: float | None = None) -> Iterator
 
 @contextmanager
 def waiting(what: str) -> Iterator[Callable[[str], object]]:
-    """Once the block has taken two seconds, show on a terminal that it is at work, and since when.
+    """Once the block has taken two seconds, show on a terminal that it is at work, and for how long.
 
-    What it yields tells the name of the next step.
+    Yields a function that shows the name of the next step.
     """
     if not sys.stderr.isatty():
         yield str
         return
-    from rich.console import Console  # noqa: PLC0415 - only where there is somebody to look
+    from rich.console import Console  # noqa: PLC0415 - needed on a terminal only
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn  # noqa: PLC0415 - likewise
 
     columns = TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn()

@@ -19,7 +19,7 @@ BEYOND = 1e9
 
 
 class Quality(IntFlag):
-    """Why a corrected sample is doubtful; 0 is a sample without reproach.
+    """Why a corrected sample is doubtful; 0 is a sample without a flag.
 
     The lower-case names are the public ones: in files they stand in the column ``quality``, on the
     link in ``MAG_FIELD.flags``.
@@ -30,9 +30,9 @@ class Quality(IntFlag):
     EXTRAPOLATED = 2
     """A parameter lies outside the calibrated range."""
     MOVING = 4
-    """A mass moved between the telemetry around the sample."""
+    """A mass was moving at the time of the sample, or had just moved."""
     SATURATED = 8
-    """A channel stood at the end of its range."""
+    """A channel was at the end of its range."""
     UNCALIBRATED = 16
     """No calibration, or one that does not belong to this sensor."""
     OFFSET_SUSPECT = 32
@@ -62,7 +62,7 @@ class Quality(IntFlag):
 
 
 class Channel(IntEnum):
-    """Whence a record of the log came; kept in the low two bits of its time stamp (µs)."""
+    """Where a record of the log came from; kept in the low two bits of its time stamp (µs)."""
 
     SENT = 0
     LINK = 1
@@ -71,14 +71,14 @@ class Channel(IntEnum):
 
 
 class Reading(msgspec.Struct, frozen=True, gc=False):
-    """One triple of channels, as an instrument gave it.
+    """One measurement of the three channels, as the instrument sent it.
 
     Attributes
     ----------
     field : tuple of 3 float
         nT, sensor axes, uncorrected.
     counts : tuple of 3 int or None
-        The converter's own numbers, where the instrument speaks counts.
+        The converter's own numbers, where the instrument sends counts.
     sequence : int or None
         Frame number, wrapping at the driver's ``SEQUENCE_MODULO``.
     device_time : float
@@ -90,7 +90,7 @@ class Reading(msgspec.Struct, frozen=True, gc=False):
     power_cycle : int or None
         How often the instrument was powered on.
     saturated : bool
-        A channel stood at the end of its range.
+        A channel was at the end of its range.
     """
 
     field: Vector

@@ -32,7 +32,9 @@ def load_toml(path: str | Path) -> dict[str, Any]:
 
 
 def check_entries(table: Mapping[str, Any], key: str, kind: Any, path: str | Path, prefix: str = "") -> None:
-    """Check each entry of the table `key` under its own name; :func:`convert` of the whole names none.
+    """Check the entries of the table `key` one by one, so that an error names the entry.
+
+    :func:`convert` of the whole table would not name it.
 
     Raises
     ------
@@ -45,7 +47,7 @@ def check_entries(table: Mapping[str, Any], key: str, kind: Any, path: str | Pat
 
 
 def convert(table: Any, kind: type[T], path: str | Path, prefix: str = "") -> T:
-    """Convert what stands in a TOML file to `kind`, a struct or a plain type.
+    """Convert a table or a value of a TOML file to `kind`, a struct or a plain type.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""The version, for whoever says or writes it down."""
+"""The version of the package."""
 
 __all__ = ["__version__"]
 

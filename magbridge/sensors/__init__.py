@@ -40,9 +40,9 @@ class Driver(Protocol):
     range_nt : float
         nT, at which a channel saturates; infinite where unknown.
     nt_per_count : float
-        nT, of one of ``Reading.counts``; 0 where it speaks none.
+        nT per count of ``Reading.counts``; 0 where the instrument sends no counts.
     sequence_modulo : int
-        ``Reading.sequence`` wraps here; 0: never, or there is none.
+        Where ``Reading.sequence`` wraps; 0: never, or there is none.
     time_modulo : float
         s, at which ``Reading.device_time`` wraps; 0 where it does not.
     period : float
@@ -69,7 +69,7 @@ class Driver(Protocol):
         ...
 
     def start(self) -> tuple[bytes, ...]:
-        """Return what to send once the port is open: commands, at least 0.1 s apart, maybe none."""
+        """Return the commands to send once the port is open, at least 0.1 s apart; maybe none."""
         ...
 
     def feed(self, data: bytes) -> list[Reading]:

@@ -57,7 +57,7 @@ CHECKSUMS: dict[str, tuple[int, Callable[[bytes], int]]] = {
     "sum": (2, lambda text: sum(text) & 0xFF),
     "crc32": (8, crc32),
 }
-"""Name: hexadecimal digits after the ``*``, and the function of all that stands before it.
+"""Name: number of hexadecimal digits after the ``*``, and the checksum of all bytes before it.
 
 ``nmea`` leaves out the first byte, the ``$``.
 """
@@ -71,7 +71,7 @@ def _finite(text: bytes) -> float:
 
 
 def _measured(text: bytes) -> float:
-    number = float(text)  # NaN is how some say that they do not know
+    number = float(text)  # NaN passes: some instruments send it for an unknown value
     if abs(number) > BEYOND:
         raise ValueError
     return number
@@ -93,12 +93,12 @@ class AsciiOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     Attributes
     ----------
     columns : list of str
-        What stands where: ``x y z`` (required), ``time temperature supply sequence power_cycle``; ``-`` for a
-        column to pass over; ``*`` at the end for any number of further ones.
+        Meaning of each column: ``x y z`` (required), ``time temperature supply sequence power_cycle``; ``-``
+        for a column to ignore; ``*`` at the end for any number of further ones.
     separator : str
         Between columns; empty for any number of blanks or tabs.
     prefix : str
-        What every line begins with.
+        The text that every line begins with.
     terminator : str
         The last byte of a line; a carriage return before it is dropped.
     unit : str
@@ -193,7 +193,7 @@ class Ascii:
         return readings
 
     def _reading(self, line: bytes) -> Reading:
-        """Return what a line says; raise ValueError where it does not say it."""
+        """Return the reading in a line; raise ValueError where the line does not hold one."""
         line = line.rstrip(b"\r")
         if self._options.checksum:
             line = _checked(line, self._options.checksum)

@@ -4,7 +4,7 @@ A byte arrives after it was sent, never before: ``arrival = device time + offset
 ``delay >= 0``. Serial converters and schedulers make the delay anything from nothing to many ms, but now and
 then it is short. So the relation between the two clocks is the straight line that the points (device time,
 arrival - device time) lie above: each block of readings gives its lowest point, and a line is fitted to the
-lowest points of the last blocks. What is left is the shortest delay, a constant.
+lowest points of the last blocks. The shortest delay, a constant, remains as an error of the times.
 
 An instrument without a clock is its own clock when it sends at a steady rate: reading n was taken at
 ``n * period``, and the line's slope is the error of its nominal period.
@@ -25,11 +25,12 @@ __all__ = ["DeviceClock", "Stamp"]
 SIGMA_CLOCK, SIGMA_PERIOD = 1e3, 1e4
 """µs/s (ppm): how wrong a clock's rate, or a nominal period, is before anything is known."""
 RESTART = 1e6
-"""µs by which an instrument's time that fell back may miss the host's, and still have wrapped."""
+"""µs: an instrument's time that went back has wrapped if, unwrapped, it fits the host's to within this; else
+the instrument was restarted."""
 HALF = 0.6
-"""Fraction of a period; a longer delay is a missing reading."""
+"""Fraction of a period: a reading later than this shows that one before it is missing."""
 KEEP_PHASE = 3
-"""Readings that may be missing before the instrument is no longer trusted to have kept its beat."""
+"""If more readings than this are missing at once, the line is begun anew: the instrument may have stopped."""
 
 
 class Stamp(NamedTuple):
@@ -93,9 +94,9 @@ class DeviceClock:
     def stamp(self, readings: Sequence[Reading], arrival_us: int) -> list[Stamp]:
         """Return when each reading of a chunk was taken, the chunk having arrived at `arrival_us` (µs).
 
-        The last one was delayed the least; the others were already waiting, and tell nothing more of the
-        delay: what waited while the host stood still may come in several chunks, of which only the last ends
-        with a fresh reading.
+        The last reading was delayed the least. The others were already waiting, so their delay says nothing
+        about the line. What piled up while the host stood still may come in several chunks, of which only the
+        last ends with a fresh reading.
         """
         last = len(readings) - 1
         if not last:
@@ -127,7 +128,8 @@ class DeviceClock:
         sequence : int or None
             The instrument's count of readings.
         tells : bool
-            Whether its delay is its own, so that the relation between the clocks is learned from it.
+            Whether the relation between the clocks is learned from this reading; False for one that only
+            waited for a later one.
         """
         missing = self._hole(sequence)
         restarted = stepped = False
@@ -151,7 +153,7 @@ class DeviceClock:
         return Stamp(out_us, restarted, stepped, 0 if restarted else missing)
 
     def _hole(self, sequence: int | None) -> int:
-        """Return how many readings the count says are missing."""
+        """Return how many readings are missing before this one, by its sequence number."""
         last, self._sequence = self._sequence, sequence
         if sequence is None or last is None:
             return 0
@@ -195,7 +197,7 @@ class DeviceClock:
     def _by_count(
         self, arrival_us: int, origin_us: int, missing: int, tells: bool
     ) -> tuple[float, bool, int]:
-        """Return the host time (µs), whether it stepped back, and how many readings are missing unseen."""
+        """Return the host time (µs), whether it stepped back, and how many more readings are missing."""
         floor, period_us = self._floor, 1e6 * self._period
         self._count += 1 + missing
         x = self._count * self._period

@@ -1,4 +1,4 @@
-"""The straight line that lies below a stream of points: what is left of delays that are never negative.
+"""The straight line below a stream of points whose vertical distances, delays, are never negative.
 
 Each block of points gives its lowest one, and a line is fitted to the lowest points of the last blocks.
 """
@@ -14,18 +14,18 @@ BLOCK = 8
 POINTS = 16
 """Lowest points that the line is fitted to."""
 SPAN = 4.0
-"""s that a block grows to, and for which every point is late before the line is believed to be another: a
-computer that is busy with something else delays them for a second."""
+"""s: blocks grow to this duration, and every point must be late for this long before the line is given up,
+since a busy computer may delay all points for a second."""
 TOLERANCE = 20_000.0
 """µs by which an arrival may contradict the line."""
 DELAY = 5_000.0
 """µs, the mean delay before anything is known."""
 STALL = 100_000.0
-"""µs, a delay that tells nothing of the usual ones any more."""
+"""µs; longer delays enter the mean delay as this, because they say nothing about the usual ones."""
 WANDER = 0.05
-"""Part of that which always remains: rates change with temperature."""
+"""Fraction of the prior sigma below which the slope's sigma never falls: rates change with temperature."""
 BOUND = 5.0
-"""Widths of the prior that a rate may be off."""
+"""Largest slope, in prior sigmas."""
 
 
 class Floor:
@@ -33,7 +33,7 @@ class Floor:
 
     Notes
     -----
-    With the lowest points (x_k, y_k) of the blocks, their mean (X, Y), and b_0 what was known of the slope::
+    With the lowest points (x_k, y_k) of the blocks, their mean (X, Y), and b_0 the prior mean of the slope::
 
         b   = b_0 + sum (x_k - X) (y_k - Y - b_0 (x_k - X)) / S,   S = sum (x_k - X)^2 + (s / s_b)^2
         s_b = s / sqrt(S)                                          afterwards
@@ -49,7 +49,7 @@ class Floor:
         self.restart(0.0, 0.0)
 
     def restart(self, x: float, y: float) -> None:
-        """Begin anew at a point; the slope is kept as what is known of it."""
+        """Begin a new line at a point; the slope so far becomes the mean of its prior."""
         self._prior = self.slope
         self._sigma = self._prior_sigma
         self._points: list[tuple[float, float]] = []
@@ -66,7 +66,7 @@ class Floor:
 
     @property
     def scatter(self) -> float:
-        """How far the lowest points of blocks scatter, in µs."""
+        """1-sigma scatter of the blocks' lowest points, in µs."""
         return self.delay / self._size + 1.0
 
     def tolerance(self, x: float) -> float:
@@ -74,9 +74,11 @@ class Floor:
         return TOLERANCE + 3.0 * self._sigma * abs(x - self._x)
 
     def add(self, x: float, y: float, above: float, limit: float) -> float:
-        """Take a point, `above` the line; return by how much all of `SPAN` exceeded `limit` (else 0).
+        """Take a point that lies `above` the line (µs); return by how much the line has risen, else 0.
 
-        Such a block is not taken; `lowest` is its lowest point until the next one is added.
+        That is the height of a block's lowest point above the line, once all blocks for `SPAN` lay more than
+        `limit` above it. Such blocks are left out of the fit; `lowest` is the lowest point of the last one
+        until a point is added.
         """
         if not self._count:
             self._began, self._least = x, inf
@@ -99,7 +101,7 @@ class Floor:
         return 0.0
 
     def _thin(self, duration: float) -> None:
-        """Make room: join blocks in pairs while they are short, else forget the oldest."""
+        """Make room: join short blocks in pairs; once they last `SPAN`, drop the oldest instead."""
         if duration >= SPAN:
             del self._points[0]
             return

@@ -21,7 +21,7 @@ class Framer:
     Attributes
     ----------
     skipped : int
-        Bytes of what was too long; who reads the frames adds those that say nothing.
+        Bytes of frames that were too long; the driver adds those of frames that it rejects.
     """
 
     __slots__ = ("_delimiter", "_limit", "_overlong", "_rest", "skipped")

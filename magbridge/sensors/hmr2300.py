@@ -34,7 +34,7 @@ CONFIRM = 4
 """Frames in a row that must end in a carriage return before an alignment is believed."""
 TEXT = bytes(range(0x20, 0x7F)) + b"\r\n"
 WINDOW = SIZE * CONFIRM + SIZE - 1
-"""Bytes in which every one of the seven alignments has that many frames."""
+"""Bytes in which each of the seven alignments has `CONFIRM` frames."""
 NUMBER = rb"([ +-][\d ]{2}[, ][\d ]{2}\d)"
 LINE = re.compile(rb"\s?" + NUMBER + rb"  " + NUMBER + rb"  " + NUMBER + rb" *")
 LINE_LIMIT = 64
@@ -48,7 +48,7 @@ class Hmr2300Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
     output : {"binary", "ascii"}
         Set at start-up. At 9600 bit/s ASCII reaches 30 readings/s, binary 100; at 19,200 50 and 154.
     rate : int
-        Readings per second; one that the device knows.
+        Readings per second; only the device's own rates.
     device : int
         Number of the device on an RS-485 line; 99 speaks to all.
     """
@@ -144,15 +144,15 @@ def _reading(x: int, y: int, z: int) -> Reading:
 def _alignment(buffer: bytes, at: int) -> tuple[int, bool]:
     """Return how many bytes after `at` the first frame begins, and whether the window has one at all.
 
-    The end of a reply to a command looks like a frame, just before the first real one; what is all
-    text is left out.
+    The end of a reply to a command may look like a frame just before the first real one, so a first frame
+    that is all text is skipped.
     """
     best, least, found = SIZE, 0, False
     for offset in range(SIZE):
         starts = range(at + offset, at + offset + SIZE * CONFIRM, SIZE)
         if all(buffer[start + SIZE - 1] == RETURN for start in starts):
             frames = [COUNTS.unpack_from(buffer, start) for start in starts]
-            # the first step would be from text to numbers, should the first frame be text
+            # without the first frame: it may be text, and its step to the second large
             variation = sum(sum(map(abs, map(sub, after, before))) for before, after in pairwise(frames[1:]))
             if not found or variation < least:
                 best, least, found = offset, variation, True

@@ -152,13 +152,13 @@ def stream_record(record: bytes) -> tuple[int, Stream]:
 
 
 def segment(record: bytes) -> tuple[tuple[int, int], Segment]:
-    """Read a segment: the numbers of its stream and its own, and its times."""
+    """Read a segment: the numbers of its stream and of itself, and its times."""
     head = SEGMENT_HEAD.unpack_from(record)
     return (head[1], head[2]), Segment(head[7], head[8] or 1, head[9] or 1)
 
 
 def column(record: bytes) -> tuple[tuple[int, int], Column]:
-    """Read a column: the numbers of its stream and its own, and what it is."""
+    """Read a column: the numbers of its stream and of itself, and its description."""
     size, number, index, kind, name, unit, _ = COLUMN_HEAD.unpack_from(record)
     text = record[size:]
     words = text[:name].decode("utf-8", "replace"), text[name : name + unit].decode("utf-8", "replace")

@@ -24,7 +24,7 @@ SEND_ALL, METADATA = 1, 2
 WRAP_1, WRAP_2 = 1 << 32, 1 << 24
 """Where the sample numbers of the two generations wrap."""
 REMEMBERED = 256
-"""Descriptors of each sort that are kept."""
+"""Descriptors of each kind that are kept at most."""
 
 
 class TwinleafOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -58,12 +58,15 @@ class TwinleafOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
             raise ValueError(f"route: expected at most {tio.MAX_ROUTING} numbers up to 255")
 
     def hops(self) -> list[int]:
-        """Return the way to the device, from the root."""
+        """Return the port numbers on the way from the root to the device."""
         return [int(hop) for hop in self.route.split("/") if hop]
 
 
 class _Row(NamedTuple):
-    """How a sample is read: `pick` takes channels and temperature from what `fields` unpacks."""
+    """How a sample is read: `pick` takes channels and temperature from what `fields` unpacks.
+
+    `size` is the length of a whole sample in bytes, `sizes` the lengths at which it may end, after any part.
+    """
 
     sizes: frozenset[int]
     size: int
@@ -240,7 +243,7 @@ class Twinleaf:
         return first, segment.start, zero, segment.decimation / segment.rate
 
     def _unwrap(self, key: int, number: int, wrap: int) -> int:
-        """Return the sample number with the turns it has made in its segment."""
+        """Return the sample number with its wraps within the segment undone."""
         last_key, last, turns = self._last
         if key != last_key:
             turns = 0
