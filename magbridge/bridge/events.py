@@ -1,4 +1,4 @@
-"""What happens to the bridge: everything it can know, and so everything a log must hold."""
+"""The events that reach the bridge: all its inputs, and so all that a log must hold."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ __all__ = ["Clock", "Event", "Start"]
 
 
 class Start(msgspec.Struct, frozen=True):
-    """All that a run depends on beside its configuration, its calibration and its events.
+    """What a run depends on besides its configuration, its calibration and its events.
 
     Attributes
     ----------
     time_us : int
         µs since 1970 UTC, a multiple of 4.
     parameters : dict of str to float
-        Values that a station set in earlier runs.
+        Values that a ground station set in earlier runs.
     signing_timestamp : int
-        The last one that was used.
+        The last that was used (units of 10 µs since 2015-01-01).
     """
 
     time_us: int
@@ -30,15 +30,15 @@ class Start(msgspec.Struct, frozen=True):
 
 
 class Event(msgspec.Struct, frozen=True, gc=False):
-    """Something that came in.
+    """One input of the bridge: bytes from a port, a change of state, or only the passing of time.
 
     Attributes
     ----------
     time_us : int
-        µs since 1970 UTC when it was stamped at the edge; a multiple of 4, never decreasing.
+        µs since 1970 UTC, when the live edge read it; a multiple of 4, never decreasing.
     channel : Channel
         ``SENSOR``: bytes as read; ``LINK``: bytes as read; ``STATE``: one MAVLink frame of our own dialect
-        that says what changed at the edge, or nothing when only time has passed.
+        that says what changed (a port, the host's clock, the log), or nothing when only time has passed.
     data : bytes
     """
 
@@ -48,18 +48,18 @@ class Event(msgspec.Struct, frozen=True, gc=False):
 
 
 class Clock:
-    """The one clock: begins at the host's UTC and then runs steadily, whatever happens to the host's.
+    """The bridge's only clock: begins at the host's UTC and then follows the host's monotonic clock.
 
-    A step of the host's clock is told apart (:meth:`step_us`), so that no interval is ever
-    measured across it.
+    A step of the host's UTC does not change it but is reported separately (:meth:`step_us`), so that no
+    interval is ever measured across a step.
     """
 
     THRESHOLD_US = 50_000
-    """Smaller differences are the host's own slewing, and are left alone."""
+    """Smaller differences are ignored: they come from the slewing of the host's clock."""
 
     AT_ONCE_US = 5_000
-    """The host's two clocks are read within this, or again: a process may be held up between
-    any two lines."""
+    """µs within which the host's two clocks must be read, else both are read again: a process may be held up
+    between any two lines."""
 
     def __init__(self) -> None:
         self._offset_us = self._ahead_us()
@@ -70,7 +70,7 @@ class Clock:
         return (time.monotonic_ns() // 1000 + self._offset_us) & ~3
 
     def step_us(self) -> int:
-        """Return by how much the host's clock was set since this was last asked; 0 where it was not."""
+        """Return by how many µs the host's clock was set since the last call; 0 where it was not."""
         difference = self._ahead_us() - self._offset_us - self._known_step_us
         if abs(difference) < self.THRESHOLD_US:
             return 0
@@ -78,7 +78,7 @@ class Clock:
         return difference
 
     def _ahead_us(self) -> int:
-        """Return by how much the host's UTC is ahead of its steady clock, right to `AT_ONCE_US`."""
+        """Return by how many µs the host's UTC is ahead of its monotonic clock, to within `AT_ONCE_US`."""
         while True:
             before, utc, after = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
             if after - before < 1000 * self.AT_ONCE_US:

@@ -1,4 +1,4 @@
-"""Everything that came and went, as records for the log: a replay needs nothing else."""
+"""All inputs and outputs of the bridge, as records for the log: a replay needs nothing else."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ __all__ = ["Journal", "declarations"]
 
 BYTES, RAW = spec("MAG_SENSOR_BYTES"), spec("MAG_RAW")
 HEAD = Struct("<BB")
-"""Its fields before the data: sensor_id, length."""
+"""The fields of MAG_SENSOR_BYTES before its data: sensor_id, length."""
 SIZE = BYTES.fields["data"].count
 SENT, LINK, SENSOR, STATE = Channel
 
@@ -24,7 +24,7 @@ class Journal:
     Attributes
     ----------
     active : bool
-        When not, nothing is collected, and counting nothing costs nothing.
+        Whether records are collected and counted; False where there is no log.
     count : int
         Records collected since the start.
     """
@@ -36,15 +36,15 @@ class Journal:
         self._scribe = Codec(system, component)
 
     def sent(self, frames: Iterable[tuple[int, bytes]]) -> None:
-        """Take what went out over the link: event time in µs, frame."""
+        """Record the frames sent over the link, each with its event time (µs)."""
         self._add([(time_us, SENT, frame) for time_us, frame in frames])
 
     def link(self, time_us: int, frames: Iterable[bytes]) -> None:
-        """Take what came over the link."""
+        """Record the frames that came over the link."""
         self._add([(time_us, LINK, frame) for frame in frames])
 
     def sensor(self, time_us: int, data: bytes) -> None:
-        """Take bytes as they came from the sensor."""
+        """Record bytes as they came from the sensor."""
         if not self.active:
             return
         for begin in range(0, len(data), SIZE):
@@ -53,15 +53,15 @@ class Journal:
             self._add([(time_us, SENSOR, frame)])
 
     def state(self, time_us: int, frame: bytes) -> None:
-        """Take a frame that says what changed at the edge."""
+        """Record a frame of :mod:`magbridge.bridge.states`, or of the run's start."""
         self._add([(time_us, STATE, frame)])
 
     def raw(self, time_us: int, payload: bytes) -> None:
-        """Write a MAG_RAW that is not published: without it, nothing could be calibrated from the log."""
+        """Record a MAG_RAW in the log only: a calibration from the log needs that of every sample."""
         self._add([(time_us, STATE, self._scribe.frame(RAW, payload))])
 
     def drain(self) -> list[tuple[int, Channel, bytes]]:
-        """Return what was collected, in order (event time in µs, channel, frame), and forget it."""
+        """Return and clear the records collected so far, in order: event time in µs, channel, frame."""
         records, self._records = self._records, []
         return records
 
@@ -74,7 +74,7 @@ class Journal:
 def declarations(
     system: int, component: int, telemetry: Mapping[str, Telemetry], nt_per_count: float = 0.0
 ) -> list[bytes]:
-    """Return the frames that tell a reader of the log which field of which message a column is.
+    """Return the frames that tell a reader of the log which field of which message each column comes from.
 
     Parameters
     ----------
@@ -83,8 +83,8 @@ def declarations(
     telemetry : mapping of str to Telemetry
         By parameter.
     nt_per_count : float
-        nT, of one count of the sensor: float32, as MAG_RAW tells a channel, is less than what was corrected;
-        0 for a sensor without counts.
+        nT per count of the sensor, 0 for one without counts. A reader then takes the channels from the
+        counts, because MAG_RAW's float32 fields are less precise than the values that were corrected.
     """
     codec = Codec(system, component)
     columns = [

@@ -1,7 +1,7 @@
 """The live edge: two ports and the one clock, turned into events.
 
-One thread reads, corrects and sends. Each port has another that opens it when it is down, so that an open
-that takes its time (a name that nobody resolves) never holds up the other line.
+One thread reads, corrects and sends. Each port has a thread of its own that opens it when it is down, so that
+an open that takes long (a host name that does not resolve) never holds up the other port.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ __all__ = ["LiveEdge"]
 RETRY = 0.25
 """s between attempts to open a port that is down."""
 PATIENCE = 2.0
-"""s that the end waits for an attempt under way."""
+"""s that :meth:`LiveEdge.close` waits for an attempt under way to open a port."""
 SLOW_US = 10_000_000
-"""µs between two words on a link that is too slow: one of them may be lost as well."""
+"""µs between two reports that the link is too slow; repeated, because one may be lost as well."""
 LOOK_US = 100_000
-"""µs between looks at the host's clock."""
+"""µs between two checks for a step of the host's clock, and for a link that is too slow."""
 
 
 class LiveEdge:
@@ -56,7 +56,7 @@ class LiveEdge:
             )
             self._openers[channel] = opener
             opener.start()
-            tried.wait(RETRY)  # what is said of the next port goes out over this one, where it can
+            tried.wait(RETRY)  # so that a report on the next port can go out over this one
 
     def events(self, deadline: Callable[[], int]) -> Iterator[Event]:
         """Yield events until :meth:`stop`, and an empty one whenever `deadline` (µs) has passed."""
@@ -71,7 +71,7 @@ class LiveEdge:
             now_us = self._clock.now_us()
             if self._woken in ready:
                 os.read(self._woken, 4096)
-            while not self._changes.empty():  # that a port opened comes before what it says
+            while not self._changes.empty():  # the news that a port opened comes before its data
                 yield Event(now_us, Channel.STATE, self._changes.get())
             for fd in ready:
                 if fd != self._woken and (data := self._read(lines[fd], fd)):
@@ -88,7 +88,7 @@ class LiveEdge:
                 yield Event(now_us, Channel.STATE, b"")
 
     def send(self, channel: Channel, data: bytes) -> None:
-        """Send to a port; what a port that is down does not take is lost."""
+        """Send to a port; while the port is down, data are dropped and counted."""
         port = self._ports[channel]
         if not port.up:
             port.dropped += len(data)
@@ -110,7 +110,7 @@ class LiveEdge:
             os.write(self._waker, b"!")
 
     def close(self) -> None:
-        """Close the ports; one that is still being opened goes with the process."""
+        """Close the ports; one that is still being opened is left to the end of the process."""
         self._stopping = True
         for channel, opener in self._openers.items():
             opener.join(PATIENCE)
@@ -122,7 +122,7 @@ class LiveEdge:
 
     def _read(self, channel: Channel, fd: int) -> bytes:
         port = self._ports[channel]
-        if fd not in port.fds():  # it was lost in sending, since the wait
+        if fd not in port.fds():  # send() has lost the port since select() returned
             return b""
         try:
             return port.read()
@@ -131,7 +131,7 @@ class LiveEdge:
             return b""
 
     def _too_slow(self, now_us: int) -> bool:
-        """Say whether it is to be told that the link had no room for something."""
+        """Say whether to report now that the link has dropped data for lack of room."""
         overrun = self._ports[Channel.LINK].overrun
         if overrun == self._overrun or now_us < self._slow_us:
             return False
@@ -142,7 +142,7 @@ class LiveEdge:
         self.tell(states.port(channel, self._ports[channel], error.reason))
 
     def _keep_open(self, channel: Channel, port: Port, tried: threading.Event) -> None:
-        """Open the port whenever it is down, tell of each change once; set `tried` after the first time."""
+        """Open the port whenever it is down, report each change once; set `tried` after the first attempt."""
         told: str | None = None
         while not self._stopping:
             if not port.up:

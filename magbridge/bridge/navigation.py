@@ -28,9 +28,9 @@ from magbridge.toml import convert
 __all__ = ["Navigation", "open_navigation"]
 
 FIX_3D = 3
-"""GPS_RAW_INT.fix_type from which a position counts."""
+"""Lowest GPS_RAW_INT.fix_type whose position is used."""
 UNKNOWN_SPEED = 0.0
-"""VFR_HUD.airspeed of a vehicle that has no log for its speed through the water."""
+"""VFR_HUD.airspeed of a vehicle that does not measure its speed through the water."""
 WORDS = {
     State.OFF: "waiting for a first position",
     State.SEARCHING: "searching",
@@ -41,7 +41,7 @@ WORDS = {
 
 
 class Navigation:
-    """Feeds the navigator, and sends what it finds.
+    """Feeds the navigator, and sends its updates and fixes.
 
     Parameters
     ----------
@@ -72,7 +72,7 @@ class Navigation:
         }
 
     def hear(self, message: Message, time_us: int) -> None:
-        """Take what a message says of the vehicle's motion, or of its position at the surface."""
+        """Pass on the vehicle's motion, or its position at the surface, from a message to the navigator."""
         handler = self._handlers.get(message.id)
         if handler is not None:
             self._tell(handler(message, time_us))
@@ -87,7 +87,7 @@ class Navigation:
         )
 
     def _depth(self, message: Message, time_us: int) -> None:
-        # its position is the autopilot's own estimate, which our fixes go into: only the depth counts
+        # only the depth: the position is the autopilot's estimate, which contains our fixes
         self.navigator.telemetry(time_us, depth=-1e-3 * message["alt"])
 
     def _local(self, message: Message, time_us: int) -> None:
@@ -107,7 +107,7 @@ class Navigation:
         return self.navigator.fix(time_us, latitude, longitude, accuracy if accuracy > 0.0 else None)
 
     def _tell(self, record: Record | None) -> None:
-        """Send an update, and as a fix what the filter vouches for."""
+        """Send an update; and a fix, if the filter vouches for it and fixes have no rate of their own."""
         if record is None:
             return
         component = self._component
@@ -139,7 +139,7 @@ class Navigation:
             self._send(record)
 
     def _between(self, time_us: int) -> None:
-        """Send where the vehicle is now, while the filter vouches for it."""
+        """Send the position dead-reckoned to `time_us` as a fix, if the filter vouches for it."""
         if (now := self.navigator.reckon(time_us)) is not None:
             self._send(now)
 
@@ -167,7 +167,7 @@ def open_navigation(
 ) -> Navigation | None:
     """Return the navigation that a configuration asks for.
 
-    What the configuration does not say of the calibration's errors, the calibration says.
+    Where the configuration sets neither ``noise`` nor ``bias_sigma``, both are taken from the calibration.
 
     Raises
     ------

@@ -35,14 +35,14 @@ from magbridge.sensors.clock import DeviceClock, Stamp
 from magbridge.version import __version__
 
 if TYPE_CHECKING:
-    from magbridge.bridge.navigation import Navigation  # it brings filterpy, which few vehicles carry
+    from magbridge.bridge.navigation import Navigation  # imports filterpy, which few vehicles have
 
 __all__ = ["Pipeline"]
 
 LATELY = 64
-"""Samples over which the sample rate is told."""
+"""Samples over which the sample rate is computed."""
 DOUBTS = int(Quality.STALE_TELEMETRY | Quality.SATURATED | Quality.UNCALIBRATED | Quality.OFFSET_SUSPECT)
-"""Flags whose coming and going is told; the others come and go with every manoeuvre."""
+"""Flags whose changes are announced; the others change with every manoeuvre."""
 CLOCK_STEP, NOTICE, PORT = (spec(name).id for name in ("MAG_CLOCK_STEP", "STATUSTEXT", "MAG_PORT"))
 
 
@@ -62,11 +62,11 @@ class Pipeline:
     component : Component
         The MAVLink side.
     journal : Journal
-        Everything that came and went since it was last drained: the log.
+        All inputs and outputs since it was last drained: the records for the log.
     sensor : SensorLine
         Holds the commands that are to be sent to the sensor.
     navigation : Navigation or None
-        Set before the first event, where the vehicle is to find its way by the field.
+        To be set before the first event, where the configuration has ``[navigation]``.
 
     Raises
     ------
@@ -122,16 +122,16 @@ class Pipeline:
 
     @property
     def nt_per_count(self) -> float:
-        """nT, of one of the sensor's counts; 0 where it speaks none."""
+        """The sensor's nT per count; 0 where it sends no counts."""
         return self._driver.nt_per_count
 
     @property
     def deadline(self) -> int:
-        """µs since 1970 UTC: feed something by then, if only time."""
+        """µs since 1970 UTC by which :meth:`feed` must be called, if only with an empty event."""
         return self.component.next_deadline
 
     def feed(self, event: Event) -> list[tuple[int, bytes]]:
-        """Take an event; return what is to be sent over the link: event time in µs, frame."""
+        """Process an event; return the frames to send over the link, each with its event time (µs)."""
         component = self.component
         component.advance(event.time_us)
         due = component.outbox.drain()
@@ -154,7 +154,7 @@ class Pipeline:
             return
         self.sensor.spoke(event.time_us)
         stamps = self._clock.stamp(readings, event.time_us)
-        for reading, stamp in zip(readings, stamps):  # noqa: B905 - a stamp each; as it stands it compiles to a bare loop
+        for reading, stamp in zip(readings, stamps):  # noqa: B905 - one stamp per reading; without strict= it compiles to a plain loop
             self._sample(reading, stamp)
 
     def _sample(self, reading: Reading, stamp: Stamp) -> None:
@@ -215,7 +215,7 @@ class Pipeline:
             self.component.announcer.state("link", f"link: {reason or 'open'}", severity)
 
     def _tune(self) -> None:
-        """Obey the parameters."""
+        """Apply the present values of the parameters to the alignment."""
         parameters = self.component.parameters
         self._revision = parameters.revision
         settings = {name: parameters.of(f"align.{name}") for name in Align.__struct_fields__}
@@ -229,7 +229,7 @@ class Pipeline:
         self._quality = doubts
 
     def _begin(self, start: Start, calibration: Calibration | None, *, foreign: bool) -> None:
-        """Write down what a replay needs, and say with what the bridge works."""
+        """Record what a replay needs, and announce the calibration in use."""
         for frame in self.beginning(start.parameters):
             self.journal.state(start.time_us, frame)
         say = self.component.announcer.say
@@ -241,7 +241,7 @@ class Pipeline:
             say(f"calibration {self._calibration_id:08x}, {calibration.method}")
 
     def beginning(self, parameters: Mapping[str, float]) -> list[bytes]:
-        """Return the frames that say from what the run started, with these parameters."""
+        """Return the frames that record how the run started, with these values of the parameters."""
         codec = Codec(self._config.link.system, self._config.link.component)
         start = codec.pack(
             "MAG_BRIDGE_START",
@@ -280,7 +280,7 @@ class Pipeline:
             -self._clock.drift_ppm,
             (len(times) - 1) * 1e6 / span_us if span_us > 0 else nan,
             stale,
-            # with what waits to be sent: in a replay several timers may fire before it is drained
+            # with the frames yet to be sent: in a replay several timers may fire before the outbox is drained
             self.journal.count + len(self.component.outbox.frames) if self.journal.active else 0,
             self._log_lost,
             self._log_state,

@@ -1,4 +1,4 @@
-"""What the bridge asks of a port: bytes in and out, never blocking, and a clear word when it is gone.
+"""What the bridge needs of a port: bytes in and out, never blocking, and a clear error when it is gone.
 
 A port that is gone raises :class:`PortError` once and is closed; :meth:`Port.open` may then be tried again.
 Writing never blocks: what a slow reader does not take is dropped and counted.
@@ -17,14 +17,14 @@ CHUNK = 65536
 
 
 class Port(ABC):
-    """What the bridge asks of a port."""
+    """What the bridge needs of a port."""
 
     def __init__(self, name: str) -> None:
         self.name = name
         self.dropped = 0
         """Bytes that could not be written."""
         self.overrun = 0
-        """Bytes of these for which an open line had no room: it is too slow."""
+        """Those of the `dropped` bytes for which an open port had no room, because it is too slow."""
 
     @property
     @abstractmethod

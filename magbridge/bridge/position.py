@@ -14,7 +14,7 @@ POSITION = spec("GLOBAL_POSITION_INT")
 MAX_AGE_US = 60_000_000
 """µs: a glider makes 20 m in a minute, over which the main field changes by less than 0.1 nT."""
 AGAIN_US = 1_000_000
-"""µs for which a value of the main field serves."""
+"""µs after which the main field is computed anew."""
 
 
 class Position:
@@ -31,7 +31,7 @@ class Position:
     def update(self, message: Message, time_us: int) -> None:
         """Take a GLOBAL_POSITION_INT."""
         latitude, longitude, altitude = message["lat"] * 1e-7, message["lon"] * 1e-7, message["alt"] * 1e-3
-        if latitude or longitude:  # 0, 0 is what an autopilot says that does not know
+        if latitude or longitude:  # an autopilot that does not know its position sends 0, 0
             self._where = latitude, longitude, -altitude
             self._when_us, self._evaluated_us = time_us, 0
 

@@ -1,4 +1,4 @@
-"""Run a bridge: set the pipeline up, feed it from an edge, send and log what it says."""
+"""Run a bridge: set up the pipeline, feed it with events, send and log its output."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ from magbridge.records import Channel
 __all__ = ["Edge", "drive", "run", "set_up"]
 
 KEEP_US = 60_000_000
-"""µs between two savings of the signing time stamp; after a crash a minute is added to it."""
+"""µs between two savings of the signing time stamp; the next run adds as much to the saved one."""
 SWITCH = 0.0005
-"""s after which the log's thread must let the bridge go on; Python's 5 ms would be seen in the latency."""
+"""s the log's thread may hold up the bridge (Python's switch interval); 5 ms would show in the latency."""
 TELL = 0.2
-"""s between looks at what there is to say on the terminal."""
+"""s between two checks for texts to print on the terminal."""
 LOG_LOOK_US = 1_000_000
-"""µs between looks at how the log is."""
+"""µs between two checks of the log."""
 
 
 class Edge(Protocol):
@@ -95,7 +95,7 @@ def run(path: Path, *, aloud: bool = False) -> None:
     ----------
     path : Path
     aloud : bool
-        Say on stderr, too, what is said over the link.
+        Print the texts that are sent over the link on stderr, too.
 
     Raises
     ------
@@ -111,7 +111,7 @@ def run(path: Path, *, aloud: bool = False) -> None:
         Thread(target=_say, args=(said,), name="voice", daemon=True).start()
     sensor = SerialPort(config.sensor.port, config.sensor.baudrate)
     link = open_link(config.link.url, config.link.baudrate, str(config.path))
-    # the link first: that the sensor's port does not open must find somebody to be told to
+    # the link first, so that a sensor's port that does not open can be reported over it
     edge = LiveEdge({Channel.LINK: link, Channel.SENSOR: sensor}, clock)
     keeper.attach(edge)
     log = _open_log(config, edge, pipeline.nt_per_count)
@@ -120,7 +120,7 @@ def run(path: Path, *, aloud: bool = False) -> None:
             signal.signal(number, lambda *_: edge.stop())
     sys.setswitchinterval(SWITCH)
     gc.collect()
-    gc.freeze()  # what is here now stays: the collector need not look at it again
+    gc.freeze()  # these objects live as long as the process: the collector need not scan them
     watch = LogWatch(log, edge, pipeline)
 
     def after(time_us: int) -> None:
@@ -137,9 +137,9 @@ def run(path: Path, *, aloud: bool = False) -> None:
 
 
 def _say(texts: deque[str]) -> None:
-    """Tell a terminal; on a thread of its own, because one that hangs must not hold up the bridge.
+    """Print texts on stderr; on its own thread, because a terminal that hangs must not hold up the bridge.
 
-    Nor its end, where Python would wait for a file in which something is still being written.
+    Nor may it hold up the exit, where Python waits for a file object that is in use: hence ``os.write``.
     """
     with suppress(OSError):  # the terminal is gone
         while True:
@@ -149,7 +149,7 @@ def _say(texts: deque[str]) -> None:
 
 
 def _open_log(config: Config, edge: LiveEdge, nt_per_count: float) -> TlogWriter | None:
-    """Open the log; a folder that cannot be made is told over the link, and does not stop the bridge."""
+    """Open the log; a folder that cannot be made is reported over the link and does not stop the bridge."""
     if config.log is None:
         return None
     directory = config.resolve(config.log.directory)
@@ -164,7 +164,7 @@ def _open_log(config: Config, edge: LiveEdge, nt_per_count: float) -> TlogWriter
 
 
 class LogWatch:
-    """Tells the pipeline when the log fails, recovers, or loses records; and the log how to begin anew."""
+    """Reports when the log fails, recovers or loses records; keeps the log's `beginning` up to date."""
 
     def __init__(self, log: TlogWriter | None, edge: LiveEdge, pipeline: Pipeline) -> None:
         self._log, self._edge, self._pipeline = log, edge, pipeline
@@ -173,7 +173,7 @@ class LogWatch:
         self._look_us = 0
 
     def look(self, time_us: int) -> None:
-        """Look, once a second."""
+        """Check the log, at most once a second."""
         if self._log is None or time_us < self._look_us:
             return
         self._look_us = time_us + LOG_LOOK_US
@@ -188,14 +188,14 @@ class LogWatch:
 
 
 class Keeper:
-    """Keeps what must outlive the process: parameters set over the link, the signing time stamp."""
+    """Saves what must outlive the process: parameters set over the link, and the signing time stamp."""
 
     MARGIN = KEEP_US // 10
-    """Added to the kept time stamp (units of 10 µs), because it may be as old as that."""
+    """Added to the saved time stamp (units of 10 µs), which may be `KEEP_US` older than the last one used."""
 
     def __init__(self, config: Config) -> None:
         self._tell: Callable[[bytes], None] = lambda _: None
-        # of a name of its own: there may be another bridge's configuration beside it
+        # named after the configuration: there may be another bridge's beside it
         self._path = config.resolve(config.link.parameters or f"{config.path.stem}.parameters.json")
         self._kept = store.load(self._path)
         self._signs = config.link.signing_key is not None
@@ -211,7 +211,7 @@ class Keeper:
         return Start(time_us, self._kept.parameters, stamp + self.MARGIN if stamp else 0)
 
     def look(self, pipeline: Pipeline, time_us: int) -> None:
-        """Save what changed; the time stamp now and then."""
+        """Save changed parameters at once, the time stamp every `KEEP_US`."""
         revision = pipeline.component.parameters.revision
         due = self._signs and time_us - self._saved_us > KEEP_US
         if time_us < self._retry_us or (revision == self._revision and not due):
@@ -221,7 +221,7 @@ class Keeper:
             self._revision, self._retry_us = -1, time_us + KEEP_US
 
     def save(self, pipeline: Pipeline) -> bool:
-        """Write the file, if there is anything to keep; a disk that is full keeps the old one: False."""
+        """Write the file if its content has changed; return False, the old file kept, where that fails."""
         stamp = pipeline.signing.last if pipeline.signing else 0
         kept = store.Kept(pipeline.component.parameters.changed(), stamp)
         if kept == self._kept:

@@ -1,4 +1,4 @@
-"""The sensor's line: does it speak, and what must it be told."""
+"""The sensor's line: whether readings come, and the commands that the sensor needs."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ __all__ = ["SensorLine"]
 COMMAND_GAP_US = 100_000
 """µs between two commands to a sensor."""
 LOOK_US = 1_000_000
-"""µs between looks at whether the sensor still speaks."""
+"""µs between two checks that readings still come."""
 
 
 class SensorLine:
@@ -22,7 +22,7 @@ class SensorLine:
     Parameters
     ----------
     name : str
-        What the sensor is called when its state is told.
+        What the sensor is called in messages about its state.
     commands : callable
         Returns the commands that start it.
     timeout_us : int
@@ -36,7 +36,7 @@ class SensorLine:
     ----------
     state : MAG_PORT_STATE
     to_send : list of bytes
-        Commands that are due; whoever feeds the pipeline sends and empties them.
+        Commands that are due; the caller of the pipeline sends them and empties the list.
     """
 
     def __init__(
@@ -63,7 +63,7 @@ class SensorLine:
             self._announcer.state("sensor", f"{self._name} speaks")
 
     def opened(self, time_us: int) -> None:
-        """Begin to configure a sensor that may have been without power: silent until it speaks."""
+        """Begin to send the start-up commands: the sensor may have been without power. Silent until it sends."""
         self.state, self._heard_us = MAG_PORT_STATE.SILENT, time_us
         self._command(time_us, self._commands())
 
@@ -77,7 +77,7 @@ class SensorLine:
         if time_us - self._heard_us < self._timeout_us or self.state == MAG_PORT_STATE.LOST:
             return
         self._announcer.state("sensor", f"{self._name} is silent", MAV_SEVERITY.ERROR)
-        self.opened(time_us)  # as a port that opened anew
+        self.opened(time_us)  # send the start-up commands again, as to a port that has just opened
 
     def _command(self, time_us: int, commands: tuple[bytes, ...]) -> None:
         if commands:

@@ -18,9 +18,9 @@ from magbridge.errors import PortError
 __all__ = ["SerialPort"]
 
 PIECE = 4095
-"""Bytes that a terminal line hands on at once, of however many wait."""
+"""Bytes that one read of a terminal device returns at most, however many are waiting."""
 SOON = 0.02
-"""s within which the next piece of a backlog is there, on a busy computer, too."""
+"""s within which the next piece of a backlog can be read, even on a busy computer."""
 
 
 class SerialPort(Port):
@@ -49,7 +49,7 @@ class SerialPort(Port):
                 opened = serial.serial_for_url(
                     name, self.baudrate, timeout=0, write_timeout=0, do_not_open=True
                 )
-                # two programs on one line lose bytes to each other
+                # two programs on one line would each read only some of the bytes
                 opened.exclusive = None if "://" in name else True
                 opened.open()
             except (serial.SerialException, OSError, ValueError) as error:
@@ -71,7 +71,8 @@ class SerialPort(Port):
     def read(self) -> bytes:
         """Return what has come; an end of file or an error on the line is a lost port.
 
-        A backlog as a whole: of an instrument without a clock, only what came last says when it was sent.
+        A backlog is returned as a whole: of an instrument without a clock, only the last reading's time of
+        arrival says when it was sent.
         """
         try:
             data = os.read(self._fd, CHUNK)
@@ -84,7 +85,7 @@ class SerialPort(Port):
         return data if len(data) < PIECE else data + self._backlog()
 
     def _backlog(self) -> bytes:
-        """Return what waits behind a first piece; the next :meth:`read` meets what ends it."""
+        """Return what is waiting after a first piece; the next :meth:`read` finds an end of file or error."""
         data = b""
         with suppress(OSError):
             for _ in range(CHUNK // PIECE):
@@ -94,9 +95,9 @@ class SerialPort(Port):
         return data
 
     def write(self, data: bytes) -> None:
-        """Write what the line's buffer takes; what was begun is ended before anything else goes out.
+        """Write what the line's buffer takes; the rest of a message goes out before the next message.
 
-        So a line that is too slow loses whole messages, counted, and never the half of one.
+        So a line that is too slow loses whole messages, which are counted, and never half of one.
         """
         try:
             if self._pump is not None:

@@ -59,8 +59,8 @@ class UdpPort(Port):
     def read(self) -> bytes:
         """Return the datagrams that have come; an unreachable peer is nothing, not an error.
 
-        All of them, as a stream gives: the samples that waited while the bridge stood still find the
-        telemetry that waited with them.
+        All that are waiting are returned at once, as from a stream, so that samples that queued up while the
+        bridge stood still meet the telemetry that queued up with them.
         """
         assert self._socket is not None
         data = b""
@@ -71,13 +71,13 @@ class UdpPort(Port):
                 break
             except OSError as error:
                 if data or error.errno in AWAY:
-                    break  # what has come is not lost with the socket
+                    break  # first return what has come
                 raise self.lost(error.strerror) from error
             if self._listen:
                 self._peers[peer] = time.monotonic()
             data += datagram
             if not datagram:
-                break  # else empty ones could keep us here
+                break  # empty datagrams could keep this loop running for ever
         return data
 
     def write(self, data: bytes) -> None:
@@ -275,7 +275,7 @@ def open_link(url: str, baudrate: int, source: str = "bridge.toml") -> Port:
     Raises
     ------
     ConfigError
-        A kind of link that there is not, or an address that is not HOST:PORT.
+        An unknown kind of link, or an address that is not HOST:PORT.
     """
     kind, colon, address = url.partition(":")
     if kind not in LINKS:

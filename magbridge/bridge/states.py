@@ -1,4 +1,4 @@
-"""What changes at the edge, as frames of our own dialect: they are logged, and a replay feeds them back."""
+"""Changes of ports, log and host's clock as frames of our own dialect, which are logged and replayed."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def notice(text: str) -> bytes:
 def port(channel: Channel, what: Port, reason: str) -> bytes:
     """Return the frame that says that a port opened (no `reason`) or which one is not open, and why."""
     state = MAG_PORT_STATE.LOST if reason else MAG_PORT_STATE.OK
-    # the name last: of a long text the end is cut off
+    # the name last, because the end of a long text is cut off
     why = f"{reason}: {what.name}" if reason else ""
     return _frame("MAG_PORT", port=int(channel), state=int(state), dropped=what.dropped, reason=why)
 
@@ -40,7 +40,7 @@ def too_slow(channel: Channel, what: Port) -> bytes:
 
 
 def opened(name: MAG_PORT_NAME) -> bytes:
-    """Return the frame that says that a port opened, where there is none to ask: in a replay."""
+    """Return the frame that says that a port opened, for a replay, which has no `Port`."""
     return _frame("MAG_PORT", port=int(name), state=int(MAG_PORT_STATE.OK))
 
 
