@@ -63,7 +63,7 @@ class SensorLine:
             self._announcer.state("sensor", f"{self._name} speaks")
 
     def opened(self, time_us: int) -> None:
-        """Begin to send the start-up commands: the sensor may have been without power. Silent until it sends."""
+        """Begin to send the start-up commands: it may have been without power. SILENT until it sends."""
         self.state, self._heard_us = MAG_PORT_STATE.SILENT, time_us
         self._command(time_us, self._commands())
 

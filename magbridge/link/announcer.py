@@ -15,16 +15,16 @@ CHUNK = 50
 LATELY = 32
 """Texts that are kept for a terminal."""
 PAUSE_US = 1_000_000
-"""us; a state that flaps is told once a second, and always its last word."""
+"""us between two announcements of a state that changes quickly; the latest is always announced."""
 
 
 class Announcer:
-    """Says things, and changes of state only when they change.
+    """Sends texts, and the text of a state only when the state has changed.
 
     Attributes
     ----------
     said : deque of str
-        The last things said: whoever takes them out may tell them elsewhere, too.
+        The last texts sent; another thread may take them out and print them.
     """
 
     def __init__(self, outbox: Outbox, timers: Timers) -> None:
@@ -52,7 +52,7 @@ class Announcer:
             )
 
     def state(self, key: str, text: str, severity: MAV_SEVERITY = MAV_SEVERITY.INFO) -> None:
-        """Say that the state of `key` is now `text`, unless that was the last thing said of it."""
+        """Announce that the state of `key` is now `text`, unless that was announced last."""
         now_us = self._outbox.codec.now_us
         said, when_us = self._last.get(key, ("", now_us - PAUSE_US))
         timer = f"say {key}"

@@ -8,14 +8,14 @@ from math import nan, sqrt
 __all__ = ["VehicleClock"]
 
 WINDOW = 32
-"""Exchanges that count."""
+"""Latest exchanges that are used."""
 JITTER_US = 200.0
-"""us that even the fastest exchange is uncertain by."""
+"""us, the uncertainty of even the fastest exchange."""
 STEP_US, DRIFT = 20_000, 500e-6
-"""us, us/us; two exchanges that differ by more than half of each round trip, this and this drift between them
-tell of a clock that was set."""
+"""us, us/us: a clock was set if the offsets of two exchanges differ by more than half of both round trips,
+plus this step, plus this drift over the time between them."""
 SPAN_US = 10_000_000
-"""us of exchanges before a drift is believed."""
+"""us that the exchanges must span before a drift is estimated."""
 PENDING = 8
 
 
@@ -25,17 +25,17 @@ class VehicleClock:
     Notes
     -----
     An exchange sent at ``ts``, answered with the vehicle's ``tc`` and received at ``tr`` gives
-    ``offset = tc - (ts + tr) / 2``, wrong by no more than half its round trip ``tr - ts``. What it is slower
-    than the fastest of late was spent waiting somewhere, nobody knows on which way, so each counts with the
-    weight ``1 / sigma^2``, ``sigma = JITTER + (rtt - min rtt) / 2``, in a straight line through the last
-    exchanges (Cristian, 1989, takes the fastest alone).
+    ``offset = tc - (ts + tr) / 2``, wrong by no more than half its round trip ``tr - ts``. The time by which
+    an exchange is slower than the fastest recent one was spent waiting, in an unknown direction. So a
+    straight line is fitted to the last exchanges with the weights ``1 / sigma^2``, where
+    ``sigma = JITTER + (rtt - min rtt) / 2`` (Cristian, 1989, uses the fastest alone).
     """
 
     def __init__(self) -> None:
         self.reset()
 
     def reset(self) -> None:
-        """Forget everything: the other clock began anew."""
+        """Forget everything: the vehicle's clock restarted or was set."""
         self._asked: deque[int] = deque(maxlen=PENDING)
         self._exchanges: deque[tuple[int, int, int]] = deque(maxlen=WINDOW)
         self._base_us = self._middle_us = 0
@@ -44,7 +44,7 @@ class VehicleClock:
 
     @property
     def known(self) -> bool:
-        """There is an estimate."""
+        """Whether there is an estimate."""
         return bool(self._exchanges)
 
     @property
@@ -98,7 +98,7 @@ class VehicleClock:
         return self._base_us + (self._offset + self._slope * (t_us - self._middle_us))
 
     def ours(self, vehicle_us: int, t_us: int, wrap_us: int = 0) -> int:
-        """Return our time at which the vehicle's clock stood at `vehicle_us`; at most `t_us`.
+        """Return our time at which the vehicle's clock showed `vehicle_us`; at most `t_us`.
 
         Parameters
         ----------
@@ -107,7 +107,7 @@ class VehicleClock:
         t_us : int
             When the message came.
         wrap_us : int
-            The time's field starts again from 0 after this long; 0 is never.
+            us after which the message's time field wraps to 0; 0: never.
         """
         offset_us = round(self.offset_us(t_us))
         if wrap_us:

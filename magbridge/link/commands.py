@@ -12,16 +12,17 @@ from magbridge.mavlink.dialect import MAV_CMD, MAV_RESULT
 __all__ = ["Commands"]
 
 OURS = 60100
-"""The first message id of our dialect: what nobody else on the vehicle can mean."""
+"""The first message id of our dialect: no other component of the vehicle has these messages."""
 AUTOPILOT_VERSION = spec("AUTOPILOT_VERSION").id
 
 
 class Commands:
     """Answers COMMAND_LONG and COMMAND_INT.
 
-    What is addressed to component 0 means whoever can: the bridge then does what only it can do, and never
-    refuses, because a station takes the refusal for the autopilot's. Calibration of the autopilot's own
-    compass (DO_START_MAG_CAL and the like) is the autopilot's business.
+    A command to component 0 is for any component that can execute it. The bridge then executes only what
+    concerns messages of its own dialect and never refuses, because a ground station would take the refusal
+    for the autopilot's. Calibration of the autopilot's own compass (DO_START_MAG_CAL and the like) is the
+    autopilot's business.
 
     Parameters
     ----------
@@ -53,7 +54,7 @@ class Commands:
         }
 
     def handle(self, message: Message, system: int, component: int) -> None:
-        """Obey and acknowledge, if the command is meant for `component` of `system`."""
+        """Execute and acknowledge a command, if it is addressed to `component` of `system`."""
         target = message["target_component"]
         if message["target_system"] not in (0, system) or target not in (0, component):
             return
@@ -115,5 +116,5 @@ class Commands:
 
 
 def whole(value: float) -> int:
-    """Return the integer that a float parameter means; -1, which is no message, where it is none."""
+    """Return a float parameter as an integer; -1, the id of no message, where it is not finite."""
     return int(value) if isfinite(value) else -1

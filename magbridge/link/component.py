@@ -1,4 +1,4 @@
-"""The bridge as a MAVLink component: what it answers, and what it says of its own accord."""
+"""The bridge as a MAVLink component: what it answers, and what it sends unasked."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class Component:
     publish : mapping of str to float
         ``[publish]``: rates in Hz; a message that is not named is off.
     tunables : iterable of Tunable
-        What else can be tuned: other rooms' rows.
+        What can be tuned besides the messages' rates.
     start_us : int
         Event time of the start, in us; a multiple of 4.
     signing : Signing or None
@@ -74,9 +74,9 @@ class Component:
     kept : mapping of str to float
         Parameters that a station changed in an earlier run.
     status : callable
-        Returns what MAG_STATUS says that the component cannot know itself (samples, log, sensor).
+        Returns the part of MAG_STATUS that the component cannot know itself (samples, log, sensor).
     speaking : callable
-        Says whether the sensor speaks: the heartbeat is critical where it does not.
+        Says whether readings come from the sensor: the heartbeat's state is critical where they do not.
 
     Attributes
     ----------
@@ -85,7 +85,7 @@ class Component:
     heard : list of bytes
         Everything that came, as frames for the log (see `TapeReader`); the bridge empties it.
     parameters, rates, announcer, vehicle, publisher
-        The services, for the rooms above.
+        The services, for use by the bridge.
     """
 
     def __init__(
@@ -118,7 +118,7 @@ class Component:
         self._reports = Reports(
             self.outbox, self.vehicle, start_us, version, calibration_id, status, speaking
         )
-        # they follow the clock and not the samples, and a rate of 0 is off
+        # sent at times of the clock, not with the samples; here a rate of 0 is off
         self._by_clock: dict[str, Callable[[], None]] = {
             "HEARTBEAT": self._reports.heartbeat,
             "MAG_STATUS": self._reports.status,
@@ -211,7 +211,7 @@ class Component:
             self.timers.cancel(name)
 
     def _changed(self, parameter: str) -> None:
-        """Obey a parameter that a station changed, where it is a rate."""
+        """Apply a parameter that a station changed, if it is a message's rate."""
         for name, rate in self.rates.items():
             if rate_name(name) == parameter:
                 rate.set(self.parameters[parameter])
@@ -219,7 +219,7 @@ class Component:
                     self._start_timer(name, self.codec.now_us)
 
     def _requestable(self) -> dict[int, Callable[[], bool]]:
-        """Return what REQUEST_MESSAGE can ask for; each says whether there was something to send."""
+        """Return what REQUEST_MESSAGE can ask for: id to a function that sends it, False if it cannot."""
         reports = {**self._by_clock, "AUTOPILOT_VERSION": self._reports.version}
         return {
             **{spec(name).id: partial(always, report) for name, report in reports.items()},
@@ -243,7 +243,7 @@ class Component:
 
 
 def always(report: Callable[[], None]) -> bool:
-    """Send a report, for which there is always something to tell."""
+    """Send a report; return True, because there is always one to send."""
     report()
     return True
 

@@ -21,7 +21,7 @@ LATITUDE_LONGITUDE_ONLY = 0
 
 
 class Fix(msgspec.Struct, frozen=True, gc=False):
-    """A position with its doubt.
+    """A position with its covariance.
 
     Attributes
     ----------
@@ -34,9 +34,9 @@ class Fix(msgspec.Struct, frozen=True, gc=False):
     covariance_nn, covariance_ne, covariance_ee : float
         m^2.
     north, east : float
-        m, from the first position that was taken in.
+        m, from the first GPS position.
     resets : int
-        How often the estimate began anew.
+        How often the estimate has jumped.
     """
 
     time_us: int
@@ -95,7 +95,7 @@ def global_position(outbox: Outbox, fix: Fix, system: int, autopilot: int) -> No
 
 
 def odometry(outbox: Outbox, fix: Fix, system: int, autopilot: int) -> None:  # noqa: ARG001 - it has no target
-    """Send ODOMETRY in the local frame, from the first position taken in; for ArduPilot and PX4."""
+    """Send ODOMETRY in the local frame, from the first GPS position; for ArduPilot and PX4."""
     covariance = [nan] * 21  # the upper triangle of x y z roll pitch yaw, row by row
     covariance[0], covariance[1], covariance[6] = fix.covariance_nn, fix.covariance_ne, fix.covariance_ee
     outbox.send(
@@ -122,7 +122,7 @@ def odometry(outbox: Outbox, fix: Fix, system: int, autopilot: int) -> None:  # 
 
 
 class Kind(NamedTuple):
-    """How a fix is sent, and how often in Hz where nothing else is said; 0 is with every update."""
+    """How a fix is sent, and its default rate in Hz; 0 is with every update."""
 
     send: Callable[[Outbox, Fix, int, int], Any]
     rate: float

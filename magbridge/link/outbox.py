@@ -10,12 +10,12 @@ __all__ = ["Outbox"]
 
 
 class Outbox:
-    """Packs what the services say; the bridge drains it.
+    """Packs and queues what the services send; the bridge drains it.
 
     Attributes
     ----------
     codec : Codec
-        Its ``now_us`` is the time of what is being handled.
+        Its ``now_us`` is the event time that the next frame gets.
     frames : list of (int, bytes)
         Event time in us, frame; in the order in which to send.
     """
@@ -33,6 +33,6 @@ class Outbox:
         self.frames.append((self.codec.now_us, self.codec.frame(layout, payload)))
 
     def drain(self) -> list[tuple[int, bytes]]:
-        """Return what waits, and forget it."""
+        """Return and clear the frames."""
         frames, self.frames = self.frames, []
         return frames

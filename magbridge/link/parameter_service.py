@@ -52,7 +52,7 @@ class ParameterService:
         )
 
     def list(self, message: Message) -> None:  # noqa: ARG002 - every handler takes its message
-        """Begin to send all, one every `PACE_US`; a list already under way begins anew."""
+        """Begin to send all parameters, one every `PACE_US`; a list already under way is begun again."""
         self._listed = 0
         self._timers.every("parameters", PACE_US, self._send_next, self._outbox.codec.now_us)
 
@@ -63,7 +63,7 @@ class ParameterService:
             self._timers.cancel("parameters")
 
     def read(self, message: Message) -> None:
-        """Send one, asked for by index or name; one that does not exist is not ours to answer for."""
+        """Send the parameter asked for by index or name; a request for one that does not exist is ignored."""
         index = message["param_index"]
         names = self._parameters.names
         if index != -1 and message["target_component"] == 0:
@@ -73,7 +73,7 @@ class ParameterService:
             self.send(name)
 
     def write(self, message: Message) -> None:
-        """Set one, and answer with the value that holds afterwards."""
+        """Set a parameter, and answer with the value that it has afterwards."""
         name, value = message["param_id"], message["param_value"]
         row = self._parameters.table.get(name)
         if row is None:

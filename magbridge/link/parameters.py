@@ -23,7 +23,7 @@ class Tunable(msgspec.Struct, frozen=True):
     key : str
         In the configuration.
     default, low, high : float
-        In `unit`; `low` and `high` are allowed.
+        In `unit`; `low` and `high` are the limits, themselves allowed.
     doc : str
         One line.
     """
@@ -102,15 +102,15 @@ def rates(defaults: Mapping[str, float], limits: Mapping[str, tuple[float, float
 
 
 def real32(value: float) -> float:
-    """Return `value` as it looks after a journey in a REAL32."""
+    """Return `value` rounded to float32, as a message carries it."""
     return float(unpack("<f", pack("<f", value))[0])
 
 
 class Parameters:
     """The values of a table of tunables.
 
-    A value that was never set is the default exactly, not its REAL32: so a bridge that nobody tunes computes
-    with the configuration's own numbers.
+    A value that was never set is exactly the default, not rounded to float32, so that a bridge that nobody
+    tunes computes with the configuration's own numbers.
 
     Attributes
     ----------
@@ -153,5 +153,5 @@ class Parameters:
         return True
 
     def restore(self, values: Mapping[str, float]) -> list[str]:
-        """Set what was kept; return the names that no longer exist or fit."""
+        """Set the values kept from an earlier run; return the names that no longer exist or fit."""
         return [name for name, value in values.items() if name not in self.table or not self.set(name, value)]

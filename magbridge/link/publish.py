@@ -20,7 +20,7 @@ NAMED, VECTOR = spec("NAMED_VALUE_FLOAT"), spec("DEBUG_VECT")
 MAGNETOMETER = 0x1C0
 """HIGHRES_IMU.fields_updated: xmag, ymag, zmag."""
 GAUSS = 1e-5
-"""in 1 nT"""
+"""Gauss in 1 nT."""
 MASK = 0xFFFFFFFF
 SATURATED, COUNTS = int(MAG_RAW_FLAGS.SATURATED), int(MAG_RAW_FLAGS.COUNTS)
 SEQUENCE, POWER_CYCLE = int(MAG_RAW_FLAGS.SEQUENCE), int(MAG_RAW_FLAGS.POWER_CYCLE)
@@ -39,7 +39,7 @@ class Sample(msgspec.Struct, frozen=True, gc=False):
     time_us : int
         us, our time of the corrected sample.
     telemetry_age : float
-        s, of the oldest parameter in the correction; NaN where none went in.
+        s, of the oldest parameter in the correction; infinite where one never came.
     anomaly : float
         nT above the main field; NaN where the position is not known.
     """

@@ -1,4 +1,4 @@
-"""What the bridge says of itself: heartbeat, status, version."""
+"""What the bridge reports of itself: heartbeat, status, version."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ CAPABILITIES = (
 
 
 class Condition(NamedTuple):
-    """What MAG_STATUS says that the rooms above know; fields, units and states as in the message."""
+    """The part of MAG_STATUS that the link cannot know itself; fields, units and states as in the message."""
 
     samples: int = 0
     samples_lost: int = 0
@@ -65,7 +65,7 @@ class Reports:
     status : callable
         Returns the Condition.
     speaking : callable
-        Says whether the sensor speaks.
+        Says whether readings come from the sensor.
     """
 
     def __init__(
@@ -83,7 +83,7 @@ class Reports:
         self._start_us, self._version, self._calibration_id = start_us, version, calibration_id
 
     def heartbeat(self) -> None:
-        """Send HEARTBEAT: active while the sensor speaks, else critical."""
+        """Send HEARTBEAT: active while readings come from the sensor, else critical."""
         self._outbox.put(HEARTBEAT, ALIVE if self._speaking() else CRITICAL)
 
     def status(self) -> None:
@@ -127,6 +127,6 @@ class Reports:
         )
 
     def sample_interval_us(self) -> int:
-        """Return the us between samples of late; 0 while not known."""
+        """Return the recent mean interval between samples in us; 0 while unknown."""
         rate = self._status().sample_rate
         return round(1e6 / rate) if rate > 0 else 0

@@ -19,7 +19,7 @@ class Kept(msgspec.Struct, frozen=True):
     Attributes
     ----------
     parameters : dict of str to float
-        Values that are not the configuration's.
+        Values that differ from the configuration's.
     signing_timestamp : int
         The last that was used (10 us since 2015-01-01).
     """
@@ -45,7 +45,7 @@ def load(path: str | Path) -> Kept:
 
 
 def save(path: str | Path, kept: Kept) -> None:
-    """Write the file, whole or not at all, and onto the disk: the next moment may be a power cut."""
+    """Write the file, whole or not at all, and sync it to the disk: power may be cut at any moment."""
     with atomic_path(path) as beside, beside.open("wb") as file:
         file.write(msgspec.json.format(msgspec.json.encode(kept), indent=2))
         file.flush()

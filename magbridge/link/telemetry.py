@@ -58,7 +58,7 @@ class Extractor:
 
 
 def find(layout: Spec, name: str, path: Path, key: str) -> Field:
-    """Return the field `name` of a message, or say which there are."""
+    """Return the field `name` of a message; the error for a name that it lacks lists those it has."""
     try:
         return layout.fields[name]
     except KeyError:
@@ -102,7 +102,7 @@ class TelemetryMap:
             self._times[layout.id] = own_time(layout)
 
     def values(self, message: Message, t_us: int, clock: VehicleClock) -> list[Value]:
-        """Return ``(name, value, time in us)`` of every parameter that `message`, come at `t_us`, carries.
+        """Return ``(name, value, time in us)`` of every parameter in `message`, received at `t_us`.
 
         The time is the message's own where it has one and the autopilot's clock is known, else `t_us`. A
         value that the sender marks as not known is NaN.
@@ -130,7 +130,7 @@ class TelemetryMap:
 
 
 def own_time(layout: Spec) -> Callable[[bytes], tuple[int, int]] | None:
-    """Return a function that reads a message's own time, and after how many us it wraps; None without."""
+    """Return a function that reads a message's own time and the us after which it wraps, or None."""
     for name, unit_us in (("time_boot_ms", 1000), ("time_usec", 1)):
         field = layout.fields.get(name)
         if field is None:

@@ -10,10 +10,10 @@ FOREVER = 1 << 62
 
 
 class Timers:
-    """Fires what is due, each at its own deadline and in the order of the deadlines.
+    """Calls the actions that are due, each with its own deadline and in the order of the deadlines.
 
-    Nothing depends on when :meth:`advance` is called, only on the times it is given: a replay, which wakes at
-    other moments, fires the same timers at the same times.
+    The result depends only on the times given to :meth:`advance`, not on when it is called: a replay, which
+    calls it at other moments, fires the same timers at the same times.
     """
 
     def __init__(self) -> None:
@@ -31,7 +31,7 @@ class Timers:
         self._set(name, time_us, 0, action)
 
     def cancel(self, name: str) -> None:
-        """Forget a timer, if there is one."""
+        """Remove a timer, if there is one."""
         self._deadlines.pop(name, None)
         if name == self._next:
             self._sort()
@@ -55,6 +55,6 @@ class Timers:
             self._sort()
 
     def _sort(self) -> None:
-        """Find which is next; of two at one time the one that was set first."""
+        """Find the next timer; of two with the same deadline, the one that was set first."""
         self._next = min(self._deadlines, key=self._deadlines.__getitem__, default="")
         self.next_deadline = self._deadlines.get(self._next, FOREVER)

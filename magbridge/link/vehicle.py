@@ -14,16 +14,16 @@ HEARTBEAT = spec("HEARTBEAT").id
 ABSENT_US = 5_000_000
 """us without a heartbeat after which the autopilot counts as gone."""
 BACK_MS = 1_000
-"""ms that ``time_boot_ms`` goes back before it is more than packets out of order."""
+"""ms by which ``time_boot_ms`` must go back to mean more than packets out of order."""
 BELIEVED = 3
-"""Messages in a row from the new boot clock before it is believed: one may be a straggler."""
+"""Messages in a row from a new boot clock before it is believed: a single one may just be late."""
 WINDOW = 64
-"""Frames by which one may come late and still be told from one that was lost."""
+"""Frames by which one may come late and no longer count as lost."""
 ALL = (1 << WINDOW) - 1
 LEAP_MS = 10_000
-"""ms that it runs ahead of ours before it is another's."""
+"""ms by which ``time_boot_ms`` may run ahead of our clock before it counts as another autopilot's."""
 TWICE, CHANGES_US = 5, 10_000_000
-"""So many changes between two boot clocks in so many us, and there are two autopilots."""
+"""This many changes between two boot clocks within this many us mean that there are two autopilots."""
 BOOT_TIMES = {
     number: spec(number).fields["time_boot_ms"]
     for number, row in MESSAGES.items()
@@ -75,7 +75,7 @@ class Vehicle:
         return True
 
     def _stranger(self, message: Message) -> None:
-        """Tell of another vehicle; a ground station is none."""
+        """Announce another vehicle on the link; a ground station is not a vehicle."""
         if message.id != HEARTBEAT:
             return
         if message["type"] != MAV_TYPE.GCS and message["autopilot"] != MAV_AUTOPILOT.INVALID:
@@ -86,7 +86,7 @@ class Vehicle:
             )
 
     def _count(self, sequence: int) -> None:
-        """Count what is missing; a packet that comes late, out of order, is not; a duplicate is nothing."""
+        """Count lost frames; one that comes late is no longer counted, and a duplicate changes nothing."""
         if self._sequence is None:
             self._sequence = sequence
         ahead = (sequence - self._sequence + 128) % 256 - 128
@@ -94,7 +94,7 @@ class Vehicle:
             self.frames_lost -= not self._seen >> -ahead & 1
             self._seen |= 1 << -ahead
             return
-        # far behind: the sender began anew
+        # far behind: the sender restarted
         self.frames_lost += max(ahead - 1, 0)
         self._seen = (self._seen << ahead | 1) & (1 << WINDOW) - 1 if ahead > 0 else ALL
         self._sequence = sequence
@@ -111,7 +111,7 @@ class Vehicle:
         self._announcer.state("autopilot", f"{who} is silent", MAV_SEVERITY.WARNING)
 
     def _watch_boot(self, boot_ms: int, t_us: int) -> None:
-        """Tell a reboot from stragglers, and from a second autopilot with its own boot clock."""
+        """Distinguish a reboot from late packets, and from a second autopilot with its own boot clock."""
         elapsed_ms = (t_us - self._boot_us) // 1000
         # modulo 2^32 ms and signed, so that the wrap after 50 days is a step forward
         ahead_ms = (boot_ms - self._boot_ms + (1 << 31)) % (1 << 32) - (1 << 31)

@@ -11,8 +11,8 @@ from magbridge.mavlink.signing import Signing
 __all__ = ["WINDOW", "Codec"]
 
 WINDOW = 4096
-"""bytes without a frame after which they are given up, whatever may have begun in them: memory
-stays bounded."""
+"""Most bytes that are kept without a whole frame; then they are skipped, even if a frame may have begun in
+them, so that memory stays bounded."""
 
 
 class Codec:
@@ -23,12 +23,12 @@ class Codec:
     system, component : int
         Our own, in what we send.
     signing : Signing or None
-        With it everything sent is signed and nothing unsigned taken.
+        With it, every frame sent is signed, and frames without a valid signature are refused.
 
     Attributes
     ----------
     now_us : int
-        Event time that signatures carry; whoever feeds or sends sets it.
+        Event time for the signatures; the caller sets it before it parses or sends.
     frames, bytes_skipped : int
         Messages accepted, bytes that belonged to no frame.
     """

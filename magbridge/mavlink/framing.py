@@ -41,7 +41,7 @@ def frame_end(data: bytes, start: int, stop: int, gap: int = 0, *, last: bool = 
     Parameters
     ----------
     data : bytes
-        What came; ``data[start]`` is a magic byte.
+        Bytes received; ``data[start]`` is a magic byte.
     start, stop : int
         Look at no more than ``data[start:stop]``.
     gap : int
@@ -52,7 +52,7 @@ def frame_end(data: bytes, start: int, stop: int, gap: int = 0, *, last: bool = 
     Returns
     -------
     int
-        The end, or `NOT_A_FRAME`, or `MORE` where `stop` came too early to tell.
+        The end, or `NOT_A_FRAME`, or `MORE` where it cannot be told without the bytes from `stop` on.
     """
     available = stop - start
     head = 10 if data[start] == V2 else 6

@@ -1,4 +1,4 @@
-"""What a message looks like on the wire, and a received one."""
+"""The layout of messages on the wire, and a received message."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ REFUSED = -2
 """`Message.id` of a frame whose signature is missing, wrong or old."""
 
 TURN_E7 = 3_600_000_000
-"""1e-7 deg of a full circle."""
+"""A full circle in 1e-7 deg."""
 IDS = {name: number for number, (name, _, _) in MESSAGES.items()}
 
 
@@ -35,7 +35,7 @@ class Field:
     code : str
         As in :mod:`struct`; ``s`` is text, ``B`` with a count is bytes.
     invalid : int or None
-        The value that says that the sender does not know; NaN says so in any float.
+        The value that means "not known"; in a float field, NaN always does.
     """
 
     __slots__ = ("code", "count", "invalid", "name", "offset", "struct", "unit")
@@ -72,7 +72,8 @@ class Spec:
     number : bytes
         The id as it stands on the wire.
     extra : bytes
-        The byte that the checksum is closed with: two dialects that differ do not understand each other.
+        CRC_EXTRA, the last byte that the checksum covers: it differs between different layouts, so that a
+        receiver with another layout refuses the frame.
     size : int
         bytes of a full payload.
     struct : Struct

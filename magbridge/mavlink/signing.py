@@ -56,7 +56,7 @@ class Signing:
     key : bytes
         32 bytes.
     last : int
-        The last time stamp used, kept from the run before, so that a clock set back does not make ours old.
+        The last time stamp used in the run before, so that ours increase even if the clock was set back.
 
     Attributes
     ----------
@@ -89,7 +89,7 @@ class Signing:
             return False
         stamp = int.from_bytes(frame[-12:-6], "little")
         key = (frame[-13], *stream)
-        # a new stream may be a minute behind, not more: it would be a recording
+        # a new stream may be a minute behind; an older one may be a recording that is sent again
         floor = self._streams.get(key, max(self.last, timestamp(t_us)) - MINUTE)
         if stamp <= floor:
             return False

@@ -1,9 +1,9 @@
 """Every byte of a link as frames in a log, and back again.
 
-A log must be readable by any MAVLink tool and still hold everything that came: frames go in as they are,
-bytes that belong to none wrapped in MAG_LINK_BYTES. Where the parser had to look at bytes beyond the frame
-that it gave out, to see that something before it was no frame, these go in as well, marked *ahead*: fed with
-them, a replay's parser comes to the same end at the same time.
+A log must be readable by any MAVLink tool and still hold every byte received: frames are logged as they are,
+bytes that belong to none are wrapped in MAG_LINK_BYTES. Where the parser needed bytes beyond the frame that
+it returned, to see that something before it was no frame, these bytes are logged as well, marked *ahead*:
+with them, a replay's parser returns the same messages at the same time.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ SIZE = WRAPPER.fields["data"].count
 
 
 class TapeWriter:
-    """Turns what a codec gave into frames for the log."""
+    """Turns the messages that a codec returned into frames for the log."""
 
     def __init__(self, system: int, component: int) -> None:
         self._codec = Codec(system, component)
@@ -46,7 +46,7 @@ class TapeWriter:
 
 
 class TapeReader:
-    """The inverse: feed it the frames of a log, and it returns the bytes that came at that moment."""
+    """The inverse of :class:`TapeWriter`: turns frames of a log into the bytes received at that moment."""
 
     def __init__(self) -> None:
         self._fed = 0  # bytes given out beyond the last record that was not ahead

@@ -48,7 +48,7 @@ def pack_record(time_us: int, channel: int, frame: bytes) -> bytes:
 
 
 class LogReader:
-    """Reads the records of a log and passes over what is damaged.
+    """Reads the records of a log and skips damaged bytes.
 
     A record counts when its frame's checksum is right (for a message outside the dialect: when another record
     follows it) and its stamp lies before 2112. Memory does not grow with the file.
@@ -58,9 +58,9 @@ class LogReader:
     records : int
         Records read so far.
     bytes_skipped : int
-        Bytes so far that belonged to none.
+        Bytes so far that belonged to no record.
     damages : int
-        Places where they stood.
+        Number of places with such bytes.
     """
 
     def __init__(self, file: BinaryIO) -> None:

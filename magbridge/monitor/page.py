@@ -26,19 +26,19 @@ from magbridge.monitor.words import FLAGS, ago, health, measured, silence, where
 __all__ = ["serve"]
 
 BREAK = 10.0
-"""s without a sample that interrupt the curve, unless the one before was as late."""
+"""s without a sample that interrupt the curve, unless the interval before was at least a third as long."""
 TUNABLES = {one.name: one for one in alignment(Align())}
-"""What every bridge has: a PARAM_VALUE tells neither unit nor range."""
+"""Parameters that every bridge has, with the unit and range that a PARAM_VALUE does not carry."""
 INK, BLUE, GREEN, AMBER, RED = "#1e293b", "#1d4ed8", "#15803d", "#b45309", "#b91c1c"
 LINE = {"type": "line", "symbol": "none", "animation": False, "color": BLUE}
 BAND = {**LINE, "stack": "band", "stackStrategy": "all", "lineStyle": {"opacity": 0}}
 ROOM, LEAST = 5.0, 50.0
-"""The band gets no more of the chart, each way, than ROOM times the curve and LEAST nT: else the
-curve is a line."""
+"""Above and below the curve, the axis leaves at most `ROOM` times the curve's range plus `LEAST` nT for the
+band: with more, the curve would look like a straight line."""
 ROUND = {"showMinLabel": False, "showMaxLabel": False}
-"""The ends of an axis are where they are, and would be written over the round number beside them."""
+"""No labels at the ends of an axis: they would be written over the round numbers beside them."""
 APART = "value => value.toLocaleString('en').replaceAll(',', '\N{NARROW NO-BREAK SPACE}')"
-"""Thousands, as everywhere on the page."""
+"""Separates thousands, as everywhere on the page."""
 CHART: dict[str, Any] = {
     "useUTC": True,
     "grid": {"left": 70, "right": 32, "top": 12, "bottom": 28},
@@ -65,7 +65,7 @@ def serve(link: str, baudrate: int, host: str, port: int, *, show: bool) -> None
     station.start()
     print(f"listening on {link}; the page is http://{host}:{port}", file=sys.stderr)
     options: dict[str, Any] = {"title": "magbridge", "favicon": "🧲", "show_welcome_message": False}
-    with suppress(KeyboardInterrupt):  # as it is told: until interrupted
+    with suppress(KeyboardInterrupt):  # Ctrl-C is how it ends
         ui.run(partial(Page, station), host=host, port=port, show=show, reload=False, **options)
 
 
@@ -213,7 +213,7 @@ class Page:
             self._chart.update()
 
     def _new(self, key: str, value: Any, box: ui.element | None = None) -> bool:
-        """Return whether `value` is not what this browser shows already; empty the `box` that showed it."""
+        """Return whether `value` is new to this browser; if so, empty the `box` that showed the old one."""
         new = key not in self._shown or bool(self._shown[key] != value)
         self._shown[key] = value
         if new and box is not None:

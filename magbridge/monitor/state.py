@@ -14,20 +14,20 @@ from magbridge.records import Quality
 __all__ = ["Parameter", "Point", "State", "Text"]
 
 BRIDGES = {spec(name).id for name in ("MAG_RAW", "MAG_FIELD", "MAG_STATUS")}
-"""Who sends one of these is a bridge."""
+"""A component that sends one of these is a bridge."""
 HOLD = 3.0
-"""s; a flag that comes and goes faster than this stands."""
+"""s for which a flag is still shown after it was last set."""
 WINDOW, BUCKET = 600.0, 1.0
-"""s of field that are kept, and that become one point."""
+"""s of total field that are kept, and s of them that make one point."""
 RETRY = 1.5
-"""s until what was not answered is asked again."""
+"""s after which a request without an answer is repeated."""
 WAITING = "no answer yet"
 AWAY = 30.0
 """s of silence after which another bridge that is heard takes its place."""
 
 
 class Text(NamedTuple):
-    """What the bridge said: when (s), how serious, in what words."""
+    """A text of the bridge: when it came (s), its MAV_SEVERITY, its words."""
 
     time: float
     severity: int
@@ -47,7 +47,7 @@ class Point:
 
 @dataclass
 class Parameter:
-    """A value as the bridge last told it, what was asked for instead (and when), and why it is not so."""
+    """A parameter: value last received, value requested (and when), and why the request was not granted."""
 
     index: int
     value: float
@@ -57,7 +57,7 @@ class Parameter:
 
 
 class State:
-    """All that a page shows of a bridge: the first that is heard, until it is silent for long.
+    """All that a page shows of one bridge: the first heard; another only once that was silent for `AWAY`.
 
     Times are the receiver's, s since 1970.
 
@@ -70,11 +70,11 @@ class State:
     interval : float
         s between its last two MAG_FIELDs; 0 before the second.
     received, lost : int
-        Its messages, and those missing by its own numbering.
+        Its messages received, and those missing by their sequence numbers.
     field, status, navigation : dict
         The last MAG_FIELD, MAG_STATUS and MAG_NAVIGATION; empty before the first.
     flags : dict of str to tuple of 2 float
-        The flags that stand, by their public names: since when, and when last seen.
+        The flags shown, by their public names: since when, and when last set.
     trace : deque of Point
         The last ten minutes of total field.
     texts : deque of Text
@@ -94,7 +94,7 @@ class State:
         self._handlers[spec("PARAM_VALUE").id] = self._value
 
     def _begin(self) -> None:
-        """Know nothing of any bridge."""
+        """Forget everything, as before any bridge was heard."""
         self.bridge: tuple[int, int] | None = None
         self.heard = self.sampled = -inf
         self.interval = 0.0
@@ -121,14 +121,14 @@ class State:
         if sender != self.bridge or not message.known:
             return
         gap = (message.sequence - self._sequence - 1) % 256
-        self.lost += gap if gap < 128 else 0  # more is one that comes late
+        self.lost += gap if gap < 128 else 0  # a larger step is a message that comes late
         self._sequence, self.heard = message.sequence, now
         self.received += 1
         if handle := self._handlers.get(message.id):
             handle(message, now)
 
     def due(self, now: float) -> list[tuple[str, dict[str, Any]]]:
-        """Return the messages to send at `now`: our heartbeat, and what is still to be asked."""
+        """Return the messages to send at `now`: our heartbeat, and requests not yet answered."""
         requests: list[tuple[str, dict[str, Any]]] = []
         if now - self._beat >= 1.0:
             self._beat = now
@@ -180,7 +180,7 @@ class State:
 
     def _status(self, message: Message, _: float) -> None:
         before, self.status = self.status.get("uptime", 0), message.fields
-        if self.status["uptime"] < before:  # it began anew, perhaps with other parameters
+        if self.status["uptime"] < before:  # the bridge restarted, perhaps with other parameters
             self.parameters.clear()
             self._count = 0
 

@@ -11,8 +11,8 @@ from magbridge.monitor.state import State
 __all__ = ["FLAGS", "ago", "health", "measured", "silence", "whereabouts"]
 
 SILENT, SLOW = 3.0, 30.0
-"""s; a bridge speaks every second, a slow sensor less often: three of its intervals, but no more
-than `SLOW`."""
+"""s of silence that are reported: `SILENT` of the bridge, which sends every second; of the field three sample
+intervals, at least `SILENT` and at most `SLOW`."""
 FLAGS = {
     "stale_telemetry": "A parameter of the calibration is old, missing or NaN",
     "extrapolated": "A parameter is outside the calibrated range",
@@ -41,7 +41,7 @@ def ago(seconds: float) -> str:
 
 
 def silence(state: State, now: float) -> str:
-    """Return what is wrong with the stream; nothing while it flows."""
+    """Return what is wrong with the stream; an empty text while messages and field come."""
     slow = max(SILENT, min(3 * state.interval, SLOW))
     for what, when, limit in (("nothing", state.heard, SILENT), ("no field", state.sampled, slow)):
         if now - when > limit:
@@ -50,7 +50,7 @@ def silence(state: State, now: float) -> str:
 
 
 def measured(state: State) -> dict[str, tuple[str, str]]:
-    """Return the field in nT: of each quantity its value and its 2-sigma."""
+    """Return the field in nT: name of each quantity to its value and its 2-sigma, as texts."""
     get = state.field.get
     shown = {"Total field": _number(get("total_field", nan), ".2f", 2 * get("total_field_sigma", nan))}
     shown["Anomaly"] = _number(get("anomaly", nan), "+.2f")
@@ -60,7 +60,7 @@ def measured(state: State) -> dict[str, tuple[str, str]]:
 
 
 def health(state: State) -> dict[str, tuple[str, bool]]:
-    """Return how the bridge is: of each thing a word, and whether it is well."""
+    """Return the bridge's condition: name of each item to its text, and whether it is in order."""
     field, get = state.field.get, state.status.get
     sensor, autopilot = (MAG_PORT_STATE(get(f"{line}_state", 0)) for line in ("sensor", "autopilot"))
     log = MAG_LOG_STATE(get("log_state", 0))
@@ -86,7 +86,7 @@ def health(state: State) -> dict[str, tuple[str, bool]]:
 
 
 def whereabouts(state: State) -> dict[str, tuple[str, bool]]:
-    """Return what the position filter says: of each thing a word, and whether it is well."""
+    """Return the position filter's condition: name of each item to its text, and whether it is in order."""
     get = state.navigation.get
     mode = MAG_NAVIGATION_STATE(get("state", 0))
     nn, ne, ee = (get(f"covariance_{axes}", nan) for axes in ("nn", "ne", "ee"))
@@ -113,7 +113,7 @@ def _count(count: int) -> str:
 
 
 def _number(value: float, form: str, two_sigma: float = nan, unit: str = "") -> tuple[str, str]:
-    """Return a value with its unit, thousands apart, and its 2-sigma; a dash and nothing where not known."""
+    """Return a value with its unit, thousands separated, and its 2-sigma; a dash and nothing if unknown."""
     apart = form.replace(".", ",.")
     text, doubt = (
         told.replace(",", "\N{NARROW NO-BREAK SPACE}").rstrip()
