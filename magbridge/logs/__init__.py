@@ -1,13 +1,13 @@
-"""Deployments in and out: one module a format, one table of them.
+"""Deployments in and out: one module per format, and one table of them.
 
 A deployment is an ``xarray.Dataset`` on ``time`` (:mod:`magbridge.columns`). A row is one time of the
-magnetometer; every other column holds what was known at that time:
+magnetometer sample; every other column holds what was known at that time:
 
 - logs of a live link (``.tlog``, ``.BIN``, ``.ulg``): the last value received at or before the row, NaN
   before the first and when it is older than 30 s. This is what the bridge itself would have known, so a
-  calibration learns from a log what it will meet live;
-- logs that were put together ashore (Slocum, Seaglider): linear between neighbours, headings on the circle,
-  NaN across gaps.
+  calibration is fitted to the same kind of data as it will correct live;
+- logs that were assembled ashore (Slocum, Seaglider): interpolated linearly, headings on the circle, NaN
+  across gaps.
 
 Each module has ``chunks(path, rows)``, which yields deployments of at most `rows` rows in the order of the
 file, and, where the format can be written, ``FileWriter(path)`` with ``append(dataset, first=...)`` and
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 __all__ = ["FORMATS", "Writer", "read", "read_chunks", "suffixes", "write"]
 
 FLIGHT = {".ebd": ".dbd", ".nbd": ".mbd", ".tbd": ".sbd", ".ecd": ".dcd", ".ncd": ".mcd", ".tcd": ".scd"}
-"""A Slocum's science file to the flight file of the same name: whoever reads one reads both."""
+"""Suffix of a Slocum's science file to that of its flight file: where both are there, both are read."""
 
 READ_ONLY = {
     ".bin": "magbridge.logs.ardupilot",
@@ -58,7 +58,7 @@ Paths = str | os.PathLike[str] | Sequence[str | os.PathLike[str]]
 
 @cache
 def _formats() -> dict[str, str]:
-    """Return :data:`FORMATS`, and what packages add."""
+    """Return :data:`FORMATS`, and the formats that packages add."""
     plugins = {f".{point.name.lower()}": point.value for point in entry_points(group="magbridge.formats")}
     return {**plugins, **FORMATS}
 
@@ -122,12 +122,12 @@ def read(paths: Paths, *, required: Iterable[str] = ()) -> xr.Dataset:
     xarray.Dataset
         On ``time``; each variable float64 with ``units`` and ``long_name``. Attributes: ``source`` (the
         file's name, and what it says of its own source), ``heading_reference`` where it is not true north,
-        and counts of what was passed over (``duplicate_rows`` ...).
+        and counts of what was skipped (``duplicate_rows`` ...).
 
     Raises
     ------
     FormatError
-        A file that does not say what it should: names file, row, column and what was expected.
+        A file whose content is wrong: names file, row, column and what was expected.
     MissingExtra
         The format needs a package that is not installed.
     """
@@ -142,7 +142,7 @@ def read_chunks(paths: Paths, rows: int = 65536, *, required: Iterable[str] = ()
     """Yield what :func:`read` returns in pieces of about `rows` rows, in bounded memory.
 
     Every piece has the same columns. CSV, netCDF, Parquet and ``.tlog`` are streamed; files of the other
-    formats are held one at a time. Of files that overlap in time, one piece each is held.
+    formats are held in memory one at a time. Of files that overlap in time, one piece each is held.
 
     Raises
     ------

@@ -1,12 +1,12 @@
 """ArduPilot's own logs (``.BIN``), through pymavlink.
 
 A row is a sample of the first magnetometer that the log has; every other column is the last value before it.
-The log holds the field after the autopilot's offsets and motor compensation; both are in it too and are taken
-off again, so ``mag_x`` is the raw channel (mG, so steps of 100 nT). Scale factors in ``COMPASS_DIA`` and
-``COMPASS_ODI`` are not.
+The log holds the field with the autopilot's offsets and motor compensation applied; these are in the log,
+too, and are subtracted again, so ``mag_x`` is the raw channel (mG, so steps of 100 nT). The scale factors in
+``COMPASS_DIA`` and ``COMPASS_ODI`` are not undone.
 
 Time is UTC once the log has a GPS fix; a log without one counts from the boot, and says so in the attribute
-``time_reference = "boot"``. What is damaged is passed over and counted in ``bytes_skipped``.
+``time_reference = "boot"``. Damaged bytes are skipped and counted in ``bytes_skipped``.
 
 References
 ----------
@@ -55,7 +55,7 @@ INSTANCE = ("I", "Instance")
 EPOCH_GPS = 315_964_800
 WEEK = 604_800
 LEAP = ((1_483_228_800, 18), (1_435_708_800, 17), (1_341_100_800, 16), (0, 15))
-"""From this UTC on, by so many s GPS time is ahead."""
+"""UTC (s) from which GPS time is ahead of UTC by this many s."""
 
 
 KINDS = {f"{name}{k}" for name in ("MAG", *FIELDS) for k in ("", "2", "3")}
@@ -66,7 +66,7 @@ COLUMNS = {
 }
 NUMBERS = (int, float)
 DAMAGE = (AttributeError, LookupError, RecursionError, TypeError, ValueError, struct.error)
-"""What pymavlink raises where a record, or the one that describes it, is not what it should be."""
+"""What pymavlink raises where a record, or its FMT record, is damaged."""
 
 
 def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
@@ -98,7 +98,7 @@ def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
             for column, field, unit, factor in fields:
                 name = column.replace("#", str(number + 1) if number else "")
                 if field not in table or name in columns or (record == "RCOU" and not np.any(table[field])):
-                    continue  # an output that is always 0 does not exist
+                    continue  # an output that is always 0 is not in use
                 columns[name] = latest(time, when, table[field] * factor)
                 units[name] = unit
     attrs: dict[str, Any] = {"bytes_skipped": skipped}
@@ -108,7 +108,7 @@ def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
 
 
 def _field(mag: dict[str, Floats], prefix: str) -> dict[str, Floats]:
-    """Raw channels: what the log holds, less the offsets and the motor compensation that are in it."""
+    """Return the raw channels in nT: the logged field less the offsets and the motor compensation."""
     return {
         f"{prefix}_{axis.lower()}": NT_PER_MG
         * (mag[f"Mag{axis}"] - mag.get(f"Ofs{axis}", 0) - mag.get(f"MO{axis}", 0))
@@ -119,7 +119,7 @@ def _field(mag: dict[str, Floats], prefix: str) -> dict[str, Floats]:
 def _instances(
     tables: dict[str, dict[str, Floats]], record: str, offset: float
 ) -> dict[int, tuple[Floats, dict[str, Floats]]]:
-    """Time and fields of each instance of a record, also where its number is in the name (``MAG2``)."""
+    """Return time and fields of each instance of a record, also if its number is in the name (``MAG2``)."""
     found = {}
     for number, name in enumerate((record, f"{record}2", f"{record}3")):
         if (table := tables.get(name)) is None or "TimeUS" not in table:
@@ -134,7 +134,7 @@ def _instances(
 
 
 def _utc_offset(tables: dict[str, dict[str, Floats]]) -> float:
-    """UTC minus time since boot, from the first GPS fix; 0 without one."""
+    """Return UTC minus time since boot in s, from the first GPS fix; 0 without one."""
     gps = tables.get("GPS")
     if gps is None or not {"GWk", "GMS", "TimeUS"} <= gps.keys():
         return 0.0
@@ -155,7 +155,7 @@ def _tables(path: Path) -> tuple[dict[str, dict[str, Floats]], int]:
         raise MissingExtra("pymavlink", "analysis") from None
 
     class Reader(DFReader_binary):  # type: ignore[misc]  # pymavlink is untyped
-        """Record by record: the index stops at the first unknown one, and may not come back from damage."""
+        """Reads record by record: an index would stop at an unknown record, and might never end on damage."""
 
         def init_arrays(self, progress_callback: object = None) -> None:
             pass
@@ -171,14 +171,14 @@ def _tables(path: Path) -> tuple[dict[str, dict[str, Floats]], int]:
                     skipped -= record.fmt.len
                     if record.fmt.name in KINDS:
                         _add(tables.setdefault(record.fmt.name, {}), record)
-            log.offset = max(log.offset, at + 3)  # a damaged description may say that a record has no length
+            log.offset = max(log.offset, at + 3)  # a damaged FMT may give records the length 0
     return {
         name: {field: np.array(table[field]) for field in table} for name, table in tables.items()
     }, skipped
 
 
 def _add(table: dict[str, array[float]], record: Any) -> None:
-    """Append the numbers of a record; one that has not the fields of those before it is damage."""
+    """Append the numbers of a record; one that lacks a field of those before it counts as damaged."""
     kinds = zip(record.fmt.columns, record.fmt.msg_types, strict=False)
     row = {name: float(getattr(record, name)) for name, kind in kinds if name in COLUMNS and kind in NUMBERS}
     if not table:

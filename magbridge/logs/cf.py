@@ -18,11 +18,11 @@ ALL = slice(None)
 
 
 def floats(variable: Any, rows: slice = ALL) -> NDArray[np.float64]:
-    """Return rows of a variable, NaN where the file has nothing.
+    """Return rows of a variable, NaN where a value is missing.
 
-    That is a number which it declares as such, compared as it is stored, before it is unpacked; or where
-    nothing was ever written, which the library fills with a number of its own. A valid range is left aside:
-    one that begins at 0 would turn a depth of -2 cm into nothing.
+    Missing are the values that the variable declares as missing, compared as stored, before unpacking; and
+    those never written, which the library fills with a number of its own. ``valid_range`` is ignored: one
+    that begins at 0 would discard a depth of -2 cm.
     """
     variable.set_auto_maskandscale(False)
     stored = variable[rows]

@@ -29,11 +29,11 @@ __all__ = [
 Floats = NDArray[np.float64]
 
 MEANING = {"heading_reference": "true", "time_reference": "utc"}
-"""Attributes that change what values mean, and what holds where they are absent."""
+"""Attributes that change what values mean, and their defaults."""
 YEAR_10000 = 253_402_300_800.0
-"""s since 1970: a time beyond is in another unit, and no calendar has it."""
+"""s since 1970: a later time is in another unit, and no calendar goes beyond it."""
 MOST = {"latitude": 90.0, **dict.fromkeys(("longitude", "roll", "pitch", "heading"), 540.0), "depth": 1e5}
-"""The most, deg or m, that these may be either way; 4952.3 is degrees and minutes written together."""
+"""Largest magnitude, deg or m, of these columns; 4952.3 is degrees and minutes written together."""
 LEAST = {
     "degC": -273.15,
     "K": 0.0,
@@ -44,10 +44,10 @@ LEAST = {
     "bar": -1.01325,
     "dbar": -10.1325,
 }
-"""No temperature is lower, and no pressure, also one that counts from the surface's: -9999 says
+"""Lowest temperatures and pressures, also of a pressure relative to the surface's: -9999 is a code for
 "not known"."""
 APART = 60.0
-"""s that a channel may be sampled before or after its row."""
+"""s by which a channel's sampling time may differ from its row's time."""
 COUNTERS = {
     "bytes_skipped": ("byte skipped", "bytes skipped"),
     "damages": ("damaged place", "damaged places"),
@@ -55,8 +55,8 @@ COUNTERS = {
     "duplicate_rows": ("duplicate row", "duplicate rows"),
     "rows_dropped": ("row dropped", "rows dropped"),
 }
-"""Attributes that count what reading passed over, and how one and several are called: they add up, and are
-not of the file that is written next."""
+"""Attributes that count what reading skipped, with singular and plural. They are summed over pieces, and are
+not copied to a file that is written."""
 
 
 def deployment(
@@ -78,16 +78,16 @@ def deployment(
     columns : mapping of str to (n,) array of float
         NaN where a row lacks the value.
     units : mapping of str to str, optional
-        Declared unit of a column; one that the table knows is converted to the table's.
+        Declared unit of a column; a column of the table is converted to the table's unit.
     attrs : mapping, optional
         Attributes of the whole, as ``heading_reference``.
     long_names : mapping of str to str, optional
-        What columns mean that the table does not know.
+        Meaning of columns that are not in the table.
 
     Raises
     ------
     FormatError
-        A declared unit that does not fit the column; a ``heading_reference`` that is none.
+        A declared unit that does not fit the column; an unknown ``heading_reference``.
     """
     units, attrs, long_names = units or {}, attrs or {}, long_names or {}
     if (reference := attrs.get("heading_reference", "true")) not in ("true", "magnetic"):
@@ -131,7 +131,7 @@ def sliced(dataset: xr.Dataset, rows: int) -> Iterator[xr.Dataset]:
 def increasing(
     file: str | Path, time: Floats, rows: Sequence[int] | None = None, *, after: float = -np.inf
 ) -> None:
-    """Check that `time` is finite and increases, also from `after`, the last one before it.
+    """Check that `time` is finite and increases, also from `after`, the last time before it.
 
     Raises
     ------
@@ -153,7 +153,7 @@ def increasing(
 
 
 def plausible(file: str | Path, dataset: xr.Dataset, rows: Sequence[int]) -> None:
-    """Check for impossible temperatures and pressures, and what would be taken for another place or moment.
+    """Check for impossible temperatures, pressures, angles, positions, depths and channel times.
 
     Raises
     ------
@@ -195,8 +195,8 @@ def same_columns(dataset: xr.Dataset, like: Mapping[str, Mapping[str, Any]]) -> 
 def join(parts: Sequence[xr.Dataset]) -> xr.Dataset:
     """Return several deployments as one, sorted in time.
 
-    A part that lacks a column has NaN there. Of rows with the same time the first part's stays, filled
-    where it has NaN from those after it; the attribute ``duplicate_rows`` counts what went.
+    A part that lacks a column has NaN there. Of rows with the same time the first part's is kept, its NaNs
+    filled from the later ones; the attribute ``duplicate_rows`` counts the rows dropped.
 
     Raises
     ------
@@ -236,20 +236,20 @@ def join(parts: Sequence[xr.Dataset]) -> xr.Dataset:
 
 
 def uncounted(dataset: xr.Dataset) -> xr.Dataset:
-    """Return the deployment without its counts of what was passed over."""
+    """Return the deployment without the attributes of :data:`COUNTERS`."""
     bare = dataset.copy(deep=False)
     bare.attrs = {name: value for name, value in dataset.attrs.items() if name not in COUNTERS}
     return bare
 
 
 def passed_over(*pieces: Mapping[str, Any]) -> dict[str, int]:
-    """Return what reading passed over, by the attributes of a deployment or its pieces; no zeros."""
+    """Return the :data:`COUNTERS` of a deployment, summed over its pieces; those that are 0 are left out."""
     counts = {name: sum(int(attrs.get(name, 0)) for attrs in pieces) for name in COUNTERS}
     return {name: count for name, count in counts.items() if count}
 
 
 def _first_known(values: Floats, starts: NDArray[np.intp]) -> Floats:
-    """First value that is not NaN of each group of rows that begins at `starts`."""
+    """Return the first value that is not NaN in each group of rows that begins at `starts`."""
     result = values[starts]
     sizes = np.diff(starts, append=len(values))
     for k in range(1, int(sizes.max(initial=1))):

@@ -1,4 +1,4 @@
-"""Several logs as one stream, in time, without holding them whole."""
+"""Several logs as one stream, sorted in time, without holding them whole."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ Open = Callable[[int], Iterator[xr.Dataset]]
 def merge(sources: Sequence[Open], rows: int) -> Iterator[xr.Dataset]:
     """Yield the logs that `sources` open as one deployment in pieces, sorted in time, with the same columns.
 
-    Each log is opened twice: once for its first row, which says when it begins and what columns it has,
-    and once when the stream has come to that time.
+    Each log is opened twice: once for its first row, which gives its start and its columns, and once when the
+    stream has reached that start.
     """
     firsts = [next(source(1)) for source in sources]
     whole = join(firsts)  # also checks that they agree on units and on what heading means
@@ -34,7 +34,7 @@ def merge(sources: Sequence[Open], rows: int) -> Iterator[xr.Dataset]:
             active[k] = piece, pieces
 
     while waiting or active:
-        # up to the horizon no log can bring another row
+        # no log can add another row up to the horizon
         horizon = min((float(piece["time"][-1]) for piece, _ in active.values()), default=np.inf)
         if waiting and waiting[0][0] <= horizon:
             _, k = waiting.pop(0)
@@ -49,5 +49,5 @@ def merge(sources: Sequence[Open], rows: int) -> Iterator[xr.Dataset]:
             else:
                 active[k] = uncounted(piece.isel(time=slice(n, None))), pieces
         piece = join([part for part in parts if part.sizes["time"]])
-        # a file is begun with the first piece, and is to name all that went into it
+        # a file's attributes are those of the first piece, and must name all sources
         yield same_columns(piece, columns).assign_attrs(source=whole.attrs["source"])

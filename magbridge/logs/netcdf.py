@@ -37,7 +37,7 @@ __all__ = ["FileWriter", "chunks"]
 DIMENSION = "N_MEASUREMENTS"
 EPOCH = "seconds since 1970-01-01T00:00:00Z"
 NAMES = {"water_temperature": "TEMP", "water_pressure": "PRES"}
-"""Columns whose name in OG1.0 is not simply ours in capitals."""
+"""Columns whose OG1.0 name is not simply our name in capitals."""
 ATTRIBUTES: dict[str, dict[str, Any]] = {
     "time": {"standard_name": "time", "calendar": "gregorian", "units": EPOCH},
     "latitude": {"standard_name": "latitude", "units": "degrees_north"},
@@ -103,7 +103,7 @@ def _chunks(path: Path, file: Any, rows: int) -> Iterator[xr.Dataset]:
 
 
 def _epoch(path: Path, variable: Any) -> tuple[float, float]:
-    """Seconds since 1970 at which the time variable is 0, and seconds in one of its units."""
+    """Return the s since 1970 at which the time variable is 0, and the s in one of its units."""
     units = getattr(variable, "units", "")
     try:
         dates: Any = netCDF4.num2date([0.0, 1.0], units, only_use_cftime_datetimes=False)
@@ -174,7 +174,7 @@ class FileWriter:
             self._variables[name] = variable
 
     def close(self) -> None:
-        """Bring everything to the file."""
+        """Write everything to the file and close it."""
         with systems_reason(self._path):
             self._file.close()
 

@@ -1,4 +1,4 @@
-"""Parquet: one float64 column a variable, its unit and meaning in the field's metadata."""
+"""Parquet: one float64 column per variable, its unit and meaning in the field's metadata."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ class FileWriter:
         self._writer.write_table(pa.Table.from_arrays(arrays, schema=self._writer.schema))
 
     def close(self) -> None:
-        """Bring everything to the file."""
+        """Write everything to the file and close it."""
         if self._writer is not None:
             self._writer.close()
 

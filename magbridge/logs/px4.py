@@ -2,8 +2,8 @@
 
 A row is a sample of the first ``sensor_mag`` (gauss, as the driver gives it: before PX4's own calibration);
 every other column is the last value before it. ``heading`` is the estimator's yaw. ``depth`` is the local
-position's z, down from where the vehicle was switched on. Time is UTC once a GPS has said it; a log without
-counts from the boot, and says so in the attribute ``time_reference = "boot"``.
+position's z, down from where the vehicle was switched on. Time is UTC if a GPS message in the log gives it;
+otherwise it counts from the boot, and the attribute ``time_reference = "boot"`` says so.
 
 References
 ----------
@@ -54,7 +54,7 @@ NEEDED = {
     "debug_key_value": {"timestamp", "value", "key[0]"},
 }
 UNUSED = ("servo", "esc")
-"""Outputs of which a log has as many as there could be; those that are always 0 do not exist."""
+"""Outputs that a log lists in the largest possible number; those that are always 0 are not in use."""
 OTHERS = ("sensor_mag", "vehicle_attitude", "vehicle_gps_position", "sensor_gps", "debug_key_value")
 
 
@@ -126,7 +126,7 @@ def _telemetry(
 
 
 def _angles(attitude: dict[str, Floats]) -> tuple[Floats, Floats, Floats]:
-    """Roll, pitch and heading in degrees of the quaternion body to north-east-down (w, x, y, z)."""
+    """Return roll, pitch and heading (deg) of the quaternion (w, x, y, z) from body to north-east-down."""
     w, x, y, z = (attitude[f"q[{k}]"] for k in range(4))
     roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
     pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1, 1))
@@ -139,7 +139,7 @@ def _time(table: dict[str, Floats], offset: float) -> Floats:
 
 
 def _utc_offset(topics: dict[str, dict[int, dict[str, Floats]]]) -> float:
-    """UTC minus time since boot, from the first GPS message that knows it; 0 without one."""
+    """Return UTC minus time since boot in s, from the first GPS message that has UTC; 0 without one."""
     for topic in ("vehicle_gps_position", "sensor_gps"):
         for gps in topics.get(topic, {}).values():
             known = np.flatnonzero(gps.get("time_utc_usec", np.zeros(0)) > 0)

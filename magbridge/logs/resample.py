@@ -10,9 +10,9 @@ __all__ = ["CIRCLES", "MAX_AGE", "latest", "linear"]
 Floats = NDArray[np.float64]
 
 MAX_AGE = 30.0
-"""s; what a live listener heard longer ago is not carried to a row."""
+"""s; a value that was received longer ago is not carried to a row."""
 CIRCLES = {"heading": (360.0, 0.0), "longitude": (360.0, -180.0)}
-"""Columns that begin anew, in deg: after how much, and where."""
+"""Columns on a circle: its circumference and its lowest value, in deg."""
 
 
 def latest(at: Floats, time: Floats, values: Floats) -> Floats:
@@ -23,7 +23,7 @@ def latest(at: Floats, time: Floats, values: Floats) -> Floats:
     at : (n,) array
         s, the rows.
     time, values : (m,) array
-        s, increasing or equal, and what was said then; NaN is not a value.
+        s, not decreasing, and the values received then; NaN is no value.
 
     Returns
     -------
@@ -42,20 +42,21 @@ def latest(at: Floats, time: Floats, values: Floats) -> Floats:
 def linear(
     at: Floats, time: Floats, values: Floats, max_gap: float, period: float | None = None, start: float = 0.0
 ) -> Floats:
-    """Return values between their neighbours in time, for what changes smoothly and was measured ashore.
+    """Return values interpolated linearly in time, for quantities that change smoothly.
 
     Parameters
     ----------
     at : (n,) array
         s, the rows.
     time, values : (m,) array
-        s, increasing, and what was measured then; NaN is not a value.
+        s, increasing, and the values measured then; NaN is no value.
     max_gap : float
-        s; between neighbours farther apart, or beyond an end by more, it is NaN.
+        s; the result is NaN between neighbours farther apart, and farther beyond an end. Nearer to an end,
+        the value there is held.
     period : float, optional
-        The values live on a circle of this circumference: 360 for a heading in degrees.
+        Circumference of the circle that the values lie on: 360 for a heading in degrees.
     start : float
-        Where they begin anew on it.
+        Lowest value on that circle.
 
     Returns
     -------

@@ -1,20 +1,20 @@
 """A Seaglider's dive as the basestation writes it: raw compass counts, attitude and the moving masses.
 
-Taken over, and how it was found out (SG167, five dives of 2014, 8 N 85 E: regression of the raw counts on
-IGRF turned by the logged attitude):
+Conventions, and how they were found (SG167, five dives of 2014, 8 N 85 E: regression of the raw counts on
+the IGRF rotated by the logged attitude):
 
 - ``eng_mag_x/y/z`` are x forward, y starboard, z down, as ours: the 3x3 matrix of that regression is the
   identity to 5 % with no element off the diagonal above 0.01;
-- one count is 1 mG = 100 nT: its diagonal is 0.97 to 1.05 counts/mG; the sensor's own calibration
-  is in the rest;
-- ``eng_head`` is magnetic (the file says so, and with it the elements between x and y vanish);
+- one count is 1 mG = 100 nT: the diagonal of that matrix is 0.97 to 1.05 counts/mG; the deviation from 1 is
+  the sensor's own calibration;
+- ``eng_head`` is magnetic (the file says so, and with that the matrix's elements between x and y vanish);
   ``magnetic_variation`` is kept as an attribute, 0.1 deg coarse;
 - ``eng_pitchCtl`` is in cm; ``eng_rollCtl`` in deg (its counts are scaled by ``ROLL_CNV`` = 0.028 deg);
   ``eng_vbdCC`` in cc.
 
-The CTD's temperature, pressure, latitude and longitude are interpolated to the compass samples. The currents
-of the three motors are known as one mean for each manoeuvre; a row within a manoeuvre in which that motor ran
-carries it, any other row 0.
+The CTD's temperature, pressure, latitude and longitude are interpolated to the compass samples. Of each
+motor's current, the file holds one mean per manoeuvre; rows within a manoeuvre in which that motor ran carry
+it, all others 0.
 """
 
 from __future__ import annotations
@@ -103,7 +103,7 @@ def dive(path: Path, file: Any) -> xr.Dataset:
 
 
 def _current(file: Any, motor: str, time: Floats) -> Floats:
-    """Mean current of one motor during the manoeuvres in which it ran."""
+    """Return the mean current (A) of one motor in the manoeuvre at each time; 0 outside manoeuvres."""
     current = np.zeros(len(time))
     starts, ends, amperes = (floats(file[name]) for name in ("gc_st_secs", "gc_end_secs", f"gc_{motor}_i"))
     for start, end, ampere in zip(starts, ends, amperes, strict=True):

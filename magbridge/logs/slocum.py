@@ -1,13 +1,12 @@
 """Slocum gliders: flight ``.dbd .mbd .sbd``, science ``.ebd .nbd .tbd``, compressed ``.dcd`` ... ``.tcd``.
 
-A row is a cycle of the flight computer; what was not updated in a cycle lies linearly between its
-neighbours. The science file of the same name beside a flight file is joined to it, and the other way round:
-either name, or both, give the same deployment. The list of sensors is looked for in the file ``<crc>.cac``
-beside the file.
+A row is a cycle of the flight computer; values that were not updated in a cycle are interpolated linearly.
+The science file of the same name beside a flight file is joined to it, and the other way round: either name,
+or both, give the same deployment. The list of sensors is read from the file ``<crc>.cac`` beside the file.
 
-Angles become degrees; ``heading`` is what the compass says, magnetic. A Slocum logs no vector magnetometer of
-its own: there is no ``mag_x``, and the log serves to drive a simulated one, or beside the log of an
-instrument that rode along.
+Angles are converted to degrees; ``heading`` is the compass's, magnetic. A Slocum logs no vector magnetometer
+of its own, so there is no ``mag_x``: the log can drive a simulated one, or be joined to the log of an
+instrument that was carried along.
 """
 
 from __future__ import annotations
@@ -91,7 +90,7 @@ def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
     if base not in tracks or not len(tracks[base][0]):
         raise FormatError(path, "expected rows, there are none")
     time = tracks[base][0]
-    time = time[np.diff(time, prepend=-np.inf) > 0]  # some files say their first cycle twice
+    time = time[np.diff(time, prepend=-np.inf) > 0]  # some files hold their first cycle twice
     increasing(path, time)
     columns, units = {}, {}
     for theirs, (ours, unit, factor) in SENSORS.items():
@@ -104,7 +103,7 @@ def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
 
 
 def _pair(path: Path) -> tuple[Path | None, Path | None]:
-    """Return the flight and the science file that belong together; None for one that is not there."""
+    """Return the flight and the science file of the same name; None for one that does not exist."""
     suffix = path.suffix
     other = (SCIENCE | FLIGHT)[suffix.lower()]
     partner = path.with_suffix(other.upper() if suffix.isupper() else other)
@@ -113,7 +112,7 @@ def _pair(path: Path) -> tuple[Path | None, Path | None]:
 
 
 def _read(path: Path | None) -> dict[str, tuple[Floats, Floats]]:
-    """Return time and values of every sensor that we know, as they were updated."""
+    """Return time and values of each of :data:`SENSORS` in the file, at its updates."""
     if path is None:
         return {}
     with (

@@ -1,21 +1,22 @@
 """MAVLink telemetry logs (``.tlog``), ours and anyone's, as deployments.
 
 A row is a magnetometer message of the best kind that the log holds
-(:data:`~magbridge.logs.telemetry_fields.SOURCES`), from the sender of most of them; every other column is the
-last value that this vehicle said before it (NaN once older than :data:`~magbridge.logs.resample.MAX_AGE`).
+(:data:`~magbridge.logs.telemetry_fields.SOURCES`), from the component that sent most of them; every other
+column is the last value from this vehicle before it (NaN once older than
+:data:`~magbridge.logs.resample.MAX_AGE`).
 
-- ``MAG_RAW`` (ours): nT as the driver made them of its counts, where the log declares what a count is, else
-  as float32 (0.004 nT at 50,000 nT); time to the µs, channel times, temperature, supply, power cycles. The
+- ``MAG_RAW`` (ours): nT computed from the counts as by the driver, where the log declares the nT per count,
+  else float32 (0.004 nT at 50,000 nT); time to the µs, channel times, temperature, supply, power cycles. The
   ``MAG_FIELD`` that follows it becomes the columns of ``magbridge correct``.
 - ``HIGHRES_IMU`` (gauss), ``RAW_IMU`` and ``SCALED_IMU*`` (mgauss, so steps of 100 nT): in the autopilot's
-  axes, its own offsets already in them; time is the record's stamp. Further magnetometers become ``mag1_x``
+  axes, with its own offsets applied; time is the record's time stamp. Further magnetometers become ``mag1_x``
   ... ``mag3_z``.
-- Without any of these, ``ATTITUDE`` or position makes the rows, and there is no ``mag_x``.
+- Without any of these, each ``ATTITUDE`` or position makes a row, and there is no ``mag_x``.
 
 Telemetry is what the log itself declares by ``MAG_COLUMN`` (a bridge's own, one from :mod:`magbridge.logs`),
 what :data:`~magbridge.logs.telemetry_fields.TELEMETRY` lists, and every ``NAMED_VALUE_FLOAT`` by its name.
-What is damaged is passed over and counted in the attributes ``bytes_skipped`` and ``damages``, a row whose
-time does not increase in ``rows_dropped``.
+Damaged bytes are skipped and counted in the attributes ``bytes_skipped`` and ``damages``; rows whose time
+does not increase are dropped and counted in ``rows_dropped``.
 """
 
 from __future__ import annotations
@@ -66,7 +67,7 @@ def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
 
 
 class Rows:
-    """Messages to rows: keeps the last value of each column, and the rows not yet taken."""
+    """Turns messages into rows: keeps the last value of each column, and the rows not yet taken."""
 
     reader: LogReader
 
@@ -142,14 +143,14 @@ class Rows:
         self.rows.append(row)
 
     def _correct(self, columns: Columns) -> None:
-        """Put the correction into the row of its reading, the last one; the first that comes is its own."""
+        """Add a ``MAG_FIELD`` to the last row, that of its reading, unless the row has one already."""
         row = self.rows[-1]
         if isnan(row[self._slot["total_field"]]):
             for name in CORRECTED:
                 row[self._slot[name]] = columns[name]
 
     def take(self, n: int) -> xr.Dataset:
-        """Return the first `n` rows, and in the attributes what was lost since the last ones."""
+        """Return the first `n` rows; the attributes count the losses since the last call."""
         array, self.rows = np.array(self.rows[:n]), self.rows[n:]
         lost = self.reader.bytes_skipped, self.reader.damages
         attrs = {

@@ -53,7 +53,7 @@ UNITS = {
 }
 UNKNOWN_INT = 0x7FFFFFFF
 UNKNOWN: dict[str, tuple[int, ...]] = {
-    # what these fields hold when their sender does not know, and the dialect does not say so
+    # what these fields hold when their sender does not know the value; the dialect does not declare it
     "lat": (0, UNKNOWN_INT),
     "lon": (0, UNKNOWN_INT),
     "relative_alt": (UNKNOWN_INT,),
@@ -62,7 +62,7 @@ UNKNOWN: dict[str, tuple[int, ...]] = {
 
 
 class Value:
-    """How one column comes out of a message: ``scale * field + offset``, in `unit`."""
+    """How one column is read from a message: ``scale * field + offset``, in `unit`."""
 
     def __init__(self, column: str, message: str, field: str) -> None:
         name, self._index = split_index(field)
@@ -89,9 +89,9 @@ class Declared(Value):
     Attributes
     ----------
     message : int
-        Id of the message that it stands in.
+        Id of the message that holds it.
     match : dict of str to str
-        What other fields must be.
+        Values that other fields of the message must have, as text.
     """
 
     def __init__(self, said: Message) -> None:
@@ -114,14 +114,14 @@ TELEMETRY = {
     spec(message).id: [Value(column, message, field) for column, field in columns.items()]
     for message, columns in FIELDS.items()
 }
-"""Message id to the columns in it."""
+"""Message id to the columns in the message."""
 
 SAMPLE, CORRECTION = spec("MAG_RAW").struct, spec("MAG_FIELD").struct
 COUNTED_POWER_CYCLES = 8  # MAG_RAW_FLAGS_POWER_CYCLE
 
 
 def sample(payload: bytes) -> Columns:
-    """Return what a ``MAG_RAW`` tells: its time, and the columns that it knows."""
+    """Return the time of a ``MAG_RAW``, and the columns whose values it holds."""
     time_us, _, x, y, z, _, _, _, *delays, temperature, supply, cycle, _, flags = SAMPLE.unpack(payload)
     row = {"time": time_us / 1e6}
     if not (isnan(x) and isnan(y) and isnan(z)):
@@ -138,7 +138,7 @@ def sample(payload: bytes) -> Columns:
 
 
 def correction(payload: bytes) -> Columns:
-    """Return what a ``MAG_FIELD`` tells: its time, and the columns of a corrected sample."""
+    """Return the time of a ``MAG_FIELD``, and the columns of a corrected sample."""
     time_us, total, _, _, sigma, x, y, z, _, _, _, anomaly, _, _, flags, _ = CORRECTION.unpack(payload)
     return {
         "time": time_us / 1e6,
@@ -162,4 +162,4 @@ SOURCES: dict[str, Callable[[bytes], Columns]] = {
     "ATTITUDE": lambda _: {},
     "GLOBAL_POSITION_INT": lambda _: {},
 }
-"""What makes a row, the best first, and the columns that come with it."""
+"""The messages that make a row, the best first, and the function that reads the row's columns from them."""

@@ -34,15 +34,15 @@ class Survey:
     system, component : int
         Its sender.
     columns : dict of str to str
-        Column to unit, each known at least once.
+        Column to unit, of each column that has a value at least once.
     named : dict of bytes to list of (str, float, float)
         ``NAMED_VALUE_FLOAT.name`` to columns, each with scale and offset.
     declared : list of Declared
-        Columns that the log itself says stand in other messages.
+        Columns that the log itself declares to be in other messages.
     attrs : dict
-        What the log says of itself.
+        Attributes that the log declares.
     ours : bool
-        A bridge's own log: the stamps carry the :class:`~magbridge.records.Channel`.
+        A bridge's own log: the time stamps carry the :class:`~magbridge.records.Channel`.
     """
 
     def __init__(self, path: Path) -> None:
@@ -57,7 +57,7 @@ class Survey:
         for self.source in SOURCES:
             senders = self._senders.get(spec(self.source).id)
             if not senders or (self.ours and "IMU" in self.source):
-                continue  # the autopilot's compass is no stand-in for the instrument
+                continue  # the autopilot's compass does not replace the instrument
             (self.system, self.component), _ = senders.most_common(1)[0]
             self.columns = self._known.get(self.system, {})
             self._name()
@@ -65,7 +65,7 @@ class Survey:
         raise FormatError(path, f"expected MAVLink records with one of {' '.join(SOURCES)}")
 
     def _name(self) -> None:
-        """Give every ``NAMED_VALUE_FLOAT`` of the vehicle its column, or those that the log declares."""
+        """Map each ``NAMED_VALUE_FLOAT`` to the columns that the log declares, else to its name."""
         self.named: dict[bytes, list[tuple[str, float, float]]] = {}
         self.declared: list[Declared] = []
         for one in self._declared.values():
@@ -81,7 +81,7 @@ class Survey:
                 self.columns.setdefault(name, "1")
 
     def _read(self, path: Path) -> None:
-        """Look at every record, but take apart only those that may tell something new."""
+        """Read every record, but decode only those that may add to what is known."""
         times: Counter[bytes] = Counter()
         settled: set[bytes] = set()
         with path.open("rb") as file:
@@ -91,7 +91,7 @@ class Survey:
                 kind = frame[5 if head == 10 else 3 : head]  # system, component, message id
                 number = int.from_bytes(kind[2:], "little")
                 if self.ours and record.channel == Channel.SENT and number not in (RAW, FIELD):
-                    continue  # what the bridge said is no telemetry
+                    continue  # the bridge's own messages are no telemetry
                 if number == NAMED.id:
                     kind += frame[head + NAMED.fields["name"].offset : head + frame[1]]
                 times[kind] += 1
@@ -102,7 +102,7 @@ class Survey:
             self._senders.setdefault(number, Counter())[kind[0], kind[1]] += n
 
     def _look(self, message: Message) -> bool:
-        """Note what the message tells; return whether one like it can tell no more."""
+        """Note what is new in a message; return whether further ones of its kind can add nothing."""
         number, system = message.id, message.system
         known = self._known.setdefault(system, {})
         if number == NAMED.id:
@@ -132,6 +132,6 @@ class Survey:
 
 
 @lru_cache(maxsize=64)
-def survey(path: Path, mtime_ns: int, size: int) -> Survey:  # noqa: ARG001 - a log that changed is another
-    """Return what a log holds, looked through once."""
+def survey(path: Path, mtime_ns: int, size: int) -> Survey:  # noqa: ARG001 - a log that changed is surveyed again
+    """Return what a log holds; cached, so that a log is surveyed only once."""
     return Survey(path)

@@ -1,12 +1,12 @@
-"""A deployment as a MAVLink telemetry log: what a bridge and an autopilot would have said.
+"""A deployment as a MAVLink telemetry log: what a bridge and an autopilot would have sent.
 
-A row becomes, all with its time: ``ATTITUDE`` (float32), ``GLOBAL_POSITION_INT`` (1e-7 deg, mm), a
-``NAMED_VALUE_FLOAT`` (float32) for every other column, ``MAG_RAW`` (float32 nT, µs) and, where the deployment
-is corrected, ``MAG_FIELD``. So a column comes back to 6e-8 of its value, time to 1 µs; a column of integers
-(counts times 100, say) comes back exactly.
+A row becomes these messages, all with its time: ``ATTITUDE`` (float32), ``GLOBAL_POSITION_INT`` (1e-7 deg,
+mm), a ``NAMED_VALUE_FLOAT`` (float32) for every other column, ``MAG_RAW`` (float32 nT, µs) and, where the
+deployment is corrected, ``MAG_FIELD``. So a column comes back to 6e-8 of its value, time to 1 µs; a column of
+integers (counts times 100, say) comes back exactly.
 
-A name of more than ten letters is cut, made unique, and told in full by a ``MAG_COLUMN`` at the start, as
-are all units and the attributes that change what values mean.
+A name of more than ten letters is cut and made unique; a ``MAG_COLUMN`` at the start of the log gives it in
+full. Units, and attributes that change what values mean, are declared in the same way.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ ATTITUDE = ("roll", "pitch", "heading")
 POSITION = ("latitude", "longitude", "depth")
 SAMPLE = (*CHANNELS, "sensor_temperature", "sensor_supply", "power_cycle")
 STANDARD = {*ATTITUDE, *POSITION, *SAMPLE, *CHANNEL_TIMES, *CORRECTED}
-"""Columns that have a message of their own."""
+"""Columns that have a field of their own in one of these messages."""
 ATTITUDE_, POSITION_, NAMED_, RAW_, FIELD_ = (
     spec(name) for name in ("ATTITUDE", "GLOBAL_POSITION_INT", "NAMED_VALUE_FLOAT", "MAG_RAW", "MAG_FIELD")
 )
@@ -55,7 +55,7 @@ class FileWriter:
         self._sequence = 0
 
     def append(self, dataset: xr.Dataset, *, first: bool) -> None:
-        """Write the rows, and before the first ones what the names stand for."""
+        """Write the rows, and before the first ones the declarations of the columns."""
         columns = [str(name) for name in dataset.data_vars]
         times = np.round(dataset["time"].values * 1e6).astype(np.int64).tolist()
         if first:
@@ -72,7 +72,7 @@ class FileWriter:
                 one(time_us, named)
 
     def close(self) -> None:
-        """Bring everything to the file."""
+        """Write everything to the file and close it."""
         self._file.close()
 
     def _declare(self, dataset: xr.Dataset) -> None:
@@ -107,7 +107,7 @@ class FileWriter:
         )
 
     def _position(self, time_us: int, row: Row) -> None:
-        # 0 is how autopilots say that they do not know
+        # autopilots send 0 for an unknown position
         latitude = _integer(row.get("latitude", nan) * 1e7) or 1
         east = row.get("longitude", nan)
         longitude = east_e7(east) or 1 if isfinite(east) else UNKNOWN_INT
@@ -139,13 +139,13 @@ class FileWriter:
 
 
 def _short(name: str, taken: set[str]) -> str:
-    """Ten letters that no other column has."""
+    """Return at most ten letters of a name, different from those `taken`."""
     short = name.encode("ascii", "replace")[:10].decode() or "_"
     return next(s for s in (short, *(f"{short[:6]}{k:04d}" for k in range(10_000))) if s not in taken)
 
 
 def _single(name: str, values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Round to what float32 holds, so that packing cannot overflow."""
+    """Round to float32, so that packing cannot overflow; columns that are not sent as float32 stay."""
     if name in (*POSITION, *CHANNEL_TIMES, "total_field"):
         return values
     with np.errstate(over="ignore"):

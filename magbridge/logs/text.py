@@ -1,10 +1,10 @@
-"""CSV: a header row, one row a sample, an empty field for a value that is lacking.
+"""CSV: a header row, one row per sample, an empty field for a missing value.
 
-A heading is ``name`` or ``name [unit]``: ``battpos [in]``. Columns of the public table need no unit; one in
-another unit that we know (``mag_x [uT]``, ``roll [rad]``) is converted. Before the header there may be lines
-``# heading_reference = magnetic``, and ``# fill_value = -9999`` where that stands for a value that is
-lacking. ``quality`` holds the names of the flags, separated by spaces. Numbers are written with as many
-digits as bring back the same bits.
+A heading is ``name`` or ``name [unit]``: ``battpos [in]``. Columns of :data:`magbridge.columns.COLUMNS` need
+no unit; those in another known unit (``mag_x [uT]``, ``roll [rad]``) are converted. Before the header there
+may be lines such as ``# heading_reference = magnetic``, and ``# fill_value = -9999`` where that number stands
+for a missing value. ``quality`` holds the names of the flags, separated by spaces. Numbers are written with
+as many digits as it takes to read back the same float64.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ __all__ = ["FileWriter", "chunks"]
 
 HEADING = re.compile(r"(?P<name>.*?)\s*(?:\[(?P<unit>[^\]]*)\])?")
 LONGEST = 1 << 20
-"""Characters of a line."""
+"""Characters of the longest line that is read."""
 ATTRIBUTE = re.compile(r"#\s*(\w+)\s*=\s*(.*?)\s*")
 
 
@@ -51,7 +51,7 @@ def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
 
 
 class _Header(NamedTuple):
-    """What stands above the rows, and the number of its last line."""
+    """What precedes the rows, and the number of the header's line."""
 
     attrs: dict[str, str]
     fill: float
@@ -61,7 +61,7 @@ class _Header(NamedTuple):
 
 
 def _header(path: Path, text: Iterator[str]) -> _Header:
-    """Take the comments and the names of the columns off the lines."""
+    """Read the comments and the names of the columns from the first lines."""
     attrs: dict[str, str] = {}
     fill = nan
     line, row = next(text, ""), 1
@@ -111,7 +111,7 @@ def _chunks(path: Path, file: TextIO, rows: int) -> Iterator[xr.Dataset]:
 
 
 def _lines(file: TextIO) -> Iterator[str]:
-    """Yield the lines; what has no ends, as the zeros that a crash leaves, is never held as one."""
+    """Yield the lines; an endless one, as of the zeros that a crash leaves, must not fill the memory."""
     while line := file.readline(LONGEST):
         if len(line) == LONGEST:
             raise csv.Error(f"a line has more than {LONGEST:,} characters")
@@ -166,7 +166,7 @@ class FileWriter:
         self._csv.writerows(zip(*columns, strict=True))
 
     def close(self) -> None:
-        """Bring everything to the file."""
+        """Write everything to the file and close it."""
         self._file.close()
 
 

@@ -7,8 +7,8 @@ The live thread only appends to a queue (about 0.3 µs an event); a thread of it
 first record after a pause is written at once, those that follow within `WINDOW` together: after ``kill -9``
 the file holds everything but the last group and reads to its end. A disk that stalls fills the queue, a disk
 that is full stops the log; either way records are dropped and counted, and the live thread never waits. The
-file that follows a log that failed begins with the start of the run, whose time is before its own: a replay
-knows that something is missing.
+first file after a failure begins with the record of the run's start, whose ``time_usec`` precedes the file:
+so a replay knows that records are missing.
 """
 
 from __future__ import annotations
@@ -34,46 +34,46 @@ Record = tuple[int, int, bytes]
 
 WINDOW = 0.005
 """s between two writes: up to 200 events a second each is written at once, and ``kill -9`` costs at most the
-last one; above that, those of 5 ms. Latency does not know the difference; the writing thread takes 66 us a
-sample at 100 Hz, where every event is its own write, and 19 us at 1,000 Hz."""
+last one; at higher rates it costs the events of 5 ms. The latency is the same; the writing thread takes 66 us
+per sample at 100 Hz, where every event has a write of its own, and 19 us at 1,000 Hz."""
 QUEUE = 100_000
 """Records (some 10 MB) that wait for a stalled disk before they are dropped."""
 RETRY_US = 2_000_000
 """µs of the events' time after which a log that failed is tried again, in a new file."""
 SYNC_US = 5_000_000
-"""µs of the events' time between two syncs: a power cut costs no more, nor does a hand that
-removes the file."""
+"""µs of the events' time between two syncs: no more is lost when the power fails or somebody deletes the
+file."""
 
 
 class TlogWriter:
     """Writes records to ``UTC-start_index.tlog`` files in a directory.
 
-    The start is the run's, so that the files of one run stand together, whoever else writes to the directory;
-    it is a few seconds late where another run has taken the name.
+    `start` is that of the run, so that the files of one run are sorted together even if others write to the
+    directory; it is some seconds late where another run has taken the name.
 
     Parameters
     ----------
     directory : path
-        Made if it is not there. Files already there are never touched.
+        Created if it does not exist. Existing files are never changed.
     max_size : float
         MB after which a new file begins.
     max_age : float
         h of the events' time after which a new file begins.
     head : sequence of bytes
-        Frames that stand in every file after its first record: what a reader of that file alone must know.
+        Frames written to every file after its first record: what a reader needs to read that file alone.
     beginning : sequence of bytes
-        Frames with which a file begins that goes on after a loss: from what the run started.
+        Frames at the beginning of the first file after a failure: the record of the run's start.
 
     Attributes
     ----------
     beginning : sequence of bytes
-        As given; the live thread may put another in its place.
+        As given; the live thread may replace it.
     records : int
-        Written so far.
+        Records written so far.
     lost : int
-        Dropped so far, because the disk stalled or the log had failed.
+        Records dropped so far, because the disk stalled or the log had failed.
     failure : str
-        Why the log is stopped, in the words of the operating system; empty while it is well.
+        The operating system's reason why the log has stopped; empty while it is being written.
 
     Raises
     ------
@@ -98,11 +98,11 @@ class TlogWriter:
         self._max_size, self._max_age_us = round(max_size * 1e6), round(max_age * 3.6e9)
         self._head, self.beginning = tuple(head), beginning
         self.records, self.failure = 0, ""
-        # of the live thread
+        # used by the live thread
         self._queue: deque[Sequence[Record]] = deque()
         self._put = self._refused = 0
         self._idle, self._wake, self._closing = True, Event(), Event()
-        # of the writing thread
+        # used by the writing thread
         self._taken = self._dropped = 0
         self._file, self._name = -1, self._directory
         self._size = self._index = self._begin_s = 0
@@ -124,14 +124,14 @@ class TlogWriter:
         time_us : int
             µs since 1970 UTC of the event, a multiple of 4.
         channel : Channel
-            Whence the frame came.
+            Where the frame came from.
         frame : bytes
             One whole MAVLink frame.
         """
         self.extend([(time_us, channel, frame)])
 
     def extend(self, records: Sequence[Record]) -> None:
-        """Log the frames of an event, as :meth:`write` does; the list is the log's from now on."""
+        """Log the frames of an event, as :meth:`write` does; the caller must not change the list later."""
         if self._put - self._taken > QUEUE:
             self._refused += len(records)
             return
@@ -142,7 +142,7 @@ class TlogWriter:
             self._wake.set()
 
     def close(self, timeout: float = 5.0) -> None:
-        """Write what waits and end; give a stalled disk no more than `timeout` s."""
+        """Write the queue and end; wait for a stalled disk at most `timeout` s."""
         self._closing.set()
         self._wake.set()
         self._thread.join(timeout)
@@ -163,7 +163,7 @@ class TlogWriter:
                 self._drain()
                 self._closing.wait(WINDOW)
             self._idle = True
-            if self._queue:  # came between the last look and the line above
+            if self._queue:  # came between the loop's last check and the line above
                 self._wake.set()
             elif self._closing.is_set():
                 break
@@ -226,7 +226,7 @@ class TlogWriter:
                 rest = rest[os.write(self._file, rest) :]
             if not 0 <= time_us - self._synced_us < SYNC_US:
                 os.fdatasync(self._file)
-                self._name.stat()  # removed, it would go on being written and be nowhere
+                self._name.stat()  # raises if the file was deleted: writing to it would go on, and be lost
                 self._synced_us = time_us
         except OSError as error:
             self._dropped += len(records)
@@ -242,7 +242,7 @@ class TlogWriter:
         if self._file >= 0:
             with suppress(OSError):  # the reader skips a torn record
                 os.ftruncate(self._file, self._size)
-                if not self._size:  # a full disk takes names, and every attempt would leave an empty file
+                if not self._size:  # on a full disk, every attempt would leave an empty file
                     self._name.unlink()
         self._end_file()
         self.failure, self._failed_us = error.strerror or str(error), time_us
@@ -252,7 +252,7 @@ class TlogWriter:
             file, self._file = self._file, -1
             try:
                 os.close(file)
-            except OSError as error:  # a network disk reports here what it could not write
+            except OSError as error:  # a network disk may report only here that it could not write
                 self.failure = error.strerror or str(error)
 
 
