@@ -1,6 +1,6 @@
-"""The command line: one thin function a command; the help is its docstring.
+"""The command line: one thin function per command; its docstring is the help.
 
-Exit codes: 0 done, 1 the data do not allow it, 2 wrong use. What is wrong goes to stderr as one line.
+Exit codes: 0 done, 1 the data do not allow it, 2 wrong use. An error is one line on stderr.
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ EXTRAS = {
     "harmonica": "grids",
     "nicegui": "monitor",
 }
-"""Which extra brings a package."""
+"""Package to the extra that installs it."""
 ENDS = (signal.SIGTERM, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else []))
-"""What ends a command: it is told to, or its terminal is gone."""
+"""Signals that end a command; SIGHUP comes when its terminal is gone."""
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -48,9 +48,9 @@ def main(arguments: list[str] | None = None) -> int:
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
         if (
             getattr(sys, name) is None
-        ):  # closed by whoever started us; in this order each gets its own descriptor
+        ):  # closed by the parent process; opened in this order, each gets its own descriptor
             setattr(sys, name, Path(os.devnull).open(mode))  # noqa: SIM115 - as long as the process
-    with suppress(ValueError):  # on another thread than the first: signals are another's business
+    with suppress(ValueError):  # signal handlers can be set on the main thread only
         _heed_signals()
     try:
         app(arguments, exit_on_error=False, print_error=False, result_action="return_value")
@@ -65,12 +65,12 @@ def main(arguments: list[str] | None = None) -> int:
         return complain(str(MissingExtra(str(error.name), extra)), 2)
     except BrokenPipeError:  # the reader of our output has gone, as `| head` does
         sys.stderr.close()
-    except (OSError, MemoryError) as error:  # the system does not give a file, a folder, room
+    except (OSError, MemoryError) as error:  # the system refuses a file, a folder or memory
         return complain(_reason(error), 1)
     except _Terminated as end:
         signal.signal(end.number, signal.SIG_DFL)
         signal.raise_signal(end.number)
-    except SystemExit as end:  # what rich makes of a reader that has gone, while it prints the help
+    except SystemExit as end:  # raised by rich if the reader has gone while it prints the help
         if not isinstance(end.__context__, BrokenPipeError):
             raise
     return 0
@@ -80,13 +80,13 @@ def _misuse(error: CycloptsError) -> str:
     if isinstance(error, UnusedCliTokensError):
         unused = " ".join(error.unused_tokens or ())
         return f"{unused}: unexpected argument; an option with several values is repeated for each"
-    if isinstance(error, MissingArgumentError) and error.keyword is None:  # the option itself is not there
+    if isinstance(error, MissingArgumentError) and error.keyword is None:  # the option itself is missing
         return str(error).replace("requires an argument", "is required")
     return str(error)
 
 
 class _Terminated(SystemExit):
-    """The process is to end by the signal `number`; what is half-written goes first."""
+    """Raised so that half-written files are removed before the signal `number` ends the process."""
 
     def __init__(self, number: int) -> None:
         super().__init__()

@@ -193,7 +193,7 @@ def correct(*files: Path, calibration: Path, output: Log, json: Json = False) ->
     rows, flagged, whole = 0, 0, False
     pieces: list[dict[str, Any]] = []
     flags: Counter[str] = Counter()
-    doubtful = ~Quality.NO_BORESIGHT  # without it, the total field is as good
+    doubtful = ~Quality.NO_BORESIGHT  # without a boresight, the total field is just as good
     with Writer(output) as writer:
         for part in track(read_chunks(files, required=CHANNELS), "correcting"):
             if not pieces:

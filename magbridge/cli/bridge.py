@@ -15,7 +15,7 @@ from magbridge.errors import DataError, WrongUse
 from magbridge.files import new_folder
 
 SLOWEST = 1e-3
-"""Times real time: below, a log of an hour takes months."""
+"""Lowest replay speed, relative to real time: a log of an hour then takes six weeks."""
 
 
 @app.command
@@ -133,7 +133,7 @@ def monitor(
 
 
 def speed_of(text: str) -> float:
-    """Return a speed: times real time, or ``max``."""
+    """Return a replay speed relative to real time; infinite for ``max``."""
     try:
         speed = inf if text == "max" else float(text)
     except ValueError:

@@ -138,7 +138,7 @@ def _summary(found: Fit, samples: int) -> str:
 
 
 def _digests(files: tuple[Path, ...]) -> dict[str, str]:
-    """Return each file's name and digest; tell of one that is there twice."""
+    """Return each file's name and digest; warn of identical files."""
     seen: dict[str, Path] = {}
     for file in files:
         first = seen.setdefault(digest(file), file)

@@ -1,4 +1,4 @@
-"""What the commands share: the application, common arguments, how a result and a complaint are told."""
+"""What the commands share: the application, common arguments, printing of results and warnings."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ __all__ = [
 
 
 def _default(value: object) -> object:
-    """Return the default as the help shows it; None where there is nothing to tell."""
+    """Return the default as the help shows it; None where it is not shown."""
     return None if value is False or value == () else value
 
 
@@ -51,7 +51,7 @@ app = App(
     name="magbridge",
     help="A magnetometer bridge for vehicles whose own iron moves.",
     version=__version__,
-    suppress_keyboard_interrupt=False,  # main says it
+    suppress_keyboard_interrupt=False,  # main() prints it
     help_format="markdown",  # so that paragraphs are wrapped as wide as the terminal is
     help_epilogue="Exit codes: 0 done, 1 the data do not allow it, 2 wrong usage.",
     default_parameter=Parameter(negative=(), show_default=_default),
@@ -59,7 +59,7 @@ app = App(
 
 
 def file_to_write(*suffixes: str) -> Callable[[Any, Any], None]:
-    """Return a check of a file to write, before any work is done for it."""
+    """Return a validator for a file to write, which is checked before any work is done."""
 
     def check(_: Any, path: Any) -> None:
         if path is None:
@@ -81,7 +81,7 @@ def _log_to_write(kind: Any, path: Any) -> None:
 
 
 def folder_to_write(_: Any, path: Any) -> None:
-    """Check a folder to write to, before any work is done for it."""
+    """Validate a folder to write to, before any work is done."""
     if path is None:
         return
     if path.exists() and not path.is_dir():
@@ -92,7 +92,7 @@ def folder_to_write(_: Any, path: Any) -> None:
 
 
 def _whole(_: Any, tokens: Sequence[Token]) -> int:
-    """Read a whole number; by itself the parser would round 1.5 to 2."""
+    """Read a whole number; cyclopts would round 1.5 to 2."""
     try:
         return int(tokens[0].value)
     except ValueError:
@@ -110,7 +110,7 @@ Json = Annotated[bool, Parameter(name="--json")]
 
 
 def some(files: tuple[Path, ...], output: Path | None = None, *others: Path | None) -> tuple[Path, ...]:
-    """Return `files`, if there are any; `output` must overwrite none of them, and none of `others`."""
+    """Return `files`; there must be one, and `output` must not be one of them or of `others`."""
     if not files:
         raise WrongUse("expected at least one FILE")
     read = [os.path.realpath(path) for path in (*files, *others) if path is not None]
@@ -126,7 +126,7 @@ def digest(path: Path) -> str:
 
 
 def note_losses(*pieces: Mapping[str, Any]) -> None:
-    """Say on stderr what reading passed over, as the attributes of a deployment or of its pieces count it."""
+    """Report on stderr what reading skipped, from the attributes of a deployment or of its pieces."""
     from magbridge.logs.deployment import COUNTERS, passed_over
 
     if counts := passed_over(*pieces):
@@ -135,7 +135,7 @@ def note_losses(*pieces: Mapping[str, Any]) -> None:
 
 
 def note_missing(calibration: Calibration, deployment: xr.Dataset) -> None:
-    """Say on stderr which columns the calibration needs and a log does not have."""
+    """Warn on stderr of columns that the calibration needs and a log does not have."""
     for name in calibration.channels:
         if name not in deployment:
             lacking = f"{deployment.attrs['source']}: no column {name!r}, which the calibration needs"

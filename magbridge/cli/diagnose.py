@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
 NOTHING = (-9999.0, -99999.0)
-"""Common codes for "not known", in any unit."""
+"""Numbers that logs commonly use for "not known", in any unit."""
 ITSELF = (
     "the calibration was fitted to this log and has absorbed part of its errors; calibrate on separate "
     "calibration runs, with --filter-corner if the sensor has an anti-alias filter"
@@ -88,7 +88,7 @@ def diagnose(
 
 
 def causes_of(facts: dict[str, Any]) -> str:
-    """Return the causes found, what the data cannot tell from them, and what is left, in one line."""
+    """Return one line: the causes found, the alternatives to each, and the effect left unexplained."""
     causes = [" or ".join(map(_plain, [one, *one["alternatives"]])) for one in facts["findings"]]
     if facts["verdict"] == "unexplained" and (within := facts["unexplained"]["alternatives"]):
         causes = [f"no name asserted; within 20:1: {', '.join(map(_plain, within))}"]
@@ -103,7 +103,7 @@ def _plain(one: dict[str, Any]) -> str:
 
 
 def _suspect(log: xr.Dataset) -> Iterator[str]:
-    """Yield warnings of isolated numbers that may mean 'not known', and would be taken for an effect."""
+    """Yield warnings of isolated values that may be codes for 'not known': they would look like an effect."""
     for name, column in log.data_vars.items():
         values = column.to_numpy()
         for nothing in NOTHING:

@@ -1,4 +1,4 @@
-"""Navigate: the track by the field, or beforehand what a map is worth."""
+"""Navigate: find the track by the field, or compute before a dive how accurate a map allows it to be."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def navigate(
     corrected = correct_rows(Correction(known), deployment)
     if options is None:
         options = informed(Options(), known, float(corrected["total_field_sigma"].median()))
-    grid, options = _where_it_swims(read_grid(map), options, deployment)
+    grid, options = _continued(read_grid(map), options, deployment)
     track = find_way(deployment.assign(corrected.data_vars), grid, options)
     write(track, output)
     if picture:
@@ -109,7 +109,7 @@ def navigate(
 
 
 def _judged(track: xr.Dataset) -> tuple[dict[str, Any], str]:
-    """Return how good a track is: by what the filter claims, and by the truth where the log tells it."""
+    """Return a track's accuracy: by the filter's own sigma, and by the true track where the log has it."""
     from magbridge.navigate.reference_track import errors
 
     vouched, rows = float(track["vouched"].mean()), track.sizes["time"]
@@ -143,7 +143,7 @@ def _bound(
     from magbridge.navigate.bound import position_bound, told
 
     plan = read(files, required=("latitude", "longitude")).dropna("time", subset=["latitude", "longitude"])
-    grid, options = _where_it_swims(read_grid(map), options or Options(), plan)
+    grid, options = _continued(read_grid(map), options or Options(), plan)
     track = [plan[name].to_numpy().astype(float) for name in ("time", "latitude", "longitude")]
     sigma = calibration.noise.sensor if calibration else 1.0
     best = position_bound(grid, track[0], track[1], track[2], options, sigma)
@@ -156,10 +156,8 @@ def _bound(
     tell({"file": str(output), **result.attrs}, f"{output}: {result.attrs['findings']}", json)
 
 
-def _where_it_swims(
-    grid: AnomalyGrid, options: Options, deployment: xr.Dataset
-) -> tuple[AnomalyGrid, Options]:
-    """Return the map at the deployment's depth, with the error that this leaves in it; and say so."""
+def _continued(grid: AnomalyGrid, options: Options, deployment: xr.Dataset) -> tuple[AnomalyGrid, Options]:
+    """Return the map continued to the deployment's depth, and options with the error of that; report it."""
     from magbridge.navigate.depth import at_depth
 
     there, known = at_depth(grid, options, deployment["depth"].to_numpy() if "depth" in deployment else 0.0)
