@@ -1,4 +1,4 @@
-"""An emulated autopilot: says over MAVLink what a deployment's telemetry says.
+"""An emulated autopilot: sends a deployment's telemetry over MAVLink.
 
 System 1, component 1. Once a second a heartbeat; with every row of the deployment the messages from which the
 bridge's configuration takes its parameters, the attitude and the position.
@@ -25,7 +25,7 @@ FIX_3D, GPS_ACCURACY = 3, 10_000
 """GPS_FIX_TYPE and mm of its receiver."""
 
 LARGEST = 2e6
-"""m, deg, m/s: what fits every field in which a position or a motion is told, mm in 32 bits too."""
+"""m, deg, m/s: the largest value that fits every position or motion field, 32 bits of mm included."""
 
 
 class Autopilot:
@@ -57,7 +57,7 @@ class Autopilot:
         return due
 
     def row(self, time_us: int, row: Mapping[str, float]) -> list[bytes]:
-        """Return the frames that tell one row: columns by their contract names, NaN where lacking."""
+        """Return the frames for one row: columns by their contract names, NaN where missing."""
         boot_ms = (time_us - self._boot_us) // 1000
         frames = [
             self._parameter(telemetry, row[name], boot_ms)
@@ -70,7 +70,7 @@ class Autopilot:
         return frames + self._position(row, boot_ms)
 
     def _position(self, row: Mapping[str, float], boot_ms: int) -> list[bytes]:
-        """Return what tells position and motion: where it believes to be, local track, speed, GPS."""
+        """Return the messages of position and motion: estimated position, local track, speed, GPS."""
         pack, frames = self._codec.pack, []
         (depth,) = _finite(row, "depth") or (nan,)
         if known := _finite(row, "latitude", "longitude"):
@@ -110,6 +110,6 @@ class Autopilot:
 
 
 def _finite(row: Mapping[str, float], *names: str) -> tuple[float, ...]:
-    """Return the row's values under these names; nothing if one of them lacks, or no message takes it."""
+    """Return the row's values under these names; nothing if one is missing or too large for a message."""
     values = tuple(row.get(name, nan) for name in names)
     return values if all(abs(value) < LARGEST for value in values) else ()

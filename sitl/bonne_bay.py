@@ -44,7 +44,7 @@ PAPER = {
 
 @dataclass(frozen=True)
 class Trials:
-    """A simulated deployment, and what each method made of it.
+    """A simulated deployment, and each method's result on it.
 
     Attributes
     ----------
@@ -53,11 +53,12 @@ class Trials:
     corrected : dict of array (n,)
         By (part, trial of the coefficients, method), nT.
     failed : dict of str
-        Why, by (trial, method).
+        Reason of the failure, by (trial, method).
     scales : dict of (float, float)
-        By (trial, method), the smallest and the largest of A on its runs: what the residual was bought with.
+        By (trial, method), the smallest and the largest scale of A on its runs: a fit can lower its
+        residual by shrinking them.
     anomaly : AnomalyGrid
-        The map that the fit was given.
+        The map used as reference of the fit.
     """
 
     parts: dict[str, xr.Dataset]
@@ -67,7 +68,7 @@ class Trials:
     anomaly: AnomalyGrid
 
     def error(self, part: str, trial: str, method: str, against: str = "reference_field") -> Array:
-        """Return what `method` with the coefficients of `trial` leaves, (n,) nT; NaN where it failed."""
+        """Return the error of `method` with the coefficients of `trial`, (n,) nT; NaN where it failed."""
         known = self.parts[part][against].to_numpy()
         found: Array = self.corrected.get((part, trial, method), np.full(known.shape, np.nan))
         return np.asarray(found - known)
@@ -80,8 +81,8 @@ class Trials:
 def measure(twin: Twin, *, at_depth: bool = False) -> dict[str, xr.Dataset]:
     """Fly trial 1, survey and trial 2; return each on one time base, without the samples of masses in motion.
 
-    With `at_depth` the reference is the map continued down to the glider, as ``--grid`` makes it; else what
-    the scenario says: the map as it was flown, as the paper has it.
+    With `at_depth` the reference is the map continued down to the glider, as ``--grid`` does it; else the
+    scenario's: the map at the altitude of its survey, as in the paper.
     """
     track = twin.fly()
     instrument = twin.scenario.instrument

@@ -18,10 +18,10 @@ Array = NDArray[np.float64]
 
 
 def oracle(vehicle: Vehicle, deployment: xr.Dataset) -> Array:
-    """Return the total field (n,), nT, that a calibration which knows the vehicle makes of its readings.
+    """Return the total field (n,), nT, corrected by a calibration that knows the vehicle exactly.
 
-    Its error is the noise floor: what noise in the channels leaves in the magnitude. The instrument must have
-    no errors of its own but noise.
+    Its error is the noise floor: the channels' noise in the magnitude. The instrument must have no errors
+    of its own but noise.
     """
     D, T = _response(vehicle, deployment)
     raw = np.column_stack([deployment[f"mag_{axis}"] for axis in "xyz"])
@@ -41,8 +41,8 @@ def information_bound(
     Parameters
     ----------
     vehicle : Vehicle
-        The truth: dipoles with a permanent and a three-axis induced moment and a position each. Known of it
-        beforehand are the sizes that such vehicles are drawn with.
+        The truth: dipoles with a permanent moment, a three-axis induced moment and a position each. The prior
+        is the distribution that such vehicles are drawn from.
     calibration, survey : Dataset (time)
         Deployments of :func:`sitl.simulate`.
     sigma, memory : float
@@ -82,7 +82,7 @@ def informed_error(
 ) -> Array:
     r"""Return the survey's error (n,), nT, of a fit that reaches :func:`information_bound` on these data.
 
-    The bound is what such a fit leaves on average; this is what luck makes of it on one vehicle.
+    The bound is such a fit's error on average over noise and vehicles; this is its error on one draw of them.
     Arguments as there.
 
     Notes
@@ -127,7 +127,7 @@ def _posterior(
 
 
 def _sensitivity(vehicle: Vehicle, deployment: xr.Dataset, sigma: float) -> tuple[Array, Array]:
-    """Return what each parameter does to the corrected magnitude (n, k), nT a unit, and the noise (n,)."""
+    """Return the derivative of the corrected magnitude by each parameter (n, k), and its noise (n,), nT."""
     ambient = np.column_stack([deployment[f"truth_field_{axis}"] for axis in "xyz"])
     channels = {name: deployment[name].to_numpy() for name in vehicle.channels}
     D, _ = _response(vehicle, deployment)

@@ -64,7 +64,7 @@ def segments(deployment: xr.Dataset) -> dict[str, xr.Dataset]:
 
 
 def at_rest(deployment: xr.Dataset, masses: Iterable[str]) -> xr.Dataset:
-    """Leave out the samples about which a mass is on its way."""
+    """Leave out the samples near which a mass is moving."""
     still = np.ones(deployment.sizes["time"], bool)
     for name in masses:
         moved = np.abs(np.diff(deployment[name])) > 1e-9

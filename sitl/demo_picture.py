@@ -1,4 +1,4 @@
-"""The demonstration's picture: what the fluxgate reads, what the bridge publishes, what is true."""
+"""The demonstration's picture: the fluxgate's readings, what the bridge publishes, and the true field."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """What two devices would have sent in a deployment: the events that a replay of it plays.
 
 The emulated fluxgate takes its readings at the deployment's times and sends each when its last channel is
-sampled; the emulated autopilot tells each row's telemetry just before.
+sampled; the emulated autopilot sends each row's telemetry just before.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def emulate(deployment: xr.Dataset, config: Config) -> Iterator[Event]:
     deployment : Dataset (time)
         With ``mag_x mag_y mag_z``, and whatever telemetry it has.
     config : Config
-        Of the bridge: which instrument is emulated, and in which messages the telemetry is told.
+        The bridge's: which instrument is emulated, and which messages carry the telemetry.
 
     Raises
     ------

@@ -44,7 +44,7 @@ class Instrument(Table, frozen=True):
     start_temperature : float or None
         degC of the fluxgate at the start; None has it settled in the water.
     thermal_lag : float
-        s with which the fluxgate follows the water.
+        s, time constant with which the fluxgate's temperature follows the water's.
     corner : float
         Hz of the RC anti-alias filter; 0 leaves it out.
     channel_delay : tuple of 3 float
@@ -149,7 +149,7 @@ class Samples:
     temperature : array (m,)
         degC at the fluxgate.
     power_cycle : array (m,)
-        How often it was powered on again.
+        How many times it was powered on again.
     """
 
     channels: Array

@@ -1,4 +1,4 @@
-"""A ground station's ear: takes the bridge's stream apart as it comes."""
+"""A ground station that listens: decodes the bridge's stream as it comes."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ COLUMNS = {
 
 
 class Listener:
-    """Counts messages, and keeps the corrected field and what was said.
+    """Counts messages, and keeps the corrected field and the texts.
 
     Attributes
     ----------
@@ -37,7 +37,7 @@ class Listener:
     said : list of str
         The STATUSTEXTs, in order.
     navigation : Counter
-        Updates of the position by the field, by what the filter said of itself.
+        Number of navigation updates by the filter's state.
     """
 
     def __init__(self) -> None:

@@ -57,7 +57,7 @@ class Leg(Table, frozen=True):
     turn : float
         deg/s, clockwise seen from above.
     heading : float or None
-        deg at its start; None goes on from where the last leg ended.
+        deg at its start; None keeps the heading at which the last leg ended.
     parameters : dict of float
         Positions of the moving masses; one that is not named stays where it is.
     segment : str
@@ -142,7 +142,7 @@ class CrissCross(Table, frozen=True, tag_field="kind", tag="criss_cross"):
     duration : float
         s of one descent or ascent.
     battery_spread : float
-        in, of the battery about where Table 1 has it at this pitch.
+        in, spread of the battery's position about Table 1's at this pitch.
     segment : str
     """
 
@@ -207,7 +207,7 @@ def _table_1(trial: int) -> tuple[Run, ...]:
 
 
 def others(rng: np.random.Generator, limits: Mapping[str, Limit]) -> dict[str, float]:
-    """Draw a place for every mass that Table 1 does not know, in the inner nine tenths of its way."""
+    """Draw a position for every mass that is not in Table 1, within the inner nine tenths of its travel."""
     return {
         name: float(rng.uniform(0.95 * limit.low + 0.05 * limit.high, 0.05 * limit.low + 0.95 * limit.high))
         for name, limit in limits.items()

@@ -12,7 +12,7 @@ __all__ = ["with_motion"]
 
 
 def with_motion(deployment: xr.Dataset) -> xr.Dataset:
-    """Return the deployment with the columns that the autopilot tells a navigator.
+    """Return the deployment with the columns that the autopilot sends to a navigator.
 
     Parameters
     ----------
@@ -24,7 +24,7 @@ def with_motion(deployment: xr.Dataset) -> xr.Dataset:
     -------
     Dataset (time)
         ``gps_latitude gps_longitude`` (deg): the log's, or its first position; ``local_north local_east`` (m)
-        of a track or a velocity. From a speed or a glide the bridge reckons for itself.
+        of a track or a velocity. From a speed or a glide the bridge dead-reckons itself.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""A bridge's own log as the script of a replay, and what it must publish again, bit for bit."""
+"""A bridge's own log: the events to replay, and what the bridge must publish again, bit for bit."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ __all__ = ["Recorded", "is_own_log", "runs"]
 
 BEGIN, PARAMETER, COLUMN = (spec(name).id for name in ("MAG_BRIDGE_START", "PARAM_VALUE", "MAG_COLUMN"))
 NOT_EVENTS = (BEGIN, PARAMETER, COLUMN, spec("MAG_RAW").id)
-"""State records that a bridge writes for whoever reads the log, not for its replay."""
+"""State records that a bridge writes for readers of the log, and that a replay does not need."""
 
 
 def is_own_log(path: Path) -> bool:
-    """Say whether a file is the beginning of a bridge's own log."""
+    """Return whether a file is the beginning of a bridge's own log."""
     if path.suffix.lower() != ".tlog":
         return False
     with path.open("rb") as file:
@@ -51,13 +51,13 @@ class Recorded:
     start : Start
         What the run started from.
     late : float
-        s of the run before the log begins: a log that was begun anew after a loss. What the bridge knew by
-        then is not in it, so it starts from nothing, but at a whole s of the run's: what it asks the
-        autopilot the log answers.
+        s of the run before the log begins; above 0 if the log was begun anew after a loss. The bridge's
+        state at that time is not in the log, so the replay starts without it, at a multiple of the time
+        synchronisation's interval: its requests to the autopilot are then those that the log answers.
     config_digest : str
-        Of the configuration that it ran with.
+        Digest of the configuration that it ran with.
     published : bytearray
-        What it published, as far as :meth:`events` has come.
+        What it published, as far as :meth:`events` has been read.
 
     Raises
     ------
@@ -77,7 +77,7 @@ class Recorded:
         parameters: dict[str, float] = {}
         for record in records:
             if record.channel == Channel.STATE and record.message.id == COLUMN:
-                continue  # stands in every file, for readers
+                continue  # repeated in every file, for readers
             if record.channel != Channel.STATE or record.message.id != PARAMETER:
                 break
             parameters[record.message["param_id"]] = record.message["param_value"]
@@ -95,7 +95,7 @@ class Recorded:
                 self.damages += reader.damages
 
     def events(self) -> Iterator[Event]:
-        """Yield what came in; what went out is kept in `published`."""
+        """Yield the inputs; the outputs are added to `published`."""
         tape = TapeReader()
         time_us = self.start.time_us
         inputs = (record for record in self._records() if not self._went_out(record) and _is_event(record))
@@ -122,11 +122,11 @@ class Recorded:
 
 
 def _is_event(record: Record) -> bool:
-    """Say whether the bridge heard it; a file's columns may stand between two pieces that came together."""
+    """Return whether a record is an input; other records may lie between two pieces that came together."""
     return record.channel != Channel.STATE or record.message.id not in NOT_EVENTS
 
 
 def _sensor_bytes(records: Iterable[Record]) -> bytes:
-    """Return bytes that came at one time, which the log may hold in pieces."""
+    """Return the bytes that came at one time; the log may hold them in several records."""
     messages = (record.message for record in records)
     return b"".join(message["data"][: message["length"]] for message in messages)

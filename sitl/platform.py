@@ -1,4 +1,4 @@
-"""The vehicle's own magnetism: iron that stays, and masses that move, each a real dipole."""
+"""The vehicle's own magnetism: fixed iron, and moving masses, each a dipole."""
 
 from __future__ import annotations
 
@@ -123,7 +123,7 @@ class Vehicle(Table, frozen=True):
 
     @property
     def channels(self) -> tuple[str, ...]:
-        """What :meth:`field` must be told."""
+        """Names of the channels that :meth:`field` needs."""
         return tuple(self.mass)
 
     def field(self, ambient: Array, channels: Mapping[str, Array], time: Array | None = None) -> Array:  # noqa: ARG002
@@ -136,7 +136,7 @@ class Vehicle(Table, frozen=True):
         channels : mapping of array (n,)
             Where the masses are; every mass must be among them.
         time : array (n,), optional
-            Iron does not mind.
+            Not used: iron does not depend on time.
         """
         fixed = ambient + np.asarray(self.hard_iron) + ambient @ np.asarray(self.soft_iron).T
         moving = (mass.field(ambient, channels[name]) for name, mass in self.mass.items())
@@ -145,13 +145,13 @@ class Vehicle(Table, frozen=True):
 
 @dataclass(frozen=True)
 class Calibrated:
-    """A vehicle that a calibration describes: its own forward model instead of iron."""
+    """A vehicle described by a calibration: the calibration's forward model in place of iron."""
 
     calibration: Calibration
 
     @property
     def channels(self) -> tuple[str, ...]:
-        """What :meth:`field` must be told: masses, and what the calibration's effects follow."""
+        """Names of the channels that :meth:`field` needs: masses, and the channels of the effects."""
         return self.calibration.channels
 
     def field(self, ambient: Array, channels: Mapping[str, Array], time: Array) -> Array:

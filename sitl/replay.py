@@ -31,14 +31,14 @@ __all__ = ["alike", "replay", "tell"]
 
 Result = dict[str, Any]
 UNKNOWN = 50_000.0
-"""nT, about the whole field: a sigma beyond it says that nothing is known."""
+"""nT, about the total field: a larger sigma means that nothing is known."""
 Floats = NDArray[np.float64]
 
 
 def replay(
     files: Sequence[Path], config: Path | None = None, speed: float = inf, log: Path | None = None
 ) -> Result:
-    """Replay `files` through the bridge; return what came of it, as the command prints it.
+    """Replay `files` through the bridge; return the results, as the command prints them.
 
     Parameters
     ----------
@@ -60,7 +60,7 @@ def replay(
         A bridge's own log without its configuration, or a log of a bridge together with other logs.
     """
     if config is not None:
-        load(config)  # what is wrong with it is told before anything begins
+        load(config)  # a faulty configuration is reported before anything begins
     if own := next((file for file in files if is_own_log(file)), None):
         if other := next((file for file in files if file.suffix.lower() != own.suffix.lower()), None):
             raise WrongUse(f"{other}: cannot be replayed together with {own}, a bridge's own log")
@@ -81,7 +81,7 @@ def replay(
 
 
 def _again(files: Sequence[Path], config: Path, speed: float, log: Path | None) -> Result:
-    """Replay a bridge's own log, and compare what is published with what was."""
+    """Replay a bridge's own log, and compare what is published now with what was published then."""
     recorded = Recorded(files)
     published = bytearray()
     stage = Stage(config, published.extend, log)
@@ -102,7 +102,7 @@ def _again(files: Sequence[Path], config: Path, speed: float, log: Path | None) 
 
 
 def alike(published: bytearray, recorded: Recorded) -> Result:
-    """Return how far a log that begins late is the same; the fields of one that does not are in its bytes."""
+    """Return how many samples agree if the log begins late; of a whole log the bytes are compared."""
     if not recorded.late:
         return {"late_s": 0.0}
     ours, theirs = (_heard(stream) for stream in (published, recorded.published))
@@ -192,7 +192,7 @@ def _nearest(times: Floats, wanted: Floats) -> NDArray[np.intp]:
 
 
 def _reference(deployment: xr.Dataset) -> Floats:
-    """Return the true total field in nT; NaN where nothing tells it."""
+    """Return the true total field in nT; NaN where it is not known."""
     try:
         return reference_field(deployment)
     except DataError:
@@ -202,7 +202,7 @@ def _reference(deployment: xr.Dataset) -> Floats:
 def _rms(values: Floats) -> float | None:
     """Return the root mean square of the finite values; None where there are none."""
     values = values[np.isfinite(values)]
-    with np.errstate(over="ignore"):  # what is no measurement is infinitely wrong
+    with np.errstate(over="ignore"):  # an absurd value is infinitely wrong
         return float(np.sqrt(np.mean(values**2))) if len(values) else None
 
 

@@ -1,7 +1,7 @@
 """Set up a replay from nothing but a log: a configuration, and a calibration fitted to part of it.
 
-Of several files (or, of one, of its three thirds) the last is left out of the fit: its error is the one that
-tells something.
+The last of several files (or the last third of a single one) is left out of the fit: only its error is out of
+sample.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class Part(NamedTuple):
 
 
 class ReplaySetup(NamedTuple):
-    """What is ready to be replayed.
+    """A deployment ready to be replayed.
 
     Attributes
     ----------
@@ -61,9 +61,9 @@ class ReplaySetup(NamedTuple):
         A ``bridge.toml``.
     deployment : Dataset (time)
     parts : list of Part
-        The last is the one that the calibration has not seen.
+        The last one was not used by the calibration.
     calibration : str
-        How it was made, or why there is none.
+        How the calibration was made, or why there is none.
     simulated : bool
         The log has no magnetometer: its field is simulated, its telemetry real.
     """
@@ -81,7 +81,7 @@ def prepare(files: Sequence[Path], folder: Path) -> ReplaySetup:
     Raises
     ------
     FormatError
-        A file cannot be read, or says neither a magnetic field nor what is needed to simulate one.
+        A file cannot be read, or holds neither a magnetic field nor what is needed to simulate one.
     """
     deployment = read(files)
     simulated = not set(CHANNELS) <= set(deployment)
@@ -107,7 +107,7 @@ def _parts(files: Sequence[Path], deployment: xr.Dataset) -> list[Part]:
     few = deployment.sizes["time"] / len(stems) / 10
     for stem in stems:
         own = read([file for file in files if file.stem == stem])["time"].to_numpy()
-        if spans and len(own) < few:  # a file of a few rows at the surface tells nothing alone
+        if spans and len(own) < few:  # a few rows at the surface are no part of their own
             spans[-1] = spans[-1]._replace(end=float(own[-1]))
         else:
             spans.append(Part(stem, float(own[0]), float(own[-1])))
@@ -179,7 +179,7 @@ def telemetry_of(deployment: xr.Dataset) -> list[str]:
 
 
 def short_names(names: Iterable[str]) -> dict[str, str]:
-    """Return a different name of at most ten letters for each."""
+    """Return a unique name of at most ten characters for each."""
     short: dict[str, str] = {}
     for name in names:
         candidate = name[:NAME]

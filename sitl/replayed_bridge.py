@@ -29,11 +29,11 @@ from sitl.timetable import read_entries
 __all__ = ["ScriptedEdge"]
 
 BATCH = 8192
-"""Bytes to the autopilot that may wait for company."""
+"""Bytes to the autopilot that may wait to be sent together."""
 
 
 class ScriptedEdge:
-    """Reads real ports in the order, and at the times, that a timetable says."""
+    """Reads real ports in the order, and at the times, given by a timetable."""
 
     def __init__(self, ports: dict[Channel, Port], timetable: int) -> None:
         self._ports = ports
@@ -54,7 +54,7 @@ class ScriptedEdge:
         self.flush()
 
     def _wait_for_times(self) -> bytes:
-        self.flush()  # whoever paces the replay wants to see what was published before the next event
+        self.flush()  # in a paced replay, what was published must be seen before the next event
         return os.read(self._timetable, 65536)
 
     def _take(self, channel: Channel, size: int) -> bytes:
@@ -69,7 +69,7 @@ class ScriptedEdge:
         return data
 
     def send(self, channel: Channel, data: bytes) -> None:
-        """Send to the autopilot; what a sensor under replay is told, it was told when the log was made."""
+        """Send to the autopilot. Commands to the sensor are dropped: the logged one has already had them."""
         if channel is Channel.SENSOR:
             return
         self._unsent += data
@@ -77,7 +77,7 @@ class ScriptedEdge:
             self.flush()
 
     def flush(self) -> None:
-        """Send what is waiting, whole."""
+        """Send all bytes that are waiting."""
         self._ports[Channel.LINK].write_all(bytes(self._unsent))
         self._unsent.clear()
 

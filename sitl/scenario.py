@@ -1,4 +1,4 @@
-"""A scenario: one TOML file that says what the world, the vehicle, the instrument and the mission are."""
+"""A scenario: one TOML file that describes world, vehicle, instrument and mission."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Place(Table, frozen=True):
 
 
 class Telemetry(Table, frozen=True):
-    """``[telemetry]``: how well the vehicle knows itself.
+    """``[telemetry]``: errors of the vehicle's own attitude and position, and the reference.
 
     Attributes
     ----------
@@ -73,8 +73,8 @@ class Scenario(Table, frozen=True):
     vehicle : Vehicle or None
         A vehicle whose magnetism is given; nothing is drawn then.
     calibration : str or None
-        A ``cal.json`` (relative to the scenario's file) that describes vehicle and instrument in the
-        vehicle's stead.
+        A ``cal.json`` (relative to the scenario's file) that describes vehicle and instrument, in place of a
+        vehicle.
     limits : dict of Limit
         The vehicle's limits where they differ from those of its kind of mass.
     world, motion, instrument, telemetry
@@ -108,7 +108,7 @@ def load(path: str | Path) -> Scenario:
     Raises
     ------
     ConfigError
-        The file is missing or not TOML, a key is unknown or missing, or a value cannot be meant.
+        The file is missing or not TOML, a key is unknown or missing, or a value is impossible.
     """
     path = Path(path)
     if path.suffix == "":

@@ -1,4 +1,4 @@
-"""Discretisations that are causal and exact: a first-order lag, and noise with a memory."""
+"""Causal, exact discretisations of a first-order lag and of autocorrelated noise."""
 
 from __future__ import annotations
 

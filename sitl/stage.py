@@ -31,7 +31,7 @@ BATCH = 2048
 CONNECT_TIMEOUT = 30.0
 """s for the bridge to start and connect."""
 PATIENCE = 1.0
-"""s for a bridge that failed to say why and end."""
+"""s that a failed bridge has to print its reason and end."""
 
 
 class Stage:
@@ -80,7 +80,7 @@ class Stage:
             while data := self._link.recv(65536):
                 self._listener(data)
         except ConnectionResetError:
-            return  # the bridge ended before its time; whoever plays to it tells why
+            return  # the bridge ended early; :meth:`play` reports why
 
     def _failure(self, otherwise: str) -> MagbridgeError:
         """End the bridge; return why it failed: the error for its exit code, with its last line on stderr."""
@@ -110,7 +110,7 @@ class Stage:
         WrongUse
             The bridge refused its configuration.
         PortError
-            It ended before its time; tells its last words.
+            It ended early; the message is its last line of output.
         """
         times = self._buffers[Channel.STATE]
         begin = msgspec.json.encode(start)
@@ -140,7 +140,7 @@ class Stage:
             self._close()
 
     def _flush(self) -> None:
-        """Write what is due: bytes first, so that whatever the timetable announces is already there."""
+        """Write what is due, bytes before timetable: what an entry announces must already be there."""
         sensor, link, times = self._buffers.values()
         while sensor:
             del sensor[: os.write(self._master, sensor)]

@@ -1,4 +1,4 @@
-"""What happened, byte by byte, and when: the script that a replay plays through a pty and a socket.
+"""The timetable of a replay: which bytes came through the pty and the socket, and when.
 
 The bytes themselves go through the pty and the socket, as real devices would send them. *When* they came
 cannot: a pty keeps no time. So the times go beside them, through a pipe, as the timetable: one entry per
@@ -22,9 +22,9 @@ Entry = struct.Struct("<QI")
 
 
 def read_entries(read: Callable[[], bytes]) -> Iterator[tuple[int, Channel, int, bytes]]:
-    """Take apart a timetable: time in µs, channel, number of bytes, and the bytes of a ``STATE`` entry.
+    """Yield a timetable's entries: time in µs, channel, number of bytes, and the bytes of a ``STATE`` entry.
 
-    `read` returns more of it, and nothing at its end.
+    `read` returns the next bytes of the timetable, and none at its end.
     """
     buffer = bytearray()
     channels = tuple(Channel)

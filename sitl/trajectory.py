@@ -1,4 +1,4 @@
-"""How the vehicle flies: legs of constant commands, flown with a real vehicle's sloth and wander."""
+"""How the vehicle flies: legs of constant commands, followed with a real vehicle's lag and wander."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 
 
 class Motion(Table, frozen=True):
-    """``[motion]``: how the vehicle answers its commands.
+    """``[motion]``: how the vehicle follows its commands.
 
     Attributes
     ----------
@@ -51,7 +51,7 @@ class Motion(Table, frozen=True):
 
 
 STEADY = Motion()
-"""A small glider's way of answering."""
+"""How a small glider follows its commands."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ class Track:
     roll, pitch, heading : array (n,)
         deg; the heading runs on past 360 (so that it can be interpolated).
     parameters : dict of array (n,)
-        Positions of the moving masses, and whatever else a log has that the vehicle's magnetism follows.
+        Positions of the moving masses, and other logged channels on which the vehicle's magnetism depends.
     run : array (n,) or None
         Number of the leg, from 1.
     segments : tuple of (name, first, last)
@@ -127,7 +127,7 @@ def fly(
         Of the wander.
     motion : Motion
     limits : mapping of Limit
-        For every moving mass. One that no leg moves stands in the middle of its way.
+        For every moving mass. One that no leg moves stays in the middle of its travel.
 
     Raises
     ------
@@ -138,7 +138,7 @@ def fly(
     t = np.arange(0.0, ends[-1], step)
     leg_of = np.searchsorted(ends, t, side="right")
     memory = motion.wander_memory / step
-    # a body of some inertia: wander without jitter, its standard deviation kept
+    # a vehicle has inertia: the wander is smoothed and keeps its standard deviation
     wander = first_order(autoregressive(rng, (len(t), 3), 1.0, memory), step, motion.wander_memory / 3)
     wander *= np.sqrt(4 / 3) * np.asarray(motion.wander)
 

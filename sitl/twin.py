@@ -158,7 +158,7 @@ class Twin:
         return np.column_stack([np.interp(grid, points, component) for component in field.T])
 
     def _channels(self, track: Track) -> dict[str, Array]:
-        """Return what the vehicle's magnetism follows."""
+        """Return the channels on which the vehicle's magnetism depends."""
         known = track.at(track.elapsed)
         for name in self.vehicle.channels:
             if name not in known:
@@ -168,7 +168,7 @@ class Twin:
         return {name: known[name] for name in self.vehicle.channels}
 
     def _telemetry(self, true: dict[str, Array], when: Array) -> dict[str, Array]:
-        """Return what the vehicle believes of attitude, position and masses."""
+        """Return the telemetry: attitude and position with their errors, all else as it is."""
         settings, rng = self.scenario.telemetry, _stream(self.seed, 4)
         seen = dict(true)
         for name in ("roll", "pitch"):
@@ -182,7 +182,7 @@ class Twin:
         return seen
 
     def _map_reference(self, columns: dict[str, Array], time: Array) -> Array:
-        """Return the IGRF with the map's anomaly, nT, where the vehicle believes it is (paper, eq. 4)."""
+        """Return the IGRF plus the map's anomaly, nT, at the vehicle's logged position (paper, eq. 4)."""
         latitude, longitude = columns["latitude"], columns["longitude"]
         main = total_field(longitude, latitude, columns["depth"], time)
         return main + self.anomaly_map().evaluate(longitude, latitude).anomaly

@@ -161,7 +161,7 @@ class World:
         water: Water,
         rng: np.random.Generator,
     ) -> World:
-        """Draw the rock about `origin`; `time` (s since 1970) only says which main field magnetises it."""
+        """Draw the rock about `origin`; `time` (s since 1970) is that of the main field magnetising it."""
         latitude, longitude, depth, when = np.array([[origin[0]], [origin[1]], [0.0], [time]])
         return cls(origin, Rock.draw(geology, igrf(longitude, latitude, depth, when)[0], rng), water)
 

@@ -39,7 +39,7 @@ def open_encoder(
     name, options, source
         As for :func:`magbridge.sensors.open_driver`.
     rate : float
-        Hz, for an instrument that dates a reading by its number.
+        Hz of the readings, for an instrument that gives a reading's number in place of its time.
 
     Raises
     ------

@@ -18,14 +18,14 @@ class Encoder(ABC):
     options
         Of the driver that reads it.
     rate : float
-        Hz, for an instrument that dates a reading by its number.
+        Hz of the readings, for an instrument that gives a reading's number in place of its time.
 
     Attributes
     ----------
     streaming : bool
         Whether it sends readings now; some wait for a command.
     power_cycle : int
-        How often it was switched on.
+        How many times it was switched on.
     """
 
     Options: ClassVar[Any]
@@ -38,20 +38,21 @@ class Encoder(ABC):
         self.power_on()
 
     def power_on(self) -> None:
-        """Be switched off and on again: count that, and readings from 0."""
+        """Switch off and on again: add a power cycle, and count readings from 0."""
         self.power_cycle += 1
         self.sequence = 0
 
     @abstractmethod
     def encode(self, reading: Reading) -> bytes:
-        """Return what it sends for one reading; nothing where it is not streaming.
+        """Return the bytes sent for one reading; none while it is not streaming.
 
-        Of `reading` it takes the field (nT, finite), `device_time` (s on its own clock, which begins at
-        power-on), `channel_delay`, `temperature` and `supply`, as far as it has them; it counts for itself.
+        It uses the reading's field (nT, finite), `device_time` (s on its own clock, which begins at
+        power-on), `channel_delay`, `temperature` and `supply`, where the instrument sends them; counters
+        are its own.
         """
 
     def feed(self, data: bytes) -> bytes:  # noqa: ARG002 - most do not listen
-        """Take what was sent to it; return its answers."""
+        """Take bytes that were sent to the instrument; return its answers."""
         return b""
 
 

@@ -54,7 +54,7 @@ class Hmr2300Encoder(Encoder):
         return self._set(command)
 
     def _set(self, command: str) -> bytes:
-        """Obey a command that needs a write enable before it."""
+        """Obey a command that is accepted only after a write enable."""
         enabled, self._enabled = self._enabled, command == "WE"
         if command in ("A", "B") and enabled:
             self.binary = command == "B"
@@ -66,5 +66,5 @@ class Hmr2300Encoder(Encoder):
 
 
 def _comma(count: int) -> str:
-    """Write a count as it does: sign, two digits, comma, three digits, leading zeros blank."""
+    """Write a count as the instrument does: sign, two digits, comma, three digits, leading zeros blank."""
     return ("-" if count < 0 else " ") + f"{abs(count):,}".rjust(6)

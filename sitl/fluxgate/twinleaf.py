@@ -82,7 +82,7 @@ class TwinleafEncoder(Encoder):
         return tio.slip(tio.pack(kind, payload, self._routing))
 
     def _describe(self) -> bytes:
-        """Return the packets that say what is in a sample."""
+        """Return the packets that describe the contents of a sample."""
         if self.generation == 2:
             return b"".join(
                 self._slip(tio.METADATA, bytes([kind, 0]) + record) for kind, record in self._records()

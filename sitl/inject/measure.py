@@ -20,11 +20,11 @@ __all__ = ["measure"]
 
 Array = NDArray[np.float64]
 FINER = 5
-"""Times, than the simulation's grid, where the instrument looks between its points."""
+"""Factor by which the simulation's grid is refined if the instrument has a filter or channel delays."""
 
 
 class _Tap(Instrument, frozen=True):
-    """The instrument, with something between the vehicle and it."""
+    """The instrument, with effects on the field before it and on the channels after it."""
 
     through: Callable[[Array, Array], Scene] | None = None
 
@@ -48,10 +48,11 @@ class _Tap(Instrument, frozen=True):
 
 
 def _between(scene: Scene) -> tuple[Array, Array, float]:
-    """Field, water and step on a finer grid.
+    """Return field, water temperature and step on a finer grid.
 
-    Between two points a field that turns is no straight line, and a delay would see its chord; masses start
-    and stop at once.
+    The Earth's part of the field turns with the vehicle and is interpolated by a spline, because a delayed
+    channel would see the error of a straight line. The rest is interpolated linearly: masses start and stop
+    abruptly.
     """
     track, t = scene.track, scene.t
     turn = rotation(track.roll, track.pitch, track.heading)
@@ -70,7 +71,7 @@ def measure(
     when: Array,
     seed: int,
 ) -> xr.Dataset:
-    """Measure with `hidden` effects out of the table `effects`; see :func:`sitl.inject.disturb`."""
+    """Measure with the `hidden` effects, looked up in `effects`; see :func:`sitl.inject.disturb`."""
     plain = twin.scenario.instrument
     scenes: list[Scene] = []
 

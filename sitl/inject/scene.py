@@ -32,18 +32,18 @@ class Scene:
     field : array (n, 3)
         nT at the sensor, body axes.
     earth : array (n, 3)
-        nT NED that the reference does not know of.
+        nT north-east-down, added to the Earth's field but not to the reference.
     water : array (n,)
         degC.
     instrument : Instrument
     reference : array (m,)
         nT by which the reference is too small.
     late : float
-        s by which the telemetry's stamps are behind.
+        s by which the telemetry's timestamps are behind.
     logged : dict of (array (n,), unit)
         Further telemetry.
     bend : list of callable
-        What happens to the channels (m, 3) after the analogue chain.
+        Functions applied to the channels (m, 3) after the analogue chain.
     truth : dict
         Numbers that a perfect diagnosis would print, by the name it would print them under.
     """
@@ -89,7 +89,7 @@ def direction(rng: Generator) -> Array:
 
 
 def relays(x: Array, centres: Array, widths: Array) -> Array:
-    """Mean of many relays that a history x (n,) has switched (Preisach 1935), less what the present tells."""
+    """Mean state of relays along a history x (n,) (Preisach 1935), less that without hysteresis."""
     total = np.zeros(len(x))
     for c, w in zip(centres, widths, strict=True):
         up, down = x >= c + w / 2, x <= c - w / 2
@@ -99,7 +99,7 @@ def relays(x: Array, centres: Array, widths: Array) -> Array:
 
 
 def furnish(scene: Scene, rng: Generator) -> None:
-    """Log what any vehicle logs, needed or not: two motors' currents, a fin, three temperatures."""
+    """Log what any vehicle logs, related to an effect or not: motor currents, a fin, temperatures."""
     n, t, step = len(scene.t), scene.t, scene.track.step
     moving = np.abs(np.gradient(scene.track.parameters["ballast"], step)) > 1.0
     duty = (autoregressive(rng, (n,), 1.0, 400.0 / step) > 0.8) & ~moving
