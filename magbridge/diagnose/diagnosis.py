@@ -25,16 +25,16 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Finding:
-    """A cause that is named, as it stands in the joint fit of all of them.
+    """A cause that is named, with its part of the joint fit of all named causes.
 
     Attributes
     ----------
     hypothesis : Hypothesis
-        Against the model without it.
+        The cause tested against the model without it.
     rivals : tuple of Rival
         The causes that could take its place, the likeliest first.
     gain : Gain
-        Of this cause beside the others.
+        What this cause gains beside the others.
     coefficients : (k,) array
         In units of their prior width.
     covariance : (k, k) array
@@ -75,7 +75,7 @@ class Diagnosis:
     fit : Joint
         At the extended calibration.
     before, after : (n,) array
-        nT, residuals with the calibration as it was, and extended, held out.
+        nT, residuals with the calibration as it was given, and with the extended one, held out.
     total : Gain
         Of all findings together.
     isolability : Isolability

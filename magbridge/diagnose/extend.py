@@ -35,10 +35,10 @@ FloatArray = NDArray[np.float64]
 
 
 def extend(problem: Problem, model: Sequence[Candidate], fit: Joint) -> Calibration:
-    """Return the calibration with the effects of `model` as terms, at `fit`.
+    """Return the calibration with the effects of `model` added, at the values of `fit`.
 
-    An error of the reference is no property of the vehicle: of those only a constant bias is kept, as the
-    reference's. All covariances are those of the joint posterior.
+    An error of the reference is no property of the vehicle: of such causes only a constant bias is kept, as
+    the reference's. All covariances are those of the joint posterior.
     """
     calibration, q = problem.calibration, len(problem.centre)
     widths = np.concatenate([np.empty(0), *(candidate.width for candidate in model)])
@@ -73,10 +73,10 @@ def extend(problem: Problem, model: Sequence[Candidate], fit: Joint) -> Calibrat
 
 
 def flown(survey: Survey, calibration: Calibration) -> Calibration:
-    """Return the calibration without those rates of change that, live, would cost more than they mend.
+    """Return the calibration without those rates of change that make the live correction worse.
 
-    Live there is no sample after, and a rate is a difference backwards: of a vehicle that sways from sample
-    to sample, noise.
+    On the vehicle the next sample is not known yet, so a rate is a backward difference, which is mostly noise
+    if the vehicle sways from sample to sample.
     """
     place = 0
     for effect in calibration.effects:
@@ -89,12 +89,12 @@ def flown(survey: Survey, calibration: Calibration) -> Calibration:
 
 
 def _power(survey: Survey, calibration: Calibration) -> float:
-    """nT², what is left of a survey as a bridge would correct it."""
+    """nT², mean square of the residual over the new samples, corrected as the bridge would."""
     return float(np.mean(residuals_of(*samples_of(survey, calibration))[~survey.learned] ** 2))
 
 
 def _without(calibration: Calibration, place: int) -> Calibration:
-    """Return the calibration without the effect at a place; another may be its equal."""
+    """Return the calibration without the effect at a place; other places may hold an equal one."""
     before, (effect, *after) = calibration.effects[:place], calibration.effects[place:]
     at = sum(term.size for term in (*calibration.terms, *before))
     own = np.arange(at, at + effect.size)
@@ -112,9 +112,9 @@ def leveled(problem: Problem, model: Sequence[Candidate], fit: Joint, extended: 
     Notes
     -----
     The logs that the calibration was fitted to have the same map as their reference. Its error may be as
-    large where they were flown as it is along the track, and is then in the calibration's scale, where no log
-    shows it. With s the coefficients that raise the corrected field by 1 nT everywhere, and m the error of
-    the map that was found,
+    large where they were flown as it is along the track; it is then part of the calibration's scale, and no
+    log shows it. With s the coefficients that raise the corrected field by 1 nT everywhere, and m the error
+    of the map that was found,
 
     .. math:: C \leftarrow C + \overline{m^2}\, s s^T
     """
@@ -139,8 +139,8 @@ def settle(
 ) -> tuple[Problem, list[Columns], Joint]:
     """Linearise anew about the extended calibration, and fit again.
 
-    A large effect has bent the magnitude. Rates of change keep the columns of the search: a live effect's
-    backward differences hold the sample's own noise.
+    The magnitude is not linear in a large effect. A model with a delay or a rate of change is left as the
+    search had it: the live effects' backward differences contain the sample's own noise.
     """
     columns = [candidate.columns for candidate in model]
     if not model or any(isinstance(effect, (RateEffect, ClockEffect)) for c in model for effect in c.effects):
@@ -148,7 +148,7 @@ def settle(
     settled = problem
     for _ in range(STEPS):
         before, columns = fit.log_likelihood, []
-        settled.let_go()  # one at a time
+        settled.let_go()  # one problem's columns at a time
         settled, columns, fit = _again(problem, model, fit, order)
         if abs(fit.log_likelihood - before) < 0.5:
             break
@@ -156,14 +156,15 @@ def settle(
 
 
 def widened(model: Sequence[Candidate], fit: Joint) -> Joint:
-    r"""Return the fit with what the regressors' idealisation adds to the covariance.
+    r"""Return the fit with the error of idealised regressors added to the covariance.
 
     Notes
     -----
     A cause of Wald's statistic ``W = b^T C_bb^-1 b`` has a signal of the whitened norm ``sqrt(W)``. A
-    regressor that is off by :data:`~.inference.evidence.IDEAL` of it leaves a misfit that nobody knows the
-    shape of: one more noise, of the power ``IDEAL^2 W / MODES`` in every direction, where the data's has 1.
-    The cause's coefficients, and what the calibration gives way to them, get that much more variance:
+    regressor that is off by a share :data:`~.inference.evidence.IDEAL` of it leaves a misfit of unknown
+    shape. This is taken for further noise, of the power ``IDEAL^2 W / MODES`` in every direction, where the
+    data's whitened noise has 1. It adds to the variance of the cause's coefficients, and of all others by
+    their correlation with them:
 
     .. math:: C \leftarrow C + \frac{IDEAL^2 W}{MODES}\, C_{:b} C_{bb}^{-1} C_{b:}
     """
@@ -179,15 +180,15 @@ def widened(model: Sequence[Candidate], fit: Joint) -> Joint:
 def _again(
     problem: Problem, model: Sequence[Candidate], fit: Joint, order: int
 ) -> tuple[Problem, list[Columns], Joint]:
-    """One step of Gauss and Newton on the whole model."""
+    """Do one Gauss-Newton step on the whole model."""
     again, columns = _about(problem, model, fit)
     c, ridge = np.append(fit.z, fit.coefficients), fit.prior[len(fit.z) :]
-    uneven = bool(np.ptp(fit.noise.scale))  # likelihoods that are compared have one kind of noise
+    uneven = bool(np.ptp(fit.noise.scale))  # likelihoods are comparable only under one kind of noise
     return again, columns, fit_joint(again, columns, order, c, blocks=uneven, ridge=ridge)
 
 
 def _about(problem: Problem, model: Sequence[Candidate], fit: Joint) -> tuple[Problem, list[Columns]]:
-    """Return the problem, and the columns of the model, linear about the calibration that `fit` extends."""
+    """Return problem and columns of the model, linearised about the calibration that `fit` extends."""
     extended = extend(problem, model, fit)
     samples, coefficients = samples_of(problem.survey, extended)
     samples.phi[np.ix_(problem.survey.learned, _since(extended, model))] = 0.0
@@ -195,8 +196,8 @@ def _about(problem: Problem, model: Sequence[Candidate], fit: Joint) -> tuple[Pr
     selector = np.eye(extended.coefficients.size)[:, problem.calibration.coefficients.size :]
     effects, at, columns = derivatives(extended, samples, g, -selector), 0, []
     again = replace(problem, residual=e, slopes=g)
-    # what the residual would be at the first point, were it linear about this one; neither the reference nor
-    # the channels' delays were mended in it
+    # the residual at the first point, extrapolated linearly from this one; errors of the reference and the
+    # channels' delays are in both, as `extended` corrects neither
     again.residual[:] += again.free[:, : DELAYS.start] @ fit.z[: DELAYS.start]
     for candidate, place in zip(model, slices(model), strict=True):
         if not candidate.effects:
@@ -210,7 +211,7 @@ def _about(problem: Problem, model: Sequence[Candidate], fit: Joint) -> tuple[Pr
 
 
 def _since(extended: Calibration, model: Sequence[Candidate]) -> NDArray[np.intp]:
-    """Return which regressors are those of causes that have appeared since the calibration."""
+    """Return the places of the regressors of causes that have appeared since the calibration."""
     late = {id(e) for c in model for piece in c.pieces if piece.since for e in piece.effects}
     counts = [effect.columns(extended.reference.field).shape[1] for effect in extended.effects]
     marks = np.repeat([id(effect) in late for effect in extended.effects], counts)

@@ -1,17 +1,18 @@
-r"""What mending gains: on dives that were left out, dive by dive against the calibration as it was.
+r"""What the extended calibration gains, measured on dives that its fit has not seen.
 
 Notes
 -----
-The *score* of a model is the log predictive density of every fold of dives, given the others. With the log
-likelihood l of the noise at the fit c to all, the folds' information ``A_f^T A_f`` and P all of it with the
-prior's, Laplace's approximation (exact for Gaussian noise, by Woodbury's identity) is
+The *score* of a model is the log predictive density of every fold of dives, given the others. With l the log
+likelihood of the noise at the fit c to all dives, c_-f the fit without fold f, ``A_f^T A_f`` the information
+of that fold and P that of all folds and the prior, Laplace's approximation (exact for Gaussian noise, by
+Woodbury's identity) is
 
 .. math:: S = l - \tfrac12 \sum_f \left[ (c - c_{-f})^T (P - A_f^T A_f) (c - c_{-f})
               + \log\det P - \log\det (P - A_f^T A_f) \right]
 
-what the data say, less what it took to learn each fold's coefficients from the others. The difference of two
-models' scores is the log of the odds that the left-out dives give one against the other: the pseudo-Bayes
-factor (Geisser & Eddy 1979, JASA 74:153).
+the log likelihood less the price of predicting each fold with coefficients learned from the others. The
+difference of two models' scores is the log of the odds that the left-out dives give one against the other:
+the pseudo-Bayes factor (Geisser & Eddy 1979, JASA 74:153).
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ class Gain:
 
     @property
     def shown(self) -> bool:
-        """Whether what was left out shows it: the interval lies below 1."""
+        """Whether the held-out dives show a gain: the interval lies below 1."""
         return self.interval[1] < 1.0
 
 
@@ -60,7 +61,8 @@ class HeldOut(NamedTuple):
 def held_out(problem: Problem, columns: Sequence[Columns], fit: Joint) -> HeldOut:
     """Leave out dives, fold by fold.
 
-    Nonlinear parameters and noise are those of the whole; every coefficient is fitted anew without the fold.
+    Nonlinear parameters and noise are those of the fit to all dives; every coefficient is fitted anew without
+    the fold.
     """
     X, noise, prior = Design(problem, kept(len(problem), columns)), fit.noise, fit.prior
     centre = np.append(problem.centre, np.zeros(X.effects))
@@ -91,7 +93,9 @@ def held_out(problem: Problem, columns: Sequence[Columns], fit: Joint) -> HeldOu
 
 
 def paired(before: FloatArray, after: FloatArray, dive: NDArray[np.int64], counts: NDArray[np.bool_]) -> Gain:
-    """Compare two residuals on the same samples; whole dives are drawn, so memory within a dive does no harm.
+    """Compare two residuals on the same samples.
+
+    The interval comes from a bootstrap of whole dives, so correlation within a dive does no harm.
 
     Parameters
     ----------

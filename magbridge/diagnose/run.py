@@ -83,7 +83,7 @@ def diagnose(
     DataError
         The data do not allow it: one line that says which column is missing or too short.
     """
-    # one thread: matrices this narrow only wait for each other, and sums keep one order on any machine
+    # one thread: for matrices this narrow more only wait, and sums keep one order on any machine
     with threadpool_limits(1, "blas"):
         diagnosis = _examine(datasets, calibration, learned_from, grid, causes, progress)
     if out_dir is not None:
@@ -145,7 +145,7 @@ def _examine(
 
 
 def _posed(survey: Survey, calibration: Calibration) -> Problem:
-    """Compare; refuse another vehicle's data, or data in another unit."""
+    """Pose the problem; refuse another vehicle's data, or data in another unit."""
     problem = pose(survey, calibration)
     off, field = float(np.median(np.abs(problem.residual))), float(np.median(survey.reference))
     if off > ABSURD * field:
@@ -168,9 +168,10 @@ def _put_forward(problem: Problem, causes: Mapping[str, Cause]) -> tuple[list[Ca
 
 
 def _whenever(candidates: Sequence[Candidate], learned: NDArray[np.bool_]) -> list[Candidate]:
-    """Return the candidates and, if there are the calibration's own logs, each as appeared since.
+    """Return the candidates and, given the calibration's own logs, of each a variant absent from those logs.
 
-    Steps, drifts and tones have a time of their own.
+    Steps, drifts and tones have no variant, since they have a time of their own; nor have errors of the
+    reference.
     """
     if not learned.any():
         return list(candidates)

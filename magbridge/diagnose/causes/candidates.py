@@ -30,7 +30,7 @@ class Candidate:
     channel : str or None
         Telemetry that it follows.
     columns : Columns
-        What its coefficients leave in the residual, each in units of its width.
+        What its coefficients add to the residual, each in units of its width.
     width : (k,) array
         Plausible size (1-sigma) of each coefficient, in its unit.
     names, units : tuple of str
@@ -42,18 +42,18 @@ class Candidate:
     again : callable or None
         Shape's values -> the same candidate with those: for profiling.
     trials : float
-        Independent hypotheses that stand behind this one (frequencies searched).
+        Number of independent hypotheses that this one was picked from (frequencies searched).
     positive : bool
         Its coefficients cannot be negative.
     narrow : float
-        Log of how much narrower than their grid's cells the data hold its nonlinear parameters.
+        Log of how much narrower than their grid's cells its nonlinear parameters are by the data.
     cells : tuple of float
         How far apart its grid's points are, in each nonlinear parameter.
     parts : tuple of Candidate
         Those that it was put together from, one after the other.
     spectra : (l, k) array or None
-        Where its numbers have one common free size (:mod:`~magbridge.diagnose.inference.statistic`): their
-        prior variances, in units of the widths squared and up to a common factor; each is tried.
+        Where its coefficients have one common free size (:mod:`~magbridge.diagnose.inference.statistic`): l
+        alternatives for their prior variances, in units of the widths squared and up to a common factor.
     since : bool
         It is absent from the logs that the calibration was fitted to.
     """
@@ -77,12 +77,12 @@ class Candidate:
 
     @property
     def size(self) -> int:
-        """Numbers."""
+        """Number of coefficients."""
         return len(self.width)
 
     @property
     def freedom(self) -> int:
-        """Free numbers."""
+        """Degrees of freedom of its test: coefficients of one common size are one."""
         return self.size if self.spectra is None else 1
 
     @property
@@ -92,7 +92,7 @@ class Candidate:
 
     @property
     def shapeless(self) -> bool:
-        """A Gaussian process of the place: it takes any shape, and leaves no remnant of an idealised one."""
+        """Whether it is a Gaussian process: it takes any shape, and leaves no remnant of an idealised one."""
         return self.spectra is not None and not self.effects
 
     @property
@@ -140,7 +140,7 @@ def since(candidate: Candidate, learned: NDArray[np.bool_]) -> Candidate:
 
 
 def per(step: str, power: int = 1) -> str:
-    """Return the unit of what a power of so many steps is multiplied with."""
+    """Return the unit of the coefficient of a power of something that is counted in units of `step`."""
     return f"nT per {step}" if power == 1 else f"nT per ({step})^{power}"
 
 
@@ -158,8 +158,8 @@ def of_effect(
 ) -> Candidate:
     """Make a candidate of an effect.
 
-    Its regressors are stepped through where `phi`, less `origin`, does not give them. `unit` is that of all
-    its numbers, or one for each of as many equal parts.
+    Its regressors are `phi` less `origin`; without `phi` they are computed sample by sample. `unit` is that
+    of all its coefficients, or has one for each of as many equal parts of them.
     """
     if phi is None:
         phi = history(problem.survey, problem.calibration, effect)

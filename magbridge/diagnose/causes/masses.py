@@ -22,11 +22,11 @@ __all__ = ["actuator_order", "hysteresis", "unmodelled_actuator"]
 FloatArray = NDArray[np.float64]
 
 MANY = 12
-"""Monomials that are tried together."""
+"""Most missing monomials that are tried together."""
 NEAR = (0.25, 0.5)
-"""How near to its way a mass may pass what it magnetises, in half travels; nearer iron would be struck."""
+"""Distances of sources from a mass' path that are tried, in half travels; nearer iron would be struck."""
 APART = 1.25
-"""How far apart sources in a row are, in their distance from the way: closer ones make the same field."""
+"""Spacing of the sources, in units of their distance from the path: closer ones make the same field."""
 STRAIGHT = 4.0
 """Scale, in half travels, of a branch of hysteresis that is practically straight."""
 
@@ -67,9 +67,9 @@ def _powers(values: FloatArray, centre: float, scale: float, order: int, rows: s
 def actuator_order(problem: Problem) -> list[Candidate]:
     """A mass needs what its polynomial lacks: a term ``T += b prod x_k^e_k``, or sources near its way.
 
-    One term, or all of the next order (paper, eq. 8); or what no polynomial of a low order follows, for the
-    mass passes iron that is near: :class:`~magbridge.calibration.followers.SourcesEffect`. Those sources have
-    one common size.
+    Candidates are each missing term up to the next order (paper, eq. 8), all of them together, and a row of
+    sources (:class:`~magbridge.calibration.followers.SourcesEffect`): of a mass that passes close to iron no
+    polynomial of a low order follows the field. The sources have one common size.
     """
     calibration = problem.calibration
     if not calibration.parameters:
@@ -84,7 +84,7 @@ def actuator_order(problem: Problem) -> list[Candidate]:
 
 
 def _sources(problem: Problem, name: str, near: float) -> Candidate:
-    """Sources all along one mass' way, and a little beyond its ends."""
+    """Return sources all along one mass' path, and a little beyond its ends."""
     low, high = extent(problem, name)
     channel, scale = problem.survey.channels[name], 0.5 * near * (high - low)
     gaps = int(np.ceil(2.0 / (APART * near)))
@@ -125,12 +125,12 @@ def _monomial(problem: Problem, exponents: tuple[int, ...]) -> Candidate:
 def hysteresis(problem: Problem) -> list[Candidate]:
     """Backlash of a drive, or moving steel remagnetised: ``T += b (S(y) - S(p)) / width``, y the play of p.
 
-    A drive's is straight, steel's is where the steel is: see
+    S is straight for the backlash of a drive; for steel it is steep where the steel is: see
     :class:`~magbridge.calibration.followers.PlayEffect`.
     """
     drives = product((0.05, 0.15, 0.3), (0.0,), (STRAIGHT,))
     steel = product((0.15, 0.3), (-1.0 / 3.0, 0.0, 1.0 / 3.0), (0.5,))
-    # only of masses that are modelled: a wide play of another is that other itself
+    # only of modelled masses: the difference between any other channel and its wide play is that channel
     names = [parameter.name for parameter in problem.calibration.parameters]
     shapes = [*drives, *steel]
     return [
@@ -142,7 +142,10 @@ def hysteresis(problem: Problem) -> list[Candidate]:
 
 
 def _plays(problem: Problem, name: str, shapes: Sequence[tuple[float, float, float]]) -> list[Candidate]:
-    """One mass' plays: widths in its whole travel, centres from its middle and scales in half of it."""
+    """Return one mass' candidates.
+
+    In `shapes`, widths are in units of its whole travel, centres (from the middle) and scales of half of it.
+    """
     low, high = extent(problem, name)
     middle, half = 0.5 * (low + high), 0.5 * (high - low)
     channel = problem.survey.channels[name]

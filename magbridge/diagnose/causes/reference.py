@@ -16,23 +16,23 @@ __all__ = ["diurnal_variation", "map_error", "reference_bias"]
 FloatArray = NDArray[np.float64]
 
 HARMONICS = np.arange(1, 5)
-"""Of a day, that the Sun makes."""
+"""Harmonics of the day in the variation that the Sun causes."""
 SHORTEST = 7200.0
-"""s; in less, a day's variation is a slope."""
+"""s, the shortest log that is tested: in less, a day's variation is a mere slope."""
 CELLS, WAVES = 300, 200
-"""Places of a map's error, and functions of them, at most."""
+"""Most cells at which a map's error is described, and most functions that describe it."""
 FINEST = 125.0
-"""m, a cell: from the height that maps are flown at nothing finer is seen."""
+"""m, the smallest cell: from the height that maps are flown at nothing finer is seen."""
 LENGTHS = np.array([2.0, 4.0, 8.0, 16.0])
-"""Over which a map's error changes, in cells."""
+"""Correlation lengths of a map's error, in cells."""
 ERROR = 20.0
-"""nT: a map's."""
+"""nT, a plausible error of a map (1-sigma)."""
 
 
 def diurnal_variation(problem: Problem) -> list[Candidate]:
     """The Earth's field itself varies: harmonics of the day along the field (Chulliat et al. 2016).
 
-    Their numbers have one common size, and fall with the order: the Sun heats the ionosphere smoothly.
+    Their coefficients have one common size and fall with the order: the Sun heats the ionosphere smoothly.
     """
     t = problem.survey.time
     if t[-1] - t[0] < SHORTEST:
@@ -50,13 +50,13 @@ def diurnal_variation(problem: Problem) -> list[Candidate]:
 def map_error(problem: Problem) -> list[Candidate]:
     r"""The anomaly map is wrong by a smooth function of place, a Gaussian process (Matern 3/2).
 
-    It is the same on every pass at one depth. What a map lacks comes from below, and changes downwards as
-    fast as along (a wave of wavenumber k grows as ``exp(k z)``: Laplace's equation); a map as flown, above
-    the vehicle, lacks little else.
+    It is the same on every pass at one depth. The sources of what a map lacks lie below, so it changes with
+    depth as fast as along the track (a wave of wavenumber k grows as ``exp(k z)``: Laplace's equation). A map
+    used as it was flown, high above the vehicle, lacks little else than this growth.
 
-    In the functions of Karhunen and Loeve at the cells that were visited, ``K(x, Z) V / lambda`` of
-    ``K(Z, Z) = V lambda V^T``: as many as there are, whatever the box. Lengths are told by the functions'
-    variances ``diag(V^T K_l V)``.
+    The error is expanded in Karhunen-Loeve functions at the visited cells Z, ``K(x, Z) V / lambda`` with
+    ``K(Z, Z) = V lambda V^T``: there are no more functions than visited cells, however large the box. A
+    correlation length l enters by the functions' prior variances alone, ``diag(V^T K_l V)``.
     """
     place = problem.survey.place
     if place is None or np.ptp(place[:, :2], axis=0).max() < 200.0:
@@ -78,7 +78,7 @@ def map_error(problem: Problem) -> list[Candidate]:
 
 
 def _cells(place: FloatArray) -> tuple[FloatArray, float]:
-    """(m, d) middles of at most :data:`CELLS` square cells that hold all of the track, and their side, m."""
+    """(m, d) mean places of the track in the cells that hold it, at most :data:`CELLS`, and their side, m."""
     side = FINEST
     while (found := _each(np.floor(place / side)))[1].max() >= CELLS:
         side *= 1.1
@@ -87,7 +87,7 @@ def _cells(place: FloatArray) -> tuple[FloatArray, float]:
 
 
 def _each(corners: FloatArray) -> tuple[FloatArray, NDArray[np.intp]]:
-    """Return the different ones (c, d) of whole numbers (n, d), and which each is (n,)."""
+    """Return the distinct rows (c, d) of whole numbers (n, d), and the place of each row among them (n,)."""
     low = corners.min(axis=0)
     box = np.ptp(corners, axis=0).astype(int) + 1
     keys, of = np.unique(np.ravel_multi_index((corners - low).astype(int).T, box), return_inverse=True)

@@ -1,4 +1,4 @@
-"""Regressors of effects along a whole survey at once, the same numbers as the live steppers give."""
+"""Regressors of effects for a whole survey at once; the values are those that the live effects compute."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Number = TypeVar("Number", np.float64, np.complex128)
 
 
 def once(made: Callable[[Problem], T]) -> Callable[[Problem], T]:
-    """Make something once for a problem: of a month a regressor is 50 MB, and causes share it."""
+    """Cache a function's result for each problem: causes share regressors, of 50 MB for a month."""
     known: WeakKeyDictionary[Problem, T] = WeakKeyDictionary()
 
     @wraps(made)
@@ -35,10 +35,16 @@ def once(made: Callable[[Problem], T]) -> Callable[[Problem], T]:
 
 
 def lagged(time: FloatArray, values: FloatArray, lag: float, stages: int = 1) -> FloatArray:
-    """(n,) y that follows x through equal lags in series.
+    """(n,) y that follows x through equal lags in series, as in a live ``ChannelEffect``.
 
-    Stepped as :class:`~magbridge.calibration.effects.ChannelEffect` does. Parameters ---------- time, values
-    : (n,) array s, and x. lag : float s, of all stages; 0: x itself. stages : int
+    Parameters
+    ----------
+    time, values : (n,) array
+        s, and x.
+    lag : float
+        s, the sum of all stages; at 0, y is x.
+    stages : int
+        Number of lags in series.
     """
     if lag <= 0.0 or len(time) < 2:
         return values
@@ -51,13 +57,13 @@ def _followed(time: FloatArray, values: FloatArray, lag: float) -> FloatArray:
     """(n,) y with ``dy/dt = (x - y) / lag``."""
     share = -np.expm1(-np.diff(time) / lag)
     usual = float(np.median(share))
-    if np.abs(share - usual).max() > 1e-6 * usual:  # gaps, and clocks that tremble
+    if np.abs(share - usual).max() > 1e-6 * usual:  # gaps, or a clock that jitters
         return _stepped(values, share)
     return np.asarray(lfilter([usual], [1.0, usual - 1.0], values, zi=[(1.0 - usual) * values[0]])[0])
 
 
 def _stepped(values: FloatArray, share: FloatArray) -> FloatArray:
-    """(n,) ``y_t = y_(t-1) + s_t (x_t - y_(t-1))``: two rows' steps are one, so are four's, and eight's."""
+    """(n,) ``y_t = y_(t-1) + s_t (x_t - y_(t-1))``, by doubling: the steps of 2, 4, 8 ... rows are one."""
     y, kept = np.append(values[0], share * values[1:]), np.append(0.0, 1.0 - share)
     step = 1
     while step < len(y):
@@ -70,8 +76,8 @@ def _stepped(values: FloatArray, share: FloatArray) -> FloatArray:
 def play(values: FloatArray, width: float) -> FloatArray:
     """(n,) play operator of `values` (:class:`~magbridge.calibration.followers.PlayEffect`).
 
-    Each row clips what was before it; clipped twice is clipped once, so two rows are one, so are
-    four, and eight.
+    Each row clips the output of the row before. Two such clips in series are one clip, so they are combined
+    by doubling: over 2, 4, 8 ... rows.
     """
     low, high = values - 0.5 * width, values + 0.5 * width
     low[0] = high[0] = values[0]

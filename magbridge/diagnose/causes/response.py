@@ -22,8 +22,8 @@ FloatArray = NDArray[np.float64]
 def nonlinearity(problem: Problem) -> list[Candidate]:
     """The response bends: ``T_i += b_i (H_i / H_0)^p``, p = 2 (a leak), 3 (a saturating core), or both.
 
-    What leaks is an even harmonic. Both are six numbers of one common size: the three channels are of one
-    make.
+    The leak is that of an even harmonic. Both together have six coefficients of one common size, because the
+    three channels are built alike.
     """
     unit, H = problem.calibration.reference.field, problem.reading
     made = []
@@ -47,7 +47,7 @@ def saturation(problem: Problem) -> list[Candidate]:
 
 
 def _clipped(problem: Problem, axis: int, knees: Sequence[float]) -> list[Candidate]:
-    """One axis', at one end."""
+    """Return the candidates for one axis, at one end of its range."""
     unit, H = problem.calibration.reference.field, problem.reading
     names = (f"{AXES[axis]} beyond", f"{AXES[axis]} slope")
 

@@ -20,25 +20,25 @@ __all__ = ["current_field", "pressure_offset", "temperature_offset", "temperatur
 FloatArray = NDArray[np.float64]
 
 LAGS = (0.0, 700.0, 1700.0, 4000.0, 10000.0)
-"""s, so close that a lag between two of them is missed by a fifth at most (RMS)."""
+"""s, spaced so closely that any lag between two of them is matched to within a fifth (RMS)."""
 STAGES = 2
-"""Heat that is conducted does not set in at once: hull, then core. Of a slab's centre one lag misses 10 to
-30 %, two 4 to 9."""
+"""Equal lags in series, because conducted heat passes the hull before it reaches the core. Of the
+temperature in the centre of a slab one lag misses 10 to 30 %, two in series miss 4 to 9 %."""
 
 
 def _origins(problem: Problem, name: str) -> list[float]:
-    """Where the channel may have stood when the vehicle was calibrated."""
+    """Return values that the channel may have had when the vehicle was calibrated."""
     low, high = extent(problem, name)
     middle = float(np.mean(problem.survey.channels[name].values))
-    if problem.survey.learned.any():  # then the data hold the calibration's own values of it
+    if problem.survey.learned.any():  # the values during the calibration are in the data
         return [middle]
     return [middle, 2 * low - high, 2 * high - low]
 
 
 @once
 def _levels(problem: Problem) -> Callable[[str, float], Callable[[slice], FloatArray]]:
-    """Temperatures behind their lags: of a month each is 5 MB, and origins and causes share it."""
-    survey = problem.survey  # what is kept for a problem must not keep the problem
+    """Return the lagged temperatures, cached: origins and causes share them, each of 5 MB for a month."""
+    survey = problem.survey  # a cache that referred to the problem would keep it alive
 
     @lru_cache(len(LAGS) * len(channels_of(problem, "temperature")))
     def level(name: str, lag: float) -> Callable[[slice], FloatArray]:
@@ -57,7 +57,7 @@ def _thermal(problem: Problem, on: Literal["offset", "scale"]) -> list[Candidate
 def _warmed(
     problem: Problem, on: Literal["offset", "scale"], name: str, lags: Sequence[float]
 ) -> list[Candidate]:
-    """One temperature's."""
+    """Return the candidates for one temperature."""
     field = problem.calibration.reference.field
     unit = "nT/degC" if on == "offset" else f"nT/degC per {field:.0f} nT"
 
@@ -77,10 +77,10 @@ def _warmed(
 def temperature_offset(problem: Problem) -> list[Candidate]:
     """Core and electronics have an offset that follows temperature: ``T += b (theta_2 - theta_0)``.
 
-    Through the hull's store of heat: ``dtheta_1/dt = 2 (theta - theta_1) / lag``,
-    ``dtheta_2/dt = 2 (theta_1 - theta_2) / lag``. Typically 0.1 nT/degC for a good fluxgate, several for a
-    low-power one (Primdahl 1979, J. Phys. E 12:241). Separated from depth by the thermal hysteresis of
-    dive and climb.
+    The core's temperature follows through the heat capacity of the hull:
+    ``dtheta_1/dt = 2 (theta - theta_1) / lag``, ``dtheta_2/dt = 2 (theta_1 - theta_2) / lag``. Typically
+    0.1 nT/degC for a good fluxgate, several for a low-power one (Primdahl 1979, J. Phys. E 12:241). Separated
+    from depth by the thermal hysteresis of dive and climb.
     """
     return _thermal(problem, "offset")
 
@@ -106,7 +106,7 @@ def pressure_offset(problem: Problem) -> list[Candidate]:
 
 
 def _proportional(problem: Problem, cause: str, kind: str, largest: float) -> list[Candidate]:
-    """``T += b c(t)`` for every channel c of a kind; at its extent some `largest` nT."""
+    """``T += b c(t)`` for every channel c of a kind; plausible are `largest` nT at the channel's extreme."""
     made = []
     for name in channels_of(problem, kind):
         low, high = extent(problem, name)

@@ -66,7 +66,7 @@ def interference_tone(problem: Problem) -> list[Candidate]:
     size = 1 << int(np.ceil(np.log2(slots[-1] + 1)) + 1)
     body = problem.slopes[:, 6:]
     lines = np.array([np.fft.rfft(np.bincount(slots, flat * slope, minlength=size)) for slope in body.T])
-    # of all three axes together: what they share counts once
+    # power in all three axes together; the inverse keeps what they share from counting twice
     power = np.einsum("if,ij,jf->f", lines.conj(), np.linalg.inv(body.T @ body), lines).real
     frequency = np.fft.rfftfreq(size, interval)
     width = min(201, len(power))

@@ -1,4 +1,4 @@
-"""What was sampled when: rates of change of the field and of the masses."""
+"""Errors of timing, and currents induced by turns: rates of change of the field and of the masses."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ __all__ = ["channel_skew", "clock_offset", "eddy_current", "field_rates", "filte
 FloatArray = NDArray[np.float64]
 
 MOMENT = 0.01
-"""s by which masses are moved on and back, to see what the coefficients do."""
+"""s by which masses are moved forward and back, for a central difference of the nine coefficients."""
 
 
 @once
@@ -28,11 +28,12 @@ def field_rates(problem: Problem) -> FloatArray:
 
 @once
 def mass_rates(problem: Problem) -> FloatArray:
-    """(9, n) rates of the nine coefficients, each mass at the larger of its speeds before and after.
+    """(9, n) rates of change, per s, of the nine coefficients while masses move.
 
-    A drive starts and stops between samples and runs evenly meanwhile: a sample is in motion where that mass
-    has moved both before and after it, and the interval that it moved all through tells the speed. Telemetry
-    has no noise that a one-sided difference would bring in.
+    A drive starts and stops between samples and runs evenly meanwhile. So a mass is in motion at a sample if
+    it moves the same way in the intervals before and after it, and its speed is the larger of the two: that
+    of an interval in which it moves all the time. One-sided differences do no harm here, because telemetry
+    does not contain the residual's noise.
     """
     survey, calibration = problem.survey, problem.calibration
     kernel = calibration.kernel
@@ -63,9 +64,9 @@ def channel_skew(problem: Problem) -> list[Candidate]:
 def filter_lag(problem: Problem) -> list[Candidate]:
     """The anti-alias filter holds the field back, not the telemetry: ``T += -tau dH/dt`` (paper, section 3).
 
-    In a uniform field ``|H|`` does not see it but where masses move:
-    ``u^T A dH_r/dt = -dF/dtheta dtheta/dt``, the signature of a clock that is off the other way, and mended
-    by the same. What tells them apart is that no filter runs ahead.
+    In a uniform field ``|H|`` shows the delay only where masses move:
+    ``u^T A dH_r/dt = -dF/dtheta dtheta/dt``. That is the signature of a clock offset of the opposite sign,
+    and the same correction removes it. The only difference is that a filter's delay cannot be negative.
     """
     return _delay(problem, ClockEffect(cause="filter_lag", sign=-1.0), 2.0, positive=True)
 

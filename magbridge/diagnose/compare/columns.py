@@ -1,4 +1,4 @@
-"""Columns of the linear problem, and what several of them are made of."""
+"""Columns of the linear problem, and mixtures of columns that share parts."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ __all__ = ["Columns", "Interpolated", "Mixture", "Since", "beside", "parts", "ti
 
 FloatArray = NDArray[np.float64]
 Columns = Callable[[slice], FloatArray]
-"""Rows -> (m, k): what one unit of each of k coefficients leaves in the residual; best stored
-column by column."""
+"""A function from a slice of m rows to (m, k): what one unit of each of k coefficients, if the calibration
+lacks it, adds to the residual. Best stored column by column."""
 
 
 @dataclass(frozen=True, eq=False)
 class Mixture:
-    r"""Columns that are made of others': :math:`\sum_i X_i M_i`.
+    r"""Columns that are linear combinations of others: :math:`\sum_i X_i M_i`.
 
-    Hypotheses are many, and what they are made of is less: a temperature behind a lag serves wherever its
-    origin was. So sums over a log are those of the different ``X_i``.
+    Many hypotheses share few parts: one lagged temperature serves all the origins that it is tried with.
+    Sums over a log are therefore taken once for each different ``X_i``.
 
     Attributes
     ----------
     parts : tuple of (Columns, (k_i, k) array)
-        X_i, and M_i.
+        X_i and M_i.
     """
 
     parts: tuple[tuple[Columns, FloatArray], ...]
@@ -43,14 +43,14 @@ class Mixture:
 
 @dataclass(frozen=True, eq=False)
 class Interpolated:
-    """Columns that are interpolated between few nodes: ``W V``.
+    """Columns interpolated from their values at a few nodes: ``W V``.
 
     Attributes
     ----------
     weights : (n, c) sparse array
-        W, of each row's nodes.
+        W, the weights of each row's nodes.
     values : (c, k) array
-        V, at the nodes.
+        V, the columns at the nodes.
     """
 
     weights: csr_array
@@ -63,7 +63,7 @@ class Interpolated:
 
 @dataclass(frozen=True)
 class Since:
-    """Columns that are zero where `fresh` (n,) is not set."""
+    """Columns set to zero in the rows where `fresh` (n,) is false."""
 
     columns: Columns
     fresh: NDArray[np.bool_] = field(compare=False)
@@ -74,14 +74,14 @@ class Since:
 
 
 def parts(columns: Columns) -> tuple[tuple[Columns, FloatArray], ...]:
-    """Return what columns are made of: of themselves, if they are no mixture."""
+    """Return the pairs (X_i, M_i) of a mixture; any other columns are their own only part, M the identity."""
     if isinstance(columns, Mixture):
         return columns.parts
     return ((columns, np.eye(columns(slice(0, 1)).shape[1])),)
 
 
 def times(columns: Columns, rows: slice, c: FloatArray) -> FloatArray:
-    """(m,) what coefficients c (k,) leave in these rows, without making all columns where that is quicker."""
+    """(m,) product of the columns' rows and coefficients c (k,), without building all columns if possible."""
     if isinstance(columns, Mixture):
         return np.asarray(sum(times(X, rows, M @ c) for X, M in columns.parts))
     if isinstance(columns, Interpolated):
@@ -90,7 +90,7 @@ def times(columns: Columns, rows: slice, c: FloatArray) -> FloatArray:
 
 
 def together(columns: Sequence[Columns]) -> Mixture:
-    """Return all as one mixture, in which nothing is twice."""
+    """Return all columns side by side as one mixture, in which shared parts occur once."""
     listed = [parts(own) for own in columns]
     ends = np.cumsum([0, *(own[0][1].shape[1] for own in listed)])
     found: dict[Columns, FloatArray] = {}

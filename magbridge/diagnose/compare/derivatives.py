@@ -1,4 +1,4 @@
-"""What every coefficient of a calibration does to the residual: ``de/dc`` of :mod:`.problem`."""
+"""Derivatives of the residual by every coefficient of a calibration: ``de/dc`` of :mod:`.problem`."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def derivatives(calibration: Calibration, samples: Samples, g: FloatArray, L: Fl
 
 
 def _tensor(calibration: Calibration) -> FloatArray:
-    """(K, m, 9): what each coefficient makes of each regressor, in each slot."""
+    """(K, m, 9) the tensor C_krs of :mod:`.problem`: coefficients, regressors, slots."""
     kernel = calibration.kernel
     exponents = [(0,) * len(calibration.parameters)]
     for parent, k in kernel.parents:

@@ -1,4 +1,4 @@
-"""Between a log's samples: rates of change along its legs, and what interpolated channels lost there."""
+"""Rates of change of sampled channels, and the error of channels that were interpolated to their rows."""
 
 from __future__ import annotations
 
@@ -13,21 +13,24 @@ __all__ = ["LOST", "bent", "rates"]
 FloatArray = NDArray[np.float64]
 
 LOST = 3
-"""Samples between two that may be lost: the rate beside them still holds 98 % of the true one's power."""
+"""Most samples missing in a row within a leg: the rate beside such a gap still has 98 % of the true
+one's power."""
 
 
 def rates(survey: Survey, H: FloatArray) -> FloatArray:
-    r"""(k, n) dH/dt, per s, of H (k, n): of the cubic spline through a leg's samples; zero at its ends.
+    r"""(k, n) dH/dt, per s, of H (k, n): of the cubic spline through each leg; zero at a leg's ends.
+
+    A leg is a run of samples in which no gap is longer than :data:`LOST` samples.
 
     Notes
     -----
-    Of a turn of angular frequency w, sampled every h, a difference both ways holds
-    ``sin(wh)/wh = 1 - (wh)^2/6 + ...``, and its coefficient would be too large by as much; the spline
-    ``3 sin(wh)/(wh (2 + cos(wh))) = 1 - (wh)^4/180 + ...``.
+    Of an oscillation of angular frequency w, sampled every h, a central difference returns only
+    ``sin(wh)/wh = 1 - (wh)^2/6 + ...`` of the rate, so a coefficient fitted to it would be too large by as
+    much. The spline returns ``3 sin(wh)/(wh (2 + cos(wh))) = 1 - (wh)^4/180 + ...``.
 
-    Rates ``D e`` of noise e have the inner product :math:`E[(D e)^T \Sigma^{-1} e] = \mathrm{tr} D` with
-    itself, whatever its covariance. That of a one-sided difference would pass for an effect; a spline has
-    nothing, being the same backwards.
+    The rates ``D e`` of noise e, of covariance Sigma, correlate with the noise:
+    :math:`E[(D e)^T \Sigma^{-1} e] = \mathrm{tr} D`, whatever Sigma is. A one-sided difference has a trace,
+    which would pass for an effect; the spline treats both directions of time alike and has none.
     """
     t, out = survey.time, np.zeros_like(H)
     starts = np.flatnonzero(~survey.follows(LOST))
@@ -38,14 +41,15 @@ def rates(survey: Survey, H: FloatArray) -> FloatArray:
 
 
 def bent(survey: Survey, H: FloatArray) -> FloatArray:
-    r"""(3, n) nT/s of H (3, n): what a second's delay leaves in a channel interpolated linearly to its row.
+    r"""(3, n) error of channels H (3, n) sampled late and interpolated to their row, nT per s of delay.
 
-    A vehicle that sways from sample to sample is not where a line has it. `H` must not hold the noise: the
-    difference is one-sided, and would find its own.
+    Linear interpolation is in error when the vehicle sways from sample to sample. `H` must be free of the
+    readings' noise: the difference is one-sided and would correlate with it.
 
     Notes
     -----
-    Sampled tau after its row, h after the sample before, the channel reads
+    A channel sampled tau after its row, and interpolated linearly from there and from the sample before it
+    (H_-, an interval h earlier), reads at its row (H_0)
 
     .. math:: H(t + \tau) - \frac{\tau}{h} \left(H(t + \tau) - H(t - h + \tau)\right)
               \approx H + \tau \left(\dot H - \frac{H_0 - H_-}{h}\right)

@@ -1,4 +1,4 @@
-"""What came before each sample, and how long before: logs have gaps."""
+"""Which samples precede each one, and by how many intervals: logs have gaps."""
 
 from __future__ import annotations
 
@@ -10,11 +10,12 @@ __all__ = ["FAR", "Past"]
 IntArray = NDArray[np.int64]
 
 FAR = 1000
-"""Intervals after which nothing is known any more."""
+"""Lag, in sampling intervals, from which on a sample says nothing about the noise; longer ones are cut
+to it."""
 
 
 class Past:
-    """The p samples before each.
+    """The p samples before each sample, and their lags.
 
     Parameters
     ----------
@@ -27,13 +28,14 @@ class Past:
     ----------
     order : int
     whole : (n,) bool array
-        They are the last p intervals' own.
+        There is no gap: the p samples before have the lags 1 to p.
     rows : (m,) int array
-        Where they are not.
+        Samples where there is one.
     lags : (l, p) int array
-        Patterns of how many intervals ago they were, :data:`FAR` where that is nobody's concern.
+        The different patterns of lags at `rows`, in intervals; :data:`FAR` where a sample is too long ago,
+        or there is none.
     pattern : (m,) int array
-        Which of them each of `rows` has.
+        Pattern of each of `rows`.
     """
 
     def __init__(self, steps: IntArray, order: int) -> None:

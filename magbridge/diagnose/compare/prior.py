@@ -1,6 +1,7 @@
-"""What is believed of a calibration before a deployment.
+"""The prior of a calibration's coefficients in a deployment.
 
-Its posterior, without what these very data told it, and with what nobody holds constant between days.
+It is the calibration's posterior without what it learned from samples that are compared here again, and with
+a drift between days that no instrument is free of.
 """
 
 from __future__ import annotations
@@ -19,9 +20,9 @@ __all__ = ["floor", "isotropic", "level", "loosened", "prior"]
 FloatArray = NDArray[np.float64]
 
 BROADEST = 1e-3
-"""Precision, of the posterior's, below which a direction that only the given logs determined is not let."""
+"""Least precision, in units of the posterior's, of a direction that only the repeated logs determined."""
 SOFT, HARD = 0.02, 2000.0
-"""Soft iron, of the field, and hard iron, nT: 1-sigma of what vehicles have."""
+"""Soft iron, as a fraction of the field, and hard iron, nT: plausible sizes (1-sigma) on any vehicle."""
 STABLE = 2e-5
 """Stability between days, as a fraction of the field: no fluxgate's scales, axes and offsets do better
 than 20 ppm."""
@@ -33,10 +34,10 @@ def level(calibration: Calibration, e: FloatArray) -> float:
 
 
 def floor(calibration: Calibration) -> FloatArray:
-    """(K, K) covariance, nT²: what the nine constants may have changed by since the calibration.
+    """(K, K) covariance, nT², of how much the nine constants may have changed since the calibration.
 
-    Its posterior knows only the noise of its samples, and a few thousand of them make that a hundredth of it.
-    What the runs' turns did to the filtered channels, and what nobody holds constant, is more.
+    The posterior counts only the noise of its samples, and a few thousand samples average that down to a
+    hundredth. The filters' lag in the turns of the calibration runs, and the drift between days, are larger.
     """
     spread = np.zeros(calibration.coefficients.size)
     for own in _constants(calibration):
@@ -45,7 +46,7 @@ def floor(calibration: Calibration) -> FloatArray:
 
 
 def isotropic(calibration: Calibration) -> FloatArray:
-    """(K,) what makes every corrected field 1 nT larger at any attitude: equal scales of all channels."""
+    """(K,) change of the coefficients that raises the total field by 1 nT at any attitude: equal scales."""
     scale = np.zeros(calibration.coefficients.size)
     for own in _constants(calibration)[:1]:
         scale[own.start : own.start + 3] = 1.0
@@ -53,7 +54,7 @@ def isotropic(calibration: Calibration) -> FloatArray:
 
 
 def _constants(calibration: Calibration) -> list[slice]:
-    """Return where the nine constants of each polynomial that has them are among the coefficients."""
+    """Return the places of the nine constants (of exponents zero) of each polynomial that has them."""
     found, k, none = [], 0, (0,) * len(calibration.parameters)
     for term in calibration.terms:
         if isinstance(term, Polynomial) and none in term.exponents:
@@ -64,7 +65,7 @@ def _constants(calibration: Calibration) -> list[slice]:
 
 
 def loosened(calibration: Calibration, L: FloatArray, centre: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return L and m with :func:`floor` added."""
+    """Return L and m of the prior with :func:`floor` added to its covariance."""
     mean = L @ centre
     broad = _factor(L @ L.T + floor(calibration))
     return broad, np.asarray(np.linalg.lstsq(broad, mean, rcond=None)[0], float)
@@ -81,10 +82,12 @@ def _factor(covariance: FloatArray) -> FloatArray:
 def prior(
     survey: Survey, calibration: Calibration, samples: Samples, e: FloatArray, g: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return L and m; of the posterior, what was learned from samples that are here again is taken out.
+    """Return L (K, q) and m (q,) of the prior ``c = c_0 + L z``, ``z ~ N(m, 1)``.
 
-    In the posterior's own units, ``P_0 = 1 - H`` with H the information of those samples, and since the
-    gradient vanished at c_0, ``P_0 m = L^T J^T W e``.
+    The information of the calibration's samples that are in the survey again (`survey.learned`) is taken out
+    of its posterior: it would count twice. In the posterior's own units the precision left is
+    ``P_0 = 1 - H`` with H the information of those samples, and since the gradient of the whole fit vanished
+    at c_0, ``P_0 m = L^T J^T W e``, the sum over those samples.
     """
     L = _factor(calibration.covariance)
     centre = np.zeros(L.shape[1])
@@ -98,7 +101,7 @@ def prior(
     white = whiten(white, steps, noise.memory) / level(calibration, e)
     A, y = white[:, :-1], white[:, -1]
     values, vectors = np.linalg.eigh(np.eye(len(centre)) - A.T @ A)
-    held = values > 0.1  # elsewhere those samples were all there was, and they speak for themselves
+    held = values > 0.1  # other directions were learned from the repeated samples alone, which count anyway
     pull = vectors @ np.where(held, vectors.T @ (A.T @ y), 0.0)
     bound = L / _physical(calibration)[:, None]
     values, vectors = np.linalg.eigh((vectors * np.where(held, values, 0.0)) @ vectors.T + bound.T @ bound)
@@ -107,10 +110,11 @@ def prior(
 
 
 def _physical(calibration: Calibration) -> FloatArray:
-    """(K,) nT: how large coefficients are on any vehicle.
+    """(K,) nT, plausible size (1-sigma) of each coefficient on any vehicle; infinite where none is known.
 
-    Soft iron is percents, hard iron thousands of nanotesla. Less at every order. On a glider's attitudes
-    scale and offset can grow against each other without end, and take the noise with them.
+    Soft iron is percents of the field, hard iron thousands of nanotesla, and both fall with the order. The
+    bound is needed because, at a glider's few attitudes, scale and offset can cancel each other: without it
+    they grow without end and fit the noise.
     """
     width, k = np.full(calibration.coefficients.size, np.inf), 0
     for term in calibration.terms:

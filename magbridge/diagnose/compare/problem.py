@@ -7,18 +7,19 @@ coefficients at every sample, a term or an effect that adds ``sum_rs phi_r C_krs
 
 .. math:: \partial e_t / \partial c_k = \sum_{rs} \phi_r(t)\, C_{krs}\, g_s(t)
 
-and a coefficient that is really there, but not in the calibration, leaves minus that in the residual. So
-every cause passes through the forward model by the one rule. The calibration stays free, with its posterior
-as prior: ``c = c_0 + L z``, ``z ~ N(m, 1)``, where L holds only the directions that these data can see.
+and a coefficient that the vehicle has but the calibration lacks adds minus that to the residual. Every cause
+passes through the forward model by this one rule. The calibration's coefficients stay free, with its
+posterior as prior (:mod:`.prior`): ``c = c_0 + L z``, ``z ~ N(m, 1)``, where L spans only the directions that
+these data can determine.
 
-Free are also three delays with which the channels may have been interpolated to their rows
-(:mod:`.interpolation`): a fault of the log, not of the vehicle, so they move no coefficient. Unseen, it is an
-error that a pair of large causes which cancel can mimic. They have one common size
-(:mod:`~magbridge.diagnose.inference.statistic`): many logs have none, and delays that are free in vain take
-up to a tenth of a skew's power.
+Three delays are free, too: the channels may have been sampled late, and then interpolated to their rows
+(:mod:`.interpolation`). That is a fault of the log, not of the vehicle, so the delays change no coefficient;
+were they left out, a pair of large causes that cancel each other could mimic them. They have one common size
+(:mod:`~magbridge.diagnose.inference.statistic`), because many logs have no such delays, and three numbers
+that are each free take up to a tenth of a skew's power.
 
-Derivatives are taken where the reading would have had no residual, ``H_r - e w / |w|^2``: at the
-reading itself they hold its noise, and scales could grow against offsets until the noise is gone
+Derivatives are taken at ``H_r - e w / |w|^2``, the reading moved until its residual vanishes: at the reading
+itself they would correlate with its noise, and scales could grow against offsets until they fit the noise
 (errors in variables).
 """
 
@@ -46,29 +47,29 @@ __all__ = ["Problem", "add_effects", "effect_columns", "history", "pose", "sampl
 FloatArray = NDArray[np.float64]
 
 DELAY = 0.3
-"""s, a plausible size of a channel's, after its row."""
+"""s, a plausible size of a channel's delay after its row."""
 DELAYS = slice(-3, None)
-"""Places of the channels' delays among what is free."""
+"""Places of the channels' delays in z."""
 SEEN = 0.01
 """Share of a prior's information that data must add for its direction to be kept."""
 
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """What a search works on.
+    """A survey compared with a calibration and linearised: what a search works on.
 
     Attributes
     ----------
     survey : Survey
     calibration : Calibration
     reading : (n, 3) array
-        nT, ``H_r - e w / |w|^2``: what bends with the reading must not hold its noise.
+        nT, ``H_r - e w / |w|^2``: for effects that depend on the reading, which must not contain its noise.
     residual : (n,) array
-        e, nT of the sensor.
+        e, in the sensor's nanotesla.
     slopes : (n, 9) array
         g.
     gain : (n,) array
-        1/s: what one nT of error in the reference does to e.
+        1/s of :mod:`magbridge.calibration.residual`: e per nT by which the true field exceeds the reference.
     late : (n, 3) array
         ``-de/dz`` of the delays, in units of :data:`DELAY`.
     directions : (K, q) array
@@ -102,17 +103,17 @@ class Problem:
         return free
 
     def let_go(self) -> None:
-        """Give back the memory of :attr:`free`, of a month 300 MB; it is made anew when it is asked for."""
+        """Release the memory of :attr:`free` (300 MB for a month); it is computed again when needed."""
         self.__dict__.pop("free", None)
 
     @property
     def stated(self) -> FloatArray:
-        """(n,) nT², variance of the residual by the calibration: noise, and errors of its coefficients."""
+        """(n,) nT², variance that the calibration states: of the noise, and of its coefficients."""
         noise, free = self.calibration.noise, self.free[:, : DELAYS.start]
         return np.asarray(noise.sensor**2 + noise.reference**2 + np.einsum("ij,ij->i", free, free))
 
     def straight(self, z: FloatArray) -> FloatArray:
-        """(n,) residual without what the delays of z (q,) have left in it."""
+        """(n,) residual without what the channels' delays in z (q,) add to it."""
         return np.asarray(self.residual - self.late @ z[DELAYS])
 
 
@@ -131,7 +132,7 @@ def add_effects(calibration: Calibration, effects: tuple[Effect, ...]) -> Calibr
 
 
 def history(survey: Survey, calibration: Calibration, effect: Effect) -> FloatArray:
-    """(r, n) regressors of one effect along the survey, stepped as the bridge would."""
+    """(r, n) regressors of one effect along the survey, computed sample by sample as the bridge does."""
     probe = add_effects(
         replace(
             calibration,
@@ -150,7 +151,7 @@ def history(survey: Survey, calibration: Calibration, effect: Effect) -> FloatAr
 
 @dataclass(frozen=True)
 class Products:
-    """Functions of time times slopes: what columns of effects are made of.
+    """Products of functions of time and slopes, from which the columns of effects are made.
 
     Attributes
     ----------
@@ -158,7 +159,7 @@ class Products:
     phi : callable or None
         Rows -> (r, m) functions; 1 if there is none.
     pairs : tuple of (int, int)
-        Of each column its function, and the slope's slot.
+        For each column, the place of its function and the slot of its slope.
     """
 
     problem: Problem
@@ -176,7 +177,7 @@ class Products:
 
 
 def _run(places: Sequence[int]) -> slice | list[int]:
-    """Return places that follow each other as a slice, which copies nothing."""
+    """Return consecutive places as a slice, which indexes without a copy."""
     run = range(places[0], places[0] + len(places))
     return slice(run.start, run.stop) if tuple(run) == tuple(places) else list(places)
 
@@ -184,9 +185,9 @@ def _run(places: Sequence[int]) -> slice | list[int]:
 def effect_columns(
     problem: Problem, effect: Effect, phi: FloatArray | Callable[[slice], FloatArray], origin: float = 0.0
 ) -> Mixture:
-    """Return what an effect's coefficients leave, from its regressors less `origin`.
+    """Return the columns of an effect's coefficients.
 
-    These are (r, n), or a function of the rows.
+    Its regressors are `phi` less `origin`; `phi` is (r, n), or a function from m rows to (r, m).
     """
     tensor = -effect.columns(problem.calibration.reference.field)
     pairs = [(int(r), int(s)) for r, s in np.argwhere(tensor.any(axis=0))]

@@ -68,7 +68,7 @@ class Survey:
         Intervals since the previous sample; :data:`~.past.FAR` where that is too long ago to predict
         this one's noise.
     dive : (n,) int array
-        Number of the dive, the unit that is left out in turn.
+        Number of the dive, the unit of cross-validation.
     place : (n, 2 or 3) array or None
         m north and east of the middle, and down where the log has a depth.
     attitude : (n, 3) array or None
@@ -114,7 +114,7 @@ class Survey:
 
     @property
     def parts(self) -> str:
-        """What is left out in turn, in words."""
+        """The units of cross-validation, in words."""
         return "eighths of the log" if np.array_equal(self.dive, _eighths(len(self))) else "dives"
 
     def past(self, order: int) -> Past:
@@ -188,7 +188,7 @@ def assemble(
 def _channels(
     table: dict[str, FloatArray], units: dict[str, str], needed: Sequence[str]
 ) -> tuple[dict[str, Channel], tuple[str, ...]]:
-    """Return the telemetry, and the names of what never changes."""
+    """Return the telemetry that varies or is needed, and the names of the channels that never change."""
     channels, still = {}, []
     for name in sorted(table):
         if name in NOT_TELEMETRY or name.startswith(OURS):

@@ -25,10 +25,11 @@ __all__ = ["take"]
 FloatArray = NDArray[np.float64]
 
 TRUSTED = 0.5
-"""Of the noise: largest cubic term in the interpolation of a channel to the time of its row."""
+"""Largest cubic term in the interpolation of a channel to the time of its row, as a multiple of the noise;
+where it is exceeded the sample is not used."""
 FAR = 10.0
-"""Half ranges from the middle of the calibration's: beyond, it is no position of a mass but a code for
-"not known"."""
+"""Distance from the middle of the calibrated range, in half ranges, beyond which a parameter's value is
+not the position of a mass but a code for "not known"."""
 
 
 def take(
@@ -112,14 +113,14 @@ def _comparable(table: dict[str, FloatArray], calibration: Calibration, source: 
             f"needed (column {worst!r} has {int(np.isfinite(table[worst]).sum())} numbers)"
         )
     table = {name: column[whole] for name, column in table.items()}
-    once = np.diff(table["time"], prepend=-np.inf) > 0.0  # what two logs share is there once
+    once = np.diff(table["time"], prepend=-np.inf) > 0.0  # a sample that two logs share is kept once
     return {name: column[once] for name, column in table.items()}
 
 
 def _columns(
     ds: xr.Dataset, calibration: Calibration, grid: AnomalyGrid | None, learned: bool
 ) -> dict[str, FloatArray]:
-    """Return every numeric column; the channels at the times of the rows, the reference added."""
+    """Return every numeric column, the channels interpolated to the rows' times, and the reference field."""
     source = str(ds.attrs.get("source", "deployment"))
     sensor = str(ds.attrs.get("sensor", ""))
     if sensor and calibration.sensor.name and sensor != calibration.sensor.name:
@@ -135,7 +136,7 @@ def _columns(
         if column.dtype.kind in "fiub" and not str(name).startswith("truth_")
     }
     in_turn = False
-    for axis in "xyz":  # a converter that takes the channels in turn says when it took each
+    for axis in "xyz":  # a log of channels that were sampled in turn has a time for each
         own = table.pop(f"mag_time_{axis}", None)
         if own is not None and np.isfinite(own).all() and not np.array_equal(own, time):
             table[f"mag_{axis}"] = _at(time, own, table[f"mag_{axis}"], TRUSTED * calibration.noise.sensor)

@@ -20,10 +20,11 @@ __all__ = ["accept"]
 def accept(problem: Problem, outcome: Outcome, tone: Candidate | None) -> tuple[bool, Leftover | None]:
     """Say whether the names are asserted, and describe what is left beside them, or else the whole signal.
 
-    Names and free descriptions both pay for the number of alternatives they were chosen from. A description
-    of what the names leave counts with them; if it is something else than they are, they pay for it as for a
-    further cause. A cause that the table lacks is a rival like any other: names are asserted if they are
-    likelier than every description, and remain possible until one beats them 20:1.
+    Names and free descriptions both pay for the number of alternatives they were chosen from. The evidence of
+    a description of what the names leave is added to theirs; unless it is a remnant of one of the named
+    causes, they pay for it as for a further cause. A cause that the table lacks is a rival like any other:
+    names are asserted if they are likelier than every description of the whole signal, and remain possible
+    unless one beats them 20:1.
     """
     model = [h.candidate for h in outcome.chosen]
     rest = leftover(problem, model, outcome.fit, outcome.order, tone)
@@ -46,7 +47,7 @@ def accept(problem: Problem, outcome: Outcome, tone: Candidate | None) -> tuple[
 
 
 def _same(chosen: Sequence[Hypothesis], rest: Leftover) -> bool:
-    """Say whether the rest is a remnant of a stronger named cause, whose regressor is idealised."""
+    """Say whether the rest is what the idealised regressor of a stronger named cause has left."""
     told = rest.description
     if told is None or told.wider:
         return False

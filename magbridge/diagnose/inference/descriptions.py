@@ -56,20 +56,20 @@ class Description(NamedTuple):
     channel : str or None
         The telemetry that it is a function of.
     trials : float
-        Independent descriptions that it was chosen from.
+        Number of independent descriptions that it was chosen from.
     period : float or None
         s, of a tone.
     holds : tuple of str
         Causes whose own regressors are among the columns.
     turned : bool
-        The columns are functions along each of the body's axes.
+        The columns are the same functions along each of the body's axes.
     remembers : bool
-        It follows the side from which the channel came, not its value.
+        It follows the channel's past (from which side it came), not its value.
     scales : bool
-        What follows the channel is in proportion to each reading: a sensitivity, no offset.
+        The effect is in proportion to each reading: a change of sensitivity, not of offset.
     wider : bool
-        It says much more than a cause that it holds: what it finds beside that is no remnant, and it is an
-        alternative to that and another.
+        It is much more general than a cause that it holds: what it finds beside that cause is no remnant, and
+        it is an alternative to that cause together with another.
     """
 
     columns: Columns
@@ -84,7 +84,7 @@ class Description(NamedTuple):
     wider: bool = False
 
     def covers(self, model: Sequence[Candidate]) -> bool:
-        """Say whether it says what a cause of `model` does, with more numbers; a wider one, what all do."""
+        """Say whether it contains a cause of `model`, with more coefficients; a wider one, whether all."""
         same = [
             candidate.cause in self.holds
             or (
@@ -99,15 +99,15 @@ class Description(NamedTuple):
 
 
 def descriptions(problem: Problem, fit: Joint, tone: Candidate | None = None) -> list[Description]:
-    """List the descriptions with which structure of any kind is looked for.
+    """List the descriptions with which structure of any kind is searched for.
 
     Parameters
     ----------
     problem : Problem
     fit : Joint
-        Without any cause; steps, passages and packets are looked for in what it leaves.
+        A fit without any cause; steps, passages and packets are searched for in its residual.
     tone : Candidate, optional
-        The strongest tone, where the table of causes has none.
+        The strongest tone, where tones are not among the causes.
     """
     return [
         *_in_time(problem, fit),
@@ -142,7 +142,7 @@ def _in_time(problem: Problem, fit: Joint) -> list[Description]:
 
 
 def _of_reading(problem: Problem) -> list[Description]:
-    """Functions of the field's direction, its rates of change, each channel's reading; one delay of all."""
+    """Functions of the field's direction, its rates of change, each channel's reading; one common delay."""
     body, rates = _body(problem), field_rates(problem)
     listed = [
         _of("broadband", direction(body), 34, holds=("nonlinearity",), wider=True),
@@ -160,7 +160,7 @@ def _of_reading(problem: Problem) -> list[Description]:
 
 
 def _of_channels(problem: Problem) -> list[Description]:
-    """For each telemetry channel a curve of its value, what depends on its past, and what follows it late."""
+    """For each telemetry channel, a curve of its value, functions of its past, and what follows it late."""
     own = {parameter.name for parameter in problem.calibration.parameters}
     listed = []
     for name, channel in problem.survey.channels.items():
@@ -204,7 +204,7 @@ def _of_attitude(problem: Problem) -> list[Description]:
 
 
 def _repeating(problem: Problem, fit: Joint, tone: Candidate | None) -> list[Description]:
-    """List what each dive repeats, what the surface does, oscillations of limited duration, and a tone."""
+    """List what the surface does, what each dive repeats, oscillations of limited duration, and a tone."""
     survey, listed = problem.survey, []
     if "depth" in survey.channels and "depth" not in survey.still:
         above = top(survey.time, survey.channels["depth"].values)
@@ -227,7 +227,7 @@ def _body(problem: Problem) -> FloatArray:
 
 
 def _along_axes(problem: Problem, basis: Columns, *, scales: bool = False) -> Columns:
-    """Each function of `basis` along each axis of the body; with `scales`, times what that channel reads."""
+    """Each function of `basis` along each axis of the body; with `scales`, times that channel's reading."""
 
     def columns(rows: slice) -> FloatArray:
         part = basis(rows)

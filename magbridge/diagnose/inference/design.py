@@ -22,18 +22,17 @@ S = TypeVar("S")
 T = TypeVar("T")
 
 CHUNK = 2048
-"""Rows that are whitened at a time, to stay near the processor."""
+"""Rows that are whitened at a time, few enough for the processor's cache."""
 KEPT = 12_500_000
-"""Numbers that are kept of columns: 100 MB."""
+"""Most numbers of columns that are kept in memory: 100 MB."""
 ALL = ((slice(None), slice(None)),)
-"""Each column by each."""
+"""Products of every column with every other."""
 THREADS, LONG, POOL = 2, 32768, "diagnose"
-"""Threads that share what is done to a log, rows beyond which it is worth the while, and the
-threads' name."""
+"""Threads that share the work on a log, rows from which they are worth their while, and their name."""
 
 
 def kept(n: int, columns: Sequence[Columns]) -> list[Columns]:
-    """Return the columns of n rows made once for all; what would fill the memory is made anew each time."""
+    """Return the columns of n rows precomputed, or unchanged where that would fill the memory."""
     if n * sum(column(slice(0, 1)).shape[1] for column in columns) > KEPT:
         return list(columns)
 
@@ -44,7 +43,7 @@ def kept(n: int, columns: Sequence[Columns]) -> list[Columns]:
 
 
 def pieces(n: int) -> list[slice]:
-    """Return the pieces in which n rows are gone through."""
+    """Return the pieces in which n rows are processed."""
     return [slice(start, min(start + CHUNK, n)) for start in range(0, n, CHUNK)]
 
 
@@ -71,7 +70,7 @@ class Design:
         return beside([self.free[rows], *(column(rows) for column in self.columns)])
 
     def times(self, c: FloatArray) -> FloatArray:
-        """(n,) what the coefficients c (q + k,) leave."""
+        """(n,) ``X c``, the product of all columns and coefficients c (q + k,)."""
         asked = [(own, column) for own, column in zip(self.at, self.columns, strict=True) if c[own].any()]
 
         def piece(rows: slice) -> FloatArray:
@@ -97,9 +96,9 @@ def normal(
 ) -> tuple[FloatArray, FloatArray]:
     """Return ``X^T X`` and ``X^T y``, X whitened if a noise is given.
 
-    Summed up in pieces that stay near the processor. Long logs are shared out among threads, always in the
-    same way: the same numbers on any machine. Of ``X^T X`` only the columns by columns that are `asked`
-    for are not zero.
+    They are summed up in pieces that fit the processor's cache. Long logs are shared out among threads,
+    always in the same way, so any machine returns the same numbers. Of ``X^T X`` only the blocks that are
+    `asked` for are computed, and their transposes; the others are zero.
     """
     past = 0 if noise is None else len(noise.memory)
 
@@ -127,9 +126,9 @@ def normal(
 
 
 def in_threads(n: int, function: Callable[[S], T], given: Iterable[S]) -> list[T]:
-    """Return what a function of all rows makes of each that is given.
+    """Return the function's results for each argument `given`.
 
-    A long log's n rows are shared out among threads, but not within one of those.
+    For a log of many rows n the calls are shared out among threads, but not from within one of those.
     """
     if n <= LONG or current_thread().name.startswith(POOL):
         return [function(one) for one in given]
@@ -138,5 +137,5 @@ def in_threads(n: int, function: Callable[[S], T], given: Iterable[S]) -> list[T
 
 @cache
 def _pool() -> ThreadPoolExecutor:
-    # the same threads all the time: new ones would leave their memory behind
+    # the same threads all the time: the memory that new ones allocate would not be released
     return ThreadPoolExecutor(THREADS, POOL)

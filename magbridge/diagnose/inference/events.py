@@ -1,4 +1,4 @@
-"""Events: the moment at which the body's own field changed, and the passage of a distant source."""
+"""Events: a step of the vehicle's own field, and the passage of a distant source."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ FloatArray = NDArray[np.float64]
 MOMENTS = 96
 """Moments at which a step is tried."""
 DURATIONS, SHORTEST, LONGEST = 12, 8.0, 0.125
-"""Durations of a passage: how many are tried, from so many samples to this share of the log."""
+"""Durations of a passage: how many are tried, the shortest in samples, the longest as a share of the log."""
 QUARTERS = np.arange(-12, 13)
 """Quarters of its duration over which a passage is evaluated."""
 
@@ -31,7 +31,7 @@ def step(problem: Problem, fit: Joint) -> tuple[Columns, float]:
     Returns
     -------
     Columns
-        The three offsets from then on.
+        Of the three offsets, from that moment on.
     trials : float
         Moments that were tried.
     """
@@ -93,7 +93,7 @@ def _passing(s: FloatArray) -> FloatArray:
 
 
 def _around(values: NDArray[Any]) -> FloatArray:
-    """Return what stands about every other value, quarter by quarter."""
+    """Return, for every other quarter, the values in the window of :data:`QUARTERS` about it."""
     return sliding_window_view(np.pad(values, len(QUARTERS) // 2), len(QUARTERS))[::2]
 
 

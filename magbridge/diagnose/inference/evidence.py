@@ -1,24 +1,24 @@
-r"""How strongly the data speak for a candidate, and how strongly they must.
+r"""The evidence for a candidate, its test, and the lead that it needs.
 
 Notes
 -----
-*Score.* For a candidate with projected information S and score b (:mod:`.joint`), ``R = b^T S^-1 b`` is what
-its likelihood ratio would be. Nobody knows beforehand how large an effect is, so its k coefficients have
-Zellner's prior ``N(0, g S^-1)`` with the g that the data like best: log evidence
-``(R - k)/2 - (k/2) log(R/k)``, 0 below ``R = k`` (Liang et al. 2008, JASA 103:410, sec. 2.4). It asks the
-same price of every cause, whatever its unit.
+*Score.* For a candidate with score b and information S, the calibration projected out (:mod:`.information`),
+``R = b^T S^-1 b`` is its likelihood ratio to second order. The size of an effect is not known beforehand, so
+its k coefficients have Zellner's prior ``N(0, g S^-1)`` with the likeliest g: log evidence
+``(R - k)/2 - (k/2) log(R/k)``, 0 below ``R = k`` (Liang et al. 2008, JASA 103:410, sec. 2.4). Every cause
+pays the same price for a coefficient, whatever its unit.
 
-*Test.* A cause's p-value is that of its likelihood ratio, times the number of independent hypotheses N behind
-it, times the number of causes; below 1 %: found. Under no effect scores are ``N(0, S)``, and N is
-``P(any of its n hypotheses passes) / a`` at the level a where they are tested: hypotheses that are much the
-same by chance become strangers far out in the tail. That far no plain simulation comes, so one hypothesis
-after the other is made to pass, and with m that pass then ``N = n E[1 / m]`` (Owen, Maximov & Chertkov 2019,
-Electron. J. Statist. 13:231). A size that cannot be negative has one tail
+*Test.* A cause's p-value is that of its likelihood ratio, times the number N of independent hypotheses behind
+the cause, times the number of causes; it is found if that is below 1 %. Under no effect scores are
+``N(0, S)``, and N is ``P(any of its n hypotheses passes) / a`` at the level a at which each is tested: even
+hypotheses that correlate strongly are nearly independent far out in the tail. Plain simulation does not reach
+that far, so each hypothesis in turn is made to pass, and with m that pass then ``N = n E[1 / m]`` (Owen,
+Maximov & Chertkov 2019, Electron. J. Statist. 13:231). A size that cannot be negative has one tail
 (:attr:`~magbridge.diagnose.causes.candidates.Candidate.tail`).
 
-Two kinds have a prior of their own. Numbers of one common size (:mod:`.statistic`) have had theirs in the
-ratio: the evidence is R / 2, less the log of how many spectra it was chosen from. A number that cannot be
-negative has half a Gaussian, twice as dense: ``log 2 Phi(sqrt(R))`` more.
+Two kinds of coefficients have a prior of their own. For those of one common size (:mod:`.statistic`) the
+ratio contains the prior: the evidence is R / 2, less the log of the number of spectra that were tried. One
+that cannot be negative has half a Gaussian, of twice the density: ``log 2 Phi(sqrt(R))`` is added.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ class Score:
 
 
 def score(info: Information, at: slice, candidate: Candidate) -> Score:
-    """Score the candidate whose columns stand at `at`; one of the wrong sign has nothing to say."""
+    """Score the candidate whose columns stand at `at`; one of the wrong sign scores zero."""
     b, statistic = info.score[at], Statistic(info.matrix[at, at], candidate.spectra)
     freedom = statistic.freedom
     if not freedom or (candidate.positive and b.min() < 0.0):
@@ -105,7 +105,7 @@ def evidence_of(candidate: Candidate, ratio: float, freedom: int) -> float:
 
 
 def weigh(ratio: float, freedom: int) -> float:
-    """Log evidence of a likelihood ratio that took so many free numbers."""
+    """Log evidence of a likelihood ratio of `freedom` free coefficients."""
     if ratio <= freedom or not freedom:
         return 0.0
     return 0.5 * (ratio - freedom) - 0.5 * freedom * float(np.log(ratio / freedom))
@@ -120,7 +120,7 @@ def lead(ratio: float) -> float:
 
 
 def slack(ratio: float) -> float:
-    """Log evidence that regressors' errors may lend to another cause, of a model of this likelihood ratio."""
+    """Log evidence that another cause may gain from the regressors' errors of a model of this ratio."""
     return 0.5 * IDEAL**2 * ratio
 
 
@@ -134,13 +134,16 @@ def trials(info: Information, candidates: Sequence[Candidate], at: Sequence[slic
         places = slices([candidates[k] for k in own])
         free = [place for k, place in zip(own, places, strict=True) if candidates[k].spectra is None]
         count = _independent(info.matrix[np.ix_(index, index)], free, LEVEL / len(causes))
-        count += len(own) - len(free)  # numbers of one common size count in full: a bound
+        count += len(own) - len(free)  # candidates of one common size count as independent: an upper bound
         found[cause] = max(1.0, count) * max(candidates[k].trials for k in own)
     return found
 
 
 def _independent(S: FloatArray, places: Sequence[slice], level: float) -> float:
-    """Return how many independent hypotheses pass as often as any at `places`, tested at `level` in all."""
+    """Return how many independent hypotheses would pass as often as any of those at `places` does.
+
+    All together they are tested at `level`.
+    """
     rng = np.random.default_rng(20131212)  # the same answer every time
     values, vectors = np.linalg.eigh(S)
     draws = (vectors * np.sqrt(np.maximum(values, 0.0))) @ rng.standard_normal((len(S), SIMULATIONS))
@@ -165,10 +168,10 @@ def _independent(S: FloatArray, places: Sequence[slice], level: float) -> float:
 def worth(ratio: float, model: Sequence[Candidate], trials: Mapping[str, float]) -> float:
     """Log evidence of a whole model of this likelihood ratio.
 
-    Every regressor pays for the hypotheses behind it that it was chosen from, and those after the first for
-    the odds that so much goes wrong in one log, and for their choice among the causes. How narrowly the data
-    then hold the nonlinear parameters counts between names alone: a free description is profiled, too, and
-    pays nothing for it.
+    Every regressor pays for the number of hypotheses of its cause. Each after the first also pays for the
+    prior odds of a further fault in one log, and for its choice among the causes. How narrowly the data
+    determine nonlinear parameters is not counted here, but only between names: free descriptions are
+    profiled, too, and do not pay for it.
     """
     further = max(sum(len(candidate.pieces) for candidate in model) - 1, 0) * (
         ODDS + float(np.log(len(trials)))

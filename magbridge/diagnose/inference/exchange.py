@@ -24,10 +24,10 @@ TRIED = 3
 
 
 def exchanged(state: State, model: list[Candidate], base: Joint) -> tuple[list[Candidate], Joint]:
-    """Replace one cause or two by others, profiled there, while the evidence of the whole model grows.
+    """Replace one cause or two by others, profiled anew, while the evidence of the whole model grows.
 
-    A replacement with more coefficients must win by what the errors of the other regressors may lend it; one
-    with fewer may lose by as much.
+    The errors of the other regressors may lend evidence to additional coefficients. So a replacement with
+    more coefficients must win by that much, and one with fewer may lose by as much.
     """
     pieces = [piece for candidate in model for piece in candidate.pieces]
     for _ in range(CHANGES):
@@ -49,7 +49,7 @@ def exchanged(state: State, model: list[Candidate], base: Joint) -> tuple[list[C
 
 
 def _more(new: list[Candidate], old: list[Candidate]) -> float:
-    """Sign of the difference in free coefficients; 0 where some share one size: the data then count them."""
+    """Sign of the difference in free coefficients; 0 where some share one size: the evidence counts those."""
     if any(c.spectra is not None for c in (*new, *old)):
         return 0.0
     return float(np.sign(sum(c.size for c in new) - sum(c.size for c in old)))
@@ -71,7 +71,7 @@ def _changes(state: State, pieces: list[Candidate], base: Joint) -> list[tuple[l
 
 
 def _separate(new: list[Candidate], pieces: list[Candidate], at: list[int]) -> bool:
-    """Say whether coefficients of one common size remain a candidate apart from the cause's others."""
+    """Say whether each candidate of one common size would be the only one of its cause."""
     changed = [*new, *(piece for n, piece in enumerate(pieces) if n not in at)]
     causes = [candidate.cause for candidate in changed]
     return all(candidate.spectra is None or causes.count(candidate.cause) == 1 for candidate in changed)

@@ -1,4 +1,4 @@
-"""Fit a noise to a residual: memory, tails and level in turn, each at its maximum given the others."""
+"""Fit the noise model to a residual: memory, tails and level in turn, each the likeliest given the others."""
 
 from __future__ import annotations
 
@@ -30,22 +30,22 @@ ALTERNATIONS = 6
 SETTLED = 0.01
 """Gain in log likelihood below which the fit has converged."""
 LOSS = 0.02
-"""Of the prediction, at most: what p coefficients lose that are fitted to samples with a whole past, p for
-each of those."""
+"""Largest order p as a share of the n samples that have a whole past: fitting p coefficients to them adds
+about p / n to the variance of the prediction."""
 NEAR = 0.9999
 """Largest partial correlation."""
 PIECE, PIECES = 600, 64
-"""Samples by which a column's frequencies are told: pieces this long, so many at most."""
+"""Pieces of a column from which its power spectrum is estimated: their length in samples, and most pieces."""
 
 
 def memory_order(residual: FloatArray, slots: NDArray[np.int64]) -> int:
     r"""Choose p by Akaike's criterion on a residual clipped against outliers; `slots` (n,) count intervals.
 
-    To whiten with too long a memory costs little, with too short a one it makes structure out of noise.
+    Whitening with too long a memory costs little; with too short a one, noise passes for structure.
 
     Notes
     -----
-    Autocovariances c_k from all pairs that are there (Dunsmuir & Robinson 1981, J. Am. Stat. Assoc. 76:560),
+    Autocovariances c_k of all pairs without a gap (Dunsmuir & Robinson 1981, J. Am. Stat. Assoc. 76:560),
     then Levinson's recursion:
 
     .. math:: \kappa_p = \frac{c_p - \sum_k a_k c_{p-k}}{v_{p-1}}, \qquad v_p = v_{p-1} (1 - \kappa_p^2)
@@ -75,15 +75,15 @@ def certainty(residual: FloatArray, noise: Noise, columns: Sequence[Columns]) ->
 
     Notes
     -----
-    Coefficients a that were fitted have the covariance ``C = (L^T L)^-1`` of their regression, L the
-    residuals before in units of s; a column x has the information ``|w|^2``,
+    The fitted memory a has the covariance ``C = (L^T L)^-1`` of its regression, with L the p preceding
+    residuals in units of s. A column x has the information ``|w|^2``,
     ``w_t = x_t - sum_k a_k x_(t-k)``:
 
     .. math:: D_k = \frac{\partial \ln |w|^2}{\partial a_k} = -\frac{2 \sum_t w_t x_{t-k}}{|w|^2}, \qquad
               \operatorname{var} \ln |w|^2 = \frac{2}{n} + D^T C D
 
-    An estimate of f degrees of freedom has the variance 2 / f. What is slow sees the level that
-    is known worst.
+    The log of a variance estimated with f degrees of freedom has the variance 2 / f. At low frequencies the
+    level is known worst.
     """
     n, p = len(residual), len(noise.memory)
     rows = np.flatnonzero(noise.past.whole)
@@ -121,11 +121,11 @@ def fit_noise(
     residual : (n,) array
         nT.
     past : Past
-        What came before each sample, as far back as the noise shall remember.
+        The samples before each one; its order is that of the noise's memory.
     blocks : bool, optional
         Let the level change from block to block; decided by the data if not given.
     like : Noise, optional
-        One that it will resemble: begins from its level and tails.
+        A noise that it will resemble: the fit begins from its level and tails.
     rounds : int
         Of the alternation between memory, tails and level.
     """
@@ -177,7 +177,7 @@ def _counts(n: int) -> NDArray[np.int64]:
 
 
 def _stable(memory: FloatArray) -> FloatArray:
-    """Pull roots that lie outside the unit circle back in."""
+    """Move roots that lie outside the unit circle, or very close to it, back inside."""
     roots = np.roots(np.append(1.0, -memory))
     size = np.abs(roots)
     if size.max(initial=0.0) < 0.9995:
@@ -186,7 +186,7 @@ def _stable(memory: FloatArray) -> FloatArray:
 
 
 def _uneven(v: FloatArray, count: NDArray[np.int64]) -> bool:
-    """Tell whether the blocks' mean absolute values differ by more than their own scatter lets them."""
+    """Tell whether the blocks' mean absolute values differ by more than chance."""
     if count.size < 4:
         return False
     size = np.abs(v)
@@ -223,7 +223,7 @@ def _levels(
 ) -> tuple[float, FloatArray]:
     """Log likelihood and level of each block, from a first guess.
 
-    A level is drawn towards the common one by as much as ten samples.
+    Each level is shrunk towards that of all blocks, which counts like ten more samples.
     """
     n = len(square)
     power = level**2

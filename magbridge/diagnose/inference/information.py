@@ -2,8 +2,8 @@ r"""The information that the data hold on every candidate at once.
 
 Notes
 -----
-The whole search's arithmetic in one matrix: the whitened columns of *all* candidates against each other,
-summed up in chunks, linear in samples. From it come scores, Occam factors, what is confounded with what, and
+One matrix serves the whole search: the inner products of the whitened columns of *all* candidates, summed up
+in chunks, at a cost linear in samples. From it come scores, Occam factors, which causes are confounded, and
 the distribution of the largest score under no effect.
 """
 
@@ -30,7 +30,7 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Information:
-    """What the data say of every candidate's coefficients, calibration (and model so far) projected out.
+    """Score and information of all candidates' coefficients, with calibration (and model) projected out.
 
     Attributes
     ----------
@@ -38,7 +38,7 @@ class Information:
         Fisher information, in units of the prior widths.
     score : (m,) array
     shift : (q + k, m) array
-        By how much calibration and model give way to one unit of each coefficient.
+        By how much calibration and model decrease for one unit of each coefficient.
     """
 
     matrix: FloatArray
@@ -46,11 +46,11 @@ class Information:
     shift: FloatArray
 
     def moved(self, base: Joint, index: NDArray[np.intp], taken: FloatArray) -> FloatArray:
-        """Return calibration and model (q + k,) at their best when those at `index` are `taken`."""
+        """Return the likeliest calibration and model (q + k,) if the coefficients at `index` are `taken`."""
         return np.append(base.z, base.coefficients) - self.shift[:, index] @ taken
 
     def without(self, index: NDArray[np.intp], prior: FloatArray) -> Information:
-        """Project out the coefficients at `index`, of this prior precision, too."""
+        """Project out the coefficients at `index` as well, with their prior precision."""
         S = self.matrix[np.ix_(index, index)] + np.diag(prior)
         K = np.linalg.solve(S, self.matrix[index])
         return Information(
@@ -58,7 +58,7 @@ class Information:
         )
 
     def fitted(self, base: Joint) -> Information:
-        """Project out the model of `base`, too, whose columns are the last."""
+        """Project out the model of `base` as well, whose columns are the last."""
         m = len(self.score) - base.coefficients.size
         prior = base.prior[len(base.z) :]
         K: FloatArray = np.asarray(
@@ -76,8 +76,8 @@ def information(
 ) -> Information:
     """Sum up the information of columns at `base` under `noise`, only the calibration projected out.
 
-    The first so many are `strangers`, made of nothing that another is made of: what they say of each other is
-    not asked for.
+    The first `strangers` of them share no parts with any other, and their products with each other are not
+    computed.
     """
     q, own = problem.free.shape[1], together(columns).parts
     sizes = [sum(len(M) for _, M in parts(one)) for one in columns[:strangers]]

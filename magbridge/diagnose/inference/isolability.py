@@ -1,10 +1,10 @@
-r"""Before any data: what this log, with this calibration, could show, and what it could never tell apart.
+r"""What a log with this calibration can show, and which causes it cannot tell apart, whatever it measured.
 
 Notes
 -----
 The information S of a cause's coefficients needs telemetry, attitude and the noise level, but no residual.
-An effect of signal-to-noise a is found with the chance that a noncentral chi-square of k freedoms and
-noncentrality ``a^2`` passes the threshold. Between two causes whose signatures, whitened and projected,
+An effect of signal-to-noise a is found with the chance that a noncentral chi-square of k degrees of freedom
+and noncentrality ``a^2`` passes the threshold. Between two causes whose signatures, whitened and projected,
 correlate by rho, the wrong one wins with the chance ``Phi(-a sqrt(1 - rho^2) / 2)`` (two points in
 Gaussian noise).
 """
@@ -28,16 +28,17 @@ __all__ = ["Isolability", "Visible", "confusion", "isolability", "threshold"]
 
 FloatArray = NDArray[np.float64]
 CONFOUNDED = 0.85
-"""Correlation beyond which two causes are listed as a pair: at signal-to-noise 6 they part in 95 of 100."""
+"""Correlation beyond which two causes are listed as a pair: at this one they are told apart in 95 of 100
+cases at signal-to-noise 6."""
 
 FREE = 1e-3
-"""Prior precision, of a plausible size's, of numbers that are each free; those of one common size are
-held to it."""
+"""Prior precision, in units of a plausible size's, of coefficients that are each free; it is 1 for those of
+one common size."""
 
 
 @dataclass(frozen=True)
 class Visible:
-    """What could be seen of one cause.
+    """How large one cause must be to be found.
 
     Attributes
     ----------
@@ -57,7 +58,7 @@ class Visible:
 
 @dataclass(frozen=True)
 class Isolability:
-    """Report of a log before its residual is looked at.
+    """What a log can show, before its residual is looked at.
 
     Attributes
     ----------
@@ -65,7 +66,7 @@ class Isolability:
     pairs : tuple of (str, str, float)
         Causes that look alike, with their correlation.
     untestable : dict
-        Cause -> what a log would need for it.
+        Cause that this log cannot test -> what a log would need for it.
     correlation : (m, m) array
         Between the causes of `visible`.
     naming : NamingTheory
@@ -96,7 +97,7 @@ def isolability(
     causes: int,
     untestable: Mapping[str, str],
 ) -> Isolability:
-    """Evaluate what `info` holds; of a cause's grid the candidate that is seen best stands for all."""
+    """Evaluate `info`; the candidate that the log shows best stands for the whole grid of its cause."""
     at = slices(candidates)
     picked = _most_visible(candidates, info, at)
     visible = [
@@ -126,7 +127,7 @@ def isolability(
 
 
 def _most_visible(candidates: Sequence[Candidate], info: Information, at: Sequence[slice]) -> list[int]:
-    """Return which candidate of each cause and channel the log shows best: it stands for their whole grid."""
+    """Return the place of the candidate of each cause and channel that the log shows best."""
     best: dict[tuple[str, str | None], tuple[float, int]] = {}
     for k, candidate in enumerate(candidates):
         total = float(np.trace(info.matrix[at[k], at[k]])) / candidate.size
@@ -158,7 +159,7 @@ def _seen(size: float) -> float:
 
 
 def _alike(info: Information, one: Candidate, a: slice, other: Candidate, b: slice) -> float:
-    """Share of one's typical signature that the other can imitate: root of the larger mean."""
+    """Correlation of two signatures: root of the mean share that one can imitate of the other, the larger."""
     A, B, C = info.matrix[a, a], info.matrix[b, b], info.matrix[a, b]
     p, q = (FREE if candidate.spectra is None else 1.0 for candidate in (one, other))
     M = C @ np.linalg.solve(B + q * np.eye(len(B)), C.T)
@@ -170,7 +171,7 @@ def _alike(info: Information, one: Candidate, a: slice, other: Candidate, b: sli
 def confusion(correlation: FloatArray, signal_to_noise: float) -> FloatArray:
     """(m, m) chance that the cause of the row is named as that of the column, at a signal-to-noise.
 
-    The pairwise chances, made to add up to one.
+    These are the pairwise chances, scaled down where those of a row add up to more than one.
     """
     wrong = norm.cdf(-0.5 * signal_to_noise * np.sqrt(2.0 * np.clip(1.0 - correlation, 0.0, None)))
     np.fill_diagonal(wrong, 0.0)

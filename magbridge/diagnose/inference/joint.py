@@ -2,8 +2,8 @@ r"""The joint likelihood: calibration free, effects free, the noise fitted anew 
 
 Notes
 -----
-Noise that is fitted without an effect swallows a large slow one, so two hypotheses are compared only after
-each has had its own noise.
+Noise that is fitted without an effect absorbs it if it is large and slow, so two hypotheses are compared only
+after the noise has been fitted under each.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ __all__ = ["FLAT", "RIDGE", "Joint", "fit_joint"]
 
 FloatArray = NDArray[np.float64]
 RIDGE = 0.1
-"""Prior precision of an effect, of a plausible size's: ten times that size is hardly believed, a hundred
-times not at all. Without it a bend of the channels and the calibration's scales grow against each other until
-the noise is gone."""
+"""Prior precision of an effect, in units of a plausible size's: ten times that size is hardly believed, a
+hundred times not at all. Without it a nonlinearity and the calibration's scales can cancel each other and
+grow until they fit the noise."""
 FLAT = 1e-6
-"""Prior precision of numbers that are free, or of no known size."""
+"""Prior precision of coefficients that are free, or of no known size."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,8 +39,8 @@ class Joint:
     Attributes
     ----------
     log_likelihood : float
-        Of the noise model, with the prior of the calibration and of the effects; numbers of one common size,
-        as the channels' delays are, are integrated out (Laplace's approximation).
+        Of the noise model, with the prior of the calibration and of the effects; coefficients of one common
+        size, as the channels' delays are, are integrated out (Laplace's approximation).
     z : (q,) array
     coefficients : (k,) array
         Of the effects, in units of their prior width.
@@ -49,7 +49,7 @@ class Joint:
     left : (n,) array
         nT, what is left of the residual.
     prior : (q + k,) array
-        Precision that every coefficient had before the data, effects in units of their widths.
+        Prior precision of every coefficient, effects in units of their widths.
     """
 
     log_likelihood: float
@@ -83,14 +83,14 @@ def fit_joint(
     order : int
         Of the noise's memory.
     *starts : (q + k,) array
-        Where to begin: the best of them; the calibration as it stands if there is none.
+        Starting points, of which the best is taken; without any, the prior mean.
     plain : bool
-        Begin where plain least squares ends, too.
+        Try the result of plain least squares as a starting point, too.
     spectra : sequence of (l, k) array or None
-        For each of `columns` whose numbers have one common free size (:mod:`.statistic`): their
-        prior variances.
+        For each of `columns` whose coefficients have one common free size (:mod:`.statistic`): l alternatives
+        for their prior variances.
     like : Joint, optional
-        A fit whose noise this one's will resemble: saves time.
+        A fit of similar noise, from which this one's begins: saves time.
     blocks : bool, optional
         See :func:`~magbridge.diagnose.inference.fit_noise.fit_noise`.
     ridge : float or (k,) array
@@ -113,8 +113,8 @@ def fit_joint(
     def value(c: FloatArray, noise: Noise) -> float:
         return noise.log_likelihood - 0.5 * float(prior @ (c - centre) ** 2)
 
-    # noise with a long memory swallows what is slow, and least squares then never asks for it again: so it is
-    # asked once as if the noise had none
+    # noise with a long memory absorbs a slow effect, and no later step finds it again: so one start is fitted
+    # as if the noise had no memory
     first = [*(starts or [centre])]
     if plain:
         first.append(_plain(X, problem.residual, prior, centre))
@@ -135,7 +135,7 @@ def fit_joint(
         gained = value(moved, tried[1]) - value(c, noise)
         if gained > 0.0:
             c, (left, noise) = moved, tried
-        if gained < 0.02:  # P is that of the last step: no other
+        if gained < 0.02:  # converged: P need not be computed again
             break
     covariance: FloatArray = np.asarray(np.linalg.inv(P), float)
     volume = sum(volume_of(covariance[own, own], prior[own]) for own, _ in common)
@@ -143,12 +143,12 @@ def fit_joint(
 
 
 def volume_of(covariance: FloatArray, prior: FloatArray) -> float:
-    """Return ``1/2 ln det(1 + g S)``: by how much the data have narrowed numbers of this prior precision."""
+    """Return ``1/2 ln det(1 + g S)``, the log of how much the data narrow coefficients of this prior."""
     return -0.5 * float(np.linalg.slogdet(covariance)[1] + np.log(prior).sum())
 
 
 def _sized(P: FloatArray, h: FloatArray, prior: FloatArray, own: slice, spectra: FloatArray) -> FloatArray:
-    """Prior precision of the numbers at `own`: the common size and spectrum that the data like best."""
+    """Prior precision of the coefficients at `own`, by their likeliest common size and spectrum."""
     others = np.delete(np.arange(len(h)), own)
     K = np.linalg.solve(P[np.ix_(others, others)] + np.diag(prior[others]), P[others, own])
     S, b = P[own, own] - P[own, others] @ K, h[own] - K.T @ h[others]

@@ -1,14 +1,15 @@
-r"""The chance that a cause, if present, would be named alone: by telemetry, attitude and noise.
+r"""The chance that a cause, if present, would be named alone.
 
-The residual tells nothing of it.
+It depends on telemetry, attitude and noise, not on the residual.
 
 Notes
 -----
-With the information S of all candidates, a cause's coefficients b of signal-to-noise ``a^2 = b^T S_jj b``
-lend a rival i the ratio ``R_i = s^T S_ii^-1 s``, ``s = S_ij b``: what the rival can imitate. The difference
-of the two ratios is normal about ``a^2 - R_i = delta^2`` with standard deviation ``2 delta`` (two subspaces
-in Gaussian noise), so the log evidence by which the truth wins has the standard deviation delta, and the
-chance to be above :func:`~.evidence.lead` is a normal integral. Rivals are taken as independent.
+With the information S of all candidates, a cause j whose coefficients b have the signal-to-noise
+``a^2 = b^T S_jj b`` gives a rival i the likelihood ratio ``R_i = s^T S_ii^-1 s``, ``s = S_ij b``: the part
+that the rival can imitate. The difference of the two ratios is normal about ``a^2 - R_i = delta^2`` with
+standard deviation ``2 delta`` (two subspaces in Gaussian noise), so the log evidence by which the truth wins
+has the standard deviation delta, and the chance that it exceeds :func:`~.evidence.lead` is a normal integral.
+Rivals are taken as independent.
 """
 
 from __future__ import annotations
@@ -31,16 +32,17 @@ DRAWS = 12
 
 
 class NamingTheory:
-    """The theory of one log: which causes it would let be named alone.
+    """The theory of one log: the chance of each cause to be named alone.
 
     Parameters
     ----------
     candidates : sequence of Candidate
     info : Information
-        Theirs, and after them perhaps others'.
+        Of the candidates' columns first; others may follow.
     trials : mapping
-        Hypotheses behind each cause.
+        Cause -> number of independent hypotheses behind it.
     causes : int
+        Number of causes in the table.
     """
 
     def __init__(
@@ -64,7 +66,7 @@ class NamingTheory:
         ----------
         cause : str
         own : (k,) int array
-            Places in the information.
+            Places of the coefficients in the information.
         b : (k,) array
         signal_to_noise : float
         """

@@ -2,14 +2,14 @@ r"""The noise of a residual: autoregressive, heavy-tailed, and louder at some ti
 
 Notes
 -----
-A residual r with p coefficients a of memory, innovations v, Student tails of nu and a scale s that may
-change from block to block::
+A residual r has p autoregressive coefficients a (its memory) and innovations v, which have Student's
+distribution of nu degrees of freedom and a scale s that may change from block to block::
 
     v_t = f_t (r_t - sum_k a_k r_(t-k)),   v_t / s_t ~ t_nu
 
-Beside a gap the p samples before a sample were at other lags: there a are the best coefficients for those,
-and f is how much less surely they predict, both from the autocovariance C of the memory a (Vecchia 1988,
-JRSS B 50:297),
+Without a gap f is 1. After a gap the p samples before have other lags l: there a are the best predictor from
+those lags, and ``1 / f`` is by how much larger its error is, both from the autocovariance C of the
+autoregression (Vecchia 1988, JRSS B 50:297),
 
     a = G^-1 c,   G_ij = C(|l_i - l_j|),   c_i = C(l_i),   f^-2 = C(0) - c^T a   in units of s^2
 
@@ -40,7 +40,7 @@ FloatArray = NDArray[np.float64]
 BAND = 32
 """Rows that are filtered by one product of matrices."""
 SOLVED = 4096
-"""Patterns of lags whose coefficients are found at a time."""
+"""Patterns of lags whose predictors are solved for at a time."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +56,7 @@ class Noise:
     nu : float
         Degrees of freedom of the tails; 1e6 is Gaussian.
     past : Past
-        What came before each sample.
+        The samples before each one.
     log_likelihood : float
     innovations : (n,) array
         v / s.
@@ -76,24 +76,24 @@ class Noise:
 
     @property
     def independent(self) -> float:
-        """How many independent samples say as much of a constant: ``n (1 - sum a)^2 C(0)``."""
+        """Number of independent samples that determine a constant as well: ``n (1 - sum a)^2 C(0)``."""
         return float(len(self.scale) * (1.0 - self.memory.sum()) ** 2 * autocovariance(self.memory, 0)[0])
 
     @cached_property
     def beside_gaps(self) -> Predictors:
-        """What predicts samples that have not all of their past."""
+        """Predictors of the samples shortly after a gap."""
         return Predictors(self.past, self.memory)
 
     def filter(self, values: FloatArray, start: int = 0, skip: int = 0) -> FloatArray:
-        """Whiten columns for least squares: they times a band matrix, band by band.
+        """Whiten columns for least squares: a product with a band matrix, computed band by band.
 
         Parameters
         ----------
         values : (m, k) array
-            Rows `start` and on of the whole, best stored column by column.
+            Rows from `start` on of the whole log's columns, best stored column by column.
         start : int
         skip : int
-            Rows at the beginning that serve as the past only.
+            Rows at the beginning that serve only as the past of the others.
 
         Returns
         -------
@@ -121,7 +121,7 @@ class Noise:
         return out[:, :own].T
 
     def _weights(self, rows: slice) -> FloatArray:
-        """(m, p + 1) what :meth:`filter` gives to each of `rows` and to those before it."""
+        """(m, p + 1) weights of each of `rows`, and of the p rows before it, in :meth:`filter`."""
         past, gaps = self.past, self.beside_gaps
         weights = np.tile(np.append(1.0, -self.memory), (rows.stop - rows.start, 1))
         some = slice(*np.searchsorted(past.rows, [rows.start, rows.stop]))
@@ -130,11 +130,11 @@ class Noise:
         return weights
 
     def whiten(self, y: FloatArray) -> FloatArray:
-        """(n,) of y (n,): :meth:`filter` of a single column, the whole."""
+        """(n,) whitened y (n,): :meth:`filter` of a single whole column."""
         return np.asarray(np.sqrt(self.kappa) * self.beside_gaps.innovations(y) / self.scale)
 
     def back(self, y: FloatArray) -> FloatArray:
-        """(n,) of y (n,), filtered backwards: the transpose of :meth:`filter`."""
+        """(n,) y (n,) filtered backwards: the product with the transpose of :meth:`filter`'s matrix."""
         y = np.sqrt(self.kappa) * y / self.scale
         early, gaps = self.past.rows, self.beside_gaps
         whole = np.where(self.past.whole, y, 0.0)
@@ -142,18 +142,18 @@ class Noise:
         out[early] = gaps.f[self.past.pattern] * y[early]
         for k, weight in enumerate(self.memory, 1):
             out[:-k] -= weight * whole[k:]
-            # of samples that are not there a is 0
+            # a is 0 for samples that do not exist
             out[early - k] -= (gaps.f * gaps.a[:, k - 1])[self.past.pattern] * y[early]
         return out
 
     def response(self, residual: FloatArray) -> FloatArray:
-        """(n,) y of the module's notes; far from where the noise was fitted, with its weights from there."""
+        """(n,) y of the module's notes; the weights of psi are those of the residual that was fitted."""
         weight = (self.nu + 1.0) / (self.nu + self.innovations**2)
         return np.asarray(weight * self.whiten(residual) / self.kappa)
 
 
 class Predictors:
-    """Predictions of samples beside gaps.
+    """Predictors of the samples shortly after a gap.
 
     Parameters
     ----------
@@ -164,10 +164,11 @@ class Predictors:
     ----------
     past, memory
     a : (l, p) array
-        Of each of the patterns of lags.
+        a of the module's notes, for each pattern of lags.
     f : (l,) array
+        f of the module's notes.
     weights : (l, p + 1) array
-        Of a sample and of those before: f, and ``-f a``.
+        Of a sample, f, and of those before it, ``-f a``.
     """
 
     def __init__(self, past: Past, memory: FloatArray) -> None:
@@ -188,12 +189,12 @@ class Predictors:
         self.weights = self.f[:, None] * np.hstack([np.ones((len(lags), 1)), -self.a])
 
     def innovations(self, residual: FloatArray) -> FloatArray:
-        """(n,) v of a residual (n,)."""
+        """(n,) innovations v of a residual (n,)."""
         past, p = self.past, len(self.memory)
         # a view of the p samples before each, which takes no memory
         lags = sliding_window_view(np.append(np.zeros(p), residual), p)[:-1, ::-1]
         v = np.asarray(residual - lags @ self.memory)
-        # of samples that are not there a is 0
+        # a is 0 for samples that do not exist
         own = residual[np.maximum(past.rows[:, None] - np.arange(p + 1), 0)]
         v[past.rows] = np.einsum("ij,ij->i", self.weights[past.pattern], own)
         return v

@@ -2,21 +2,21 @@ r"""The uncertainty of nonlinear parameters, and what it adds to the covariance 
 
 Notes
 -----
-*Within a cell of their grid* the likelihood has one peak. With the parameters' derivatives
-``J_s = d(X b)/ds`` beside the columns of calibration and effects, their information is the matrix M of what
-is left of ``J_s`` when those are projected out, and these give way to a unit of each by K
-(:mod:`.information`). So with a prior of a cell, N(0, 1) in its units, all others' covariance is
+*Within a cell of their grid* the likelihood has one peak. The nonlinear parameters s have the derivatives
+``J_s = d(X b)/ds``. M is their information with calibration and effects projected out, and K is by how much
+all other coefficients change for a unit of each (:mod:`.information`). With the prior N(0, 1) in units of a
+cell, the covariance of the other coefficients is
 
 .. math:: C + K (M + 1)^{-1} K^T
 
-*Beyond it* there are other peaks: those of an onset lie hours apart, each with a size of its own. With d_k by
-how much all coefficients differ at the other points of the grid, C_k their covariance there, and w_k these
-points' posterior weights, the mixture of all has the moments
+*Beyond that cell* there may be other peaks: those of an onset may lie hours apart, each with a size of its
+own. With d_k the difference of all coefficients at another point of the grid, C_k their covariance there, and
+w_k that point's posterior weight, the mixture of all points has the covariance
 
 .. math:: C + \sum_k w_k \left(d_k d_k^T + C_k - C\right)
 
-A point weighs as much as its evidence; the estimate, which was profiled, by its share of a cell less
-(:attr:`~magbridge.diagnose.causes.candidates.Candidate.narrow`).
+A point's weight is its evidence. The estimate was profiled within its cell, so its evidence is reduced by the
+log of the share of the cell that it holds (:attr:`~magbridge.diagnose.causes.candidates.Candidate.narrow`).
 """
 
 from __future__ import annotations
@@ -52,17 +52,17 @@ def loosened(
     fit: Joint,
     grid: Sequence[Candidate] = (),
 ) -> Joint:
-    """Return the fit, its coefficients' covariance that with the nonlinear parameters free, too.
+    """Return the fit with the coefficients' covariance for nonlinear parameters that are free as well.
 
     Parameters
     ----------
     problem : Problem
     model : sequence of Candidate
     columns : sequence of Columns
-        Theirs, in this problem.
+        Of the model, in this problem.
     fit : Joint
     grid : sequence of Candidate
-        All that were searched.
+        All candidates that were searched.
     """
     pieces = [piece for candidate in model for piece in candidate.pieces]
     if all(piece.again is None for piece in pieces):
@@ -74,7 +74,7 @@ def loosened(
 def _within(
     problem: Problem, pieces: Sequence[Candidate], columns: Sequence[Columns], fit: Joint
 ) -> FloatArray:
-    """(q + k, q + k) what is added by the cells that the parameters are in."""
+    """(q + k, q + k) covariance added by the parameters' uncertainty within their cells."""
     slopes = [
         slope
         for piece, own in zip(pieces, slices(pieces), strict=True)
@@ -88,7 +88,7 @@ def _within(
 
 
 def _slopes(piece: Candidate, b: FloatArray) -> Iterator[Columns]:
-    """Yield what a cell of each nonlinear parameter does to the residual."""
+    """Yield the derivative of the residual by each nonlinear parameter, in units of its cell."""
     if piece.again is None:
         return
     values = [value for value, _ in piece.shape.values()]
@@ -109,7 +109,7 @@ def _beyond(
     fit: Joint,
     grid: Sequence[Candidate],
 ) -> FloatArray:
-    """(q + k, q + k) what is added by all other cells."""
+    """(q + k, q + k) covariance added by all other cells."""
     more = np.zeros_like(fit.covariance)
     points = [[c for c in grid if piece.again and _alike(c, piece)] for piece in pieces]
     every = [candidate for some in points for candidate in some]
@@ -129,7 +129,7 @@ def _alike(one: Candidate, other: Candidate) -> bool:
 
 
 def _elsewhere(info: Information, fit: Joint, mine: Placed, points: Sequence[Placed]) -> FloatArray:
-    """(q + k, q + k) what is added by the points of one piece's grid."""
+    """(q + k, q + k) covariance added by the other points of one piece's grid."""
     piece, own = mine
     q, first = len(fit.z), len(info.score) - fit.coefficients.size
     here = slice(own.start - first, own.stop - first)
@@ -141,9 +141,9 @@ def _elsewhere(info: Information, fit: Joint, mine: Placed, points: Sequence[Pla
     alone = replace(alone, score=alone.score + alone.matrix[:, own] @ fit.coefficients[here])
 
     def moments(candidate: Candidate, place: slice) -> tuple[float, FloatArray, FloatArray]:
-        """Return evidence, all coefficients and their covariance, less what all candidates share."""
+        """Return evidence, all coefficients and their covariance, each up to what is common to all points."""
         s = score(alone, place, candidate)
-        # the other causes give way to it, and the calibration to all
+        # the other causes change with this one, and the calibration with all of them
         way = np.zeros((len(fit.covariance), candidate.size))
         way[:q] = info.shift[:, rest] @ K[:, place] - info.shift[:, place]
         way[q + rest - first] = -K[:, place]

@@ -15,8 +15,9 @@ g the score of each single sample and h its information at that frequency, the l
 .. math:: B(t_0) = \sum_t g_t e^{-(t - t_0)^2 / 2 (Q P)^2 + 2 \pi i (t - t_0) / P}, \qquad
           S(t_0) = \tfrac12 \sum_t h_t e^{-(t - t_0)^2 / (Q P)^2}
 
-so all moments are two convolutions, over intervals: those without a sample have g = h = 0. A packet is worth
-its place if the evidence, averaged over all places that it could have had, is above one.
+so two convolutions over the log's intervals evaluate all moments at once; intervals without a sample have
+g = h = 0. A place is a period, a length and a moment. A packet is accepted if its Bayes factor, averaged over
+all places that it could have had, is above one.
 """
 
 from __future__ import annotations
@@ -39,25 +40,25 @@ __all__ = ["Packets", "packets"]
 FloatArray = NDArray[np.float64]
 
 CYCLES = (0.75, 2.25, 6.75)
-"""Q."""
+"""Values of Q that are tried."""
 SHORTEST, LONGEST = 4.0, 1.0 / 6.0
-"""Period, in intervals; length Q P, of the log."""
+"""Shortest period, in intervals; longest length Q P, as a share of the log."""
 HEARD = 6.0
-"""Likelihood ratio below which a place is none."""
+"""Likelihood ratio below which a place is ignored."""
 MOST = 12
-"""Packets in a log."""
+"""Most packets in a log."""
 APART = 2.5
-"""Lengths, or bandwidths, from which on two packets are two."""
+"""Lengths in time, and bandwidths in frequency, within which two places hold the same packet."""
 REACH = 5.0
-"""Lengths, beyond which a packet is over."""
+"""Lengths from its moment beyond which a packet is cut off."""
 SPARSE = 8
-"""Intervals for each sample, beyond which a log holds no packets that anyone could follow."""
+"""Intervals per sample; a log with fewer samples than one in so many is not searched for packets."""
 
 
 class Places(NamedTuple):
-    """Where packets of one period and length, in intervals, may be.
+    """Places of packets of one period and length, in intervals.
 
-    Moments (m,), likelihood ratios (m,), and the log of a place's share.
+    Moments (m,), likelihood ratios (m,), and the log of the prior probability of one place.
     """
 
     period: float
@@ -68,9 +69,10 @@ class Places(NamedTuple):
 
 
 class Packets(NamedTuple):
-    """Packets that are worth their places.
+    """The accepted packets.
 
-    Their two columns each, how many, the number of sets of so many, and the loudest's period (s).
+    Their columns, two for each; their number; how many sets of as many packets they were chosen from; and the
+    period of the loudest, s.
     """
 
     columns: Columns
@@ -119,7 +121,7 @@ def _columns(problem: Problem, found: list[tuple[float, Places]]) -> Columns:
             since = (slots[rows] - moment) / own.length
             here = np.abs(since) < REACH
             turns = 2.0 * np.pi * own.length / own.period * since[here]
-            # in units of what white noise lets see of it
+            # divided by the root of the length, so that in white noise all packets have about one norm
             under = np.exp(-0.5 * since[here] ** 2) / np.sqrt(own.length)
             out[here, 2 * k], out[here, 2 * k + 1] = under * np.cos(turns), under * np.sin(turns)
         return np.asarray(problem.gain[rows, None] * out)
@@ -128,7 +130,7 @@ def _columns(problem: Problem, found: list[tuple[float, Places]]) -> Columns:
 
 
 class _Spectra:
-    """What a log says of packets: transforms over `whole` intervals, of which the first n are the log's."""
+    """Spectra of g and h of the module's notes, over `whole` intervals: the log's n, then zeros."""
 
     def __init__(self, problem: Problem, fit: Joint) -> None:
         noise, slots = fit.noise, problem.survey.slots
@@ -142,10 +144,10 @@ class _Spectra:
         self.H = np.array([rfft(np.bincount(slots, h * some), self.whole) for some in parts])
 
     def places(self) -> list[Places]:
-        """List the places of each period and length where anything is heard."""
+        """List the places of each period and length whose likelihood ratio exceeds :data:`HEARD`."""
         asked = []
         for Q in CYCLES:
-            # one bandwidth 1 / (2 pi Q) apart
+            # periods one relative bandwidth, 1 / (2 pi Q), apart
             count = max(int(2.0 * np.pi * Q * np.log(LONGEST * self.n / Q / SHORTEST)), 0)
             periods = SHORTEST * np.exp(np.arange(count) / (2.0 * np.pi * Q))
             asked += [(Q, float(period), count) for period in periods]
@@ -153,20 +155,20 @@ class _Spectra:
         return [own for own in found if own.moment.size]
 
     def _heard(self, Q: float, period: float, count: int) -> Places:
-        """Places of one period and length; `count` periods are asked for with this Q."""
+        """Places of one period and length; `count` periods are tried with this Q."""
         length = Q * period
-        # so few samples still hold all frequencies below twice its own
+        # thinned to so few moments, all frequencies up to twice the packet's own are still resolved
         every = min(2 ** int(np.log2(period / SHORTEST)), self.finest)
         samples = self.whole // every
         f = np.arange(samples // 2 + 1) / self.whole
         kernel = np.exp(-0.5 * (2.0 * np.pi * length * (f - 1.0 / period)) ** 2)
         B = ifft(self.G[: len(f)] * kernel, samples) / every
-        # of a packet's own band: Gauss and Hermite's nodes
+        # the mean over the packet's band, at the nodes of Gauss-Hermite quadrature
         near = 1.0 / period + np.array([-1.0, 0.0, 1.0]) * np.sqrt(1.5) / (2.0 * np.pi * length)
         seen = _passed(self.noise, near) @ np.array([1.0, 4.0, 1.0]) / 6.0
         kernel = np.exp(-0.25 * (2.0 * np.pi * length * f) ** 2)
         S = irfft(seen @ self.H[:, : len(f)] * kernel, samples) / every
-        # the kernels' own sums: sqrt(2 pi) length, and sqrt(pi) length
+        # the kernels sum to one, those of the notes to sqrt(2 pi) length and sqrt(pi) length
         known = 0.5 * np.sqrt(np.pi) * length * S
         ratio = 2.0 * np.pi * length**2 * np.abs(B) ** 2 / np.maximum(known, 1e-3 * known.max())
         moments = -(-self.n // every)
@@ -176,7 +178,7 @@ class _Spectra:
 
 
 def _passed(noise: Noise, frequency: FloatArray) -> FloatArray:
-    """(2, k) power that whitening passes, by turns a sample: of whole pasts, and on average by gaps."""
+    """(2, k) power gain of whitening at frequencies (k,), per sample: away from gaps, and after them."""
     past, gaps = noise.past, noise.beside_gaps
     lags = np.arange(1, past.order + 1)
     whole = np.abs(1.0 - np.exp(-2j * np.pi * np.outer(frequency, lags)) @ noise.memory) ** 2

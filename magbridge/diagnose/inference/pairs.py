@@ -2,14 +2,14 @@ r"""Two causes at once: every pair of candidates in place of two regressors of a
 
 Notes
 -----
-A wrong cause may persist only because the one beside it is wrong, too, and neither gives way alone. So
-replacements are weighed in pairs, with all others of the model projected out (:mod:`.information`):
+A wrong cause may persist only because another is wrong, too: replacing either alone is no improvement. So
+replacements are weighed in pairs, with the rest of the model projected out (:mod:`.information`):
 
 .. math:: E_{ab} = E_a + E_{b \mid a}, \qquad
           E_{AB} = \ln \frac{1}{|A| |B|} \sum_{a \in A, b \in B} e^{E_{ab}}
 
-with A, B the grids of two causes' nonlinear parameters. A candidate whose numbers have one common size is
-only ever the first of its pair, at the size that it would have alone.
+with A, B the grids of two causes' nonlinear parameters. A candidate whose coefficients have one common size
+is always the first of its pair, at the size that it would have alone.
 """
 
 from __future__ import annotations
@@ -36,12 +36,12 @@ Group = tuple[str, str | None]
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """Two that could stand in the place of two others.
+    """Two candidates that could replace one or two of a model.
 
     Attributes
     ----------
     first, second : Candidate
-        In this one's and that one's place.
+        In the place of the first and of the second.
     behind : float
         Log evidence by which they lose, each averaged over its grid.
     """
@@ -52,7 +52,7 @@ class Pair:
 
 
 class _Stack:
-    """Candidates of one size, whose free numbers are scored at once."""
+    """Candidates with the same number of free coefficients, scored all at once."""
 
     def __init__(
         self, places: Sequence[int], at: Sequence[slice], candidates: Sequence[Candidate], info: Information
@@ -71,9 +71,9 @@ class _Stack:
         Parameters
         ----------
         rows, K : (k, M) array
-            Its information with all columns, and what it takes of them.
+            Rows of the other one in the information matrix M, and ``A^-1 M`` with A its own block and prior.
         taken : (k,) array
-            What it takes of the score.
+            ``A^-1 b`` of its own score b.
         """
         U = rows[:, self.index]
         S = self.S - np.einsum("amk,aml->mkl", U, K[:, self.index])
@@ -93,7 +93,7 @@ class _Stack:
 def pairs_of(
     state: State, info: Information, model: Sequence[Candidate], base: Joint, *places: int
 ) -> list[Pair]:
-    """Return what two could stand in the place of one of `model`, or of two, the likeliest first.
+    """Return the pairs that could replace one or two causes of `model`, the likeliest first.
 
     Parameters
     ----------
@@ -102,9 +102,9 @@ def pairs_of(
         Of all candidates and of `model`, whose columns are the last: :meth:`~.rounds.State.beside`.
     model : sequence of Candidate
     base : Joint
-        Its fit.
+        The model's fit.
     *places : int
-        Of the one or the two.
+        In `model`, of the one or two that are replaced.
     """
     table = _Table(state, info, model, base, places)
     groups = list(table.members)
@@ -113,7 +113,7 @@ def pairs_of(
 
 
 class _Table:
-    """Log evidences of all pairs in the place of two of a model."""
+    """Log evidences of all pairs in the place of one or two causes of a model."""
 
     def __init__(
         self, state: State, info: Information, model: Sequence[Candidate], base: Joint, places: Sequence[int]
@@ -125,7 +125,7 @@ class _Table:
         alone = info.without(others, base.prior[len(base.z) + others - ends[0]])
         c = base.coefficients
         self.signals = [alone.matrix[:, at] @ c[np.r_[at] - ends[0]] for at in here]
-        # what the data say when all of them are taken out of the fit
+        # the scores with all of them taken out of the fit
         self.info = replace(alone, score=alone.score + sum(self.signals))
         self.state, self.base, self.standing = state, base, [model[n] for n in places]
         self.candidates = [*state.candidates, *self.standing]
@@ -138,7 +138,7 @@ class _Table:
         self.paid = float(np.sum(np.log([candidate.trials for candidate in self.standing])))
 
     def _fill(self) -> None:
-        """Score every candidate alone, and beside each."""
+        """Score every candidate alone, and beside each other one."""
         m, info = len(self.candidates), self.info
         sizes: dict[int, list[int]] = {}
         for n, candidate in enumerate(self.candidates):
@@ -160,14 +160,14 @@ class _Table:
         np.fill_diagonal(self.evidence, -np.inf)
 
     def _own(self) -> tuple[float, float]:
-        """Log evidence of what stands there, an average over its grids, and by how much of it must win."""
+        """Log evidence of the standing causes, averaged over their grids, and the lead that they need."""
         m, groups = len(self.state.candidates), [key(candidate) for candidate in self.standing]
-        # under the noise that is left all ratios are larger than what the models gain
+        # under the noise that is left, which is less, ratios exceed what the model as a whole has gained
         whole = self.state.ratio(self.base)
         if len(groups) == 1:
             own, grid = self.scores[m], [self.scores[n].evidence for n in self.state.groups[groups[0]]]
             needed = lead(min(own.ratio, whole))
-            # a pair has one more to account for, and it must not be what the single one's regressor leaves
+            # the pair pays for one more cause, which must not be what the single one's regressor leaves
             return own.evidence + _average(np.array(grid)) + needed + float(
                 np.log(len(self.state.trials))
             ), needed
@@ -180,7 +180,7 @@ class _Table:
         return best + self._price(*groups), lead(min(ratio, whole))
 
     def _price(self, A: Group, B: Group) -> float:
-        """Log evidence of the average over two grids, against the best there."""
+        """Log of the evidence's average over two grids, relative to the best there."""
         return _average(self.evidence[np.ix_(self.state.groups[A], self.state.groups[B])])
 
     def pair(self, A: Group, B: Group) -> Pair | None:
@@ -220,7 +220,7 @@ class _Table:
         return not same or min(ratios) >= REMNANT**2 * max(ratios)
 
     def _swapped(self, a: int, b: int) -> bool:
-        """Say whether a rather stands in the second's place, by name, else by what it takes of its signal."""
+        """Say whether a rather replaces the second one, judged by cause, else by the signal it explains."""
         if len(self.standing) == 1:
             return False
         names = [candidate.cause for candidate in self.standing]
@@ -239,6 +239,6 @@ class _Table:
 
 
 def _average(evidences: FloatArray) -> float:
-    """Log of their average against the best."""
+    """Log of the average of evidences given by their logs, relative to the best."""
     top = float(np.max(evidences))
     return float(logsumexp(evidences - top)) - float(np.log(np.size(evidences))) if np.isfinite(top) else 0.0

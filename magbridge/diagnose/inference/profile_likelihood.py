@@ -18,8 +18,8 @@ __all__ = ["refined", "sharpen"]
 FloatArray = NDArray[np.float64]
 
 COLUMNS, STAGES = 144, 2
-"""Columns of the values tried within a nonlinear parameter's bracket, and how often that is narrowed to the
-neighbours of the best value."""
+"""Number of columns that all values tried within a nonlinear parameter's bracket may have, and number of
+stages: after each the bracket is narrowed to the neighbours of the best value."""
 
 
 def sharpen(state: State, model: list[Candidate], hypothesis: Hypothesis, base: Joint) -> Hypothesis:
@@ -68,7 +68,7 @@ def _profiled(
         ratios = np.array([s.ratio for s in scores])
         k = int(np.argmax(ratios))
         if not stage:
-            # of a cell: two are between
+            # as a share of one cell: the bracket spans two
             share = 2.0 * float(np.mean(np.exp(0.5 * (ratios - ratios[k]))))
             narrower = max(-float(np.log(share)), 0.0)
         low, high = values[k], values[k + 2]
@@ -78,14 +78,14 @@ def _profiled(
 
 
 def _bracket(state: State, candidate: Candidate, name: str) -> tuple[float, float]:
-    """Between which values of one nonlinear parameter its grid leaves a candidate free."""
+    """Return the values of one nonlinear parameter's grid between which a candidate stands."""
     here = candidate.shape[name][0]
     if name == "period":  # a resolved line is a thousandth wide, the grid is one of peaks
         share = 0.6 * here / float(np.ptp(state.problem.survey.time))
         return here / (1.0 + share), here * (1.0 + share)
     grid = sorted({state.candidates[k].shape[name][0] for k in state.groups[key(candidate)]})
     width = 0.5 * (grid[-1] - grid[0])
-    # what is positive stays so
+    # a positive parameter stays positive
     low = max(
         (v for v in grid if v < here), default=max(here - width, 0.5 * here if grid[0] > 0.0 else -np.inf)
     )
@@ -95,7 +95,7 @@ def _bracket(state: State, candidate: Candidate, name: str) -> tuple[float, floa
 def refined(
     state: State, model: list[Candidate], base: Joint, members: int | None = None
 ) -> tuple[list[Candidate], Joint]:
-    """Profile the nonlinear parameters of the first `members` beside the others; they end up last."""
+    """Profile the nonlinear parameters of the first `members`, each beside the others; they end up last."""
     for _ in range(len(model) if members is None else members):
         own, others = model[0], model[1:]
         c = np.append(base.coefficients[own.size :], base.coefficients[: own.size])

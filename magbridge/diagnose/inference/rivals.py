@@ -17,13 +17,13 @@ __all__ = ["Rival", "rivals_of"]
 
 @dataclass(frozen=True)
 class Rival:
-    """A rival of a cause: the best candidate of its own cause and channel.
+    """A rival of a cause, by the best candidate of its grid.
 
     Attributes
     ----------
     candidate : Candidate
     behind : float
-        Log evidence by which it loses, as an average over the grid of its nonlinear parameters.
+        Log evidence by which it loses, averaged over the grid of its nonlinear parameters.
     """
 
     candidate: Candidate
@@ -31,12 +31,12 @@ class Rival:
 
     @property
     def cause(self) -> str:
-        """Its name."""
+        """The cause's name."""
         return self.candidate.cause
 
     @property
     def channel(self) -> str | None:
-        """What it follows."""
+        """Telemetry that it follows."""
         return self.candidate.channel
 
 

@@ -40,7 +40,7 @@ class Hypothesis:
     evidence : float
         Log Bayes factor against the model without it.
     p_value : float
-        Look-elsewhere and number of causes included.
+        With the price of the hypotheses behind the cause (look-elsewhere) and of the number of causes.
     fit : Joint
         Of the whole model; this cause's coefficients are the last.
     """
@@ -53,7 +53,7 @@ class Hypothesis:
 
     @property
     def signal_to_noise(self) -> float:
-        """Whitened norm of the effect under the remaining noise, projected, less what noise alone gives."""
+        """Whitened norm of the effect, calibration and model projected out, less what noise alone gives."""
         size = self.candidate.size
         known = self.fit.prior[-size:] * np.diag(self.fit.covariance)[-size:]
         power = wald(self.fit, size) - float(np.sum(1.0 - known))
@@ -67,7 +67,7 @@ def wald(fit: Joint, size: int) -> float:
 
 
 def own_ratio(fit: Joint, candidate: Candidate) -> float:
-    """Likelihood ratio of the last candidate's numbers under the noise that is left."""
+    """Likelihood ratio of the last candidate's coefficients under the noise that is left."""
     own = slice(-candidate.size, None)
     spread = 0.0 if candidate.spectra is None else volume_of(fit.covariance[own, own], fit.prior[own])
     return wald(fit, candidate.size) - 2.0 * spread
@@ -107,11 +107,11 @@ class State:
         )  # fmt: skip
 
     def ratio(self, fit: Joint) -> float:
-        """Twice the log likelihood that a model has gained over none."""
+        """Twice the gain in log likelihood over the fit without any cause."""
         return 2.0 * (fit.log_likelihood - self.null.log_likelihood)
 
     def value(self, model: Sequence[Candidate], fit: Joint) -> float:
-        """Log evidence of a whole model; what an idealised regressor leaves is not yet another cause."""
+        """Log evidence of a model; each cause must also outweigh what idealised regressors may leave."""
         ratio, causes = self.ratio(fit), {candidate.cause for candidate in model}
         narrow = sum(candidate.narrow for candidate in model)
         return worth(ratio, model, self.trials) - narrow - len(causes) * slack(ratio)
@@ -121,9 +121,9 @@ class State:
         return [score(info, at, candidate) for at, candidate in zip(self.at, self.candidates, strict=True)]
 
     def best(self, scores: Sequence[Score]) -> dict[tuple[str, str | None], tuple[int, float]]:
-        """Best member of each group, and the log of its grid's average over the peak.
+        """Best member of each group, and the log of its grid's average evidence, relative to the best.
 
-        That is the price of the nonlinear parameters.
+        The latter is the price of the nonlinear parameters.
         """
         found = {}
         for group, members in self.groups.items():
@@ -133,7 +133,7 @@ class State:
         return found
 
     def round(self, model: list[Candidate], base: Joint) -> list[Hypothesis]:
-        """Every cause beside `model`, the likeliest first."""
+        """Fit the best causes beside `model`, each on its own, and list them, the likeliest first."""
         own = self.beside(model, base).fitted(base)
         if not self.trials:
             self.trials = trials(own, self.candidates, self.at)
@@ -146,13 +146,13 @@ class State:
             for group, (k, average) in self.best(scores).items():
                 under.setdefault(group, []).append((k, average, scores[k], info))
         listed = sorted(under.values(), key=lambda entries: -max(entry[2].evidence for entry in entries))
-        # what takes longest first: the threads end together
+        # the largest, which take longest, first: then the threads end together
         tried = sorted(listed[:SHORT_LIST], key=lambda entries: -self.candidates[entries[0][0]].size)
         found = in_threads(len(self.problem), partial(self._joint, model, base), tried)
         return sorted(found, key=lambda h: -h.evidence)
 
     def beside(self, model: Sequence[Candidate], base: Joint) -> Information:
-        """Information of all candidates, `model`'s last, under its noise, the calibration projected out."""
+        """Information of all candidates, then of `model`, under its noise, the calibration projected out."""
         known, info = self.last
         if known is not base:
             info = self._under(base.noise, model, base)
@@ -161,7 +161,7 @@ class State:
         return info
 
     def _bare(self, model: list[Candidate], base: Joint, info: Information) -> Information:
-        """Score again under the noise that remains when the best candidate of every cause is fitted."""
+        """Information under the noise that remains when the best candidate of every cause is fitted."""
         top: dict[str, tuple[float, int]] = {}
         scores = self.scores(info)
         for k, s in enumerate(scores):
@@ -204,7 +204,7 @@ class State:
             ratio = max(0.0, 2.0 * (fit.log_likelihood - base.log_likelihood))
             if candidate.positive and fit.coefficients[-1] < 0.0:
                 ratio = 0.0
-            # a gain that is not the effect's own, but of a noise that found another optimum beside it
+            # no more than the effect itself can gain: the rest is of a noise that found another optimum
             ratio = min(ratio, own_ratio(fit, candidate))
             freedom = mine[0][2].freedom
             p_value = self.p_value(candidate, ratio, freedom)
@@ -215,7 +215,7 @@ class State:
     def p_value(self, candidate: Candidate, ratio: float, freedom: int) -> float:
         """P-value of a likelihood ratio, times the hypotheses behind its cause, times the causes.
 
-        The noise's level is an estimate, so the distribution is Fisher's F.
+        The noise's level is estimated, too, so the distribution is Fisher's F.
         """
         tests = candidate.tail * self.trials.get(candidate.cause, 1.0) * self.causes
         freedom, certain = max(freedom, 1), self.certain.get(key(candidate), np.inf)
@@ -223,7 +223,7 @@ class State:
 
 
 def _made_once(n: int, columns: Sequence[Columns]) -> list[Columns]:
-    """Return `columns` made of what is kept of all that they are made of."""
+    """Return `columns` with their shared parts precomputed."""
     shared = [X for X, _ in together(columns).parts]
     known = dict(zip(shared, kept(n, shared), strict=True))
     return [Mixture(tuple((known[X], M) for X, M in parts(own))) for own in columns]

@@ -2,15 +2,15 @@ r"""The search for the causes that the data support, one after the other.
 
 Notes
 -----
-Candidates are scored (:mod:`.evidence`) under two noises, since the noise of the model so far may have
-swallowed an effect: that one, and the noise that is left when every cause may take what it can. The best of
-each cause are then fitted jointly with noise and calibration. The best that passes the test is added; so on
-while one does. A cause that is found again is not another cause but needs more than one of its regressors:
-they become one candidate. Then causes change places with their rivals (:mod:`.exchange`); another start is a
-choice of all at once (:mod:`.simultaneous`); and what later findings have made needless is dropped.
+Candidates are scored (:mod:`.evidence`) under two noises: that of the model so far, and that which is left
+when the best candidate of every cause is fitted, because the former may have absorbed an effect. The best of
+each cause are then fitted jointly with noise and calibration. The best that passes the test is added, and so
+on while one does. A cause that is found again needs more than one regressor: these become one candidate. Then
+causes are exchanged for their rivals (:mod:`.exchange`). A second start chooses all causes from one matrix
+(:mod:`.simultaneous`). Last, causes that later findings have made needless are dropped.
 
-What a cause's place could be taken by is read off one matrix at the end: the information of all candidates
-under the noise that is left, the other causes projected out.
+The rivals of each cause are read off one matrix at the end: the information of all candidates under the noise
+that is left, the other causes projected out.
 """
 
 from __future__ import annotations
@@ -50,15 +50,15 @@ class Outcome:
     rivals : tuple of tuple of Rival
         For each chosen one, all others that it does not beat by :func:`~.evidence.lead`, the best first.
     null, fit : Joint
-        Without any cause, and with the chosen ones.
+        Fits without any cause, and with the chosen ones.
     order : int
-        Memory of the noise.
+        Order of the noise's memory.
     tested : dict
         Cause -> (smallest p-value, ratio) of the first round.
     info : Information
         Of all candidates under the noise that is left, only the calibration projected out.
     trials : dict
-        Independent hypotheses behind each cause.
+        Cause -> number of independent hypotheses behind it.
     """
 
     chosen: tuple[Hypothesis, ...]
@@ -72,7 +72,7 @@ class Outcome:
 
 
 def search(problem: Problem, candidates: Sequence[Candidate], causes: int) -> Outcome:
-    """Find the causes that the data speak for.
+    """Find the causes that the data support.
 
     Parameters
     ----------
@@ -86,7 +86,7 @@ def search(problem: Problem, candidates: Sequence[Candidate], causes: int) -> Ou
     order = memory_order(rough.left, problem.survey.slots)
     state = State(problem, candidates, order, causes)
     null = state.null = state.fit([])
-    state.blocks = bool(np.ptp(null.noise.scale))  # likelihoods that are compared have one kind of noise
+    state.blocks = bool(np.ptp(null.noise.scale))  # likelihoods are comparable only under one kind of noise
     first = state.round([], null) if candidates else []
     tested: dict[str, tuple[float, float]] = {}
     for h in first:
@@ -101,12 +101,12 @@ def search(problem: Problem, candidates: Sequence[Candidate], causes: int) -> Ou
 
 
 def _likeliest(state: State, null: Joint, first: list[Hypothesis]) -> tuple[list[Candidate], Joint]:
-    """Return what is worth most: causes found one by one, chosen together, or a single one that is enough."""
+    """Return the likeliest model: causes found one by one, chosen together, or one that alone is enough."""
     one_by_one, at_once = _chain(state, null, first), chosen_at_once(state)
     found = [exchanged(state, *one_by_one) if one_by_one[0] else one_by_one]
     before = {key(candidate) for candidate in one_by_one[0]}
     if at_once and (before or len(at_once) > 1) and {key(candidate) for candidate in at_once} != before:
-        # a single one has had its test
+        # a single cause, chosen at once where one by one none passed, is not taken: it has been tested
         start = refined(state, at_once, state.fit(at_once, rounds=6))
         found.append(exchanged(state, *start))
     model, base = max(found, key=lambda entry: state.value(*entry))
@@ -124,7 +124,7 @@ def _chain(state: State, null: Joint, first: list[Hypothesis]) -> tuple[list[Can
     base, found = null, first
     heard: dict[str, float] = {}
     for _ in range(MOST):
-        # numbers of one common size are a whole: it neither grows nor is a part
+        # a candidate of one common size is a whole: neither extended nor added to its cause's others
         whole = {c.cause for c in model if c.spectra is not None}
         grown = [
             h for h in found if h.candidate.cause not in (whole if h.candidate.spectra is None else heard)
@@ -142,12 +142,14 @@ def _chain(state: State, null: Joint, first: list[Hypothesis]) -> tuple[list[Can
 
 
 def _next(found: list[Hypothesis], heard: Mapping[str, float], ratio: float) -> Hypothesis | None:
-    """Pick the best that passes; of what idealised regressors may have left, only more of the same cause.
+    """Pick the best that passes, unless it is so weak that other causes' idealised regressors may leave it.
 
-    `heard` holds the signal-to-noise of the causes that are in the model, `ratio` is its likelihood ratio.
+    `heard` holds the signal-to-noise of the causes that are in the model, `ratio` is the model's likelihood
+    ratio.
 
-    More of a cause that is there already comes before another that explains hardly more; and fewer numbers
-    before more, where what the model has left may be what makes the difference.
+    A further regressor of a cause in the model is preferred to another cause that explains hardly more. Among
+    candidates whose evidence differs by less than the regressors' errors may account for, the one with the
+    fewest coefficients is preferred.
     """
 
     def left(cause: str) -> float:
@@ -176,7 +178,7 @@ def _with(state: State, model: list[Candidate], best: Hypothesis) -> tuple[list[
 
 
 def _remove(state: State, model: list[Candidate], base: Joint, null: Joint) -> tuple[list[Hypothesis], Joint]:
-    """Drop what later findings have made needless; measure what stays against the model without it."""
+    """Drop causes that later findings have made needless; test each other against the model without it."""
     chosen: list[Hypothesis] = []
     k = 0
     while k < len(model):

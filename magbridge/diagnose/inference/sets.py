@@ -1,4 +1,4 @@
-"""The sets: for each cause found, every other that is not ruled out, alone or together with another."""
+"""The sets: for each cause found, all others that are not ruled out, alone or in a pair."""
 
 from __future__ import annotations
 

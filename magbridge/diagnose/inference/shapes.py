@@ -32,25 +32,28 @@ __all__ = [
 FloatArray = NDArray[np.float64]
 
 BEND = 32
-"""Order of a channel's free response: fine enough for a converter's coarsest steps."""
+"""Order of the polynomials of a channel's response: fine enough for a converter's coarsest steps."""
 PLAYS = (0.3, 0.8)
 """Widths of the play operators that describe a channel's past, in half ranges."""
 LAGS = (0.0, 300.0, 1000.0, 3000.0, 10000.0)
-"""s, behind which the inside of a hull follows: heat, water that seeps, stress that relaxes."""
+"""s, lags with which the inside of a hull follows: heat, water that seeps, stress that relaxes."""
 SWAYS = (0.0, 10.0, 30.0)
-"""s, behind which something loose, or on a line, follows a turn."""
+"""s, lags with which something loose, or on a line, follows a turn."""
 SKIN = (5.0, 20.0)
-"""m, in which light, air and waves fade."""
+"""m, depths over which light, warmth and waves fade."""
 REPEATED = 8
 """Half waves per dive of what repeats with every dive."""
 ZERO = (500.0, 1000.0, 2000.0)
-"""Widths, nT, of what happens where a channel reads zero."""
+"""Widths, nT, of errors where a channel reads zero."""
 SLOPES = (0.0, 0.1, 0.2)
 """Sines of the angles at which a loose object in the hull starts to slide."""
 
 
 def spectra(count: int, axes: int) -> tuple[tuple[str, FloatArray], ...]:
-    """Widths of an exponential memory's half waves (relaxation, telegraph): ``1 / sqrt(1 + (k / k_0)^2)``."""
+    """Prior widths of half waves for an exponential memory (relaxation, switching), by kind.
+
+    The k-th has ``1 / sqrt(1 + (k / k_0)^2)``, k_0 the corner of the kind.
+    """
     k = np.repeat(np.arange(1, count + 1), axes)
     corners = {"drift": 1.0, "switching": 8.0}
     return tuple((kind, 10.0 / np.sqrt(1.0 + (k / corner) ** 2)) for kind, corner in corners.items())
@@ -72,7 +75,7 @@ def direction(body: FloatArray) -> Columns:
 def response(reading: FloatArray, slopes: FloatArray) -> Columns:
     """Each channel's error as any smooth function of its own reading: Chebyshev polynomials."""
     x = np.clip([_scaled(channel) for channel in reading.T], -1.0, 1.0)
-    turning = x + 1j * np.sqrt(1.0 - x**2)  # by the angle whose cosine is x
+    turning = x + 1j * np.sqrt(1.0 - x**2)  # cos k theta = T_k(x), with x = cos theta
 
     def columns(rows: slice) -> FloatArray:
         waves = powers(turning[:, rows], BEND).real.swapaxes(0, 1)
@@ -82,7 +85,7 @@ def response(reading: FloatArray, slopes: FloatArray) -> Columns:
 
 
 def bends() -> tuple[tuple[str, FloatArray], ...]:
-    """Widths of a response's polynomials: with steps, with a corner, or without."""
+    """Prior widths of a response's polynomials: of one with steps, with a corner, or smooth."""
     k = np.arange(1.0, BEND + 1.0)
     return tuple(
         ("broadband", np.tile(30.0 / width, 3)) for width in (np.sqrt(1.0 + (k / 8.0) ** 2), k**2, k**3)
@@ -92,7 +95,7 @@ def bends() -> tuple[tuple[str, FloatArray], ...]:
 def crossing(reading: FloatArray, slopes: FloatArray) -> Columns:
     """Each channel's error where it passes zero (Hermite's functions).
 
-    There a feedback current turns, or a converter's first bit flips.
+    There the feedback current changes sign, or a converter's first bit flips.
     """
 
     def columns(rows: slice) -> FloatArray:
@@ -110,7 +113,7 @@ def curve(values: FloatArray) -> Columns:
 
 
 def memory(values: FloatArray) -> Columns:
-    """Functions of a channel's past: curved branches of hysteresis, narrow and wide; its way of motion."""
+    """Functions of a channel's past: curved branches of hysteresis, narrow and wide; its direction."""
     y = _scaled(values)
     plays = [play(y, width) for width in PLAYS]
     change = np.diff(y, prepend=y[0])
@@ -125,12 +128,12 @@ def memory(values: FloatArray) -> Columns:
 
 
 def behind(time: FloatArray, values: FloatArray) -> Columns:
-    """Return a channel behind each of :data:`LAGS`: in some proportion they are any smooth response."""
+    """Return a channel with each of :data:`LAGS`: in some proportion they make any smooth response to it."""
     return _centred(_followed(time, _scaled(values)[None], LAGS), len(values))
 
 
 def swings(time: FloatArray, rate: FloatArray) -> Columns:
-    """Return what a turn swings out, to its own side or to the same one either way, at once or late."""
+    """Return functions of a turn's rate, with lags: the rate, and its square, the same to either side."""
     low, high = np.quantile(rate, (0.001, 0.999))  # telemetry that jumps is no turn
     y = np.clip(rate, low, high) / max(high, -low, 1e-12)
     swung = _followed(time, y[None], SWAYS)
@@ -138,7 +141,7 @@ def swings(time: FloatArray, rate: FloatArray) -> Columns:
 
 
 def top(time: FloatArray, depth: FloatArray) -> Columns:
-    """Return what the surface does to a vehicle, and what is left of it for a while."""
+    """Return effects of the surface on a vehicle that fade with depth, and, with lags, afterwards."""
     near = np.exp(-(depth - depth.min()) / np.array(SKIN)[:, None])
     return _centred(_followed(time, near, LAGS[:-1]), len(depth))
 
@@ -166,7 +169,7 @@ def ends(down: FloatArray) -> Columns:
 
 
 def _followed(time: FloatArray, values: FloatArray, lags: Sequence[float]) -> Columns:
-    """Each of `values` (k, n) behind each lag; kept in half the memory, which of a month they would fill."""
+    """Each of `values` (k, n) with each lag; in single precision, since of a month they fill the memory."""
     followed = np.stack([lagged(time, y, lag).astype(np.float32) for y in values for lag in lags])
     return lambda rows: followed[:, rows].T.astype(float)
 

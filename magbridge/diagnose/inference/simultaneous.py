@@ -1,7 +1,7 @@
-"""Another start of the search: all causes chosen at once, in the one matrix of the first round.
+"""A second start of the search: all causes chosen from one matrix, that of the first round.
 
-There the noise has swallowed nothing: it is what is left when every cause takes what it can. Causes that were
-found one after the other may have gone astray where several act.
+Its noise has not absorbed an effect: it is what is left when the best candidate of every cause is fitted.
+Where several causes act, the search one by one may go astray.
 """
 
 from __future__ import annotations

@@ -2,17 +2,18 @@ r"""Likelihood ratio of a candidate whose coefficients are each free, or have on
 
 Notes
 -----
-With projected information S and score b of k columns in units of their widths, numbers that are free have the
-likelihood ratio ``R = b^T S^-1 b``, of as many freedoms as the data see directions.
+With projected information S and score b of k columns in units of their widths, coefficients that are each
+free have the likelihood ratio ``R = b^T S^-1 b``, with as many degrees of freedom as the data determine
+directions.
 
-Where there are more numbers than anyone believes in (a smooth function of the place, a slow curve), they have
-a Gaussian prior of a common size g and of a spectrum w, both the ones that the data like best: a Gaussian
+A smooth function of the place, or a slow curve, has more coefficients than the data can determine. These have
+a Gaussian prior whose variance is a common size g times a spectrum w, the likeliest of each: a Gaussian
 process. With ``w^1/2 S w^1/2 = V diag(lambda) V^T``, ``y = V^T w^1/2 b`` the log evidence is
 
 .. math:: E = \max_{g, w} \tfrac12 \sum_i \left(\frac{g y_i^2}{1 + g \lambda_i} - \ln(1 + g \lambda_i)\right)
 
-which is a variance component's likelihood ratio: under no effect ``R = 2 E`` is at most a chi-square of one
-freedom (Self & Liang 1987), whatever the number of columns.
+half the likelihood ratio of a variance component: under no effect ``R = 2 E`` is at most a chi-square of one
+degree of freedom (Self & Liang 1987), whatever the number of columns.
 """
 
 from __future__ import annotations
@@ -27,23 +28,23 @@ __all__ = ["Ridge", "Statistic"]
 FloatArray = NDArray[np.float64]
 
 SIZES = np.logspace(-7, 2, 64)
-"""Common sizes g, squared, in units of the widths."""
+"""Values of g that are tried, in units of the widths squared."""
 VISIBLE = 1e-3
-"""Information, of the prior's own, below which a direction is invisible."""
+"""Information, as a fraction of the prior's own, below which a direction is ignored."""
 
 
 @dataclass(frozen=True, eq=False)
 class Ridge:
-    """What is best: likelihood ratio, estimate, and prior variance (k,) of every number.
+    """The estimate at the likeliest size and spectrum.
 
     Attributes
     ----------
     ratio : float
     estimate : (k,) array
     variance : (k,) array
-        Of the prior.
+        Prior variance of each coefficient.
     price : float
-        Log evidence: its part that is prior and volume.
+        Log evidence that the prior costs: its density at the estimate, and the volume (Occam's factor).
     signal_to_noise : float
         Whitened norm of the estimate.
     """
@@ -56,13 +57,13 @@ class Ridge:
 
 
 class Statistic:
-    """The likelihood ratio of one candidate's numbers.
+    """The likelihood ratio of one candidate's coefficients.
 
     Parameters
     ----------
     S : (k, k) array
     spectra : (l, k) array, optional
-        Prior variances up to a common factor, each tried; free numbers if there are none.
+        Alternatives for the prior variances, up to a common factor; without any, each coefficient is free.
     """
 
     def __init__(self, S: FloatArray, spectra: FloatArray | None = None) -> None:

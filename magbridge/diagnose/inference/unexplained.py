@@ -2,10 +2,10 @@
 
 Notes
 -----
-A free description has more numbers than anyone believes in, so they have one common free size
-(:mod:`.statistic`). Noise that was fitted without the effect may have swallowed it. So a description is found
-under the noise that stands and under the one that is left when slow curves take what they can, and then
-weighed by the whole likelihood, with a noise of its own.
+A free description has more coefficients than the data can determine, so they have one common free size
+(:mod:`.statistic`). Noise that was fitted without an effect may have absorbed it. So descriptions are scored
+under the noise of the fit and under that which is left when slow curves are fitted as well; the best are then
+weighed by the whole likelihood, with the noise fitted anew.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ __all__ = ["Leftover", "leftover"]
 FloatArray = NDArray[np.float64]
 
 LOUD = 3
-"""Best descriptions under each noise that are then weighed by the full likelihood."""
+"""Number of the best descriptions under each noise that are then weighed by the full likelihood."""
 TURNS = 6
-"""Alternations between a curve and its direction."""
+"""Alternations between fitting a curve and fitting its direction."""
 CALM = 2
 """Rounds of fitting slow curves and noise in turn."""
 
@@ -58,11 +58,11 @@ class Leftover(NamedTuple):
     best_channel : str or None
         The telemetry that correlates with it best.
     description : Description, optional
-        What told it.
+        The description that found it.
     choice : int
-        How many it was chosen from.
+        Number of descriptions that it was chosen from.
     within : tuple of Rival
-        The names that stay possible: it is likelier than they are, but not 20:1.
+        The causes that remain possible: it is likelier than they are, but by less than 20:1.
     """
 
     kind: str
@@ -82,10 +82,10 @@ class Leftover(NamedTuple):
 
 
 def lone(S: FloatArray, b: FloatArray, width: FloatArray, whole: Ridge) -> Ridge:
-    """One curve along one direction of the body, ``c = f d^T``: a third of three curves' numbers, and two.
+    """Estimate one curve along one direction of the body, ``c = f d^T``, instead of one curve for each axis.
 
-    f by the ridge along d, d by least squares with f, from the `whole` estimate on; the direction's two
-    numbers cost what :func:`~.evidence.weigh` asks for them.
+    In turn f is estimated along d, and d by least squares given f, beginning with the direction of the
+    `whole` estimate. The two free numbers of the direction pay as in :func:`~.evidence.weigh`.
     """
     count = len(width) // 3
     own = np.linalg.svd(whole.estimate.reshape(count, 3), full_matrices=False)[2][0]
@@ -117,9 +117,9 @@ def leftover(
     problem, model, fit, order
         The model that was found.
     tone : Candidate, optional
-        The best periodic disturbance, if the table does not hold that cause.
+        The strongest tone, where tones are not among the causes.
     but : sequence of Candidate
-        Causes that are not to be told again with more numbers.
+        Causes whose own regressors no description may contain.
     """
     listed = [one for one in descriptions(problem, fit, tone) if not one.covers(but)]
     made = kept(len(problem), [one.columns for one in listed])
@@ -133,15 +133,14 @@ def leftover(
             len(problem), lambda entry: _weighed(problem, columns, fit, order, *entry[2:]), loud
         )
         for (own, kind, one, best, _), evidence in zip(loud, weighed, strict=True):
-            # a gain beyond the formula's is that of a noise which found another optimum beside
-            # the description
+            # no more than the description itself can gain: the rest is of a noise that found another optimum
             found.append((min(own, evidence), kind, one, best.signal_to_noise))
     evidence, kind, one, size = max(found, key=lambda entry: entry[0])
     # half of a chi-square's tail: a size that cannot be negative is zero as often as not (Self & Liang 1987)
     tail = 0.5 * float(chi2.sf(2.0 * max(evidence, 0.0), 1))
     count = sum(len(one.widths) for one in listed)
     p_value = min(1.0, count * tail)
-    # without a name stricter than for a cause: it is the asymptotic distribution
+    # stricter where no cause was found: the distribution is only asymptotic
     if p_value >= (LEVEL if model else 0.1 * LEVEL):
         return None
     channel = one.channel or _goes_with(problem, fit)
@@ -151,7 +150,7 @@ def leftover(
 def _scored(
     problem: Problem, noise: Noise, fit: Joint, model: Sequence[Columns], listed: Sequence[Description]
 ) -> Iterator[tuple[float, str, Description, Ridge, FloatArray]]:
-    """Yield each description at each width: log evidence under `noise`, and how the model gives way."""
+    """Yield, for each description and width, the log evidence under `noise`, and the shift of the model."""
     columns = [*(one.columns for one in listed), *model]
     info = information(problem, noise, fit, columns, strangers=len(listed)).fitted(fit)
     ends = np.cumsum([0, *(one.widths[0][1].size for one in listed)]).tolist()
@@ -168,7 +167,7 @@ def _scored(
 def _calm(
     problem: Problem, model: Sequence[Columns], fit: Joint, order: int, slow: Sequence[Description]
 ) -> Noise:
-    """Return the noise that is left when slow curves take what they can, from one without memory on."""
+    """Return the noise that is left when slow curves are fitted, beginning with a noise without memory."""
     jumps = np.abs(np.diff(fit.left))
     level = 1.4826 * float(np.median(jumps)) / np.sqrt(2.0) + 1e-12
     white = np.full(len(problem), level)
@@ -200,7 +199,7 @@ def _weighed(
 
 
 def _goes_with(problem: Problem, fit: Joint) -> str | None:
-    """Return the channel of which a curve through ten bins explains most of what is left."""
+    """Return the channel whose means in ten bins explain most of what is left; None below 2 %."""
     best: tuple[float, str | None] = (0.02, None)
     total = float(fit.left @ fit.left)
     for name, channel in problem.survey.channels.items():
