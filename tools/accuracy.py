@@ -1,12 +1,12 @@
 """How well each calibration does out of sample, over random simulated gliders, beside what is possible.
 
 Each glider has dipoles of its own, flies the paper's Table 1, is calibrated, and flies a survey on another
-day with other roll and pitch. Printed for each method: the survey's RMS error over its noise floor (the error
-of a calibration that knows the vehicle), as median, 95th percentile and worst of the gliders, the RMS in nT
-on calibration and survey, and whether the predicted sigma is right. The oracle knows that masses are dipoles,
-along which lines they travel, and how large moments, volumes and iron are on such gliders: its bound is what
-its fits leave on average (Cramér-Rao, with that prior), what they reach on these very data stands below it.
-Samples while a mass is on its way are left out.
+day with other roll and pitch. Printed for each method: the survey's RMS error over its noise floor (the
+error of a calibration that knows the vehicle), as median, 95th percentile and worst of the gliders, the RMS
+in nT on calibration and survey, and whether the predicted sigma is right. The oracle knows that masses are
+dipoles, along which lines they travel, and the distribution of moments, volumes and iron on such gliders:
+its bound is the average error of its fits (Cramér-Rao, with that prior); their error on these very data is
+listed below it. Samples taken while a mass was moving are left out.
 
     python tools/accuracy.py --seeds 40 --out accuracy/
     python tools/accuracy.py --peers .venv-peers/bin/python        # see tools/peers.py
@@ -52,7 +52,7 @@ NOISES = {"1 nT white": (1.0, 0.0), "5 nT AR(1)": (5.0, 10.0)}
 """nT of a channel, and samples over which its correlation falls by e."""
 MASSES = {1: ("battpos",), 2: ("battpos", "ballast"), 3: ("battpos", "ballast", "rollpos")}
 TAPE = 0.05
-"""m, how well someone measures where the masses sit."""
+"""m, 1-sigma of the masses' positions as measured with a tape."""
 
 
 class Case(NamedTuple):
@@ -131,7 +131,7 @@ def calibrate(
 
 
 def tape(vehicle: Vehicle, seed: int) -> dict[str, dict[str, object]]:
-    """Return the masses' positions as someone measures them; the tables of a ``vehicle.toml``."""
+    """Return the masses' positions with the errors of a measurement; the tables of a ``vehicle.toml``."""
     rng = np.random.default_rng([seed, 99])
     return {
         name: {
@@ -144,7 +144,7 @@ def tape(vehicle: Vehicle, seed: int) -> dict[str, dict[str, object]]:
 
 
 def strangers(runs: xr.Dataset, peers: str) -> Iterator[tuple[str, tuple[np.ndarray, np.ndarray, str]]]:
-    """Yield public methods' answers: corrected is ``A (raw - T)``."""
+    """Yield the public methods' results: the corrected field is ``A (raw - T)``."""
     yield "scipy ellipsoid", (*ellipsoid(runs), "")
     if not peers:
         return

@@ -4,9 +4,9 @@
     python3 tools/dev.py bench processor start      some of it
     python3 tools/dev.py bench --json               for machines, with details
 
-Repetitions of the thing and of its floor alternate, and medians are told, so that a busy machine slows both
-alike. Processor time and ratios hold on a busy machine; latencies do not: the load average is told with them,
-and the floor's own tail says how far to believe them.
+Repetitions of the program and of its floor alternate and medians are printed, so that a busy machine slows
+both alike. Processor time and ratios hold on a busy machine; latencies do not: the load average is printed
+with them, and the floor's own tail shows how far they can be trusted.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""The blind study: effects that the detector cannot know, hidden in simulated deployments, to be found.
+"""The blind study: effects hidden in simulated deployments, which the detector must find without a hint.
 
-Run it as ``python tools/blind.py --cases 800 --out study``; a study that was interrupted goes on where it
-stopped, and a longer one holds the shorter. ``--part null,named`` runs some of its parts.
-``--scheduler ADDRESS`` uses a dask cluster that is there (its workers start in a checkout); otherwise a local
+Run it as ``python tools/blind.py --cases 800 --out study``; an interrupted study continues where it
+stopped, and a longer one contains the shorter. ``--part null,named`` runs some of its parts.
+``--scheduler ADDRESS`` uses an existing dask cluster (its workers start in a checkout); otherwise a local
 one is made. Tables go to ``table.md``, figures beside.
 """
 
@@ -28,7 +28,7 @@ Row = dict[str, Any]
 
 
 def read(log: Path) -> dict[int, Row]:
-    """Cases that are done, by number; a last line that was cut off is not."""
+    """Return the cases that are done, by number; a truncated last line is not."""
     whole = log.read_text().splitlines(keepends=True) if log.exists() else []
     return {row["number"]: row for row in (json.loads(line) for line in whole if line.endswith("\n"))}
 

@@ -1,10 +1,9 @@
 """The twin of the Bonne Bay trials beside the paper: its Tables 1 and 2, and the like of Figures 2 to 6.
 
 The twin's glider flies the paper's runs among rock of its own, from a boat at -10 degC into water at
-2 degC. Each trial's spirals calibrate (against the IGRF and the aeromagnetic map, which is all that anyone
-has), and the survey between them is corrected with either. Nothing here was fitted to the paper but the
-sizes in ``sitl/scenarios/bonne_bay.toml``; of the worlds that could be drawn, the default seed is one that
-comes near it.
+2 degC. It is calibrated on each trial's spirals (against the IGRF and the aeromagnetic map, as in the paper),
+and the survey between them is corrected with either calibration. Only the sizes in
+``sitl/scenarios/bonne_bay.toml`` were fitted to the paper; the default seed draws a world that comes near it.
 
     python tools/bonne_bay.py --out bonne_bay/
     python tools/bonne_bay.py --seeds 20           # the same tables as medians over 20 worlds
@@ -132,7 +131,7 @@ def by_world(flights: list[Trials], seeds: Iterable[int], console: Console) -> N
 
 
 def signature(flight: Trials) -> str:
-    """Return which part of the paper's signature a world lacks, if any; by cubic, or auto if refused."""
+    """Return which part of the paper's signature a world lacks, if any; cubic's, or auto's if that failed."""
     method = "auto" if any((trial, "cubic") in flight.failed for trial in TRIALS) else "cubic"
     runs, survey = ([flight.rms(part or trial, trial, method) for trial in TRIALS] for part in ("", "survey"))
     if min(flight.rms(trial, trial, "nominal") for trial in TRIALS) < 3.0 * max(runs):

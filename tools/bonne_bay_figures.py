@@ -50,7 +50,7 @@ def _figure_2(flight: Trials) -> Figure:
         grid.longitude, grid.latitude, grid.anomaly, cmap="RdBu_r", vmin=-scale, vmax=scale, shading="gouraud"
     )
     axes.plot(survey["longitude"], survey["latitude"], color="black", label="survey")
-    for trial, marker, size in zip(TRIALS, "x+", (6, 10), strict=True):  # both stand at one place
+    for trial, marker, size in zip(TRIALS, "x+", (6, 10), strict=True):  # both have the same position
         part = flight.parts[trial].isel(time=slice(0, None, 90))
         axes.plot(
             part["longitude"],

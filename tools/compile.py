@@ -1,9 +1,9 @@
 """Build hook: the live path compiled by mypyc where there is a C compiler; where there is none, plain Python.
 
 Both are the same code and give the same bits; compiled, a sample costs half the processor time. An editable
-installation is never compiled: what is edited is what runs.
+installation is never compiled, so that edits take effect.
 
-The environment variable ``MAGBRIDGE_COMPILE`` says ``never``, or ``always``: fail where it cannot be done.
+The environment variable ``MAGBRIDGE_COMPILE`` may be ``never``, or ``always``: fail if it cannot be compiled.
 """
 
 from __future__ import annotations
@@ -57,6 +57,6 @@ class Compile(BuildHookInterface[Any]):
         build_data |= {"pure_python": False, "infer_tag": True}
 
     def finalize(self, version: str, build_data: dict[str, Any], artifact_path: str) -> None:  # noqa: ARG002
-        """Remove what was only needed on the way."""
+        """Remove the intermediate files."""
         if hasattr(self, "_folder"):
             self._folder.cleanup()

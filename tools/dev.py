@@ -6,8 +6,8 @@
     python3 tools/dev.py compiled [ARG ...] the live path's tests, compiled
     python3 tools/dev.py bench [ARG ...]    tools/bench.py, compiled
 
-The first call makes ``.venv`` and installs the locked dependencies into it; what is edited is what runs
-there. The last two install the package as a user would, compiled where there is a C compiler, into
+The first call makes ``.venv`` and installs the locked dependencies and the checkout itself, editable, into
+it. The last two install the package as a user would, compiled where there is a C compiler, into
 ``.compiled``.
 """
 
@@ -48,9 +48,9 @@ def run(*command: str | Path, **variables: str) -> None:
 
 
 def run_tests(python: Path, *arguments: str, **variables: str) -> None:
-    """Run the tests, and those that fail once more, one at a time: their sensors and links keep real time.
+    """Run the tests, then those that failed again, one at a time: their sensors and links run in real time.
 
-    A machine that stands still for half a second makes telemetry stale, as it should.
+    A machine that stalls for half a second makes telemetry stale, as it should.
     """
     pytest = (python, "-m", "pytest")
     if call(*pytest, "-n", "2", "--dist", "loadfile", *arguments, **variables) == 1:
@@ -59,7 +59,7 @@ def run_tests(python: Path, *arguments: str, **variables: str) -> None:
 
 
 def install(extra: str, place: Path = BIN, *options: str) -> None:
-    """Bring an environment to what the lock file says, with one extra; what else is in it stays."""
+    """Install the lock file's versions into an environment, with one extra; other packages in it stay."""
     if not (BIN / "python").exists():
         venv.create(BIN.parent, with_pip=True)
     if not (BIN / "uv").exists():

@@ -20,7 +20,7 @@ XML = ROOT / "magbridge" / "mavlink" / "magbridge.xml"
 OUT = XML.with_name("dialect.py")
 DEFINITIONS = Path(pymavlink.__file__).parent / "dialects" / "v20"
 INCLUDED = "all.xml"
-"""Not only ours: whatever an autopilot says can become a parameter, and stands in logs."""
+"""More than our own messages: any that an autopilot sends can become a parameter, and is in logs."""
 ENUMS: dict[str, tuple[str, ...]] = {
     "MAG_LOG_STATE": (),
     "MAG_NAVIGATION_STATE": (),
@@ -44,7 +44,7 @@ ENUMS: dict[str, tuple[str, ...]] = {
     "MAV_STATE": (),
     "MAV_TYPE": ("GCS", "ONBOARD_CONTROLLER"),
 }
-"""The enumerations that the code speaks of, and which of their entries; none listed is all."""
+"""The enumerations that the code uses, and which of their entries; an empty list means all."""
 CODES = {
     "char": "s", "int8_t": "b", "uint8_t": "B", "int16_t": "h", "uint16_t": "H", "int32_t": "i",
     "uint32_t": "I", "int64_t": "q", "uint64_t": "Q", "float": "f", "double": "d",
@@ -66,7 +66,7 @@ def collect(path: Path, seen: dict[Path, Any]) -> dict[Path, Any]:
 
 
 def invalid(one: Any) -> str:
-    """Return the number that says 'not known', empty where there is none (or NaN, which says it itself)."""
+    """Return the number that stands for 'not known'; empty if there is none, or if it is NaN."""
     text = one.invalid.strip("[]:,")
     if match := re.fullmatch(r"(U?)INT(\d+)_(MAX|MIN)", text):
         bits = int(match[2]) - (match[1] == "")

@@ -2,8 +2,8 @@
 
     python tools/headline.py --seeds 3
 
-Prints, beside the paper, the twin's survey error before and after, against the field that was really there.
-Nothing tells the detector that it is a temperature.
+Prints, beside the paper, the twin's survey error before and after, against the true field. The detector has
+no hint that the cause is a temperature.
 """
 
 from __future__ import annotations
@@ -28,12 +28,11 @@ from sitl.scenario import load
 from sitl.twin import Twin
 
 REFERENCES = ("true", *CHARTS)
-"""The field that was there; the aeromagnetic map continued down to the glider, as ``--grid`` does; as
-it was flown."""
+"""The true field; the aeromagnetic map continued down to the glider, as ``--grid`` does; the map as flown."""
 
 
 def fly(seed: int, reference: str) -> dict[str, xr.Dataset]:
-    """The twin's three parts, on one time base, masses at rest, against one of :data:`REFERENCES`."""
+    """Return the twin's three parts, on one time base, masses at rest, with one of :data:`REFERENCES`."""
     scenario = load("bonne_bay")
     telemetry = msgspec.structs.replace(scenario.telemetry, reference="map" if reference == "map" else "true")
     twin = Twin.draw(msgspec.structs.replace(scenario, telemetry=telemetry), seed)
@@ -41,7 +40,7 @@ def fly(seed: int, reference: str) -> dict[str, xr.Dataset]:
 
 
 def rms(calibration: Calibration, ds: xr.Dataset, against: str = "truth_total_field") -> float:
-    """Error of the corrected total field, nT."""
+    """Return the RMS error of the corrected total field, nT."""
     return float(np.sqrt(np.mean((corrected(ds, calibration).total - ds[against].to_numpy()) ** 2)))
 
 

@@ -3,31 +3,31 @@
     python tools/navigation.py [--runs 100] [--part accuracy] ... [--keep DIR] [--peers PYTHON] [--data DIR]
 
 accuracy      error over the posterior Cramér-Rao bound, lost runs, consistency, for narrow and wide starts,
-              with what an auto calibration leaves
-nominal       the same, with what a nominal calibration leaves
+              with the remaining errors of an auto calibration
+nominal       the same, with the remaining errors of a nominal calibration
 watch         how long a filter that is in the wrong place vouches for it
-misinformed   whether one vouches for its position that has been told the wrong level, or half a map
+misinformed   whether a filter vouches for its position when the level is wrong, or half of the map is
 dived         gliders that dive under a map flown 90 m above the sea, without and with its continuation
 calibrations  simulated gliders, each calibrated by nominal, cubic and auto, that fly the same survey
 speed         one update, 100,000 samples, the start
 peers         Stone Soup (tools/voyages/stone_soup.py) on the same measurements; MagNav.jl's published flight
 
-A run takes about a second, accuracy of 100 runs a row a quarter of an hour on a free core; with ``--keep``
-rows that are done are kept in a folder, and taken up again.
+A run takes about a second; accuracy with 100 runs a row takes a quarter of an hour on a free core. With
+``--keep`` finished rows are kept in a folder and used again.
 
-What the columns of the accuracy tables hold, for the errors of the second half of each run:
+The columns of the accuracy tables, from the errors of the second half of each run:
 
 DRMS m        median over the runs of the error's root mean square
 ratio         median over the runs of that, over the bound **of the same run** (its track, map and noise)
 90 %          the same ratio's 90th percentile
 RMS ratio     root mean square error of all runs together over that of all bounds: 1 for an efficient
-              estimator. The median is below it, because one run's errors follow each other and so scatter
-              widely about its bound
-alone m       median of what dead reckoning alone would have
+              estimator. The median is below it, because the errors within a run are correlated, so that its
+              RMS scatters widely about its bound
+alone m       median of the error of dead reckoning alone
 lost %        the truth was outside the 99.99 % ellipse for half an hour on end
 NEES/2        mean of the squared error over its covariance, 1 when consistent; then how many of 4 instants
               have the mean of the runs within its 99 % chi-square limits
-false alarm % it said to be lost, and was not
+false alarm % the filter reported to be lost, and was not
 vouched %     of the time
 after h       median over the runs of when it first vouched for its position
 """
@@ -66,14 +66,14 @@ STARTS = {"narrow": 0.2, "wide": 1.0}
 
 
 class Runs(NamedTuple):
-    """Where runs are made: on how many processors, how many a row, and the folder that keeps them, if any."""
+    """How runs are made: number of processors, runs in a row, and the folder that keeps them, if any."""
 
     pool: ProcessPoolExecutor
     count: int
     keep: Path | None
 
     def __call__(self, run: partial[Any]) -> list[Any]:
-        """Return `run` of 0, 1, ...: from the folder, where they have been made before."""
+        """Return `run` of 0, 1, ...; from the folder if they were made before."""
         row = f"{run.func.__name__} {run.args} {self.count}"
         kept = self.keep / sha256(row.encode()).hexdigest()[:16] if self.keep else None
         if kept and kept.exists():
@@ -122,7 +122,7 @@ def row(label: str, runs: Sequence[Score]) -> list[str]:
 
 
 def accuracy(runs: Runs, _asked: argparse.Namespace, left: str = "auto") -> None:
-    """Narrow and wide starts on every map, with what a calibration leaves."""
+    """Narrow and wide starts on every map, with the remaining errors of a calibration."""
     slow = LEFT[left]
     print(
         f"\n## Accuracy with {left}: {runs.count} runs of 6 h a row, {min(SPEEDS)} to {max(SPEEDS)} m/s;"
@@ -185,7 +185,7 @@ def watch(runs: Runs, _asked: argparse.Namespace) -> None:
 
 
 def misinformed(runs: Runs, _asked: argparse.Namespace) -> None:
-    """Whether a filter believes itself whose map or calibration is not what it claims to be."""
+    """Whether a filter vouches for its position when the map or the calibration is worse than it claims."""
     print(
         "\n"
         f"## Told wrong: {runs.count} runs of 6 h a row, on a field {LEVEL:g} nT off, or of which the map "
@@ -202,7 +202,7 @@ def misinformed(runs: Runs, _asked: argparse.Namespace) -> None:
 
 
 def dives(runs: Runs, _asked: argparse.Namespace) -> None:
-    """What it costs to take a map for the field below it."""
+    """What it costs to use a map at its own altitude for the field below it."""
     print(
         f"\n## Under a map from 90 m up: {runs.count} worlds, 4 h, dives of 140 m, 54 nT of rock 350 m down\n"
     )

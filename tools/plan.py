@@ -3,7 +3,7 @@
 One plan for all, made before the first flight from the physical widths alone: ten spirals as long as the
 table's, masses and pitch within the table's own ends, trimmed as the vehicle trims itself, banked as the
 paper's at most. Each glider is then calibrated by `auto` on either, and flies the same survey. Printed: the
-error that was expected over the mission, and the survey's RMS over the noise floor as it came.
+error that was expected over the mission, and the survey's actual RMS over the noise floor.
 
     python tools/plan.py --seeds 12
 """
@@ -40,7 +40,7 @@ BANK = 6.0
 
 
 def chosen(scenario: Scenario, noise: float) -> tuple[Plan, Plan]:
-    """Return Table 1 and as many runs of a plan, with what either is expected to bring."""
+    """Return Table 1 and as many runs of a plan, with the error expected after either."""
     parts = segments(simulate(scenario, 0))
     runs, survey = (observed(parts[name]) for name in ("calibration", "survey"))
     before = expected_calibration(runs.ranges(), float(runs.reference.mean()), noise=noise)

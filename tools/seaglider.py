@@ -1,8 +1,8 @@
 """Do the moving masses matter on a real glider? Each dive is corrected by a calibration of all the others.
 
-A Seaglider's compass counts in steps of about 1 mG (100 nT), and knows nothing of its battery and its
-buoyancy engine. Printed for each choice of masses: the RMS error of the dives left out in the sensor's own
-nT, beside what its steps alone leave, dive by dive.
+A Seaglider's compass counts in steps of about 1 mG (100 nT), and is not corrected for its battery and its
+buoyancy engine. Printed for each choice of masses: the RMS error of the dives left out, in the sensor's own
+nT, beside that of its steps alone, dive by dive.
 
     python tools/seaglider.py ../shared/data/seaglider_sg167/*.nc
 """

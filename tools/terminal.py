@@ -1,4 +1,4 @@
-"""What the tools show alike: their tables, and their own docstring as the help."""
+"""What the tools have in common: the form of their tables, and their own docstring as the help."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Measured in a process of its own, where what it takes at most is of nothing else; and by processor time."""
+"""Measurements in a process of their own, where the peak memory is of nothing else; and of processor time."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def apart(script: str, *arguments: object) -> Any:
 
 
 def spent(work: Callable[[], object]) -> float:
-    """Return the processor time, in s, of all threads."""
+    """Return the processor time, in s, that `work` takes in all threads."""
     begun = time.process_time()
     work()
     return time.process_time() - begun

@@ -63,7 +63,7 @@ def fitting(folder: Path, repetitions: int) -> list[Row]:  # noqa: ARG001  (the 
 
 
 class Floors:
-    """The products within `correct`, without anything around them.
+    """The matrix products within `correct` alone.
 
     Parameters
     ----------
@@ -95,7 +95,7 @@ class Floors:
 
 
 def correcting(folder: Path, repetitions: int) -> list[Row]:  # noqa: ARG001
-    """Time `correct` where every sample has other positions, where they stand still, and one by one."""
+    """Time `correct` with positions that change at every sample, with positions at rest, and one by one."""
     data = table_1()
     calibration = fit(data).calibration
     rng = np.random.default_rng(1)
@@ -157,7 +157,7 @@ def table_1(noise: float = 1.0) -> Observations:
 
 
 def many(count: int) -> Observations:
-    """Return so many samples: the same runs again and again, each time with noise of their own."""
+    """Return `count` samples: the same runs repeated, each time with new noise."""
     runs = table_1(0.0)
     rng = np.random.default_rng(2)
     pick = np.arange(count) % len(runs)

@@ -21,7 +21,7 @@ __all__ = ["diagnosing", "long_survey"]
 MONTH = 648_000
 """Samples of 30 days at 0.25 Hz."""
 NIGHTLY, MONTHLY = 10.0, 1.0
-"""nT/degC: an effect of signal-to-noise 30 or 40 in a night, and in a month."""
+"""nT/degC, in a night and in a month: either makes a signal-to-noise ratio of 30 to 40."""
 
 IN_ANOTHER = """
 import json, resource, sys, time
@@ -66,9 +66,9 @@ def long_survey(hours: float, count: int = 0, size: float = 0.0) -> tuple[xr.Dat
     ----------
     hours : float
     count : int
-        So many samples: the survey again and again, with noise of its own each time; 0: once.
+        Number of samples: the survey is repeated, each time with new noise; 0: flown once.
     size : float
-        nT/degC of an offset that follows the logged temperature.
+        nT/degC of an offset proportional to the logged temperature.
     """
     scenario = load("random_glider")
     replace = msgspec.structs.replace
@@ -78,7 +78,7 @@ def long_survey(hours: float, count: int = 0, size: float = 0.0) -> tuple[xr.Dat
     )
     whole = segments(simulate(replace(scenario, mission=parts), 3))
     calibration = fit(observations(whole["calibration"], ["battpos", "ballast"]), "auto").calibration
-    # what is flown again and again must not bring its own noise again: that would be a tone
+    # a survey that is repeated must not repeat its noise: that would be a tone
     quiet = replace(
         scenario,
         instrument=replace(scenario.instrument, noise_sigma=0.0, channel_delay=(0.0, 0.0, 0.0)),

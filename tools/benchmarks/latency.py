@@ -1,8 +1,8 @@
 """From the last byte of a frame into the pty to the datagram out, of the real ``magbridge run``.
 
-One thread of this process is the fluxgate, the autopilot and the station: it writes a frame, and then asks
-the socket again and again until the next thing is due, so that what is measured is the bridge and not a
-wake-up of ours. The floor is measured in the same way: a process that sends whatever it reads.
+One thread of this process is the fluxgate, the autopilot and the station: it writes a frame, and then polls
+the socket until the next frame is due, so that the bridge is measured and not the wake-up of this process.
+The floor is measured in the same way: a process that sends whatever it reads.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ SECONDS = 5.0
 GRACE = 1.0
 """s in which the last samples may still come."""
 WARM_UP = 0.5
-"""s at the beginning that do not count: caches, the first IGRF."""
+"""s at the beginning that are not measured: caches fill, the IGRF is computed first."""
 RAW, FIELD = spec("MAG_RAW").id, spec("MAG_FIELD").id
 BIN = Path(sys.executable).parent
 
@@ -95,7 +95,7 @@ def started(command: Callable[[str, int], list[str]]) -> Iterator[Stage]:
 
 
 def bridge_command(folder: Path) -> Callable[[str, int], list[str]]:
-    """Return what starts the bridge of the workload."""
+    """Return the command that starts the bridge of the workload."""
 
     def command(device: str, port: int) -> list[str]:
         config = write_config(folder, device, f"udpout:127.0.0.1:{port}")
@@ -189,7 +189,7 @@ def _sequences_of_messages() -> Callable[[bytes], list[int]]:
     def sequences(data: bytes) -> list[int]:
         messages = codec.parse(data)
         raw = [message["sequence"] for message in messages if message.id == RAW]
-        # a raw reading that came without its corrected field is not what was asked for
+        # a raw reading without its corrected field does not count
         return raw if any(message.id == FIELD for message in messages) else []
 
     return sequences

@@ -41,7 +41,7 @@ def classes() -> ModuleType:
 
 
 class Peer:
-    """pymavlink's codec, given the bytes that the bridge is given and the messages that it publishes."""
+    """pymavlink's codec: decodes what the bridge receives, and encodes the messages that it publishes."""
 
     def __init__(self) -> None:
         self._in = classes().MAVLink(None)
@@ -53,7 +53,7 @@ class Peer:
         return sum(len(self._in.parse_buffer(piece) or ()) for piece in pieces)
 
     def arguments(self, published: bytes) -> list[tuple[type, tuple[Any, ...]]]:
-        """Return class and arguments of every message of a stream: what :meth:`encode` is to make it from."""
+        """Return class and arguments of every message of a stream, as :meth:`encode` takes them."""
         reader = classes().MAVLink(None)
         messages = reader.parse_buffer(published) or []
         return [(type(one), tuple(self._argument(one, name) for name in one.fieldnames)) for one in messages]
@@ -69,6 +69,6 @@ class Peer:
         return value.encode() if isinstance(value, str) else value
 
     def encode(self, messages: Iterable[tuple[type, tuple[Any, ...]]]) -> int:
-        """Make and pack messages; return the bytes."""
+        """Make and pack messages; return the number of bytes."""
         out = self._out
         return sum(len(kind(*arguments).pack(out)) for kind, arguments in messages)

@@ -50,7 +50,7 @@ class Edge:
 
 
 def processor(folder: Path, repetitions: int) -> list[Row]:
-    """Measure with masses that mostly rest, and with masses that never do."""
+    """Measure with masses that are mostly at rest, and with masses that always move."""
     return [row for moving in (False, True) for row in _measure(folder, repetitions, moving=moving)]
 
 
@@ -63,7 +63,7 @@ def _measure(folder: Path, repetitions: int, *, moving: bool) -> list[Row]:
     put = 0
 
     def live(edge: Edge) -> None:
-        """Feed the bridge, and wait until the log's thread has written what it said."""
+        """Feed the bridge, and wait until the log's thread has written every record."""
         nonlocal put
         drive(pipeline, edge, log, lambda _: None)
         put = pipeline.journal.count

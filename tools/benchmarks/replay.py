@@ -1,8 +1,8 @@
 """Replay as fast as it goes, against what pymavlink's codec alone would take for the same messages.
 
-Two processes play, the bridge and the stage that feeds it and listens. By wall clock that holds
-where both have a core of their own; the bridge is the slower one, so its processor time tells the
-same on a busy machine.
+There are two processes, the bridge and the stage that feeds it and listens. The wall clock is right where
+both have a core of their own; the bridge is the slower one, so on a busy machine its processor time says
+the same.
 """
 
 from __future__ import annotations

@@ -10,7 +10,7 @@ __all__ = ["Row"]
 
 
 class Row(NamedTuple):
-    """What was measured, beside its floor in the same run and what was asked.
+    """A measured figure, beside its floor in the same run and its target.
 
     Attributes
     ----------
@@ -18,12 +18,12 @@ class Row(NamedTuple):
     value : float
     unit : str
     floor : float or None
-        The same thing done bare, in the same unit; `floor_is` says how.
+        The same work at its barest, in the same unit; `floor_is` says how.
     ratio : float or None
-        The figure that `most` or `least` is about, where it is not `value` itself: the median over the
-        repetitions of value by floor.
+        The figure that `most` or `least` limits, where it is not `value` itself: the median over the
+        repetitions of value divided by floor.
     most, least : float or None
-        What was asked.
+        The target: upper or lower limit.
     detail : mapping
         For ``--json``.
     """
@@ -40,7 +40,7 @@ class Row(NamedTuple):
 
     @property
     def holds(self) -> bool | None:
-        """Whether it is as asked; None where nothing was."""
+        """Whether the target is met; None without one."""
         judged = self.value if self.ratio is None else self.ratio
         if self.most is not None:
             return judged <= self.most

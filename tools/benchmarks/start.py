@@ -19,7 +19,7 @@ from magbridge.mavlink import Codec
 __all__ = ["start"]
 
 FLOOR = "import numpy, msgspec, serial"
-"""What no bridge can do without; cyclopts (the command line) and our own modules come on top."""
+"""The imports that any bridge needs; cyclopts (the command line) and our own modules come on top."""
 SETTLE = 3.0
 """s of readings and telemetry before the memory is read."""
 HERTZ = 100

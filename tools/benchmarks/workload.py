@@ -1,4 +1,4 @@
-"""What the bridge is given in every benchmark: one configuration, one calibration, one stream of events."""
+"""The bridge's input in every benchmark: one configuration, one calibration, one stream of events."""
 
 from __future__ import annotations
 
@@ -91,8 +91,8 @@ class Feed:
     Parameters
     ----------
     moving : bool
-        The masses never rest; else they rest nine seconds of ten, and their telemetry trembles in
-        its last digit.
+        The masses always move; else they are at rest nine seconds of ten, and their telemetry jitters in its
+        last digit.
     """
 
     def __init__(self, *, moving: bool = False) -> None:
@@ -103,7 +103,7 @@ class Feed:
         self._samples = count()
 
     def events(self, seconds: int, hertz: int, begin_us: int) -> Iterator[Event]:
-        """Yield a time's events: `hertz` readings and 20 messages a second, and the heartbeat."""
+        """Yield the events of `seconds`: `hertz` readings and 20 messages a second, and the heartbeat."""
         for second in range(seconds):
             start_us = begin_us + second * 1_000_000
             due = [(start_us, Channel.LINK, -1)]

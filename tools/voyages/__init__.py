@@ -1,1 +1,1 @@
-"""What ``tools/navigation.py`` runs: voyages over simulated maps, good and astray; others on the same."""
+"""What ``tools/navigation.py`` runs: voyages over simulated maps, and other programs on the same data."""

@@ -1,4 +1,4 @@
-"""Others on the navigator's problem: Stone Soup on our measurements, and ours on MagNav.jl's flight."""
+"""Comparison with others: Stone Soup on our measurements, and our navigator on MagNav.jl's flight."""
 
 from __future__ import annotations
 
@@ -71,8 +71,8 @@ def magnav(folder: Path) -> None:
     """Fly MagNav.jl's simple example: its map, its compensated magnetometer, its inertial track.
 
     Its script promises 'navigation errors' of 7 m from an EKF on 18 inertial states; the inertial track that
-    it is given is 2 m off over these 100 s. Comparable is the error of the position; not its filter, which
-    estimates the inertial unit.
+    it is given is 2 m off over these 100 s. The errors of the position can be compared; the filters cannot,
+    because its filter estimates the errors of the inertial unit.
     """
     grid = read_grid(folder / "map")
     flight = np.genfromtxt(folder / "xyz.csv", delimiter=",", names=True)

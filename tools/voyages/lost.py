@@ -1,4 +1,4 @@
-"""Voyages on which a filter is in the wrong place or has the wrong map, and how long it stands by it."""
+"""Voyages on which a filter is in the wrong place or has the wrong map, and how long it vouches for that."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ LEVEL = 60.0  # nT
 
 
 def carried(kind: Map, seed: int) -> tuple[float, float]:
-    """Carry a tracking vehicle off by 1.5 lengths at 2 h; return as :func:`silence`."""
+    """Displace a tracking vehicle by 1.5 correlation lengths at 2 h; return as :func:`silence`."""
     grid = synthetic(kind, seed % 10)
     length, angle = 1.5 * grid.correlation_length, np.random.default_rng(seed).uniform(0.0, 2.0 * np.pi)
     options = with_options(GLIDER, start_sigma=0.2 * grid.correlation_length)
@@ -22,7 +22,7 @@ def carried(kind: Map, seed: int) -> tuple[float, float]:
 
 
 def misled(kind: Map, seed: int) -> tuple[float, float]:
-    """Start a filter that claims a tenth of a length, and is one length off; return as :func:`silence`."""
+    """Start a filter with a tenth of its true start error, 1-sigma one length; return as :func:`silence`."""
     grid = synthetic(kind, seed % 10)
     options = with_options(GLIDER, start_sigma=grid.correlation_length)
     ds = voyage(grid, options, 7000 + seed, speed=SPEEDS[seed % 3])
@@ -38,7 +38,7 @@ def level(kind: Map, seed: int) -> tuple[float, float]:
 
 
 def half(kind: Map, seed: int) -> tuple[float, float]:
-    """Sail on a field of which the map knows half the variance; return as :func:`standing`."""
+    """Sail on a field of which the map holds half the variance; return as :func:`standing`."""
     grid, other = synthetic(kind, seed % 10), synthetic(kind, 10 + seed % 10)
     field = AnomalyGrid(grid.longitude, grid.latitude, (grid.anomaly + other.anomaly) / 2**0.5)
     options = with_options(GLIDER, start_sigma=0.2 * grid.correlation_length)
@@ -46,12 +46,12 @@ def half(kind: Map, seed: int) -> tuple[float, float]:
 
 
 def outside(run: Run) -> NDArray[np.bool_]:
-    """Return where the vehicle is not where the filter says, by its own ellipse and by the map's scale."""
+    """Return when the vehicle is outside the filter's ellipse and over a quarter correlation length away."""
     return (run.nees > OUTSIDE) & (run.error > 0.25 * run.length)
 
 
 def silence(run: Run) -> tuple[float, float]:
-    """Return for how many hours on end the filter vouched for a wrong place, and was elsewhere at all."""
+    """Return the longest spells (hours) in which the filter vouched for a wrong place, and was at one."""
     return longest(outside(run) & run.vouched, run.hours), longest(outside(run), run.hours)
 
 

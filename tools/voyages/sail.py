@@ -36,7 +36,7 @@ LEFT = {"auto": 0.5, "nominal": 125.0}
 GLIDER = Options(current_sigma=0.05, bias_sigma=LEFT["auto"], bias_time=1800.0, map_sigma=1.0, interval=40.0)
 """A glider moves 14 m in 40 s: less than 2 % of any correlation length here."""
 AT_HOURS = (3.0, 4.0, 5.0, 6.0)
-OUTSIDE = float(chi2.ppf(0.9999, 2))  # squared distance: the truth is not where the filter says
+OUTSIDE = float(chi2.ppf(0.9999, 2))  # squared distance beyond which the filter is wrong
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ def voyage(
     Parameters
     ----------
     jump : (hour, north, east)
-        Metres by which the vehicle is carried off at once, unknown to itself.
+        Metres by which the vehicle is displaced at once, unnoticed by its dead reckoning.
     """
     rng = np.random.default_rng(seed)
     n = int(hours * HOUR / every)
@@ -108,14 +108,14 @@ def adrift(
     every: float = 4.0,
     jump: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> xr.Dataset:
-    """Return what a vehicle measures that moves so through a water that moves too, on a map with errors.
+    """Return the measurements of a vehicle that moves through water with a current, over a map with errors.
 
     Parameters
     ----------
     velocity : Array, (n, 2)
         m/s north and east through the water, each `every` s up to its sample.
     errors, sigma : Array, (n,)
-        nT: of the corrected total field, and what the calibration claims for them.
+        nT: errors of the corrected total field, and the 1-sigma that the calibration claims.
     """
     o, n = options, len(velocity)
     time = START + every * np.arange(1, n + 1)
@@ -157,7 +157,7 @@ def _markov(rng: np.random.Generator, n: int, sigma: float, decay: float, size: 
 
 @dataclass(frozen=True)
 class Run:
-    """What one voyage came to; arrays over the records."""
+    """The result of one voyage; arrays over the records."""
 
     hours: Array
     error: Array  # m
@@ -208,7 +208,7 @@ class Score(NamedTuple):
 
 
 def longest(flags: NDArray[np.bool_], hours: Array) -> float:
-    """Return how long, in hours, the flags stood at most."""
+    """Return the longest time, in hours, that the flags were set without a break."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(int), [0]])))
     spans = [hours[min(b, hours.size) - 1] - hours[a] for a, b in zip(edges[::2], edges[1::2], strict=True)]
     return float(max(spans, default=0.0))
