@@ -59,7 +59,7 @@ def set_up(config: Config, start: Start) -> Pipeline:
     Raises
     ------
     ConfigError, FormatError, CalibrationError
-        The configuration, or a file that it names, does not say what it should.
+        The content of the configuration, or of a file that it names, is wrong.
     """
     calibration = None
     if config.calibration is not None:

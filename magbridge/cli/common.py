@@ -120,7 +120,7 @@ def some(files: tuple[Path, ...], output: Path | None = None, *others: Path | No
 
 
 def digest(path: Path) -> str:
-    """Return the SHA-256 of a file, by which a calibration knows what it was made from."""
+    """Return the SHA-256 of a file; a calibration keeps those of the files that it was fitted to."""
     with path.open("rb") as file:
         return file_digest(file, "sha256").hexdigest()
 

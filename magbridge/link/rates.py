@@ -28,8 +28,9 @@ class Rate:
     def due(self, t_us: int) -> bool:
         """Say whether the sample at `t_us` goes out.
 
-        Slots lie a period apart and a sample may be a quarter of it early, so that a jittering stream at just
-        this rate passes whole. A pause, or a time far back, begins the slots anew.
+        Slots lie a period apart, and a sample may be early by a quarter of it, so that a jittering stream at
+        just this rate passes completely. After a pause, or a step far back in time, the slots start again at
+        the sample.
         """
         if self.hertz <= 0:
             return self.hertz == 0

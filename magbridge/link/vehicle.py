@@ -39,7 +39,7 @@ class Vehicle:
     clock : VehicleClock
         Reset when the autopilot reboots.
     reboots, frames_lost : int
-        Times that the boot clock began anew; frames missing by the autopilot's sequence numbers.
+        Number of restarts of the boot clock; number of frames missing by the autopilot's sequence numbers.
     """
 
     def __init__(

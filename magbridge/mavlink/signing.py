@@ -1,4 +1,4 @@
-"""Message signing: who wrote a frame, and that it is not an old one sent again.
+"""Message signing: it proves who wrote a frame, and that it is not an old one sent again.
 
 Notes
 -----

@@ -41,7 +41,7 @@ class Stamp(NamedTuple):
     time_us : int
         µs since 1970 UTC, a multiple of 4, increasing unless `stepped`.
     restarted : bool
-        The instrument's own clock began anew: it was powered on again.
+        The instrument's own clock restarted: it was powered on again.
     stepped : bool
         One of the two clocks was set; the relation between them is learned anew.
     missing : int
