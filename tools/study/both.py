@@ -2,14 +2,15 @@ r"""Whether an ideal analyst would name two causes that are hidden at once.
 
 Notes
 -----
-He knows neither, and weighs every cause alone and every two of them. The log evidence of two is that of the
-one, and of the other beside it, in the order that suits them better; every cause pays for its independent
-hypotheses, the second 20:1 and its choice among the causes, too. He names the best whole; his set holds the
-causes of all within 20:1 of it.
+The analyst does not know which two are hidden, and weighs every cause alone and every pair of causes. The log
+evidence of a pair is that of the first cause, plus that of the second beside it, in the better of the two
+orders. Every cause pays for its independent hypotheses; the second also pays 20:1, and for its choice among
+the causes. The analyst names the model (one cause or a pair) of the best evidence; the set holds the causes
+of all models within 20:1 of it.
 
-*both* is his chance to name the two if he has their true shapes beside the table's columns, *inside* that
-his set holds them, *regressed* his chance with the columns alone: what those do not tell of the one may
-speak for another.
+*both* is the chance to name the two if their true shapes are known beside the table's columns, *inside* that
+the set holds them, and *regressed* the chance to name them with the table's columns alone: what those leave
+of one cause may look like another.
 """
 
 from __future__ import annotations
@@ -68,7 +69,7 @@ def weighed(
 
 
 def by_causes(values: Mapping[tuple[Span, ...], Array]) -> Wholes:
-    """Best value of every set of causes."""
+    """Return the best log evidence of every set of causes."""
     wholes: Wholes = {}
     for spans, value in values.items():
         whole = frozenset(span.cause for span in spans)
@@ -77,13 +78,13 @@ def by_causes(values: Mapping[tuple[Span, ...], Array]) -> Wholes:
 
 
 def named(wholes: Wholes, truth: frozenset[str]) -> float:
-    """Chance that the truth is the best whole."""
+    """Chance that the true set of causes has the best evidence."""
     best = np.max([*wholes.values()], axis=0)
     return float(np.mean(wholes[truth] >= best)) if truth in wholes else 0.0
 
 
 def held(wholes: Wholes, truth: frozenset[str]) -> float:
-    """Chance that each cause of the truth is in a whole within 20:1 of the best."""
+    """Chance that each true cause is in a model within 20:1 of the best."""
     near = np.max([*wholes.values()], axis=0) - ODDS
     inside = [
         np.max([value for whole, value in wholes.items() if cause in whole], axis=0, initial=-np.inf) > near

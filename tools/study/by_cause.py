@@ -37,7 +37,7 @@ def by_cause(part: Mapping[str, Sequence[Row]]) -> list[str]:
 
 
 def _line(name: str, part: Mapping[str, Sequence[Row]]) -> list[str]:
-    """Cells of one cause."""
+    """Return the table's cells for one cause."""
 
     def own(*parts: str) -> list[Row]:
         return [r for p in parts for r in part.get(p, ()) if list(r["names"]) == [name]]
@@ -61,7 +61,7 @@ def _line(name: str, part: Mapping[str, Sequence[Row]]) -> list[str]:
 
 
 def _half(known: Sequence[Row]) -> str:
-    """Point of half detection."""
+    """Return the signal-to-noise of half detection: theory's, the measured one, and by how much it is off."""
     half, factor = [t["half"] for t in told(known)], beside_ideal(known)
     if not half or factor is None:
         return "-"
@@ -73,6 +73,6 @@ def _parameters(z: np.ndarray) -> str:
 
 
 def _instead(name: str, named: Sequence[Row]) -> list[str]:
-    """What else was named, or what it was called without a name."""
+    """Return what else was named, and the kinds of what was left unexplained."""
     kinds = {r["unexplained"]["kind"] for r in named if r["unexplained"]}
     return sorted(kinds.union(*map(asserted, named)) - {name})

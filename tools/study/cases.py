@@ -1,4 +1,4 @@
-"""The cases: what is hidden in each part of the study, and what a diagnosis makes of it."""
+"""The cases: which effects each part of the study hides, and what is recorded of a case's diagnosis."""
 
 from __future__ import annotations
 
@@ -39,17 +39,17 @@ LASTING = (
 """Causes that last to another deployment; the others are tied to a moment, a place or the range
 of one log."""
 NAMELESS = ("unknown", "seen", "foreign")
-"""Parts in which nothing in the table is what is hidden."""
+"""Parts in which the hidden effect is not among the causes of the table."""
 TOLD = ("named", "ladder", "pair", *NAMELESS)
-"""Parts of which theory says what comes out."""
+"""Parts for which theory predicts the outcome."""
 STRANGE = ("trailing", "compliant", "restart", "whistle")
-"""Foreign effects made after the detector, which has no description for them either."""
+"""Foreign effects made after the detector was frozen; its descriptions were not designed for them either."""
 SEEN = (
     "pan", "loose", "corrosion", "pulsation", "needle", "thermostat", "perming", "staircase", "swell",
     "cargo", "contact", "strobe", "storm", "rotor", "viscous", "brownout", "mains", "slip", "motional",
     "leak", "ranges", "sag", "crossover", "popcorn", "discharge", "towed", "sunlit", "eccentric", "astray",
 )  # fmt: skip
-"""Those that were so once, before the detector was last mended."""
+"""Foreign effects that were once made for this purpose, but before the detector was last improved."""
 GOLDEN = 0.6180339887498949
 
 
@@ -98,7 +98,7 @@ def _gain(k: int) -> Row:
 
 
 def _charted(k: int) -> Row:
-    """As the paper's log: the reference is a map, the vehicle surfaces; a third have no other fault."""
+    """As the paper's log: the reference is a map, the vehicle surfaces; a third of the cases hide nothing."""
     names = () if k % 3 == 0 else (LASTING[k % len(LASTING)],)
     return {
         "names": names, "wanted": LOUD[k % len(LOUD)] * bool(names), "noise": GLIDER,
@@ -121,19 +121,19 @@ PARTS: dict[str, Part] = {
 
 
 def losses(k: int) -> str:
-    """What the k-th case of a part loses: one in three does, in one way or another.
+    """Return how the k-th case of a part loses samples: one in three does, in one of the four ways.
 
-    The golden section keeps step with nothing.
+    Multiples of the golden section keep no step with the cycles of causes, noises and sizes.
     """
     place = int(3 * len(LOSSES) * (GOLDEN * k % 1.0))
     return LOSSES[place] if place < len(LOSSES) else ""
 
 
 def plan(cases: int, parts: tuple[str, ...] = tuple(PARTS), seed: int = 0) -> list[Row]:
-    """The study's entries, every part's evenly among the others'; a longer study holds the shorter one.
+    """Return the study's entries, the parts evenly mixed; a longer study contains the shorter one.
 
-    Another `seed` hides the same causes at the same signal-to-noise, in other vehicles, and draws
-    all else anew.
+    Another `seed` hides the same causes at the same signal-to-noise in other vehicles, and draws everything
+    else anew.
     """
     made = []
     for place, (name, part) in enumerate(PARTS.items()):
@@ -151,7 +151,7 @@ def plan(cases: int, parts: tuple[str, ...] = tuple(PARTS), seed: int = 0) -> li
 
 
 def case(entry: Row) -> Row:
-    """Hide, diagnose, and say what came out, with what theory says of it."""
+    """Hide the effects of an entry, diagnose the log, and return the outcome beside theory's prediction."""
     began = time.process_time()
     number, noise, names, without = entry["number"], entry["noise"], entry["names"], entry.get("without", "")
     stage = stage_of(number, noise, entry.get("reference", "true"))
@@ -182,7 +182,7 @@ def case(entry: Row) -> Row:
 
 
 def _scores(found: Row, names: tuple[str, ...], whole: xr.Dataset) -> list[float]:
-    """(value - truth) / sigma of each parameter that physics knows, towards larger sizes, if named."""
+    """Return (value - truth) / sigma of each parameter of known truth, if named; positive if too large."""
     truth = json.loads(whole.attrs["truth"])
     own = [f["parameters"] for f in found["findings"] if names == (f["cause"],)]
     if len(own) != 1:
@@ -197,7 +197,7 @@ def _scores(found: Row, names: tuple[str, ...], whole: xr.Dataset) -> list[float
 def _theory(
     part: str, hidden: list[Found], stall: Stall, ds: xr.Dataset, result: Diagnosis
 ) -> list[dict[str, Any]]:
-    """What theory says of a case: of one that is hidden, or of two at once."""
+    """Return theory's prediction for a case of one hidden effect, or of two at once."""
     names = [one.hidden.name for one in hidden]
     if part not in TOLD or "outliers" in names:  # nothing else comes one by one
         return []
@@ -216,12 +216,12 @@ def _theory(
 
 
 def alike(other: str, late: Found, stall: Stall) -> Array:
-    """Signature of another delay of this length in the log that hides `late`, of the sign that it can have.
+    """Signature of the other delay cause, at this delay, in the log that hides `late`, of a possible sign.
 
-    A late field is an early clock, but for a mass that starts or stops within the delay of a sample. The
-    telemetry of an early clock shows it to have done so a delay before, when a filter has ``1 - 1/e`` of the
-    way behind it: of what the two differ by beside one telemetry, 1/e is left. That of a log whose filter
-    lags fits an early clock just as well.
+    A field that is late looks like a clock that is early, except where a mass starts or stops within the
+    delay of a sample. There the telemetry of an early clock shows the motion one delay earlier, when a filter
+    has covered ``1 - 1/e`` of its response; so, with the same telemetry, 1/e of the two signatures'
+    difference remains. The telemetry of a log whose filter lags fits an early clock just as well.
     """
     d = late.signature
     if other == "clock_offset":

@@ -1,6 +1,6 @@
-"""What each hypothesis of a table would make of a hidden effect: draws of likelihood ratios.
+"""Draws of the likelihood ratios of all hypotheses of a table, given a hidden effect.
 
-No deployment is needed.
+They follow from the information matrix: no deployment needs to be simulated.
 """
 
 from __future__ import annotations
@@ -18,16 +18,28 @@ from magbridge.diagnose.inference.statistic import Statistic
 Array = NDArray[np.float64]
 DRAWS = 400
 SHOWN = "as shown"
-"""In a channel's place: a cause's own signature, not the table's columns."""
+"""Instead of a channel's name: the span is a cause's true signature, not columns of the table."""
 
 
 @dataclass(frozen=True, eq=False)
 class Span:
-    """One of a cause's hypotheses: its columns, the log of how many it stands for, whether it has a sign.
+    """One of a cause's hypotheses.
 
-    Where its numbers have one common size, `spectra` (l, k) are their prior variances
-    (:mod:`magbridge.diagnose.inference.statistic`). Of a true shape `more` is how many further numbers its
-    cause has: they fit nothing but noise.
+    Attributes
+    ----------
+    cause : str
+    channel : str or None
+    own : slice
+        Places of its columns.
+    price : float
+        Log of the number of hypotheses that it stands for.
+    positive : bool
+        Its coefficients cannot be negative.
+    spectra : (l, k) array or None
+        Where its coefficients have one common size (:mod:`magbridge.diagnose.inference.statistic`): l
+        alternatives for their prior variances.
+    more : float
+        Of a true shape: how many further coefficients its cause has, which fit nothing but noise.
     """
 
     cause: str
@@ -40,19 +52,19 @@ class Span:
 
     @property
     def tail(self) -> float:
-        """Share of a chi-square's tail that is a test's: half, where a size cannot be negative."""
+        """Share of a chi-square's tail that counts in a test: half where a size cannot be negative."""
         return 0.5 if self.positive or self.spectra is not None else 1.0
 
 
 class Draws(NamedTuple):
-    """Fisher's information S of all columns, the truth's last; draws of their scores' noise (m, DRAWS)."""
+    """Fisher information S of all columns, the truth's last, and draws of their scores' noise (m, DRAWS)."""
 
     S: Array
     noise: Array
 
     @classmethod
     def of(cls, S: Array) -> Draws:
-        """Draw scores' noise of information S."""
+        """Draw the noise of scores whose covariance is S."""
         values, vectors = np.linalg.eigh(0.5 * (S + S.T))
         drawn = np.random.default_rng(20131212).standard_normal((len(S), DRAWS))
         return cls(S, vectors @ (drawn * np.sqrt(np.maximum(values, 0.0))[:, None]))
@@ -63,7 +75,7 @@ class Draws(NamedTuple):
         return float(np.sqrt(self.S[-1, -1]))
 
     def ratio(self, span: Span, scale: float | Array = 1.0) -> tuple[Array, float]:
-        """Likelihood ratios of a hypothesis, with the truth times `scale`, and its free numbers."""
+        """Likelihood ratios of a hypothesis, with the truth scaled by `scale`, and its degrees of freedom."""
         statistic = Statistic(self.S[span.own, span.own], span.spectra)
         given, scale = self.S[span.own, -1], np.asarray(scale)[..., None]
         scores = np.moveaxis(self.noise[span.own] + scale[..., None] * given[:, None], -2, 0)
@@ -75,21 +87,21 @@ class Draws(NamedTuple):
         ) if span.positive else value, statistic.freedom + span.more
 
     def beside(self, span: Span) -> Draws:
-        """Return what is left for others where a hypothesis takes what it can."""
+        """Return the draws with one hypothesis projected out."""
         taken = self.S[:, span.own] @ root_of(self.S, span)
         own = root_of(self.S, span).T @ self.noise[span.own]
         return Draws(self.S - taken @ taken.T, self.noise - taken @ own)
 
 
 def explained(S: Array, span: Span) -> float:
-    """What a hypothesis explains of the truth's power; one of the wrong sign explains nothing."""
+    """Power of the truth's signature that a hypothesis explains; one of the wrong sign explains nothing."""
     if span.positive and S[span.own, -1].min() < 0.0:
         return 0.0
     return float(np.sum((root_of(S, span).T @ S[span.own, -1]) ** 2))
 
 
 def weigh(ratio: Array, freedom: float) -> Array:
-    """Log evidence of likelihood ratios that took so many free numbers (Liang et al. 2008, sec. 2.4)."""
+    """Log evidence of likelihood ratios of `freedom` free coefficients (Liang et al. 2008, sec. 2.4)."""
     if not freedom:
         return np.zeros_like(ratio)
     more = np.maximum(ratio, freedom)
@@ -97,15 +109,15 @@ def weigh(ratio: Array, freedom: float) -> Array:
 
 
 def evidence(span: Span, ratio: Array, freedom: float) -> Array:
-    """Log evidence of likelihood ratios; numbers of one common size are integrated out of theirs."""
+    """Log evidence of likelihood ratios; coefficients of one common size are already integrated out."""
     if span.spectra is not None:
         return 0.5 * ratio - np.log(len(span.spectra))
-    # a known sign: what of the posterior has it, where half of the prior had
+    # of a known sign: the share of the posterior that has it, over half of the prior
     return weigh(ratio, freedom) + (np.log(2.0 * ndtr(np.sqrt(ratio))) if span.positive else 0.0)
 
 
 def with_another(draws: Draws, first: Span, spans: Sequence[Span]) -> dict[str, tuple[float, Span]]:
-    """Signal-to-noise of the truth that `first` leaves with the best other of each cause, and that one."""
+    """For each cause, the truth's signal-to-noise left by `first` and its best hypothesis, and the latter."""
     S = draws.beside(first).S
     left: dict[str, tuple[float, Span]] = {}
     for span in spans:
@@ -117,22 +129,22 @@ def with_another(draws: Draws, first: Span, spans: Sequence[Span]) -> dict[str, 
 
 
 def root_of(S: Array, span: Span) -> Array:
-    """Return R (k, f): ``R R^T`` is the covariance of a hypothesis' numbers where the data see them."""
+    """Return R (k, f): ``R R^T`` is the covariance of a hypothesis' coefficients, where the data see them."""
     own = S[span.own, span.own]
-    if span.spectra is not None:  # with their prior, of the size that the truth would give them
+    if span.spectra is not None:  # with their prior, at the likeliest size given the truth
         own = own + np.diag(1.0 / Statistic(own, span.spectra).best(S[span.own, -1]).variance)
     statistic = Statistic(own)
     return np.asarray(statistic.vectors / np.sqrt(statistic.values))
 
 
 def numbers(S: Array, span: Span) -> float:
-    """Free numbers of a hypothesis: of those with a common size as many as the data decide on."""
+    """Number of coefficients that the data determine: of one common size, those not held by the prior."""
     root = root_of(S, span)
     return float(np.trace(root.T @ S[span.own, span.own] @ root))
 
 
 def by_cause(evidences: Mapping[Span, Array], name: str = "", truth: Array | None = None) -> dict[str, Array]:
-    """Each cause's evidence, averaged over its grid, of its best channel; the truth pays likewise."""
+    """Each cause's log evidence, averaged over its grid, for its best channel; the truth pays as much."""
     groups: dict[tuple[str, str | None], list[tuple[Array, float]]] = {}
     for span, evidence in evidences.items():
         groups.setdefault((span.cause, span.channel), []).append((evidence, span.price))

@@ -86,7 +86,7 @@ def plot_detection(rows: Sequence[Row], path: Path) -> None:
 
 
 def _halves(axis: Axes, rows: Sequence[Row]) -> None:
-    """By how much each cause's point of half detection is off theory's, with its 68 % interval."""
+    """Draw the signal-to-noise that each cause needs relative to theory, with its 68 % interval."""
     own = {
         name: beside_ideal([r for r in rows if list(r["names"]) == [name] and r["theory"]]) for name in KNOWN
     }

@@ -1,4 +1,4 @@
-"""What a diagnosis buys: errors on another deployment of the vehicle, beside those of who knows the cause."""
+"""What a diagnosis gains: errors on another deployment of the vehicle, beside those of an oracle."""
 
 from __future__ import annotations
 
@@ -18,15 +18,14 @@ from study.stage import DAY, Stall, again
 
 Array = NDArray[np.float64]
 DELAYS = ("filter_lag", "clock_offset")
-"""In a uniform field these two are one: what is left of a late field is the masses that moved meanwhile."""
+"""In a uniform field these two look the same: a late field shows only where masses have moved meanwhile."""
 
 
 def gain(hidden: Hidden, stall: Stall, ds: xr.Dataset, result: Diagnosis) -> dict[str, float]:
-    """Mean square error (nT²) on another deployment: as calibrated, extended, and by who knows the cause.
+    """Mean square error (nT²) on another deployment: as calibrated, extended, and extended by an oracle.
 
-    Counted are the samples whose masses stand where the first deployment had them, too: elsewhere a
-    polynomial has only its own sigma to tell how little it knows. ``everywhere`` is what was extended
-    on all samples.
+    Counted are the samples whose masses stand within the range of the first deployment: beyond it a
+    polynomial extrapolates. ``everywhere`` is the error of the extended calibration on all samples.
     """
     calibration = stall.stage.calibration
     other = add_noise(again(stall.stage).measure((hidden,), stall.number + 1), "white", stall.number + 1)
@@ -41,7 +40,7 @@ def gain(hidden: Hidden, stall: Stall, ds: xr.Dataset, result: Diagnosis) -> dic
 def harm(hidden: tuple[Hidden, ...], stall: Stall, ds: xr.Dataset, result: Diagnosis) -> dict[str, float]:
     """Mean square error (nT²) against the true field, as calibrated and extended.
 
-    Of this log, and of one on another day.
+    Both on this log, and on one of another day (keys with " elsewhere").
     """
     calibration = stall.stage.calibration
     other = again(stall.stage, DAY).measure(hidden, stall.number + 1)
@@ -56,7 +55,7 @@ def harm(hidden: tuple[Hidden, ...], stall: Stall, ds: xr.Dataset, result: Diagn
 
 
 def _inside(other: xr.Dataset, ds: xr.Dataset, calibration: Calibration) -> NDArray[np.bool_]:
-    """Samples of a log whose masses stand where those of `ds` did."""
+    """Samples of a log whose masses stand within the range that those of `ds` covered."""
     inside = np.ones(other.sizes["time"], bool)
     for parameter in calibration.parameters:
         known = ds[parameter.name]
@@ -65,10 +64,10 @@ def _inside(other: xr.Dataset, ds: xr.Dataset, calibration: Calibration) -> NDAr
 
 
 def _oracle(name: str, result: Diagnosis) -> Calibration:
-    """Extend by who knows the cause: its regressors alone, profiled and fitted, and nobody doubts them.
+    """Extend as an oracle that knows the cause: its regressors alone are searched, and always accepted.
 
-    Of the two delays it takes the telemetry's: that has no noise, of which a reading's rate of change
-    would add more.
+    Of the two delays it corrects the telemetry's, which has no noise; the rate of change of a reading would
+    add some.
     """
     problem = result.problem
     known = "clock_offset" if name in DELAYS else name

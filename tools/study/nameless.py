@@ -2,23 +2,23 @@ r"""Whether an ideal analyst whose table lacks the cause would be misled by its 
 
 Notes
 -----
-He weighs the names of M causes, one or two of them, against N descriptions without a name, at even odds,
-as the detector does. Each pays for its choice. With the likelihood ratios R and free numbers k of names m
-and log evidence ``E(R, k) = (R - k)/2 - (k/2) ln(R/k)`` (a variance component of k freedoms) something
-without a name needs
+The analyst weighs the names of M causes, alone and in pairs, against N descriptions without a name, at even
+odds, as the detector does. Each pays for having been chosen. With the likelihood ratios R_m and numbers of
+coefficients k_m of names m, and the log evidence ``E(R, k) = (R - k)/2 - (k/2) ln(R/k)`` (a variance
+component of k degrees of freedom), a description must exceed
 
 .. math:: T = \max_m \left(E(R_m, k_m) - c_m\right) - \ln M
 
-c is the price of a name's grid and, of a pair, 20:1 and its choice among the causes.
+where c is the price of a name's grid and, for a pair, of 20:1 and of its choice among the causes.
 
-*unnamed*: at best one of the descriptions has the very shape of the truth, and as many numbers as its cause
-would have: ``P(E(R_d, k) - ln N > T)``. No description that could have been anything else does better: a
-bound for all analysts. (Of a cause of three numbers at S/N 10, N = 20, it is 95 % where the best name of
-three numbers leaves 4.8.)
+*unnamed*: at best one of the descriptions has exactly the true shape, and as many coefficients as its cause
+would have: ``P(E(R_d, k) - ln N > T)``. No more general description does better, so this bounds all analysts.
+(For a cause of three coefficients at S/N 10 and N = 20 it is 95 % where the best name of three coefficients
+leaves an S/N of 4.8.)
 
-*described*: the chance with the descriptions that there are, ``P(max_j E_j - ln N > T)``: each has
-numbers of one common size, which is the likeliest, and pays for all the shapes that it could have taken,
-and for its choice.
+*described*: the chance with the detector's descriptions, ``P(max_j E_j - ln N > T)``: the coefficients of
+each have one common size, the likeliest, and each pays for all the shapes that it could have taken and for
+its choice.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ Array = NDArray[np.float64]
 def against(
     draws: Draws, names: Mapping[str, Array], pairs: Sequence[tuple[Span, Span]], trials: Mapping[str, float]
 ) -> Array:
-    """Log evidence T that a nameless thing needs; `names` are priced for their grids, `pairs` are not."""
+    """Log evidence T that a description must exceed; the price of grids is included in `names` only."""
     found = [*names.values()]
     for first, second in pairs:
         one, other = draws.ratio(first), draws.beside(first).ratio(second)

@@ -1,4 +1,4 @@
-"""What stands between an effect and whoever looks for it: a log's noise, and the samples that it lacks."""
+"""What makes an effect hard to find: a log's noise, and its lost samples."""
 
 from __future__ import annotations
 
@@ -10,31 +10,32 @@ from scipy.signal import lfilter
 Array = NDArray[np.float64]
 Rows = NDArray[np.intp]
 MEMORY = 0.8
-"""Correlation of neighbours in noise with a memory."""
+"""Correlation of neighbouring samples in autoregressive noise."""
 SLOWER = 0.95
-"""Correlation of neighbours in the slower third of noise that is white upon something slower."""
+"""Correlation of neighbouring samples in the autoregressive third (by power) of mixed noise."""
 NOISES = ("white", "ar", "mixed", "heavy", "uneven", "half", "map")
-"""White; with a memory; white upon a longer one; heavy-tailed; louder at times; half as loud again as
-calibrated; over rock that is rough."""
+"""White; autoregressive; white plus slower autoregressive; heavy-tailed; louder at times; half as loud again
+as calibrated; white over rock of a stronger field."""
 GLIDER = "glider"
 """The noise of the paper's twin: eight times as large, and correlated."""
 LOSSES = ("single", "bursts", "hole", "surfacing")
-"""One sample in twenty; a dozen times some two minutes; a sixth of the log at once; 44 s of every dive."""
+"""What is lost: one sample in twenty; two minutes or so, a dozen times; a sixth of the log at once; 44 s of
+every dive."""
 
 
 def statistics(noise: str) -> tuple[float, float]:
-    """Correlation of neighbours, and 1-sigma (nT), that who knows the noise reckons with."""
+    """Correlation of neighbouring samples, and 1-sigma (nT), with which theory whitens this noise."""
     return (MEMORY if noise in ("ar", GLIDER) else 0.0), {"half": 1.5, GLIDER: 8.0}.get(noise, 1.0)
 
 
 def autoregression(white: Array, memory: float) -> Array:
-    """Give white noise of unit variance (n, k) a memory, and leave its variance."""
+    """Make white noise of unit variance (n, k) autoregressive, of the same variance."""
     driven = np.vstack([white[:1], white[1:] * np.sqrt(1 - memory**2)])
     return np.asarray(lfilter([1.0], [1.0, -memory], driven, axis=0))
 
 
 def add_noise(ds: xr.Dataset, kind: str, seed: int) -> xr.Dataset:
-    """Add noise of unit variance, or what its `kind` says, to each channel."""
+    """Add noise of its `kind` to each channel, of unit variance unless the kind says otherwise."""
     rng = np.random.default_rng([seed, 99])
     n = ds.sizes["time"]
     noise = rng.standard_normal((n, 3))
@@ -71,7 +72,7 @@ def left(losses: str, n: int, seed: int) -> Rows:
 
 
 def whiten(x: Array, noise: str, rows: Rows) -> Array:
-    """Innovations in units of their 1-sigma, by the true noise, of what was measured at `rows` alone.
+    """Innovations, in units of their 1-sigma under the true noise, of a signal x sampled at `rows` alone.
 
     Over a step of k rows an AR(1) is one of ``rho^k``. The first row has no past and is left out.
     """

@@ -1,4 +1,4 @@
-"""What is counted in the cases: what came out of one, and rates of many beside theory's."""
+"""What is counted: the outcome of one case, and rates over many, beside theory's."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from study.theory import SIZES
 Row = dict[str, Any]
 SURE = norm.ppf(0.95)
 ALLOWED = 0.95
-"""Theory's chance to name the truth alone, or to name nothing, from which on a detector is held to it."""
+"""Least chance, by theory, to name the truth alone (or to name nothing) in the cases held to a target."""
 SEEN = 0.1
-"""Theory's p-value in a log, up to which the diagnosis' is compared with it: p-values end at one."""
+"""Largest p-value, by theory, of a log whose diagnosis is compared with theory: p-values end at one."""
 
 
 def found(row: Row) -> bool:
@@ -34,12 +34,12 @@ def asserted(row: Row) -> set[str]:
 
 
 def beside(row: Row) -> set[str]:
-    """Those, and what it cannot tell from them."""
+    """Causes that the diagnosis names, and those that it cannot tell from them."""
     return asserted(row).union(*(entry[3] for entry in row["found"]))
 
 
 def sets(row: Row) -> set[str]:
-    """Those, and the names that what is 'unexplained' cannot be told from."""
+    """Causes as in :func:`beside`, and those that are not ruled out for what is 'unexplained'."""
     return beside(row).union(a["cause"] for a in (row["unexplained"] or {}).get("alternatives", ()))
 
 
@@ -48,7 +48,7 @@ def right(row: Row) -> bool:
 
 
 def right_alone(row: Row) -> bool:
-    """One cause is named, the truth, and no other stands beside it."""
+    """Exactly the truth is named, and without alternatives."""
     return asserted(row) == sets(row) == set(row["names"])
 
 
@@ -57,12 +57,12 @@ def holds(row: Row) -> bool:
 
 
 def nameable(row: Row) -> bool:
-    """Theory can name what is hidden, and nothing else."""
+    """By theory, what is hidden can be named, and nothing else (both, where two are hidden)."""
     return all(t.get("both", t.get("alone")) >= ALLOWED for t in row["theory"])
 
 
 def unlike(row: Row) -> bool:
-    """Theory can tell what is hidden from all that the table knows."""
+    """By theory, what is hidden can be told from every cause of the table."""
     return all(t["unnamed"] >= ALLOWED for t in row["theory"])
 
 
@@ -87,22 +87,22 @@ def gained(rows: Sequence[Row]) -> float:
 
 
 def scores(rows: Sequence[Row]) -> NDArray[np.float64]:
-    """(value - truth) / sigma of all parameters that physics knows."""
+    """(value - truth) / sigma of all parameters of known truth."""
     return np.array([z for r in rows for z in r["scores"]])
 
 
 def told(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """Theory of the rows that have one."""
+    """Theory's predictions for all rows that have any."""
     return [t for r in rows for t in r["theory"]]
 
 
 def chance(rows: Sequence[Row], key: str) -> float:
-    """Theory's mean chance."""
+    """Mean of theory's chance `key`; NaN if there is none."""
     return float(np.mean([t[key] for t in told(rows)])) if told(rows) else np.nan
 
 
 def curve(rows: Sequence[Row], size: NDArray[np.float64] | float) -> NDArray[np.float64]:
-    """Theory's mean chance that what is hidden in the rows is found, were it of that signal-to-noise."""
+    """Theory's mean chance that the rows' hidden effects are found, if they had this signal-to-noise."""
     if not told(rows):
         return np.full(np.shape(size), np.nan)
     half, sure = np.array([(t["half"], t["sure"]) for t in told(rows)]).T
@@ -110,7 +110,7 @@ def curve(rows: Sequence[Row], size: NDArray[np.float64] | float) -> NDArray[np.
 
 
 def efficiency(rows: Sequence[Row]) -> tuple[float, float, float] | None:
-    """By how much the point of half detection is off theory's: factor with its 68 % interval.
+    """Ratio of the point of half detection to theory's, with its 68 % interval.
 
     Detection at signal-to-noise a is ``Phi((a / f - half) / width)``, f by maximum likelihood; `half`
     and the width are theory's of each case.
@@ -133,15 +133,16 @@ def efficiency(rows: Sequence[Row]) -> tuple[float, float, float] | None:
 
 
 def equal(row: Row) -> float:
-    """Signal-to-noise at which theory's detector would have the diagnosis' p-value, in the same noise."""
+    """Signal-to-noise at which the ideal detector would reach the diagnosis' p-value, in the same noise."""
     surprise = -np.log(np.minimum.accumulate(row["theory"][0]["here"]))
     return float(np.interp(-np.log(row["p_value"]), surprise, SIZES))
 
 
 def beside_ideal(rows: Sequence[Row]) -> tuple[float, float, float] | None:
-    """By how much more signal-to-noise the detector needs than theory's: factor with its 68 % interval.
+    """Ratio of the signal-to-noise that the detector needs to the ideal one's, with its 68 % interval.
 
-    Both see the same noise, which cancels: a log says as much as dozens that are counted as found or not.
+    Both see the same noise, which cancels: one log compared like this tells as much as dozens that are merely
+    counted as found or not.
     """
     rows = [r for r in rows if r["theory"] and np.interp(r["wanted"], SIZES, r["theory"][0]["here"]) < SEEN]
     if len(rows) < 3:
@@ -174,6 +175,6 @@ def percent(share: float) -> str:
 
 
 def off(factor: tuple[float, float, float]) -> str:
-    """By how many per cent factor and its interval's ends are off one."""
+    """Write by how many per cent a factor, and the ends of its interval, differ from one."""
     middle, low, high = (100 * (f - 1) for f in factor)
     return f"{middle:+.0f} ({low:+.0f} to {high:+.0f}) %"

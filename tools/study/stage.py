@@ -33,22 +33,22 @@ Array = NDArray[np.float64]
 HOURS = 6.0
 """Length of a deployment; the tests' are shorter."""
 VEHICLES = 23
-"""Of a seed. A prime: parts step through their causes and sizes in cycles, and each of these meets
-every vehicle."""
+"""Number of vehicles of one seed. It is prime: parts step through their causes and sizes in cycles, and so
+each of these meets every vehicle."""
 SEEDS = 1_000_000
-"""Numbers that a study of one seed may have."""
+"""Most case numbers of one seed."""
 INERTIA = 3.0
-"""s, twice, with which the attitude follows what :mod:`sitl.trajectory` draws."""
+"""s, time constant of each of two lags with which the attitude follows what :mod:`sitl.trajectory` draws."""
 TURN_ON = 20.0
-"""nT an axis, by which the paper's offset settles anew at every power-on."""
+"""nT (1-sigma) per axis by which the paper's offset changes at every power-on."""
 DAY = timedelta(days=1)
 CHARTS = ("map at its depth", "map")
-"""An aeromagnetic map, continued down to the glider or taken as it was flown, for a reference."""
+"""Maps that serve as reference: aeromagnetic, continued down to the glider, or taken as it was flown."""
 
 
 @dataclass(frozen=True)
 class Remembered(World):
-    """A world that remembers the field along a track: all cases of a vehicle fly through the same."""
+    """A world that caches the field along a track: all cases of a vehicle fly the same one."""
 
     known: dict[bytes, Array] = attribute(default_factory=dict)
 
@@ -63,9 +63,9 @@ class Remembered(World):
 class Stage(NamedTuple):
     """A vehicle with its calibration, and a deployment's track with the times of its rows.
 
-    `prior` (K, K) is what the calibration's coefficients are allowed: its covariance, and what no instrument
-    holds; `learned` the calibration's own log, where a diagnosis is given it; `chart` the map that both have
-    for a reference.
+    `prior` (K, K) is the prior covariance of the calibration's coefficients in a diagnosis: its own, and the
+    drift that no instrument is free of. `learned` is the calibration's own log, where the diagnosis is given
+    it, and `chart` the map that is the reference of both logs.
     """
 
     twin: Twin
@@ -86,8 +86,8 @@ class Stage(NamedTuple):
 def vehicle(seed: int, rms: float = 60.0, reference: str = "true") -> Stage:
     """Draw a vehicle, calibrate it on a log of its own, fly its survey; `rms` (nT) is the rock's field.
 
-    Against a map, one of :data:`CHARTS`, it is a glider like the paper's: its log is louder, and its offset
-    has settled anew when it surveys.
+    Where the reference is a map, one of :data:`CHARTS`, it is a glider like the paper's: its noise is larger,
+    and its offset has changed between calibration and survey.
     """
     swap = msgspec.structs.replace
     base = load("demo")
@@ -100,7 +100,7 @@ def vehicle(seed: int, rms: float = 60.0, reference: str = "true") -> Stage:
     world = swap(base.world, water=water, geology=swap(base.world.geology, rms=rms))
     base = swap(base, instrument=instrument, world=world, motion=swap(base.motion, settle=40.0))
     trial = swap(base, mission=(Spirals(),))
-    # no multiple of the sampling's 4 s: else every mass would start to move just when a sample is taken
+    # not a multiple of the sampling interval, 4 s: else every mass would start to move just at a sample
     survey = CrissCross(hours=HOURS, roll=(0.0, 4.0), pitch=(24.0, 3.0), battery_spread=0.12, duration=701.5)
     twin = Twin.draw(swap(base, instrument=swap(instrument, noise_sigma=0.0), mission=(survey,)), seed)
     if reference == "true":
@@ -118,12 +118,12 @@ def drawn(twin: Twin, reference: str) -> AnomalyGrid:
     chart = twin.anomaly_map()
     if reference == "map at its depth":
         return chart
-    # that knows no altitude
+    # the same without its altitude, so that it is not continued downward
     return AnomalyGrid(chart.longitude, chart.latitude, chart.anomaly, name=chart.name)
 
 
 def charted(ds: xr.Dataset, chart: AnomalyGrid) -> xr.Dataset:
-    """A log whose reference is a map, off by what it was off before besides."""
+    """Return a log with a map as reference; the error that its reference had before is kept on top."""
     known = reference_field(ds.drop_vars("reference_field"), chart)
     return ds.assign(reference_field=ds["reference_field"] - ds["truth_total_field"] + known)
 
@@ -133,7 +133,7 @@ def calibrated(spirals: xr.Dataset) -> Calibration:
 
 
 def again(stage: Stage, later: timedelta = timedelta()) -> Stage:
-    """Another deployment of the same vehicle in the same waters, whose reference is true."""
+    """Return another deployment of the same vehicle in the same waters, with the true field as reference."""
     scenario = msgspec.structs.replace(stage.twin.scenario, start=stage.twin.scenario.start + later)
     twin = replace(stage.twin, scenario=scenario, seed=stage.twin.seed + 1000)
     return _flown(twin, stage.calibration)
@@ -142,8 +142,8 @@ def again(stage: Stage, later: timedelta = timedelta()) -> Stage:
 def _flown(twin: Twin, calibration: Calibration) -> Stage:
     twin = replace(twin, world=Remembered(twin.world.origin, twin.world.rock, twin.world.water))
     track = twin.fly()
-    # a hull has inertia: without it the attitude has no rate, and a delay of a millisecond is a
-    # noise of its own
+    # a hull has inertia: without it the attitude has no rate of change, and a delay of a millisecond would
+    # look like noise
     smooth = {
         name: first_order(first_order(getattr(track, name), track.step, INERTIA), track.step, INERTIA)
         for name in ("roll", "pitch", "heading")
@@ -154,14 +154,14 @@ def _flown(twin: Twin, calibration: Calibration) -> Stage:
 
 
 def stage_of(number: int, noise: str, reference: str = "true") -> Stage:
-    """The stage of a case."""
+    """Return the stage of a case."""
     seed, place = divmod(number, SEEDS)
     rms = {"map": 300.0, GLIDER: 120.0}.get(noise, 60.0)
     return vehicle(VEHICLES * seed + place % VEHICLES, rms, reference)
 
 
 def compare(ds: xr.Dataset, calibration: Calibration) -> tuple[Array, Array]:
-    """Residual (n,) and its derivative by the calibration's coefficients (n, K)."""
+    """Return the residual (n,), and its derivatives by the calibration's coefficients (n, K)."""
     H = np.column_stack([ds[f"mag_{axis}"] for axis in "xyz"])
     p = np.column_stack([ds[name] for name in calibration.channels])
     phi = regressors(calibration, H, p, ds["time"].to_numpy()).T
@@ -174,19 +174,19 @@ def compare(ds: xr.Dataset, calibration: Calibration) -> tuple[Array, Array]:
 
 
 def project(X: Array, A: Array, covariance: Array) -> Array:
-    """Take out of columns X what a calibration (columns A, prior `covariance`) fitted with them absorbs.
+    """Project the calibration (columns A, prior `covariance`) out of columns X.
 
-    The inner product of the result with X is Fisher's information with the calibration free; Woodbury's
-    identity needs no inverse of the prior.
+    The inner product of the result with X is the Fisher information with the calibration free. By Woodbury's
+    identity the prior covariance need not be inverted.
     """
     inner = np.eye(len(covariance)) + (A.T @ A) @ covariance
     return np.asarray(X - A @ (covariance @ np.linalg.solve(inner, A.T @ X)))
 
 
 def size_of(name: str, d: Array, A: Array, covariance: Array) -> float:
-    """Signal-to-noise of a signature: the norm of what the free calibration leaves of it.
+    """Signal-to-noise of a signature d: its norm with the calibration projected out.
 
-    Outliers come one by one, each at a moment that nobody knows: theirs is that of the largest.
+    For outliers, each at an unknown moment of its own, it is that of the largest.
     """
     left = project(d[:, None], A, covariance)[:, 0]
     if name == "outliers":
@@ -195,7 +195,7 @@ def size_of(name: str, d: Array, A: Array, covariance: Array) -> float:
 
 
 class Found(NamedTuple):
-    """An effect of the wanted size: what it is, what it leaves (whitened), and the log with it."""
+    """An effect of the wanted size, its whitened signature in the residual, and the log with it."""
 
     hidden: Hidden
     signature: Array
@@ -203,9 +203,9 @@ class Found(NamedTuple):
 
 
 class Stall(NamedTuple):
-    """What all sizes share: the log's rows, its residual without an effect, the calibration's columns.
+    """What does not depend on the effect: a log's rows, its residual without one, the calibration's columns.
 
-    Residual and columns are whitened.
+    The columns (of `rows` only) are whitened; the residual (of all rows) is not.
     """
 
     stage: Stage
@@ -217,7 +217,7 @@ class Stall(NamedTuple):
 
     @classmethod
     def of(cls, stage: Stage, number: int, noise: str, losses: str = "") -> Stall:
-        """Set up; `number` draws what the vehicle logs beside, and which samples are lost."""
+        """Set up; `number` seeds the unneeded telemetry, and which samples are lost."""
         clean = stage.measure((), number)
         rows = left(losses, len(stage.when), number)
         e, J = compare(clean, stage.calibration)
@@ -228,13 +228,13 @@ class Stall(NamedTuple):
         return self.stage.measure(hidden, self.number)
 
     def show(self, hidden: Hidden) -> Found:
-        """What an effect does here."""
+        """Return an effect's signature and log here."""
         ds = self.measure(hidden)
         d = compare(ds, self.stage.calibration)[0] - self.residual
         return Found(hidden, whiten(d[self.rows], self.noise, self.rows), ds)
 
     def log(self, ds: xr.Dataset) -> xr.Dataset:
-        """What is there to be diagnosed: with noise, without what was lost."""
+        """Return the log to be diagnosed: with noise, and without the lost samples."""
         return add_noise(ds, self.noise, self.number).isel(time=self.rows)
 
     def hide(self, name: str, wanted: float, seed: int) -> Found:

@@ -40,7 +40,7 @@ from study.stage import CHARTS
 
 Parts = dict[str, list[Row]]
 OFF = 0.15
-"""By which the point of half detection may be off."""
+"""Most by which the point of half detection may differ from theory's, as a fraction."""
 Line = tuple[str, str, str, str]
 """Figure, target, what an ideal detector does, what was measured | in how many cases."""
 
@@ -105,7 +105,7 @@ def _detection(part: Parts) -> list[Line]:
 
 
 def _sets(named: Sequence[Row]) -> list[Line]:
-    """A case's set: what is named, what cannot be told from it, and the names that an 'unexplained' keeps."""
+    """Lines on a case's set: what is named, its alternatives, and those of what is 'unexplained'."""
     out: list[Line] = []
     for label, rows, targets in (
         ("where theory allows 95 %", [*filter(nameable, named)], ("at least 90 %", "", "at most 1.5")),
@@ -153,7 +153,7 @@ def _gains(rows: Sequence[Row]) -> list[Line]:
 
 
 def _harm(part: Parts) -> list[Line]:
-    """Against what is there: the true field, or on another deployment what is true of the reference."""
+    """Lines on harm: errors against the true field, or on another deployment against the true reference."""
     gain, charted = part.get("gain", []), part.get("charted", [])
     groups = {"harm: extension makes the corrected field worse": gain + charted}
     groups |= {f"... against a {kind}": [r for r in charted if r["reference"] == kind] for kind in CHARTS}
@@ -161,7 +161,7 @@ def _harm(part: Parts) -> list[Line]:
 
 
 def _nameless(part: Parts) -> list[Line]:
-    """A wrong name is one that the diagnosis asserts."""
+    """Lines on effects without a name; a wrong name counts if the diagnosis asserts it."""
     unknown = part.get("unknown", [])
     out: list[Line] = []
     for label, rows in (
@@ -193,7 +193,7 @@ def _pairs(pairs: Sequence[Row]) -> list[Line]:
 
 
 def _losses(rows: Sequence[Row]) -> list[str]:
-    """What lost samples change: the same figures of the cases whose logs are whole, and of the others."""
+    """Return the same figures for cases whose logs are whole and for those that lost samples."""
     groups = [r for r in rows if not r["losses"]], [r for r in rows if r["losses"]]
 
     def line(figure: str, parts: tuple[str, ...], good: Callable[[Row], bool]) -> str:

@@ -1,18 +1,18 @@
-r"""What a detector could do at best that knows the noise and the true shape of what is hidden.
+r"""The best that a detector could do that knows the noise and the true shape of what is hidden.
 
 Notes
 -----
-Let d be the hidden signature and X a rival's columns, whitened, with the calibration projected out. Scores of
-all columns are then ``N(X^T d, X^T X)``, whatever the data were: so the ideal detector's answers are drawn
-from that distribution without a deployment. It weighs the truth, a single column d with as many free numbers
-k as the cause has in the table, against every other cause of the table by the same evidence E that the real
-one uses, and names all within 20:1.
+Let d be the hidden signature and X the columns of all hypotheses, whitened, with the calibration projected
+out. The scores of all columns are then ``N(X^T d, X^T X)``, whatever the data are, so the ideal detector's
+answers are drawn from that distribution and no deployment is simulated. It weighs the truth (a single column
+d, with as many degrees of freedom k as the cause has in the table) against every other cause of the table, by
+the same evidence that the real detector uses, and its set holds all causes within 20:1 of the best.
 
-*Found* is what passes one of the tests of the table, or the truth's own: ``chi2_k`` beyond its quantile at
-1 % over all causes and their independent hypotheses. Half point and 95 % point are read off the draws with d
-at other sizes.
+An effect is *found* if one of the table's tests, or the truth's own, passes: ``chi2_k`` beyond its quantile
+at 1 % divided among all causes and their independent hypotheses. The signal-to-noise of half detection, and
+that of 95 %, are read off the draws with d scaled to other sizes.
 
-What has no name is :mod:`study.nameless`'s, two that are hidden at once :mod:`study.both`'s.
+Effects without a name are in :mod:`study.nameless`, two that are hidden at once in :mod:`study.both`.
 """
 
 from __future__ import annotations
@@ -48,11 +48,11 @@ class Setting(NamedTuple):
     causes : mapping
         The whole table.
     trials : mapping
-        Cause -> independent hypotheses behind it.
+        Cause -> number of independent hypotheses behind it.
     free : sequence of Description
-        What structure without a name is looked for with, where the cause is to be without one.
+        The detector's descriptions without a name, in the parts where the hidden effect has none.
     others : mapping of array (n,)
-        Whitened true signatures of other causes, beside what the table makes of them.
+        Whitened true signatures of other causes, which are rivals beside the table's columns.
     """
 
     causes: Mapping[str, Cause]
@@ -67,9 +67,9 @@ def ideal(one: Found, stall: Stall, ds: xr.Dataset, setting: Setting) -> dict[st
     Parameters
     ----------
     one : Found
-        What is hidden.
+        The hidden effect.
     stall : Stall
-        Where.
+        The log that it is hidden in.
     ds : Dataset
         The deployment that is diagnosed.
     setting : Setting
@@ -121,9 +121,9 @@ def ideal(one: Found, stall: Stall, ds: xr.Dataset, setting: Setting) -> dict[st
 def information(
     hidden: Sequence[Found], stall: Stall, ds: xr.Dataset, setting: Setting
 ) -> tuple[list[Span], Array, Array]:
-    """Fisher's information (m, m) of every hypothesis' columns, and scores (m, 1) of the log's own noise.
+    """Return spans, Fisher information (m, m) of all columns, and scores (m, 1) of the log's own noise.
 
-    What is hidden stands last, one by one and, of several, their sum.
+    The hidden signatures are the last columns: each one and, if there are several, their sum.
     """
     problem = pose(take([ds], stall.stage.calibration), stall.stage.calibration)
     candidates = [c for cause in setting.causes.values() for c in cause.candidates(problem)]
@@ -176,13 +176,13 @@ def best_of(S: Array, spans: Sequence[Span]) -> dict[str, Span]:
 
 
 def _worth(S: Array, span: Span) -> float:
-    """Log evidence that a hypothesis has on the mean."""
+    """Log evidence of a hypothesis at its mean likelihood ratio."""
     freedom = numbers(S, span)
     return float(weigh(np.array(explained(S, span) + freedom), freedom))
 
 
 def p_values(draws: Draws, spans: Sequence[Span], setting: Setting) -> Array:
-    """Smallest p-value of the tests, for each of :data:`SIZES` and draws; searches elsewhere count."""
+    """Smallest p-value of all tests, for each of :data:`SIZES` and each draw, look-elsewhere included."""
     scale, least = SIZES / draws.wanted, np.ones((len(SIZES), 1))
     for span in spans:
         ratio, freedom = draws.ratio(span, scale)
@@ -193,6 +193,6 @@ def p_values(draws: Draws, spans: Sequence[Span], setting: Setting) -> Array:
 
 
 def _found(p: Array) -> dict[str, float]:
-    """Half point and 95 % point of detection."""
+    """Signal-to-noise at which 50 % and 95 % are found."""
     chance = np.maximum.accumulate(np.mean(p < LEVEL, axis=1))
     return {"half": float(np.interp(0.5, chance, SIZES)), "sure": float(np.interp(0.95, chance, SIZES))}
