@@ -1,11 +1,11 @@
 """Hide an effect in a simulated deployment, with finer physics than anyone would fit to it.
 
-It shares nothing with the detector: heat soaks through a slab where the detector has one time constant, steel
-has a Preisach distribution where it has one backlash, currents flow in wires with a shape, filters and
-converters are the instrument's own, the ionosphere has a spectrum. Each effect is one function of the
-:class:`~.scene.Scene`, a size and a stream of random numbers that draw its direction, place and time; sizes
-are proportional to what they do, as far as physics lets them. What belongs to the vehicle or its instrument
-is the same on every deployment: only its :class:`~.scene.Hidden` draws it.
+It shares nothing with the detector: heat soaks through a slab where the detector has two lags in series,
+steel has a Preisach distribution where it has one play operator, currents flow in wires with a shape, filters
+and converters are the instrument's own, the ionosphere has a spectrum. Each effect is one function of the
+:class:`~.scene.Scene`, a size, and a random generator that draws its direction, place and time. An effect is
+proportional to its size as far as physics allows. Properties of the vehicle or its instrument are drawn from
+the seed of :class:`~.scene.Hidden` alone, so they are the same on every deployment.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ EFFECTS: dict[str, Effect] = {
     "interference_tone": surroundings.hum,
     "outliers": sensor.bit_flips,
 }
-"""Cause, as the contract names it -> what is hidden."""
+"""Cause, by its public name -> the effect that is hidden."""
 FOREIGN: dict[str, Effect] = {
     "relay": vehicle.relay,
     "ship": surroundings.ship,
@@ -82,7 +82,7 @@ FOREIGN: dict[str, Effect] = {
     "restart": sensor.restart,
     "whistle": sensor.whistle,
 }
-"""Effects that the contract has no name for."""
+"""Effects that are none of the named causes."""
 
 
 def disturb(
@@ -98,7 +98,7 @@ def disturb(
     when : array (m,)
         s after the track's start; a few seconds short of its end.
     seed : int
-        Of what is logged beside and does not matter.
+        Of the telemetry that has nothing to do with the effects.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""Measure along a track while something goes wrong."""
+"""Measure along a track with hidden effects."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def measure(
     tap = _Tap(**{name: getattr(plain, name) for name in plain.__struct_fields__}, through=through)
     out = replace(twin, scenario=msgspec.structs.replace(twin.scenario, instrument=tap)).measure(track, when)
     scene = scenes[0]
-    # the truth is larger than the reference by so much
+    # `reference` is by how much the true field exceeds the logged reference
     out["reference_field"] = (
         "time",
         out["reference_field"].to_numpy() - scene.reference,

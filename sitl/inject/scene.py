@@ -66,7 +66,7 @@ class Scene:
         return self.track.elapsed
 
     def add(self, shape: Array, vector: Array) -> None:
-        """Add ``shape(t) vector`` to the field at the sensor; `vector` (3,) in body axes is the truth."""
+        """Add ``shape(t) vector`` to the field at the sensor, and note `vector` (3,), body axes, as truth."""
         self.field = self.field + shape[:, None] * vector
         self.truth |= dict(zip("xyz", (self.instrument.matrix() @ vector).tolist(), strict=True))
 
@@ -75,7 +75,7 @@ Effect = Callable[[Scene, float, Generator], None]
 
 
 class Hidden(msgspec.Struct, frozen=True):
-    """One hidden effect: name in :data:`EFFECTS` or :data:`FOREIGN`, size, and the seed of all else."""
+    """One hidden effect: its name in :data:`EFFECTS` or :data:`FOREIGN`, size, and the seed for the rest."""
 
     name: str
     size: float

@@ -12,7 +12,7 @@ from sitl.signals import first_order
 Array = NDArray[np.float64]
 
 CALIBRATED_AT = 4.5
-"""degC, about which the instrument's temperature stood when it was calibrated."""
+"""degC, the instrument's temperature during the calibration, to about half a degree."""
 
 
 def soaked(surface: Array, step: float, lag: float) -> Array:
@@ -27,7 +27,7 @@ def soaked(surface: Array, step: float, lag: float) -> Array:
 
 
 def _warmer(scene: Scene, rng: Generator) -> Array:
-    """By how much the core is warmer than when it was calibrated, degC."""
+    """Return by how much the core is warmer than during the calibration, degC."""
     core = soaked(scene.logged["sensor_temperature"][0], scene.track.step, float(rng.uniform(300, 4000)))
     return core - CALIBRATED_AT - 0.5 * rng.normal()
 
@@ -58,7 +58,7 @@ def creep(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def multiplexed(scene: Scene, size: float, rng: Generator) -> None:
-    """The converter takes the channels in turn, and nobody says so; size in s between channels."""
+    """The converter samples the channels in turn, and the log does not say so; size in s between channels."""
     order = rng.choice([-1.0, 1.0])
     delays = (0.0, size, 2 * size) if order > 0 else (2 * size, size, 0.0)
     scene.instrument = msgspec.structs.replace(scene.instrument, channel_delay=delays)
@@ -66,7 +66,7 @@ def multiplexed(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def anti_alias(scene: Scene, size: float, rng: Generator) -> None:  # noqa: ARG001  (a filter has no direction)
-    """A slow RC before the converter; size its time constant in s."""
+    """A slow RC filter before the converter; size is its time constant in s."""
     scene.instrument = msgspec.structs.replace(scene.instrument, corner=1.0 / (2 * np.pi * max(size, 1e-6)))
     scene.truth["delay"] = size
 
@@ -78,7 +78,7 @@ def late_stamps(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def core(scene: Scene, size: float, rng: Generator) -> None:
-    """The feedback's finite gain lets the core's curve through; size in nT at 50,000 nT."""
+    """The feedback's gain is finite, so the core's nonlinearity shows; size in nT at 50,000 nT."""
     a, b = rng.normal(0, 1, 3), rng.normal(0, 1, 3)
     scene.bend.append(
         lambda H: H - size * (a * (H / 5e4) ** 2 + b * np.tan(np.clip(H / 5e4, -1.2, 1.2)) / 1.5574)
@@ -101,7 +101,7 @@ def rail(scene: Scene, size: float, rng: Generator) -> None:  # noqa: ARG001  (t
 
 
 def bit_flips(scene: Scene, size: float, rng: Generator) -> None:
-    """A bus drops bits now and then: a dozen samples are off by about `size` nT, on any channel."""
+    """A bus flips bits now and then: a dozen samples are off by `size` nT, or two or four times that."""
 
     def bend(H: Array) -> Array:
         rows = rng.choice(len(H) // 4, 12, replace=False) * 4
@@ -115,7 +115,7 @@ def bit_flips(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def perming(scene: Scene, size: float, rng: Generator) -> None:
-    """Cores never quite saturated remember past fields, each by relays of its own; size in nT."""
+    """Cores that are never quite saturated remember past fields, each by relays of its own; size in nT."""
     memory = [
         rng.normal() * relays(h / 2e4, rng.normal(0.0, 0.8, 80), rng.lognormal(np.log(0.6), 0.5, 80))
         for h in scene.field.T
@@ -124,7 +124,7 @@ def perming(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def staircase(scene: Scene, size: float, rng: Generator) -> None:
-    """Most of the field is cancelled, by uneven steps, the rest measured with another gain; size in nT."""
+    """Uneven steps cancel most of the field, and the rest is measured with another gain; size in nT."""
     step, gain, steps = 4000.0, rng.choice([-1.0, 1.0]), 0.5 * rng.normal(size=(64, 3))
 
     def bend(H: Array) -> Array:
@@ -136,19 +136,19 @@ def staircase(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def brownout(scene: Scene, size: float, rng: Generator) -> None:
-    """The converter's reference sags with its supply, by load and charge; in 1e-5 of the field at 1 A."""
+    """The converter's reference sags with load and charge of the supply; size in 1e-5 of the field at 1 A."""
     step, load = (
         scene.track.step,
         scene.logged["amps_a"][0] + scene.logged["amps_b"][0] + rng.uniform(0.1, 0.3),
     )
     drawn = np.cumsum(load) / np.sum(load)
-    slow = first_order(load, step, float(rng.uniform(100.0, 400.0)))  # ions that have to get there
+    slow = first_order(load, step, float(rng.uniform(100.0, 400.0)))  # ions take time to diffuse
     sag = 0.6 * load + 0.4 * slow + rng.uniform(0.3, 1.0) * drawn**3
     scene.field = scene.field * (1.0 + 1e-5 * size * sag[:, None])
 
 
 def ranges(scene: Scene, size: float, rng: Generator) -> None:
-    """Each channel has a range for large readings with another gain, left late; size in nT at full scale."""
+    """Large readings have a range of another gain, switched with hysteresis; size in nT at full scale."""
     changes, gains = rng.uniform(0.3, 0.6, 3), rng.choice([-1.0, 1.0], 3)
 
     def bend(H: Array) -> Array:
@@ -162,7 +162,7 @@ def ranges(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def sag(scene: Scene, size: float, rng: Generator) -> None:
-    """A core's bracket leans under its weight, towards a neighbour's field; size in 2e-5 rad at 1 g."""
+    """A core's bracket bends under its weight towards another channel's axis; size in 2e-5 rad at 1 g."""
     leaning = int(rng.integers(0, 3))
     neighbour = (leaning + int(rng.integers(1, 3))) % 3
     roll, pitch = np.radians(scene.track.roll), np.radians(scene.track.pitch)
@@ -174,7 +174,7 @@ def sag(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def crossover(scene: Scene, size: float, rng: Generator) -> None:
-    """Two transistors take turns as a feedback current changes sign, and pause between; size in nT."""
+    """Two transistors share the feedback current by its sign, with a dead zone about zero; size in nT."""
     widths, gaps = rng.uniform(600.0, 2500.0, 3), rng.lognormal(0.0, 0.5, 3) * rng.choice([-1.0, 1.0], 3)
 
     def bend(H: Array) -> Array:
@@ -185,7 +185,7 @@ def crossover(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def popcorn(scene: Scene, size: float, rng: Generator) -> None:
-    """A defect in the voltage reference traps a charge at random: two gains; size in 1e-5 of the field."""
+    """A defect in the voltage reference switches at random between two gains; size in 1e-5 of the field."""
     dwell = rng.exponential(1.0, len(scene.t)) * np.resize(rng.uniform(200.0, 1800.0, 2), len(scene.t))
     trapped = np.searchsorted(np.cumsum(dwell), scene.t) % 2
     scene.field = scene.field * (1.0 + 1e-5 * size * trapped[:, None])
@@ -200,7 +200,7 @@ def restart(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def whistle(scene: Scene, size: float, rng: Generator) -> None:
-    """The excitation beats with another oscillator, faster or slower as the electronics warm; size in nT."""
+    """The excitation beats with another oscillator, faster as the electronics warm; size in nT."""
     warm = scene.logged["sensor_temperature"][0]
     beat = rng.uniform(0.02, 0.1) * (1.0 + rng.uniform(0.03, 0.1) * (warm - warm[0]))
     phase = 2.0 * np.pi * np.cumsum(beat) * scene.track.step + rng.uniform(0.0, 2.0 * np.pi)

@@ -36,7 +36,7 @@ def bad_map(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def wrong_level(scene: Scene, size: float, rng: Generator) -> None:
-    """The main-field model is off at this site, and the slope of it a little; size in nT."""
+    """The main-field model is off at this site, by slightly different amounts along the way; size in nT."""
     along = scene.when / scene.when[-1] - 0.5
     scene.reference = scene.reference + size * (1.0 + 0.02 * rng.normal() * along)
     scene.truth["bias"] = size
@@ -102,7 +102,7 @@ def storm(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def mains(scene: Scene, size: float, rng: Generator) -> None:
-    """A three-phase cable on the bottom, 50 Hz as sampled, louder the nearer; size in nT at 100 m."""
+    """A three-phase cable on the bottom, its 50 Hz aliased by the sampling; size in nT at 100 m."""
     track, t = scene.track, scene.t
     north, east = track.local(track.latitude, track.longitude)
     k, course = rng.integers(len(t)), rng.uniform(0.0, np.pi)

@@ -57,16 +57,17 @@ def neighbours(scene: Scene, size: float, rng: Generator) -> None:
 def preisach(scene: Scene, size: float, rng: Generator) -> None:
     """Steel in the battery's path, remagnetised as it moves: relays of many widths; size in nT."""
     x = scene.track.parameters["battpos"] / SWING["battpos"]
-    # what does not depend on the past belongs to the position, and to any calibration
+    # relays() leaves out what depends on the position alone: a calibration has that already
     memory = relays(x, rng.normal(0, 0.35, 80), rng.lognormal(np.log(0.5), 0.4, 80))
     scene.field = scene.field + size * direction(rng) * memory[:, None]
 
 
 def ring(scene: Scene, size: float, rng: Generator) -> None:
-    """A conducting ring with inductance; size in s times the field's change.
+    """A conducting ring with inductance; size in s, which multiplies the field's rate of change.
 
-    It lies where its own field stands across its axis. A dipole n seen from p is ``3 p (p . n) - n``: at the
-    magic angle, ``(p . n)^2 = 1/3``, it has nothing along n.
+    It lies where its own field at the sensor is perpendicular to its axis n. The field of a dipole along n,
+    in the direction p, is ``3 p (p . n) - n``: at the magic angle, ``(p . n)^2 = 1/3``, it has no part
+    along n.
     """
     normal = np.eye(3)[rng.integers(3)] + 0.05 * rng.normal(size=3)
     normal /= np.linalg.norm(normal)
@@ -90,7 +91,7 @@ def squeezed(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def relay(scene: Scene, size: float, rng: Generator) -> None:
-    """A payload that nothing logs switches on and off, a dozen times or so; size in nT."""
+    """An unlogged payload switches on and off, a dozen times or so; size in nT."""
     flips = np.cumsum(rng.exponential(0.08 * scene.t[-1], 60))
     state = np.searchsorted(flips, scene.t) % 2
     scene.field = scene.field + size * direction(rng) * state[:, None]
@@ -105,7 +106,7 @@ def pan(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def loose(scene: Scene, size: float, rng: Generator) -> None:
-    """A loose magnet slides to the lower end, and sticks until the hull tips the other way; size in nT."""
+    """A loose magnet slides to the lower end, and sticks until the hull tilts the other way; size in nT."""
     tip = scene.track.pitch - rng.uniform(-5.0, 5.0)
     stick = rng.uniform(5.0, 12.0)
     last = np.maximum.accumulate(np.where(np.abs(tip) > stick, np.arange(len(tip)), 0))
@@ -114,7 +115,7 @@ def loose(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def corrosion(scene: Scene, size: float, rng: Generator) -> None:
-    """A galvanic current in the hull: paint and fouling let it wander, speed feeds it; size in nT."""
+    """A galvanic current in the hull, which wanders (paint, fouling) and grows with speed; size in nT."""
     wander = autoregressive(rng, (len(scene.t),), 1.0, 2500.0 / scene.track.step)
     fed = np.sqrt(1.0 + np.abs(np.gradient(scene.track.depth, scene.track.step)))
     scene.field = scene.field + size * direction(rng) * (fed * wander)[:, None]
@@ -145,7 +146,7 @@ def thermostat(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def cargo(scene: Scene, size: float, rng: Generator) -> None:
-    """Iron in a sling stays below in a roll, but its bearing rubs; magnetised by induction; size in nT."""
+    """Iron in a sling, partly magnetised by induction, hangs down in a roll but for friction; size in nT."""
     roll, rubs, held = scene.track.roll, rng.uniform(1.0, 3.0), 0.0
     hung = np.empty_like(roll)
     for k, angle in enumerate(roll):
@@ -161,7 +162,7 @@ def cargo(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def contact(scene: Scene, size: float, rng: Generator) -> None:
-    """A corroded joint that pressure closes leads a varying part of a motor's current; size in nT/A."""
+    """A corroded joint that pressure closes carries a varying part of a motor's current; size in nT/A."""
     name = str(rng.choice(["amps_a", "amps_b"]))
     closes = rng.uniform(0.25, 0.6) * scene.track.depth.max()
     shut, part, leads = False, 0.0, np.empty(len(scene.t))
@@ -173,7 +174,7 @@ def contact(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def strobe(scene: Scene, size: float, rng: Generator) -> None:
-    """An unlogged payload works a part of each cycle; its clock slows with its cells; size in nT."""
+    """An unlogged payload is on for a part of each cycle; its clock slows with its cells; size in nT."""
     along = scene.t / scene.t[-1]
     slower = rng.uniform(0.15, 0.4) * along**2 + 0.01 * autoregressive(
         rng, (len(along),), 1.0, 900.0 / scene.track.step
@@ -185,9 +186,9 @@ def strobe(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def rotor(scene: Scene, size: float, rng: Generator) -> None:
-    """A brushless motor's rotor rests in another of a dozen cogs after each run; size in nT.
+    """A brushless motor's magnetic rotor stops at a random one of a dozen cogs after each run; size in nT.
 
-    As it spins its field averages out.
+    While it spins its field averages out.
     """
     name = str(rng.choice(["ballast", "battpos"]))
     runs = np.abs(np.gradient(scene.track.parameters[name])) > 1e-6
@@ -202,9 +203,9 @@ def rotor(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def viscous(scene: Scene, size: float, rng: Generator) -> None:
-    """Steel plate creeps after the field that it lies in, by minutes to hours, mostly in plane; size in nT.
+    """The magnetisation of a steel plate follows the field late (magnetic viscosity); size in nT.
 
-    That is magnetic viscosity.
+    The lags are minutes to hours; the magnetisation is mostly in the plane of the plate.
     """
     lags = 120.0 * 3.0 ** np.arange(5)
     unit = scene.field / np.linalg.norm(scene.field[0])
@@ -217,9 +218,9 @@ def viscous(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def slip(scene: Scene, size: float, rng: Generator) -> None:
-    """The battery's encoder miscounts in every move, until an end stop sets it right; size in inches a move.
+    """The battery's encoder miscounts in every move, until an end stop resets it; size in inches a move.
 
-    That happens every dozen moves or so.
+    It is reset every dozen moves or so.
     """
     place = scene.track.parameters["battpos"]
     way = np.abs(np.diff(place, prepend=place[0]))
@@ -233,7 +234,7 @@ def slip(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def motional(scene: Scene, size: float, rng: Generator) -> None:
-    """Two metals on the hull short the field v x B of their own way; size in nT at 0.3 m/s across B."""
+    """Motion drives a current (v x B) between two metals on the hull; size in nT at 0.3 m/s across B."""
     track = scene.track
     north, east = track.local(track.latitude, track.longitude)
     v = np.gradient(np.column_stack([north, east, track.depth]), track.step, axis=0)
@@ -243,7 +244,7 @@ def motional(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def leak(scene: Scene, size: float, rng: Generator) -> None:
-    """A seal weeps below a depth; what it lets in leads a current, and takes its time to dry; size in nT."""
+    """A seal leaks below a depth; the water carries a current, and takes its time to dry; size in nT."""
     deep = np.maximum(scene.track.depth / scene.track.depth.max() - rng.uniform(0.5, 0.8), 0.0)
     dries, wets = (scene.track.step / lag for lag in (rng.uniform(2000.0, 6000.0), rng.uniform(100.0, 300.0)))
     wet, leads = 0.0, np.empty(len(scene.t))
@@ -254,7 +255,7 @@ def leak(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def discharge(scene: Scene, size: float, rng: Generator) -> None:
-    """Cells become more magnetic as they discharge, on the mass that moves; size in nT at the end."""
+    """The cells in the moving battery become more magnetic as they discharge; size in nT at the end."""
     load = scene.logged["amps_a"][0] + scene.logged["amps_b"][0] + rng.uniform(0.05, 0.2)
     drawn = (np.cumsum(load) / np.sum(load)) ** rng.uniform(1.0, 2.0)
     place = scene.track.parameters["battpos"]
@@ -273,21 +274,21 @@ def towed(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def sunlit(scene: Scene, size: float, rng: Generator) -> None:
-    """The sun warms a dark, unmeasured housing near the surface, water cools it; size in nT at most."""
+    """The sun warms a dark housing of unlogged temperature near the surface; size in nT at most."""
     shines = np.exp(-scene.track.depth / rng.uniform(3.0, 10.0))
     warm = first_order(shines, scene.track.step, float(rng.uniform(200.0, 900.0)))
     scene.field = scene.field + size * direction(rng) * ((warm - warm[0]) / np.ptp(warm))[:, None]
 
 
 def eccentric(scene: Scene, size: float, rng: Generator) -> None:
-    """The gear of the battery's encoder is eccentric: an error of a wave each turn; size in inches."""
+    """The gear of the battery's encoder is eccentric: a sinusoidal error each turn; size in inches."""
     place = scene.track.parameters["battpos"]
     turn = 2.0 * np.pi * place / rng.uniform(0.2, 0.5) + rng.uniform(0.0, 2.0 * np.pi)
     scene.logged["battpos"] = (place + size * np.sin(turn), "in")
 
 
 def trailing(scene: Scene, size: float, rng: Generator) -> None:
-    """A load's leads are drawn apart by the battery as it slides; size in nT/A an inch from its mean."""
+    """The battery draws a motor's leads apart as it slides; size in nT/A, one inch from its mean position."""
     name = str(rng.choice(["amps_a", "amps_b"]))
     place = scene.track.parameters["battpos"]
     drawn = (place - np.mean(place)) * scene.logged[name][0]
@@ -295,7 +296,7 @@ def trailing(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def compliant(scene: Scene, size: float, rng: Generator) -> None:
-    """The battery's carriage gives way under its weight, unseen by its encoder; size in inches at 1 g."""
+    """The battery's carriage yields to its weight, which the encoder does not see; size in inches at 1 g."""
     weight = np.sin(np.radians(scene.track.pitch))
     gives = first_order(weight, scene.track.step, float(rng.uniform(1.0, 4.0)))
     scene.logged["battpos"] = (scene.track.parameters["battpos"] - size * gives, "in")
