@@ -66,7 +66,7 @@ class Scene:
         return self.track.elapsed
 
     def add(self, shape: Array, vector: Array) -> None:
-        """Add ``shape(t) vector`` to the field at the sensor, and note `vector` (3,), body axes, as truth."""
+        """Add ``shape(t) vector`` (body axes) to the field at the sensor; the truth is `vector` as read."""
         self.field = self.field + shape[:, None] * vector
         self.truth |= dict(zip("xyz", (self.instrument.matrix() @ vector).tolist(), strict=True))
 
