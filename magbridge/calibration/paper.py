@@ -11,11 +11,14 @@ columns of M are the ellipsoid's axes, and S the lengths of its semi-axes (nT) i
 from __future__ import annotations
 
 from itertools import permutations
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["from_paper", "to_paper"]
+from magbridge.calibration.model import Calibration
+
+__all__ = ["facts", "from_paper", "to_paper"]
 
 FloatArray = NDArray[np.float64]
 
@@ -37,3 +40,11 @@ def to_paper(A: FloatArray, field: float) -> tuple[FloatArray, FloatArray]:
 def from_paper(M: FloatArray, S: FloatArray, field: float) -> FloatArray:
     """Return ``A = H_e M S^-1 M^T`` (3, 3)."""
     return np.asarray((M * (field / np.asarray(S))) @ np.asarray(M).T)
+
+
+def facts(calibration: Calibration) -> dict[str, Any]:
+    """Return M, S and T (nT) of the terms, at the middle of each parameter's range, as plain values."""
+    middle = {parameter.name: parameter.centre for parameter in calibration.parameters}
+    A, T = calibration.matrices(np.array([[*middle.values()]]))
+    M, S = to_paper(A[0], calibration.reference.field)
+    return {"at": middle, "M": M.tolist(), "S_nT": S.tolist(), "T_nT": T[0].tolist()}

@@ -76,7 +76,7 @@ def calibrate(
     strict
         Exit with 1 when the data do not support the fit.
     json
-        Print the result as JSON.
+        Print the result as JSON, with the paper's M, S and T at the middle of each parameter's range.
     """
     from magbridge.calibration.file import save
     from magbridge.calibration.fitting.columns import observations
@@ -119,6 +119,8 @@ def calibrate(
 
 
 def _facts(found: Fit, samples: int) -> dict[str, Any]:
+    from magbridge.calibration.paper import facts
+
     return {
         "samples": samples,
         "rms_nT": found.rms,
@@ -126,6 +128,7 @@ def _facts(found: Fit, samples: int) -> dict[str, Any]:
         "scales": found.scales,
         "noise_nT": found.calibration.noise.sensor,
         "warnings": found.warnings,
+        "paper": facts(found.calibration),
     }
 
 

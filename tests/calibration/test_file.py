@@ -24,8 +24,17 @@ from magbridge.calibration.file import (
     load,
     save,
 )
-from magbridge.calibration.model import Boresight, Calibration, Noise, Parameter, Reference, Run, Sensor
-from magbridge.calibration.paper import from_paper, to_paper
+from magbridge.calibration.model import (
+    Boresight,
+    Calibration,
+    Noise,
+    Parameter,
+    Reference,
+    Run,
+    Sensor,
+    identity,
+)
+from magbridge.calibration.paper import facts, from_paper, to_paper
 from magbridge.calibration.terms import Polynomial, full_order
 from magbridge.errors import CalibrationError, FormatError
 
@@ -214,3 +223,12 @@ def test_the_paper_s_view_converts_both_ways() -> None:
     # S are semi-axes: a reading at the end of one has the field's magnitude
     assert np.linalg.norm(A @ (M[:, 0] * S[0])) == pytest.approx(50_000.0)
     np.testing.assert_allclose(to_paper(np.diag([1.1, 0.9, 1.0]), 1.0)[0], np.eye(3), atol=1e-12)
+
+
+def test_the_paper_s_view_of_a_calibration(cal: Calibration) -> None:
+    told = json.loads(json.dumps(facts(cal)))
+    assert told["at"] == {"battpos": 0.05}
+    A, T = cal.matrices(np.array([[0.05]]))
+    np.testing.assert_allclose(from_paper(told["M"], told["S_nT"], 51_000.0), A[0], rtol=1e-12)
+    np.testing.assert_allclose(told["T_nT"], T[0])
+    assert facts(identity())["M"] == np.eye(3).tolist()
