@@ -147,6 +147,14 @@ def test_a_sensitivity_that_follows_a_channel_is_no_offset_that_does(problem: Pr
     assert [one.covers([scale]) for one in of_channel] == [False, False, True]
 
 
+def test_where_a_channel_has_one_cause_its_sensitivity_is_no_alternative(problem: Problem) -> None:
+    """In a vehicle that turns little, a current's field looks like a sensitivity that follows the current."""
+    squeezed = next(c for c in CAUSES["pressure_offset"].candidates(problem) if c.channel == "depth")
+    listed = descriptions(problem, fit_joint(problem, [], 1))
+    of_channel = [one for one in listed if one.channel == "depth" and not one.remembers]
+    assert [one.covers([squeezed]) for one in of_channel] == [True, True, True]
+
+
 def test_functions_of_the_direction_and_of_the_reading_hold_a_bend(problem: Problem) -> None:
     """To 1 % of what a calibration's constants do not hold: the field hardly changes its size."""
     rows = slice(0, len(problem))

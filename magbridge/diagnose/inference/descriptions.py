@@ -42,6 +42,9 @@ FloatArray = NDArray[np.float64]
 
 BODY, EARTH = 24, 48
 """Half waves per log of slow curves along the axes of the body, and along the field."""
+SCALES = {"temperature_offset": False, "temperature_scale": True}
+"""Whether it is the sensitivity that follows a temperature. Of other channels the table has one cause, which
+either description says with more numbers."""
 
 
 class Description(NamedTuple):
@@ -91,7 +94,7 @@ class Description(NamedTuple):
                 candidate.channel is not None
                 and candidate.channel == self.channel
                 and (candidate.cause == "hysteresis") == self.remembers
-                and (candidate.cause == "temperature_scale") == self.scales
+                and SCALES.get(candidate.cause, self.scales) == self.scales
             )
             for candidate in model
         ]
@@ -178,7 +181,7 @@ def _of_channels(problem: Problem) -> list[Description]:
 def _late(problem: Problem, name: str, channel: Channel) -> list[Description]:
     """Return what follows a channel late, as heat soaks into a hull: an offset, or a sensitivity."""
     late, listed = behind(problem.survey.time, channel.values), []
-    for cause, scales in (("temperature_offset", False), ("temperature_scale", True)):
+    for cause, scales in SCALES.items():
         columns = _along_axes(problem, late, scales=scales)
         held = (cause,) if "temperature" in channel.kinds else ()
         listed.append(_of("broadband", columns, 15, channel=name, turned=True, scales=scales, holds=held))
