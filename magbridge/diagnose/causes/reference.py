@@ -15,10 +15,6 @@ __all__ = ["diurnal_variation", "map_error", "reference_bias"]
 
 FloatArray = NDArray[np.float64]
 
-HARMONICS = np.arange(1, 5)
-"""Harmonics of the day in the variation that the Sun causes."""
-SHORTEST = 7200.0
-"""s, the shortest log that is tested: in less, a day's variation is a mere slope."""
 CELLS, WAVES = 300, 200
 """Most cells at which a map's error is described, and most functions that describe it."""
 FINEST = 125.0
@@ -30,21 +26,21 @@ ERROR = 20.0
 
 
 def diurnal_variation(problem: Problem) -> list[Candidate]:
-    """The Earth's field itself varies: harmonics of the day along the field (Chulliat et al. 2016).
-
-    Their coefficients have one common size and fall with the order: the Sun heats the ionosphere smoothly.
-    """
+    """The Earth's field itself varies: harmonics of the day along the field (Chulliat et al. 2016)."""
     t = problem.survey.time
-    if t[-1] - t[0] < SHORTEST:
-        return []
+    span = float(t[-1] - t[0])
+    harmonics = [h for h in (1, 2, 3) if 86400.0 / h < 4.0 * span]
+    made = []
+    for some in (harmonics[k:] for k in range(len(harmonics))):
 
-    def basis(rows: slice) -> FloatArray:
-        angle = 2.0 * np.pi * t[rows, None] / 86400.0 * HARMONICS
-        return np.hstack([np.cos(angle), np.sin(angle)])
+        def basis(rows: slice, some: list[int] = some) -> FloatArray:
+            angle = 2.0 * np.pi * t[rows, None] / 86400.0 * np.array(some)
+            return np.hstack([np.cos(angle), np.sin(angle)])
 
-    names = tuple(f"{f} {24 // h} h" for f in ("cos", "sin") for h in HARMONICS)
-    width = np.tile(20.0 / HARMONICS, 2)
-    return [of_reference(problem, "diurnal_variation", basis, width, names, spectra=np.ones((1, len(width))))]
+        names = tuple(f"{f} {24 // h} h" for f in ("cos", "sin") for h in some)
+        width = np.tile(20.0 / np.array(some), 2)
+        made.append(of_reference(problem, "diurnal_variation", basis, width, names))
+    return made
 
 
 def map_error(problem: Problem) -> list[Candidate]:
