@@ -132,7 +132,7 @@ def test_a_run_given_twice_counts_once(
     assert main(["calibrate", str(good[0]), str(again), *PARAMETERS, "-o", str(tmp_path / "cal.json")]) == 0
     said = capsys.readouterr().err
     assert f"{again}: identical to {good[0]}; its samples are counted once" in said
-    assert "in the logs: duplicate rows 563" in said
+    assert "in the logs: 563 duplicate rows" in said
     once, twice = (json.loads(path.read_text()) for path in (good[1], tmp_path / "cal.json"))
     assert once["coefficients"] == twice["coefficients"]
 
