@@ -47,9 +47,9 @@ IMPLAUSIBLE = 5.0
 
 def late(problem: Problem, fit: Joint) -> str:
     """Say so when the channels look interpolated, which adds a noise that no calibration can undo."""
-    own, to_x = np.arange(len(fit.z))[DELAYS], np.array([[-1.0, 1.0, 0.0], [-1.0, 0.0, 1.0]])
-    later = DELAY * to_x @ fit.z[own]
-    covariance = DELAY**2 * to_x @ fit.covariance[np.ix_(own, own)] @ to_x.T
+    delays, to_x = np.arange(len(fit.z))[DELAYS], np.array([[-1.0, 1.0, 0.0], [-1.0, 0.0, 1.0]])
+    later = DELAY * to_x @ fit.z[delays]
+    covariance = DELAY**2 * to_x @ fit.covariance[np.ix_(delays, delays)] @ to_x.T
     if chi2.sf(later @ np.linalg.solve(covariance, later), later.size) >= LEVEL:
         return ""
     y, z = (

@@ -63,7 +63,7 @@ def _finding(diagnosis: Diagnosis, finding: Finding, causes: Mapping[str, Cause]
         "signal_to_noise": _round(finding.signal_to_noise),
         "p_value": _round(finding.hypothesis.p_value),
         "alternatives": alternatives(rivals),
-        "isolability": _round(told(diagnosis, finding.hypothesis)),
+        "isolability": _round(chance_alone(diagnosis, finding.hypothesis)),
         "separated_by": causes[candidate.cause].separated_by if rivals else None,
         "parameters": parameters(finding, len(diagnosis.problem)),
         "gain": _gain(finding.gain, diagnosis),
@@ -91,14 +91,14 @@ def parameters(finding: Finding, samples: int) -> dict[str, dict[str, Any]]:
     for k, name in enumerate(candidate.names):
         parts.setdefault(name.partition(" (")[0] if _adds_up(candidate) else name, []).append(k)
     found: dict[str, dict[str, Any]] = {}
-    for name, own in parts.items():
-        listed = {f"{name} ({i})": [k] for i, k in enumerate(own, 1)} if len(own) > 1 else {}
-        for label, some in ({name: own} | listed).items():
+    for name, members in parts.items():
+        listed = {f"{name} ({i})": [k] for i, k in enumerate(members, 1)} if len(members) > 1 else {}
+        for label, some in ({name: members} | listed).items():
             sigma = float(np.sqrt(covariance[np.ix_(some, some)].sum()))
             found[label] = {
                 "value": _round(float(value[some].sum())),
                 "sigma": _round(sigma),
-                "unit": candidate.units[own[0]],
+                "unit": candidate.units[members[0]],
             }
     shape = {
         name: {"value": float(v), "sigma": None, "unit": unit} for name, (v, unit) in candidate.shape.items()
@@ -125,14 +125,16 @@ def _adds_up(candidate: Candidate) -> bool:
     return len(channels) == 1 and not candidate.shape.keys().isdisjoint(("lag", "onset"))
 
 
-def told(diagnosis: Diagnosis, hypothesis: Hypothesis) -> float:
+def chance_alone(diagnosis: Diagnosis, hypothesis: Hypothesis) -> float:
     """Theory's chance that this cause, of this size and direction, is named alone in this log."""
     info, chosen = diagnosis.outcome.info, diagnosis.outcome.chosen
     k = next(i for i, one in enumerate(chosen) if one.candidate is hypothesis.candidate)
     first = len(info.score) - sum(one.candidate.size for one in chosen[k:])
-    own = np.arange(first, first + hypothesis.candidate.size)
+    index = np.arange(first, first + hypothesis.candidate.size)
     b = hypothesis.fit.coefficients[-hypothesis.candidate.size :]
-    return diagnosis.isolability.naming.chance(hypothesis.candidate.cause, own, b, hypothesis.signal_to_noise)
+    return diagnosis.isolability.naming.chance(
+        hypothesis.candidate.cause, index, b, hypothesis.signal_to_noise
+    )
 
 
 def _wrong(diagnosis: Diagnosis) -> dict[str, Any]:

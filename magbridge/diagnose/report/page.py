@@ -5,63 +5,23 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from html import escape
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from magbridge.diagnose.report import figures
-from magbridge.diagnose.report.doubts import (
-    gained,
-    grounded,
-    implausible,
-    in_motion,
-    late,
-    nameless,
-    no_gain,
-    outshone,
-    recent,
-    rivalled,
-    several,
-    unsettled,
-)
-from magbridge.diagnose.report.findings import parameters, told
-from magbridge.diagnose.report.words import (
-    MANY,
-    chance,
-    label,
-    listed,
-    measured,
-    number,
-    physics,
-    plain,
-    sizes,
-)
+from magbridge.diagnose.report.doubts import gained, late, nameless, unsettled
+from magbridge.diagnose.report.found import found
+from magbridge.diagnose.report.words import bold, figure, label, listed, number, plain, sizes
 
 if TYPE_CHECKING:
     from magbridge.diagnose.causes import Cause
-    from magbridge.diagnose.causes.candidates import Candidate
-    from magbridge.diagnose.diagnosis import Diagnosis, Finding
+    from magbridge.diagnose.diagnosis import Diagnosis
 
 __all__ = ["report_html"]
 
-STYLE = """
-:root{color-scheme:light}
-body{font:15px/1.55 system-ui,sans-serif;color:#22303c;max-width:62rem;margin:2.5rem auto;padding:0 1.2rem}
-h1{font-size:1.6rem;margin-bottom:.2rem}
-h2{font-size:1.15rem;margin-top:2.4rem;border-bottom:1px solid #dde2e6;padding-bottom:.3rem}
-h3{font-size:1rem;margin-bottom:.2rem}
-figure{margin:1rem 0}
-img{max-width:100%}
-figcaption,.faint{color:#66727e;font-size:.88rem}
-table{border-collapse:collapse;font-size:.9rem;margin:.6rem 0;display:block;overflow-x:auto}
-td,th{padding:.22rem .8rem .22rem 0;text-align:left;border-bottom:1px solid #eceff1}
-th{white-space:nowrap}
-td.n{text-align:right;font-variant-numeric:tabular-nums}
-.verdict{font-size:1.1rem;background:#f2f6f8;border-left:4px solid #1f6f8b;padding:.8rem 1.1rem}
-.pair{display:flex;gap:1rem;flex-wrap:wrap;align-items:flex-start}
-.pair figure{flex:1 1 24rem}
-code{background:#f2f4f6;padding:0 .25em}
-"""
+STYLE = Path(__file__).with_name("style.css")
 KINDS = {
     "switching": "An offset that switches",
     "drift": "A slow drift",
@@ -90,7 +50,7 @@ def report_html(diagnosis: Diagnosis, causes: Mapping[str, Cause], remarks: Sequ
         "<h2>Measured against simulated</h2>",
         *_compared(diagnosis),
         "<h2>What was found, and why it is believed</h2>",
-        *_found(diagnosis, causes),
+        *found(diagnosis, causes),
         "<h2>What is left</h2>",
         _left(diagnosis, causes),
         "<h2>What this log could have shown at all</h2>",
@@ -99,7 +59,7 @@ def report_html(diagnosis: Diagnosis, causes: Mapping[str, Cause], remarks: Sequ
     content = "\n".join(part for part in body if part)
     return (
         f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{title}</title>'
-        f"<style>{STYLE}</style></head><body>{content}</body></html>\n"
+        f"<style>\n{STYLE.read_text('utf-8')}</style></head><body>{content}</body></html>\n"
     )
 
 
@@ -138,56 +98,42 @@ def _compared(diagnosis: Diagnosis) -> list[str]:
             "Any other structure in the difference is an effect that the calibration does not describe.</p>"
         ),
         late(diagnosis.problem, diagnosis.fit),
-        _figure(
+        figure(
             figures.measured(diagnosis),
             f"The total field, measured and corrected, and the reference; below, their difference {sides}.",
         ),
         '<div class="pair">',
-        _figure(
+        figure(
             figures.spectrum(diagnosis),
             "Spectral density of the difference; dashed: the noise model.",
         ),
-        _figure(
+        figure(
             figures.evidence(diagnosis),
             "The likeliest causes, each tried alone with calibration and noise refitted. A cause is "
             "detected below p = 0.01" + ("; blue: named in the end." if diagnosis.findings else "."),
         ),
         "</div>",
-        _figure(
+        figure(
             figures.channels(diagnosis),
             "The difference against each channel: mean and scatter in twenty bins. A line that is not flat "
             "is an effect that the model lacks.",
         ),
-        _figure(
+        figure(
             figures.track(diagnosis),
             "The difference along the track. An error of the map looks the same on every pass at one depth.",
         ),
     ]
 
 
-def _figure(png: str | None, caption: str) -> str:
-    if png is None:
-        return ""
-    return (
-        f'<figure><img alt="{escape(caption)}" src="data:image/png;base64,{png}">'
-        f"<figcaption>{caption}</figcaption></figure>"
-    )
-
-
-def _name(candidate: Candidate) -> str:
-    channel = candidate.channel
-    return f"<b>{candidate.cause.replace('_', ' ')}</b>" + (f" ({escape(channel)})" if channel else "")
-
-
 def _sentence(diagnosis: Diagnosis) -> str:
     total = diagnosis.total
     causes = [
-        _name(one.candidate) + (f" <span class=faint>or {listed(one.rivals)}</span>" if one.rivals else "")
+        bold(one.candidate) + (f" <span class=faint>or {listed(one.rivals)}</span>" if one.rivals else "")
         for one in diagnosis.findings
     ]
     if diagnosis.wrong is not None:
         causes.append(f"<b>outliers</b> ({diagnosis.wrong.rows.size} wrong samples)")
-    found = f"Found: {', '.join(causes)}. {gained(total, diagnosis.problem.survey.parts)}"
+    names = f"Found: {', '.join(causes)}. {gained(total, diagnosis.problem.survey.parts)}"
     rest = diagnosis.unexplained
     withheld = rest.within if rest else ()
     louder = rest and all(rest.signal_to_noise > one.signal_to_noise for one in diagnosis.findings)
@@ -199,71 +145,11 @@ def _sentence(diagnosis: Diagnosis) -> str:
     return {
         "nothing_found": f"Nothing was found: {number(total.before)} nT RMS is consistent with noise "
         f"({number(float(np.std(diagnosis.fit.left)))} nT) and the calibration's stated uncertainty.",
-        "explained": f"{found} Nothing else stands out of the noise.",
-        "partly_explained": f"{found} {'Something stronger' if louder else 'Something else'} is left that no "
+        "explained": f"{names} Nothing else stands out of the noise.",
+        "partly_explained": f"{names} {'Something stronger' if louder else 'Something else'} is left that no "
         "known cause explains.",
         "unexplained": f"An effect is present ({number(total.before)} nT RMS), but {name}.",
     }[diagnosis.verdict]
-
-
-def _found(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> list[str]:
-    if not diagnosis.findings and diagnosis.wrong is None:
-        if diagnosis.unexplained is not None:
-            return ["<p>An effect is present, but no name is asserted: see what is left.</p>"]
-        return ["<p>No cause passes the test at a family-wise false-alarm rate of 1 %.</p>"]
-    parts = [_figure(figures.terms(diagnosis), "What each cause adds to the total field.")]
-    for finding in diagnosis.findings:
-        parts += _cause(diagnosis, finding, causes[finding.candidate.cause])
-    if diagnosis.wrong is not None:
-        rows_at = ", ".join(
-            datetime.fromtimestamp(float(t), UTC).strftime("%H:%M:%S")
-            for t in diagnosis.problem.survey.time[diagnosis.wrong.rows[:12]]
-        )
-        parts.append(
-            f"<h3><b>outliers</b></h3><p>{diagnosis.wrong.rows.size} isolated samples are wrong, "
-            f"the first at {rows_at} UTC; the figures above leave them out.</p>"
-        )
-    return parts
-
-
-def _cause(diagnosis: Diagnosis, finding: Finding, cause: Cause) -> list[str]:
-    """Tell of one cause: its physics, the evidence, its numbers, and what speaks against it."""
-    candidate, gain = finding.candidate, finding.gain
-    numbers = parameters(finding, len(diagnosis.problem))
-    rows = "".join(
-        f'<tr><td>{escape(name)}</td><td class="n">{measured(value["value"], value["sigma"])}</td>'
-        f'<td class="n">{"± " + measured(value["sigma"], value["sigma"]) if value["sigma"] else ""}</td>'
-        f"<td>{escape(value['unit'])}</td></tr>"
-        for name, value in numbers.items()
-    )
-    return [
-        f"<h3>{_name(candidate)}</h3>",
-        f'<p class="faint">{physics(cause)}</p>',
-        (
-            f"<p>Signal-to-noise {finding.signal_to_noise:.1f} with the calibration refitted. The chance "
-            "that any of the causes tried would look this strong by noise alone is "
-            f"{chance(finding.hypothesis.p_value)}. Without this cause the held-out RMS is "
-            f"{1 / max(gain.ratio, 1e-9):.2f} times as large (95 %: {1 / max(gain.interval[1], 1e-9):.2f} to "
-            f"{1 / max(gain.interval[0], 1e-9):.2f}).</p>"
-        ),
-        _folded(
-            f"<table><tr><th>term</th><th>value</th><th>1 sigma</th><th>unit</th></tr>{rows}</table>",
-            len(numbers),
-        ),
-        several(candidate.names),
-        implausible(candidate, finding.coefficients),
-        recent(candidate),
-        in_motion(diagnosis, finding),
-        grounded(diagnosis, candidate),
-        rivalled(cause, finding.rivals, told(diagnosis, finding.hypothesis)),
-        no_gain(gain),
-        outshone(finding, diagnosis.unexplained),
-    ]
-
-
-def _folded(table: str, size: int) -> str:
-    """Fold a table that is too long to be read line by line."""
-    return table if size <= MANY else f"<details><summary>{size} terms</summary>{table}</details>"
 
 
 def _left(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> str:
@@ -324,7 +210,7 @@ def _isolability(diagnosis: Diagnosis) -> list[str]:
         if pairs
         else "",
         f"<p>Not testable in this log, with what it would take: {missing}.</p>" if missing else "",
-        _figure(
+        figure(
             figures.likeness(diagnosis),
             "Correlation of the signatures of two causes in this log, with the calibration free.",
         ),

@@ -1,4 +1,4 @@
-"""Names and numbers for people to read."""
+"""Names, numbers and figures as the page shows them."""
 
 from __future__ import annotations
 
@@ -12,9 +12,22 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from magbridge.diagnose.causes import Cause
+    from magbridge.diagnose.causes.candidates import Candidate
     from magbridge.diagnose.inference.rivals import Rival
 
-__all__ = ["MANY", "chance", "label", "listed", "measured", "number", "physics", "plain", "sizes"]
+__all__ = [
+    "MANY",
+    "bold",
+    "chance",
+    "figure",
+    "label",
+    "listed",
+    "measured",
+    "number",
+    "physics",
+    "plain",
+    "sizes",
+]
 
 RAISED = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
 MANY = 24
@@ -30,6 +43,12 @@ def plain(labelled: str) -> str:
     """Return a cause with its channel, ``cause (channel)``, as people read it."""
     cause, bracket, channel = labelled.partition(" (")
     return escape(cause.replace("_", " ") + bracket + channel)
+
+
+def bold(candidate: Candidate) -> str:
+    """Return a candidate's cause in bold, and its channel."""
+    channel = candidate.channel
+    return f"<b>{candidate.cause.replace('_', ' ')}</b>" + (f" ({escape(channel)})" if channel else "")
 
 
 def listed(rivals: Sequence[Rival]) -> str:
@@ -69,10 +88,20 @@ def sizes(smallest: Mapping[str, tuple[float, str]]) -> str:
     """Return sizes in words from values and units by name, without infinite ones: nothing would show them."""
     seen = [(name, size, unit) for name, (size, unit) in smallest.items() if isfinite(size)]
     shown = seen if len(seen) <= MANY else seen[:3]
-    told = [
+    texts = [
         ", ".join(f"{escape(name)} {number(size)}" for name, size, _ in same) + f" {escape(unit)}"
         for unit, same in groupby(shown, key=itemgetter(2))
     ]
     if len(shown) < len(seen):
-        told.append(f"and {len(seen) - len(shown)} more")
-    return ", ".join(told) or "invisible"
+        texts.append(f"and {len(seen) - len(shown)} more")
+    return ", ".join(texts) or "invisible"
+
+
+def figure(png: str | None, caption: str) -> str:
+    """Return a picture (base64 of a PNG) above its caption; nothing if there is none."""
+    if png is None:
+        return ""
+    return (
+        f'<figure><img alt="{escape(caption)}" src="data:image/png;base64,{png}">'
+        f"<figcaption>{caption}</figcaption></figure>"
+    )

@@ -1,0 +1,96 @@
+"""The page's section on what was found, and why it is believed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from html import escape
+from typing import TYPE_CHECKING
+
+from magbridge.diagnose.report import figures
+from magbridge.diagnose.report.doubts import (
+    grounded,
+    implausible,
+    in_motion,
+    no_gain,
+    outshone,
+    recent,
+    rivalled,
+    several,
+)
+from magbridge.diagnose.report.findings import chance_alone, parameters
+from magbridge.diagnose.report.words import MANY, bold, chance, figure, measured, physics
+
+if TYPE_CHECKING:
+    from magbridge.diagnose.causes import Cause
+    from magbridge.diagnose.diagnosis import Diagnosis, Finding
+
+__all__ = ["found"]
+
+
+def found(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> list[str]:
+    """Return the section on what was found: each cause, and isolated wrong samples.
+
+    Parameters
+    ----------
+    diagnosis : Diagnosis
+    causes : mapping
+        The table of causes that were asked about.
+    """
+    if not diagnosis.findings and diagnosis.wrong is None:
+        if diagnosis.unexplained is not None:
+            return ["<p>An effect is present, but no name is asserted: see what is left.</p>"]
+        return ["<p>No cause passes the test at a family-wise false-alarm rate of 1 %.</p>"]
+    parts = [figure(figures.terms(diagnosis), "What each cause adds to the total field.")]
+    for finding in diagnosis.findings:
+        parts += _cause(diagnosis, finding, causes[finding.candidate.cause])
+    if diagnosis.wrong is not None:
+        rows_at = ", ".join(
+            datetime.fromtimestamp(float(t), UTC).strftime("%H:%M:%S")
+            for t in diagnosis.problem.survey.time[diagnosis.wrong.rows[:12]]
+        )
+        parts.append(
+            f"<h3><b>outliers</b></h3><p>{diagnosis.wrong.rows.size} isolated samples are wrong, "
+            f"the first at {rows_at} UTC; the figures above leave them out.</p>"
+        )
+    return parts
+
+
+def _cause(diagnosis: Diagnosis, finding: Finding, cause: Cause) -> list[str]:
+    """Tell of one cause: its physics, the evidence, its numbers, and what speaks against it."""
+    candidate, gain = finding.candidate, finding.gain
+    numbers = parameters(finding, len(diagnosis.problem))
+    rows = "".join(
+        f'<tr><td>{escape(name)}</td><td class="n">{measured(value["value"], value["sigma"])}</td>'
+        f'<td class="n">{"± " + measured(value["sigma"], value["sigma"]) if value["sigma"] else ""}</td>'
+        f"<td>{escape(value['unit'])}</td></tr>"
+        for name, value in numbers.items()
+    )
+    return [
+        f"<h3>{bold(candidate)}</h3>",
+        f'<p class="faint">{physics(cause)}</p>',
+        (
+            f"<p>Signal-to-noise {finding.signal_to_noise:.1f} with the calibration refitted. The chance "
+            "that any of the causes tried would look this strong by noise alone is "
+            f"{chance(finding.hypothesis.p_value)}. Without this cause the held-out RMS is "
+            f"{1 / max(gain.ratio, 1e-9):.2f} times as large (95 %: {1 / max(gain.interval[1], 1e-9):.2f} to "
+            f"{1 / max(gain.interval[0], 1e-9):.2f}).</p>"
+        ),
+        _folded(
+            f"<table><tr><th>term</th><th>value</th><th>1 sigma</th><th>unit</th></tr>{rows}</table>",
+            len(numbers),
+        ),
+        several(candidate.names),
+        implausible(candidate, finding.coefficients),
+        recent(candidate),
+        in_motion(diagnosis, finding),
+        grounded(diagnosis, candidate),
+        rivalled(cause, finding.rivals, chance_alone(diagnosis, finding.hypothesis)),
+        no_gain(gain),
+        outshone(finding, diagnosis.unexplained),
+    ]
+
+
+def _folded(table: str, size: int) -> str:
+    """Fold a table that is too long to be read line by line."""
+    return table if size <= MANY else f"<details><summary>{size} terms</summary>{table}</details>"
