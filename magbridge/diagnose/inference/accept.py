@@ -48,10 +48,10 @@ def accept(problem: Problem, outcome: Outcome, tone: Candidate | None) -> tuple[
 
 def _same(chosen: Sequence[Hypothesis], rest: Leftover) -> bool:
     """Say whether the rest is what the idealised regressor of a stronger named cause has left."""
-    told = rest.description
-    if told is None or told.wider:
+    description = rest.description
+    if description is None or description.wider:
         return False
-    return any(told.covers([h.candidate]) and h.signal_to_noise > rest.signal_to_noise for h in chosen)
+    return any(description.covers([h.candidate]) and h.signal_to_noise > rest.signal_to_noise for h in chosen)
 
 
 def _within(outcome: Outcome, behind: float) -> tuple[Rival, ...]:

@@ -72,13 +72,13 @@ def passage(problem: Problem, fit: Joint) -> tuple[Columns, float]:
     """
     t = problem.survey.time - problem.survey.time[0]
     gain = fit.noise.whiten(problem.gain)
-    with_y, own = gain * fit.noise.response(fit.left), gain * gain
+    matched, power = gain * fit.noise.response(fit.left), gain * gain
     shape = _passing(QUARTERS / 4.0)
     pairs = np.einsum("ik,jk->ijk", shape, shape).reshape(9, -1)
     best, nearest, scale, trials = -np.inf, 0.0, 1.0, 1.0
     for duration in np.geomspace(SHORTEST / len(t), LONGEST, DURATIONS) * float(t[-1]):
         quarters = (4.0 * t / duration).astype(int)
-        b, S = (_around(np.bincount(quarters, x)) @ f.T for x, f in ((with_y, shape), (own, pairs)))
+        b, S = (_around(np.bincount(quarters, x)) @ f.T for x, f in ((matched, shape), (power, pairs)))
         ratio = _ratio(S.reshape(-1, 3, 3), b)
         at, count = int(np.argmax(ratio)), float(ratio.size * DURATIONS)
         evidence = 0.5 * float(ratio[at]) - float(np.log(count))

@@ -129,13 +129,14 @@ def trials(info: Information, candidates: Sequence[Candidate], at: Sequence[slic
     causes = dict.fromkeys(candidate.cause for candidate in candidates)
     found = {}
     for cause in causes:
-        own = [k for k, candidate in enumerate(candidates) if candidate.cause == cause]
-        index = np.concatenate([np.arange(at[k].start, at[k].stop) for k in own])
-        places = slices([candidates[k] for k in own])
-        free = [place for k, place in zip(own, places, strict=True) if candidates[k].spectra is None]
+        members = [k for k, candidate in enumerate(candidates) if candidate.cause == cause]
+        index = np.concatenate([np.arange(at[k].start, at[k].stop) for k in members])
+        places = slices([candidates[k] for k in members])
+        free = [place for k, place in zip(members, places, strict=True) if candidates[k].spectra is None]
         count = _independent(info.matrix[np.ix_(index, index)], free, LEVEL / len(causes))
-        count += len(own) - len(free)  # candidates of one common size count as independent: an upper bound
-        found[cause] = max(1.0, count) * max(candidates[k].trials for k in own)
+        # candidates of one common size count as independent: an upper bound
+        count += len(members) - len(free)
+        found[cause] = max(1.0, count) * max(candidates[k].trials for k in members)
     return found
 
 

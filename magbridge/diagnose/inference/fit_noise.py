@@ -59,8 +59,8 @@ def memory_order(residual: FloatArray, slots: NDArray[np.int64]) -> int:
         kappa = np.clip((c[p] - a @ c[p - 1 : 0 : -1]) / v, -NEAR, NEAR)
         a, v = np.append(a - kappa * a[::-1], kappa), v * (1.0 - kappa**2)
         costs[p] = n * np.log(v) + 2.0 * p
-    told = [p for p in ORDERS if p <= LOSS * np.count_nonzero(slots[p:] - slots[:-p] == p)]
-    return min(told, key=lambda p: costs[p], default=1)
+    determined = [p for p in ORDERS if p <= LOSS * np.count_nonzero(slots[p:] - slots[:-p] == p)]
+    return min(determined, key=lambda p: costs[p], default=1)
 
 
 def _product(r: FloatArray, slots: NDArray[np.int64], lag: int) -> float:
@@ -163,9 +163,9 @@ def _regressed(lags: FloatArray, r: FloatArray, weight: FloatArray) -> FloatArra
     for start in range(0, len(r), CHUNK):
         rows = slice(start, start + CHUNK)
         X = np.ascontiguousarray(lags[rows])
-        own = X * weight[rows, None]
-        P += own.T @ X
-        b += own.T @ r[rows]
+        weighted = X * weight[rows, None]
+        P += weighted.T @ X
+        b += weighted.T @ r[rows]
     return np.asarray(np.linalg.lstsq(P, b, rcond=None)[0], float)
 
 

@@ -79,20 +79,20 @@ def information(
     The first `strangers` of them share no parts with any other, and their products with each other are not
     computed.
     """
-    q, own = problem.free.shape[1], together(columns).parts
+    q, shared = problem.free.shape[1], together(columns).parts
     sizes = [sum(len(M) for _, M in parts(one)) for one in columns[:strangers]]
     ends = (q + np.cumsum([0, *sizes])).tolist()
     alone = [(slice(*pair), slice(*pair)) for pair in pairwise(ends)]
     asked = [(slice(q), slice(None)), *alone, (slice(ends[-1], None), slice(q, None))]
     G, b = normal(
-        lambda rows: beside([problem.free[rows], *(X(rows) for X, _ in own)]),
+        lambda rows: beside([problem.free[rows], *(X(rows) for X, _ in shared)]),
         noise.response(base.left),
         noise,
         asked if strangers else ALL,
     )
     pull = base.prior[:q] * (problem.centre - base.z)
     K = np.linalg.solve(G[:q, :q] + np.diag(base.prior[:q]), G[:q, q:])
-    M = csr_array(np.concatenate([M for _, M in own]))
+    M = csr_array(np.concatenate([M for _, M in shared]))
     return Information(
         M.T @ (G[q:, q:] - G[q:, :q] @ K) @ M, M.T @ (b[q:] - K.T @ (b[:q] + pull)), np.asarray(K @ M)
     )

@@ -109,7 +109,7 @@ def isolability(
     R = np.eye(len(picked))
     for i, a in enumerate(picked):
         for j, b in enumerate(picked[:i]):
-            R[i, j] = R[j, i] = _alike(info, candidates[a], at[a], candidates[b], at[b])
+            R[i, j] = R[j, i] = _likeness(info, candidates[a], at[a], candidates[b], at[b])
     names = [f"{v.cause} ({v.channel})" if v.channel else v.cause for v in visible]
     pairs = [
         (names[j], names[i], float(R[i, j]))
@@ -143,22 +143,22 @@ def _visible(candidate: Candidate, info: Information, own: slice, hypotheses: fl
     power = np.diag(info.matrix[own, own])
     if candidate.spectra is not None:  # what counts is what all of them do together
         x = sure / float(np.sqrt(max(power.sum(), 1e-300)))
-        sizes = {"size": (_seen(x), "of a plausible one")}
+        sizes = {"size": (_plausible(x), "of a plausible one")}
     else:
         size = sure / np.sqrt(np.maximum(power, 1e-300))
         sizes = {
-            name: (_seen(float(x)) * float(w), unit)
+            name: (_plausible(float(x)) * float(w), unit)
             for name, x, w, unit in zip(candidate.names, size, candidate.width, candidate.units, strict=True)
         }
     return Visible(candidate.cause, candidate.channel, half, sure, sizes)
 
 
-def _seen(size: float) -> float:
+def _plausible(size: float) -> float:
     """Return a size in units of a plausible one; infinite where nothing plausible would show."""
     return size if size < 50.0 else float("inf")
 
 
-def _alike(info: Information, one: Candidate, a: slice, other: Candidate, b: slice) -> float:
+def _likeness(info: Information, one: Candidate, a: slice, other: Candidate, b: slice) -> float:
     """Correlation of two signatures: root of the mean share that one can imitate of the other, the larger."""
     A, B, C = info.matrix[a, a], info.matrix[b, b], info.matrix[a, b]
     p, q = (FREE if candidate.spectra is None else 1.0 for candidate in (one, other))

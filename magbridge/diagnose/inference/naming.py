@@ -75,7 +75,7 @@ class NamingTheory:
             return 0.0
         s = self.S[:, own] @ b * (signal_to_noise / np.sqrt(power))
         freedom, a2 = self.freedoms.get(cause, len(own)), signal_to_noise**2
-        mine = weigh(a2 + freedom, freedom)
+        truth = weigh(a2 + freedom, freedom)
         chances: dict[str, float] = {}
         for k, candidate in enumerate(self.candidates):
             k_free = self.statistics[k].freedom
@@ -86,9 +86,9 @@ class NamingTheory:
                 continue
             ratio = float(self.statistics[k].ratio(part[:, None])[0])
             delta = max(np.sqrt(max(a2 - ratio, 0.0)), 1e-3)
-            wins = float(norm.cdf((mine - weigh(ratio + k_free, k_free) - lead(a2)) / delta))
-            heard = float(ncx2.sf(self.limit[k], k_free, max(ratio, 1e-9)))
-            chances[candidate.cause] = min(chances.get(candidate.cause, 1.0), 1.0 - (1.0 - wins) * heard)
+            wins = float(norm.cdf((truth - weigh(ratio + k_free, k_free) - lead(a2)) / delta))
+            detected = float(ncx2.sf(self.limit[k], k_free, max(ratio, 1e-9)))
+            chances[candidate.cause] = min(chances.get(candidate.cause, 1.0), 1.0 - (1.0 - wins) * detected)
         return float(np.prod(list(chances.values())))
 
     def alone(self, cause: str, signal_to_noise: float) -> float:

@@ -111,7 +111,7 @@ def _beyond(
 ) -> FloatArray:
     """(q + k, q + k) covariance added by all other cells."""
     more = np.zeros_like(fit.covariance)
-    points = [[c for c in grid if piece.again and _alike(c, piece)] for piece in pieces]
+    points = [[c for c in grid if piece.again and _same_grid(c, piece)] for piece in pieces]
     every = [candidate for some in points for candidate in some]
     if not every:
         return more
@@ -123,7 +123,7 @@ def _beyond(
     return more
 
 
-def _alike(one: Candidate, other: Candidate) -> bool:
+def _same_grid(one: Candidate, other: Candidate) -> bool:
     """Tell whether two candidates are points of one grid, with the same numbers."""
     return key(one) == key(other) and one.names == other.names
 

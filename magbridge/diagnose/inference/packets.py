@@ -43,7 +43,7 @@ CYCLES = (0.75, 2.25, 6.75)
 """Values of Q that are tried."""
 SHORTEST, LONGEST = 4.0, 1.0 / 6.0
 """Shortest period, in intervals; longest length Q P, as a share of the log."""
-HEARD = 6.0
+LEAST_RATIO = 6.0
 """Likelihood ratio below which a place is ignored."""
 MOST = 12
 """Most packets in a log."""
@@ -65,7 +65,7 @@ class Places(NamedTuple):
     length: float
     moment: FloatArray
     ratio: FloatArray
-    share: float
+    log_prior: float
 
 
 class Packets(NamedTuple):
@@ -86,22 +86,23 @@ def packets(problem: Problem, fit: Joint) -> Packets | None:
     slots = problem.survey.slots
     if slots[-1] > SPARSE * len(slots):
         return None
-    places = _Spectra(problem, fit).places()
+    listed = _Spectra(problem, fit).places()
     found: list[tuple[float, Places]] = []
     price = 0.0
     while len(found) < MOST:
-        best = max(places, key=lambda own: own.ratio.max(), default=None)
+        best = max(listed, key=lambda places: places.ratio.max(), default=None)
         if best is None:
             break
         at = int(np.argmax(best.ratio))
         ratio, moment = float(best.ratio[at]), float(best.moment[at])
         near = 0.0
-        for own in places:
-            length, band = np.hypot(own.length, best.length), np.hypot(1.0 / own.length, 1.0 / best.length)
-            if abs(1.0 / own.period - 1.0 / best.period) < APART * band / (2.0 * np.pi):
-                same = np.abs(own.moment - moment) < APART * length
-                near += float(np.sum(np.exp(own.share + 0.5 * (own.ratio[same] - ratio))))
-                own.ratio[same] = 0.0
+        for places in listed:
+            length = np.hypot(places.length, best.length)
+            band = np.hypot(1.0 / places.length, 1.0 / best.length)
+            if abs(1.0 / places.period - 1.0 / best.period) < APART * band / (2.0 * np.pi):
+                same = np.abs(places.moment - moment) < APART * length
+                near += float(np.sum(np.exp(places.log_prior + 0.5 * (places.ratio[same] - ratio))))
+                places.ratio[same] = 0.0
         if weigh(ratio, 2) + np.log(near) <= 0.0:
             break
         price -= float(np.log(near))
@@ -117,12 +118,12 @@ def _columns(problem: Problem, found: list[tuple[float, Places]]) -> Columns:
 
     def columns(rows: slice) -> FloatArray:
         out = np.zeros((len(slots[rows]), 2 * len(found)))
-        for k, (moment, own) in enumerate(found):
-            since = (slots[rows] - moment) / own.length
+        for k, (moment, places) in enumerate(found):
+            since = (slots[rows] - moment) / places.length
             here = np.abs(since) < REACH
-            turns = 2.0 * np.pi * own.length / own.period * since[here]
+            turns = 2.0 * np.pi * places.length / places.period * since[here]
             # divided by the root of the length, so that in white noise all packets have about one norm
-            under = np.exp(-0.5 * since[here] ** 2) / np.sqrt(own.length)
+            under = np.exp(-0.5 * since[here] ** 2) / np.sqrt(places.length)
             out[here, 2 * k], out[here, 2 * k + 1] = under * np.cos(turns), under * np.sin(turns)
         return np.asarray(problem.gain[rows, None] * out)
 
@@ -144,17 +145,17 @@ class _Spectra:
         self.H = np.array([rfft(np.bincount(slots, h * some), self.whole) for some in parts])
 
     def places(self) -> list[Places]:
-        """List the places of each period and length whose likelihood ratio exceeds :data:`HEARD`."""
+        """List the places of each period and length whose likelihood ratio exceeds :data:`LEAST_RATIO`."""
         asked = []
         for Q in CYCLES:
             # periods one relative bandwidth, 1 / (2 pi Q), apart
             count = max(int(2.0 * np.pi * Q * np.log(LONGEST * self.n / Q / SHORTEST)), 0)
             periods = SHORTEST * np.exp(np.arange(count) / (2.0 * np.pi * Q))
             asked += [(Q, float(period), count) for period in periods]
-        found = in_threads(self.n, lambda one: self._heard(*one), asked)
-        return [own for own in found if own.moment.size]
+        found = in_threads(self.n, lambda one: self._likely(*one), asked)
+        return [places for places in found if places.moment.size]
 
-    def _heard(self, Q: float, period: float, count: int) -> Places:
+    def _likely(self, Q: float, period: float, count: int) -> Places:
         """Places of one period and length; `count` periods are tried with this Q."""
         length = Q * period
         # thinned to so few moments, all frequencies up to twice the packet's own are still resolved
@@ -172,9 +173,9 @@ class _Spectra:
         known = 0.5 * np.sqrt(np.pi) * length * S
         ratio = 2.0 * np.pi * length**2 * np.abs(B) ** 2 / np.maximum(known, 1e-3 * known.max())
         moments = -(-self.n // every)
-        heard = np.flatnonzero(ratio[:moments] > HEARD)
-        share = -float(np.log(len(CYCLES) * count * moments))
-        return Places(period, length, (every * heard).astype(float), ratio[heard], share)
+        likely = np.flatnonzero(ratio[:moments] > LEAST_RATIO)
+        log_prior = -float(np.log(len(CYCLES) * count * moments))
+        return Places(period, length, (every * likely).astype(float), ratio[likely], log_prior)
 
 
 def _passed(noise: Noise, frequency: FloatArray) -> FloatArray:

@@ -134,7 +134,7 @@ class _Table:
         for n, candidate in enumerate(self.standing):
             self.members[key(candidate)].append(len(state.candidates) + n)
         self._fill()
-        self.best, self.lead = self._own()
+        self.best, self.lead = self._current()
         self.paid = float(np.sum(np.log([candidate.trials for candidate in self.standing])))
 
     def _fill(self) -> None:
@@ -159,7 +159,7 @@ class _Table:
         self.evidence = np.maximum(beside, beside.T)
         np.fill_diagonal(self.evidence, -np.inf)
 
-    def _own(self) -> tuple[float, float]:
+    def _current(self) -> tuple[float, float]:
         """Log evidence of the standing causes, averaged over their grids, and the lead that they need."""
         m, groups = len(self.state.candidates), [key(candidate) for candidate in self.standing]
         # under the noise that is left, which is less, ratios exceed what the model as a whole has gained
@@ -168,9 +168,8 @@ class _Table:
             own, grid = self.scores[m], [self.scores[n].evidence for n in self.state.groups[groups[0]]]
             needed = lead(min(own.ratio, whole))
             # the pair pays for one more cause, which must not be what the single one's regressor leaves
-            return own.evidence + _average(np.array(grid)) + needed + float(
-                np.log(len(self.state.trials))
-            ), needed
+            price = needed + float(np.log(len(self.state.trials)))
+            return own.evidence + _average(np.array(grid)) + price, needed
         found = []
         for a, b in ((m, m + 1), (m + 1, m)):
             first = self.scores[a]
@@ -185,12 +184,12 @@ class _Table:
 
     def pair(self, A: Group, B: Group) -> Pair | None:
         """Return the best of two grids, unless what stands is better by more than :func:`~.evidence.lead`."""
-        own = [key(candidate) for candidate in self.standing]
+        current = [key(candidate) for candidate in self.standing]
         block = self.evidence[np.ix_(self.members[A], self.members[B])]
         top = float(block.max())
         if (
-            (len(own) > 1 and {A, B} == set(own))
-            or (len(own) == 1 and own[0] in (A, B))
+            (len(current) > 1 and {A, B} == set(current))
+            or (len(current) == 1 and current[0] in (A, B))
             or not np.isfinite(top)
         ):
             return None
@@ -198,11 +197,11 @@ class _Table:
         a, b = self.members[A][int(rows)], self.members[B][int(columns)]
         one, two = self.candidates[a], self.candidates[b]
         behind = self.best - top - self._price(A, B) + float(np.log(one.trials * two.trials)) - self.paid
-        if behind > self.lead or not self._heard(a, b):
+        if behind > self.lead or not self._significant(a, b):
             return None
         return Pair(two, one, behind) if self._swapped(a, b) else Pair(one, two, behind)
 
-    def _heard(self, a: int, b: int) -> bool:
+    def _significant(self, a: int, b: int) -> bool:
         """Say whether each passes its test beside the other.
 
         Where one cause stood, neither may be what the other leaves.

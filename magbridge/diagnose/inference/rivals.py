@@ -51,7 +51,7 @@ def rivals_of(
     alone = info.without(others, base.prior[len(base.z) + others - ends[0]])
     # the scores with this cause taken out of the fit
     alone = replace(alone, score=alone.score + alone.matrix[:, own] @ c)
-    mine = score(alone, slice(int(own[0]), int(own[-1]) + 1), model[k])
+    standing = score(alone, slice(int(own[0]), int(own[-1]) + 1), model[k])
     scores = state.scores(alone)
     rivals = []
     best = state.best(scores)
@@ -61,7 +61,7 @@ def rivals_of(
         if group == key(model[k]) or group[0] in {other.cause for other in model if other is not model[k]}:
             continue
         cheaper = average - paid - float(np.log(candidate.trials / model[k].trials))
-        behind = mine.evidence - s.evidence - cheaper
-        if behind < lead(mine.ratio) and state.p_value(candidate, s.ratio, s.freedom) < LEVEL:
+        behind = standing.evidence - s.evidence - cheaper
+        if behind < lead(standing.ratio) and state.p_value(candidate, s.ratio, s.freedom) < LEVEL:
             rivals.append(Rival(candidate, behind))
     return tuple(sorted(rivals, key=lambda rival: rival.behind))

@@ -66,7 +66,7 @@ def wald(fit: Joint, size: int) -> float:
     return float(b @ np.linalg.solve(own, b))
 
 
-def own_ratio(fit: Joint, candidate: Candidate) -> float:
+def wald_ratio(fit: Joint, candidate: Candidate) -> float:
     """Likelihood ratio of the last candidate's coefficients under the noise that is left."""
     own = slice(-candidate.size, None)
     spread = 0.0 if candidate.spectra is None else volume_of(fit.covariance[own, own], fit.prior[own])
@@ -74,7 +74,22 @@ def own_ratio(fit: Joint, candidate: Candidate) -> float:
 
 
 class State:
-    """The state of one search: the problem, its candidates, the model so far."""
+    """The state of one search: the problem, its candidates, the model so far.
+
+    Attributes
+    ----------
+    null : Joint
+        The fit without any cause.
+    as_fitted, cleared : Information
+        Of all candidates beside no cause: under the noise of that fit, and under the noise that remains when
+        the best candidate of every cause is fitted.
+    trials : dict
+        Cause -> number of independent hypotheses behind it.
+    certain : dict
+        Group -> degrees of freedom of the noise's level.
+    groups : dict
+        Cause and channel -> places of its candidates.
+    """
 
     def __init__(self, problem: Problem, candidates: Sequence[Candidate], order: int, causes: int) -> None:
         self.problem, self.candidates, self.order, self.causes = problem, list(candidates), order, causes
@@ -85,8 +100,8 @@ class State:
         self.certain: dict[tuple[str, str | None], float] = {}
         self.last: tuple[Joint | None, Information | None] = None, None
         self.null: Joint
-        self.own: Information
-        self.bare: Information
+        self.as_fitted: Information
+        self.cleared: Information
         self.groups: dict[tuple[str, str | None], list[int]] = {}
         for k, candidate in enumerate(self.candidates):
             self.groups.setdefault(key(candidate), []).append(k)
@@ -134,14 +149,14 @@ class State:
 
     def round(self, model: list[Candidate], base: Joint) -> list[Hypothesis]:
         """Fit the best causes beside `model`, each on its own, and list them, the likeliest first."""
-        own = self.beside(model, base).fitted(base)
+        as_fitted = self.beside(model, base).fitted(base)
         if not self.trials:
-            self.trials = trials(own, self.candidates, self.at)
+            self.trials = trials(as_fitted, self.candidates, self.at)
         under: dict[tuple[str, str | None], list[tuple[int, float, Score, Information]]] = {}
-        bare = self._bare(model, base, own)
+        cleared = self._cleared(model, base, as_fitted)
         if not model:
-            self.own, self.bare = own, bare
-        for info in (own, bare):
+            self.as_fitted, self.cleared = as_fitted, cleared
+        for info in (as_fitted, cleared):
             scores = self.scores(info)
             for group, (k, average) in self.best(scores).items():
                 under.setdefault(group, []).append((k, average, scores[k], info))
@@ -160,7 +175,7 @@ class State:
         assert info is not None
         return info
 
-    def _bare(self, model: list[Candidate], base: Joint, info: Information) -> Information:
+    def _cleared(self, model: list[Candidate], base: Joint, info: Information) -> Information:
         """Information under the noise that remains when the best candidate of every cause is fitted."""
         top: dict[str, tuple[float, int]] = {}
         scores = self.scores(info)
@@ -197,18 +212,18 @@ class State:
         found = []
         for k in {entry[0] for entry in entries}:
             candidate = self.candidates[k]
-            mine = [entry for entry in entries if entry[0] == k]
+            won = [entry for entry in entries if entry[0] == k]
             index = np.arange(self.at[k].start, self.at[k].stop)
-            starts = [np.append(info.moved(base, index, s.estimate), s.estimate) for _, _, s, info in mine]
+            starts = [np.append(info.moved(base, index, s.estimate), s.estimate) for _, _, s, info in won]
             fit = self.fit([*model, candidate], *starts, like=base, rounds=2)
             ratio = max(0.0, 2.0 * (fit.log_likelihood - base.log_likelihood))
             if candidate.positive and fit.coefficients[-1] < 0.0:
                 ratio = 0.0
             # no more than the effect itself can gain: the rest is of a noise that found another optimum
-            ratio = min(ratio, own_ratio(fit, candidate))
-            freedom = mine[0][2].freedom
+            ratio = min(ratio, wald_ratio(fit, candidate))
+            freedom = won[0][2].freedom
             p_value = self.p_value(candidate, ratio, freedom)
-            evidence = evidence_of(candidate, ratio, freedom) + mine[0][1] - float(np.log(candidate.trials))
+            evidence = evidence_of(candidate, ratio, freedom) + won[0][1] - float(np.log(candidate.trials))
             found.append(Hypothesis(candidate, ratio, evidence, p_value, fit))
         return max(found, key=lambda h: h.evidence)
 

@@ -93,16 +93,16 @@ def search(problem: Problem, candidates: Sequence[Candidate], causes: int) -> Ou
         if h.p_value <= tested.get(h.candidate.cause, (np.inf, 0.0))[0]:
             tested[h.candidate.cause] = (h.p_value, h.ratio)
     model, base = _likeliest(state, null, first) if first else ([], null)
-    chosen, base = _remove(state, model, base, null)
+    chosen, base = _backward_elimination(state, model, base, null)
     model = [h.candidate for h in chosen]
-    info = state.beside(model, base) if chosen or not first else state.own
+    info = state.beside(model, base) if chosen or not first else state.as_fitted
     rivals = sets_of(state, info, model, base) if model else ()
     return Outcome(tuple(chosen), rivals, null, base, order, tested, info, state.trials)
 
 
 def _likeliest(state: State, null: Joint, first: list[Hypothesis]) -> tuple[list[Candidate], Joint]:
     """Return the likeliest model: causes found one by one, chosen together, or one that alone is enough."""
-    one_by_one, at_once = _chain(state, null, first), chosen_at_once(state)
+    one_by_one, at_once = _forward_selection(state, null, first), chosen_at_once(state)
     found = [exchanged(state, *one_by_one) if one_by_one[0] else one_by_one]
     before = {key(candidate) for candidate in one_by_one[0]}
     if at_once and (before or len(at_once) > 1) and {key(candidate) for candidate in at_once} != before:
@@ -118,53 +118,53 @@ def _likeliest(state: State, null: Joint, first: list[Hypothesis]) -> tuple[list
     return model, base
 
 
-def _chain(state: State, null: Joint, first: list[Hypothesis]) -> tuple[list[Candidate], Joint]:
+def _forward_selection(state: State, null: Joint, first: list[Hypothesis]) -> tuple[list[Candidate], Joint]:
     """Add cause after cause while one passes the test, beginning with the best of `first`."""
     model: list[Candidate] = []
     base, found = null, first
-    heard: dict[str, float] = {}
+    strengths: dict[str, float] = {}
     for _ in range(MOST):
         # a candidate of one common size is a whole: neither extended nor added to its cause's others
         whole = {c.cause for c in model if c.spectra is not None}
         grown = [
-            h for h in found if h.candidate.cause not in (whole if h.candidate.spectra is None else heard)
+            h for h in found if h.candidate.cause not in (whole if h.candidate.spectra is None else strengths)
         ]
-        best = _next(grown, heard, state.ratio(base))
+        best = _next(grown, strengths, state.ratio(base))
         if best is None:
             break
         best = sharpen(state, model, best, base)
         cause = best.candidate.cause
         size = 0.0 if best.candidate.shapeless else best.signal_to_noise
-        heard[cause] = max(heard.get(cause, 0.0), size)
-        model, base = _with(state, model, best)
+        strengths[cause] = max(strengths.get(cause, 0.0), size)
+        model, base = _added(state, model, best)
         found = state.round(model, base)
     return model, base
 
 
-def _next(found: list[Hypothesis], heard: Mapping[str, float], ratio: float) -> Hypothesis | None:
+def _next(found: list[Hypothesis], strengths: Mapping[str, float], ratio: float) -> Hypothesis | None:
     """Pick the best that passes, unless it is so weak that other causes' idealised regressors may leave it.
 
-    `heard` holds the signal-to-noise of the causes that are in the model, `ratio` is the model's likelihood
-    ratio.
+    `strengths` holds the signal-to-noise of the causes that are in the model, `ratio` is the model's
+    likelihood ratio.
 
     A further regressor of a cause in the model is preferred to another cause that explains hardly more. Among
     candidates whose evidence differs by less than the regressors' errors may account for, the one with the
     fewest coefficients is preferred.
     """
 
-    def left(cause: str) -> float:
-        return REMNANT * max((size for other, size in heard.items() if other != cause), default=0.0)
+    def remnant(cause: str) -> float:
+        return REMNANT * max((size for other, size in strengths.items() if other != cause), default=0.0)
 
-    sure = [h for h in found if h.p_value < LEVEL and h.signal_to_noise >= left(h.candidate.cause)]
-    if not sure:
+    significant = [h for h in found if h.p_value < LEVEL and h.signal_to_noise >= remnant(h.candidate.cause)]
+    if not significant:
         return None
-    near = sure[0].evidence - lead(sure[0].ratio)
-    more = next((h for h in sure if h.candidate.cause in heard and h.evidence > near), None)
-    alike = [h for h in sure if h.evidence >= sure[0].evidence - slack(ratio)]
-    return more or min(alike, key=lambda h: h.candidate.size)
+    near = significant[0].evidence - lead(significant[0].ratio)
+    more = next((h for h in significant if h.candidate.cause in strengths and h.evidence > near), None)
+    as_likely = [h for h in significant if h.evidence >= significant[0].evidence - slack(ratio)]
+    return more or min(as_likely, key=lambda h: h.candidate.size)
 
 
-def _with(state: State, model: list[Candidate], best: Hypothesis) -> tuple[list[Candidate], Joint]:
+def _added(state: State, model: list[Candidate], best: Hypothesis) -> tuple[list[Candidate], Joint]:
     """Add a candidate to the model, or to its cause's own if that is in it already."""
     new = best.candidate
     for k, own in enumerate(model):
@@ -177,7 +177,9 @@ def _with(state: State, model: list[Candidate], best: Hypothesis) -> tuple[list[
     return [*model, new], best.fit
 
 
-def _remove(state: State, model: list[Candidate], base: Joint, null: Joint) -> tuple[list[Hypothesis], Joint]:
+def _backward_elimination(
+    state: State, model: list[Candidate], base: Joint, null: Joint
+) -> tuple[list[Hypothesis], Joint]:
     """Drop causes that later findings have made needless; test each other against the model without it."""
     chosen: list[Hypothesis] = []
     k = 0

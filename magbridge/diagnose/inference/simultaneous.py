@@ -20,7 +20,7 @@ MOST = 6
 
 def chosen_at_once(state: State) -> list[Candidate]:
     """Choose causes one after the other, each scored with the calibration and the earlier ones free."""
-    info = state.bare
+    info = state.cleared
     picked: list[int] = []
     loudest, ratio = 0.0, 0.0
     while len(picked) < MOST:
@@ -28,17 +28,17 @@ def chosen_at_once(state: State) -> list[Candidate]:
         ranked = sorted(
             ((scores[k].evidence + price, k) for k, price in state.best(scores).values()), reverse=True
         )
-        sure = []
+        significant = []
         for evidence, k in ranked:
             s, candidate = scores[k], state.candidates[k]
             size = float(np.sqrt(max(s.ratio - s.freedom, 0.0)))
-            heard = state.p_value(candidate, s.ratio, s.freedom) < LEVEL and size >= REMNANT * loudest
-            if heard and candidate.cause not in {state.candidates[j].cause for j in picked}:
-                sure.append((evidence, k))
-        if not sure:
+            passed = state.p_value(candidate, s.ratio, s.freedom) < LEVEL and size >= REMNANT * loudest
+            if passed and candidate.cause not in {state.candidates[j].cause for j in picked}:
+                significant.append((evidence, k))
+        if not significant:
             break
-        alike = [k for evidence, k in sure if evidence >= sure[0][0] - slack(ratio)]
-        k = min(alike, key=lambda k: state.candidates[k].size)
+        as_likely = [k for evidence, k in significant if evidence >= significant[0][0] - slack(ratio)]
+        k = min(as_likely, key=lambda k: state.candidates[k].size)
         picked.append(k)
         ratio += scores[k].ratio
         loudest = max(loudest, float(np.sqrt(max(scores[k].ratio - scores[k].freedom, 0.0))))
@@ -51,10 +51,10 @@ def enough(state: State, first: list[Hypothesis]) -> Hypothesis | None:
     members = {(id(c.columns)): k for k, c in enumerate(state.candidates)}
     for h in first:
         k = members[id(h.candidate.columns)]
-        s = score(state.bare, state.at[k], h.candidate)
+        s = score(state.cleared, state.at[k], h.candidate)
         if h.p_value >= LEVEL or not s.freedom:
             continue
-        left = state.bare.without(np.arange(state.at[k].start, state.at[k].stop), s.prior)
+        left = state.cleared.without(np.arange(state.at[k].start, state.at[k].stop), s.prior)
         others = [
             (candidate, other)
             for candidate, other in zip(state.candidates, state.scores(left), strict=True)

@@ -35,7 +35,7 @@ __all__ = ["Leftover", "leftover"]
 
 FloatArray = NDArray[np.float64]
 
-LOUD = 3
+SHORT_LIST = 3
 """Number of the best descriptions under each noise that are then weighed by the full likelihood."""
 TURNS = 6
 """Alternations between fitting a curve and fitting its direction."""
@@ -81,20 +81,20 @@ class Leftover(NamedTuple):
         return self.evidence - float(np.log(self.choice))
 
 
-def lone(S: FloatArray, b: FloatArray, width: FloatArray, whole: Ridge) -> Ridge:
+def along_one_direction(S: FloatArray, b: FloatArray, width: FloatArray, whole: Ridge) -> Ridge:
     """Estimate one curve along one direction of the body, ``c = f d^T``, instead of one curve for each axis.
 
     In turn f is estimated along d, and d by least squares given f, beginning with the direction of the
     `whole` estimate. The two free numbers of the direction pay as in :func:`~.evidence.weigh`.
     """
     count = len(width) // 3
-    own = np.linalg.svd(whole.estimate.reshape(count, 3), full_matrices=False)[2][0]
+    direction = np.linalg.svd(whole.estimate.reshape(count, 3), full_matrices=False)[2][0]
     for _ in range(TURNS):
-        along = np.kron(np.eye(count), own[:, None])
+        along = np.kron(np.eye(count), direction[:, None])
         best = Statistic(along.T @ S @ along, width[None, ::3] ** 2).best(along.T @ b)
         axes = np.kron(best.estimate[:, None], np.eye(3))
-        own = np.linalg.lstsq(axes.T @ S @ axes, axes.T @ b, rcond=None)[0]
-        own /= max(float(np.linalg.norm(own)), 1e-300)
+        direction = np.linalg.lstsq(axes.T @ S @ axes, axes.T @ b, rcond=None)[0]
+        direction /= max(float(np.linalg.norm(direction)), 1e-300)
     price = 1.0 + float(np.log(max(0.5 * best.ratio + best.price, 1.0)))
     return replace(
         best, ratio=best.ratio - 2.0 * price, estimate=along @ best.estimate, price=best.price + price
@@ -128,13 +128,13 @@ def leftover(
     found: list[tuple[float, str, Description, float]] = []
     for noise in (fit.noise, _calm(problem, columns, fit, order, listed[:2])):
         scored = _scored(problem, noise, fit, columns, listed)
-        loud = sorted(scored, key=lambda entry: -entry[0])[:LOUD]
+        tried = sorted(scored, key=lambda entry: -entry[0])[:SHORT_LIST]
         weighed = in_threads(
-            len(problem), lambda entry: _weighed(problem, columns, fit, order, *entry[2:]), loud
+            len(problem), lambda entry: _weighed(problem, columns, fit, order, *entry[2:]), tried
         )
-        for (own, kind, one, best, _), evidence in zip(loud, weighed, strict=True):
+        for (by_score, kind, one, best, _), evidence in zip(tried, weighed, strict=True):
             # no more than the description itself can gain: the rest is of a noise that found another optimum
-            found.append((min(own, evidence), kind, one, best.signal_to_noise))
+            found.append((min(by_score, evidence), kind, one, best.signal_to_noise))
     evidence, kind, one, size = max(found, key=lambda entry: entry[0])
     # half of a chi-square's tail: a size that cannot be negative is zero as often as not (Self & Liang 1987)
     tail = 0.5 * float(chi2.sf(2.0 * max(evidence, 0.0), 1))
@@ -143,7 +143,7 @@ def leftover(
     # stricter where no cause was found: the distribution is only asymptotic
     if p_value >= (LEVEL if model else 0.1 * LEVEL):
         return None
-    channel = one.channel or _goes_with(problem, fit)
+    channel = one.channel or _best_channel(problem, fit)
     return Leftover(kind, size, p_value, evidence, one.period, channel, one, count)
 
 
@@ -160,7 +160,7 @@ def _scored(
             S, b = info.matrix[at, at], info.score[at]
             best = Statistic(S, width[None] ** 2).best(b)
             if one.turned:
-                best = max(best, lone(S, b, width, best), key=lambda found: found.ratio)
+                best = max(best, along_one_direction(S, b, width, best), key=lambda found: found.ratio)
             yield 0.5 * best.ratio - float(np.log(one.trials)), kind, one, best, info.shift[:, at]
 
 
@@ -198,7 +198,7 @@ def _weighed(
     return gained - best.price - float(np.log(one.trials))
 
 
-def _goes_with(problem: Problem, fit: Joint) -> str | None:
+def _best_channel(problem: Problem, fit: Joint) -> str | None:
     """Return the channel whose means in ten bins explain most of what is left; None below 2 %."""
     best: tuple[float, str | None] = (0.02, None)
     total = float(fit.left @ fit.left)
