@@ -26,15 +26,15 @@ def track(items: Iterable[T], what: str, total: float | None = None) -> Iterator
     from rich.console import Console  # noqa: PLC0415 - needed on a terminal only
     from rich.progress import Progress  # noqa: PLC0415 - likewise
 
-    begun = told = time.monotonic()
+    begun = updated = time.monotonic()
     with Progress(console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task(what, total=total, visible=False)
         for done, item in enumerate(items, 1):
             yield item
             now = time.monotonic()
-            if now - told > PAUSE:
+            if now - updated > PAUSE:
                 progress.update(task, completed=done, visible=now - begun > PATIENCE)
-                told = now
+                updated = now
 
 
 @contextmanager

@@ -156,8 +156,10 @@ class Calibrated:
 
     def field(self, ambient: Array, channels: Mapping[str, Array], time: Array) -> Array:
         """Return the field at the sensor as :meth:`Vehicle.field` does; `time` is in s since 1970."""
-        told = np.column_stack([channels[name] for name in self.channels]) if self.channels else None
-        return forward(self.calibration, ambient, np.empty((len(time), 0)) if told is None else told, time)
+        sampled = np.column_stack([channels[name] for name in self.channels]) if self.channels else None
+        return forward(
+            self.calibration, ambient, np.empty((len(time), 0)) if sampled is None else sampled, time
+        )
 
 
 def draw_vehicle(rng: np.random.Generator, masses: Sequence[str] = ("battpos", "ballast")) -> Vehicle:

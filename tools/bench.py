@@ -91,7 +91,7 @@ def main() -> int:
         print(f"{name} ...", file=sys.stderr)
         results.append(measure(name, chosen.factor))
     if chosen.json:
-        told = [
+        results = [
             {
                 **result,
                 "rows": [
@@ -101,7 +101,7 @@ def main() -> int:
             }
             for result in results
         ]
-        print(json.dumps(told, indent=1))
+        print(json.dumps(results, indent=1))
     else:
         Console(width=None if sys.stdout.isatty() else 160).print(show(results))
     return int(any(row.holds is False for result in results for row in result["rows"]))

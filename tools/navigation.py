@@ -170,15 +170,17 @@ def watch(runs: Runs, _asked: argparse.Namespace) -> None:
         for kind in MAPS[:4]:
             spans = np.array(runs(partial(how, kind)))
             lost = spans[spans[:, 1] > 0.0]
-            told = (np.mean(lost[:, 0] <= 0.5), np.mean(lost[:, 1] <= 2.0)) if len(lost) else (np.nan, np.nan)
+            shares = (
+                (np.mean(lost[:, 0] <= 0.5), np.mean(lost[:, 1] <= 2.0)) if len(lost) else (np.nan, np.nan)
+            )
             within = 60.0 * np.percentile(lost[:, 0], 95) if len(lost) else np.nan
             table.append(
                 (
                     f"{how.__name__}; {kind}",
                     f"{100 * len(lost) / len(spans):.0f}",
-                    f"{100 * told[0]:.0f}",
+                    f"{100 * shares[0]:.0f}",
                     f"{within:.0f}",
-                    f"{100 * told[1]:.0f}",
+                    f"{100 * shares[1]:.0f}",
                 )
             )
             show(table)

@@ -143,7 +143,7 @@ class LiveEdge:
 
     def _keep_open(self, channel: Channel, port: Port, tried: threading.Event) -> None:
         """Open the port whenever it is down, report each change once; set `tried` after the first attempt."""
-        told: str | None = None
+        reported: str | None = None
         while not self._stopping:
             if not port.up:
                 try:
@@ -151,8 +151,8 @@ class LiveEdge:
                     reason = ""
                 except PortError as error:
                     reason = error.reason
-                if not reason or told != reason:
+                if not reason or reported != reason:
                     self.tell(states.port(channel, port, reason))
-                told = reason
+                reported = reason
             tried.set()
             time.sleep(RETRY)

@@ -130,8 +130,8 @@ def note_losses(*pieces: Mapping[str, Any]) -> None:
     from magbridge.logs.deployment import COUNTERS, passed_over
 
     if counts := passed_over(*pieces):
-        told = ", ".join(f"{count} {COUNTERS[name][count > 1]}" for name, count in counts.items())
-        complain(f"in the logs: {told}", 0)
+        losses = ", ".join(f"{count} {COUNTERS[name][count > 1]}" for name, count in counts.items())
+        complain(f"in the logs: {losses}", 0)
 
 
 def note_missing(calibration: Calibration, deployment: xr.Dataset) -> None:

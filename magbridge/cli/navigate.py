@@ -140,14 +140,14 @@ def _bound(
     from magbridge.field.read import read_grid
     from magbridge.logs import read, write
     from magbridge.navigate import Options
-    from magbridge.navigate.bound import position_bound, told
+    from magbridge.navigate.bound import as_dataset, position_bound
 
     plan = read(files, required=("latitude", "longitude")).dropna("time", subset=["latitude", "longitude"])
     grid, options = _continued(read_grid(map), options or Options(), plan)
     track = [plan[name].to_numpy().astype(float) for name in ("time", "latitude", "longitude")]
     sigma = calibration.noise.sensor if calibration else 1.0
     best = position_bound(grid, track[0], track[1], track[2], options, sigma)
-    result = told(best, grid)
+    result = as_dataset(best, grid)
     write(result, output)
     if picture:
         from magbridge.navigate.draw import draw_bound

@@ -76,8 +76,8 @@ class Rows:
         self._path, self._survey = path, survey
         self._source, self._make = spec(survey.source).id, SOURCES[survey.source]
         columns = ["time", *(f"mag_{axis}" for axis in "xyz" if "IMU" in survey.source)]
-        own = {value.column for value in TELEMETRY.get(self._source, []) if value.column.startswith("mag")}
-        columns += [name for name in survey.columns if name not in own]
+        raw = {value.column for value in TELEMETRY.get(self._source, []) if value.column.startswith("mag")}
+        columns += [name for name in survey.columns if name not in raw]
         self._slot = {name: k for k, name in enumerate(columns)}
         self._values = [nan] * len(columns)
         self._stamps = [NEVER] * len(columns)

@@ -217,8 +217,8 @@ class TlogWriter:
         """Write whole records; when that fails, leave none half-written."""
         if not self._size:
             first = 0 if self._torn else 1
-            told = (*self.beginning, *self._head) if self._torn else self._head
-            declared = [(records[0][0], Channel.STATE, frame) for frame in told]
+            frames = (*self.beginning, *self._head) if self._torn else self._head
+            declared = [(records[0][0], Channel.STATE, frame) for frame in frames]
             data = _packed([*records[:first], *declared, *records[first:]])
         rest, time_us = memoryview(data), records[-1][0]
         try:

@@ -64,7 +64,7 @@ def health(state: State) -> dict[str, tuple[str, bool]]:
     field, get = state.field.get, state.status.get
     sensor, autopilot = (MAG_PORT_STATE(get(f"{line}_state", 0)) for line in ("sensor", "autopilot"))
     log = MAG_LOG_STATE(get("log_state", 0))
-    told = {name: get(counter, 0) for name, counter in LOSSES.items()}
+    losses = {name: get(counter, 0) for name, counter in LOSSES.items()}
     return {
         "Sensor": (sensor.name.lower(), sensor == MAG_PORT_STATE.OK),
         "Autopilot": (autopilot.name.lower(), autopilot == MAG_PORT_STATE.OK),
@@ -81,7 +81,7 @@ def health(state: State) -> dict[str, tuple[str, bool]]:
             f"{_count(state.lost)} of {_count(state.lost + state.received)}",
             not state.lost,
         ),
-        **{name: (_count(count), not count) for name, count in told.items()},
+        **{name: (_count(count), not count) for name, count in losses.items()},
     }
 
 

@@ -17,7 +17,7 @@ from magbridge.navigate.model import Options, block_length, measurement_row, pri
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["Bound", "position_bound", "told"]
+__all__ = ["Bound", "as_dataset", "position_bound"]
 
 Array = NDArray[np.float64]
 
@@ -130,7 +130,7 @@ def _along(time: Array, latitude: Array, longitude: Array) -> Array:
     return np.concatenate([[0.0], np.cumsum(np.hypot(*np.array(legs).T))])
 
 
-def told(bound: Bound, grid: AnomalyGrid) -> xr.Dataset:
+def as_dataset(bound: Bound, grid: AnomalyGrid) -> xr.Dataset:
     """Return the bound as a dataset on ``time``, with a sentence on it as the attribute ``findings``."""
     import xarray as xr  # noqa: PLC0415 - the live path runs without it
 

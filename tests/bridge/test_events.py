@@ -17,11 +17,11 @@ from magbridge.bridge.events import Clock
 clock = Clock()
 print("begun", flush=True)
 end_us = clock.now_us() + 2_300_000
-told = []
+steps = []
 while clock.now_us() < end_us:
     if step := clock.step_us():
-        told.append(step)
-print(told)
+        steps.append(step)
+print(steps)
 """
 
 
@@ -52,9 +52,9 @@ def test_held_up_beside_a_look_at_utc(monkeypatch: pytest.MonkeyPatch, held: str
             time.sleep(wait)
         return utc
 
-    for offset_us[0], told in ((0, 0), (-3_600_000_000, -3_600_000_000), (-3_600_000_000, 0)):
+    for offset_us[0], expected in ((0, 0), (-3_600_000_000, -3_600_000_000), (-3_600_000_000, 0)):
         waits[:] = [1.4e-6 * Clock.THRESHOLD_US, 0.0]
         monkeypatch.setattr(time, "time_ns", slow)
-        assert clock.step_us() == pytest.approx(told, abs=Clock.AT_ONCE_US)
+        assert clock.step_us() == pytest.approx(expected, abs=Clock.AT_ONCE_US)
         assert not waits
         monkeypatch.undo()

@@ -143,7 +143,7 @@ def test_second_system_on_the_link(rig: Rig, table: Row) -> None:
         ]  # fmt: skip
 
     rig.autopilot.retell = join
-    told = rig.until_said("vehicle 2 is on the link too: ignored", mark)
+    delay = rig.until_said("vehicle 2 is on the link too: ignored", mark)
     rig.run(0.5)
     rig.autopilot.retell = lambda frame: [frame]
     assert rig.undue_flags(mark) == ""
@@ -154,7 +154,7 @@ def test_second_system_on_the_link(rig: Rig, table: Row) -> None:
     assert shouted
     table(
         "a second vehicle on the link whose telemetry has the same names",
-        f"STATUSTEXT once (after {told:.2f} s); its telemetry is ignored",
+        f"STATUSTEXT once (after {delay:.2f} s); its telemetry is ignored",
         "at once",
         "nothing",
     )
@@ -172,12 +172,12 @@ def test_two_autopilots_answer(rig: Rig, table: Row) -> None:
         return [frame, other.pack("SYS_STATUS"), other.pack("ATTITUDE", time_boot_ms=86_400_000 + 50 * count)]
 
     rig.autopilot.retell = both
-    told = rig.until_said("two autopilots speak as 1:1", mark)
+    delay = rig.until_said("two autopilots speak as 1:1", mark)
     rig.autopilot.retell = lambda frame: [frame]
     back = rig.until_well()
     table(
         "two programs answer as the autopilot (1:1)",
-        f"STATUSTEXT after {told:.2f} s; flags: {rig.flags(mark) or 'none'}",
+        f"STATUSTEXT after {delay:.2f} s; flags: {rig.flags(mark) or 'none'}",
         seconds(back),
         "nothing; `link_frames_lost` grows because their sequence numbers interleave",
     )
@@ -188,12 +188,12 @@ def test_another_bridge_answers(rig: Rig, table: Row) -> None:
     rig.until_well()
     mark = rig.mark
     rig.autopilot.send(Codec(1, 191).pack("HEARTBEAT", type=18, autopilot=8))
-    told = rig.until_said("another program speaks as 1:191", mark)
+    delay = rig.until_said("another program speaks as 1:191", mark)
     back = rig.until_well()
     assert rig.undue_flags(mark) == ""
     table(
         "another program uses the bridge's own address (1:191)",
-        f"STATUSTEXT after {told:.2f} s; its messages are not taken for telemetry",
+        f"STATUSTEXT after {delay:.2f} s; its messages are not taken for telemetry",
         "at once",
         "nothing",
     )

@@ -35,8 +35,8 @@ def events(pipeline: Pipeline, begin: int, end: int) -> Iterator[Event]:
         line = f"{20_000 * cos(turn):.2f} {20_000 * sin(turn):.2f} 45000 4.0 {(50 * k - 30) / 1e3} {k}\n"
         yield Event(t_us, Channel.SENSOR, line.encode())
         if k % 4 == 0:
-            told = {"time_boot_ms": (t_us - BOOT) // 1000 - 25, "value": sin(k / 90), "name": "battpos"}
-            yield Event(t_us + 4_000, Channel.LINK, autopilot.pack("NAMED_VALUE_FLOAT", **told))
+            battpos = {"time_boot_ms": (t_us - BOOT) // 1000 - 25, "value": sin(k / 90), "name": "battpos"}
+            yield Event(t_us + 4_000, Channel.LINK, autopilot.pack("NAMED_VALUE_FLOAT", **battpos))
         while asked := [
             ts1 for ts1 in pipeline.component.vehicle.clock._asked if ts1 // 1000 > t_us - 50_000
         ]:
@@ -90,11 +90,11 @@ def test_a_log_after_a_loss_is_replayed_as_far_as_it_can_be(tmp_path: Path) -> N
 def test_a_file_may_end_in_the_middle_of_what_came_at_once(tmp_path: Path) -> None:
     """As after a bridge stood still: the sensor's bytes of a second, in one read, are many records."""
     pipeline = bridge(tmp_path, Start(START))
-    told = list(events(pipeline, 0, 60))
-    lines = b"".join(event.data for event in told if event.channel == Channel.SENSOR)
+    fed = list(events(pipeline, 0, 60))
+    lines = b"".join(event.data for event in fed if event.channel == Channel.SENSOR)
     head = declarations(1, 191, pipeline._config.telemetry, 0.0)
     with TlogWriter(tmp_path / "logs", head=head, max_size=1e-3) as log:
-        sent = pipeline.feed(Event(told[-1].time_us, Channel.SENSOR, lines))
+        sent = pipeline.feed(Event(fed[-1].time_us, Channel.SENSOR, lines))
         log.extend(pipeline.journal.drain())
     files = sorted((tmp_path / "logs").iterdir())
     assert len(files) > 2

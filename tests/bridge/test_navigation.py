@@ -152,12 +152,12 @@ def test_odometry_goes_on_between_updates(folder: Path) -> None:
     path = folder / "odometry.toml"
     path.write_text(CONFIG.replace("FIX", "ODOMETRY"))
     pipeline = set_up(load(path), Start(START))
-    told = list(events(read_grid(folder / "grid.nc"), path))
-    stream = b"".join(frame for event in told for _, frame in pipeline.feed(event))
+    given = list(events(read_grid(folder / "grid.nc"), path))
+    stream = b"".join(frame for event in given for _, frame in pipeline.feed(event))
     silent = b"".join(
         frame
         for k in range(600)
-        for _, frame in pipeline.feed(Event(told[-1].time_us + 200_000 * k, Channel.LINK, b""))
+        for _, frame in pipeline.feed(Event(given[-1].time_us + 200_000 * k, Channel.LINK, b""))
     )
     sent = heard(stream)["ODOMETRY"]
     times = np.array([one["time_usec"] for one in sent])

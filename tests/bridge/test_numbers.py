@@ -34,11 +34,11 @@ def test_in_a_line_of_the_sensor(pipeline: Pipeline, column: int) -> None:
         words = ["20000", "-100", "40000", "4", str(0.1 * k), str(k)]
         words[column] = wild or words[column]
         line = f"{' '.join(words)}\n".encode()
-        told = fields(pipeline.feed(Event(START + 100_000 * (k + 1), Channel.SENSOR, line)))
-        for one in told:
+        sent = fields(pipeline.feed(Event(START + 100_000 * (k + 1), Channel.SENSOR, line)))
+        for one in sent:
             assert one["total_field_sigma"] >= 1.0
-    assert len(told) == 1  # the last line was a good one
-    assert told[0]["total_field_sigma"] < 1e4
+    assert len(sent) == 1  # the last line was a good one
+    assert sent[0]["total_field_sigma"] < 1e4
 
 
 @pytest.mark.parametrize("value", TELEMETRY)
@@ -56,7 +56,7 @@ def test_in_the_telemetry(pipeline: Pipeline, value: float) -> None:
         assert one["total_field_sigma"] >= 1.0
 
 
-def fields(told: list[tuple[int, bytes]]) -> list[Message]:
+def fields(sent: list[tuple[int, bytes]]) -> list[Message]:
     """Return each MAG_FIELD that was said."""
-    messages = Codec(0, 0).parse(b"".join(frame for _, frame in told))
+    messages = Codec(0, 0).parse(b"".join(frame for _, frame in sent))
     return [one for one in messages if one.name == "MAG_FIELD"]

@@ -141,8 +141,8 @@ def test_host_clock_set_forward_and_back(make_rig: MakeRig, table: Row) -> None:
         rig.step(step)
         noticed = rig.until_said("clock was set by", seen)
         # less than the threshold is slewing, and so may a late look at one of two clocks be off
-        (told,) = [float(text.split()[-2]) for text in rig.said(seen) if "clock was set by" in text]
-        assert told == pytest.approx(step, abs=Clock.THRESHOLD_US * 1e-6)
+        (reported,) = [float(text.split()[-2]) for text in rig.said(seen) if "clock was set by" in text]
+        assert reported == pytest.approx(step, abs=Clock.THRESHOLD_US * 1e-6)
         rig.run(0.2)
         after = rig.of("MAG_FIELD")[-1]
         elapsed = (after["time_usec"] - before["time_usec"]) * 1e-6

@@ -25,7 +25,7 @@ def test_sensor_unplugged_in_the_middle_of_a_frame(rig: Rig, table: Row) -> None
     rig.fluxgate.unplug(after=17)
     away = time.monotonic()
     rig.until_status(lambda status: status["sensor_state"] == LOST)
-    told = rig.until_said("digitizer lost", mark)
+    delay = rig.until_said("digitizer lost", mark)
     beat = rig.of("HEARTBEAT", mark)[-1]
     assert beat["system_status"] == 5  # critical
     rig.run(0.3)
@@ -46,7 +46,7 @@ def test_sensor_unplugged_in_the_middle_of_a_frame(rig: Rig, table: Row) -> None
         seconds(back),
         f"the readings in between and one frame: `samples_lost` {lost}, `sensor_bytes_skipped`",
     )
-    assert told < 1.5
+    assert delay < 1.5
     assert back < 2.0
 
 
@@ -107,15 +107,15 @@ def test_second_bridge_on_the_same_sensor(rig: Rig, table: Row) -> None:
             '"cal.json"', '"../cal.json"'
         )
         config.write_text(text)
-        ear, told = Codec(0, 0), []
+        ear, texts = Codec(0, 0), []
 
         def refused() -> bool:
             try:
                 heard = ear.parse(sink.recv(65536))
-                told.extend(message["text"] for message in heard if message.name == "STATUSTEXT")
+                texts.extend(message["text"] for message in heard if message.name == "STATUSTEXT")
             except BlockingIOError:
                 pass
-            return any("digitizer lost" in text for text in told)
+            return any("digitizer lost" in text for text in texts)
 
         other = rig.spawn(config)
         try:
@@ -128,7 +128,7 @@ def test_second_bridge_on_the_same_sensor(rig: Rig, table: Row) -> None:
     assert after["samples_lost"] == before["samples_lost"]
     assert after["sensor_bytes_skipped"] == before["sensor_bytes_skipped"]
     assert rig.undue_flags(mark) == ""
-    reason = next(text for text in told if "digitizer lost" in text)
+    reason = next(text for text in texts if "digitizer lost" in text)
     table(
         "a second `magbridge run` on the same serial port",
         f'the first: no change. The second: heartbeat critical, STATUSTEXT "{reason}"; it waits for the port',

@@ -248,7 +248,7 @@ def test_a_change_of_position_is_the_difference_of_the_totals() -> None:
     for h, p in zip(field.tolist(), positions.tolist(), strict=True):
         there, spans = corrector.step(0, tuple(h), p).total_field, [(0, 0.0, p[0]), (1, -0.5, p[1])]
         elsewhere = [corrector.step(0, tuple(h), at).total_field for at in ((0.0, p[1]), (p[0], -0.5))]
-        told = corrector.changes(tuple(h), tuple(p), spans)
-        assert told == pytest.approx([there - value for value in elsewhere], abs=1e-11 * there)
-        assert corrector.changes(tuple(h), tuple(p), spans) == told
-        assert corrector.changes(tuple(h), (*p, 3.0), [*spans, (2, 0.0, 1.0)]) == told
+        moved = corrector.changes(tuple(h), tuple(p), spans)
+        assert moved == pytest.approx([there - value for value in elsewhere], abs=1e-11 * there)
+        assert corrector.changes(tuple(h), tuple(p), spans) == moved
+        assert corrector.changes(tuple(h), (*p, 3.0), [*spans, (2, 0.0, 1.0)]) == moved

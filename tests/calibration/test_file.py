@@ -175,11 +175,11 @@ def test_any_edit_is_read_or_refused_in_one_line(data: st.DataObject, cal: Calib
     try:
         read = decode_calibration(json.dumps(content).encode(), "cal.json")
     except (FormatError, CalibrationError) as refused:
-        told = str(refused)
+        said = str(refused)
     else:
-        told = f"cal.json: {read.method}"
-    assert told.startswith("cal.json: ")
-    assert "\n" not in told or told == f"cal.json: {content['method']}"
+        said = f"cal.json: {read.method}"
+    assert said.startswith("cal.json: ")
+    assert "\n" not in said or said == f"cal.json: {content['method']}"
 
 
 @settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -191,9 +191,9 @@ def test_any_damage_is_read_or_refused_in_one_line(places: list[tuple[int, int]]
     try:
         assert isinstance(decode_calibration(bytes(content), "cal.json"), Calibration)
     except (FormatError, CalibrationError) as refused:
-        told = str(refused)
-        assert told.startswith("cal.json: ")
-        assert "\n" not in told
+        said = str(refused)
+        assert said.startswith("cal.json: ")
+        assert "\n" not in said
 
 
 def test_a_key_that_is_no_text(cal: Calibration) -> None:
@@ -226,9 +226,9 @@ def test_the_paper_s_view_converts_both_ways() -> None:
 
 
 def test_the_paper_s_view_of_a_calibration(cal: Calibration) -> None:
-    told = json.loads(json.dumps(facts(cal)))
-    assert told["at"] == {"battpos": 0.05}
+    result = json.loads(json.dumps(facts(cal)))
+    assert result["at"] == {"battpos": 0.05}
     A, T = cal.matrices(np.array([[0.05]]))
-    np.testing.assert_allclose(from_paper(told["M"], told["S_nT"], 51_000.0), A[0], rtol=1e-12)
-    np.testing.assert_allclose(told["T_nT"], T[0])
+    np.testing.assert_allclose(from_paper(result["M"], result["S_nT"], 51_000.0), A[0], rtol=1e-12)
+    np.testing.assert_allclose(result["T_nT"], T[0])
     assert facts(identity())["M"] == np.eye(3).tolist()

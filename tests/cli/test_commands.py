@@ -60,9 +60,9 @@ def test_what_was_passed_over_is_told(
     log.write_bytes(data[: len(data) // 2] + bytes(500) + data[len(data) // 2 :])
     write(rows.isel(time=slice(150, 200)), other)
     assert main(["convert", str(other), str(log), "-o", str(both)]) == 0
-    told = capsys.readouterr().err
-    assert told.startswith("magbridge: in the logs: 5")
-    assert " bytes skipped, 1 damaged place, 50 duplicate rows" in told
+    lines = capsys.readouterr().err
+    assert lines.startswith("magbridge: in the logs: 5")
+    assert " bytes skipped, 1 damaged place, 50 duplicate rows" in lines
     assert main(["convert", str(both), "-o", str(tmp_path / "again.csv")]) == 0
     assert not capsys.readouterr().err
 
@@ -73,8 +73,8 @@ def test_what_headings_are_counted_from_may_be_told(deployment: Path, tmp_path: 
     assert read(out).attrs["heading_reference"] == "magnetic"
     offsets = []
     for reference in ("true", "magnetic"):
-        told = ["--method", "nominal", "--heading-reference", reference, "-o", str(tmp_path / "cal.json")]
-        assert main(["calibrate", str(deployment), *told]) == 0
+        options = ["--method", "nominal", "--heading-reference", reference, "-o", str(tmp_path / "cal.json")]
+        assert main(["calibrate", str(deployment), *options]) == 0
         boresight = load_calibration(tmp_path / "cal.json").boresight
         assert boresight
         offsets.append(boresight.rotation[2])
@@ -96,9 +96,9 @@ def test_correct_writes_what_the_contract_names(
     out = tmp_path / "corrected.nc"
     arguments = ["correct", str(deployment), "--calibration", str(calibration), "-o", str(out), "--json"]
     assert main(arguments) == 0
-    told = json.loads(capsys.readouterr().out)
+    result = json.loads(capsys.readouterr().out)
     corrected = read(out)
-    assert told["rows"] == corrected.sizes["time"] == 3600
+    assert result["rows"] == corrected.sizes["time"] == 3600
     names = ["total_field", "total_field_sigma", "field_x", "field_y", "field_z", "anomaly", "quality"]
     assert list(corrected) == names
     truth = read(deployment)
@@ -147,8 +147,8 @@ def test_numbers_that_may_say_not_known_are_told(
     diagnosed = ["--calibration", str(calibration), "-o", str(tmp_path / "doubt")]
     write(rows, tmp_path / "log.csv")
     assert main(["diagnose", str(tmp_path / "log.csv"), *diagnosed]) == 1
-    told, refused = capsys.readouterr().err.splitlines()
-    assert f"log.csv, column 'pump_current': -9999 in 2 of {FEW} rows is read as a number" in told
+    warning, refused = capsys.readouterr().err.splitlines()
+    assert f"log.csv, column 'pump_current': -9999 in 2 of {FEW} rows is read as a number" in warning
     assert refused.endswith(f"{FEW} samples, at least 60 needed")
     declared = tmp_path / "declared.csv"
     declared.write_text("# fill_value = -9999\n" + (tmp_path / "log.csv").read_text())
@@ -184,10 +184,10 @@ def test_plan(
         "2",
     ]
     assert main([*arguments, "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
-    before, first, second = told["expected_worst_nT"]
+    result = json.loads(capsys.readouterr().out)
+    before, first, second = result["expected_worst_nT"]
     assert before > first > second
-    assert [set(run) for run in told["runs"]] == [{"pitch", "roll", *names}] * 2
+    assert [set(run) for run in result["runs"]] == [{"pitch", "roll", *names}] * 2
     assert main(arguments) == 0
     lines = capsys.readouterr().out.splitlines()
     assert [line.split()[0] for line in lines] == ["run", "none", "1", "2", "each"]

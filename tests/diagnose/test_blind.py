@@ -182,10 +182,10 @@ def test_a_maps_error_is_told_by_its_size(short: None) -> None:
     hidden = here.hide("map_error", 40.0, 24)
     diagnosis = diagnose([here.log(hidden.ds)], here.stage.calibration)
     (named,) = [one for one in diagnosis.findings if one.candidate.cause == "map_error"]
-    told = parameters(named, len(diagnosis.problem))
-    assert set(told) == {"rms"}
-    assert told["rms"]["value"] == pytest.approx(np.std(hidden.signature), rel=0.2)
-    assert 0.0 < told["rms"]["sigma"] < 0.2 * told["rms"]["value"]
+    numbers = parameters(named, len(diagnosis.problem))
+    assert set(numbers) == {"rms"}
+    assert numbers["rms"]["value"] == pytest.approx(np.std(hidden.signature), rel=0.2)
+    assert 0.0 < numbers["rms"]["sigma"] < 0.2 * numbers["rms"]["value"]
 
 
 def test_a_channels_name_does_not_decide(warm: tuple[xr.Dataset, object], written: tuple[Path, str]) -> None:

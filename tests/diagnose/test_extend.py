@@ -146,10 +146,10 @@ def test_a_maps_error_is_in_the_level_of_what_was_fitted_to_the_same_map(
     )
     extended = extend(whole, [chart], found)
     assert leveled(new, [chart], found, extended) is extended
-    told = leveled(seen, [chart], found, extended)
+    spread = leveled(seen, [chart], found, extended)
     before, after = (
         correct(c, whole.survey.field, whole.survey.values(c.channels), whole.survey.time).sigma
-        for c in (extended, told)
+        for c in (extended, spread)
     )
     np.testing.assert_allclose(np.sqrt(after**2 - before**2), 30.0, rtol=0.02)
 

@@ -61,15 +61,14 @@ def test_the_score_is_the_density_of_each_dive_given_the_others(problem: Problem
     y = fit.noise.response(posed.residual)
     white = fit.noise.response(fit.left)
     assert np.abs(A.T @ white - fit.prior * (c - np.append(posed.centre, 0.0))).max() < 0.05 * np.abs(A).max()
-    told = fit.noise.log_likelihood + 0.5 * float(white @ white)
-    expected = told
+    expected = fit.noise.log_likelihood + 0.5 * float(white @ white)
     for dive in range(DIVES):
         out = posed.survey.dive == dive
         P = A[~out].T @ A[~out] + np.diag(fit.prior)
         mean = np.linalg.solve(P, A[~out].T @ y[~out] + fit.prior * np.append(posed.centre, 0.0))
         spread = np.eye(out.sum()) + A[out] @ np.linalg.solve(P, A[out].T)
-        own = multivariate_normal(A[out] @ mean, spread).logpdf(y[out])
-        expected += own + 0.5 * out.sum() * np.log(2.0 * np.pi)
+        predicted = multivariate_normal(A[out] @ mean, spread).logpdf(y[out])
+        expected += predicted + 0.5 * out.sum() * np.log(2.0 * np.pi)
     assert held_out(posed, columns, fit).score == pytest.approx(expected, abs=0.05)
 
 

@@ -47,10 +47,10 @@ def made(whole: Problem, field: np.ndarray, seed: int) -> Survey:
 def test_a_line_leaves_its_delay_times_what_it_is_bent_by(right: Callable[[int], Problem]) -> None:
     survey = right(400).survey
     error = interpolated(survey.time) - swaying(survey.time)
-    told = TAKEN * bent(survey, swaying(survey.time).T).T
+    expected = TAKEN * bent(survey, swaying(survey.time).T).T
     inside = slice(10, -10)
     for k in (1, 2):
-        assert np.sum((error - told)[inside, k] ** 2) < 0.02 * np.sum(error[inside, k] ** 2)
+        assert np.sum((error - expected)[inside, k] ** 2) < 0.02 * np.sum(error[inside, k] ** 2)
 
 
 def test_the_delays_are_found(right: Callable[[int], Problem]) -> None:
@@ -61,8 +61,8 @@ def test_the_delays_are_found(right: Callable[[int], Problem]) -> None:
     fit = fit_joint(problem, [], 1)
     found = DELAY * (fit.z[DELAYS] - fit.z[DELAYS][0])
     np.testing.assert_allclose(found, TAKEN, atol=0.03)
-    told = [float(x) for x in re.findall(r"([\d.]+) ± [\d.]+ s", late(problem, fit))]
-    np.testing.assert_allclose(told, found[1:], atol=1e-3)
+    stated = [float(x) for x in re.findall(r"([\d.]+) ± [\d.]+ s", late(problem, fit))]
+    np.testing.assert_allclose(stated, found[1:], atol=1e-3)
 
 
 def test_the_delays_stay_where_the_comparison_is_linearised_anew(right: Callable[[int], Problem]) -> None:

@@ -30,7 +30,7 @@ def test_a_causes_physics_is_a_sentence(cause: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("value", "sigma", "told"),
+    ("value", "sigma", "text"),
     [
         (431.1, 173.0, "430 ± 170"),
         (-1330.2, 22.4, "\N{MINUS SIGN}1330 ± 22"),
@@ -40,23 +40,23 @@ def test_a_causes_physics_is_a_sentence(cause: str) -> None:
         (1e5, 1234.0, "100000 ± 1200"),
     ],
 )
-def test_a_number_is_written_to_two_digits_of_its_sigma(value: float, sigma: float, told: str) -> None:
-    assert f"{measured(value, sigma)} ± {measured(sigma, sigma)}" == told
+def test_a_number_is_written_to_two_digits_of_its_sigma(value: float, sigma: float, text: str) -> None:
+    assert f"{measured(value, sigma)} ± {measured(sigma, sigma)}" == text
 
 
 @pytest.mark.parametrize(
-    ("value", "told"), [(1073.2, "1070"), (0.0768, "0.0768"), (900.0, "900"), (2, "2"), (0.0, "0")]
+    ("value", "text"), [(1073.2, "1070"), (0.0768, "0.0768"), (900.0, "900"), (2, "2"), (0.0, "0")]
 )
-def test_a_size_is_written_without_an_exponent(value: float, told: str) -> None:
-    assert number(value) == told
+def test_a_size_is_written_without_an_exponent(value: float, text: str) -> None:
+    assert number(value) == text
 
 
 @pytest.mark.parametrize(
-    ("p_value", "told"),
+    ("p_value", "text"),
     [(0.5, "0.5"), (0.00231, "0.002"), (3.4e-8, "3·10⁻⁸"), (9.7e-10, "1·10⁻⁹"), (0.0, "below 1·10⁻⁹⁹")],
 )
-def test_a_chance_is_written_to_one_digit(p_value: float, told: str) -> None:
-    assert chance(p_value) == told
+def test_a_chance_is_written_to_one_digit(p_value: float, text: str) -> None:
+    assert chance(p_value) == text
 
 
 def test_the_command_s_line_names_every_cause_that_may_be_it() -> None:
@@ -108,8 +108,8 @@ def test_a_shift_of_the_whole_field_beside_a_wrong_reference_is_told(right: Call
     grown = problem.calibration.coefficients + np.repeat([20.0, 0.0], [3, 6])
     louder = replace(problem.calibration, coefficients=grown)
     bias, order = (CAUSES[cause].candidates(problem)[0] for cause in ("reference_bias", "actuator_order"))
-    told = unsettled(problem, [order, bias], louder)
-    assert "the whole corrected field by +20.0 nT, to within 0.0 nT" in told
+    text = unsettled(problem, [order, bias], louder)
+    assert "the whole corrected field by +20.0 nT, to within 0.0 nT" in text
     s = isotropic(louder)
     charted = replace(problem.calibration, covariance=louder.covariance + 30.0**2 * np.outer(s, s))
     assert "by +0.0 nT, to within 30.0 nT" in unsettled(problem, [order, bias], charted)

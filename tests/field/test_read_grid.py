@@ -210,13 +210,13 @@ def test_one_clear_line(tmp_path, name, write, message):
 
 
 def grid_or_one_line(path):
-    told = f"{path}: "
+    said = f"{path}: "
     try:
         assert read_grid(path).anomaly.size >= 16
     except FormatError as error:
-        told = str(error)
-    assert told.startswith(f"{path}: ")
-    assert "\n" not in told
+        said = str(error)
+    assert said.startswith(f"{path}: ")
+    assert "\n" not in said
 
 
 WORDS = (

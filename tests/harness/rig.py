@@ -175,8 +175,8 @@ class Rig:
         begun = time.monotonic()
         while not condition():
             if self.since(begun) > timeout:
-                told = "; ".join(self.said())[-1500:]
-                raise AssertionError(f"not within {timeout} s; said: {told}; {self.status}")
+                recent = "; ".join(self.said())[-1500:]
+                raise AssertionError(f"not within {timeout} s; said: {recent}; {self.status}")
             self.fluxgate.turn()
             now = time.monotonic()
             self.heard += [Heard(now, message) for message in self.autopilot.turn()]

@@ -279,12 +279,12 @@ def test_channels_are_what_the_driver_made_of_its_counts(tmp_path: Path) -> None
     with TlogWriter(tmp_path, head=declarations(1, 191, {}, nt_per_count)) as log:
         log.write(T0, Channel.STATE, codec.pack("MAG_BRIDGE_START"))
         for k, (channels, numbers) in enumerate(zip(field, counts.tolist(), strict=True)):
-            told = dict(
+            values = dict(
                 zip(("x", "y", "z", "count_x", "count_y", "count_z"), (*channels, *numbers), strict=True)
             )
             if k == 99:
-                told |= {"count_x": 0, "count_y": 0, "count_z": 0}
-            log.write(T0 + k * S, Channel.SENT, codec.pack("MAG_RAW", time_usec=T0 + k * S, **told))
+                values |= {"count_x": 0, "count_y": 0, "count_z": 0}
+            log.write(T0 + k * S, Channel.SENT, codec.pack("MAG_RAW", time_usec=T0 + k * S, **values))
     back = logs.read(sorted(tmp_path.iterdir()))
     for axis, exact in zip("xyz", field.T, strict=True):
         single = exact.astype(np.float32).astype(float)

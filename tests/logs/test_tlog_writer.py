@@ -170,8 +170,8 @@ def test_a_file_after_a_loss_begins_with_the_beginning_and_one_in_turn_does_not(
         aside.rename(folder)
         for k in (4, 5):
             log.write(T0 + k * 4_000_000, 0, FRAME)
-    told = [[frame for _, frame in records(path)] for path in sorted(folder.iterdir())]
-    assert told == [[FRAME, head]] * 3 + [[begin, head, FRAME], [FRAME, head]]
+    written = [[frame for _, frame in records(path)] for path in sorted(folder.iterdir())]
+    assert written == [[FRAME, head]] * 3 + [[begin, head, FRAME], [FRAME, head]]
 
 
 def test_stalled_disk_drops_and_counts_and_never_blocks(

@@ -69,13 +69,13 @@ def test_figures(air: Air) -> None:
     assert shown["Forward"] == ("-4\u202f203.0", "± 2.2")
     assert shown["Anomaly"][0] == shown["Starboard"][0] == "–"
     air.say(NOW, "MAG_STATUS", sensor_state=3, autopilot_state=1, log_state=2, samples_lost=7, uptime=4)
-    told = health(air.state)
-    assert told["Sensor"] == ("lost", False)
-    assert told["Autopilot"] == ("ok", True)
-    assert told["Log"] == ("failed", False)
-    assert told["Latency"] == ("4.2 ms", True)
-    assert told["Calibration"] == ("0000beef", True)
-    assert told["Samples lost at the sensor"] == ("7", False)
+    items = health(air.state)
+    assert items["Sensor"] == ("lost", False)
+    assert items["Autopilot"] == ("ok", True)
+    assert items["Log"] == ("failed", False)
+    assert items["Latency"] == ("4.2 ms", True)
+    assert items["Calibration"] == ("0000beef", True)
+    assert items["Samples lost at the sensor"] == ("7", False)
 
 
 def test_the_position_by_the_field(air: Air) -> None:
@@ -83,11 +83,11 @@ def test_the_position_by_the_field(air: Air) -> None:
     assert whereabouts(air.state)["State"] == ("off", True)
     place = {"lat": 495_000_000, "lon": -579_000_000, "covariance_nn": 400.0, "covariance_ee": 900.0}
     air.say(NOW, "MAG_NAVIGATION", state=4, innovation=2.5, innovation_variance=1.0, bias=1.0, **place)
-    told = whereabouts(air.state)
-    assert told["State"] == ("lost", False)
-    assert told["Position"][0] == "49.50000, -57.90000"
-    assert told["1σ of the longer axis"][0] == "30 m"
-    assert told["Innovation ± 2σ"] == ("+2.5 ± 2.0", False)
+    items = whereabouts(air.state)
+    assert items["State"] == ("lost", False)
+    assert items["Position"][0] == "49.50000, -57.90000"
+    assert items["1σ of the longer axis"][0] == "30 m"
+    assert items["Innovation ± 2σ"] == ("+2.5 ± 2.0", False)
 
 
 def test_only_the_first_bridge_is_heard(air: Air) -> None:

@@ -8,7 +8,7 @@ import pytest
 from magbridge.errors import OutOfRange
 from magbridge.field.grid import AnomalyGrid
 from magbridge.navigate import Options, position_bound
-from magbridge.navigate.bound import told
+from magbridge.navigate.bound import as_dataset
 from magbridge.navigate.draw import draw_bound
 
 TRACK = ([1.4e9, 1.4e9 + 7200, 1.4e9 + 14400], [49.48, 49.5, 49.5], [-57.95, -57.9, -57.85])
@@ -75,7 +75,7 @@ def test_its_sentence_says_when_it_is_best(grid, options):
         (np.linspace(50.0, 90.0, bound.time.size), "at best 50 m at the start, at the end 90 m"),
         (np.linspace(90.0, 50.0, bound.time.size), f"at best 50 m after {np.ptp(bound.time) / 3600.0:.1f} h"),
     ):
-        assert told(bound._replace(sigma=sigma), grid).attrs["findings"].startswith(words)
+        assert as_dataset(bound._replace(sigma=sigma), grid).attrs["findings"].startswith(words)
 
 
 def test_its_picture(grid, options, tmp_path):

@@ -62,14 +62,14 @@ def test_a_log_against_its_map(folder, capsys):
     )
     assert code == 0
     said = capsys.readouterr()
-    told = json.loads(said.out)
-    assert told["findings"] == said.err == ""
+    result = json.loads(said.out)
+    assert result["findings"] == said.err == ""
     track = read(folder / "out.nc")
     error = np.hypot(track["error_north"], track["error_east"])
-    assert told["error_m"] == pytest.approx(float((error**2).mean()) ** 0.5)
+    assert result["error_m"] == pytest.approx(float((error**2).mean()) ** 0.5)
     alone = np.hypot(track["error_north"] - track["north"], track["error_east"] - track["east"])
-    assert told["dead_reckoning_error_m"] == pytest.approx(float((alone**2).mean()) ** 0.5)
-    assert 0.0 < told["vouched"] <= 1.0
+    assert result["dead_reckoning_error_m"] == pytest.approx(float((alone**2).mean()) ** 0.5)
+    assert 0.0 < result["vouched"] <= 1.0
     assert float(error[-100:].mean()) < 150.0
     assert picture.stat().st_size > 40_000
 

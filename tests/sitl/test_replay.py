@@ -155,8 +155,8 @@ def test_a_velocity_is_told_as_a_track() -> None:
 def test_a_position_of_any_turn_and_a_depth_that_is_none_are_told(tmp_path: Path) -> None:
     row = {"latitude": 49.5, "longitude": 302.0, "depth": 1e300, "water_speed": 1e300}
     said = Codec(255, 190).parse(b"".join(Autopilot(load_config(config(tmp_path)), 0).row(4, row)))
-    (told,) = [message for message in said if message.name == "GLOBAL_POSITION_INT"]
-    assert (told["lat"], told["lon"], told["alt"]) == (495_000_000, -580_000_000, 0)
+    (sent,) = [message for message in said if message.name == "GLOBAL_POSITION_INT"]
+    assert (sent["lat"], sent["lon"], sent["alt"]) == (495_000_000, -580_000_000, 0)
     assert [message.name for message in said] == ["GLOBAL_POSITION_INT"]
 
 

@@ -42,8 +42,8 @@ def diagnosing(folder: Path, repetitions: int) -> list[Row]:  # noqa: ARG001  (o
         apart(IN_ANOTHER, 12, count, size)
         for size, count in ((0.0, 0), (NIGHTLY, 0), (0.0, MONTH), (MONTHLY, MONTH))
     )
-    told = ("seconds", "processor seconds", "samples", "verdict", "causes", "MB")
-    detail = {name: [run[k] for run in (night, found, month, loud)] for k, name in enumerate(told)}
+    fields = ("seconds", "processor seconds", "samples", "verdict", "causes", "MB")
+    detail = {name: [run[k] for run in (night, found, month, loud)] for k, name in enumerate(fields)}
     slope = float(np.log(month[1] / night[1]) / np.log(month[2] / night[2]))
     share = f"{month[2] / night[2]:.0f} times 12 h"
     return [

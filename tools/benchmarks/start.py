@@ -67,6 +67,8 @@ def imports(folder: Path) -> list[str]:
             link.recv(65536)
         finally:
             process.terminate()
-        told = process.communicate()[1]
-    names = {name.partition(".")[0] for name in re.findall(r"^import time:.*\| +(\S+)$", told, re.MULTILINE)}
+        listing = process.communicate()[1]
+    names = {
+        name.partition(".")[0] for name in re.findall(r"^import time:.*\| +(\S+)$", listing, re.MULTILINE)
+    }
     return sorted(name for name in names - sys.stdlib_module_names if not name.startswith("_"))

@@ -51,8 +51,8 @@ def fit_cubic(data: Observations, order: int = 3) -> Fit:
     check_scales(samples, start)
     covariance = covariance_of(found.normal.hessian / noise.sigma**2 + prior.precision)
     plain = polynomial_samples(data, exponents)
-    own = NoiseModel(noise.sigma * PLAIN)  # A is near I, so the sensor's noise is the magnitude's
-    return assemble(data, plain, ranges, exponents, start, covariance, own, "cubic")
+    as_magnitude = NoiseModel(noise.sigma * PLAIN)  # A is near I, so the sensor's noise is the magnitude's
+    return assemble(data, plain, ranges, exponents, start, covariance, as_magnitude, "cubic")
 
 
 def _start(data: Observations) -> NDArray[np.float64]:

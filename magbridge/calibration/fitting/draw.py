@@ -63,10 +63,12 @@ def draw_fit(calibration: Calibration, data: Observations, path: str | Path) -> 
         axis.set_xlabel(name)
     axes[0, 0].set_ylabel(f"as read, nT: {_rms(read):.0f} RMS")
     axes[1, 0].set_ylabel(f"corrected, nT: {_rms(left):.2f} RMS")
-    told = {"a colour for each run": dots, "2 sigma of the sensor's noise": band}
+    legend = {"a colour for each run": dots, "2 sigma of the sensor's noise": band}
     if beyond.any():
-        told[f"beyond the scale: {beyond.sum()} of {len(data)}, up to {np.abs(left).max():.0f} nT"] = above
-    figure.legend(told.values(), told, loc="outside upper right", ncols=len(told), fontsize=8, frameon=False)
+        legend[f"beyond the scale: {beyond.sum()} of {len(data)}, up to {np.abs(left).max():.0f} nT"] = above
+    figure.legend(
+        legend.values(), legend, loc="outside upper right", ncols=len(legend), fontsize=8, frameon=False
+    )
     with atomic_path(path) as partial:
         figure.savefig(partial, dpi=110)
 

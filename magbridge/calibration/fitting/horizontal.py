@@ -68,8 +68,10 @@ def fit_horizontal(data: Observations, order: int = 0) -> Fit:  # noqa: ARG001  
         x = found.x
         sigma = float(np.sqrt(np.mean((misfit(x, sigma)[:-12] * sigma) ** 2)))
     covariance = np.linalg.inv(found.jac.T @ found.jac)
-    map_ = np.array([(_own(x + h, unit) - _own(x - h, unit)) / 2e-6 for h in 1e-6 * np.eye(12)]).T
-    coefficients = _own(x, unit)
+    map_ = np.array(
+        [(_coefficients(x + h, unit) - _coefficients(x - h, unit)) / 2e-6 for h in 1e-6 * np.eye(12)]
+    ).T
+    coefficients = _coefficients(x, unit)
     check_scales(samples, coefficients)
     noise = estimate_noise(residuals_of(samples, coefficients), samples.steps, 9.0)
     return assemble(
@@ -78,7 +80,7 @@ def fit_horizontal(data: Observations, order: int = 0) -> Fit:  # noqa: ARG001  
     )  # fmt: skip
 
 
-def _own(x: FloatArray, unit: float) -> FloatArray:
+def _coefficients(x: FloatArray, unit: float) -> FloatArray:
     """Return the nine coefficients (nT) for B and T: A of ``B = R A``, and T."""
     _, A = polar(np.eye(3) + x[:9].reshape(3, 3))
     a = unit * (A - np.eye(3))

@@ -44,11 +44,11 @@ def unfiltered(data: Observations, corner: float) -> Observations:
     if len(data) < 3:
         return data
     tau = 1.0 / (2.0 * np.pi * corner)
-    told = float(np.ptp(data.time))
-    if tau > told:
+    duration = float(np.ptp(data.time))
+    if tau > duration:
         raise CalibrationError(
             f"filter corner = {corner:g} Hz: its time constant of {tau:.3g} s is longer than the data "
-            f"({told:.3g} s)"
+            f"({duration:.3g} s)"
         )
     reach = max(int(np.ceil(0.5 * REACH * tau / np.median(np.diff(data.time)))), 1)
     stretch = np.cumsum(data.steps != 1)

@@ -54,12 +54,12 @@ def fit_per_run(data: Observations, order: int = 3) -> Fit:
         if rows.sum() < FEWEST:
             continue
         runs += 1
-        part, z, own = single.part(rows), np.zeros(9), NoiseModel(noise.sigma)
+        part, z, scatter = single.part(rows), np.zeros(9), NoiseModel(noise.sigma)
         for _ in range(3):
-            found = gauss_newton(part, prior, own, z)
+            found = gauss_newton(part, prior, scatter, z)
             z = found.z
-            own = estimate_noise(residuals_of(part, prior.coefficients(z)), part.steps, 5.0)
-        Lambda = found.normal.hessian / own.sigma**2 + prior.precision
+            scatter = estimate_noise(residuals_of(part, prior.coefficients(z)), part.steps, 5.0)
+        Lambda = found.normal.hessian / scatter.sigma**2 + prior.precision
         precision += np.kron(np.outer(typical, typical), Lambda)
         right += np.kron(typical, Lambda @ prior.coefficients(z))
     if runs <= order:
