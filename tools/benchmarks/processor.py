@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import gc
 import time
-from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from statistics import median
 
@@ -55,57 +55,56 @@ def processor(folder: Path, repetitions: int) -> list[Row]:
 
 
 def _measure(folder: Path, repetitions: int, *, moving: bool) -> list[Row]:
-    pipeline = set_up(load(write_config(folder)), Start(BEGIN_US))
-    feed, peer, log = Feed(moving=moving), Peer(), TlogWriter(folder / "logs")
-    bridge, decode, encode, logged = [], [], [], []
-    gc.collect()
-    gc.freeze()
-    put = 0
-
-    def live(edge: Edge) -> None:
-        """Feed the bridge, and wait until the log's thread has written every record."""
-        nonlocal put
-        drive(pipeline, edge, log, lambda _: None)
-        put = pipeline.journal.count
-        while log.records + log.lost < put:
-            time.sleep(0.01)
-
-    counts: Counter[str] = Counter()
-    for repetition in range(repetitions + 1):
-        events = list(feed.events(SECONDS, HERTZ, BEGIN_US + repetition * SECONDS * 1_000_000))
-        heard = [event.data for event in events if event.channel is Channel.LINK]
-        edge = Edge(events)
-        bridge.append(spent(lambda edge=edge: live(edge)))
-        decode.append(spent(lambda heard=heard: peer.decode(heard)))
-        messages = peer.arguments(bytes(edge.sent))
-        encode.append(spent(lambda messages=messages: peer.encode(messages)))
-        kept = [peer.sensor_bytes(event.data) for event in events if event.channel is Channel.SENSOR]
-        logged.append(spent(lambda kept=kept: peer.encode(kept)))
-        counts.update(kind.__name__ for kind, _ in messages)
-    log.close()
-    gc.unfreeze()
     state = "masses in motion" if moving else "masses at rest"
-    link = [d + e for d, e in zip(decode, encode, strict=True)]
+    times, messages = _times(folder, repetitions, moving=moving)
+    link = [d + e for d, e in zip(times["decode"], times["encode"], strict=True)]
     floors = {
         "pymavlink, link": link,
-        "pymavlink, link and log": [one + more for one, more in zip(link, logged, strict=True)],
+        "pymavlink, link and log": [a + b for a, b in zip(link, times["encode_log"], strict=True)],
     }
-    each = 1e6 / (SECONDS * HERTZ)
+    detail = {f"{name}_us": median(times[name]) for name in ("decode", "encode", "encode_log")}
     return [
         Row(
             f"processor time a sample, {state}",
-            median(bridge[1:]) * each,  # the first repetition warms up
+            median(times["bridge"]),
             "us",
-            median(floor[1:]) * each,
+            median(floor),
             name,
-            median([b / f for b, f in zip(bridge[1:], floor[1:], strict=True)]),
+            median([b / f for b, f in zip(times["bridge"], floor, strict=True)]),
             most=BUDGET,
-            detail={
-                "decode_us": median(decode[1:]) * each,
-                "encode_us": median(encode[1:]) * each,
-                "encode_log_us": median(logged[1:]) * each,
-                "messages_out": sum(counts.values()) / (SECONDS * HERTZ * (repetitions + 1)),
-            },
+            detail=detail | {"messages_out": messages},
         )
         for name, floor in floors.items()
     ]
+
+
+def _times(folder: Path, repetitions: int, *, moving: bool) -> tuple[dict[str, list[float]], float]:
+    """Return the µs that a sample takes in each repetition, by what is done; and the messages it sends."""
+    pipeline = set_up(load(write_config(folder)), Start(BEGIN_US))
+    feed, peer, log = Feed(moving=moving), Peer(), TlogWriter(folder / "logs")
+    samples, messages = SECONDS * HERTZ, 0
+    times: dict[str, list[float]] = {"bridge": [], "decode": [], "encode": [], "encode_log": []}
+
+    def live(edge: Edge) -> None:
+        """Feed the bridge, and wait until the log's thread has written every record."""
+        drive(pipeline, edge, log, lambda _: None)
+        while log.records + log.lost < pipeline.journal.count:
+            time.sleep(0.01)
+
+    gc.collect()
+    gc.freeze()
+    for repetition in range(repetitions + 1):
+        events = list(feed.events(SECONDS, HERTZ, BEGIN_US + repetition * SECONDS * 1_000_000))
+        edge = Edge(events)
+        bridge = spent(partial(live, edge))
+        heard = [event.data for event in events if event.channel is Channel.LINK]
+        sent = peer.arguments(bytes(edge.sent))
+        kept = [peer.sensor_bytes(event.data) for event in events if event.channel is Channel.SENSOR]
+        floors = (partial(peer.decode, heard), partial(peer.encode, sent), partial(peer.encode, kept))
+        if repetition:  # the first one warms up
+            messages += len(sent)
+            for name, seconds in zip(times, (bridge, *map(spent, floors)), strict=True):
+                times[name].append(1e6 * seconds / samples)
+    log.close()
+    gc.unfreeze()
+    return times, messages / (samples * repetitions)
