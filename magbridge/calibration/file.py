@@ -107,7 +107,15 @@ def decode_calibration(data: bytes, file: str | Path = "cal.json") -> Calibratio
 
 
 def load(path: str | Path) -> Calibration:
-    """Read ``cal.json``; errors as :func:`decode_calibration`, or FormatError if it cannot be opened."""
+    """Read ``cal.json``.
+
+    Raises
+    ------
+    FormatError
+        It cannot be opened, or as :func:`decode_calibration`.
+    CalibrationError
+        As :func:`decode_calibration`.
+    """
     try:
         data = Path(path).read_bytes()
     except OSError as problem:
@@ -116,7 +124,13 @@ def load(path: str | Path) -> Calibration:
 
 
 def save(calibration: Calibration, path: str | Path) -> None:
-    """Write ``cal.json``: whole, or not at all."""
+    """Write ``cal.json``: whole, or not at all.
+
+    Raises
+    ------
+    WriteError
+        The file cannot be written; what was there before is as it was.
+    """
     with atomic_path(path) as beside:
         beside.write_bytes(encode_calibration(calibration))
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magbridge.errors import FormatError, OutOfRange
-from magbridge.field.earth import metres_per_degree
+from magbridge.field.earth import metres_per_degree, wrap
 from magbridge.field.spline import WEIGHTS, coefficients, weights
 
 __all__ = ["AnomalyGrid", "Local"]
@@ -133,7 +133,7 @@ class AnomalyGrid:
         depth : float, optional
             m below the surface; default the map's own height.
         """
-        u = ((longitude - self._x0 + 180.0) % 360.0 - 180.0) / self._dx
+        u = wrap(longitude - self._x0) / self._dx
         if u < 0.0:  # a grid may span more than half the globe
             u += 360.0 / self._dx
         v = (latitude - self._y0) / self._dy
@@ -177,7 +177,7 @@ class AnomalyGrid:
         )
         rows, columns = self._whole.shape
         with np.errstate(invalid="ignore"):
-            u = ((lon - self._x0 + 180.0) % 360.0 - 180.0) / self._dx
+            u = wrap(lon - self._x0) / self._dx
             u = np.where(u < 0.0, u + 360.0 / self._dx, u)
             v = (lat - self._y0) / self._dy
             inside = (u >= 0.0) & (u <= columns) & (v >= 0.0) & (v <= rows)

@@ -161,10 +161,19 @@ def read_chunks(paths: Paths, rows: int = 65536, *, required: Iterable[str] = ()
 def write(dataset: xr.Dataset, path: str | os.PathLike[str]) -> None:
     """Write a deployment; `path` is complete or as it was before.
 
+    Parameters
+    ----------
+    dataset : Dataset (time)
+        With columns as :func:`read` returns them.
+    path : path
+        Its suffix chooses the format.
+
     Raises
     ------
     FormatError
         The suffix is not that of a format that can be written.
+    WriteError
+        The file cannot be written.
     """
     with Writer(path) as writer:
         writer.append(dataset)

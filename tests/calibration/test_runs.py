@@ -85,7 +85,7 @@ def test_boresight_is_found_and_makes_the_vector_right(glider: Gliders) -> None:
 
 
 def test_table_1_sees_63_of_90_coefficients(glider: Gliders) -> None:
-    """Ballast at two positions: squares and cubes of it are not to be told (SCIENCE, section 2)."""
+    """Ballast at two positions: squares and cubes of it cannot be told apart."""
     runs = glider(0, 2).runs
     held = np.array([np.median(runs.parameters[runs.runs == r], axis=0) for r in runs.runs])
     samples = polynomial_samples(replace(runs, parameters=held), full_order(2, 3))
