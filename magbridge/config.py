@@ -34,6 +34,8 @@ NotNegative = Annotated[float, Meta(ge=0, le=1e9)]
 Rate = Annotated[float, Meta(ge=-1e9, le=1e9)]
 Name = Annotated[str, Meta(min_length=1)]
 SystemId = Annotated[int, Meta(ge=1, le=255)]
+Baudrate = Annotated[int, Meta(gt=0, le=20_000_000)]
+"""Bounded: what does not fit 32 bits is refused only when the port is opened."""
 
 
 class Sensor(Table, frozen=True):
@@ -56,7 +58,7 @@ class Sensor(Table, frozen=True):
 
     driver: str
     port: Name
-    baudrate: Annotated[int, Meta(gt=0)] = 9600
+    baudrate: Baudrate = 9600
     timeout: Positive = 10.0
     options: dict[str, Any] = msgspec.field(default_factory=dict)
 
@@ -88,8 +90,8 @@ class Link(Table, frozen=True):
     system: SystemId = 1
     component: SystemId = 191
     autopilot: SystemId = 1
-    baudrate: Annotated[int, Meta(gt=0)] = 57600
-    signing_key: str | None = None
+    baudrate: Baudrate = 57600
+    signing_key: Name | None = None
     parameters: Name | None = None
 
     def __post_init__(self) -> None:
@@ -122,7 +124,7 @@ class Telemetry(Table, frozen=True):
 class CalibrationFile(Table, frozen=True):
     """``[calibration]``: the ``cal.json`` to correct with."""
 
-    file: str
+    file: Name
 
 
 class Align(Table, frozen=True):
@@ -171,7 +173,7 @@ class Navigation(Table, frozen=True):
         Prior uncertainties and settings of the position filter: :class:`magbridge.navigate.Options`.
     """
 
-    map: str
+    map: Name
     fix: str
     rate: NotNegative | None = None
     depth: NotNegative = 0.0

@@ -74,6 +74,12 @@ def test_a_file_from_windows_is_read(tmp_path: Path) -> None:
         ),
         ('url = "udpout:192.0.2.1:14550"', 'url = ""', "link.url: expected `str` of length >= 1"),
         ('port = "/dev/ttyUSB0"', 'port = ""', "sensor.port: expected `str` of length >= 1"),
+        (
+            'driver = "hmr2300"',
+            'driver = "hmr2300"\nbaudrate = 99999999999',
+            "sensor.baudrate: expected `int` <= 20",
+        ),
+        ("[telemetry", "signing_key = ''\n[telemetry", "link.signing_key: expected `str` of length >= 1"),
         ("[telemetry", "component = 1\n[telemetry", "link: component: another than the autopilot's, 1"),
         ("HIGHRES_IMU = 0", "HIGHRES_IMU = nan", "publish.HIGHRES_IMU: expected `float` "),
         ("HIGHRES_IMU = 0", "HIGHRES_IMU = inf", "publish.HIGHRES_IMU: expected `float` <= 1000000000"),

@@ -1,7 +1,7 @@
 """What the bridge needs of a port: bytes in and out, never blocking, and a clear error when it is gone.
 
 A port that is gone raises :class:`PortError` once and is closed; :meth:`Port.open` may then be tried again.
-Writing never blocks: what a slow reader does not take is dropped and counted.
+Writing never blocks: what a slow reader does not take waits while it is new, then is dropped and counted.
 """
 
 from __future__ import annotations
@@ -48,7 +48,14 @@ class Port(ABC):
 
     @abstractmethod
     def write(self, data: bytes) -> None:
-        """Send `data` whole or drop it; raises :class:`PortError` when the port is gone."""
+        """Send each message in `data` whole or drop it; raises :class:`PortError` when the port is gone."""
+
+    def flush(self) -> None:  # noqa: B027 - most ports keep nothing
+        """Go on sending what a slow line had no room for; raises :class:`PortError` when the port is gone."""
+
+    def blocked(self) -> list[int]:
+        """Return the file descriptors that take more of that once they are writable."""
+        return []
 
     def write_all(self, data: bytes) -> None:
         """Send `data` whole, waiting for a slow reader; for a replay, which has no deadline."""

@@ -19,7 +19,7 @@ from magbridge.bridge.events import Clock, Event, Start
 from magbridge.bridge.journal import declarations
 from magbridge.bridge.live import LiveEdge
 from magbridge.bridge.pipeline import Pipeline
-from magbridge.bridge.serial_port import SerialPort
+from magbridge.bridge.serial_port import serial_line
 from magbridge.bridge.sockets import open_link
 from magbridge.calibration import file as calibration_file
 from magbridge.config import Config, load
@@ -106,11 +106,11 @@ def run(path: Path, *, aloud: bool = False) -> None:
     keeper = Keeper(config)
     clock = Clock()
     pipeline = set_up(config, keeper.start(clock.now_us()))
+    sensor = serial_line(config.sensor.port, config.sensor.baudrate, str(config.path), "sensor.port")
+    link = open_link(config.link.url, config.link.baudrate, str(config.path))
     if aloud:
         said = pipeline.component.announcer.said
         Thread(target=_say, args=(said,), name="voice", daemon=True).start()
-    sensor = SerialPort(config.sensor.port, config.sensor.baudrate)
-    link = open_link(config.link.url, config.link.baudrate, str(config.path))
     # the link first, so that a sensor's port that does not open can be reported over it
     edge = LiveEdge({Channel.LINK: link, Channel.SENSOR: sensor}, clock)
     keeper.attach(edge)

@@ -7,28 +7,39 @@ import glob
 import os
 import select
 import threading
+import time
 from contextlib import suppress
+from importlib.util import find_spec
+from math import inf
 from typing import Any
+from urllib.parse import urlsplit
 
 import serial
 
-from magbridge.bridge.port import CHUNK, Port
-from magbridge.errors import PortError
+from magbridge.bridge.port import CHUNK
+from magbridge.bridge.stream import Stream
+from magbridge.errors import ConfigError, PortError
 
-__all__ = ["SerialPort"]
+__all__ = ["SerialPort", "serial_line"]
 
 PIECE = 4095
 """Bytes that one read of a terminal device returns at most, however many are waiting."""
 SOON = 0.02
 """s within which the next piece of a backlog can be read, even on a busy computer."""
 
+LEAD = 0.05
+"""s of the line's time that are handed to the system at once."""
+HELD = 20_000
+"""Bytes that a line which does not say how much waits in it holds when it is full: a pseudo-terminal does."""
 
-class SerialPort(Port):
+
+class SerialPort(Stream):
     """A serial line by device name, pattern (``/dev/ttyUSB*``) or pyserial URL."""
 
     def __init__(self, name: str, baudrate: int) -> None:
-        super().__init__(name)
+        super().__init__(name, round(baudrate / 10 * LEAD))
         self.baudrate = baudrate
+        self._idle_at = -inf
         self._serial: Any = None
         self._fd = -1
         self._pump: _Pump | None = None
@@ -94,25 +105,40 @@ class SerialPort(Port):
                 data += os.read(self._fd, CHUNK)
         return data
 
-    def write(self, data: bytes) -> None:
-        """Write what the line's buffer takes; the rest of a message goes out before the next message.
+    def blocked(self) -> list[int]:
+        """Return the descriptor, but not of a line that we pace: it is writable all the time."""
+        return super().blocked() if self._idle_at == -inf else []
 
-        So a line that is too slow loses whole messages, which are counted, and never half of one.
+    def _room(self) -> bool:
+        """Say whether less than 256 bytes wait in the system, for only then is a line writable.
+
+        A pseudo-terminal does not say what waits in it and is writable until it is full. Once it was, it gets
+        no more than its baud rate carries.
         """
+        if self._pump is not None:
+            return True
+        now = time.monotonic()
+        if self._idle_at > now + LEAD:
+            return False
+        room = bool(select.select([], [self._fd], [], 0)[1])
+        with suppress(OSError):  # just unplugged: writing will tell
+            if not room and getattr(self._serial, "out_waiting", -1) == 0:
+                self._idle_at = now + HELD * 10 / self.baudrate
+        return room
+
+    def _put(self, data: bytearray) -> int:
         try:
             if self._pump is not None:
                 self._serial.write(data)
-                return
-            if self._begun:
-                del self._begun[: os.write(self._fd, self._begun)]
-            if self._begun:
-                self.overran(data)
-            else:
-                self._begun += data[os.write(self._fd, data) :]
+                return len(data)
+            sent = os.write(self._fd, data)
         except BlockingIOError:
-            self.overran(data)
+            return 0
         except (serial.SerialException, OSError) as error:
             raise self.lost(_reason(error)) from error
+        if self._idle_at > -inf:
+            self._idle_at = max(self._idle_at, time.monotonic()) + sent * 10 / self.baudrate
+        return sent
 
     def close(self) -> None:
         """Close the device."""
@@ -120,8 +146,38 @@ class SerialPort(Port):
             self._pump.close()
         if self._serial is not None:
             self._serial.close()
-        self._serial, self._fd, self._pump = None, -1, None
-        self._begun.clear()
+        self._serial, self._fd, self._pump, self._idle_at = None, -1, None, -inf
+        self._forget()
+
+
+def serial_line(name: str, baudrate: int, source: str, key: str) -> SerialPort:
+    """Return the (unopened) port of a serial line.
+
+    Parameters
+    ----------
+    name : str
+        A device, a pattern or a pyserial URL.
+    baudrate : int
+    source, key : str
+        The file and the key that `name` comes from, for the error.
+
+    Raises
+    ------
+    ConfigError
+        No name, a URL of a kind that pyserial does not know, or one of a socket without HOST:PORT.
+    """
+    kind, url, _ = name.partition("://")
+    known = kind.isalnum() and find_spec(f"serial.urlhandler.protocol_{kind.lower()}")
+    if not name or (url and not known):
+        raise ConfigError(source, key, f"expected a device, socket://, rfc2217:// or loop://, got {name!r}")
+    if kind in ("socket", "rfc2217"):
+        try:
+            whole = urlsplit(name).hostname and urlsplit(name).port
+        except ValueError:
+            whole = None
+        if not whole:
+            raise ConfigError(source, key, f"expected {kind}://HOST:PORT, got {name!r}")
+    return SerialPort(name, baudrate)
 
 
 def _reason(error: Exception) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import select
 import socket
 import time
 from collections.abc import Callable
@@ -10,13 +11,14 @@ from contextlib import suppress
 from functools import partial
 
 from magbridge.bridge.port import CHUNK, Port
-from magbridge.bridge.serial_port import SerialPort
+from magbridge.bridge.serial_port import serial_line
+from magbridge.bridge.stream import Stream
 from magbridge.errors import ConfigError, PortError
 
 __all__ = ["LINKS", "TcpClient", "TcpServer", "UdpPort", "open_link"]
 
-PENDING = 262144
-"""Bytes that may wait for a slow reader of a stream."""
+UNSENT = 4096
+"""Bytes that may wait in the system for a slow connection; the rest waits here, where it can be dropped."""
 PEER_TIMEOUT = 30.0
 """s without a packet after which a UDP peer is forgotten."""
 AWAY = (errno.ECONNREFUSED, errno.ENETUNREACH, errno.EHOSTUNREACH, errno.ENETDOWN, errno.EPERM)
@@ -114,14 +116,13 @@ class UdpPort(Port):
         self._socket = None
 
 
-class _Stream(Port):
-    """One TCP connection, with what its reader has not yet taken."""
+class _Connection(Stream):
+    """One TCP connection."""
 
     def __init__(self, name: str, address: tuple[str, int]) -> None:
-        super().__init__(name)
+        super().__init__(name, UNSENT)
         self._address = address
         self._connection: socket.socket | None = None
-        self._pending = bytearray()
 
     def fds(self) -> list[int]:
         """Return the connection's descriptor, if there is one."""
@@ -141,18 +142,21 @@ class _Stream(Port):
         return data
 
     def write(self, data: bytes) -> None:
-        """Send `data`, or keep it until the reader takes more; a full backlog drops it whole."""
+        """Send as :meth:`Stream.write` does; without a connection, `data` are dropped."""
         if self._connection is None:
             self.dropped += len(data)
-            return
-        if len(self._pending) + len(data) > PENDING:
-            self.overran(data)
-            data = b""
-        self._pending += data
+        else:
+            super().write(data)
+
+    def _room(self) -> bool:
+        return self._connection is not None and bool(select.select([], [self._connection], [], 0)[1])
+
+    def _put(self, data: bytearray) -> int:
+        assert self._connection is not None
         try:
-            del self._pending[: self._connection.send(self._pending)]
+            return self._connection.send(data)
         except BlockingIOError:
-            pass
+            return 0
         except OSError as error:
             raise self.lost(error.strerror) from error
 
@@ -167,6 +171,7 @@ class _Stream(Port):
         """Make `connection` the one to use."""
         connection.setblocking(False)
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, UNSENT)
         self.drop()
         self._connection = connection
 
@@ -175,10 +180,10 @@ class _Stream(Port):
         if self._connection is not None:
             self._connection.close()
         self._connection = None
-        self._pending.clear()
+        self._forget()
 
 
-class TcpClient(_Stream):
+class TcpClient(_Connection):
     """``tcp``: connects to a server."""
 
     @property
@@ -198,7 +203,7 @@ class TcpClient(_Stream):
         self.drop()
 
 
-class TcpServer(_Stream):
+class TcpServer(_Connection):
     """``tcpin``: waits for a client; a new one takes the place of the old, which may be dead."""
 
     def __init__(self, name: str, address: tuple[str, int]) -> None:
@@ -233,12 +238,10 @@ class TcpServer(_Stream):
         except PortError:
             return b""
 
-    def write(self, data: bytes) -> None:
+    def flush(self) -> None:
         """Send to the client; a client that leaves is no error."""
-        try:
-            super().write(data)
-        except PortError:
-            self.dropped += len(data)
+        with suppress(PortError):
+            super().flush()
 
     def lost(self, reason: object) -> PortError:
         """Drop the client: the port itself is well."""
@@ -275,14 +278,14 @@ def open_link(url: str, baudrate: int, source: str = "bridge.toml") -> Port:
     Raises
     ------
     ConfigError
-        An unknown kind of link, or an address that is not HOST:PORT.
+        An unknown kind of link or of serial URL, or an address that is not HOST:PORT.
     """
     kind, colon, address = url.partition(":")
     if kind not in LINKS:
         if colon and kind.isalnum() and kind != "serial" and not address.startswith("//"):
             known = ", ".join(LINKS)
             raise ConfigError(source, "link.url", f"expected {known} or a serial device, got {url!r}")
-        return SerialPort(url.removeprefix("serial:"), baudrate)
+        return serial_line(url.removeprefix("serial:"), baudrate, source, "link.url")
     try:
         return LINKS[kind](url, _address(address))
     except ValueError as error:

@@ -45,6 +45,10 @@ class Extractor:
             if isinstance(value, str) != (field.code == "s"):
                 kind = "text" if field.code == "s" else "a number"
                 raise ConfigError(path, f"{key}.match.{field.name}", f"{kind}, not {value!r}")
+            if isinstance(value, str) and len(value.encode()) > field.struct.size:
+                raise ConfigError(
+                    path, f"{key}.match.{field.name}", f"at most {field.struct.size} bytes, not {value!r}"
+                )
 
     def value(self, payload: bytes) -> float | None:
         """Return the value, NaN where the sender does not know it, None where the message does not match."""

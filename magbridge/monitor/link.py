@@ -55,3 +55,4 @@ class StationLink:
             requests = self.state.due(now)
         for name, fields in requests:
             self.port.write(self._codec.pack(name, **fields))
+        self.port.flush()

@@ -92,7 +92,7 @@ def test_a_serial_line_that_is_too_slow(make_rig: MakeRig, table: Row) -> None:
     rig.until_said("bytes not sent so far", mark, 30.0)
     table(
         "autopilot's serial line too slow: nobody reads it",
-        "whole messages are dropped; "
+        "whole messages are dropped, those first that a newer one replaces; "
         'STATUSTEXT "link: too slow, 1740 bytes not sent so far", again every 10 s',
         f"{back:.2f} s",
         "messages to the autopilot, visible in MAG_FIELD's `sequence`; the log has them all",

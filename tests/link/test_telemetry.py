@@ -96,6 +96,10 @@ def test_the_messages_own_time():
             r"telemetry.p.match.nam: .* no field 'nam'",
         ),
         (Telemetry("NAMED_VALUE_FLOAT", "value", match={"name": 3}), r"telemetry.p.match.name: text, not 3"),
+        (
+            Telemetry("NAMED_VALUE_FLOAT", "value", match={"name": "battery_position"}),
+            r"telemetry.p.match.name: at most 10 bytes, not 'battery_position'",
+        ),
         (Telemetry("BATTERY_STATUS", "id", match={"id": "a"}), r"telemetry.p.match.id: a number, not 'a'"),
     ],
 )
