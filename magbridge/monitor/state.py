@@ -106,7 +106,7 @@ class State:
         self.trace: deque[Point] = deque()
         self.texts: deque[Text] = deque(maxlen=200)
         self.parameters: dict[str, Parameter] = {}
-        self._count = 0
+        self._count = self._lost_before = 0
         self._sequence = -1
         self._piece = (0, 0)
         self._beat = self._asked = -inf
@@ -183,6 +183,8 @@ class State:
         if self.status["uptime"] < before:  # the bridge restarted, perhaps with other parameters
             self.parameters.clear()
             self._count = 0
+            self.lost = self._lost_before  # its sequence numbers began anew
+        self._lost_before = self.lost
 
     def _navigation(self, message: Message, _: float) -> None:
         self.navigation = message.fields

@@ -61,6 +61,23 @@ def test_a_slow_sensor_is_not_silent(air: Air) -> None:
     assert silence(air.state, NOW + 49) == "no field heard for 13 s"
 
 
+def test_a_restart_loses_nothing(air: Air) -> None:
+    """The sequence numbers begin anew; what was lost before and is lost after counts."""
+    for k in range(100):
+        air.field(NOW + k * 0.1)
+    air.bridge.sequence += 3
+    air.say(NOW + 11, "MAG_STATUS", uptime=11)
+    assert air.state.lost == 3
+    air.bridge = Codec(1, 191)
+    air.bridge.sequence = 200
+    air.field(NOW + 12)
+    air.say(NOW + 12, "MAG_STATUS", uptime=1)
+    assert air.state.lost == 3
+    air.bridge.sequence += 2
+    air.field(NOW + 13)
+    assert air.state.lost == 5
+
+
 def test_figures(air: Air) -> None:
     assert {value for value, _ in measured(air.state).values()} == {"–"}
     air.field(NOW, 52_134.268, x=-4_203.04, sigma_x=1.1, y=nan, latency=0.0042, calibration_id=0xBEEF)
