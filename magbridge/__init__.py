@@ -9,16 +9,15 @@ From logs of calibration runs to corrected samples::
     mb.write(mb.correct_rows(mb.Correction(found.calibration), mb.read("survey.nc")), "corrected.nc")
 
 :func:`magbridge.diagnose.run.diagnose` and :func:`magbridge.navigate.batch.navigate` go on from there. Each
-name is imported when it is first asked for: the bridge itself needs few of them.
+name is imported when it is first asked for: the bridge itself needs few of them. And since the program begins
+here, too, where Ctrl-C would still print a traceback, not even :mod:`typing` is imported at once.
 """
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
-
 from magbridge.version import __version__
 
+TYPE_CHECKING = False  # type checkers take it for true
 if TYPE_CHECKING:
     from magbridge.calibration.correct import Corrector, correct
     from magbridge.calibration.file import load, save
@@ -67,7 +66,9 @@ _HOMES = {
 }
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> object:
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from importlib import import_module  # noqa: PLC0415 - see above
+
     return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
