@@ -8,7 +8,7 @@ from typing import Any, TypeVar, overload
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["metres_per_degree", "offset", "separation", "worse_axis", "wrap"]
+__all__ = ["metres_per_degree", "offset", "separation", "usual", "worse_axis", "wrap"]
 
 EQUATORIAL_RADIUS = 6_378_137.0  # m
 ECCENTRICITY_SQUARED = 6.694_379_990_14e-3  # both WGS84
@@ -82,3 +82,8 @@ def worse_axis(nn: Number, ne: Number, ee: Number) -> Number:
 def wrap(degrees: Number) -> Number:
     """Return an angle, or an array of them, in -180..180 deg."""
     return (degrees + 180.0) % 360.0 - 180.0
+
+
+def usual(longitude: float) -> float:
+    """Return a longitude, deg, of a map across the antimeridian as people write it: 180.01 is -179.99."""
+    return longitude - 360.0 if longitude > 180.0 else longitude

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magbridge.errors import FormatError, OutOfRange
-from magbridge.field.earth import metres_per_degree, wrap
+from magbridge.field.earth import metres_per_degree, usual, wrap
 from magbridge.field.spline import WEIGHTS, coefficients, weights
 
 __all__ = ["AnomalyGrid", "Local"]
@@ -263,9 +263,12 @@ class AnomalyGrid:
         write(self, path)
 
     def __repr__(self) -> str:
+        west, east = float(self.longitude[0]), float(self.longitude[-1])
+        if east - west < 359.0:  # one all around begins where its file does
+            west, east = usual(west), usual(east)
         return (
             f"{self.name} (latitude {self.latitude[0]:.4f} to {self.latitude[-1]:.4f},"
-            f" longitude {self.longitude[0]:.4f} to {self.longitude[-1]:.4f})"
+            f" longitude {west:.4f} to {east:.4f})"
         )
 
 

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from magbridge.errors import OutOfRange
 from magbridge.field.continuation import continued
+from magbridge.field.earth import usual
 from magbridge.field.grid import AnomalyGrid
 from magbridge.files import atomic_path
 
@@ -174,8 +175,9 @@ def draw_steps(steps: Sequence[Step], path: str | Path) -> None:
         )
         axis.set_title(step.title, fontsize=10)
         axis.set_aspect(1.0 / np.cos(np.radians(grid.latitude.mean())))
-        axis.ticklabel_format(useOffset=False)
+        axis.ticklabel_format(axis="y", useOffset=False)
         axis.locator_params(axis="x", nbins=4)
+        axis.xaxis.set_major_formatter(lambda value, _: f"{usual(value):.7g}")
     for axis in axes[len(steps) :]:
         axis.set_axis_off()
     figure.colorbar(image, ax=axes, label="anomaly, nT", shrink=0.8)

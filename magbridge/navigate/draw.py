@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 from numpy.typing import NDArray
 
-from magbridge.field.earth import metres_per_degree
+from magbridge.field.earth import metres_per_degree, usual
 from magbridge.field.grid import AnomalyGrid
 from magbridge.files import atomic_path
 from magbridge.navigate.bound import Bound
@@ -139,8 +139,9 @@ def _map(axis: Axes, grid: AnomalyGrid, longitude: Any, latitude: Any) -> None:
     axis.set_ylim(y - height, y + height)
     axis.set_facecolor("0.92")  # off the map
     axis.set_aspect(1.0 / slender)
-    axis.ticklabel_format(useOffset=False)
+    axis.ticklabel_format(axis="y", useOffset=False)
     axis.xaxis.set_major_locator(MaxNLocator(5))
+    axis.xaxis.set_major_formatter(lambda value, _: f"{usual(value):.7g}")
     axis.set_xlabel("longitude, deg")
     axis.set_ylabel("latitude, deg")
     scale = axis.inset_axes((0.04, 0.05, 0.3, 0.02))
