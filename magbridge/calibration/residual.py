@@ -32,6 +32,7 @@ __all__ = [
     "normal_equations",
     "residuals",
     "residuals_of",
+    "robust_scale",
     "scales_and_offsets",
     "whiten",
 ]
@@ -122,6 +123,11 @@ def residuals_of(samples: Samples, coefficients: FloatArray) -> FloatArray:
         for start in range(0, len(samples.field), CHUNK)
     ]
     return np.concatenate(pieces)
+
+
+def robust_scale(values: FloatArray) -> float:
+    """1-sigma of the bulk of values about zero, outliers or not: 1.48 times their median magnitude."""
+    return 1.4826 * float(np.median(np.abs(values)))
 
 
 def scales_and_offsets(samples: Samples, coefficients: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from magbridge.calibration.followers import ClockEffect
 from magbridge.calibration.instrument import RateEffect
 from magbridge.calibration.model import Calibration
-from magbridge.calibration.residual import residuals, residuals_of
+from magbridge.calibration.residual import residuals, residuals_of, robust_scale
 from magbridge.diagnose.causes.candidates import Candidate, slices
 from magbridge.diagnose.compare.columns import Columns
 from magbridge.diagnose.compare.derivatives import derivatives
@@ -131,7 +131,7 @@ def leveled(problem: Problem, model: Sequence[Candidate], fit: Joint, extended: 
 
 def level(fit: Joint) -> float:
     """Return the 1-sigma of what is left, nT: that of the bulk, not of outliers."""
-    return 1.4826 * float(np.median(np.abs(fit.left - np.median(fit.left))))
+    return robust_scale(fit.left - np.median(fit.left))
 
 
 def settle(

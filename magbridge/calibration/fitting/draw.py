@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from magbridge.calibration.fitting.data import Observations
 from magbridge.calibration.fitting.validate import in_sensor_units
 from magbridge.calibration.model import Calibration
+from magbridge.calibration.residual import robust_scale
 from magbridge.files import atomic_path
 
 __all__ = ["draw_fit"]
@@ -43,7 +44,7 @@ def draw_fit(calibration: Calibration, data: Observations, path: str | Path) -> 
     axes = figure.subplots(2, len(abscissae), sharex="col", sharey="row", squeeze=False)
     noise = calibration.noise.sensor
     # the median, because samples with masses in motion must not set the scale
-    edge = WIDE * max(noise, float(np.median(np.abs(left))) / 0.6745)
+    edge = WIDE * max(noise, robust_scale(left))
     beyond = np.abs(left) > edge
     for values, row in ((read, axes[0]), (np.where(beyond, np.nan, left), axes[1])):
         for axis, x in zip(row, abscissae.values(), strict=True):

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from magbridge.calibration.residual import whiten
+from magbridge.calibration.residual import robust_scale, whiten
 
 __all__ = ["OUTLIER", "NoiseModel", "estimate_noise"]
 
@@ -69,8 +69,8 @@ def estimate_noise(
 
 
 def _robust(e: FloatArray) -> float:
-    """Return the scale of the bulk: 1.48 times the median magnitude, which is sigma for a Gaussian."""
-    return 1.4826 * float(np.median(np.abs(e))) or float(np.abs(e).mean()) or 1e-9
+    """Return :func:`robust_scale`, or the mean magnitude where more than half are zero."""
+    return robust_scale(e) or float(np.abs(e).mean()) or 1e-9
 
 
 def _memory(e: FloatArray, follows: NDArray[np.bool_], doubt: tuple[float, float]) -> float:

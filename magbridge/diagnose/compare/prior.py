@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magbridge.calibration.model import Calibration
-from magbridge.calibration.residual import Samples, whiten
+from magbridge.calibration.residual import Samples, robust_scale, whiten
 from magbridge.calibration.terms import Polynomial
 from magbridge.diagnose.compare.derivatives import derivatives
 from magbridge.diagnose.compare.survey import Survey
@@ -30,7 +30,7 @@ than 20 ppm."""
 
 def level(calibration: Calibration, e: FloatArray) -> float:
     """Return the noise's 1-sigma, nT: the calibration's, or that of the residual e (n,)."""
-    return calibration.noise.sensor or 1.4826 * float(np.median(np.abs(e))) or 1.0
+    return calibration.noise.sensor or robust_scale(e) or 1.0
 
 
 def floor(calibration: Calibration) -> FloatArray:

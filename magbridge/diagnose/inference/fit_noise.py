@@ -9,6 +9,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from scipy.special import gammaln
 
+from magbridge.calibration.residual import robust_scale
 from magbridge.diagnose.compare.columns import Columns
 from magbridge.diagnose.compare.derivatives import CHUNK
 from magbridge.diagnose.compare.past import Past
@@ -51,7 +52,7 @@ def memory_order(residual: FloatArray, slots: NDArray[np.int64]) -> int:
     .. math:: \kappa_p = \frac{c_p - \sum_k a_k c_{p-k}}{v_{p-1}}, \qquad v_p = v_{p-1} (1 - \kappa_p^2)
     """
     n = len(residual)
-    scale = 1.4826 * np.median(np.abs(residual)) + 1e-12
+    scale = robust_scale(residual) + 1e-12
     r = np.clip(residual, -6.0 * scale, 6.0 * scale)
     c = np.array([_product(r, slots, k) for k in range(LONGEST + 1)])
     a, v, costs = np.zeros(0), c[0] + 1e-300, {}
@@ -135,7 +136,7 @@ def fit_noise(
     lags = sliding_window_view(np.append(np.zeros(order), residual), order)[:n, ::-1]
     memory, nu = np.zeros(order), 12.0
     if like is None:
-        weight, scale = np.ones(n), np.full(n, 1.4826 * float(np.median(np.abs(residual))) + 1e-12)
+        weight, scale = np.ones(n), np.full(n, robust_scale(residual) + 1e-12)
     else:
         nu, scale = like.nu, like.scale
         weight = (nu + 1.0) / (nu + ((residual - lags @ like.memory) / scale) ** 2)
@@ -206,7 +207,7 @@ def _tails(v: FloatArray, count: NDArray[np.int64], nu: float) -> tuple[float, F
     """Find the best tails, uphill from `nu`, the level of each sample under them, and the log likelihood."""
     at = TAILS.index(nu)
     square = v * v
-    start = np.full(count.size, float(np.median(np.abs(v))) * 1.4826 + 1e-12)
+    start = np.full(count.size, robust_scale(v) + 1e-12)
     tried = {at: _levels(square, count, nu, start)}
     while True:
         for near in (at - 1, at + 1):

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from magbridge.calibration.residual import robust_scale
 from magbridge.diagnose.compare.columns import Columns
 from magbridge.diagnose.compare.problem import DELAYS, Problem
 from magbridge.diagnose.inference.design import Design, in_threads, kept, normal
@@ -157,11 +158,11 @@ def _sized(P: FloatArray, h: FloatArray, prior: FloatArray, own: slice, spectra:
 
 def _plain(X: Design, residual: FloatArray, prior: FloatArray, centre: FloatArray) -> FloatArray:
     """Least squares as if the noise were white, outliers cut off."""
-    level = 1.4826 * float(np.median(np.abs(residual - np.median(residual)))) + 1e-12
+    level = robust_scale(residual - np.median(residual)) + 1e-12
     P, b = normal(X.rows, residual)
     c = centre + np.linalg.solve(P / level**2 + np.diag(prior), (b - P @ centre) / level**2)
     left = residual - X.times(c)
-    level = 1.4826 * float(np.median(np.abs(left))) + 1e-12
+    level = robust_scale(left) + 1e-12
     cut = np.clip(left, *(np.median(left) + np.array([-8.0, 8.0]) * level))
     return np.asarray(
         c + np.linalg.solve(P / level**2 + np.diag(prior), X.against(cut) / level**2 - prior * (c - centre))

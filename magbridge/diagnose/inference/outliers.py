@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.special import gammaln
 from scipy.stats import chi2
 
+from magbridge.calibration.residual import robust_scale
 from magbridge.diagnose.inference.evidence import LEVEL
 from magbridge.diagnose.inference.fit_noise import TAILS
 from magbridge.diagnose.inference.joint import Joint
@@ -50,7 +51,7 @@ def outliers(fit: Joint, causes: int) -> Outliers | None:
 
 def _mixture(v: FloatArray, nu: float, eps: float) -> tuple[float, FloatArray]:
     """Log likelihood of the mixture after expectation maximisation, and each sample's chance to be wrong."""
-    s, wide = 1.4826 * float(np.median(np.abs(v))), float(np.abs(v).max())
+    s, wide = robust_scale(v), float(np.abs(v).max())
     at_zero = gammaln(0.5 * (nu + 1.0)) - gammaln(0.5 * nu) - 0.5 * np.log(np.pi * nu)
     member = np.zeros(len(v))
     value = -np.inf

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from magbridge.calibration.residual import robust_scale
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.compare.columns import Columns
 from magbridge.diagnose.compare.problem import Problem
@@ -168,8 +169,7 @@ def _calm(
     problem: Problem, model: Sequence[Columns], fit: Joint, order: int, slow: Sequence[Description]
 ) -> Noise:
     """Return the noise that is left when slow curves are fitted, beginning with a noise without memory."""
-    jumps = np.abs(np.diff(fit.left))
-    level = 1.4826 * float(np.median(jumps)) / np.sqrt(2.0) + 1e-12
+    level = robust_scale(np.diff(fit.left)) / np.sqrt(2.0) + 1e-12
     white = np.full(len(problem), level)
     noise = replace(fit.noise, memory=np.zeros(order), scale=white, nu=1e6, innovations=fit.left / level)
     width = np.concatenate([one.widths[1][1] for one in slow])
