@@ -28,7 +28,7 @@ from sitl.scenario import load
 from sitl.stage import Stage
 from sitl.twin import simulate
 
-__all__ = ["demo", "tell"]
+__all__ = ["demo", "summary"]
 
 PARAMETERS = ("battpos", "ballast")
 Floats = NDArray[np.float64]
@@ -110,7 +110,7 @@ def rms(error: Floats) -> float:
     return float(np.sqrt(np.mean(error**2)))
 
 
-def tell(result: dict[str, Any]) -> str:
+def summary(result: dict[str, Any]) -> str:
     """Return the demonstration's result for people to read."""
     rows = [
         ("raw, as the fluxgate reads it", result["raw_rms_nT"]),

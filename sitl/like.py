@@ -17,7 +17,7 @@ from sitl.scenario import Scenario
 from sitl.trajectory import Track
 from sitl.twin import FINE_STEP, Twin
 
-__all__ = ["simulate_like", "where"]
+__all__ = ["placed_at", "simulate_like"]
 
 Array = NDArray[np.float64]
 
@@ -49,7 +49,7 @@ def simulate_like(log: xr.Dataset, scenario: Scenario, seed: int = 0) -> xr.Data
     FormatError
         The log lacks a column that the forward model needs, or one holds nothing.
     """
-    twin = Twin.draw(where(log, scenario), seed)
+    twin = Twin.draw(placed_at(log, scenario), seed)
     measured = twin.measure(*read_track(log, scenario, twin.vehicle.channels))
     replaced = [name for name in log.data_vars if str(name).startswith(("mag_", "reference_field"))]
     own = [
@@ -64,7 +64,7 @@ def simulate_like(log: xr.Dataset, scenario: Scenario, seed: int = 0) -> xr.Data
     return out
 
 
-def where(log: xr.Dataset, scenario: Scenario) -> Scenario:
+def placed_at(log: xr.Dataset, scenario: Scenario) -> Scenario:
     """Return the scenario at the log's median position, starting at the log's first time."""
     latitude, longitude = (_column(log, name) for name in ("latitude", "longitude"))
     place = msgspec.structs.replace(

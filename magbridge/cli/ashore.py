@@ -17,11 +17,11 @@ from magbridge.cli.common import (
     Picture,
     Whole,
     app,
+    check_inputs,
     file_to_write,
     note_losses,
     note_missing,
-    some,
-    tell,
+    print_result,
 )
 from magbridge.progress import track, waiting
 
@@ -45,7 +45,7 @@ def convert(*files: Path, output: Log, heading_reference: Heading = None, json: 
 
     rows, pieces = 0, []
     with Writer(output) as writer:
-        for part in track(read_chunks(some(files, output)), "reading"):
+        for part in track(read_chunks(check_inputs(files, output)), "reading"):
             pieces.append(part.attrs)
             if heading_reference:
                 part.attrs["heading_reference"] = heading_reference
@@ -53,7 +53,7 @@ def convert(*files: Path, output: Log, heading_reference: Heading = None, json: 
             rows += part.sizes["time"]
             names = [str(name) for name in part.data_vars]
     note_losses(*pieces)
-    tell({"file": str(output), "rows": rows, "columns": names}, f"{output}: {rows} rows", json)
+    print_result({"file": str(output), "rows": rows, "columns": names}, f"{output}: {rows} rows", json)
 
 
 @app.command(usage="Usage: magbridge simulate SCENARIO -o FILE [OPTIONS]")
@@ -87,19 +87,19 @@ def simulate(
         Print the result as JSON.
     """
     from magbridge.logs import read, write
-    from sitl.like import simulate_like, where
+    from sitl.like import placed_at, simulate_like
     from sitl.scenario import load
     from sitl.twin import Twin
     from sitl.twin import simulate as simulate_scenario
 
-    some((scenario, *like), output)
-    some((scenario, *like, output), map_output)
+    check_inputs((scenario, *like), output)
+    check_inputs((scenario, *like, output), map_output)
     chosen = load(scenario)
     with waiting("simulating"):
         if like:
             log = read(like)
             note_losses(log.attrs)
-            chosen = where(log, chosen)
+            chosen = placed_at(log, chosen)
             deployment = simulate_like(log, chosen, seed)
         else:
             deployment = simulate_scenario(chosen, seed)
@@ -107,7 +107,7 @@ def simulate(
     if map_output is not None:
         Twin.draw(chosen, seed).anomaly_map().save(map_output)
     rows = deployment.sizes["time"]
-    tell({"file": str(output), "rows": rows, "seed": seed}, f"{output}: {rows} rows", json)
+    print_result({"file": str(output), "rows": rows, "seed": seed}, f"{output}: {rows} rows", json)
 
 
 @app.command(usage="Usage: magbridge map GRID... -o grid.nc [OPTIONS]")
@@ -145,7 +145,7 @@ def map(  # noqa: A001 - the command's name
     from magbridge.field.prepare import draw_steps, prepare
     from magbridge.field.read import read_grid, read_polygon
 
-    some(grids, output, mask)
+    check_inputs(grids, output, mask)
     polygon = read_polygon(mask) if mask else None
     with waiting("preparing"):
         result, steps = prepare([read_grid(path) for path in grids], altitude, passes, polygon, spacing)
@@ -154,7 +154,7 @@ def map(  # noqa: A001 - the command's name
         draw_steps(steps, picture)
     titles = [step.title for step in steps]
     facts = {"file": str(output), "steps": titles, "rms_nT": result.rms}
-    tell(facts, f"{output}: {', '.join(titles)}", json)
+    print_result(facts, f"{output}: {', '.join(titles)}", json)
 
 
 @app.command(usage="Usage: magbridge correct FILE... --calibration cal.json -o FILE [OPTIONS]")
@@ -187,7 +187,7 @@ def correct(*files: Path, calibration: Path, output: Log, json: Json = False) ->
     from magbridge.logs import Writer, read_chunks
     from magbridge.records import Quality
 
-    some(files, output, calibration)
+    check_inputs(files, output, calibration)
     known = load(calibration)
     correction = Correction(known)
     rows, flagged, whole = 0, 0, False
@@ -214,4 +214,4 @@ def correct(*files: Path, calibration: Path, output: Log, json: Json = False) ->
     facts = {"file": str(output), "rows": rows, "flagged": flagged, "flags": +flags}
     named = ", ".join(f"{name} {count}" for name, count in (+flags).items())
     summary = f"{output}: {rows} samples, {flagged} of them flagged" + (f" ({named})" if named else "")
-    tell(facts, summary, json)
+    print_result(facts, summary, json)

@@ -10,7 +10,7 @@ from typing import Annotated
 
 from cyclopts import Parameter, validators
 
-from magbridge.cli.common import Folder, Json, Whole, app, folder_to_write, some, tell
+from magbridge.cli.common import Folder, Json, Whole, app, check_inputs, folder_to_write, print_result
 from magbridge.errors import DataError, WrongUse
 from magbridge.files import new_folder
 
@@ -44,7 +44,7 @@ def demo(
 
     with new_folder(out):
         result = demonstration.demo(out, seed, say=lambda text: print(text, file=sys.stderr))
-    tell(result, demonstration.tell(result), json)
+    print_result(result, demonstration.summary(result), json)
 
 
 @app.command(usage="Usage: magbridge run --config bridge.toml")
@@ -94,10 +94,11 @@ def replay(
         Print the result as JSON.
     """
     from sitl import replay as replaying
+    from sitl.replay_summary import summary
 
     with new_folder(log) if log else nullcontext():
-        result = replaying.replay(some(files), config, speed_of(speed), log)
-    tell(result, replaying.tell(result), json)
+        result = replaying.replay(check_inputs(files), config, speed_of(speed), log)
+    print_result(result, summary(result), json)
     if not all(run["identical"] for run in result.get("runs", ())):
         raise DataError("the replay did not publish what the log holds")
 

@@ -16,11 +16,11 @@ from magbridge.cli.common import (
     Picture,
     Whole,
     app,
+    check_inputs,
     complain,
     digest,
     note_losses,
-    some,
-    tell,
+    print_result,
 )
 from magbridge.errors import DataError, WrongUse
 from magbridge.progress import waiting
@@ -89,7 +89,7 @@ def calibrate(
     from magbridge.field.reference import earth_field
     from magbridge.logs import read
 
-    some(files, output, vehicle, grid)
+    check_inputs(files, output, vehicle, grid)
     if vehicle and method != "auto":
         raise WrongUse(f"--vehicle: method {method} does not use the positions of the masses; auto does")
     anomalies = read_grid(grid) if grid else None
@@ -109,7 +109,7 @@ def calibrate(
         draw_fit(found.calibration, data, picture)
     for warning in found.warnings:
         complain(warning, 0)
-    tell(
+    print_result(
         {"file": str(output), "method": method, **_facts(found, len(data))},
         f"{output}: {method}, {_summary(found, len(data))}",
         json,
@@ -188,4 +188,4 @@ def plan(
     known = load(calibration)
     with waiting("planning"):
         found = flight_plan.flight_plan(known, deployment, earth_field(deployment)[1], runs=runs, roll=roll)
-    tell(flight_plan.facts(found, known), flight_plan.tell(found, known), json)
+    print_result(flight_plan.facts(found, known), flight_plan.summary(found, known), json)

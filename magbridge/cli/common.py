@@ -31,14 +31,14 @@ __all__ = [
     "Picture",
     "Whole",
     "app",
+    "check_inputs",
     "complain",
     "digest",
     "file_to_write",
     "folder_to_write",
     "note_losses",
     "note_missing",
-    "some",
-    "tell",
+    "print_result",
 ]
 
 
@@ -109,7 +109,9 @@ Whole = Annotated[int, Parameter(converter=_whole)]
 Json = Annotated[bool, Parameter(name="--json")]
 
 
-def some(files: tuple[Path, ...], output: Path | None = None, *others: Path | None) -> tuple[Path, ...]:
+def check_inputs(
+    files: tuple[Path, ...], output: Path | None = None, *others: Path | None
+) -> tuple[Path, ...]:
     """Return `files`; there must be one, and `output` must not be one of them or of `others`."""
     if not files:
         raise WrongUse("expected at least one FILE")
@@ -142,7 +144,7 @@ def note_missing(calibration: Calibration, deployment: xr.Dataset) -> None:
             complain(f"{lacking}: every sample is flagged, with a sigma to match", 0)
 
 
-def tell(result: dict[str, Any], sentence: str, as_json: bool) -> None:
+def print_result(result: dict[str, Any], sentence: str, as_json: bool) -> None:
     """Print the result, for people or for machines."""
     print(msgspec.json.encode(result).decode() if as_json else sentence)
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from magbridge.cli.common import Folder, Json, app, complain, digest, note_losses, some, tell
+from magbridge.cli.common import Folder, Json, app, check_inputs, complain, digest, note_losses, print_result
 from magbridge.progress import waiting
 
 if TYPE_CHECKING:
@@ -60,7 +60,7 @@ def diagnose(
     from magbridge.field.read import read_grid
     from magbridge.logs import read
 
-    some(files, output / "calibration.json", calibration)
+    check_inputs(files, output / "calibration.json", calibration)
     known = load(calibration)
     with waiting("reading") as step:
         logs = [read(path) for path in files]
@@ -84,7 +84,7 @@ def diagnose(
     rms = f"{facts['rms_before_nT']:.2f} -> {facts['rms_after_nT']:.2f} nT RMS held out"
     if found.findings and not found.total.shown:
         rms += ", no gain shown (95 %: {:.2f} to {:.2f} times)".format(*found.total.interval)
-    tell(facts, f"{facts['verdict']}: {causes_of(facts)}; {rms}; {output / 'report.html'}", json)
+    print_result(facts, f"{facts['verdict']}: {causes_of(facts)}; {rms}; {output / 'report.html'}", json)
 
 
 def causes_of(facts: dict[str, Any]) -> str:

@@ -12,11 +12,11 @@ from magbridge.cli.common import (
     Log,
     Picture,
     app,
+    check_inputs,
     complain,
     note_losses,
     note_missing,
-    some,
-    tell,
+    print_result,
 )
 
 if TYPE_CHECKING:
@@ -72,7 +72,7 @@ def navigate(
     from magbridge.calibration.file import load
     from magbridge.errors import WrongUse
 
-    some(files, output, map, calibration, config)
+    check_inputs(files, output, map, calibration, config)
     known, options = load(calibration) if calibration else None, _options(config)
     if bound:
         _bound(files, map, output, options, known, picture, json)
@@ -105,7 +105,7 @@ def navigate(
     for finding in track.attrs["findings"].splitlines():
         complain(finding, 0)
     facts, summary = _judged(track)
-    tell({"file": str(output), **facts}, f"{output}: {summary}", json)
+    print_result({"file": str(output), **facts}, f"{output}: {summary}", json)
 
 
 def _judged(track: xr.Dataset) -> tuple[dict[str, Any], str]:
@@ -153,7 +153,7 @@ def _bound(
         from magbridge.navigate.draw import draw_bound
 
         draw_bound(best, grid, picture)
-    tell({"file": str(output), **result.attrs}, f"{output}: {result.attrs['findings']}", json)
+    print_result({"file": str(output), **result.attrs}, f"{output}: {result.attrs['findings']}", json)
 
 
 def _continued(grid: AnomalyGrid, options: Options, deployment: xr.Dataset) -> tuple[AnomalyGrid, Options]:

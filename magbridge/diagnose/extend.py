@@ -24,7 +24,7 @@ from magbridge.diagnose.inference.evidence import IDEAL
 from magbridge.diagnose.inference.joint import Joint, fit_joint
 from magbridge.version import __version__
 
-__all__ = ["extend", "flown", "leveled", "settle", "widened"]
+__all__ = ["extend", "flyable", "relinearised", "with_map_error", "with_misfit"]
 
 STEPS = 4
 """Linearisations at most; a second one is rarely needed."""
@@ -72,7 +72,7 @@ def extend(problem: Problem, model: Sequence[Candidate], fit: Joint) -> Calibrat
     )
 
 
-def flown(survey: Survey, calibration: Calibration) -> Calibration:
+def flyable(survey: Survey, calibration: Calibration) -> Calibration:
     """Return the calibration without those rates of change that make the live correction worse.
 
     On the vehicle the next sample is not known yet, so a rate is a backward difference, which is mostly noise
@@ -106,7 +106,9 @@ def _without(calibration: Calibration, place: int) -> Calibration:
     )
 
 
-def leveled(problem: Problem, model: Sequence[Candidate], fit: Joint, extended: Calibration) -> Calibration:
+def with_map_error(
+    problem: Problem, model: Sequence[Candidate], fit: Joint, extended: Calibration
+) -> Calibration:
     r"""Return the extended calibration with a map's error in its covariance.
 
     Notes
@@ -134,7 +136,7 @@ def level(fit: Joint) -> float:
     return robust_scale(fit.left - np.median(fit.left))
 
 
-def settle(
+def relinearised(
     problem: Problem, model: Sequence[Candidate], fit: Joint, order: int
 ) -> tuple[Problem, list[Columns], Joint]:
     """Linearise anew about the extended calibration, and fit again.
@@ -155,7 +157,7 @@ def settle(
     return settled, columns, fit
 
 
-def widened(model: Sequence[Candidate], fit: Joint) -> Joint:
+def with_misfit(model: Sequence[Candidate], fit: Joint) -> Joint:
     r"""Return the fit with the error of idealised regressors added to the covariance.
 
     Notes

@@ -20,7 +20,7 @@ from magbridge.diagnose.compare.problem import Problem, pose
 from magbridge.diagnose.compare.survey import Survey
 from magbridge.diagnose.compare.take import take
 from magbridge.diagnose.diagnosis import Diagnosis, Finding
-from magbridge.diagnose.extend import extend, flown, leveled, settle, widened
+from magbridge.diagnose.extend import extend, flyable, relinearised, with_map_error, with_misfit
 from magbridge.diagnose.gain import held_out, paired
 from magbridge.diagnose.inference.accept import accept
 from magbridge.diagnose.inference.evidence import ODDS, REMNANT
@@ -119,11 +119,11 @@ def _examine(
     if wrong is not None and named and wrong.ratio < (REMNANT * max(h.signal_to_noise for h in named)) ** 2:
         wrong = None  # a remnant of the strongest cause's idealised regressor
     progress("extending the calibration")
-    settled, columns, fit = settle(problem, model, fit, outcome.order)
-    fit = widened(model, loosened(settled, model, columns, fit, candidates))
+    settled, columns, fit = relinearised(problem, model, fit, outcome.order)
+    fit = with_misfit(model, loosened(settled, model, columns, fit, candidates))
     extended = calibration
     if model:
-        extended = leveled(settled, model, fit, flown(problem.survey, extend(settled, model, fit)))
+        extended = with_map_error(settled, model, fit, flyable(problem.survey, extend(settled, model, fit)))
     progress("measuring the gain")
     counts = _counted(problem, wrong)
     before = after = problem.straight(outcome.null.z)

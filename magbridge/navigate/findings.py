@@ -27,7 +27,7 @@ FLAT = 3.0  # times the sigma of bias and map error: a map with less relief carr
 DOUBLE = 2.0  # times the sigma of bias and map error: a larger scatter is that of another field
 BETTER = 0.6  # of the scatter at the map's own place: a shift must do at least as well to be believed
 LEVEL = 4.0  # sigmas of the calibration's bias: a larger difference in level has another reason
-TOLD = 3  # jumps of the filter that are reported one by one: the map of another place causes dozens
+LISTED = 3  # jumps of the filter that are reported one by one: the map of another place causes dozens
 EXPLAINED = 0.5  # of the field's variance along the track, below which the map does not describe it
 
 
@@ -71,14 +71,14 @@ def findings_of(
                 else f"dead reckoning is as good as this map can be ({_sigma(result, silent):.0f} m)"
             )
         )
-    findings += _told_by_jumps(jumps, float(result["time"][0]))
+    findings += _jumps(jumps, float(result["time"][0]))
     if (lost := (state == State.LOST)).any():
         findings.append(
             f"lost for {100.0 * lost.mean():.0f} % of the track, first after {hours[lost][0]:.1f} h"
         )
-    findings += _told_by_level(result, options)
+    findings += _level(result, options)
     if reference_track is not None:
-        findings += _told_by_positions(grid, reference_track, options)
+        findings += _positions(grid, reference_track, options)
     if state[-1] == State.SEARCHING and not off[-1]:
         findings.append("several positions still explain the field at the end of the log")
     return findings
@@ -88,10 +88,10 @@ def _sigma(result: xr.Dataset, rows: NDArray[np.bool_]) -> float:
     return float(np.sqrt(np.median((result["covariance_nn"] + result["covariance_ee"]).to_numpy()[rows])))
 
 
-def _told_by_jumps(jumps: Sequence[Jump], start: float) -> list[str]:
+def _jumps(jumps: Sequence[Jump], start: float) -> list[str]:
     hours = [(jump.time_us * 1e-6 - start) / 3600.0 for jump in jumps]
     said = []
-    for hour, jump in zip(hours, jumps[:TOLD], strict=False):
+    for hour, jump in zip(hours, jumps[:LISTED], strict=False):
         far = hypot(jump.north, jump.east)
         sentence = f"after {hour:.1f} h {jump.cause}: moved {far:.0f} m ({_compass(jump.north, jump.east)})"
         if far > 3.0 * jump.allowed:
@@ -100,12 +100,12 @@ def _told_by_jumps(jumps: Sequence[Jump], start: float) -> list[str]:
                 " the start or the map is in the wrong place (datum?)"
             )
         said.append(sentence)
-    if len(jumps) > TOLD:
-        said.append(f"moved another {len(jumps) - TOLD} times, the last time after {hours[-1]:.1f} h")
+    if len(jumps) > LISTED:
+        said.append(f"moved another {len(jumps) - LISTED} times, the last time after {hours[-1]:.1f} h")
     return said
 
 
-def _told_by_level(result: xr.Dataset, options: Options) -> list[str]:
+def _level(result: xr.Dataset, options: Options) -> list[str]:
     """Report the bias at the end, if no calibration would leave it."""
     tracked = result.where(result["state"] == State.TRACKING, drop=True)
     if not tracked.sizes["time"]:
@@ -158,7 +158,7 @@ def best_shift(grid: AnomalyGrid, latitude: Array, longitude: Array, depth: Arra
     return Shift(*best, origin)
 
 
-def _told_by_positions(grid: AnomalyGrid, reference_track: xr.Dataset, options: Options) -> list[str]:
+def _positions(grid: AnomalyGrid, reference_track: xr.Dataset, options: Options) -> list[str]:
     """Compare the map with the field at known positions: its place, and whether it is this field's map."""
     latitude, longitude = reference_track["latitude"].to_numpy(), reference_track["longitude"].to_numpy()
     depth = (

@@ -17,7 +17,8 @@ from magbridge.logs.tlog import TlogWriter
 from magbridge.mavlink import Codec
 from magbridge.records import Channel
 from sitl.own_log import Recorded, is_own_log, runs
-from sitl.replay import alike, tell
+from sitl.replay import agreement
+from sitl.replay_summary import summary
 
 BOOT = START - 77_000_000
 
@@ -76,12 +77,12 @@ def test_a_log_after_a_loss_is_replayed_as_far_as_it_can_be(tmp_path: Path) -> N
     assert 15.0 < recorded.late < 45.0
     again = bridge(tmp_path, recorded.start)
     published = bytearray(b"".join(f for event in recorded.events() for _, f in again.feed(event)))
-    result = alike(published, recorded)
+    result = agreement(published, recorded)
     assert result["samples"] > 500
     assert result["same_samples"] > 0.9 * result["samples"]
-    assert alike(published, Recorded(first)) == {"late_s": 0.0}
+    assert agreement(published, Recorded(first)) == {"late_s": 0.0}
     more = {"files": second, "messages": recorded.messages, "bytes": 1, "seconds": 1.0, "same_config": True}
-    said = tell(
+    said = summary(
         {"runs": [result | more | {"identical": False, "first_difference": 0, "beyond": 0, "damages": 0}]}
     )
     assert f"begins {recorded.late:.1f} s into the run" in said

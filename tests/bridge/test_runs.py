@@ -21,7 +21,7 @@ from magbridge.logs import read
 from magbridge.mavlink import Codec, LogReader, Signing
 from magbridge.records import Channel
 from sitl.own_log import is_own_log, runs
-from sitl.replay import alike
+from sitl.replay import agreement
 
 MakeRig = Callable[..., Rig]
 KEY = bytes(range(32))
@@ -290,7 +290,7 @@ def test_a_log_that_is_removed(make_rig: MakeRig, table: Row) -> None:
     recorded, published = rig.replay([anew])
     assert recorded.late > 5.0
     assert recorded.start.parameters == {"MB_GAP_FACTOR": 3.0}
-    again = alike(bytearray(published), recorded)
+    again = agreement(bytearray(published), recorded)
     assert again["samples"] > 50
     (said,) = {line for line in rig.said(mark) if line.startswith("log: ") and "written" not in line}
     table(

@@ -15,7 +15,7 @@ from magbridge.diagnose.causes.candidates import Candidate, of_effect, since
 from magbridge.diagnose.compare.past import Past
 from magbridge.diagnose.compare.problem import Problem, pose
 from magbridge.diagnose.compare.survey import Survey
-from magbridge.diagnose.extend import MODES, extend, flown, leveled, settle, widened
+from magbridge.diagnose.extend import MODES, extend, flyable, relinearised, with_map_error, with_misfit
 from magbridge.diagnose.inference.evidence import IDEAL
 from magbridge.diagnose.inference.fit_noise import fit_noise
 from magbridge.diagnose.inference.joint import Joint, fit_joint
@@ -44,7 +44,7 @@ def fit(coefficients: np.ndarray, calibration: int = 4) -> Joint:
 
 def test_a_misfit_grows_with_the_effect_and_points_anywhere() -> None:
     before = fit(np.array([3.0, 0.0, 0.0]))
-    after = widened([candidate(3)], before)
+    after = with_misfit([candidate(3)], before)
     own = slice(4, 7)
     wald = before.coefficients @ np.linalg.solve(before.covariance[own, own], before.coefficients)
     np.testing.assert_allclose(
@@ -60,14 +60,15 @@ def test_a_misfit_grows_with_the_effect_and_points_anywhere() -> None:
 
 def test_what_is_hardly_seen_is_hardly_widened() -> None:
     before = fit(np.array([1e-3, 0.0]))
-    np.testing.assert_allclose(widened([candidate(2)], before).covariance, before.covariance, rtol=1e-4)
+    np.testing.assert_allclose(with_misfit([candidate(2)], before).covariance, before.covariance, rtol=1e-4)
 
 
 def test_two_causes_are_widened_each_by_its_own() -> None:
     before = fit(np.array([2.0, 0.0, 0.0, 0.0]))
-    after = widened([candidate(1), candidate(3)], before)
+    after = with_misfit([candidate(1), candidate(3)], before)
     np.testing.assert_allclose(
-        after.covariance[5:, 5:] @ np.ones(3), widened([candidate(1)], before).covariance[5:, 5:] @ np.ones(3)
+        after.covariance[5:, 5:] @ np.ones(3),
+        with_misfit([candidate(1)], before).covariance[5:, 5:] @ np.ones(3),
     )
 
 
@@ -96,13 +97,13 @@ def skewed(whole: Problem, period: float) -> tuple[Survey, Calibration]:
 
 def test_a_rate_is_flown_with_where_a_difference_backwards_tells_it(right: Callable[[int], Problem]) -> None:
     survey, calibration = skewed(right(300), 200.0)
-    assert flown(survey, calibration) is calibration
+    assert flyable(survey, calibration) is calibration
 
 
 def test_a_rate_that_is_noise_live_is_left_out(right: Callable[[int], Problem]) -> None:
     """A sway of two and a half samples."""
     survey, calibration = skewed(right(300), 10.0)
-    calm = flown(survey, calibration)
+    calm = flyable(survey, calibration)
     assert [effect.kind for effect in calm.effects] == ["time"]
     np.testing.assert_array_equal(calm.coefficients[-3:], [1.0, 2.0, 3.0])
     np.testing.assert_array_equal(np.diag(calm.covariance)[-3:], [4.0, 5.0, 6.0])
@@ -127,7 +128,7 @@ def test_what_has_come_since_is_not_in_the_calibrations_logs(right: Callable[[in
     assert not late.columns(slice(0, 150)).any()
     np.testing.assert_array_equal(late.columns(slice(150, 300)), lasting.columns(slice(150, 300)))
     fit = fit_joint(problem, [late.columns], 1)
-    _, _, settled = settle(problem, [late], fit, 1)
+    _, _, settled = relinearised(problem, [late], fit, 1)
     np.testing.assert_allclose(settled.coefficients * late.width, there, atol=0.5)
     np.testing.assert_allclose(settled.left, 0.0, atol=0.5)
 
@@ -145,8 +146,8 @@ def test_a_maps_error_is_in_the_level_of_what_was_fitted_to_the_same_map(
         for learned in (False, True)
     )
     extended = extend(whole, [chart], found)
-    assert leveled(new, [chart], found, extended) is extended
-    spread = leveled(seen, [chart], found, extended)
+    assert with_map_error(new, [chart], found, extended) is extended
+    spread = with_map_error(seen, [chart], found, extended)
     before, after = (
         correct(c, whole.survey.field, whole.survey.values(c.channels), whole.survey.time).sigma
         for c in (extended, spread)
@@ -165,7 +166,7 @@ def test_a_rate_that_is_there_twice_is_left_out_twice(right: Callable[[int], Pro
         coefficients=np.append(plain, [0.0, 0.3, 0.0, 0.0, 0.3, 0.0, 1.0, 2.0, 3.0]),
         covariance=np.diag(np.append(np.diag(calibration.covariance)[:-6], np.arange(1.0, 10.0))),
     )
-    calm = flown(survey, twice)
+    calm = flyable(survey, twice)
     assert calm.effects == (step,)
     np.testing.assert_array_equal(calm.coefficients, [*plain, 1.0, 2.0, 3.0])
     np.testing.assert_array_equal(np.diag(calm.covariance)[-3:], [7.0, 8.0, 9.0])

@@ -10,10 +10,10 @@ import numpy as np
 
 from magbridge.diagnose.causes.time_dependent import offset_drift
 from magbridge.diagnose.causes.timing import channel_skew
-from magbridge.diagnose.compare.interpolation import bent
+from magbridge.diagnose.compare.interpolation import interpolation_error
 from magbridge.diagnose.compare.problem import DELAY, DELAYS, Problem, pose
 from magbridge.diagnose.compare.survey import Survey
-from magbridge.diagnose.extend import settle
+from magbridge.diagnose.extend import relinearised
 from magbridge.diagnose.inference.information import information
 from magbridge.diagnose.inference.joint import fit_joint
 from magbridge.diagnose.report.doubts import late
@@ -47,7 +47,7 @@ def made(whole: Problem, field: np.ndarray, seed: int) -> Survey:
 def test_a_line_leaves_its_delay_times_what_it_is_bent_by(right: Callable[[int], Problem]) -> None:
     survey = right(400).survey
     error = interpolated(survey.time) - swaying(survey.time)
-    expected = TAKEN * bent(survey, swaying(survey.time).T).T
+    expected = TAKEN * interpolation_error(survey, swaying(survey.time).T).T
     inside = slice(10, -10)
     for k in (1, 2):
         assert np.sum((error - expected)[inside, k] ** 2) < 0.02 * np.sum(error[inside, k] ** 2)
@@ -71,7 +71,7 @@ def test_the_delays_stay_where_the_comparison_is_linearised_anew(right: Callable
     time = whole.survey.time
     problem = pose(made(whole, interpolated(time), 1), whole.calibration)
     drift = offset_drift(problem)[0]
-    _, _, fit = settle(problem, [drift], fit_joint(problem, [drift.columns], 1), 1)
+    _, _, fit = relinearised(problem, [drift], fit_joint(problem, [drift.columns], 1), 1)
     np.testing.assert_allclose(DELAY * (fit.z[DELAYS] - fit.z[DELAYS][0]), TAKEN, atol=0.03)
 
 

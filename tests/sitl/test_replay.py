@@ -22,8 +22,9 @@ from sitl.autopilot import Autopilot
 from sitl.demo import demo
 from sitl.motion import with_motion
 from sitl.own_log import Recorded, is_own_log
-from sitl.replay import replay, tell
+from sitl.replay import replay
 from sitl.replay_setup import bridge_toml, short_names
+from sitl.replay_summary import summary
 
 
 @pytest.fixture(scope="module")
@@ -98,7 +99,7 @@ def test_a_log_that_breaks_off_is_the_same_as_far_as_it_goes_and_no_further(
         assert run["first_difference"] in (None, run["bytes"])
         assert run["beyond"] < 1000
         assert run["identical"] == (not run["beyond"])
-        assert ("to the end of the log" in tell({"runs": [run]})) == bool(run["beyond"])
+        assert ("to the end of the log" in summary({"runs": [run]})) == bool(run["beyond"])
 
 
 def test_another_configuration_is_told_apart(survey: Path, tmp_path: Path) -> None:
@@ -109,7 +110,7 @@ def test_another_configuration_is_told_apart(survey: Path, tmp_path: Path) -> No
     (run,) = result["runs"]
     assert not run["identical"]
     assert not run["same_config"]
-    assert "not identical" in tell(result)
+    assert "not identical" in summary(result)
 
 
 @pytest.mark.parametrize("motion", ["glide", "position"])
@@ -131,7 +132,7 @@ def test_a_replay_finds_its_way_by_the_field(tmp_path: Path, motion: str) -> Non
     result = replay([tmp_path / "log.nc"], path)
     assert sum(result["navigation"].values()) > 100
     assert not {"off", "lost"} & set(result["navigation"])
-    assert "position updates" in tell(result)
+    assert "position updates" in summary(result)
 
 
 def test_a_velocity_is_told_as_a_track() -> None:

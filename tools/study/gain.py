@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from magbridge.calibration.model import Calibration
 from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.diagnosis import Diagnosis
-from magbridge.diagnose.extend import extend, settle, widened
+from magbridge.diagnose.extend import extend, relinearised, with_misfit
 from magbridge.diagnose.inference.search import search
 from sitl.columns import corrected
 from sitl.inject import Hidden
@@ -73,8 +73,8 @@ def _oracle(name: str, result: Diagnosis) -> Calibration:
     known = "clock_offset" if name in DELAYS else name
     outcome = search(problem, CAUSES[known].candidates(problem), 1)
     model = [hypothesis.candidate for hypothesis in outcome.chosen]
-    settled, _, fit = settle(problem, model, outcome.fit, outcome.order)
-    return extend(settled, model, widened(model, fit))
+    settled, _, fit = relinearised(problem, model, outcome.fit, outcome.order)
+    return extend(settled, model, with_misfit(model, fit))
 
 
 def error(ds: xr.Dataset, calibration: Calibration) -> Array:

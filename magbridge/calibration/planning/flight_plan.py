@@ -17,7 +17,7 @@ from magbridge.errors import CalibrationError
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["facts", "flight_plan", "tell"]
+__all__ = ["facts", "flight_plan", "summary"]
 
 FloatArray = NDArray[np.float64]
 
@@ -77,7 +77,7 @@ def facts(found: Plan, calibration: Calibration) -> dict[str, Any]:
     }
 
 
-def tell(found: Plan, calibration: Calibration) -> str:
+def summary(found: Plan, calibration: Calibration) -> str:
     """Return a plan as a table: the runs in order of worth, and the error expected after each."""
     names = [f"{one.name} [{one.unit}]" if one.unit else one.name for one in calibration.parameters]
     head = f"{'run':>4} {'pitch':>7} {'roll':>7} {' '.join(f'{name:>14}' for name in names)}"

@@ -8,7 +8,7 @@ from scipy.interpolate import CubicSpline
 
 from magbridge.diagnose.compare.survey import Survey
 
-__all__ = ["LOST", "bent", "rates"]
+__all__ = ["LOST", "interpolation_error", "rates"]
 
 FloatArray = NDArray[np.float64]
 
@@ -40,7 +40,7 @@ def rates(survey: Survey, H: FloatArray) -> FloatArray:
     return out
 
 
-def bent(survey: Survey, H: FloatArray) -> FloatArray:
+def interpolation_error(survey: Survey, H: FloatArray) -> FloatArray:
     r"""(3, n) error of channels H (3, n) sampled late and interpolated to their row, nT per s of delay.
 
     Linear interpolation is in error when the vehicle sways from sample to sample. `H` must be free of the

@@ -38,7 +38,7 @@ from magbridge.calibration.residual import Samples, residuals
 from magbridge.calibration.terms import Effect
 from magbridge.diagnose.compare.columns import Mixture
 from magbridge.diagnose.compare.derivatives import CHUNK, derivatives
-from magbridge.diagnose.compare.interpolation import bent
+from magbridge.diagnose.compare.interpolation import interpolation_error
 from magbridge.diagnose.compare.prior import level, loosened, prior
 from magbridge.diagnose.compare.survey import Survey
 
@@ -237,7 +237,7 @@ def pose(survey: Survey, calibration: Calibration) -> Problem:
     values, vectors = np.linalg.eigh(seen / level(calibration, e) ** 2)
     keep = values > SEEN
     V, rest = vectors[:, keep], L @ vectors[:, ~keep]
-    late = -DELAY * g[:, 6:] * bent(survey, reading.T).T
+    late = -DELAY * g[:, 6:] * interpolation_error(survey, reading.T).T
     directions, centre = np.hstack([L @ V, np.zeros((len(L), 3))]), np.append(V.T @ centre, np.zeros(3))
     return Problem(survey, calibration, reading, e, g, gain, late, directions, centre, rest @ rest.T)
 
