@@ -10,6 +10,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from sitl.columns import channels
 from sitl.platform import HARD_IRON, MOMENT, SOFT_IRON, VOLUME_SPREAD, Vehicle
 
 __all__ = ["information_bound", "informed_error", "oracle"]
@@ -24,7 +25,7 @@ def oracle(vehicle: Vehicle, deployment: xr.Dataset) -> Array:
     of its own but noise.
     """
     D, T = _response(vehicle, deployment)
-    raw = np.column_stack([deployment[f"mag_{axis}"] for axis in "xyz"])
+    raw = channels(deployment)
     return np.asarray(np.linalg.norm(np.linalg.solve(D, (raw - T)[..., None])[..., 0], axis=1))
 
 

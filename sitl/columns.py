@@ -15,7 +15,7 @@ from magbridge.columns import CHANNELS, COLUMNS, Column
 from sitl.platform import MOUNTINGS
 from sitl.trajectory import Track
 
-__all__ = ["at_rest", "corrected", "dataset", "segments", "side_by_side"]
+__all__ = ["at_rest", "channels", "corrected", "dataset", "segments", "side_by_side"]
 
 Array = NDArray[np.float64]
 
@@ -81,7 +81,12 @@ def side_by_side(deployment: xr.Dataset, names: Sequence[str]) -> Array:
     return out
 
 
+def channels(deployment: xr.Dataset) -> Array:
+    """Return the three channels as read, (n, 3), nT."""
+    return side_by_side(deployment, CHANNELS)
+
+
 def corrected(deployment: xr.Dataset, calibration: Calibration) -> CorrectedArrays:
     """Correct a deployment's channels as they stand, row by row."""
-    H, p = (side_by_side(deployment, names) for names in (CHANNELS, calibration.channels))
-    return correct(calibration, H, p, deployment["time"].to_numpy())
+    positions = side_by_side(deployment, calibration.channels)
+    return correct(calibration, channels(deployment), positions, deployment["time"].to_numpy())

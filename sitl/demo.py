@@ -20,7 +20,7 @@ from magbridge.calibration.fitting.lowpass import unfiltered
 from magbridge.config import load as load_config
 from magbridge.logs import write
 from magbridge.records import Quality
-from sitl.columns import corrected, segments
+from sitl.columns import channels, corrected, segments
 from sitl.emulation import emulate, start_us
 from sitl.listener import Listener
 from sitl.replay_setup import bridge_toml
@@ -91,7 +91,7 @@ def _align(field: dict[str, Floats], survey: xr.Dataset) -> xr.Dataset:
 
 def _compare(survey: xr.Dataset, nominal: Fit, heard: xr.Dataset) -> dict[str, Any]:
     truth = survey["truth_total_field"].to_numpy()
-    raw = np.sqrt(sum(survey[f"mag_{axis}"].to_numpy() ** 2 for axis in "xyz"))
+    raw = np.linalg.norm(channels(survey), axis=1)
     error = (heard["total_field"] - heard["truth"]).to_numpy()
     good = (heard["quality"].to_numpy().astype(int) & ~int(Quality.NO_BORESIGHT)) == 0
     return {

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from magbridge.files import atomic_path
 from magbridge.records import Quality
+from sitl.columns import channels
 from sitl.demo import rms
 
 mpl.use("agg")
@@ -29,7 +30,7 @@ def draw(survey: xr.Dataset, nominal: Floats, heard: xr.Dataset, path: Path) -> 
     hours = _hours(survey["time"], survey)
     received = _hours(heard["time"], survey)
     truth = survey["truth_total_field"].to_numpy()
-    raw = np.sqrt(sum(survey[f"mag_{axis}"].to_numpy() ** 2 for axis in "xyz"))
+    raw = np.linalg.norm(channels(survey), axis=1)
     style: dict[Any, Any] = {
         "font.size": 9,
         "axes.spines.top": False,

@@ -38,13 +38,12 @@ from terminal import command_line, table
 
 from magbridge.calibration.fitting.columns import observations
 from magbridge.calibration.fitting.fit import fit
-from magbridge.columns import CHANNELS
 from magbridge.errors import CalibrationError
 from magbridge.field.igrf import igrf
 from sitl import Twin, load, segments, simulate
 from sitl.bonne_bay import METHODS
 from sitl.bound import information_bound, informed_error, oracle
-from sitl.columns import at_rest, corrected, side_by_side
+from sitl.columns import at_rest, channels, corrected, side_by_side
 from sitl.instrument import rotation
 from sitl.platform import Vehicle
 
@@ -156,7 +155,7 @@ def strangers(runs: xr.Dataset, peers: str) -> Iterator[tuple[str, tuple[np.ndar
         file = Path(folder) / "runs.npz"
         np.savez(
             file,
-            field=side_by_side(runs, CHANNELS),
+            field=channels(runs),
             reference=total(runs),
             attitude=side_by_side(runs, ("roll", "pitch", "heading")),
             rates=np.vstack([turned, turned[-1:]]),
@@ -193,7 +192,7 @@ def total(part: xr.Dataset) -> np.ndarray:
 
 
 def left(A: np.ndarray, T: np.ndarray, part: xr.Dataset) -> np.ndarray:
-    return np.linalg.norm((side_by_side(part, CHANNELS) - T) @ A.T, axis=1) - total(part)
+    return np.linalg.norm((channels(part) - T) @ A.T, axis=1) - total(part)
 
 
 def rms(error: np.ndarray) -> float:

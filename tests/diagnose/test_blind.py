@@ -18,12 +18,12 @@ from study.noise import GLIDER, LOSSES, NOISES
 from study.rates import worse
 from threadpoolctl import threadpool_limits
 
-from magbridge.calibration.correct import correct
 from magbridge.calibration.file import load
 from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.report.findings import parameters
 from magbridge.diagnose.run import diagnose
 from magbridge.errors import DataError
+from sitl.columns import corrected
 from sitl.inject import Hidden, disturb
 
 SAFE = 0.97
@@ -167,9 +167,7 @@ def test_what_is_written(warm: tuple[xr.Dataset, object], written: tuple[Path, s
     assert found["gain"]["interval"][0] <= found["gain"]["rms_ratio"] <= found["gain"]["interval"][1] < 1.0
     assert set(found["findings"][0]["parameters"]["x"]) == {"value", "sigma", "unit"}
     extended = load(tmp_path / "out" / "calibration.json")
-    H = np.column_stack([ds[f"mag_{axis}"] for axis in "xyz"])
-    p = np.column_stack([ds[name] for name in extended.channels])
-    error = correct(extended, H, p, ds["time"].to_numpy()).total - ds["reference_field"].to_numpy()
+    error = corrected(ds, extended).total - ds["reference_field"].to_numpy()
     assert np.sqrt(np.mean(error**2)) == pytest.approx(1.0, abs=0.05)
     page = (tmp_path / "out" / "report.html").read_text()
     assert page.count("data:image/png;base64,") >= 6

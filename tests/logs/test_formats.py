@@ -230,7 +230,7 @@ def test_units_of_two_kinds_are_not_mixed(tmp_path: Path) -> None:
         logs.read([tmp_path / "a.csv", tmp_path / "b.csv"])
 
 
-def test_a_units_we_know_is_converted(tmp_path: Path) -> None:
+def test_a_unit_that_we_know_is_converted(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text(
         "time [ms],mag_x [uT],roll [rad],depth [metres]\n1500,50,3.141592653589793,7\n"
     )

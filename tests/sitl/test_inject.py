@@ -14,6 +14,7 @@ import xarray as xr
 
 import sitl.inject
 from sitl import Twin, load
+from sitl.columns import channels
 from sitl.inject import EFFECTS, FOREIGN, Hidden, disturb
 from sitl.inject.sensor import soaked
 from sitl.mission import CrissCross
@@ -49,10 +50,6 @@ def clean(stage: Stage) -> xr.Dataset:
 
 def seen(stage: Stage, *hidden: Hidden) -> xr.Dataset:
     return disturb(stage[0], hidden, *stage[1:], seed=3)
-
-
-def channels(ds: xr.Dataset) -> np.ndarray:
-    return np.column_stack([ds[f"mag_{axis}"] for axis in "xyz"])
 
 
 def effect(stage: Stage, clean: xr.Dataset, name: str, times: float = 1.0) -> tuple[np.ndarray, xr.Dataset]:

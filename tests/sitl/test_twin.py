@@ -13,6 +13,7 @@ from magbridge.calibration.model import Parameter, identity
 from magbridge.errors import ConfigError, FormatError, WrongUse
 from magbridge.field.igrf import igrf
 from sitl import Scenario, Twin, load, segments, simulate, simulate_like
+from sitl.columns import channels
 from sitl.instrument import Instrument
 from sitl.mission import Leg, Legs, Spirals
 from sitl.platform import Vehicle
@@ -27,10 +28,6 @@ SHORT = (Legs(runs=(Leg(duration=400, pitch=-26, turn=0.8), Leg(duration=400, pi
 @pytest.fixture(scope="module")
 def demo() -> xr.Dataset:
     return simulate(load("demo"), 3)
-
-
-def channels(deployment: xr.Dataset) -> np.ndarray:
-    return np.column_stack([deployment[f"mag_{axis}"] for axis in "xyz"])
 
 
 def test_every_scenario_that_comes_along_reads() -> None:

@@ -98,12 +98,11 @@ def _joined(parts: Sequence[dict[str, FloatArray]]) -> dict[str, FloatArray]:
 
 def _comparable(table: dict[str, FloatArray], calibration: Calibration, source: str) -> dict[str, FloatArray]:
     """Return the rows that have channels, reference and parameters, each instant once."""
-    channels = [f"mag_{axis}" for axis in "xyz"]
-    needed = [*channels, "reference_field", *(parameter.name for parameter in calibration.parameters)]
+    needed = [*CHANNELS, "reference_field", *(parameter.name for parameter in calibration.parameters)]
     size = table["time"].size
     if size < FEWEST:
         raise DataError(f"{source}: {size} samples, at least {FEWEST} needed")
-    for name in channels:
+    for name in CHANNELS:
         table[name][~(np.abs(table[name]) < BEYOND)] = np.nan
     whole = np.all([np.isfinite(table[name]) for name in needed], axis=0)
     if whole.sum() < FEWEST:
