@@ -39,7 +39,7 @@ from terminal import command_line, table
 from magbridge.calibration.fitting.columns import observations
 from magbridge.calibration.fitting.fit import fit
 from magbridge.errors import CalibrationError
-from magbridge.field.igrf import igrf
+from magbridge.field.reference import main_field
 from sitl import Twin, load, segments, simulate
 from sitl.bonne_bay import METHODS
 from sitl.bound import information_bound, informed_error, oracle
@@ -150,7 +150,6 @@ def strangers(runs: xr.Dataset, peers: str) -> Iterator[tuple[str, tuple[np.ndar
     attitude = rotation(*(runs[name].to_numpy() for name in ("roll", "pitch", "heading")))
     time = runs["time"].to_numpy()
     turned = (attitude[:-1].inv() * attitude[1:]).as_rotvec() / np.diff(time)[:, None]
-    place = [runs[name].to_numpy()[:1] for name in ("longitude", "latitude", "depth", "time")]
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "runs.npz"
         np.savez(
@@ -159,7 +158,7 @@ def strangers(runs: xr.Dataset, peers: str) -> Iterator[tuple[str, tuple[np.ndar
             reference=total(runs),
             attitude=side_by_side(runs, ("roll", "pitch", "heading")),
             rates=np.vstack([turned, turned[-1:]]),
-            reference_ned=igrf(*place)[0],
+            reference_ned=main_field(runs)[0],
             time=time,
         )
         command = [peers, str(Path(__file__).with_name("peers.py")), str(file)]

@@ -8,7 +8,6 @@ no hint that the cause is a temperature.
 
 from __future__ import annotations
 
-import argparse
 import os
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "2")
@@ -17,6 +16,7 @@ import msgspec
 import numpy as np
 import xarray as xr
 from study.stage import CHARTS
+from terminal import command_line
 
 from magbridge.calibration.fitting.columns import observations
 from magbridge.calibration.fitting.fit import fit
@@ -45,8 +45,8 @@ def rms(calibration: Calibration, ds: xr.Dataset, against: str = "truth_total_fi
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seeds", type=int, default=3)
+    parser = command_line(__doc__)
+    parser.add_argument("--seeds", type=int, default=3, help="worlds, from 21 on")
     options = parser.parse_args()
     paper = PAPER["trial 1", "cubic"][1]
     print(

@@ -26,7 +26,7 @@ from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.mission import Mission
 from magbridge.calibration.planning.limits import Limits, PlannedRun, settled, trim_of
 from magbridge.calibration.planning.plan import Plan, evaluate_runs, expected_calibration, plan
-from magbridge.field.igrf import igrf
+from magbridge.field.reference import main_field
 from sitl import Twin, load, segments, simulate
 from sitl.bound import oracle
 from sitl.columns import at_rest, corrected
@@ -44,7 +44,7 @@ def chosen(scenario: Scenario, noise: float) -> tuple[Plan, Plan]:
     parts = segments(simulate(scenario, 0))
     runs, survey = (observed(parts[name]) for name in ("calibration", "survey"))
     before = expected_calibration(runs.ranges(), float(runs.reference.mean()), noise=noise)
-    mission, ned = Mission.of(survey), igrf(*place(parts["calibration"]))[0]
+    mission, ned = Mission.of(survey), main_field(parts["calibration"])[0]
     table = [
         PlannedRun(pitch, BANK, (battery, float(np.copysign(200.0, pitch))))
         for _, pitch, battery, _ in TABLE_1
@@ -56,12 +56,7 @@ def chosen(scenario: Scenario, noise: float) -> tuple[Plan, Plan]:
 def observed(part: xr.Dataset) -> Observations:
     """Return a part of a deployment with its true field's vector."""
     found = observations(at_rest(part, MASSES), MASSES)
-    ned = igrf(*place(part))[0]
-    return replace(found, reference_ned=np.tile(ned, (len(found), 1)))
-
-
-def place(part: xr.Dataset) -> list[np.ndarray]:
-    return [part[name].to_numpy()[:1] for name in ("longitude", "latitude", "depth", "time")]
+    return replace(found, reference_ned=np.tile(main_field(part)[0], (len(found), 1)))
 
 
 def flown(scenario: Scenario, seed: int) -> float:
