@@ -108,7 +108,7 @@ def calibrate(
 
         draw_fit(found.calibration, data, picture)
     for warning in found.warnings:
-        complain(warning, 0)
+        complain(warning)
     print_result(
         {"file": str(output), "method": method, **_facts(found, len(data))},
         f"{output}: {method}, {_summary(found, len(data))}",
@@ -146,7 +146,7 @@ def _digests(files: tuple[Path, ...]) -> dict[str, str]:
     for file in files:
         first = seen.setdefault(digest(file), file)
         if first is not file:
-            complain(f"{file}: identical to {first}; its samples are counted once", 0)
+            complain(f"{file}: identical to {first}; its samples are counted once")
     return {file.name: key for key, file in seen.items()}
 
 

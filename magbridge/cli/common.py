@@ -133,7 +133,7 @@ def note_losses(*pieces: Mapping[str, Any]) -> None:
 
     if counts := passed_over(*pieces):
         losses = ", ".join(f"{count} {COUNTERS[name][count > 1]}" for name, count in counts.items())
-        complain(f"in the logs: {losses}", 0)
+        complain(f"in the logs: {losses}")
 
 
 def note_missing(calibration: Calibration, deployment: xr.Dataset) -> None:
@@ -141,7 +141,7 @@ def note_missing(calibration: Calibration, deployment: xr.Dataset) -> None:
     for name in calibration.channels:
         if name not in deployment:
             lacking = f"{deployment.attrs['source']}: no column {name!r}, which the calibration needs"
-            complain(f"{lacking}: every sample is flagged, with a sigma to match", 0)
+            complain(f"{lacking}: every sample is flagged, with a sigma to match")
 
 
 def print_result(result: dict[str, Any], sentence: str, as_json: bool) -> None:
@@ -149,7 +149,7 @@ def print_result(result: dict[str, Any], sentence: str, as_json: bool) -> None:
     print(msgspec.json.encode(result).decode() if as_json else sentence)
 
 
-def complain(sentence: str, code: int) -> int:
-    """Print one line to stderr and return `code`."""
+def complain(sentence: str, code: int = 0) -> int:
+    """Print one line to stderr; return `code`, the exit code that goes with it."""
     print("magbridge:", " ".join(sentence.split()), file=sys.stderr)
     return code

@@ -68,7 +68,7 @@ def diagnose(
         remarks = [f"{path}: {ITSELF}" for path in files if digest(path) in known.inputs.values()]
         remarks += [remark for log in logs for remark in _suspect(log)]
         for remark in remarks:
-            complain(remark, 0)
+            complain(remark)
         found = examine(
             logs,
             known,
@@ -79,7 +79,7 @@ def diagnose(
             remarks=remarks,
         )
     if doubt := unsettled(found.problem, found.named, found.calibration):
-        complain(doubt, 0)
+        complain(doubt)
     facts = findings(found, CAUSES)
     rms = f"{facts['rms_before_nT']:.2f} -> {facts['rms_after_nT']:.2f} nT RMS held out"
     if found.findings and not found.total.shown:

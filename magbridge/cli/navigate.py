@@ -103,7 +103,7 @@ def navigate(
 
         draw_navigation(track, grid, picture)
     for finding in track.attrs["findings"].splitlines():
-        complain(finding, 0)
+        complain(finding)
     facts, summary = _judged(track)
     print_result({"file": str(output), **facts}, f"{output}: {summary}", json)
 
@@ -165,8 +165,7 @@ def _continued(grid: AnomalyGrid, options: Options, deployment: xr.Dataset) -> t
         complain(
             f"{grid.name}: at {grid.altitude:.0f} m; continued to {-there.altitude:.0f} m below the "
             f"surface, and what that leaves out counts as the map's error: {known.map_sigma:.1f} nT over "
-            f"{known.map_length:.0f} m",
-            0,
+            f"{known.map_length:.0f} m"
         )
     return there, known
 
