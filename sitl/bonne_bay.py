@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from magbridge.calibration.fitting.columns import observations
 from magbridge.calibration.fitting.fit import fit
+from magbridge.calibration.residual import rms
 from magbridge.columns import CHANNEL_TIMES, CHANNELS
 from magbridge.errors import CalibrationError
 from magbridge.field.grid import AnomalyGrid
@@ -75,7 +76,7 @@ class Trials:
 
     def rms(self, part: str, trial: str, method: str, against: str = "reference_field") -> float:
         """Return the RMS of :meth:`error`, nT."""
-        return float(np.sqrt(np.mean(self.error(part, trial, method, against) ** 2)))
+        return rms(self.error(part, trial, method, against))
 
 
 def measure(twin: Twin, *, at_depth: bool = False) -> dict[str, xr.Dataset]:

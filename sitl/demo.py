@@ -17,6 +17,7 @@ from magbridge.calibration.file import save
 from magbridge.calibration.fitting.columns import observations
 from magbridge.calibration.fitting.fit import Fit, fit
 from magbridge.calibration.fitting.lowpass import unfiltered
+from magbridge.calibration.residual import rms
 from magbridge.config import load as load_config
 from magbridge.logs import write
 from magbridge.records import Quality
@@ -103,11 +104,6 @@ def _compare(survey: xr.Dataset, nominal: Fit, heard: xr.Dataset) -> dict[str, A
         "unflagged_sigma_nT": rms(heard["sigma"].to_numpy()[good]),
         "flagged": int((~good).sum()),
     }
-
-
-def rms(error: Floats) -> float:
-    """Return the root mean square."""
-    return float(np.sqrt(np.mean(error**2)))
 
 
 def summary(result: dict[str, Any]) -> str:

@@ -10,10 +10,10 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from magbridge.calibration.residual import rms
 from magbridge.files import atomic_path
 from magbridge.records import Quality
 from sitl.columns import channels
-from sitl.demo import rms
 
 mpl.use("agg")
 import matplotlib.pyplot as plt

@@ -38,6 +38,7 @@ from terminal import command_line, table
 
 from magbridge.calibration.fitting.columns import observations
 from magbridge.calibration.fitting.fit import fit
+from magbridge.calibration.residual import rms
 from magbridge.errors import CalibrationError
 from magbridge.field.reference import main_field
 from sitl import Twin, load, segments, simulate
@@ -192,10 +193,6 @@ def total(part: xr.Dataset) -> np.ndarray:
 
 def left(A: np.ndarray, T: np.ndarray, part: xr.Dataset) -> np.ndarray:
     return np.linalg.norm((channels(part) - T) @ A.T, axis=1) - total(part)
-
-
-def rms(error: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(error**2)))
 
 
 def show(rows: list[Row], console: Console) -> None:

@@ -23,6 +23,7 @@ from rich.progress import track
 from rich.table import Table
 from terminal import command_line, table
 
+from magbridge.calibration.residual import rms
 from sitl.bonne_bay import METHODS, PAPER, TRIALS, Trials, fly
 from sitl.mission import TABLE_1
 
@@ -82,7 +83,7 @@ def _medians(good: list[Trials], trial: str, method: str) -> tuple[str, ...]:
     figures = (
         [flight.rms(trial, trial, method) for flight in good],
         [flight.rms("survey", trial, method) for flight in good],
-        [np.sqrt(np.mean(error**2)) for error in errors],
+        [rms(error) for error in errors],
         [np.std(error) for error in errors],
     )
     ends = [np.median([flight.scales[trial, method][end] for flight in good]) for end in (0, 1)]

@@ -13,14 +13,13 @@ import os
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "2")
 
 import msgspec
-import numpy as np
 import xarray as xr
 from study.stage import CHARTS
 from terminal import command_line
 
 from magbridge.calibration.fitting.columns import observations
 from magbridge.calibration.fitting.fit import fit
-from magbridge.calibration.model import Calibration
+from magbridge.calibration.residual import rms
 from magbridge.diagnose.run import diagnose
 from sitl.bonne_bay import MASSES, PAPER, measure
 from sitl.columns import corrected
@@ -37,11 +36,6 @@ def fly(seed: int, reference: str) -> dict[str, xr.Dataset]:
     telemetry = msgspec.structs.replace(scenario.telemetry, reference="map" if reference == "map" else "true")
     twin = Twin.draw(msgspec.structs.replace(scenario, telemetry=telemetry), seed)
     return measure(twin, at_depth=reference == "map at its depth")
-
-
-def rms(calibration: Calibration, ds: xr.Dataset, against: str = "truth_total_field") -> float:
-    """Return the RMS error of the corrected total field, nT."""
-    return float(np.sqrt(np.mean((corrected(ds, calibration).total - ds[against].to_numpy()) ** 2)))
 
 
 def main() -> None:
@@ -62,11 +56,14 @@ def main() -> None:
                 f"{h.candidate.cause} ({h.candidate.channel})" if h.candidate.channel else h.candidate.cause
                 for h in found.findings
             )
-            floor = load("bonne_bay").instrument.noise_sigma
+            survey, floor = parts["survey"], load("bonne_bay").instrument.noise_sigma
+            before, after = (
+                rms(corrected(survey, known).total - survey["truth_total_field"].to_numpy())
+                for known in (calibration, found.calibration)
+            )
             print(
-                f"| {seed} | {reference} | {paper} nT | {rms(calibration, parts['survey']):.1f} nT | "
-                f"{rms(found.calibration, parts['survey']):.1f} nT | {floor:.1f} nT | {found.verdict}: "
-                f"{named or '-'} |",
+                f"| {seed} | {reference} | {paper} nT | {before:.1f} nT | {after:.1f} nT | {floor:.1f} nT | "
+                f"{found.verdict}: {named or '-'} |",
                 flush=True,
             )
 

@@ -15,7 +15,7 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 import xarray as xr
-from accuracy import rms, total
+from accuracy import total
 from rich.console import Console
 from rich.progress import track
 from terminal import command_line, table
@@ -26,6 +26,7 @@ from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.mission import Mission
 from magbridge.calibration.planning.limits import Limits, PlannedRun, settled, trim_of
 from magbridge.calibration.planning.plan import Plan, evaluate_runs, expected_calibration, plan
+from magbridge.calibration.residual import rms
 from magbridge.field.reference import main_field
 from sitl import Twin, load, segments, simulate
 from sitl.bound import oracle

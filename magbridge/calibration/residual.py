@@ -32,6 +32,7 @@ __all__ = [
     "normal_equations",
     "residuals",
     "residuals_of",
+    "rms",
     "robust_scale",
     "scales_and_offsets",
     "whiten",
@@ -123,6 +124,11 @@ def residuals_of(samples: Samples, coefficients: FloatArray) -> FloatArray:
         for start in range(0, len(samples.field), CHUNK)
     ]
     return np.concatenate(pieces)
+
+
+def rms(values: FloatArray) -> float:
+    """Root mean square of the values (n,)."""
+    return float(np.sqrt(np.mean(values**2)))
 
 
 def robust_scale(values: FloatArray) -> float:

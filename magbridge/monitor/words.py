@@ -116,7 +116,7 @@ def _number(value: float, form: str, two_sigma: float = nan, unit: str = "") -> 
     """Return a value with its unit, thousands separated, and its 2-sigma; a dash and nothing if unknown."""
     apart = form.replace(".", ",.")
     text, doubt = (
-        told.replace(",", "\N{NARROW NO-BREAK SPACE}").rstrip()
-        for told in (f"{value:{apart}} {unit}", f"± {two_sigma:{apart.lstrip('+')}}")
+        plain.replace(",", "\N{NARROW NO-BREAK SPACE}").rstrip()
+        for plain in (f"{value:{apart}} {unit}", f"± {two_sigma:{apart.lstrip('+')}}")
     )
     return text if isfinite(value) else "–", doubt if isfinite(two_sigma) else ""

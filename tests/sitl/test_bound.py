@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from magbridge.calibration.residual import rms
 from sitl import Twin, load, segments, simulate
 from sitl.bound import information_bound, oracle
 from sitl.mission import CrissCross, Spirals
@@ -19,10 +20,6 @@ SCENARIO = msgspec.structs.replace(
 def flight() -> tuple[Twin, xr.Dataset, xr.Dataset]:
     parts = segments(simulate(SCENARIO, 1))
     return Twin.draw(SCENARIO, 1), parts["calibration"], parts["survey"]
-
-
-def rms(values: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(values**2)))
 
 
 def test_who_knows_the_vehicle_is_left_with_the_noise(flight: tuple[Twin, xr.Dataset, xr.Dataset]) -> None:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from magbridge.calibration.fitting.data import Observations
 from magbridge.calibration.fitting.validate import in_sensor_units
 from magbridge.calibration.model import Calibration
-from magbridge.calibration.residual import robust_scale
+from magbridge.calibration.residual import rms, robust_scale
 from magbridge.files import atomic_path
 
 __all__ = ["draw_fit"]
@@ -62,8 +62,8 @@ def draw_fit(calibration: Calibration, data: Observations, path: str | Path) -> 
         (above,) = axis.plot(up, np.full(len(up), 1.05 * edge), "^", c="0.3", ms=3, mew=0)
         axis.plot(down, np.full(len(down), -1.05 * edge), "v", c="0.3", ms=3, mew=0)
         axis.set_xlabel(name)
-    axes[0, 0].set_ylabel(f"as read, nT: {_rms(read):.0f} RMS")
-    axes[1, 0].set_ylabel(f"corrected, nT: {_rms(left):.2f} RMS")
+    axes[0, 0].set_ylabel(f"as read, nT: {rms(read):.0f} RMS")
+    axes[1, 0].set_ylabel(f"corrected, nT: {rms(left):.2f} RMS")
     legend = {"a colour for each run": dots, "2 sigma of the sensor's noise": band}
     if beyond.any():
         legend[f"beyond the scale: {beyond.sum()} of {len(data)}, up to {np.abs(left).max():.0f} nT"] = above
@@ -82,7 +82,3 @@ def _abscissae(data: Observations) -> dict[str, FloatArray]:
         shown["heading, deg"] = np.degrees(data.attitude[:, 2]) % 360.0
     units = (f", {unit}" if unit else "" for unit in data.units)
     return shown | {f"{n}{u}": p for n, u, p in zip(data.names, units, data.parameters.T, strict=True)}
-
-
-def _rms(values: FloatArray) -> float:
-    return float(np.sqrt(np.mean(values**2)))

@@ -16,7 +16,7 @@ from magbridge.calibration.fitting.data import Observations
 from magbridge.calibration.fitting.identify import combinations, expected_ratio, heading_gap, warnings_for
 from magbridge.calibration.fitting.noise import NoiseModel
 from magbridge.calibration.model import Calibration, Noise, Parameter, Reference, Run, Sensor
-from magbridge.calibration.residual import Samples, residuals_of, scales_and_offsets
+from magbridge.calibration.residual import Samples, residuals_of, rms, scales_and_offsets
 from magbridge.calibration.terms import Polynomial
 from magbridge.errors import CalibrationError
 from magbridge.version import __version__
@@ -79,7 +79,7 @@ class Fit:
     @property
     def rms(self) -> float:
         """RMS of the residual, nT."""
-        return float(np.sqrt(np.mean(self.residual**2)))
+        return rms(self.residual)
 
 
 def fit(

@@ -12,6 +12,7 @@ from magbridge.calibration.correct import correct
 from magbridge.calibration.fitting.data import Observations
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.model import Calibration
+from magbridge.calibration.residual import rms
 from magbridge.errors import CalibrationError
 
 __all__ = ["HeldOut", "in_sensor_units", "leave_runs_out"]
@@ -47,8 +48,7 @@ class HeldOut:
         """RMS error of each run, nT."""
         kept = np.isfinite(self.error)
         return {
-            str(label): float(np.sqrt(np.mean(self.error[kept & (self.runs == label)] ** 2)))
-            for label in np.unique(self.runs[kept])
+            str(label): rms(self.error[kept & (self.runs == label)]) for label in np.unique(self.runs[kept])
         }
 
 
