@@ -175,54 +175,73 @@ def test_a_long_text_is_put_together(air: Air) -> None:
     assert air.state.texts[1].time == NOW + 2
 
 
-def test_parameters_with_a_real_bridge(air: Air) -> None:
-    """Fetched also where some are lost on the way; set; refused with the bridge's own words."""
-    bridge = Component(Link("udpout:h:1"), {}, alignment(Align()), start_us=round(NOW * 1e6))
-    lose = {"MB_SETTLE_TIME", "MB_GAP_FACTOR"}
-    clock = [NOW]
+class Exchange:
+    """The station and a real bridge, whose first answers for the parameters of `lose` are lost."""
 
-    def run(seconds: float, answers: bool = True) -> None:
-        end = clock[0] + seconds
-        while clock[0] < end:
-            clock[0] += 0.1
-            us = round(clock[0] * 1e6)
-            for name, fields in air.state.due(clock[0]):
+    def __init__(self, air: Air, *lose: str) -> None:
+        self.bridge = Component(Link("udpout:h:1"), {}, alignment(Align()), start_us=round(NOW * 1e6))
+        self.air, self.lose, self.now = air, set(lose), NOW
+
+    def run(self, seconds: float, *, answers: bool = True) -> None:
+        end = self.now + seconds
+        while self.now < end:
+            self.now += 0.1
+            us = round(self.now * 1e6)
+            for name, fields in self.air.state.due(self.now):
                 if answers:
-                    bridge.receive(air.codec.pack(name, **fields), us)
-            bridge.advance(us)
-            for _, frame in bridge.outbox.drain():
-                name = next(iter(Codec(0, 0).parse(frame)))
-                if name.name == "PARAM_VALUE" and name["param_id"] in lose:
-                    lose.remove(name["param_id"])
-                    continue
-                air.give(frame, clock[0])
+                    self.bridge.receive(self.air.codec.pack(name, **fields), us)
+            self.bridge.advance(us)
+            for _, frame in self.bridge.outbox.drain():
+                message = next(iter(Codec(0, 0).parse(frame)))
+                if message.name == "PARAM_VALUE" and message["param_id"] in self.lose:
+                    self.lose.remove(message["param_id"])
+                else:
+                    self.air.give(frame, self.now)
 
-    run(8)
-    assert not lose
-    assert set(air.state.parameters) == set(bridge.parameters.names)
+
+def test_parameters_are_fetched_also_where_some_are_lost_on_the_way(air: Air) -> None:
+    exchange = Exchange(air, "MB_SETTLE_TIME", "MB_GAP_FACTOR")
+    exchange.run(8)
+    assert not exchange.lose
+    parameters = exchange.bridge.parameters
+    assert set(air.state.parameters) == set(parameters.names)
+    assert air.state.parameters["MB_SETTLE_TIME"].value == pytest.approx(parameters["MB_SETTLE_TIME"])
+
+
+def test_a_parameter_is_set_or_refused_with_the_bridges_own_words(air: Air) -> None:
+    exchange = Exchange(air)
+    exchange.run(8)
     settle = air.state.parameters["MB_SETTLE_TIME"]
-    assert settle.value == pytest.approx(bridge.parameters["MB_SETTLE_TIME"])
 
     air.state.set("MB_SETTLE_TIME", 7.3)
-    run(1)
-    assert bridge.parameters["MB_SETTLE_TIME"] == pytest.approx(7.3)
+    exchange.run(1)
+    assert exchange.bridge.parameters["MB_SETTLE_TIME"] == pytest.approx(7.3)
     assert (settle.value, settle.asked, settle.error) == (pytest.approx(7.3), None, "")
 
     air.state.set("MB_SETTLE_TIME", -1)
-    run(1)
+    exchange.run(1)
     assert settle.error == "-1 is not within 0 to 3600 s"
     assert (settle.value, settle.asked) == (pytest.approx(7.3), None)
 
     air.state.set("MB_SETTLE_TIME", 1e39)
     assert settle.error == "expected a number"
 
+
+def test_a_parameter_that_is_not_answered_is_asked_for_again(air: Air) -> None:
+    exchange = Exchange(air)
+    exchange.run(8)
+    settle = air.state.parameters["MB_SETTLE_TIME"]
     air.state.set("MB_SETTLE_TIME", 8)
-    run(4, answers=False)
+    exchange.run(4, answers=False)
     assert (settle.error, settle.asked) == ("no answer yet", 8)
-    run(2)
+    exchange.run(2)
     assert (settle.error, settle.value) == ("", 8)
 
-    air.say(clock[0], "MAG_STATUS", uptime=0)
-    assert not air.state.parameters  # another run: asked again
-    run(4)
-    assert len(air.state.parameters) == len(bridge.parameters.names)
+
+def test_another_run_s_parameters_are_fetched_anew(air: Air) -> None:
+    exchange = Exchange(air)
+    exchange.run(8)
+    air.say(exchange.now, "MAG_STATUS", uptime=0)
+    assert not air.state.parameters
+    exchange.run(4)
+    assert len(air.state.parameters) == len(exchange.bridge.parameters.names)

@@ -18,6 +18,7 @@ from magbridge.calibration.fitting.columns import observations
 from magbridge.calibration.fitting.data import Observations, polynomial_samples
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.kernel import Kernel
+from magbridge.calibration.model import Calibration
 from magbridge.calibration.residual import residuals_of
 from magbridge.calibration.terms import full_order
 from sitl import load, segments, simulate
@@ -98,6 +99,36 @@ def correcting(folder: Path, repetitions: int) -> list[Row]:  # noqa: ARG001
     """Time `correct` with positions that change at every sample, with positions at rest, and one by one."""
     data = table_1()
     calibration = fit(data).calibration
+    jobs, (rows, columns) = _jobs(calibration, data)
+    found: dict[str, list[float]] = {name: [] for name in jobs}
+    with threadpool_limits(1):
+        for _ in range(repetitions):
+            for name, (job, samples) in jobs.items():
+                found[name].append(1e6 * spent(job) / samples)
+
+    def beside(what: str, floor: str, said: str, **target: float) -> Row:
+        ratio = median(b / a for a, b in zip(found["moving"], found[floor], strict=True))
+        return Row(what, median(found["moving"]), "us", median(found[floor]), said, ratio=ratio, **target)
+
+    bare = f"{rows} products of monomials @ {rows} x {columns} table, on whole arrays"
+    return [
+        beside("correct, sigmas and all, positions new with every sample", "bare", bare, least=0.5),
+        beside("the same, the product in pieces that stay in the cache", "pieces", "as above, in pieces"),
+        beside(
+            "the same, beside all three products that it contains",
+            "contained",
+            "coarse and fine parts, in pieces",
+        ),
+        Row("correct, positions held", median(found["still"]), "us"),
+        Row("one sample live, positions held", median(found["live held"]), "us"),
+        Row("one sample live, positions new", median(found["live"]), "us"),
+    ]
+
+
+def _jobs(
+    calibration: Calibration, data: Observations
+) -> tuple[dict[str, tuple[Callable[[], object], int]], tuple[int, int]]:
+    """Return what is timed, each with its number of samples; and the shape of the calibration's table."""
     rng = np.random.default_rng(1)
     n, few = 200_000, 2000
     field = data.field[rng.integers(0, len(data), n)]
@@ -113,7 +144,7 @@ def correcting(folder: Path, repetitions: int) -> list[Row]:  # noqa: ARG001
         for reading, value in zip(readings, positions, strict=True):
             corrector.step(0, reading, value)
 
-    work: dict[str, tuple[Callable[[], object], int]] = {
+    jobs: dict[str, tuple[Callable[[], object], int]] = {
         "bare": (lambda: floors.product(n), n),
         "pieces": (lambda: floors.product(CHUNK), n),
         "contained": (floors.contained, n),
@@ -122,30 +153,7 @@ def correcting(folder: Path, repetitions: int) -> list[Row]:  # noqa: ARG001
         "live": (lambda: live(values), few),
         "live held": (lambda: live([values[0]] * few), few),
     }
-    found: dict[str, list[float]] = {name: [] for name in work}
-    with threadpool_limits(1):
-        for _ in range(repetitions):
-            for name, (job, samples) in work.items():
-                found[name].append(1e6 * spent(job) / samples)
-
-    def beside(what: str, floor: str, said: str, **target: float) -> Row:
-        ratio = median(b / a for a, b in zip(found["moving"], found[floor], strict=True))
-        return Row(what, median(found["moving"]), "us", median(found[floor]), said, ratio=ratio, **target)
-
-    rows, columns = floors.table.shape
-    bare = f"{rows} products of monomials @ {rows} x {columns} table, on whole arrays"
-    return [
-        beside("correct, sigmas and all, positions new with every sample", "bare", bare, least=0.5),
-        beside("the same, the product in pieces that stay in the cache", "pieces", "as above, in pieces"),
-        beside(
-            "the same, beside all three products that it contains",
-            "contained",
-            "coarse and fine parts, in pieces",
-        ),
-        Row("correct, positions held", median(found["still"]), "us"),
-        Row("one sample live, positions held", median(found["live held"]), "us"),
-        Row("one sample live, positions new", median(found["live"]), "us"),
-    ]
+    return jobs, floors.table.shape
 
 
 def table_1(noise: float = 1.0) -> Observations:
