@@ -77,9 +77,9 @@ def held_out(problem: Problem, columns: Sequence[Columns], fit: Joint) -> HeldOu
         first = max(rows.start - len(noise.memory), 0)
         A = noise.filter(X.rows(slice(first, rows.stop)), first, rows.start - first)
         for k in np.unique(of[rows]):
-            own = A[of[rows] == k]
-            P[k] += own.T @ own
-            b[k] += own.T @ (y[rows][of[rows] == k] + own @ c)
+            fold_rows = A[of[rows] == k]
+            P[k] += fold_rows.T @ fold_rows
+            b[k] += fold_rows.T @ (y[rows][of[rows] == k] + fold_rows @ c)
     whole_P, whole_b = P.sum(axis=0) + np.diag(prior), b.sum(axis=0) + prior * centre
     others = whole_P - P
     without = np.linalg.solve(others, (whole_b - b)[:, :, None])[:, :, 0]

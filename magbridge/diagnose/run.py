@@ -176,7 +176,7 @@ def _whenever(candidates: Sequence[Candidate], learned: NDArray[np.bool_]) -> li
     if not learned.any():
         return list(candidates)
     timed = [any(isinstance(effect, TimeEffect) for effect in candidate.effects) for candidate in candidates]
-    lasting = [c for c, own in zip(candidates, timed, strict=True) if c.effects and not own]
+    lasting = [c for c, has_time in zip(candidates, timed, strict=True) if c.effects and not has_time]
     return [*candidates, *(since(candidate, learned) for candidate in lasting)]
 
 

@@ -91,11 +91,11 @@ def times(columns: Columns, rows: slice, c: FloatArray) -> FloatArray:
 
 def together(columns: Sequence[Columns]) -> Mixture:
     """Return all columns side by side as one mixture, in which shared parts occur once."""
-    listed = [parts(own) for own in columns]
-    ends = np.cumsum([0, *(own[0][1].shape[1] for own in listed)])
+    listed = [parts(one) for one in columns]
+    ends = np.cumsum([0, *(blocks[0][1].shape[1] for blocks in listed)])
     found: dict[Columns, FloatArray] = {}
-    for own, start, end in zip(listed, ends, ends[1:], strict=False):
-        for X, M in own:
+    for blocks, start, end in zip(listed, ends, ends[1:], strict=False):
+        for X, M in blocks:
             whole = found.setdefault(X, np.zeros((len(M), ends[-1])))
             whole[:, start:end] += M
     return Mixture(tuple(found.items()))

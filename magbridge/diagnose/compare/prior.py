@@ -40,16 +40,16 @@ def floor(calibration: Calibration) -> FloatArray:
     hundredth. The filters' lag in the turns of the calibration runs, and the drift between days, are larger.
     """
     spread = np.zeros(calibration.coefficients.size)
-    for own in _constants(calibration):
-        spread[own] = STABLE * calibration.reference.field
+    for constants in _constants(calibration):
+        spread[constants] = STABLE * calibration.reference.field
     return np.diag(spread**2)
 
 
 def isotropic(calibration: Calibration) -> FloatArray:
     """(K,) change of the coefficients that raises the total field by 1 nT at any attitude: equal scales."""
     scale = np.zeros(calibration.coefficients.size)
-    for own in _constants(calibration)[:1]:
-        scale[own.start : own.start + 3] = 1.0
+    for constants in _constants(calibration)[:1]:
+        scale[constants.start : constants.start + 3] = 1.0
     return scale
 
 

@@ -134,11 +134,11 @@ def _columns(
         for name, column in ds.data_vars.items()
         if column.dtype.kind in "fiub" and not str(name).startswith("truth_")
     }
-    in_turn = False
+    in_turn, trusted = False, TRUSTED * calibration.noise.sensor
     for axis in "xyz":  # a log of channels that were sampled in turn has a time for each
-        own = table.pop(f"mag_time_{axis}", None)
-        if own is not None and np.isfinite(own).all() and not np.array_equal(own, time):
-            table[f"mag_{axis}"] = _at(time, own, table[f"mag_{axis}"], TRUSTED * calibration.noise.sensor)
+        sampled = table.pop(f"mag_time_{axis}", None)
+        if sampled is not None and np.isfinite(sampled).all() and not np.array_equal(sampled, time):
+            table[f"mag_{axis}"] = _at(time, sampled, table[f"mag_{axis}"], trusted)
             in_turn = True
     table |= {"time": time, "learned": np.full(time.size, float(learned))}
     if in_turn:
@@ -150,7 +150,7 @@ def _columns(
     return table
 
 
-def _at(time: FloatArray, own: FloatArray, values: FloatArray, trusted: float) -> FloatArray:
+def _at(time: FloatArray, sampled: FloatArray, values: FloatArray, trusted: float) -> FloatArray:
     """Return a channel at the row's time: the cubic through its sample, the one after and the two before.
 
     Linear interpolation is off by the curvature of a turn: tenths of a nanotesla, always with the same sign.
@@ -159,7 +159,7 @@ def _at(time: FloatArray, own: FloatArray, values: FloatArray, trusted: float) -
     out = np.full(time.size, np.nan)
     if time.size < 4:
         return out
-    a, b, c, d, t = own[:-3], own[1:-2], own[2:-1], own[3:], time[2:-1]
+    a, b, c, d, t = sampled[:-3], sampled[1:-2], sampled[2:-1], sampled[3:], time[2:-1]
     first = (values[2:-1] - values[1:-2]) / (c - b)
     after = (values[3:] - values[2:-1]) / (d - c)
     before = (values[1:-2] - values[:-3]) / (b - a)

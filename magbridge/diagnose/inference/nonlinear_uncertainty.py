@@ -77,8 +77,8 @@ def _within(
     """(q + k, q + k) covariance added by the parameters' uncertainty within their cells."""
     slopes = [
         slope
-        for piece, own in zip(pieces, slices(pieces), strict=True)
-        for slope in _slopes(piece, fit.coefficients[own])
+        for piece, at in zip(pieces, slices(pieces), strict=True)
+        for slope in _slopes(piece, fit.coefficients[at])
     ]
     if not slopes:
         return np.zeros_like(fit.covariance)
@@ -117,9 +117,9 @@ def _beyond(
         return more
     info = information(problem, fit.noise, fit, [*(candidate.columns for candidate in every), *columns])
     places = iter(placed := list(zip([*every, *pieces], slices([*every, *pieces]), strict=True)))
-    for mine, some in zip(placed[len(every) :], points, strict=True):
+    for placed_piece, some in zip(placed[len(every) :], points, strict=True):
         if some:
-            more += _elsewhere(info, fit, mine, [next(places) for _ in some])
+            more += _elsewhere(info, fit, placed_piece, [next(places) for _ in some])
     return more
 
 
@@ -128,9 +128,9 @@ def _same_grid(one: Candidate, other: Candidate) -> bool:
     return key(one) == key(other) and one.names == other.names
 
 
-def _elsewhere(info: Information, fit: Joint, mine: Placed, points: Sequence[Placed]) -> FloatArray:
+def _elsewhere(info: Information, fit: Joint, placed_piece: Placed, points: Sequence[Placed]) -> FloatArray:
     """(q + k, q + k) covariance added by the other points of one piece's grid."""
-    piece, own = mine
+    piece, own = placed_piece
     q, first = len(fit.z), len(info.score) - fit.coefficients.size
     here = slice(own.start - first, own.stop - first)
     rest = np.setdiff1d(np.arange(first, len(info.score)), np.arange(own.start, own.stop))

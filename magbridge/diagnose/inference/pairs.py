@@ -165,11 +165,11 @@ class _Table:
         # under the noise that is left, which is less, ratios exceed what the model as a whole has gained
         whole = self.state.ratio(self.base)
         if len(groups) == 1:
-            own, grid = self.scores[m], [self.scores[n].evidence for n in self.state.groups[groups[0]]]
-            needed = lead(min(own.ratio, whole))
+            standing, grid = self.scores[m], [self.scores[n].evidence for n in self.state.groups[groups[0]]]
+            needed = lead(min(standing.ratio, whole))
             # the pair pays for one more cause, which must not be what the single one's regressor leaves
             price = needed + float(np.log(len(self.state.trials)))
-            return own.evidence + _average(np.array(grid)) + price, needed
+            return standing.evidence + _average(np.array(grid)) + price, needed
         found = []
         for a, b in ((m, m + 1), (m + 1, m)):
             first = self.scores[a]

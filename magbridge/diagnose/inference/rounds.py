@@ -241,7 +241,7 @@ def _made_once(n: int, columns: Sequence[Columns]) -> list[Columns]:
     """Return `columns` with their shared parts precomputed."""
     shared = [X for X, _ in together(columns).parts]
     known = dict(zip(shared, kept(n, shared), strict=True))
-    return [Mixture(tuple((known[X], M) for X, M in parts(own))) for own in columns]
+    return [Mixture(tuple((known[X], M) for X, M in parts(column))) for column in columns]
 
 
 def _ridge(model: Sequence[Candidate]) -> FloatArray:
