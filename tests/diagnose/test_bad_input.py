@@ -16,6 +16,7 @@ from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.model import Calibration, Sensor
 from magbridge.cli import main
 from magbridge.diagnose.compare.take import take
+from magbridge.diagnose.diagnosis import Diagnosis
 from magbridge.diagnose.report import files
 from magbridge.diagnose.run import diagnose
 from magbridge.errors import DataError, WriteError
@@ -36,35 +37,38 @@ def some(ds: xr.Dataset, count: int) -> xr.DataArray:
     return ds["time"] >= ds["time"][count]
 
 
-def test_the_demonstrations_survey_is_plain(plain: tuple[xr.Dataset, Calibration], tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def found(
+    plain: tuple[xr.Dataset, Calibration], tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Diagnosis, Path]:
+    """A diagnosis, and the folder it was written to."""
+    folder = tmp_path_factory.mktemp("found")
+    return diagnose([plain[0]], plain[1], folder, remarks=["a<b>.csv: fitted to this log"]), folder
+
+
+def test_the_demonstrations_survey_is_plain(found: tuple[Diagnosis, Path]) -> None:
     """And the report says what its reader must know of the log."""
-    found = diagnose([plain[0]], plain[1], tmp_path, remarks=["a<b>.csv: fitted to this log"])
-    assert found.verdict == "nothing_found"
-    assert "a&lt;b&gt;.csv: fitted to this log.</p>" in (tmp_path / "report.html").read_text()
+    assert found[0].verdict == "nothing_found"
+    assert "a&lt;b&gt;.csv: fitted to this log.</p>" in (found[1] / "report.html").read_text()
 
 
-def test_where_one_file_cannot_be_written_none_is(
-    plain: tuple[xr.Dataset, Calibration], tmp_path: Path
-) -> None:
+def test_where_one_file_cannot_be_written_none_is(found: tuple[Diagnosis, Path], tmp_path: Path) -> None:
     (tmp_path / "report.html").mkdir()
     (tmp_path / "findings.json").write_text("of an earlier diagnosis")
     with pytest.raises(WriteError, match=r"report\.html: cannot be written: Is a directory"):
-        diagnose([plain[0]], plain[1], tmp_path)
+        files.write(found[0], tmp_path)
     assert {path.name for path in tmp_path.iterdir()} == {"report.html", "findings.json"}
     assert (tmp_path / "findings.json").read_text() == "of an earlier diagnosis"
 
 
-def test_a_full_disk_names_the_file_that_has_no_room(
-    plain: tuple[xr.Dataset, Calibration], tmp_path: Path
-) -> None:
+def test_a_full_disk_names_the_file_that_has_no_room(found: tuple[Diagnosis, Path], tmp_path: Path) -> None:
     """The limit of a file's size stands for the disk's end."""
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    found = diagnose([plain[0]], plain[1])
     for room, name in ((0, "calibration.json"), (300_000, "report.html")):
         resource.setrlimit(resource.RLIMIT_FSIZE, (room, limits[1]))
         try:
             with pytest.raises(WriteError, match=rf"doubt/{name}: cannot be written: File too large"):
-                files.write(found, tmp_path / "doubt")
+                files.write(found[0], tmp_path / "doubt")
         finally:
             resource.setrlimit(resource.RLIMIT_FSIZE, limits)
         assert not list(tmp_path.iterdir())
