@@ -27,8 +27,7 @@ def test_garbage_from_the_link(rig: Rig, table: Row) -> None:
     )
     skipped = after["link_bytes_skipped"] - before["link_bytes_skipped"]
     lost = after["link_frames_lost"] - before["link_frames_lost"]
-    rig.autopilot.say("PARAM_REQUEST_READ", target_system=1, target_component=191, param_index=0)
-    rig.until(lambda: rig.of("PARAM_VALUE", mark))
+    rig.until_answered()
     assert rig.undue_flags(mark) == ""
     table(
         "3,300 bytes of noise and half frames from the link",

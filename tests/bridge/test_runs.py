@@ -109,9 +109,7 @@ def said_in(logs: list[Path], text: str) -> bool:
 def test_autopilot_on_a_serial_line_pulled_out_and_back(make_rig: MakeRig, table: Row) -> None:
     rig = make_rig("serial")
     rig.start()
-    mark = rig.mark
-    rig.autopilot.say("PARAM_REQUEST_READ", target_system=1, target_component=191, param_index=0)
-    rig.until(lambda: rig.of("PARAM_VALUE", mark))
+    rig.until_answered()
     last, mark, away = rig.of("MAG_FIELD")[-1]["sequence"], rig.mark, time.monotonic()
     rig.autopilot.down()
     rig.run(1.0)
@@ -184,8 +182,7 @@ def test_forged_signed_packets(make_rig: MakeRig, table: Row) -> None:
         rig.autopilot.send(frame)
     rig.until_status(lambda status: status["link_refused"] == before["link_refused"] + len(wrong))
     rig.run(0.8)  # beyond max_age: only later genuine telemetry keeps the field good
-    rig.autopilot.say("PARAM_REQUEST_READ", target_system=1, target_component=191, param_index=0)
-    rig.until(lambda: rig.of("PARAM_VALUE", mark))
+    rig.until_answered()
     assert rig.undue_flags(mark) == ""
     assert all(message.frame[2] & 1 for _, message in rig.heard)
     table(

@@ -13,9 +13,9 @@ from magbridge.diagnose.compare.problem import Problem, pose
 from magbridge.diagnose.compare.survey import Survey
 from magbridge.diagnose.inference.information import information
 from magbridge.diagnose.inference.joint import fit_joint
-from magbridge.diagnose.inference.packets import packets
+from magbridge.diagnose.inference.packets import Packets, packets
 from magbridge.diagnose.inference.shapes import ends, repeated
-from magbridge.diagnose.inference.statistic import Statistic
+from magbridge.diagnose.inference.statistic import Ridge, Statistic
 
 
 def drawn(problem: Problem, memory: float, rng: np.random.Generator) -> NDArray[np.float64]:
@@ -27,6 +27,15 @@ def drawn(problem: Problem, memory: float, rng: np.random.Generator) -> NDArray[
     return np.asarray(r[place])
 
 
+def fitted(given: Problem) -> tuple[Packets, Ridge]:
+    """Return the packets of a log, and the best estimate of their sizes."""
+    base = fit_joint(given, [], 1)
+    found = packets(given, base)
+    assert found is not None
+    info = information(given, base.noise, base, [found.columns])
+    return found, Statistic(info.matrix, np.ones((1, 2 * found.number))).best(info.score)
+
+
 @pytest.mark.parametrize("memory", [0.0, 0.8])
 def test_two_packets_are_found_where_they_are_in_noise_of_any_memory(problem: Problem, memory: float) -> None:
     n, rng = len(problem), np.random.default_rng(3)
@@ -36,11 +45,7 @@ def test_two_packets_are_found_where_they_are_in_noise_of_any_memory(problem: Pr
         planted += 2.5 * np.exp(-0.5 * ((t - moment) / length) ** 2) * np.cos(2 * np.pi * t / period + 1.0)
     noise = drawn(problem, memory, rng)
     given = replace(problem, residual=problem.gain * planted + noise)
-    base = fit_joint(given, [], 1)
-    found = packets(given, base)
-    assert found is not None
-    info = information(given, base.noise, base, [found.columns])
-    best = Statistic(info.matrix, np.ones((1, 2 * found.number))).best(info.score)
+    found, best = fitted(given)
     estimate = found.columns(slice(None)) @ best.estimate
     planted *= problem.gain
     assert np.sum((estimate - planted) ** 2) < np.sum(planted**2) / 3.0
@@ -76,11 +81,7 @@ def test_a_packet_keeps_its_period_and_place_where_samples_are_lost(
     log = pose(thinned(whole.survey, here), whole.calibration)
     planted = log.gain * planted[here]
     given = replace(log, residual=planted + drawn(log, 0.5, rng))
-    base = fit_joint(given, [], 1)
-    found = packets(given, base)
-    assert found is not None
-    info = information(given, base.noise, base, [found.columns])
-    best = Statistic(info.matrix, np.ones((1, 2 * found.number))).best(info.score)
+    found, best = fitted(given)
     assert np.sum((found.columns(slice(None)) @ best.estimate - planted) ** 2) < 0.2 * np.sum(planted**2)
     assert found.period == pytest.approx(4.0 * 41.0, rel=0.1)
 

@@ -25,6 +25,15 @@ TURN = 0.002
 """s between two looks at everything."""
 
 
+def open_line(name: Path) -> tuple[int, int]:
+    """Make a serial line whose far end is a device called `name`; return the descriptors of both ends."""
+    near, far = pty.openpty()
+    tty.setraw(far)
+    os.set_blocking(near, False)
+    name.symlink_to(os.ttyname(far))
+    return near, far
+
+
 class Fluxgate:
     """A digitizer on a pty, found under a name that can change as those of USB adapters do."""
 
@@ -39,11 +48,8 @@ class Fluxgate:
 
     def plug(self, name: str = "ttyUSB0", *, powered_anew: bool = False) -> None:
         """Plug it in."""
-        self._master, self._slave = pty.openpty()
-        tty.setraw(self._slave)
-        os.set_blocking(self._master, False)
         self._name = self.folder / name
-        self._name.symlink_to(os.ttyname(self._slave))
+        self._master, self._slave = open_line(self._name)
         if powered_anew:
             self.encoder.power_on()
             self._on, self._sent = time.monotonic(), 0
@@ -86,11 +92,8 @@ class SerialEnd:
     """One end of a serial line, spoken to as a socket is; the other end is a device called `name`."""
 
     def __init__(self, name: Path) -> None:
-        self._master, self._slave = pty.openpty()
-        tty.setraw(self._slave)
-        os.set_blocking(self._master, False)
         self._name = name
-        name.symlink_to(os.ttyname(self._slave))
+        self._master, self._slave = open_line(name)
 
     def sendall(self, data: bytes) -> None:
         """Put bytes on the line."""

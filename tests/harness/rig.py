@@ -188,6 +188,12 @@ class Rig:
         begun = time.monotonic()
         self.until(lambda: self.since(begun) >= seconds, seconds + 5)
 
+    def until_answered(self) -> None:
+        """Ask the bridge for a parameter, and wait for the answer."""
+        mark = self.mark
+        self.autopilot.say("PARAM_REQUEST_READ", target_system=1, target_component=191, param_index=0)
+        self.until(lambda: self.of("PARAM_VALUE", mark))
+
     def until_well(self) -> float:
         """Wait for a run of good samples, a sensor and an autopilot; return the s to the first of the run.
 
