@@ -287,6 +287,9 @@ def open_link(url: str, baudrate: int, source: str = "bridge.toml") -> Port:
             raise ConfigError(source, "link.url", f"expected {known} or a serial device, got {url!r}")
         return serial_line(url.removeprefix("serial:"), baudrate, source, "link.url")
     try:
-        return LINKS[kind](url, _address(address))
+        host, port = _address(address)
+        if not port and kind in ("udpout", "tcp"):  # of one's own, 0 is any that is free
+            raise ValueError("expected HOST:PORT")  # noqa: TRY301 - as `_address` does
+        return LINKS[kind](url, (host, port))
     except ValueError as error:
         raise ConfigError(source, "link.url", f"{error}, got {url!r}") from error

@@ -112,7 +112,7 @@ def test_a_saturated_line_carries_what_is_new() -> None:
     free, count = 0.0, 200
     while last < begun + 2.0:
         now = time.monotonic()
-        free, last = min(free + (now - last) * baud / 10, 500.0), now
+        free, last = min(free + (now - last) * baud / 10, 5000.0), now
         if now > begun + (count - 200) * 0.0025:
             port.write(sample(codec, count := count + 1))
         port.flush()
@@ -144,13 +144,11 @@ def test_what_waits_for_a_slow_reader(key: bytes | None) -> None:
         port.write(sample(codec, count := count + 1))
     time.sleep(2 * LATE)
     told = count
-    for _ in range(5):
+    while count < told + 5 or count % 100 == 0:  # no text at the end
         port.write(sample(codec, count := count + 1))
     heard: list[Message] = []
     reader.now_us = codec.now_us
-    while [one.name for one in heard[-3:]] != ["MAG_FIELD", "NAMED_VALUE_FLOAT", "NAMED_VALUE_FLOAT"] or (
-        heard[-3]["sequence"] < count
-    ):
+    while len(heard) < 3 or heard[-3].name != "MAG_FIELD" or heard[-3]["sequence"] < count:
         port.flush()
         heard += reader.parse(drained(client, 1))
     client.close()
@@ -159,10 +157,10 @@ def test_what_waits_for_a_slow_reader(key: bytes | None) -> None:
     assert all(one.known for one in heard)
     fields = [one["sequence"] for one in heard if one.name == "MAG_FIELD"]
     assert fields == sorted(fields)
-    assert fields[-5:] == list(range(told + 1, told + 6))
+    assert fields[-1] == count
     assert len(fields) < told
     names = [one["name"] for one in heard if one.name == "NAMED_VALUE_FLOAT"]
-    assert names[-10:] == ["mag_total", "mag_sigma"] * 5
+    assert names[-2:] == ["mag_total", "mag_sigma"]
     assert [one["text"] for one in heard if one.name == "STATUSTEXT"] == [
         f"{number}" for number in range(100, count + 1, 100)
     ]
@@ -263,7 +261,15 @@ def test_datagrams_that_waited_come_at_once() -> None:
 
 
 @pytest.mark.parametrize(
-    "url", ["udpin:14550", "tcp:host:http", "tcp:host:70000", "socket://host", "rfc2217://host:70000"]
+    "url",
+    [
+        "udpin:14550",
+        "tcp:host:http",
+        "tcp:host:70000",
+        "udpout:host:0",
+        "socket://host",
+        "rfc2217://host:70000",
+    ],
 )
 def test_an_address_that_is_none(url: str) -> None:
     with pytest.raises(ConfigError, match="HOST:PORT"):
