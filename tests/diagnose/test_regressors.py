@@ -222,3 +222,14 @@ def test_sources_along_its_way_hold_the_field_of_iron_that_a_mass_passes(problem
         field = np.sum(slopes * (3.0 * r * (r @ m)[:, None] / far**2 - m) / far**3, axis=1)
         next_power = missed(p[:, None] ** 4 * slopes, field)
         assert min(missed(columns, field) for columns in listed) < min(0.2, 0.4 * next_power)
+
+
+def test_a_core_that_shows_through_changes_the_sensitivity_too(problem: Problem) -> None:
+    """A feedback of finite gain leaves the core the field that its output takes: not flat at zero."""
+    shown = np.einsum("ni,ni->n", problem.slopes[:, 6:], np.arctanh(0.8 * problem.reading / 5e4))
+    every = CAUSES["nonlinearity"].candidates(problem)[-1].columns(slice(0, len(problem)))
+
+    def left(X: np.ndarray) -> float:
+        return float(np.linalg.norm(shown - X @ np.linalg.lstsq(X, shown, rcond=1e-12)[0]))
+
+    assert left(every) < 0.2 * left(every[:, 3:])

@@ -135,6 +135,7 @@ def test_powers_have_units_of_their_own(problem: Problem) -> None:
     bent = CAUSES["nonlinearity"].candidates(problem)[-1]
     unit = f"{problem.calibration.reference.field:.0f} nT"
     assert dict(zip(bent.names, bent.units, strict=True)) == {
+        **{f"{axis}1": f"nT per {unit}" for axis in "xyz"},
         **{f"{axis}2": f"nT per ({unit})^2" for axis in "xyz"},
         **{f"{axis}3": f"nT per ({unit})^3" for axis in "xyz"},
     }

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import reduce
 from itertools import product
 
 import numpy as np
@@ -20,19 +21,24 @@ FloatArray = NDArray[np.float64]
 
 
 def nonlinearity(problem: Problem) -> list[Candidate]:
-    """The response bends: ``T_i += b_i (H_i / H_0)^p``, p = 2 (a leak), 3 (a saturating core), or both.
+    """The response bends: ``T_i += b_i (H_i / H_0)^p``, p = 2 (a leak), 3 (a saturating core), or 1 to 3.
 
-    The leak is that of an even harmonic. Both together have six coefficients of one common size, because the
-    three channels are built alike.
+    The leak is that of an even harmonic. A feedback of finite gain leaves the core the field that its output
+    takes, and that is the inverse of its magnetisation curve: steeper the farther out, but not flat at zero
+    either. So a core that shows through also changes the sensitivity, and p = 1 belongs to the bend. All nine
+    coefficients have one common size, because the three channels are built alike.
     """
+    powered = [_power(problem, power) for power in (1, 2, 3)]
+    every = replace(reduce(Candidate.with_, powered), parts=(), spectra=np.ones((1, 9)))
+    return [*powered[1:], every]
+
+
+def _power(problem: Problem, power: int) -> Candidate:
     unit, H = problem.calibration.reference.field, problem.reading
-    made = []
-    for power in (2, 3):
-        effect = ResponseEffect(cause="nonlinearity", unit=unit, power=power)
-        phi = lambda rows, power=power: powers(H[rows].T / unit, power)[-1]  # noqa: E731
-        names = tuple(f"{axis}{power}" for axis in AXES)
-        made.append(of_effect(problem, effect, 50.0, per(f"{unit:.0f} nT", power), names=names, phi=phi))
-    return [*made, replace(made[0].with_(made[1]), parts=(), spectra=np.ones((1, 6)))]
+    effect = ResponseEffect(cause="nonlinearity", unit=unit, power=power)
+    phi = lambda rows: powers(H[rows].T / unit, power)[-1]  # noqa: E731  (a regressor is one line)
+    names = tuple(f"{axis}{power}" for axis in AXES)
+    return of_effect(problem, effect, 50.0, per(f"{unit:.0f} nT", power), names=names, phi=phi)
 
 
 def saturation(problem: Problem) -> list[Candidate]:
