@@ -113,12 +113,12 @@ def with_map_error(
 
     Notes
     -----
-    The logs that the calibration was fitted to have the same map as their reference. Its error may be as
-    large where they were flown as it is along the track; it is then part of the calibration's scale, and no
-    log shows it. With s the coefficients that raise the corrected field by 1 nT everywhere, and m the error
-    of the map that was found,
+    The logs that the calibration was fitted to have the same map as their reference, so the mean of its error
+    may have gone into the calibration's scale. How large it is rests on the map's altitude, which may be half
+    the usual or twice, and half of the error is taken to be uncertain. With s the coefficients that raise the
+    corrected field by 1 nT everywhere, and m the error of the map that was found,
 
-    .. math:: C \leftarrow C + \overline{m^2}\, s s^T
+    .. math:: C \leftarrow C + \overline{(m / 2)^2}\, s s^T
     """
     if not problem.survey.learned.any():
         return extended
@@ -126,7 +126,7 @@ def with_map_error(
     for candidate, own in zip(model, slices(model), strict=True):
         if candidate.cause == "map_error":
             b = fit.coefficients[own]
-            power += float(b @ normal(candidate.columns, problem.residual)[0] @ b) / len(problem)
+            power += 0.25 * float(b @ normal(candidate.columns, problem.residual)[0] @ b) / len(problem)
     s = isotropic(extended)
     return replace(extended, covariance=extended.covariance + power * np.outer(s, s))
 

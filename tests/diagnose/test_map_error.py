@@ -6,26 +6,66 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+import pytest
+from numpy.typing import NDArray
 
-from magbridge.diagnose.causes.reference import map_error
+from magbridge.diagnose.causes.candidates import Candidate
+from magbridge.diagnose.causes.map_error import map_error
 from magbridge.diagnose.compare.problem import Problem
-from magbridge.diagnose.inference.joint import fit_joint
+from magbridge.diagnose.inference.joint import Joint, fit_joint
+
+N = 1500
+NORTH = 2000.0 * (1.0 - np.abs(np.linspace(-1.0, 1.0, N)))
+DOWN = 75.0 * (1.0 - np.cos(2.0 * np.pi * np.arange(N) / 170.0))
+"""m, a line there and back at other depths."""
+
+
+def drawn(whole: Problem, error: NDArray[np.float64], down: NDArray[np.float64]) -> Problem:
+    """Return a problem whose reference has an `error` (n,), nT, along a track at depths `down`."""
+    place = np.stack([NORTH, np.zeros(N), down], axis=1)
+    return replace(whole, residual=whole.residual + error, survey=replace(whole.survey, place=place))
+
+
+def fitted(problem: Problem, chart: Candidate) -> Joint:
+    assert chart.shapeless
+    return fit_joint(problem, [chart.columns], 1, spectra=[chart.spectra])
+
+
+def flown(altitude: float) -> NDArray[np.float64]:
+    """(n,) nT that a map from an altitude lacks of two waves, which do not average out along the track."""
+    found = np.zeros(N)
+    for length, phase in ((1600.0, 0.3), (5000.0, 1.0)):
+        k = 2.0 * np.pi / length
+        grown = np.exp(k * (DOWN - 150.0)) - np.exp(k * (-altitude - 150.0))
+        found += 60.0 * grown * np.cos(k * NORTH + phase)
+    return found
 
 
 def test_what_a_map_as_flown_lacks_grows_with_depth(right: Callable[[int], Problem]) -> None:
-    """A line there and back at other depths: without them, one place has two errors."""
-    n, k, flown = 1500, 2.0 * np.pi / 1600.0, -90.0
-    north = 2000.0 * (1.0 - np.abs(np.linspace(-1.0, 1.0, n)))
-    down = 75.0 * (1.0 - np.cos(2.0 * np.pi * np.arange(n) / 170.0))
-    missing = 60.0 * (np.exp(k * (down - 150.0)) - np.exp(k * (flown - 150.0))) * np.sin(k * north)
-    whole = right(n)
-    whole = replace(whole, residual=whole.residual + missing)
-    place = np.stack([north, np.zeros(n), down], axis=1)
-    left = []
-    for known in (place, place[:, :2]):
-        problem = replace(whole, survey=replace(whole.survey, place=known))
-        (chart,) = map_error(problem)
-        fit = fit_joint(problem, [chart.columns], 1, spectra=[chart.spectra])
-        left.append(float(np.std(fit.left)))
-        assert chart.shapeless
+    """Without the depths, one place has two errors."""
+    missing, left = flown(90.0), []
+    for down in (DOWN, np.zeros(N)):
+        problem = drawn(right(N), missing, down)
+        left.append(float(np.std(fitted(problem, map_error(problem)[0]).left)))
     assert left[0] < 0.1 * np.std(missing) < 0.2 * np.std(missing) < left[1], left
+
+
+@pytest.mark.parametrize("altitude", [60.0, 100.0, 150.0])
+def test_the_mean_of_what_a_map_lacks_is_known(right: Callable[[int], Problem], altitude: float) -> None:
+    """The growth with depth tells it from a constant of the calibration's."""
+    missing = flown(altitude)
+    problem = drawn(right(N), missing + 40.0, DOWN)
+    chart, _ = map_error(problem)
+    fit = fitted(problem, chart)
+    error = chart.columns(slice(None)) @ fit.coefficients / problem.gain
+    assert abs(error.mean() - missing.mean()) < 0.2 * np.sqrt(np.mean(missing**2))
+
+
+def test_what_is_drawn_wrong_is_the_same_at_every_depth(right: Callable[[int], Problem]) -> None:
+    wrong = 30.0 * np.exp(-0.5 * ((NORTH - 900.0) / 400.0) ** 2)
+    problem = drawn(right(N), wrong, DOWN)
+    _, chart = map_error(problem)
+    fit = fitted(problem, chart)
+    assert np.std(fit.left) < 0.1 * np.std(wrong)
+    error = chart.columns(slice(None)) @ fit.coefficients / problem.gain
+    np.testing.assert_allclose(error, error[::-1], atol=1e-6)  # there and back

@@ -10,8 +10,9 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from magbridge.diagnose.causes.candidates import Candidate
+from magbridge.diagnose.causes.map_error import map_error
 from magbridge.diagnose.causes.masses import actuator_order, hysteresis, unmodelled_actuator
-from magbridge.diagnose.causes.reference import diurnal_variation, map_error, reference_bias
+from magbridge.diagnose.causes.reference import diurnal_variation, reference_bias
 from magbridge.diagnose.causes.response import nonlinearity, saturation
 from magbridge.diagnose.causes.telemetry import (
     current_field,
@@ -61,7 +62,7 @@ CAUSES: dict[str, Cause] = {
     "saturation": Cause(saturation, "a channel near its end", "turn the channel away from the field: saturation occurs only near full scale"),
     "pressure_offset": Cause(pressure_offset, "depth or pressure that varies", "hold one depth for an hour: the temperature settles, the pressure effect stays"),
     "diurnal_variation": Cause(diurnal_variation, "at least two hours", "a base station ashore"),
-    "map_error": Cause(map_error, "positions over some hundred metres", "cross the track again at the same depth: an error of the map is the same on every pass"),
+    "map_error": Cause(map_error, "positions over some hundred metres", "cross the track again, at another depth too: an error of the map is the same on every pass at one depth"),
     "reference_bias": Cause(reference_bias, "a reference", "calibrate and survey at one place, next to a proton magnetometer"),
     "interference_tone": Cause(interference_tone, "even sampling", "change the sampling rate: an alias changes its frequency"),
 }  # fmt: skip

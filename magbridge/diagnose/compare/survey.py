@@ -69,8 +69,8 @@ class Survey:
         this one's noise.
     dive : (n,) int array
         Number of the dive, the unit of cross-validation.
-    place : (n, 2 or 3) array or None
-        m north and east of the middle, and down where the log has a depth.
+    place : (n, 3) array or None
+        m north and east of the middle, and below the surface: 0 in a log without a depth.
     attitude : (n, 3) array or None
         deg, roll, pitch, heading.
     learned : (n,) bool array
@@ -207,15 +207,15 @@ def _channels(
 
 
 def _place(table: dict[str, FloatArray]) -> FloatArray | None:
-    """(n, 2 or 3) m north and east of the middle, and down if the log has a depth; None without positions."""
+    """(n, 3) m north and east of the middle, and below the surface; None without positions."""
     if not {"latitude", "longitude"} <= set(table):
         return None
     middle = np.median(table["latitude"])
     north = np.radians(table["latitude"] - middle) * 6.3712e6
     along = wrap(table["longitude"] - table["longitude"][0])  # also across the date line
     east = np.radians(along - np.median(along)) * 6.3712e6 * np.cos(np.radians(middle))
-    down = [_held(table["depth"])] if "depth" in table else []
-    return np.stack([north, east, *down], axis=1)
+    down = _held(table["depth"]) if "depth" in table else np.zeros_like(north)
+    return np.stack([north, east, down], axis=1)
 
 
 def _kinds(name: str, unit: str) -> tuple[str, ...]:
