@@ -6,12 +6,15 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
+from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.accept import _within, accept
 from magbridge.diagnose.inference.evidence import ODDS
 from magbridge.diagnose.inference.search import search
+from magbridge.diagnose.inference.varying import varying
 
 ROWS = 300
 
@@ -51,3 +54,41 @@ def test_a_name_is_asserted_possible_or_ruled_out(right: Callable[[int], Problem
     assert said == sorted(said)
     assert said.count("possible") == 1
     assert {"asserted", "ruled out"} < set(said)
+
+
+@pytest.mark.parametrize(("follows", "named"), [(0.0, True), (0.2, True), (1.0, False)])
+def test_a_name_whose_size_follows_something_else_is_not_asserted(
+    right: Callable[[int], Problem], follows: float, named: bool
+) -> None:
+    """A payload's current at S/N 14 or more, its leads drawn apart by a moving mass."""
+    problem, rng = right(ROWS), np.random.default_rng(10)
+    drawn = np.where(np.sin(np.arange(ROWS) / 3.0) > 0.3, 1.0, 0.0)
+    place = problem.survey.channels["p"].values
+    away = drawn * (1.0 + follows * place / np.std(place[drawn > 0.0]))
+    problem = replace(problem, residual=1.5 * away + rng.normal(size=ROWS))
+    name = Candidate("a", "amps", lambda rows: drawn[rows, None], np.ones(1), ("b",), ("nT",))
+    outcome = search(problem, [name], 1)
+    assert [h.candidate for h in outcome.chosen] == [name]
+    assert accept(problem, outcome, None)[0] == named
+
+
+def test_the_size_of_a_cause_may_follow_all_but_its_own_channel(problem: Problem) -> None:
+    """What follows a pressure and the pitch at once is held; of the pressure's square the rest is."""
+    survey, rows = problem.survey, slice(0, len(problem))
+    assert survey.attitude is not None
+    squeezed = next(c for c in CAUSES["pressure_offset"].candidates(problem) if c.channel == "depth")
+    described = varying(problem, squeezed, {"pressure_offset": 2.0})
+    assert described is not None
+    X = described.columns(rows)
+    assert X.shape[1] == described.widths[0][1].size
+
+    def left(y: np.ndarray) -> float:
+        return float(np.sum((y - X @ np.linalg.lstsq(X, y, rcond=None)[0]) ** 2) / (y @ y))
+
+    own = squeezed.columns(rows)[:, 0]
+    assert left(own * (2.0 - survey.attitude[:, 1])) < 1e-9
+    assert left(own * np.cos(np.radians(survey.attitude[:, 2]))) < 1e-9
+    assert left(own * survey.channels["depth"].values ** 2) > 1e-3
+    assert described.covers([squeezed])
+    slow = replace(squeezed, spectra=np.ones((1, squeezed.size)))
+    assert varying(problem, slow, {"pressure_offset": 2.0}) is None

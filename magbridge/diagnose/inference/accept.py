@@ -13,6 +13,7 @@ from magbridge.diagnose.inference.evidence import ODDS, REMNANT, worth
 from magbridge.diagnose.inference.rivals import Rival
 from magbridge.diagnose.inference.search import Hypothesis, Outcome
 from magbridge.diagnose.inference.unexplained import Leftover, leftover
+from magbridge.diagnose.inference.varying import varying
 
 __all__ = ["accept"]
 
@@ -27,7 +28,8 @@ def accept(problem: Problem, outcome: Outcome, tone: Candidate | None) -> tuple[
     unless one beats them 20:1.
     """
     model = [h.candidate for h in outcome.chosen]
-    rest = leftover(problem, model, outcome.fit, outcome.order, tone)
+    uneven = [one for candidate in model if (one := varying(problem, candidate, outcome.trials)) is not None]
+    rest = leftover(problem, model, outcome.fit, outcome.order, tone, also=uneven)
     if not model:
         return False, rest
     ratio = 2.0 * (outcome.fit.log_likelihood - outcome.null.log_likelihood)
@@ -38,7 +40,8 @@ def accept(problem: Problem, outcome: Outcome, tone: Candidate | None) -> tuple[
             rest = None
     # a description that contains the names' own regressors, with nothing else beside them, is no alternative
     alone = rest is None or _same(outcome.chosen, rest)
-    free = leftover(problem, [], outcome.null, outcome.order, tone, but=model if alone else ())
+    but = model if alone else ()
+    free = leftover(problem, [], outcome.null, outcome.order, tone, but=but, also=uneven)
     if not alone:
         names -= ODDS
     if free is None or names >= free.among:

@@ -110,6 +110,7 @@ def leftover(
     tone: Candidate | None = None,
     *,
     but: Sequence[Candidate] = (),
+    also: Sequence[Description] = (),
 ) -> Leftover | None:
     """Test whether anything is left beside `model`; the description with the best evidence, or None.
 
@@ -121,8 +122,10 @@ def leftover(
         The strongest tone, where tones are not among the causes.
     but : sequence of Candidate
         Causes whose own regressors no description may contain.
+    also : sequence of Description
+        Further descriptions.
     """
-    listed = [one for one in descriptions(problem, fit, tone) if not one.covers(but)]
+    listed = [one for one in (*descriptions(problem, fit, tone), *also) if not one.covers(but)]
     made = kept(len(problem), [one.columns for one in listed])
     listed = [one._replace(columns=columns) for one, columns in zip(listed, made, strict=True)]
     columns = [candidate.columns for candidate in model]
