@@ -81,6 +81,10 @@ FOREIGN: dict[str, Effect] = {
     "compliant": vehicle.compliant,
     "restart": sensor.restart,
     "whistle": sensor.whistle,
+    "yielding": vehicle.yielding,
+    "afterglow": vehicle.afterglow,
+    "mast": sensor.mast,
+    "annealed": sensor.annealed,
 }
 """Effects that are none of the named causes."""
 

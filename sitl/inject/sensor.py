@@ -205,3 +205,18 @@ def whistle(scene: Scene, size: float, rng: Generator) -> None:
     beat = rng.uniform(0.02, 0.1) * (1.0 + rng.uniform(0.03, 0.1) * (warm - warm[0]))
     phase = 2.0 * np.pi * np.cumsum(beat) * scene.track.step + rng.uniform(0.0, 2.0 * np.pi)
     scene.field = scene.field + size * direction(rng) * np.cos(phase)[:, None]
+
+
+def mast(scene: Scene, size: float, rng: Generator) -> None:
+    """The flow bends the sensor's mast, as the square of the speed; size in 1e-5 rad at 0.3 m/s down."""
+    sinking = np.gradient(scene.track.depth, scene.track.step) / 0.3
+    bent = first_order(sinking * np.abs(sinking), scene.track.step, float(rng.uniform(1.0, 10.0)))
+    scene.field = scene.field + 1e-5 * size * bent[:, None] * np.cross(direction(rng), scene.field)
+
+
+def annealed(scene: Scene, size: float, rng: Generator) -> None:
+    """Stress in the cores depends on whether they were warmed or cooled, and by how much; size in nT."""
+    warm = soaked(scene.water, scene.track.step, 300.0)
+    x = (warm - warm.mean()) / np.ptp(warm)
+    memory = relays(x, rng.uniform(-0.5, 0.5, 60), rng.uniform(0.1, 0.5, 60))
+    scene.field = scene.field + size * direction(rng) * memory[:, None]

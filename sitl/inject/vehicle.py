@@ -300,3 +300,18 @@ def compliant(scene: Scene, size: float, rng: Generator) -> None:
     weight = np.sin(np.radians(scene.track.pitch))
     gives = first_order(weight, scene.track.step, float(rng.uniform(1.0, 4.0)))
     scene.logged["battpos"] = (scene.track.parameters["battpos"] - size * gives, "in")
+
+
+def yielding(scene: Scene, size: float, rng: Generator) -> None:
+    """A plastic hull creeps under pressure and recovers within the hour; size in nT once it has at depth."""
+    pressed = scene.track.depth / scene.track.depth.max()
+    crept = first_order(pressed, scene.track.step, float(rng.uniform(1200.0, 3600.0)))
+    scene.field = scene.field + size * direction(rng) * (crept - crept[0])[:, None]
+
+
+def afterglow(scene: Scene, size: float, rng: Generator) -> None:
+    """The pump's brake stays energised until its relay cools, without a logged current; size in nT."""
+    moved = np.abs(np.gradient(scene.track.parameters["ballast"], scene.track.step)) > 1.0
+    warm = first_order(moved.astype(float), scene.track.step, float(rng.uniform(40.0, 200.0)))
+    held = warm > rng.uniform(0.05, 0.2) * max(warm.max(), 1e-9)
+    scene.field = scene.field + size * direction(rng) * held[:, None]
