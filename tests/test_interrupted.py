@@ -7,7 +7,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -15,14 +14,6 @@ import xarray as xr
 
 from magbridge.logs import write
 from sitl import load, simulate
-
-
-@pytest.fixture(autouse=True)
-def heard() -> Iterator[None]:
-    """A shell's background jobs, and all that they start, ignore Ctrl-C: also these tests, in a script."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
 
 
 @pytest.mark.parametrize(
