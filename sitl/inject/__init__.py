@@ -15,6 +15,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from sitl.inject import sensor, surroundings, vehicle
+from sitl.inject.foreign import FOREIGN
 from sitl.inject.measure import measure
 from sitl.inject.scene import Effect, Hidden, Scene, furnish
 from sitl.trajectory import Track
@@ -45,48 +46,6 @@ EFFECTS: dict[str, Effect] = {
     "outliers": sensor.bit_flips,
 }
 """Cause, by its public name -> the effect that is hidden."""
-FOREIGN: dict[str, Effect] = {
-    "relay": vehicle.relay,
-    "ship": surroundings.ship,
-    "pan": vehicle.pan,
-    "loose": vehicle.loose,
-    "corrosion": vehicle.corrosion,
-    "pulsation": surroundings.pulsation,
-    "needle": vehicle.needle,
-    "thermostat": vehicle.thermostat,
-    "perming": sensor.perming,
-    "staircase": sensor.staircase,
-    "swell": surroundings.swell,
-    "cargo": vehicle.cargo,
-    "contact": vehicle.contact,
-    "strobe": vehicle.strobe,
-    "storm": surroundings.storm,
-    "rotor": vehicle.rotor,
-    "viscous": vehicle.viscous,
-    "brownout": sensor.brownout,
-    "mains": surroundings.mains,
-    "slip": vehicle.slip,
-    "motional": vehicle.motional,
-    "leak": vehicle.leak,
-    "ranges": sensor.ranges,
-    "sag": sensor.sag,
-    "crossover": sensor.crossover,
-    "popcorn": sensor.popcorn,
-    "discharge": vehicle.discharge,
-    "towed": vehicle.towed,
-    "sunlit": vehicle.sunlit,
-    "eccentric": vehicle.eccentric,
-    "astray": surroundings.astray,
-    "trailing": vehicle.trailing,
-    "compliant": vehicle.compliant,
-    "restart": sensor.restart,
-    "whistle": sensor.whistle,
-    "yielding": vehicle.yielding,
-    "afterglow": vehicle.afterglow,
-    "mast": sensor.mast,
-    "annealed": sensor.annealed,
-}
-"""Effects that are none of the named causes."""
 
 
 def disturb(

@@ -14,7 +14,7 @@ from sitl.instrument import Instrument
 from sitl.signals import autoregressive, first_order
 from sitl.trajectory import Track
 
-__all__ = ["Effect", "Generator", "Hidden", "Scene", "direction", "furnish", "relays"]
+__all__ = ["Effect", "Generator", "Hidden", "Scene", "direction", "furnish", "relays", "soaked"]
 
 Array = NDArray[np.float64]
 Generator = np.random.Generator
@@ -83,7 +83,7 @@ class Hidden(msgspec.Struct, frozen=True):
 
 
 def direction(rng: Generator) -> Array:
-    """Draw a unit vector."""
+    """Draw a unit vector (3,)."""
     d = rng.normal(size=3)
     return np.asarray(d / np.linalg.norm(d))
 
@@ -96,6 +96,17 @@ def relays(x: Array, centres: Array, widths: Array) -> Array:
         last = np.maximum.accumulate(np.where(up | down, np.arange(len(x)), 0))
         total += np.where(up[last], 1.0, -1.0) - np.where(x >= c, 1.0, -1.0)
     return total / len(centres)
+
+
+def soaked(surface: Array, step: float, lag: float) -> Array:
+    """Return the temperature (n,) in the middle of a slab whose faces follow `surface` (n,), every `step` s.
+
+    `lag` is the slowest mode's time constant, s (Carslaw & Jaeger 1959, sec. 3.4).
+    """
+    modes = range(40)
+    weights = np.array([4.0 * (-1) ** k / (np.pi * (2 * k + 1)) for k in modes])
+    parts = [first_order(surface, step, lag / (2 * k + 1) ** 2) for k in modes]
+    return np.asarray((weights / weights.sum()) @ np.array(parts))
 
 
 def furnish(scene: Scene, rng: Generator) -> None:

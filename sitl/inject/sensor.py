@@ -6,24 +6,12 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from sitl.inject.scene import Generator, Scene, direction, relays
-from sitl.signals import first_order
+from sitl.inject.scene import Generator, Scene, direction, soaked
 
 Array = NDArray[np.float64]
 
 CALIBRATED_AT = 4.5
 """degC, the instrument's temperature during the calibration, to about half a degree."""
-
-
-def soaked(surface: Array, step: float, lag: float) -> Array:
-    """Temperature in the middle of a slab whose faces follow `surface` (Carslaw & Jaeger 1959, sec. 3.4).
-
-    ``lag`` is the slowest mode's time constant, s.
-    """
-    modes = range(40)
-    weights = np.array([4.0 * (-1) ** k / (np.pi * (2 * k + 1)) for k in modes])
-    parts = [first_order(surface, step, lag / (2 * k + 1) ** 2) for k in modes]
-    return np.asarray((weights / weights.sum()) @ np.array(parts))
 
 
 def _warmer(scene: Scene, rng: Generator) -> Array:
@@ -112,111 +100,3 @@ def bit_flips(scene: Scene, size: float, rng: Generator) -> None:
         return out
 
     scene.bend.append(bend)
-
-
-def perming(scene: Scene, size: float, rng: Generator) -> None:
-    """Cores that are never quite saturated remember past fields, each by relays of its own; size in nT."""
-    memory = [
-        rng.normal() * relays(h / 2e4, rng.normal(0.0, 0.8, 80), rng.lognormal(np.log(0.6), 0.5, 80))
-        for h in scene.field.T
-    ]
-    scene.field = scene.field + size * np.stack(memory, axis=1)
-
-
-def staircase(scene: Scene, size: float, rng: Generator) -> None:
-    """Uneven steps cancel most of the field, and the rest is measured with another gain; size in nT."""
-    step, gain, steps = 4000.0, rng.choice([-1.0, 1.0]), 0.5 * rng.normal(size=(64, 3))
-
-    def bend(H: Array) -> Array:
-        code = np.round(H / step).astype(int)
-        own = gain * (H / step - code) + np.take_along_axis(steps, code % 64, axis=0)
-        return np.asarray(H + size * own)
-
-    scene.bend.append(bend)
-
-
-def brownout(scene: Scene, size: float, rng: Generator) -> None:
-    """The converter's reference sags with load and charge of the supply; size in 1e-5 of the field at 1 A."""
-    step, load = (
-        scene.track.step,
-        scene.logged["amps_a"][0] + scene.logged["amps_b"][0] + rng.uniform(0.1, 0.3),
-    )
-    drawn = np.cumsum(load) / np.sum(load)
-    slow = first_order(load, step, float(rng.uniform(100.0, 400.0)))  # ions take time to diffuse
-    sag = 0.6 * load + 0.4 * slow + rng.uniform(0.3, 1.0) * drawn**3
-    scene.field = scene.field * (1.0 + 1e-5 * size * sag[:, None])
-
-
-def ranges(scene: Scene, size: float, rng: Generator) -> None:
-    """Large readings have a range of another gain, switched with hysteresis; size in nT at full scale."""
-    changes, gains = rng.uniform(0.3, 0.6, 3), rng.choice([-1.0, 1.0], 3)
-
-    def bend(H: Array) -> Array:
-        x = np.abs(H) / np.abs(H).max(axis=0)
-        up, down = x > changes + 0.05, x < changes - 0.05
-        last = np.maximum.accumulate(np.where(up | down, np.arange(len(H))[:, None], 0), axis=0)
-        upper = np.take_along_axis(up, last, axis=0)
-        return np.asarray(H + size * gains * upper * x * np.sign(H))
-
-    scene.bend.append(bend)
-
-
-def sag(scene: Scene, size: float, rng: Generator) -> None:
-    """A core's bracket bends under its weight towards another channel's axis; size in 2e-5 rad at 1 g."""
-    leaning = int(rng.integers(0, 3))
-    neighbour = (leaning + int(rng.integers(1, 3))) % 3
-    roll, pitch = np.radians(scene.track.roll), np.radians(scene.track.pitch)
-    weight = np.column_stack([-np.sin(pitch), np.cos(pitch) * np.sin(roll), np.cos(pitch) * np.cos(roll)])
-    swing = first_order(weight[:, neighbour] - weight[0, neighbour], scene.track.step, 1.0)
-    out = scene.field.copy()
-    out[:, leaning] += 2e-5 * size * swing * scene.field[:, neighbour]
-    scene.field = out
-
-
-def crossover(scene: Scene, size: float, rng: Generator) -> None:
-    """Two transistors share the feedback current by its sign, with a dead zone about zero; size in nT."""
-    widths, gaps = rng.uniform(600.0, 2500.0, 3), rng.lognormal(0.0, 0.5, 3) * rng.choice([-1.0, 1.0], 3)
-
-    def bend(H: Array) -> Array:
-        x = H / widths
-        return np.asarray(H - size * gaps * 2.0 * x / (1.0 + x**4))
-
-    scene.bend.append(bend)
-
-
-def popcorn(scene: Scene, size: float, rng: Generator) -> None:
-    """A defect in the voltage reference switches at random between two gains; size in 1e-5 of the field."""
-    dwell = rng.exponential(1.0, len(scene.t)) * np.resize(rng.uniform(200.0, 1800.0, 2), len(scene.t))
-    trapped = np.searchsorted(np.cumsum(dwell), scene.t) % 2
-    scene.field = scene.field * (1.0 + 1e-5 * size * trapped[:, None])
-
-
-def restart(scene: Scene, size: float, rng: Generator) -> None:
-    """The sensor rests at the surface, and its offset settles anew on each dive; size in nT."""
-    depth = scene.track.depth
-    up = depth < depth.min() + 0.1 * np.ptp(depth)
-    dive = np.cumsum(np.diff(up, prepend=up[0]) & ~up)
-    scene.field = scene.field + size * rng.normal(size=(dive[-1] + 1, 3))[dive]
-
-
-def whistle(scene: Scene, size: float, rng: Generator) -> None:
-    """The excitation beats with another oscillator, faster as the electronics warm; size in nT."""
-    warm = scene.logged["sensor_temperature"][0]
-    beat = rng.uniform(0.02, 0.1) * (1.0 + rng.uniform(0.03, 0.1) * (warm - warm[0]))
-    phase = 2.0 * np.pi * np.cumsum(beat) * scene.track.step + rng.uniform(0.0, 2.0 * np.pi)
-    scene.field = scene.field + size * direction(rng) * np.cos(phase)[:, None]
-
-
-def mast(scene: Scene, size: float, rng: Generator) -> None:
-    """The flow bends the sensor's mast, as the square of the speed; size in 1e-5 rad at 0.3 m/s down."""
-    sinking = np.gradient(scene.track.depth, scene.track.step) / 0.3
-    bent = first_order(sinking * np.abs(sinking), scene.track.step, float(rng.uniform(1.0, 10.0)))
-    scene.field = scene.field + 1e-5 * size * bent[:, None] * np.cross(direction(rng), scene.field)
-
-
-def annealed(scene: Scene, size: float, rng: Generator) -> None:
-    """Stress in the cores depends on whether they were warmed or cooled, and by how much; size in nT."""
-    warm = soaked(scene.water, scene.track.step, 300.0)
-    x = (warm - warm.mean()) / np.ptp(warm)
-    memory = relays(x, rng.uniform(-0.5, 0.5, 60), rng.uniform(0.1, 0.5, 60))
-    scene.field = scene.field + size * direction(rng) * memory[:, None]

@@ -1,0 +1,89 @@
+"""What goes wrong around the vehicle and is in no table: ships, seas, storms and cables."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sitl.inject.scene import Generator, Scene, direction
+from sitl.signals import autoregressive, first_order
+from sitl.world import dipole_field
+
+Array = NDArray[np.float64]
+
+
+def ship(scene: Scene, size: float, rng: Generator) -> None:
+    """A ship passes: a distant dipole on a straight course; size in nT at its nearest."""
+    t0 = rng.uniform(0.3, 0.7) * scene.t[-1]
+    r = np.column_stack([4.0 * (scene.t - t0), np.full_like(scene.t, 900.0), np.full_like(scene.t, -50.0)])
+    own = dipole_field(r, np.broadcast_to(direction(rng), r.shape))
+    scene.earth = scene.earth + size * own / np.linalg.norm(own, axis=1).max()
+
+
+def pulsation(scene: Scene, size: float, rng: Generator) -> None:
+    """Field lines ring after a gust of solar wind: packets of Pc5 (Jacobs et al. 1964); size in nT.
+
+    Their periods are 150 to 600 s.
+    """
+    total = np.zeros_like(scene.t)
+    for _ in range(4):
+        t0, length = rng.uniform(0.0, 1.0) * scene.t[-1], rng.uniform(600.0, 2400.0)
+        since = scene.t - t0
+        phase = 2 * np.pi * since / rng.uniform(150.0, 600.0) * (1.0 + 0.1 * since / length)
+        total += rng.uniform(0.5, 1.0) * np.exp(-0.5 * (since / length) ** 2) * np.cos(phase)
+    scene.earth = scene.earth + size * np.outer(total, [0.7, 0.5, 0.3])
+
+
+def swell(scene: Scene, size: float, rng: Generator) -> None:
+    """Sea water moved by a swell through the Earth's field (Weaver 1965); size in nT at the surface."""
+    track, omega = scene.track, 2 * np.pi / rng.uniform(11.0, 17.0)
+    wave = omega**2 / 9.81
+    course = rng.uniform(0.0, 2 * np.pi)
+    north, east = track.local(track.latitude, track.longitude)
+    groups = autoregressive(rng, (len(scene.t), 2), 1.0, rng.uniform(100.0, 300.0) / track.step)
+    phase = omega * scene.t - wave * (north * np.cos(course) + east * np.sin(course))
+    moved = groups[:, 0] * np.cos(phase) + groups[:, 1] * np.sin(phase)
+    scene.earth = scene.earth + size * np.outer(np.exp(-wave * track.depth) * moved, [0.6, 0.2, 0.77])
+
+
+def storm(scene: Scene, size: float, rng: Generator) -> None:
+    """A magnetic storm: the wind's shock, then a ring current (Burton et al. 1975); size in nT."""
+    t0 = rng.uniform(0.1, 0.4) * scene.t[-1]
+    since = scene.t - t0
+    after = since > rng.uniform(900.0, 3600.0)
+    # a new wind every few minutes
+    south = np.repeat(rng.normal(0.6, 0.8, 60), len(since) // 60 + 1)[: len(since)]
+    ring = (
+        7.7
+        * 3600.0
+        * first_order(np.where(after, np.maximum(south, 0.0), 0.0), scene.track.step, 7.7 * 3600.0)
+    )
+    shock = np.where(since > 0.0, 1.0 - np.exp(-np.maximum(since, 0.0) / 120.0), 0.0)
+    total = ring / max(float(ring.max()), 1e-9) - rng.uniform(0.15, 0.35) * shock
+    scene.earth = scene.earth + size * np.outer(total, [-0.5, 0.05, 0.45])
+
+
+def mains(scene: Scene, size: float, rng: Generator) -> None:
+    """A three-phase cable on the bottom, its 50 Hz aliased by the sampling; size in nT at 100 m."""
+    track, t = scene.track, scene.t
+    north, east = track.local(track.latitude, track.longitude)
+    k, course = rng.integers(len(t)), rng.uniform(0.0, np.pi)
+    aside = (east - east[k]) * np.cos(course) - (north - north[k]) * np.sin(course)
+    above = track.depth.max() + rng.uniform(20.0, 60.0) - track.depth
+    drift = np.cumsum(autoregressive(rng, (len(t),), 0.02, 300.0 / track.step)) * track.step
+    phase = 2 * np.pi * (50.0 * t + drift)
+    bearing = np.arctan2(aside, above)
+    across = np.array([-np.sin(course), np.cos(course), 0.0])
+    turning = np.outer(np.cos(phase + 2 * bearing), across) + np.outer(
+        np.sin(phase + 2 * bearing), [0.0, 0.0, 1.0]
+    )
+    scene.earth = scene.earth + size * 1e4 / (aside**2 + above**2)[:, None] * turning
+
+
+def astray(scene: Scene, size: float, rng: Generator) -> None:
+    """The current under water is unknown, so the map is read off track; size in nT after half an hour."""
+    top = scene.track.depth < scene.track.depth.min() + 0.1 * np.ptp(scene.track.depth)
+    fixed = scene.t[np.maximum.accumulate(np.where(top, np.arange(len(top)), 0))]
+    current = autoregressive(rng, (len(top),), 1.0, 7200.0 / scene.track.step) + rng.choice([-1.0, 1.0])
+    off = current * (scene.t - fixed) / 1800.0
+    scene.reference = scene.reference + size * np.interp(scene.when, scene.t, off)

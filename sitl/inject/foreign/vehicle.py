@@ -1,0 +1,240 @@
+"""What goes wrong with the vehicle and is in no table: payloads, loose iron, bad contacts, bent encoders."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sitl.inject.scene import Generator, Scene, direction
+from sitl.instrument import rotation
+from sitl.signals import autoregressive, first_order
+from sitl.world import MU_0_OVER_4_PI, dipole_field
+
+Array = NDArray[np.float64]
+
+
+def relay(scene: Scene, size: float, rng: Generator) -> None:
+    """An unlogged payload switches on and off, a dozen times or so; size in nT."""
+    flips = np.cumsum(rng.exponential(0.08 * scene.t[-1], 60))
+    state = np.searchsorted(flips, scene.t) % 2
+    scene.field = scene.field + size * direction(rng) * state[:, None]
+
+
+def pan(scene: Scene, size: float, rng: Generator) -> None:
+    """An unlogged scanning head: its magnet sweeps a sector, no two sweeps of one length; size in nT."""
+    turns = np.cumsum(rng.uniform(0.02, 0.06, 80)) * scene.t[-1]
+    angle = np.radians(150.0) * np.interp(scene.t, turns, (-1.0) ** np.arange(80))
+    a, b = direction(rng), direction(rng)
+    scene.field = scene.field + size * (np.outer(np.cos(angle), a) + np.outer(np.sin(angle), b))
+
+
+def loose(scene: Scene, size: float, rng: Generator) -> None:
+    """A loose magnet slides to the lower end, and sticks until the hull tilts the other way; size in nT."""
+    tip = scene.track.pitch - rng.uniform(-5.0, 5.0)
+    stick = rng.uniform(5.0, 12.0)
+    last = np.maximum.accumulate(np.where(np.abs(tip) > stick, np.arange(len(tip)), 0))
+    slid = first_order(np.sign(tip[last]), scene.track.step, 3.0)
+    scene.field = scene.field + size * direction(rng) * slid[:, None]
+
+
+def corrosion(scene: Scene, size: float, rng: Generator) -> None:
+    """A galvanic current in the hull, which wanders (paint, fouling) and grows with speed; size in nT."""
+    wander = autoregressive(rng, (len(scene.t),), 1.0, 2500.0 / scene.track.step)
+    fed = np.sqrt(1.0 + np.abs(np.gradient(scene.track.depth, scene.track.step)))
+    scene.field = scene.field + size * direction(rng) * (fed * wander)[:, None]
+
+
+def needle(scene: Scene, size: float, rng: Generator) -> None:
+    """A payload's compass: a card that points north, floats level, and is dragged in turns; size in nT."""
+    track = scene.track
+    turned = np.radians(track.heading)
+    dragged = rng.uniform(0.1, 0.4) * (
+        turned - first_order(turned, track.step, float(rng.uniform(10.0, 40.0)))
+    )
+    level = np.column_stack([np.cos(dragged), np.sin(dragged), np.zeros_like(dragged)])
+    card = rotation(track.roll, track.pitch, track.heading).apply(level, inverse=True)
+    own = dipole_field(np.broadcast_to(direction(rng), card.shape), card)
+    scene.field = scene.field + size * own / np.linalg.norm(own, axis=1).max()
+
+
+def thermostat(scene: Scene, size: float, rng: Generator) -> None:
+    """An unlogged payload heats itself, the longer the colder the water, then cools; size in nT."""
+    lag, band = rng.uniform(400.0, 1200.0), rng.uniform(1.0, 3.0)
+    warm, heats, on = 15.0, False, np.empty(len(scene.t))
+    for k, water in enumerate(scene.water):
+        heats = warm < 15.0 + (0.5 if heats else -0.5) * band
+        warm += scene.track.step / lag * (water - warm + 30.0 * heats)
+        on[k] = heats
+    scene.field = scene.field + size * direction(rng) * on[:, None]
+
+
+def cargo(scene: Scene, size: float, rng: Generator) -> None:
+    """Iron in a sling, partly magnetised by induction, hangs down in a roll but for friction; size in nT."""
+    roll, rubs, held = scene.track.roll, rng.uniform(1.0, 3.0), 0.0
+    hung = np.empty_like(roll)
+    for k, angle in enumerate(roll):
+        held = min(max(held, angle - rubs), angle + rubs)
+        hung[k] = held
+    hung = first_order(hung, scene.track.step, 4.0)
+    arm, place = np.array([0.0, 0.0, 0.3]), np.array([-0.6, 0.0, 0.05]) + 0.1 * rng.normal(size=3)
+    turn = rotation(hung, np.zeros_like(hung), np.zeros_like(hung))
+    away, rest = -(place + turn.apply(arm, inverse=True)), -(place + arm)
+    own = turn.apply(direction(rng), inverse=True) + 0.5 * scene.field / np.linalg.norm(scene.field[0])
+    moved = dipole_field(away, own) - dipole_field(np.broadcast_to(rest, own.shape), own)
+    scene.field = scene.field + size * moved / np.linalg.norm(moved, axis=1).max()
+
+
+def contact(scene: Scene, size: float, rng: Generator) -> None:
+    """A corroded joint that pressure closes carries a varying part of a motor's current; size in nT/A."""
+    name = str(rng.choice(["amps_a", "amps_b"]))
+    closes = rng.uniform(0.25, 0.6) * scene.track.depth.max()
+    shut, part, leads = False, 0.0, np.empty(len(scene.t))
+    for k, depth in enumerate(scene.track.depth):
+        if shut != (depth > closes + (-8.0 if shut else 8.0)):
+            shut, part = not shut, float(rng.lognormal(0.0, 0.4))
+        leads[k] = part * shut
+    scene.field = scene.field + size * direction(rng) * (leads * scene.logged[name][0])[:, None]
+
+
+def strobe(scene: Scene, size: float, rng: Generator) -> None:
+    """An unlogged payload is on for a part of each cycle; its clock slows with its cells; size in nT."""
+    along = scene.t / scene.t[-1]
+    slower = rng.uniform(0.15, 0.4) * along**2 + 0.01 * autoregressive(
+        rng, (len(along),), 1.0, 900.0 / scene.track.step
+    )
+    turns = np.cumsum(1.0 - slower) * scene.track.step / rng.uniform(60.0, 240.0)
+    on = (turns % 1.0 < rng.uniform(0.1, 0.4)).astype(float)
+    drawn = first_order(on, scene.track.step, 2.0) * (1.0 - 0.15 * along)
+    scene.field = scene.field + size * direction(rng) * drawn[:, None]
+
+
+def rotor(scene: Scene, size: float, rng: Generator) -> None:
+    """A brushless motor's magnetic rotor stops at a random one of a dozen cogs after each run; size in nT.
+
+    While it spins its field averages out.
+    """
+    name = str(rng.choice(["ballast", "battpos"]))
+    runs = np.abs(np.gradient(scene.track.parameters[name])) > 1e-6
+    turn = np.cumsum(np.diff(runs, prepend=runs[0]) & runs)
+    angle = rng.integers(0, 12, turn[-1] + 1)[turn] * np.pi / 6.0
+    shaft = direction(rng)
+    a = np.cross(shaft, direction(rng))
+    a /= np.linalg.norm(a)
+    rests = np.outer(np.cos(angle), a) + np.outer(np.sin(angle), np.cross(shaft, a))
+    still = 1.0 - first_order(runs.astype(float), scene.track.step, 1.0)
+    scene.field = scene.field + size * rests * still[:, None]
+
+
+def viscous(scene: Scene, size: float, rng: Generator) -> None:
+    """The magnetisation of a steel plate follows the field late (magnetic viscosity); size in nT.
+
+    The lags are minutes to hours; the magnetisation is mostly in the plane of the plate.
+    """
+    lags = 120.0 * 3.0 ** np.arange(5)
+    unit = scene.field / np.linalg.norm(scene.field[0])
+    crept = np.mean([first_order(unit, scene.track.step, float(lag)) for lag in lags], axis=0)
+    normal, place = direction(rng), direction(rng)
+    moment = crept - 0.9 * np.outer(crept @ normal, normal)
+    scene.field = (
+        scene.field + size * dipole_field(np.broadcast_to(place, moment.shape), moment) / MU_0_OVER_4_PI
+    )
+
+
+def slip(scene: Scene, size: float, rng: Generator) -> None:
+    """The battery's encoder miscounts in every move, until an end stop resets it; size in inches a move.
+
+    It is reset every dozen moves or so.
+    """
+    place = scene.track.parameters["battpos"]
+    way = np.abs(np.diff(place, prepend=place[0]))
+    runs = np.cumsum(np.diff(way > 1e-6, prepend=False) & (way > 1e-6))
+    missed = rng.normal(size=runs[-1] + 1)
+    missed[rng.random(len(missed)) < 1.0 / 12.0] = np.nan
+    lost = np.zeros(len(missed))
+    for k in range(1, len(missed)):
+        lost[k] = 0.0 if np.isnan(missed[k]) else lost[k - 1] + missed[k]
+    scene.logged["battpos"] = (place + size * lost[runs], "in")
+
+
+def motional(scene: Scene, size: float, rng: Generator) -> None:
+    """Motion drives a current (v x B) between two metals on the hull; size in nT at 0.3 m/s across B."""
+    track = scene.track
+    north, east = track.local(track.latitude, track.longitude)
+    v = np.gradient(np.column_stack([north, east, track.depth]), track.step, axis=0)
+    ahead = rotation(track.roll, track.pitch, track.heading).apply(v, inverse=True)
+    driven = np.cross(ahead, scene.field / np.linalg.norm(scene.field[0])) @ direction(rng) / 0.3
+    scene.field = scene.field + size * direction(rng) * first_order(driven, track.step, 5.0)[:, None]
+
+
+def leak(scene: Scene, size: float, rng: Generator) -> None:
+    """A seal leaks below a depth; the water carries a current, and takes its time to dry; size in nT."""
+    deep = np.maximum(scene.track.depth / scene.track.depth.max() - rng.uniform(0.5, 0.8), 0.0)
+    dries, wets = (scene.track.step / lag for lag in (rng.uniform(2000.0, 6000.0), rng.uniform(100.0, 300.0)))
+    wet, leads = 0.0, np.empty(len(scene.t))
+    for k, head in enumerate(deep):
+        wet += 3.0 * wets * head - dries * wet
+        leads[k] = wet
+    scene.field = scene.field + size * direction(rng) * (leads / max(leads.max(), 1e-9))[:, None]
+
+
+def discharge(scene: Scene, size: float, rng: Generator) -> None:
+    """The cells in the moving battery become more magnetic as they discharge; size in nT at the end."""
+    load = scene.logged["amps_a"][0] + scene.logged["amps_b"][0] + rng.uniform(0.05, 0.2)
+    drawn = (np.cumsum(load) / np.sum(load)) ** rng.uniform(1.0, 2.0)
+    place = scene.track.parameters["battpos"]
+    nearer = 1.0 + rng.uniform(0.05, 0.15) * (place - place[0])
+    scene.field = scene.field + size * direction(rng) * (drawn * nearer**3)[:, None]
+
+
+def towed(scene: Scene, size: float, rng: Generator) -> None:
+    """A magnet on a line astern swings out in turns, and back when they end; size in nT at 1 deg/s."""
+    rate = np.gradient(scene.track.heading, scene.track.step)
+    swung = first_order(
+        first_order(rate, scene.track.step, 8.0), scene.track.step, float(rng.uniform(5.0, 30.0))
+    )
+    aside, astern = direction(rng), direction(rng)
+    scene.field = scene.field + size * (swung[:, None] * aside - 0.5 * (swung**2)[:, None] * astern)
+
+
+def sunlit(scene: Scene, size: float, rng: Generator) -> None:
+    """The sun warms a dark housing of unlogged temperature near the surface; size in nT at most."""
+    shines = np.exp(-scene.track.depth / rng.uniform(3.0, 10.0))
+    warm = first_order(shines, scene.track.step, float(rng.uniform(200.0, 900.0)))
+    scene.field = scene.field + size * direction(rng) * ((warm - warm[0]) / np.ptp(warm))[:, None]
+
+
+def eccentric(scene: Scene, size: float, rng: Generator) -> None:
+    """The gear of the battery's encoder is eccentric: a sinusoidal error each turn; size in inches."""
+    place = scene.track.parameters["battpos"]
+    turn = 2.0 * np.pi * place / rng.uniform(0.2, 0.5) + rng.uniform(0.0, 2.0 * np.pi)
+    scene.logged["battpos"] = (place + size * np.sin(turn), "in")
+
+
+def trailing(scene: Scene, size: float, rng: Generator) -> None:
+    """The battery draws a motor's leads apart as it slides; size in nT/A, one inch from its mean position."""
+    name = str(rng.choice(["amps_a", "amps_b"]))
+    place = scene.track.parameters["battpos"]
+    drawn = (place - np.mean(place)) * scene.logged[name][0]
+    scene.field = scene.field + size * direction(rng) * drawn[:, None]
+
+
+def compliant(scene: Scene, size: float, rng: Generator) -> None:
+    """The battery's carriage yields to its weight, which the encoder does not see; size in inches at 1 g."""
+    weight = np.sin(np.radians(scene.track.pitch))
+    gives = first_order(weight, scene.track.step, float(rng.uniform(1.0, 4.0)))
+    scene.logged["battpos"] = (scene.track.parameters["battpos"] - size * gives, "in")
+
+
+def yielding(scene: Scene, size: float, rng: Generator) -> None:
+    """A plastic hull creeps under pressure and recovers within the hour; size in nT once it has at depth."""
+    pressed = scene.track.depth / scene.track.depth.max()
+    crept = first_order(pressed, scene.track.step, float(rng.uniform(1200.0, 3600.0)))
+    scene.field = scene.field + size * direction(rng) * (crept - crept[0])[:, None]
+
+
+def afterglow(scene: Scene, size: float, rng: Generator) -> None:
+    """The pump's brake stays energised until its relay cools, without a logged current; size in nT."""
+    moved = np.abs(np.gradient(scene.track.parameters["ballast"], scene.track.step)) > 1.0
+    warm = first_order(moved.astype(float), scene.track.step, float(rng.uniform(40.0, 200.0)))
+    held = warm > rng.uniform(0.05, 0.2) * max(warm.max(), 1e-9)
+    scene.field = scene.field + size * direction(rng) * held[:, None]
