@@ -99,10 +99,11 @@ class SerialPort(Stream):
         """Return what is waiting after a first piece; the next :meth:`read` finds an end of file or error."""
         data = b""
         with suppress(OSError):
-            for _ in range(CHUNK // PIECE):
-                if not select.select([self._fd], [], [], SOON)[0]:
+            while len(data) < CHUNK and select.select([self._fd], [], [], SOON)[0]:
+                piece = os.read(self._fd, CHUNK)
+                if not piece:
                     break
-                data += os.read(self._fd, CHUNK)
+                data += piece
         return data
 
     def blocked(self) -> list[int]:
