@@ -33,7 +33,7 @@ OWN = {
 
 
 def dataset(track: Track, when: Array, columns: Mapping[str, Array], source: str) -> xr.Dataset:
-    """Return `columns`, sampled at `when` (s after the track's start), as a deployment."""
+    """Return `columns`, sampled at `when` (n,), s after the track's start, as a deployment."""
     known = dict(COLUMNS | OWN)
     for name in track.parameters:
         unit = MOUNTINGS[name].unit if name in MOUNTINGS else "1"
@@ -87,6 +87,6 @@ def channels(deployment: xr.Dataset) -> Array:
 
 
 def corrected(deployment: xr.Dataset, calibration: Calibration) -> CorrectedArrays:
-    """Correct a deployment's channels as they stand, row by row."""
+    """Correct a deployment's channels as they stand, row by row; the arrays are (n, ...)."""
     positions = side_by_side(deployment, calibration.channels)
     return correct(calibration, channels(deployment), positions, deployment["time"].to_numpy())

@@ -105,6 +105,8 @@ class Instrument(Table, frozen=True):
             s between the grid's points.
         when : array (m,)
             s after the first point at which triples are taken; inside the grid, channel delays included.
+        rng : Generator
+            Of the offsets at power-on and of the noise.
         """
         temperature = first_order(water, step, self.thermal_lag, self.start_temperature)
         warm = (temperature - self.reference_temperature)[:, None]
@@ -130,7 +132,7 @@ class Instrument(Table, frozen=True):
         )
 
     def digitise(self, field: Array) -> Array:
-        """Return `field` (nT) as the converter gives it: rounded to its step, clipped at its ends."""
+        """Return `field` (n, 3), nT, as the converter gives it: rounded to its step, clipped at its ends."""
         half = 2 ** (self.bits - 1)
         step = self.full_scale / half
         return np.asarray(np.clip(np.rint(field / step), -half, half - 1) * step)

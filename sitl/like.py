@@ -36,6 +36,7 @@ def simulate_like(log: xr.Dataset, scenario: Scenario, seed: int = 0) -> xr.Data
     scenario : Scenario
         Its mission, place and start are not used.
     seed : int
+        Of what the scenario leaves open, and of the noise.
 
     Returns
     -------

@@ -155,7 +155,7 @@ class Calibrated:
         return self.calibration.channels
 
     def field(self, ambient: Array, channels: Mapping[str, Array], time: Array) -> Array:
-        """Return the field at the sensor as :meth:`Vehicle.field` does; `time` is in s since 1970."""
+        """Return the field at the sensor (n, 3) as :meth:`Vehicle.field`; `time` (n,) is s since 1970."""
         sampled = np.column_stack([channels[name] for name in self.channels]) if self.channels else None
         return forward(
             self.calibration, ambient, np.empty((len(time), 0)) if sampled is None else sampled, time

@@ -115,7 +115,7 @@ def _parts(files: Sequence[Path], deployment: xr.Dataset) -> list[Part]:
 
 
 def rows_of(part: Part, time: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return which times belong to a part."""
+    """Return which times (n,), s since 1970, belong to a part."""
     return (time >= part.begin) & (time <= part.end)
 
 

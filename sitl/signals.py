@@ -78,7 +78,7 @@ def first_order_at(u: Array, y: Array, step: float, time_constant: float, when: 
 
 
 def autoregressive(rng: np.random.Generator, shape: tuple[int, ...], sigma: float, memory: float) -> Array:
-    """Return stationary noise whose correlation falls by e every `memory` points of the first axis.
+    """Return stationary noise of a shape; its correlation falls by e in `memory` points of the first axis.
 
     `sigma` is the standard deviation of the noise itself, not of its innovations; a memory of 0
     is white noise.

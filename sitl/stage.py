@@ -102,6 +102,7 @@ class Stage:
         start : Start
             The bridge's own.
         events : iterable of Event
+            What came from sensor and link, in order of time.
         speed : float
             How many times faster than they happened.
 

@@ -95,14 +95,14 @@ class Track:
         return np.asarray(self.step * np.arange(len(self.depth)))
 
     def at(self, when: Array) -> dict[str, Array]:
-        """Return every quantity by name at `when` (s after the start), linear between the points."""
+        """Return every quantity by name at `when` (m,), s after the start, linear between the points."""
         names = ("latitude", "longitude", "depth", "roll", "pitch", "heading")
         columns = {name: getattr(self, name) for name in names} | self.parameters
         elapsed = self.elapsed
         return {name: np.interp(when, elapsed, column) for name, column in columns.items()}
 
     def local(self, latitude: Array, longitude: Array) -> tuple[Array, Array]:
-        """Return places (deg) as metres north and east of where the track begins."""
+        """Return places (m,), deg, as metres north and east of where the track begins."""
         return separation(float(self.latitude[0]), float(self.longitude[0]), latitude, longitude)
 
 
@@ -119,6 +119,7 @@ def fly(
     Parameters
     ----------
     legs : sequence of Leg
+        In the order in which they are flown.
     start : tuple of 3 float
         s since 1970, latitude and longitude in deg.
     step : float
@@ -126,6 +127,7 @@ def fly(
     rng : Generator
         Of the wander.
     motion : Motion
+        How the vehicle moves.
     limits : mapping of Limit
         For every moving mass. One that no leg moves stays in the middle of its travel.
 

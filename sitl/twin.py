@@ -98,6 +98,7 @@ class Twin:
         Parameters
         ----------
         track : Track
+            As :meth:`fly` returns it.
         when : array (n,)
             s after the track's start of each triple; channel delays must end inside the track.
 

@@ -78,7 +78,7 @@ class Water(Table, frozen=True):
     thickness: float = 15.0
 
     def temperature(self, depth: Array) -> Array:
-        """Return degC at `depth` (m)."""
+        """Return degC (n,) at `depth` (n,), m."""
         share = 0.5 * (1 + np.tanh((depth - self.thermocline) / self.thickness))
         return np.asarray(self.surface + (self.deep - self.surface) * share)
 

@@ -94,6 +94,7 @@ def run(path: Path, *, aloud: bool = False) -> None:
     Parameters
     ----------
     path : Path
+        The ``bridge.toml``.
     aloud : bool
         Print the texts that are sent over the link on stderr, too.
 

@@ -159,6 +159,7 @@ def serial_line(name: str, baudrate: int, source: str, key: str) -> SerialPort:
     name : str
         A device, a pattern or a pyserial URL.
     baudrate : int
+        Bits per second.
     source, key : str
         The file and the key that `name` comes from, for the error.
 

@@ -193,6 +193,7 @@ def correct(
     Parameters
     ----------
     calibration : Calibration
+        Of the sensor that took the samples.
     field : (n, 3) array
         nT, raw, sensor axes.
     channels : (n, k) array

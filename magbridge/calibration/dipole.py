@@ -99,6 +99,8 @@ def expand_dipole(values: FloatArray, order: int) -> FloatArray:
     ----------
     values : (..., n, s) array
         At ``cos(pi (i + 1/2) / n)``, n > order.
+    order : int
+        Of the highest power.
 
     Returns
     -------
@@ -153,7 +155,7 @@ class Dipole(PositionTerm, frozen=True, kw_only=True):
             raise CalibrationError("dipole: at: expected a place away from the sensor")
 
     def expand(self, calibration: Calibration) -> Expansion:
-        """Give the dipole as a power series in its parameter, scaled as the calibration scales it."""
+        """Return the dipole as a power series in its scaled parameter; CalibrationError: too near for one."""
         names = [parameter.name for parameter in calibration.parameters]
         k = names.index(self.parameter)
         parameter = calibration.parameters[k]

@@ -79,6 +79,7 @@ def decode_calibration(data: bytes, file: str | Path = "cal.json") -> Calibratio
     Parameters
     ----------
     data : bytes
+        The file's content.
     file : path
         Named in errors.
 

@@ -37,6 +37,7 @@ def forward(
     Parameters
     ----------
     calibration : Calibration
+        Of the simulated sensor.
     field_body : (n, 3) array
         nT, the true field in body axes (in the calibration's sensor axes if it has no boresight).
     channels : (n, k) array

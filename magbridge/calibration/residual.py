@@ -70,7 +70,7 @@ class Samples:
     kappa: float = 0.0
 
     def part(self, rows: slice | NDArray[np.bool_] | NDArray[np.intp]) -> Samples:
-        """Pick samples."""
+        """Pick samples: an (n,) mask, places or a slice."""
         return Samples(
             self.field[rows], self.reference[rows], self.phi[rows], self.steps[rows], self.unit, self.kappa
         )
@@ -90,6 +90,7 @@ def residuals(samples: Samples, coefficients: FloatArray) -> tuple[FloatArray, F
     Parameters
     ----------
     samples : Samples
+        n of them, with m monomials.
     coefficients : (9 m,) array
         nT, monomial by monomial.
     """
@@ -132,7 +133,7 @@ def rms(values: FloatArray) -> float:
 
 
 def robust_scale(values: FloatArray) -> float:
-    """1-sigma of the bulk of values about zero, outliers or not: 1.48 times their median magnitude."""
+    """1-sigma of the bulk of values (n,) about zero, outliers or not: 1.48 times their median magnitude."""
     return 1.4826 * float(np.median(np.abs(values)))
 
 
@@ -156,7 +157,9 @@ def normal_equations(
     Parameters
     ----------
     samples : Samples
+        n of them, with m monomials.
     coefficients : (9 m,) array
+        nT, monomial by monomial: where to linearise.
     weight : (n,) array, optional
         Of each whitened residual (robust fits); 1 if not given.
     memory : float
@@ -182,7 +185,7 @@ def normal_equations(
 
 
 def whiten(values: FloatArray, steps: FloatArray, memory: float) -> FloatArray:
-    """Whiten AR(1) noise, across gaps too: ``(v_i - r v_(i-1)) / sqrt(1 - r^2)``, r = memory^steps."""
+    """Whiten AR(1) noise (n, ...), gaps too: ``(v_i - r v_(i-1)) / sqrt(1 - r^2)``, r = memory^steps (n,)."""
     white, r, gaps = values.copy(), np.full(len(values) - 1, memory), np.flatnonzero(steps[1:] != 1)
     r[gaps] = memory ** steps[1:][gaps]
     r = r.reshape(-1, *(1,) * (values.ndim - 1))

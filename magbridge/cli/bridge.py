@@ -134,7 +134,7 @@ def monitor(
 
 
 def speed_of(text: str) -> float:
-    """Return a replay speed relative to real time; infinite for ``max``."""
+    """Return a replay speed relative to real time, infinite for ``max``; WrongUse: no positive number."""
     try:
         speed = inf if text == "max" else float(text)
     except ValueError:

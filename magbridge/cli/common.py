@@ -112,7 +112,7 @@ Json = Annotated[bool, Parameter(name="--json")]
 def check_inputs(
     files: tuple[Path, ...], output: Path | None = None, *others: Path | None
 ) -> tuple[Path, ...]:
-    """Return `files`; there must be one, and `output` must not be one of them or of `others`."""
+    """Return `files`; WrongUse: there is none, or `output` is one of them or of `others`."""
     if not files:
         raise WrongUse("expected at least one FILE")
     read = [os.path.realpath(path) for path in (*files, *others) if path is not None]

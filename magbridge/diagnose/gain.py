@@ -102,6 +102,7 @@ def paired(before: FloatArray, after: FloatArray, dive: NDArray[np.int64], count
     before, after : (n,) array
         nT.
     dive : (n,) int array
+        Number of the dive that each sample belongs to.
     counts : (n,) bool array
         Samples that count.
     """

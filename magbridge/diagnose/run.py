@@ -65,6 +65,7 @@ def diagnose(
     datasets : sequence of Dataset
         Deployments that the calibration has not seen.
     calibration : Calibration
+        What the forward model knows.
     out_dir : path, optional
         Where ``findings.json``, ``calibration.json`` and ``report.html`` go; nothing is written if not given.
     learned_from : sequence of Dataset, optional

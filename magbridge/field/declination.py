@@ -20,6 +20,7 @@ def with_true_heading(deployment: xr.Dataset, reference: str | None = None) -> x
     Parameters
     ----------
     deployment : Dataset (time)
+        With ``heading`` (deg), and ``latitude longitude`` (deg) if it is magnetic.
     reference : {"true", "magnetic"}, optional
         The north that headings are measured from; default: the attribute ``heading_reference``.
 

@@ -25,7 +25,7 @@ def metres_per_degree(latitude: float) -> tuple[float, float]: ...
 @overload
 def metres_per_degree(latitude: Array) -> tuple[Array, Array]: ...
 def metres_per_degree(latitude: float | Array) -> tuple[float | Array, float | Array]:
-    """Return the metres that a degree of latitude and a degree of longitude span at `latitude` (deg).
+    """Return the metres that a degree of latitude and one of longitude span at `latitude` (deg, or (n,)).
 
     Notes
     -----
@@ -59,7 +59,7 @@ def separation(
     latitude: float | Array, longitude: float | Array, to_latitude: Array, to_longitude: Array
 ) -> tuple[Array, Array]: ...
 def separation(latitude: Any, longitude: Any, to_latitude: Any, to_longitude: Any) -> tuple[Any, Any]:
-    """Return m (north, east) from one position (deg) to another, from one to many, or pair by pair.
+    """Return m (north, east) from one position (deg) to another, from one to many (n,), or pair by pair.
 
     The inverse of :func:`offset`.
     """

@@ -26,7 +26,7 @@ def begins(path: Path) -> bytes:
 
 
 def grd(path: Path) -> Parts:
-    """Surfer 6 text or binary, Surfer 7, else Geosoft."""
+    """Read Surfer 6 text or binary, Surfer 7, else Geosoft; FormatError: none of them, or damaged."""
     start = begins(path)
     if start not in _SURFER:
         return _geosoft(path)
@@ -89,7 +89,13 @@ def _geosoft(path: Path) -> Parts:
 
 
 def ascii_grid(path: Path) -> Parts:
-    """ESRI ASCII: ``ncols``, ``nrows``, a corner or centre, ``cellsize``, then rows from the north."""
+    """Read ESRI ASCII: ``ncols nrows``, a corner or centre, ``cellsize``, then rows from the north.
+
+    Raises
+    ------
+    FormatError
+        A header or a number is missing.
+    """
     words = path.read_text(errors="replace").split()
     head: dict[str, float] = {}
     at = 0
@@ -111,7 +117,13 @@ def ascii_grid(path: Path) -> Parts:
 
 
 def table(path: Path) -> Parts:
-    """Longitude, latitude, anomaly in columns, header or not; any order of rows; gaps are holes."""
+    """Read longitude, latitude, anomaly in columns, header or not; any order of rows; gaps are holes.
+
+    Raises
+    ------
+    FormatError
+        No such columns, or nodes that form no grid.
+    """
     with path.open(errors="replace") as file:
         first = file.readline()
     delimiter = next((mark for mark in ",;" if mark in first), None)
@@ -164,7 +176,13 @@ def _levels(values: Array) -> tuple[Array, NDArray[np.intp]]:
 
 
 def folder(path: Path) -> Parts:
-    """MagNav's example: longitudes, latitudes and altitude beside a matrix, each in its own CSV file."""
+    """Read MagNav's example: longitudes, latitudes and altitude beside a matrix, each a CSV file.
+
+    Raises
+    ------
+    FormatError
+        One of the files is missing or is no table of numbers.
+    """
     try:
         x, y, altitude, values = (
             np.loadtxt(path / f"{name}.csv", delimiter=",", ndmin=2) for name in ("xx", "yy", "alt", "map")
@@ -175,7 +193,7 @@ def folder(path: Path) -> Parts:
 
 
 def geotiff(path: Path) -> Parts:
-    """One band with a pixel scale and a tie point, in geographic coordinates."""
+    """Read one band with a pixel scale and a tie point in geographic coordinates; FormatError: any other."""
     from PIL import Image, UnidentifiedImageError  # noqa: PLC0415  comes with matplotlib
 
     try:

@@ -28,7 +28,7 @@ PROJECTED = ("easting", "northing", "projection_x_coordinate", "projection_y_coo
 
 
 def netcdf(path: Path) -> Parts:
-    """CF or GMT netCDF: one two-dimensional variable on geographic axes."""
+    """Read CF or GMT netCDF, one two-dimensional variable on geographic axes; FormatError: any other."""
     import xarray as xr  # noqa: PLC0415  the live path runs without xarray
 
     try:

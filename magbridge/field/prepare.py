@@ -85,7 +85,7 @@ def prepare(
 
 
 def continue_upward(grid: AnomalyGrid, height: float) -> AnomalyGrid:
-    """Return the grid as a survey `height` metres (>= 0) higher would have seen it; holes stay holes."""
+    """Return the grid as a survey `height` m higher would have seen it, holes kept; OutOfRange: below 0 m."""
     if height < 0.0:
         raise OutOfRange(
             "altitude",

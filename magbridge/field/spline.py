@@ -19,7 +19,7 @@ WEIGHTS = np.concatenate([VALUE, SLOPE, CURVATURE])  # (12, 4) times powers of t
 
 
 def coefficients(values: Array) -> Array:
-    """Return B-spline coefficients (ny + 2, nx + 2): one beyond each edge, the curvature there being zero."""
+    """Return B-spline coefficients (ny + 2, nx + 2) of values (ny, nx), without curvature at the edges."""
     from scipy.ndimage import spline_filter  # noqa: PLC0415  the live path runs without scipy
 
     pad = [(min(PAD, n - 1),) * 2 for n in values.shape]

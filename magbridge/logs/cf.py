@@ -18,7 +18,7 @@ ALL = slice(None)
 
 
 def floats(variable: Any, rows: slice = ALL) -> NDArray[np.float64]:
-    """Return rows of a variable, NaN where a value is missing.
+    """Return rows of a variable, in its shape, NaN where a value is missing.
 
     Missing are the values that the variable declares as missing, compared as stored, before unpacking; and
     those never written, which the library fills with a number of its own. ``valid_range`` is ignored: one

@@ -110,7 +110,7 @@ class Bank:
         return w / w.sum(), x[:, None] + shifts, np.repeat(part[:, :, None], w.size, axis=2)
 
     def predict(self, F: Array, Q: Array) -> None:
-        """Propagate every hypothesis by one transition."""
+        """Propagate every hypothesis by one transition: F and the noise's covariance Q, (6, 6)."""
         self.x = F @ self.x
         half = (F @ self.P.reshape(N_STATES, -1)).reshape(self.P.shape)
         self.P = F @ half + Q[:, :, None]

@@ -63,7 +63,9 @@ def navigate(
         On ``time``, with ``total_field`` (nT), ``total_field_sigma`` if known (else 1 nT), and the columns of
         one of :data:`MOTIONS`.
     grid : AnomalyGrid
+        The anomaly map, at the altitude where the vehicle is (:func:`~.depth.at_depth`).
     options : Options, optional
+        How well start, current, calibration and map are known.
     start : (latitude, longitude), optional
         deg; default the log's first position.
     fixes : bool, optional

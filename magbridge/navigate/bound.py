@@ -54,6 +54,7 @@ def position_bound(
     Parameters
     ----------
     grid : AnomalyGrid
+        The anomaly map.
     time : array_like, (n,)
         s since 1970 UTC, increasing: the planned track's corners are enough.
     latitude, longitude : array_like, (n,)

@@ -59,10 +59,12 @@ class DeadReckoning:
         return offset(self.latitude, self.longitude, self._velocity[0] * elapsed, self._velocity[1] * elapsed)
 
     def telemetry(self, time: float, values: dict[str, float]) -> None:
-        """Take in what is known at `time` (s).
+        """Take in what is known at `time`.
 
         Parameters
         ----------
+        time : float
+            s, on any clock; an earlier one than the last moves nothing.
         values : dict
             Any of ``depth`` m, ``heading`` deg true, ``pitch`` deg, ``speed`` m/s through the water;
             ``velocity_north velocity_east`` m/s; ``north east`` m, a local position of which only the

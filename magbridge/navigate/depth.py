@@ -23,6 +23,7 @@ def at_depth(grid: AnomalyGrid, options: Options, depth: ArrayLike) -> tuple[Ano
     grid : AnomalyGrid
         One of unknown altitude is returned as it is.
     options : Options
+        Its map error is that of the map as it is.
     depth : array_like, (n,)
         m, the vehicle's; NaN is ignored, and without any depth the map is continued to the surface.
 

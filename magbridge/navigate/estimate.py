@@ -90,7 +90,10 @@ class Estimate:
         self.state = State.SEARCHING
 
     def correct(self, there: Array, sigma: float) -> None:
-        """Take in a fix, m from the dead-reckoned position, at the time of the last prediction."""
+        """Take in a fix (2,), m north and east of the dead-reckoned position; `sigma` m on each axis.
+
+        It holds at the time of the last prediction.
+        """
         assert self._filter is not None
         self._read()
         if distance(there - self.x[:2], self.P[:2, :2] + sigma**2 * np.eye(2)) > CONTRADICTION:

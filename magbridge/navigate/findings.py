@@ -47,6 +47,7 @@ def findings_of(
     grid, options
         What `result` was made with.
     jumps : sequence of Jump
+        What the integrity monitor saw, in order.
     reference_track : Dataset or None
         ``latitude longitude total_field`` at known positions.
     """
@@ -135,6 +136,8 @@ def best_shift(grid: AnomalyGrid, latitude: Array, longitude: Array, depth: Arra
 
     Parameters
     ----------
+    grid : AnomalyGrid
+        The anomaly map.
     latitude, longitude, depth : array, (n,)
         deg, m.
     anomaly : array, (n,)

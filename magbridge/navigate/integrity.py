@@ -139,7 +139,10 @@ class IntegrityMonitor:
         """Natural logarithm of the odds of *elsewhere* against *here*."""
 
     def step(self, block: Block, metres: float, x: Array, P: Array) -> Verdict:
-        """Take in a block `metres` after the previous one; compare with the filter's estimate after it."""
+        """Take in a block `metres` after the previous one.
+
+        It is compared with the filter's estimate after that block: `x` (6,) and its covariance `P` (6, 6).
+        """
         self._waiting.append(block)
         self._metres += metres
         first = self._waiting[0]

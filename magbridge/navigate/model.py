@@ -131,6 +131,7 @@ def informed(options: Options, calibration: Calibration, sigma: float) -> Option
     options : Options
         Their bias is that of all other sources: the map's level, the field's variation in time.
     calibration : Calibration
+        Of the total field that will be taken in.
     sigma : float
         nT, 1-sigma that the calibration claims for a typical sample.
 
@@ -221,6 +222,10 @@ def resolution(grid: AnomalyGrid, options: Options, variance: float) -> float:
 
     Parameters
     ----------
+    grid : AnomalyGrid
+        Its scatter σ and its correlation length L.
+    options : Options
+        Bias and map error.
     variance : float
         nT², of a measurement. A sixteenth of what bias and map error gain until the next is added (as for
         half the spread): those errors persist, and so do the curvature's.

@@ -59,6 +59,10 @@ class Navigator(Estimate):
 
         Parameters
         ----------
+        time_us : int
+            µs of event time.
+        latitude, longitude : float
+            deg.
         sigma : float, optional
             m, each axis; default ``options.start_sigma``.
         """

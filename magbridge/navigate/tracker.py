@@ -55,7 +55,7 @@ class Tracker:
         return covariance
 
     def predict(self, F: Array, Q: Array) -> None:
-        """Propagate by one transition."""
+        """Propagate by one transition: F and the noise's covariance Q, (6, 6)."""
         self._filter.F, self._filter.Q = F, Q
         self._filter.predict()
 

@@ -56,8 +56,11 @@ def disturb(
     Parameters
     ----------
     twin : Twin
+        The world, the vehicle and its instrument.
     hidden : tuple of Hidden
+        By their names in :data:`EFFECTS` or :data:`FOREIGN`.
     track : Track
+        As :meth:`~sitl.twin.Twin.fly` returns it.
     when : array (m,)
         s after the track's start; a few seconds short of its end.
     seed : int

@@ -71,7 +71,7 @@ def measure(
     when: Array,
     seed: int,
 ) -> xr.Dataset:
-    """Measure with the `hidden` effects, looked up in `effects`; see :func:`sitl.inject.disturb`."""
+    """Measure with the `hidden` effects, looked up in `effects`; arguments as :func:`sitl.inject.disturb`."""
     plain = twin.scenario.instrument
     scenes: list[Scene] = []
 

@@ -13,7 +13,7 @@ from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.descriptions import descriptions
 from magbridge.diagnose.inference.joint import fit_joint
-from magbridge.diagnose.inference.shapes import behind, bends, crossing, response, swings, top
+from magbridge.diagnose.inference.shapes import delayed, bends, crossing, response, swings, top
 from magbridge.diagnose.inference.statistic import SIZES, Statistic
 from magbridge.diagnose.run import diagnose
 from sitl import load, simulate
@@ -100,7 +100,7 @@ def test_a_slab_that_follows_a_temperature_is_described() -> None:
     time = 4.0 * np.arange(5400)
     water = np.tanh(3.0 * np.sin(2.0 * np.pi * time / 5500.0)) + time / time[-1]
     core = followed(time, water, 1800.0) - followed(time, water, 200.0) / 3.0
-    X = behind(time, water)(slice(None))
+    X = delayed(time, water)(slice(None))
     assert left_of(core, X) < 1e-3
     assert left_of(core, X[:, :1]) > 0.1
 
@@ -117,7 +117,7 @@ def test_what_the_sun_warms_at_the_surface_is_described() -> None:
     time = 4.0 * np.arange(5400)
     depth = np.abs((time % 5000.0) - 2500.0) * 0.08
     warm = followed(time, np.exp(-depth / 8.0), 500.0)
-    assert left_of(warm, top(time, depth)(slice(None))) < 0.02
+    assert left_of(warm, near_surface(time, depth)(slice(None))) < 0.02
 
 
 def test_turns_and_the_surface_are_among_the_descriptions(problem: Problem) -> None:

@@ -14,7 +14,7 @@ from magbridge.diagnose.compare.survey import Survey
 from magbridge.diagnose.inference.information import information
 from magbridge.diagnose.inference.joint import fit_joint
 from magbridge.diagnose.inference.packets import Packets, packets
-from magbridge.diagnose.inference.shapes import ends, repeated
+from magbridge.diagnose.inference.shapes import lower_end, repeated
 from magbridge.diagnose.inference.statistic import Ridge, Statistic
 
 
@@ -88,7 +88,7 @@ def test_a_packet_keeps_its_period_and_place_where_samples_are_lost(
 
 def test_what_lies_loose_changes_ends_when_it_is_tipped_far_enough() -> None:
     down = np.sin(np.radians([0.0, 4.0, 8.0, 4.0, -4.0, -8.0, -4.0, 4.0, 30.0]))
-    sides = ends(down)(slice(None))
+    sides = lower_end(down)(slice(None))
     steps = np.diff(sides, axis=0)
     assert (steps[:, 1] != 0.0).tolist() == [False, True, False, False, True, False, False, True]
 

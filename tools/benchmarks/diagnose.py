@@ -65,6 +65,7 @@ def long_survey(hours: float, count: int = 0, size: float = 0.0) -> tuple[xr.Dat
     Parameters
     ----------
     hours : float
+        How long it lasts.
     count : int
         Number of samples: the survey is repeated, each time with new noise; 0: flown once.
     size : float

@@ -73,6 +73,7 @@ def ideal(one: Found, stall: Stall, ds: xr.Dataset, setting: Setting) -> dict[st
     ds : Dataset
         The deployment that is diagnosed.
     setting : Setting
+        What the analyst may consider.
 
     Returns
     -------

@@ -84,6 +84,20 @@ def voyage(
 
     Parameters
     ----------
+    grid : AnomalyGrid
+        The true anomaly, of which the filter's map differs by the options' map error.
+    options : Options
+        The filter's.
+    seed : int
+        Of everything that is drawn.
+    sigma : float
+        nT, white noise of a sample.
+    hours : float
+        How long it lasts.
+    speed : float
+        m/s through the water.
+    every : float
+        s between samples.
     jump : (hour, north, east)
         Metres by which the vehicle is displaced at once, unnoticed by its dead reckoning.
     """
@@ -112,10 +126,16 @@ def adrift(
 
     Parameters
     ----------
+    grid, options
+        As for :func:`voyage`.
+    rng : Generator
+        Of current, drift, start and the map's error.
     velocity : Array, (n, 2)
         m/s north and east through the water, each `every` s up to its sample.
     errors, sigma : Array, (n,)
         nT: errors of the corrected total field, and the 1-sigma that the calibration claims.
+    every, jump
+        As for :func:`voyage`.
     """
     o, n = options, len(velocity)
     time = START + every * np.arange(1, n + 1)

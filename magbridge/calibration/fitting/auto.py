@@ -59,6 +59,7 @@ def fit_auto(
     Parameters
     ----------
     data : Observations
+        The calibration runs.
     order : int
         Highest total degree.
     vehicle : mapping of Mounting (or of its fields), optional

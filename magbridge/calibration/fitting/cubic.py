@@ -33,6 +33,7 @@ def fit_cubic(data: Observations, order: int = 3) -> Fit:
     Parameters
     ----------
     data : Observations
+        The calibration runs.
     order : int
         Highest total degree; the paper's is 3.
     """

@@ -104,7 +104,7 @@ class Observations:
         return len(self.field)
 
     def part(self, rows: NDArray[np.bool_]) -> Observations:
-        """Pick rows."""
+        """Pick rows: an (n,) mask."""
         columns = ((name, getattr(self, name)) for name in _PER_SAMPLE)
         picked: dict[str, Any] = {name: None if v is None else v[rows] for name, v in columns}
         return replace(self, **picked)
@@ -185,13 +185,13 @@ def _plausible(names: Sequence[str], positions: FloatArray) -> None:
 def monomials(
     positions: FloatArray, parameters: Sequence[Parameter], exponents: Sequence[Exponents]
 ) -> FloatArray:
-    """Return (n, m) monomials of positions (n, k, in their units), scaled as `parameters` say."""
+    """Return (n, m) monomials of positions (n, k), in their units, scaled as the k `parameters` say."""
     x = (positions - [p.centre for p in parameters]) / [p.scale for p in parameters]
     return np.stack([np.prod(x ** np.array(powers), axis=1) for powers in exponents], axis=1)
 
 
 def polynomial_samples(data: Observations, exponents: tuple[Exponents, ...], kappa: float = 0.0) -> Samples:
-    """Return the samples of `data` with the monomials of their scaled positions."""
+    """Return the samples of `data` with the monomials of their scaled positions; `kappa` as in Samples."""
     ranges = data.ranges()
     phi = monomials(data.parameters, ranges, exponents)
     return Samples(data.field, data.reference, phi, data.steps, float(data.reference.mean()), kappa)

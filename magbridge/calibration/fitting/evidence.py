@@ -34,7 +34,7 @@ SIGMA_STEP = 0.1  # of log sigma: scales it like a prior sigma of eta
 
 @dataclass(frozen=True, eq=False)
 class Quadratic:
-    """``cost(z) = c_0 - 2 b.z + z^T H z``, of n samples."""
+    """``cost(z) = c_0 - 2 b.z + z^T H z``, of n samples; H (q, q) and b (q,)."""
 
     H: FloatArray
     b: FloatArray
@@ -43,14 +43,14 @@ class Quadratic:
 
     @classmethod
     def about(cls, z: FloatArray, normal: NormalEquations, n: float) -> Quadratic:
-        """Return the quadratic whose value, gradient and Hessian at `z` are `normal`'s."""
+        """Return the quadratic whose value, gradient and Hessian at `z` (q,) are `normal`'s."""
         H, g = normal.hessian, normal.gradient
         return cls(H, H @ z - g, float(normal.cost - 2.0 * g @ z + z @ H @ z), n)
 
 
 @dataclass(frozen=True, eq=False)
 class Widths:
-    """Where the evidence is largest: eta, the noise (sensor nT), log Z."""
+    """Where the evidence is largest: eta (h,), the noise (sensor nT), log Z."""
 
     eta: FloatArray
     sigma: float
@@ -58,13 +58,17 @@ class Widths:
     determined: float
     """How many numbers the data, not the prior, determined: ``q - tr M^-1``."""
     mean: FloatArray
-    """Posterior mean of z."""
+    """Posterior mean of z (q,)."""
 
 
 def evidence(
     quadratic: Quadratic, structure: Structure, eta: FloatArray, log_sigma: float
 ) -> tuple[float, FloatArray, FloatArray, float]:
-    """Return log evidence, its gradient by (eta, log sigma), the posterior mean, and `Widths.determined`."""
+    """Return log evidence, its gradient by (eta, log sigma), the posterior mean, and `Widths.determined`.
+
+    `eta` is (h,), the gradient (h + 1,), the mean of z (q,); `log_sigma` is that of the noise in sensor nT.
+    With no finite evidence the first is -inf and the others are zero.
+    """
     w = structure.widths(eta)
     s2 = np.exp(2.0 * log_sigma)
     M = (w[:, None] * quadratic.H * w) / s2
@@ -91,7 +95,7 @@ def evidence(
 
 
 def maximise(quadratic: Quadratic, structure: Structure, eta: FloatArray, sigma: float) -> Widths:
-    """Climb from `eta` and `sigma` to where the evidence is largest."""
+    """Climb from `eta` (h,) and `sigma` (sensor nT) to where the evidence is largest."""
     middle = np.append(structure.centre, np.log(sigma))
     scale = np.append(structure.spread, SIGMA_STEP)
 

@@ -90,6 +90,7 @@ def fit(
     Parameters
     ----------
     data : Observations
+        The calibration runs; :func:`~.columns.observations` takes them from a deployment.
     method : str
         One of :data:`METHODS`.
     order : int

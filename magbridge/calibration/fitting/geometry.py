@@ -115,6 +115,7 @@ def mounted_structure(
     exponents : tuple of tuple of int
         Its monomials.
     parameters : tuple of Parameter
+        Scales of the monomials' positions.
     vehicle : mapping of Mounting (or of its fields)
         Keyed by the parameter's name.
 

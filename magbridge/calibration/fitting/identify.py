@@ -46,6 +46,7 @@ def combinations(samples: Samples, coefficients: FloatArray, sigma: float) -> Co
     Parameters
     ----------
     samples : Samples
+        The calibration runs.
     coefficients : (9 m,) array
         Where to linearise.
     sigma : float

@@ -32,6 +32,7 @@ def unfiltered(data: Observations, corner: float) -> Observations:
     Parameters
     ----------
     data : Observations
+        As the filter passed them on.
     corner : float
         Hz.
 

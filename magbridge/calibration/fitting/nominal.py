@@ -138,7 +138,7 @@ def starts(samples: Samples) -> list[FloatArray]:
 
 
 def check_scales(samples: Samples, coefficients: FloatArray) -> None:
-    """Refuse a collapsed fit.
+    """Refuse a collapsed fit; `coefficients` are (9 m,), nT.
 
     Raises
     ------

@@ -64,11 +64,11 @@ class Structure:
     renew: Callable[[FloatArray], tuple[Structure, FloatArray]] | None = None
 
     def widths(self, eta: FloatArray) -> FloatArray:
-        """(q,) prior 1-sigma of z."""
+        """(q,) prior 1-sigma of z at `eta` (h,)."""
         return np.asarray(np.exp(self.constant + self.design @ eta))
 
     def coefficients(self, z: FloatArray) -> FloatArray:
-        """``c = E z + offset``."""
+        """(K,) ``c = E z + offset`` of z (q,)."""
         return np.asarray(self.E @ z + self.offset)
 
 

@@ -37,11 +37,11 @@ class Prior:
     offset: FloatArray | float = 0.0
 
     def coefficients(self, z: FloatArray) -> FloatArray:
-        """``c = E z + offset``."""
+        """(K,) ``c = E z + offset`` of z (q,)."""
         return np.asarray(self.E @ z + self.offset)
 
     def reduce(self, normal: NormalEquations) -> NormalEquations:
-        """Return the normal equations in z."""
+        """Return normal equations in c (K) as those in z (q)."""
         return NormalEquations(self.E.T @ normal.hessian @ self.E, self.E.T @ normal.gradient, normal.cost)
 
 
@@ -71,6 +71,7 @@ def gauss_newton(
     samples, prior, noise
         See the module's notes.
     start : (q,) array
+        z at the first step.
     steps : int
         How many at most.
     tolerance : float
@@ -122,7 +123,7 @@ def _solve(precision: FloatArray, gradient: FloatArray) -> FloatArray:
 
 
 def covariance_of(precision: FloatArray) -> FloatArray:
-    """Inverse of a positive definite precision, symmetric to the last bit.
+    """Inverse of a positive definite precision (q, q), symmetric to the last bit.
 
     Raises
     ------

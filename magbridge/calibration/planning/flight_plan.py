@@ -41,6 +41,7 @@ def flight_plan(
     field_ned : (n, 3) array or None
         nT, north-east-down, the Earth's field along it.
     runs : int
+        How many to choose.
     roll : float
         deg, the largest bank either way.
 

@@ -57,7 +57,7 @@ class Limits:
 
 
 def trim_of(data: Observations) -> Callable[[FloatArray], float] | None:
-    """Return the pitch (deg) that positions trim a vehicle to, linear in them; None if undetermined."""
+    """Return the pitch (deg) that positions (k,) trim a vehicle to, linear in them; None if undetermined."""
     if data.attitude is None or not data.names:
         return None
     known = np.isfinite(data.attitude[:, 1])

@@ -143,7 +143,7 @@ class _Design:
 def evaluate_runs(
     calibration: Calibration, mission: Mission, field_ned: FloatArray, runs: Sequence[PlannedRun]
 ) -> Plan:
-    """Return what given runs are expected to bring, one after the other; arguments as for :func:`plan`."""
+    """Return what given runs are expected to bring, one after the other; `field_ned` is (3,), nT."""
     design = _Design(calibration, mission, field_ned)
     C = calibration.covariance
     course = [design.variances(C)]
@@ -171,6 +171,7 @@ def plan(
     field_ned : (3,) array
         nT, where the runs will be flown.
     limits : Limits
+        Pitch, bank and positions that the vehicle can fly.
     runs : int
         How many spirals.
 

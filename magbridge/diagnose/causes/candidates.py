@@ -158,8 +158,8 @@ def of_effect(
 ) -> Candidate:
     """Make a candidate of an effect.
 
-    Its regressors are `phi` less `origin`; without `phi` they are computed sample by sample. `unit` is that
-    of all its coefficients, or has one for each of as many equal parts of them.
+    Its regressors are `phi` (r, n) less `origin`; without `phi` they are computed sample by sample. `unit` is
+    that of all its coefficients, or has one for each of as many equal parts of them.
     """
     if phi is None:
         phi = history(problem.survey, problem.calibration, effect)
@@ -184,7 +184,10 @@ def of_reference(
     names: tuple[str, ...],
     **more: Any,
 ) -> Candidate:
-    """Make a candidate of an error in the reference: the field is ``H_e + sum_k b_k basis_k(t)``, nT."""
+    """Make a candidate of an error in the reference: the field is ``H_e + sum_k b_k basis_k(t)``, nT.
+
+    `basis` gives (m, k) of m rows; `width` (k,) is the usual size of each coefficient, nT.
+    """
     return Candidate(
         cause,
         None,

@@ -74,7 +74,7 @@ class Since:
 
 
 def parts(columns: Columns) -> tuple[tuple[Columns, FloatArray], ...]:
-    """Return the pairs (X_i, M_i) of a mixture; any other columns are their own only part, M the identity."""
+    """Return the pairs (X_i, M_i (p_i, k)) of a mixture; other columns are their own only part, M = I."""
     if isinstance(columns, Mixture):
         return columns.parts
     return ((columns, np.eye(columns(slice(0, 1)).shape[1])),)

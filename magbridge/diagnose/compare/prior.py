@@ -65,7 +65,7 @@ def _constants(calibration: Calibration) -> list[slice]:
 
 
 def loosened(calibration: Calibration, L: FloatArray, centre: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return L and m of the prior with :func:`floor` added to its covariance."""
+    """Return L (K, r) and m (r,), covariance ``L L^T`` and mean ``L m``, with :func:`floor` added."""
     mean = L @ centre
     broad = _factor(L @ L.T + floor(calibration))
     return broad, np.asarray(np.linalg.lstsq(broad, mean, rcond=None)[0], float)

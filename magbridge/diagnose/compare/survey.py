@@ -128,7 +128,7 @@ class Survey:
         return {}
 
     def values(self, names: Sequence[str]) -> FloatArray:
-        """(n, k) channels, in this order."""
+        """(n, k) channels, in this order; DataError: one is missing."""
         missing = [name for name in names if name not in self.channels]
         if missing:
             raise DataError(
@@ -153,6 +153,7 @@ def assemble(
     units : dict
         Column -> unit.
     source : str
+        Where they come from, for people to read.
     needed : sequence of str
         Channels that are kept even if they never change.
     """

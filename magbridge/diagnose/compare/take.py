@@ -45,6 +45,7 @@ def take(
     datasets : sequence of Dataset
         To be diagnosed.
     calibration : Calibration
+        Decides which channels a deployment must have.
     learned_from : sequence of Dataset
         The logs that the calibration was fitted to, if available.
     grid : AnomalyGrid, optional

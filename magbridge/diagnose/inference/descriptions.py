@@ -22,18 +22,18 @@ from magbridge.diagnose.inference.packets import packets
 from magbridge.diagnose.inference.shapes import (
     REPEATED,
     SLOPES,
-    behind,
     bends,
     crossing,
     curve,
+    delayed,
     direction,
-    ends,
+    lower_end,
     memory,
+    near_surface,
     repeated,
     response,
     spectra,
     swings,
-    top,
 )
 
 __all__ = ["Description", "descriptions"]
@@ -107,6 +107,7 @@ def descriptions(problem: Problem, fit: Joint, tone: Candidate | None = None) ->
     Parameters
     ----------
     problem : Problem
+        The survey to be described.
     fit : Joint
         A fit without any cause; steps, passages and packets are searched for in its residual.
     tone : Candidate, optional
@@ -180,7 +181,7 @@ def _of_channels(problem: Problem) -> list[Description]:
 
 def _late(problem: Problem, name: str, channel: Channel) -> list[Description]:
     """Return what follows a channel late, as heat soaks into a hull: an offset, or a sensitivity."""
-    late, listed = behind(problem.survey.time, channel.values), []
+    late, listed = delayed(problem.survey.time, channel.values), []
     for cause, scales in SCALES.items():
         columns = _along_axes(problem, late, scales=scales)
         held = (cause,) if "temperature" in channel.kinds else ()
@@ -198,7 +199,7 @@ def _of_attitude(problem: Problem) -> list[Description]:
     for down in (-np.sin(pitch), np.sin(roll) * np.cos(pitch)):
         listed += [
             _of("broadband", _along_axes(problem, curve(down)), 12, turned=True),
-            _of("switching", _along_axes(problem, ends(down)), 3 * len(SLOPES), turned=True),
+            _of("switching", _along_axes(problem, lower_end(down)), 3 * len(SLOPES), turned=True),
         ]
     for angle in angles:
         swung = swings(time, rates(problem.survey, angle[None])[0])
@@ -210,7 +211,7 @@ def _repeating(problem: Problem, fit: Joint, tone: Candidate | None) -> list[Des
     """List what the surface does, what each dive repeats, oscillations of limited duration, and a tone."""
     survey, listed = problem.survey, []
     if "depth" in survey.channels and "depth" not in survey.still:
-        above = top(survey.time, survey.channels["depth"].values)
+        above = near_surface(survey.time, survey.channels["depth"].values)
         listed.append(_of("broadband", _along_axes(problem, above), 24, turned=True))
     if np.ptp(survey.dive):
         listed.append(_of("broadband", _along_axes(problem, repeated(problem)), 3 * REPEATED, turned=True))

@@ -94,7 +94,7 @@ class Design:
 def normal(
     X: Columns, y: FloatArray, noise: Noise | None = None, asked: Sequence[tuple[slice, slice]] = ALL
 ) -> tuple[FloatArray, FloatArray]:
-    """Return ``X^T X`` and ``X^T y``, X whitened if a noise is given.
+    """Return ``X^T X`` (k, k) and ``X^T y`` (k,), X whitened if a noise is given.
 
     They are summed up in pieces that fit the processor's cache. Long logs are shared out among threads,
     always in the same way, so any machine returns the same numbers. Of ``X^T X`` only the blocks that are

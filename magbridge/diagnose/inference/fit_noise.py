@@ -74,6 +74,8 @@ def _product(r: FloatArray, slots: NDArray[np.int64], lag: int) -> float:
 def certainty(residual: FloatArray, noise: Noise, columns: Sequence[Columns]) -> list[float]:
     r"""Degrees of freedom of the noise's level at the frequencies where each of `columns` has its power.
 
+    `residual` (n,) is what the noise was fitted to, nT.
+
     Notes
     -----
     The fitted memory a has the covariance ``C = (L^T L)^-1`` of its regression, with L the p preceding

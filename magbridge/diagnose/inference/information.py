@@ -46,11 +46,11 @@ class Information:
     shift: FloatArray
 
     def moved(self, base: Joint, index: NDArray[np.intp], taken: FloatArray) -> FloatArray:
-        """Return the likeliest calibration and model (q + k,) if the coefficients at `index` are `taken`."""
+        """Return the likeliest calibration and model (q + k,) if coefficients at `index` (i,) are `taken`."""
         return np.append(base.z, base.coefficients) - self.shift[:, index] @ taken
 
     def without(self, index: NDArray[np.intp], prior: FloatArray) -> Information:
-        """Project out the coefficients at `index` as well, with their prior precision."""
+        """Project out the coefficients at `index` as well, with their prior precision (i,)."""
         S = self.matrix[np.ix_(index, index)] + np.diag(prior)
         K = np.linalg.solve(S, self.matrix[index])
         return Information(

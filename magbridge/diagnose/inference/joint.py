@@ -79,6 +79,7 @@ def fit_joint(
     Parameters
     ----------
     problem : Problem
+        The survey, with the prior of its q calibration coefficients.
     columns : sequence of Columns
         The effects'.
     order : int

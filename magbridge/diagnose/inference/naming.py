@@ -65,10 +65,13 @@ class NamingTheory:
         Parameters
         ----------
         cause : str
+            By its public name.
         own : (k,) int array
             Places of the coefficients in the information.
         b : (k,) array
+            Only its direction counts.
         signal_to_noise : float
+            Of the effect, after projection.
         """
         power = float(b @ self.S[np.ix_(own, own)] @ b)
         if power <= 0.0 or signal_to_noise <= 0.0:
@@ -97,7 +100,9 @@ class NamingTheory:
         Parameters
         ----------
         cause : str
+            By its public name.
         signal_to_noise : float
+            Of the effect, after projection.
         """
         rng = np.random.default_rng(20131214)
         best: dict[str | None, tuple[float, int]] = {}

@@ -92,6 +92,7 @@ class Noise:
         values : (m, k) array
             Rows from `start` on of the whole log's columns, best stored column by column.
         start : int
+            Place of the first row in the log.
         skip : int
             Rows at the beginning that serve only as the past of the others.
 

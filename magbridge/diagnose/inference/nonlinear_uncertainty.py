@@ -57,10 +57,13 @@ def loosened(
     Parameters
     ----------
     problem : Problem
+        The survey.
     model : sequence of Candidate
+        The causes found.
     columns : sequence of Columns
         Of the model, in this problem.
     fit : Joint
+        Of the model, its nonlinear parameters held.
     grid : sequence of Candidate
         All candidates that were searched.
     """

@@ -98,9 +98,11 @@ def pairs_of(
     Parameters
     ----------
     state : State
+        Of the search.
     info : Information
         Of all candidates and of `model`, whose columns are the last: :meth:`~.rounds.State.beside`.
     model : sequence of Candidate
+        The causes found so far.
     base : Joint
         The model's fit.
     *places : int

@@ -114,7 +114,7 @@ class State:
         like: Joint | None = None,
         rounds: int = 4,
     ) -> Joint:
-        """Fit a model jointly with calibration and noise; see :func:`~.joint.fit_joint`."""
+        """Fit a model jointly with calibration and noise; arguments as of :func:`~.joint.fit_joint`."""
         columns = [candidate.columns for candidate in model]
         return fit_joint(
             self.problem, columns, self.order, *starts, plain=plain, spectra=[c.spectra for c in model],

@@ -77,6 +77,7 @@ def search(problem: Problem, candidates: Sequence[Candidate], causes: int) -> Ou
     Parameters
     ----------
     problem : Problem
+        The survey, and the calibration's prior.
     candidates : sequence of Candidate
         Of all causes.
     causes : int

@@ -1,4 +1,8 @@
-"""The functions of which descriptions without a name are made, and their prior widths."""
+"""The functions of which descriptions without a name are made, and their prior widths.
+
+Arguments are histories of the log's n samples, (n,) or (n, 3); what is returned is a block of columns,
+(m, k) of m rows: :mod:`magbridge.diagnose.compare.columns`.
+"""
 
 from __future__ import annotations
 
@@ -15,18 +19,18 @@ from magbridge.diagnose.inference.design import pieces
 __all__ = [
     "REPEATED",
     "SLOPES",
-    "behind",
     "bends",
     "crossing",
     "curve",
+    "delayed",
     "direction",
-    "ends",
+    "lower_end",
     "memory",
+    "near_surface",
     "repeated",
     "response",
     "spectra",
     "swings",
-    "top",
 ]
 
 FloatArray = NDArray[np.float64]
@@ -60,7 +64,7 @@ def spectra(count: int, axes: int) -> tuple[tuple[str, FloatArray], ...]:
 
 
 def direction(body: FloatArray) -> Columns:
-    """Functions up to quartic of the field's direction in the body."""
+    """Functions up to quartic of the field's direction in the body, that of `body` (n, 3)."""
     unit = body / np.linalg.norm(body, axis=1)[:, None]
     exponents = [(i, j, d - i - j) for d in (1, 2, 3, 4) for i in range(d + 1) for j in range(d + 1 - i)]
 
@@ -73,7 +77,10 @@ def direction(body: FloatArray) -> Columns:
 
 
 def response(reading: FloatArray, slopes: FloatArray) -> Columns:
-    """Each channel's error as any smooth function of its own reading: Chebyshev polynomials."""
+    """Each channel's error as any smooth function of its own reading (n, 3): Chebyshev polynomials.
+
+    `slopes` (n, 3) are what one nT in each channel adds to the residual.
+    """
     x = np.clip([_scaled(channel) for channel in reading.T], -1.0, 1.0)
     turning = x + 1j * np.sqrt(1.0 - x**2)  # cos k theta = T_k(x), with x = cos theta
 
@@ -85,7 +92,7 @@ def response(reading: FloatArray, slopes: FloatArray) -> Columns:
 
 
 def bends() -> tuple[tuple[str, FloatArray], ...]:
-    """Prior widths of a response's polynomials: of one with steps, with a corner, or smooth."""
+    """Prior widths (3 BEND,) of a response's polynomials: of one with steps, with a corner, or smooth."""
     k = np.arange(1.0, BEND + 1.0)
     return tuple(
         ("broadband", np.tile(30.0 / width, 3)) for width in (np.sqrt(1.0 + (k / 8.0) ** 2), k**2, k**3)
@@ -93,7 +100,7 @@ def bends() -> tuple[tuple[str, FloatArray], ...]:
 
 
 def crossing(reading: FloatArray, slopes: FloatArray) -> Columns:
-    """Each channel's error where it passes zero (Hermite's functions).
+    """Each channel's error where it passes zero (Hermite's functions); arguments as of :func:`response`.
 
     There the feedback current changes sign, or a converter's first bit flips.
     """
@@ -107,13 +114,13 @@ def crossing(reading: FloatArray, slopes: FloatArray) -> Columns:
 
 
 def curve(values: FloatArray) -> Columns:
-    """Powers of a channel."""
+    """Powers of a channel (n,)."""
     y = _scaled(values)
     return _centred(lambda rows: powers(y[rows], 4).T, len(y))
 
 
 def memory(values: FloatArray) -> Columns:
-    """Functions of a channel's past: curved branches of hysteresis, narrow and wide; its direction."""
+    """Functions of a channel's past (n,): curved branches of hysteresis, narrow and wide; its direction."""
     y = _scaled(values)
     plays = [play(y, width) for width in PLAYS]
     change = np.diff(y, prepend=y[0])
@@ -127,21 +134,21 @@ def memory(values: FloatArray) -> Columns:
     return _centred(columns, len(y))
 
 
-def behind(time: FloatArray, values: FloatArray) -> Columns:
-    """Return a channel with each of :data:`LAGS`: in some proportion they make any smooth response to it."""
+def delayed(time: FloatArray, values: FloatArray) -> Columns:
+    """Return a channel (n,) with each of :data:`LAGS`: mixed, they make any smooth response to it."""
     return _centred(_followed(time, _scaled(values)[None], LAGS), len(values))
 
 
 def swings(time: FloatArray, rate: FloatArray) -> Columns:
-    """Return functions of a turn's rate, with lags: the rate, and its square, the same to either side."""
+    """Return functions of a turn's rate (n,), with lags: the rate; its square, the same to either side."""
     low, high = np.quantile(rate, (0.001, 0.999))  # telemetry that jumps is no turn
     y = np.clip(rate, low, high) / max(high, -low, 1e-12)
     swung = _followed(time, y[None], SWAYS)
     return _centred(lambda rows: powers(swung(rows).T, 2).reshape(2 * len(SWAYS), -1).T, len(rate))
 
 
-def top(time: FloatArray, depth: FloatArray) -> Columns:
-    """Return effects of the surface on a vehicle that fade with depth, and, with lags, afterwards."""
+def near_surface(time: FloatArray, depth: FloatArray) -> Columns:
+    """Return effects of the surface that fade with depth (n,), m, and, with lags, afterwards."""
     near = np.exp(-(depth - depth.min()) / np.array(SKIN)[:, None])
     return _centred(_followed(time, near, LAGS[:-1]), len(depth))
 
@@ -158,8 +165,11 @@ def repeated(problem: Problem) -> Columns:
     return _centred(lambda rows: powers(turning[rows], REPEATED).real.T, len(u))
 
 
-def ends(down: FloatArray) -> Columns:
-    """Return the end of the hull at which a loose object lies: the lower one, once tilted by so much."""
+def lower_end(down: FloatArray) -> Columns:
+    """Return the end of the hull at which a loose object lies: the lower one, once tilted by so much.
+
+    `down` (n,) is the sine of the tilt; :data:`SLOPES` are those at which it starts to slide.
+    """
     place = np.arange(len(down))
     sides = []
     for slope in SLOPES:

@@ -30,6 +30,7 @@ def varying(problem: Problem, candidate: Candidate, trials: Mapping[str, float])
     Parameters
     ----------
     problem : Problem
+        The survey.
     candidate : Candidate
         The cause; None is returned for one that takes almost any shape.
     trials : mapping

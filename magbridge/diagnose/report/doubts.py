@@ -78,7 +78,7 @@ def several(names: tuple[str, ...]) -> str:
 
 
 def implausible(candidate: Candidate, b: NDArray[np.float64]) -> str:
-    """Say so when a cause is implausibly large: two causes that cancel each other grow together."""
+    """Say so when a cause's b (k,), in units of its widths, is implausibly large, as if two cancelled."""
     times = float(np.abs(b).max())
     if candidate.spectra is not None or times < IMPLAUSIBLE:
         return ""

@@ -34,6 +34,7 @@ def found(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> list[str]:
     Parameters
     ----------
     diagnosis : Diagnosis
+        What is told.
     causes : mapping
         The table of causes that were asked about.
     """

@@ -38,6 +38,7 @@ def report_html(diagnosis: Diagnosis, causes: Mapping[str, Cause], remarks: Sequ
     Parameters
     ----------
     diagnosis : Diagnosis
+        What is told.
     causes : mapping
         The table of causes that were asked about.
     remarks : sequence of str

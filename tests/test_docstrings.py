@@ -1,0 +1,75 @@
+"""Public docstrings say what a signature cannot: an array's shape, and the errors that are raised."""
+
+from __future__ import annotations
+
+import ast
+import re
+from functools import cache
+from pathlib import Path
+
+import magbridge
+import sitl
+from magbridge import errors
+
+ROOMS = [Path(str(package.__file__)).parent for package in (magbridge, sitl)]
+ERRORS = {name for name, thing in vars(errors).items() if isinstance(thing, type)}
+SHAPE = re.compile(r"\((\.\.\.|[\w+ ]+),[\w+*., ()-]*\)|\bshape\b|[Aa]rguments as")
+"""``(n,)``, ``(n, 3)``, ``(..., 9 m)``, or a reference to where it is said."""
+
+
+def functions(scope: ast.Module | ast.ClassDef) -> list[ast.FunctionDef]:
+    """Those with a docstring; an overload or a property's setter has none."""
+    return [n for n in scope.body if isinstance(n, ast.FunctionDef) and ast.get_docstring(n)]
+
+
+@cache
+def public() -> dict[str, ast.FunctionDef]:
+    """Functions in ``__all__``, and methods of the classes there, but for those that override another."""
+    trees = {path: ast.parse(path.read_text()) for room in ROOMS for path in room.rglob("*.py")}
+    classes = {n.name: n for tree in trees.values() for n in tree.body if isinstance(n, ast.ClassDef)}
+
+    def above(one: ast.ClassDef) -> set[str]:
+        bases = [classes[base.id] for base in one.bases if isinstance(base, ast.Name) and base.id in classes]
+        return {n.name for base in bases for n in functions(base)}.union(*map(above, bases))
+
+    found = {}
+    for path, tree in trees.items():
+        lists = [
+            n.value for n in tree.body if isinstance(n, ast.Assign) and ast.unparse(n.targets[0]) == "__all__"
+        ]
+        names = ast.literal_eval(lists[0]) if lists else ()
+        own = [n for n in functions(tree) if n.name in names]
+        for one in (n for n in tree.body if isinstance(n, ast.ClassDef) and n.name in names):
+            own += [n for n in functions(one) if n.name[0] != "_" and n.name not in above(one)]
+        found |= {f"{path}:{n.lineno} {n.name}": n for n in own}
+    assert len(found) > 500
+    return found
+
+
+def test_an_array_has_a_shape() -> None:
+    def kinds(function: ast.FunctionDef) -> str:
+        given = [n.annotation for n in ast.walk(function.args) if isinstance(n, ast.arg)]
+        return " ".join(ast.unparse(kind) for kind in (*given, function.returns) if kind)
+
+    silent = [
+        where
+        for where, function in public().items()
+        if re.search(r"Array\b", kinds(function)) and not SHAPE.search(str(ast.get_docstring(function)))
+    ]
+    assert not silent
+
+
+def test_an_error_that_is_raised_is_named() -> None:
+    """But for commands: their docstrings are what ``--help`` prints, and their errors are exit codes."""
+
+    def raised(function: ast.FunctionDef) -> set[str]:
+        thrown = [n.exc for n in ast.walk(function) if isinstance(n, ast.Raise)]
+        return {ast.unparse(one.func) for one in thrown if isinstance(one, ast.Call)} & ERRORS
+
+    silent = [
+        where
+        for where, function in public().items()
+        if "/cli/" not in where
+        and not all(name in str(ast.get_docstring(function)) for name in raised(function))
+    ]
+    assert not silent
