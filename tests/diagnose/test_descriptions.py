@@ -13,7 +13,7 @@ from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.descriptions import descriptions
 from magbridge.diagnose.inference.joint import fit_joint
-from magbridge.diagnose.inference.shapes import delayed, bends, crossing, response, swings, top
+from magbridge.diagnose.inference.shapes import bends, crossing, delayed, near_surface, response, swings
 from magbridge.diagnose.inference.statistic import SIZES, Statistic
 from magbridge.diagnose.run import diagnose
 from sitl import load, simulate
