@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from magbridge.diagnose.compare.columns import Columns
 from magbridge.diagnose.compare.problem import Problem
-from magbridge.diagnose.inference.design import Design, kept
+from magbridge.diagnose.inference.design import Design, precomputed
 from magbridge.diagnose.inference.joint import Joint
 
 __all__ = ["Gain", "HeldOut", "held_out", "paired"]
@@ -64,7 +64,7 @@ def held_out(problem: Problem, columns: Sequence[Columns], fit: Joint) -> HeldOu
     Nonlinear parameters and noise are those of the fit to all dives; every coefficient is fitted anew without
     the fold.
     """
-    X, noise, prior = Design(problem, kept(len(problem), columns)), fit.noise, fit.prior
+    X, noise, prior = Design(problem, precomputed(len(problem), columns)), fit.noise, fit.prior
     centre = np.append(problem.centre, np.zeros(X.effects))
     c = np.append(fit.z, fit.coefficients)
     y = noise.response(problem.residual - X.times(c))

@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import chi2
 
 from magbridge.diagnose.causes.candidates import Candidate, slices
-from magbridge.diagnose.inference.evidence import LEVEL, evidence_of, score, trials, weigh, worth
+from magbridge.diagnose.inference.evidence import LEVEL, evidence_of, log_bayes, log_odds, score, trials
 from magbridge.diagnose.inference.information import Information
 
 
@@ -29,7 +29,7 @@ def test_what_cannot_be_negative_has_twice_the_prior_where_it_is() -> None:
     exact = np.log(np.trapezoid(prior * np.exp(b * estimate - 0.5 * b**2), b))
     one_sided = evidence_of(candidate("filter_lag", positive=True), estimate**2, 1)
     assert one_sided == pytest.approx(exact, abs=0.06)
-    assert one_sided - weigh(estimate**2, 1) == pytest.approx(np.log(2.0), abs=0.05)
+    assert one_sided - log_bayes(estimate**2, 1) == pytest.approx(np.log(2.0), abs=0.05)
 
 
 @pytest.mark.parametrize(
@@ -50,13 +50,13 @@ def test_a_size_that_cannot_be_negative_has_one_tail(one: Candidate, least: floa
 def test_numbers_of_one_size_are_not_weighed_twice() -> None:
     one = candidate("map_error", 40, spectra=np.ones((4, 40)))
     assert evidence_of(one, 30.0, 1) == pytest.approx(15.0 - np.log(4.0))
-    assert worth(30.0, [one], {"map_error": 1.0}) == pytest.approx(evidence_of(one, 30.0, 1))
+    assert log_odds(30.0, [one], {"map_error": 1.0}) == pytest.approx(evidence_of(one, 30.0, 1))
 
 
 def test_a_second_regressor_pays_for_its_choice_and_for_the_odds() -> None:
     model = [candidate("clock_offset"), candidate("reference_bias")]
     trials = {"clock_offset": 1.0, "reference_bias": 3.0}
-    assert weigh(200.0, 2) - worth(200.0, model, trials) == pytest.approx(np.log(20.0 * 2.0 * 3.0))
+    assert log_bayes(200.0, 2) - log_odds(200.0, model, trials) == pytest.approx(np.log(20.0 * 2.0 * 3.0))
 
 
 def counted(S: np.ndarray, sizes: list[int]) -> float:

@@ -11,7 +11,7 @@ import pytest
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.design import normal
-from magbridge.diagnose.inference.evidence import weigh
+from magbridge.diagnose.inference.evidence import log_bayes
 from magbridge.diagnose.inference.joint import Joint, fit_joint
 from magbridge.diagnose.inference.nonlinear_uncertainty import loosened
 
@@ -89,7 +89,7 @@ def test_other_peaks_of_the_likelihood_count_by_their_evidence(right: Callable[[
     grid = [step(float(onset)) for onset in range(10, ROWS, 10)]
     fits = [fitted(problem, beside, one) for one in grid]
     null = fitted(problem, beside).log_likelihood
-    weight = np.exp([weigh(2.0 * (one.log_likelihood - null), 1) for one in fits])
+    weight = np.exp([log_bayes(2.0 * (one.log_likelihood - null), 1) for one in fits])
     best = int(np.argmax(weight))
     fit = fits[best]
     apart = np.array([np.append(one.z, one.coefficients) for one in fits]) - np.append(

@@ -17,7 +17,7 @@ import pytest
 from scipy.stats import norm
 from study.both import by_causes, held, named, weighed
 from study.cases import PARTS, plan
-from study.draws import SHOWN, Draws, Span, evidence, weigh, with_another
+from study.draws import SHOWN, Draws, Span, evidence, log_bayes, with_another
 from study.nameless import against, nameless
 from study.noise import LOSSES, MEMORY, autoregression, left, whiten
 from study.rates import beside_ideal, efficiency, share
@@ -178,7 +178,7 @@ def nameless_chances(apart: float, k: int = 3, wanted: float = 10.0) -> dict[str
     X[:, 0] = X[:, 30] / wanted
     draws, name = Draws.of(X.T @ X), Span("other", None, slice(27, 30))
     ratio, freedom = draws.ratio(name)
-    needed = against(draws, {"other": weigh(ratio, freedom)}, [], {})
+    needed = against(draws, {"other": log_bayes(ratio, freedom)}, [], {})
     free = Description(lambda rows: X[rows, :27], (("drift", np.ones(27)),) * 20)
     truth = Span("truth", SHOWN, slice(30, 31), more=k - 1)
     return nameless(draws, evidence(truth, *draws.ratio(truth)), needed, [free])
@@ -226,8 +226,8 @@ def test_a_detector_that_needs_more_is_told_by_its_p_values() -> None:
 
 
 def test_evidence_asks_its_price() -> None:
-    assert weigh(np.array([3.0]), 3) == pytest.approx(0.0)
-    assert weigh(np.array([60.0]), 3) < weigh(np.array([60.0]), 1)
+    assert log_bayes(np.array([3.0]), 3) == pytest.approx(0.0)
+    assert log_bayes(np.array([60.0]), 3) < log_bayes(np.array([60.0]), 1)
 
 
 def test_a_share_tells_its_interval() -> None:

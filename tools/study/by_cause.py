@@ -17,10 +17,10 @@ from study.rates import (
     gained,
     holds,
     off,
+    predicted,
     right_alone,
     scores,
     sets,
-    told,
 )
 
 COLUMNS = (
@@ -43,7 +43,9 @@ def _line(name: str, part: Mapping[str, Sequence[Row]]) -> list[str]:
         return [r for p in parts for r in part.get(p, ()) if list(r["names"]) == [name]]
 
     named, loud = own("named"), own("loud", "gain")
-    ideal = {key: f"{chance(named, key):.2f}" if told(named) else "-" for key in ("alone", "inside", "size")}
+    ideal = {
+        key: f"{chance(named, key):.2f}" if predicted(named) else "-" for key in ("alone", "inside", "size")
+    }
     sizes = [len(sets(r)) for r in named if sets(r)] or [0]
     gain = gained(own("gain"))
     return [
@@ -62,7 +64,7 @@ def _line(name: str, part: Mapping[str, Sequence[Row]]) -> list[str]:
 
 def _half(known: Sequence[Row]) -> str:
     """Return the signal-to-noise of half detection: theory's, the measured one, and by how much it is off."""
-    half, factor = [t["half"] for t in told(known)], beside_ideal(known)
+    half, factor = [t["half"] for t in predicted(known)], beside_ideal(known)
     if not half or factor is None:
         return "-"
     return f"{np.mean(half):.1f} / {np.mean(half) * factor[0]:.1f} ({off(factor)})"

@@ -40,7 +40,7 @@ LASTING = (
 of one log."""
 NAMELESS = ("unknown", "seen", "foreign")
 """Parts in which the hidden effect is not among the causes of the table."""
-TOLD = ("named", "ladder", "pair", *NAMELESS)
+PREDICTED = ("named", "ladder", "pair", *NAMELESS)
 """Parts for which theory predicts the outcome."""
 STRANGE = ("yielding", "afterglow", "mast", "annealed")
 """Foreign effects made after the detector was frozen; its descriptions were not designed for them either."""
@@ -200,7 +200,7 @@ def _theory(
 ) -> list[dict[str, Any]]:
     """Return theory's prediction for a case of one hidden effect, or of two at once."""
     names = [one.hidden.name for one in hidden]
-    if part not in TOLD or "outliers" in names:  # nothing else comes one by one
+    if part not in PREDICTED or "outliers" in names:  # nothing else comes one by one
         return []
     late = next((one for one in hidden if one.hidden.name in DELAYS), hidden[0])
     others = {

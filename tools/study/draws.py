@@ -100,7 +100,7 @@ def explained(S: Array, span: Span) -> float:
     return float(np.sum((root_of(S, span).T @ S[span.own, -1]) ** 2))
 
 
-def weigh(ratio: Array, freedom: float) -> Array:
+def log_bayes(ratio: Array, freedom: float) -> Array:
     """Log evidence of likelihood ratios of `freedom` free coefficients (Liang et al. 2008, sec. 2.4)."""
     if not freedom:
         return np.zeros_like(ratio)
@@ -113,7 +113,7 @@ def evidence(span: Span, ratio: Array, freedom: float) -> Array:
     if span.spectra is not None:
         return 0.5 * ratio - np.log(len(span.spectra))
     # of a known sign: the share of the posterior that has it, over half of the prior
-    return weigh(ratio, freedom) + (np.log(2.0 * ndtr(np.sqrt(ratio))) if span.positive else 0.0)
+    return log_bayes(ratio, freedom) + (np.log(2.0 * ndtr(np.sqrt(ratio))) if span.positive else 0.0)
 
 
 def with_another(draws: Draws, first: Span, spans: Sequence[Span]) -> dict[str, tuple[float, Span]]:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.stats import binomtest
 
 from study.cases import KNOWN
-from study.rates import Row, beside_ideal, curve, found, told
+from study.rates import Row, beside_ideal, curve, found, predicted
 
 NEITHER = "no name"
 
@@ -72,7 +72,7 @@ def plot_detection(rows: Sequence[Row], path: Path) -> None:
             size, 100 * share, [[100 * (share - ends.low)], [100 * (ends.high - share)]], fmt="o",
             color="tab:blue", capsize=2, label="measured, with 95 % interval" if size == sizes[0] else None,
         )  # fmt: skip
-    if told(single):
+    if predicted(single):
         a = np.geomspace(1.5, 100.0, 200)
         left.plot(a, 100 * curve(single, a), color="0.4", label="an ideal detector")
         left.legend(loc="lower right")

@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from magbridge.diagnose.inference.descriptions import Description
 from magbridge.diagnose.inference.evidence import ODDS
-from study.draws import Draws, Span, weigh
+from study.draws import Draws, Span, log_bayes
 
 Array = NDArray[np.float64]
 
@@ -44,7 +44,7 @@ def against(
         one, other = draws.ratio(first), draws.beside(first).ratio(second)
         grids = sum(np.log(trials.get(span.cause, 1.0)) for span in (first, second))
         ratio = one[0] + other[0]
-        found.append(weigh(ratio, one[1] + other[1]) - grids - ODDS - np.log(max(len(trials), 1)))
+        found.append(log_bayes(ratio, one[1] + other[1]) - grids - ODDS - np.log(max(len(trials), 1)))
     return np.asarray(np.max(found, axis=0) - np.log(max(len(trials), 1)))
 
 

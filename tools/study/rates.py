@@ -91,21 +91,21 @@ def scores(rows: Sequence[Row]) -> NDArray[np.float64]:
     return np.array([z for r in rows for z in r["scores"]])
 
 
-def told(rows: Sequence[Row]) -> list[dict[str, Any]]:
+def predicted(rows: Sequence[Row]) -> list[dict[str, Any]]:
     """Theory's predictions for all rows that have any."""
     return [t for r in rows for t in r["theory"]]
 
 
 def chance(rows: Sequence[Row], key: str) -> float:
     """Mean of theory's chance `key`; NaN if there is none."""
-    return float(np.mean([t[key] for t in told(rows)])) if told(rows) else np.nan
+    return float(np.mean([t[key] for t in predicted(rows)])) if predicted(rows) else np.nan
 
 
 def curve(rows: Sequence[Row], size: NDArray[np.float64] | float) -> NDArray[np.float64]:
     """Theory's mean chance that the rows' hidden effects are found, if they had this signal-to-noise."""
-    if not told(rows):
+    if not predicted(rows):
         return np.full(np.shape(size), np.nan)
-    half, sure = np.array([(t["half"], t["sure"]) for t in told(rows)]).T
+    half, sure = np.array([(t["half"], t["sure"]) for t in predicted(rows)]).T
     return np.asarray(norm.cdf((np.asarray(size)[..., None] - half) / ((sure - half) / SURE)).mean(axis=-1))
 
 

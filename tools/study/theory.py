@@ -30,7 +30,7 @@ from magbridge.diagnose.compare.problem import pose
 from magbridge.diagnose.compare.take import take
 from magbridge.diagnose.inference.descriptions import Description
 from magbridge.diagnose.inference.evidence import LEVEL, ODDS
-from study.draws import SHOWN, Draws, Span, by_cause, evidence, explained, numbers, weigh, with_another
+from study.draws import SHOWN, Draws, Span, by_cause, evidence, explained, log_bayes, numbers, with_another
 from study.nameless import against, nameless
 from study.noise import whiten
 from study.stage import Found, Stall, compare, project
@@ -179,7 +179,7 @@ def best_of(S: Array, spans: Sequence[Span]) -> dict[str, Span]:
 def _worth(S: Array, span: Span) -> float:
     """Log evidence of a hypothesis at its mean likelihood ratio."""
     freedom = numbers(S, span)
-    return float(weigh(np.array(explained(S, span) + freedom), freedom))
+    return float(log_bayes(np.array(explained(S, span) + freedom), freedom))
 
 
 def p_values(draws: Draws, spans: Sequence[Span], setting: Setting) -> Array:

@@ -9,7 +9,7 @@ import numpy as np
 
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.compare.problem import Problem
-from magbridge.diagnose.inference.evidence import ODDS, REMNANT, worth
+from magbridge.diagnose.inference.evidence import ODDS, REMNANT, log_odds
 from magbridge.diagnose.inference.rivals import Rival
 from magbridge.diagnose.inference.search import Hypothesis, Outcome
 from magbridge.diagnose.inference.unexplained import Leftover, leftover
@@ -33,7 +33,7 @@ def accept(problem: Problem, outcome: Outcome, tone: Candidate | None) -> tuple[
     if not model:
         return False, rest
     ratio = 2.0 * (outcome.fit.log_likelihood - outcome.null.log_likelihood)
-    names = worth(ratio, model, outcome.trials) - float(np.log(len(outcome.trials)))
+    names = log_odds(ratio, model, outcome.trials) - float(np.log(len(outcome.trials)))
     if rest is not None:
         names += rest.among
         if rest.signal_to_noise < REMNANT * max(h.signal_to_noise for h in outcome.chosen):

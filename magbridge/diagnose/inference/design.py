@@ -15,7 +15,7 @@ from magbridge.diagnose.compare.columns import Columns, beside, times
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.noise import Noise
 
-__all__ = ["ALL", "Design", "in_threads", "kept", "normal", "pieces"]
+__all__ = ["ALL", "Design", "in_threads", "normal", "pieces", "precomputed"]
 
 FloatArray = NDArray[np.float64]
 S = TypeVar("S")
@@ -31,7 +31,7 @@ THREADS, LONG, POOL = 2, 32768, "diagnose"
 """Threads that share the work on a log, rows from which they are worth their while, and their name."""
 
 
-def kept(n: int, columns: Sequence[Columns]) -> list[Columns]:
+def precomputed(n: int, columns: Sequence[Columns]) -> list[Columns]:
     """Return the columns of n rows precomputed, or unchanged where that would fill the memory."""
     if n * sum(column(slice(0, 1)).shape[1] for column in columns) > KEPT:
         return list(columns)

@@ -1,4 +1,4 @@
-r"""The evidence for a candidate, its test, and the lead that it needs.
+r"""The evidence for a candidate, its test, and the margin by which it must win.
 
 Notes
 -----
@@ -44,12 +44,12 @@ __all__ = [
     "Score",
     "evidence_of",
     "evidence_of_all",
-    "lead",
+    "log_bayes",
+    "log_odds",
+    "margin",
+    "regressor_error",
     "score",
-    "slack",
     "trials",
-    "weigh",
-    "worth",
 ]
 
 FloatArray = NDArray[np.float64]
@@ -101,26 +101,26 @@ def evidence_of(candidate: Candidate, ratio: float, freedom: int) -> float:
     if candidate.spectra is not None:
         return 0.5 * ratio - float(np.log(len(candidate.spectra)))
     sided = float(np.log(2.0) + log_ndtr(np.sqrt(ratio))) if candidate.positive else 0.0
-    return weigh(ratio, freedom) + sided
+    return log_bayes(ratio, freedom) + sided
 
 
-def weigh(ratio: float, freedom: int) -> float:
-    """Log evidence of a likelihood ratio of `freedom` free coefficients."""
+def log_bayes(ratio: float, freedom: int) -> float:
+    """Log evidence (Bayes factor against no effect) of a likelihood ratio of `freedom` free coefficients."""
     if ratio <= freedom or not freedom:
         return 0.0
     return 0.5 * (ratio - freedom) - 0.5 * freedom * float(np.log(ratio / freedom))
 
 
-def lead(ratio: float) -> float:
+def margin(ratio: float) -> float:
     """Log evidence by which a cause of this likelihood ratio must win to be named alone.
 
     The error of its regressor is allowed for.
     """
-    return ODDS + slack(ratio)
+    return ODDS + regressor_error(ratio)
 
 
-def slack(ratio: float) -> float:
-    """Log evidence that another cause may gain from the regressors' errors of a model of this ratio."""
+def regressor_error(ratio: float) -> float:
+    """Log evidence that another cause may gain from the errors of the regressors in a model of this ratio."""
     return 0.5 * IDEAL**2 * ratio
 
 
@@ -166,8 +166,8 @@ def _independent(S: FloatArray, places: Sequence[slice], level: float) -> float:
     return len(seen) * float(np.mean(1.0 / np.sum(passed, axis=0)))
 
 
-def worth(ratio: float, model: Sequence[Candidate], trials: Mapping[str, float]) -> float:
-    """Log evidence of a whole model of this likelihood ratio.
+def log_odds(ratio: float, model: Sequence[Candidate], trials: Mapping[str, float]) -> float:
+    """Log posterior odds of a whole model of this likelihood ratio against no effect.
 
     Every regressor pays for the number of hypotheses of its cause. Each after the first also pays for the
     prior odds of a further fault in one log, and for its choice among the causes. How narrowly the data
@@ -188,4 +188,4 @@ def evidence_of_all(ratio: float, model: Sequence[Candidate]) -> float:
     spectra = sum(
         float(np.log(len(candidate.spectra))) for candidate in model if candidate.spectra is not None
     )
-    return (weigh(ratio, free) if free else 0.5 * ratio) + sided - spectra
+    return (log_bayes(ratio, free) if free else 0.5 * ratio) + sided - spectra

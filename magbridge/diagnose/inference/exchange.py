@@ -8,7 +8,7 @@ from itertools import combinations
 import numpy as np
 
 from magbridge.diagnose.causes.candidates import Candidate
-from magbridge.diagnose.inference.evidence import slack
+from magbridge.diagnose.inference.evidence import regressor_error
 from magbridge.diagnose.inference.joint import Joint
 from magbridge.diagnose.inference.pairs import pairs_of
 from magbridge.diagnose.inference.profile_likelihood import refined
@@ -38,8 +38,8 @@ def exchanged(state: State, model: list[Candidate], base: Joint) -> tuple[list[C
             more = _more(new, [pieces[n] for n in at])
             if len({c.cause for c in changed}) > len({piece.cause for piece in pieces}):
                 more = max(more, 0.0)  # a further cause never makes a model simpler
-            lent = slack(state.ratio(state.fit(rest, like=base))) if rest and more else 0.0
-            gain = state.value(changed, fit) - own - more * lent
+            allowed = regressor_error(state.ratio(state.fit(rest, like=base))) if rest and more else 0.0
+            gain = state.value(changed, fit) - own - more * allowed
             if gain > better[0]:  # a month's fit is large: only one is kept
                 better = gain, changed, fit
         if better[1] is pieces:

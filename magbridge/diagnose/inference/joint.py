@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from magbridge.calibration.residual import robust_scale
 from magbridge.diagnose.compare.columns import Columns
 from magbridge.diagnose.compare.problem import DELAYS, Problem
-from magbridge.diagnose.inference.design import Design, in_threads, kept, normal
+from magbridge.diagnose.inference.design import Design, in_threads, normal, precomputed
 from magbridge.diagnose.inference.fit_noise import fit_noise
 from magbridge.diagnose.inference.noise import Noise
 from magbridge.diagnose.inference.statistic import Statistic
@@ -100,7 +100,7 @@ def fit_joint(
     rounds : int
         At most.
     """
-    X = Design(problem, kept(len(problem), columns))
+    X = Design(problem, precomputed(len(problem), columns))
     q, k = X.free.shape[1], X.effects
     prior = np.append(np.ones(q), np.broadcast_to(ridge, k))
     common = [(slice(q + DELAYS.start, q), np.ones((1, 3)))]

@@ -8,8 +8,8 @@ With the information S of all candidates, a cause j whose coefficients b have th
 ``a^2 = b^T S_jj b`` gives a rival i the likelihood ratio ``R_i = s^T S_ii^-1 s``, ``s = S_ij b``: the part
 that the rival can imitate. The difference of the two ratios is normal about ``a^2 - R_i = delta^2`` with
 standard deviation ``2 delta`` (two subspaces in Gaussian noise), so the log evidence by which the truth wins
-has the standard deviation delta, and the chance that it exceeds :func:`~.evidence.lead` is a normal integral.
-Rivals are taken as independent.
+has the standard deviation delta, and the chance that it exceeds :func:`~.evidence.margin` is a normal
+integral. Rivals are taken as independent.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2, ncx2, norm
 
 from magbridge.diagnose.causes.candidates import Candidate, slices
-from magbridge.diagnose.inference.evidence import LEVEL, lead, weigh
+from magbridge.diagnose.inference.evidence import LEVEL, log_bayes, margin
 from magbridge.diagnose.inference.information import Information
 from magbridge.diagnose.inference.statistic import Statistic
 
@@ -78,7 +78,7 @@ class NamingTheory:
             return 0.0
         s = self.S[:, own] @ b * (signal_to_noise / np.sqrt(power))
         freedom, a2 = self.freedoms.get(cause, len(own)), signal_to_noise**2
-        truth = weigh(a2 + freedom, freedom)
+        truth = log_bayes(a2 + freedom, freedom)
         chances: dict[str, float] = {}
         for k, candidate in enumerate(self.candidates):
             k_free = self.statistics[k].freedom
@@ -89,7 +89,7 @@ class NamingTheory:
                 continue
             ratio = float(self.statistics[k].ratio(part[:, None])[0])
             delta = max(np.sqrt(max(a2 - ratio, 0.0)), 1e-3)
-            wins = float(norm.cdf((truth - weigh(ratio + k_free, k_free) - lead(a2)) / delta))
+            wins = float(norm.cdf((truth - log_bayes(ratio + k_free, k_free) - margin(a2)) / delta))
             detected = float(ncx2.sf(self.limit[k], k_free, max(ratio, 1e-9)))
             chances[candidate.cause] = min(chances.get(candidate.cause, 1.0), 1.0 - (1.0 - wins) * detected)
         return float(np.prod(list(chances.values())))

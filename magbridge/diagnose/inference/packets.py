@@ -31,7 +31,7 @@ from scipy.fft import ifft, irfft, next_fast_len, rfft
 from magbridge.diagnose.compare.columns import Columns
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.design import in_threads
-from magbridge.diagnose.inference.evidence import weigh
+from magbridge.diagnose.inference.evidence import log_bayes
 from magbridge.diagnose.inference.joint import Joint
 from magbridge.diagnose.inference.noise import Noise
 
@@ -103,7 +103,7 @@ def packets(problem: Problem, fit: Joint) -> Packets | None:
                 same = np.abs(places.moment - moment) < APART * length
                 near += float(np.sum(np.exp(places.log_prior + 0.5 * (places.ratio[same] - ratio))))
                 places.ratio[same] = 0.0
-        if weigh(ratio, 2) + np.log(near) <= 0.0:
+        if log_bayes(ratio, 2) + np.log(near) <= 0.0:
             break
         price -= float(np.log(near))
         found.append((moment, best))

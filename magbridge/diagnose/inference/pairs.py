@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from scipy.special import log_ndtr, logsumexp
 
 from magbridge.diagnose.causes.candidates import Candidate
-from magbridge.diagnose.inference.evidence import LEVEL, REMNANT, lead, score
+from magbridge.diagnose.inference.evidence import LEVEL, REMNANT, margin, score
 from magbridge.diagnose.inference.information import Information
 from magbridge.diagnose.inference.joint import Joint
 from magbridge.diagnose.inference.rounds import State, key
@@ -136,7 +136,7 @@ class _Table:
         for n, candidate in enumerate(self.standing):
             self.members[key(candidate)].append(len(state.candidates) + n)
         self._fill()
-        self.best, self.lead = self._current()
+        self.best, self.margin = self._current()
         self.paid = float(np.sum(np.log([candidate.trials for candidate in self.standing])))
 
     def _fill(self) -> None:
@@ -162,13 +162,13 @@ class _Table:
         np.fill_diagonal(self.evidence, -np.inf)
 
     def _current(self) -> tuple[float, float]:
-        """Log evidence of the standing causes, averaged over their grids, and the lead that they need."""
+        """Log evidence of the standing causes, averaged over their grids, and the margin that they need."""
         m, groups = len(self.state.candidates), [key(candidate) for candidate in self.standing]
         # under the noise that is left, which is less, ratios exceed what the model as a whole has gained
         whole = self.state.ratio(self.base)
         if len(groups) == 1:
             standing, grid = self.scores[m], [self.scores[n].evidence for n in self.state.groups[groups[0]]]
-            needed = lead(min(standing.ratio, whole))
+            needed = margin(min(standing.ratio, whole))
             # the pair pays for one more cause, which must not be what the single one's regressor leaves
             price = needed + float(np.log(len(self.state.trials)))
             return standing.evidence + _average(np.array(grid)) + price, needed
@@ -178,14 +178,14 @@ class _Table:
             second = score(self.info.without(np.r_[self.at[a]], first.prior), self.at[b], self.candidates[b])
             found.append((first.evidence + second.evidence, first.ratio + second.ratio))
         best, ratio = max(found)
-        return best + self._price(*groups), lead(min(ratio, whole))
+        return best + self._price(*groups), margin(min(ratio, whole))
 
     def _price(self, A: Group, B: Group) -> float:
         """Log of the evidence's average over two grids, relative to the best there."""
         return _average(self.evidence[np.ix_(self.state.groups[A], self.state.groups[B])])
 
     def pair(self, A: Group, B: Group) -> Pair | None:
-        """Return the best of two grids, unless what stands is better by more than :func:`~.evidence.lead`."""
+        """Return the best of two grids, unless what stands beats it by :func:`~.evidence.margin`."""
         current = [key(candidate) for candidate in self.standing]
         block = self.evidence[np.ix_(self.members[A], self.members[B])]
         top = float(block.max())
@@ -199,7 +199,7 @@ class _Table:
         a, b = self.members[A][int(rows)], self.members[B][int(columns)]
         one, two = self.candidates[a], self.candidates[b]
         behind = self.best - top - self._price(A, B) + float(np.log(one.trials * two.trials)) - self.paid
-        if behind > self.lead or not self._significant(a, b):
+        if behind > self.margin or not self._significant(a, b):
             return None
         return Pair(two, one, behind) if self._swapped(a, b) else Pair(one, two, behind)
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from magbridge.diagnose.causes.candidates import Candidate
-from magbridge.diagnose.inference.evidence import LEVEL, lead, score
+from magbridge.diagnose.inference.evidence import LEVEL, margin, score
 from magbridge.diagnose.inference.information import Information
 from magbridge.diagnose.inference.joint import Joint
 from magbridge.diagnose.inference.rounds import State, key
@@ -62,6 +62,6 @@ def rivals_of(
             continue
         cheaper = average - paid - float(np.log(candidate.trials / model[k].trials))
         behind = standing.evidence - s.evidence - cheaper
-        if behind < lead(standing.ratio) and state.p_value(candidate, s.ratio, s.freedom) < LEVEL:
+        if behind < margin(standing.ratio) and state.p_value(candidate, s.ratio, s.freedom) < LEVEL:
             rivals.append(Rival(candidate, behind))
     return tuple(sorted(rivals, key=lambda rival: rival.behind))

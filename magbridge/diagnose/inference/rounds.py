@@ -13,8 +13,8 @@ from scipy.special import fdtrc
 from magbridge.diagnose.causes.candidates import Candidate, slices
 from magbridge.diagnose.compare.columns import Columns, Mixture, parts, together
 from magbridge.diagnose.compare.problem import Problem
-from magbridge.diagnose.inference.design import in_threads, kept
-from magbridge.diagnose.inference.evidence import Score, evidence_of, score, slack, trials, worth
+from magbridge.diagnose.inference.design import in_threads, precomputed
+from magbridge.diagnose.inference.evidence import Score, evidence_of, log_odds, regressor_error, score, trials
 from magbridge.diagnose.inference.fit_noise import certainty
 from magbridge.diagnose.inference.information import Information, information
 from magbridge.diagnose.inference.joint import RIDGE, Joint, fit_joint, volume_of
@@ -129,7 +129,7 @@ class State:
         """Log evidence of a model; each cause must also outweigh what idealised regressors may leave."""
         ratio, causes = self.ratio(fit), {candidate.cause for candidate in model}
         narrow = sum(candidate.narrow for candidate in model)
-        return worth(ratio, model, self.trials) - narrow - len(causes) * slack(ratio)
+        return log_odds(ratio, model, self.trials) - narrow - len(causes) * regressor_error(ratio)
 
     def scores(self, info: Information) -> list[Score]:
         """Score every candidate."""
@@ -240,7 +240,7 @@ class State:
 def _made_once(n: int, columns: Sequence[Columns]) -> list[Columns]:
     """Return `columns` with their shared parts precomputed."""
     shared = [X for X, _ in together(columns).parts]
-    known = dict(zip(shared, kept(n, shared), strict=True))
+    known = dict(zip(shared, precomputed(n, shared), strict=True))
     return [Mixture(tuple((known[X], M) for X, M in parts(column))) for column in columns]
 
 

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.compare.problem import Problem
-from magbridge.diagnose.inference.evidence import LEVEL, REMNANT, evidence_of, lead, slack
+from magbridge.diagnose.inference.evidence import LEVEL, REMNANT, evidence_of, margin, regressor_error
 from magbridge.diagnose.inference.exchange import exchanged
 from magbridge.diagnose.inference.fit_noise import memory_order
 from magbridge.diagnose.inference.information import Information
@@ -48,7 +48,7 @@ class Outcome:
     chosen : tuple of Hypothesis
         In the order found; each against the model without it.
     rivals : tuple of tuple of Rival
-        For each chosen one, all others that it does not beat by :func:`~.evidence.lead`, the best first.
+        For each chosen one, all others that it does not beat by :func:`~.evidence.margin`, the best first.
     null, fit : Joint
         Fits without any cause, and with the chosen ones.
     order : int
@@ -159,9 +159,9 @@ def _next(found: list[Hypothesis], strengths: Mapping[str, float], ratio: float)
     significant = [h for h in found if h.p_value < LEVEL and h.signal_to_noise >= remnant(h.candidate.cause)]
     if not significant:
         return None
-    near = significant[0].evidence - lead(significant[0].ratio)
+    near = significant[0].evidence - margin(significant[0].ratio)
     more = next((h for h in significant if h.candidate.cause in strengths and h.evidence > near), None)
-    as_likely = [h for h in significant if h.evidence >= significant[0].evidence - slack(ratio)]
+    as_likely = [h for h in significant if h.evidence >= significant[0].evidence - regressor_error(ratio)]
     return more or min(as_likely, key=lambda h: h.candidate.size)
 
 

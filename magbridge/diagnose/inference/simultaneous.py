@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from magbridge.diagnose.causes.candidates import Candidate
-from magbridge.diagnose.inference.evidence import LEVEL, REMNANT, score, slack
+from magbridge.diagnose.inference.evidence import LEVEL, REMNANT, regressor_error, score
 from magbridge.diagnose.inference.rounds import Hypothesis, State
 
 __all__ = ["MOST", "chosen_at_once", "enough"]
@@ -37,7 +37,9 @@ def chosen_at_once(state: State) -> list[Candidate]:
                 significant.append((evidence, k))
         if not significant:
             break
-        as_likely = [k for evidence, k in significant if evidence >= significant[0][0] - slack(ratio)]
+        as_likely = [
+            k for evidence, k in significant if evidence >= significant[0][0] - regressor_error(ratio)
+        ]
         k = min(as_likely, key=lambda k: state.candidates[k].size)
         picked.append(k)
         ratio += scores[k].ratio

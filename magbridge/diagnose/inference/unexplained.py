@@ -23,7 +23,7 @@ from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.compare.columns import Columns
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.descriptions import Description, descriptions
-from magbridge.diagnose.inference.design import Design, in_threads, kept
+from magbridge.diagnose.inference.design import Design, in_threads, precomputed
 from magbridge.diagnose.inference.evidence import LEVEL
 from magbridge.diagnose.inference.fit_noise import fit_noise
 from magbridge.diagnose.inference.information import information
@@ -86,7 +86,7 @@ def along_one_direction(S: FloatArray, b: FloatArray, width: FloatArray, whole: 
     """Estimate one curve along one direction of the body, ``c = f d^T``, instead of one curve for each axis.
 
     In turn f is estimated along d, and d by least squares given f, beginning with the direction of the
-    `whole` estimate. The two free numbers of the direction pay as in :func:`~.evidence.weigh`.
+    `whole` estimate. The two free numbers of the direction pay as in :func:`~.evidence.log_bayes`.
     """
     count = len(width) // 3
     direction = np.linalg.svd(whole.estimate.reshape(count, 3), full_matrices=False)[2][0]
@@ -126,7 +126,7 @@ def leftover(
         Further descriptions.
     """
     listed = [one for one in (*descriptions(problem, fit, tone), *also) if not one.covers(but)]
-    made = kept(len(problem), [one.columns for one in listed])
+    made = precomputed(len(problem), [one.columns for one in listed])
     listed = [one._replace(columns=columns) for one, columns in zip(listed, made, strict=True)]
     columns = [candidate.columns for candidate in model]
     found: list[tuple[float, str, Description, float]] = []
