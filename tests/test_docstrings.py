@@ -1,4 +1,4 @@
-"""Public docstrings say what a signature cannot: an array's shape, and the errors that are raised."""
+"""Docstrings say what a signature cannot: an array's shape, the errors raised, what a constant means."""
 
 from __future__ import annotations
 
@@ -73,3 +73,16 @@ def test_an_error_that_is_raised_is_named() -> None:
         and not all(name in str(ast.get_docstring(function)) for name in raised(function))
     ]
     assert not silent
+
+
+def test_what_a_constant_means_stands_below_it() -> None:
+    """Where an editor and the documentation find it, in one style; a comment there is for a linter."""
+    trailing = re.compile(r"^[A-Z][A-Z_0-9, ]*(: [^=]+)? = .*  # (?!noqa|fmt:|type:)", re.MULTILINE)
+    found = [
+        f"{path}: {match[0]}"
+        for room in ROOMS
+        for path in room.rglob("*.py")
+        for match in trailing.finditer(path.read_text())
+        if "TYPE_CHECKING" not in match[0]
+    ]
+    assert not found

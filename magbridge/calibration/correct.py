@@ -29,10 +29,12 @@ __all__ = ["CorrectedArrays", "Corrector", "correct", "regressors"]
 
 FloatArray = NDArray[np.float64]
 Span = tuple[int, float, float]
-CHUNK = 4096  # samples at a time: enough to outweigh the overhead of a call, few enough for a core's cache
+CHUNK = 4096
+"""Samples at a time: enough to outweigh the overhead of a call, few enough for a core's cache."""
 GAP, STALE_TELEMETRY = int(Quality.GAP), int(Quality.STALE_TELEMETRY)
 EXTRAPOLATED = int(Quality.EXTRAPOLATED)
-MARGIN = 0.02  # of the half range: telemetry that jitters at the end of its range is not extrapolated
+MARGIN = 0.02
+"""Share of the half range: telemetry that jitters at the end of its range is not extrapolated."""
 MANY = for_arrays()
 
 

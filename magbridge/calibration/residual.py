@@ -39,7 +39,8 @@ __all__ = [
 ]
 
 FloatArray = NDArray[np.float64]
-CHUNK = 8192  # rows of the Jacobian at a time: bounded memory at any number of samples
+CHUNK = 8192
+"""Rows of the Jacobian at a time: bounded memory at any number of samples."""
 
 
 @dataclass(frozen=True, eq=False)

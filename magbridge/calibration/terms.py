@@ -44,7 +44,8 @@ Exponents = tuple[int, ...]
 Step = Callable[[int, float, float, float, Sequence[float]], tuple[float, ...]]
 """One sample into an effect: time (µs), the raw channels (nT), the values -> its regressors."""
 
-HIGHEST = 30  # total degree: beyond, powers are noise
+HIGHEST = 30
+"""Highest total degree: beyond, powers are noise."""
 Power = Annotated[int, Meta(ge=1, le=HIGHEST)]
 Width = Annotated[float, Meta(ge=1e-9, le=1e12)]
 """A divisor, in any unit."""

@@ -10,11 +10,16 @@ from numpy.typing import NDArray
 
 __all__ = ["metres_per_degree", "offset", "separation", "usual", "worse_axis", "wrap"]
 
-EQUATORIAL_RADIUS = 6_378_137.0  # m
-ECCENTRICITY_SQUARED = 6.694_379_990_14e-3  # both WGS84
-RADIAN = pi / 180.0  # of a degree
-ACROSS = EQUATORIAL_RADIUS * RADIAN  # m per degree of longitude, divided by w
-ALONG = ACROSS * (1.0 - ECCENTRICITY_SQUARED)  # m per degree of latitude, divided by w³
+EQUATORIAL_RADIUS = 6_378_137.0
+"""m, of WGS84."""
+ECCENTRICITY_SQUARED = 6.694_379_990_14e-3
+"""Of WGS84."""
+RADIAN = pi / 180.0
+"""A degree, in radians."""
+ACROSS = EQUATORIAL_RADIUS * RADIAN
+"""m per degree of longitude, divided by w."""
+ALONG = ACROSS * (1.0 - ECCENTRICITY_SQUARED)
+"""m per degree of latitude, divided by w³."""
 
 Array = NDArray[np.float64]
 Number = TypeVar("Number", float, Array)

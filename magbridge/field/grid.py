@@ -24,12 +24,17 @@ __all__ = ["AnomalyGrid", "Local"]
 Array = NDArray[np.float64]
 T = TypeVar("T", float, Array)
 
-EVEN = 1e-3  # of a step: what rounded coordinates may deviate from an even spacing
-HOLE = 9.9e4  # nT: beyond any anomaly; 99999 and 1.7e38 are how formats without NaN write a hole
-FLAT = 1e-6  # nT: what rounding leaves of a plane
-NOT_AN_ANOMALY = 15_000.0  # nT: a median this large is the total field, not an anomaly
+EVEN = 1e-3
+"""Share of a step by which rounded coordinates may deviate from an even spacing."""
+HOLE = 9.9e4
+"""nT: beyond any anomaly; 99999 and 1.7e38 are how formats without NaN write a hole."""
+FLAT = 1e-6
+"""nT: what rounding leaves of a plane."""
+NOT_AN_ANOMALY = 15_000.0
+"""nT: a median this large is the total field, not an anomaly."""
 
-DOWN, ACROSS = [0, 1, 0, 2, 1, 0], [0, 0, 1, 0, 1, 2]  # orders of derivative, as in Local
+DOWN, ACROSS = [0, 1, 0, 2, 1, 0], [0, 0, 1, 0, 1, 2]
+"""Orders of derivative, north and east, in the order of Local."""
 
 
 class Local(NamedTuple, Generic[T]):

@@ -24,8 +24,10 @@ __all__ = ["coverage", "igrf", "magnitude", "total_field"]
 
 Array = NDArray[np.float64]
 
-REFERENCE_RADIUS = 6_371_200.0  # m, of the model's sphere
-BLOCK = 2048  # samples; the working arrays of a block stay in the cache
+REFERENCE_RADIUS = 6_371_200.0
+"""m, of the model's sphere."""
+BLOCK = 2048
+"""Samples; the working arrays of a block stay in the cache."""
 
 
 class Model(NamedTuple):

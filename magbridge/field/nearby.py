@@ -18,9 +18,12 @@ __all__ = ["NearbyField"]
 
 Array = NDArray[np.float64]
 
-REACH = 20_000.0  # m, from the middle to the edge
-DEEP = 2_000.0  # m, depth up to which it is fitted
-LONG = 20 * 86_400.0  # s, before and after
+REACH = 20_000.0
+"""m from the middle of the box to its edge."""
+DEEP = 2_000.0
+"""m, depth up to which it is fitted."""
+LONG = 20 * 86_400.0
+"""s before and after the time that it is fitted at."""
 
 
 class NearbyField:

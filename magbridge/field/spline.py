@@ -9,13 +9,15 @@ __all__ = ["WEIGHTS", "coefficients", "weights"]
 
 Array = NDArray[np.float64]
 
-PAD = 16  # nodes: that far inside, the influence of a cubic spline's end has fallen to 1e-9
+PAD = 16
+"""Nodes: that far inside, the influence of a cubic spline's end has fallen to 1e-9."""
 
 # Cubic B-spline on a uniform axis: weights of four nodes as cubics in the fraction t, powers t⁰ t¹ t² t³.
 VALUE = np.array([[1, -3, 3, -1], [4, 0, -6, 3], [1, 3, 3, -3], [0, 0, 0, 1]]) / 6.0
 SLOPE = np.array([[-3, 6, -3, 0], [0, -12, 9, 0], [3, 6, -9, 0], [0, 0, 3, 0]]) / 6.0
 CURVATURE = np.array([[6, -6, 0, 0], [-12, 18, 0, 0], [6, -18, 0, 0], [0, 6, 0, 0]]) / 6.0
-WEIGHTS = np.concatenate([VALUE, SLOPE, CURVATURE])  # (12, 4) times powers of t
+WEIGHTS = np.concatenate([VALUE, SLOPE, CURVATURE])
+"""Weights of four nodes for value, slope and curvature, (12, 4), times powers of t."""
 
 
 def coefficients(values: Array) -> Array:

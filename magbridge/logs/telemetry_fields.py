@@ -117,7 +117,8 @@ TELEMETRY = {
 """Message id to the columns in the message."""
 
 SAMPLE, CORRECTION = spec("MAG_RAW").struct, spec("MAG_FIELD").struct
-COUNTED_POWER_CYCLES = 8  # MAG_RAW_FLAGS_POWER_CYCLE
+COUNTED_POWER_CYCLES = 8
+"""Flag of MAG_RAW: its power cycle is counted (MAG_RAW_FLAGS_POWER_CYCLE)."""
 
 
 def sample(payload: bytes) -> Columns:

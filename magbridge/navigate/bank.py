@@ -22,14 +22,22 @@ __all__ = ["Bank"]
 
 Array = NDArray[np.float64]
 
-MOST = 6_000  # hypotheses
-AT_FIRST = 20_000  # of them, until the first measurement has thinned them out
-CELL = 0.8  # of the resolution, within which two hypotheses are one
-SPACING = 1.2  # of two neighbours, in their own sigma: their sum is flat to 1 %
-EDGE = 3.5  # sigma: how far the hypotheses cover the Gaussian to begin with
-FADED = 1e-7  # of the largest weight: a hypothesis with less is dropped
-COARSER = 1.25  # factor by which the resolution changes at a time
-MERGE_EVERY = 4  # updates
+MOST = 6_000
+"""Hypotheses, at most."""
+AT_FIRST = 20_000
+"""Hypotheses, at most, until the first measurement has thinned them out."""
+CELL = 0.8
+"""Share of the resolution, within which two hypotheses are one."""
+SPACING = 1.2
+"""Distance of two neighbours, in their own sigma: their sum is flat to 1 %."""
+EDGE = 3.5
+"""Sigmas: how far the hypotheses cover the Gaussian to begin with."""
+FADED = 1e-7
+"""Share of the largest weight: a hypothesis with less is dropped."""
+COARSER = 1.25
+"""Factor by which the resolution changes at a time."""
+MERGE_EVERY = 4
+"""Updates from one merging of hypotheses to the next."""
 # One Gaussian as three narrower ones (DeMars et al. 2013, table 1), their variance such that the sum
 # keeps its own.
 THREE = np.array([-1.0575154615, 0.0, 1.0575154615])

@@ -36,7 +36,8 @@ MOTIONS: dict[str, dict[str, str]] = {
 }
 """Kinds of motion that a log may hold, best first: its columns, and their names in the dead reckoning."""
 
-GPS_SIGMA = 10.0  # m, each axis, of a receiver that has just surfaced
+GPS_SIGMA = 10.0
+"""m, each axis, of a receiver that has just surfaced."""
 
 UNITS = {
     "latitude": "deg", "longitude": "deg", "smoothed_latitude": "deg", "smoothed_longitude": "deg",

@@ -21,7 +21,8 @@ __all__ = ["Bound", "as_dataset", "position_bound"]
 
 Array = NDArray[np.float64]
 
-STEP = 0.005  # deg, over which the main field's slope is taken
+STEP = 0.005
+"""deg, over which the main field's slope is taken."""
 
 
 class Bound(NamedTuple):

@@ -12,7 +12,8 @@ from magbridge.navigate.model import Block, Options
 
 __all__ = ["Collector"]
 
-LEAST = 1e-3  # nT: a smaller sigma is not believed
+LEAST = 1e-3
+"""nT: a smaller sigma is not believed."""
 
 
 class Sums(NamedTuple):

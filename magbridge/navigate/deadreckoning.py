@@ -8,10 +8,14 @@ from magbridge.field.earth import offset, separation
 
 __all__ = ["DeadReckoning"]
 
-GLIDE = 8.0  # deg, of pitch; a glider flatter than that is turning between dive and climb
-DEPTH_BASE = 10.0  # s, over which the depth's rate is taken
-FASTEST = 3.0  # m/s, through the water; a higher speed comes from a jump in the depth
-LONGEST = 3600.0  # s without telemetry, after which the motion is unknown
+GLIDE = 8.0
+"""deg, of pitch; a glider flatter than that is turning between dive and climb."""
+DEPTH_BASE = 10.0
+"""s, over which the depth's rate is taken."""
+FASTEST = 3.0
+"""m/s, through the water; a higher speed comes from a jump in the depth."""
+LONGEST = 3600.0
+"""s without telemetry, after which the motion is unknown."""
 
 
 class DeadReckoning:

@@ -19,13 +19,20 @@ __all__ = ["Estimate"]
 
 Array = NDArray[np.float64]
 
-CONTRADICTION = 25.0  # squared distance of a fix in sigmas, two degrees of freedom: by chance in 4e-6
-UNINFORMED = 0.8  # of the sigma of dead reckoning alone: above it the field has added no information
-REACH = 300.0  # m, smallest radius in which the integrity monitor searches
-JOIN, SPLIT = 1.2, 1.5  # of the resolution: below the first, one hypothesis; above the second, several
-FINER = 0.8  # of the resolution: it changes only if a measurement asks for one finer than this
-DOUBTFUL = 1.0  # log odds: another place explains the field better, though not yet beyond doubt
-SPREADS = (2.0, 4.0, 2.0, 8.0)  # times the reach: 1-sigma of successive searches
+CONTRADICTION = 25.0
+"""Squared distance of a fix in sigmas, two degrees of freedom: by chance in 4e-6."""
+UNINFORMED = 0.8
+"""Share of the sigma of dead reckoning alone, above which the field has added no information."""
+REACH = 300.0
+"""m, smallest radius in which the integrity monitor searches."""
+JOIN, SPLIT = 1.2, 1.5
+"""Position spread over the resolution: below the first, one hypothesis; above the second, several."""
+FINER = 0.8
+"""Share of the resolution: it changes only if a measurement asks for one finer than this."""
+DOUBTFUL = 1.0
+"""Log odds: another place explains the field better, though not yet beyond doubt."""
+SPREADS = (2.0, 4.0, 2.0, 8.0)
+"""1-sigma of successive searches, over the reach."""
 
 
 class Estimate:

@@ -20,15 +20,24 @@ __all__ = ["Shift", "best_shift", "findings_of"]
 
 Array = NDArray[np.floating[Any]]
 
-SPARSE = 40  # positions, below which a map's place cannot be judged
-SEARCH = 1_500.0  # m, the largest displacement of a map that is tried, on each axis
-LATTICE = 31  # shifts on each axis
-FLAT = 3.0  # times the sigma of bias and map error: a map with less relief carries no information
-DOUBLE = 2.0  # times the sigma of bias and map error: a larger scatter is that of another field
-BETTER = 0.6  # of the scatter at the map's own place: a shift must do at least as well to be believed
-LEVEL = 4.0  # sigmas of the calibration's bias: a larger difference in level has another reason
-LISTED = 3  # jumps of the filter that are reported one by one: the map of another place causes dozens
-EXPLAINED = 0.5  # of the field's variance along the track, below which the map does not describe it
+SPARSE = 40
+"""Positions, below which a map's place cannot be judged."""
+SEARCH = 1_500.0
+"""m, the largest displacement of a map that is tried, on each axis."""
+LATTICE = 31
+"""Shifts that are tried on each axis."""
+FLAT = 3.0
+"""Relief over the sigma of bias and map error, below which a map carries no information."""
+DOUBLE = 2.0
+"""Scatter over the sigma of bias and map error, above which it is that of another field."""
+BETTER = 0.6
+"""Share of the scatter at the map's own place: a shift must do at least as well to be believed."""
+LEVEL = 4.0
+"""Sigmas of the calibration's bias: a larger difference in level has another reason."""
+LISTED = 3
+"""Jumps of the filter that are reported one by one: the map of another place causes dozens."""
+EXPLAINED = 0.5
+"""Share of the field's variance along the track, below which the map does not describe it."""
 
 
 def findings_of(

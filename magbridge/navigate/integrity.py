@@ -27,10 +27,14 @@ __all__ = ["IntegrityMonitor", "Unmapped", "Verdict"]
 
 Array = NDArray[np.float64]
 
-AGREES = 9.0  # squared distance in sigmas within which two estimates are the same place
-ELSEWHERE = 16.0  # squared distance in sigmas beyond which they are not
-PATIENCE_US = 45_000_000  # µs over which blocks are averaged to one measurement of the rivals,
-STRIDES = 3.0  # or, if that comes sooner, so many times the distance that a block covers
+AGREES = 9.0
+"""Squared distance in sigmas within which two estimates are the same place."""
+ELSEWHERE = 16.0
+"""Squared distance in sigmas beyond which they are not."""
+PATIENCE_US = 45_000_000
+"""µs over which blocks are averaged to one measurement of the rivals."""
+STRIDES = 3.0
+"""Distance over that which a block covers: they are averaged after it, if that comes sooner."""
 
 
 class Verdict(Enum):

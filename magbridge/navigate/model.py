@@ -41,9 +41,12 @@ __all__ = [
 Array = NDArray[np.float64]
 
 N_STATES = 6
-LASTING = 3.0  # intervals: noise with a longer correlation time becomes a bias
-LEG = 1_800.0  # s, between turns or from dive to climb
-FINE = 0.35  # of the spread that one measurement allows: errors of successive ones are alike and add up
+LASTING = 3.0
+"""Intervals: noise with a longer correlation time becomes a bias."""
+LEG = 1_800.0
+"""s, between turns or from dive to climb."""
+FINE = 0.35
+"""Share of the spread that one measurement allows: errors of successive ones are alike and add up."""
 
 
 class Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

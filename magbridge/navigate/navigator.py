@@ -28,7 +28,8 @@ from magbridge.records import Corrected, Quality
 __all__ = ["UNUSABLE", "Navigator"]
 
 UNUSABLE = int(Quality.SATURATED | Quality.UNCALIBRATED)
-FRESH = 3.0  # intervals: no position is dead-reckoned from an update older than that
+FRESH = 3.0
+"""Intervals: no position is dead-reckoned from an update older than that."""
 
 
 class Navigator(Estimate):

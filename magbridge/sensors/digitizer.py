@@ -67,7 +67,8 @@ FULL_SCALE = 1 << 23
 WRAP_US = 1 << 32
 NO_TEMPERATURE = -32768
 NO_SUPPLY = 65535
-BODY = Struct("<BBHHIIIhHBHbHbHb")  # 24 bits: the lower 16, and the upper 8 with the sign
+BODY = Struct("<BBHHIIIhHBHbHbHb")
+"""A reading's body; a channel's 24 bits are the lower 16, and the upper 8 with the sign."""
 Positive = Annotated[float, Meta(gt=0)]
 
 

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 from magbridge.field.grid import AnomalyGrid
 from voyages.sail import GLIDER, OUTSIDE, SPEEDS, Map, Run, longest, sail, synthetic, voyage
 
-LEVEL = 60.0  # nT
+LEVEL = 60.0
+"""nT by which the field is measured too large."""
 
 
 def carried(kind: Map, seed: int) -> tuple[float, float]:

@@ -26,8 +26,10 @@ from magbridge.navigate.record import State
 
 Array = NDArray[np.float64]
 
-START = 1_386_201_600.0  # s, 2013-12-05
-PLACE = (49.5, -57.9)  # deg, Bonne Bay
+START = 1_386_201_600.0
+"""s, 2013-12-05."""
+PLACE = (49.5, -57.9)
+"""deg, Bonne Bay."""
 HOUR = 3600.0
 SPEEDS = (0.35, 0.25, 0.5)
 """m/s, from run to run."""
@@ -36,7 +38,8 @@ LEFT = {"auto": 0.5, "nominal": 125.0}
 GLIDER = Options(current_sigma=0.05, bias_sigma=LEFT["auto"], bias_time=1800.0, map_sigma=1.0, interval=40.0)
 """A glider moves 14 m in 40 s: less than 2 % of any correlation length here."""
 AT_HOURS = (3.0, 4.0, 5.0, 6.0)
-OUTSIDE = float(chi2.ppf(0.9999, 2))  # squared distance beyond which the filter is wrong
+OUTSIDE = float(chi2.ppf(0.9999, 2))
+"""Squared distance beyond which the filter is wrong."""
 
 
 @dataclass(frozen=True)

@@ -37,8 +37,10 @@ __all__ = ["fit_auto"]
 
 FloatArray = NDArray[np.float64]
 
-ENOUGH, BLOCK = 6000, 50  # samples that choose the start, in blocks of neighbours
-ROUNDS = 16  # of coefficients, widths, noise, at most; five or six are usually enough
+ENOUGH, BLOCK = 6000, 50
+"""Samples that choose the start, and the size of the blocks of neighbours in which they are taken."""
+ROUNDS = 16
+"""Rounds of coefficients, widths, noise, at most; five or six are usually enough."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,8 +25,10 @@ from magbridge.calibration.model import Boresight, Calibration
 __all__ = ["field_body", "find_boresight"]
 
 FloatArray = NDArray[np.float64]
-FEWEST = 30  # samples with attitude and direction
-COMPASS_SIGMA = np.radians(0.5)  # rad, compass error common to all runs, which their scatter does not show
+FEWEST = 30
+"""Samples with attitude and direction that a boresight takes."""
+COMPASS_SIGMA = np.radians(0.5)
+"""rad, compass error common to all runs, which their scatter does not show."""
 
 
 def field_body(attitude: FloatArray, field_ned: FloatArray) -> FloatArray:

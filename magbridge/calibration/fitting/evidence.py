@@ -27,9 +27,12 @@ from magbridge.calibration.residual import NormalEquations
 __all__ = ["Quadratic", "Widths", "evidence", "is_maximum", "maximise"]
 
 FloatArray = NDArray[np.float64]
-FARTHEST = 10.0  # sigmas of the prior of eta: nothing physical lies beyond, and exp must not overflow
-STILL = 0.01  # of log evidence: two answers that differ by less count as the same
-SIGMA_STEP = 0.1  # of log sigma: scales it like a prior sigma of eta
+FARTHEST = 10.0
+"""Sigmas of the prior of eta: nothing physical lies beyond, and exp must not overflow."""
+STILL = 0.01
+"""Log evidence: two answers that differ by less count as the same."""
+SIGMA_STEP = 0.1
+"""Scales log sigma as a prior's sigma scales eta."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -34,9 +34,12 @@ METHODS: dict[str, str] = {
 }
 """Name -> ``module:function``, each ``(observations, order, **options) -> Fit``."""
 
-ONE_ATTITUDE = 5.0  # deg from the mean direction
-UNSUPPORTED = 5.0  # times the noise: with a larger expected error the data do not support the fit
-UNSEEN = 270.0  # deg, a gap in the headings: less than a quarter of the compass does not determine the rest
+ONE_ATTITUDE = 5.0
+"""deg: all samples within that of their mean direction are one attitude."""
+UNSUPPORTED = 5.0
+"""Expected error over noise, above which the data do not support the fit."""
+UNSEEN = 270.0
+"""deg, a gap in the headings: less than a quarter of the compass does not determine the rest."""
 
 
 @dataclass(frozen=True, eq=False)

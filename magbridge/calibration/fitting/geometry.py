@@ -34,11 +34,16 @@ __all__ = ["Mounting", "mounted_structure", "read_vehicle"]
 FloatArray = NDArray[np.float64]
 Vector = tuple[float, float, float]
 
-MOMENT, INDUCED = 2000.0, 30.0  # nT at the sensor: a battery pack at arm's length
-INDUCED_APART = 0.4  # of the induced moment: by how much the susceptibilities of the three axes differ
-TRAVEL_SIGMA = 0.03  # of the travel: sensor and vehicle are a degree or two out of alignment
-REST_T, REST_A = 1.0, 0.25  # nT over half the range: what the dipole does not describe
-LATENT = 12  # latent numbers of a mass
+MOMENT, INDUCED = 2000.0, 30.0
+"""nT at the sensor, of a mass' own and induced moment: a battery pack at arm's length."""
+INDUCED_APART = 0.4
+"""Share of the induced moment by which the susceptibilities of the three axes differ."""
+TRAVEL_SIGMA = 0.03
+"""Share of the travel: sensor and vehicle are a degree or two out of alignment."""
+REST_T, REST_A = 1.0, 0.25
+"""nT over half the range, in T and in a: what the dipole does not describe."""
+LATENT = 12
+"""Latent numbers of a mass."""
 
 
 class Mounting(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -30,7 +30,8 @@ from magbridge.errors import CalibrationError
 __all__ = ["fit_horizontal"]
 
 FloatArray = NDArray[np.float64]
-FIRST_NOISE = 1e-3  # of the field: the noise that attitude errors make, before it is estimated
+FIRST_NOISE = 1e-3
+"""Share of the field: the noise that attitude errors make, before it is estimated."""
 
 
 def fit_horizontal(data: Observations, order: int = 0) -> Fit:  # noqa: ARG001  (one ellipsoid has none)

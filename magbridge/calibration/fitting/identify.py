@@ -17,8 +17,10 @@ from magbridge.calibration.terms import Polynomial
 __all__ = ["Combinations", "combinations", "expected_ratio", "heading_gap", "warnings_for"]
 
 FloatArray = NDArray[np.float64]
-ROWS = 5_000  # of the Jacobian: more do not change its rank
-RANK_TOLERANCE = 1e-9  # of the largest singular value
+ROWS = 5_000
+"""Rows of the Jacobian: more do not change its rank."""
+RANK_TOLERANCE = 1e-9
+"""Share of the largest singular value, below which one counts as zero."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,7 +23,8 @@ from magbridge.errors import CalibrationError
 
 __all__ = ["unfiltered"]
 
-REACH = 4.0  # time constants that a slope spans at least: over shorter spans it would be noise
+REACH = 4.0
+"""Time constants that a slope spans at least: over shorter spans it would be noise."""
 
 
 def unfiltered(data: Observations, corner: float) -> Observations:

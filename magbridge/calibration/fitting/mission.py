@@ -18,8 +18,10 @@ from magbridge.errors import CalibrationError
 __all__ = ["Mission", "expected_error", "nearby_mission"]
 
 FloatArray = NDArray[np.float64]
-POINTS = 600  # samples that represent a mission
-ROLL = 10.0  # deg either way, by which a survey rolls further than the runs did
+POINTS = 600
+"""Samples that represent a mission."""
+ROLL = 10.0
+"""deg either way, by which a survey rolls further than the runs did."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,9 +25,12 @@ from magbridge.errors import CalibrationError
 
 __all__ = ["fit_per_run"]
 
-FEWEST = 20  # samples of a run that is fitted
-AT_REST = 0.05  # by which monomials may differ from the run's median: samples with the masses at rest
-WIDTHS = np.array([0.005] * 6 + [0.02] * 3)  # of the field: prior of a run about the nominal ellipsoid
+FEWEST = 20
+"""Samples of a run that is fitted."""
+AT_REST = 0.05
+"""Largest difference of a monomial from the run's median in a sample with the masses at rest."""
+WIDTHS = np.array([0.005] * 6 + [0.02] * 3)
+"""Share of the field: 1-sigma of a run's nine coefficients about the nominal ellipsoid."""
 
 
 def fit_per_run(data: Observations, order: int = 3) -> Fit:

@@ -28,11 +28,16 @@ __all__ = ["Structure", "free_structure"]
 
 FloatArray = NDArray[np.float64]
 
-GAIN, SOFT_IRON = 0.02, 0.015  # of the field
-HARD_IRON = 3000.0  # nT
-FIRST_T, FIRST_A, RATIO = 200.0, 8.0, 0.05  # nT and nT over half the range seen; travel over distance
-CROSS_T, CROSS_A = 0.1, 0.1  # nT
-FACTOR_FIXED, FACTOR_MASS, FACTOR_RATIO = np.log(2.0), np.log(3.3), np.log(1.8)  # 1-sigma of log widths
+GAIN, SOFT_IRON = 0.02, 0.015
+"""Share of the field: 1-sigma of the common gain and of soft iron."""
+HARD_IRON = 3000.0
+"""nT, 1-sigma of hard iron."""
+FIRST_T, FIRST_A, RATIO = 200.0, 8.0, 0.05
+"""nT in T and in a over half the range seen, of a mass; its travel over its distance."""
+CROSS_T, CROSS_A = 0.1, 0.1
+"""nT, in T and in a, of cross terms: masses hardly magnetise each other."""
+FACTOR_FIXED, FACTOR_MASS, FACTOR_RATIO = np.log(2.0), np.log(3.3), np.log(1.8)
+"""1-sigma of the logarithms of the widths: of fixed iron, of a mass, of travel over distance."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,7 +18,8 @@ from magbridge.errors import CalibrationError
 __all__ = ["HeldOut", "in_sensor_units", "leave_runs_out"]
 
 FloatArray = NDArray[np.float64]
-FEWEST = 30  # samples of a run that is worth leaving out
+FEWEST = 30
+"""Samples of a run that is worth leaving out."""
 
 
 @dataclass(frozen=True, eq=False)

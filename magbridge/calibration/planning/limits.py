@@ -15,9 +15,12 @@ from magbridge.calibration.model import Parameter
 __all__ = ["Limits", "PlannedRun", "candidate_runs", "settled", "trim_of"]
 
 FloatArray = NDArray[np.float64]
-SLACK = 3.0  # deg, by which another trim of the vehicle changes the pitch at the same positions
-STILL = 0.01  # of half a position's range, from one sample to the next: a mass at rest
-REACH = 0.35  # of half a position's range, by which a run may differ from positions that were flown
+SLACK = 3.0
+"""deg, by which another trim of the vehicle changes the pitch at the same positions."""
+STILL = 0.01
+"""Share of half a position's range, from one sample to the next: a mass at rest."""
+REACH = 0.35
+"""Share of half a position's range, by which a run may differ from positions that were flown."""
 
 
 @dataclass(frozen=True)

@@ -36,9 +36,12 @@ __all__ = ["Plan", "evaluate_runs", "expected_calibration", "plan"]
 
 FloatArray = NDArray[np.float64]
 HEADINGS = 24
-SAMPLES = 225  # of a run: a quarter of an hour at the paper's 0.25 Hz
-LEVELS = 7  # of each position that are tried
-POWER = 4  # of the variance, that is the eighth power of sigma
+SAMPLES = 225
+"""Samples of a run: a quarter of an hour at the paper's 0.25 Hz."""
+LEVELS = 7
+"""Values of each position that are tried."""
+POWER = 4
+"""Power of the variance that is averaged over the mission, the eighth of sigma: the worst counts most."""
 
 
 @dataclass(frozen=True)
