@@ -20,6 +20,8 @@ from threadpoolctl import threadpool_limits
 
 from magbridge.calibration.file import load
 from magbridge.diagnose.causes import CAUSES
+from magbridge.diagnose.gain import Gain
+from magbridge.diagnose.report.doubts import useful
 from magbridge.diagnose.report.findings import parameters
 from magbridge.diagnose.run import diagnose
 from magbridge.errors import DataError
@@ -171,6 +173,9 @@ def test_what_is_written(warm: tuple[xr.Dataset, object], written: tuple[Path, s
     assert np.sqrt(np.mean(error**2)) == pytest.approx(1.0, abs=0.05)
     page = (tmp_path / "out" / "report.html").read_text()
     assert page.count("data:image/png;base64,") >= 6
+    assert page.index('<a href="#cause0"><b>current field</b>') < page.index("<h2>")
+    assert '<h3 id="cause0"><b>current field</b>' in page
+    assert "<code>calibration.json</code> beside this page, corrects" in page
     assert "http" not in page.replace("http-equiv", "")
 
 
@@ -183,13 +188,16 @@ def test_a_maps_error_is_told_by_its_size(short: None) -> None:
     numbers = parameters(named, len(diagnosis.problem))
     assert set(numbers) == {"rms"}
     assert numbers["rms"]["value"] == pytest.approx(np.std(hidden.signature), rel=0.2)
+    assert not useful(diagnosis)  # nothing of it is the vehicle's
     assert 0.0 < numbers["rms"]["sigma"] < 0.2 * numbers["rms"]["value"]
 
 
 def test_a_channels_name_does_not_decide(warm: tuple[xr.Dataset, object], written: tuple[Path, str]) -> None:
     ds, calibration = warm
     renamed = ds.rename({written[1]: "zz"})
-    assert diagnose([renamed], calibration).findings[0].candidate.channel == "zz"
+    found = diagnose([renamed], calibration)
+    assert found.findings[0].candidate.channel == "zz"
+    assert "do not fly it" in useful(replace(found, total=Gain(1.0, 1.0, 1.0, (0.9, 1.1))))
 
 
 def test_bad_input_is_one_line(warm: tuple[xr.Dataset, object]) -> None:

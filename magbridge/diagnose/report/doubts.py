@@ -39,6 +39,7 @@ __all__ = [
     "rivalled",
     "several",
     "unsettled",
+    "useful",
 ]
 
 IMPLAUSIBLE = 5.0
@@ -125,6 +126,18 @@ def gained(gain: Gain, parts: str) -> str:
         f"(ratio {gain.ratio:.2f}, 95 % interval {low:.2f} to "
         f"{high:.2f}{'' if gain.shown else ': no gain is shown'})."
     )
+
+
+def useful(diagnosis: Diagnosis) -> str:
+    """Say what the extended calibration is good for; nothing where nothing was added to it."""
+    if not any(effect in diagnosis.calibration.effects for c in diagnosis.named for effect in c.effects):
+        return ""
+    verdict = (
+        "corrects for what belongs to the vehicle and its sensor"
+        if diagnosis.total.shown
+        else "shows no gain on what it was not fitted to: do not fly it before another log does"
+    )
+    return f"<p>The extended calibration, <code>calibration.json</code> beside this page, {verdict}.</p>"
 
 
 def recent(candidate: Candidate) -> str:

@@ -7,6 +7,7 @@ from datetime import UTC, datetime
 from html import escape
 from typing import TYPE_CHECKING
 
+from magbridge.calibration.residual import rms
 from magbridge.diagnose.report import figures
 from magbridge.diagnose.report.doubts import (
     grounded,
@@ -19,13 +20,13 @@ from magbridge.diagnose.report.doubts import (
     several,
 )
 from magbridge.diagnose.report.findings import chance_alone, parameters
-from magbridge.diagnose.report.words import MANY, bold, chance, figure, measured, physics
+from magbridge.diagnose.report.words import MANY, bold, chance, figure, listed, measured, number, physics
 
 if TYPE_CHECKING:
     from magbridge.diagnose.causes import Cause
     from magbridge.diagnose.diagnosis import Diagnosis, Finding
 
-__all__ = ["found"]
+__all__ = ["found", "overview"]
 
 
 def found(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> list[str]:
@@ -43,7 +44,8 @@ def found(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> list[str]:
             return ["<p>An effect is present, but no name is asserted: see what is left.</p>"]
         return ["<p>No cause passes the test at a family-wise false-alarm rate of 1 %.</p>"]
     parts = [figure(figures.terms(diagnosis), "What each cause adds to the total field.")]
-    for finding in diagnosis.findings:
+    for k, finding in enumerate(diagnosis.findings):
+        parts += [f'<h3 id="cause{k}">{bold(finding.candidate)}</h3>']
         parts += _cause(diagnosis, finding, causes[finding.candidate.cause])
     if diagnosis.wrong is not None:
         rows_at = ", ".join(
@@ -57,6 +59,21 @@ def found(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> list[str]:
     return parts
 
 
+def overview(diagnosis: Diagnosis) -> str:
+    """Return a table with a row for each named cause; empty if there is none."""
+    rows = []
+    for k, one in enumerate(diagnosis.findings):
+        field = one.candidate.columns(slice(0, len(diagnosis.problem))) @ one.coefficients
+        rows.append(
+            f'<tr><td><a href="#cause{k}">{bold(one.candidate)}</a></td>'
+            f'<td class="n">{number(rms(field))} nT</td><td class="n">{one.signal_to_noise:.1f}</td>'
+            f'<td class="n">× {1 / max(one.gain.ratio, 1e-9):.2f}</td><td>{listed(one.rivals)}</td></tr>'
+        )
+    heads = ("cause", "its field, RMS", "S/N", "held-out RMS without it", "or possibly")
+    head = "".join(f"<th>{one}</th>" for one in heads)
+    return f"<table><tr>{head}</tr>{''.join(rows)}</table>" if rows else ""
+
+
 def _cause(diagnosis: Diagnosis, finding: Finding, cause: Cause) -> list[str]:
     """Tell of one cause: its physics, the evidence, its numbers, and what speaks against it."""
     candidate, gain = finding.candidate, finding.gain
@@ -68,7 +85,6 @@ def _cause(diagnosis: Diagnosis, finding: Finding, cause: Cause) -> list[str]:
         for name, value in numbers.items()
     )
     return [
-        f"<h3>{bold(candidate)}</h3>",
         f'<p class="faint">{physics(cause)}</p>',
         (
             f"<p>Signal-to-noise {finding.signal_to_noise:.1f} with the calibration refitted. The chance "

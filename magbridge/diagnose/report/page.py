@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from magbridge.diagnose.report import figures
-from magbridge.diagnose.report.doubts import gained, late, nameless, unsettled
-from magbridge.diagnose.report.found import found
+from magbridge.diagnose.report.doubts import gained, late, nameless, unsettled, useful
+from magbridge.diagnose.report.found import found, overview
 from magbridge.diagnose.report.words import bold, figure, label, listed, number, plain, sizes
 
 if TYPE_CHECKING:
     from magbridge.diagnose.causes import Cause
-    from magbridge.diagnose.diagnosis import Diagnosis
+    from magbridge.diagnose.diagnosis import Diagnosis, Finding
 
 __all__ = ["report_html"]
 
@@ -71,16 +71,18 @@ def _verdict(diagnosis: Diagnosis, remarks: Sequence[str]) -> list[str]:
         datetime.fromtimestamp(float(t), UTC).strftime("%Y-%m-%d %H:%M") for t in survey.time[[0, -1]]
     )
     doubt = unsettled(diagnosis.problem, diagnosis.named, diagnosis.calibration)
+    dives = f" in {np.unique(survey.dive).size} dives" if survey.parts == "dives" else ""
     return [
         (
-            f'<p class="faint">{first} to {last} UTC · '
-            f"{len(survey)} samples in {np.unique(survey.dive).size} {survey.parts} · "
+            f'<p class="faint">{first} to {last} UTC · {len(survey)} samples{dives} · '
             f"calibration: {escape(diagnosis.problem.calibration.method or 'unnamed')}, "
             f"{diagnosis.problem.calibration.coefficients.size} coefficients</p>"
         ),
         f'<p class="verdict">{_sentence(diagnosis)}</p>',
+        overview(diagnosis),
         *(f"<p><b>Note:</b> {escape(remark)}.</p>" for remark in remarks),
         f"<p><b>Note:</b> {doubt}.</p>" if doubt else "",
+        useful(diagnosis),
     ]
 
 
@@ -129,7 +131,7 @@ def _compared(diagnosis: Diagnosis) -> list[str]:
 def _sentence(diagnosis: Diagnosis) -> str:
     total = diagnosis.total
     causes = [
-        bold(one.candidate) + (f" <span class=faint>or {listed(one.rivals)}</span>" if one.rivals else "")
+        bold(one.candidate) + (f" <span class=faint>or {_others(one)}</span>" if one.rivals else "")
         for one in diagnosis.findings
     ]
     if diagnosis.wrong is not None:
@@ -151,6 +153,11 @@ def _sentence(diagnosis: Diagnosis) -> str:
         "known cause explains.",
         "unexplained": f"An effect is present ({number(total.before)} nT RMS), but {name}.",
     }[diagnosis.verdict]
+
+
+def _others(finding: Finding) -> str:
+    """Return the rivals of a cause, or how many there are."""
+    return listed(finding.rivals) if len(finding.rivals) < 3 else f"one of {len(finding.rivals)} others"
 
 
 def _left(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> str:
