@@ -6,11 +6,12 @@ The instrument reads ``H_r = D(p) H + T(p)``. The corrected field is::
 
     H_c = A(p) (H_r - T(p)),   |H_c| = H_e = |IGRF| + anomaly             (paper, eqs. 3, 4 and 7)
 
-The paper's eq. 2 puts the rotation M where it drops out of the magnitude; with its eq. 3 the corrected
-vector is in the ellipsoid's own axes. We take ``A = M S^-1 M^T``, **symmetric**: the same ellipsoid, six
-numbers, and a vector that stays in sensor axes (see :mod:`.paper`). Each of the nine
-coefficients is a polynomial in the positions scaled to the range seen, ``x = (p - centre) / scale``.
-All are kept in nT: ``A = I + a / F_0``, with F_0 the field at calibration.
+The paper is Claus & Bachmayer 2016, Field and Service Robotics, doi:10.1007/978-3-319-27702-8_6. Its eq. 2
+puts the rotation M where it drops out of the magnitude; with its eq. 3 the corrected vector is in the
+ellipsoid's own axes. We take ``A = M S^-1 M^T``, **symmetric**: the same ellipsoid, six numbers, and a vector
+that stays in sensor axes (see :mod:`.paper`). Each of the nine coefficients is a polynomial in the positions
+scaled to the range seen, ``x = (p - centre) / scale``. All are kept in nT: ``A = I + a / F_0``, with F_0 the
+field at calibration.
 """
 
 from __future__ import annotations
