@@ -102,13 +102,20 @@ def correct_rows(correction: Correction, deployment: xr.Dataset) -> xr.Dataset:
     correction : Correction
         Keeps its state from one piece to the next.
     deployment : Dataset (time)
-        With ``mag_x mag_y mag_z``, and the parameters that the calibration needs.
+        With ``mag_x mag_y mag_z`` (nT, sensor axes), and the parameters that the calibration needs; what is
+        missing is not known, and the samples are flagged, as live.
 
     Returns
     -------
     Dataset (time)
         ``total_field total_field_sigma field_x field_y field_z anomaly quality``; ``time`` as in the input.
-        The anomaly is the total field minus the IGRF, NaN where there is no position.
+        The field is in body axes. The anomaly is the total field minus the IGRF, NaN where there is no
+        position. All in nT, but for ``quality``, the bits of :class:`~magbridge.records.Quality`.
+
+    Raises
+    ------
+    OutOfRange
+        A date that the IGRF does not cover.
     """
     import xarray as xr  # noqa: PLC0415 - the live path runs without it
 

@@ -102,7 +102,8 @@ def fit(
         nT, 1-sigma of a constant error of the reference over the site. No scalar fit at one site can tell
         it from the gain, so it goes into the covariance.
     **options
-        Options of the method.
+        Further arguments of the method's own function, as ``vehicle`` of
+        :func:`~magbridge.calibration.fitting.auto.fit_auto`.
 
     Raises
     ------
