@@ -17,7 +17,7 @@ from magbridge.diagnose.gain import Gain
 from magbridge.diagnose.inference.rivals import Rival
 from magbridge.diagnose.inference.unexplained import Leftover
 from magbridge.diagnose.report.doubts import IMPLAUSIBLE, gained, implausible, nameless, no_gain, unsettled
-from magbridge.diagnose.report.words import chance, measured, number, physics, sizes
+from magbridge.diagnose.report.words import chance, measured, number, physics, row, sizes
 
 
 @pytest.mark.parametrize("cause", CAUSES)
@@ -38,10 +38,17 @@ def test_a_causes_physics_is_a_sentence(cause: str) -> None:
         (0.01234567, 0.00012, "0.01235 ± 0.00012"),
         (12.0, 0.96, "12.00 ± 0.96"),
         (1e5, 1234.0, "100000 ± 1200"),
+        (-3.2, 100.0, "0 ± 100"),
     ],
 )
 def test_a_number_is_written_to_two_digits_of_its_sigma(value: float, sigma: float, text: str) -> None:
     assert f"{measured(value, sigma)} ± {measured(sigma, sigma)}" == text
+
+
+def test_when_something_began_is_a_date() -> None:
+    cells = '<td class="n">2026-06-01 11:50:41</td><td class="n"></td><td>UTC</td>'
+    assert row("onset (2)", 1780314641.5, None, "s") == f"<tr><td>onset (2)</td>{cells}</tr>"
+    assert '<td class="n">± 0.50</td><td>nT/A</td>' in row("x", 12.0, 0.5, "nT/A")
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from datetime import UTC, datetime
-from html import escape
 from typing import TYPE_CHECKING
 
 from magbridge.calibration.residual import rms
@@ -20,7 +19,7 @@ from magbridge.diagnose.report.doubts import (
     several,
 )
 from magbridge.diagnose.report.findings import chance_alone, parameters
-from magbridge.diagnose.report.words import MANY, bold, chance, figure, listed, measured, number, physics
+from magbridge.diagnose.report.words import MANY, bold, chance, figure, listed, number, physics, row
 
 if TYPE_CHECKING:
     from magbridge.diagnose.causes import Cause
@@ -78,12 +77,7 @@ def _cause(diagnosis: Diagnosis, finding: Finding, cause: Cause) -> list[str]:
     """Tell of one cause: its physics, the evidence, its numbers, and what speaks against it."""
     candidate, gain = finding.candidate, finding.gain
     numbers = parameters(finding, len(diagnosis.problem))
-    rows = "".join(
-        f'<tr><td>{escape(name)}</td><td class="n">{measured(value["value"], value["sigma"])}</td>'
-        f'<td class="n">{"± " + measured(value["sigma"], value["sigma"]) if value["sigma"] else ""}</td>'
-        f"<td>{escape(value['unit'])}</td></tr>"
-        for name, value in numbers.items()
-    )
+    rows = "".join(row(name, **value) for name, value in numbers.items())
     return [
         f'<p class="faint">{physics(cause)}</p>',
         (

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
 from html import escape
 from inspect import getdoc
 from itertools import groupby
@@ -26,6 +27,7 @@ __all__ = [
     "number",
     "physics",
     "plain",
+    "row",
     "sizes",
 ]
 
@@ -73,7 +75,21 @@ def measured(value: float, sigma: float | None) -> str:
     if not sigma or not isfinite(sigma):
         return number(value, 4)
     places = 1 - floor(log10(sigma))
-    return f"{round(value, places):.{max(places, 0)}f}".replace("-", "\N{MINUS SIGN}")
+    # an added 0 turns what was rounded to -0 into 0
+    return f"{round(value, places) + 0.0:.{max(places, 0)}f}".replace("-", "\N{MINUS SIGN}")
+
+
+def row(name: str, value: float, sigma: float | None, unit: str) -> str:
+    """Return a number's row: name, value, sigma, unit; a time (s since 1970) as its date."""
+    if name.startswith("onset"):
+        shown, unit = datetime.fromtimestamp(value, UTC).strftime("%Y-%m-%d %H:%M:%S"), "UTC"
+    else:
+        shown = measured(value, sigma)
+    within = f"± {measured(sigma, sigma)}" if sigma else ""
+    return (
+        f'<tr><td>{escape(name)}</td><td class="n">{shown}</td><td class="n">{within}</td>'
+        f"<td>{escape(unit)}</td></tr>"
+    )
 
 
 def chance(p_value: float) -> str:
