@@ -16,7 +16,7 @@ Row = dict[str, Any]
 SURE = norm.ppf(0.95)
 ALLOWED = 0.95
 """Least chance, by theory, to name the truth alone (or to name nothing) in the cases held to a target."""
-SEEN = 0.1
+COMPARABLE = 0.1
 """Largest p-value, by theory, of a log whose diagnosis is compared with theory: p-values end at one."""
 
 
@@ -144,7 +144,8 @@ def beside_ideal(rows: Sequence[Row]) -> tuple[float, float, float] | None:
     Both see the same noise, which cancels: one log compared like this tells as much as dozens that are merely
     counted as found or not.
     """
-    rows = [r for r in rows if r["theory"] and np.interp(r["wanted"], SIZES, r["theory"][0]["here"]) < SEEN]
+    known = [r for r in rows if r["theory"]]
+    rows = [r for r in known if np.interp(r["wanted"], SIZES, r["theory"][0]["here"]) < COMPARABLE]
     if len(rows) < 3:
         return None
     logs = np.log([r["wanted"] / equal(r) for r in rows])
