@@ -127,7 +127,7 @@ class SerialPort(Stream):
                 self._idle_at = now + HELD * 10 / self.baudrate
         return room
 
-    def _put(self, data: bytearray) -> int:
+    def _put(self, data: bytes | bytearray) -> int:
         try:
             if self._pump is not None:
                 self._serial.write(data)

@@ -151,7 +151,7 @@ class _Connection(Stream):
     def _room(self) -> bool:
         return self._connection is not None and bool(select.select([], [self._connection], [], 0)[1])
 
-    def _put(self, data: bytearray) -> int:
+    def _put(self, data: bytes | bytearray) -> int:
         assert self._connection is not None
         try:
             return self._connection.send(data)

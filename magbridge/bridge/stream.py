@@ -46,6 +46,10 @@ class Stream(Port):
 
     def write(self, data: bytes) -> None:
         """Send messages, each whole or not at all; those for which there is no room wait."""
+        free = not (self._begun or self._waiting) and len(data) <= self._piece
+        if free and self._room():  # as on most lines at most times: nothing need be cut into messages
+            self._begun += data[self._put(data) :]
+            return
         now = time.monotonic()
         self._waiting.extend(_Waiting(now, _kind(frame), frame) for frame in _frames(data))
         self.flush()
@@ -70,7 +74,7 @@ class Stream(Port):
         """Say whether what is handed to the system now leaves soon."""
 
     @abstractmethod
-    def _put(self, data: bytearray) -> int:
+    def _put(self, data: bytes | bytearray) -> int:
         """Hand `data` to the system; return how many bytes it took. Raises :class:`PortError`."""
 
     def _forget(self) -> None:
