@@ -69,8 +69,8 @@ class Link(Table, frozen=True):
     Attributes
     ----------
     url : str
-        As in the MAVLink world: ``udpin:``, ``udpout:``, ``tcp:``, ``tcpin:`` and an address, or a
-        serial device.
+        As in the MAVLink world: ``udpin:``, ``udpout:``, ``tcp:``, ``tcpin:`` and ``HOST:PORT`` or
+        ``[IPV6]:PORT``, or a serial device.
     system : int
         The vehicle's system id: ours, and the only one we listen to.
     component : int

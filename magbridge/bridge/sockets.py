@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import errno
+import re
 import select
 import socket
 import time
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
+from ipaddress import IPv6Address
+from operator import itemgetter
+from typing import Any
 
 from magbridge.bridge.port import CHUNK, Port
 from magbridge.bridge.serial_port import serial_line
@@ -23,6 +27,7 @@ PEER_TIMEOUT = 30.0
 """s without a packet after which a UDP peer is forgotten."""
 AWAY = (errno.ECONNREFUSED, errno.ENETUNREACH, errno.EHOSTUNREACH, errno.ENETDOWN, errno.EPERM)
 """What a UDP socket reports when nobody listens (yet): no fault of the port."""
+ADDRESS = re.compile(r"(?://)?(?:\[(?P<ipv6>.+)\]|(?P<host>[^:]*)):(?P<port>[0-9]{1,5})")
 
 
 class UdpPort(Port):
@@ -32,7 +37,7 @@ class UdpPort(Port):
         super().__init__(name)
         self._address, self._listen = address, listen
         self._socket: socket.socket | None = None
-        self._peers: dict[tuple[str, int], float] = {}
+        self._peers: dict[Any, float] = {}
 
     @property
     def up(self) -> bool:
@@ -41,16 +46,17 @@ class UdpPort(Port):
 
     def open(self) -> None:
         """Bind or connect; raises :class:`PortError`."""
-        opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        opened.setblocking(False)
-        opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
         try:
-            if self._listen:
-                opened.bind(self._address)
-            else:
-                opened.connect(self._address)
+            family, address = _resolve(self._address, socket.SOCK_DGRAM, listen=self._listen)
+            opened = socket.socket(family, socket.SOCK_DGRAM)
+            opened.setblocking(False)
+            opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
+            try:
+                (opened.bind if self._listen else opened.connect)(address)
+            except OSError:
+                opened.close()
+                raise
         except OSError as error:
-            opened.close()
             raise PortError(self.name, error.strerror or str(error)) from error
         self._socket = opened
 
@@ -95,7 +101,7 @@ class UdpPort(Port):
             else:
                 self._send(data, peer)
 
-    def _send(self, data: bytes, peer: tuple[str, int] | None) -> None:
+    def _send(self, data: bytes, peer: Any) -> None:
         assert self._socket is not None
         try:
             if peer is None:
@@ -218,7 +224,9 @@ class TcpServer(_Connection):
     def open(self) -> None:
         """Listen; raises :class:`PortError`."""
         try:
-            self._listener = socket.create_server(self._address, reuse_port=False)
+            family, address = _resolve(self._address, socket.SOCK_STREAM, listen=True)
+            both = family == socket.AF_INET6 and socket.has_dualstack_ipv6()
+            self._listener = socket.create_server(address, family=family, dualstack_ipv6=both)
         except OSError as error:
             raise PortError(self.name, error.strerror or str(error)) from error
         self._listener.setblocking(False)
@@ -256,11 +264,23 @@ class TcpServer(_Connection):
         self._listener = None
 
 
+def _resolve(address: tuple[str, int], kind: int, *, listen: bool) -> tuple[int, Any]:
+    """Return the family and the socket address of a host; of a name that has both, IPv4's. Raises OSError."""
+    host, port = address
+    found = socket.getaddrinfo(host or None, port, type=kind, flags=socket.AI_PASSIVE if listen else 0)
+    family, *_, resolved = min(found, key=itemgetter(0))
+    return family, resolved
+
+
 def _address(text: str) -> tuple[str, int]:
-    host, colon, port = text.rpartition(":")
-    if not colon or not port.isdigit() or int(port) > 65535:
-        raise ValueError("expected HOST:PORT")
-    return host.removeprefix("//"), int(port)
+    """Return host and port; raises ValueError."""
+    match = ADDRESS.fullmatch(text)
+    if match is None or int(match["port"]) > 65535:
+        raise ValueError(text)
+    if match["ipv6"]:
+        return str(IPv6Address(match["ipv6"])), int(match["port"])
+    match["host"].encode("idna")  # raises UnicodeError, as looking it up would
+    return match["host"], int(match["port"])
 
 
 LINKS: dict[str, Callable[[str, tuple[str, int]], Port]] = {
@@ -272,24 +292,25 @@ LINKS: dict[str, Callable[[str, tuple[str, int]], Port]] = {
 """Link kinds by the first part of the URL, as in the MAVLink world; any other URL is a serial device."""
 
 
-def open_link(url: str, baudrate: int, source: str = "bridge.toml") -> Port:
+def open_link(url: str, baudrate: int, source: str = "bridge.toml", key: str = "link.url") -> Port:
     """Return the (unopened) port for a MAVLink URL.
 
     Raises
     ------
     ConfigError
-        An unknown kind of link or of serial URL, or an address that is not HOST:PORT.
+        An unknown kind of link or of serial URL, or an address that is not HOST:PORT; it names `source` and
+        `key`.
     """
     kind, colon, address = url.partition(":")
     if kind not in LINKS:
         if colon and kind.isalnum() and kind != "serial" and not address.startswith("//"):
             known = ", ".join(LINKS)
-            raise ConfigError(source, "link.url", f"expected {known} or a serial device, got {url!r}")
-        return serial_line(url.removeprefix("serial:"), baudrate, source, "link.url")
+            raise ConfigError(source, key, f"expected {known} or a serial device, got {url!r}")
+        return serial_line(url.removeprefix("serial:"), baudrate, source, key)
     try:
         host, port = _address(address)
         if not port and kind in ("udpout", "tcp"):  # of one's own, 0 is any that is free
-            raise ValueError("expected HOST:PORT")  # noqa: TRY301 - as `_address` does
-        return LINKS[kind](url, (host, port))
+            raise ValueError(url)  # noqa: TRY301 - as `_address` does
     except ValueError as error:
-        raise ConfigError(source, "link.url", f"{error}, got {url!r}") from error
+        raise ConfigError(source, key, f"expected HOST:PORT or [IPV6]:PORT, got {url!r}") from error
+    return LINKS[kind](url, (host, port))

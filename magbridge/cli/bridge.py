@@ -118,7 +118,7 @@ def monitor(
     Parameters
     ----------
     link
-        The link to the bridge: udpin:HOST:PORT, udpout, tcp, tcpin, or a serial device.
+        The link to the bridge: udpin:HOST:PORT (or [IPV6]:PORT), udpout, tcp, tcpin, or a serial device.
     host
         The address to serve the page at; 0.0.0.0 makes it visible to other machines.
     port

@@ -57,13 +57,15 @@ def serve(link: str, baudrate: int, host: str, port: int, *, show: bool) -> None
     ConfigError, PortError
         `link` is no address, or it or the page's own port cannot be opened.
     """
-    station = StationLink(open_link(link, baudrate, "magbridge monitor"))
+    station = StationLink(open_link(link, baudrate, "magbridge monitor", "LINK"))
+    ipv6 = ":" in host
+    family, place = (socket.AF_INET6, f"[{host}]:{port}") if ipv6 else (socket.AF_INET, f"{host}:{port}")
     try:
-        socket.create_server((host, port)).close()  # the web server itself would only log it
+        socket.create_server((host, port), family=family).close()  # the web server itself would only log it
     except OSError as error:
-        raise PortError(f"{host}:{port}", error.strerror or str(error)) from error
+        raise PortError(place, error.strerror or str(error)) from error
     station.start()
-    print(f"listening on {link}; the page is http://{host}:{port}", file=sys.stderr)
+    print(f"listening on {link}; the page is http://{place}", file=sys.stderr)
     options: dict[str, Any] = {"title": "magbridge", "favicon": "🧲", "show_welcome_message": False}
     with suppress(KeyboardInterrupt):  # Ctrl-C is how it ends
         ui.run(partial(Page, station), host=host, port=port, show=show, reload=False, **options)

@@ -238,6 +238,32 @@ def test_a_server_takes_the_next_client() -> None:
     assert not port.up
 
 
+@pytest.mark.parametrize("kinds", [("udpin", "udpout"), ("tcpin", "tcp")])
+@pytest.mark.parametrize(
+    ("host", "to"), [("[::1]", "[::1]"), ("[::]", "127.0.0.1"), ("localhost", "127.0.0.1")]
+)
+def test_a_link_by_ipv6_and_by_both(kinds: tuple[str, str], host: str, to: str) -> None:
+    """A station that listens to all of IPv6 hears IPv4, too; a name that is both means IPv4."""
+    here = open_link(f"{kinds[0]}:{host}:0", 0)
+    try:
+        here.open()
+    except PortError as error:
+        pytest.skip(f"no IPv6 here: {error.reason}")
+    with socket.socket(fileno=os.dup(here.fds()[0])) as listener:
+        there = open_link(f"{kinds[1]}:{to}:{listener.getsockname()[1]}", 0)
+    there.open()
+    heard = b""
+    for one, other in ((there, here), (here, there)):
+        one.write(FRAME)
+        while not heard:
+            assert select.select(other.fds(), [], [], 5)[0]
+            heard = other.read()
+        assert heard == FRAME
+        heard = b""
+    here.close()
+    there.close()
+
+
 def test_a_udp_peer_that_is_not_there_is_no_fault() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as gone:
         gone.bind(("127.0.0.1", 0))
@@ -276,6 +302,10 @@ def test_datagrams_that_waited_come_at_once() -> None:
         "udpin:14550",
         "tcp:host:http",
         "tcp:host:70000",
+        "tcp:host:1\N{SUPERSCRIPT TWO}",
+        "tcp:a..b:5760",
+        "udpin:::1:14550",
+        "udpin:[::g]:14550",
         "udpout:host:0",
         "socket://host",
         "rfc2217://host:70000",

@@ -95,7 +95,7 @@ def test_bad_input_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = str(taken.getsockname()[1])
         for arguments, code, expected in (
-            (["udpin:nowhere"], 2, "expected HOST:PORT"),
+            (["udpin:nowhere"], 2, "magbridge monitor: LINK: expected HOST:PORT or [IPV6]:PORT"),
             (["/dev/nowhere"], 1, "/dev/nowhere: "),
             (["udpin:127.0.0.1:0", "--port", port], 1, f"127.0.0.1:{port}: Address already in use"),
             (["--port", "99999"], 2, "99999"),
