@@ -11,7 +11,15 @@ from magbridge.errors import PortError
 from magbridge.mavlink import Codec
 from magbridge.monitor.state import State
 
-__all__ = ["StationLink"]
+__all__ = ["StationLink", "now"]
+
+ASLEEP = getattr(time, "CLOCK_BOOTTIME", None)
+"""A clock that goes on while the computer sleeps, where there is one."""
+
+
+def now() -> float:
+    """Return s of a clock that nobody sets."""
+    return time.monotonic() if ASLEEP is None else time.clock_gettime(ASLEEP)
 
 
 class StationLink:
@@ -48,11 +56,11 @@ class StationLink:
     def _turn(self) -> None:
         ready, _, _ = select.select(self.port.fds(), [], [], 0.1)
         heard = self._codec.parse(self.port.read()) if ready else []
-        now = time.time()
+        moment = now()
         with self.lock:
             for message in heard:
-                self.state.hear(message, now)
-            requests = self.state.due(now)
+                self.state.hear(message, moment)
+            requests = self.state.due(moment)
         for name, fields in requests:
             self.port.write(self._codec.pack(name, **fields))
         self.port.flush()

@@ -19,7 +19,7 @@ from magbridge.config import Align
 from magbridge.errors import PortError
 from magbridge.link import alignment
 from magbridge.mavlink.dialect import MAV_SEVERITY
-from magbridge.monitor.link import StationLink
+from magbridge.monitor.link import StationLink, now
 from magbridge.monitor.state import Point
 from magbridge.monitor.words import FLAGS, ago, health, measured, silence, whereabouts
 
@@ -115,11 +115,10 @@ class Page:
         ui.timer(0.5, self._refresh)
 
     def _refresh(self) -> None:
-        now = time.time()
         with self._station.lock:
-            self._tell_stream(self._station.trouble or silence(self._state, now))
+            self._tell_stream(self._station.trouble or silence(self._state, now()))
             self._tell_figures()
-            self._tell_flags(now)
+            self._tell_flags()
             self._tell_texts()
             self._tell_parameters()
             self._draw()
@@ -143,8 +142,8 @@ class Page:
             label.set_text(text if self._state.status else "–")
             label.style(f"color: {INK if well or not self._state.status else RED}")
 
-    def _tell_flags(self, now: float) -> None:
-        flags = {name: f"since {_clock(t)}, {ago(now - t)}" for name, (t, _) in self._state.flags.items()}
+    def _tell_flags(self) -> None:
+        flags = {name: f"since {_clock(t)}, {ago(now() - t)}" for name, (t, _) in self._state.flags.items()}
         if not self._new("flags", flags or bool(self._state.field), self._flags):
             return
         with self._flags:
@@ -274,4 +273,5 @@ def _nothing() -> None:
 
 
 def _clock(when: float) -> str:
-    return time.strftime("%H:%M:%S", time.gmtime(when))
+    """Return the UTC of a moment on the station's clock."""
+    return time.strftime("%H:%M:%S", time.gmtime(time.time() - (now() - when)))

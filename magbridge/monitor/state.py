@@ -59,7 +59,7 @@ class Parameter:
 class State:
     """All that a page shows of one bridge: the first heard; another only once that was silent for `AWAY`.
 
-    Times are the receiver's, s since 1970.
+    Times are the receiver's, s of a clock that nobody sets.
 
     Attributes
     ----------

@@ -1,6 +1,6 @@
 """Run magbridge with a host clock that a test can set: ``stepped.py OFFSET_FILE ARGUMENT...``.
 
-The program is the unmodified one; only its source of UTC, ``time.time_ns``, is the host's plus the
+The program is the unmodified one; only its UTC, ``time.time_ns`` and ``time.time``, is the host's plus the
 microseconds that a file holds. (A time namespace shifts only the monotonic clocks, and the real one belongs
 to everybody.)
 """
@@ -14,6 +14,7 @@ from pathlib import Path
 offset = Path(sys.argv.pop(1))
 host = time.time_ns
 time.time_ns = lambda: host() + 1000 * int(offset.read_text())
+time.time = lambda: time.time_ns() * 1e-9
 
 from magbridge.cli import main  # noqa: E402 - the clock first
 

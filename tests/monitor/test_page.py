@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from pathlib import Path
 from urllib.error import URLError
 from urllib.request import urlopen
 
@@ -28,9 +29,18 @@ def free(kind: socket.SocketKind) -> int:
 
 
 @pytest.fixture
-def page() -> Iterator[tuple[str, tuple[str, int]]]:
+def clock(tmp_path: Path) -> Path:
+    """By how many µs the page's computer's clock is set forward."""
+    offset = tmp_path / "offset"
+    offset.write_text("0")
+    return offset
+
+
+@pytest.fixture
+def page(clock: Path) -> Iterator[tuple[str, tuple[str, int]]]:
     link, port = free(socket.SOCK_DGRAM), free(socket.SOCK_STREAM)
-    command = [sys.executable, "-m", "magbridge", "monitor", f"udpin:127.0.0.1:{link}", "--port", str(port)]
+    launch = [sys.executable, str(Path(__file__).parents[1] / "harness" / "stepped.py"), str(clock)]
+    command = [*launch, "monitor", f"udpin:127.0.0.1:{link}", "--port", str(port)]
     # NiceGUI looks at them
     alone = {name: value for name, value in os.environ.items() if "PYTEST" not in name}
     with subprocess.Popen(command, stderr=subprocess.PIPE, env=alone) as process:
@@ -89,6 +99,22 @@ def test_page(page: tuple[str, tuple[str, int]]) -> None:
         assert time.monotonic() < deadline, missing
     assert 'src="http' not in html  # it must show without a network
     assert 'href="http' not in html
+
+
+def test_a_clock_set_back_hides_no_silence(page: tuple[str, tuple[str, int]], clock: Path) -> None:
+    url, link = page
+    get(url)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        sender.settimeout(10)
+        sender.sendto(Codec(1, 191).pack("MAG_FIELD", total_field=52_134.268), link)
+        sender.recv(4096)
+        clock.write_text("-3600000000")
+        heard = b"".join([sender.recv(4096) for _ in range(10)])
+    names = [message.name for message in Codec(1, 191).parse(heard)]
+    assert names.count("HEARTBEAT") > 1
+    deadline = time.monotonic() + 15.0
+    while "nothing heard for" not in get(url):
+        assert time.monotonic() < deadline
 
 
 def test_bad_input_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
