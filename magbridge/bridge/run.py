@@ -23,7 +23,6 @@ from magbridge.bridge.serial_port import serial_line
 from magbridge.bridge.sockets import open_link
 from magbridge.calibration import file as calibration_file
 from magbridge.config import Config, load
-from magbridge.errors import PortError
 from magbridge.link import store
 from magbridge.logs.tlog import TlogWriter
 from magbridge.mavlink import load_key
@@ -150,18 +149,12 @@ def _say(texts: deque[str]) -> None:
 
 
 def _open_log(config: Config, edge: LiveEdge, nt_per_count: float) -> TlogWriter | None:
-    """Open the log; a folder that cannot be made is reported over the link and does not stop the bridge."""
     if config.log is None:
         return None
     directory = config.resolve(config.log.directory)
-    try:
-        head = declarations(config.link.system, config.link.component, config.telemetry, nt_per_count)
-        log = TlogWriter(directory, max_size=config.log.max_size, max_age=config.log.max_age, head=head)
-    except PortError as error:
-        edge.tell(states.log_state(error.reason, 0))
-        return None
+    head = declarations(config.link.system, config.link.component, config.telemetry, nt_per_count)
     edge.tell(states.log_state("", 0))
-    return log
+    return TlogWriter(directory, max_size=config.log.max_size, max_age=config.log.max_age, head=head)
 
 
 class LogWatch:

@@ -23,7 +23,6 @@ from threading import Event, Thread
 from types import TracebackType
 from typing import Self
 
-from magbridge.errors import PortError
 from magbridge.mavlink import pack_record
 from magbridge.records import Channel
 
@@ -54,7 +53,7 @@ class TlogWriter:
     Parameters
     ----------
     directory : path
-        Created if it does not exist. Existing files are never changed.
+        Created if it does not exist, or no longer. Existing files are never changed.
     max_size : float
         MB after which a new file begins.
     max_age : float
@@ -74,11 +73,6 @@ class TlogWriter:
         Records dropped so far, because the disk stalled or the log had failed.
     failure : str
         The operating system's reason why the log has stopped; empty while it is being written.
-
-    Raises
-    ------
-    PortError
-        The directory cannot be made.
     """
 
     def __init__(
@@ -91,10 +85,6 @@ class TlogWriter:
         beginning: Sequence[bytes] = (),
     ) -> None:
         self._directory = Path(directory)
-        try:
-            self._directory.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise PortError(str(directory), error.strerror or str(error)) from error
         self._max_size, self._max_age_us = round(max_size * 1e6), round(max_age * 3.6e9)
         self._head, self.beginning = tuple(head), beginning
         self.records, self.failure = 0, ""
@@ -199,6 +189,7 @@ class TlogWriter:
             return False
         begin_s = self._begin_s or time_us // 1_000_000
         try:
+            self._directory.mkdir(parents=True, exist_ok=True)
             while self._file < 0:
                 begin = datetime.fromtimestamp(begin_s, UTC)
                 self._name = self._directory / f"{begin:%Y%m%dT%H%M%SZ}_{self._index + 1:04d}.tlog"
