@@ -70,5 +70,5 @@ def _own_log(result: Result) -> str:
     if not result["same_config"]:
         lines.append("the configuration is not the one the log was recorded with")
     if result["damages"]:
-        lines.append(f"{result['damages']} damaged places in the log were skipped")
+        lines.append(f"damaged places in the log, which were skipped: {result['damages']}")
     return "\n".join(lines)

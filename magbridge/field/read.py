@@ -58,6 +58,8 @@ def read_grid(path: str | Path) -> AnomalyGrid:
     path = Path(path)
     if not path.exists():
         raise FormatError(path, "no such file")
+    if not (path.is_file() or path.is_dir()):  # opening a pipe waits for whoever writes to it
+        raise FormatError(path, "expected a file, not a pipe or a device")
     reader = folder if path.is_dir() else READERS.get(path.suffix.lower())
     if reader is None:
         raise FormatError(path, f"expected a grid: one of {' '.join(READERS)} or a folder")

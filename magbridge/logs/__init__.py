@@ -85,7 +85,8 @@ def _paths(paths: Paths) -> list[Path]:
         if path.is_dir():
             raise FormatError(path, "expected a file, not a directory")
         if not path.is_file():
-            raise FormatError(path, "expected a file, there is none")
+            what = "not a pipe or a device" if path.exists() else "there is none"
+            raise FormatError(path, f"expected a file, {what}")
         _module(path)
     return [path for path in checked if not _with_flight(path, checked)]
 

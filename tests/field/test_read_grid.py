@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import struct
 
 import numpy as np
@@ -181,6 +182,7 @@ def scattered(path):
     ("name", "write", "message"),
     [
         ("none.nc", None, "no such file"),
+        ("a.nc", os.mkfifo, "expected a file, not a pipe or a device"),
         ("a.png", lambda p: p.write_bytes(b"x"), "expected a grid: one of .nc"),
         ("a.nc", lambda p: p.write_bytes(b"not netCDF"), "expected a netCDF grid"),
         ("a.nc", lambda p: cf(p, "mGal"), "expected a magnetic field in nT, found the unit 'mGal'"),

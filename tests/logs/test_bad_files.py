@@ -102,6 +102,7 @@ def test_anything_else_under_that_name(suffix: str, content: bytes, tmp_path: Pa
     [
         (lambda path: path, "expected a file, there is none"),
         (lambda path: path.mkdir(), "expected a file, not a directory"),
+        (os.mkfifo, "expected a file, not a pipe or a device"),
     ],
 )
 def test_no_file(make: Callable[[Path], object], expected: str, tmp_path: Path) -> None:
