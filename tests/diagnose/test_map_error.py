@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.causes.map_error import map_error
+from magbridge.diagnose.causes.reference import reference_bias
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.joint import Joint, fit_joint
 
@@ -52,12 +53,13 @@ def test_what_a_map_as_flown_lacks_grows_with_depth(right: Callable[[int], Probl
 
 @pytest.mark.parametrize("altitude", [60.0, 100.0, 150.0])
 def test_the_mean_of_what_a_map_lacks_is_known(right: Callable[[int], Problem], altitude: float) -> None:
-    """The growth with depth tells it from a constant of the calibration's."""
+    """The growth with depth tells it from a constant."""
     missing = flown(altitude)
     problem = drawn(right(N), missing + 40.0, DOWN)
     chart, _ = map_error(problem)
-    fit = fitted(problem, chart)
-    error = chart.columns(slice(None)) @ fit.coefficients / problem.gain
+    [constant] = reference_bias(problem)
+    fit = fit_joint(problem, [chart.columns, constant.columns], 1, spectra=[chart.spectra, None])
+    error = chart.columns(slice(None)) @ fit.coefficients[: chart.size] / problem.gain
     assert abs(error.mean() - missing.mean()) < 0.2 * np.sqrt(np.mean(missing**2))
 
 

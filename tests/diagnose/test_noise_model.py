@@ -32,6 +32,17 @@ def test_memory_and_level_are_found(rho: float) -> None:
     assert memory_order(r, np.cumsum(steps)) == 1
 
 
+def test_noise_is_no_slower_than_a_log_can_tell() -> None:
+    """What wanders throughout a log is left for drifts to explain; slow noise is fitted as it is."""
+    v = np.random.default_rng(3).normal(size=4000)
+    steps = np.ones(len(v), int)
+    steps[0] = FAR
+    noise = fit_noise(np.cumsum(v), Past(steps, 5))
+    assert np.abs(np.roots(np.append(1.0, -noise.memory))).max() == pytest.approx(1.0 - 20.0 / len(v))
+    slow, _ = made("white", len(v), 0.98)
+    assert fit_noise(slow, Past(steps, 1)).memory[0] == pytest.approx(0.98, abs=0.01)
+
+
 @pytest.mark.parametrize("lost", [0.0, 0.05, 0.125])
 def test_a_memory_is_taken_for_no_shorter_where_few_samples_have_all_of_their_past(lost: float) -> None:
     """White noise upon a slow one: too short a memory would make structure out of it."""

@@ -35,6 +35,11 @@ LOSS = 0.02
 about p / n to the variance of the prediction."""
 NEAR = 0.9999
 """Largest partial correlation."""
+TIMES = 20.0
+"""Time constants of the memory that a log holds at least. Slower noise would swallow slow effects, and so few
+repetitions cannot show its level."""
+BRIEFEST, SLOWEST = 20.0, 2000.0
+"""Samples, the least and the most of the longest time constant, in short and in long logs."""
 PIECE, PIECES = 600, 64
 """Pieces of a column from which its power spectrum is estimated: their length in samples, and most pieces."""
 
@@ -145,7 +150,7 @@ def fit_noise(
     v, log_likelihood = residual, -np.inf
     for _ in range(rounds):
         if whole.sum() > 2 * order:
-            memory = _stable(_regressed(lags, residual, whole * weight / scale**2))
+            memory = _stable(_regressed(lags, residual, whole * weight / scale**2), n)
         beside_gaps = Predictors(past, memory)
         v = beside_gaps.innovations(residual)
         if blocks is None:
@@ -179,13 +184,13 @@ def _counts(n: int) -> NDArray[np.int64]:
     return count
 
 
-def _stable(memory: FloatArray) -> FloatArray:
-    """Move roots that lie outside the unit circle, or very close to it, back inside."""
+def _stable(memory: FloatArray, n: int) -> FloatArray:
+    """Move roots that lie outside the unit circle, or too close to it for n samples, back inside."""
     roots = np.roots(np.append(1.0, -memory))
-    size = np.abs(roots)
-    if size.max(initial=0.0) < 0.9995:
+    size, largest = np.abs(roots), 1.0 - 1.0 / np.clip(n / TIMES, BRIEFEST, SLOWEST)
+    if size.max(initial=0.0) < largest:
         return memory
-    return np.asarray(-np.real(np.poly(roots * np.where(size > 0.9995, 0.9995 / size, 1.0)))[1:])
+    return np.asarray(-np.real(np.poly(roots * np.where(size > largest, largest / size, 1.0)))[1:])
 
 
 def _uneven(v: FloatArray, count: NDArray[np.int64]) -> bool:
