@@ -79,9 +79,9 @@ class Page:
         self._shown: dict[str, Any] = {}
         self._inputs: dict[str, ui.number] = {}
         ui.query("body").classes("bg-slate-100").style(f"color: {INK}")
-        with ui.header().classes("items-center gap-4 px-6 py-2 bg-slate-800"):
+        with ui.header().classes("items-center gap-x-4 gap-y-1 px-6 py-2 bg-slate-800"):
             ui.label("magbridge").classes("text-lg font-semibold")
-            self._from = ui.label().classes("text-sm text-slate-300")
+            self._from = ui.label().classes("text-sm text-slate-300 max-sm:order-last max-sm:w-full")
             ui.space()
             self._stream = ui.label().classes("text-sm px-3 py-1 rounded-full")
         facts = list(health(self._state))
@@ -109,7 +109,7 @@ class Page:
                     self._texts = ui.column().classes("w-full h-60 gap-1 overflow-auto flex-nowrap")
                 with _card("Parameters (Enter sets one)"):
                     self._parameters = ui.element().classes(
-                        "w-full h-60 grid grid-cols-3 content-start gap-x-4 overflow-auto"
+                        "w-full h-60 grid grid-cols-2 sm:grid-cols-3 content-start gap-x-4 overflow-auto"
                     )
         self._refresh()
         ui.timer(0.5, self._refresh)
@@ -126,8 +126,9 @@ class Page:
     def _tell_stream(self, trouble: str) -> None:
         who = "vehicle {}, component {}".format(*self._state.bridge) if self._state.bridge else ""
         self._from.set_text(f"{self._station.port.name} \N{EN SPACE} {who}")
-        self._stream.set_text(trouble or "live")
-        self._stream.style(f"background: {RED if trouble else GREEN}")
+        flagged = self._state.flags.keys() - {"no_boresight"}
+        self._stream.set_text(trouble or ("live, flagged" if flagged else "live"))
+        self._stream.style(f"background: {RED if trouble else AMBER if flagged else GREEN}")
         self._body.style(f"opacity: {0.45 if trouble else 1}")
 
     def _tell_figures(self) -> None:
