@@ -27,7 +27,9 @@ def load_toml(path: str | Path) -> dict[str, Any]:
         return tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))
     except OSError as error:
         raise ConfigError(path, "", error.strerror or str(error)) from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except UnicodeDecodeError as error:
+        raise ConfigError(path, "", "expected text in UTF-8") from error
+    except tomllib.TOMLDecodeError as error:
         raise ConfigError(path, "", f"not TOML: {error}") from error
 
 

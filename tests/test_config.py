@@ -52,6 +52,13 @@ def test_a_file_from_windows_is_read(tmp_path: Path) -> None:
     assert load(path).sensor == load(write(tmp_path, GOOD)).sensor
 
 
+def test_another_encoding(tmp_path: Path) -> None:
+    path = write(tmp_path, GOOD)
+    path.write_bytes(GOOD.encode("utf-16"))
+    with pytest.raises(ConfigError, match=r"toml: expected text in UTF-8$"):
+        load(path)
+
+
 @pytest.mark.parametrize(
     ("old", "new", "line"),
     [

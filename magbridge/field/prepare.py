@@ -73,8 +73,9 @@ def prepare(
             lifted.append(grid)
     result, apart = _merged(lifted, spacing)
     if len(grids) > 1:
-        differ = f", {apart:.1f} nT RMS apart where they overlap" if isfinite(apart) else ""
-        steps.append(Step(f"merged{differ}", result))
+        nowhere = "no two of them overlap"
+        differ = f"{apart:.1f} nT RMS apart where they overlap" if isfinite(apart) else nowhere
+        steps.append(Step(f"merged, {differ}", result))
     if mask is not None:
         result = _masked(result, np.asarray(mask, float))
         steps.append(Step("masked", result))

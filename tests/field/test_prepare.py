@@ -110,7 +110,7 @@ def test_it_is_told_how_far_surveys_are_apart():
         merged(a, b, c) == f"merged, {np.sqrt((3**2 + 9**2 + 6**2) / 3):.1f} nT RMS apart where they overlap"
     )
     west, east = (AnomalyGrid(LON[part], LAT, a.anomaly[:, part]) for part in (slice(30), slice(40, None)))
-    assert merged(west, east) == "merged"
+    assert merged(west, east) == "merged, no two of them overlap"
 
 
 def test_merge_across_the_antimeridian():
