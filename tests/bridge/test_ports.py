@@ -77,7 +77,7 @@ def test_a_slow_line_loses_whole_messages() -> None:
     tty.setraw(slave)
     port = open_link(f"serial:{os.ttyname(slave)}", 4_000_000)
     port.open()
-    frames = [number.to_bytes(2, "little") * 350 for number in range(2 * MOST)]
+    frames = [b"%04d" % number * 175 for number in range(2 * MOST)]
     for frame in frames:
         port.write(frame)
     received = b""
