@@ -51,5 +51,9 @@ FOREIGN: dict[str, Effect] = {
     "afterglow": vehicle.afterglow,
     "mast": sensor.mast,
     "annealed": sensor.annealed,
+    "dynamo": surroundings.dynamo,
+    "hvdc": surroundings.hvdc,
+    "dew": sensor.dew,
+    "sampler": vehicle.sampler,
 }
 """Effect, by its name."""

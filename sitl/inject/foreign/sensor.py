@@ -117,3 +117,15 @@ def annealed(scene: Scene, size: float, rng: Generator) -> None:
     x = (warm - warm.mean()) / np.ptp(warm)
     memory = relays(x, rng.uniform(-0.5, 0.5, 60), rng.uniform(0.1, 0.5, 60))
     scene.field = scene.field + size * direction(rng) * memory[:, None]
+
+
+def dew(scene: Scene, size: float, rng: Generator) -> None:
+    """Water condenses on the electronics below the dew point, leaks current, and dries late; size in nT."""
+    warm = soaked(scene.water, scene.track.step, 300.0)
+    cold = np.maximum(np.quantile(warm, rng.uniform(0.3, 0.7)) - warm, 0.0)
+    wets, dries = scene.track.step / rng.uniform(100.0, 300.0), scene.track.step / rng.uniform(1500.0, 5000.0)
+    film, wet = 0.0, np.empty(len(cold))
+    for k, below in enumerate(cold / max(cold.max(), 1e-9)):
+        film = min(film + wets * below, 1.0) - dries * film
+        wet[k] = film
+    scene.field = scene.field + size * direction(rng) * wet[:, None]

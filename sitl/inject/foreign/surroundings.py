@@ -87,3 +87,28 @@ def astray(scene: Scene, size: float, rng: Generator) -> None:
     current = autoregressive(rng, (len(top),), 1.0, 7200.0 / scene.track.step) + rng.choice([-1.0, 1.0])
     off = current * (scene.t - fixed) / 1800.0
     scene.reference = scene.reference + size * np.interp(scene.when, scene.t, off)
+
+
+def dynamo(scene: Scene, size: float, rng: Generator) -> None:
+    """A tidal stream carries the Earth's field along, the more water lies above (Longuet-Higgins 1949).
+
+    Size in nT at the greatest depth.
+    """
+    stream = np.cos(2 * np.pi * scene.t / 44714.0 + rng.uniform(0.0, 2 * np.pi))
+    course = rng.uniform(0.0, 2 * np.pi)
+    above = scene.track.depth / scene.track.depth.max()
+    scene.earth = scene.earth + size * np.outer(stream * above, [np.cos(course), np.sin(course), 0.0])
+
+
+def hvdc(scene: Scene, size: float, rng: Generator) -> None:
+    """A direct-current cable on the bottom; its load changes by the half-hour. Size in nT at 100 m."""
+    track, t = scene.track, scene.t
+    north, east = track.local(track.latitude, track.longitude)
+    k, course = rng.integers(len(t)), rng.uniform(0.0, np.pi)
+    aside = (east - east[k]) * np.cos(course) - (north - north[k]) * np.sin(course)
+    above = track.depth.max() + rng.uniform(20.0, 60.0) - track.depth
+    traded = rng.uniform(-0.3, 1.0, int(t[-1] // 1800.0) + 1)
+    load = first_order(traded[(t // 1800.0).astype(int)], track.step, 60.0)
+    across = np.array([-np.sin(course), np.cos(course), 0.0])
+    around = np.outer(above, across) - np.outer(aside, [0.0, 0.0, 1.0])
+    scene.earth = scene.earth + size * 100.0 * (load / (aside**2 + above**2))[:, None] * around

@@ -238,3 +238,12 @@ def afterglow(scene: Scene, size: float, rng: Generator) -> None:
     warm = first_order(moved.astype(float), scene.track.step, float(rng.uniform(40.0, 200.0)))
     held = warm > rng.uniform(0.05, 0.2) * max(warm.max(), 1e-9)
     scene.field = scene.field + size * direction(rng) * held[:, None]
+
+
+def sampler(scene: Scene, size: float, rng: Generator) -> None:
+    """A water sampler's unlogged pump runs on every climb, and draws more as its filter clogs; size in nT."""
+    sinking = np.gradient(first_order(scene.track.depth, scene.track.step, 20.0), scene.track.step)
+    runs = sinking < -rng.uniform(0.02, 0.1)
+    hours = np.cumsum(runs) * scene.track.step / 3600.0
+    draws = runs * (1.0 + rng.uniform(0.05, 0.2) * hours)
+    scene.field = scene.field + size * direction(rng) * first_order(draws, scene.track.step, 5.0)[:, None]
