@@ -24,6 +24,8 @@ __all__ = ["Step", "continue_upward", "draw_steps", "hanning", "merge", "prepare
 Array = NDArray[np.float64]
 
 HANNING = np.outer([1.0, 2.0, 1.0], [1.0, 2.0, 1.0]) / 16.0
+MOST = 10_000_000
+"""Nodes of a merged map. As many, from two surveys that overlap, take 2 GB."""
 
 
 class Step(NamedTuple):
@@ -58,7 +60,8 @@ def prepare(
     Raises
     ------
     OutOfRange
-        An altitude below a grid's: continuing downward amplifies what the survey did not resolve.
+        An altitude below a grid's: continuing downward amplifies what the survey did not resolve. More
+        than :data:`MOST` nodes.
     """
     steps = [Step(f"as surveyed: {Path(grid.name).name}", grid) for grid in grids]
     known = [grid.altitude for grid in grids if isfinite(grid.altitude)]
@@ -100,7 +103,7 @@ def merge(grids: Sequence[AnomalyGrid], spacing: float | None = None) -> Anomaly
     """Return the mean of the grids wherever at least one has a value; on the finest of their spacings.
 
     Where they overlap, their differences show their errors: the mean of their variances is taken as at
-    least half of the mean squared difference.
+    least half of the mean squared difference. OutOfRange: more than :data:`MOST` nodes.
     """
     return _merged(grids, spacing)[0]
 
@@ -114,16 +117,21 @@ def _merged(grids: Sequence[AnomalyGrid], spacing: float | None) -> tuple[Anomal
     near = [(g, 360.0 * round((float(first.longitude[0]) - float(g.longitude[0])) / 360.0)) for g in grids]
     longitude = _cover([g.longitude + turn for g, turn in near], step)
     latitude = _cover([g.latitude for g in grids], step)
-    x, y = (axis.ravel() for axis in np.meshgrid(longitude, latitude))
-    shape = (latitude.size, longitude.size)
-    total, squares, variance, count = np.zeros((4, *shape))
-    for grid in grids:
-        local = grid.evaluate(x, y)
-        anomaly = np.nan_to_num(local.anomaly).reshape(shape)
-        total += anomaly
-        squares += anomaly**2
-        variance += np.nan_to_num(local.variance).reshape(shape)
-        count += np.isfinite(local.anomaly).reshape(shape)
+    size = longitude.size * latitude.size
+    if size > MOST:
+        wide = 1.05 * step * sqrt(size / MOST)
+        raise OutOfRange("map", f"{size} nodes", f"at most {MOST}: set a spacing of {wide:.2g} deg or more")
+    total, squares, variance, count = np.zeros((4, latitude.size, longitude.size))
+    for grid, turn in near:
+        columns = _reach(longitude, grid.longitude + turn)
+        x = longitude[columns]
+        for row in range(*_reach(latitude, grid.latitude).indices(latitude.size)):  # all at once: 1 kB a node
+            local = grid.evaluate(x, np.full(x.size, latitude[row]))
+            anomaly = np.nan_to_num(local.anomaly)
+            total[row, columns] += anomaly
+            squares[row, columns] += anomaly**2
+            variance[row, columns] += np.nan_to_num(local.variance)
+            count[row, columns] += np.isfinite(local.anomaly)
     shared = count > 1
     differences = 2.0 * (squares - total**2 / np.maximum(count, 1.0))[shared] / (count[shared] - 1.0)
     apart = sqrt(max(float(differences.mean()), 0.0)) if shared.any() else nan
@@ -206,3 +214,9 @@ def _cover(axes: Sequence[Array], step: float) -> Array:
     low, high = min(float(a[0]) for a in axes), max(float(a[-1]) for a in axes)
     axis: Array = low + step * np.arange(int((high - low) / step + 1e-6) + 1, dtype=float)
     return axis
+
+
+def _reach(axis: Array, own: Array) -> slice:
+    """Return where on an axis a grid with its `own` axis has values, and a node more on either side."""
+    first, last = np.searchsorted(axis, own[[0, -1]])
+    return slice(max(int(first) - 1, 0), int(last) + 1)

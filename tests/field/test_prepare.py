@@ -113,6 +113,15 @@ def test_it_is_told_how_far_surveys_are_apart():
     assert merged(west, east) == "merged, no two of them overlap"
 
 
+def test_a_map_that_would_fill_the_memory_is_refused():
+    """Two fine surveys of opposite coasts: what lies between them would be nodes as well."""
+    west = AnomalyGrid(LON, LAT, monopole(60.0))
+    east = AnomalyGrid(LON + 40.0, LAT + 10.0, monopole(60.0))
+    with pytest.raises(OutOfRange, match=r"146\d{6} nodes: at most 10000000: set a spacing of 0\.0067 deg"):
+        merge([west, east])
+    assert 1e6 < merge([west, east], spacing=0.01).anomaly.size < 1e7
+
+
 def test_merge_across_the_antimeridian():
     values = np.full((61, 50), 5.0)
     west = AnomalyGrid(LON[:50] + 238.0, LAT, values)
