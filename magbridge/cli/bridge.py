@@ -111,6 +111,7 @@ def monitor(
     host: str = "127.0.0.1",
     port: Annotated[Whole, Parameter(validator=validators.Number(gte=1, lte=65535))] = 8080,
     baudrate: Annotated[Whole, Parameter(validator=validators.Number(gt=0))] = 57600,
+    signing_key: Path | None = None,
     show: bool = False,
 ) -> None:
     """Serve the ground station's page, which shows live what a bridge measures and announces over MAVLink.
@@ -125,12 +126,15 @@ def monitor(
         The port to serve the page at.
     baudrate
         Baud rate of a serial link.
+    signing_key
+        The file of 32 bytes that the bridge has: what is sent is signed, and what is not is refused.
     show
         Open the page in a browser.
     """
+    from magbridge.mavlink import load_key
     from magbridge.monitor.page import serve
 
-    serve(link, baudrate, host, port, show=show)
+    serve(link, baudrate, host, port, key=load_key(signing_key) if signing_key else None, show=show)
 
 
 def speed_of(text: str) -> float:

@@ -8,7 +8,7 @@ from threading import Lock, Thread
 
 from magbridge.bridge.port import Port
 from magbridge.errors import PortError
-from magbridge.mavlink import Codec
+from magbridge.mavlink import Codec, Signing
 from magbridge.monitor.state import State
 
 __all__ = ["StationLink", "now"]
@@ -25,6 +25,12 @@ def now() -> float:
 class StationLink:
     """Listens to `port`, as ground station 255:190, until the process ends.
 
+    Parameters
+    ----------
+    port : Port
+    key : bytes or None
+        32 bytes: what is sent is signed, and what is not signed with it is refused.
+
     Attributes
     ----------
     state : State
@@ -33,9 +39,15 @@ class StationLink:
         Why the port is not open; empty while it is.
     """
 
-    def __init__(self, port: Port) -> None:
+    def __init__(self, port: Port, key: bytes | None = None) -> None:
         self.port, self.state, self.lock, self.trouble = port, State(), Lock(), ""
-        self._codec = Codec(255, 190)
+        self._signing = Signing(key) if key else None
+        self._codec = Codec(255, 190, self._signing)
+
+    @property
+    def refused(self) -> int:
+        """Number of frames without a valid signature."""
+        return self._signing.refused if self._signing else 0
 
     def start(self) -> None:
         """Open the port and begin; raises :class:`PortError`."""
@@ -55,6 +67,7 @@ class StationLink:
 
     def _turn(self) -> None:
         ready, _, _ = select.select(self.port.fds(), [], [], 0.1)
+        self._codec.now_us = time.time_ns() // 1000
         heard = self._codec.parse(self.port.read()) if ready else []
         moment = now()
         with self.lock:

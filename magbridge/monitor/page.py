@@ -49,7 +49,9 @@ CHART: dict[str, Any] = {
 GRID = "w-full grid gap-4 grid-cols-1"
 
 
-def serve(link: str, baudrate: int, host: str, port: int, *, show: bool) -> None:
+def serve(
+    link: str, baudrate: int, host: str, port: int, *, key: bytes | None = None, show: bool = False
+) -> None:
     """Listen to `link` and serve the page until interrupted.
 
     Raises
@@ -57,7 +59,7 @@ def serve(link: str, baudrate: int, host: str, port: int, *, show: bool) -> None
     ConfigError, PortError
         `link` is no address, or it or the page's own port cannot be opened.
     """
-    station = StationLink(open_link(link, baudrate, "magbridge monitor", "LINK"))
+    station = StationLink(open_link(link, baudrate, "magbridge monitor", "LINK"), key)
     ipv6 = ":" in host
     family, place = (socket.AF_INET6, f"[{host}]:{port}") if ipv6 else (socket.AF_INET, f"{host}:{port}")
     try:
@@ -116,7 +118,10 @@ class Page:
 
     def _refresh(self) -> None:
         with self._station.lock:
-            self._tell_stream(self._station.trouble or silence(self._state, now()))
+            quiet = silence(self._state, now())
+            if quiet and self._station.refused:
+                quiet += f"; frames refused for their signature: {self._station.refused}"
+            self._tell_stream(self._station.trouble or quiet)
             self._tell_figures()
             self._tell_flags()
             self._tell_texts()

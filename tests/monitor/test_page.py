@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from urllib.error import URLError
 from urllib.request import urlopen
@@ -16,7 +17,7 @@ from urllib.request import urlopen
 import pytest
 
 from magbridge.cli import main
-from magbridge.mavlink import Codec
+from magbridge.mavlink import Codec, Signing
 from magbridge.monitor.state import Point
 
 pytest.importorskip("nicegui")
@@ -36,11 +37,11 @@ def clock(tmp_path: Path) -> Path:
     return offset
 
 
-@pytest.fixture
-def page(clock: Path) -> Iterator[tuple[str, tuple[str, int]]]:
+@contextmanager
+def served(clock: Path, *options: str) -> Iterator[tuple[str, tuple[str, int]]]:
     link, port = free(socket.SOCK_DGRAM), free(socket.SOCK_STREAM)
     launch = [sys.executable, str(Path(__file__).parents[1] / "harness" / "stepped.py"), str(clock)]
-    command = [*launch, "monitor", f"udpin:127.0.0.1:{link}", "--port", str(port)]
+    command = [*launch, "monitor", f"udpin:127.0.0.1:{link}", "--port", str(port), *options]
     # NiceGUI looks at them
     alone = {name: value for name, value in os.environ.items() if "PYTEST" not in name}
     with subprocess.Popen(command, stderr=subprocess.PIPE, env=alone) as process:
@@ -50,6 +51,12 @@ def page(clock: Path) -> Iterator[tuple[str, tuple[str, int]]]:
         process.send_signal(signal.SIGINT)
         assert not process.stderr.read().strip()
     assert process.returncode == 0
+
+
+@pytest.fixture
+def page(clock: Path) -> Iterator[tuple[str, tuple[str, int]]]:
+    with served(clock) as running:
+        yield running
 
 
 def get(url: str) -> str:
@@ -115,6 +122,25 @@ def test_a_clock_set_back_hides_no_silence(page: tuple[str, tuple[str, int]], cl
         assert time.monotonic() < deadline
 
 
+def test_a_bridge_that_signs_is_asked_in_signed_messages(clock: Path, tmp_path: Path) -> None:
+    """And only what is signed with the same key is believed."""
+    key = bytes(range(32))
+    (tmp_path / "key").write_bytes(key)
+    bridge = Codec(1, 191, Signing(key))
+    with served(clock, "--signing-key", str(tmp_path / "key")) as (url, link):
+        get(url)
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+            sender.settimeout(10)
+            sender.sendto(Codec(1, 191).pack("MAG_FIELD", total_field=52_134.268), link)
+            deadline = time.monotonic() + 10.0
+            while "nothing heard yet; frames refused for their signature: 1" not in get(url):
+                assert time.monotonic() < deadline
+            bridge.now_us = time.time_ns() // 1000
+            sender.sendto(bridge.pack("MAG_FIELD", total_field=52_134.268), link)
+            names = [bridge.parse(sender.recv(4096))[0].name for _ in range(3)]
+        assert "PARAM_REQUEST_LIST" in names
+
+
 def test_bad_input_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = str(taken.getsockname()[1])
@@ -123,6 +149,7 @@ def test_bad_input_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
             (["/dev/nowhere"], 1, "/dev/nowhere: "),
             (["udpin:127.0.0.1:0", "--port", port], 1, f"127.0.0.1:{port}: Address already in use"),
             (["--port", "99999"], 2, "99999"),
+            (["--signing-key", "/nowhere"], 2, "/nowhere: No such file or directory"),
         ):
             assert main(["monitor", *arguments]) == code
             line = capsys.readouterr().err
