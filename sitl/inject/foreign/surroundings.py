@@ -65,15 +65,10 @@ def storm(scene: Scene, size: float, rng: Generator) -> None:
 
 def mains(scene: Scene, size: float, rng: Generator) -> None:
     """A three-phase cable on the bottom, its 50 Hz aliased by the sampling; size in nT at 100 m."""
-    track, t = scene.track, scene.t
-    north, east = track.local(track.latitude, track.longitude)
-    k, course = rng.integers(len(t)), rng.uniform(0.0, np.pi)
-    aside = (east - east[k]) * np.cos(course) - (north - north[k]) * np.sin(course)
-    above = track.depth.max() + rng.uniform(20.0, 60.0) - track.depth
-    drift = np.cumsum(autoregressive(rng, (len(t),), 0.02, 300.0 / track.step)) * track.step
-    phase = 2 * np.pi * (50.0 * t + drift)
+    aside, above, across = _cable(scene, rng)
+    drift = np.cumsum(autoregressive(rng, (len(scene.t),), 0.02, 300.0 / scene.track.step)) * scene.track.step
+    phase = 2 * np.pi * (50.0 * scene.t + drift)
     bearing = np.arctan2(aside, above)
-    across = np.array([-np.sin(course), np.cos(course), 0.0])
     turning = np.outer(np.cos(phase + 2 * bearing), across) + np.outer(
         np.sin(phase + 2 * bearing), [0.0, 0.0, 1.0]
     )
@@ -102,13 +97,18 @@ def dynamo(scene: Scene, size: float, rng: Generator) -> None:
 
 def hvdc(scene: Scene, size: float, rng: Generator) -> None:
     """A direct-current cable on the bottom; its load changes by the half-hour. Size in nT at 100 m."""
-    track, t = scene.track, scene.t
-    north, east = track.local(track.latitude, track.longitude)
-    k, course = rng.integers(len(t)), rng.uniform(0.0, np.pi)
-    aside = (east - east[k]) * np.cos(course) - (north - north[k]) * np.sin(course)
-    above = track.depth.max() + rng.uniform(20.0, 60.0) - track.depth
-    traded = rng.uniform(-0.3, 1.0, int(t[-1] // 1800.0) + 1)
-    load = first_order(traded[(t // 1800.0).astype(int)], track.step, 60.0)
-    across = np.array([-np.sin(course), np.cos(course), 0.0])
+    aside, above, across = _cable(scene, rng)
+    traded = rng.uniform(-0.3, 1.0, int(scene.t[-1] // 1800.0) + 1)
+    load = first_order(traded[(scene.t // 1800.0).astype(int)], scene.track.step, 60.0)
     around = np.outer(above, across) - np.outer(aside, [0.0, 0.0, 1.0])
     scene.earth = scene.earth + size * 100.0 * (load / (aside**2 + above**2))[:, None] * around
+
+
+def _cable(scene: Scene, rng: Generator) -> tuple[Array, Array, Array]:
+    """Lay a straight cable below the track: m aside and above (n,), and north-east-down across it."""
+    track = scene.track
+    north, east = track.local(track.latitude, track.longitude)
+    k, course = rng.integers(len(north)), rng.uniform(0.0, np.pi)
+    aside = (east - east[k]) * np.cos(course) - (north - north[k]) * np.sin(course)
+    above = track.depth.max() + rng.uniform(20.0, 60.0) - track.depth
+    return aside, above, np.array([-np.sin(course), np.cos(course), 0.0])
