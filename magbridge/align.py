@@ -222,6 +222,7 @@ class Aligner:
                 quality |= MOVING
                 spans.append((index, before, value))
         sigma = variance**0.5
+        # the two low bits of a time belong to the log
         return Sample(sample_us - sample_us % 4, field, tuple(values), oldest, quality, sigma, tuple(spans))
 
     def _common_time(self, reading: Reading, time_us: int) -> tuple[Vector, int]:

@@ -98,10 +98,19 @@ def test_stale_telemetry_is_flagged_and_its_sigma_grows() -> None:
 
 
 def test_telemetry_never_seen_spans_the_whole_range() -> None:
-    sample = Aligner((BATTERY,), Align()).reading(reading(), START)
+    ballast = Input("ballast", -1.0, 3.0, max_age=10.0)
+    sample = Aligner((ballast,), Align()).reading(reading(), START)
     assert flags(sample) == {"stale_telemetry"}
-    assert sample.spans == ((0, -1.0, 1.0),)
+    assert sample.values == (1.0,)  # the middle of the range
+    assert sample.spans == ((0, -1.0, 3.0),)
     assert sample.age == inf
+
+
+def test_before_the_first_telemetry_its_age_is_the_time_until_then() -> None:
+    aligner = Aligner((BATTERY,), Align(filter_delay=5.0))
+    aligner.telemetry("battpos", START, 0.3)
+    sample = aligner.reading(reading(), START + 2 * SECOND)
+    assert (sample.values, sample.age) == ((0.3,), pytest.approx(3.0))
 
 
 def test_nan_telemetry_keeps_the_last_value_but_flags() -> None:
@@ -117,11 +126,14 @@ def test_nan_telemetry_keeps_the_last_value_but_flags() -> None:
 
 def test_a_moving_mass_is_flagged_until_it_rests() -> None:
     aligner = Aligner((BATTERY,), Align(settle_time=3.0))
-    seen = []
+    seen, before = [], 0.0
     for k in range(20):
         position = min(max(k - 5, 0), 5) * 0.1  # moves from 5 s to 10 s
         aligner.telemetry("battpos", START + k * SECOND, position)
-        seen.append("moving" in flags(aligner.reading(reading(), START + k * SECOND)))
+        sample = aligner.reading(reading(), START + k * SECOND)
+        seen.append("moving" in flags(sample))
+        assert sample.spans == (((0, before, position),) if seen[-1] else ())
+        before = position
     assert seen == [False] * 6 + [True] * 5 + [True] * 3 + [False] * 6
 
 
