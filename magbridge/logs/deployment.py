@@ -209,12 +209,12 @@ def join(parts: Sequence[xr.Dataset]) -> xr.Dataset:
     described: dict[str, dict[str, Any]] = {}
     for part in parts:
         for name in part.data_vars:
-            attrs = described.setdefault(str(name), part[name].attrs)
-            if attrs.get("units") != part[name].attrs.get("units"):
+            own = part.variables[name].attrs
+            attrs = described.setdefault(str(name), own)
+            if attrs.get("units") != own.get("units"):
                 raise FormatError(
                     part.attrs.get("source", ""),
-                    f"expected {attrs.get('units')} as in the files before, not "
-                    f"{part[name].attrs.get('units')}",
+                    f"expected {attrs.get('units')} as in the files before, not {own.get('units')}",
                     column=str(name),
                 )
     time = np.concatenate([part["time"].values for part in parts])
@@ -224,7 +224,10 @@ def join(parts: Sequence[xr.Dataset]) -> xr.Dataset:
     variables = {}
     for name, attrs in described.items():
         values = np.concatenate(
-            [part[name].values if name in part else np.full(part.sizes["time"], np.nan) for part in parts]
+            [
+                part.variables[name].values if name in part else np.full(part.sizes["time"], np.nan)
+                for part in parts
+            ]
         )[order]
         variables[name] = ("time", _first_known(values, starts), attrs)
     attrs = _join_attrs([part.attrs for part in parts])
@@ -265,9 +268,9 @@ def _join_attrs(all_attrs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
             if (other := attrs.get(key, default)) != first:
                 raise FormatError(attrs.get("source", ""), f"expected {key} {first} as before, not {other}")
     joined: dict[str, Any] = {}
-    sources: list[str] = []
+    sources: dict[str, None] = {}
     for attrs in all_attrs:
-        sources += [name for name in str(attrs.get("source", "")).split(", ") if name not in sources]
+        sources |= dict.fromkeys(str(attrs.get("source", "")).split(", "))
         for key, value in attrs.items():
             if key in COUNTERS and key in joined:
                 joined[key] += value

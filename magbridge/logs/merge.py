@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
@@ -18,13 +19,15 @@ def merge(sources: Sequence[Open], rows: int) -> Iterator[xr.Dataset]:
     """Yield the logs that `sources` open as one deployment in pieces, sorted in time, with the same columns.
 
     Each log is opened twice: once for its first row, which gives its start and its columns, and once when the
-    stream has reached that start.
+    stream has reached that start. Short pieces, as of many short logs, are joined to pieces of `rows` rows.
     """
     firsts = [next(source(1)) for source in sources]
     whole = join(firsts)  # also checks that they agree on units and on what heading means
     columns = {str(name): dict(whole[name].attrs) for name in whole.data_vars}
-    waiting = sorted((float(first["time"][0]), k) for k, first in enumerate(firsts))
+    waiting = deque(sorted((float(first["time"].values[0]), k) for k, first in enumerate(firsts)))
     active: dict[int, tuple[xr.Dataset, Iterator[xr.Dataset]]] = {}
+    parts: list[xr.Dataset] = []
+    held = 0
 
     def advance(k: int, pieces: Iterator[xr.Dataset]) -> None:
         piece = next(pieces, None)
@@ -33,21 +36,28 @@ def merge(sources: Sequence[Open], rows: int) -> Iterator[xr.Dataset]:
         else:
             active[k] = piece, pieces
 
+    def joined() -> xr.Dataset:
+        # a file's attributes are those of the first piece, and must name all sources
+        return same_columns(join(parts), columns).assign_attrs(source=whole.attrs["source"])
+
     while waiting or active:
         # no log can add another row up to the horizon
-        horizon = min((float(piece["time"][-1]) for piece, _ in active.values()), default=np.inf)
+        horizon = min((float(piece["time"].values[-1]) for piece, _ in active.values()), default=np.inf)
         if waiting and waiting[0][0] <= horizon:
-            _, k = waiting.pop(0)
+            _, k = waiting.popleft()
             advance(k, sources[k](rows))
             continue
-        parts = []
         for k, (piece, pieces) in sorted(active.items()):
             n = int(np.searchsorted(piece["time"].values, horizon, side="right"))
-            parts.append(piece.isel(time=slice(0, n)))
+            held += n
             if n == piece.sizes["time"]:
+                parts.append(piece)
                 advance(k, pieces)
-            else:
+            elif n:
+                parts.append(piece.isel(time=slice(0, n)))
                 active[k] = uncounted(piece.isel(time=slice(n, None))), pieces
-        piece = join([part for part in parts if part.sizes["time"]])
-        # a file's attributes are those of the first piece, and must name all sources
-        yield same_columns(piece, columns).assign_attrs(source=whole.attrs["source"])
+        if held >= rows:
+            yield joined()
+            parts, held = [], 0
+    if parts:
+        yield joined()

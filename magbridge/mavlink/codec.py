@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from magbridge.mavlink.framing import MAGIC, MORE, frame_end, join, message
+from magbridge.mavlink.framing import MORE, find_magic, frame_end, join, message
 from magbridge.mavlink.messages import BAD_DATA, REFUSED, Message, Spec, spec
 from magbridge.mavlink.signing import Signing
 
@@ -60,16 +60,15 @@ class Codec:
         begin, at = 0, self._looked  # begin: end of the last frame; at: no frame begins before
         while begin < len(data):
             stop = min(len(data), begin + WINDOW)
-            match = MAGIC.search(data, at, stop)
-            start = match.start() if match else stop
-            end = frame_end(data, start, stop) if match else MORE
+            start = find_magic(data, at, stop)
+            end = frame_end(data, start, stop) if start < stop else MORE
             if end > 0:
                 if begin < start:
                     found.append(self._skip(data[begin:start]))
                 found.append(self._accept(message(data[start:end])))
                 begin = at = end
-            elif match and end != MORE:
-                at = match.end()
+            elif end != MORE:
+                at = start + 1
             elif stop == begin + WINDOW:
                 found.append(self._skip(data[begin:stop]))
                 begin = at = stop

@@ -8,7 +8,7 @@ from typing import BinaryIO
 
 import msgspec
 
-from magbridge.mavlink.framing import MAGIC, MORE, frame_end, message
+from magbridge.mavlink.framing import MAGIC, MORE, NOT_A_FRAME, find_magic, frame_end, message
 from magbridge.mavlink.messages import Message
 
 __all__ = ["LogReader", "Record", "pack_record"]
@@ -17,6 +17,8 @@ STAMP = Struct(">Q")
 LATEST = 1 << 52
 """us; a stamp beyond the year 2112 is damage."""
 CHUNK = 1 << 20
+STEP = 4096
+"""Bytes of damage to search at once for the next record."""
 
 
 class Record(msgspec.Struct, frozen=True, gc=False):
@@ -75,8 +77,8 @@ class LogReader:
             last = not chunk
             data, at = data[at:] + chunk, 0
             while len(data) - at > 8:
-                match = MAGIC.match(data, at + 8)
-                end = frame_end(data, at + 8, len(data), 8, last=last) if match else 0
+                begins = data[at + 8] in MAGIC
+                end = frame_end(data, at + 8, len(data), 8, last=last) if begins else NOT_A_FRAME
                 if end == MORE and not last:
                     break
                 stamp = STAMP.unpack_from(data, at)[0]
@@ -85,8 +87,7 @@ class LogReader:
                     yield Record(stamp & ~3, stamp & 3, data[at + 8 : end])
                     at, whole = end, True
                     continue
-                match = MAGIC.search(data, at + 9)
-                following = match.start() - 8 if match else max(at + 1, len(data) - 8)
+                following = find_magic(data, at + 9, min(at + 9 + STEP, len(data))) - 8
                 self.damages += whole
                 self.bytes_skipped += following - at
                 at, whole = following, False
