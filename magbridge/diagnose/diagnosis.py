@@ -80,6 +80,7 @@ class Diagnosis:
         Of all findings together.
     isolability : Isolability
     verdict : str
+        As in ``findings.json``: ``explained`` only where what was left out of the fit shows a gain.
     """
 
     problem: Problem

@@ -21,7 +21,7 @@ from magbridge.diagnose.compare.survey import Survey
 from magbridge.diagnose.compare.take import take
 from magbridge.diagnose.diagnosis import Diagnosis, Finding
 from magbridge.diagnose.extend import extend, flyable, relinearised, with_map_error, with_misfit
-from magbridge.diagnose.gain import held_out, paired
+from magbridge.diagnose.gain import Gain, held_out, paired
 from magbridge.diagnose.inference.accept import accept
 from magbridge.diagnose.inference.evidence import ODDS, REMNANT
 from magbridge.diagnose.inference.isolability import isolability
@@ -136,12 +136,13 @@ def _examine(
             named, rivals, model, fit, after, extended = (), (), [], outcome.null, before, calibration
             rest = leftover(problem, [], outcome.null, outcome.order, tone)
     rest = rest or _loud(problem, after, counts)
+    total = paired(before, after, problem.survey.dive, counts)
     return Diagnosis(
         problem=problem, outcome=outcome, findings=_findings(problem, named, rivals, fit, after, counts),
         wrong=wrong, unexplained=rest, calibration=extended, fit=fit, before=before, after=after,
-        total=paired(before, after, problem.survey.dive, counts),
+        total=total,
         isolability=isolability(candidates, outcome.info, outcome.trials, len(causes), untestable),
-        verdict=_verdict(named, wrong, rest),
+        verdict=_verdict(named, wrong, rest, total),
     )  # fmt: skip
 
 
@@ -226,7 +227,8 @@ def _without(fit: Joint, own: slice) -> Joint:
     return replace(fit, coefficients=np.delete(fit.coefficients, own), prior=prior)
 
 
-def _verdict(named: Sequence[Hypothesis], wrong: Outliers | None, rest: Leftover | None) -> str:
+def _verdict(named: Sequence[Hypothesis], wrong: Outliers | None, rest: Leftover | None, total: Gain) -> str:
+    """Say which verdict of ``findings.json`` it is; names that gain nothing held out explain only in part."""
     if named or wrong:
-        return "partly_explained" if rest else "explained"
+        return "partly_explained" if rest or (named and not total.shown) else "explained"
     return "unexplained" if rest else "nothing_found"

@@ -15,9 +15,12 @@ from magbridge.diagnose.compare.prior import isotropic
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.gain import Gain
 from magbridge.diagnose.inference.rivals import Rival
+from magbridge.diagnose.inference.search import Hypothesis
 from magbridge.diagnose.inference.unexplained import Leftover
 from magbridge.diagnose.report.doubts import IMPLAUSIBLE, gained, implausible, nameless, no_gain, unsettled
+from magbridge.diagnose.report.found import _folded
 from magbridge.diagnose.report.words import chance, measured, number, physics, row, sizes
+from magbridge.diagnose.run import _verdict
 
 
 @pytest.mark.parametrize("cause", CAUSES)
@@ -87,7 +90,7 @@ def test_sizes_of_one_unit_name_it_once() -> None:
     }
     assert sizes(smallest) == "x 0.555, z 0.2 nT/degC, delay 1 s"
     assert sizes({f"c{k}": (1.0, "nT") for k in range(30)}) == "c0 1, c1 1, c2 1 nT, and 27 more"
-    assert sizes({"x": (np.inf, "nT")}) == "invisible"
+    assert sizes({"x": (np.inf, "nT")}) == "no plausible size reaches it"
 
 
 def test_a_cause_that_is_larger_than_such_causes_are_is_doubted() -> None:
@@ -107,6 +110,21 @@ def test_a_gain_that_does_not_show_is_said_to_be_none() -> None:
     assert gained(much, "dives").endswith("(ratio 0.65, 95 % interval 0.48 to 0.83).")
     assert no_gain(none)
     assert not no_gain(much)
+
+
+def test_names_that_gain_nothing_explain_only_in_part(right: Callable[[int], Problem]) -> None:
+    """As where a survey is diagnosed with the calibration that was fitted to it."""
+    candidate = CAUSES["reference_bias"].candidates(right(100))[0]
+    named = [Hypothesis(candidate, ratio=25.0, evidence=9.0, p_value=1e-3, fit=None)]
+    gains = [Gain(588.1, 587.3, 0.999, (0.863, upper)) for upper in (1.021, 0.999)]
+    assert [_verdict(named, None, None, gain) for gain in gains] == ["partly_explained", "explained"]
+    assert _verdict([], None, None, gains[0]) == "nothing_found"
+
+
+def test_a_long_table_of_terms_is_folded_to_a_line() -> None:
+    terms = {f"x{k}": {"value": float(k), "sigma": 1.0} for k in range(15)}
+    assert _folded("table", terms).startswith("<details><summary>15 terms, 12 of them beyond 2 sigma<")
+    assert _folded("table", dict(list(terms.items())[:9])) == "table"
 
 
 def test_a_shift_of_the_whole_field_beside_a_wrong_reference_is_told(right: Callable[[int], Problem]) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from magbridge.calibration.residual import rms
 from magbridge.diagnose.report import figures
@@ -89,7 +89,7 @@ def _cause(diagnosis: Diagnosis, finding: Finding, cause: Cause) -> list[str]:
         ),
         _folded(
             f"<table><tr><th>term</th><th>value</th><th>1 sigma</th><th>unit</th></tr>{rows}</table>",
-            len(numbers),
+            numbers,
         ),
         several(candidate.names),
         implausible(candidate, finding.coefficients),
@@ -102,6 +102,11 @@ def _cause(diagnosis: Diagnosis, finding: Finding, cause: Cause) -> list[str]:
     ]
 
 
-def _folded(table: str, size: int) -> str:
-    """Fold a table that is too long to be read line by line."""
-    return table if size <= MANY else f"<details><summary>{size} terms</summary>{table}</details>"
+def _folded(table: str, numbers: Mapping[str, Mapping[str, Any]]) -> str:
+    """Fold a table that is too long to be read line by line: its terms count together, few by themselves."""
+    if len(numbers) <= MANY:
+        return table
+    clear = sum(abs(one["value"]) > 2.0 * one["sigma"] for one in numbers.values() if one["sigma"])
+    return (
+        f"<details><summary>{len(numbers)} terms, {clear} of them beyond 2 sigma</summary>{table}</details>"
+    )

@@ -139,6 +139,7 @@ def _sentence(diagnosis: Diagnosis) -> str:
     names = f"Found: {', '.join(causes)}. {gained(total, diagnosis.problem.survey.parts)}"
     rest = diagnosis.unexplained
     withheld = rest.within if rest else ()
+    nothing_else = "Nothing else stands out of the noise."
     louder = rest and all(rest.signal_to_noise > one.signal_to_noise for one in diagnosis.findings)
     name = (
         f"no name is asserted; not ruled out: {listed(withheld)}"
@@ -148,9 +149,11 @@ def _sentence(diagnosis: Diagnosis) -> str:
     return {
         "nothing_found": f"Nothing was found: {number(total.before)} nT RMS is consistent with noise "
         f"({number(float(np.std(diagnosis.fit.left)))} nT) and the calibration's stated uncertainty.",
-        "explained": f"{names} Nothing else stands out of the noise.",
+        "explained": f"{names} {nothing_else}",
         "partly_explained": f"{names} {'Something stronger' if louder else 'Something else'} is left that no "
-        "known cause explains.",
+        "known cause explains."
+        if rest
+        else f"{names} {nothing_else}",
         "unexplained": f"An effect is present ({number(total.before)} nT RMS), but {name}.",
     }[diagnosis.verdict]
 
@@ -207,7 +210,9 @@ def _isolability(diagnosis: Diagnosis) -> list[str]:
             '<p class="faint">Computed from telemetry, attitude and noise alone: how large each effect must '
             "be to be found in 95 of 100 deployments like this one, and which causes look alike in it. "
             "Signal-to-noise (S/N) is the size of an effect over the whole log, in units of the noise, less "
-            "the part that the calibration can imitate.</p>"
+            "the part that the calibration can imitate. A cause that the log hardly excites, as a delay "
+            "while no mass moves, does not reach it at any plausible size (at most 50 times the usual "
+            "one).</p>"
         ),
         (
             "<table><tr><th>cause</th><th>50 % at S/N</th><th>95 % at S/N</th>"

@@ -32,7 +32,7 @@ __all__ = [
 ]
 
 RAISED = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
-MANY = 24
+MANY = 12
 """Numbers that a table shows unfolded."""
 
 
@@ -101,7 +101,7 @@ def chance(p_value: float) -> str:
 
 
 def sizes(smallest: Mapping[str, tuple[float, str]]) -> str:
-    """Return sizes in words from values and units by name, without infinite ones: nothing would show them."""
+    """Return sizes in words from values and units by name; an infinite one is left out."""
     seen = [(name, size, unit) for name, (size, unit) in smallest.items() if isfinite(size)]
     shown = seen if len(seen) <= MANY else seen[:3]
     texts = [
@@ -110,7 +110,7 @@ def sizes(smallest: Mapping[str, tuple[float, str]]) -> str:
     ]
     if len(shown) < len(seen):
         texts.append(f"and {len(seen) - len(shown)} more")
-    return ", ".join(texts) or "invisible"
+    return ", ".join(texts) or "no plausible size reaches it"
 
 
 def figure(png: str | None, caption: str) -> str:
