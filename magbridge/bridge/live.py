@@ -64,13 +64,15 @@ class LiveEdge:
         while not self._stopping:
             wait = (min(deadline(), look_us) - self._clock.now_us()) * 1e-6
             lines = {fd: channel for channel, port in self._ports.items() for fd in port.fds()}
-            blocked = [fd for port in self._ports.values() for fd in port.blocked()]
+            full = [channel for channel, port in self._ports.items() if port.waiting]
+            blocked = [fd for channel in full for fd in self._ports[channel].blocked()]
             try:
                 ready = select.select([*lines, self._woken], blocked, [], max(wait, 0.0))[0]
             except (OSError, ValueError):  # a descriptor was closed between asking for it and waiting
                 continue
             now_us = self._clock.now_us()
-            self._flush()
+            for channel in full:
+                self._flush(channel)
             if self._woken in ready:
                 os.read(self._woken, 4096)
             while not self._changes.empty():  # the news that a port opened comes before its data
@@ -100,13 +102,12 @@ class LiveEdge:
         except PortError as error:
             self._lost(channel, error)
 
-    def _flush(self) -> None:
+    def _flush(self, channel: Channel) -> None:
         """Go on sending what waits for a slow line."""
-        for channel, port in self._ports.items():
-            try:
-                port.flush()
-            except PortError as error:
-                self._lost(channel, error)
+        try:
+            self._ports[channel].flush()
+        except PortError as error:
+            self._lost(channel, error)
 
     def tell(self, state: bytes) -> None:
         """Add a state frame to the events; from any thread."""

@@ -50,11 +50,16 @@ class Port(ABC):
     def write(self, data: bytes) -> None:
         """Send each message in `data` whole or drop it; raises :class:`PortError` when the port is gone."""
 
+    @property
+    def waiting(self) -> bool:
+        """Whether something waits that a slow line had no room for."""
+        return False
+
     def flush(self) -> None:  # noqa: B027 - most ports keep nothing
-        """Go on sending what a slow line had no room for; raises :class:`PortError` when the port is gone."""
+        """Go on sending what is waiting; raises :class:`PortError` when the port is gone."""
 
     def blocked(self) -> list[int]:
-        """Return the file descriptors that take more of that once they are writable."""
+        """Return the file descriptors that take more of what is waiting once they are writable."""
         return []
 
     def write_all(self, data: bytes) -> None:

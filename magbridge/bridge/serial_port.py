@@ -43,7 +43,6 @@ class SerialPort(Stream):
         self._serial: Any = None
         self._fd = -1
         self._pump: _Pump | None = None
-        self._begun = bytearray()
 
     @property
     def up(self) -> bool:

@@ -46,7 +46,7 @@ class Stream(Port):
 
     def write(self, data: bytes) -> None:
         """Send messages, each whole or not at all; those for which there is no room wait."""
-        free = not (self._begun or self._waiting) and len(data) <= self._piece
+        free = not self.waiting and len(data) <= self._piece
         if free and self._room():  # as on most lines at most times: nothing need be cut into messages
             self._begun += data[self._put(data) :]
             return
@@ -58,16 +58,21 @@ class Stream(Port):
             while len(self._waiting) > MOST // 2:
                 self.overran(self._waiting.popleft().frame)
 
+    @property
+    def waiting(self) -> bool:
+        """Whether a message, or the rest of one, waits for room."""
+        return bool(self._begun or self._waiting)
+
     def flush(self) -> None:
         """Send of what waits as much as there is room for."""
-        while (self._begun or self._waiting) and self._room():
+        while self.waiting and self._room():
             if not self._begun:
                 self._begin()
             del self._begun[: self._put(self._begun)]
 
     def blocked(self) -> list[int]:
-        """Return the descriptor that takes more once it is writable, if anything waits for that."""
-        return self.fds()[-1:] if self._begun or self._waiting else []
+        """Return the descriptor that takes more once it is writable."""
+        return self.fds()[-1:]
 
     @abstractmethod
     def _room(self) -> bool:
