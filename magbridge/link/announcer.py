@@ -15,7 +15,7 @@ CHUNK = 50
 LATELY = 32
 """Texts that are kept for a terminal."""
 PAUSE_US = 1_000_000
-"""us between two announcements of a state that changes quickly; the latest is always announced."""
+"""µs between two announcements of a state that changes quickly; the latest is always announced."""
 
 
 class Announcer:

@@ -10,12 +10,12 @@ __all__ = ["VehicleClock"]
 WINDOW = 32
 """Latest exchanges that are used."""
 JITTER_US = 200.0
-"""us, the uncertainty of even the fastest exchange."""
+"""µs, the uncertainty of even the fastest exchange."""
 STEP_US, DRIFT = 20_000, 500e-6
-"""us, us/us: a clock was set if the offsets of two exchanges differ by more than half of both round trips,
+"""µs, µs/µs: a clock was set if the offsets of two exchanges differ by more than half of both round trips,
 plus this step, plus this drift over the time between them."""
 SPAN_US = 10_000_000
-"""us that the exchanges must span before a drift is estimated."""
+"""µs that the exchanges must span before a drift is estimated."""
 PENDING = 8
 
 
@@ -94,7 +94,7 @@ class VehicleClock:
         self.sigma = sqrt(1.0 / s) * 1e-6
 
     def offset_us(self, t_us: int) -> float:
-        """Return the vehicle's clock minus ours at `t_us` (ours), in us; 0 while unknown."""
+        """Return the vehicle's clock minus ours at `t_us` (ours), in µs; 0 while unknown."""
         return self._base_us + (self._offset + self._slope * (t_us - self._middle_us))
 
     def ours(self, vehicle_us: int, t_us: int, wrap_us: int = 0) -> int:
@@ -107,7 +107,7 @@ class VehicleClock:
         t_us : int
             When the message came.
         wrap_us : int
-            us after which the message's time field wraps to 0; 0: never.
+            µs after which the message's time field wraps to 0; 0: never.
         """
         offset_us = round(self.offset_us(t_us))
         if wrap_us:

@@ -31,7 +31,7 @@ class Commands:
         What can be requested, by message id; sends the message, and returns False where there is nothing to
         send yet.
     interval_us : callable
-        Interval of a message id in us: -1 off, 0 unknown; KeyError where it has none.
+        Interval of a message id in µs: -1 off, 0 unknown; KeyError where it has none.
     set_rate : callable
         Takes a message id and a rate in Hz (-1 off, None for the default); returns whether it is allowed.
         KeyError where the message has no rate.

@@ -65,7 +65,7 @@ class Component:
     tunables : iterable of Tunable
         What can be tuned besides the messages' rates.
     start_us : int
-        Event time of the start, in us; a multiple of 4.
+        Event time of the start, in µs; a multiple of 4.
     signing : Signing or None
     calibration_id : int
         CRC-32 of the calibration's file; 0 is none.
@@ -146,7 +146,7 @@ class Component:
 
     @property
     def next_deadline(self) -> int:
-        """Event time in us by which :meth:`advance` has something to do."""
+        """Event time in µs by which :meth:`advance` has something to do."""
         return self.timers.next_deadline
 
     def advance(self, t_us: int) -> None:

@@ -26,7 +26,7 @@ class Fix(msgspec.Struct, frozen=True, gc=False):
     Attributes
     ----------
     time_us : int
-        us since 1970 UTC at which it holds.
+        µs since 1970 UTC at which it holds.
     age : float
         s, since then.
     latitude, longitude : float

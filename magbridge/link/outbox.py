@@ -17,7 +17,7 @@ class Outbox:
     codec : Codec
         Its ``now_us`` is the event time that the next frame gets.
     frames : list of (int, bytes)
-        Event time in us, frame; in the order in which to send.
+        Event time in µs, frame; in the order in which to send.
     """
 
     def __init__(self, codec: Codec) -> None:

@@ -14,7 +14,7 @@ from magbridge.mavlink.dialect import MAV_PARAM_TYPE, MAV_SEVERITY
 __all__ = ["ParameterService"]
 
 PACE_US = 20_000
-"""us between the values of a list: 50 a second, which a slow radio can carry."""
+"""µs between the values of a list: 50 a second, which a slow radio can carry."""
 
 
 class ParameterService:

@@ -41,22 +41,8 @@ def alignment(align: Align) -> list[Tunable]:
     """Return the tunables of ``[align]``."""
     rows = (
         ("MB_FILT_DELAY", "filter_delay", 0, 60, "s", "delay of the anti-alias filter"),
-        (
-            "MB_GAP_FACTOR",
-            "gap_factor",
-            1.01,
-            1000,
-            "",
-            "sample periods without a sample that count as a gap",
-        ),
-        (
-            "MB_MOVING_RATE",
-            "moving_rate",
-            1e-6,
-            10,
-            "1/s",
-            "rate of change, in ranges per second, that counts as motion",
-        ),
+        ("MB_GAP_FACTOR", "gap_factor", 1.01, 1000, "", "sample periods without a sample that are a gap"),
+        ("MB_MOVING_RATE", "moving_rate", 1e-6, 10, "1/s", "ranges per second from which on a mass moves"),
         ("MB_SETTLE_TIME", "settle_time", 0, 3600, "s", "how long samples stay flagged after a motion"),
         ("MB_STALE_GROW", "stale_growth", 0, 1e4, "nT/s", "growth of sigma with the age of stale telemetry"),
         ("MB_TURNON_SIGMA", "turn_on_sigma", 0, 1e5, "nT", "1-sigma of the offset's change at power-on"),

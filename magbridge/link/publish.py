@@ -34,10 +34,10 @@ class Sample(msgspec.Struct, frozen=True, gc=False):
     ----------
     reading : Reading
     reading_us : int
-        us, our time at the reading's ``device_time``.
+        µs, our time at the reading's ``device_time``.
     corrected : Corrected
     time_us : int
-        us, our time of the corrected sample.
+        µs, our time of the corrected sample.
     telemetry_age : float
         s, of the oldest parameter in the correction; infinite where one never came.
     anomaly : float
@@ -63,7 +63,7 @@ class Publisher:
     calibration_id : int
         CRC-32 of the calibration's file; 0 is none.
     start_us : int
-        us, when the bridge started: NAMED_VALUE_FLOAT counts from there.
+        µs, when the bridge started: NAMED_VALUE_FLOAT counts from there.
     """
 
     def __init__(
@@ -73,7 +73,7 @@ class Publisher:
         self._calibration_id, self._start_us = calibration_id, start_us
         self._messages = [(rates[name], getattr(self, method)) for name, method in PUBLISHED.items()]
         self.utc_offset_us = 0
-        """us that the host's clock was set by since the start: added to every UNIX time that is sent."""
+        """µs that the host's clock was set by since the start: added to every UNIX time that is sent."""
         self.latest: Sample | None = None
         self.samples = 0
 

@@ -58,7 +58,7 @@ class Reports:
     outbox : Outbox
     vehicle : Vehicle
     start_us : int
-        us, when the bridge started.
+        µs, when the bridge started.
     version : str
         Of the program, ``"0.1.0"``.
     calibration_id : int
@@ -127,6 +127,6 @@ class Reports:
         )
 
     def sample_interval_us(self) -> int:
-        """Return the recent mean interval between samples in us; 0 while unknown."""
+        """Return the recent mean interval between samples in µs; 0 while unknown."""
         rate = self._status().sample_rate
         return round(1e6 / rate) if rate > 0 else 0

@@ -21,7 +21,7 @@ class Kept(msgspec.Struct, frozen=True):
     parameters : dict of str to float
         Values that differ from the configuration's.
     signing_timestamp : int
-        The last that was used (10 us since 2015-01-01).
+        The last that was used (10 µs since 2015-01-01).
     """
 
     parameters: dict[str, float] = {}

@@ -17,7 +17,7 @@ __all__ = ["TelemetryMap"]
 
 Value = tuple[str, float, int]
 YEAR_2001_US = 10**15
-"""us; a 64-bit time beyond it counts from 1970 and not from the boot."""
+"""µs; a 64-bit time beyond it counts from 1970 and not from the boot."""
 
 
 class Extractor:
@@ -106,7 +106,7 @@ class TelemetryMap:
             self._times[layout.id] = own_time(layout)
 
     def values(self, message: Message, t_us: int, clock: VehicleClock) -> list[Value]:
-        """Return ``(name, value, time in us)`` of every parameter in `message`, received at `t_us`.
+        """Return ``(name, value, time in µs)`` of every parameter in `message`, received at `t_us`.
 
         The time is the message's own where it has one and the autopilot's clock is known, else `t_us`. A
         value that the sender marks as not known is NaN.
@@ -134,7 +134,7 @@ class TelemetryMap:
 
 
 def own_time(layout: Spec) -> Callable[[bytes], tuple[int, int]] | None:
-    """Return a function that reads a message's own time and the us after which it wraps, or None."""
+    """Return a function that reads a message's own time and the µs after which it wraps, or None."""
     for name, unit_us in (("time_boot_ms", 1000), ("time_usec", 1)):
         field = layout.fields.get(name)
         if field is None:

@@ -12,7 +12,7 @@ __all__ = ["Vehicle"]
 
 HEARTBEAT = spec("HEARTBEAT").id
 ABSENT_US = 5_000_000
-"""us without a heartbeat after which the autopilot counts as gone."""
+"""µs without a heartbeat after which the autopilot counts as gone."""
 BACK_MS = 1_000
 """ms by which ``time_boot_ms`` must go back to mean more than packets out of order."""
 BELIEVED = 3
@@ -23,7 +23,7 @@ ALL = (1 << WINDOW) - 1
 LEAP_MS = 10_000
 """ms by which ``time_boot_ms`` may run ahead of our clock before it counts as another autopilot's."""
 TWICE, CHANGES_US = 5, 10_000_000
-"""This many changes between two boot clocks within this many us mean that there are two autopilots."""
+"""This many changes between two boot clocks within this many µs mean that there are two autopilots."""
 BOOT_TIMES = {
     number: spec(number).fields["time_boot_ms"]
     for number, row in MESSAGES.items()

@@ -2,7 +2,7 @@
 
 Notes
 -----
-The signature is a link id, a time stamp ``t`` (48 bit, units of 10 us since 2015-01-01) and the first 6 bytes
+The signature is a link id, a time stamp ``t`` (48 bit, units of 10 µs since 2015-01-01) and the first 6 bytes
 of ``SHA-256(key + frame + link id + t)``. Stamps of one stream (link id, system, component) must increase. A
 stamp counts only once its hash has proved right: otherwise one forged packet from the future would lock out
 every genuine one that follows, as it does in pymavlink 2.4.50.
@@ -18,16 +18,16 @@ from magbridge.errors import ConfigError
 __all__ = ["Signing", "load_key", "timestamp"]
 
 EPOCH_US = 1_420_070_400_000_000
-"""2015-01-01 in us of UNIX time."""
+"""2015-01-01 in µs of UNIX time."""
 MINUTE = 6_000_000
-"""in units of 10 us"""
+"""in units of 10 µs"""
 LIMIT = (1 << 48) - 1
 NEED_NO_SIGNATURE = frozenset({109})
 """RADIO_STATUS: radios put it on the link, and they have no key."""
 
 
 def timestamp(t_us: int) -> int:
-    """Return the signing time stamp of a UNIX time in us."""
+    """Return the signing time stamp of a UNIX time in µs."""
     return min(max(t_us - EPOCH_US, 0) // 10, LIMIT)
 
 

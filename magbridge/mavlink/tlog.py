@@ -1,4 +1,4 @@
-"""Telemetry logs: each record an 8-byte big-endian time stamp (us of UNIX time) and one MAVLink frame."""
+"""Telemetry logs: each record an 8-byte big-endian time stamp (µs of UNIX time) and one MAVLink frame."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ __all__ = ["LogReader", "Record", "pack_record"]
 
 STAMP = Struct(">Q")
 LATEST = 1 << 52
-"""us; a stamp beyond the year 2112 is damage."""
+"""µs; a stamp beyond the year 2112 is damage."""
 CHUNK = 1 << 20
 STEP = 4096
 """Bytes of damage to search at once for the next record."""
@@ -27,7 +27,7 @@ class Record(msgspec.Struct, frozen=True, gc=False):
     Attributes
     ----------
     time_us : int
-        us of UNIX time; a multiple of 4.
+        µs of UNIX time; a multiple of 4.
     channel : int
         The stamp's low two bits: :class:`magbridge.records.Channel` in our logs, a link number in others'.
     frame : bytes
