@@ -117,11 +117,13 @@ class Autopilot:
         self.codec = codec
         self.tells = True
         """Whether it sends telemetry."""
+        self.told: list[float] = []
+        """When it sent telemetry (s, monotonic)."""
         self.retell: Callable[[bytes], list[bytes]] = lambda frame: [frame]
         """What the link makes of a telemetry frame."""
         self._kind, _, self._at = url.partition(":")
         self._ear = Codec(0, 0)
-        self._booted = self._beat = self._told = time.monotonic()
+        self._booted = self._beat = self._due = time.monotonic()
         self._boot_ms = 5000
         self._listener: socket.socket | None = None
         self._line: socket.socket | SerialEnd | None = None
@@ -201,8 +203,9 @@ class Autopilot:
         if now >= self._beat:
             self._beat = now + 1 / BEAT_HZ
             self.say("HEARTBEAT", type=12, autopilot=3, system_status=4, mavlink_version=3)
-        if self.tells and now >= self._told:
-            self._told = now + 1 / TELEMETRY_HZ
+        if self.tells and now >= self._due:
+            self._due = now + 1 / TELEMETRY_HZ
+            self.told.append(now)
             for frame in self.retell(self.telemetry()):
                 self.send(frame)
         for message in self._hear():

@@ -12,6 +12,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -249,13 +250,18 @@ class Rig:
         return Quality(seen & ~self.normal).names()
 
     def undue_flags(self, mark: int) -> str:
-        """Return the same without `stale_telemetry` where the machine stood still, and none came."""
+        """Return the same without `stale_telemetry` where none came: the machine stood still, or we did."""
         seen = 0
         for when, message in self.heard[mark:]:
             if message.name == "MAG_FIELD":
-                late = self.machine.seconds(when - 1.0, when) > STALE_BY
+                late = self.machine.seconds(when - 1.0, when) > STALE_BY or self.untold(when) > STALE_BY
                 seen |= message["flags"] & ~(Quality.STALE_TELEMETRY if late else 0)
         return Quality(seen & ~self.normal).names()
+
+    def untold(self, when: float) -> float:
+        """Return the longest time (s) in which we sent no telemetry, of the second before `when`."""
+        sent = [t for t in self.autopilot.told if when - 1.0 < t < when]
+        return max(after - before for before, after in pairwise([when - 1.0, *sent, when]))
 
     @property
     def status(self) -> dict[str, object]:
