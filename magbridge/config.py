@@ -51,7 +51,7 @@ class Sensor(Table, frozen=True):
     baudrate : int
         bit/s.
     timeout : float
-        s without a byte after which the sensor counts as silent.
+        s without a reading after which the sensor counts as silent.
     options : dict
         The driver's own settings.
     """
@@ -81,7 +81,7 @@ class Link(Table, frozen=True):
         bit/s, where the link is a serial device.
     signing_key : str or None
         File of 32 bytes; packets are signed and unsigned ones refused.
-    parameters : str
+    parameters : str or None
         File that keeps parameters changed over the link; by default ``bridge.parameters.json`` beside a
         configuration called ``bridge.toml``.
     """
