@@ -15,7 +15,7 @@ from magbridge.diagnose.compare.derivatives import CHUNK
 from magbridge.diagnose.compare.past import Past
 from magbridge.diagnose.inference.noise import Noise, Predictors
 
-__all__ = ["LONGEST", "TAILS", "certainty", "fit_noise", "memory_order"]
+__all__ = ["LONGEST", "TAILS", "certainty", "fit_noise", "longest", "memory_order"]
 
 FloatArray = NDArray[np.float64]
 
@@ -121,6 +121,7 @@ def fit_noise(
     blocks: bool | None = None,
     like: Noise | None = None,
     rounds: int = 3,
+    brief: bool = False,
 ) -> Noise:
     """Fit the noise model.
 
@@ -136,6 +137,8 @@ def fit_noise(
         A noise that it will resemble: the fit begins from its level and tails.
     rounds : int
         Of the alternation between memory, tails and level.
+    brief : bool
+        Allow no longer memory than :data:`BRIEFEST`.
     """
     n, order, whole = len(residual), past.order, past.whole
     count = _counts(n)
@@ -150,7 +153,7 @@ def fit_noise(
     v, log_likelihood = residual, -np.inf
     for _ in range(rounds):
         if whole.sum() > 2 * order:
-            memory = _stable(_regressed(lags, residual, whole * weight / scale**2), n)
+            memory = _stable(_regressed(lags, residual, whole * weight / scale**2), 0 if brief else n)
         beside_gaps = Predictors(past, memory)
         v = beside_gaps.innovations(residual)
         if blocks is None:
@@ -184,10 +187,15 @@ def _counts(n: int) -> NDArray[np.int64]:
     return count
 
 
+def longest(n: int) -> float:
+    """Return the longest time constant that noise of n samples may have, in samples."""
+    return float(np.clip(n / TIMES, BRIEFEST, SLOWEST))
+
+
 def _stable(memory: FloatArray, n: int) -> FloatArray:
     """Move roots that lie outside the unit circle, or too close to it for n samples, back inside."""
     roots = np.roots(np.append(1.0, -memory))
-    size, largest = np.abs(roots), 1.0 - 1.0 / np.clip(n / TIMES, BRIEFEST, SLOWEST)
+    size, largest = np.abs(roots), 1.0 - 1.0 / longest(n)
     if size.max(initial=0.0) < largest:
         return memory
     return np.asarray(-np.real(np.poly(roots * np.where(size > largest, largest / size, 1.0)))[1:])

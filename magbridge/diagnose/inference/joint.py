@@ -73,6 +73,7 @@ def fit_joint(
     blocks: bool | None = None,
     ridge: float | FloatArray = RIDGE,
     rounds: int = 5,
+    brief: bool = False,
 ) -> Joint:
     """Maximise the joint likelihood of calibration, effects and noise.
 
@@ -93,7 +94,7 @@ def fit_joint(
         for their prior variances.
     like : Joint, optional
         A fit of similar noise, from which this one's begins: saves time.
-    blocks : bool, optional
+    blocks, brief : bool, optional
         See :func:`~magbridge.diagnose.inference.fit_noise.fit_noise`.
     ridge : float or (k,) array
         Prior precision of the effects, in units of their widths.
@@ -110,7 +111,8 @@ def fit_joint(
 
     def at(c: FloatArray) -> tuple[FloatArray, Noise]:
         left = problem.residual - X.times(c)
-        return left, fit_noise(left, past, blocks=blocks, like=None if like is None else like.noise)
+        known = None if like is None else like.noise
+        return left, fit_noise(left, past, blocks=blocks, like=known, brief=brief)
 
     def value(c: FloatArray, noise: Noise) -> float:
         return noise.log_likelihood - 0.5 * float(prior @ (c - centre) ** 2)

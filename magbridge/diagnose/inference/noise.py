@@ -79,6 +79,12 @@ class Noise:
         """Number of independent samples that determine a constant as well: ``n (1 - sum a)^2 C(0)``."""
         return float(len(self.scale) * (1.0 - self.memory.sum()) ** 2 * autocovariance(self.memory, 0)[0])
 
+    @property
+    def slowest(self) -> float:
+        """Longest time constant of its memory, in samples."""
+        size = np.abs(np.roots(np.append(1.0, -self.memory))).max(initial=0.0)
+        return 1.0 / (1.0 - float(size))
+
     @cached_property
     def beside_gaps(self) -> Predictors:
         """Predictors of the samples shortly after a gap."""

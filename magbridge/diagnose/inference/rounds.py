@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass
 from functools import partial
 
@@ -93,6 +94,7 @@ class State:
 
     def __init__(self, problem: Problem, candidates: Sequence[Candidate], order: int, causes: int) -> None:
         self.problem, self.candidates, self.order, self.causes = problem, list(candidates), order, causes
+        self.brief = False
         self.at = slices(self.candidates)
         self.columns = _made_once(len(problem), [candidate.columns for candidate in self.candidates])
         self.trials: dict[str, float] = {}
@@ -106,6 +108,13 @@ class State:
         for k, candidate in enumerate(self.candidates):
             self.groups.setdefault(key(candidate), []).append(k)
 
+    def beside_brief_noise(self) -> State:
+        """Return the same search, with noise whose memory is too short to pass for a slow cause."""
+        brief = copy(self)
+        brief.brief, brief.last = True, (None, None)
+        brief.null = brief.fit([])
+        return brief
+
     def fit(
         self,
         model: Sequence[Candidate],
@@ -118,7 +127,7 @@ class State:
         columns = [candidate.columns for candidate in model]
         return fit_joint(
             self.problem, columns, self.order, *starts, plain=plain, spectra=[c.spectra for c in model],
-            like=like, blocks=self.blocks, ridge=_ridge(model), rounds=rounds,
+            like=like, blocks=self.blocks, brief=self.brief, ridge=_ridge(model), rounds=rounds,
         )  # fmt: skip
 
     def ratio(self, fit: Joint) -> float:
@@ -194,6 +203,7 @@ class State:
             spectra=[candidate.spectra for candidate in every],
             ridge=1.0,
             rounds=1,
+            brief=self.brief,
         )
         if not model:
             middle = [self.columns[members[len(members) // 2]] for members in self.groups.values()]
@@ -245,10 +255,9 @@ def _made_once(n: int, columns: Sequence[Columns]) -> list[Columns]:
 
 
 def _ridge(model: Sequence[Candidate]) -> FloatArray:
-    """(k,) prior precision that a fit begins from."""
-    return np.concatenate(
-        [np.empty(0), *(np.full(c.size, RIDGE if c.spectra is None else 1.0) for c in model)]
-    )
+    """(k,) prior precision that a fit begins from: nature's sizes are known, a fault's hardly."""
+    natural = [not c.effects or c.spectra is not None for c in model]
+    return np.repeat(np.where(natural, 1.0, RIDGE), [c.size for c in model])
 
 
 def key(candidate: Candidate) -> tuple[str, str | None]:

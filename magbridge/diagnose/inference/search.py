@@ -9,6 +9,10 @@ on while one does. A cause that is found again needs more than one regressor: th
 causes are exchanged for their rivals (:mod:`.exchange`). A second start chooses all causes from one matrix
 (:mod:`.simultaneous`). Last, causes that later findings have made needless are dropped.
 
+Noise that ends up as slow as it may be may have absorbed what several causes do together: then none alone
+stands out from it. So a third start finds causes one by one beside noise of a short memory. What they are
+worth is judged beside noise of any.
+
 The rivals of each cause are read off one matrix at the end: the information of all candidates under the noise
 that is left, the other causes projected out.
 """
@@ -25,7 +29,7 @@ from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.evidence import LEVEL, REMNANT, evidence_of, margin, regressor_error
 from magbridge.diagnose.inference.exchange import exchanged
-from magbridge.diagnose.inference.fit_noise import memory_order
+from magbridge.diagnose.inference.fit_noise import longest, memory_order
 from magbridge.diagnose.inference.information import Information
 from magbridge.diagnose.inference.joint import Joint, fit_joint
 from magbridge.diagnose.inference.profile_likelihood import refined, sharpen
@@ -37,6 +41,9 @@ from magbridge.diagnose.inference.simultaneous import MOST, chosen_at_once, enou
 __all__ = ["Hypothesis", "Outcome", "search"]
 
 FloatArray = NDArray[np.float64]
+
+SLOW = 0.5
+"""Share of the longest time constant that noise may have. Slower noise may have absorbed causes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,12 +118,22 @@ def _likeliest(state: State, null: Joint, first: list[Hypothesis]) -> tuple[list
         start = refined(state, at_once, state.fit(at_once, rounds=6))
         found.append(exchanged(state, *start))
     model, base = max(found, key=lambda entry: state.value(*entry))
+    swallowed = base.noise.slowest > SLOW * longest(len(state.problem))
+    if swallowed and (slow := _beside_brief_noise(state)):
+        start = refined(state, slow, state.fit(slow, rounds=6))
+        model, base = max((model, base), exchanged(state, *start), key=lambda entry: state.value(*entry))
     if len({candidate.cause for candidate in model}) > 1:
         alone = enough(state, first)
         if alone is not None and state.value([alone.candidate], alone.fit) > state.value(model, base):
             alone = sharpen(state, [], alone, null)
             model, base = [alone.candidate], alone.fit
     return model, base
+
+
+def _beside_brief_noise(state: State) -> list[Candidate]:
+    """Return the causes found one by one beside noise whose memory is too short to pass for a slow cause."""
+    brief = state.beside_brief_noise()
+    return _forward_selection(brief, brief.null, brief.round([], brief.null))[0]
 
 
 def _forward_selection(state: State, null: Joint, first: list[Hypothesis]) -> tuple[list[Candidate], Joint]:

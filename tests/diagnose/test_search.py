@@ -1,0 +1,60 @@
+"""The search, on residuals that are made."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.signal import lfilter
+
+from magbridge.calibration.instrument import TimeEffect
+from magbridge.diagnose.causes.candidates import Candidate
+from magbridge.diagnose.compare.problem import Problem
+from magbridge.diagnose.inference.rounds import State
+from magbridge.diagnose.inference.search import search
+
+
+def candidate(cause: str, x: NDArray[np.float64], width: float) -> Candidate:
+    """A vehicle's fault of one free number that adds x (n,) times `width`, nT."""
+    return Candidate(
+        cause, None, lambda rows: width * x[rows, None], np.array([width]), ("size",), ("nT",),
+        (TimeEffect(cause=cause, shape="step", start=0.0),),
+    )  # fmt: skip
+
+
+def test_noise_does_not_swallow_what_two_causes_do_together(right: Callable[[int], Problem]) -> None:
+    """A warming over rough rock: beside either alone, slow noise describes the other as well."""
+    rng = np.random.default_rng(2)
+    n, functions = 3000, 60
+    t = np.linspace(0.0, 1.0, n)
+    warming = 1.0 - np.exp(-t / 0.1)
+    places = np.linspace(0.0, 1.0, functions)
+    rock = np.exp(-0.5 * ((t[:, None] - places) / 0.01) ** 2)
+    noise = lfilter([0.6], [1.0, -0.8], rng.normal(size=n))
+    problem = replace(right(n), residual=noise + 60.0 * warming + 20.0 * rock @ rng.normal(size=functions))
+    names = tuple(f"function {k}" for k in range(functions))
+    chart = Candidate(
+        "map_error", None, rock.__getitem__, np.ones(functions), names, ("nT",) * functions,
+        spectra=np.ones((1, functions)),
+    )  # fmt: skip
+    step = candidate("offset_step", (t > 0.1).astype(float), 10.0)
+    outcome = search(problem, [candidate("temperature_offset", warming, 10.0), step, chart], 3)
+    assert {h.candidate.cause for h in outcome.chosen} == {"temperature_offset", "map_error"}
+    assert outcome.fit.noise.slowest < 10.0 < 100.0 < outcome.null.noise.slowest
+
+
+def test_what_nature_cannot_do_is_the_vehicles(right: Callable[[int], Problem]) -> None:
+    """Of two causes of one shape the reference takes no more than a usual error of it."""
+    rng = np.random.default_rng(1)
+    n = 600
+    x = np.linspace(-1.0, 1.0, n)
+    fault = candidate("offset_drift", x, 50.0)
+    natural = replace(candidate("diurnal_variation", x, 20.0), effects=())
+    problem = replace(right(n), residual=150.0 * x + rng.normal(size=n))
+    fit = State(problem, [fault, natural], 1, 2).fit([fault, natural])
+    drift, daily = fit.coefficients * [50.0, 20.0]
+    assert drift + daily == pytest.approx(150.0, abs=1.0)
+    assert daily == pytest.approx(150.0 * 20.0**2 / (20.0**2 + 50.0**2 / 0.1), rel=0.05)
