@@ -31,10 +31,10 @@ __all__ = ["TlogWriter"]
 Record = tuple[int, int, bytes]
 """µs of the event, channel, frame."""
 
-WINDOW = 0.02
-"""s between two writes: up to 50 events a second each is written at once, and ``kill -9`` costs at most the
-last one; at higher rates it costs the events of 20 ms. With 5 ms, each of 100 samples/s would wake the
-writing thread, which takes twice the processor time; the latency is the same."""
+WINDOW = 0.005
+"""s between two writes: up to 200 events a second each is written at once, and ``kill -9`` costs at most the
+last one; at higher rates it costs the events of 5 ms. The latency is the same; the writing thread takes 66 us
+per sample at 100 Hz, where every event has a write of its own, and 19 us at 1,000 Hz."""
 QUEUE = 100_000
 """Records (some 10 MB) that wait for a stalled disk before they are dropped."""
 RETRY_US = 2_000_000

@@ -323,7 +323,7 @@ def test_killed_without_warning(make_rig: MakeRig, table: Row) -> None:
     assert first_difference(published[: len(recorded.published)], recorded.published) is None
     heard = [message.frame for _, message in rig.heard]
     missing = [frame for frame in heard[-200:] if frame not in recorded.published]
-    assert len(missing) <= 20, "more than the last 20 ms"
+    assert len(missing) <= 20, "more than the last event"
     assert missing == heard[len(heard) - len(missing) :]
     with log.open("rb") as file:
         channels = {record.channel for record in LogReader(file)}
@@ -341,7 +341,7 @@ def test_killed_without_warning(make_rig: MakeRig, table: Row) -> None:
         "`kill -9`, started again",
         "nothing, then a normal start. Parameters set over the link are kept",
         f"{back:.1f} s after the start",
-        f"at most the last 20 ms of the log: {len(missing)} messages here; the rest replays to the same "
+        f"at most the last event of the log: {len(missing)} messages here; the rest replays to the same "
         "bytes",
     )
 
