@@ -42,14 +42,15 @@ NAMELESS = ("unknown", "seen", "foreign")
 """Parts in which the hidden effect is not among the causes of the table."""
 PREDICTED = ("named", "ladder", "pair", *NAMELESS)
 """Parts for which theory predicts the outcome."""
-STRANGE = ("dynamo", "hvdc", "dew", "sampler")
+STRANGE = ("substorm", "litter", "stuck", "sounder")
 """Foreign effects made after the detector was frozen; its descriptions were not designed for them either."""
 SEEN = (
     "pan", "loose", "corrosion", "pulsation", "needle", "thermostat", "perming", "staircase", "swell",
     "cargo", "contact", "strobe", "storm", "rotor", "viscous", "brownout", "mains", "slip", "motional",
     "leak", "ranges", "sag", "crossover", "popcorn", "discharge", "towed", "sunlit", "eccentric", "astray",
     "trailing", "compliant", "restart", "whistle",
-    "yielding", "afterglow", "mast", "annealed",
+    "yielding", "afterglow", "mast", "annealed", "dynamo", "hvdc", "dew",
+    "sampler",
 )  # fmt: skip
 """Foreign effects that were once made for this purpose, but before the detector was last improved."""
 GOLDEN = 0.6180339887498949

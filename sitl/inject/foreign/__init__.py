@@ -55,5 +55,9 @@ FOREIGN: dict[str, Effect] = {
     "hvdc": surroundings.hvdc,
     "dew": sensor.dew,
     "sampler": vehicle.sampler,
+    "substorm": surroundings.substorm,
+    "litter": surroundings.litter,
+    "stuck": sensor.stuck,
+    "sounder": vehicle.sounder,
 }
 """Effect, by its name."""

@@ -129,3 +129,15 @@ def dew(scene: Scene, size: float, rng: Generator) -> None:
         film = min(film + wets * below, 1.0) - dries * film
         wet[k] = film
     scene.field = scene.field + size * direction(rng) * wet[:, None]
+
+
+def stuck(scene: Scene, size: float, rng: Generator) -> None:
+    """A bit of one channel's converter sticks half way: every other step reads too high; size in nT."""
+    channel, step = int(rng.integers(0, 3)), rng.uniform(500.0, 4000.0)
+
+    def bend(H: Array) -> Array:
+        out = H.copy()
+        out[:, channel] += size * (np.floor(H[:, channel] / step) % 2.0)
+        return out
+
+    scene.bend.append(bend)

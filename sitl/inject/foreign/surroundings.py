@@ -104,6 +104,26 @@ def hvdc(scene: Scene, size: float, rng: Generator) -> None:
     scene.earth = scene.earth + size * 100.0 * (load / (aside**2 + above**2))[:, None] * around
 
 
+def substorm(scene: Scene, size: float, rng: Generator) -> None:
+    """Substorms bend the field for an hour or two: each sets in fast and recovers slowly; size in nT."""
+    total = np.zeros_like(scene.t)
+    for _ in range(int(rng.integers(2, 6))):
+        since = (scene.t - rng.uniform(-0.05, 1.0) * scene.t[-1]) / rng.uniform(900.0, 2700.0)
+        total -= rng.uniform(0.4, 1.0) * np.maximum(since, 0.0) * np.exp(1.0 - np.maximum(since, 0.0))
+    scene.earth = scene.earth + size * np.outer(total, [0.8, 0.2, 0.5])
+
+
+def litter(scene: Scene, size: float, rng: Generator) -> None:
+    """Iron litter on the sea bed, another piece below each dive; size in nT at the greatest depth."""
+    depth = scene.track.depth
+    down = depth > 0.5 * depth.max()
+    dive = np.cumsum(np.diff(down, prepend=False) & down)
+    nearest = rng.uniform(10.0, 30.0)
+    nearer = (nearest / (depth.max() + nearest - depth)) ** 3
+    pieces = rng.normal(size=(dive[-1] + 1, 3))
+    scene.earth = scene.earth + size * nearer[:, None] * pieces[dive]
+
+
 def _cable(scene: Scene, rng: Generator) -> tuple[Array, Array, Array]:
     """Lay a straight cable below the track: m aside and above (n,), and north-east-down across it."""
     track = scene.track

@@ -247,3 +247,12 @@ def sampler(scene: Scene, size: float, rng: Generator) -> None:
     hours = np.cumsum(runs) * scene.track.step / 3600.0
     draws = runs * (1.0 + rng.uniform(0.05, 0.2) * hours)
     scene.field = scene.field + size * direction(rng) * first_order(draws, scene.track.step, 5.0)[:, None]
+
+
+def sounder(scene: Scene, size: float, rng: Generator) -> None:
+    """An unlogged echo sounder hears the bottom below a depth and pings faster the nearer; size in nT."""
+    depth = scene.track.depth
+    heard = depth > rng.uniform(0.3, 0.7) * depth.max()
+    near = rng.uniform(5.0, 20.0)
+    pings = heard * np.minimum(2.0 * near / (depth.max() + near - depth), 1.0)
+    scene.field = scene.field + size * direction(rng) * first_order(pings, scene.track.step, 5.0)[:, None]
