@@ -90,6 +90,8 @@ class State:
         Group -> degrees of freedom of the noise's level.
     groups : dict
         Cause and channel -> places of its candidates.
+    brief : bool
+        Whether noise may have a short memory only: :meth:`beside_brief_noise`.
     """
 
     def __init__(self, problem: Problem, candidates: Sequence[Candidate], order: int, causes: int) -> None:
