@@ -70,6 +70,7 @@ class Recorded:
         self.published = bytearray()
         self.messages = 0
         self.damages = 0
+        self._last_us = 0
         records = self._records()
         first = next(records, None)
         if first is None or first.message.id != BEGIN:
@@ -109,8 +110,6 @@ class Recorded:
                 yield Event(time_us, Channel.LINK, data)
         # timers that fired after the last input
         yield Event(max(time_us, self._last_us), Channel.STATE, b"")
-
-    _last_us = 0
 
     def _went_out(self, record: Record) -> bool:
         self._last_us = record.time_us

@@ -48,7 +48,7 @@ def read_entries(read: Callable[[], bytes]) -> Iterator[tuple[int, Channel, int,
 
 
 def pace(events: Iterable[Event], speed: float) -> Iterator[tuple[float, Event]]:
-    """Yield how long to wait before each event, in s, and the event.
+    """Yield how long to wait before each event, in s (negative: it is late), and the event.
 
     Parameters
     ----------
@@ -62,9 +62,4 @@ def pace(events: Iterable[Event], speed: float) -> Iterator[tuple[float, Event]]
     for event in events:
         if first_us is None:
             first_us = event.time_us
-        wait = (
-            begun + (event.time_us - first_us) * 1e-6 / speed - time.monotonic()
-            if speed != float("inf")
-            else 0.0
-        )
-        yield wait, event
+        yield begun + (event.time_us - first_us) * 1e-6 / speed - time.monotonic(), event

@@ -66,8 +66,11 @@ class Scene:
         return self.track.elapsed
 
     def add(self, shape: Array, vector: Array) -> None:
-        """Add ``shape(t) vector`` (body axes) to the field at the sensor; the truth is `vector` as read."""
+        """Add ``shape(t) vector``, (n,) times (3,) nT in body axes, to the field at the sensor."""
         self.field = self.field + shape[:, None] * vector
+
+    def tell(self, vector: Array) -> None:
+        """Note as the truth what the channels read of a `vector` (3,) in body axes."""
         self.truth |= dict(zip("xyz", (self.instrument.matrix() @ vector).tolist(), strict=True))
 
 

@@ -22,7 +22,9 @@ def _warmer(scene: Scene, rng: Generator) -> Array:
 
 def heat_offset(scene: Scene, size: float, rng: Generator) -> None:
     """An offset that follows the core's temperature; size in nT/degC."""
-    scene.add(_warmer(scene, rng), size * direction(rng))
+    warmer, vector = _warmer(scene, rng), size * direction(rng)
+    scene.add(warmer, vector)
+    scene.tell(vector)
 
 
 def heat_scale(scene: Scene, size: float, rng: Generator) -> None:
@@ -35,14 +37,16 @@ def jump(scene: Scene, size: float, rng: Generator) -> None:
     """A shock: the offset jumps and settles within a minute; size in nT."""
     t0 = rng.uniform(0.15, 0.85) * scene.t[-1]
     settled = np.where(scene.t > t0, 1.0 - 0.15 * np.exp(-np.maximum(scene.t - t0, 0.0) / 20.0), 0.0)
-    scene.add(settled, size * direction(rng))
+    vector = size * direction(rng)
+    scene.add(settled, vector)
+    scene.tell(vector)
 
 
 def creep(scene: Scene, size: float, rng: Generator) -> None:
     """Stress relaxes logarithmically (magnetic viscosity: Street & Woolley 1949); size in nT over the log."""
     tau = rng.uniform(0.3, 1.5) * scene.t[-1]
     crept = np.log1p(scene.t / tau) / np.log1p(scene.t[-1] / tau)
-    scene.field = scene.field + size * direction(rng) * crept[:, None]
+    scene.add(crept, size * direction(rng))
 
 
 def multiplexed(scene: Scene, size: float, rng: Generator) -> None:

@@ -30,7 +30,9 @@ def wires(scene: Scene, size: float, rng: Generator) -> None:
         dl = np.broadcast_to((b - a) / 200, points.shape)
         r = -points
         total += MU_0_OVER_4_PI * np.sum(np.cross(dl, r) / np.linalg.norm(r, axis=1)[:, None] ** 3, axis=0)
-    scene.add(scene.logged[name][0], size * total / np.linalg.norm(total))
+    vector = size * total / np.linalg.norm(total)
+    scene.add(scene.logged[name][0], vector)
+    scene.tell(vector)
 
 
 def magnet_on_fin(scene: Scene, size: float, rng: Generator) -> None:
@@ -51,7 +53,7 @@ def neighbours(scene: Scene, size: float, rng: Generator) -> None:
     """Two masses that magnetise each other, and a field too curved for a cubic; size in nT."""
     x, y = (scene.track.parameters[name] / SWING[name] for name in ("battpos", "ballast"))
     curved = (35 * x**4 - 30 * x**2 + 3) / 8 + rng.normal(0, 0.5) * x**3 * y
-    scene.field = scene.field + size * direction(rng) * np.tanh(0.5 * curved)[:, None]
+    scene.add(np.tanh(0.5 * curved), size * direction(rng))
 
 
 def preisach(scene: Scene, size: float, rng: Generator) -> None:
@@ -59,7 +61,7 @@ def preisach(scene: Scene, size: float, rng: Generator) -> None:
     x = scene.track.parameters["battpos"] / SWING["battpos"]
     # relays() leaves out what depends on the position alone: a calibration has that already
     memory = relays(x, rng.normal(0, 0.35, 80), rng.lognormal(np.log(0.5), 0.4, 80))
-    scene.field = scene.field + size * direction(rng) * memory[:, None]
+    scene.add(memory, size * direction(rng))
 
 
 def ring(scene: Scene, size: float, rng: Generator) -> None:
@@ -75,7 +77,7 @@ def ring(scene: Scene, size: float, rng: Generator) -> None:
     place = normal / np.sqrt(3.0) + side / np.linalg.norm(side) * np.sqrt(2.0 / 3.0)
     flux = first_order(scene.field @ normal, scene.track.step, float(rng.uniform(0.05, 0.3)))
     shape = 3 * place * (place @ normal) - normal
-    scene.field = scene.field - size * shape * np.gradient(flux, scene.track.step)[:, None]
+    scene.add(np.gradient(flux, scene.track.step), -size * shape)
     coupling = -size * np.outer(shape, normal)
     scene.truth |= {"xyz"[i] + "xyz"[j]: float(coupling[i, j]) for i in range(3) for j in range(3) if i != j}
 
@@ -88,3 +90,4 @@ def squeezed(scene: Scene, size: float, rng: Generator) -> None:
     vector = size * direction(rng)
     slope = float(np.polyfit(depth, strain, 1)[0])
     scene.add(strain / slope, slope * vector)
+    scene.tell(slope * vector)

@@ -101,7 +101,7 @@ def whistle(scene: Scene, size: float, rng: Generator) -> None:
     warm = scene.logged["sensor_temperature"][0]
     beat = rng.uniform(0.02, 0.1) * (1.0 + rng.uniform(0.03, 0.1) * (warm - warm[0]))
     phase = 2.0 * np.pi * np.cumsum(beat) * scene.track.step + rng.uniform(0.0, 2.0 * np.pi)
-    scene.field = scene.field + size * direction(rng) * np.cos(phase)[:, None]
+    scene.add(np.cos(phase), size * direction(rng))
 
 
 def mast(scene: Scene, size: float, rng: Generator) -> None:
@@ -116,7 +116,7 @@ def annealed(scene: Scene, size: float, rng: Generator) -> None:
     warm = soaked(scene.water, scene.track.step, 300.0)
     x = (warm - warm.mean()) / np.ptp(warm)
     memory = relays(x, rng.uniform(-0.5, 0.5, 60), rng.uniform(0.1, 0.5, 60))
-    scene.field = scene.field + size * direction(rng) * memory[:, None]
+    scene.add(memory, size * direction(rng))
 
 
 def dew(scene: Scene, size: float, rng: Generator) -> None:
@@ -128,7 +128,7 @@ def dew(scene: Scene, size: float, rng: Generator) -> None:
     for k, below in enumerate(cold / max(cold.max(), 1e-9)):
         film = min(film + wets * below, 1.0) - dries * film
         wet[k] = film
-    scene.field = scene.field + size * direction(rng) * wet[:, None]
+    scene.add(wet, size * direction(rng))
 
 
 def stuck(scene: Scene, size: float, rng: Generator) -> None:

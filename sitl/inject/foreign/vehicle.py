@@ -16,8 +16,8 @@ Array = NDArray[np.float64]
 def relay(scene: Scene, size: float, rng: Generator) -> None:
     """An unlogged payload switches on and off, a dozen times or so; size in nT."""
     flips = np.cumsum(rng.exponential(0.08 * scene.t[-1], 60))
-    state = np.searchsorted(flips, scene.t) % 2
-    scene.field = scene.field + size * direction(rng) * state[:, None]
+    on = (np.searchsorted(flips, scene.t) % 2).astype(float)
+    scene.add(on, size * direction(rng))
 
 
 def pan(scene: Scene, size: float, rng: Generator) -> None:
@@ -34,14 +34,14 @@ def loose(scene: Scene, size: float, rng: Generator) -> None:
     stick = rng.uniform(5.0, 12.0)
     last = np.maximum.accumulate(np.where(np.abs(tip) > stick, np.arange(len(tip)), 0))
     slid = first_order(np.sign(tip[last]), scene.track.step, 3.0)
-    scene.field = scene.field + size * direction(rng) * slid[:, None]
+    scene.add(slid, size * direction(rng))
 
 
 def corrosion(scene: Scene, size: float, rng: Generator) -> None:
     """A galvanic current in the hull, which wanders (paint, fouling) and grows with speed; size in nT."""
     wander = autoregressive(rng, (len(scene.t),), 1.0, 2500.0 / scene.track.step)
     fed = np.sqrt(1.0 + np.abs(np.gradient(scene.track.depth, scene.track.step)))
-    scene.field = scene.field + size * direction(rng) * (fed * wander)[:, None]
+    scene.add(fed * wander, size * direction(rng))
 
 
 def needle(scene: Scene, size: float, rng: Generator) -> None:
@@ -65,7 +65,7 @@ def thermostat(scene: Scene, size: float, rng: Generator) -> None:
         heats = warm < 15.0 + (0.5 if heats else -0.5) * band
         warm += scene.track.step / lag * (water - warm + 30.0 * heats)
         on[k] = heats
-    scene.field = scene.field + size * direction(rng) * on[:, None]
+    scene.add(on, size * direction(rng))
 
 
 def cargo(scene: Scene, size: float, rng: Generator) -> None:
@@ -93,7 +93,7 @@ def contact(scene: Scene, size: float, rng: Generator) -> None:
         if shut != (depth > closes + (-8.0 if shut else 8.0)):
             shut, part = not shut, float(rng.lognormal(0.0, 0.4))
         leads[k] = part * shut
-    scene.field = scene.field + size * direction(rng) * (leads * scene.logged[name][0])[:, None]
+    scene.add(leads * scene.logged[name][0], size * direction(rng))
 
 
 def strobe(scene: Scene, size: float, rng: Generator) -> None:
@@ -105,7 +105,7 @@ def strobe(scene: Scene, size: float, rng: Generator) -> None:
     turns = np.cumsum(1.0 - slower) * scene.track.step / rng.uniform(60.0, 240.0)
     on = (turns % 1.0 < rng.uniform(0.1, 0.4)).astype(float)
     drawn = first_order(on, scene.track.step, 2.0) * (1.0 - 0.15 * along)
-    scene.field = scene.field + size * direction(rng) * drawn[:, None]
+    scene.add(drawn, size * direction(rng))
 
 
 def rotor(scene: Scene, size: float, rng: Generator) -> None:
@@ -163,7 +163,7 @@ def motional(scene: Scene, size: float, rng: Generator) -> None:
     v = np.gradient(np.column_stack([north, east, track.depth]), track.step, axis=0)
     ahead = rotation(track.roll, track.pitch, track.heading).apply(v, inverse=True)
     driven = np.cross(ahead, scene.field / np.linalg.norm(scene.field[0])) @ direction(rng) / 0.3
-    scene.field = scene.field + size * direction(rng) * first_order(driven, track.step, 5.0)[:, None]
+    scene.add(first_order(driven, track.step, 5.0), size * direction(rng))
 
 
 def leak(scene: Scene, size: float, rng: Generator) -> None:
@@ -174,7 +174,7 @@ def leak(scene: Scene, size: float, rng: Generator) -> None:
     for k, head in enumerate(deep):
         wet += 3.0 * wets * head - dries * wet
         leads[k] = wet
-    scene.field = scene.field + size * direction(rng) * (leads / max(leads.max(), 1e-9))[:, None]
+    scene.add(leads / max(leads.max(), 1e-9), size * direction(rng))
 
 
 def discharge(scene: Scene, size: float, rng: Generator) -> None:
@@ -183,7 +183,7 @@ def discharge(scene: Scene, size: float, rng: Generator) -> None:
     drawn = (np.cumsum(load) / np.sum(load)) ** rng.uniform(1.0, 2.0)
     place = scene.track.parameters["battpos"]
     nearer = 1.0 + rng.uniform(0.05, 0.15) * (place - place[0])
-    scene.field = scene.field + size * direction(rng) * (drawn * nearer**3)[:, None]
+    scene.add(drawn * nearer**3, size * direction(rng))
 
 
 def towed(scene: Scene, size: float, rng: Generator) -> None:
@@ -200,7 +200,7 @@ def sunlit(scene: Scene, size: float, rng: Generator) -> None:
     """The sun warms a dark housing of unlogged temperature near the surface; size in nT at most."""
     shines = np.exp(-scene.track.depth / rng.uniform(3.0, 10.0))
     warm = first_order(shines, scene.track.step, float(rng.uniform(200.0, 900.0)))
-    scene.field = scene.field + size * direction(rng) * ((warm - warm[0]) / np.ptp(warm))[:, None]
+    scene.add((warm - warm[0]) / np.ptp(warm), size * direction(rng))
 
 
 def eccentric(scene: Scene, size: float, rng: Generator) -> None:
@@ -215,7 +215,7 @@ def trailing(scene: Scene, size: float, rng: Generator) -> None:
     name = str(rng.choice(["amps_a", "amps_b"]))
     place = scene.track.parameters["battpos"]
     drawn = (place - np.mean(place)) * scene.logged[name][0]
-    scene.field = scene.field + size * direction(rng) * drawn[:, None]
+    scene.add(drawn, size * direction(rng))
 
 
 def compliant(scene: Scene, size: float, rng: Generator) -> None:
@@ -229,7 +229,7 @@ def yielding(scene: Scene, size: float, rng: Generator) -> None:
     """A plastic hull creeps under pressure and recovers within the hour; size in nT once it has at depth."""
     pressed = scene.track.depth / scene.track.depth.max()
     crept = first_order(pressed, scene.track.step, float(rng.uniform(1200.0, 3600.0)))
-    scene.field = scene.field + size * direction(rng) * (crept - crept[0])[:, None]
+    scene.add(crept - crept[0], size * direction(rng))
 
 
 def afterglow(scene: Scene, size: float, rng: Generator) -> None:
@@ -237,7 +237,7 @@ def afterglow(scene: Scene, size: float, rng: Generator) -> None:
     moved = np.abs(np.gradient(scene.track.parameters["ballast"], scene.track.step)) > 1.0
     warm = first_order(moved.astype(float), scene.track.step, float(rng.uniform(40.0, 200.0)))
     held = warm > rng.uniform(0.05, 0.2) * max(warm.max(), 1e-9)
-    scene.field = scene.field + size * direction(rng) * held[:, None]
+    scene.add(held, size * direction(rng))
 
 
 def sampler(scene: Scene, size: float, rng: Generator) -> None:
@@ -246,7 +246,7 @@ def sampler(scene: Scene, size: float, rng: Generator) -> None:
     runs = sinking < -rng.uniform(0.02, 0.1)
     hours = np.cumsum(runs) * scene.track.step / 3600.0
     draws = runs * (1.0 + rng.uniform(0.05, 0.2) * hours)
-    scene.field = scene.field + size * direction(rng) * first_order(draws, scene.track.step, 5.0)[:, None]
+    scene.add(first_order(draws, scene.track.step, 5.0), size * direction(rng))
 
 
 def sounder(scene: Scene, size: float, rng: Generator) -> None:
@@ -255,4 +255,4 @@ def sounder(scene: Scene, size: float, rng: Generator) -> None:
     heard = depth > rng.uniform(0.3, 0.7) * depth.max()
     near = rng.uniform(5.0, 20.0)
     pings = heard * np.minimum(2.0 * near / (depth.max() + near - depth), 1.0)
-    scene.field = scene.field + size * direction(rng) * first_order(pings, scene.track.step, 5.0)[:, None]
+    scene.add(first_order(pings, scene.track.step, 5.0), size * direction(rng))
