@@ -26,7 +26,7 @@ from magbridge.calibration.terms import PAIRS, Exponents
 if TYPE_CHECKING:
     from magbridge.calibration.model import Calibration
 
-__all__ = ["compile_kernel"]
+__all__ = ["coefficient_tensor", "compile_kernel"]
 
 FloatArray = NDArray[np.float64]
 
@@ -38,20 +38,8 @@ SLOT = ((0, 3, 4), (3, 1, 5), (4, 5, 2))
 
 def compile_kernel(calibration: Calibration) -> Kernel:
     """Compile `calibration`; see the module's notes."""
-    expansions = [term.expand(calibration) for term in calibration.terms]
-    exponents = _closed({e for expansion in expansions for e in expansion.exponents}, calibration)
+    P, exponents = coefficient_tensor(calibration)
     row = {exponent: i for i, exponent in enumerate(exponents)}
-    effects = [effect.columns(calibration.reference.field) for effect in calibration.effects]
-    m = len(exponents) + sum(columns.shape[1] for columns in effects)
-    P = np.zeros((calibration.coefficients.size, m, 9))
-    k, r = 0, len(exponents)
-    for expansion in expansions:
-        rows = [row[exponent] for exponent in expansion.exponents]
-        P[k : k + len(expansion.columns), rows] = expansion.columns
-        k += len(expansion.columns)
-    for columns in effects:
-        P[k : k + columns.shape[0], r : r + columns.shape[1]] = columns
-        k, r = k + columns.shape[0], r + columns.shape[1]
     P[:, :, :6] /= calibration.reference.field
     W = np.tensordot(calibration.coefficients, P, 1)
     W[0, :3] += 1.0
@@ -68,12 +56,40 @@ def compile_kernel(calibration: Calibration) -> Kernel:
         parents=tuple((row[_parent(e)[0]], _parent(e)[1]) for e in exponents[1:]),
         monomials=len(exponents),
         weights=W,
-        units=tuple(units.tolist()) if effects else None,
+        units=tuple(units.tolist()) if calibration.effects else None,
         first=first,
         second=second,
         coarse=coarse,
         fine=fine,
     )
+
+
+def coefficient_tensor(calibration: Calibration) -> tuple[FloatArray, list[Exponents]]:
+    """Return what one unit of each coefficient adds to each regressor's nine slots, and the monomials.
+
+    Returns
+    -------
+    tensor : (K, m, 9) array
+        nT at F_0, as :class:`~magbridge.calibration.terms.Expansion`; the regressors are the monomials, then
+        those of the effects.
+    exponents : list of tuple of int
+        The monomials in the kernel's order: each follows from one before it.
+    """
+    expansions = [term.expand(calibration) for term in calibration.terms]
+    exponents = _closed({e for expansion in expansions for e in expansion.exponents}, calibration)
+    row = {exponent: i for i, exponent in enumerate(exponents)}
+    effects = [effect.columns(calibration.reference.field) for effect in calibration.effects]
+    m = len(exponents) + sum(columns.shape[1] for columns in effects)
+    tensor = np.zeros((calibration.coefficients.size, m, 9))
+    k, r = 0, len(exponents)
+    for expansion in expansions:
+        rows = [row[exponent] for exponent in expansion.exponents]
+        tensor[k : k + len(expansion.columns), rows] = expansion.columns
+        k += len(expansion.columns)
+    for columns in effects:
+        tensor[k : k + columns.shape[0], r : r + columns.shape[1]] = columns
+        k, r = k + columns.shape[0], r + columns.shape[1]
+    return tensor, exponents
 
 
 def _parent(exponent: Exponents) -> tuple[Exponents, int]:

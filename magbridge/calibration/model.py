@@ -16,7 +16,7 @@ field at calibration.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import msgspec
@@ -178,6 +178,13 @@ class Calibration:
     def kernel(self) -> Kernel:
         """The calibration compiled for correcting samples, made once."""
         return compile_kernel(self)
+
+    def without_effects(self) -> Calibration:
+        """Return the position terms alone, with their part of coefficients and covariance."""
+        own = slice(sum(term.size for term in self.terms))
+        return replace(
+            self, effects=(), coefficients=self.coefficients[own], covariance=self.covariance[own, own]
+        )
 
     def matrices(self, positions: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return ``A`` and ``T`` of the position terms.

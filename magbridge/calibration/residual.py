@@ -29,6 +29,7 @@ from magbridge.calibration.terms import PAIRS, symmetric
 __all__ = [
     "NormalEquations",
     "Samples",
+    "jacobian",
     "normal_equations",
     "residuals",
     "residuals_of",
@@ -119,6 +120,11 @@ def residuals(samples: Samples, coefficients: FloatArray) -> tuple[FloatArray, F
     return e, g
 
 
+def jacobian(phi: FloatArray, g: FloatArray) -> FloatArray:
+    """(n, 9 m) derivatives by all coefficients, ``phi (x) g``, of monomials (n, m) and those by the nine."""
+    return np.asarray(phi[:, :, None] * g[:, None, :]).reshape(len(g), -1)
+
+
 def residuals_of(samples: Samples, coefficients: FloatArray) -> FloatArray:
     """Residual e (n,) alone, in bounded memory; arguments as for :func:`residuals`."""
     pieces = [
@@ -172,7 +178,7 @@ def normal_equations(
         first = max(start - 1, 0)  # one row of overlap: whitening looks back
         part = samples.part(slice(first, start + CHUNK))
         e, g = residuals(part, coefficients)
-        J = (part.phi[:, :, None] * g[:, None, :]).reshape(len(e), size)
+        J = jacobian(part.phi, g)
         if memory:
             e, J = whiten(e, part.steps, memory), whiten(J, part.steps, memory)
         e, J = e[start - first :], J[start - first :]

@@ -17,7 +17,7 @@ from magbridge.calibration.correct import regressors
 from magbridge.calibration.fitting.columns import observations
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.model import Calibration
-from magbridge.calibration.residual import Samples, residuals
+from magbridge.calibration.residual import Samples, jacobian, residuals
 from magbridge.diagnose.compare.prior import floor
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.reference import reference_field
@@ -170,7 +170,7 @@ def compare(ds: xr.Dataset, calibration: Calibration) -> tuple[Array, Array]:
     W[:, :6] *= calibration.reference.field
     samples = Samples(H, ds["reference_field"].to_numpy(), phi, np.ones(len(H)), calibration.reference.field)
     e, g = residuals(samples, W.ravel())
-    return e, (phi[:, :, None] * g[:, None, :]).reshape(len(e), -1)
+    return e, jacobian(phi, g)
 
 
 def project(X: Array, A: Array, covariance: Array) -> Array:

@@ -29,7 +29,7 @@ from magbridge.calibration.fitting.noise import OUTLIER, NoiseModel, estimate_no
 from magbridge.calibration.fitting.nominal import check_scales, starts
 from magbridge.calibration.fitting.prior import Structure, free_structure
 from magbridge.calibration.fitting.solve import Prior, Solution, covariance_of, gauss_newton
-from magbridge.calibration.residual import Samples, residuals, residuals_of
+from magbridge.calibration.residual import Samples, jacobian, residuals, residuals_of
 from magbridge.calibration.terms import full_order
 from magbridge.errors import CalibrationError
 
@@ -162,7 +162,7 @@ def _doubt(samples: Samples, prior: Prior, solution: Solution, noise: NoiseModel
     """Variance of the model at a sample, and its covariance with the next one's, nT² (mean of all)."""
     few = _thinned(samples)
     _, g = residuals(few, prior.coefficients(solution.z))
-    J = (few.phi[:, :, None] * g[:, None, :]).reshape(len(g), -1)
+    J = jacobian(few.phi, g)
     P = covariance_of(solution.normal.hessian / noise.sigma**2 + prior.precision)
     JP = J @ (prior.E @ P @ prior.E.T)
     next_one = few.steps[1:] == 1

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from magbridge.calibration.fitting.data import Observations
 from magbridge.calibration.fitting.mission import expected_error, nearby_mission
 from magbridge.calibration.model import Calibration
-from magbridge.calibration.residual import Samples, residuals
+from magbridge.calibration.residual import Samples, jacobian, residuals
 from magbridge.calibration.terms import Polynomial
 
 __all__ = ["Combinations", "combinations", "expected_ratio", "heading_gap", "warnings_for"]
@@ -57,7 +57,7 @@ def combinations(samples: Samples, coefficients: FloatArray, sigma: float) -> Co
     step = max(len(samples.field) // ROWS, 1)
     part = samples.part(slice(None, None, step))
     _, g = residuals(part, coefficients)
-    J = (part.phi[:, :, None] * g[:, None, :]).reshape(len(g), -1) * np.sqrt(step) / sigma
+    J = jacobian(part.phi, g) * np.sqrt(step) / sigma
     # columns are scaled to one norm: a coefficient's unit must not decide whether it is estimable
     size = np.linalg.norm(J, axis=0)
     scale = np.where(size > 0.0, size, 1.0)

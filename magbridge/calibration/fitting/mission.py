@@ -88,15 +88,7 @@ def expected_error(calibration: Calibration, mission: Mission) -> FloatArray:
     -------
     (n,) array
     """
-    keep = sum(term.size for term in calibration.terms)
-    model = replace(
-        calibration,
-        effects=(),
-        coefficients=calibration.coefficients[:keep],
-        covariance=calibration.covariance[:keep, :keep],
-        noise=Noise(0.0),
-        boresight=None,
-    )
+    model = replace(calibration.without_effects(), noise=Noise(0.0), boresight=None)
     truth = mission.field_body
     if calibration.boresight is not None:
         truth = truth @ calibration.boresight.matrix()

@@ -28,7 +28,7 @@ from magbridge.calibration.fitting.prior import free_structure
 from magbridge.calibration.forward import forward
 from magbridge.calibration.model import Calibration, Noise, Parameter, Reference
 from magbridge.calibration.planning.limits import Limits, PlannedRun, candidate_runs
-from magbridge.calibration.residual import Samples, residuals
+from magbridge.calibration.residual import Samples, jacobian, residuals
 from magbridge.calibration.terms import Polynomial, full_order
 from magbridge.errors import CalibrationError
 
@@ -101,7 +101,7 @@ class _Design:
         self.calibration, self.field_ned = calibration, field_ned
         self.exponents = calibration.terms[0].exponents
         phi, g = self.derivative(mission.field_body, mission.parameters)
-        self.points = (phi[:, :, None] * g[:, None, :]).reshape(len(g), -1)
+        self.points = jacobian(phi, g)
 
     def derivative(self, truth: FloatArray, positions: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return monomials and the residual's derivative at true fields in body axes."""

@@ -133,15 +133,7 @@ def add_effects(calibration: Calibration, effects: tuple[Effect, ...]) -> Calibr
 
 def history(survey: Survey, calibration: Calibration, effect: Effect) -> FloatArray:
     """(r, n) regressors of one effect along the survey, computed sample by sample as the bridge does."""
-    probe = add_effects(
-        replace(
-            calibration,
-            effects=(),
-            coefficients=calibration.coefficients[: _terms(calibration)],
-            covariance=calibration.covariance[: _terms(calibration), : _terms(calibration)],
-        ),
-        (effect,),
-    )
+    probe = add_effects(calibration.without_effects(), (effect,))
     step = effect.begin(probe)
     channels = survey.values(probe.channels)
     times = np.rint(survey.time * 1e6).astype(np.int64).tolist()
@@ -240,7 +232,3 @@ def pose(survey: Survey, calibration: Calibration) -> Problem:
     late = -DELAY * g[:, 6:] * interpolation_error(survey, reading.T).T
     directions, centre = np.hstack([L @ V, np.zeros((len(L), 3))]), np.append(V.T @ centre, np.zeros(3))
     return Problem(survey, calibration, reading, e, g, gain, late, directions, centre, rest @ rest.T)
-
-
-def _terms(calibration: Calibration) -> int:
-    return sum(term.size for term in calibration.terms)
