@@ -36,9 +36,6 @@ MOTIONS: dict[str, dict[str, str]] = {
 }
 """Kinds of motion that a log may hold, best first: its columns, and their names in the dead reckoning."""
 
-GPS_SIGMA = 10.0
-"""m, each axis, of a receiver that has just surfaced."""
-
 UNITS = {
     "latitude": "deg", "longitude": "deg", "smoothed_latitude": "deg", "smoothed_longitude": "deg",
     "depth": "m", "covariance_nn": "m2", "covariance_ne": "m2", "covariance_ee": "m2",
@@ -54,7 +51,6 @@ def navigate(
     options: Options | None = None,
     *,
     start: tuple[float, float] | None = None,
-    fixes: bool = False,
 ) -> xr.Dataset:
     """Return the track that the field and the map give.
 
@@ -68,10 +64,7 @@ def navigate(
     options : Options, optional
         How well start, current, calibration and map are known.
     start : (latitude, longitude), optional
-        deg; default the log's first position.
-    fixes : bool, optional
-        Take in every ``gps_latitude gps_longitude`` as a fix; by default only the first, as the start, and
-        the others are the reference track.
+        deg; default the log's first position. Later ones are the reference track.
 
     Returns
     -------
@@ -94,7 +87,6 @@ def navigate(
     navigator = Navigator(grid, options)
     latitude, longitude = start if start is not None else first_position(deployment, source)
     moves = _columns(deployment, MOTIONS[motion] | {"depth": "depth"})
-    surfaced = _columns(deployment, {"gps_latitude": "a", "gps_longitude": "o"}) if fixes else {}
     records: list[Record] = []
     states: list[tuple[Array, Array, Array, Array, int]] = []
 
@@ -106,12 +98,9 @@ def navigate(
     time_us = np.round(time * 1e6).astype(np.int64)
     navigator.fix(int(time_us[0]) - 1, latitude, longitude)
     rows = {name: values.tolist() for name, values in moves.items()}
-    places = zip(surfaced["a"].tolist(), surfaced["o"].tolist(), strict=True) if surfaced else None
     samples = zip(time_us.tolist(), field.tolist(), sigma.tolist(), strict=True)
     for i, (t, f, s) in enumerate(track(samples, "navigating", total=len(time_us))):
         navigator.telemetry(t, **{name: values[i] for name, values in rows.items()})
-        if places is not None:
-            keep(navigator.fix(t, *next(places), GPS_SIGMA))
         keep(navigator.measure(t, f, s))
     keep(navigator.finish())
     if not records:

@@ -53,7 +53,7 @@ class Estimate:
         filter began as wide as its rivals do, or they have since come to the same place; and nothing speaks
         against it now.
     moved : tuple of ndarray
-        F and Q from the previous update to the last one, for a smoother.
+        F and Q of the last prediction, for a smoother.
     jumps : list of Jump
         Restarts of the estimate, across which a smoother must not look.
     """
@@ -66,7 +66,6 @@ class Estimate:
         self.moved = np.eye(6), np.zeros((6, 6))
         self.jumps: list[Jump] = []
         self._time_us, self._travelled = 0, 0.0
-        self._reported = False
         self._filter: Tracker | Bank | None = None
         self._monitor: IntegrityMonitor | None = None
         self._unmapped = Unmapped(grid, options)
@@ -129,7 +128,6 @@ class Estimate:
         if on_the_map:
             self._judge(block, seconds, metres, seen.log_likelihood)
         self._choose(on_the_map)
-        self._reported = True
         proven = self._confirmed and self._described
         doubted = self.odds > DOUBTFUL or self._nowhere > 0.0 or widest(self.P) > self.options.vouch_sigma
         self.vouched = self.state is State.TRACKING and proven and not doubted
@@ -141,8 +139,7 @@ class Estimate:
         self._time_us, self._travelled = time_us, travelled
         F, Q = transition(self.options, seconds, metres)
         self._alone = F[:4, :4] @ self._alone @ F[:4, :4].T + Q[:4, :4]
-        self.moved = (F, Q) if self._reported else (F @ self.moved[0], F @ self.moved[1] @ F.T + Q)
-        self._reported = False
+        self.moved = F, Q
         if self._filter is None:
             self.x, self.P = F @ self.x, F @ self.P @ F.T + Q
         else:

@@ -136,15 +136,6 @@ def test_a_gliders_log_is_told_from_another_vehicles(ds, grid, options):
     assert navigate(other, grid, options).attrs["motion"] == "position"
 
 
-def test_fixes_on_the_way(ds, grid, options):
-    gps = xr.full_like(ds["truth_latitude"], np.nan)
-    gps[::450] = ds["truth_latitude"][::450]
-    lon = xr.full_like(gps, np.nan)
-    lon[::450] = ds["truth_longitude"][::450]
-    result = navigate(ds.assign(gps_latitude=gps, gps_longitude=lon), grid, options, fixes=True)
-    assert rms(result) < 80.0
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
