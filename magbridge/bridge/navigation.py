@@ -79,6 +79,7 @@ class Navigation:
 
     def sample(self, time_us: int, corrected: Corrected) -> None:
         """Take a corrected sample."""
+        self.navigator.utc_offset_us = self._component.codec.utc_offset_us
         self._tell(self.navigator.sample(time_us, corrected))
 
     def _attitude(self, message: Message, time_us: int) -> None:
@@ -115,7 +116,7 @@ class Navigation:
             self._state = record.state
             severity = MAV_SEVERITY.WARNING if record.state is State.LOST else MAV_SEVERITY.INFO
             component.announcer.state("navigation", f"navigation: {WORDS[record.state]}", severity)
-        offset_us = component.publisher.utc_offset_us
+        offset_us = component.codec.utc_offset_us
         if self._rate.due(record.time_us):
             component.outbox.send(
                 "MAG_NAVIGATION",
@@ -148,7 +149,7 @@ class Navigation:
         origin = self._origin or (at.latitude, at.longitude)
         north, east = separation(*origin, at.latitude, at.longitude)
         fix = Fix(
-            time_us=at.time_us + component.publisher.utc_offset_us,
+            time_us=at.time_us + component.codec.utc_offset_us,
             age=(component.codec.now_us - at.time_us) * 1e-6,
             latitude=at.latitude,
             longitude=at.longitude,

@@ -113,7 +113,7 @@ class Pipeline:
         self.journal = Journal(config.link.system, config.link.component, active=config.log is not None)
         self.navigation: Navigation | None = None
         self._raw_rate = self.component.rates["MAG_RAW"]
-        self._position = Position()
+        self._position = Position(self._tell_no_anomaly)
         self._samples = self._lost = self._quality = self._log_lost = 0
         self._times: deque[int] = deque(maxlen=LATELY)
         self._log_state = MAG_LOG_STATE.OFF
@@ -151,6 +151,7 @@ class Pipeline:
     def _hear_sensor(self, event: Event) -> None:
         readings = self._driver.feed(event.data)
         if not readings:
+            self.sensor.mumbled(event.time_us)
             return
         self.sensor.spoke(event.time_us)
         stamps = self._clock.stamp(readings, event.time_us)
@@ -166,7 +167,8 @@ class Pipeline:
         )
         if (corrected.quality ^ self._quality) & DOUBTS:
             self._tell_doubts(corrected.quality & DOUBTS)
-        anomaly = corrected.total_field - self._position.main_field(sample.time_us)
+        utc_us = sample.time_us + self.component.codec.utc_offset_us
+        anomaly = corrected.total_field - self._position.main_field(sample.time_us, utc_us)
         if self.navigation is not None:
             self.navigation.sample(sample.time_us, corrected)
         publisher = self.component.publisher
@@ -193,7 +195,7 @@ class Pipeline:
         """Take note of a change at the edge: a port, or the host's clock."""
         for message in Codec(0, 0).parse(event.data):
             if message.id == CLOCK_STEP:
-                self.component.publisher.utc_offset_us += message["step"]
+                self.component.codec.utc_offset_us += message["step"]
                 step = f"clock was set by {message['step'] * 1e-6:+.3f} s"
                 self.component.announcer.say(step, MAV_SEVERITY.NOTICE)
             elif message.id == NOTICE:
@@ -227,6 +229,9 @@ class Pipeline:
         severity = MAV_SEVERITY.WARNING if names else MAV_SEVERITY.INFO
         self.component.announcer.state("quality", f"field: {names or 'good'}", severity)
         self._quality = doubts
+
+    def _tell_no_anomaly(self, reason: str) -> None:
+        self.component.announcer.state("anomaly", f"no anomaly: {reason}", MAV_SEVERITY.WARNING)
 
     def _begin(self, start: Start, calibration: Calibration | None, *, foreign: bool) -> None:
         """Record what a replay needs, and announce the calibration in use."""

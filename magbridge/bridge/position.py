@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from math import nan
 from typing import ClassVar
 
@@ -18,11 +19,18 @@ AGAIN_US = 1_000_000
 
 
 class Position:
-    """The vehicle's last position; the field model is loaded when the first one comes."""
+    """The vehicle's last position; the field model is loaded when the first one comes.
+
+    Parameters
+    ----------
+    tell : callable
+        Takes the reason why there is no main field at a known position.
+    """
 
     MESSAGE: ClassVar[int] = POSITION.id
 
-    def __init__(self) -> None:
+    def __init__(self, tell: Callable[[str], None]) -> None:
+        self._tell = tell
         self._where: tuple[float, float, float] | None = None
         self._when_us = self._evaluated_us = 0
         self._field = nan
@@ -35,16 +43,22 @@ class Position:
             self._where = latitude, longitude, -altitude
             self._when_us, self._evaluated_us = time_us, 0
 
-    def main_field(self, time_us: int) -> float:
-        """Return the IGRF's total field in nT; NaN where the position is not known, or no model covers it."""
+    def main_field(self, time_us: int, utc_us: int) -> float:
+        """Return the IGRF's total field in nT; NaN where the position is not known, or no model covers it.
+
+        Parameters
+        ----------
+        time_us, utc_us : int
+            µs of event time, and of UNIX time by the host's clock as it is set now.
+        """
         if self._where is None or abs(time_us - self._when_us) > MAX_AGE_US:
             return nan
-        if abs(time_us - self._evaluated_us) > AGAIN_US:
-            self._evaluated_us = time_us
-            self._field = self._evaluate(time_us)
+        if abs(utc_us - self._evaluated_us) > AGAIN_US:
+            self._evaluated_us = utc_us
+            self._field = self._evaluate(utc_us)
         return self._field
 
-    def _evaluate(self, time_us: int) -> float:
+    def _evaluate(self, utc_us: int) -> float:
         assert self._where is not None
         try:
             from magbridge.field.nearby import NearbyField  # noqa: PLC0415 - the field model is optional live
@@ -52,6 +66,7 @@ class Position:
             if self._model is None:
                 self._model = NearbyField()
             assert isinstance(self._model, NearbyField)
-            return self._model.at(*self._where, time_us * 1e-6)[0]
-        except (ImportError, MagbridgeError):
+            return self._model.at(*self._where, utc_us * 1e-6)[0]
+        except (ImportError, MagbridgeError) as error:
+            self._tell(str(error))
             return nan

@@ -23,8 +23,8 @@ class SensorLine:
     ----------
     name : str
         What the sensor is called in messages about its state.
-    commands : callable
-        Returns the commands that start it.
+    start : callable
+        To be called whenever the line was opened; returns the commands that start the sensor.
     timeout_us : int
         µs without a reading after which it counts as silent.
     announcer, timers
@@ -42,17 +42,19 @@ class SensorLine:
     def __init__(
         self,
         name: str,
-        commands: Callable[[], tuple[bytes, ...]],
+        start: Callable[[], tuple[bytes, ...]],
         timeout_us: int,
         announcer: Announcer,
         timers: Timers,
         start_us: int,
     ) -> None:
-        self._name, self._commands, self._timeout_us = name, commands, timeout_us
+        self._name, self._start, self._timeout_us = name, start, timeout_us
         self._announcer, self._timers = announcer, timers
         self.state = MAG_PORT_STATE.ABSENT
         self.to_send: list[bytes] = []
         self._heard_us = start_us
+        self._commands: tuple[bytes, ...] = ()
+        self._mumbled_us = 0
         timers.every("sensor", LOOK_US, self._look, start_us + LOOK_US)
 
     def spoke(self, time_us: int) -> None:
@@ -62,10 +64,14 @@ class SensorLine:
             self.state = MAG_PORT_STATE.OK
             self._announcer.state("sensor", f"{self._name} speaks")
 
+    def mumbled(self, time_us: int) -> None:
+        """Take note of bytes that complete no reading."""
+        self._mumbled_us = time_us
+
     def opened(self, time_us: int) -> None:
         """Begin to send the start-up commands: it may have been without power. SILENT until it sends."""
-        self.state, self._heard_us = MAG_PORT_STATE.SILENT, time_us
-        self._command(time_us, self._commands())
+        self._commands = self._start()
+        self._wake(time_us)
 
     def lost(self, reason: str) -> None:
         """Take note that the port is gone."""
@@ -76,8 +82,14 @@ class SensorLine:
     def _look(self, time_us: int) -> None:
         if time_us - self._heard_us < self._timeout_us or self.state == MAG_PORT_STATE.LOST:
             return
-        self._announcer.state("sensor", f"{self._name} is silent", MAV_SEVERITY.ERROR)
-        self.opened(time_us)  # send the start-up commands again, as to a port that has just opened
+        mumbles = time_us - self._mumbled_us < self._timeout_us // 2
+        what = "sends, but no readings: baud rate?" if mumbles else "is silent"
+        self._announcer.state("sensor", f"{self._name} {what}", MAV_SEVERITY.ERROR)
+        self._wake(time_us)
+
+    def _wake(self, time_us: int) -> None:
+        self.state, self._heard_us = MAG_PORT_STATE.SILENT, time_us
+        self._command(time_us, self._commands)
 
     def _command(self, time_us: int, commands: tuple[bytes, ...]) -> None:
         if commands:

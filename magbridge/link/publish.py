@@ -72,8 +72,6 @@ class Publisher:
         self._outbox, self._codec = outbox, outbox.codec
         self._calibration_id, self._start_us = calibration_id, start_us
         self._messages = [(rates[name], getattr(self, method)) for name, method in PUBLISHED.items()]
-        self.utc_offset_us = 0
-        """µs that the host's clock was set by since the start: added to every UNIX time that is sent."""
         self.latest: Sample | None = None
         self.samples = 0
 
@@ -112,7 +110,7 @@ class Publisher:
         x_count, y_count, z_count = reading.counts or NO_COUNTS
         x_late, y_late, z_late = reading.channel_delay
         return RAW.struct.pack(
-            sample.reading_us + self.utc_offset_us,
+            sample.reading_us + self._codec.utc_offset_us,
             (reading.sequence or 0) & MASK,
             x,
             y,
@@ -135,7 +133,7 @@ class Publisher:
         x, y, z = corrected.field
         x_sigma, y_sigma, z_sigma = corrected.field_sigma
         payload = FIELD.struct.pack(
-            sample.time_us + self.utc_offset_us,
+            sample.time_us + self._codec.utc_offset_us,
             corrected.total_field,
             self.samples & MASK,
             self._calibration_id,
@@ -157,7 +155,7 @@ class Publisher:
     def _imu(self, sample: Sample) -> tuple[bytes]:
         x, y, z = sample.corrected.field
         payload = IMU.struct.pack(
-            sample.time_us + self.utc_offset_us,
+            sample.time_us + self._codec.utc_offset_us,
             0,
             0,
             0,
@@ -187,7 +185,7 @@ class Publisher:
 
     def _vector(self, sample: Sample) -> tuple[bytes]:
         payload = VECTOR.struct.pack(
-            sample.time_us + self.utc_offset_us, *sample.corrected.field, b"mag_field"
+            sample.time_us + self._codec.utc_offset_us, *sample.corrected.field, b"mag_field"
         )
         return (self._codec.frame(VECTOR, payload),)
 

@@ -91,8 +91,8 @@ class Reports:
         codec, vehicle, clock = self._outbox.codec, self._vehicle, self._vehicle.clock
         condition = self._status()
         payload = STATUS.struct.pack(
-            codec.now_us,
-            round(clock.offset_us(codec.now_us)),
+            codec.utc_us,
+            round(clock.offset_us(codec.now_us)) - codec.utc_offset_us if clock.known else 0,
             (codec.now_us - self._start_us) // 1_000_000 & MASK,
             self._calibration_id,
             condition.samples & MASK,

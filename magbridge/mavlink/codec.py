@@ -27,8 +27,9 @@ class Codec:
 
     Attributes
     ----------
-    now_us : int
-        Event time for the signatures; the caller sets it before it parses or sends.
+    now_us, utc_offset_us : int
+        Event time, which the caller sets before it parses or sends, and what is to be added to it for UNIX
+        time: what the host's clock was set by since the start.
     frames, bytes_skipped : int
         Messages accepted, bytes that belonged to no frame.
     """
@@ -36,11 +37,16 @@ class Codec:
     def __init__(self, system: int, component: int, signing: Signing | None = None) -> None:
         self.system, self.component = system, component
         self.signing = signing
-        self.now_us = 0
+        self.now_us = self.utc_offset_us = 0
         self.sequence = 0
         self.frames = self.bytes_skipped = 0
         self._rest = b""
         self._looked = 0
+
+    @property
+    def utc_us(self) -> int:
+        """UNIX time, for signatures and in messages."""
+        return self.now_us + self.utc_offset_us
 
     @property
     def pending(self) -> bytes:
@@ -89,7 +95,7 @@ class Codec:
             layout, payload, self.sequence, self.system, self.component, signed=self.signing is not None
         )
         self.sequence = self.sequence + 1 & 0xFF
-        return self.signing.sign(frame, self.now_us) if self.signing else frame
+        return self.signing.sign(frame, self.utc_us) if self.signing else frame
 
     def _skip(self, data: bytes) -> Message:
         self.bytes_skipped += len(data)
@@ -97,7 +103,7 @@ class Codec:
 
     def _accept(self, one: Message) -> Message:
         if self.signing and not self.signing.accept(
-            one.frame, (one.system, one.component), one.id, self.now_us
+            one.frame, (one.system, one.component), one.id, self.utc_us
         ):
             return Message(REFUSED, one.system, one.component, one.sequence, b"", one.frame, known=False)
         self.frames += 1

@@ -62,11 +62,23 @@ class Collector:
         self._sums: Sums | None = None
         self._seconds = 0.0  # from its first sample to its last
 
-    def add(self, time_us: int, where: DeadReckoning, total_field: float, sigma: float) -> Block | None:
-        """Take in a sample; return the block that it fills."""
+    def add(
+        self, time_us: int, where: DeadReckoning, total_field: float, sigma: float, utc_offset_us: int = 0
+    ) -> Block | None:
+        """Take in a sample; return the block that it fills.
+
+        Parameters
+        ----------
+        time_us, utc_offset_us : int
+            µs of a clock that is never set, and what is to be added for UNIX time: the main field has a date.
+        where : DeadReckoning
+            At the place of the sample.
+        total_field, sigma : float
+            nT.
+        """
         s = self._sums or Sums(time_us, where.latitude, where.longitude, where.travelled)
         main, slope_north, slope_east = self._main_field.at(
-            where.latitude, where.longitude, where.depth, time_us * 1e-6
+            where.latitude, where.longitude, where.depth, (time_us + utc_offset_us) * 1e-6
         )
         variance = max(sigma, LEAST) ** 2
         white, w = min(self._white, variance), 1.0 / variance

@@ -44,11 +44,13 @@ class Navigator(Estimate):
     ----------
     dropped : int
         Number of samples that were dropped because they came out of time order.
+    utc_offset_us : int
+        µs to be added to the samples' times for UNIX time, where the host's clock was set since the start.
     """
 
     def __init__(self, grid: AnomalyGrid, options: Options | None = None) -> None:
         super().__init__(grid, options or Options())
-        self.dropped = 0
+        self.dropped = self.utc_offset_us = 0
         self._reckoning = DeadReckoning()
         self._collector = Collector(self.options, block_length(grid))
         self._latest_us = 0
@@ -105,7 +107,7 @@ class Navigator(Estimate):
         self._latest_us = time_us
         where = self._reckoning
         where.advance(time_us * 1e-6)
-        block = self._collector.add(time_us, where, total_field, sigma)
+        block = self._collector.add(time_us, where, total_field, sigma, self.utc_offset_us)
         return None if block is None else self._update(block)
 
     def finish(self) -> Record | None:

@@ -69,7 +69,10 @@ class Driver(Protocol):
         ...
 
     def start(self) -> tuple[bytes, ...]:
-        """Return the commands to send once the port is open, at least 0.1 s apart; maybe none."""
+        """Begin a line that has just been opened, perhaps in the middle of a frame.
+
+        Return the commands to send to the instrument, at least 0.1 s apart; maybe none.
+        """
         ...
 
     def feed(self, data: bytes) -> list[Reading]:

@@ -178,7 +178,11 @@ class Ascii:
         return self._framer.skipped
 
     def start(self) -> tuple[bytes, ...]:
-        """Return the configured commands."""
+        """Forget half a line, and skip the next one where nothing would tell it from a whole one.
+
+        Return the configured commands.
+        """
+        self._framer.begin(inside=not (self._prefix or self._options.checksum))
         return tuple(command.encode(ENCODING) for command in self._options.start)
 
     def feed(self, data: bytes) -> list[Reading]:

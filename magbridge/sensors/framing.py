@@ -33,6 +33,17 @@ class Framer:
         self._overlong = False
         self.skipped = 0
 
+    def begin(self, *, inside: bool) -> None:
+        """Begin anew: what waits for its delimiter is skipped.
+
+        Parameters
+        ----------
+        inside : bool
+            The next byte may be in the middle of a frame: all up to the first delimiter is skipped.
+        """
+        self.skipped += len(self._rest)
+        self._rest, self._overlong = b"", inside
+
     def split(self, data: bytes) -> list[bytes]:
         """Take bytes; return the frames that they complete, empty ones left out."""
         pieces = (self._rest + data).split(self._delimiter)

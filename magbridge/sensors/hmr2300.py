@@ -90,7 +90,10 @@ class Hmr2300:
         return self._lines.skipped
 
     def start(self) -> tuple[bytes, ...]:
-        """Return the commands: stop, set output and rate, send continuously."""
+        """Forget half a frame; return the commands: stop, set output and rate, send continuously."""
+        self._lines.skipped += len(self._rest)
+        self._lines.begin(inside=False)
+        self._rest, self._aligned = b"", False
         do = f"*{self._options.device:02d}"
         output = "A" if self._options.output == "ascii" else "B"
         enable = f"{do}WE\r"

@@ -18,8 +18,10 @@ class AsciiEncoder(Encoder):
     Options = wire.AsciiOptions
 
     def encode(self, reading: Reading) -> bytes:
-        """Return one line."""
+        """Return one line; the end of another before the first: a listener cannot tell half a line."""
         options = self.options
+        end = b"\r\n" if options.terminator == "\n" else b"\r"
+        before = b"" if self.sequence else end
         time = reading.device_time % options.time_modulo if options.time_modulo else reading.device_time
         values = {
             "time": time / wire.SECONDS[options.time_unit],
@@ -38,4 +40,4 @@ class AsciiEncoder(Encoder):
         if options.checksum:
             digits, function = wire.CHECKSUMS[options.checksum]
             text += f"*{function(text):0{digits}X}".encode()
-        return text + (b"\r\n" if options.terminator == "\n" else b"\r")
+        return before + text + end

@@ -192,3 +192,15 @@ def test_whatever_is_said_it_goes_on(chunks):
     assert all(row.low <= component.parameters[row.name] <= row.high * 1.0001 for row in rows)
     beats = [1 for _, frame in component.outbox.drain() if frame[7:10] == b"\0\0\0"]
     assert len(beats) >= 1
+
+
+def test_the_status_is_dated_by_the_clock_as_it_was_set(link):
+    """The autopilot's clock is 1,000 s; ours, set to be right, changes and its own does not."""
+    (ask,) = [m for m in link.to(0.6) if m.get_type() == "TIMESYNC"]
+    link.fly("TIMESYNC", tc1=1000 * 10**9, ts1=ask.ts1)
+    before = link.only(link.to(1.0), "MAG_STATUS")[-1]
+    assert before.time_usec == link.now
+    link.component.codec.utc_offset_us = -3_600_000_000
+    after = link.only(link.to(2.0), "MAG_STATUS")[-1]
+    assert after.time_usec == link.now - 3_600_000_000
+    assert after.vehicle_clock_offset - before.vehicle_clock_offset == 3_600_000_000

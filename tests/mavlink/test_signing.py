@@ -95,3 +95,15 @@ def test_key_file(tmp_path):
         load_key(path)
     path.write_bytes(KEY)
     assert load_key(path) == KEY
+
+
+def test_signatures_follow_the_host_s_clock(peer):
+    """A computer without a clock of its own wakes up in 1970, until it hears the time."""
+    ours, theirs = codec(now=5_000_000), station(peer)
+    (refused,) = theirs.parse_buffer(text(codec(now=5_000_000)))
+    assert refused.get_type() == "BAD_DATA"
+    ours.utc_offset_us = NOW - ours.now_us
+    (message,) = theirs.parse_buffer(text(ours))
+    assert message.get_signed()
+    stranger = peer.MAVLink_param_request_list_message(1, 191).pack(station(peer, NOW - 90_000_000))
+    assert [m.id for m in ours.parse(stranger)] == [REFUSED]

@@ -162,3 +162,17 @@ def test_across_the_antimeridian(study, options):
     assert records[-1].longitude < -179.9
     assert abs(records[-1].east) < 60.0
     assert all(np.isfinite(r.map_anomaly) for r in records)
+
+
+def test_the_main_field_is_that_of_the_day_to_which_the_clock_was_set(ds, grid, options) -> None:
+    """A computer without a clock of its own wakes up in 1970; the field there has lost 1.8 µT since."""
+    innovations = []
+    for offset_us in (0, START_US):
+        navigator = Navigator(grid, options)
+        navigator.utc_offset_us = offset_us
+        navigator.fix(START_US - offset_us, *PLACE)
+        moved = ds.assign_coords(time=ds["time"] - offset_us * 1e-6)
+        records, _ = feed(navigator, moved, slice(0, 60))
+        innovations.append([record.innovation for record in records])
+    assert len(innovations[0]) > 2
+    assert innovations[1] == pytest.approx(innovations[0], abs=1e-3)

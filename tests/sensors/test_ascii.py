@@ -137,3 +137,12 @@ def test_an_overlong_line_is_skipped() -> None:
     driver = open_driver("ascii", {})
     assert [r.field for r in driver.feed(b"1 2 " + b"3" * 1000 + b"\n1 2 3\n")] == [(1, 2, 3)]
     assert driver.bytes_skipped == 1004
+
+
+def test_what_tells_half_a_line_from_a_whole_one_costs_none() -> None:
+    driver = open_driver("ascii", {"prefix": "$MAG ", "columns": ["x", "y", "z"]})
+    driver.start()
+    assert [r.field for r in driver.feed(b"$MAG 1 2 3\n$MAG 4 5")] == [(1, 2, 3)]
+    driver.start()  # the line was opened again
+    assert [r.field for r in driver.feed(b"8 9\n$MAG 4 5 6\n")] == [(4, 5, 6)]
+    assert (driver.frames_bad, driver.bytes_skipped) == (1, 11)

@@ -93,3 +93,13 @@ def test_replies_before_the_stream_are_skipped() -> None:
     frames = b"".join(frame(100 + k, 200 - k, 300) for k in range(10))
     assert len(driver.feed(replies + frames)) == 10
     assert driver.bytes_skipped == len(replies)
+
+
+def test_halves_of_two_frames_are_no_reading() -> None:
+    """The line was pulled out after three bytes of a frame, and opened again before the last four of one."""
+    driver = open_driver("hmr2300", {})
+    before, after = frame(1000, 2000, 3000), frame(-9000, -8000, -7000)
+    driver.feed(before * 6 + before[:3])
+    driver.start()
+    assert [reading.counts for reading in driver.feed(after[3:] + after * 6)] == [(-9000, -8000, -7000)] * 6
+    assert driver.bytes_skipped == 7

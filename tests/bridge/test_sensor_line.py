@@ -1,0 +1,80 @@
+"""What the sensor's line is taken for: half a line, an instrument that sends rarely, another instrument."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from small import START, small_bridge
+
+from magbridge.bridge import states
+from magbridge.bridge.events import Event, Start
+from magbridge.bridge.pipeline import Pipeline
+from magbridge.calibration.model import Parameter
+from magbridge.mavlink import Codec
+from magbridge.mavlink.dialect import MAG_PORT_NAME
+from magbridge.records import Channel
+
+LINE = b"12340.5 43210.9 -234.5 4.0 %.1f 7\r\n"
+
+
+class Bench:
+    """A bridge, and what it has said."""
+
+    def __init__(self, folder: Path) -> None:
+        self.bridge: Pipeline = small_bridge(
+            folder, Start(START), Parameter("battpos", "", -1.0, 1.0, 0.0, 1.0), ["MAG_RAW"]
+        )
+        self._ear = Codec(0, 0)
+        self.raw: list[float] = []
+        self.said: list[str] = []
+
+    def feed(self, seconds: float, channel: Channel, data: bytes) -> None:
+        event = Event(START + round(seconds * 1e6), channel, data)
+        for _, frame in self.bridge.feed(event):
+            for message in self._ear.parse(frame):
+                if message.name == "MAG_RAW":
+                    self.raw.append(message["x"])
+                elif message.name == "STATUSTEXT":
+                    self.said.append(message["text"])
+
+    def open(self, seconds: float) -> None:
+        self.feed(seconds, Channel.STATE, states.opened(MAG_PORT_NAME.SENSOR))
+
+    def hear(self, seconds: float, data: bytes) -> None:
+        self.feed(seconds, Channel.SENSOR, data)
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Bench:
+    made = Bench(tmp_path)
+    made.open(0.0)
+    return made
+
+
+def test_half_a_line_is_no_sample(bench: Bench) -> None:
+    """Neither the one that the bridge came into, nor two halves from before and after an unplugging."""
+    whole = LINE % 1.0
+    bench.hear(0.1, whole[4:])
+    bench.hear(0.2, whole + whole[:9])
+    bench.open(1.0)
+    bench.hear(1.1, whole[11:])
+    bench.hear(1.2, LINE % 2.0)
+    assert bench.raw == [12340.5, 12340.5]
+
+
+def test_an_instrument_that_sends_rarely_is_heard_each_time(bench: Bench) -> None:
+    """`sensor.timeout` is 10 s: that it is asked to start anew costs no reading."""
+    for k in range(5):
+        bench.hear(15.0 * k, LINE % (15.0 * k))
+    assert len(bench.raw) == 4  # the first may have been half a line
+    assert "ascii is silent" in bench.said
+
+
+def test_an_instrument_that_speaks_otherwise_is_not_silent(bench: Bench) -> None:
+    for k in range(21):
+        bench.hear(k, b"$GPGGA,123519,4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,*47\r\n")
+    assert not bench.raw
+    assert bench.said[-1] == "ascii sends, but no readings: baud rate?"
+    bench.feed(45.0, Channel.STATE, b"")
+    assert bench.said[-1] == "ascii is silent"
