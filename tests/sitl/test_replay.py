@@ -16,7 +16,8 @@ from magbridge.config import load as load_config
 from magbridge.errors import DataError, FormatError, WrongUse
 from magbridge.field.earth import offset
 from magbridge.logs import read, write
-from magbridge.mavlink import Codec
+from magbridge.mavlink import Codec, LogReader
+from magbridge.records import Channel
 from sitl import Twin, load, segments, simulate
 from sitl.autopilot import Autopilot
 from sitl.demo import demo
@@ -28,12 +29,27 @@ from sitl.replay_summary import summary
 
 
 @pytest.fixture(scope="module")
-def survey(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The first ten minutes of a simulated survey."""
-    deployment = segments(simulate(load("demo"), 3))["survey"].isel(time=slice(0, 150))
+def flown() -> xr.Dataset:
+    """A simulated survey."""
+    return segments(simulate(load("demo"), 3))["survey"]
+
+
+@pytest.fixture(scope="module")
+def survey(flown: xr.Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Its first ten minutes."""
     path = tmp_path_factory.mktemp("survey") / "survey.nc"
-    write(deployment, path)
+    write(flown.isel(time=slice(0, 150)), path)
     return path
+
+
+@pytest.fixture(scope="module")
+def recorded(survey: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """The configuration of a bridge that replayed them, and its log."""
+    folder = tmp_path_factory.mktemp("recorded")
+    path = config(folder)
+    replay([survey], path, log=folder / "logs")
+    (log,) = (folder / "logs").glob("*.tlog")
+    return path, log
 
 
 def config(folder: Path, driver: str = "digitizer", options: str = "") -> Path:
@@ -67,10 +83,10 @@ def test_every_instrument_s_protocol_arrives_whole(
     assert any("speaks" in text for text in result["said"])
 
 
-def test_a_log_of_a_replay_is_replayed_bit_for_bit(survey: Path, tmp_path: Path) -> None:
-    path = config(tmp_path)
-    replay([survey], path, log=tmp_path / "logs")
-    (log,) = sorted((tmp_path / "logs").glob("*.tlog"))
+def test_a_log_of_a_replay_is_replayed_bit_for_bit(
+    survey: Path, recorded: tuple[Path, Path], tmp_path: Path
+) -> None:
+    path, log = recorded
     assert is_own_log(log)
     assert not is_own_log(survey)
     (run,) = replay([log], path, log=tmp_path / "again")["runs"]
@@ -87,26 +103,32 @@ def test_a_log_of_a_replay_is_replayed_bit_for_bit(survey: Path, tmp_path: Path)
 
 
 def test_a_log_that_breaks_off_is_the_same_as_far_as_it_goes_and_no_further(
-    survey: Path, tmp_path: Path
+    recorded: tuple[Path, Path], tmp_path: Path
 ) -> None:
-    path = config(tmp_path)
-    replay([survey], path, log=tmp_path / "logs")
-    (log,) = (tmp_path / "logs").glob("*.tlog")
+    """Cut between a reading and what was published of it, after that, and within the next record."""
+    path, log = recorded
     whole, cut = log.read_bytes(), tmp_path / "cut.tlog"
-    for size in range(len(whole) // 2, len(whole) // 2 + 400, 57):
+    with log.open("rb") as file:
+        records = list(LogReader(file))
+    ends = np.cumsum([8 + len(record.frame) for record in records])
+    assert ends[-1] == len(whole)
+    channels = [record.channel for record in records]
+    reading = channels.index(Channel.SENSOR, len(records) // 2)
+    last = next(k for k in range(reading + 1, len(records)) if channels[k + 1] != Channel.SENT)
+    for size, lacks in ((ends[reading], True), (ends[last], False), (ends[last] + 11, False)):
         cut.write_bytes(whole[:size])
         (run,) = replay([cut], path)["runs"]
-        assert run["first_difference"] in (None, run["bytes"])
-        assert run["beyond"] < 1000
-        assert run["identical"] == (not run["beyond"])
-        assert ("to the end of the log" in summary({"runs": [run]})) == bool(run["beyond"])
+        assert run["first_difference"] == (run["bytes"] if lacks else None)
+        assert run["identical"] != lacks
+        assert 0 < run["beyond"] < 1000 or not lacks
+        assert ("to the end of the log" in summary({"runs": [run]})) == lacks
 
 
-def test_another_configuration_is_told_apart(survey: Path, tmp_path: Path) -> None:
-    path = config(tmp_path)
-    replay([survey], path, log=tmp_path / "logs")
-    path.write_text(path.read_text().replace("HIGHRES_IMU = 0", "HIGHRES_IMU = -1"))
-    result = replay(sorted((tmp_path / "logs").glob("*.tlog")), path)
+def test_another_configuration_is_told_apart(recorded: tuple[Path, Path], tmp_path: Path) -> None:
+    path, log = recorded
+    other = tmp_path / "bridge.toml"
+    other.write_text(path.read_text().replace("HIGHRES_IMU = 0", "HIGHRES_IMU = -1"))
+    result = replay([log], other)
     (run,) = result["runs"]
     assert not run["identical"]
     assert not run["same_config"]
@@ -114,14 +136,14 @@ def test_another_configuration_is_told_apart(survey: Path, tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("motion", ["glide", "position"])
-def test_a_replay_finds_its_way_by_the_field(tmp_path: Path, motion: str) -> None:
+def test_a_replay_finds_its_way_by_the_field(flown: xr.Dataset, tmp_path: Path, motion: str) -> None:
     """However a log tells motion, the bridge hears it: its filter knows where it begins, and is not lost."""
     Twin.draw(load("demo"), 3).anomaly_map().save(tmp_path / "grid.nc")
     save(
         replace(identity(), covariance=1e-4 * np.eye(9), noise=Noise(1.0), method="nominal"),
         tmp_path / "c.json",
     )
-    log = segments(simulate(load("demo"), 3))["survey"].isel(time=slice(0, 800))
+    log = flown.isel(time=slice(0, 800))
     log = log.assign({f"mag_{axis}": log[f"truth_field_{axis}"] for axis in "xyz"})
     write(log if motion == "glide" else log.drop_vars("pitch"), tmp_path / "log.nc")
     path = config(tmp_path)
@@ -167,10 +189,10 @@ def test_speed_is_kept(survey: Path, tmp_path: Path) -> None:
     assert 1.9 < result["seconds"] < 10.0
 
 
-def test_a_bridge_s_own_log_needs_its_configuration(survey: Path, tmp_path: Path) -> None:
-    path = config(tmp_path)
-    replay([survey], path, log=tmp_path / "logs")
-    (log,) = (tmp_path / "logs").glob("*.tlog")
+def test_a_bridge_s_own_log_needs_its_configuration(
+    survey: Path, recorded: tuple[Path, Path], tmp_path: Path
+) -> None:
+    path, log = recorded
     with pytest.raises(WrongUse, match="--config"):
         replay([log])
     for files in ([log, survey], [survey, log]):
@@ -182,11 +204,9 @@ def test_a_bridge_s_own_log_needs_its_configuration(survey: Path, tmp_path: Path
         replay([log], tmp_path / "none.toml")
 
 
-def test_a_log_that_does_not_begin_a_run_is_refused(survey: Path, tmp_path: Path) -> None:
-    replay([survey], config(tmp_path), log=tmp_path / "logs")
-    (log,) = (tmp_path / "logs").glob("*.tlog")
+def test_a_log_that_does_not_begin_a_run_is_refused(recorded: tuple[Path, Path], tmp_path: Path) -> None:
     tail = tmp_path / "tail.tlog"
-    tail.write_bytes(log.read_bytes()[2000:])
+    tail.write_bytes(recorded[1].read_bytes()[2000:])
     with pytest.raises(FormatError, match=r"tail\.tlog: expected the log of a bridge, from its start"):
         Recorded([tail])
 
