@@ -156,7 +156,9 @@ class LiveEdge:
         """Open the port whenever it is down, report each change once; set `tried` after the first attempt."""
         reported: str | None = None
         while not self._stopping:
-            if not port.up:
+            if port.up:
+                port.tend()
+            else:
                 try:
                     port.open()
                     reason = ""

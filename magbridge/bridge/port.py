@@ -35,6 +35,9 @@ class Port(ABC):
     def open(self) -> None:
         """Open it; raises :class:`PortError`."""
 
+    def tend(self) -> None:  # noqa: B027 - most ports need nothing
+        """Do now and then, while it is open, what may take long; called by the thread that opens it."""
+
     @abstractmethod
     def fds(self) -> list[int]:
         """Return the file descriptors to wait for."""

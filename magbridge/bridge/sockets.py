@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import os
 import re
 import select
 import socket
@@ -24,7 +25,7 @@ __all__ = ["LINKS", "TcpClient", "TcpServer", "UdpPort", "open_link"]
 UNSENT = 4096
 """Bytes that may wait in the system for a slow connection; the rest waits here, where it can be dropped."""
 PEER_TIMEOUT = 30.0
-"""s without a packet after which a UDP peer is forgotten."""
+"""s without a packet after which a UDP peer is forgotten, or connected anew."""
 AWAY = (errno.ECONNREFUSED, errno.ENETUNREACH, errno.EHOSTUNREACH, errno.ENETDOWN, errno.EPERM)
 """What a UDP socket reports when nobody listens (yet): no fault of the port."""
 ADDRESS = re.compile(r"(?://)?(?:\[(?P<ipv6>.+)\]|(?P<host>[^:]*)):(?P<port>[0-9]{1,5})")
@@ -38,6 +39,7 @@ class UdpPort(Port):
         self._address, self._listen = address, listen
         self._socket: socket.socket | None = None
         self._peers: dict[Any, float] = {}
+        self._heard = 0.0
 
     @property
     def up(self) -> bool:
@@ -47,18 +49,34 @@ class UdpPort(Port):
     def open(self) -> None:
         """Bind or connect; raises :class:`PortError`."""
         try:
-            family, address = _resolve(self._address, socket.SOCK_DGRAM, listen=self._listen)
-            opened = socket.socket(family, socket.SOCK_DGRAM)
-            opened.setblocking(False)
-            opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
-            try:
-                (opened.bind if self._listen else opened.connect)(address)
-            except OSError:
-                opened.close()
-                raise
+            opened = self._new()
         except OSError as error:
             raise PortError(self.name, error.strerror or str(error)) from error
-        self._socket = opened
+        self._socket, self._heard = opened, time.monotonic()
+
+    def tend(self) -> None:
+        """Connect anew if nothing has come for long, and the host, or we, have another address by now."""
+        opened, now = self._socket, time.monotonic()
+        if opened is None or self._listen or now - self._heard < PEER_TIMEOUT:
+            return
+        self._heard = now
+        with suppress(OSError), self._new() as new:  # not known at present, or closed meanwhile
+            if _ends(new) != _ends(opened):
+                # the same descriptor, because the bridge may be waiting for it
+                os.dup2(new.fileno(), opened.fileno(), inheritable=False)
+
+    def _new(self) -> socket.socket:
+        """Return a socket that is bound or connected; raises OSError."""
+        family, address = _resolve(self._address, socket.SOCK_DGRAM, listen=self._listen)
+        opened = socket.socket(family, socket.SOCK_DGRAM)
+        opened.setblocking(False)
+        opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
+        try:
+            (opened.bind if self._listen else opened.connect)(address)
+        except OSError:
+            opened.close()
+            raise
+        return opened
 
     def fds(self) -> list[int]:
         """Return the one descriptor, if open."""
@@ -81,8 +99,9 @@ class UdpPort(Port):
                 if data or error.errno in AWAY:
                     break  # first return what has come
                 raise self.lost(error.strerror) from error
+            self._heard = time.monotonic()
             if self._listen:
-                self._peers[peer] = time.monotonic()
+                self._peers[peer] = self._heard
             data += datagram
             if not datagram:
                 break  # empty datagrams could keep this loop running for ever
@@ -270,6 +289,11 @@ def _resolve(address: tuple[str, int], kind: int, *, listen: bool) -> tuple[int,
     found = socket.getaddrinfo(host or None, port, type=kind, flags=socket.AI_PASSIVE if listen else 0)
     family, *_, resolved = min(found, key=itemgetter(0))
     return family, resolved
+
+
+def _ends(connected: socket.socket) -> tuple[Any, Any]:
+    """Return our own address, without its port, and the peer's."""
+    return connected.getsockname()[0], connected.getpeername()
 
 
 def _address(text: str) -> tuple[str, int]:
