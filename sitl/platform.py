@@ -156,10 +156,8 @@ class Calibrated:
 
     def field(self, ambient: Array, channels: Mapping[str, Array], time: Array) -> Array:
         """Return the field at the sensor (n, 3) as :meth:`Vehicle.field`; `time` (n,) is s since 1970."""
-        sampled = np.column_stack([channels[name] for name in self.channels]) if self.channels else None
-        return forward(
-            self.calibration, ambient, np.empty((len(time), 0)) if sampled is None else sampled, time
-        )
+        sampled = np.reshape([channels[name] for name in self.channels], (-1, len(time))).T
+        return forward(self.calibration, ambient, sampled, time)
 
 
 def draw_vehicle(rng: np.random.Generator, masses: Sequence[str] = ("battpos", "ballast")) -> Vehicle:

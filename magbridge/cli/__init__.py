@@ -45,10 +45,9 @@ ENDS = (signal.SIGTERM, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else []))
 
 def main(arguments: list[str] | None = None) -> int:
     """Run a command; return its exit code."""
+    # closed by the parent process; opened in this order, each gets its own descriptor
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
-        if (
-            getattr(sys, name) is None
-        ):  # closed by the parent process; opened in this order, each gets its own descriptor
+        if getattr(sys, name) is None:
             setattr(sys, name, Path(os.devnull).open(mode))  # noqa: SIM115 - as long as the process
     with suppress(ValueError):  # signal handlers can be set on the main thread only
         _heed_signals()

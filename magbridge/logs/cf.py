@@ -29,9 +29,8 @@ def floats(variable: Any, rows: slice = ALL) -> NDArray[np.float64]:
     attributes = variable.ncattrs()
     nothing = [variable.getncattr("missing_value")] if "missing_value" in attributes else []
     fill = variable.get_fill_value()
-    if "_FillValue" in attributes or (
-        fill is not None and stored.dtype.itemsize > 1
-    ):  # any byte may be meant
+    # any byte may be meant: of bytes, only a fill value that is declared counts
+    if "_FillValue" in attributes or (fill is not None and stored.dtype.itemsize > 1):
         nothing.append(fill)
     scale, offset = getattr(variable, "scale_factor", 1.0), getattr(variable, "add_offset", 0.0)
     values = stored.astype(np.float64) * scale + offset

@@ -115,9 +115,8 @@ def _read(path: Path | None) -> dict[str, tuple[Floats, Floats]]:
     """Return time and values of each of :data:`SENSORS` in the file, at its updates."""
     if path is None:
         return {}
-    with (
-        tempfile.TemporaryDirectory() as scratch
-    ):  # dbdreader writes the list of sensors where it looks for it
+    # dbdreader writes the list of sensors where it looks for it
+    with tempfile.TemporaryDirectory() as scratch:
         for cache in [*path.parent.glob("*.cac"), *path.parent.glob("*.CAC")]:
             Path(scratch, cache.name.lower()).symlink_to(cache.resolve())
         try:

@@ -95,12 +95,8 @@ class Bank:
         position shift with it.
         """
         values, axes = np.linalg.eigh(P[:2, :2])
-        area = (
-            (2.0 * EDGE / SPACING) ** 2
-            * np.pi
-            / 4.0
-            * np.sqrt(np.prod(np.maximum(values, self.resolution**2)))
-        )
+        spread = np.sqrt(np.prod(np.maximum(values, self.resolution**2)))
+        area = (2.0 * EDGE / SPACING) ** 2 * np.pi / 4.0 * spread
         self.resolution = max(self.resolution, float(np.sqrt(area / AT_FIRST)))
         part, w, shifts = P.copy(), np.ones(1), np.zeros((x.size, 1))
         for value, axis in zip(values, axes.T, strict=True):
@@ -136,12 +132,8 @@ class Bank:
         off = np.isnan(local.anomaly)
         anomaly, gn, ge, hnn, hne, hee, v = np.where(off, 0.0, local) if off.any() else np.array(local)
         pnn, pne, pee = self.P[0, 0], self.P[0, 1], self.P[1, 1]
-        a, b, c, d = (
-            hnn * pnn + hne * pne,
-            hnn * pne + hne * pee,
-            hne * pnn + hee * pne,
-            hne * pne + hee * pee,
-        )
+        a, b = hnn * pnn + hne * pne, hnn * pne + hne * pee
+        c, d = hne * pnn + hee * pne, hne * pne + hee * pee
         anomaly += block.slope_north * north + block.slope_east * east + 0.5 * (a + d)
         bent = 0.5 * (a * a + 2.0 * b * c + d * d)
         self.blur = float(self.w @ bent)

@@ -27,9 +27,9 @@ def test_errors_of_the_map_add_up(study: ModuleType) -> None:
     assert at_depth(drawn, options, depth) == (drawn, options), "an altitude that nobody knows"
 
 
-def test_a_glider_that_dives_under_it_is_found(study: ModuleType) -> None:
+@pytest.mark.usefixtures("study")  # finds the tools
+def test_a_glider_that_dives_under_it_is_found() -> None:
     """Taken for the field below it, the map leads the filter away; continued to the depth, it does not."""
-    assert study
     flown, below = import_module("voyages.dived").dived(2)
     assert below.error < 0.2 * flown.error
     assert below.nees < 2.0

@@ -82,9 +82,9 @@ class Draws(NamedTuple):
         value = statistic.ratio(scores.reshape(len(given), -1)).reshape(scores.shape[1:])
         if span.more:
             value = value + 2.0 * np.random.default_rng(20131213).standard_gamma(0.5 * span.more, DRAWS)
-        return np.where(
-            scores[0] > 0.0, value, 0.0
-        ) if span.positive else value, statistic.freedom + span.more
+        if span.positive:
+            value = np.where(scores[0] > 0.0, value, 0.0)
+        return value, statistic.freedom + span.more
 
     def beside(self, span: Span) -> Draws:
         """Return the draws with one hypothesis projected out."""

@@ -34,12 +34,10 @@ def staircase(scene: Scene, size: float, rng: Generator) -> None:
 
 def brownout(scene: Scene, size: float, rng: Generator) -> None:
     """The converter's reference sags with load and charge of the supply; size in 1e-5 of the field at 1 A."""
-    step, load = (
-        scene.track.step,
-        scene.logged["amps_a"][0] + scene.logged["amps_b"][0] + rng.uniform(0.1, 0.3),
-    )
+    load = scene.logged["amps_a"][0] + scene.logged["amps_b"][0] + rng.uniform(0.1, 0.3)
     drawn = np.cumsum(load) / np.sum(load)
-    slow = first_order(load, step, float(rng.uniform(100.0, 400.0)))  # ions take time to diffuse
+    # ions take time to diffuse
+    slow = first_order(load, scene.track.step, float(rng.uniform(100.0, 400.0)))
     sag = 0.6 * load + 0.4 * slow + rng.uniform(0.3, 1.0) * drawn**3
     scene.field = scene.field * (1.0 + 1e-5 * size * sag[:, None])
 

@@ -53,11 +53,8 @@ def storm(scene: Scene, size: float, rng: Generator) -> None:
     after = since > rng.uniform(900.0, 3600.0)
     # a new wind every few minutes
     south = np.repeat(rng.normal(0.6, 0.8, 60), len(since) // 60 + 1)[: len(since)]
-    ring = (
-        7.7
-        * 3600.0
-        * first_order(np.where(after, np.maximum(south, 0.0), 0.0), scene.track.step, 7.7 * 3600.0)
-    )
+    decay = 7.7 * 3600.0
+    ring = decay * first_order(np.where(after, np.maximum(south, 0.0), 0.0), scene.track.step, decay)
     shock = np.where(since > 0.0, 1.0 - np.exp(-np.maximum(since, 0.0) / 120.0), 0.0)
     total = ring / max(float(ring.max()), 1e-9) - rng.uniform(0.15, 0.35) * shock
     scene.earth = scene.earth + size * np.outer(total, [-0.5, 0.05, 0.45])

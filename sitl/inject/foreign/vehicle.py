@@ -135,9 +135,8 @@ def viscous(scene: Scene, size: float, rng: Generator) -> None:
     crept = np.mean([first_order(unit, scene.track.step, float(lag)) for lag in lags], axis=0)
     normal, place = direction(rng), direction(rng)
     moment = crept - 0.9 * np.outer(crept @ normal, normal)
-    scene.field = (
-        scene.field + size * dipole_field(np.broadcast_to(place, moment.shape), moment) / MU_0_OVER_4_PI
-    )
+    own = dipole_field(np.broadcast_to(place, moment.shape), moment)
+    scene.field = scene.field + size * own / MU_0_OVER_4_PI
 
 
 def slip(scene: Scene, size: float, rng: Generator) -> None:
