@@ -110,68 +110,33 @@ class Publisher:
         x_count, y_count, z_count = reading.counts or NO_COUNTS
         x_late, y_late, z_late = reading.channel_delay
         return RAW.struct.pack(
-            sample.reading_us + self._codec.utc_offset_us,
-            (reading.sequence or 0) & MASK,
-            x,
-            y,
-            z,
-            x_count,
-            y_count,
-            z_count,
-            round(x_late * 1e6),
-            round(y_late * 1e6),
-            round(z_late * 1e6),
-            reading.temperature,
-            reading.supply,
-            (reading.power_cycle or 0) & 0xFFFF,
-            0,
-            flags,
-        )
+            sample.reading_us + self._codec.utc_offset_us, (reading.sequence or 0) & MASK,
+            x, y, z, x_count, y_count, z_count,
+            round(x_late * 1e6), round(y_late * 1e6), round(z_late * 1e6),
+            reading.temperature, reading.supply, (reading.power_cycle or 0) & 0xFFFF, 0, flags,
+        )  # fmt: skip
 
     def _field(self, sample: Sample) -> tuple[bytes]:
         corrected = sample.corrected
         x, y, z = corrected.field
         x_sigma, y_sigma, z_sigma = corrected.field_sigma
         payload = FIELD.struct.pack(
-            sample.time_us + self._codec.utc_offset_us,
-            corrected.total_field,
-            self.samples & MASK,
-            self._calibration_id,
-            corrected.total_field_sigma,
-            x,
-            y,
-            z,
-            x_sigma,
-            y_sigma,
-            z_sigma,
-            sample.anomaly,
-            sample.telemetry_age,
-            (self._codec.now_us - sample.time_us) * 1e-6,
-            corrected.quality,
-            0,
-        )
+            sample.time_us + self._codec.utc_offset_us, corrected.total_field,
+            self.samples & MASK, self._calibration_id, corrected.total_field_sigma,
+            x, y, z, x_sigma, y_sigma, z_sigma, sample.anomaly, sample.telemetry_age,
+            (self._codec.now_us - sample.time_us) * 1e-6, corrected.quality, 0,
+        )  # fmt: skip
         return (self._codec.frame(FIELD, payload),)
 
     def _imu(self, sample: Sample) -> tuple[bytes]:
         x, y, z = sample.corrected.field
         payload = IMU.struct.pack(
             sample.time_us + self._codec.utc_offset_us,
-            0,
-            0,
-            0,
-            0,
-            0,
-            0,
-            x * GAUSS,
-            y * GAUSS,
-            z * GAUSS,
-            0,
-            0,
-            0,
-            0,
-            MAGNETOMETER,
-            0,
-        )
+            0, 0, 0, 0, 0, 0,  # accelerations and rotations
+            x * GAUSS, y * GAUSS, z * GAUSS,
+            0, 0, 0, 0,  # pressures, altitude, temperature
+            MAGNETOMETER, 0,
+        )  # fmt: skip
         return (self._codec.frame(IMU, payload),)
 
     def _named(self, sample: Sample) -> tuple[bytes, ...]:

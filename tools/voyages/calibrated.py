@@ -5,11 +5,12 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from accuracy import rms, total
+from accuracy import total
 from msgspec.structs import replace as with_options
 
 from magbridge.calibration.fitting.columns import observations
 from magbridge.calibration.fitting.fit import fit
+from magbridge.calibration.residual import rms
 from magbridge.correction import Correction, correct_rows
 from magbridge.field.earth import separation
 from magbridge.navigate.model import informed
