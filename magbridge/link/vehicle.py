@@ -52,7 +52,9 @@ class Vehicle:
         self._announcer, self._timers = announcer, timers
         self._sequence: int | None = None
         self._seen = ALL  # bit k: the frame k before the latest has come
-        self._boot_ms = self._boot_us = 0
+        self._boots: dict[
+            int, tuple[int, int]
+        ] = {}  # of each kind of message: its boot time (ms), our time (µs)
         self._behind = 0
         self._changes: list[int] = []
 
@@ -69,7 +71,7 @@ class Vehicle:
         if message.component == self.autopilot:
             self._count(message.sequence)
             if message.id in BOOT_TIMES:
-                self._watch_boot(BOOT_TIMES[message.id].get(message.payload), t_us)
+                self._watch_boot(message.id, BOOT_TIMES[message.id].get(message.payload), t_us)
             elif message.id == HEARTBEAT:
                 self._present(t_us)
         return True
@@ -110,24 +112,31 @@ class Vehicle:
         self.state = MAG_PORT_STATE.LOST
         self._announcer.state("autopilot", f"{who} is silent", MAV_SEVERITY.WARNING)
 
-    def _watch_boot(self, boot_ms: int, t_us: int) -> None:
-        """Distinguish a reboot from late packets, and from a second autopilot with its own boot clock."""
-        elapsed_ms = (t_us - self._boot_us) // 1000
+    def _watch_boot(self, kind: int, boot_ms: int, t_us: int) -> None:
+        """Distinguish a reboot from late packets, and from a second autopilot with its own boot clock.
+
+        Each kind of message is compared with its own last one: some are sent long after they were stamped.
+        """
+        if kind not in self._boots:
+            self._boots[kind] = boot_ms, t_us
+            return
+        last_ms, last_us = self._boots[kind]
         # modulo 2^32 ms and signed, so that the wrap after 50 days is a step forward
-        ahead_ms = (boot_ms - self._boot_ms + (1 << 31)) % (1 << 32) - (1 << 31)
-        if self._boot_us and ahead_ms < -BACK_MS:
+        ahead_ms = (boot_ms - last_ms + (1 << 31)) % (1 << 32) - (1 << 31)
+        if ahead_ms < -BACK_MS:
             self._behind += 1
             if self._behind < BELIEVED:
                 return
             self._behind = 0
             self.reboots += 1
             self.clock.reset()
+            self._boots.clear()
             self._announcer.say(f"autopilot {self.system}:{self.autopilot} rebooted", MAV_SEVERITY.WARNING)
-        elif self._behind or (self._boot_us and ahead_ms > elapsed_ms + LEAP_MS):
+        elif self._behind or ahead_ms > (t_us - last_us) // 1000 + LEAP_MS:
             self._behind = 0
             self._change(t_us)
-        if ahead_ms > 0 or ahead_ms < -BACK_MS or not self._boot_us:
-            self._boot_ms, self._boot_us = boot_ms, t_us
+        if ahead_ms > 0 or ahead_ms < -BACK_MS:
+            self._boots[kind] = boot_ms, t_us
 
     def _change(self, t_us: int) -> None:
         """Count how often the boot clock went back and forth."""

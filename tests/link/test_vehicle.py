@@ -45,6 +45,21 @@ def test_stragglers_duplicates_and_the_wrap_are_no_reboot(link):
     assert link.component.vehicle.reboots == 0
 
 
+def test_telemetry_that_is_sent_long_after_it_was_stamped_is_no_reboot(link):
+    """Three positions at once, 1.5 s old, as from a controller that sends them on; attitudes are fresh."""
+    link.fly("TIMESYNC", tc1=50_000_000_000, ts1=link.only(link.to(0.6), "TIMESYNC")[0].ts1)
+    said = []
+    for i in range(100):
+        said += link.texts(link.to(1 + i * 0.1))
+        said += link.texts(link.fly("ATTITUDE", time_boot_ms=50_000 + 100 * i))
+        if i % 5 == 0:
+            late = link.autopilot.pack("NAMED_VALUE_FLOAT", time_boot_ms=48_500 + 100 * i, value=0.5)
+            said += link.texts(link.give(late * 3))
+    assert said == []
+    assert link.component.vehicle.reboots == 0
+    assert link.component.vehicle.clock.known
+
+
 def test_two_autopilots_with_one_address(link):
     times = [boot for i in range(20) for boot in (500_000 + 200 * i, 3_000 + 200 * i)]
     said = boots(link, link.autopilot, times)
