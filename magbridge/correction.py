@@ -7,7 +7,7 @@ the sigma: the correction is evaluated at both ends of the interval in which the
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from math import hypot, inf, isfinite, nan
 from typing import TYPE_CHECKING
 
@@ -30,7 +30,7 @@ __all__ = ["TEMPERATURE", "Correction", "correct_rows"]
 TEMPERATURE = "sensor_temperature"
 """The one parameter that comes with the reading itself, not as telemetry."""
 MAX_AGE = 30.0
-"""s after which telemetry is stale, by default."""
+"""s after which telemetry is stale, unless :meth:`magbridge.align.Aligner.tune` has said otherwise."""
 
 
 class Correction:
@@ -41,21 +41,13 @@ class Correction:
     calibration : Calibration or None
         Without one every sample passes unchanged, flagged ``uncalibrated``.
     settings : Align, optional
-    ages : mapping of str to float
-        s after which a parameter's telemetry is stale; 30 s where not given.
     """
 
-    def __init__(
-        self,
-        calibration: Calibration | None,
-        settings: Align | None = None,
-        ages: Mapping[str, float] | None = None,
-    ) -> None:
+    def __init__(self, calibration: Calibration | None, settings: Align | None = None) -> None:
         calibration = calibration if calibration is not None else identity()
         ranges = {parameter.name: (parameter.low, parameter.high) for parameter in calibration.parameters}
         inputs = tuple(
-            Input(name, *ranges.get(name, (nan, nan)), max_age=(ages or {}).get(name, MAX_AGE))
-            for name in calibration.channels
+            Input(name, *ranges.get(name, (nan, nan)), max_age=MAX_AGE) for name in calibration.channels
         )
         self.aligner = Aligner(inputs, settings or Align(), calibration.sensor.power_cycle)
         self.names = tuple(one.name for one in inputs)

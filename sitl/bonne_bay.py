@@ -74,9 +74,9 @@ class Trials:
         found: Array = self.corrected.get((part, trial, method), np.full(known.shape, np.nan))
         return np.asarray(found - known)
 
-    def rms(self, part: str, trial: str, method: str, against: str = "reference_field") -> float:
-        """Return the RMS of :meth:`error`, nT."""
-        return rms(self.error(part, trial, method, against))
+    def rms(self, part: str, trial: str, method: str) -> float:
+        """Return the RMS of :meth:`error` against the reference, nT."""
+        return rms(self.error(part, trial, method))
 
 
 def measure(twin: Twin, *, at_depth: bool = False) -> dict[str, xr.Dataset]:

@@ -1,4 +1,4 @@
-"""The paper's view of a calibration: rotation M, scale S, translation T, and back.
+"""The paper's view of a calibration: rotation M, scale S, translation T.
 
 Notes
 -----
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from magbridge.calibration.model import Calibration
 
-__all__ = ["facts", "from_paper", "to_paper"]
+__all__ = ["facts", "to_paper"]
 
 FloatArray = NDArray[np.float64]
 
@@ -35,11 +35,6 @@ def to_paper(A: FloatArray, field: float) -> tuple[FloatArray, FloatArray]:
     if np.linalg.det(axes) < 0.0:
         axes[:, np.argmin(np.abs(np.diag(axes)))] *= -1.0
     return axes, field / values
-
-
-def from_paper(M: FloatArray, S: FloatArray, field: float) -> FloatArray:
-    """Return ``A = H_e M S^-1 M^T`` (3, 3)."""
-    return np.asarray((M * (field / np.asarray(S))) @ np.asarray(M).T)
 
 
 def facts(calibration: Calibration) -> dict[str, Any]:

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from numpy.typing import ArrayLike
 
 from magbridge.calibration.correct import correct
 from magbridge.calibration.dipole import Dipole
@@ -34,7 +35,7 @@ from magbridge.calibration.model import (
     Sensor,
     identity,
 )
-from magbridge.calibration.paper import facts, from_paper, to_paper
+from magbridge.calibration.paper import facts, to_paper
 from magbridge.calibration.terms import Polynomial, full_order
 from magbridge.errors import CalibrationError, FormatError
 
@@ -212,7 +213,12 @@ def test_a_file_that_is_not_there(tmp_path: Path) -> None:
         load(tmp_path / "none.json")
 
 
-def test_the_paper_s_view_converts_both_ways() -> None:
+def from_paper(M: ArrayLike, S: ArrayLike, field: float) -> np.ndarray:
+    """``A = H_e M S^-1 M^T``."""
+    return np.asarray(M) @ np.diag(field / np.asarray(S)) @ np.asarray(M).T
+
+
+def test_the_paper_s_view_is_the_same_ellipsoid() -> None:
     rng = np.random.default_rng(3)
     root = np.eye(3) + 0.05 * rng.normal(size=(3, 3))
     A = root @ root.T

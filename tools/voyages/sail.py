@@ -77,13 +77,14 @@ def voyage(
     options: Options,
     seed: int,
     *,
-    sigma: float = 1.0,
     hours: float = 6.0,
     speed: float = 0.35,
     every: float = 4.0,
     jump: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> xr.Dataset:
     """Return a deployment drawn from the options' own model: legs of 45 minutes at random headings.
+
+    A sample has 1 nT of white noise.
 
     Parameters
     ----------
@@ -93,8 +94,6 @@ def voyage(
         The filter's.
     seed : int
         Of everything that is drawn.
-    sigma : float
-        nT, white noise of a sample.
     hours : float
         How long it lasts.
     speed : float
@@ -109,9 +108,9 @@ def voyage(
     legs = np.cumsum(rng.uniform(-100.0, 100.0, n // int(2700 / every) + 1)) + rng.uniform(0.0, 360.0)
     heading = np.radians(legs[np.arange(n) // int(2700 / every)])
     bias = _markov(rng, n, options.bias_sigma, every / options.bias_time)[:, 0]
-    errors = bias + rng.normal(size=n) * sigma
+    errors = bias + rng.normal(size=n)
     velocity = speed * np.column_stack([np.cos(heading), np.sin(heading)])
-    return adrift(grid, options, rng, velocity, errors, np.full(n, sigma), every=every, jump=jump)
+    return adrift(grid, options, rng, velocity, errors, np.ones(n), every=every, jump=jump)
 
 
 def adrift(
