@@ -22,6 +22,7 @@ from magbridge.columns import CHANNELS, COLUMNS
 from magbridge.errors import CalibrationError, FormatError
 from magbridge.field.reference import reference_field
 from magbridge.logs import read
+from magbridge.logs.telemetry_writer import short_name
 from sitl.like import simulate_like
 from sitl.scenario import load
 
@@ -33,8 +34,6 @@ SENSITIVITY = 5e-5
 """V/nT of the emulated fluxgate."""
 SETTLE_TIME = 4.0
 """s after a movement: eight time constants of the paper's anti-alias filter."""
-NAME = 10
-"""Characters of a NAMED_VALUE_FLOAT's name."""
 
 
 class Part(NamedTuple):
@@ -179,13 +178,8 @@ def telemetry_of(deployment: xr.Dataset) -> list[str]:
 
 
 def short_names(names: Iterable[str]) -> dict[str, str]:
-    """Return a unique name of at most ten characters for each."""
+    """Return a short name of its own for each."""
     short: dict[str, str] = {}
     for name in names:
-        candidate = name[:NAME]
-        number = 0
-        while candidate in short.values():
-            number += 1
-            candidate = f"{name[: NAME - len(str(number))]}{number}"
-        short[name] = candidate
+        short[name] = short_name(name, short.values())
     return short

@@ -11,6 +11,7 @@ full. Units, and attributes that change what values mean, are declared in the sa
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from math import isfinite, isnan, nan, radians
 from pathlib import Path
 from typing import Any
@@ -26,7 +27,7 @@ from magbridge.mavlink import Codec, Spec, pack_record, spec
 from magbridge.mavlink.messages import east_e7
 from magbridge.records import Channel, Quality
 
-__all__ = ["FileWriter"]
+__all__ = ["FileWriter", "short_name"]
 
 VEHICLE, AUTOPILOT, BRIDGE = 1, 1, 191
 ATTITUDE = ("roll", "pitch", "heading")
@@ -83,7 +84,7 @@ class FileWriter:
         for name in map(str, dataset.data_vars):
             if name in STANDARD:
                 continue
-            short = _short(name, taken)
+            short = short_name(name, taken)
             taken.add(short)
             self._named.append((name, short.encode()))
             unit = str(dataset[name].attrs.get("units", "1"))
@@ -138,8 +139,8 @@ class FileWriter:
         self._say(time_us, Channel.SENT, self._bridge, FIELD_, *fields)
 
 
-def _short(name: str, taken: set[str]) -> str:
-    """Return at most ten letters of a name, different from those `taken`."""
+def short_name(name: str, taken: Collection[str]) -> str:
+    """Return at most ten letters of a name, as a NAMED_VALUE_FLOAT holds, different from those `taken`."""
     short = name.encode("ascii", "replace")[:10].decode() or "_"
     return next(s for s in (short, *(f"{short[:6]}{k:04d}" for k in range(10_000))) if s not in taken)
 

@@ -236,7 +236,7 @@ def test_a_bridge_that_cannot_start_says_why(survey: Path, tmp_path: Path) -> No
 
 def test_short_names_differ() -> None:
     names = short_names(["pitch_current_a", "pitch_current_b", "roll"])
-    assert list(names.values()) == ["pitch_curr", "pitch_cur1", "roll"]
+    assert list(names.values()) == ["pitch_curr", "pitch_0000", "roll"]
 
 
 def test_the_demonstration_shows_what_calibration_is_worth(tmp_path: Path) -> None:
