@@ -21,7 +21,8 @@ WINDOW = 64
 """Frames by which one may come late and no longer count as lost."""
 ALL = (1 << WINDOW) - 1
 LEAP_MS = 10_000
-"""ms by which ``time_boot_ms`` may run ahead of our clock before it counts as another autopilot's."""
+"""ms by which ``time_boot_ms`` may run ahead of our clock, or lag behind other messages', before it counts as
+another autopilot's."""
 TWICE, CHANGES_US = 5, 10_000_000
 """This many changes between two boot clocks within this many µs mean that there are two autopilots."""
 BOOT_TIMES = {
@@ -52,9 +53,8 @@ class Vehicle:
         self._announcer, self._timers = announcer, timers
         self._sequence: int | None = None
         self._seen = ALL  # bit k: the frame k before the latest has come
-        self._boots: dict[
-            int, tuple[int, int]
-        ] = {}  # of each kind of message: its boot time (ms), our time (µs)
+        self._boot_ms = self._boot_us = 0
+        self._stamps: dict[int, int] = {}  # the last boot time (ms) of each kind of message
         self._behind = 0
         self._changes: list[int] = []
 
@@ -113,30 +113,27 @@ class Vehicle:
         self._announcer.state("autopilot", f"{who} is silent", MAV_SEVERITY.WARNING)
 
     def _watch_boot(self, kind: int, boot_ms: int, t_us: int) -> None:
-        """Distinguish a reboot from late packets, and from a second autopilot with its own boot clock.
-
-        Each kind of message is compared with its own last one: some are sent long after they were stamped.
-        """
-        if kind not in self._boots:
-            self._boots[kind] = boot_ms, t_us
-            return
-        last_ms, last_us = self._boots[kind]
-        # modulo 2^32 ms and signed, so that the wrap after 50 days is a step forward
-        ahead_ms = (boot_ms - last_ms + (1 << 31)) % (1 << 32) - (1 << 31)
-        if ahead_ms < -BACK_MS:
+        """Distinguish a reboot from late packets, and from a second autopilot with its own boot clock."""
+        ahead_ms = _after(boot_ms, self._boot_ms)
+        goes_on = _after(boot_ms, self._stamps.setdefault(kind, boot_ms)) >= -BACK_MS
+        if goes_on:
+            self._stamps[kind] = boot_ms
+        if self._boot_us and ahead_ms < -BACK_MS:
+            if goes_on and ahead_ms > -LEAP_MS:
+                return  # of a kind that is sent long after it was stamped
             self._behind += 1
             if self._behind < BELIEVED:
                 return
             self._behind = 0
             self.reboots += 1
             self.clock.reset()
-            self._boots.clear()
+            self._stamps.clear()
             self._announcer.say(f"autopilot {self.system}:{self.autopilot} rebooted", MAV_SEVERITY.WARNING)
-        elif self._behind or ahead_ms > (t_us - last_us) // 1000 + LEAP_MS:
+        elif self._behind or (self._boot_us and ahead_ms > (t_us - self._boot_us) // 1000 + LEAP_MS):
             self._behind = 0
             self._change(t_us)
-        if ahead_ms > 0 or ahead_ms < -BACK_MS:
-            self._boots[kind] = boot_ms, t_us
+        if ahead_ms > 0 or ahead_ms < -BACK_MS or not self._boot_us:
+            self._boot_ms, self._boot_us = boot_ms, t_us
 
     def _change(self, t_us: int) -> None:
         """Count how often the boot clock went back and forth."""
@@ -145,3 +142,8 @@ class Vehicle:
             self._announcer.state(
                 "autopilots", f"two autopilots speak as {self.system}:{self.autopilot}", MAV_SEVERITY.WARNING
             )
+
+
+def _after(one_ms: int, other_ms: int) -> int:
+    """Return the ms from another boot time to one, signed: the wrap after 50 days is a step forward."""
+    return (one_ms - other_ms + (1 << 31)) % (1 << 32) - (1 << 31)

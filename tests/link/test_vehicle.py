@@ -45,6 +45,12 @@ def test_stragglers_duplicates_and_the_wrap_are_no_reboot(link):
     assert link.component.vehicle.reboots == 0
 
 
+def test_a_reboot_soon_after_a_boot(link):
+    assert boots(link, link.autopilot, [*range(3000, 8000, 500), *range(500, 3000, 500)]) == [
+        "autopilot 1:1 rebooted"
+    ]
+
+
 def test_telemetry_that_is_sent_long_after_it_was_stamped_is_no_reboot(link):
     """Three positions at once, 1.5 s old, as from a controller that sends them on; attitudes are fresh."""
     link.fly("TIMESYNC", tc1=50_000_000_000, ts1=link.only(link.to(0.6), "TIMESYNC")[0].ts1)
