@@ -149,7 +149,7 @@ def _glides(deployment: xr.Dataset) -> bool:
     rate = np.gradient(known["depth"].to_numpy().astype(float)) if known.sizes["time"] > 2 else np.zeros(0)
     steep = np.abs(known["pitch"].to_numpy()[: rate.size]) > GLIDE
     agree = rate[steep] * known["pitch"].to_numpy()[: rate.size][steep] < 0.0
-    return steep.mean() > 0.5 and bool(agree.mean() > 0.8) if steep.size else False
+    return bool(steep.mean() > 0.5 and agree.mean() > 0.8) if steep.size else False
 
 
 def _columns(deployment: xr.Dataset, names: Mapping[str, str]) -> dict[str, Floats]:

@@ -121,7 +121,7 @@ class _Design:
         noise, memory = self.calibration.noise.sensor, self.calibration.noise.memory
         weight = SAMPLES / HEADINGS / noise**2 * (1.0 - memory) / (1.0 + memory)
         values, vectors = np.linalg.eigh(g.T @ g * weight)
-        return np.kron(phi[:1].T, vectors * np.sqrt(np.maximum(values, 0.0)))
+        return np.asarray(np.kron(phi[:1].T, vectors * np.sqrt(np.maximum(values, 0.0))), np.float64)
 
     def variances(self, C: FloatArray) -> FloatArray:
         """Return the variance (n,), nT², at the mission's points."""

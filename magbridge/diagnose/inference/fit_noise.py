@@ -264,7 +264,7 @@ def _levels(
 def _spread(levels: FloatArray, count: NDArray[np.int64]) -> FloatArray:
     """(n,) level of each sample; of a single block it takes no memory."""
     if count.size == 1:
-        return np.broadcast_to(levels, count.sum())
+        return np.broadcast_to(levels, int(count.sum()))
     return np.repeat(levels, count)
 
 

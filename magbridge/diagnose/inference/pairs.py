@@ -83,7 +83,7 @@ class _Stack:
         y = np.einsum("mij,mi->mj", vectors, b)
         ratio = np.sum(np.where(seen, y**2 / np.where(seen, values, 1.0), 0.0), axis=1)
         ratio[self.positive & (b.min(axis=1) < 0.0)] = 0.0
-        freedom = seen.sum(axis=1)
+        freedom = seen.sum(axis=1, dtype=np.float64)
         over = np.maximum(ratio / np.maximum(freedom, 1), 1.0)
         evidence = 0.5 * freedom * (over - 1.0 - np.log(over))
         evidence += np.where(self.positive & (ratio > 0.0), np.log(2.0) + log_ndtr(np.sqrt(ratio)), 0.0)

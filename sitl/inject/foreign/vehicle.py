@@ -235,14 +235,14 @@ def afterglow(scene: Scene, size: float, rng: Generator) -> None:
     """The pump's brake stays energised until its relay cools, without a logged current; size in nT."""
     moved = np.abs(np.gradient(scene.track.parameters["ballast"], scene.track.step)) > 1.0
     warm = first_order(moved.astype(float), scene.track.step, float(rng.uniform(40.0, 200.0)))
-    held = warm > rng.uniform(0.05, 0.2) * max(warm.max(), 1e-9)
+    held = (warm > rng.uniform(0.05, 0.2) * max(warm.max(), 1e-9)).astype(float)
     scene.add(held, size * direction(rng))
 
 
 def sampler(scene: Scene, size: float, rng: Generator) -> None:
     """A water sampler's unlogged pump runs on every climb, and draws more as its filter clogs; size in nT."""
     sinking = np.gradient(first_order(scene.track.depth, scene.track.step, 20.0), scene.track.step)
-    runs = sinking < -rng.uniform(0.02, 0.1)
+    runs = (sinking < -rng.uniform(0.02, 0.1)).astype(float)
     hours = np.cumsum(runs) * scene.track.step / 3600.0
     draws = runs * (1.0 + rng.uniform(0.05, 0.2) * hours)
     scene.add(first_order(draws, scene.track.step, 5.0), size * direction(rng))
@@ -251,7 +251,7 @@ def sampler(scene: Scene, size: float, rng: Generator) -> None:
 def sounder(scene: Scene, size: float, rng: Generator) -> None:
     """An unlogged echo sounder hears the bottom below a depth and pings faster the nearer; size in nT."""
     depth = scene.track.depth
-    heard = depth > rng.uniform(0.3, 0.7) * depth.max()
+    heard = (depth > rng.uniform(0.3, 0.7) * depth.max()).astype(float)
     near = rng.uniform(5.0, 20.0)
     pings = heard * np.minimum(2.0 * near / (depth.max() + near - depth), 1.0)
     scene.add(first_order(pings, scene.track.step, 5.0), size * direction(rng))
