@@ -113,6 +113,8 @@ class Component:
         self.parameters = Parameters([*rates({**DEFAULTS, **publish}, LIMITS), *tunables])
         for name in self.parameters.restore(kept or {}):
             self.announcer.say(f"kept parameter {name} does not fit: default", MAV_SEVERITY.WARNING)
+        if changed := self.parameters.changed():
+            self.announcer.say(f"kept from the link, not as configured: {', '.join(changed)}")
         self.rates = {name: Rate(self.parameters[rate_name(name)]) for name in LIMITS}
         self.publisher = Publisher(self.outbox, self.rates, calibration_id, start_us)
         self._reports = Reports(
