@@ -11,6 +11,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 
+# threads only wait for each other on matrices this narrow, above all beside those of a second worker
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 import pymavlink
 import pytest
 from hypothesis import settings

@@ -19,13 +19,15 @@ from magbridge.diagnose.compare.past import FAR
 from magbridge.diagnose.compare.problem import Problem, pose
 from magbridge.diagnose.compare.survey import Channel, Survey
 from magbridge.diagnose.compare.take import take
+from magbridge.diagnose.inference.descriptions import Description, descriptions
+from magbridge.diagnose.inference.joint import fit_joint
 from sitl import load, simulate
 from sitl.columns import segments
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def problem() -> Problem:
     """The demo's survey against the calibration of its own runs."""
     scenario = load("demo")
@@ -35,6 +37,12 @@ def problem() -> Problem:
     )
     calibration = fit(learned, "auto").calibration
     return pose(take([parts["survey"]], calibration), calibration)
+
+
+@pytest.fixture(scope="session")
+def listed(problem: Problem) -> list[Description]:
+    """Its descriptions without a name, beside noise alone."""
+    return descriptions(problem, fit_joint(problem, [], 1))
 
 
 def _right(rows: int) -> Problem:

@@ -11,8 +11,7 @@ from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.lowpass import unfiltered
 from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.compare.problem import Problem
-from magbridge.diagnose.inference.descriptions import descriptions
-from magbridge.diagnose.inference.joint import fit_joint
+from magbridge.diagnose.inference.descriptions import Description
 from magbridge.diagnose.inference.shapes import bends, crossing, delayed, near_surface, response, swings
 from magbridge.diagnose.inference.statistic import SIZES, Statistic
 from magbridge.diagnose.run import diagnose
@@ -120,49 +119,55 @@ def test_what_the_sun_warms_at_the_surface_is_described() -> None:
     assert left_of(warm, near_surface(time, depth)(slice(None))) < 0.02
 
 
-def test_turns_and_the_surface_are_among_the_descriptions(problem: Problem) -> None:
+def test_turns_and_the_surface_are_among_the_descriptions(
+    problem: Problem, listed: list[Description]
+) -> None:
     """Seen through the projection; no other description holds half of what turns do."""
     survey, rows = problem.survey, slice(0, len(problem))
     assert survey.attitude is not None
-    listed = [one.columns(rows) for one in descriptions(problem, fit_joint(problem, [], 1))]
+    columns = [one.columns(rows) for one in listed]
     seen = problem.slopes[:, 6:] @ [0.4, -0.8, 0.45]
     turning = np.gradient(np.unwrap(np.radians(survey.attitude[:, 2])), survey.time)
-    best, second = sorted(left_of(followed(survey.time, turning, 15.0) * seen, X) for X in listed)[:2]
+    best, second = sorted(left_of(followed(survey.time, turning, 15.0) * seen, X) for X in columns)[:2]
     assert best < 0.2
     assert second > 0.5
     near = np.exp(-survey.channels["depth"].values / 10.0)
     warm = followed(survey.time, near, 600.0) * seen
-    assert min(left_of(warm, X) for X in listed if X.shape[1] == 24) < 0.01
+    assert min(left_of(warm, X) for X in columns if X.shape[1] == 24) < 0.01
 
 
-def test_a_sensitivity_that_follows_a_channel_is_no_offset_that_does(problem: Problem) -> None:
+def test_a_sensitivity_that_follows_a_channel_is_no_offset_that_does(
+    problem: Problem, listed: list[Description]
+) -> None:
     offset, scale = (
         next(c for c in CAUSES[name].candidates(problem) if c.channel == "sensor_temperature")
         for name in ("temperature_offset", "temperature_scale")
     )
-    listed = descriptions(problem, fit_joint(problem, [], 1))
     of_channel = [one for one in listed if one.channel == "sensor_temperature" and not one.remembers]
     assert [one.scales for one in of_channel] == [False, False, True]
     assert [one.covers([offset]) for one in of_channel] == [True, True, False]
     assert [one.covers([scale]) for one in of_channel] == [False, False, True]
 
 
-def test_where_a_channel_has_one_cause_its_sensitivity_is_no_alternative(problem: Problem) -> None:
+def test_where_a_channel_has_one_cause_its_sensitivity_is_no_alternative(
+    problem: Problem, listed: list[Description]
+) -> None:
     """In a vehicle that turns little, a current's field looks like a sensitivity that follows the current."""
     squeezed = next(c for c in CAUSES["pressure_offset"].candidates(problem) if c.channel == "depth")
-    listed = descriptions(problem, fit_joint(problem, [], 1))
     of_channel = [one for one in listed if one.channel == "depth" and not one.remembers]
     assert [one.covers([squeezed]) for one in of_channel] == [True, True, True]
 
 
-def test_functions_of_the_direction_and_of_the_reading_hold_a_bend(problem: Problem) -> None:
+def test_functions_of_the_direction_and_of_the_reading_hold_a_bend(
+    problem: Problem, listed: list[Description]
+) -> None:
     """To 1 % of what a calibration's constants do not hold: the field hardly changes its size."""
     rows = slice(0, len(problem))
     (bend, more, _), (step, *_) = (
         CAUSES[name].candidates(problem) for name in ("nonlinearity", "offset_step")
     )
     bent = np.hstack([bend.columns(rows), more.columns(rows)])
-    held = [one for one in descriptions(problem, fit_joint(problem, [], 1)) if "nonlinearity" in one.holds]
+    held = [one for one in listed if "nonlinearity" in one.holds]
     assert len(held) == 2
 
     def left(X: np.ndarray) -> float:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from magbridge.diagnose.causes.masses import actuator_order, hysteresis
 from magbridge.diagnose.compare.columns import Columns
 from magbridge.diagnose.compare.problem import Problem
-from magbridge.diagnose.inference.descriptions import descriptions
+from magbridge.diagnose.inference.descriptions import Description
 from magbridge.diagnose.inference.events import MOMENTS, passage, step
 from magbridge.diagnose.inference.joint import fit_joint
 
@@ -53,9 +53,8 @@ def test_a_dipole_that_passes_is_told_by_three_numbers(problem: Problem) -> None
 
 
 def test_a_curve_through_a_mass_position_covers_its_order_and_its_memory_the_hysteresis(
-    problem: Problem,
+    problem: Problem, listed: list[Description]
 ) -> None:
-    listed = descriptions(problem, fit_joint(problem, [], 1))
     order = actuator_order(problem)[0]
     back = next(one for one in hysteresis(problem) if one.channel == "battpos")
     curve, memory, *late = (one for one in listed if one.channel == "battpos")
@@ -64,8 +63,8 @@ def test_a_curve_through_a_mass_position_covers_its_order_and_its_memory_the_hys
     assert not any(one.covers([order]) or one.covers([back]) for one in late)
 
 
-def test_every_description_has_as_many_columns_as_widths(problem: Problem) -> None:
-    for one in descriptions(problem, fit_joint(problem, [], 1)):
+def test_every_description_has_as_many_columns_as_widths(listed: list[Description]) -> None:
+    for one in listed:
         columns = one.columns(slice(0, 50))
         assert np.isfinite(columns).all()
         assert {columns.shape[1]} == {len(width) for _, width in one.widths}
