@@ -16,7 +16,6 @@ from study import stage
 from study.cases import alike, case
 from study.noise import GLIDER, LOSSES, NOISES
 from study.rates import worse
-from threadpoolctl import threadpool_limits
 
 from magbridge.calibration.file import load
 from magbridge.diagnose.causes import CAUSES
@@ -39,8 +38,7 @@ def short() -> Iterator[None]:
     """Two hours where the study has six."""
     hours, stage.HOURS = stage.HOURS, 2.0
     stage.vehicle.cache_clear()
-    with threadpool_limits(1):
-        yield
+    yield
     stage.HOURS = hours
     stage.vehicle.cache_clear()
 

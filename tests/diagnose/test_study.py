@@ -240,9 +240,8 @@ def test_a_share_tells_its_interval() -> None:
 def started(stack: ExitStack, *command: str, cwd: Path) -> None:
     """A process that ends with the stack."""
     process = subprocess.Popen(
-        [sys.executable, "-m", *command], cwd=cwd, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
-        env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
-    )  # fmt: skip
+        [sys.executable, "-m", *command], cwd=cwd, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
 
     def end() -> None:
         process.send_signal(signal.SIGTERM)
