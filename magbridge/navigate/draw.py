@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from magbridge.field.earth import metres_per_degree, usual
 from magbridge.field.grid import AnomalyGrid
+from magbridge.field.igrf import total_field
 from magbridge.files import atomic_path
 from magbridge.navigate.bound import Bound
 from magbridge.navigate.record import State
@@ -23,7 +24,7 @@ from magbridge.navigate.reference_track import errors
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["draw_bound", "draw_navigation"]
+__all__ = ["draw_bound", "draw_navigation", "measured_on_track"]
 
 Array = NDArray[np.floating[Any]]
 
@@ -42,9 +43,9 @@ def draw_navigation(result: xr.Dataset, grid: AnomalyGrid, path: str | Path) -> 
 
     axis = panels["field"]
     axis.plot(
-        hours, result["anomaly"], ".", ms=2, color="0.3", label="measured, at the dead-reckoned position"
+        hours, measured_on_track(result), ".", ms=2, color="0.3", label="measured, on the filter's track"
     )
-    axis.plot(hours, result["map_anomaly"], color="C3", lw=1, label="map under the track")
+    axis.plot(hours, result["map_anomaly"], color="C3", lw=1, label="map, on the filter's track")
     axis.set_ylabel("anomaly, nT")
 
     axis = panels["innovation"]
@@ -69,6 +70,7 @@ def draw_navigation(result: xr.Dataset, grid: AnomalyGrid, path: str | Path) -> 
     if np.isfinite(error).any():
         axis.semilogy(hours, error, color="0.2", lw=0.8, label="error")
         axis.semilogy(hours, reckoned, color="0.35", ls="--", lw=1, label="error, dead reckoning alone")
+    axis.set_ylim(bottom=0.02 * float(smoothed.min()))  # the first error may be of millimetres
     axis.set_ylabel("position error, m")
     _plain(axis)
     axis.set_xlabel("hours")
@@ -95,7 +97,9 @@ def draw_bound(bound: Bound, grid: AnomalyGrid, path: str | Path) -> None:
     axis.legend(loc="best", fontsize=8)
     scale = figure.colorbar(line, ax=axis, label="smallest possible position error (DRMS), m", shrink=0.9)
     _plain(scale.ax)
-    axis.set_title(f"at the end {bound.sigma[-1]:.0f} m; dead reckoning alone {bound.unaided[-1]:.0f} m")
+    axis.set_title(
+        f"at best {bound.sigma[-1]:.0f} m at the end; dead reckoning alone {bound.unaided[-1]:.0f} m"
+    )
 
     axis = panels["time"]
     hours = (bound.time - bound.time[0]) / 3600.0
@@ -148,6 +152,18 @@ def _map(axis: Axes, grid: AnomalyGrid, longitude: Any, latitude: Any) -> None:
     axis.figure.colorbar(drawn, cax=scale, orientation="horizontal")
     scale.set_title("anomaly, nT", fontsize=8)
     scale.tick_params(labelsize=8)
+
+
+def measured_on_track(result: xr.Dataset) -> Array:
+    """Return the anomaly (n,), nT: the measured field minus the main field at the filter's position."""
+    longitude, latitude = result["longitude"].to_numpy(), result["latitude"].to_numpy()
+    per_latitude, per_longitude = metres_per_degree(latitude)
+    east, north = result["east"].to_numpy() / per_longitude, result["north"].to_numpy() / per_latitude
+    depth, time = np.nan_to_num(result["depth"].to_numpy()), result["time"].to_numpy()
+    main = total_field(longitude, latitude, depth, time)
+    reckoned = total_field(longitude - east, latitude - north, depth, time)
+    measured: Array = result["anomaly"].to_numpy() + reckoned - main
+    return measured
 
 
 def _tracks(axis: Axes, result: xr.Dataset) -> list[Array]:

@@ -36,6 +36,8 @@ LEVEL = 4.0
 """Sigmas of the calibration's bias: a larger difference in level has another reason."""
 LISTED = 3
 """Jumps of the filter that are reported one by one: the map of another place causes dozens."""
+DOUBTFUL = 3.0
+"""Sigma of a sample over the median one, above which it says nothing about the map."""
 EXPLAINED = 0.5
 """Share of the field's variance along the track, below which the map does not describe it."""
 
@@ -103,15 +105,17 @@ def _jumps(jumps: Sequence[Jump], start: float) -> list[str]:
     said = []
     for hour, jump in zip(hours, jumps[:LISTED], strict=False):
         far = hypot(jump.north, jump.east)
-        sentence = f"after {hour:.1f} h {jump.cause}: moved {far:.0f} m ({_compass(jump.north, jump.east)})"
+        moved = f"moved {far:.0f} m ({_compass(jump.north, jump.east)})" if far >= 0.5 else "restarted there"
+        sentence = f"after {hour:.1f} h {jump.cause}: {moved}"
         if far > 3.0 * jump.allowed:
             sentence += (
                 f", {far / jump.allowed:.0f} times what dead reckoning allows:"
                 " the start or the map is in the wrong place (datum?)"
             )
         said.append(sentence)
-    if len(jumps) > LISTED:
-        said.append(f"moved another {len(jumps) - LISTED} times, the last time after {hours[-1]:.1f} h")
+    if (others := len(jumps) - LISTED) > 0:
+        times = "once more" if others == 1 else f"another {others} times, the last time"
+        said.append(f"moved {times} after {hours[-1]:.1f} h")
     return said
 
 
@@ -181,6 +185,9 @@ def _positions(grid: AnomalyGrid, reference_track: xr.Dataset, options: Options)
     time = reference_track["time"].to_numpy()
     measured = reference_track["total_field"].to_numpy() - total_field(longitude, latitude, depth, time)
     known = np.isfinite(measured + grid.evaluate(longitude, latitude, depth).anomaly)
+    if "total_field_sigma" in reference_track:  # while a mass moves the field is off by any amount
+        sigma = reference_track["total_field_sigma"].to_numpy()
+        known &= sigma <= DOUBTFUL * np.nanmedian(sigma)
     if known.sum() < SPARSE:
         return []
     thin = np.flatnonzero(known)[:: max(1, int(known.sum()) // 400)]

@@ -24,6 +24,7 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from magbridge.calibration.model import Calibration
+from magbridge.config import NotNegative, Positive
 from magbridge.field.grid import AnomalyGrid
 
 __all__ = [
@@ -81,20 +82,20 @@ class Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
         Odds at which another explanation of the field replaces the filter's.
     """
 
-    start_sigma: float = 50.0
-    current_sigma: float = 0.1
-    current_time: float = 21_600.0
-    drift: float = 0.2
-    bias_sigma: float = 5.0
-    bias_time: float = 21_600.0
-    map_sigma: float = 2.0
-    map_length: float = 1_000.0
-    noise: float | None = None
-    memory: float = 0.0
-    gate: float = 16.0
-    interval: float = 20.0
-    vouch_sigma: float = 500.0
-    doubt: float = 2_000.0
+    start_sigma: Positive = 50.0
+    current_sigma: NotNegative = 0.1
+    current_time: Positive = 21_600.0
+    drift: NotNegative = 0.2
+    bias_sigma: NotNegative = 5.0
+    bias_time: Positive = 21_600.0
+    map_sigma: NotNegative = 2.0
+    map_length: Positive = 1_000.0
+    noise: NotNegative | None = None
+    memory: NotNegative = 0.0
+    gate: Positive = 16.0
+    interval: NotNegative = 20.0
+    vouch_sigma: Positive = 500.0
+    doubt: Positive = 2_000.0
 
 
 class Block(NamedTuple):

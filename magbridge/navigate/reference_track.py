@@ -26,7 +26,8 @@ def reference_track(deployment: xr.Dataset, used: frozenset[str]) -> xr.Dataset 
     """Return the best position that the estimate has not used, with the field there, or None."""
     for pair in REFERENCES:
         if pair[0] not in used and all(name in deployment for name in pair):
-            wanted = [*pair, "total_field", *(["depth"] if "depth" in deployment else [])]
+            others = [name for name in ("total_field_sigma", "depth") if name in deployment]
+            wanted = [*pair, "total_field", *others]
             known = deployment[wanted].rename(dict(zip(pair, ("latitude", "longitude"), strict=True)))
             known = known.dropna("time", subset=["latitude", "longitude"])
             if known.sizes["time"]:

@@ -10,12 +10,13 @@ import xarray as xr
 from msgspec.structs import replace
 
 from magbridge.errors import FormatError
+from magbridge.field.earth import metres_per_degree
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.igrf import total_field
 from magbridge.field.read import read_grid
 from magbridge.navigate import Navigator, Options
 from magbridge.navigate.batch import navigate
-from magbridge.navigate.draw import draw_navigation
+from magbridge.navigate.draw import draw_navigation, measured_on_track
 
 PLACE = (49.5, -57.9)
 
@@ -66,6 +67,20 @@ def test_its_picture(result, grid, tmp_path):
     assert (tmp_path / "track.png").stat().st_size > 40_000
 
 
+def test_what_is_drawn_is_the_anomaly_on_the_filters_track(result):
+    """What is recorded has the main field where dead reckoning was: five km north, that is 10 nT off."""
+    moved = result.isel(time=slice(3)).assign(
+        north=("time", [0.0, -5_000.0, 0.0]), east=("time", np.zeros(3))
+    )
+    same, other, _ = measured_on_track(moved) - moved["anomaly"].to_numpy()
+    assert same == pytest.approx(0.0, abs=1e-6)
+    there = moved["latitude"][1] + 5_000.0 / metres_per_degree(49.5)[0]
+    place = {name: moved[name].to_numpy()[1:2] for name in ("longitude", "latitude", "depth", "time")}
+    expected = total_field(**place | {"latitude": [float(there)]}) - total_field(**place)
+    assert other == pytest.approx(float(expected[0]), abs=0.01)
+    assert 5.0 < abs(other) < 30.0
+
+
 def test_a_shifted_map_is_recognised(ds, grid, options):
     shifted = AnomalyGrid(grid.longitude + 300 / 72_400, grid.latitude + 400 / 111_200, grid.anomaly)
     findings = navigate(ds, shifted, options, start=PLACE).attrs["findings"]
@@ -85,6 +100,16 @@ def test_another_map_altogether_is_recognised(study, ds, options):
     result = navigate(ds, wrong, options, start=PLACE)
     assert "lost for" in result.attrs["findings"]
     assert float(result["vouched"][result["time"] > result["time"][0] + 1800].mean()) < 0.1
+
+
+def test_what_is_known_badly_says_nothing_about_the_map(ds, grid, options):
+    """While a mass moves the field is off by hundreds of nT, and says so: its sigma is as large."""
+    moving = np.arange(ds.sizes["time"]) % 25 == 0
+    off = ds.assign(
+        total_field=ds["total_field"] + np.where(moving, 400.0, 0.0),
+        total_field_sigma=ds["total_field_sigma"].where(~moving, 300.0),
+    )
+    assert navigate(off, grid, options, start=PLACE).attrs["findings"] == ""
 
 
 def test_a_flat_map_is_recognised(study, options):

@@ -110,13 +110,12 @@ def test_wrong_use_is_one_line(folder, capsys):
     assert run(folder, str(folder / "log.nc"), "--map", str(folder / "grid.nc"), calibration=False) == 2
     assert "expected --calibration" in capsys.readouterr().err
     (folder / "other.toml").write_text("[navigation.options]\nstart_sgma = 1.0\n")
-    code = run(
-        folder,
-        str(folder / "log.nc"),
-        "--map",
-        str(folder / "grid.nc"),
-        "--config",
-        str(folder / "other.toml"),
+    others = (
+        *(str(folder / "log.nc"), "--map", str(folder / "grid.nc")),
+        *("--config", str(folder / "other.toml")),
     )
-    assert code == 2
+    assert run(folder, *others) == 2
     assert "navigation.options.start_sgma: unknown key" in capsys.readouterr().err
+    (folder / "other.toml").write_text("[navigation.options]\nstart_sigma = -1.0\n")
+    assert run(folder, *others) == 2
+    assert "navigation.options.start_sigma: expected `float` > 0.0" in capsys.readouterr().err
