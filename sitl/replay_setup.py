@@ -129,7 +129,9 @@ def _calibrate(deployment: xr.Dataset, parts: Sequence[Part], path: Path) -> str
     except (CalibrationError, FormatError) as error:
         return f"none: {error}"
     save(found.calibration, path)
-    return f"nominal, fitted on {parts[0].name} to {parts[-2].name}: {found.rms:.1f} nT RMS there"
+    first, last = parts[0].name, parts[-2].name
+    fitted = first if first == last else f"{first} to {last}"
+    return f"nominal, fitted on {fitted}: {found.rms:.1f} nT RMS there"
 
 
 def bridge_toml(deployment: xr.Dataset, names: Iterable[str], *, calibrated: bool, log: str = "") -> str:

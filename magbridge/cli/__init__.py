@@ -77,7 +77,8 @@ def main(arguments: list[str] | None = None) -> int:
 
 def _misuse(error: CycloptsError) -> str:
     if isinstance(error, UnusedCliTokensError):
-        unused = " ".join(error.unused_tokens or ())
+        first, *others = error.unused_tokens or ("",)
+        unused = f"{first} and {len(others)} more" if others else first
         return f"{unused}: unexpected argument; an option with several values is repeated for each"
     if isinstance(error, MissingArgumentError) and error.keyword is None:  # the option itself is missing
         return str(error).replace("requires an argument", "is required")

@@ -22,6 +22,7 @@ from magbridge.cli.common import (
     note_losses,
     note_missing,
     print_result,
+    refuse_other_units,
 )
 from magbridge.progress import track, waiting
 
@@ -202,7 +203,9 @@ def correct(*files: Path, calibration: Path, output: Log, json: Json = False) ->
             corrected = correct_rows(correction, part)
             writer.append(corrected)
             rows += part.sizes["time"]
-            whole |= bool(part[list(CHANNELS)].to_array().notnull().all("variable").any())
+            if not whole:
+                refuse_other_units(known, part)
+                whole = bool(part[list(CHANNELS)].to_array().notnull().all("variable").any())
             quality = corrected["quality"].to_numpy().astype(int)
             flagged += int((quality & doubtful != 0).sum())
             flags.update({flag.names(): int((quality & flag != 0).sum()) for flag in doubtful})

@@ -13,7 +13,7 @@ import msgspec
 from cyclopts import App, Parameter, Token
 
 from magbridge import __version__
-from magbridge.errors import WrongUse
+from magbridge.errors import FormatError, WrongUse
 from magbridge.logs import suffixes
 
 if TYPE_CHECKING:
@@ -39,6 +39,7 @@ __all__ = [
     "note_losses",
     "note_missing",
     "print_result",
+    "refuse_other_units",
 ]
 
 
@@ -142,6 +143,16 @@ def note_missing(calibration: Calibration, deployment: xr.Dataset) -> None:
         if name not in deployment:
             lacking = f"{deployment.attrs['source']}: no column {name!r}, which the calibration needs"
             complain(f"{lacking}: every sample is flagged, with a sigma to match")
+
+
+def refuse_other_units(calibration: Calibration, deployment: xr.Dataset) -> None:
+    """FormatError: the channels of a log that is to be corrected cannot be nT."""
+    from magbridge.columns import CHANNELS
+    from magbridge.field.reference import other_units
+
+    channels = deployment[list(CHANNELS)].to_array().to_numpy().T
+    if wrong := other_units(channels, calibration.reference.field):
+        raise FormatError(deployment.attrs["source"], wrong)
 
 
 def print_result(result: dict[str, Any], sentence: str, as_json: bool) -> None:

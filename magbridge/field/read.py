@@ -75,13 +75,17 @@ def read_grid(path: str | Path) -> AnomalyGrid:
 def read_polygon(path: str | Path) -> Array:
     """Read a polygon: a text file with longitude and latitude (deg) in each row, (k, 2), k at least 3.
 
+    A header that begins with ``longitude`` is skipped.
+
     Raises
     ------
     FormatError
         It cannot be read or is not a polygon.
     """
     try:
-        polygon = np.loadtxt(path, delimiter=",", ndmin=2)
+        with Path(path).open(encoding="utf-8-sig") as file:
+            header = file.readline().lower().startswith("longitude")
+        polygon = np.loadtxt(path, delimiter=",", ndmin=2, encoding="utf-8-sig", skiprows=int(header))
     except OSError as error:
         raise FormatError(path, f"cannot be read: {error.strerror or error}") from error
     except ValueError as error:

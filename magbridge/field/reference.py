@@ -101,6 +101,22 @@ def earth_field(deployment: xr.Dataset, grid: AnomalyGrid | None = None) -> tupl
     return total, vector, name
 
 
+def other_units(channels: Array, reference: float) -> str:
+    """Say so when raw channels (n, 3) cannot be nT in a field of `reference`, nT, as gauss or µT; else "".
+
+    No iron changes the field tenfold.
+    """
+    lengths = magnitude(channels)
+    whole = np.isfinite(lengths)
+    read = float(np.median(lengths[whole])) if whole.any() else reference
+    if 0.1 * reference < read < 10.0 * reference:
+        return ""
+    return (
+        f"mag_x mag_y mag_z: the length of the vector is {read:.3g} (median), where the reference is "
+        f"{reference:.0f} nT: expected nT"
+    )
+
+
 def main_field(deployment: xr.Dataset) -> Array:
     """Return the IGRF at every sample, (n, 3) nT, north-east-down; NaN where there is no position."""
     field = np.full((deployment.sizes["time"], 3), np.nan)

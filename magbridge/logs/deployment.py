@@ -46,6 +46,8 @@ LEAST = {
 }
 """Lowest temperatures and pressures, also of a pressure relative to the surface's: -9999 is a code for
 "not known"."""
+FIELDS = 1e3, 1e6
+"""nT, between which every reference field lies: 5e-05 is in tesla, and -9999 a code for "not known"."""
 APART = 60.0
 """s by which a channel's sampling time may differ from its row's time."""
 COUNTERS = {
@@ -153,7 +155,7 @@ def increasing(
 
 
 def plausible(file: str | Path, dataset: xr.Dataset, rows: Sequence[int]) -> None:
-    """Check for impossible temperatures, pressures, angles, positions, depths and channel times.
+    """Check for impossible temperatures, pressures, angles, positions, depths, references and channel times.
 
     Raises
     ------
@@ -165,6 +167,9 @@ def plausible(file: str | Path, dataset: xr.Dataset, rows: Sequence[int]) -> Non
         values, unit = column.values, usual(column.attrs.get("units", ""))
         if name in MOST:
             wrong, expected = np.abs(values) > MOST[str(name)], f"{unit}, at most {MOST[str(name)]:g}"
+        elif name == "reference_field":
+            wrong = (values < FIELDS[0]) | (values > FIELDS[1])
+            expected = f"{FIELDS[0]:g} to {FIELDS[1]:g} nT, or nothing where it is not known"
         elif name in CHANNEL_TIMES:
             wrong, expected = np.abs(values - time) > APART, f"a time within {APART:g} s of the row's"
         elif unit in LEAST:

@@ -11,6 +11,7 @@ from magbridge.calibration.file import save as save_calibration
 from magbridge.calibration.fitting.fit import METHODS
 from magbridge.calibration.model import identity
 from magbridge.cli import main
+from magbridge.columns import CHANNELS
 from magbridge.logs import read, write
 
 METHOD_NAMES = ", ".join(f'"{name}"' for name in METHODS)
@@ -65,6 +66,27 @@ def test_a_log_without_a_whole_reading_is_not_corrected(
     assert not output.exists()
 
 
+@pytest.mark.parametrize("command", ["correct", "navigate"])
+@pytest.mark.parametrize("unit", [1e-9, 1e-3, 1e9])
+def test_a_log_in_another_unit_is_not_corrected(
+    unit: float,
+    command: str,
+    deployment: Path,
+    calibration: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Tesla, µT or worse under the name of nT would otherwise be corrected to a field, unflagged."""
+    rows, log = read(deployment).isel(time=slice(0, 60)), tmp_path / "log.nc"
+    write(rows.assign({name: unit * rows[name] for name in CHANNELS}), log)
+    options = ["--calibration", calibration, "-o", tmp_path / "x.nc"]
+    more = ["--map", tmp_path / "none.nc"] if command == "navigate" else []
+    line = complaint(capsys, command, log, *options, *more, code=1)
+    assert line.startswith("log.nc (deployment.csv): mag_x mag_y mag_z: the length of the vector is ")
+    assert line.endswith(" nT: expected nT")
+    assert list(tmp_path.iterdir()) == [log]
+
+
 @pytest.mark.parametrize(
     ("arguments", "code", "words"),
     [
@@ -116,6 +138,7 @@ def test_a_log_without_a_whole_reading_is_not_corrected(
         (["convert", "{d}", "-o", "nowhere/x.csv"], 2, "There is no folder nowhere"),
         (["convert", "{d}", "-o", "."], 2, "It is a folder"),
         (["simulate", "demo", "--like", "{d}", "b.nc", "-o", "x.nc"], 2, "b.nc: unexpected argument"),
+        (["simulate", "demo", "--like", "{d}", "b", "c", "d", "-o", "x.nc"], 2, "b and 2 more: unexpected"),
         (["convert", "{d}", "-o", "/proc/self/x.csv"], 2, "The folder /proc/self cannot be written to"),
         (["diagnose", "{d}", "--calibration", "{d}", "-o", "{d}"], 2, "It is a file"),
         (["demo", "--out", "{d}"], 2, "It is a file"),
@@ -164,6 +187,11 @@ def test_a_full_disk_gets_one_line_and_leaves_nothing(
         ("time", 1.78e12, "row 12, column 'time': expected seconds since 1970"),
         ("latitude", 4952.3, "row 12, column 'latitude': expected deg, at most 90"),
         ("mag_time_z", 12.0, "row 12, column 'mag_time_z': expected a time within 60 s"),
+        (
+            "reference_field",
+            5.2e-5,
+            "row 12, column 'reference_field': expected 1000 to 1e+06 nT, or nothing",
+        ),
     ],
 )
 def test_what_would_be_another_place_or_moment(

@@ -15,7 +15,7 @@ from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
 from magbridge.errors import FormatError
 from magbridge.field.grid import AnomalyGrid
-from magbridge.field.read import read_grid
+from magbridge.field.read import read_grid, read_polygon
 
 LON, LAT = np.linspace(10.0, 10.5, 11), np.linspace(54.0, 54.4, 9)
 MAP = 30 * np.sin(np.meshgrid(LON, LAT)[0] * 9) + 100 * (np.meshgrid(LON, LAT)[1] - 54)
@@ -225,6 +225,18 @@ WORDS = (
     b"DSAA DSBB DSRB GRID DATA ncols nrows xllcorner yllcenter cellsize "
     b"lon lat mag 1 -9 nan inf 1e400 , ; ( ["
 )
+
+
+def test_a_polygon_may_have_a_header(tmp_path):
+    corners = "10.1,54.1\n10.4,54.1\n10.2,54.3\n"
+    for text in (corners, "\ufefflongitude,latitude\n" + corners):
+        (tmp_path / "mask.csv").write_text(text, encoding="utf-8")
+        np.testing.assert_array_equal(
+            read_polygon(tmp_path / "mask.csv"), [[10.1, 54.1], [10.4, 54.1], [10.2, 54.3]]
+        )
+    (tmp_path / "mask.csv").write_text("place,longitude,latitude\n")
+    with pytest.raises(FormatError, match=r"mask.csv: expected longitude,latitude in every row: could not"):
+        read_polygon(tmp_path / "mask.csv")
 
 
 @given(

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from magbridge import logs
 from magbridge.columns import CHANNEL_TIMES, COLUMNS
-from magbridge.logs.deployment import APART, LEAST, MOST, deployment, join
+from magbridge.logs.deployment import APART, FIELDS, LEAST, MOST, deployment, join
 
 EXACT = [".csv", ".nc", ".parquet"]
 WRITABLE = [*EXACT, ".tlog"]
@@ -48,6 +48,8 @@ def deployments(draw: st.DrawFn, width: int) -> xr.Dataset:
         bounds = (
             {"min_value": least and int(least)} if most is None else {"min_value": -most, "max_value": most}
         )
+        if name == "reference_field":
+            bounds = {"min_value": FIELDS[0], "max_value": FIELDS[1]}
         value = st.floats(**bounds, allow_infinity=False, width=width) | st.just(np.nan)
         column = np.array(draw(st.lists(value, min_size=len(time), max_size=len(time))), dtype=float)
         columns[name] = time + column if name in CHANNEL_TIMES else column

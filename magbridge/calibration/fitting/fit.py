@@ -19,6 +19,7 @@ from magbridge.calibration.model import Calibration, Noise, Parameter, Reference
 from magbridge.calibration.residual import Samples, residuals_of, rms, scales_and_offsets
 from magbridge.calibration.terms import Polynomial
 from magbridge.errors import CalibrationError
+from magbridge.field.reference import other_units
 from magbridge.version import __version__
 
 __all__ = ["METHODS", "Fit", "fit"]
@@ -116,7 +117,8 @@ def fit(
     chosen: Callable[..., Fit] = getattr(import_module(module), name)
     # one thread: for matrices this small threads cost more than they gain, and the order of sums is fixed
     with threadpool_limits(1, "blas"):
-        _refuse_other_units(data)
+        if wrong := other_units(data.field, float(np.median(data.reference))):  # no fit would settle
+            raise CalibrationError(wrong)
         _refuse_one_attitude(data)
         return _judged(_biased(chosen(data, order, **options), site_bias), data)
 
@@ -136,16 +138,6 @@ def _biased(found: Fit, sigma: float) -> Fit:
             reference=Reference(field, calibration.reference.model, 0.0, sigma),
         ),
     )
-
-
-def _refuse_other_units(data: Observations) -> None:
-    """Refuse gauss or µT declared as nT: no iron changes the field tenfold, and no fit would settle."""
-    read, true = float(np.median(np.linalg.norm(data.field, axis=1))), float(np.median(data.reference))
-    if not 0.1 * true < read < 10.0 * true:
-        raise CalibrationError(
-            f"mag_x mag_y mag_z: the length of the vector is {read:.3g} (median), where the reference is "
-            f"{true:.0f} nT: expected nT"
-        )
 
 
 def _refuse_one_attitude(data: Observations) -> None:

@@ -62,9 +62,9 @@ def late(problem: Problem, fit: Joint) -> str:
         "<p>The channels look as if they were sampled in turn and interpolated to the time of each row: y "
         f"{y} and z {z} later than x (a channel that is noisier than the others would look the same). The "
         f"{number(taken)} nT RMS that this causes is removed from what follows. To avoid it, sample all "
-        "three channels at once, or faster than the vehicle sways; or log the channels as read, each with "
-        "its own time (mag_time_x, mag_time_y, mag_time_z), which loses less than the log's "
-        "interpolation.</p>"
+        "three channels at once, or faster than the vehicle sways. A log of the channels as read, each with "
+        "its own time (mag_time_x, mag_time_y, mag_time_z), loses less than one that has interpolated "
+        "them.</p>"
     )
 
 

@@ -154,7 +154,7 @@ def _sentence(diagnosis: Diagnosis) -> str:
         "known cause explains."
         if rest
         else f"{names} {nothing_else}",
-        "unexplained": f"An effect is present ({number(total.before)} nT RMS), but {name}.",
+        "unexplained": f"An effect is present in the {number(total.before)} nT RMS that differ, but {name}.",
     }[diagnosis.verdict]
 
 
