@@ -8,7 +8,6 @@ from itertools import combinations
 import numpy as np
 
 from magbridge.diagnose.causes.candidates import Candidate
-from magbridge.diagnose.inference.evidence import regressor_error
 from magbridge.diagnose.inference.joint import Joint
 from magbridge.diagnose.inference.pairs import pairs_of
 from magbridge.diagnose.inference.profile_likelihood import refined
@@ -24,35 +23,19 @@ TRIED = 3
 
 
 def exchanged(state: State, model: list[Candidate], base: Joint) -> tuple[list[Candidate], Joint]:
-    """Replace one cause or two by others, profiled anew, while the evidence of the whole model grows.
-
-    The errors of the other regressors may lend evidence to additional coefficients. So a replacement with
-    more coefficients must win by that much, and one with fewer may lose by as much.
-    """
+    """Replace one cause or two by others, profiled anew, while the evidence of the whole model grows."""
     pieces = [piece for candidate in model for piece in candidate.pieces]
     for _ in range(CHANGES):
-        own, better = state.value(pieces, base), (0.0, pieces, base)
+        best, better = state.value(pieces, base), (pieces, base)
         for new, at in _changes(state, pieces, base):
-            rest = [piece for n, piece in enumerate(pieces) if n not in at]
-            changed, fit = refined(state, [*new, *rest], state.fit([*new, *rest], like=base), len(new))
-            more = _more(new, [pieces[n] for n in at])
-            if len({c.cause for c in changed}) > len({piece.cause for piece in pieces}):
-                more = max(more, 0.0)  # a further cause never makes a model simpler
-            allowed = regressor_error(state.ratio(state.fit(rest, like=base))) if rest and more else 0.0
-            gain = state.value(changed, fit) - own - more * allowed
-            if gain > better[0]:  # a month's fit is large: only one is kept
-                better = gain, changed, fit
-        if better[1] is pieces:
+            changed = [*new, *(piece for n, piece in enumerate(pieces) if n not in at)]
+            entry = refined(state, changed, state.fit(changed, like=base), len(new))
+            if state.value(*entry) > best:  # a month's fit is large: only one is kept
+                best, better = state.value(*entry), entry
+        if better[0] is pieces:
             break
-        _, pieces, base = better
+        pieces, base = better
     return _gathered(state, pieces, base)
-
-
-def _more(new: list[Candidate], old: list[Candidate]) -> float:
-    """Sign of the difference in free coefficients; 0 where some share one size: the evidence counts those."""
-    if any(c.spectra is not None for c in (*new, *old)):
-        return 0.0
-    return float(np.sign(sum(c.size for c in new) - sum(c.size for c in old)))
 
 
 def _changes(state: State, pieces: list[Candidate], base: Joint) -> list[tuple[list[Candidate], list[int]]]:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,6 +62,19 @@ class Hypothesis:
         return float(np.sqrt(power)) if power > 0.0 else 0.0
 
 
+class Best(NamedTuple):
+    """The best candidate of a grid under one noise.
+
+    Its place among all, the price of its nonlinear parameters (log of the grid's average evidence, relative
+    to the best), its score, and the information that gave it.
+    """
+
+    place: int
+    price: float
+    score: Score
+    info: Information
+
+
 def wald(fit: Joint, size: int) -> float:
     """Wald's statistic of the last coefficients."""
     b, own = fit.coefficients[-size:], fit.covariance[-size:, -size:]
@@ -81,9 +95,6 @@ class State:
     ----------
     null : Joint
         The fit without any cause.
-    as_fitted, cleared : Information
-        Of all candidates beside no cause: under the noise of that fit, and under the noise that remains when
-        the best candidate of every cause is fitted.
     trials : dict
         Cause -> number of independent hypotheses behind it.
     certain : dict
@@ -104,8 +115,6 @@ class State:
         self.certain: dict[tuple[str, str | None], float] = {}
         self.last: tuple[Joint | None, Information | None] = None, None
         self.null: Joint
-        self.as_fitted: Information
-        self.cleared: Information
         self.groups: dict[tuple[str, str | None], list[int]] = {}
         for k, candidate in enumerate(self.candidates):
             self.groups.setdefault(key(candidate), []).append(k)
@@ -163,17 +172,14 @@ class State:
         as_fitted = self.beside(model, base).fitted(base)
         if not self.trials:
             self.trials = trials(as_fitted, self.candidates, self.at)
-        under: dict[tuple[str, str | None], list[tuple[int, float, Score, Information]]] = {}
-        cleared = self._cleared(model, base, as_fitted)
-        if not model:
-            self.as_fitted, self.cleared = as_fitted, cleared
-        for info in (as_fitted, cleared):
+        under: dict[tuple[str, str | None], list[Best]] = {}
+        for info in (as_fitted, self._cleared(model, base, as_fitted)):
             scores = self.scores(info)
-            for group, (k, average) in self.best(scores).items():
-                under.setdefault(group, []).append((k, average, scores[k], info))
-        listed = sorted(under.values(), key=lambda entries: -max(entry[2].evidence for entry in entries))
+            for group, (k, price) in self.best(scores).items():
+                under.setdefault(group, []).append(Best(k, price, scores[k], info))
+        listed = sorted(under.values(), key=lambda won: -max(best.score.evidence for best in won))
         # the largest, which take longest, first: then the threads end together
-        tried = sorted(listed[:SHORT_LIST], key=lambda entries: -self.candidates[entries[0][0]].size)
+        tried = sorted(listed[:SHORT_LIST], key=lambda won: -self.candidates[won[0].place].size)
         found = in_threads(len(self.problem), partial(self._joint, model, base), tried)
         return sorted(found, key=lambda h: -h.evidence)
 
@@ -217,25 +223,24 @@ class State:
         """Information of all candidates and of `model` under a noise."""
         return information(self.problem, noise, base, [*self.columns, *(c.columns for c in model)])
 
-    def _joint(
-        self, model: list[Candidate], base: Joint, entries: list[tuple[int, float, Score, Information]]
-    ) -> Hypothesis:
+    def _joint(self, model: list[Candidate], base: Joint, won: list[Best]) -> Hypothesis:
         """Fit one cause jointly at the grid points that won under either noise."""
         found = []
-        for k in {entry[0] for entry in entries}:
-            candidate = self.candidates[k]
-            won = [entry for entry in entries if entry[0] == k]
-            index = np.arange(self.at[k].start, self.at[k].stop)
-            starts = [np.append(info.moved(base, index, s.estimate), s.estimate) for _, _, s, info in won]
+        for k in {best.place for best in won}:
+            candidate, index = self.candidates[k], np.arange(self.at[k].start, self.at[k].stop)
+            here = [best for best in won if best.place == k]
+            starts = [np.append(info.moved(base, index, s.estimate), s.estimate) for _, _, s, info in here]
             fit = self.fit([*model, candidate], *starts, like=base, rounds=2)
             ratio = max(0.0, 2.0 * (fit.log_likelihood - base.log_likelihood))
             if candidate.positive and fit.coefficients[-1] < 0.0:
                 ratio = 0.0
             # no more than the effect itself can gain: the rest is of a noise that found another optimum
             ratio = min(ratio, wald_ratio(fit, candidate))
-            freedom = won[0][2].freedom
+            freedom = here[0].score.freedom
             p_value = self.p_value(candidate, ratio, freedom)
-            evidence = evidence_of(candidate, ratio, freedom) + won[0][1] - float(np.log(candidate.trials))
+            evidence = (
+                evidence_of(candidate, ratio, freedom) + here[0].price - float(np.log(candidate.trials))
+            )
             found.append(Hypothesis(candidate, ratio, evidence, p_value, fit))
         return max(found, key=lambda h: h.evidence)
 

@@ -6,12 +6,12 @@ Candidates are scored (:mod:`.evidence`) under two noises: that of the model so 
 when the best candidate of every cause is fitted, because the former may have absorbed an effect. The best of
 each cause are then fitted jointly with noise and calibration. The best that passes the test is added, and so
 on while one does. A cause that is found again needs more than one regressor: these become one candidate. Then
-causes are exchanged for their rivals (:mod:`.exchange`). A second start chooses all causes from one matrix
-(:mod:`.simultaneous`). Last, causes that later findings have made needless are dropped.
+causes are exchanged for their rivals (:mod:`.exchange`). Last, causes that later findings have made needless
+are dropped.
 
 Noise that ends up as slow as it may be may have absorbed what several causes do together: then none alone
-stands out from it. So a third start finds causes one by one beside noise of a short memory. What they are
-worth is judged beside noise of any.
+stands out from it. So a second start finds causes beside noise of a short memory. What they are worth is
+judged beside noise of any.
 
 The rivals of each cause are read off one matrix at the end: the information of all candidates under the noise
 that is left, the other causes projected out.
@@ -27,21 +27,22 @@ from numpy.typing import NDArray
 
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.compare.problem import Problem
-from magbridge.diagnose.inference.evidence import LEVEL, REMNANT, evidence_of, margin, regressor_error
+from magbridge.diagnose.inference.evidence import LEVEL, REMNANT, evidence_of, regressor_error
 from magbridge.diagnose.inference.exchange import exchanged
 from magbridge.diagnose.inference.fit_noise import longest, memory_order
 from magbridge.diagnose.inference.information import Information
 from magbridge.diagnose.inference.joint import Joint, fit_joint
 from magbridge.diagnose.inference.profile_likelihood import refined, sharpen
 from magbridge.diagnose.inference.rivals import Rival
-from magbridge.diagnose.inference.rounds import Hypothesis, State, key
+from magbridge.diagnose.inference.rounds import Hypothesis, State
 from magbridge.diagnose.inference.sets import sets_of
-from magbridge.diagnose.inference.simultaneous import MOST, chosen_at_once, enough
 
 __all__ = ["Hypothesis", "Outcome", "search"]
 
 FloatArray = NDArray[np.float64]
 
+MOST = 6
+"""Regressors found one by one in a log, at most."""
 SLOW = 0.5
 """Share of the longest time constant that noise may have. Slower noise may have absorbed causes."""
 
@@ -103,30 +104,20 @@ def search(problem: Problem, candidates: Sequence[Candidate], causes: int) -> Ou
     model, base = _likeliest(state, null, first) if first else ([], null)
     chosen, base = _backward_elimination(state, model, base, null)
     model = [h.candidate for h in chosen]
-    info = state.beside(model, base) if chosen or not first else state.as_fitted
+    info = state.beside(model, base)
     rivals = sets_of(state, info, model, base) if model else ()
     return Outcome(tuple(chosen), rivals, null, base, order, tested, info, state.trials)
 
 
 def _likeliest(state: State, null: Joint, first: list[Hypothesis]) -> tuple[list[Candidate], Joint]:
-    """Return the likeliest model: causes found one by one, chosen together, or one that alone is enough."""
-    one_by_one, at_once = _forward_selection(state, null, first), chosen_at_once(state)
-    found = [exchanged(state, *one_by_one) if one_by_one[0] else one_by_one]
-    before = {key(candidate) for candidate in one_by_one[0]}
-    if at_once and (before or len(at_once) > 1) and {key(candidate) for candidate in at_once} != before:
-        # a single cause, chosen at once where one by one none passed, is not taken: it has been tested
-        start = refined(state, at_once, state.fit(at_once, rounds=6))
-        found.append(exchanged(state, *start))
-    model, base = max(found, key=lambda entry: state.value(*entry))
+    """Return the likelier of the models found beside noise of any memory, and of a short one if need be."""
+    model, base = _forward_selection(state, null, first)
+    if model:
+        model, base = exchanged(state, model, base)
     swallowed = base.noise.slowest > SLOW * longest(len(state.problem))
     if swallowed and (slow := _beside_brief_noise(state)):
         start = refined(state, slow, state.fit(slow, rounds=6))
         model, base = max((model, base), exchanged(state, *start), key=lambda entry: state.value(*entry))
-    if len({candidate.cause for candidate in model}) > 1:
-        alone = enough(state, first)
-        if alone is not None and state.value([alone.candidate], alone.fit) > state.value(model, base):
-            alone = sharpen(state, [], alone, null)
-            model, base = [alone.candidate], alone.fit
     return model, base
 
 
@@ -163,23 +154,16 @@ def _next(found: list[Hypothesis], strengths: Mapping[str, float], ratio: float)
     """Pick the best that passes, unless it is so weak that other causes' idealised regressors may leave it.
 
     `strengths` holds the signal-to-noise of the causes that are in the model, `ratio` is the model's
-    likelihood ratio.
-
-    A further regressor of a cause in the model is preferred to another cause that explains hardly more. Among
-    candidates whose evidence differs by less than the regressors' errors may account for, the one with the
-    fewest coefficients is preferred.
+    likelihood ratio. Among candidates whose evidence differs by less than the regressors' errors may account
+    for, the one with the fewest coefficients is preferred.
     """
 
     def remnant(cause: str) -> float:
         return REMNANT * max((size for other, size in strengths.items() if other != cause), default=0.0)
 
     significant = [h for h in found if h.p_value < LEVEL and h.signal_to_noise >= remnant(h.candidate.cause)]
-    if not significant:
-        return None
-    near = significant[0].evidence - margin(significant[0].ratio)
-    more = next((h for h in significant if h.candidate.cause in strengths and h.evidence > near), None)
     as_likely = [h for h in significant if h.evidence >= significant[0].evidence - regressor_error(ratio)]
-    return more or min(as_likely, key=lambda h: h.candidate.size)
+    return min(as_likely, key=lambda h: h.candidate.size, default=None)
 
 
 def _added(state: State, model: list[Candidate], best: Hypothesis) -> tuple[list[Candidate], Joint]:
@@ -198,7 +182,7 @@ def _added(state: State, model: list[Candidate], best: Hypothesis) -> tuple[list
 def _backward_elimination(
     state: State, model: list[Candidate], base: Joint, null: Joint
 ) -> tuple[list[Hypothesis], Joint]:
-    """Drop causes that later findings have made needless; test each other against the model without it."""
+    """Drop causes without which the model is likelier, or which fail their test beside the others."""
     chosen: list[Hypothesis] = []
     k = 0
     while k < len(model):
@@ -206,7 +190,7 @@ def _backward_elimination(
         without = state.fit(others) if others else null
         ratio = max(0.0, 2.0 * (base.log_likelihood - without.log_likelihood))
         p_value = state.p_value(own, ratio, own.freedom)
-        if p_value >= LEVEL:
+        if p_value >= LEVEL or (others and state.value(others, without) > state.value(model, base)):
             model, base, chosen, k = others, without, [], 0
             continue
         c, at = base.coefficients, sum(candidate.size for candidate in model[:k])
