@@ -10,7 +10,7 @@ the distribution of the largest score under no effect.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -69,6 +69,17 @@ class Information:
             self.score[:m] - K.T @ (self.score[m:] - prior * base.coefficients),
             np.vstack([self.shift[:, :m] - self.shift[:, m:] @ K, K]),
         )
+
+    def instead(self, base: Joint, own: NDArray[np.intp]) -> Information:
+        """Take the coefficients at `own` out of the model of `base`, and project out its others.
+
+        The model's columns are the last. The scores are those of what `base` leaves and of what the
+        coefficients at `own` (i,) explain in it.
+        """
+        first = len(self.score) - base.coefficients.size
+        others = np.setdiff1d(np.arange(first, len(self.score)), own)
+        alone = self.without(others, base.prior[len(base.z) + others - first])
+        return replace(alone, score=alone.score + alone.matrix[:, own] @ base.coefficients[own - first])
 
 
 def information(

@@ -137,11 +137,9 @@ def _elsewhere(info: Information, fit: Joint, placed_piece: Placed, points: Sequ
     q, first = len(fit.z), len(info.score) - fit.coefficients.size
     here = slice(own.start - first, own.stop - first)
     rest = np.setdiff1d(np.arange(first, len(info.score)), np.arange(own.start, own.stop))
-    prior = fit.prior[q + rest - first]
-    K = np.linalg.solve(info.matrix[np.ix_(rest, rest)] + np.diag(prior), info.matrix[rest])
-    alone = info.without(rest, prior)
-    # the scores with this piece taken out of the fit
-    alone = replace(alone, score=alone.score + alone.matrix[:, own] @ fit.coefficients[here])
+    prior = np.diag(fit.prior[q + rest - first])
+    K = np.linalg.solve(info.matrix[np.ix_(rest, rest)] + prior, info.matrix[rest])
+    alone = info.instead(fit, np.arange(own.start, own.stop))
 
     def moments(candidate: Candidate, place: slice) -> tuple[float, FloatArray, FloatArray]:
         """Return evidence, all coefficients and their covariance, each up to what is common to all points."""

@@ -15,7 +15,7 @@ is always the first of its pair, at the size that it would have alone.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -122,13 +122,8 @@ class _Table:
     ) -> None:
         ends = state.at[-1].stop + np.cumsum([0, *(candidate.size for candidate in model)])
         here = [slice(int(ends[n]), int(ends[n + 1])) for n in places]
-        own = np.r_[*here]
-        others = np.setdiff1d(np.arange(ends[0], ends[-1]), own)
-        alone = info.without(others, base.prior[len(base.z) + others - ends[0]])
-        c = base.coefficients
-        self.signals = [alone.matrix[:, at] @ c[np.r_[at] - ends[0]] for at in here]
-        # the scores with all of them taken out of the fit
-        self.info = replace(alone, score=alone.score + sum(self.signals))
+        self.info = info.instead(base, np.r_[*here])
+        self.signals = [self.info.matrix[:, at] @ base.coefficients[np.r_[at] - ends[0]] for at in here]
         self.state, self.base, self.standing = state, base, [model[n] for n in places]
         self.candidates = [*state.candidates, *self.standing]
         self.at = [*state.at, *here]

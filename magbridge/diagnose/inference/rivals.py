@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -46,11 +46,7 @@ def rivals_of(
     """Return the rivals of the k-th cause of `model`, whose columns are the last of `info`."""
     ends = state.at[-1].stop + np.cumsum([0, *(candidate.size for candidate in model)])
     own = np.arange(ends[k], ends[k + 1])
-    others = np.setdiff1d(np.arange(ends[0], ends[-1]), own)
-    c = base.coefficients[own - ends[0]]
-    alone = info.without(others, base.prior[len(base.z) + others - ends[0]])
-    # the scores with this cause taken out of the fit
-    alone = replace(alone, score=alone.score + alone.matrix[:, own] @ c)
+    alone = info.instead(base, own)
     standing = score(alone, slice(int(own[0]), int(own[-1]) + 1), model[k])
     scores = state.scores(alone)
     rivals = []

@@ -44,6 +44,19 @@ CALM = 2
 """Rounds of fitting slow curves and noise in turn."""
 
 
+class Scored(NamedTuple):
+    """A description scored under one noise: the log evidence, its kind, its estimate, the shift of the model.
+
+    The shift (q + k, l) is by how much calibration and model decrease for one unit of each coefficient.
+    """
+
+    evidence: float
+    kind: str
+    description: Description
+    best: Ridge
+    shift: FloatArray
+
+
 class Leftover(NamedTuple):
     """Unexplained structure: its kind, its size, and the channel it correlates with.
 
@@ -129,17 +142,14 @@ def leftover(
     made = precomputed(len(problem), [one.columns for one in listed])
     listed = [one._replace(columns=columns) for one, columns in zip(listed, made, strict=True)]
     columns = [candidate.columns for candidate in model]
-    found: list[tuple[float, str, Description, float]] = []
+    found: list[tuple[float, Scored]] = []
     for noise in (fit.noise, _calm(problem, columns, fit, order, listed[:2])):
         scored = _scored(problem, noise, fit, columns, listed)
-        tried = sorted(scored, key=lambda entry: -entry[0])[:SHORT_LIST]
-        weighed = in_threads(
-            len(problem), lambda entry: _weighed(problem, columns, fit, order, *entry[2:]), tried
-        )
-        for (by_score, kind, one, best, _), evidence in zip(tried, weighed, strict=True):
-            # no more than the description itself can gain: the rest is of a noise that found another optimum
-            found.append((min(by_score, evidence), kind, one, best.signal_to_noise))
-    evidence, kind, one, size = max(found, key=lambda entry: entry[0])
+        tried = sorted(scored, key=lambda one: -one.evidence)[:SHORT_LIST]
+        weighed = in_threads(len(problem), lambda one: _weighed(problem, columns, fit, order, one), tried)
+        # no more than the description itself can gain: the rest is of a noise that found another optimum
+        found += [(min(one.evidence, gained), one) for one, gained in zip(tried, weighed, strict=True)]
+    evidence, (_, kind, one, best, _) = max(found, key=lambda entry: entry[0])
     # half of a chi-square's tail: a size that cannot be negative is zero as often as not (Self & Liang 1987)
     tail = 0.5 * float(chi2.sf(2.0 * max(evidence, 0.0), 1))
     count = sum(len(one.widths) for one in listed)
@@ -148,13 +158,13 @@ def leftover(
     if p_value >= (LEVEL if model else 0.1 * LEVEL):
         return None
     channel = one.channel or _best_channel(problem, fit)
-    return Leftover(kind, size, p_value, evidence, one.period, channel, one, count)
+    return Leftover(kind, best.signal_to_noise, p_value, evidence, one.period, channel, one, count)
 
 
 def _scored(
     problem: Problem, noise: Noise, fit: Joint, model: Sequence[Columns], listed: Sequence[Description]
-) -> Iterator[tuple[float, str, Description, Ridge, FloatArray]]:
-    """Yield, for each description and width, the log evidence under `noise`, and the shift of the model."""
+) -> Iterator[Scored]:
+    """Score each description with each of its widths under `noise`."""
     columns = [*(one.columns for one in listed), *model]
     info = information(problem, noise, fit, columns, strangers=len(listed)).fitted(fit)
     ends = np.cumsum([0, *(one.widths[0][1].size for one in listed)]).tolist()
@@ -165,7 +175,7 @@ def _scored(
             best = Statistic(S, width[None] ** 2).best(b)
             if one.turned:
                 best = max(best, along_one_direction(S, b, width, best), key=lambda found: found.ratio)
-            yield 0.5 * best.ratio - float(np.log(one.trials)), kind, one, best, info.shift[:, at]
+            yield Scored(0.5 * best.ratio - float(np.log(one.trials)), kind, one, best, info.shift[:, at])
 
 
 def _calm(
@@ -186,19 +196,17 @@ def _calm(
     return noise
 
 
-def _weighed(
-    problem: Problem, model: Sequence[Columns], fit: Joint, order: int, one: Description, best: Ridge,
-    shift: FloatArray,
-) -> float:  # fmt: skip
+def _weighed(problem: Problem, model: Sequence[Columns], fit: Joint, order: int, scored: Scored) -> float:
     """Log evidence of a description against the model, its noise fitted anew (Laplace's approximation)."""
-    moved = -shift @ best.estimate
-    left = fit.left - Design(problem, [*model, one.columns]).times(np.append(moved, best.estimate))
+    one, c = scored.description, scored.best.estimate
+    moved = -scored.shift @ c
+    left = fit.left - Design(problem, [*model, one.columns]).times(np.append(moved, c))
     noise = fit_noise(left, problem.survey.past(order), blocks=bool(np.ptp(fit.noise.scale)), like=fit.noise)
     before = fit.z - problem.centre
     after = before + moved[: len(fit.z)]
     pull = float(fit.prior[: len(fit.z)] @ (after**2 - before**2))
     gained = noise.log_likelihood - fit.noise.log_likelihood - 0.5 * pull
-    return gained - best.price - float(np.log(one.trials))
+    return gained - scored.best.price - float(np.log(one.trials))
 
 
 def _best_channel(problem: Problem, fit: Joint) -> str | None:
