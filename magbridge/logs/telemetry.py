@@ -15,6 +15,7 @@ column is the last value from this vehicle before it (NaN once older than
 
 Telemetry is what the log itself declares by ``MAG_COLUMN`` (a bridge's own, one from :mod:`magbridge.logs`),
 what :data:`~magbridge.logs.telemetry_fields.TELEMETRY` lists, and every ``NAMED_VALUE_FLOAT`` by its name.
+Where the clock of a bridge was set, its rows are dated by the clock as it was set last in the file.
 Damaged bytes are skipped and counted in the attributes ``bytes_skipped`` and ``damages``; rows whose time
 does not increase are dropped and counted in ``rows_dropped``.
 """
@@ -28,7 +29,7 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
-from magbridge.columns import CORRECTED
+from magbridge.columns import CHANNEL_TIMES, CORRECTED
 from magbridge.logs.deployment import deployment
 from magbridge.logs.resample import MAX_AGE
 from magbridge.logs.telemetry_fields import SOURCES, TELEMETRY, Columns, correction
@@ -43,7 +44,8 @@ MAX_AGE_US = round(MAX_AGE * 1e6)
 NEVER = -(1 << 62)
 SINGLE = 1e-7
 """Relative error of a float32; counts that differ from the channel by more belong to another sensor."""
-FIELD, NAMED = spec("MAG_FIELD").id, spec("NAMED_VALUE_FLOAT")
+FIELD, STEP, NAMED = spec("MAG_FIELD").id, spec("MAG_CLOCK_STEP").id, spec("NAMED_VALUE_FLOAT")
+TIMES = ("time", *CHANNEL_TIMES)
 
 
 def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
@@ -100,12 +102,15 @@ class Rows:
             if one.message != self._source:
                 self._tables.setdefault(one.message, []).append((self._slot[one.column], one.find))
         self._last = -inf
+        self._to_step_us = survey.stepped_us
         self._dropped = self._skipped = self._damages = 0
 
     def put(self, record: Record) -> None:
         """Take the next record of the log."""
         message = record.message
         number, payload = message.id, message.payload
+        if number == STEP:
+            self._to_step_us -= message["step"]
         if message.system != self._survey.system:
             return
         if not (self._survey.ours and record.channel == Channel.SENT):
@@ -130,7 +135,11 @@ class Rows:
         self._values[slot], self._stamps[slot] = value, time_us
 
     def _row(self, time_us: int, columns: Columns) -> None:
-        time = columns.get("time", time_us / 1e6)
+        columns.setdefault("time", (time_us + self._survey.stepped_us - self._to_step_us) / 1e6)
+        if self._to_step_us:
+            later = {name: round(1e6 * columns[name]) + self._to_step_us for name in TIMES if name in columns}
+            columns |= {name: at_us / 1e6 for name, at_us in later.items()}
+        time = columns["time"]
         if time <= self._last:
             self._dropped += 1
             return

@@ -17,9 +17,8 @@ from magbridge.records import Channel
 __all__ = ["Survey", "survey"]
 
 V2 = 0xFD
-RAW, FIELD, COLUMN, START, BYTES = (
-    spec(name).id for name in ("MAG_RAW", "MAG_FIELD", "MAG_COLUMN", "MAG_BRIDGE_START", "MAG_SENSOR_BYTES")
-)
+RAW, FIELD, COLUMN, STEP = (spec(f"MAG_{name}").id for name in ("RAW", "FIELD", "COLUMN", "CLOCK_STEP"))
+START, BYTES = spec("MAG_BRIDGE_START").id, spec("MAG_SENSOR_BYTES").id
 NAMED = spec("NAMED_VALUE_FLOAT")
 UNITS = {"sensor_supply": "V"}
 
@@ -43,11 +42,14 @@ class Survey:
         Attributes that the log declares.
     ours : bool
         A bridge's own log: the time stamps carry the :class:`~magbridge.records.Channel`.
+    stepped_us : int
+        µs by which the bridge's clock was set in the course of the log.
     """
 
     def __init__(self, path: Path) -> None:
         self.attrs: dict[str, Any] = {}
         self.ours = False
+        self.stepped_us = 0
         self._senders: dict[int, Counter[tuple[int, int]]] = {}
         self._known: dict[int, dict[str, str]] = {}
         self._named: dict[int, dict[bytes, str]] = {}
@@ -117,6 +119,9 @@ class Survey:
             return False
         elif number in (START, BYTES):
             self.ours = True
+        elif number == STEP:
+            self.stepped_us += message["step"]
+            return False
         elif number in (RAW, FIELD):
             for column in (sample if number == RAW else correction)(message.payload):
                 if column != "time":

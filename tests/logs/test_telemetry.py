@@ -148,6 +148,25 @@ def test_a_bridges_own_log(tmp_path: Path) -> None:
     assert not {"mag", "sensor_supply", "imu_temperature"} & set(back.data_vars) - {"imu_temperature"}
 
 
+@pytest.mark.parametrize("step", [-3600 * S, 3600 * S, 50 * 31_557_600 * S])
+def test_a_clock_that_is_set_costs_no_rows_and_dates_those_before(tmp_path: Path, step: int) -> None:
+    """The records' stamps go on; what is published is dated by the clock as it is set."""
+    log, ours = Log(), (1, 191)
+    log.say(0, "MAG_BRIDGE_START", by=ours, channel=Channel.STATE)
+    for k in range(6):
+        set_us = step if k >= 3 else 0
+        if k == 3:
+            log.say(
+                k, "MAG_CLOCK_STEP", by=(0, 0), channel=Channel.STATE, time_usec=T0 + k * S + step, step=step
+            )
+        log.say(k, "MAG_RAW", by=ours, channel=Channel.SENT, time_usec=T0 + k * S + set_us, x=k, delay_z=20)
+    back = log.read(tmp_path)
+    np.testing.assert_array_equal(back["time"], [(T0 + step) / S + k for k in range(6)])
+    np.testing.assert_array_equal(back["mag_x"], range(6))
+    np.testing.assert_allclose(back["mag_time_z"] - back["time"], 20e-6, rtol=0, atol=0.5e-6)
+    assert back.attrs["rows_dropped"] == 0
+
+
 def test_a_bridges_log_without_readings_gives_no_compass_instead(tmp_path: Path) -> None:
     log = Log()
     log.say(0, "MAG_BRIDGE_START", by=(1, 191), channel=Channel.STATE)
