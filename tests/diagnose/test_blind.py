@@ -196,6 +196,11 @@ def test_a_channels_name_does_not_decide(warm: tuple[xr.Dataset, object], writte
     found = diagnose([renamed], calibration)
     assert found.findings[0].candidate.channel == "zz"
     assert "do not fly it" in useful(replace(found, total=Gain(1.0, 1.0, 1.0, (0.9, 1.1))))
+    assert "It leaves" not in useful(found)
+    first = found.findings[0]
+    sun = replace(first.candidate, cause="diurnal_variation", channel=None, effects=())
+    both = (first, replace(first, hypothesis=replace(first.hypothesis, candidate=sun)))
+    assert useful(replace(found, findings=both)).endswith("is without: diurnal variation.</p>")
 
 
 def test_bad_input_is_one_line(warm: tuple[xr.Dataset, object]) -> None:

@@ -15,7 +15,7 @@ from magbridge.diagnose.compare.derivatives import CHUNK, derivatives
 from magbridge.diagnose.compare.problem import DELAY, DELAYS, Problem, samples_of
 from magbridge.diagnose.inference.evidence import LEVEL
 from magbridge.diagnose.inference.joint import Joint
-from magbridge.diagnose.report.words import listed, measured, number
+from magbridge.diagnose.report.words import label, listed, measured, number
 
 if TYPE_CHECKING:
     from magbridge.calibration.model import Calibration
@@ -129,15 +129,19 @@ def gained(gain: Gain, parts: str) -> str:
 
 
 def useful(diagnosis: Diagnosis) -> str:
-    """Say what the extended calibration is good for; nothing where nothing was added to it."""
-    if not any(effect in diagnosis.calibration.effects for c in diagnosis.named for effect in c.effects):
+    """Say what the extended calibration corrects for and what not; nothing where nothing was added to it."""
+    added = diagnosis.calibration.effects
+    if not any(effect in added for candidate in diagnosis.named for effect in candidate.effects):
         return ""
+    stays = [c for c in diagnosis.named if not c.effects or any(effect not in added for effect in c.effects)]
+    others = ", ".join(escape(label(candidate.cause, candidate.channel)) for candidate in stays)
+    but = f" It leaves in the field what the RMS above is without: {others}." if stays else ""
     verdict = (
         "corrects for what belongs to the vehicle and its sensor"
         if diagnosis.total.shown
         else "shows no gain on what it was not fitted to: do not fly it before another log does"
     )
-    return f"<p>The extended calibration, <code>calibration.json</code> beside this page, {verdict}.</p>"
+    return f"<p>The extended calibration, <code>calibration.json</code> beside this page, {verdict}.{but}</p>"
 
 
 def recent(candidate: Candidate) -> str:
