@@ -94,6 +94,16 @@ def test_table_1_sees_63_of_90_coefficients(glider: Gliders) -> None:
     assert (np.diff(seen.sigma) >= 0.0).all()
 
 
+def test_readings_that_a_fit_multiplies_are_told(glider: Gliders) -> None:
+    """Anomalies shrink with the readings: a reference that is wrong along the track can do that unnoticed."""
+    runs = glider(0, 2).runs
+    told = [fit(replace(runs, field=gain * runs.field), "nominal").warnings for gain in (1.0, 1.3, 0.8)]
+    plain, shrunk, grown = (" ".join(one).partition("the fit multiplies the readings by ")[2] for one in told)
+    assert not plain
+    assert float(shrunk[:4]) < 0.8
+    assert float(grown[:4]) > 1.1
+
+
 def test_warnings_are_in_a_pilot_s_words(glider: Gliders) -> None:
     words = "\n".join(fit(glider(0, 2).runs).warnings)
     assert "ballast was only ever at 2 positions (-200 and 200 cm3)" in words

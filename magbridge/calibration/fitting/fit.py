@@ -39,6 +39,8 @@ ONE_ATTITUDE = 5.0
 """deg: all samples within that of their mean direction are one attitude."""
 UNSUPPORTED = 5.0
 """Expected error over noise, above which the data do not support the fit."""
+GAIN = 0.1
+"""Departure of the middle scale from 1 that few sensors have: a wrong reference shrinks all scales."""
 UNSEEN = 270.0
 """deg, a gap in the headings: less than a quarter of the compass does not determine the rest."""
 
@@ -162,6 +164,13 @@ def _judged(found: Fit, data: Observations) -> Fit:
     outliers = found.details.get("outliers", 0)
     if outliers > 0.02 * len(data):
         warnings.append(f"{outliers} of {len(data)} samples are outliers and were left out of the fit")
+    smallest, largest = found.scales
+    if abs(0.5 * (smallest + largest) - 1.0) > GAIN:
+        warnings.append(
+            f"the fit multiplies the readings by {smallest:.2f} to {largest:.2f}, and anomalies with them: "
+            "unless the sensor is that far off, the reference is; fit to runs at one place, or with a better "
+            "map (--grid)"
+        )
     gap = heading_gap(data)
     if gap > UNSEEN:
         warnings.insert(
