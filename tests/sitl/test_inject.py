@@ -42,7 +42,7 @@ DRAWN = {
     "eccentric": 128.3, "astray": 30.63, "trailing": 31.72, "compliant": 75.28, "restart": 265.4,
     "whistle": 122.1, "yielding": 64.62, "afterglow": 72.66, "mast": 23.29, "annealed": 44.57,
     "dynamo": 74.55, "hvdc": 69.44, "dew": 108.6, "sampler": 126, "substorm": 227.3, "litter": 25.65,
-    "stuck": 112.6, "sounder": 93.7,
+    "stuck": 112.6, "sounder": 93.7, "gradient": 46.64, "squeezed": 36.07, "flare": 67.93, "swarf": 78.9,
 }  # fmt: skip
 """Norm (nT) of what each does to the log of :func:`stage`, as first drawn.
 

@@ -42,7 +42,7 @@ NAMELESS = ("unknown", "seen", "foreign")
 """Parts in which the hidden effect is not among the causes of the table."""
 PREDICTED = ("named", "ladder", "pair", *NAMELESS)
 """Parts for which theory predicts the outcome."""
-STRANGE = ("substorm", "litter", "stuck", "sounder")
+STRANGE = ("gradient", "squeezed", "flare", "swarf")
 """Foreign effects made after the detector was frozen; its descriptions were not designed for them either."""
 SEEN = (
     "pan", "loose", "corrosion", "pulsation", "needle", "thermostat", "perming", "staircase", "swell",
@@ -50,7 +50,7 @@ SEEN = (
     "leak", "ranges", "sag", "crossover", "popcorn", "discharge", "towed", "sunlit", "eccentric", "astray",
     "trailing", "compliant", "restart", "whistle",
     "yielding", "afterglow", "mast", "annealed", "dynamo", "hvdc", "dew",
-    "sampler",
+    "sampler", "substorm", "litter", "stuck", "sounder",
 )  # fmt: skip
 """Foreign effects that were once made for this purpose, but before the detector was last improved."""
 GOLDEN = 0.6180339887498949

@@ -59,5 +59,9 @@ FOREIGN: dict[str, Effect] = {
     "litter": surroundings.litter,
     "stuck": sensor.stuck,
     "sounder": vehicle.sounder,
+    "gradient": sensor.gradient,
+    "squeezed": sensor.squeezed,
+    "flare": surroundings.flare,
+    "swarf": vehicle.swarf,
 }
 """Effect, by its name."""

@@ -139,3 +139,16 @@ def stuck(scene: Scene, size: float, rng: Generator) -> None:
         return out
 
     scene.bend.append(bend)
+
+
+def gradient(scene: Scene, size: float, rng: Generator) -> None:
+    """Cores are strained while the housing around them is warmer or colder; size in nT at 1 degC."""
+    middle = soaked(scene.water, scene.track.step, float(rng.uniform(200.0, 1200.0)))
+    housing = first_order(scene.water, scene.track.step, float(rng.uniform(20.0, 60.0)))
+    scene.add(housing - middle, size * direction(rng))
+
+
+def squeezed(scene: Scene, size: float, rng: Generator) -> None:
+    """Pressure narrows the feedback coils, each by its own; size in 1e-5 of the field at 100 m."""
+    strain = scene.track.depth / 100.0 * (1.0 + 0.05 * scene.track.depth / 100.0)
+    scene.field = scene.field * (1.0 + 1e-5 * size * np.outer(strain, rng.uniform(0.5, 1.5, 3)))

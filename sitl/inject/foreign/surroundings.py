@@ -121,6 +121,14 @@ def litter(scene: Scene, size: float, rng: Generator) -> None:
     scene.earth = scene.earth + size * nearer[:, None] * pieces[dive]
 
 
+def flare(scene: Scene, size: float, rng: Generator) -> None:
+    """A flare on the Sun drives more current in the ionosphere for half an hour (a crochet); size in nT."""
+    since = np.maximum(scene.t - rng.uniform(0.1, 0.9) * scene.t[-1], 0.0)
+    rises, falls = rng.uniform(60.0, 300.0), rng.uniform(600.0, 2400.0)
+    shape = np.exp(-since / falls) - np.exp(-since / rises)
+    scene.earth = scene.earth + size * np.outer(shape / shape.max(), [0.8, 0.3, 0.4])
+
+
 def _cable(scene: Scene, rng: Generator) -> tuple[Array, Array, Array]:
     """Lay a straight cable below the track: m aside and above (n,), and north-east-down across it."""
     track = scene.track

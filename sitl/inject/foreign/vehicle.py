@@ -255,3 +255,10 @@ def sounder(scene: Scene, size: float, rng: Generator) -> None:
     near = rng.uniform(5.0, 20.0)
     pings = heard * np.minimum(2.0 * near / (depth.max() + near - depth), 1.0)
     scene.add(first_order(pings, scene.track.step, 5.0), size * direction(rng))
+
+
+def swarf(scene: Scene, size: float, rng: Generator) -> None:
+    """Iron swarf drifts after the pumped oil and is late by up to an hour; size in nT over a stroke."""
+    oil = scene.track.parameters["ballast"]
+    late = first_order(oil, scene.track.step, float(rng.uniform(400.0, 3000.0)))
+    scene.add((late - oil) / np.ptp(oil), size * direction(rng))
