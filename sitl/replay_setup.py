@@ -32,6 +32,8 @@ FULL_SCALE = 100_000.0
 """nT that the emulated fluxgate can read."""
 SENSITIVITY = 5e-5
 """V/nT of the emulated fluxgate."""
+TIMEOUT = 10.0
+"""s without a reading, after which the sensor counts as silent; at least three times the log's interval."""
 SETTLE_TIME = 4.0
 """s after a movement: eight time constants of the paper's anti-alias filter."""
 
@@ -89,7 +91,9 @@ def prepare(files: Sequence[Path], folder: Path) -> ReplaySetup:
     parts = _parts(files, deployment)
     summary = _calibrate(deployment, parts, folder / "cal.json")
     config = folder / "bridge.toml"
-    text = bridge_toml(deployment, telemetry_of(deployment), calibrated=summary.startswith("nominal"))
+    names, steps = telemetry_of(deployment), np.diff(deployment["time"].to_numpy())
+    timeout = max(TIMEOUT, 3.0 * float(np.median(steps))) if steps.size else TIMEOUT
+    text = bridge_toml(deployment, names, calibrated=summary.startswith("nominal"), timeout=timeout)
     config.write_text(text, encoding="utf-8")
     return ReplaySetup(config, deployment, parts, summary, simulated)
 
@@ -134,11 +138,14 @@ def _calibrate(deployment: xr.Dataset, parts: Sequence[Part], path: Path) -> str
     return f"nominal, fitted on {fitted}: {found.rms:.1f} nT RMS there"
 
 
-def bridge_toml(deployment: xr.Dataset, names: Iterable[str], *, calibrated: bool, log: str = "") -> str:
+def bridge_toml(
+    deployment: xr.Dataset, names: Iterable[str], *, calibrated: bool, log: str = "", timeout: float = TIMEOUT
+) -> str:
     """Return a ``bridge.toml`` for an emulated digitizer, with the columns `names` as parameters."""
     lines = [
         "[sensor]",
         'driver = "digitizer"',
+        f"timeout = {timeout:.1f}",
         'port = "/dev/null"  # a replay puts its own pty here',
         "[sensor.options]",
         f"sensitivity = {SENSITIVITY}",

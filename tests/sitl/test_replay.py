@@ -249,6 +249,14 @@ def test_the_demonstration_shows_what_calibration_is_worth(tmp_path: Path) -> No
     assert len(said) == 5
 
 
+def test_a_log_of_few_samples_is_no_silent_sensor(flown: xr.Dataset, tmp_path: Path) -> None:
+    """Seagliders sample every 20 s: at the bridge's 10 s their sensor would fall silent after each."""
+    write(flown.isel(time=slice(0, None, 5)), tmp_path / "log.nc")
+    result = replay([tmp_path / "log.nc"])
+    assert result["samples"] > 200
+    assert not any("silent" in said for said in result["said"])
+
+
 @pytest.mark.real
 def test_measured_counts_and_moving_masses_go_through(real_data: Path) -> None:
     """Seaglider 167: the dive that was left out of the fit is right to about one count (100 nT)."""
