@@ -164,6 +164,11 @@ def _checked(content: _File, terms: tuple[Term, ...], effects: tuple[Term, ...])
         raise CalibrationError(f"covariance: expected {coefficients.size} x {coefficients.size} numbers")
     covariance = np.array(content.covariance, float)
     _check_covariance(covariance)
+    if content.boresight:
+        _check_covariance(np.array(content.boresight.covariance), "boresight: ")
+    names = [parameter.name for parameter in content.parameters]
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise CalibrationError(f"parameter {twice[0]!r} is named twice")
     for parameter in content.parameters:
         if not (parameter.scale > 0.0 and parameter.low <= parameter.high):
             raise CalibrationError(f"parameter {parameter.name!r}: expected scale > 0 and low <= high")
@@ -194,17 +199,17 @@ def _checked(content: _File, terms: tuple[Term, ...], effects: tuple[Term, ...])
     )
 
 
-def _check_covariance(covariance: FloatArray) -> None:
+def _check_covariance(covariance: FloatArray, whose: str = "") -> None:
     """Symmetric and positive semidefinite, up to rounding."""
     scale = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
     with np.errstate(over="ignore"):  # a covariance beside a variance of zero: refused below
         correlation = covariance / scale / scale[:, None]
     if (np.diag(covariance) < 0.0).any() or np.abs(correlation).max(initial=0.0) > 1.0 + 1e-6:
-        raise CalibrationError("covariance: a variance is negative or a correlation above 1")
+        raise CalibrationError(f"{whose}covariance: a variance is negative or a correlation above 1")
     if not np.allclose(correlation, correlation.T, rtol=0.0, atol=1e-9):
-        raise CalibrationError("covariance: expected a symmetric matrix")
+        raise CalibrationError(f"{whose}covariance: expected a symmetric matrix")
     if np.linalg.eigvalsh(correlation)[0] < -1e-6 * len(correlation):
-        raise CalibrationError("covariance: expected a positive semidefinite matrix")
+        raise CalibrationError(f"{whose}covariance: expected a positive semidefinite matrix")
 
 
 def _plain(problem: Exception) -> str:

@@ -133,6 +133,11 @@ EDITS: dict[str, tuple[Callable[[dict[str, Any]], Any], type[Exception], str]] =
     "exponents": (
         lambda c: c["terms"][0].update(exponents=[[0, 0], [1, 0], [2, 0]]), CalibrationError,
         "one for each parameter"),
+    "the same parameter": (
+        lambda c: c["parameters"].append(c["parameters"][0]), CalibrationError, "'battpos' is named twice"),
+    "a boresight's negative variance": (
+        lambda c: c.update(boresight={"rotation": [0.0] * 3, "covariance": np.diag([1, 1, -1.0]).tolist()}),
+        CalibrationError, "boresight: covariance: a variance is negative"),
     "an effect among terms": (
         lambda c: c["terms"].append(c["effects"].pop()), CalibrationError, "terms and effects"),
 }  # fmt: skip
