@@ -82,7 +82,7 @@ class Pipeline:
         self._driver = open_driver(config.sensor.driver, config.sensor.options, config.path)
         self._clock = DeviceClock.of(self._driver)
         self._telemetry = TelemetryMap(config.telemetry, config.link.autopilot, config.path)
-        foreign = calibration is not None and calibration.sensor.name not in ("", config.sensor.driver)
+        foreign = calibration is not None and not calibration.sensor.may_be(config.sensor.driver)
         check_publish(config.publish, config.path)
         if calibration is not None:
             check(calibration, config)

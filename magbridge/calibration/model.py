@@ -60,6 +60,10 @@ class Sensor(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     name: str = ""
     power_cycle: int | None = None
 
+    def may_be(self, name: str) -> bool:
+        """Whether this is the sensor of that name; either may be unknown (empty)."""
+        return "" in (self.name, name) or self.name == name
+
 
 UNKNOWN = Sensor()
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import resource
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from magbridge.calibration.file import save as save_calibration
 from magbridge.calibration.fitting.fit import METHODS
-from magbridge.calibration.model import identity
+from magbridge.calibration.model import Sensor, identity
 from magbridge.cli import main
 from magbridge.columns import CHANNELS
 from magbridge.logs import read, write
@@ -85,6 +86,17 @@ def test_a_log_in_another_unit_is_not_corrected(
     assert line.startswith("log.nc (deployment.csv): mag_x mag_y mag_z: the length of the vector is ")
     assert line.endswith(" nT: expected nT")
     assert list(tmp_path.iterdir()) == [log]
+
+
+def test_a_log_of_another_sensor_is_not_corrected(
+    deployment: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log, calibration, output = (tmp_path / name for name in ("log.nc", "cal.json", "x.nc"))
+    write(read(deployment).isel(time=slice(0, 60)).assign_attrs(sensor="hmr2300"), log)
+    save_calibration(replace(identity(), sensor=Sensor("digitizer")), calibration)
+    line = complaint(capsys, "correct", log, "--calibration", calibration, "-o", output, code=1)
+    assert line.endswith(": sensor 'hmr2300', but the calibration is of 'digitizer'")
+    assert not output.exists()
 
 
 @pytest.mark.parametrize(

@@ -123,7 +123,7 @@ def _columns(
     """Return every numeric column, the channels interpolated to the rows' times, and the reference field."""
     source = str(ds.attrs.get("source", "deployment"))
     sensor = str(ds.attrs.get("sensor", ""))
-    if sensor and calibration.sensor.name and sensor != calibration.sensor.name:
+    if not calibration.sensor.may_be(sensor):
         raise DataError(f"{source}: sensor {sensor!r}, but the calibration is of {calibration.sensor.name!r}")
     require(ds, (*CHANNELS, *(parameter.name for parameter in calibration.parameters)))
     once = np.unique(ds["time"], return_index=True)[1]
