@@ -154,7 +154,7 @@ def _sentence(diagnosis: Diagnosis) -> str:
         "known cause explains."
         if rest
         else f"{names} {nothing_else}",
-        "unexplained": f"An effect is present in the {number(total.before)} nT RMS that differ, but {name}.",
+        "unexplained": f"The difference of {number(total.before)} nT RMS is more than noise, but {name}.",
     }[diagnosis.verdict]
 
 
