@@ -23,6 +23,8 @@ __all__ = [
     "Link",
     "Log",
     "Navigation",
+    "NotNegative",
+    "Positive",
     "Sensor",
     "Telemetry",
     "load",

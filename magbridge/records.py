@@ -10,7 +10,7 @@ from math import nan
 
 import msgspec
 
-__all__ = ["BEYOND", "Channel", "Corrected", "Quality", "Reading"]
+__all__ = ["BEYOND", "Channel", "Corrected", "Quality", "Reading", "Vector"]
 
 Vector = tuple[float, float, float]
 

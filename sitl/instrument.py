@@ -14,7 +14,7 @@ from magbridge.config import NotNegative, Positive
 from magbridge.toml import Table
 from sitl.signals import autoregressive, first_order, first_order_at
 
-__all__ = ["Instrument", "Samples"]
+__all__ = ["Instrument", "Samples", "rotation"]
 
 Array = NDArray[np.float64]
 Vector = tuple[float, float, float]
@@ -161,7 +161,7 @@ class Samples:
 
 
 def rotation(roll: float | Array, pitch: float | Array, heading: float | Array) -> Rotation:
-    """Return the rotations that take body vectors to the world's axes, angles in deg, order 3-2-1.
+    """Return the rotations that take body vectors to the world's axes, angles (n,) in deg, order 3-2-1.
 
     ``rotation(...).apply(field_ned, inverse=True)`` is the field in body axes.
     """

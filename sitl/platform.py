@@ -15,7 +15,18 @@ from magbridge.calibration.model import Calibration
 from magbridge.toml import Table
 from sitl.world import MU_0_OVER_4_PI, dipole_field
 
-__all__ = ["MOUNTINGS", "Calibrated", "Mass", "Mounting", "Vehicle", "draw_vehicle"]
+__all__ = [
+    "HARD_IRON",
+    "MOMENT",
+    "MOUNTINGS",
+    "SOFT_IRON",
+    "VOLUME_SPREAD",
+    "Calibrated",
+    "Mass",
+    "Mounting",
+    "Vehicle",
+    "draw_vehicle",
+]
 
 Array = NDArray[np.float64]
 Vector = tuple[float, float, float]

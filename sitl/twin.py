@@ -26,7 +26,7 @@ from sitl.scenario import Scenario
 from sitl.trajectory import Track, fly
 from sitl.world import World
 
-__all__ = ["Twin", "simulate"]
+__all__ = ["FINE_STEP", "Twin", "simulate"]
 
 Array = NDArray[np.float64]
 

@@ -12,7 +12,7 @@ from magbridge.field.grid import AnomalyGrid
 from magbridge.field.igrf import igrf, total_field
 from magbridge.toml import Table
 
-__all__ = ["Geology", "Rock", "Water", "World", "dipole_field"]
+__all__ = ["MU_0_OVER_4_PI", "Geology", "Rock", "Water", "World", "dipole_field"]
 
 Array = NDArray[np.float64]
 

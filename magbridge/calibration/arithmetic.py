@@ -24,7 +24,18 @@ from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from typing import Any
 
-__all__ = ["COARSE", "FINE", "Prepared", "apply", "combined", "for_arrays", "powers", "prepare", "split"]
+__all__ = [
+    "BITS",
+    "COARSE",
+    "FINE",
+    "Prepared",
+    "apply",
+    "combined",
+    "for_arrays",
+    "powers",
+    "prepare",
+    "split",
+]
 
 BITS = 21
 COARSE, FINE = 1.5 * 2.0 ** (52 - BITS), 1.5 * 2.0 ** (52 - 2 * BITS)

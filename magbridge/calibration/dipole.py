@@ -30,7 +30,7 @@ from magbridge.errors import CalibrationError
 if TYPE_CHECKING:
     from magbridge.calibration.model import Calibration
 
-__all__ = ["ORDER", "Dipole", "dipole_tensor", "expand_dipole"]
+__all__ = ["ORDER", "Dipole", "dipole_columns", "dipole_tensor", "expand_dipole"]
 
 FloatArray = NDArray[np.float64]
 Vector = tuple[float, float, float]

@@ -19,7 +19,16 @@ from magbridge.errors import CalibrationError
 if TYPE_CHECKING:
     from magbridge.calibration.model import Calibration
 
-__all__ = ["ClockEffect", "MonomialEffect", "PlayEffect", "PowersEffect", "SourcesEffect"]
+__all__ = [
+    "MAX_INTERVAL",
+    "ClockEffect",
+    "MonomialEffect",
+    "PlayEffect",
+    "PowersEffect",
+    "SourcesEffect",
+    "offsets",
+    "powers",
+]
 
 FloatArray = NDArray[np.float64]
 MAX_INTERVAL = 60_000_000

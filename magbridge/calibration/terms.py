@@ -26,14 +26,19 @@ if TYPE_CHECKING:
     from magbridge.calibration.model import Calibration
 
 __all__ = [
+    "HIGHEST",
     "PAIRS",
     "SLOTS",
     "TERMS",
     "Effect",
     "Expansion",
+    "Exponents",
     "Polynomial",
     "PositionTerm",
+    "Power",
+    "Step",
     "Term",
+    "Width",
     "full_order",
     "symmetric",
     "term_class",

@@ -8,7 +8,16 @@ from typing import Any, TypeVar, overload
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["metres_per_degree", "offset", "separation", "usual", "worse_axis", "wrap"]
+__all__ = [
+    "ECCENTRICITY_SQUARED",
+    "EQUATORIAL_RADIUS",
+    "metres_per_degree",
+    "offset",
+    "separation",
+    "usual",
+    "worse_axis",
+    "wrap",
+]
 
 EQUATORIAL_RADIUS = 6_378_137.0
 """m, of WGS84."""

@@ -19,7 +19,7 @@ from magbridge.errors import FormatError, OutOfRange
 from magbridge.field.earth import metres_per_degree, usual, wrap
 from magbridge.field.spline import WEIGHTS, coefficients, weights
 
-__all__ = ["AnomalyGrid", "Local"]
+__all__ = ["AnomalyGrid", "Local", "filled"]
 
 Array = NDArray[np.float64]
 T = TypeVar("T", float, Array)
@@ -278,7 +278,7 @@ class AnomalyGrid:
 
 
 def filled(values: Array) -> Array:
-    """Return the values with each hole filled from the nearest node, so that a transform can be applied."""
+    """Return values (ny, nx), each hole (NaN) filled from the nearest node: a transform takes no holes."""
     hole = np.isnan(values)
     if not hole.any():
         return values

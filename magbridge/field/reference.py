@@ -16,7 +16,7 @@ from magbridge.field.igrf import igrf, magnitude, total_field
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["earth_field", "main_field", "positions", "reference_field"]
+__all__ = ["earth_field", "main_field", "other_units", "positions", "reference_field"]
 
 Array = NDArray[np.float64]
 

@@ -21,7 +21,7 @@ from magbridge.link.vehicle import Vehicle
 from magbridge.mavlink import Codec, Message, Signing, TapeWriter, spec
 from magbridge.mavlink.dialect import MAV_SEVERITY
 
-__all__ = ["LIMITS", "Component", "check_publish"]
+__all__ = ["LIMITS", "TIMESYNC_US", "Component", "check_publish"]
 
 TIMESYNC = spec("TIMESYNC")
 LIMITS = {

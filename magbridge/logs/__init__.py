@@ -34,7 +34,7 @@ from magbridge.files import atomic_path
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["FORMATS", "Writer", "read", "read_chunks", "suffixes", "write"]
+__all__ = ["FLIGHT", "FORMATS", "Writer", "read", "read_chunks", "suffixes", "write"]
 
 FLIGHT = {".ebd": ".dbd", ".nbd": ".mbd", ".tbd": ".sbd", ".ecd": ".dcd", ".ncd": ".mcd", ".tcd": ".scd"}
 """Suffix of a Slocum's science file to that of its flight file: where both are there, both are read."""

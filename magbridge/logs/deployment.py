@@ -15,6 +15,7 @@ from magbridge.errors import FormatError
 from magbridge.records import Quality
 
 __all__ = [
+    "COUNTERS",
     "MEANING",
     "deployment",
     "increasing",

@@ -18,7 +18,7 @@ from magbridge.field.earth import metres_per_degree, worse_axis
 from magbridge.field.grid import AnomalyGrid
 from magbridge.navigate.model import N_STATES, Block
 
-__all__ = ["Bank"]
+__all__ = ["Bank", "widest"]
 
 Array = NDArray[np.float64]
 
@@ -227,6 +227,6 @@ class Bank:
 
 
 def widest(P: Array) -> float:
-    """Return the largest 1-sigma of the position, m."""
+    """Return the largest 1-sigma of the position, m, of a covariance (6, 6)."""
     (nn, ne), (_, ee) = P[:2, :2].tolist()
     return float(worse_axis(nn, ne, ee))

@@ -6,7 +6,7 @@ from math import cos, hypot, isfinite, nan, radians, sin, tan
 
 from magbridge.field.earth import offset, separation
 
-__all__ = ["DeadReckoning"]
+__all__ = ["GLIDE", "DeadReckoning"]
 
 GLIDE = 8.0
 """deg, of pitch; a glider flatter than that is turning between dive and climb."""

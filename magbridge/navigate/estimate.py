@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from magbridge.field.earth import offset
 from magbridge.field.grid import AnomalyGrid
 from magbridge.navigate.bank import Bank, widest
-from magbridge.navigate.integrity import IntegrityMonitor, Unmapped, Verdict, distance
+from magbridge.navigate.integrity import IntegrityMonitor, Unmapped, Verdict, squared_mahalanobis
 from magbridge.navigate.model import Block, Options, any_level, prior, resolution, transition
 from magbridge.navigate.record import Jump, State
 from magbridge.navigate.tracker import Innovation, Tracker
@@ -102,7 +102,7 @@ class Estimate:
         """
         assert self._filter is not None
         self._read()
-        if distance(there - self.x[:2], self.P[:2, :2] + sigma**2 * np.eye(2)) > CONTRADICTION:
+        if squared_mahalanobis(there - self.x[:2], self.P[:2, :2] + sigma**2 * np.eye(2)) > CONTRADICTION:
             _, start = prior(self.options, sigma)
             start[2:, 2:] += self.P[2:, 2:]
             self._begin(np.concatenate([there, self.x[2:]]), start, "a fix contradicts the filter")

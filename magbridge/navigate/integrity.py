@@ -23,7 +23,7 @@ from magbridge.field.grid import AnomalyGrid
 from magbridge.navigate.bank import Bank, widest
 from magbridge.navigate.model import Block, Options, block_length, transition
 
-__all__ = ["IntegrityMonitor", "Unmapped", "Verdict"]
+__all__ = ["IntegrityMonitor", "Unmapped", "Verdict", "squared_mahalanobis"]
 
 Array = NDArray[np.float64]
 
@@ -168,18 +168,28 @@ class IntegrityMonitor:
 
     def _compare(self, x: Array, P: Array) -> Verdict:
         there, spread = self.elsewhere.moments()
-        if self.odds > self._threshold and distance(there - x, P) > ELSEWHERE:
+        if self.odds > self._threshold and squared_mahalanobis(there - x, P) > ELSEWHERE:
             return Verdict.ELSEWHERE
         if widest(spread) > 1.5 * max(self.elsewhere.resolution, widest(P)):
             return Verdict.OPEN
-        if distance(there - x, spread + P) < AGREES:
+        if squared_mahalanobis(there - x, spread + P) < AGREES:
             return Verdict.HOLDS
         here, narrow = self.here.moments()  # where the filter would be without its single linearisation
-        return Verdict.ELSEWHERE if distance(there - here, spread + narrow) < AGREES else Verdict.OPEN
+        return (
+            Verdict.ELSEWHERE if squared_mahalanobis(there - here, spread + narrow) < AGREES else Verdict.OPEN
+        )
 
 
-def distance(apart: Array, P: Array) -> float:
-    """Return the squared Mahalanobis distance of two positions under a covariance."""
+def squared_mahalanobis(apart: Array, P: Array) -> float:
+    """Return the squared Mahalanobis distance of two positions.
+
+    Parameters
+    ----------
+    apart : (2,) or (6,) array
+        m north and east from one to the other, first.
+    P : (2, 2) or (6, 6) array
+        m², covariance.
+    """
     return float(apart[:2] @ np.linalg.solve(P[:2, :2], apart[:2]))
 
 

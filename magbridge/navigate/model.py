@@ -28,6 +28,7 @@ from magbridge.config import NotNegative, Positive
 from magbridge.field.grid import AnomalyGrid
 
 __all__ = [
+    "N_STATES",
     "Block",
     "Options",
     "any_level",

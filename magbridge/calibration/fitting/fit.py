@@ -22,7 +22,7 @@ from magbridge.errors import CalibrationError
 from magbridge.field.reference import other_units
 from magbridge.version import __version__
 
-__all__ = ["METHODS", "Fit", "fit"]
+__all__ = ["METHODS", "Fit", "assemble", "fit"]
 
 FloatArray = NDArray[np.float64]
 
@@ -211,7 +211,21 @@ def assemble(
     method: str,
     details: dict[str, Any] | None = None,
 ) -> Fit:
-    """Return the fit: its numbers as a calibration with a table of runs, and its residuals."""
+    """Return the fit: its numbers as a calibration with a table of runs, and its residuals.
+
+    Parameters
+    ----------
+    data, samples
+        The calibration runs, and what was fitted of them.
+    parameters, exponents
+        The positions that the coefficients depend on, and the m monomials in them.
+    coefficients : (9 m,) array
+        nT, monomial by monomial.
+    covariance : (9 m, 9 m) array
+        nT².
+    noise, method, details
+        As :class:`Fit` and its calibration have them.
+    """
     e = residuals_of(samples, coefficients)
     assert data.time is not None
     steps = np.diff(data.time)

@@ -22,7 +22,15 @@ from magbridge.calibration.fitting.solve import Prior, covariance_of, gauss_newt
 from magbridge.calibration.residual import Samples, residuals_of, scales_and_offsets
 from magbridge.errors import CalibrationError
 
-__all__ = ["SCALE_SIGMA", "check_scales", "fit_nominal", "nominal", "nominal_samples"]
+__all__ = [
+    "HARD_IRON_SIGMA",
+    "SCALE_SIGMA",
+    "check_scales",
+    "fit_nominal",
+    "nominal",
+    "nominal_samples",
+    "starts",
+]
 
 FloatArray = NDArray[np.float64]
 
@@ -122,7 +130,7 @@ def _precision(E: FloatArray, scale_sigma: float, gain_sigma: float) -> FloatArr
 
 
 def starts(samples: Samples) -> list[FloatArray]:
-    """Return two starts: no iron at all, and the sphere that fits best by linear least squares.
+    """Return two starts (9,), nT: no iron at all, and the sphere that fits best by linear least squares.
 
     ``|h|^2 = 2 h^T T + (F^2 - |T|^2)`` is linear in T and one constant.
     """

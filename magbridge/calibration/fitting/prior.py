@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from magbridge.calibration.terms import Exponents
 
-__all__ = ["Structure", "free_structure"]
+__all__ = ["FACTOR_MASS", "Structure", "free_structure", "gain_rotation"]
 
 FloatArray = NDArray[np.float64]
 

@@ -42,7 +42,7 @@ from magbridge.diagnose.compare.interpolation import interpolation_error
 from magbridge.diagnose.compare.prior import level, loosened, prior
 from magbridge.diagnose.compare.survey import Survey
 
-__all__ = ["Problem", "add_effects", "effect_columns", "history", "pose", "samples_of"]
+__all__ = ["DELAY", "DELAYS", "Problem", "add_effects", "effect_columns", "history", "pose", "samples_of"]
 
 FloatArray = NDArray[np.float64]
 

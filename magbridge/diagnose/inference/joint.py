@@ -22,7 +22,7 @@ from magbridge.diagnose.inference.fit_noise import fit_noise
 from magbridge.diagnose.inference.noise import Noise
 from magbridge.diagnose.inference.statistic import Statistic
 
-__all__ = ["FLAT", "RIDGE", "Joint", "fit_joint"]
+__all__ = ["FLAT", "RIDGE", "Joint", "fit_joint", "volume_of"]
 
 FloatArray = NDArray[np.float64]
 RIDGE = 0.1
@@ -147,7 +147,10 @@ def fit_joint(
 
 
 def volume_of(covariance: FloatArray, prior: FloatArray) -> float:
-    """Return ``1/2 ln det(1 + g S)``, the log of how much the data narrow coefficients of this prior."""
+    """Return ``1/2 ln det(1 + g S)``, the log of how much the data narrow coefficients.
+
+    Their posterior covariance is (k, k), their prior's precision (k,).
+    """
     return -0.5 * float(np.linalg.slogdet(covariance)[1] + np.log(prior).sum())
 
 

@@ -23,7 +23,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Ridge", "Statistic"]
+__all__ = ["VISIBLE", "Ridge", "Statistic"]
 
 FloatArray = NDArray[np.float64]
 

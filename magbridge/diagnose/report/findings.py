@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from magbridge.diagnose.diagnosis import Diagnosis, Finding
     from magbridge.diagnose.gain import Gain
 
-__all__ = ["findings", "findings_json", "parameters"]
+__all__ = ["chance_alone", "findings", "findings_json", "parameters"]
 
 FloatArray = NDArray[np.float64]
 
