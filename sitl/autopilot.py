@@ -14,13 +14,12 @@ from typing import Any
 from magbridge.config import Config, Telemetry
 from magbridge.errors import DataError
 from magbridge.mavlink.codec import Codec
+from magbridge.mavlink.dialect import MAV_AUTOPILOT, MAV_STATE, MAV_TYPE
 from magbridge.mavlink.messages import east_e7, spec, split_index
 
 __all__ = ["Autopilot"]
 
 HEARTBEAT_US = 1_000_000
-SUBMARINE, GENERIC, ACTIVE = 12, 0, 4
-"""MAV_TYPE, MAV_AUTOPILOT and MAV_STATE of its heartbeat."""
 FIX_3D, GPS_ACCURACY = 3, 10_000
 """GPS_FIX_TYPE and mm of its receiver."""
 
@@ -50,7 +49,11 @@ class Autopilot:
         due = []
         while self._next_heartbeat_us <= until_us:
             frame = self._codec.pack(
-                "HEARTBEAT", type=SUBMARINE, autopilot=GENERIC, system_status=ACTIVE, mavlink_version=3
+                "HEARTBEAT",
+                type=MAV_TYPE.SUBMARINE,
+                autopilot=MAV_AUTOPILOT.GENERIC,
+                system_status=MAV_STATE.ACTIVE,
+                mavlink_version=3,
             )
             due.append((self._next_heartbeat_us, frame))
             self._next_heartbeat_us += HEARTBEAT_US

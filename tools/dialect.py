@@ -22,13 +22,14 @@ DEFINITIONS = Path(pymavlink.__file__).parent / "dialects" / "v20"
 INCLUDED = "all.xml"
 """More than our own messages: any that an autopilot sends can become a parameter, and is in logs."""
 ENUMS: dict[str, tuple[str, ...]] = {
+    "FIRMWARE_VERSION_TYPE": ("OFFICIAL",),
     "MAG_LOG_STATE": (),
     "MAG_NAVIGATION_STATE": (),
     "MAG_PORT_NAME": (),
     "MAG_PORT_STATE": (),
     "MAG_QUALITY": (),
     "MAG_RAW_FLAGS": (),
-    "MAV_AUTOPILOT": ("INVALID",),
+    "MAV_AUTOPILOT": ("GENERIC", "INVALID"),
     "MAV_CMD": (
         "GET_MESSAGE_INTERVAL",
         "SET_MESSAGE_INTERVAL",
@@ -37,12 +38,14 @@ ENUMS: dict[str, tuple[str, ...]] = {
         "REQUEST_AUTOPILOT_CAPABILITIES",
         "EXTERNAL_POSITION_ESTIMATE",
     ),
+    "MAV_ESTIMATOR_TYPE": ("NAIVE",),
+    "MAV_FRAME": ("GLOBAL", "LOCAL_NED", "BODY_FRD"),
     "MAV_PARAM_TYPE": ("REAL32",),
     "MAV_PROTOCOL_CAPABILITY": ("PARAM_FLOAT", "COMMAND_INT", "MAVLINK2"),
     "MAV_RESULT": (),
     "MAV_SEVERITY": (),
     "MAV_STATE": (),
-    "MAV_TYPE": ("GCS", "ONBOARD_CONTROLLER"),
+    "MAV_TYPE": ("GCS", "SUBMARINE", "ONBOARD_CONTROLLER"),
 }
 """The enumerations that the code uses, and which of their entries; an empty list means all."""
 CODES = {

@@ -10,14 +10,14 @@ import msgspec
 
 from magbridge.field.earth import worse_axis
 from magbridge.link.outbox import Outbox
+from magbridge.mavlink.dialect import MAV_CMD, MAV_ESTIMATOR_TYPE, MAV_FRAME
 
 __all__ = ["FIXES", "Fix", "Kind"]
 
-EXTERNAL_POSITION_ESTIMATE = 43003
-GLOBAL_FRAME, LOCAL_NED, BODY_FRD = 0, 1, 12
-NAIVE_ESTIMATOR = 1
 UNKNOWN_SOURCE = 0
+"""GLOBAL_POSITION_UNKNOWN"""
 LATITUDE_LONGITUDE_ONLY = 0
+"""GLOBAL_POSITION_SENSOR.flags"""
 
 
 class Fix(msgspec.Struct, frozen=True, gc=False):
@@ -60,8 +60,8 @@ def external_position(outbox: Outbox, fix: Fix, system: int, autopilot: int) -> 
     """Send MAV_CMD_EXTERNAL_POSITION_ESTIMATE: ArduPilot resets its position to it while it dead-reckons."""
     outbox.send(
         "COMMAND_INT",
-        command=EXTERNAL_POSITION_ESTIMATE,
-        frame=GLOBAL_FRAME,
+        command=MAV_CMD.EXTERNAL_POSITION_ESTIMATE,
+        frame=MAV_FRAME.GLOBAL,
         param1=outbox.codec.now_us * 1e-6 % 1e5,
         param2=fix.age,
         param3=fix.sigma,
@@ -101,8 +101,8 @@ def odometry(outbox: Outbox, fix: Fix, system: int, autopilot: int) -> None:  # 
     outbox.send(
         "ODOMETRY",
         time_usec=fix.time_us,
-        frame_id=LOCAL_NED,
-        child_frame_id=BODY_FRD,
+        frame_id=MAV_FRAME.LOCAL_NED,
+        child_frame_id=MAV_FRAME.BODY_FRD,
         x=fix.north,
         y=fix.east,
         z=nan,
@@ -116,7 +116,7 @@ def odometry(outbox: Outbox, fix: Fix, system: int, autopilot: int) -> None:  # 
         pose_covariance=covariance,
         velocity_covariance=[nan] * 21,
         reset_counter=fix.resets & 0xFF,
-        estimator_type=NAIVE_ESTIMATOR,
+        estimator_type=MAV_ESTIMATOR_TYPE.NAIVE,
         quality=100 if isfinite(fix.sigma) else -1,
     )
 

@@ -10,7 +10,13 @@ from typing import NamedTuple
 from magbridge.link.outbox import Outbox
 from magbridge.link.vehicle import Vehicle
 from magbridge.mavlink import spec
-from magbridge.mavlink.dialect import MAV_AUTOPILOT, MAV_PROTOCOL_CAPABILITY, MAV_STATE, MAV_TYPE
+from magbridge.mavlink.dialect import (
+    FIRMWARE_VERSION_TYPE,
+    MAV_AUTOPILOT,
+    MAV_PROTOCOL_CAPABILITY,
+    MAV_STATE,
+    MAV_TYPE,
+)
 
 __all__ = ["Condition", "Reports"]
 
@@ -25,8 +31,6 @@ ALIVE, CRITICAL = (
     )
     for state in (MAV_STATE.ACTIVE, MAV_STATE.CRITICAL)
 )
-OFFICIAL = 255
-"""FIRMWARE_VERSION_TYPE_OFFICIAL"""
 CAPABILITIES = (
     MAV_PROTOCOL_CAPABILITY.PARAM_FLOAT
     | MAV_PROTOCOL_CAPABILITY.COMMAND_INT
@@ -123,7 +127,9 @@ class Reports:
         self._outbox.send(
             "AUTOPILOT_VERSION",
             capabilities=CAPABILITIES,
-            flight_sw_version=int.from_bytes(bytes([*numbers, 0, 0, 0][:3]) + bytes((OFFICIAL,)), "big"),
+            flight_sw_version=int.from_bytes(
+                bytes([*numbers, 0, 0, 0][:3]) + bytes((FIRMWARE_VERSION_TYPE.OFFICIAL,)), "big"
+            ),
         )
 
     def sample_interval_us(self) -> int:

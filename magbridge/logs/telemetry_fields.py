@@ -8,10 +8,11 @@ from typing import Any
 
 from magbridge.columns import CHANNEL_TIMES, CORRECTED
 from magbridge.mavlink import Message, spec
+from magbridge.mavlink.dialect import MAG_RAW_FLAGS
 from magbridge.mavlink.messages import split_index
 
 __all__ = [
-    "COUNTED_POWER_CYCLES",
+    "POWER_CYCLE",
     "SOURCES",
     "TELEMETRY",
     "UNKNOWN_INT",
@@ -117,8 +118,8 @@ TELEMETRY = {
 """Message id to the columns in the message."""
 
 SAMPLE, CORRECTION = spec("MAG_RAW").struct, spec("MAG_FIELD").struct
-COUNTED_POWER_CYCLES = 8
-"""Flag of MAG_RAW: its power cycle is counted (MAG_RAW_FLAGS_POWER_CYCLE)."""
+POWER_CYCLE = int(MAG_RAW_FLAGS.POWER_CYCLE)
+"""Flag of MAG_RAW: its power cycle is counted."""
 
 
 def sample(payload: bytes) -> Columns:
@@ -133,7 +134,7 @@ def sample(payload: bytes) -> Columns:
         row["sensor_temperature"] = temperature
     if not isnan(supply):
         row["sensor_supply"] = supply
-    if flags & COUNTED_POWER_CYCLES:
+    if flags & POWER_CYCLE:
         row["power_cycle"] = cycle
     return row
 

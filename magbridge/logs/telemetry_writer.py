@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from magbridge.columns import CHANNEL_TIMES, CHANNELS, CORRECTED
 from magbridge.logs.deployment import MEANING
-from magbridge.logs.telemetry_fields import COUNTED_POWER_CYCLES, UNKNOWN_INT
+from magbridge.logs.telemetry_fields import POWER_CYCLE, UNKNOWN_INT
 from magbridge.mavlink import Codec, Spec, pack_record, spec
 from magbridge.mavlink.messages import east_e7
 from magbridge.records import Channel, Quality
@@ -126,7 +126,7 @@ class FileWriter:
         x, y, z, temperature, supply, cycle = (row.get(name, nan) for name in SAMPLE)
         delays = [_delay(row.get(name, nan), time_us) for name in CHANNEL_TIMES]
         fields = time_us, 0, x, y, z, 0, 0, 0, *delays, temperature, supply
-        power = (int(cycle) & 0xFFFF, 0, COUNTED_POWER_CYCLES) if isfinite(cycle) else (0, 0, 0)
+        power = (int(cycle) & 0xFFFF, 0, POWER_CYCLE) if isfinite(cycle) else (0, 0, 0)
         self._say(time_us, Channel.SENT, self._bridge, RAW_, *fields, *power)
 
     def _field(self, time_us: int, row: Row) -> None:

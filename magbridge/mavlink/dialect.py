@@ -370,6 +370,10 @@ MESSAGES: dict[int, tuple[str, int, str]] = {
 }
 
 
+class FIRMWARE_VERSION_TYPE(IntEnum):
+    OFFICIAL = 255
+
+
 class MAG_LOG_STATE(IntEnum):
     OFF = 0
     OK = 1
@@ -416,6 +420,7 @@ class MAG_RAW_FLAGS(IntEnum):
 
 
 class MAV_AUTOPILOT(IntEnum):
+    GENERIC = 0
     INVALID = 8
 
 
@@ -426,6 +431,16 @@ class MAV_CMD(IntEnum):
     REQUEST_PROTOCOL_VERSION = 519
     REQUEST_AUTOPILOT_CAPABILITIES = 520
     EXTERNAL_POSITION_ESTIMATE = 43003
+
+
+class MAV_ESTIMATOR_TYPE(IntEnum):
+    NAIVE = 1
+
+
+class MAV_FRAME(IntEnum):
+    GLOBAL = 0
+    LOCAL_NED = 1
+    BODY_FRD = 12
 
 
 class MAV_PARAM_TYPE(IntEnum):
@@ -474,4 +489,5 @@ class MAV_STATE(IntEnum):
 
 class MAV_TYPE(IntEnum):
     GCS = 6
+    SUBMARINE = 12
     ONBOARD_CONTROLLER = 18
