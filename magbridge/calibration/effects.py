@@ -3,12 +3,17 @@
 An effect names its channels, says what its coefficients do with its regressors (`columns`), and computes the
 regressors sample by sample (`begin` returns a stepper with a fresh state). Live and batch run the same
 stepper, so both give the same bits.
+
+Here are what they share and the effect of one telemetry channel; the others are in :mod:`.mass_effects` and
+:mod:`.instrument_effects`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import accumulate, repeat
 from math import exp, isnan
+from operator import mul
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import numpy as np
@@ -20,12 +25,27 @@ from magbridge.calibration.terms import Effect, Power, Step
 if TYPE_CHECKING:
     from magbridge.calibration.model import Calibration
 
-__all__ = ["ChannelEffect", "Follower"]
+__all__ = ["MAX_INTERVAL", "ChannelEffect", "SingleChannelEffect", "offsets", "powers"]
 
 FloatArray = NDArray[np.float64]
+MAX_INTERVAL = 60_000_000
+"""µs; over a longer gap no rate of change is computed."""
 
 
-class Follower(Effect, frozen=True, kw_only=True):
+def offsets(regressors: int) -> FloatArray:
+    """Return columns (3 r, r, 9): each regressor adds to T with three coefficients of its own."""
+    columns = np.zeros((3 * regressors, regressors, 9))
+    for r in range(regressors):
+        columns[3 * r : 3 * r + 3, r, 6:9] = np.eye(3)
+    return columns
+
+
+def powers(x: float, order: int) -> tuple[float, ...]:
+    """Return ``x, x^2, ... x^order``."""
+    return tuple(accumulate(repeat(x, order), mul))
+
+
+class SingleChannelEffect(Effect, frozen=True, kw_only=True):
     """An effect that depends on one telemetry channel.
 
     Attributes
@@ -49,7 +69,7 @@ class Follower(Effect, frozen=True, kw_only=True):
         return (self.channel,)
 
 
-class ChannelEffect(Follower, frozen=True, kw_only=True):
+class ChannelEffect(SingleChannelEffect, frozen=True, kw_only=True):
     """Offset or scale proportional to a channel, at once or through lags in series.
 
     Attributes

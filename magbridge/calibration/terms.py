@@ -64,14 +64,14 @@ TERMS: dict[str, str] = {
     "polynomial": "magbridge.calibration.terms:Polynomial",
     "dipole": "magbridge.calibration.dipole:Dipole",
     "channel": "magbridge.calibration.effects:ChannelEffect",
-    "powers": "magbridge.calibration.followers:PowersEffect",
-    "sources": "magbridge.calibration.followers:SourcesEffect",
-    "monomial": "magbridge.calibration.followers:MonomialEffect",
-    "play": "magbridge.calibration.followers:PlayEffect",
-    "clock": "magbridge.calibration.followers:ClockEffect",
-    "time": "magbridge.calibration.instrument:TimeEffect",
-    "rate": "magbridge.calibration.instrument:RateEffect",
-    "response": "magbridge.calibration.instrument:ResponseEffect",
+    "powers": "magbridge.calibration.mass_effects:PowersEffect",
+    "sources": "magbridge.calibration.mass_effects:SourcesEffect",
+    "monomial": "magbridge.calibration.mass_effects:MonomialEffect",
+    "play": "magbridge.calibration.mass_effects:PlayEffect",
+    "clock": "magbridge.calibration.mass_effects:ClockEffect",
+    "time": "magbridge.calibration.instrument_effects:TimeEffect",
+    "rate": "magbridge.calibration.instrument_effects:RateEffect",
+    "response": "magbridge.calibration.instrument_effects:ResponseEffect",
 }
 """Name in ``cal.json`` -> ``module:class``; others join by the entry point group ``magbridge.terms``."""
 

@@ -9,8 +9,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from magbridge.calibration.followers import ClockEffect
-from magbridge.calibration.instrument import RateEffect
+from magbridge.calibration.instrument_effects import RateEffect
+from magbridge.calibration.mass_effects import ClockEffect
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.residual import residuals, residuals_of, robust_scale
 from magbridge.diagnose.causes.candidates import Candidate, slices

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 from threadpoolctl import threadpool_limits
 
-from magbridge.calibration.instrument import TimeEffect
+from magbridge.calibration.instrument_effects import TimeEffect
 from magbridge.calibration.model import Calibration
 from magbridge.diagnose.causes import CAUSES, Cause
 from magbridge.diagnose.causes.candidates import Candidate, since, slices

@@ -9,14 +9,14 @@ import pytest
 
 from magbridge.calibration.correct import correct, regressors
 from magbridge.calibration.effects import ChannelEffect
-from magbridge.calibration.followers import (
+from magbridge.calibration.instrument_effects import RateEffect, ResponseEffect, TimeEffect
+from magbridge.calibration.mass_effects import (
     ClockEffect,
     MonomialEffect,
     PlayEffect,
     PowersEffect,
     SourcesEffect,
 )
-from magbridge.calibration.instrument import RateEffect, ResponseEffect, TimeEffect
 from magbridge.calibration.model import Calibration, Noise, Parameter, Reference
 from magbridge.calibration.terms import HIGHEST, Effect, Polynomial, symmetric
 from magbridge.errors import CalibrationError

@@ -11,14 +11,14 @@ import pytest
 from magbridge.calibration.correct import Corrector, correct
 from magbridge.calibration.effects import ChannelEffect
 from magbridge.calibration.file import decode_calibration, encode_calibration
-from magbridge.calibration.followers import (
+from magbridge.calibration.instrument_effects import RateEffect, ResponseEffect, TimeEffect
+from magbridge.calibration.mass_effects import (
     ClockEffect,
     MonomialEffect,
     PlayEffect,
     PowersEffect,
     SourcesEffect,
 )
-from magbridge.calibration.instrument import RateEffect, ResponseEffect, TimeEffect
 from magbridge.calibration.model import Calibration, Noise, Parameter, Reference
 from magbridge.calibration.residual import residuals
 from magbridge.calibration.terms import Effect, Polynomial

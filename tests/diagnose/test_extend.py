@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from magbridge.calibration.correct import correct
-from magbridge.calibration.followers import PowersEffect
-from magbridge.calibration.instrument import RateEffect, TimeEffect
+from magbridge.calibration.instrument_effects import RateEffect, TimeEffect
+from magbridge.calibration.mass_effects import PowersEffect
 from magbridge.calibration.model import Calibration
 from magbridge.diagnose.causes.candidates import Candidate, of_effect, since
 from magbridge.diagnose.compare.past import Past

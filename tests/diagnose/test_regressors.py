@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from magbridge.calibration.effects import ChannelEffect
-from magbridge.calibration.followers import MonomialEffect, PlayEffect, PowersEffect, SourcesEffect
+from magbridge.calibration.mass_effects import MonomialEffect, PlayEffect, PowersEffect, SourcesEffect
 from magbridge.calibration.model import Calibration, Noise, Parameter, Reference
 from magbridge.calibration.terms import Polynomial
 from magbridge.diagnose.causes import CAUSES

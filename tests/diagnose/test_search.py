@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from magbridge.calibration.instrument import TimeEffect
+from magbridge.calibration.instrument_effects import TimeEffect
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.rounds import State

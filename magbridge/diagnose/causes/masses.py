@@ -10,7 +10,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from magbridge.calibration.followers import MonomialEffect, PlayEffect, PowersEffect, SourcesEffect
+from magbridge.calibration.mass_effects import MonomialEffect, PlayEffect, PowersEffect, SourcesEffect
 from magbridge.calibration.terms import Polynomial, full_order
 from magbridge.diagnose.causes.candidates import AXES, Candidate, of_effect, per
 from magbridge.diagnose.causes.channels import channels_of, extent
@@ -68,8 +68,8 @@ def actuator_order(problem: Problem) -> list[Candidate]:
     """A mass needs what its polynomial lacks: a term ``T += b prod x_k^e_k``, or sources near its way.
 
     Candidates are each missing term up to the next order (paper, eq. 8), all of them together, and a row of
-    sources (:class:`~magbridge.calibration.followers.SourcesEffect`): of a mass that passes close to iron no
-    polynomial of a low order follows the field. The sources have one common size.
+    sources (:class:`~magbridge.calibration.mass_effects.SourcesEffect`): of a mass that passes close to iron
+    no polynomial of a low order follows the field. The sources have one common size.
     """
     calibration = problem.calibration
     if not calibration.parameters:
@@ -126,7 +126,7 @@ def hysteresis(problem: Problem) -> list[Candidate]:
     """Backlash of a drive, or moving steel remagnetised: ``T += b (S(y) - S(p)) / width``, y the play of p.
 
     S is straight for the backlash of a drive; for steel it is steep where the steel is: see
-    :class:`~magbridge.calibration.followers.PlayEffect`.
+    :class:`~magbridge.calibration.mass_effects.PlayEffect`.
     """
     drives = product((0.05, 0.15, 0.3), (0.0,), (STRAIGHT,))
     steel = product((0.15, 0.3), (-1.0 / 3.0, 0.0, 1.0 / 3.0), (0.5,))

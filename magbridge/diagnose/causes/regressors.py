@@ -74,7 +74,7 @@ def _stepped(values: FloatArray, share: FloatArray) -> FloatArray:
 
 
 def play(values: FloatArray, width: float) -> FloatArray:
-    """(n,) play operator of `values` (:class:`~magbridge.calibration.followers.PlayEffect`).
+    """(n,) play operator of `values` (:class:`~magbridge.calibration.mass_effects.PlayEffect`).
 
     Each row clips the output of the row before. Two such clips in series are one clip, so they are combined
     by doubling: over 2, 4, 8 ... rows.

@@ -10,7 +10,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from magbridge.calibration.instrument import ResponseEffect
+from magbridge.calibration.instrument_effects import ResponseEffect
 from magbridge.diagnose.causes.candidates import AXES, Candidate, of_effect, per
 from magbridge.diagnose.causes.regressors import powers
 from magbridge.diagnose.compare.problem import Problem

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from magbridge.calibration.instrument import TimeEffect
+from magbridge.calibration.instrument_effects import TimeEffect
 from magbridge.diagnose.causes.candidates import AXES, Candidate, of_effect, per
 from magbridge.diagnose.causes.regressors import powers
 from magbridge.diagnose.compare.problem import Problem

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from magbridge.calibration.followers import ClockEffect
-from magbridge.calibration.instrument import RateEffect
+from magbridge.calibration.instrument_effects import RateEffect
+from magbridge.calibration.mass_effects import ClockEffect
 from magbridge.diagnose.causes.candidates import AXES, Candidate, of_effect
 from magbridge.diagnose.causes.regressors import once
 from magbridge.diagnose.compare.interpolation import LOST, rates

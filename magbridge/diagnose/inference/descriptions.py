@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from magbridge.calibration.followers import ClockEffect
+from magbridge.calibration.mass_effects import ClockEffect
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.causes.regressors import powers
 from magbridge.diagnose.causes.timing import field_rates, mass_rates

@@ -10,7 +10,7 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from magbridge.calibration.followers import MAX_INTERVAL, offsets, powers
+from magbridge.calibration.effects import MAX_INTERVAL, offsets, powers
 from magbridge.calibration.terms import HIGHEST, Effect, Power, Step, Width
 
 if TYPE_CHECKING:

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import accumulate, repeat
 from math import isnan, tanh
-from operator import mul, sub
+from operator import sub
 from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from magbridge.calibration.effects import Follower
+from magbridge.calibration.effects import MAX_INTERVAL, SingleChannelEffect, offsets, powers
 from magbridge.calibration.terms import HIGHEST, Effect, Exponents, Power, Step, Width
 from magbridge.errors import CalibrationError
 
@@ -20,35 +19,17 @@ if TYPE_CHECKING:
     from magbridge.calibration.model import Calibration
 
 __all__ = [
-    "MAX_INTERVAL",
     "ClockEffect",
     "MonomialEffect",
     "PlayEffect",
     "PowersEffect",
     "SourcesEffect",
-    "offsets",
-    "powers",
 ]
 
 FloatArray = NDArray[np.float64]
-MAX_INTERVAL = 60_000_000
-"""µs; over a longer gap no rate of change is computed."""
 
 
-def offsets(regressors: int) -> FloatArray:
-    """Return columns (3 r, r, 9): each regressor adds to T with three coefficients of its own."""
-    columns = np.zeros((3 * regressors, regressors, 9))
-    for r in range(regressors):
-        columns[3 * r : 3 * r + 3, r, 6:9] = np.eye(3)
-    return columns
-
-
-def powers(x: float, order: int) -> tuple[float, ...]:
-    """Return ``x, x^2, ... x^order``."""
-    return tuple(accumulate(repeat(x, order), mul))
-
-
-class MassEffect(Follower, frozen=True, kw_only=True):
+class MassEffect(SingleChannelEffect, frozen=True, kw_only=True):
     """Offsets from a mass whose position is one telemetry channel.
 
     Attributes
