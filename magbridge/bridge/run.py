@@ -23,9 +23,11 @@ from magbridge.bridge.serial_port import serial_line
 from magbridge.bridge.sockets import open_link
 from magbridge.calibration import file as calibration_file
 from magbridge.config import Config, load
+from magbridge.errors import FormatError
 from magbridge.link import store
 from magbridge.logs.tlog import TlogWriter
 from magbridge.mavlink import load_key
+from magbridge.mavlink.dialect import MAV_SEVERITY
 from magbridge.records import Channel
 
 __all__ = ["Edge", "drive", "run", "set_up"]
@@ -35,7 +37,7 @@ KEEP_US = 60_000_000
 SWITCH = 0.0005
 """s the log's thread may hold up the bridge (Python's switch interval); 5 ms would show in the latency."""
 TELL = 0.2
-"""s between two checks for texts to print on the terminal."""
+"""s between two checks for texts to print."""
 LOG_LOOK_US = 1_000_000
 """µs between two checks of the log."""
 
@@ -87,15 +89,15 @@ def drive(pipeline: Pipeline, edge: Edge, log: TlogWriter | None, after: Callabl
         after(event.time_us)
 
 
-def run(path: Path, *, aloud: bool = False) -> None:
+def run(path: Path) -> None:
     """Attach to the sensor and the link that a ``bridge.toml`` names, until stopped by a signal.
+
+    What is announced over the link is printed on stderr, too.
 
     Parameters
     ----------
     path : Path
         The ``bridge.toml``.
-    aloud : bool
-        Print the texts that are sent over the link on stderr, too.
 
     Raises
     ------
@@ -108,9 +110,7 @@ def run(path: Path, *, aloud: bool = False) -> None:
     pipeline = set_up(config, keeper.start(clock.now_us()))
     sensor = serial_line(config.sensor.port, config.sensor.baudrate, str(config.path), "sensor.port")
     link = open_link(config.link.url, config.link.baudrate, str(config.path))
-    if aloud:
-        said = pipeline.component.announcer.said
-        Thread(target=_say, args=(said,), name="voice", daemon=True).start()
+    Thread(target=_say, args=(pipeline.component.announcer.said,), name="voice", daemon=True).start()
     # the link first, so that a sensor's port that does not open can be reported over it
     edge = LiveEdge({Channel.LINK: link, Channel.SENSOR: sensor}, clock)
     keeper.attach(edge)
@@ -136,16 +136,22 @@ def run(path: Path, *, aloud: bool = False) -> None:
             log.close()
 
 
-def _say(texts: deque[str]) -> None:
+def _say(texts: deque[tuple[MAV_SEVERITY, str]]) -> None:
     """Print texts on stderr; on its own thread, because a terminal that hangs must not hold up the bridge.
 
     Nor may it hold up the exit, where Python waits for a file object that is in use: hence ``os.write``.
+    The journal takes the syslog level, which a MAVLink severity is, from ``<N>`` before a line (sd-daemon(3)).
     """
-    with suppress(OSError):  # the terminal is gone
-        while True:
-            while texts:
-                os.write(sys.stderr.fileno(), f"magbridge: {texts.popleft()}\n".encode())
-            time.sleep(TELL)
+    stderr = sys.stderr.fileno()
+    status = os.fstat(stderr)
+    journal = os.environ.get("JOURNAL_STREAM") == f"{status.st_dev}:{status.st_ino}"
+    while True:
+        while texts:
+            severity, text = texts.popleft()
+            prefix = f"<{severity:d}>" if journal else "magbridge: "
+            with suppress(OSError):  # nobody reads it, or a full disk
+                os.write(stderr, f"{prefix}{text}\n".encode())
+        time.sleep(TELL)
 
 
 def _open_log(config: Config, edge: LiveEdge, nt_per_count: float) -> TlogWriter | None:
@@ -191,13 +197,23 @@ class Keeper:
         self._tell: Callable[[bytes], None] = lambda _: None
         # named after the configuration: there may be another bridge's beside it
         self._path = config.resolve(config.link.parameters or f"{config.path.stem}.parameters.json")
-        self._kept = store.load(self._path)
+        self._spoilt = False
+        try:
+            self._kept = store.load(self._path)
+        except (FormatError, OSError):  # no reason to keep a vehicle ashore
+            self._kept, self._spoilt = store.Kept(), True
         self._signs = config.link.signing_key is not None
         self._saved_us = self._retry_us = self._revision = 0
 
     def attach(self, edge: LiveEdge) -> None:
-        """Tell `edge` when something cannot be kept."""
+        """Tell `edge` when something cannot be kept, or could not be read; then the file is set aside."""
         self._tell = edge.tell
+        if self._spoilt:
+            name = self._path.name
+            if self._path.is_file():
+                with suppress(OSError):
+                    self._path.replace(self._path.with_name(f"{name}.damaged"))
+            self._tell(states.notice(f"cannot be read, not used: {name}", MAV_SEVERITY.ERROR))
 
     def start(self, time_us: int) -> Start:
         """Return the start of a run at `time_us`."""

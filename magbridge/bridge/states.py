@@ -19,9 +19,9 @@ def clock_step(time_us: int, step_us: int) -> bytes:
     return _frame("MAG_CLOCK_STEP", time_usec=time_us + step_us, step=step_us)
 
 
-def notice(text: str) -> bytes:
-    """Return the frame of a warning that the bridge is to pass on, at most 50 characters."""
-    return _frame("STATUSTEXT", severity=int(MAV_SEVERITY.WARNING), text=text)
+def notice(text: str, severity: MAV_SEVERITY = MAV_SEVERITY.WARNING) -> bytes:
+    """Return the frame of a text that the bridge is to pass on, at most 50 characters."""
+    return _frame("STATUSTEXT", severity=int(severity), text=text)
 
 
 def port(channel: Channel, what: Port, reason: str) -> bytes:

@@ -58,10 +58,9 @@ def run(*, config: Path) -> None:
     """
     from magbridge.bridge.run import run as attach
 
-    aloud = sys.stderr.isatty()
-    if aloud:
+    if sys.stderr.isatty():
         print(f"{config}: running until Ctrl-C; announcements on the link are repeated here", file=sys.stderr)
-    attach(config, aloud=aloud)
+    attach(config)
 
 
 @app.command(usage="Usage: magbridge replay FILE... [--config bridge.toml] [OPTIONS]")

@@ -13,7 +13,7 @@ __all__ = ["Announcer"]
 CHUNK = 50
 """Characters in one STATUSTEXT."""
 LATELY = 32
-"""Texts that are kept for a terminal."""
+"""Texts that are kept for stderr."""
 PAUSE_US = 1_000_000
 """µs between two announcements of a state that changes quickly; the latest is always announced."""
 
@@ -23,19 +23,19 @@ class Announcer:
 
     Attributes
     ----------
-    said : deque of str
+    said : deque of (MAV_SEVERITY, str)
         The last texts sent; another thread may take them out and print them.
     """
 
     def __init__(self, outbox: Outbox, timers: Timers) -> None:
         self._outbox, self._timers = outbox, timers
-        self.said: deque[str] = deque(maxlen=LATELY)
+        self.said: deque[tuple[MAV_SEVERITY, str]] = deque(maxlen=LATELY)
         self._last: dict[str, tuple[str, int]] = {}
         self._number = 0
 
     def say(self, text: str, severity: MAV_SEVERITY = MAV_SEVERITY.INFO) -> None:
         """Send `text`, in pieces where it is long; what is not ASCII becomes a question mark."""
-        self.said.append(text)
+        self.said.append((severity, text))
         data = text.encode("ascii", "replace")
         pieces = [data[i : i + CHUNK] for i in range(0, len(data), CHUNK)]
         if len(pieces) > 1:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import Annotated
 
 import msgspec
+from msgspec import Meta
 
 from magbridge.errors import FormatError
 from magbridge.files import atomic_path
@@ -24,8 +26,8 @@ class Kept(msgspec.Struct, frozen=True):
         The last that was used (10 µs since 2015-01-01).
     """
 
-    parameters: dict[str, float] = {}
-    signing_timestamp: int = 0
+    parameters: dict[str, Annotated[float, Meta(ge=-3e38, le=3e38)]] = {}
+    signing_timestamp: Annotated[int, Meta(ge=0, lt=1 << 48)] = 0
 
 
 def load(path: str | Path) -> Kept:

@@ -6,6 +6,7 @@ import os
 import pty
 import select
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -47,6 +48,36 @@ def test_a_terminal_that_hangs_holds_nobody_up(tmp_path: Path) -> None:
             time.sleep(0.05)
         process.terminate()
         assert process.wait(30.0) == 0
+
+
+def test_a_service_tells_the_journal_how_severe_it_is(tmp_path: Path) -> None:
+    """To systemd's journal, standard error is a socket that JOURNAL_STREAM names."""
+    (tmp_path / "bridge.toml").write_text(CONFIG)
+    ours, theirs = socket.socketpair()
+    status = os.fstat(theirs.fileno())
+    environment = os.environ | {"JOURNAL_STREAM": f"{status.st_dev}:{status.st_ino}"}
+    command = [sys.executable, "-m", "magbridge", "run", "--config", "bridge.toml"]
+    with subprocess.Popen(command, cwd=tmp_path, stderr=theirs, env=environment) as process, theirs, ours:
+        try:
+            read_until(ours.fileno(), ("<4>no calibration: raw field\n", "<3>hmr2300 lost: No such file or"))
+        finally:
+            process.terminate()
+    assert process.returncode == 0
+
+
+@pytest.mark.parametrize("content", ['{"parameters": {"MB_GAP_F', None])
+def test_kept_parameters_that_cannot_be_read_keep_no_vehicle_ashore(
+    tmp_path: Path, content: str | None
+) -> None:
+    """A file is set aside; a folder of that name stays."""
+    kept = tmp_path / "bridge.parameters.json"
+    kept.write_text(content) if content else kept.mkdir()
+    with on_a_terminal(tmp_path) as (process, terminal):
+        read_until(terminal, (*WANTED, "cannot be read, not used: bridge.parameters.json"))
+        process.terminate()
+        assert process.wait(30.0) == 0
+    aside = tmp_path / "bridge.parameters.json.damaged"
+    assert kept.is_dir() if content is None else aside.read_text() == content
 
 
 @contextmanager

@@ -140,6 +140,13 @@ def test_store(tmp_path):
     save(path, kept)
     assert load(path) == kept
     assert [one.name for one in tmp_path.iterdir()] == ["parameters.json"]
-    path.write_text('{"parameters": {"a": "b"}}')
+
+
+@pytest.mark.parametrize(
+    "content", ['{"parameters": {"a": "b"}}', '{"parameters": {"a": 1e300}}', '{"signing_timestamp": -1}', ""]
+)
+def test_a_store_that_is_damaged(tmp_path, content):
+    path = tmp_path / "parameters.json"
+    path.write_text(content)
     with pytest.raises(FormatError, match=r"parameters.json"):
         load(path)
