@@ -140,7 +140,7 @@ def _say(texts: deque[tuple[MAV_SEVERITY, str]]) -> None:
     """Print texts on stderr; on its own thread, because a terminal that hangs must not hold up the bridge.
 
     Nor may it hold up the exit, where Python waits for a file object that is in use: hence ``os.write``.
-    The journal takes the syslog level, which a MAVLink severity is, from ``<N>`` before a line (sd-daemon(3)).
+    The journal takes a syslog level, which a MAVLink severity is, from ``<N>`` before a line (sd-daemon(3)).
     """
     stderr = sys.stderr.fileno()
     status = os.fstat(stderr)
