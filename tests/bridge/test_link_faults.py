@@ -211,7 +211,7 @@ def test_parameter_out_of_range(rig: Rig, table: Row) -> None:
     rig.until(lambda: len(rig.of("PARAM_VALUE", mark)) == 4)
     assert {message["param_value"] for message in rig.of("PARAM_VALUE", mark)} == {2.5}
     assert rig.undue_flags(mark) == ""
-    assert not (rig.folder / "parameters.json").exists()
+    assert not (rig.folder / "bridge.parameters.json").exists()
     table(
         "a parameter write out of range (also NaN or infinite)",
         "PARAM_VALUE with the value still in force, STATUSTEXT with the limits",
