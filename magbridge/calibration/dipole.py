@@ -3,7 +3,7 @@
 Notes
 -----
 A mass at ``r(p) = r_0 + t p``, seen from the sensor, with permanent moment m and susceptibilities chi along
-the body's axes adds to the field at the sensor (r-hat the unit vector; Blakely 1996, eq. 4.14; m includes
+the body's axes adds to the field at the sensor (r-hat the unit vector; Blakely 1995, eq. 4.14; m includes
 mu_0/4pi)::
 
     G(r) = (3 r-hat r-hat^T - I) / |r|^3,   T += G(r) m,   H -> (I + G(r) chi) H
