@@ -1,3 +1,5 @@
+"""The noise's autoregressive model, its filter and its level."""
+
 from __future__ import annotations
 
 import numpy as np

@@ -1,3 +1,5 @@
+"""Writing tlogs: rotation, full and stalled disks, loss of power."""
+
 from __future__ import annotations
 
 import contextlib

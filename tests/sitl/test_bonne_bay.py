@@ -1,3 +1,5 @@
+"""Guihen's trials in Bonne Bay, flown by the twin."""
+
 from __future__ import annotations
 
 import numpy as np

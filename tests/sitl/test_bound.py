@@ -1,3 +1,5 @@
+"""The information bound on a calibration's error."""
+
 from __future__ import annotations
 
 import msgspec

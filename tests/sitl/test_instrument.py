@@ -1,3 +1,5 @@
+"""The simulated fluxgate: axes, filter, converter, temperature and noise."""
+
 from __future__ import annotations
 
 import numpy as np

@@ -1,3 +1,5 @@
+"""The simulated vehicle's magnetic masses."""
+
 from __future__ import annotations
 
 import numpy as np

@@ -1,3 +1,5 @@
+"""First-order lags and autoregressive noise."""
+
 from __future__ import annotations
 
 import numpy as np

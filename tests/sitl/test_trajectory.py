@@ -1,3 +1,5 @@
+"""Missions and the path, attitude and mass positions that the vehicle makes of them."""
+
 from __future__ import annotations
 
 import numpy as np

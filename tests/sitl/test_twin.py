@@ -1,3 +1,5 @@
+"""Deployments of the digital twin: scenarios, seeds, missions and logs that drive it."""
+
 from __future__ import annotations
 
 from dataclasses import replace

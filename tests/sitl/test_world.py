@@ -1,3 +1,5 @@
+"""The simulated Earth field, rock and water."""
+
 from __future__ import annotations
 
 import choclo
