@@ -6,7 +6,7 @@ import time as clock
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
-from math import exp, inf
+from math import inf
 from typing import NamedTuple
 
 import numpy as np
@@ -23,6 +23,7 @@ from magbridge.navigate.deadreckoning import DeadReckoning
 from magbridge.navigate.model import Block, Options, block_length
 from magbridge.navigate.navigator import Navigator
 from magbridge.navigate.record import State
+from sitl.signals import autoregressive
 
 Array = NDArray[np.float64]
 
@@ -107,7 +108,7 @@ def voyage(
     n = int(hours * HOUR / every)
     legs = np.cumsum(rng.uniform(-100.0, 100.0, n // int(2700 / every) + 1)) + rng.uniform(0.0, 360.0)
     heading = np.radians(legs[np.arange(n) // int(2700 / every)])
-    bias = _markov(rng, n, options.bias_sigma, every / options.bias_time)[:, 0]
+    bias = autoregressive(rng, (n,), options.bias_sigma, options.bias_time / every)
     errors = bias + rng.normal(size=n)
     velocity = speed * np.column_stack([np.cos(heading), np.sin(heading)])
     return adrift(grid, options, rng, velocity, errors, np.ones(n), every=every, jump=jump)
@@ -141,12 +142,12 @@ def adrift(
     """
     o, n = options, len(velocity)
     time = START + every * np.arange(1, n + 1)
-    current = _markov(rng, n, o.current_sigma, every / o.current_time, 2)
+    current = autoregressive(rng, (n, 2), o.current_sigma, o.current_time / every)
     drift = rng.normal(size=(n, 2)) * o.drift * every**0.5
     away = rng.normal(size=2) * o.start_sigma + np.cumsum(current * every + drift, axis=0)
     away[time > START + jump[0] * HOUR] += jump[1:]
     metres = every * float(np.hypot(*velocity.T).mean())
-    errors = errors + _markov(rng, n, o.map_sigma, metres / o.map_length)[:, 0]
+    errors = errors + autoregressive(rng, (n,), o.map_sigma, o.map_length / metres)
     reckoned, true = np.empty((n, 2)), np.empty((n, 2))
     where = PLACE
     for i, (north, east) in enumerate((every * velocity).tolist()):
@@ -165,16 +166,6 @@ def adrift(
         "away_east": away[:, 1],
     }
     return xr.Dataset({k: ("time", v) for k, v in columns.items()}, {"time": time}, {"source": "voyage"})
-
-
-def _markov(rng: np.random.Generator, n: int, sigma: float, decay: float, size: int = 1) -> Array:
-    """Return n steps of `size` Gauss-Markov processes, each step `decay` correlation times long."""
-    kept = exp(-decay)
-    noise = rng.normal(size=(n, size)) * sigma
-    noise[1:] *= (1.0 - kept * kept) ** 0.5
-    for i in range(1, n):
-        noise[i] += kept * noise[i - 1]
-    return noise
 
 
 @dataclass(frozen=True)
