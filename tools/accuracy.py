@@ -269,7 +269,7 @@ def arguments() -> argparse.Namespace:
         default=40,
         help="gliders that the peers are given (12 s each): two masses, first noise",
     )
-    parser.add_argument("--jobs", type=int, default=2, choices=(1, 2), help="processes")
+    parser.add_argument("--jobs", type=int, default=2, help="processes")
     parser.add_argument("--out", type=Path, help="folder for accuracy.csv and accuracy.txt")
     return parser.parse_args()
 
