@@ -9,6 +9,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -20,13 +21,13 @@ from magbridge.field.earth import offset, separation
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.igrf import total_field
 from sitl.columns import dataset
-from sitl.instrument import rotation
+from sitl.instrument import Samples, rotation
 from sitl.platform import Calibrated, Vehicle, draw_vehicle
 from sitl.scenario import Scenario
 from sitl.trajectory import Track, fly
 from sitl.world import World
 
-__all__ = ["FINE_STEP", "Twin", "simulate"]
+__all__ = ["FINE_STEP", "Ambient", "Twin", "simulate"]
 
 Array = NDArray[np.float64]
 
@@ -34,6 +35,24 @@ FINE_STEP = 0.5
 """s between the simulation's points: a spiral's arc departs from its chords by 0.1 nT."""
 FIELD_STEP = 4.0
 """s between evaluations of the Earth's field, which varies by less than 0.01 nT about a line meanwhile."""
+
+
+class Ambient(NamedTuple):
+    """What an instrument is exposed to, on a track's grid of n points.
+
+    Attributes
+    ----------
+    earth : array (n, 3)
+        nT north-east-down, of the Earth alone.
+    field : array (n, 3)
+        nT at the sensor, body axes, the vehicle's included.
+    water : array (n,)
+        degC.
+    """
+
+    earth: Array
+    field: Array
+    water: Array
 
 
 @dataclass(frozen=True)
@@ -107,15 +126,38 @@ class Twin:
         Dataset (time)
             The contract's columns and ``truth_*``.
         """
-        instrument, reference = self.scenario.instrument, self.scenario.telemetry.reference
+        ambient = self.ambient(track)
+        samples = self.scenario.instrument.measure(
+            ambient.field, ambient.water, track.step, when, self.instrument_rng()
+        )
+        return self.log(track, when, ambient.earth, samples)
+
+    def ambient(self, track: Track) -> Ambient:
+        """Return what the instrument is exposed to along a track."""
         earth = self._earth_field(track)
         attitude = rotation(track.roll, track.pitch, track.heading)
-        at_sensor = self.vehicle.field(
+        field = self.vehicle.field(
             attitude.apply(earth, inverse=True), self._channels(track), track.start + track.elapsed
         )
         water = self.world.water.temperature(track.depth) if track.water is None else track.water
-        samples = instrument.measure(at_sensor, water, track.step, when, _stream(self.seed, 3))
+        return Ambient(earth, field, water)
 
+    def instrument_rng(self) -> np.random.Generator:
+        """Return the generator of the instrument's offsets at power-on and of its noise."""
+        return _stream(self.seed, 3)
+
+    def log(self, track: Track, when: Array, earth: Array, samples: Samples) -> xr.Dataset:
+        """Return the deployment of an instrument's samples, as :meth:`measure` does.
+
+        Parameters
+        ----------
+        track, when
+            As for :meth:`measure`.
+        earth : array (n, 3)
+            As :attr:`Ambient.earth`.
+        samples : Samples
+            What the instrument gave for `when`.
+        """
         true = track.at(when)
         field_ned = np.column_stack([np.interp(when, track.elapsed, b) for b in earth.T])
         field_body = rotation(true["roll"], true["pitch"], true["heading"]).apply(field_ned, inverse=True)
@@ -129,10 +171,11 @@ class Twin:
         for k, axis in enumerate("xyz"):
             columns[f"mag_{axis}"] = samples.channels[:, k]
             columns[f"truth_field_{axis}"] = field_body[:, k]
-            if any(instrument.channel_delay):
+            if any(self.scenario.instrument.channel_delay):
                 columns[f"mag_time_{axis}"] = track.start + samples.times[:, k]
         if track.run is not None:
             columns["run"] = track.run[np.rint(when / track.step).astype(np.intp)]
+        reference = self.scenario.telemetry.reference
         if reference == "true":
             columns["reference_field"] = columns["truth_total_field"]
         elif reference == "map":

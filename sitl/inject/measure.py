@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 import msgspec
@@ -11,40 +10,18 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from sitl.inject.scene import Effect, Hidden, Scene, furnish
-from sitl.instrument import Instrument, Samples, rotation
+from sitl.inject.catalogue import EFFECTS
+from sitl.inject.foreign import FOREIGN
+from sitl.inject.scene import Hidden, Scene, furnish
+from sitl.instrument import Samples, rotation
 from sitl.trajectory import Track
 from sitl.twin import Twin
 
-__all__ = ["measure"]
+__all__ = ["disturb"]
 
 Array = NDArray[np.float64]
 FINER = 5
 """Factor by which the simulation's grid is refined if the instrument has a filter or channel delays."""
-
-
-class _Tap(Instrument, frozen=True):
-    """The instrument, with effects on the field before it and on the channels after it."""
-
-    through: Callable[[Array, Array], Scene] | None = None
-
-    def measure(
-        self, field: Array, water: Array, step: float, when: Array, rng: np.random.Generator
-    ) -> Samples:
-        assert self.through is not None
-        scene = self.through(field, water)
-        if scene.earth.any():
-            track = scene.track
-            turn = rotation(track.roll, track.pitch, track.heading)
-            scene.field = scene.field + turn.apply(scene.earth, inverse=True)
-        field, water = scene.field, scene.water
-        if scene.instrument.corner or any(scene.instrument.channel_delay):
-            field, water, step = _between(scene)
-        samples = scene.instrument.measure(field, water, step, when, rng)
-        channels = samples.channels
-        for bend in scene.bend:
-            channels = bend(channels)
-        return Samples(channels, samples.times, samples.temperature, samples.power_cycle)
 
 
 def _between(scene: Scene) -> tuple[Array, Array, float]:
@@ -63,29 +40,58 @@ def _between(scene: Scene) -> tuple[Array, Array, float]:
     return field, np.interp(fine, t, scene.water), track.step / FINER
 
 
-def measure(
-    effects: Mapping[str, Effect],
-    twin: Twin,
-    hidden: tuple[Hidden, ...],
-    track: Track,
-    when: Array,
-    seed: int,
-) -> xr.Dataset:
-    """Measure with the `hidden` effects, looked up in `effects`; arguments as :func:`sitl.inject.disturb`."""
-    plain = twin.scenario.instrument
-    scenes: list[Scene] = []
+def _samples(scene: Scene, rng: np.random.Generator) -> Samples:
+    """Return what the scene's instrument gives, the effects on the channels after it included."""
+    track = scene.track
+    if scene.earth.any():
+        turn = rotation(track.roll, track.pitch, track.heading)
+        scene.field = scene.field + turn.apply(scene.earth, inverse=True)
+    field, water, step = scene.field, scene.water, track.step
+    if scene.instrument.corner or any(scene.instrument.channel_delay):
+        field, water, step = _between(scene)
+    samples = scene.instrument.measure(field, water, step, scene.when, rng)
+    for bend in scene.bend:
+        samples = replace(samples, channels=bend(samples.channels))
+    return samples
 
-    def through(field: Array, water: Array) -> Scene:
-        scene = Scene(track, when, field, np.zeros_like(field), water, plain, reference=np.zeros(len(when)))
-        furnish(scene, np.random.default_rng([seed, 77]))
-        for one in hidden:
-            effects[one.name](scene, one.size, np.random.default_rng([one.seed, 78]))
-        scenes.append(scene)
-        return scene
 
-    tap = _Tap(**{name: getattr(plain, name) for name in plain.__struct_fields__}, through=through)
-    out = replace(twin, scenario=msgspec.structs.replace(twin.scenario, instrument=tap)).measure(track, when)
-    scene = scenes[0]
+def disturb(twin: Twin, hidden: tuple[Hidden, ...], track: Track, when: Array, seed: int = 0) -> xr.Dataset:
+    """Measure along `track` with `hidden` effects; without any, the furnished deployment alone.
+
+    Parameters
+    ----------
+    twin : Twin
+        The world, the vehicle and its instrument.
+    hidden : tuple of Hidden
+        By their names in :data:`EFFECTS` or :data:`FOREIGN`.
+    track : Track
+        As :meth:`~sitl.twin.Twin.fly` returns it.
+    when : array (m,)
+        s after the track's start; a few seconds short of its end.
+    seed : int
+        Of the telemetry that has nothing to do with the effects.
+
+    Returns
+    -------
+    Dataset (time)
+        As :meth:`~sitl.twin.Twin.measure`, with more telemetry. ``attrs["truth"]`` (JSON) holds what a
+        perfect diagnosis would print of a single effect, where physics has such numbers.
+    """
+    ambient = twin.ambient(track)
+    scene = Scene(
+        track,
+        when,
+        field=ambient.field,
+        earth=np.zeros_like(ambient.field),
+        water=ambient.water,
+        instrument=twin.scenario.instrument,
+        reference=np.zeros(len(when)),
+    )
+    furnish(scene, np.random.default_rng([seed, 77]))
+    effects = EFFECTS | FOREIGN
+    for one in hidden:
+        effects[one.name](scene, one.size, np.random.default_rng([one.seed, 78]))
+    out = twin.log(track, when, ambient.earth, _samples(scene, twin.instrument_rng()))
     # `reference` is by how much the true field exceeds the logged reference
     out["reference_field"] = (
         "time",
