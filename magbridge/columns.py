@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
 __all__ = [
+    "AGE",
     "CHANNELS",
     "CHANNEL_TIMES",
     "COLUMNS",
@@ -37,6 +38,8 @@ CHANNELS = ("mag_x", "mag_y", "mag_z")
 """The raw, uncorrected channels in sensor axes (x forward, y starboard, z down)."""
 CHANNEL_TIMES = ("mag_time_x", "mag_time_y", "mag_time_z")
 """When each channel was sampled, where not all were at ``time``."""
+AGE = "age_"
+"""Before the name of a parameter: how old its value was, in s, in the log of a bridge."""
 
 COLUMNS: dict[str, Column] = {
     "time": Column("s", "seconds since 1970-01-01 UTC"),

@@ -7,20 +7,21 @@ the sigma: the correction is evaluated at both ends of the interval in which the
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from math import hypot, inf, isfinite, nan
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from magbridge.align import Aligner, Input, Sample
 from magbridge.calibration.correct import Corrector
 from magbridge.calibration.model import Calibration, identity
-from magbridge.columns import COLUMNS, CORRECTED
+from magbridge.columns import AGE, COLUMNS, CORRECTED
 from magbridge.config import Align
 from magbridge.field.igrf import magnitude
 from magbridge.field.reference import main_field
 from magbridge.records import BEYOND, Corrected, Reading
+from magbridge.toml import convert
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -41,9 +42,11 @@ class Correction:
     calibration : Calibration or None
         Without one every sample passes unchanged, flagged ``uncalibrated``.
     settings : Align, optional
+        If not given, and what :func:`correct_rows` corrects is a bridge's own log: that bridge's.
     """
 
     def __init__(self, calibration: Calibration | None, settings: Align | None = None) -> None:
+        self._given = settings is not None
         calibration = calibration if calibration is not None else identity()
         ranges = {parameter.name: (parameter.low, parameter.high) for parameter in calibration.parameters}
         inputs = tuple(
@@ -53,6 +56,22 @@ class Correction:
         self.names = tuple(one.name for one in inputs)
         self._wants_temperature = TEMPERATURE in self.names
         self._corrector = Corrector(calibration)
+
+    def as_declared(self, attrs: Mapping[str, Any]) -> None:
+        """Align as the bridge did whose log declares its settings among its attributes.
+
+        Raises
+        ------
+        ConfigError
+            A number out of range.
+        """
+        declared = {key: float(value) for key, value in attrs.items() if isinstance(value, (int, float))}
+        names = [key for key in Align.__struct_fields__ if f"align.{key}" in declared]
+        if names and not self._given:
+            settings = {key: declared[f"align.{key}"] for key in names}
+            self.aligner.settings = convert(settings, Align, attrs.get("source", "the log"), "align.")
+        ages = {name: declared.get(f"telemetry.{name}.max_age") for name in self.names}
+        self.aligner.tune(self.aligner.settings, {name: age for name, age in ages.items() if age})
 
     def telemetry(self, name: str, value: float, time_us: int) -> None:
         """Take a telemetry value; a name that the calibration does not need is ignored."""
@@ -111,6 +130,7 @@ def correct_rows(correction: Correction, deployment: xr.Dataset) -> xr.Dataset:
     """
     import xarray as xr  # noqa: PLC0415 - the live path runs without it
 
+    correction.as_declared(deployment.attrs)
     rows = [correction.reading(*row)[1] for row in _readings(correction, deployment)]
     results = np.array(
         [(row.total_field, row.total_field_sigma, *row.field, nan, row.quality) for row in rows], dtype=float
@@ -138,13 +158,15 @@ def _readings(correction: Correction, deployment: xr.Dataset) -> Iterator[tuple[
     times = np.asarray(deployment["time"].to_numpy(), float)
     stamps = (np.rint(times * 1e6).astype(np.int64) & ~3).tolist()
     delays = [np.nan_to_num(np.array(column(f"mag_time_{axis}")) - times).round(6).tolist() for axis in "xyz"]
-    telemetry = [(name, column(name)) for name in correction.names if name != TEMPERATURE]
+    telemetry = [(name, column(name), column(AGE + name)) for name in correction.names if name != TEMPERATURE]
     cycles = column("power_cycle")
     channels = zip(*(column(f"mag_{axis}") for axis in "xyz"), strict=True)
     rows = zip(stamps, channels, zip(*delays, strict=True), column(TEMPERATURE), cycles, strict=True)
     for row, (stamp, field, delay, temperature, cycle) in enumerate(rows):
-        for name, values in telemetry:
-            if isfinite(values[row]):  # an empty cell is not a message that the value is unknown
+        for name, values, ages in telemetry:
+            if isfinite(ages[row]):
+                correction.telemetry(name, values[row], stamp - round(ages[row] * 1e6))
+            elif isfinite(values[row]):  # an empty cell is not a message that the value is unknown
                 correction.telemetry(name, values[row], stamp)
         power_cycle = int(cycle) if isfinite(cycle) else None
         yield Reading(field, channel_delay=delay, temperature=temperature, power_cycle=power_cycle), stamp

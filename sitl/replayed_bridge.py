@@ -15,9 +15,8 @@ from pathlib import Path
 import msgspec
 
 from magbridge.bridge.events import Event, Start
-from magbridge.bridge.journal import declarations
 from magbridge.bridge.port import Port
-from magbridge.bridge.run import drive, set_up
+from magbridge.bridge.run import declared, drive, set_up
 from magbridge.bridge.serial_port import SerialPort
 from magbridge.bridge.sockets import open_link
 from magbridge.config import Log, load
@@ -100,10 +99,7 @@ def main() -> int:
         link.open()
         edge = ScriptedEdge({Channel.SENSOR: sensor, Channel.LINK: link}, chosen.timetable)
         pipeline = set_up(config, edge.start())
-        head = declarations(
-            config.link.system, config.link.component, config.telemetry, pipeline.nt_per_count
-        )
-        log = TlogWriter(chosen.log, head=head) if chosen.log else None
+        log = TlogWriter(chosen.log, head=declared(config, pipeline)) if chosen.log else None
         drive(pipeline, edge, log, lambda _: None)
         if log is not None:
             log.close(timeout=60.0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from struct import Struct
+from typing import Any
 
 from magbridge.config import Telemetry
 from magbridge.mavlink import Codec, spec
@@ -72,9 +73,13 @@ class Journal:
 
 
 def declarations(
-    system: int, component: int, telemetry: Mapping[str, Telemetry], nt_per_count: float = 0.0
+    system: int,
+    component: int,
+    telemetry: Mapping[str, Telemetry],
+    nt_per_count: float = 0.0,
+    settings: Mapping[str, float] | None = None,
 ) -> list[bytes]:
-    """Return the frames that tell a reader of the log which field of which message each column comes from.
+    """Return the frames that tell a reader of the log what each column comes from, and how it was corrected.
 
     Parameters
     ----------
@@ -85,9 +90,14 @@ def declarations(
     nt_per_count : float
         nT per count of the sensor, 0 for one without counts. A reader then takes the channels from the
         counts, because MAG_RAW's float32 fields are less precise than the values that were corrected.
+    settings : mapping of str to float, optional
+        What decides about flags and sigmas, by its key in the configuration: attributes of the log.
     """
     codec = Codec(system, component)
-    columns = [
+    columns: list[dict[str, Any]] = [
+        {"column": key, "scale": value} for key, value in (settings or {}).items()
+    ]
+    columns += [
         {
             "column": name,
             "unit": one.unit,

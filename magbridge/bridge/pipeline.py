@@ -126,6 +126,13 @@ class Pipeline:
         return self._driver.nt_per_count
 
     @property
+    def settings(self) -> dict[str, float]:
+        """The values that the alignment computes with, by their keys in the configuration."""
+        parameters = self.component.parameters
+        keys = (row.key for row in parameters.table.values())
+        return {key: parameters.of(key) for key in keys if key.startswith(("align.", "telemetry."))}
+
+    @property
     def deadline(self) -> int:
         """µs since 1970 UTC by which :meth:`feed` must be called, if only with an empty event."""
         return self.component.next_deadline

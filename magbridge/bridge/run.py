@@ -30,7 +30,7 @@ from magbridge.mavlink import load_key
 from magbridge.mavlink.dialect import MAV_SEVERITY
 from magbridge.records import Channel
 
-__all__ = ["Edge", "drive", "run", "set_up"]
+__all__ = ["Edge", "declared", "drive", "run", "set_up"]
 
 KEEP_US = 60_000_000
 """µs between two savings of the signing time stamp; the next run adds as much to the saved one."""
@@ -74,6 +74,12 @@ def set_up(config: Config, start: Start) -> Pipeline:
     return pipeline
 
 
+def declared(config: Config, pipeline: Pipeline) -> list[bytes]:
+    """Return the frames that every file of the log begins with."""
+    us, own = config.link, pipeline.settings
+    return declarations(us.system, us.component, config.telemetry, pipeline.nt_per_count, own)
+
+
 def drive(pipeline: Pipeline, edge: Edge, log: TlogWriter | None, after: Callable[[int], None]) -> None:
     """Feed the pipeline until the edge ends; call ``after(time_us)`` when each event is dealt with."""
     for event in edge.events(lambda: pipeline.deadline):
@@ -114,7 +120,7 @@ def run(path: Path) -> None:
     # the link first, so that a sensor's port that does not open can be reported over it
     edge = LiveEdge({Channel.LINK: link, Channel.SENSOR: sensor}, clock)
     keeper.attach(edge)
-    log = _open_log(config, edge, pipeline.nt_per_count)
+    log = _open_log(config, edge, pipeline)
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         if number == signal.SIGINT or signal.getsignal(number) != signal.SIG_IGN:  # as SIGHUP is under nohup
             signal.signal(number, lambda *_: edge.stop())
@@ -154,11 +160,11 @@ def _say(texts: deque[tuple[MAV_SEVERITY, str]]) -> None:
         time.sleep(TELL)
 
 
-def _open_log(config: Config, edge: LiveEdge, nt_per_count: float) -> TlogWriter | None:
+def _open_log(config: Config, edge: LiveEdge, pipeline: Pipeline) -> TlogWriter | None:
     if config.log is None:
         return None
     directory = config.resolve(config.log.directory)
-    head = declarations(config.link.system, config.link.component, config.telemetry, nt_per_count)
+    head = declared(config, pipeline)
     edge.tell(states.log_state("", 0))
     return TlogWriter(directory, max_size=config.log.max_size, max_age=config.log.max_age, head=head)
 

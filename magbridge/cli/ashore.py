@@ -163,10 +163,11 @@ def correct(*files: Path, calibration: Path, output: Log, json: Json = False) ->
     """Correct a log with a calibration, as the bridge would have done live.
 
     The arithmetic and the state (lags, backlash) are the bridge's own, but the input is the log's rows. In
-    a bridge's own log these are MAG_RAW with the latest telemetry before each: the bridge itself
-    interpolates the position of a moving mass between messages, and the channels of a sensor that has no
-    counts are float32 (to 0.002 nT of 50,000 nT). [align] of bridge.toml is not known here either. For what
-    the bridge would have published bit for bit, put the calibration into a bridge.toml and run: magbridge
+    a bridge's own log (also converted to .nc or .parquet) these are MAG_RAW with the latest telemetry before
+    each and its age; [align] and every max_age are known as they were when the log began. The bridge itself
+    uses every message about a moving mass, and the channels of a sensor that has no counts are float32 here
+    (to 0.002 nT of 50,000 nT). Of another log, telemetry counts as new in every row that has it. For what the
+    bridge would have published bit for bit, put the calibration into a bridge.toml and run: magbridge
     replay LOG --config bridge.toml --log DIR. The replay also reports that this differs from what was
     published at the time.
 

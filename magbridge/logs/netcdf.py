@@ -148,7 +148,11 @@ class FileWriter:
         file.createDimension(DIMENSION, None)
         first = float(dataset["time"][0]) if dataset.sizes["time"] else 0.0
         file.setncatts(
-            {key: value for key, value in dataset.attrs.items() if isinstance(value, (str, int, float))}
+            {
+                key: value
+                for key, value in dataset.attrs.items()
+                if isinstance(value, (str, int, float)) and "/" not in key  # which netCDF forbids
+            }
             | {
                 "title": "magnetometer deployment",
                 "featureType": "trajectory",

@@ -13,8 +13,9 @@ column is the last value from this vehicle before it (NaN once older than
   ... ``mag3_z``.
 - Without any of these, each ``ATTITUDE`` or position makes a row, and there is no ``mag_x``.
 
-Telemetry is what the log itself declares by ``MAG_COLUMN`` (a bridge's own, one from :mod:`magbridge.logs`),
-what :data:`~magbridge.logs.telemetry_fields.TELEMETRY` lists, and every ``NAMED_VALUE_FLOAT`` by its name.
+Telemetry is what the log itself declares by ``MAG_COLUMN`` (a bridge's own, with the age of each value; one
+from :mod:`magbridge.logs`), what :data:`~magbridge.logs.telemetry_fields.TELEMETRY` lists, and every
+``NAMED_VALUE_FLOAT`` by its name.
 Where the clock of a bridge was set, its rows are dated by the clock as it was set last in the file.
 Damaged bytes are skipped and counted in the attributes ``bytes_skipped`` and ``damages``; rows whose time
 does not increase are dropped and counted in ``rows_dropped``.
@@ -29,7 +30,7 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
-from magbridge.columns import CHANNEL_TIMES, CORRECTED
+from magbridge.columns import AGE, CHANNEL_TIMES, CORRECTED
 from magbridge.logs.deployment import deployment
 from magbridge.logs.resample import MAX_AGE
 from magbridge.logs.telemetry_fields import SOURCES, TELEMETRY, Columns, correction
@@ -101,6 +102,8 @@ class Rows:
         for one in survey.declared:
             if one.message != self._source:
                 self._tables.setdefault(one.message, []).append((self._slot[one.column], one.find))
+        aged = [one for one in survey.columns if survey.ours and AGE + one in survey.columns]
+        self._aged = [(self._slot[AGE + one], self._slot[one]) for one in aged]
         self._last = -inf
         self._to_step_us = survey.stepped_us
         self._dropped = self._skipped = self._damages = 0
@@ -146,6 +149,8 @@ class Rows:
         self._last = time
         oldest = time_us - MAX_AGE_US
         row = [v if t >= oldest else nan for v, t in zip(self._values, self._stamps, strict=True)]
+        for slot, of in self._aged:
+            row[slot] = (time_us - self._stamps[of]) * 1e-6 if self._stamps[of] >= oldest else nan
         for name, value in columns.items():
             row[self._slot[name]] = value
         row[0] = time

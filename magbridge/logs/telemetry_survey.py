@@ -9,6 +9,7 @@ from math import isnan
 from pathlib import Path
 from typing import Any
 
+from magbridge.columns import AGE
 from magbridge.errors import FormatError
 from magbridge.logs.telemetry_fields import SOURCES, TELEMETRY, Declared, Value, correction, sample
 from magbridge.mavlink import LogReader, Message, spec
@@ -72,6 +73,8 @@ class Survey:
         self.declared: list[Declared] = []
         for one in self._declared.values():
             self.columns[one.column] = one.unit
+            if self.ours and one.message not in (RAW, FIELD):
+                self.columns[AGE + one.column] = "s"
             if one.message != NAMED.id or one.match.keys() != {"name"}:
                 self.declared.append(one)
             else:
@@ -112,7 +115,7 @@ class Survey:
             self._named.setdefault(system, {})[letters] = message["name"]
         elif number == COLUMN:
             if not message["message"]:
-                self.attrs[message["column"]] = message["unit"]
+                self.attrs[message["column"]] = message["unit"] or message["scale"]
             else:
                 with suppress(KeyError, ValueError):  # of a dialect that we do not know
                     self._declared[message["column"]] = Declared(message)

@@ -79,6 +79,12 @@ def test_a_number_beyond_all_measure_is_no_reading(plain: tuple[xr.Dataset, Cali
     assert diagnose([wild], plain[1]).verdict == "nothing_found"
 
 
+def test_how_old_a_parameter_was_is_no_telemetry(plain: tuple[xr.Dataset, Calibration]) -> None:
+    """The log of a bridge says it; nothing can follow it."""
+    aged = plain[0].assign(age_battpos=plain[0]["time"] % 3.0)
+    assert take([aged], plain[1]).channels.keys() == take([plain[0]], plain[1]).channels.keys()
+
+
 def test_a_sample_that_is_given_twice_is_one(plain: tuple[xr.Dataset, Calibration]) -> None:
     ds, calibration = plain
     again = np.sort([*range(ds.sizes["time"]), *range(5, 500, 20)])

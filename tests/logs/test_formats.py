@@ -259,6 +259,11 @@ def test_meaning_and_attributes_are_kept(suffix: str, tmp_path: Path) -> None:
     assert back.attrs == dataset.attrs | {"source": f"log{suffix} (made)"}
 
 
+def test_an_attribute_whose_name_netcdf_forbids_is_left_out(tmp_path: Path) -> None:
+    logs.write(deployment("made", [1.0], {}, attrs={"telemetry.a/b.max_age": 3.0}), tmp_path / "log.nc")
+    assert logs.read(tmp_path / "log.nc").attrs.keys() == {"source"}
+
+
 def test_csv_is_as_plain_as_can_be(tmp_path: Path) -> None:
     dataset = deployment(
         "made", [1.5, 2], {"mag_x": [1, np.nan], "battpos": [0.1, 2], "quality": [0, 3]}, {"battpos": "in"}

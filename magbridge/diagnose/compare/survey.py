@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from magbridge.columns import AGE
 from magbridge.diagnose.compare.past import FAR, Past
 from magbridge.errors import DataError
 from magbridge.field.earth import wrap
@@ -31,7 +32,7 @@ KINDS = {
 """Kind of a channel by its unit. Any other unit is taken for the position of something that moves."""
 HINTS = (("temp", "temperature"), ("current", "current"), ("press", "pressure"))
 """Kind by name for a channel without a unit; without a hint it is tried as every kind."""
-OURS = ("mag_", "truth_")
+OURS = ("mag_", "truth_", AGE)
 FIELDS = {"nT", "uT", "\N{MICRO SIGN}T", "mG", "G", "T"}
 """Units of another magnetometer, which follows everything that this one does and so explains nothing."""
 NOT_TELEMETRY = {

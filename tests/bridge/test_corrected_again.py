@@ -1,0 +1,48 @@
+"""`magbridge correct` on a bridge's own log: the field, the sigmas and the flags that were published."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from small import START, small_bridge
+
+from magbridge import logs
+from magbridge.bridge.events import Event, Start
+from magbridge.bridge.run import declared
+from magbridge.calibration.file import load as load_calibration
+from magbridge.calibration.model import Parameter
+from magbridge.columns import CORRECTED
+from magbridge.config import load
+from magbridge.correction import Correction, correct_rows
+from magbridge.logs.tlog import TlogWriter
+from magbridge.mavlink import Codec
+from magbridge.records import Channel, Quality
+
+KEPT = {"MB_AGE_BATTPOS": 3.0, "MB_SETTLE_TIME": 4.0, "MB_STALE_GROW": 20.0}
+"""Set over the link in an earlier run."""
+BATTERY = Parameter("battpos", "", -1.0, 1.0, 0.0, 1.0)
+
+
+def test_flags_and_sigmas_are_those_of_the_bridge(tmp_path: Path) -> None:
+    """Telemetry comes every few seconds, once not for a minute, once as not known."""
+    rng = np.random.default_rng(1)
+    pipeline = small_bridge(tmp_path, Start(START, KEPT), BATTERY, ["MAG_FIELD"])
+    autopilot = Codec(1, 1)
+    with TlogWriter(tmp_path / "logs", head=declared(load(tmp_path / "bridge.toml"), pipeline)) as log:
+        for k in range(400):
+            position = np.nan if 300 <= k < 310 else 0.1 * (k // 50)
+            if rng.random() < 0.4 and not 200 <= k < 260:
+                frame = autopilot.pack("NAMED_VALUE_FLOAT", name="battpos", value=position)
+                pipeline.feed(Event(START + k * 1_000_000 - 400_000, Channel.LINK, frame))
+            line = b"12340.5 43210.9 -234.5 4.0 %d 7\r\n" % k
+            pipeline.feed(Event(START + k * 1_000_000, Channel.SENSOR, line))
+            log.extend(pipeline.journal.drain())
+    rows = logs.read(sorted((tmp_path / "logs").iterdir()))
+    logs.write(rows, tmp_path / "converted.nc")
+    converted = logs.read(tmp_path / "converted.nc")
+    again = correct_rows(Correction(load_calibration(tmp_path / "cal.json")), converted)
+    seen = {flag for flag in Quality for quality in rows["quality"].to_numpy() if int(quality) & flag}
+    assert {Quality.STALE_TELEMETRY, Quality.MOVING} <= seen
+    for name in set(CORRECTED) - {"anomaly"}:
+        np.testing.assert_allclose(again[name], rows[name], rtol=1e-7, err_msg=name)
