@@ -191,3 +191,11 @@ def test_a_late_clock_is_set_right_while_the_mass_moves_steadily(sign: float) ->
     np.testing.assert_allclose(vector[seen], np.broadcast_to(H, (4, 3)), atol=1e-6)
     # no rate is known at the first sample, nor after a gap
     assert np.abs(vector[[0, 4]] - H).max() > 0.9 * speed * delay * np.abs(T).max()
+
+
+def test_a_term_that_lacks_a_method_cannot_be_made() -> None:
+    class Half(Effect, frozen=True, kw_only=True):
+        kind = "half"
+
+    with pytest.raises(TypeError, match=r"abstract methods? .*begin"):
+        Half()  # type: ignore[abstract]

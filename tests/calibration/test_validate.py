@@ -1,8 +1,10 @@
-"""Measured data: a Seaglider's own magnetometer, one dive left out at a time."""
+"""Runs left out of a fit one at a time, simulated and of a Seaglider's own magnetometer."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +16,9 @@ from magbridge.field.declination import with_true_heading
 from magbridge.field.reference import earth_field
 from magbridge.logs import read
 
-COUNT = 100.0  # nT: the sensor's quantisation
+COUNT = 100.0
+"""nT, the sensor's quantisation."""
+Gliders = Callable[..., Any]
 
 
 @pytest.mark.real
@@ -29,13 +33,13 @@ def test_seaglider_dives_left_out(real_data: Path) -> None:
     assert 0.8 < np.nanstd(moving.standardised) < 1.35
 
 
-def test_two_runs_at_least(glider) -> None:  # type: ignore[no-untyped-def]
+def test_two_runs_at_least(glider: Gliders) -> None:
     runs = glider(0, 2).runs
     with pytest.raises(CalibrationError, match="leaving runs out: found 1"):
         leave_runs_out(runs.part(np.asarray(runs.runs) == 0), "nominal")
 
 
-def test_left_out_runs_are_near_the_floor(glider) -> None:  # type: ignore[no-untyped-def]
+def test_left_out_runs_are_near_the_floor(glider: Gliders) -> None:
     """Leaving out inner runs (the outermost would be extrapolation) costs a little; sigma knows how much."""
     runs = glider(0, 1).runs
     found = leave_runs_out(runs.part(np.asarray(runs.runs) < 4), "auto", 1)

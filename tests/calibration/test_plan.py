@@ -1,0 +1,53 @@
+"""The error expected on a mission, and the runs to fly next."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from magbridge.calibration.correct import correct
+from magbridge.calibration.fitting.fit import fit
+from magbridge.calibration.fitting.mission import Mission, expected_error
+from magbridge.calibration.planning.limits import Limits, PlannedRun, settled, trim_of
+from magbridge.calibration.planning.plan import evaluate_runs, expected_calibration, plan
+from magbridge.errors import CalibrationError
+from sitl.mission import TABLE_1
+
+Gliders = Callable[..., Any]
+
+
+def test_expected_error_is_what_comes(glider: Gliders) -> None:
+    one = glider(1, 2)
+    calibration = fit(one.runs).calibration
+    expected = expected_error(calibration, Mission.of(one.survey))
+    total = correct(calibration, one.quiet, one.survey.parameters, one.survey.time).total
+    assert np.sqrt(np.mean((total - one.survey.reference) ** 2)) < 3.0 * np.sqrt(np.mean(expected**2))
+
+
+def test_planned_runs_beat_table_1(glider: Gliders) -> None:
+    """Six against ten, trimmed as the glider trims itself, banked no more than the paper's spirals."""
+    one = glider(2, 2)
+    parameters = one.runs.ranges()
+    before = expected_calibration(parameters, 52_000.0)
+    mission = Mission.of(one.survey)
+    ned = one.runs.reference_ned[0]
+    paper = evaluate_runs(
+        before, mission, ned,
+        [PlannedRun(pitch, 6.0, (battery, float(np.copysign(200.0, pitch))))
+         for _, pitch, battery, _ in TABLE_1],
+    )  # fmt: skip
+    limits = Limits(roll=(-6.0, 6.0), pitch_at=trim_of(one.runs), flown=settled(one.runs))
+    ours = plan(before, mission, ned, limits, runs=6)
+    assert len(ours.runs) == 6
+    assert ours.worst[-1] < 0.5 * paper.worst[-1]
+    assert ours.rms[-1] < 0.5 * paper.rms[-1]
+    assert all(run.pitch * run.parameters[1] > 0.0 for run in ours.runs), (
+        "dives with the ballast in, climbs out"
+    )
+    assert all(-6.0 <= run.roll <= 6.0 and 14.0 <= abs(run.pitch) <= 30.0 for run in ours.runs)
+    with pytest.raises(CalibrationError, match="within the vehicle's limits"):
+        plan(before, mission, ned, replace(limits, pitch=(80.0, 85.0)), runs=1)
