@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from magbridge import logs
 from magbridge.errors import FormatError
@@ -212,9 +213,8 @@ def test_quaternion_of_known_attitudes() -> None:
     pytest.importorskip("pyulog")
     from magbridge.logs.px4 import _angles  # noqa: PLC0415 - needs pyulog
 
-    rotation = pytest.importorskip("scipy.spatial.transform").Rotation
     angles = np.random.default_rng(0).uniform([-180, -89, 0], [180, 89, 360], (50, 3))
-    x, y, z, w = rotation.from_euler("ZYX", angles[:, ::-1], degrees=True).as_quat().T
+    x, y, z, w = Rotation.from_euler("ZYX", angles[:, ::-1], degrees=True).as_quat().T
     np.testing.assert_allclose(
         np.transpose(_angles({"q[0]": w, "q[1]": x, "q[2]": y, "q[3]": z})), angles, atol=1e-9
     )

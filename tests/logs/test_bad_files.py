@@ -7,6 +7,7 @@ import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
 
+import netCDF4
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -162,8 +163,6 @@ def test_time_goes_back(suffix: str, tmp_path: Path) -> None:
     dataset = deployment("made", np.arange(1.0, 6), {"mag_x": np.zeros(5)})
     logs.write(dataset, path)
     if suffix == ".nc":
-        import netCDF4  # noqa: PLC0415 - not for the other format
-
         with netCDF4.Dataset(path, "a") as file:
             file["TIME"][3] = 2.5
     else:
@@ -178,7 +177,6 @@ def test_time_goes_back(suffix: str, tmp_path: Path) -> None:
 
 
 def test_netcdf_of_another_shape(tmp_path: Path) -> None:
-    netCDF4 = pytest.importorskip("netCDF4")
     path = tmp_path / "log.nc"
     with netCDF4.Dataset(path, "w") as file:
         file.createDimension("obs", 3)
@@ -209,7 +207,6 @@ def test_netcdf_that_is_cut_short_is_told_in_the_library_s_words_alone(tmp_path:
 
 
 def test_netcdf_whose_names_are_no_text(tmp_path: Path) -> None:
-    netCDF4 = pytest.importorskip("netCDF4")
     path = tmp_path / "log.nc"
     with netCDF4.Dataset(path, "w", format="NETCDF3_CLASSIC") as file:
         file.createDimension("N_MEASUREMENTS", 2)

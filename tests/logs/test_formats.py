@@ -5,6 +5,7 @@ from __future__ import annotations
 import tempfile
 from pathlib import Path
 
+import netCDF4
 import numpy as np
 import pytest
 import xarray as xr
@@ -306,7 +307,6 @@ def test_a_count_that_is_none_fits_a_telemetry_log(tmp_path: Path) -> None:
 
 
 def test_netcdf_has_the_shape_of_og1(tmp_path: Path) -> None:
-    netCDF4 = pytest.importorskip("netCDF4")
     logs.write(example(5), tmp_path / "a.nc")
     with netCDF4.Dataset(tmp_path / "a.nc") as file:
         assert file.dimensions["N_MEASUREMENTS"].isunlimited()
@@ -321,7 +321,6 @@ def test_netcdf_has_the_shape_of_og1(tmp_path: Path) -> None:
 
 
 def test_og1_file_of_someone_else(tmp_path: Path) -> None:
-    netCDF4 = pytest.importorskip("netCDF4")
     with netCDF4.Dataset(tmp_path / "a.nc", "w") as file:
         file.createDimension("N_MEASUREMENTS", 3)
         for name, dtype, values, fill, attrs in (

@@ -7,6 +7,7 @@ import shutil
 from pathlib import Path
 
 import numpy as np
+import ppigrf
 import pytest
 
 from magbridge import logs
@@ -39,7 +40,6 @@ def test_seaglider(seaglider: list[Path]) -> None:
 
 def test_seaglider_axes_and_scale_are_ours(seaglider: list[Path]) -> None:
     """Regression of the channels on IGRF turned by the logged attitude: one to one, axis by axis."""
-    ppigrf = pytest.importorskip("ppigrf")
     back = logs.read(seaglider)
     east, north, up = (float(f.item()) for f in ppigrf.igrf(84.7, 8.15, 0, datetime.datetime(2014, 9, 16)))
     horizontal = np.hypot(east, north)

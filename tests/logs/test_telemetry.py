@@ -7,11 +7,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from pymavlink import mavutil
+from pymavlink.dialects.v10 import common as v1
 
 from magbridge import logs
 from magbridge.bridge.journal import declarations
 from magbridge.config import Telemetry
 from magbridge.errors import FormatError
+from magbridge.logs.deployment import deployment
 from magbridge.logs.tlog import TlogWriter
 from magbridge.mavlink import Codec, pack_record
 from magbridge.records import Channel, Quality
@@ -227,7 +230,6 @@ def test_damage_is_passed_over_and_counted(tmp_path: Path) -> None:
 
 
 def test_version_1_frames(tmp_path: Path) -> None:
-    v1 = pytest.importorskip("pymavlink.dialects.v10.common")
     mav = v1.MAVLink(None, srcSystem=1, srcComponent=1)
     log = Log()
     for k in range(4):
@@ -314,8 +316,6 @@ def test_channels_are_what_the_driver_made_of_its_counts(tmp_path: Path) -> None
 
 def test_names_longer_than_ten_letters(tmp_path: Path) -> None:
     """Cut for the message, whole again in the deployment; any MAVLink tool plots the short one."""
-    from magbridge.logs.deployment import deployment  # noqa: PLC0415 - only here
-
     columns = {
         name: [float(k)] for k, name in enumerate(("water_temperature", "water_temperatures", "water_temp"))
     }
@@ -328,9 +328,6 @@ def test_names_longer_than_ten_letters(tmp_path: Path) -> None:
 
 
 def test_any_mavlink_tool_reads_what_we_write(tmp_path: Path) -> None:
-    mavutil = pytest.importorskip("pymavlink.mavutil")
-    from magbridge.logs.deployment import deployment  # noqa: PLC0415 - only here
-
     dataset = deployment(
         "made", [1.0, 2.0], {"mag_x": [5, 6], "roll": [90, 0], "battpos": [0.5, 1]}, {"battpos": "in"}
     )

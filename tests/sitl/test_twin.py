@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from magbridge import logs
 from magbridge.calibration.file import save as save_calibration
 from magbridge.calibration.model import Parameter, identity
 from magbridge.errors import ConfigError, FormatError, WrongUse
@@ -235,7 +236,6 @@ def test_a_seagliders_own_attitude_explains_its_magnetometer(real_data: Path) ->
 
     Its counts are of 100 nT.
     """
-    logs = pytest.importorskip("magbridge.logs")
     log = logs.read(sorted((real_data / "seaglider_sg167").glob("*.nc")))
     simulated = simulate_like(log, load("seaglider"), 1)
     measured = np.column_stack([channels(log), np.ones(log.sizes["time"])])
@@ -249,7 +249,6 @@ def test_a_seagliders_own_attitude_explains_its_magnetometer(real_data: Path) ->
 
 @pytest.mark.real
 def test_a_slocums_telemetry_drives_a_glider_that_it_never_was(real_data: Path) -> None:
-    logs = pytest.importorskip("magbridge.logs")
     pytest.importorskip("dbdreader")
     log = logs.read(sorted((real_data / "slocum_comet").glob("*.[de]bd")))
     simulated = simulate_like(log, load("comet"), 1)
