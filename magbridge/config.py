@@ -48,8 +48,9 @@ class Sensor(Table, frozen=True):
     driver : str
         A name from the driver table (:data:`magbridge.sensors.DRIVERS`).
     port : str
-        A device, a pattern (``/dev/ttyUSB*``: the first that opens, so that a sensor that comes back
-        under another name is found again) or a pyserial URL (``socket://``, ``rfc2217://``, ``loop://``).
+        A device, a pattern (``/dev/ttyUSB*``: the first on which a reading comes within `timeout`, so that
+        a sensor that comes back under another name is found again) or a pyserial URL (``socket://``,
+        ``rfc2217://``, ``loop://``).
     baudrate : int
         bit/s.
     timeout : float

@@ -132,6 +132,9 @@ def run(path: Path) -> None:
     def after(time_us: int) -> None:
         keeper.look(pipeline, time_us)
         watch.look(time_us)
+        if pipeline.sensor.stranger:
+            pipeline.sensor.stranger = False
+            sensor.move_on()
 
     try:
         drive(pipeline, edge, log, after)

@@ -37,6 +37,9 @@ class SensorLine:
     state : MAG_PORT_STATE
     to_send : list of bytes
         Commands that are due; the caller of the pipeline sends them and empties the list.
+    stranger : bool
+        No reading has come since the line was opened: it may be another instrument's. Whoever opened the line
+        tries another one, if there is one, and sets this back.
     """
 
     def __init__(
@@ -52,6 +55,7 @@ class SensorLine:
         self._announcer, self._timers = announcer, timers
         self.state = MAG_PORT_STATE.ABSENT
         self.to_send: list[bytes] = []
+        self.stranger = self._known = False
         self._heard_us = start_us
         self._commands: tuple[bytes, ...] = ()
         self._mumbled_us = 0
@@ -59,7 +63,7 @@ class SensorLine:
 
     def spoke(self, time_us: int) -> None:
         """Take note of a reading."""
-        self._heard_us = time_us
+        self._heard_us, self._known = time_us, True
         if self.state != MAG_PORT_STATE.OK:
             self.state = MAG_PORT_STATE.OK
             self._announcer.state("sensor", f"{self._name} speaks")
@@ -70,7 +74,7 @@ class SensorLine:
 
     def opened(self, time_us: int) -> None:
         """Begin to send the start-up commands: it may have been without power. SILENT until it sends."""
-        self._commands = self._start()
+        self._commands, self._known = self._start(), False
         self._wake(time_us)
 
     def lost(self, reason: str) -> None:
@@ -85,6 +89,7 @@ class SensorLine:
         mumbles = time_us - self._mumbled_us < self._timeout_us // 2
         what = "sends, but no readings: baud rate?" if mumbles else "is silent"
         self._announcer.state("sensor", f"{self._name} {what}", MAV_SEVERITY.ERROR)
+        self.stranger = not self._known
         self._wake(time_us)
 
     def _wake(self, time_us: int) -> None:

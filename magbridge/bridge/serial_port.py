@@ -39,6 +39,7 @@ class SerialPort(Stream):
     def __init__(self, name: str, baudrate: int) -> None:
         super().__init__(name, round(baudrate / 10 * LEAD))
         self.baudrate = baudrate
+        self._last = self._passed = ""
         self._idle_at = -inf
         self._serial: Any = None
         self._fd = -1
@@ -51,10 +52,8 @@ class SerialPort(Stream):
 
     def open(self) -> None:
         """Open the first device that the name or pattern finds; raises :class:`PortError`."""
-        # a pattern may be absolute, which pathlib does not glob
-        names = sorted(glob.glob(self.name)) if glob.has_magic(self.name) else [self.name]  # noqa: PTH207 - a pattern from the root
         reason: object = "no such device"
-        for name in names:
+        for name in self._names():
             try:
                 opened = serial.serial_for_url(
                     name, self.baudrate, timeout=0, write_timeout=0, do_not_open=True
@@ -70,9 +69,22 @@ class SerialPort(Stream):
             except (AttributeError, OSError):  # loop:// and rfc2217:// have no descriptor
                 self._pump = _Pump(opened)
                 self._fd = self._pump.fd
-            self._serial = opened
+            self._serial, self._last = opened, name
             return
         raise PortError(self.name, str(reason))
+
+    def move_on(self) -> None:
+        """Close the device if the pattern finds others, too: the next one will be opened."""
+        if len(self._names()) > 1:
+            self._passed = self._last
+            self.close()
+
+    def _names(self) -> list[str]:
+        """Return the devices that there are, beginning with the one after that which was passed over."""
+        if not glob.has_magic(self.name):
+            return [self.name]
+        found = glob.glob(self.name)  # noqa: PTH207 - it may be absolute, which pathlib does not glob
+        return sorted(found, key=lambda name: (name <= self._passed, name))
 
     def fds(self) -> list[int]:
         """Return the one descriptor, if open."""

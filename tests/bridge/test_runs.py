@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 from checks import Row, first_difference, replays
+from devices import open_line
 from rig import Rig
 
 from magbridge.bridge.events import Clock
@@ -50,6 +51,33 @@ def test_neither_sensor_nor_autopilot_at_the_start(make_rig: MakeRig, table: Row
         said = [record.message["text"] for record in LogReader(file) if record.message.name == "STATUSTEXT"]
     assert any(text.startswith("digitizer lost: no such device: /") for text in said)
     assert any(text.startswith(f"link: Connection refused: {rig.url[:8]}") for text in said)
+
+
+@pytest.mark.parametrize("speaks", [True, False])
+def test_another_device_fits_the_pattern_too(make_rig: MakeRig, table: Row, speaks: bool) -> None:
+    """A GPS, on or off, is found before the sensor; and again after the sensor was unplugged."""
+    rig = make_rig()
+    gps, far = open_line(rig.fluxgate.folder / "ttyUSB0")
+    if speaks:
+        os.write(gps, 40 * b"$GPGGA,123519,4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,*47\r\n")
+    rig.fluxgate.plug("ttyUSB1")
+    found = rig.start()
+    rig.fluxgate.unplug()
+    rig.until_status(lambda status: status["sensor_state"] != 1)
+    rig.fluxgate.plug("ttyUSB2")
+    back = rig.until_well()
+    if not speaks:
+        table(
+            "another device, a GPS, fits the sensor's pattern, and is found first",
+            'STATUSTEXT "digitizer is silent", and `sensor_state` silent, until it is left for the next',
+            f"{found:.2f} s after the start (`sensor.timeout` is 0.5 s); unplugged, and back: {back:.2f} s",
+            "nothing; it gets the sensor's start-up commands",
+        )
+    assert found < 5.0
+    assert back < 2.0
+    replays(rig)
+    os.close(gps)
+    os.close(far)
 
 
 def test_tcp_server_gone_and_back(make_rig: MakeRig, table: Row) -> None:
