@@ -28,6 +28,7 @@ __all__ = [
     "BITS",
     "COARSE",
     "FINE",
+    "PAIRS",
     "Prepared",
     "apply",
     "combined",
@@ -46,6 +47,7 @@ Prepared = tuple[list[float], list[list[float]]]
 six entries Q (6), L (3) and O (1)."""
 Numbers = tuple[float, float, float, float, float, float, float, float]
 PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+"""Row and column of each of a symmetric matrix's six entries, in the order in which they are kept."""
 
 
 def for_arrays() -> Any:

@@ -19,9 +19,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from magbridge.calibration.arithmetic import COARSE, FINE
+from magbridge.calibration.arithmetic import COARSE, FINE, PAIRS
 from magbridge.calibration.kernel import COLUMNS, Kernel
-from magbridge.calibration.terms import PAIRS, Exponents
+from magbridge.calibration.terms import Exponents
 
 if TYPE_CHECKING:
     from magbridge.calibration.model import Calibration

@@ -24,7 +24,8 @@ import numpy as np
 from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
 
-from magbridge.calibration.terms import PAIRS, Expansion, PositionTerm
+from magbridge.calibration.arithmetic import PAIRS
+from magbridge.calibration.terms import Expansion, PositionTerm
 from magbridge.errors import CalibrationError
 
 if TYPE_CHECKING:

@@ -24,7 +24,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from magbridge.calibration.terms import PAIRS, symmetric
+from magbridge.calibration.arithmetic import PAIRS
+from magbridge.calibration.terms import symmetric
 
 __all__ = [
     "NormalEquations",

@@ -27,7 +27,6 @@ if TYPE_CHECKING:
 
 __all__ = [
     "HIGHEST",
-    "PAIRS",
     "SLOTS",
     "TERMS",
     "Effect",
@@ -57,8 +56,6 @@ Width = Annotated[float, Meta(ge=1e-9, le=1e12)]
 
 SLOTS = ("a_xx", "a_yy", "a_zz", "a_xy", "a_xz", "a_yz", "t_x", "t_y", "t_z")
 """The nine coefficients: six of the symmetric ``A`` (as ``a = (A - I) F_0``, nT) and three of ``T`` (nT)."""
-PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
-"""Row and column of A's six."""
 
 TERMS: dict[str, str] = {
     "polynomial": "magbridge.calibration.terms:Polynomial",
