@@ -98,7 +98,7 @@ def draw_bound(bound: Bound, grid: AnomalyGrid, path: str | Path) -> None:
     scale = figure.colorbar(line, ax=axis, label="smallest possible position error (DRMS), m", shrink=0.9)
     _plain(scale.ax)
     axis.set_title(
-        f"at best {bound.sigma[-1]:.0f} m at the end; dead reckoning alone {bound.unaided[-1]:.0f} m"
+        f"at the end no better than {bound.sigma[-1]:.0f} m; dead reckoning alone {bound.unaided[-1]:.0f} m"
     )
 
     axis = panels["time"]
