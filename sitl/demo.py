@@ -82,19 +82,22 @@ def demo(folder: Path, seed: int = 1, say: Callable[[str], None] = print) -> dic
 
 
 def _align(field: dict[str, Floats], survey: xr.Dataset) -> xr.Dataset:
-    """Return what was heard, on the times at which it was measured, with the truth at those times."""
-    when = field.pop("time")
+    """Return what was heard, on the times at which it was measured, with the truth at those times.
+
+    ``flagged`` is true where a flag speaks against the total field, which needs no boresight.
+    """
     times = survey["time"].to_numpy()
-    truth = np.interp(when, times, survey["truth_total_field"].to_numpy())
-    columns = {**field, "truth": truth}
-    return xr.Dataset({name: ("time", column) for name, column in columns.items()}, coords={"time": when})
+    truth = np.interp(field["time"], times, survey["truth_total_field"].to_numpy())
+    flagged = (field["quality"].astype(int) & ~int(Quality.NO_BORESIGHT)) != 0
+    columns = {**field, "truth": truth, "flagged": flagged}
+    return xr.Dataset({name: ("time", column) for name, column in columns.items()})
 
 
 def _compare(survey: xr.Dataset, nominal: Fit, heard: xr.Dataset) -> dict[str, Any]:
     truth = survey["truth_total_field"].to_numpy()
     raw = np.linalg.norm(channels(survey), axis=1)
     error = (heard["total_field"] - heard["truth"]).to_numpy()
-    good = (heard["quality"].to_numpy().astype(int) & ~int(Quality.NO_BORESIGHT)) == 0
+    good = ~heard["flagged"].to_numpy()
     return {
         "samples": heard.sizes["time"],
         "raw_rms_nT": rms(raw - truth),

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from magbridge.calibration.residual import rms
 from magbridge.files import atomic_path
-from magbridge.records import Quality
 from sitl.columns import channels
 
 mpl.use("agg")
@@ -94,7 +93,7 @@ def _levels(axes: Axes, title: str, *lines: tuple[Floats, Floats, str, str]) -> 
 
 def _errors(axes: Axes, hours: Floats, nominal: Floats, received: Floats, heard: xr.Dataset) -> None:
     error = (heard["total_field"] - heard["truth"]).to_numpy()
-    flagged = (heard["quality"].to_numpy().astype(int) & ~int(Quality.NO_BORESIGHT)) != 0
+    flagged = heard["flagged"].to_numpy()
     good = rms(error[~flagged])
     axes.set_title("Error")
     axes.plot(hours, nominal, color=NOMINAL, lw=1, label=f"one ellipsoid: {rms(nominal):.0f} nT RMS")
