@@ -43,19 +43,16 @@ def test_telemetry_stale(rig: Rig, table: Row, how: str) -> None:
     rig.until_well()
     mark = rig.mark
     sigma = rig.of("MAG_FIELD")[-1]["total_field_sigma"]
-    if how == "frozen":  # the same message, with the same time, again and again
-        frozen = rig.autopilot.telemetry()
-        rig.autopilot.retell = lambda _: [frozen]
-    else:
-        rig.autopilot.tells = False
-    noticed = rig.until(lambda: "stale_telemetry" in rig.flags(mark))
-    rig.run(0.5)
-    status = rig.fresh_status()
-    assert status["telemetry_stale"] == 1
-    doubtful = rig.of("MAG_FIELD")[-1]
-    assert doubtful["total_field_sigma"] > sigma
-    assert doubtful["telemetry_age"] > 0.5
-    rig.autopilot.retell, rig.autopilot.tells = lambda frame: [frame], True
+    # frozen: the same message, with the same time, again and again
+    frames = [rig.autopilot.telemetry()] if how == "frozen" else []
+    with rig.autopilot.retelling(lambda _: frames):
+        noticed = rig.until(lambda: "stale_telemetry" in rig.flags(mark))
+        rig.run(0.5)
+        status = rig.fresh_status()
+        assert status["telemetry_stale"] == 1
+        doubtful = rig.of("MAG_FIELD")[-1]
+        assert doubtful["total_field_sigma"] > sigma
+        assert doubtful["telemetry_age"] > 0.5
     back = rig.until_well()
     rig.until_said("field: good", mark)
     assert noticed < 1.5
@@ -77,9 +74,8 @@ def test_telemetry_stale(rig: Rig, table: Row, how: str) -> None:
 def test_telemetry_duplicated(rig: Rig, table: Row) -> None:
     rig.until_well()
     before, mark = rig.fresh_status(), rig.mark
-    rig.autopilot.retell = lambda frame: [frame] * 3
-    rig.run(0.7)
-    rig.autopilot.retell = lambda frame: [frame]
+    with rig.autopilot.retelling(lambda frame: [frame] * 3):
+        rig.run(0.7)
     rig.run(0.2)
     after = rig.fresh_status()
     assert rig.undue_flags(mark) == ""
@@ -104,9 +100,8 @@ def test_telemetry_out_of_order(rig: Rig, table: Row) -> None:
         frames, kept[:] = [kept[i] for i in (2, 0, 3, 1)], []
         return frames
 
-    rig.autopilot.retell = shuffle
-    rig.run(16 / TELEMETRY_HZ)
-    rig.autopilot.retell = lambda frame: [frame]
+    with rig.autopilot.retelling(shuffle):
+        rig.run(16 / TELEMETRY_HZ)
     rig.run(0.2)
     after = rig.fresh_status()
     lost = after["link_frames_lost"] - before["link_frames_lost"]
@@ -141,10 +136,9 @@ def test_second_system_on_the_link(rig: Rig, table: Row) -> None:
             ),
         ]  # fmt: skip
 
-    rig.autopilot.retell = join
-    delay = rig.until_said("vehicle 2 is on the link too: ignored", mark)
-    rig.run(0.5)
-    rig.autopilot.retell = lambda frame: [frame]
+    with rig.autopilot.retelling(join):
+        delay = rig.until_said("vehicle 2 is on the link too: ignored", mark)
+        rig.run(0.5)
     assert rig.undue_flags(mark) == ""
     assert not rig.of("PARAM_VALUE", mark)
     fields = np.array([message["total_field"] for message in rig.of("MAG_FIELD", mark)])
@@ -170,9 +164,8 @@ def test_two_autopilots_answer(rig: Rig, table: Row) -> None:
         # another vehicle, on for a day
         return [frame, other.pack("SYS_STATUS"), other.pack("ATTITUDE", time_boot_ms=86_400_000 + 50 * count)]
 
-    rig.autopilot.retell = both
-    delay = rig.until_said("two autopilots speak as 1:1", mark)
-    rig.autopilot.retell = lambda frame: [frame]
+    with rig.autopilot.retelling(both):
+        delay = rig.until_said("two autopilots speak as 1:1", mark)
     back = rig.until_well()
     table(
         "two programs answer as the autopilot (1:1)",

@@ -11,7 +11,7 @@ import time
 import tty
 from array import array
 from collections.abc import Callable, Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from magbridge.mavlink import Codec, Message
@@ -115,11 +115,9 @@ class Autopilot:
 
     def __init__(self, url: str, codec: Codec) -> None:
         self.codec = codec
-        self.tells = True
-        """Whether it sends telemetry."""
         self.told: list[float] = []
         """When it sent telemetry (s, monotonic)."""
-        self.retell: Callable[[bytes], list[bytes]] = lambda frame: [frame]
+        self._retell: Callable[[bytes], list[bytes]] = lambda frame: [frame]
         """What the link makes of a telemetry frame."""
         self._kind, _, self._at = url.partition(":")
         self._ear = Codec(0, 0)
@@ -128,6 +126,15 @@ class Autopilot:
         self._listener: socket.socket | None = None
         self._line: socket.socket | SerialEnd | None = None
         self._peer: tuple[str, int] | None = None
+
+    @contextmanager
+    def retelling(self, retell: Callable[[bytes], list[bytes]]) -> Iterator[None]:
+        """Let the link make of each telemetry frame what `retell` makes of it."""
+        plain, self._retell = self._retell, retell
+        try:
+            yield
+        finally:
+            self._retell = plain
 
     @property
     def address(self) -> tuple[str, int]:
@@ -203,10 +210,10 @@ class Autopilot:
         if now >= self._beat:
             self._beat = now + 1 / BEAT_HZ
             self.say("HEARTBEAT", type=12, autopilot=3, system_status=4, mavlink_version=3)
-        if self.tells and now >= self._due:
+        if now >= self._due:
             self._due = now + 1 / TELEMETRY_HZ
             self.told.append(now)
-            for frame in self.retell(self.telemetry()):
+            for frame in self._retell(self.telemetry()):
                 self.send(frame)
         for message in self._hear():
             if message.known and message.name == "TIMESYNC" and message["tc1"] == 0:
