@@ -5,7 +5,7 @@ These names are public (files, command line, the link). Any other name is teleme
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, NamedTuple
 
 from magbridge.errors import FormatError
@@ -22,7 +22,9 @@ __all__ = [
     "NT_PER_UNIT",
     "Column",
     "factor",
+    "may_be",
     "require",
+    "require_units",
     "usual",
 ]
 
@@ -114,6 +116,11 @@ _SAME = {
     "tesla": "T",
     "gauss": "G",
     "mgauss": "mG",
+    "inch": "in",
+    "inches": "in",
+    "cc": "cm3",
+    "cm^3": "cm3",
+    "cm³": "cm3",
 }
 
 
@@ -133,6 +140,11 @@ def usual(unit: str) -> str:
     return _SAME.get(unit, unit)
 
 
+def may_be(unit: str, other: str) -> bool:
+    """Whether two units can be the same; either may be undeclared (empty, or the 1 that is then written)."""
+    return {unit, other} & {"", "1"} != set() or usual(unit) == usual(other)
+
+
 def require(deployment: xr.Dataset, names: Iterable[str]) -> None:
     """Check that a deployment has these columns.
 
@@ -146,3 +158,18 @@ def require(deployment: xr.Dataset, names: Iterable[str]) -> None:
             there = " ".join(str(column) for column in deployment.data_vars)
             source = deployment.attrs.get("source", "the deployment")
             raise FormatError(source, f"expected this column; there are: {there}", column=name)
+
+
+def require_units(deployment: xr.Dataset, units: Mapping[str, str]) -> None:
+    """Check that the columns of a deployment are in these units, where a column declares one.
+
+    Raises
+    ------
+    FormatError
+        One is in another unit: names the file, the column, and both units.
+    """
+    for name, unit in units.items():
+        given = str(deployment[name].attrs.get("units", "")) if name in deployment else ""
+        if not may_be(given, unit):
+            expected = f"expected {unit!r}, the calibration's unit, not {given!r}"
+            raise FormatError(deployment.attrs.get("source", "the deployment"), expected, column=name)

@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from magbridge.bridge.pipeline import check
+from magbridge.calibration.model import Calibration, Parameter, identity
 from magbridge.config import load
 from magbridge.errors import ConfigError
 
@@ -100,3 +102,21 @@ def test_one_clear_line_names_the_key(tmp_path: Path, old: str, new: str, line: 
     assert line in str(caught.value)
     assert str(caught.value).startswith(str(path))
     assert "\n" not in str(caught.value)
+
+
+def calibrated_in(unit: str) -> Calibration:
+    return identity((Parameter("battpos", unit, -0.5, 0.5, 0.0, 0.5),))
+
+
+@pytest.mark.parametrize("unit", ["in", "inches", "", "1"])
+def test_a_unit_may_be_undeclared_and_spelled_otherwise(tmp_path: Path, unit: str) -> None:
+    """1 is what a calibration says that was fitted to a CSV whose header declares no unit."""
+    check(calibrated_in(unit), load(write(tmp_path, GOOD)))
+
+
+def test_telemetry_in_another_unit_than_the_calibration_s(tmp_path: Path) -> None:
+    path = write(tmp_path, GOOD)
+    with pytest.raises(ConfigError) as caught:
+        check(calibrated_in("mm"), load(path))
+    line = f"{path}: telemetry.battpos.unit: expected 'mm', the calibration's unit, not 'in'"
+    assert str(caught.value) == line

@@ -13,6 +13,7 @@ from magbridge.bridge.position import Position
 from magbridge.bridge.sensor_line import SensorLine
 from magbridge.calibration.file import calibration_id
 from magbridge.calibration.model import Calibration
+from magbridge.columns import may_be
 from magbridge.config import Align, Config
 from magbridge.correction import TEMPERATURE, Correction
 from magbridge.errors import ConfigError
@@ -307,7 +308,7 @@ def check(calibration: Calibration, config: Config) -> None:
     ConfigError
         A parameter that ``[telemetry]`` lacks, or that comes in another unit.
     """
-    units = {parameter.name: parameter.unit for parameter in calibration.parameters}
+    units = calibration.units
     for name in calibration.channels:
         if name == TEMPERATURE:
             continue
@@ -316,7 +317,9 @@ def check(calibration: Calibration, config: Config) -> None:
                 config.path, f"telemetry.{name}", "missing: the calibration needs this parameter"
             )
         unit = config.telemetry[name].unit
-        if units.get(name) and unit and unit != units[name]:
+        if not may_be(unit, units.get(name, "")):
             raise ConfigError(
-                config.path, f"telemetry.{name}.unit", f"the calibration is in {units[name]}, not in {unit}"
+                config.path,
+                f"telemetry.{name}.unit",
+                f"expected {units[name]!r}, the calibration's unit, not {unit!r}",
             )

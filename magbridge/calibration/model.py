@@ -178,6 +178,11 @@ class Calibration:
             names += [name for name in effect.channels() if name not in names]
         return tuple(names)
 
+    @property
+    def units(self) -> dict[str, str]:
+        """Unit of each parameter."""
+        return {parameter.name: parameter.unit for parameter in self.parameters}
+
     @cached_property
     def kernel(self) -> Kernel:
         """The calibration compiled for correcting samples, made once."""

@@ -22,7 +22,7 @@ from magbridge.cli.common import (
     note_losses,
     note_missing,
     print_result,
-    refuse_other_sensor,
+    refuse_unsuited,
 )
 from magbridge.progress import track, waiting
 
@@ -205,7 +205,7 @@ def correct(*files: Path, calibration: Path, output: Log, json: Json = False) ->
             writer.append(corrected)
             rows += part.sizes["time"]
             if not whole:
-                refuse_other_sensor(known, part)
+                refuse_unsuited(known, part)
                 whole = bool(part[list(CHANNELS)].to_array().notnull().all("variable").any())
             quality = corrected["quality"].to_numpy().astype(int)
             flagged += int((quality & doubtful != 0).sum())

@@ -39,7 +39,7 @@ __all__ = [
     "note_losses",
     "note_missing",
     "print_result",
-    "refuse_other_sensor",
+    "refuse_unsuited",
 ]
 
 
@@ -145,14 +145,15 @@ def note_missing(calibration: Calibration, deployment: xr.Dataset) -> None:
             complain(f"{lacking}: every sample is flagged, with a sigma to match")
 
 
-def refuse_other_sensor(calibration: Calibration, deployment: xr.Dataset) -> None:
-    """FormatError: a log that is to be corrected is of another sensor, or its channels cannot be nT."""
-    from magbridge.columns import CHANNELS
+def refuse_unsuited(calibration: Calibration, deployment: xr.Dataset) -> None:
+    """FormatError: a log to be corrected is of another sensor, or parameters or channels in another unit."""
+    from magbridge.columns import CHANNELS, require_units
     from magbridge.field.reference import other_units
 
     source, sensor = deployment.attrs["source"], str(deployment.attrs.get("sensor", ""))
     if not calibration.sensor.may_be(sensor):
         raise FormatError(source, f"sensor {sensor!r}, but the calibration is of {calibration.sensor.name!r}")
+    require_units(deployment, calibration.units)
     channels = deployment[list(CHANNELS)].to_array().to_numpy().T
     if wrong := other_units(channels, calibration.reference.field):
         raise FormatError(source, wrong)

@@ -17,7 +17,7 @@ from magbridge.cli.common import (
     note_losses,
     note_missing,
     print_result,
-    refuse_other_sensor,
+    refuse_unsuited,
 )
 
 if TYPE_CHECKING:
@@ -93,7 +93,7 @@ def navigate(
     deployment = with_true_heading(read(files, required=CHANNELS), heading_reference)
     note_losses(deployment.attrs)
     note_missing(known, deployment)
-    refuse_other_sensor(known, deployment)
+    refuse_unsuited(known, deployment)
     corrected = correct_rows(Correction(known), deployment)
     if options is None:
         options = informed(Options(), known, float(corrected["total_field_sigma"].median()))

@@ -220,7 +220,7 @@ def join(parts: Sequence[xr.Dataset]) -> xr.Dataset:
             if attrs.get("units") != own.get("units"):
                 raise FormatError(
                     part.attrs.get("source", ""),
-                    f"expected {attrs.get('units')} as in the files before, not {own.get('units')}",
+                    f"expected {attrs.get('units')!r} as in the files before, not {own.get('units')!r}",
                     column=str(name),
                 )
     time = np.concatenate([part["time"].values for part in parts])

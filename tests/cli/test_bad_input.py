@@ -10,7 +10,7 @@ import pytest
 
 from magbridge.calibration.file import save as save_calibration
 from magbridge.calibration.fitting.fit import METHODS
-from magbridge.calibration.model import Sensor, identity
+from magbridge.calibration.model import Parameter, Sensor, identity
 from magbridge.cli import main
 from magbridge.columns import CHANNELS
 from magbridge.logs import read, write
@@ -97,6 +97,34 @@ def test_a_log_of_another_sensor_is_not_corrected(
     line = complaint(capsys, "correct", log, "--calibration", calibration, "-o", output, code=1)
     assert line.endswith(": sensor 'hmr2300', but the calibration is of 'digitizer'")
     assert not output.exists()
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["correct", "log.nc", "-o", "x.nc"],
+        ["navigate", "log.nc", "-o", "x.nc", "--map", "none.nc"],
+        ["diagnose", "log.nc", "-o", "doubt"],
+        ["plan", "--mission", "log.nc"],
+    ],
+    ids=lambda arguments: arguments[0],
+)
+def test_a_position_in_another_unit_is_refused(
+    arguments: list[str],
+    deployment: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Metres taken for inches were corrected to a field that was off by hundreds of nT, unflagged."""
+    monkeypatch.chdir(tmp_path)
+    rows = read(deployment).isel(time=slice(0, 60))
+    rows["battpos"] = (0.0254 * rows["battpos"]).assign_attrs(units="m")
+    write(rows, "log.nc")
+    save_calibration(identity((Parameter("battpos", "in", -0.5, 0.5, 0.0, 0.5),)), Path("cal.json"))
+    line = complaint(capsys, *arguments, "--calibration", "cal.json", code=1)
+    assert line.endswith(": column 'battpos': expected 'in', the calibration's unit, not 'm'")
+    assert {path.name for path in tmp_path.iterdir()} == {"log.nc", "cal.json"}
 
 
 @pytest.mark.parametrize(

@@ -229,7 +229,7 @@ def test_units_of_two_kinds_are_not_mixed(tmp_path: Path) -> None:
     for name, unit, start in (("a", "in", 0), ("b", "cm", 10)):
         (tmp_path / f"{name}.csv").write_text(f"time,battpos [{unit}]\n{start},1\n")
     with pytest.raises(
-        ValueError, match=r"b.csv: column 'battpos': expected in as in the files before, not cm"
+        ValueError, match=r"b.csv: column 'battpos': expected 'in' as in the files before, not 'cm'"
     ):
         logs.read([tmp_path / "a.csv", tmp_path / "b.csv"])
 

@@ -12,6 +12,7 @@ from magbridge.calibration.fitting.mission import Mission
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.planning.limits import Limits, settled, trim_of
 from magbridge.calibration.planning.plan import Plan, plan
+from magbridge.columns import require_units
 from magbridge.errors import CalibrationError
 
 if TYPE_CHECKING:
@@ -48,13 +49,16 @@ def flight_plan(
     Raises
     ------
     CalibrationError
-        The mission has no attitude or position, or lacks a parameter of the calibration.
+        The mission has no attitude or position.
+    FormatError
+        It lacks a parameter of the calibration, or has it in another unit.
     """
     if field_ned is None:
         raise CalibrationError("the mission needs latitude and longitude, to know the Earth's field there")
     total = np.linalg.norm(field_ned, axis=1)
     some = ("time", np.ones(mission.sizes["time"]))  # placeholder readings; zeros would count as missing
-    names = tuple(parameter.name for parameter in calibration.parameters)
+    require_units(mission, calibration.units)
+    names = tuple(calibration.units)
     data = observations(
         mission.assign({f"mag_{axis}": some for axis in "xyz"}).drop_vars("reference_field", errors="ignore"),
         names,

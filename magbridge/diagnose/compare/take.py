@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magbridge.calibration.model import Calibration
-from magbridge.columns import CHANNELS, require
+from magbridge.columns import CHANNELS, require, require_units
 from magbridge.config import Align
 from magbridge.diagnose.compare.survey import FEWEST, Survey, assemble
 from magbridge.errors import DataError
@@ -99,7 +99,7 @@ def _joined(parts: Sequence[dict[str, FloatArray]]) -> dict[str, FloatArray]:
 
 def _comparable(table: dict[str, FloatArray], calibration: Calibration, source: str) -> dict[str, FloatArray]:
     """Return the rows that have channels, reference and parameters, each instant once."""
-    needed = [*CHANNELS, "reference_field", *(parameter.name for parameter in calibration.parameters)]
+    needed = [*CHANNELS, "reference_field", *calibration.units]
     size = table["time"].size
     if size < FEWEST:
         raise DataError(f"{source}: {size} samples, at least {FEWEST} needed")
@@ -125,7 +125,8 @@ def _columns(
     sensor = str(ds.attrs.get("sensor", ""))
     if not calibration.sensor.may_be(sensor):
         raise DataError(f"{source}: sensor {sensor!r}, but the calibration is of {calibration.sensor.name!r}")
-    require(ds, (*CHANNELS, *(parameter.name for parameter in calibration.parameters)))
+    require(ds, (*CHANNELS, *calibration.units))
+    require_units(ds, calibration.units)
     once = np.unique(ds["time"], return_index=True)[1]
     if once.size < ds.sizes["time"]:
         ds = ds.isel(time=once)
