@@ -21,9 +21,9 @@ from rich.progress import track
 from terminal import command_line, table
 
 from magbridge.calibration.fitting.columns import observations
-from magbridge.calibration.fitting.data import Observations
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.mission import Mission
+from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.planning.limits import Limits, PlannedRun, settled, trim_of
 from magbridge.calibration.planning.plan import Plan, evaluate_runs, expected_calibration, plan
 from magbridge.calibration.residual import rms

@@ -81,8 +81,8 @@ def calibrate(
     from magbridge.calibration.file import save
     from magbridge.calibration.fitting.columns import observations
     from magbridge.calibration.fitting.fit import fit
-    from magbridge.calibration.fitting.geometry import read_vehicle
     from magbridge.calibration.fitting.lowpass import unfiltered
+    from magbridge.calibration.fitting.mounted_masses import read_vehicle
     from magbridge.columns import CHANNELS
     from magbridge.field.declination import with_true_heading
     from magbridge.field.read import read_grid

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from magbridge.calibration.fitting.data import Observations
+from magbridge.calibration.fitting.observations import Observations
 from sitl.instrument import Instrument
 from sitl.mission import CrissCross, Spirals
 from sitl.platform import Vehicle, draw_vehicle

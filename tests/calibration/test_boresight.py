@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from magbridge.calibration.correct import correct
 from magbridge.calibration.fitting.boresight import field_body, find_boresight
-from magbridge.calibration.fitting.data import Observations
+from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.model import identity
 
 

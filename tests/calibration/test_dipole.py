@@ -11,7 +11,7 @@ import pytest
 
 from magbridge.calibration.dipole import Dipole, dipole_tensor
 from magbridge.calibration.fitting.fit import fit
-from magbridge.calibration.fitting.geometry import read_vehicle
+from magbridge.calibration.fitting.mounted_masses import read_vehicle
 from magbridge.calibration.model import Calibration, Noise, Parameter, Reference
 from magbridge.errors import CalibrationError, ConfigError
 

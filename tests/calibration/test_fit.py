@@ -12,10 +12,10 @@ import pytest
 from scipy.optimize import least_squares
 
 from magbridge.calibration.correct import correct
-from magbridge.calibration.fitting.data import Observations, polynomial_samples
 from magbridge.calibration.fitting.evidence import Quadratic, evidence
 from magbridge.calibration.fitting.fit import METHODS, fit
 from magbridge.calibration.fitting.nominal import nominal, nominal_samples
+from magbridge.calibration.fitting.observations import Observations, polynomial_samples
 from magbridge.calibration.fitting.prior import free_structure
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.residual import Samples, normal_equations, residuals, whiten

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from magbridge.calibration.fitting.data import polynomial_samples
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.identify import combinations
+from magbridge.calibration.fitting.observations import polynomial_samples
 from magbridge.calibration.terms import full_order
 
 Gliders = Callable[..., Any]

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from magbridge.calibration.fitting.data import Observations
 from magbridge.calibration.fitting.lowpass import unfiltered
+from magbridge.calibration.fitting.observations import Observations
 from magbridge.errors import CalibrationError
 
 CORNER = 0.33

@@ -21,12 +21,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from magbridge.calibration.fitting.data import Observations, polynomial_samples
 from magbridge.calibration.fitting.evidence import Quadratic, Widths, is_maximum, maximise
 from magbridge.calibration.fitting.fit import Fit, assemble
-from magbridge.calibration.fitting.geometry import Mounting, mounted_structure
+from magbridge.calibration.fitting.mounted_masses import Mounting, mounted_structure
 from magbridge.calibration.fitting.noise import OUTLIER, NoiseModel, estimate_noise
 from magbridge.calibration.fitting.nominal import check_scales, starts
+from magbridge.calibration.fitting.observations import Observations, polynomial_samples
 from magbridge.calibration.fitting.prior import Structure, free_structure
 from magbridge.calibration.fitting.solve import Prior, Solution, covariance_of, gauss_newton
 from magbridge.calibration.residual import Samples, jacobian, residuals, residuals_of

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from magbridge.calibration.correct import correct
-from magbridge.calibration.fitting.data import Observations
+from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.model import Boresight, Calibration
 
 __all__ = ["field_body", "find_boresight"]

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from magbridge.calibration.fitting.data import Observations
+from magbridge.calibration.fitting.observations import Observations
 from magbridge.columns import CHANNELS, COLUMNS, require
 from magbridge.errors import CalibrationError
 

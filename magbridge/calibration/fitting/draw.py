@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from magbridge.calibration.fitting.data import Observations
+from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.validate import in_sensor_units
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.residual import rms, robust_scale

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from magbridge.calibration.fitting.boresight import find_boresight
-from magbridge.calibration.fitting.data import Observations
 from magbridge.calibration.fitting.identify import combinations, expected_ratio, heading_gap, warnings_for
 from magbridge.calibration.fitting.noise import NoiseModel
+from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.model import Calibration, Noise, Parameter, Reference, Run, Sensor
 from magbridge.calibration.residual import Samples, residuals_of, rms, scales_and_offsets
 from magbridge.calibration.terms import Polynomial

@@ -20,10 +20,10 @@ from scipy.linalg import polar
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from magbridge.calibration.fitting.data import Observations
 from magbridge.calibration.fitting.fit import Fit, assemble
 from magbridge.calibration.fitting.noise import estimate_noise
 from magbridge.calibration.fitting.nominal import HARD_IRON_SIGMA, SCALE_SIGMA, check_scales, nominal_samples
+from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.residual import residuals_of
 from magbridge.errors import CalibrationError
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from magbridge.calibration.fitting.data import Observations
 from magbridge.calibration.fitting.mission import expected_error, nearby_mission
+from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.residual import Samples, jacobian, residuals
 from magbridge.calibration.terms import Polynomial

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from magbridge.calibration.correct import correct
 from magbridge.calibration.fitting.boresight import field_body
-from magbridge.calibration.fitting.data import Observations
+from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.forward import forward
 from magbridge.calibration.model import Calibration, Noise
 from magbridge.errors import CalibrationError

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magbridge.calibration.correct import correct
-from magbridge.calibration.fitting.data import Observations
 from magbridge.calibration.fitting.fit import fit
+from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.residual import rms
 from magbridge.errors import CalibrationError

@@ -9,7 +9,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from magbridge.calibration.fitting.data import Observations
+from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.model import Parameter
 
 __all__ = ["Limits", "PlannedRun", "candidate_runs", "settled", "trim_of"]

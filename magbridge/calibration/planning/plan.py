@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from magbridge.calibration.fitting.boresight import field_body
-from magbridge.calibration.fitting.data import monomials
 from magbridge.calibration.fitting.mission import Mission
+from magbridge.calibration.fitting.observations import monomials
 from magbridge.calibration.fitting.prior import free_structure
 from magbridge.calibration.forward import forward
 from magbridge.calibration.model import Calibration, Noise, Parameter, Reference
