@@ -170,6 +170,7 @@ class Pipeline:
         self._samples += 1
         self._lost += stamp.missing
         self._times.append(stamp.time_us)
+        self.sensor.read(reading.field, stamp.time_us)
         sample, corrected = self._correction.reading(
             reading, stamp.time_us, restarted=stamp.restarted, missing=stamp.missing
         )

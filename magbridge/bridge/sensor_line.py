@@ -7,11 +7,15 @@ from collections.abc import Callable
 from magbridge.link.announcer import Announcer
 from magbridge.link.timers import Timers
 from magbridge.mavlink.dialect import MAG_PORT_STATE, MAV_SEVERITY
+from magbridge.records import Vector
 
 __all__ = ["SensorLine"]
 
 COMMAND_GAP_US = 100_000
 """µs between two commands to a sensor."""
+SAME_US, SAME = 60_000_000, 10
+"""µs, and number of readings, after which one that repeats is announced: the sensor may hang. It has no flag,
+because one that counts in steps of 100 nT may as well be at rest."""
 LOOK_US = 1_000_000
 """µs between two checks that readings still come."""
 
@@ -59,6 +63,9 @@ class SensorLine:
         self._heard_us = start_us
         self._commands: tuple[bytes, ...] = ()
         self._mumbled_us = 0
+        self._field: Vector | None = None
+        self._repeats = self._since_us = 0
+        self._hangs = False
         timers.every("sensor", LOOK_US, self._look, start_us + LOOK_US)
 
     def spoke(self, time_us: int) -> None:
@@ -67,6 +74,20 @@ class SensorLine:
         if self.state != MAG_PORT_STATE.OK:
             self.state = MAG_PORT_STATE.OK
             self._announcer.state("sensor", f"{self._name} speaks")
+
+    def read(self, field: Vector, time_us: int) -> None:
+        """Take note of what a reading holds (nT); one that stays the same for long is announced."""
+        if field != self._field:
+            self._field, self._repeats, self._since_us = field, 0, time_us
+            if self._hangs:
+                self._hangs = False
+                self._announcer.state("reading", f"{self._name}'s readings change again")
+            return
+        self._repeats += 1
+        if not self._hangs and self._repeats >= SAME and time_us - self._since_us >= SAME_US:
+            self._hangs = True
+            text = f"{self._name} sends the same reading for {SAME_US // 1_000_000} s"
+            self._announcer.state("reading", text, MAV_SEVERITY.WARNING)
 
     def mumbled(self, time_us: int) -> None:
         """Take note of bytes that complete no reading."""

@@ -71,6 +71,16 @@ def test_an_instrument_that_sends_rarely_is_heard_each_time(bench: Bench) -> Non
     assert "ascii is silent" in bench.said
 
 
+def test_an_instrument_that_hangs_is_told(bench: Bench) -> None:
+    """After a minute, and that it changes again; a few readings that happen to be equal are none."""
+    for k in range(130):
+        z = -234.5 if 5 <= k < 30 or 40 <= k < 110 else float(k)
+        bench.hear(k, b"12340.5 43210.9 %.1f 4.0 %d 7\r\n" % (z, k))
+        hangs = [text for text in bench.said if "reading" in text]
+        assert len(hangs) == (k >= 100) + (k >= 110)
+    assert hangs == ["ascii sends the same reading for 60 s", "ascii's readings change again"]
+
+
 def test_an_instrument_that_speaks_otherwise_is_not_silent(bench: Bench) -> None:
     for k in range(21):
         bench.hear(k, b"$GPGGA,123519,4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,*47\r\n")
