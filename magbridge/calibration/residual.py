@@ -59,8 +59,8 @@ class Samples:
         Monomials of the positions.
     steps : (n,) array
         Sampling intervals since the previous sample; infinite where that belongs to another run.
-    unit : float
-        nT, F_0: ``A = I + a / F_0``.
+    F_0 : float
+        nT, the total field that the coefficients of A refer to: ``A = I + a / F_0``.
     kappa : float
         Noise of the reference divided by the sensor's.
     """
@@ -69,13 +69,13 @@ class Samples:
     reference: FloatArray
     phi: FloatArray
     steps: FloatArray
-    unit: float
+    F_0: float
     kappa: float = 0.0
 
     def part(self, rows: slice | NDArray[np.bool_] | NDArray[np.intp]) -> Samples:
         """Pick samples: an (n,) mask, places or a slice."""
         return Samples(
-            self.field[rows], self.reference[rows], self.phi[rows], self.steps[rows], self.unit, self.kappa
+            self.field[rows], self.reference[rows], self.phi[rows], self.steps[rows], self.F_0, self.kappa
         )
 
 
@@ -98,7 +98,7 @@ def residuals(samples: Samples, coefficients: FloatArray) -> tuple[FloatArray, F
         nT, monomial by monomial.
     """
     theta = samples.phi @ coefficients.reshape(-1, 9)
-    A = np.eye(3) + symmetric(theta[:, :6] / samples.unit)
+    A = np.eye(3) + symmetric(theta[:, :6] / samples.F_0)
     d = samples.field - theta[:, 6:]
     b = _times(A, d)
     F = np.sqrt((b * b).sum(axis=1))
@@ -116,7 +116,7 @@ def residuals(samples: Samples, coefficients: FloatArray) -> tuple[FloatArray, F
         g[:, slot] = z[:, i] * d[:, j] - k[:, 0] * w[:, i] * u[:, j]
         if i != j:
             g[:, slot] += z[:, j] * d[:, i] - k[:, 0] * w[:, j] * u[:, i]
-    g[:, :6] /= samples.unit
+    g[:, :6] /= samples.F_0
     g[:, 6:] = -_times(A, z)
     return e, g
 
@@ -148,7 +148,7 @@ def robust_scale(values: FloatArray) -> float:
 def scales_and_offsets(samples: Samples, coefficients: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Eigenvalues of A (n, 3) and size of T (n,), nT, at every sample."""
     theta = samples.phi @ coefficients.reshape(-1, 9)
-    A = np.eye(3) + symmetric(theta) / samples.unit
+    A = np.eye(3) + symmetric(theta) / samples.F_0
     return np.asarray(np.linalg.eigvalsh(A)), np.asarray(np.linalg.norm(theta[:, 6:], axis=1))
 
 

@@ -85,7 +85,7 @@ def test_normal_equations_in_pieces_are_those_of_all(
 def test_evidence_has_the_slope_it_says(glider: Gliders) -> None:
     exponents = full_order(2, 2)
     samples = polynomial_samples(glider(0).runs, exponents)
-    structure = free_structure(exponents, ("a", "b"), samples.unit)
+    structure = free_structure(exponents, ("a", "b"), samples.F_0)
     normal = normal_equations(samples, np.zeros(54))
     quadratic = Quadratic.about(np.zeros(54), normal, 2250.0)
     x = np.append(structure.centre, np.log(30.0))

@@ -75,7 +75,7 @@ def fit_auto(
     ranges = data.ranges()
     exponents = full_order(len(ranges), order)
     samples = polynomial_samples(data, exponents)
-    structure = free_structure(exponents, data.names, samples.unit)
+    structure = free_structure(exponents, data.names, samples.F_0)
     if vehicle:
         structure = mounted_structure(structure, exponents, ranges, vehicle)
     best = _best(samples, structure)

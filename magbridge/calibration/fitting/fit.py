@@ -240,7 +240,7 @@ def assemble(
             noise.memory,
             float(np.median(steps)) if steps.size else 0.0,
         ),
-        reference=Reference(samples.unit, data.model),
+        reference=Reference(samples.F_0, data.model),
         sensor=Sensor(data.sensor),
         runs=_runs(data, e),
         method=method,

@@ -51,28 +51,28 @@ def fit_horizontal(data: Observations, order: int = 0) -> Fit:  # noqa: ARG001  
     assert data.attitude is not None
     assert data.reference_ned is not None
     samples = nominal_samples(data)
-    unit = samples.unit
+    F_0 = samples.F_0
     level = Rotation.from_euler("YX", data.attitude[:, 1::-1])
     ned = data.reference_ned
     horizontal, vertical = np.hypot(ned[:, 0], ned[:, 1]), ned[:, 2]
     widths = np.array([SCALE_SIGMA] * 9 + [HARD_IRON_SIGMA] * 3)
 
     def misfit(x: FloatArray, sigma: float) -> FloatArray:
-        B, T = np.eye(3) + x[:9].reshape(3, 3), unit * x[9:]
+        B, T = np.eye(3) + x[:9].reshape(3, 3), F_0 * x[9:]
         l = level.apply((data.field - T) @ B.T)  # noqa: E741  (the notes' letter)
         parts = np.concatenate([np.hypot(l[:, 0], l[:, 1]) - horizontal, l[:, 2] - vertical])
         return np.concatenate([parts / sigma, x / widths])
 
-    sigma, x = FIRST_NOISE * unit, np.zeros(12)
+    sigma, x = FIRST_NOISE * F_0, np.zeros(12)
     for _ in range(3):
         found = least_squares(misfit, x, args=(sigma,), loss="soft_l1", f_scale=3.0)
         x = found.x
         sigma = float(np.sqrt(np.mean((misfit(x, sigma)[:-12] * sigma) ** 2)))
     covariance = np.linalg.inv(found.jac.T @ found.jac)
     map_ = np.array(
-        [(_coefficients(x + h, unit) - _coefficients(x - h, unit)) / 2e-6 for h in 1e-6 * np.eye(12)]
+        [(_coefficients(x + h, F_0) - _coefficients(x - h, F_0)) / 2e-6 for h in 1e-6 * np.eye(12)]
     ).T
-    coefficients = _coefficients(x, unit)
+    coefficients = _coefficients(x, F_0)
     check_scales(samples, coefficients)
     noise = estimate_noise(residuals_of(samples, coefficients), samples.steps, 9.0)
     return assemble(
@@ -81,8 +81,8 @@ def fit_horizontal(data: Observations, order: int = 0) -> Fit:  # noqa: ARG001  
     )  # fmt: skip
 
 
-def _coefficients(x: FloatArray, unit: float) -> FloatArray:
+def _coefficients(x: FloatArray, F_0: float) -> FloatArray:
     """Return the nine coefficients (nT) for B and T: A of ``B = R A``, and T."""
     _, A = polar(np.eye(3) + x[:9].reshape(3, 3))
-    a = unit * (A - np.eye(3))
-    return np.concatenate([a[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]], unit * x[9:]])
+    a = F_0 * (A - np.eye(3))
+    return np.concatenate([a[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]], F_0 * x[9:]])

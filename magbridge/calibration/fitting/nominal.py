@@ -95,11 +95,11 @@ def nominal(
         E[2, 0] = 1.0
     keep = [s for s in range(9) if not (axes_fixed and s in {3, 4, 5}) and not (equal_xz and s == 2)]
     E = E[:, keep]
-    prior = Prior(_precision(E, scale_sigma, gain_sigma) / samples.unit**2, E)
+    prior = Prior(_precision(E, scale_sigma, gain_sigma) / samples.F_0**2, E)
     best = None
     for start in starts(samples):
         z = np.asarray(np.linalg.lstsq(E, start, rcond=None)[0], float)
-        noise = NoiseModel(1e-3 * samples.unit)  # wide at first: far from the answer, residuals are not noise
+        noise = NoiseModel(1e-3 * samples.F_0)  # wide at first: far from the answer, residuals are not noise
         for _ in range(4):
             found = gauss_newton(samples, prior, noise, z)
             z = found.z
@@ -135,7 +135,7 @@ def starts(samples: Samples) -> list[FloatArray]:
     ``|h|^2 = 2 h^T T + (F^2 - |T|^2)`` is linear in T and one constant.
     """
     h = samples.field
-    design = np.column_stack([2.0 * h, np.full(len(h), samples.unit)])
+    design = np.column_stack([2.0 * h, np.full(len(h), samples.F_0)])
     scale = np.abs(design).max(axis=0) + 1e-300
     right = (h * h).sum(axis=1) - samples.reference**2
     # a weak ridge holds the directions that the samples do not determine
@@ -156,11 +156,11 @@ def check_scales(samples: Samples, coefficients: FloatArray) -> None:
     seen = samples.part(slice(None, None, max(len(samples.phi) // 1000, 1)))
     scales, T = scales_and_offsets(seen, coefficients)
     worst = int(
-        np.argmax(np.maximum(np.abs(np.log2(np.maximum(scales, 1e-3))).max(axis=1), T / (2.0 * samples.unit)))
+        np.argmax(np.maximum(np.abs(np.log2(np.maximum(scales, 1e-3))).max(axis=1), T / (2.0 * samples.F_0)))
     )
-    if scales[worst, 0] < 0.5 or scales[worst, 2] > 2.0 or T[worst] / samples.unit > 2.0:
+    if scales[worst, 0] < 0.5 or scales[worst, 2] > 2.0 or T[worst] / samples.F_0 > 2.0:
         listed = ", ".join(f"{value:.3g}" for value in scales[worst])
         raise CalibrationError(
             f"the fit collapsed: scales {listed} (expected near 1), offset {T[worst]:.0f} nT in a field of "
-            f"{samples.unit:.0f} nT; there are too few attitudes to tell scale from offset"
+            f"{samples.F_0:.0f} nT; there are too few attitudes to tell scale from offset"
         )

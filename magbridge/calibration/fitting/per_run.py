@@ -46,7 +46,7 @@ def fit_per_run(data: Observations, order: int = 3) -> Fit:
     samples = polynomial_samples(data, exponents)
     single = nominal_samples(data)
     middle, _, noise = nominal(data)
-    prior = Prior(np.diag((WIDTHS * samples.unit) ** -2.0), np.eye(9), middle)
+    prior = Prior(np.diag((WIDTHS * samples.F_0) ** -2.0), np.eye(9), middle)
     size = 9 * len(exponents)
     precision, right, runs = np.eye(size) / ANYTHING**2, np.zeros(size), 0
     assert data.runs is not None

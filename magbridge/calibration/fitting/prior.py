@@ -82,7 +82,7 @@ def gain_rotation() -> FloatArray:
     return np.array([[1, 1, 1], [1, -1, 0], [1, 1, -2]]).T / np.sqrt([3.0, 2.0, 6.0])
 
 
-def free_structure(exponents: tuple[Exponents, ...], names: tuple[str, ...], unit: float) -> Structure:
+def free_structure(exponents: tuple[Exponents, ...], names: tuple[str, ...], F_0: float) -> Structure:
     """Return the structure of polynomials with physical widths, the masses' places being unknown.
 
     Parameters
@@ -91,11 +91,11 @@ def free_structure(exponents: tuple[Exponents, ...], names: tuple[str, ...], uni
         The monomials; the constant one first.
     names : tuple of str
         Of the parameters.
-    unit : float
-        nT, F_0.
+    F_0 : float
+        nT, as in :class:`~magbridge.calibration.residual.Samples`.
     """
     labels = ["gain", "soft iron", "hard iron"]
-    centre = [np.log(np.sqrt(3.0) * GAIN * unit), np.log(SOFT_IRON * unit), np.log(HARD_IRON)]
+    centre = [np.log(np.sqrt(3.0) * GAIN * F_0), np.log(SOFT_IRON * F_0), np.log(HARD_IRON)]
     spread = [FACTOR_FIXED] * 3
     for name in names:
         labels += [f"{name} in T", f"{name} in A", f"{name} travel over distance"]
