@@ -14,7 +14,7 @@ from magbridge.link.outbox import Outbox
 from magbridge.link.parameter_service import ParameterService
 from magbridge.link.parameters import Parameters, Tunable, rate_name, rates
 from magbridge.link.publish import PUBLISHED, Publisher
-from magbridge.link.rates import Rate
+from magbridge.link.rates import Rate, period_us
 from magbridge.link.reports import Condition, Reports
 from magbridge.link.timers import Timers
 from magbridge.link.vehicle import Vehicle
@@ -33,6 +33,8 @@ LIMITS = {
 """The messages whose rate (Hz) can be set, and within which limits."""
 DEFAULTS = {"HEARTBEAT": 1.0, "MAG_STATUS": 1.0, "MAG_NAVIGATION": 0.0}
 TIMESYNC_US = 1_000_000
+LONGEST_US = 0x7FFFFFFF
+"""µs, 36 min: the longest interval that a MESSAGE_INTERVAL holds."""
 
 
 def check_publish(publish: Mapping[str, float], path: Path) -> None:
@@ -208,7 +210,7 @@ class Component:
         hertz = self.rates[name].hertz
         if hertz > 0:
             report = self._by_clock[name]
-            self.timers.every(name, round(1e6 / hertz), lambda _: report(), first_us)
+            self.timers.every(name, period_us(hertz), lambda _: report(), first_us)
         else:
             self.timers.cancel(name)
 
@@ -230,9 +232,10 @@ class Component:
 
     def _interval_us(self, number: int) -> int:
         hertz = self.rates[name_of(number)].hertz
-        if hertz == 0:
-            return self._reports.sample_interval_us()
-        return round(1e6 / hertz) if hertz > 0 else -1
+        interval_us = (
+            period_us(hertz) if hertz > 0 else -1 if hertz < 0 else self._reports.sample_interval_us()
+        )
+        return min(interval_us, LONGEST_US)
 
     def _set_rate(self, number: int, hertz: float | None) -> bool:
         parameter = rate_name(name_of(number))

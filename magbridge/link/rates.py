@@ -2,7 +2,15 @@
 
 from __future__ import annotations
 
-__all__ = ["Rate"]
+__all__ = ["Rate", "period_us"]
+
+NEVER_US = 1e15
+"""µs, 31 years: a longer period is none."""
+
+
+def period_us(hertz: float) -> int:
+    """Return the µs between two messages at a rate above 0, which may be 1e-300 Hz."""
+    return round(min(1e6 / hertz, NEVER_US))
 
 
 class Rate:
@@ -22,7 +30,7 @@ class Rate:
     def set(self, hertz: float) -> None:
         """Change the rate; the next sample goes out."""
         self.hertz = hertz
-        self._period_us = round(1e6 / hertz) if hertz > 0 else 0
+        self._period_us = period_us(hertz) if hertz > 0 else 0
         self._next_us = 0
 
     def due(self, t_us: int) -> bool:

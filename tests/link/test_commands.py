@@ -75,6 +75,13 @@ def test_intervals_that_are_refused(link, message, interval):
     assert link.component.parameters.changed() == before
 
 
+@pytest.mark.parametrize("message", [HIGHRES_IMU, STATUS])
+def test_an_interval_of_an_age_is_kept(link, message):
+    """MESSAGE_INTERVAL holds 36 minutes."""
+    assert result(link, ask(link, SET, message, 1e38)) == ACCEPTED
+    assert link.only(ask(link, GET, message), "MESSAGE_INTERVAL")[0].interval_us == 0x7FFFFFFF
+
+
 def test_interval_of_a_message_we_do_not_send(link):
     assert link.only(ask(link, GET, 24), "MESSAGE_INTERVAL")[0].interval_us == 0
     assert result(link, ask(link, GET, 70_000)) == DENIED
