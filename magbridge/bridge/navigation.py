@@ -158,7 +158,7 @@ class Navigation:
             covariance_ee=at.covariance_ee,
             north=north,
             east=east,
-            resets=len(self.navigator.jumps),
+            resets=len(self.navigator.estimate.jumps),
         )
         self._fix.send(component.outbox, fix, *component.peer)
 

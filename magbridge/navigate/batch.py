@@ -93,7 +93,8 @@ def navigate(
     def keep(record: Record | None) -> None:
         if record is not None:
             records.append(record)
-            states.append((navigator.x, navigator.P, *navigator.moved, len(navigator.jumps)))
+            now = navigator.estimate
+            states.append((now.x, now.P, *now.moved, len(now.jumps)))
 
     time_us = np.round(time * 1e6).astype(np.int64)
     navigator.fix(int(time_us[0]) - 1, latitude, longitude)
@@ -109,7 +110,7 @@ def navigate(
     result.attrs = {"source": source, "map": grid.name, "motion": motion}
     known = reference_track(deployment, frozenset(MOTIONS[motion]))
     result = with_errors(result, known)
-    findings = findings_of(result, grid, options, navigator.jumps, known)
+    findings = findings_of(result, grid, options, navigator.estimate.jumps, known)
     return result.assign_attrs(findings="\n".join(findings))
 
 

@@ -45,7 +45,11 @@ class Estimate:
 
     Attributes
     ----------
+    options : Options
+        As given, but with a wider constant error of the field once the filter was lost.
     state : State
+    time_us : int
+        µs, of the last start, fix or measurement.
     x, P : ndarray, (6,), (6, 6)
         Estimate and covariance, of :mod:`~magbridge.navigate.model`'s states.
     vouched : bool
@@ -65,7 +69,7 @@ class Estimate:
         self.vouched = False
         self.moved = np.eye(6), np.zeros((6, 6))
         self.jumps: list[Jump] = []
-        self._time_us, self._travelled = 0, 0.0
+        self.time_us, self._travelled = 0, 0.0
         self._filter: Tracker | Bank | None = None
         self._monitor: IntegrityMonitor | None = None
         self._unmapped = Unmapped(grid, options)
@@ -76,6 +80,11 @@ class Estimate:
         self._searches = 0
         self._confirmed = False  # rivals that began wider have come to the same place
         self._described = False  # the map has described the field
+
+    @property
+    def begun(self) -> bool:
+        """Whether a measurement has been taken in."""
+        return self._filter is not None
 
     @property
     def odds(self) -> float:
@@ -89,7 +98,7 @@ class Estimate:
 
     def start(self, time_us: int, sigma: float) -> None:
         """Begin at the dead-reckoned position, known to `sigma` m on each axis."""
-        self._time_us = time_us
+        self.time_us = time_us
         self.x, self.P = prior(self.options, sigma)
         self._alone = self.P[:4, :4].copy()
         self._confirmed = sigma >= self._reach()
@@ -135,8 +144,8 @@ class Estimate:
 
     def predict(self, time_us: int, travelled: float) -> tuple[float, float]:
         """Propagate to `time_us`, `travelled` m after the start; return the seconds and metres passed."""
-        seconds, metres = (time_us - self._time_us) * 1e-6, travelled - self._travelled
-        self._time_us, self._travelled = time_us, travelled
+        seconds, metres = (time_us - self.time_us) * 1e-6, travelled - self._travelled
+        self.time_us, self._travelled = time_us, travelled
         F, Q = transition(self.options, seconds, metres)
         self._alone = F[:4, :4] @ self._alone @ F[:4, :4].T + Q[:4, :4]
         self.moved = F, Q
@@ -178,7 +187,7 @@ class Estimate:
 
     def _jump(self, x: Array, cause: str) -> None:
         north, east = (x[:2] - self.x[:2]).tolist()
-        self.jumps.append(Jump(self._time_us, north, east, widest(self._alone), cause))
+        self.jumps.append(Jump(self.time_us, north, east, widest(self._alone), cause))
         self._monitor, self._confirmed = None, False
 
     def _judge(self, block: Block, seconds: float, metres: float, likelihood: float) -> None:

@@ -32,7 +32,7 @@ FRESH = 3.0
 """Intervals: no position is dead-reckoned from an update older than that."""
 
 
-class Navigator(Estimate):
+class Navigator:
     """Position from the total field and a map, around a dead-reckoned track.
 
     Parameters
@@ -42,6 +42,8 @@ class Navigator(Estimate):
 
     Attributes
     ----------
+    estimate : Estimate
+        The position around the dead-reckoned track, and whether to trust it.
     dropped : int
         Number of samples that were dropped because they came out of time order.
     utc_offset_us : int
@@ -49,10 +51,11 @@ class Navigator(Estimate):
     """
 
     def __init__(self, grid: AnomalyGrid, options: Options | None = None) -> None:
-        super().__init__(grid, options or Options())
+        options = options or Options()
+        self.estimate = Estimate(grid, options)
         self.dropped = self.utc_offset_us = 0
         self._reckoning = DeadReckoning()
-        self._collector = Collector(self.options, block_length(grid))
+        self._collector = Collector(options, block_length(grid))
         self._latest_us = 0
 
     def fix(
@@ -71,17 +74,19 @@ class Navigator(Estimate):
         """
         if not (isfinite(latitude) and isfinite(longitude)):
             return None
-        sigma = self.options.start_sigma if sigma is None else sigma
+        sigma = self.estimate.options.start_sigma if sigma is None else sigma
         self._reckoning.advance(time_us * 1e-6)
-        if self._filter is None:
+        if not self.estimate.begun:
             self._reckoning.place(latitude, longitude)
             self._collector.flush()  # drops samples that were taken at another place
-            self.start(time_us, sigma)
+            self.estimate.start(time_us, sigma)
             return None
         record = self.finish()
         where = self._reckoning
-        self.predict(time_us, where.travelled)
-        self.correct(np.array(separation(where.latitude, where.longitude, latitude, longitude)), sigma)
+        self.estimate.predict(time_us, where.travelled)
+        self.estimate.correct(
+            np.array(separation(where.latitude, where.longitude, latitude, longitude)), sigma
+        )
         return record
 
     def telemetry(self, time_us: int, **values: float) -> None:
@@ -99,7 +104,7 @@ class Navigator(Estimate):
 
         A sample that is NaN, not later than the previous one, or before any position is ignored.
         """
-        if self.state is State.OFF or not isfinite(total_field + sigma):
+        if self.estimate.state is State.OFF or not isfinite(total_field + sigma):
             return None
         if time_us <= self._latest_us:
             self.dropped += 1
@@ -120,26 +125,28 @@ class Navigator(Estimate):
 
         None if the filter does not vouch for it: the last update was not vouched for, or is too long ago.
         """
-        elapsed = (time_us - self._time_us) * 1e-6
-        if not self.vouched or elapsed > FRESH * self.options.interval:
+        last = self.estimate
+        elapsed = (time_us - last.time_us) * 1e-6
+        if not last.vouched or elapsed > FRESH * last.options.interval:
             return None
-        F, Q = transition(self.options, max(elapsed, 0.0), 0.0)
-        x, P = F @ self.x, F @ self.P @ F.T + Q
-        if widest(P) > self.options.vouch_sigma:
+        F, Q = transition(last.options, max(elapsed, 0.0), 0.0)
+        x, P = F @ last.x, F @ last.P @ F.T + Q
+        if widest(P) > last.options.vouch_sigma:
             return None
         place = offset(*self._reckoning.ahead(time_us * 1e-6), float(x[0]), float(x[1]))
         (nn, ne), (_, ee) = P[:2, :2].tolist()
         return Reckoned(time_us, *place, nn, ne, ee)
 
     def _update(self, block: Block) -> Record:
-        seen = self.update(block, self._reckoning.travelled)
-        north, east, current_north, current_east, bias, map_error = self.x.tolist()
+        now = self.estimate
+        seen = now.update(block, self._reckoning.travelled)
+        north, east, current_north, current_east, bias, map_error = now.x.tolist()
         latitude, longitude = offset(block.latitude, block.longitude, north, east)
-        (nn, ne), (_, ee) = self.P[:2, :2].tolist()
+        (nn, ne), (_, ee) = now.P[:2, :2].tolist()
         return Record(
             time_us=block.time_us,
-            state=self.state,
-            vouched=self.vouched,
+            state=now.state,
+            vouched=now.vouched,
             latitude=latitude,
             longitude=longitude,
             covariance_nn=nn,
@@ -147,18 +154,18 @@ class Navigator(Estimate):
             covariance_ee=ee,
             innovation=seen.value,
             innovation_variance=seen.variance,
-            gate=self.options.gate,
+            gate=now.options.gate,
             accepted=seen.accepted,
             depth=block.depth,
             anomaly=block.anomaly,
             map_anomaly=seen.anomaly,
             bias=bias,
-            bias_sigma=sqrt(self.P[4, 4]),
+            bias_sigma=sqrt(now.P[4, 4]),
             map_error=map_error,
             current_north=current_north,
             current_east=current_east,
             north=north,
             east=east,
-            hypotheses=self.hypotheses,
-            odds=self.odds,
+            hypotheses=now.hypotheses,
+            odds=now.odds,
         )

@@ -105,11 +105,11 @@ def test_samples_that_cannot_be_used(grid, options):
 
 def test_nothing_before_a_start(grid):
     nav = Navigator(grid)
-    assert nav.state is State.OFF
+    assert nav.estimate.state is State.OFF
     nav.telemetry(START_US, heading=0.0, speed=0.35)
     nav.fix(START_US, np.nan, 1.0)
     assert nav.measure(START_US + 4_000_000, 52_300.0, 1.0) is None
-    assert nav.state is State.OFF
+    assert nav.estimate.state is State.OFF
 
 
 def test_a_fix_is_taken_in_and_a_contradiction_believed(grid, options, ds):
@@ -118,12 +118,14 @@ def test_a_fix_is_taken_in_and_a_contradiction_believed(grid, options, ds):
     t = records[-1].time_us + 30_000_000
     near = offset(records[-1].latitude, records[-1].longitude, 20.0, 0.0)
     nav.fix(t, *near, 5.0)
-    assert np.sqrt(nav.P[0, 0]) < 6.0
-    assert not nav.jumps
+    assert np.sqrt(nav.estimate.P[0, 0]) < 6.0
+    assert not nav.estimate.jumps
     far = offset(*near, 3000.0, -2000.0)
     nav.fix(t + 1_000_000, *far, 5.0)
-    assert nav.jumps[0].cause == "a fix contradicts the filter"
-    assert (nav.jumps[0].north, nav.jumps[0].east) == pytest.approx((3000.0, -2000.0), abs=30.0)
+    assert nav.estimate.jumps[0].cause == "a fix contradicts the filter"
+    assert (nav.estimate.jumps[0].north, nav.estimate.jumps[0].east) == pytest.approx(
+        (3000.0, -2000.0), abs=30.0
+    )
 
 
 def test_off_the_map_it_reckons(study, grid, options, ds):
@@ -133,7 +135,7 @@ def test_off_the_map_it_reckons(study, grid, options, ds):
     assert np.isnan(small.look_up(PLACE[1], PLACE[0]).anomaly)
     assert {r.state for r in records} <= {State.DEAD_RECKONING, State.SEARCHING}
     assert not any(r.vouched for r in records)
-    assert nav.P[0, 0] > options.start_sigma**2
+    assert nav.estimate.P[0, 0] > options.start_sigma**2
 
 
 def test_a_flat_map_says_nothing(grid, options, ds):

@@ -238,7 +238,7 @@ def sail(ds: xr.Dataset, grid: AnomalyGrid, options: Options) -> Run:
         navigator.telemetry(round(1e6 * (t - every)), **motion)
         record = navigator.measure(round(1e6 * t), field, sigma)
         if record is not None:
-            place, spread = navigator.x[:2], navigator.P[:2, :2].ravel()
+            place, spread = navigator.estimate.x[:2], navigator.estimate.P[:2, :2].ravel()
             found.append((record.time_us * 1e-6, *place, *spread, record.state, record.vouched))
     seconds = clock.process_time() - begun
     table = np.array(found, float)
