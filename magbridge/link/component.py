@@ -232,10 +232,9 @@ class Component:
 
     def _interval_us(self, number: int) -> int:
         hertz = self.rates[name_of(number)].hertz
-        interval_us = (
-            period_us(hertz) if hertz > 0 else -1 if hertz < 0 else self._reports.sample_interval_us()
-        )
-        return min(interval_us, LONGEST_US)
+        if hertz < 0:
+            return -1
+        return min(period_us(hertz) if hertz else self._reports.sample_interval_us(), LONGEST_US)
 
     def _set_rate(self, number: int, hertz: float | None) -> bool:
         parameter = rate_name(name_of(number))

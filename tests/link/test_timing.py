@@ -35,6 +35,7 @@ def test_all_none_and_too_fast():
     times = [START + 10_000 * i for i in range(100)]
     assert passed(Rate(0), times) == times
     assert passed(Rate(-1), times) == []
+    assert passed(Rate(1e-320), times) == times[:1]
     assert passed(Rate(1000), times) == times
 
 
