@@ -8,7 +8,7 @@ from statistics import median
 
 import msgspec
 import numpy as np
-from benchmarks.apart import apart, spent
+from benchmarks.measure import in_own_process, processor_time
 from benchmarks.row import Row
 from scipy.optimize import least_squares
 from threadpoolctl import threadpool_limits
@@ -48,11 +48,13 @@ def fitting(folder: Path, repetitions: int) -> list[Row]:  # noqa: ARG001  (the 
     fit(data)
     with threadpool_limits(1):
         for _ in range(repetitions):
-            ours.append(spent(lambda: fit(data)))
+            ours.append(processor_time(lambda: fit(data)))
             theirs.append(
-                spent(lambda: least_squares(lambda c: residuals_of(samples, c), np.zeros(90), method="lm"))
+                processor_time(
+                    lambda: least_squares(lambda c: residuals_of(samples, c), np.zeros(90), method="lm")
+                )
             )
-    (few, _), (all_, memory) = (apart(IN_ANOTHER, count) for count in LARGE)
+    (few, _), (all_, memory) = (in_own_process(IN_ANOTHER, count) for count in LARGE)
     return [
         Row(f"auto, {len(data)} samples, 2 masses, one core", median(ours), "s", most=1.0),
         Row("the same by scipy, finite differences, no hyperparameters", median(theirs), "s", median(ours),
@@ -104,7 +106,7 @@ def correcting(folder: Path, repetitions: int) -> list[Row]:  # noqa: ARG001
     with threadpool_limits(1):
         for _ in range(repetitions):
             for name, (job, samples) in jobs.items():
-                found[name].append(1e6 * spent(job) / samples)
+                found[name].append(1e6 * processor_time(job) / samples)
 
     def beside(what: str, floor: str, said: str, **target: float) -> Row:
         ratio = median(b / a for a, b in zip(found["moving"], found[floor], strict=True))

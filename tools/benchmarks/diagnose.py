@@ -7,7 +7,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import xarray as xr
-from benchmarks.apart import apart
+from benchmarks.measure import in_own_process
 from benchmarks.row import Row
 
 from magbridge.calibration.fitting.columns import observations
@@ -39,7 +39,7 @@ print(json.dumps([time.monotonic() - begun, time.process_time() - used, len(foun
 def diagnosing(folder: Path, repetitions: int) -> list[Row]:  # noqa: ARG001  (others write there and repeat)
     """Time `diagnose` without its figures: 12 h and 30 days, plain and with an effect."""
     night, found, month, loud = (
-        apart(IN_ANOTHER, 12, count, size)
+        in_own_process(IN_ANOTHER, 12, count, size)
         for size, count in ((0.0, 0), (NIGHTLY, 0), (0.0, MONTH), (MONTHLY, MONTH))
     )
     fields = ("seconds", "processor seconds", "samples", "verdict", "causes", "MB")

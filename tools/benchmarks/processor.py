@@ -13,7 +13,7 @@ from functools import partial
 from pathlib import Path
 from statistics import median
 
-from benchmarks.apart import spent
+from benchmarks.measure import processor_time
 from benchmarks.peer import Peer
 from benchmarks.row import Row
 from benchmarks.workload import BEGIN_US, Feed, write_config
@@ -96,14 +96,14 @@ def _times(folder: Path, repetitions: int, *, moving: bool) -> tuple[dict[str, l
     for repetition in range(repetitions + 1):
         events = list(feed.events(SECONDS, HERTZ, BEGIN_US + repetition * SECONDS * 1_000_000))
         edge = Edge(events)
-        bridge = spent(partial(live, edge))
+        bridge = processor_time(partial(live, edge))
         heard = [event.data for event in events if event.channel is Channel.LINK]
         sent = peer.arguments(bytes(edge.sent))
         kept = [peer.sensor_bytes(event.data) for event in events if event.channel is Channel.SENSOR]
         floors = (partial(peer.decode, heard), partial(peer.encode, sent), partial(peer.encode, kept))
         if repetition:  # the first one warms up
             messages += len(sent)
-            for name, seconds in zip(times, (bridge, *map(spent, floors)), strict=True):
+            for name, seconds in zip(times, (bridge, *map(processor_time, floors)), strict=True):
                 times[name].append(1e6 * seconds / samples)
     log.close()
     gc.unfreeze()

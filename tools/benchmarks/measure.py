@@ -1,4 +1,4 @@
-"""Measurements in a process of their own, where the peak memory is of nothing else; and of processor time."""
+"""Measuring: in a process of its own, whose peak memory is of nothing else; and processor time."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-__all__ = ["apart", "spent"]
+__all__ = ["in_own_process", "processor_time"]
 
 
-def apart(script: str, *arguments: object) -> Any:
+def in_own_process(script: str, *arguments: object) -> Any:
     """Run a script, which finds the arguments in ``sys.argv``; return what it prints as JSON."""
     command = [sys.executable, "-c", script, *map(str, arguments)]
     place = Path(__file__).parents[1]
@@ -21,7 +21,7 @@ def apart(script: str, *arguments: object) -> Any:
     return json.loads(done.stdout)
 
 
-def spent(work: Callable[[], object]) -> float:
+def processor_time(work: Callable[[], object]) -> float:
     """Return the processor time, in s, that `work` takes in all threads."""
     begun = time.process_time()
     work()
