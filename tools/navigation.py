@@ -50,11 +50,23 @@ import numpy as np
 from msgspec.structs import replace as with_options
 from scipy.stats import chi2
 from terminal import command_line
-from voyages.beside import magnav, stone_soup
 from voyages.calibrated import METHODS, flown
 from voyages.dived import dived
 from voyages.lost import LEVEL, carried, half, level, misled
-from voyages.sail import AT_HOURS, GLIDER, LEFT, PLACE, SPEEDS, START, Map, Score, sail, synthetic, voyage
+from voyages.others import magnav, stone_soup
+from voyages.simulated import (
+    AT_HOURS,
+    GLIDER,
+    LEFT,
+    PLACE,
+    SPEEDS,
+    START,
+    Map,
+    Score,
+    sail,
+    synthetic,
+    voyage,
+)
 
 from magbridge.navigate.batch import navigate
 from magbridge.navigate.model import Block, prior, transition

@@ -16,10 +16,10 @@ from magbridge.navigate.model import Options
 
 @pytest.fixture(scope="session")
 def study() -> Iterator[ModuleType]:
-    """tools/voyages/sail.py, with the others beside it."""
+    """tools/voyages/simulated.py, with the others beside it."""
     tools = str(Path(__file__).parents[2] / "tools")
     sys.path.insert(0, tools)
-    yield import_module("voyages.sail")
+    yield import_module("voyages.simulated")
     sys.path.remove(tools)
 
 

@@ -17,7 +17,7 @@ from magbridge.navigate.model import informed
 from sitl import load, segments, simulate
 from sitl.bonne_bay import MASSES, METHODS
 from sitl.columns import at_rest
-from voyages.sail import GLIDER, PLACE, Map, Score, adrift, sail, synthetic
+from voyages.simulated import GLIDER, PLACE, Map, Score, adrift, sail, synthetic
 
 
 class Flown(NamedTuple):

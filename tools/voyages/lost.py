@@ -7,7 +7,7 @@ from msgspec.structs import replace as with_options
 from numpy.typing import NDArray
 
 from magbridge.field.grid import AnomalyGrid
-from voyages.sail import GLIDER, OUTSIDE, SPEEDS, Map, Run, longest, sail, synthetic, voyage
+from voyages.simulated import GLIDER, OUTSIDE, SPEEDS, Map, Run, longest, sail, synthetic, voyage
 
 LEVEL = 60.0
 """nT by which the field is measured too large."""

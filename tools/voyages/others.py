@@ -1,4 +1,4 @@
-"""Comparison with others: Stone Soup on our measurements, and our navigator on MagNav.jl's flight."""
+"""Other programs: Stone Soup on our measurements, and our navigator on MagNav.jl's flight."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from magbridge.field.igrf import total_field
 from magbridge.field.read import read_grid
 from magbridge.navigate.batch import navigate
 from magbridge.navigate.model import Options, prior, transition
-from voyages.sail import PLACE, START, Map, blocks, sail, synthetic, voyage
+from voyages.simulated import PLACE, START, Map, blocks, sail, synthetic, voyage
 
 
 def stone_soup(python: str, kind: Map, glider: Options, share: float, seed: int) -> tuple[float, ...]:
