@@ -1,6 +1,6 @@
-"""The paper's own mystery: calibrated at -10 degC, surveyed at +2 degC, and what ``diagnose`` says.
+"""The paper's trials, calibrated at -10 degC and surveyed at +2 degC: what ``diagnose`` finds.
 
-    python tools/headline.py --seeds 3
+    python tools/bonne_bay_diagnosis.py --seeds 3
 
 Prints, beside the paper, the twin's survey error before and after, against the true field. The detector has
 no hint that the cause is a temperature.
