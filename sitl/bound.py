@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -27,6 +27,21 @@ def oracle(vehicle: Vehicle, deployment: xr.Dataset) -> Array:
     D, T = _response(vehicle, deployment)
     raw = channels(deployment)
     return np.asarray(np.linalg.norm(np.linalg.solve(D, (raw - T)[..., None])[..., 0], axis=1))
+
+
+class _Posterior(NamedTuple):
+    """What the calibration data tell of the k parameters θ, each in units of its prior's width."""
+
+    covariance: Array
+    """(k, k), of θ."""
+    calibration: Array
+    """(m, k), g of the calibration's samples, whitened."""
+    whiten: Callable[[Array], Array]
+    """Whitens columns (m, j), nT, on the calibration's samples."""
+    survey: Array
+    """(n, k), nT, of the survey's corrected magnitude by θ."""
+    floor: Array
+    """(n,), nT, the noise of the survey's corrected magnitude."""
 
 
 def information_bound(
@@ -67,8 +82,9 @@ def information_bound(
     noise's memory, the information is :math:`\sum \mathbf g \mathbf g^T` plus the prior's (Kay 1993,
     *Estimation Theory*, ch. 3 and 15).
     """
-    covariance, _, _, h, floor = _posterior(vehicle, calibration, survey, sigma, memory, at_sigma)
-    return np.sqrt(np.einsum("ni,ij,nj->n", h, covariance, h) + floor**2), floor
+    known = _posterior(vehicle, calibration, survey, sigma, memory, at_sigma)
+    h, floor = known.survey, known.floor
+    return np.sqrt(np.einsum("ni,ij,nj->n", h, known.covariance, h) + floor**2), floor
 
 
 def informed_error(
@@ -92,12 +108,13 @@ def informed_error(
     centre is :math:`\mathbf p` of its widths off the truth,
     :math:`dθ = P (\mathbf g^T \mathbf e + \mathbf p)`.
     """
-    covariance, g, whiten, h, _ = _posterior(vehicle, calibration, survey, sigma, memory, at_sigma)
+    known = _posterior(vehicle, calibration, survey, sigma, memory, at_sigma)
     noise, after = (
         oracle(vehicle, part) - part["truth_total_field"].to_numpy() for part in (calibration, survey)
     )
-    off = covariance @ (g.T @ whiten(noise[:, None])[:, 0] + rng.normal(size=len(covariance)))
-    return np.asarray(after - h @ off)
+    whitened = known.whiten(noise[:, None])[:, 0]
+    off = known.covariance @ (known.calibration.T @ whitened + rng.normal(size=len(known.covariance)))
+    return np.asarray(after - known.survey @ off)
 
 
 def _posterior(
@@ -107,8 +124,8 @@ def _posterior(
     sigma: float,
     memory: float,
     at_sigma: float,
-) -> tuple[Array, Array, Callable[[Array], Array], Array, Array]:
-    """Return θ's covariance in units of its prior, g and its whitening, the survey's g and floor (nT)."""
+) -> _Posterior:
+    """Return what the calibration data tell; arguments as for :func:`information_bound`."""
     g, floor = _sensitivity(vehicle, calibration, sigma)
     follows = (np.diff(calibration["run"].to_numpy(), prepend=np.nan) == 0)[:, None]
     phi = np.exp(-1 / memory) if memory else 0.0
@@ -124,7 +141,7 @@ def _posterior(
     g = whiten(g) * scale  # θ in units of its prior: the information matrix is then well scaled
     covariance = np.linalg.inv(g.T @ g + np.eye(len(scale)))
     h, survey_floor = _sensitivity(vehicle, survey, sigma)
-    return covariance, g, whiten, h * scale, survey_floor
+    return _Posterior(covariance, g, whiten, h * scale, survey_floor)
 
 
 def _sensitivity(vehicle: Vehicle, deployment: xr.Dataset, sigma: float) -> tuple[Array, Array]:
