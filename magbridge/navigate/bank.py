@@ -72,7 +72,7 @@ class Bank:
         self._elsewhere = float(np.nanmean(grid.anomaly)), float(np.nanvar(grid.anomaly))
         self._updates = 0
         self.resolution = self.finest = resolution
-        self.blur = 0.0
+        self.curvature_variance = 0.0
         """nT², variance that the map's curvature within the hypotheses added to the last measurement's."""
         self.w, self.x, self.P = self._cut(x, P)
         if level**2 > P[4, 4]:
@@ -136,7 +136,7 @@ class Bank:
         c, d = hne * pnn + hee * pne, hne * pne + hee * pee
         anomaly += block.slope_north * north + block.slope_east * east + 0.5 * (a + d)
         bent = 0.5 * (a * a + 2.0 * b * c + d * d)
-        self.blur = float(self.w @ bent)
+        self.curvature_variance = float(self.w @ bent)
         v = v + block.variance + bent
         slopes = np.where(off, 0.0, (gn + block.slope_north, ge + block.slope_east))
         gain = slopes[0] * self.P[0] + slopes[1] * self.P[1] + self.P[4] + self.P[5]

@@ -193,7 +193,7 @@ class Estimate:
     def _judge(self, block: Block, seconds: float, metres: float, likelihood: float) -> None:
         """Compare the filter with its rivals, and replace it if one of them has won."""
         assert self._filter is not None
-        unmapped = self._unmapped.update(block, seconds, metres, self._filter.blur)
+        unmapped = self._unmapped.update(block, seconds, metres, self._filter.curvature_variance)
         self._nowhere = max(self._nowhere + unmapped - likelihood, -log(self.options.doubt))
         if self._nowhere > log(self.options.doubt):
             self._search_anew()

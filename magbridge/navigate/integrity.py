@@ -68,11 +68,12 @@ class Unmapped:
         self._x = 0.0, 0.0
         self._p = self._value, 0.0, self._slope
 
-    def update(self, block: Block, seconds: float, metres: float, blur: float) -> float:
-        """Take in a measurement so long and so far after the previous one; return its log-likelihood.
+    def update(self, block: Block, seconds: float, metres: float, curvature_variance: float) -> float:
+        """Take in a measurement, `seconds` and `metres` after the previous one; return its log-likelihood.
 
-        `blur` (nT²) is the variance that the filter adds to the measurement's for the map's curvature. It is
-        added here too; else a filter that is still searching would lose by its larger variance alone.
+        `curvature_variance` (nT²) is what the filter adds to the measurement's variance for the map's
+        curvature. It is added here too; else a filter that is still searching would lose by its larger
+        variance alone.
         """
         o, rate = self._options, self._rate
         kept = exp(-rate * metres)
@@ -88,7 +89,7 @@ class Unmapped:
             a * c * (p - v) + (a * d + b * c) * q + b * d * (r - w),
             c * c * (p - v) + 2.0 * c * d * q + d * d * (r - w) + w,
         )
-        y, s = block.anomaly - self._mean - value, p + block.variance + blur
+        y, s = block.anomaly - self._mean - value, p + block.variance + curvature_variance
         self._x = value + p / s * y, slope + q / s * y
         self._p = p - p * p / s, q - p * q / s, r - q * q / s
         return -0.5 * (y * y / s + log(2.0 * pi * s))

@@ -39,7 +39,7 @@ class Tracker:
         self._grid, self._gate = grid, gate
         self._filter = ExtendedKalmanFilter(dim_x=N_STATES, dim_z=1)
         self._filter.x, self._filter.P = x.copy(), P.copy()
-        self.blur = 0.0
+        self.curvature_variance = 0.0
         """nT², variance that the map's curvature within the spread added to the last measurement's."""
 
     @property
@@ -83,8 +83,8 @@ class Tracker:
         c, d = local.north_east * pnn + local.east_east * pne, local.north_east * pne + local.east_east * pee
         slopes = local.north + block.slope_north, local.east + block.slope_east
         expected = local.anomaly + block.slope_north * north + block.slope_east * east + 0.5 * (a + d)
-        self.blur = 0.5 * (a * a + 2.0 * b * c + d * d)
-        variance = block.variance + local.variance + self.blur
+        self.curvature_variance = 0.5 * (a * a + 2.0 * b * c + d * d)
+        variance = block.variance + local.variance + self.curvature_variance
         row = measurement_row(*slopes)
         innovation = self._observe(block.anomaly, expected + float(self.x[4] + self.x[5]), row, variance)
         return innovation._replace(anomaly=local.anomaly)
