@@ -92,7 +92,7 @@ class ChannelEffect(SingleChannelEffect, frozen=True, kw_only=True):
     stages: Power = 1
     on: Literal["offset", "scale"] = "offset"
 
-    def columns(self, field: float) -> FloatArray:  # noqa: ARG002  (others need it)
+    def columns(self, field: float) -> FloatArray:
         """One regressor, one slot for each axis."""
         columns = np.zeros((3, 1, 9))
         columns[:, 0, 6:9] = np.eye(3) * (self.on == "offset")

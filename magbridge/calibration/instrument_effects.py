@@ -56,11 +56,11 @@ class TimeEffect(Effect, frozen=True, kw_only=True):
         """Three coefficients (nT) for each function of time."""
         return 3 * self.regressors
 
-    def columns(self, field: float) -> FloatArray:  # noqa: ARG002  (others need it)
+    def columns(self, field: float) -> FloatArray:
         """Offsets."""
         return offsets(self.regressors)
 
-    def begin(self, calibration: Calibration) -> Step:  # noqa: ARG002  (others need it)
+    def begin(self, calibration: Calibration) -> Step:
         """Return a stepper; it has no state."""
         start, period, shape, order = round(self.start * 1e6), self.period * 1e6, self.shape, self.order
 
@@ -100,7 +100,7 @@ class RateEffect(Effect, frozen=True, kw_only=True):
         """Number of coefficients (times, s)."""
         return {"skew": 3, "eddy": 6}[self.on]
 
-    def columns(self, field: float) -> FloatArray:  # noqa: ARG002  (others need it)
+    def columns(self, field: float) -> FloatArray:
         """Three regressors, the rates of the three channels (nT/s)."""
         columns = np.zeros((self.size, 3, 9))
         if self.on == "skew":
@@ -112,7 +112,7 @@ class RateEffect(Effect, frozen=True, kw_only=True):
                 columns[k, j, 6 + i] = 1.0
         return columns
 
-    def begin(self, calibration: Calibration) -> Step:  # noqa: ARG002  (others need it)
+    def begin(self, calibration: Calibration) -> Step:
         """Return a stepper; rates are zero until three samples have come without a gap."""
         before: tuple[float, float, float] = (0.0, 0.0, 0.0)
         slope: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -164,14 +164,14 @@ class ResponseEffect(Effect, frozen=True, kw_only=True):
         """Three coefficients for a power, two for a knee."""
         return 3 if self.power else 2
 
-    def columns(self, field: float) -> FloatArray:  # noqa: ARG002  (others need it)
+    def columns(self, field: float) -> FloatArray:
         """For a power, each channel has a regressor of its own; for a knee, one channel has both."""
         columns = np.zeros((self.size, self.size, 9))
         for k in range(self.size):
             columns[k, k, 6 + (k if self.power else self.axis)] = 1.0 if self.power else -1.0
         return columns
 
-    def begin(self, calibration: Calibration) -> Step:  # noqa: ARG002  (others need it)
+    def begin(self, calibration: Calibration) -> Step:
         """Return a stepper; it has no state."""
         power, unit, axis, knee = self.power, self.unit, self.axis, self.knee
         sign = 1.0 if knee >= 0.0 else -1.0

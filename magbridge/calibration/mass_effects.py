@@ -41,7 +41,7 @@ class MassEffect(SingleChannelEffect, frozen=True, kw_only=True):
     centre: float
     scale: Width
 
-    def columns(self, field: float) -> FloatArray:  # noqa: ARG002  (others need it)
+    def columns(self, field: float) -> FloatArray:
         """Offsets."""
         return offsets(self.size // 3)
 
@@ -145,7 +145,7 @@ class MonomialEffect(Effect, frozen=True, kw_only=True):
         if min(self.exponents, default=0) < 0 or sum(self.exponents) > HIGHEST:
             raise CalibrationError(f"monomial: expected exponents >= 0, together at most {HIGHEST}")
 
-    def columns(self, field: float) -> FloatArray:  # noqa: ARG002  (others need it)
+    def columns(self, field: float) -> FloatArray:
         """Offsets."""
         return offsets(1)
 
@@ -238,7 +238,7 @@ class ClockEffect(Effect, frozen=True, kw_only=True):
         """One delay."""
         return 1
 
-    def columns(self, field: float) -> FloatArray:  # noqa: ARG002  (others need it)
+    def columns(self, field: float) -> FloatArray:
         """One coefficient for nine regressors: the rates of change of the nine coefficients, nT/s."""
         return self.sign * np.eye(9)[None]
 
