@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
+from gliders import Gliders
 
 from magbridge.calibration.dipole import Dipole, dipole_tensor
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.mounted_masses import read_vehicle
 from magbridge.calibration.model import Calibration, Noise, Parameter, Reference
 from magbridge.errors import CalibrationError, ConfigError
-
-Gliders = Callable[..., Any]
 
 
 def test_a_dipole_term_is_the_dipole() -> None:

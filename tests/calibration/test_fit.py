@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
+from gliders import Glider, Gliders
 from scipy.optimize import least_squares
 
 from magbridge.calibration.correct import correct
@@ -22,10 +22,8 @@ from magbridge.calibration.residual import Samples, normal_equations, residuals,
 from magbridge.calibration.terms import full_order
 from magbridge.errors import CalibrationError
 
-Gliders = Callable[..., Any]
 
-
-def survey_error(calibration: Calibration, glider: Any) -> tuple[float, float]:
+def survey_error(calibration: Calibration, glider: Glider) -> tuple[float, float]:
     """RMS over the noise floor on the survey, and deviation of the standardised error."""
     k = len(calibration.parameters)
     noisy, quiet = (
@@ -38,7 +36,7 @@ def survey_error(calibration: Calibration, glider: Any) -> tuple[float, float]:
     )
 
 
-def rms_on_survey(calibration: Calibration, glider: Any) -> float:
+def rms_on_survey(calibration: Calibration, glider: Glider) -> float:
     k = len(calibration.parameters)
     total = correct(
         calibration, glider.survey.field, glider.survey.parameters[:, :k], glider.survey.time

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
+from gliders import Gliders
 
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.identify import combinations
 from magbridge.calibration.fitting.observations import polynomial_samples
 from magbridge.calibration.terms import full_order
-
-Gliders = Callable[..., Any]
 
 
 def test_table_1_sees_63_of_90_coefficients(glider: Gliders) -> None:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
+from gliders import Gliders
 
 from magbridge.calibration.correct import correct
 from magbridge.calibration.fitting.fit import fit
@@ -16,8 +15,6 @@ from magbridge.calibration.planning.limits import Limits, PlannedRun, settled, t
 from magbridge.calibration.planning.plan import evaluate_runs, expected_calibration, plan
 from magbridge.errors import CalibrationError
 from sitl.mission import TABLE_1
-
-Gliders = Callable[..., Any]
 
 
 def test_expected_error_is_what_comes(glider: Gliders) -> None:

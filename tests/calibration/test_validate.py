@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
+from gliders import Gliders
 
 from magbridge.calibration.fitting.columns import observations
 from magbridge.calibration.fitting.validate import leave_runs_out
@@ -18,7 +17,6 @@ from magbridge.logs import read
 
 COUNT = 100.0
 """nT, the sensor's quantisation."""
-Gliders = Callable[..., Any]
 
 
 @pytest.mark.real
