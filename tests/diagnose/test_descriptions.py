@@ -10,6 +10,7 @@ from magbridge.calibration.fitting.columns import observations
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.lowpass import unfiltered
 from magbridge.diagnose.causes import CAUSES
+from magbridge.diagnose.causes.masses import actuator_order, hysteresis
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.descriptions import Description
 from magbridge.diagnose.inference.shapes import bends, crossing, delayed, near_surface, response, swings
@@ -179,3 +180,21 @@ def test_functions_of_the_direction_and_of_the_reading_hold_a_bend(
         assert one.covers([bend])
         assert not one.covers([bend, step])
         assert not one.covers([])
+
+
+def test_a_curve_through_a_mass_position_covers_its_order_and_its_memory_the_hysteresis(
+    problem: Problem, listed: list[Description]
+) -> None:
+    order = actuator_order(problem)[0]
+    back = next(one for one in hysteresis(problem) if one.channel == "battpos")
+    curve, memory, *late = (one for one in listed if one.channel == "battpos")
+    assert (curve.covers([order]), curve.covers([back])) == (True, False)
+    assert (memory.covers([order]), memory.covers([back])) == (False, True)
+    assert not any(one.covers([order]) or one.covers([back]) for one in late)
+
+
+def test_every_description_has_as_many_columns_as_widths(listed: list[Description]) -> None:
+    for one in listed:
+        columns = one.columns(slice(0, 50))
+        assert np.isfinite(columns).all()
+        assert {columns.shape[1]} == {len(width) for _, width in one.widths}

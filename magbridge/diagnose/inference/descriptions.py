@@ -16,9 +16,9 @@ from magbridge.diagnose.compare.columns import Columns
 from magbridge.diagnose.compare.interpolation import rates
 from magbridge.diagnose.compare.problem import Problem, effect_columns
 from magbridge.diagnose.compare.survey import Channel
-from magbridge.diagnose.inference.events import passage, step
 from magbridge.diagnose.inference.joint import Joint
 from magbridge.diagnose.inference.packets import packets
+from magbridge.diagnose.inference.passage import passage
 from magbridge.diagnose.inference.shapes import (
     REPEATED,
     SLOPES,
@@ -109,7 +109,7 @@ def descriptions(problem: Problem, fit: Joint, tone: Candidate | None = None) ->
     problem : Problem
         The survey to be described.
     fit : Joint
-        A fit without any cause; steps, passages and packets are searched for in its residual.
+        A fit without any cause; passages and packets are searched for in its residual.
     tone : Candidate, optional
         The strongest tone, where tones are not among the causes.
     """
@@ -123,7 +123,7 @@ def descriptions(problem: Problem, fit: Joint, tone: Candidate | None = None) ->
 
 
 def _in_time(problem: Problem, fit: Joint) -> list[Description]:
-    """Slow curves in body axes and along the field, a constant, a step of offsets, a passing source."""
+    """Slow curves in body axes and along the field, a constant, a passing source."""
     u = problem.survey.time - problem.survey.time[0]
     turning = np.exp(1j * np.pi * u / max(float(u[-1]), 1.0))
     fresh = ~problem.survey.learned
@@ -131,7 +131,6 @@ def _in_time(problem: Problem, fit: Joint) -> list[Description]:
     def waves(count: int) -> Columns:
         return lambda rows: powers(turning[rows], count).real.T
 
-    since, moments = step(problem, fit)
     passing, times = passage(problem, fit)
     return [
         Description(_along_axes(problem, waves(BODY)), spectra(BODY, 3), turned=True),
@@ -140,7 +139,6 @@ def _in_time(problem: Problem, fit: Joint) -> list[Description]:
             (*spectra(EARTH, 1), ("transient", np.full(EARTH, 10.0))),
         ),
         _of("drift", lambda rows: (problem.gain * fresh)[rows, None], 1, 1.0, holds=("reference_bias",)),
-        _of("switching", since, 3, trials=moments, holds=("offset_step",)),
         _of("transient", passing, 3, trials=times),
     ]
 

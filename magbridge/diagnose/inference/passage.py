@@ -1,57 +1,25 @@
-"""Events: a step of the vehicle's own field, and the passage of a distant source."""
+"""The passage of a distant source."""
 
 from __future__ import annotations
 
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from magbridge.diagnose.compare.columns import Columns, beside
+from magbridge.diagnose.compare.columns import Columns
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.joint import Joint
 
-__all__ = ["passage", "step"]
+__all__ = ["passage"]
 
 FloatArray = NDArray[np.float64]
 
-MOMENTS = 96
-"""Moments at which a step is tried."""
 DURATIONS, SHORTEST, LONGEST = 12, 8.0, 0.125
-"""Durations of a passage: how many are tried, the shortest in samples, the longest as a share of the log."""
+"""Durations: how many are tried, the shortest in samples, the longest as a share of the log."""
 QUARTERS = np.arange(-12, 13)
-"""Quarters of its duration over which a passage is evaluated."""
-
-
-def step(problem: Problem, fit: Joint) -> tuple[Columns, float]:
-    """Find the most likely moment of a change of the offsets, with the calibration free.
-
-    Returns
-    -------
-    Columns
-        Of the three offsets, from that moment on.
-    trials : float
-        Moments that were tried.
-    """
-    n, q, past = len(problem), problem.free.shape[1], len(fit.noise.memory)
-    body, y = -problem.slopes[:, 6:], fit.noise.response(fit.left)
-    edges = np.unique(np.linspace(0, n, MOMENTS + 2).astype(int))
-    pieces = len(edges) - 1
-    G, b = np.zeros((pieces, q + 3, q + 3)), np.zeros((pieces, 3))
-    for k, (start, end) in enumerate(pairwise(edges)):
-        first = max(start - past, 0)
-        X = beside([problem.free[first:end], body[first:end]])
-        X = fit.noise.filter(X, first, start - first)
-        G[k], b[k] = X.T @ X, X[:, q:].T @ y[start:end]
-    # sums from each moment on; the first is that of the whole log
-    G, b = (np.cumsum(x[::-1], axis=0)[::-1] for x in (G, b))
-    P, K = G[0, :q, :q] + np.diag(fit.prior[:q]), G[1:, :q, q:]
-    S = G[1:, q:, q:] - K.transpose(0, 2, 1) @ np.linalg.solve(P, K)
-    onset = edges[1 + int(np.argmax(_ratio(S, b[1:])))]
-    since = np.arange(n) >= onset
-    return lambda rows: body[rows] * since[rows, None], float(MOMENTS)
+"""Quarters of its duration over which it is evaluated."""
 
 
 def passage(problem: Problem, fit: Joint) -> tuple[Columns, float]:

@@ -1,0 +1,30 @@
+"""A source that passes is described by few numbers."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from magbridge.diagnose.compare.problem import Problem
+from magbridge.diagnose.inference.joint import fit_joint
+from magbridge.diagnose.inference.passage import passage
+
+
+def test_a_dipole_that_passes_is_told_by_three_numbers(problem: Problem) -> None:
+    """Against a dipole's field on a straight course, along the Earth's: Anderson's functions hold it."""
+    t = problem.survey.time - problem.survey.time[0]
+    speed, nearest = 900.0 / (0.02 * t[-1]), 0.6 * t[-1]
+    r = np.column_stack([speed * (t - nearest), np.full(len(t), 900.0), np.full(len(t), -50.0)])
+    far = np.linalg.norm(r, axis=1)[:, None]
+    m, earth = np.array([0.3, -0.8, 0.5]), np.array([0.5, 0.1, 0.85])
+    field = (3.0 * r * (r @ m)[:, None] / far**2 - m) / far**3
+    planted = problem.gain * (field @ earth)
+    planted *= 6.0 / np.abs(planted).max()
+    noise = np.random.default_rng(5).normal(size=len(problem))
+    given = replace(problem, residual=planted + noise)
+    columns, trials = passage(given, fit_joint(given, [], 1))
+    X = columns(slice(None))
+    left = planted - X @ np.linalg.lstsq(X, planted, rcond=None)[0]
+    assert left @ left < 0.1 * (planted @ planted)
+    assert 100 < trials < 10 * len(problem)
