@@ -38,11 +38,13 @@ def extend(problem: Problem, model: Sequence[Candidate], fit: Joint) -> Calibrat
     """Return the calibration with the effects of `model` added, at the values of `fit`.
 
     An error of the reference is no property of the vehicle: of such causes only a constant bias is kept, as
-    the reference's. All covariances are those of the joint posterior.
+    the reference's. Of a filter's attenuation nothing is kept; the other coefficients are free of it. All
+    covariances are those of the joint posterior.
     """
     calibration, q = problem.calibration, len(problem.centre)
     widths = np.concatenate([np.empty(0), *(candidate.width for candidate in model)])
-    kept = np.concatenate([np.empty(0, bool), *(np.full(c.size, bool(c.effects)) for c in model)])
+    pieces = [piece for candidate in model for piece in candidate.pieces]
+    kept = np.concatenate([np.empty(0, bool), *(np.full(c.size, bool(c.effects)) for c in pieces)])
     b = fit.coefficients * widths
     K, k = calibration.coefficients.size, int(kept.sum())
     M = np.zeros((K + k, q + len(b)))

@@ -9,16 +9,18 @@ import numpy as np
 
 from magbridge.calibration.correct import correct
 from magbridge.calibration.instrument_effects import RateEffect, TimeEffect
-from magbridge.calibration.mass_effects import PowersEffect
+from magbridge.calibration.mass_effects import ClockEffect, PowersEffect
 from magbridge.calibration.model import Calibration
+from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.causes.candidates import Candidate, of_effect, since
-from magbridge.diagnose.compare.past import Past
+from magbridge.diagnose.compare.past import FAR, Past
 from magbridge.diagnose.compare.problem import Problem, pose
 from magbridge.diagnose.compare.survey import Survey
 from magbridge.diagnose.extend import MODES, extend, flyable, relinearised, with_map_error, with_misfit
 from magbridge.diagnose.inference.evidence import IDEAL
 from magbridge.diagnose.inference.fit_noise import fit_noise
 from magbridge.diagnose.inference.joint import Joint, fit_joint
+from magbridge.diagnose.report.doubts import unsettled
 
 
 def candidate(size: int) -> Candidate:
@@ -70,6 +72,43 @@ def test_two_causes_are_widened_each_by_its_own() -> None:
         after.covariance[5:, 5:] @ np.ones(3),
         with_misfit([candidate(1)], before).covariance[5:, 5:] @ np.ones(3),
     )
+
+
+def test_a_calibration_from_turns_is_freed_of_a_filters_attenuation(right: Callable[[int], Problem]) -> None:
+    """Runs turn in five minutes, the survey in an hour; what the runs lost has gone into the gain."""
+    rng, tau = np.random.default_rng(5), 1.5
+    leg, row = np.divmod(np.arange(1600), 100)
+    learned = leg < 8
+    omega = 2.0 * np.pi / np.where(learned, 300.0, 4000.0)
+    u, v = np.array([np.linalg.qr(rng.normal(size=(3, 2)))[0].T for _ in range(16)])[leg].swapaxes(0, 1)
+    turning = np.cos(4.0 * omega * row)[:, None] * u + np.sin(4.0 * omega * row)[:, None] * v
+    field = 5e4 * turning / np.sqrt(1.0 + (omega * tau) ** 2)[:, None] + rng.normal(size=(1600, 3))
+    whole = right(1600)
+    survey = replace(
+        whole.survey, field=field, time=whole.survey.time + 1e4 * leg, learned=learned, dive=leg,
+        steps=np.where(row > 0, 1, FAR),
+    )  # fmt: skip
+    lost = 5e4 * 0.5 * (tau * 2.0 * np.pi / 300.0) ** 2
+    calibration = replace(
+        whole.calibration, coefficients=np.repeat([lost, 0.0], [3, 6]), covariance=np.diag(np.full(9, 100.0))
+    )
+    problem = pose(survey, calibration)
+    *_, attenuated = CAUSES["filter_lag"].candidates(problem)
+    found = fit_joint(problem, [attenuated.columns], 1)
+    assert abs(found.coefficients[0] - tau**2) < 4.0 * np.sqrt(found.covariance[-1, -1]) < 0.2
+    extended = extend(problem, [attenuated], found)
+    assert extended.effects == ()
+    off = [
+        correct(one, field, survey.values(["p"]), survey.time).total[~learned].mean() - 5e4
+        for one in (calibration, extended)
+    ]
+    assert off[0] > 15.0
+    assert abs(off[1]) < 1.0
+    assert not unsettled(problem, [attenuated], extended)  # the reference is right
+    problem.let_go()
+    delay = ClockEffect(cause="filter_lag", sign=-1.0)
+    both = of_effect(problem, delay, 2.0, "s", names=("delay",), phi=np.ones((9, 1600))).with_(attenuated)
+    assert extend(problem, [both], fit_joint(problem, [both.columns], 1)).effects == (delay,)
 
 
 def skewed(whole: Problem, period: float) -> tuple[Survey, Calibration]:

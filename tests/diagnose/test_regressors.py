@@ -16,6 +16,7 @@ from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.causes.masses import actuator_order
 from magbridge.diagnose.causes.regressors import lagged
 from magbridge.diagnose.causes.timing import field_rates, mass_rates
+from magbridge.diagnose.compare.interpolation import rates
 from magbridge.diagnose.compare.past import FAR
 from magbridge.diagnose.compare.problem import Problem, effect_columns, history, pose
 from magbridge.diagnose.compare.survey import Channel, Survey
@@ -96,16 +97,16 @@ def test_a_rate_of_change_is_the_whole_logs_where_samples_are_lost(
     turning = 2e4 * np.sin(2.0 * np.pi * survey.time[:, None] / np.array([150.0, 230.0, 700.0]))
     here = np.append(True, rng.random(len(whole) - 1) > share)
 
-    def rates(field: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    def rated(field: np.ndarray, rows: np.ndarray) -> np.ndarray:
         log = thinned(replace(survey, field=field), rows)
         return field_rates(replace(whole, survey=log)).T
 
-    expected, found = rates(turning, here | True)[here], rates(turning, here)
+    expected, found = rated(turning, here | True)[here], rated(turning, here)
     seen = found.any(axis=1)
     assert seen.mean() > 0.995
     assert np.sum((found - expected)[seen] ** 2) < 0.01 * np.sum(expected[seen] ** 2)
     noise = rng.normal(size=turning.shape)
-    own = np.sum(rates(noise, here) * noise[here]) / 3.0
+    own = np.sum(rated(noise, here) * noise[here]) / 3.0
     assert abs(own) < 0.05 * len(found) / whole.survey.interval
 
 
@@ -118,6 +119,36 @@ def test_a_rate_of_change_holds_a_turn_of_a_few_samples(right: Callable[[int], P
     found = field_rates(replace(whole, survey=survey)).T
     np.testing.assert_allclose(found[10:-10], 0.992 * expected[10:-10], rtol=0.002, atol=1.0)
     assert not found[[0, -1]].any()
+
+
+def test_a_second_derivative_is_that_of_a_turn(right: Callable[[int], Problem]) -> None:
+    """Of 30 samples; in a leg of its own, whose ends have none."""
+    survey = right(300).survey
+    phase = 2.0 * np.pi * np.arange(len(survey)) / 30.0 + np.arange(3.0)[:, None]
+    found = rates(survey, 2e4 * np.sin(phase), 2)
+    expected = -2e4 * (2.0 * np.pi / 30.0 / survey.interval) ** 2 * np.sin(phase)
+    np.testing.assert_allclose(found[:, 20:-20], expected[:, 20:-20], rtol=0.005, atol=0.1)
+    assert not found[:, [0, -1]].any()
+
+
+def test_a_filter_shortens_a_field_that_turns(right: Callable[[int], Problem]) -> None:
+    """By an RC filter's steady answer. Without the calibration's own runs no such cause is put forward."""
+    whole, tau, period = right(300), 1.5, 240.0
+    phase, steepness = 2.0 * np.pi * whole.survey.time / period, np.arctan(2.0 * np.pi * tau / period)
+
+    def seen(shorter: float, later: float) -> Problem:
+        turning = 4e4 * shorter * np.stack([np.cos(phase - later), np.sin(phase - later)], axis=1)
+        field = np.column_stack([turning, np.full(len(phase), 3e4)])
+        return pose(replace(whole.survey, field=field, learned=phase > 0.0), whole.calibration)
+
+    full, short = seen(1.0, 0.0), seen(float(np.cos(steepness)), float(steepness))
+    *_, attenuated = CAUSES["filter_lag"].candidates(short)
+    assert (attenuated.names, attenuated.units, attenuated.effects) == (("variance",), ("s^2",), ())
+    expected = (short.residual - full.residual)[20:-20]
+    assert expected.mean() < -20.0 or expected.mean() > 20.0
+    np.testing.assert_allclose(tau**2 * attenuated.columns(slice(20, -20))[:, 0], expected, rtol=0.01)
+    new = replace(short, survey=replace(short.survey, learned=phase < 0.0))
+    assert [c.names for c in CAUSES["filter_lag"].candidates(new)] == [("delay",)]
 
 
 def test_a_mass_rate_is_the_drives_speed_while_it_moves(problem: Problem) -> None:

@@ -56,7 +56,7 @@ CAUSES: dict[str, Cause] = {
     "hysteresis": Cause(hysteresis, "a calibration with parameters", "approach one position from both sides"),
     "eddy_current": Cause(eddy_current, "turns", "reverse the turn"),
     "channel_skew": Cause(channel_skew, "turns", "reverse the turn; roll about the axis that all channels share"),
-    "filter_lag": Cause(filter_lag, "masses that move while sampled", "change the corner of the filter, or step an actuator"),
+    "filter_lag": Cause(filter_lag, "masses that move while sampled, or the calibration's own runs", "change the corner of the filter, or step an actuator"),
     "clock_offset": Cause(clock_offset, "a calibration with parameters that move while sampled", "move an actuator at constant attitude"),
     "nonlinearity": Cause(nonlinearity, "attitudes that take a channel through its range", "turn every channel through the whole field"),
     "saturation": Cause(saturation, "a channel near its end", "turn the channel away from the field: saturation occurs only near full scale"),

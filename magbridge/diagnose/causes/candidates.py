@@ -36,7 +36,7 @@ class Candidate:
     names, units : tuple of str
         Of the coefficients.
     effects : tuple of Effect
-        What it adds to the calibration; none where it is the reference that is wrong.
+        What it adds to the calibration; none where the reference is wrong, or what it was fitted to.
     shape : dict
         Nonlinear parameters: name -> (value, unit).
     again : callable or None

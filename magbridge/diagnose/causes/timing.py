@@ -62,13 +62,38 @@ def channel_skew(problem: Problem) -> list[Candidate]:
 
 
 def filter_lag(problem: Problem) -> list[Candidate]:
-    """The anti-alias filter holds the field back, not the telemetry: ``T += -tau dH/dt`` (paper, section 3).
+    """The anti-alias filter: ``T += -tau dH/dt + (variance / 2) d^2H/dt^2`` (paper, section 3).
 
-    In a uniform field ``|H|`` shows the delay only where masses move:
-    ``u^T A dH_r/dt = -dF/dtheta dtheta/dt``. That is the signature of a clock offset of the opposite sign,
-    and the same correction removes it. The only difference is that a filter's delay cannot be negative.
+    It holds the field back, not the telemetry. In a uniform field ``|H|`` shows the delay only where masses
+    move: ``u^T A dH_r/dt = -dF/dtheta dtheta/dt``. That is the signature of a clock offset of the opposite
+    sign, and the same correction removes it. The only difference is that a filter's delay cannot be negative.
+
+    It also shortens a field that turns. From turning calibration runs that has gone into the calibration, so
+    it shows where these are compared with a survey that turns less.
     """
-    return _delay(problem, ClockEffect(cause="filter_lag", sign=-1.0), 2.0, positive=True)
+    delayed = _delay(problem, ClockEffect(cause="filter_lag", sign=-1.0), 2.0, positive=True)
+    return [*delayed, _shortened(problem)] if problem.survey.learned.any() else delayed
+
+
+def _shortened(problem: Problem) -> Candidate:
+    r"""Return the attenuation of a field that turns.
+
+    Notes
+    -----
+    A filter whose impulse response has the variance sigma^2 about its mean, the delay, passes on
+
+    .. math:: H + \tfrac12 \sigma^2 \ddot H + \dots
+
+    For an RC filter sigma is its time constant. A field that turns with omega is shortened by
+    ``sigma^2 omega^2 / 2`` of its turning part. As with ``calibrate --filter-corner``, the calibration is
+    fitted without it, and nothing is added to a field that turns live. The second derivative is that of
+    :attr:`~.compare.problem.Problem.reading`, because it would correlate with the noise of its own sample.
+    """
+    bend = rates(problem.survey, problem.reading.T, 2).T
+    columns = -0.5 * np.einsum("ij,ij->i", problem.slopes[:, 6:], bend)[:, None]
+    return Candidate(
+        "filter_lag", None, columns.__getitem__, np.ones(1), ("variance",), ("s^2",), positive=True
+    )
 
 
 def clock_offset(problem: Problem) -> list[Candidate]:

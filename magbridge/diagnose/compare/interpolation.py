@@ -17,8 +17,8 @@ LOST = 3
 one's power."""
 
 
-def rates(survey: Survey, H: FloatArray) -> FloatArray:
-    r"""(k, n) dH/dt, per s, of H (k, n): of the cubic spline through each leg; zero at a leg's ends.
+def rates(survey: Survey, H: FloatArray, order: int = 1) -> FloatArray:
+    r"""(k, n) first or second derivative of H (k, n): of the cubic spline through each leg; zero at its ends.
 
     A leg is a run of samples in which no gap is longer than :data:`LOST` samples.
 
@@ -36,7 +36,8 @@ def rates(survey: Survey, H: FloatArray) -> FloatArray:
     starts = np.flatnonzero(~survey.follows(LOST))
     for start, end in zip(starts, np.append(starts[1:], len(t)), strict=True):
         if end - start > 2:
-            out[:, start + 1 : end - 1] = CubicSpline(t[start:end], H[:, start:end], axis=1).c[2, 1:].T
+            spline = CubicSpline(t[start:end], H[:, start:end], axis=1).c
+            out[:, start + 1 : end - 1] = order * spline[3 - order, 1:].T
     return out
 
 

@@ -38,10 +38,13 @@ __all__ = [
     "recent",
     "rivalled",
     "several",
+    "shortened",
     "unsettled",
     "useful",
 ]
 
+REFERENCE = ("map_error", "reference_bias", "diurnal_variation")
+"""Causes that are errors of the reference."""
 IMPLAUSIBLE = 5.0
 """Multiple of its plausible size above which a cause is doubted."""
 
@@ -100,6 +103,18 @@ def grounded(diagnosis: Diagnosis, candidate: Candidate) -> str:
     )
 
 
+def shortened(finding: Finding) -> str:
+    """Say what becomes of a filter's attenuation: the calibration is free of it, a turning field is not."""
+    variance = dict(zip(finding.candidate.names, finding.coefficients, strict=True)).get("variance", 0.0)
+    if variance <= 0.0:
+        return ""
+    return (
+        "<p>It shortens a field that turns, as an RC filter of "
+        f"{number(0.5 / np.pi / np.sqrt(variance), 2)} Hz does. The extended calibration is fitted without "
+        "that, as with calibrate --filter-corner. In turns the corrected field stays too short.</p>"
+    )
+
+
 def in_motion(diagnosis: Diagnosis, finding: Finding) -> str:
     """Say so when a cause acts while masses move: one that moved unseen between rows looks the same."""
     survey = diagnosis.problem.survey
@@ -131,7 +146,7 @@ def gained(gain: Gain, parts: str) -> str:
 def useful(diagnosis: Diagnosis) -> str:
     """Say what the extended calibration corrects for and what not; nothing where nothing was added to it."""
     added = diagnosis.calibration.effects
-    if not any(effect in added for candidate in diagnosis.named for effect in candidate.effects):
+    if all(c.cause in REFERENCE or (c.effects and set(added).isdisjoint(c.effects)) for c in diagnosis.named):
         return ""
     stays = [c for c in diagnosis.named if not c.effects or any(effect not in added for effect in c.effects)]
     others = ", ".join(escape(label(candidate.cause, candidate.channel)) for candidate in stays)
@@ -189,7 +204,7 @@ def unsettled(problem: Problem, named: Sequence[Candidate], extended: Calibratio
 
     A constant may belong to either. Nothing is said where shift and sigma are below the noise.
     """
-    if all(candidate.effects for candidate in named):
+    if not any(candidate.cause in REFERENCE for candidate in named):
         return ""
     survey = problem.survey
     before = residuals_of(*samples_of(survey, problem.calibration))

@@ -17,6 +17,7 @@ from magbridge.diagnose.report.doubts import (
     recent,
     rivalled,
     several,
+    shortened,
 )
 from magbridge.diagnose.report.findings import chance_alone, parameters
 from magbridge.diagnose.report.words import MANY, bold, chance, figure, listed, number, physics, row
@@ -96,6 +97,7 @@ def _cause(diagnosis: Diagnosis, finding: Finding, cause: Cause) -> list[str]:
         recent(candidate),
         in_motion(diagnosis, finding),
         grounded(diagnosis, candidate),
+        shortened(finding),
         rivalled(cause, finding.rivals, chance_alone(diagnosis, finding.hypothesis)),
         no_gain(gain),
         outshone(finding, diagnosis.unexplained),
