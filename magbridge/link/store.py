@@ -23,11 +23,11 @@ class Kept(msgspec.Struct, frozen=True):
     parameters : dict of str to float
         Values that differ from the configuration's.
     signing_timestamp : int
-        The last that was used (10 µs since 2015-01-01).
+        The last that was used (10 µs since 2015-01-01); 48 bits on the link, and a margin is added to it.
     """
 
     parameters: dict[str, Annotated[float, Meta(ge=-3e38, le=3e38)]] = {}
-    signing_timestamp: Annotated[int, Meta(ge=0, lt=1 << 48)] = 0
+    signing_timestamp: Annotated[int, Meta(ge=0, lt=1 << 47)] = 0
 
 
 def load(path: str | Path) -> Kept:

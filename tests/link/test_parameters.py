@@ -143,7 +143,14 @@ def test_store(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "content", ['{"parameters": {"a": "b"}}', '{"parameters": {"a": 1e300}}', '{"signing_timestamp": -1}', ""]
+    "content",
+    [
+        '{"parameters": {"a": "b"}}',
+        '{"parameters": {"a": 1e300}}',
+        '{"signing_timestamp": -1}',
+        '{"signing_timestamp": 281474976710655}',
+        "",
+    ],
 )
 def test_a_store_that_is_damaged(tmp_path, content):
     path = tmp_path / "parameters.json"
