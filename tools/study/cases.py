@@ -42,7 +42,7 @@ NAMELESS = ("unknown", "seen", "foreign")
 """Parts in which the hidden effect is not among the causes of the table."""
 PREDICTED = ("named", "ladder", "pair", *NAMELESS)
 """Parts for which theory predicts the outcome."""
-STRANGE = ("gradient", "squeezed", "flare", "swarf")
+STRANGE = ("ageing", "crossfield", "railway", "rudder")
 """Foreign effects made after the detector was frozen; its descriptions were not designed for them either."""
 SEEN = (
     "pan", "loose", "corrosion", "pulsation", "needle", "thermostat", "perming", "staircase", "swell",
@@ -51,6 +51,7 @@ SEEN = (
     "trailing", "compliant", "restart", "whistle",
     "yielding", "afterglow", "mast", "annealed", "dynamo", "hvdc", "dew",
     "sampler", "substorm", "litter", "stuck", "sounder",
+    "gradient", "squeezed", "flare", "swarf",
 )  # fmt: skip
 """Foreign effects that were once made for this purpose, but before the detector was last improved."""
 GOLDEN = 0.6180339887498949

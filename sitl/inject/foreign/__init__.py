@@ -63,5 +63,9 @@ FOREIGN: dict[str, Effect] = {
     "squeezed": sensor.squeezed,
     "flare": surroundings.flare,
     "swarf": vehicle.swarf,
+    "ageing": sensor.ageing,
+    "crossfield": sensor.crossfield,
+    "railway": surroundings.railway,
+    "rudder": vehicle.rudder,
 }
 """Effect, by its name."""

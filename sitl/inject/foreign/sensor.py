@@ -152,3 +152,17 @@ def squeezed(scene: Scene, size: float, rng: Generator) -> None:
     """Pressure narrows the feedback coils, each by its own; size in 1e-5 of the field at 100 m."""
     strain = scene.track.depth / 100.0 * (1.0 + 0.05 * scene.track.depth / 100.0)
     scene.field = scene.field * (1.0 + 1e-5 * size * np.outer(strain, rng.uniform(0.5, 1.5, 3)))
+
+
+def ageing(scene: Scene, size: float, rng: Generator) -> None:
+    """The feedback resistors age, each by its own, fast at first; size in 1e-5 of the field in a decade."""
+    burnt_in = rng.uniform(600.0, 3600.0)
+    grown = np.log10(1.0 + scene.t / burnt_in)
+    scene.field = scene.field * (1.0 + 1e-5 * size * np.outer(grown, rng.uniform(0.3, 1.7, 3)))
+
+
+def crossfield(scene: Scene, size: float, rng: Generator) -> None:
+    """A core reads less where the field across it is strong (Ripka 2001); size in 1e-4 at 50,000 nT."""
+    across = np.roll(scene.field, 1, axis=1) ** 2 + np.roll(scene.field, 2, axis=1) ** 2
+    loss = 1e-4 * size * rng.uniform(0.3, 1.7, 3) * across / (across + 5e4**2) * 2.0
+    scene.field = scene.field * (1.0 - loss)

@@ -129,6 +129,19 @@ def flare(scene: Scene, size: float, rng: Generator) -> None:
     scene.earth = scene.earth + size * np.outer(shape / shape.max(), [0.8, 0.3, 0.4])
 
 
+def railway(scene: Scene, size: float, rng: Generator) -> None:
+    """A railway's direct current returns through the ground, and trains start, roll and brake; size in nT."""
+    n, step = len(scene.t), scene.track.step
+    starts = np.cumsum(rng.exponential(rng.uniform(600.0, 1500.0), 200))
+    drawn = np.zeros(n)
+    for start, rolls, way in zip(starts, rng.uniform(60.0, 300.0, 200), rng.normal(size=200), strict=True):
+        since = scene.t - start
+        drawn += way * ((since > 0.0) & (since < rolls)) * np.exp(-np.maximum(since, 0.0) / 90.0)
+        drawn -= 0.4 * way * ((since > rolls + 40.0) & (since < rolls + 65.0))
+    spread = first_order(drawn, step, float(rng.uniform(3.0, 15.0)))
+    scene.earth = scene.earth + size * np.outer(spread, direction(rng))
+
+
 def _cable(scene: Scene, rng: Generator) -> tuple[Array, Array, Array]:
     """Lay a straight cable below the track: m aside and above (n,), and north-east-down across it."""
     track = scene.track

@@ -262,3 +262,13 @@ def swarf(scene: Scene, size: float, rng: Generator) -> None:
     oil = scene.track.parameters["ballast"]
     late = first_order(oil, scene.track.step, float(rng.uniform(400.0, 3000.0)))
     scene.add((late - oil) / np.ptp(oil), size * direction(rng))
+
+
+def rudder(scene: Scene, size: float, rng: Generator) -> None:
+    """An unlogged rudder of steel is put over to turn, and hunts while it holds a course; size in nT."""
+    step = scene.track.step
+    turning = first_order(np.gradient(scene.track.heading, step), step, float(rng.uniform(2.0, 6.0)))
+    hunts = 0.05 * autoregressive(rng, (len(scene.t),), 1.0, 60.0 / step)
+    angle = np.radians(35.0) * np.tanh(turning / rng.uniform(0.5, 2.0) + hunts)
+    a, b = direction(rng), direction(rng)
+    scene.field = scene.field + size * (np.outer(np.cos(angle) - 1.0, a) + np.outer(np.sin(angle), b))
