@@ -42,8 +42,9 @@ def test_importing_brings_nothing_heavy(imports: str, heavy: set[str]) -> None:
     assert done.stdout.strip() == "[]"
 
 
-def test_from_a_log_to_corrected_samples(tmp_path: Path) -> None:
-    deployment = simulate(load("demo"), 5)
+@pytest.mark.parametrize("lacking", [[], ["reference_field"]], ids=["simulated", "as a vehicle's"])
+def test_from_a_log_to_corrected_samples(tmp_path: Path, lacking: list[str]) -> None:
+    deployment = simulate(load("demo"), 5).drop_vars(lacking)
     runs, survey = tmp_path / "runs.nc", tmp_path / "survey.nc"
     mb.write(deployment.isel(time=deployment["run"].to_numpy() < 11), runs)
     mb.write(deployment.isel(time=deployment["run"].to_numpy() >= 11), survey)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.columns import CHANNELS, COLUMNS, require
 from magbridge.errors import CalibrationError
+from magbridge.field.reference import earth_field
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -37,13 +38,14 @@ def observations(
     parameters : sequence of str
         Columns that move masses.
     reference : callable, optional
-        ``ds -> (total (n,) nT, vector (n, 3) NED nT or None, name)``. If not given, or where the
-        deployment has it, the column ``reference_field`` is used.
+        ``ds -> (total (n,) nT, vector (n, 3) NED nT or None, name)``. Where the deployment has the column
+        ``reference_field``, that is the total. If not given: that column alone, or without it
+        :func:`~magbridge.field.reference.earth_field`.
 
     Raises
     ------
     FormatError
-        A column is missing.
+        A column is missing, or there is neither a reference nor a position.
     CalibrationError
         A column does not hold numbers; a parameter is a column with another meaning.
     """
@@ -53,6 +55,8 @@ def observations(
     columns = {name: _column(ds, name) for name in names}
     vector: FloatArray | None = None
     model = "reference_field"
+    if reference is None and model not in ds:
+        reference = earth_field
     if reference is not None:
         total, vector, model = reference(ds)
         if "reference_field" in ds:
