@@ -102,8 +102,8 @@ def run(case: Case) -> list[Row]:
     for method in case.methods:
         try:
             error, sigma, residual = calibrate(method, vehicle, runs, survey, names, case.seed)
-        except CalibrationError as error:
-            add(method, np.nan, np.nan, failed=str(error))
+        except CalibrationError as refused:
+            add(method, np.nan, np.nan, failed=str(refused))
             continue
         add(method, residual, rms(error), float(np.std(error / sigma)))
     for at_sigma, name in ((0.5, "oracle"), (TAPE, "oracle, positions to 5 cm")):
@@ -192,7 +192,7 @@ def total(part: xr.Dataset) -> np.ndarray:
 
 
 def left(A: np.ndarray, T: np.ndarray, part: xr.Dataset) -> np.ndarray:
-    return np.linalg.norm((channels(part) - T) @ A.T, axis=1) - total(part)
+    return np.asarray(np.linalg.norm((channels(part) - T) @ A.T, axis=1) - total(part))
 
 
 def show(rows: list[Row], console: Console) -> None:
@@ -302,4 +302,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -222,4 +222,4 @@ def _frame(axes: Axes, survey: xr.Dataset) -> None:
 
 def _hours(part: xr.Dataset) -> np.ndarray:
     time = part["time"].to_numpy()
-    return (time - time[0]) / 3600
+    return np.asarray((time - time[0]) / 3600)

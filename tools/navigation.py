@@ -37,7 +37,7 @@ from __future__ import annotations
 import argparse
 import os
 import time as clock
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from hashlib import sha256
@@ -50,7 +50,7 @@ import numpy as np
 from msgspec.structs import replace as with_options
 from scipy.stats import chi2
 from terminal import command_line
-from voyages.calibrated import METHODS, flown
+from voyages.calibrated import flown
 from voyages.dived import dived
 from voyages.lost import LEVEL, carried, half, level, misled
 from voyages.others import magnav, stone_soup
@@ -71,7 +71,9 @@ from voyages.simulated import (
 from magbridge.navigate.batch import navigate
 from magbridge.navigate.model import Block, prior, transition
 from magbridge.navigate.tracker import Tracker
+from sitl.bonne_bay import METHODS
 
+Table = list[Sequence[str]]
 MAPS = (Map(60, 2000), Map(60, 800), Map(20, 1000), Map(20, 1000, rough=True), Map(5, 1000), Map(1, 2000))
 STARTS = {"narrow": 0.2, "wide": 1.0}
 """1-sigma of the first position, in correlation lengths of the map."""
@@ -81,16 +83,17 @@ class Runs(NamedTuple):
     """How runs are made: number of processors, runs in a row, and the folder that keeps them, if any."""
 
     pool: ProcessPoolExecutor
-    count: int
+    number: int
     keep: Path | None
 
     def __call__(self, run: partial[Any]) -> list[Any]:
         """Return `run` of 0, 1, ...; from the folder if they were made before."""
-        row = f"{run.func.__name__} {run.args} {self.count}"
+        row = f"{run.func.__name__} {run.args} {self.number}"
         kept = self.keep / sha256(row.encode()).hexdigest()[:16] if self.keep else None
         if kept and kept.exists():
-            return loads(kept.read_bytes())
-        made = list(self.pool.map(run, range(self.count)))
+            made: list[Any] = loads(kept.read_bytes())
+            return made
+        made = list(self.pool.map(run, range(self.number)))
         if kept:
             kept.write_bytes(dumps(made))
         return made
@@ -137,10 +140,10 @@ def accuracy(runs: Runs, _asked: argparse.Namespace, left: str = "auto") -> None
     """Narrow and wide starts on every map, with the remaining errors of a calibration."""
     slow = LEFT[left]
     print(
-        f"\n## Accuracy with {left}: {runs.count} runs of 6 h a row, {min(SPEEDS)} to {max(SPEEDS)} m/s;"
+        f"\n## Accuracy with {left}: {runs.number} runs of 6 h a row, {min(SPEEDS)} to {max(SPEEDS)} m/s;"
         f" 1 nT white, {slow:g} nT slow, map error 1 nT, current 0.05 m/s\n"
     )
-    table = [HEAD]
+    table: Table = [HEAD]
     for kind in MAPS:
         for start, share in STARTS.items():
             label = f"{kind}; {start} {share * synthetic(kind, 0).correlation_length:.0f} m"
@@ -153,11 +156,11 @@ def calibrations(runs: Runs, _asked: argparse.Namespace) -> None:
     kinds = (Map(60, 2000), Map(20, 1000))
     print(
         "\n"
-        f"## What calibration buys: {runs.count} gliders, their own calibration runs and survey of 6 h; "
+        f"## What calibration buys: {runs.number} gliders, their own calibration runs and survey of 6 h; "
         "start within a length\n"
     )
     found = runs(partial(flown, kinds))
-    table = [("calibration", "error nT", "claimed nT", *HEAD)]
+    table: Table = [("calibration", "error nT", "claimed nT", *HEAD)]
     for k, kind in enumerate(kinds):
         for method in METHODS:
             made = [glider[k, method] for glider in found]
@@ -173,11 +176,11 @@ def watch(runs: Runs, _asked: argparse.Namespace) -> None:
     """How soon a lost filter stops vouching for itself."""
     print(
         "\n"
-        f"## A lost filter says so: {runs.count} runs of 6 h a row. Lost: the truth is outside the 99.99 % "
+        f"## A lost filter says so: {runs.number} runs of 6 h a row. Lost: the truth is outside the 99.99 % "
         "ellipse, and a quarter of\n"
         "a correlation length away or more. Flagged: it no longer vouches for its position\n"
     )
-    table = [("how, map", "lost %", "flagged in 30 min %", "95 % within min", "found in 2 h %")]
+    table: Table = [("how, map", "lost %", "flagged in 30 min %", "95 % within min", "found in 2 h %")]
     for how in (carried, misled):
         for kind in MAPS[:4]:
             spans = np.array(runs(partial(how, kind)))
@@ -202,11 +205,11 @@ def misinformed(runs: Runs, _asked: argparse.Namespace) -> None:
     """Whether a filter vouches for its position when the map or the calibration is worse than it claims."""
     print(
         "\n"
-        f"## Told wrong: {runs.count} runs of 6 h a row, on a field {LEVEL:g} nT off, or of which the map "
+        f"## Told wrong: {runs.number} runs of 6 h a row, on a field {LEVEL:g} nT off, or of which the map "
         "knows half the variance.\n"
         "Share of the time that it vouches for where it is, and for where it is not\n"
     )
-    table = [("how, map", "rightly %", "wrongly %", "95 % of runs, wrongly %")]
+    table: Table = [("how, map", "rightly %", "wrongly %", "95 % of runs, wrongly %")]
     for how in (level, half):
         for kind in MAPS[:4]:
             right, wrong = 100 * np.array(runs(partial(how, kind))).T
@@ -218,10 +221,11 @@ def misinformed(runs: Runs, _asked: argparse.Namespace) -> None:
 def dives(runs: Runs, _asked: argparse.Namespace) -> None:
     """What it costs to use a map at its own altitude for the field below it."""
     print(
-        f"\n## Under a map from 90 m up: {runs.count} worlds, 4 h, dives of 140 m, 54 nT of rock 350 m down\n"
+        "\n"
+        f"## Under a map from 90 m up: {runs.number} worlds, 4 h, dives of 140 m, 54 nT of rock 350 m down\n"
     )
     found = np.array(runs(partial(dived)))
-    table = [("map", "error m: median", "90 %", "worst", "NEES/2", "vouched %")]
+    table: Table = [("map", "error m: median", "90 %", "worst", "NEES/2", "vouched %")]
     for name, column in zip(
         ("as it was flown", "at the glider's depth"), found.transpose(1, 2, 0), strict=True
     ):
@@ -254,7 +258,8 @@ def timings() -> tuple[float, float, float, float]:
         begun = clock.process_time()
         navigate(ds, grid, with_options(options, interval=interval), start=PLACE)
         whole.append(clock.process_time() - begun)
-    return each, *whole, one(Map(60, 2000), 1.0, 1.0, 7).seconds
+    blocks, singly = whole
+    return each, blocks, singly, one(Map(60, 2000), 1.0, 1.0, 7).seconds
 
 
 def speed(runs: Runs, _asked: argparse.Namespace) -> None:
@@ -270,14 +275,14 @@ def speed(runs: Runs, _asked: argparse.Namespace) -> None:
 def peers(runs: Runs, asked: argparse.Namespace) -> None:
     """Stone Soup's filters on the same measurements, and the flight that MagNav.jl publishes."""
     if asked.peers:
-        some = runs._replace(count=min(runs.count, 20))
+        some = runs._replace(number=min(runs.number, 20))
         print(
             "\n"
             "## Stone Soup on the same measurements: DRMS (m) of the second half, NEES/2; medians of "
-            f"{some.count} runs\n"
+            f"{some.number} runs\n"
         )
         head = ("bound", "ours", "NEES/2", "EKF", "NEES/2", "20,000 particles", "NEES/2", "ms/update")
-        table = [("map, start", *head)]
+        table: Table = [("map, start", *head)]
         for kind in (Map(20, 1000), Map(60, 2000)):
             for name, share in STARTS.items():
                 found = np.median(some(partial(stone_soup, asked.peers, kind, GLIDER, share)), axis=0)
@@ -300,7 +305,7 @@ def show(table: Sequence[Sequence[str]]) -> None:
         print("  ".join(cells), flush=True)
 
 
-PARTS = {
+PARTS: dict[str, Callable[[Runs, argparse.Namespace], None]] = {
     "accuracy": accuracy,
     "watch": watch,
     "misinformed": misinformed,

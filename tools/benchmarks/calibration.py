@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 from statistics import median
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -108,7 +109,7 @@ def correcting(folder: Path, repetitions: int) -> list[Row]:  # noqa: ARG001
             for name, (job, samples) in jobs.items():
                 found[name].append(1e6 * processor_time(job) / samples)
 
-    def beside(what: str, floor: str, said: str, **target: float) -> Row:
+    def beside(what: str, floor: str, said: str, **target: Any) -> Row:
         ratio = median(b / a for a, b in zip(found["moving"], found[floor], strict=True))
         return Row(what, median(found["moving"]), "us", median(found[floor]), said, ratio=ratio, **target)
 
@@ -136,7 +137,7 @@ def _jobs(
     field = data.field[rng.integers(0, len(data), n)]
     moving = rng.uniform(data.parameters.min(axis=0), data.parameters.max(axis=0), (n, 2))
     still = np.repeat(moving[::200], 200, axis=0)
-    when = np.arange(n) * 4.0
+    when = 4.0 * np.arange(float(n))
     floors = Floors(calibration.kernel, moving)
     values = moving[:few].tolist()
     readings = [(x, y, z) for x, y, z in field[:few].tolist()]
@@ -179,5 +180,5 @@ def many(count: int) -> Observations:
         names=runs.names,
         units=runs.units,
         runs=runs.runs[pick].astype(int) + 10 * (np.arange(count) // len(runs)),
-        time=np.arange(count) * 4.0,
+        time=4.0 * np.arange(float(count)),
     )

@@ -14,8 +14,9 @@ def main() -> None:
     link = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     link.connect(("127.0.0.1", int(sys.argv[2])))
     link.send(b"ready")
+    both: list[int | socket.socket] = [tty, link]
     while True:
-        ready = select.select([tty, link], [], [])[0]
+        ready = select.select(both, [], [])[0]
         if link in ready:
             link.recv(65536)
         if tty in ready:

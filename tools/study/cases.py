@@ -231,4 +231,4 @@ def alike(other: str, late: Found, stall: Stall) -> Array:
     if other == "clock_offset":
         return d
     f = stall.show(Hidden(other, late.hidden.size, stall.number)).signature
-    return d + (f - d) / np.e if f @ d > 0.0 else f
+    return d + np.exp(-1.0) * (f - d) if f @ d > 0.0 else f

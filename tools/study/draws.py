@@ -111,7 +111,7 @@ def log_bayes(ratio: Array, freedom: float) -> Array:
 def evidence(span: Span, ratio: Array, freedom: float) -> Array:
     """Log evidence of likelihood ratios; coefficients of one common size are already integrated out."""
     if span.spectra is not None:
-        return 0.5 * ratio - np.log(len(span.spectra))
+        return np.asarray(0.5 * ratio - np.log(len(span.spectra)))
     # of a known sign: the share of the posterior that has it, over half of the prior
     return log_bayes(ratio, freedom) + (np.log(2.0 * ndtr(np.sqrt(ratio))) if span.positive else 0.0)
 

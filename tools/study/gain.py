@@ -79,4 +79,5 @@ def _oracle(name: str, result: Diagnosis) -> Calibration:
 
 def error(ds: xr.Dataset, calibration: Calibration) -> Array:
     """Error of the corrected total field against the reference, (n,) nT."""
-    return corrected(ds, calibration).total - ds["reference_field"].to_numpy() - calibration.reference.bias
+    reference = ds["reference_field"].to_numpy() + calibration.reference.bias
+    return np.asarray(corrected(ds, calibration).total - reference)

@@ -144,11 +144,11 @@ def _flown(twin: Twin, calibration: Calibration) -> Stage:
     track = twin.fly()
     # a hull has inertia: without it the attitude has no rate of change, and a delay of a millisecond would
     # look like noise
-    smooth = {
-        name: first_order(first_order(getattr(track, name), track.step, INERTIA), track.step, INERTIA)
-        for name in ("roll", "pitch", "heading")
-    }
-    track = replace(track, **smooth)
+    roll, pitch, heading = (
+        first_order(first_order(angle, track.step, INERTIA), track.step, INERTIA)
+        for angle in (track.roll, track.pitch, track.heading)
+    )
+    track = replace(track, roll=roll, pitch=pitch, heading=heading)
     when = np.arange(0.0, track.elapsed[-1] - 30.0, 1 / twin.scenario.instrument.rate)
     return Stage(twin, track, when, calibration, calibration.covariance + floor(calibration))
 
@@ -191,7 +191,7 @@ def size_of(name: str, d: Array, A: Array, covariance: Array) -> float:
     left = project(d[:, None], A, covariance)[:, 0]
     if name == "outliers":
         return float(np.abs(left).max())
-    return float(np.sqrt(max(d @ left, 0.0)))
+    return float(np.sqrt(max(float(d @ left), 0.0)))
 
 
 class Found(NamedTuple):

@@ -96,11 +96,10 @@ def _detection(part: Parts) -> list[Line]:
     ):
         if factor:
             out.append((label, "within 15 %", "0 %", f"{off(factor)} | {len(known)}"))
-    own = [beside_ideal([r for r in known if list(r["names"]) == [name]]) for name in EFFECTS]
-    if each := [abs(factor[0] - 1.0) <= OFF for factor in own if factor]:
-        out.append(
-            ("... cause by cause: within 15 %", "all", "all", f"{sum(each)} of {len(each)} | {len(known)}")
-        )
+    factors = [beside_ideal([r for r in known if list(r["names"]) == [name]]) for name in EFFECTS]
+    if within := [abs(factor[0] - 1.0) <= OFF for factor in factors if factor]:
+        share_within = f"{sum(within)} of {len(within)} | {len(known)}"
+        out.append(("... cause by cause: within 15 %", "all", "all", share_within))
     return out
 
 

@@ -185,7 +185,7 @@ class Run:
     @property
     def second_half(self) -> NDArray[np.bool_]:
         """Records of the second half."""
-        return self.hours > 0.5 * self.hours[-1]
+        return np.asarray(self.hours > 0.5 * self.hours[-1])
 
     def score(self) -> Score:
         """Return what the tables need."""

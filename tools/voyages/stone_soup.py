@@ -19,6 +19,7 @@ import sys
 import time
 from collections.abc import Iterator
 from datetime import datetime, timedelta
+from typing import Any
 
 import numpy as np
 from scipy.interpolate import RectBivariateSpline
@@ -49,7 +50,7 @@ class FieldOnMap(NonLinearGaussianMeasurement):
         """Return the number of measured values."""
         return 1
 
-    def function(self, state, noise=False, **kwargs):  # noqa: ARG002  Stone Soup's signature
+    def function(self, state: Any, noise: bool = False, **kwargs: Any) -> Any:  # noqa: ARG002  Stone Soup's signature
         """Return the field at the position, without noise: the updaters add it."""
         x = np.asarray(state.state_vector, float)
         field = self.spline(self.position[0] + x[0], self.position[1] + x[1], grid=False)
@@ -95,7 +96,7 @@ def particles(data: dict[str, np.ndarray]) -> Iterator[tuple[np.ndarray, np.ndar
 
 def main() -> None:
     data = dict(np.load(sys.argv[1]))
-    out = {}
+    out: dict[str, Any] = {}
     for name, method in (("ekf", ekf), ("particles", particles)):
         begun = time.process_time()
         found = list(method(data))
