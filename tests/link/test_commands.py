@@ -3,56 +3,54 @@
 from __future__ import annotations
 
 from math import inf, nan
+from typing import Any
 
 import pytest
+from line import Line
 
 ACCEPTED, TEMPORARILY_REJECTED, DENIED, UNSUPPORTED = 0, 1, 2, 3
 FIELD, HEARTBEAT, STATUS, HIGHRES_IMU, VERSION = 60101, 0, 60102, 105, 148
 GET, SET, REQUEST, CAPABILITIES, START_MAG_CAL = 510, 511, 512, 520, 42424
 
 
-def result(link, messages):
+def result(link: Line, messages: list[Any]) -> int:
     (ack,) = link.only(messages, "COMMAND_ACK")
     assert (ack.get_srcComponent(), ack.command) == (191, link.asked)
-    return ack.result
+    number: int = ack.result
+    return number
 
 
-def ask(link, number, *params, **options):
-    link.asked = number
-    return link.command(number, *params, **options)
-
-
-def test_request_message(link):
-    heard = ask(link, REQUEST, STATUS)
+def test_request_message(link: Line) -> None:
+    heard = link.command(REQUEST, STATUS)
     assert result(link, heard) == ACCEPTED
     assert len(link.only(heard, "MAG_STATUS")) == 1
-    assert result(link, ask(link, REQUEST, FIELD)) == TEMPORARILY_REJECTED  # no sample yet
-    assert result(link, ask(link, REQUEST, 24)) == DENIED
-    assert result(link, ask(link, REQUEST, nan)) == DENIED
-    assert result(link, ask(link, REQUEST, inf)) == DENIED
+    assert result(link, link.command(REQUEST, FIELD)) == TEMPORARILY_REJECTED  # no sample yet
+    assert result(link, link.command(REQUEST, 24)) == DENIED
+    assert result(link, link.command(REQUEST, nan)) == DENIED
+    assert result(link, link.command(REQUEST, inf)) == DENIED
 
 
-def test_version(link):
+def test_version(link: Line) -> None:
     for number, param in ((REQUEST, VERSION), (CAPABILITIES, 1)):
-        heard = ask(link, number, param)
+        heard = link.command(number, param)
         assert result(link, heard) == ACCEPTED
         (version,) = link.only(heard, "AUTOPILOT_VERSION")
         assert version.flight_sw_version == 0x010203FF
         assert version.capabilities == 2 | 8 | 8192
 
 
-def test_intervals(link):
-    heard = ask(link, SET, HIGHRES_IMU, 100_000)
+def test_intervals(link: Line) -> None:
+    heard = link.command(SET, HIGHRES_IMU, 100_000)
     assert result(link, heard) == ACCEPTED
     (value,) = link.only(heard, "PARAM_VALUE")  # a parameter changed: stations want to know
     assert (value.param_id, value.param_value) == ("MB_R_HIGHRES_IMU", 10.0)
-    heard = ask(link, GET, HIGHRES_IMU)
+    heard = link.command(GET, HIGHRES_IMU)
     assert link.only(heard, "MESSAGE_INTERVAL")[0].interval_us == 100_000
-    assert result(link, ask(link, SET, HIGHRES_IMU, -1)) == ACCEPTED
-    assert link.only(ask(link, GET, HIGHRES_IMU), "MESSAGE_INTERVAL")[0].interval_us == -1
-    assert result(link, ask(link, SET, HEARTBEAT, 200_000)) == ACCEPTED
+    assert result(link, link.command(SET, HIGHRES_IMU, -1)) == ACCEPTED
+    assert link.only(link.command(GET, HIGHRES_IMU), "MESSAGE_INTERVAL")[0].interval_us == -1
+    assert result(link, link.command(SET, HEARTBEAT, 200_000)) == ACCEPTED
     assert len(link.only(link.to(10.05), "HEARTBEAT")) == pytest.approx(50, abs=1)
-    assert result(link, ask(link, SET, HEARTBEAT, 0)) == ACCEPTED
+    assert result(link, link.command(SET, HEARTBEAT, 0)) == ACCEPTED
     assert len(link.only(link.to(20.05), "HEARTBEAT")) == pytest.approx(10, abs=1)
 
 
@@ -69,47 +67,47 @@ def test_intervals(link):
         (1e30, 0),
     ],
 )
-def test_intervals_that_are_refused(link, message, interval):
+def test_intervals_that_are_refused(link: Line, message: float, interval: float) -> None:
     before = dict(link.component.parameters.changed())
-    assert result(link, ask(link, SET, message, interval)) == DENIED
+    assert result(link, link.command(SET, message, interval)) == DENIED
     assert link.component.parameters.changed() == before
 
 
 @pytest.mark.parametrize("message", [HIGHRES_IMU, STATUS])
-def test_an_interval_of_an_age_is_kept(link, message):
+def test_an_interval_of_an_age_is_kept(link: Line, message: int) -> None:
     """MESSAGE_INTERVAL holds 36 minutes."""
-    assert result(link, ask(link, SET, message, 1e38)) == ACCEPTED
-    assert link.only(ask(link, GET, message), "MESSAGE_INTERVAL")[0].interval_us == 0x7FFFFFFF
+    assert result(link, link.command(SET, message, 1e38)) == ACCEPTED
+    assert link.only(link.command(GET, message), "MESSAGE_INTERVAL")[0].interval_us == 0x7FFFFFFF
 
 
-def test_interval_of_a_message_we_do_not_send(link):
-    assert link.only(ask(link, GET, 24), "MESSAGE_INTERVAL")[0].interval_us == 0
-    assert result(link, ask(link, GET, 70_000)) == DENIED
+def test_interval_of_a_message_we_do_not_send(link: Line) -> None:
+    assert link.only(link.command(GET, 24), "MESSAGE_INTERVAL")[0].interval_us == 0
+    assert result(link, link.command(GET, 70_000)) == DENIED
 
 
-def test_unknown_commands_are_unsupported_but_not_for_others(link):
-    assert result(link, ask(link, 400, 1)) == UNSUPPORTED
-    assert ask(link, 400, 1, target=(1, 1)) == []
-    assert ask(link, 400, 1, target=(2, 191)) == []
+def test_unknown_commands_are_unsupported_but_not_for_others(link: Line) -> None:
+    assert result(link, link.command(400, 1)) == UNSUPPORTED
+    assert link.command(400, 1, target=(1, 1)) == []
+    assert link.command(400, 1, target=(2, 191)) == []
 
 
-def test_to_everybody_we_do_only_what_only_we_can(link):
-    assert ask(link, START_MAG_CAL, 1, target=(1, 0)) == []
-    assert ask(link, REQUEST, VERSION, target=(1, 0)) == []
-    assert ask(link, SET, HIGHRES_IMU, 1000, target=(0, 0)) == []
-    heard = ask(link, REQUEST, STATUS, target=(1, 0))
+def test_to_everybody_we_do_only_what_only_we_can(link: Line) -> None:
+    assert link.command(START_MAG_CAL, 1, target=(1, 0)) == []
+    assert link.command(REQUEST, VERSION, target=(1, 0)) == []
+    assert link.command(SET, HIGHRES_IMU, 1000, target=(0, 0)) == []
+    heard = link.command(REQUEST, STATUS, target=(1, 0))
     assert result(link, heard) == ACCEPTED
     assert len(link.only(heard, "MAG_STATUS")) == 1
 
 
-def test_command_int(link):
+def test_command_int(link: Line) -> None:
     link.asked = REQUEST
     heard = link.say("command_int", 1, 191, 0, REQUEST, 0, 0, STATUS, 0, 0, 0, 0, 0, 0)
     assert result(link, heard) == ACCEPTED
 
 
-def test_the_acknowledgement_is_addressed(link):
-    (ack,) = link.only(ask(link, 400), "COMMAND_ACK")
+def test_the_acknowledgement_is_addressed(link: Line) -> None:
+    (ack,) = link.only(link.command(400), "COMMAND_ACK")
     frame = next(frame for _, frame in reversed(link.sent) if frame[7] == 77)
     assert ack.result == UNSUPPORTED
     assert frame[10 + 8 : 10 + 10] == bytes((255, 190))  # target_system, target_component

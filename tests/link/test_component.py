@@ -5,10 +5,12 @@ from __future__ import annotations
 import random
 from math import inf, nan
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from line import Line, MakeLine
 
 from magbridge.config import Align, Link
 from magbridge.errors import ConfigError
@@ -21,7 +23,7 @@ START = 1_700_000_000_000_000
 NOW = START + 100_000
 
 
-def test_heartbeat_once_a_second_at_its_own_time(link):
+def test_heartbeat_once_a_second_at_its_own_time(link: Line) -> None:
     link.to(10.05)
     beats = [at for at, frame in link.sent if frame[7] == 0]
     assert beats == [START + i * 1_000_000 for i in range(11)]
@@ -31,7 +33,7 @@ def test_heartbeat_once_a_second_at_its_own_time(link):
     assert beat.system_status == 5  # critical: no sensor
 
 
-def test_when_it_is_woken_does_not_matter(make_link):
+def test_when_it_is_woken_does_not_matter(make_link: MakeLine) -> None:
     lazy, eager = make_link(), make_link()
     lazy.to(30)
     for i in range(301):
@@ -39,7 +41,7 @@ def test_when_it_is_woken_does_not_matter(make_link):
     assert lazy.sent == eager.sent
 
 
-def test_next_deadline_is_when_something_is_sent(link):
+def test_next_deadline_is_when_something_is_sent(link: Line) -> None:
     for _ in range(20):
         deadline = link.component.next_deadline
         link.component.advance(deadline - 4)
@@ -48,7 +50,7 @@ def test_next_deadline_is_when_something_is_sent(link):
         assert {at for at, _ in link.component.outbox.drain()} == {deadline}
 
 
-def test_status(make_link):
+def test_status(make_link: MakeLine) -> None:
     link = make_link(
         calibration_id=7,
         status=lambda: Condition(samples=5, sensor_state=MAG_PORT_STATE.OK, log_records=(1 << 32) + 3),
@@ -64,7 +66,7 @@ def test_status(make_link):
     assert link.only(heard, "HEARTBEAT")[-1].system_status == 4
 
 
-def test_telemetry_only_of_our_vehicle(link):
+def test_telemetry_only_of_our_vehicle(link: Line) -> None:
     link.fly("ATTITUDE", roll=0.5)
     assert [message["roll"] for message in link.telemetry] == [0.5]
     for codec in (Codec(2, 1), Codec(1, 191)):
@@ -72,7 +74,7 @@ def test_telemetry_only_of_our_vehicle(link):
         assert link.telemetry == []
 
 
-def test_everything_heard_is_kept_for_the_log(link):
+def test_everything_heard_is_kept_for_the_log(link: Line) -> None:
     frame = link.autopilot.pack("ATTITUDE", roll=0.5)
     inside = link.autopilot.pack("MAG_LINK_BYTES", length=1, data=b"x")
     noise = bytes(range(250)) * 2
@@ -83,10 +85,11 @@ def test_everything_heard_is_kept_for_the_log(link):
     assert b"".join(message["data"][: message["length"]] for message in kept) == noise + inside
 
 
-def test_replaying_what_was_heard_gives_the_same_bytes(make_link):
+def test_replaying_what_was_heard_gives_the_same_bytes(make_link: MakeLine) -> None:
     """Garbage, requests, time synchronisation, cut at random: the log's frames bring it all back."""
     rng = random.Random(5)
-    first, second, log = make_link(), make_link(), []
+    first, second = make_link(), make_link()
+    log: list[tuple[int, bytes]] = []
     for i in range(400):
         first.now += 4 * rng.randrange(20_000)
         first.component.advance(first.now)
@@ -116,16 +119,17 @@ def test_replaying_what_was_heard_gives_the_same_bytes(make_link):
     assert first.component.codec.bytes_skipped == second.component.codec.bytes_skipped > 1000
 
 
-def test_timesync_is_answered_to_the_asker(link):
+def test_timesync_is_answered_to_the_asker(link: Line) -> None:
     (answer,) = link.only(link.say("timesync", 0, 123456789), "TIMESYNC")
     assert (answer.tc1, answer.ts1) == (NOW * 1000, 123456789)
     mine = link.fly("TIMESYNC", ts1=5, target_system=1, target_component=158)
     assert not link.only(mine, "TIMESYNC")
 
 
-def test_signed_both_ways(make_link):
+def test_signed_both_ways(make_link: MakeLine) -> None:
     key = bytes(range(32))
-    link = make_link(signing=Signing(key))
+    signing = Signing(key)
+    link = make_link(signing=signing)
     link.station.signing.secret_key = key
     link.station.signing.sign_outgoing = True
     link.station.signing.timestamp = (START - 1_420_070_400_000_000) // 10
@@ -133,12 +137,12 @@ def test_signed_both_ways(make_link):
     values = link.say("param_request_read", 1, 191, b"", 0)
     assert [message.get_signed() for message in values] == [True]
     link.fly("PARAM_REQUEST_READ", target_system=1, target_component=191, param_index=0)
-    assert link.component.codec.signing.refused == 1
+    assert signing.refused == 1
     (status,) = link.only(link.to(1), "MAG_STATUS")
     assert status.link_refused == 1
 
 
-def test_publish_is_checked():
+def test_publish_is_checked() -> None:
     check_publish({"MAG_FIELD": 0, "NAMED_VALUE_FLOAT": 1, "DEBUG_VECT": -1}, Path("b.toml"))
     for publish, complaint in (
         ({"MAG_FILED": 0}, r"b.toml: publish.MAG_FILED: expected one of .*MAG_FIELD"),
@@ -166,10 +170,12 @@ COMMANDS = [510, 511, 512, 519, 520, 42424]
 
 
 @st.composite
-def message(draw):
+def message(draw: st.DrawFn) -> bytes:
     """Bytes of a message that the component reacts to, with any values in it."""
     layout = spec(draw(st.sampled_from(ANSWERED)))
-    fields = {name: draw(VALUES[field.code]) for name, field in layout.fields.items() if field.code != "s"}
+    fields: dict[str, Any] = {
+        name: draw(VALUES[field.code]) for name, field in layout.fields.items() if field.code != "s"
+    }
     fields["target_system"], fields["target_component"] = 1, draw(st.sampled_from([0, 191]))
     if "param_id" in layout.fields:
         fields["param_id"] = draw(st.sampled_from(["MB_R_HEARTBEAT", "MB_GAP_FACTOR", b"\xff" * 16]))
@@ -180,7 +186,7 @@ def message(draw):
 
 
 @given(st.lists(st.one_of(message(), st.binary(max_size=30)), max_size=15))
-def test_whatever_is_said_it_goes_on(chunks):
+def test_whatever_is_said_it_goes_on(chunks: list[bytes]) -> None:
     component = Component(Link("u"), {"HIGHRES_IMU": 1.0}, alignment(Align()), start_us=START)
     for i, chunk in enumerate(chunks):
         now = START + i * 300_000
@@ -194,7 +200,7 @@ def test_whatever_is_said_it_goes_on(chunks):
     assert len(beats) >= 1
 
 
-def test_the_status_is_dated_by_the_clock_as_it_was_set(link):
+def test_the_status_is_dated_by_the_clock_as_it_was_set(link: Line) -> None:
     """The autopilot's clock is 1,000 s; ours, set to be right, changes and its own does not."""
     (ask,) = [m for m in link.to(0.6) if m.get_type() == "TIMESYNC"]
     link.fly("TIMESYNC", tc1=1000 * 10**9, ts1=ask.ts1)

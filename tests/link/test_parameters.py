@@ -4,24 +4,27 @@ from __future__ import annotations
 
 import itertools
 from math import inf, nan
+from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from line import Line, MakeLine
 
 from magbridge.config import Align, Telemetry
 from magbridge.errors import FormatError
 from magbridge.link import Parameters, alignment, telemetry_ages
 from magbridge.link.component import LIMITS
-from magbridge.link.parameters import rates, real32
+from magbridge.link.parameters import Tunable, rates, real32
 from magbridge.link.store import Kept, load, save
 
 
-def write(link, name, value, kind=9):
+def write(link: Line, name: str, value: float, kind: int = 9) -> list[Any]:
     return link.say("param_set", 1, 191, name.encode(), value, kind)
 
 
-def test_list_comes_whole_and_paced(link):
+def test_list_comes_whole_and_paced(link: Line) -> None:
     assert not link.only(link.say("param_request_list", 1, 191), "PARAM_VALUE")
     values = link.only(link.to(5), "PARAM_VALUE")
     table = link.component.parameters.table
@@ -33,7 +36,7 @@ def test_list_comes_whole_and_paced(link):
     assert len(link.only(link.to(6), "PARAM_VALUE")) == 0
 
 
-def test_names_and_ranges_are_sound(link):
+def test_names_and_ranges_are_sound(link: Line) -> None:
     for row in link.component.parameters.table.values():
         assert row.name.startswith("MB_")
         assert len(row.name) <= 16
@@ -41,7 +44,7 @@ def test_names_and_ranges_are_sound(link):
         assert row.doc
 
 
-def test_read_by_name_and_index(link):
+def test_read_by_name_and_index(link: Line) -> None:
     for request in ((b"MB_GAP_FACTOR", -1), (b"", link.component.parameters.names.index("MB_GAP_FACTOR"))):
         (value,) = link.say("param_request_read", 1, 191, *request)
         assert (value.param_id, value.param_value) == ("MB_GAP_FACTOR", 2.5)
@@ -49,14 +52,14 @@ def test_read_by_name_and_index(link):
         assert link.say("param_request_read", 1, 191, *request) == []
 
 
-def test_not_ours(link):
+def test_not_ours(link: Line) -> None:
     assert link.say("param_request_read", 1, 1, b"MB_GAP_FACTOR", -1) == []
     assert link.say("param_request_read", 2, 191, b"MB_GAP_FACTOR", -1) == []
     assert link.say("param_request_read", 1, 0, b"", 0) == []  # an index means the autopilot's
     assert link.say("param_set", 1, 0, b"NO_SUCH", 1.0, 9) == []
 
 
-def test_set(link):
+def test_set(link: Line) -> None:
     before = link.component.parameters.revision
     (value,) = write(link, "MB_GAP_FACTOR", 4.0)
     assert value.param_value == 4.0
@@ -66,7 +69,7 @@ def test_set(link):
 
 
 @pytest.mark.parametrize("value", [0.5, -1.0, 1e6, nan, inf, -inf, 3.4e38])
-def test_out_of_range_is_refused_and_said(link, value):
+def test_out_of_range_is_refused_and_said(link: Line, value: float) -> None:
     heard = write(link, "MB_GAP_FACTOR", value)
     assert [v.param_value for v in link.only(heard, "PARAM_VALUE")] == [2.5]
     text = "".join(link.texts(heard))
@@ -75,20 +78,20 @@ def test_out_of_range_is_refused_and_said(link, value):
     assert link.component.parameters.changed() == {}
 
 
-def test_only_real32(link):
+def test_only_real32(link: Line) -> None:
     heard = write(link, "MB_GAP_FACTOR", 4.0, kind=6)
     assert link.texts(heard) == ["MB_GAP_FACTOR: only REAL32 is taken"]
     assert link.only(heard, "PARAM_VALUE")[0].param_value == 2.5
 
 
-def test_a_rate_parameter_is_obeyed(link):
+def test_a_rate_parameter_is_obeyed(link: Line) -> None:
     write(link, "MB_R_HEARTBEAT", 5.0)
     assert len(link.only(link.to(10.05), "HEARTBEAT")) == pytest.approx(50, abs=1)
     write(link, "MB_R_STATUS", -1.0)
     assert not link.only(link.to(20), "MAG_STATUS")
 
 
-def test_kept_parameters_come_back(make_link):
+def test_kept_parameters_come_back(make_link: MakeLine) -> None:
     link = make_link(kept={"MB_GAP_FACTOR": 3.5, "MB_R_RAW": 2.0, "GONE": 1.0})
     assert link.component.parameters["MB_GAP_FACTOR"] == 3.5
     assert link.component.rates["MAG_RAW"].hertz == 2.0
@@ -105,12 +108,12 @@ ROWS = [
 ]
 
 
-def test_names_do_not_collide():
+def test_names_do_not_collide() -> None:
     assert len(Parameters(ROWS).names) == len(ROWS)
 
 
 @given(st.sampled_from(ROWS), st.floats(width=32))
-def test_what_is_set_reads_back_or_nothing_changes(row, value):
+def test_what_is_set_reads_back_or_nothing_changes(row: Tunable, value: float) -> None:
     parameters = Parameters(ROWS)
     before = parameters[row.name]
     if parameters.set(row.name, value):
@@ -124,7 +127,7 @@ def test_what_is_set_reads_back_or_nothing_changes(row, value):
         assert parameters.revision == 0
 
 
-def test_a_default_read_and_written_back_stays_exact():
+def test_a_default_read_and_written_back_stays_exact() -> None:
     parameters = Parameters(ROWS)
     exact = parameters["MB_MOVING_RATE"]
     assert exact != real32(exact)
@@ -133,7 +136,7 @@ def test_a_default_read_and_written_back_stays_exact():
     assert parameters["MB_MOVING_RATE"] == exact
 
 
-def test_store(tmp_path):
+def test_store(tmp_path: Path) -> None:
     path = tmp_path / "parameters.json"
     assert load(path) == Kept()
     kept = Kept({"MB_GAP_FACTOR": real32(0.1)}, 12345678901234)
@@ -152,7 +155,7 @@ def test_store(tmp_path):
         "",
     ],
 )
-def test_a_store_that_is_damaged(tmp_path, content):
+def test_a_store_that_is_damaged(tmp_path: Path, content: str) -> None:
     path = tmp_path / "parameters.json"
     path.write_text(content)
     with pytest.raises(FormatError, match=r"parameters.json"):

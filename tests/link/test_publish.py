@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from math import nan
+from typing import Any
 
 import pytest
+from line import Line, MakeLine
 
 from magbridge.link import Sample
 from magbridge.records import Corrected, Quality, Reading
@@ -25,23 +27,23 @@ CORRECTED = Corrected(
 )
 
 
-def sample(t_us=START, **fields):
+def sample(t_us: int = START, **fields: float) -> Sample:
     return Sample(READING, t_us + 4000, CORRECTED, t_us, **fields)
 
 
-def publish(link, one):
+def publish(link: Line, one: Sample) -> list[Any]:
     link.component.publisher.publish(one)
     return link.hear()
 
 
 @pytest.fixture
-def line(make_link):
+def line(make_link: MakeLine) -> Line:
     line = make_link(publish=ALL, calibration_id=0xDEADBEEF)
     line.to(0.1)
     return line
 
 
-def test_raw(line):
+def test_raw(line: Line) -> None:
     (raw,) = line.only(publish(line, sample()), "MAG_RAW")
     assert raw.time_usec == START + 4000
     assert (raw.x, raw.y, raw.z) == pytest.approx(READING.field, abs=0.002)
@@ -52,14 +54,14 @@ def test_raw(line):
     assert raw.flags == 1 | 2 | 4 | 8
 
 
-def test_raw_of_an_instrument_that_says_little(line):
+def test_raw_of_an_instrument_that_says_little(line: Line) -> None:
     plain = Sample(Reading((1.0, 2.0, 3.0)), START, CORRECTED, START)
     (raw,) = line.only(publish(line, plain), "MAG_RAW")
     assert raw.flags == 0
     assert (raw.count_x, raw.sequence, raw.power_cycle) == (0, 0, 0)
 
 
-def test_field(line):
+def test_field(line: Line) -> None:
     (field,) = line.only(publish(line, sample(telemetry_age=0.25, anomaly=-12.5)), "MAG_FIELD")
     assert field.total_field == CORRECTED.total_field  # double: not rounded
     assert (field.x, field.y, field.z) == CORRECTED.field
@@ -69,7 +71,7 @@ def test_field(line):
     assert field.latency == pytest.approx(0.1)
 
 
-def test_standard_messages(line):
+def test_standard_messages(line: Line) -> None:
     heard = publish(line, sample())
     (imu,) = line.only(heard, "HIGHRES_IMU")
     assert (imu.xmag, imu.ymag, imu.zmag) == pytest.approx((0.2, -0.01, 0.45), rel=1e-6)
@@ -85,7 +87,7 @@ def test_standard_messages(line):
     assert {one.time_boot_ms for one in named} == {2500}
 
 
-def test_rates(make_link):
+def test_rates(make_link: MakeLine) -> None:
     line = make_link(publish={"MAG_FIELD": 0.0, "HIGHRES_IMU": 3.0})
     heard = []
     for i in range(1000):  # 10 Hz
@@ -102,13 +104,13 @@ def test_rates(make_link):
     assert len(heard) == pytest.approx(100, abs=1)
 
 
-def test_the_latest_sample_on_request(line):
+def test_the_latest_sample_on_request(line: Line) -> None:
     publish(line, sample())
     heard = line.command(512, 105)
     assert [one.get_type() for one in heard] == ["HIGHRES_IMU", "COMMAND_ACK"]
 
 
-def test_nan_is_published_as_nan(line):
+def test_nan_is_published_as_nan(line: Line) -> None:
     one = Sample(Reading((nan, 1.0, 2.0)), START, Corrected(nan, nan, (nan,) * 3, (nan,) * 3, 16), START)
     (field,) = line.only(publish(line, one), "MAG_FIELD")
     assert field.total_field != field.total_field

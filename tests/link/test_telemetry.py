@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from math import isnan
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -19,12 +20,19 @@ from magbridge.mavlink.messages import spec
 NOW = 1_700_000_000_000_000
 
 
-def values(telemetry, message_name, clock=None, component=1, /, **fields):
+def values(
+    telemetry: dict[str, Telemetry],
+    message_name: str,
+    clock: VehicleClock | None = None,
+    component: int = 1,
+    /,
+    **fields: Any,
+) -> list[tuple[str, float, int]]:
     (message,) = Codec(1, 191).parse(Codec(1, component).pack(message_name, **fields))
     return TelemetryMap(telemetry).values(message, NOW, clock or VehicleClock())
 
 
-def test_scale_offset_and_match():
+def test_scale_offset_and_match() -> None:
     telemetry = {
         "battpos": Telemetry("NAMED_VALUE_FLOAT", "value", match={"name": "battpos"}, scale=2.0, offset=1.0),
         "fin": Telemetry("NAMED_VALUE_FLOAT", "value", match={"name": "fin"}),
@@ -35,7 +43,7 @@ def test_scale_offset_and_match():
     assert values(telemetry, "ATTITUDE", roll=1) == []
 
 
-def test_arrays_and_numeric_match():
+def test_arrays_and_numeric_match() -> None:
     telemetry = {
         "ballast": Telemetry("ACTUATOR_OUTPUT_STATUS", "actuator[2]"),
         "cell": Telemetry("BATTERY_STATUS", "voltages[1]", match={"id": 1}, scale=1e-3),
@@ -48,20 +56,20 @@ def test_arrays_and_numeric_match():
     assert values(telemetry, "GPS_STATUS", satellite_snr=bytes(range(20))) == [("cov", 3, NOW)]
 
 
-def test_not_known_is_nan():
+def test_not_known_is_nan() -> None:
     telemetry = {"i": Telemetry("SYS_STATUS", "current_battery", scale=0.01)}
     (one,) = values(telemetry, "SYS_STATUS", current_battery=-1)
     assert isnan(one[1])
     assert values(telemetry, "SYS_STATUS", current_battery=150)[0][1] == 1.5
 
 
-def known_clock(offset_us):
+def known_clock(offset_us: int) -> VehicleClock:
     clock = VehicleClock()
     clock.answer((NOW + offset_us) * 1000, clock.ask(NOW), NOW)
     return clock
 
 
-def test_the_messages_own_time():
+def test_the_messages_own_time() -> None:
     telemetry = {"roll": Telemetry("ATTITUDE", "roll"), "servo": Telemetry("SERVO_OUTPUT_RAW", "servo1_raw")}
     clock = known_clock(-NOW + 3_600_000_000 * 5)  # the autopilot runs for 5 h
     boot_ms = 3_600_000 * 5
@@ -103,12 +111,12 @@ def test_the_messages_own_time():
         (Telemetry("BATTERY_STATUS", "id", match={"id": "a"}), r"telemetry.p.match.id: a number, not 'a'"),
     ],
 )
-def test_mistakes_are_one_clear_line(what, complaint):
+def test_mistakes_are_one_clear_line(what: Telemetry, complaint: str) -> None:
     with pytest.raises(ConfigError, match=complaint):
         TelemetryMap({"p": what}, path=Path("b.toml"))
 
 
-def test_every_numeric_field_of_every_message_maps():
+def test_every_numeric_field_of_every_message_maps() -> None:
     for number in MESSAGES:
         layout = spec(number)
         telemetry = {
@@ -122,14 +130,15 @@ def test_every_numeric_field_of_every_message_maps():
 
 
 @pytest.mark.real
-def test_measured_telemetry(real_data):
+def test_measured_telemetry(real_data: Path) -> None:
     wanted = {
         "roll": Telemetry("ATTITUDE", "roll"),
         "current": Telemetry("SYS_STATUS", "current_battery", scale=0.01, unit="A"),
         "thruster": Telemetry("SERVO_OUTPUT_RAW", "servo3_raw"),
         "mag_x": Telemetry("RAW_IMU", "xmag"),
     }
-    telemetry, clock, got = TelemetryMap(wanted), VehicleClock(), {name: [] for name in wanted}
+    telemetry, clock = TelemetryMap(wanted), VehicleClock()
+    got: dict[str, list[float]] = {name: [] for name in wanted}
     with (real_data / "ardusub" / "small.tlog").open("rb") as file:
         records = [(one.time_us, one.message) for one in LogReader(file)]
     begin = time.process_time()

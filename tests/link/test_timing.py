@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import random
+from collections.abc import Iterable
+from types import ModuleType
+from typing import Any
 
 import pytest
 
@@ -15,23 +18,23 @@ from magbridge.mavlink import Codec
 START = 1_700_000_000_000_000
 
 
-def passed(rate: Rate, times) -> list[int]:
+def passed(rate: Rate, times: Iterable[int]) -> list[int]:
     return [t for t in times if rate.due(t)]
 
 
 @pytest.mark.parametrize("hertz", [1, 3, 7, 9.9, 10])
-def test_thinned_without_drift(hertz):
+def test_thinned_without_drift(hertz: float) -> None:
     times = [START + 100_000 * i for i in range(10_000)]  # 10 Hz, 1000 s
     assert len(passed(Rate(hertz), times)) == pytest.approx(1000 * hertz, abs=1)
 
 
-def test_a_jittering_stream_at_just_the_rate_passes_whole():
+def test_a_jittering_stream_at_just_the_rate_passes_whole() -> None:
     rng = random.Random(2)
     times = [START + 100_000 * i + rng.randrange(-20_000, 20_000) for i in range(1000)]
     assert len(passed(Rate(10), times)) == pytest.approx(1000, abs=2)
 
 
-def test_all_none_and_too_fast():
+def test_all_none_and_too_fast() -> None:
     times = [START + 10_000 * i for i in range(100)]
     assert passed(Rate(0), times) == times
     assert passed(Rate(-1), times) == []
@@ -39,7 +42,7 @@ def test_all_none_and_too_fast():
     assert passed(Rate(1000), times) == times
 
 
-def test_pauses_and_steps_back_begin_anew():
+def test_pauses_and_steps_back_begin_anew() -> None:
     rate = Rate(1)
     assert passed(rate, [START, START + 500_000, START + 1_000_000]) == [START, START + 1_000_000]
     assert passed(rate, [START + 3600_000_000, START + 3600_500_000]) == [START + 3600_000_000]
@@ -51,8 +54,10 @@ def test_pauses_and_steps_back_begin_anew():
     assert rate.due(START + 1_100_000)
 
 
-def test_timers_fire_in_order_at_their_own_times():
-    timers, fired, begun = Timers(), [], []
+def test_timers_fire_in_order_at_their_own_times() -> None:
+    timers = Timers()
+    fired: list[tuple[str, int]] = []
+    begun: list[int] = []
     timers.every("a", 300, lambda t: fired.append(("a", t)), 0)
     timers.every("b", 500, lambda t: fired.append(("b", t)), 100)
     timers.at("c", 600, lambda t: timers.at("d", t + 1, lambda t: fired.append(("d", t))))
@@ -66,14 +71,14 @@ def test_timers_fire_in_order_at_their_own_times():
 
 
 class Talker:
-    def __init__(self, peer) -> None:
+    def __init__(self, peer: ModuleType) -> None:
         self.codec = Codec(1, 191)
         self.outbox, self.timers = Outbox(self.codec), Timers()
         self.announcer = Announcer(self.outbox, self.timers)
         self.station = peer.MAVLink(None)
         self.codec.now_us = START
 
-    def at(self, seconds: float) -> list:
+    def at(self, seconds: float) -> list[Any]:
         def begin(t: int) -> None:
             self.codec.now_us = t
 
@@ -83,18 +88,18 @@ class Talker:
 
 
 @pytest.fixture
-def talker(peer):
+def talker(peer: ModuleType) -> Talker:
     return Talker(peer)
 
 
-def test_short_text(talker):
+def test_short_text(talker: Talker) -> None:
     talker.announcer.say("sensor found")
     (message,) = talker.at(0)
     assert (message.text, message.id, message.severity) == ("sensor found", 0, 6)
 
 
 @pytest.mark.parametrize("length", [50, 51, 99, 100, 150, 151])
-def test_long_text_in_pieces(talker, length):
+def test_long_text_in_pieces(talker: Talker, length: int) -> None:
     text = "".join(chr(97 + i % 26) for i in range(length))
     for _ in range(2):
         talker.announcer.say(text)
@@ -109,7 +114,7 @@ def test_long_text_in_pieces(talker, length):
     assert talker.at(0)[0].text == "5 ?T"
 
 
-def test_only_changes_are_said(talker):
+def test_only_changes_are_said(talker: Talker) -> None:
     for second, state in enumerate(("ok", "ok", "lost", "lost", "ok")):
         talker.at(second * 2)
         talker.announcer.state("sensor", state)
@@ -117,7 +122,7 @@ def test_only_changes_are_said(talker):
     assert [m.text for m in talker.at(20)] == ["ok"]
 
 
-def test_what_flaps_is_said_once_a_second_and_its_last_word_always(talker):
+def test_what_flaps_is_said_once_a_second_and_its_last_word_always(talker: Talker) -> None:
     said = []
     for i in range(201):  # 100 Hz for 2 s, ends on "up"
         said += talker.at(i / 100)

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import random
+from collections.abc import Iterable
 from math import isnan
 
 import pytest
+from line import Line
 
 from magbridge.link.clock import VehicleClock
 from magbridge.mavlink import Codec
@@ -13,7 +15,7 @@ from magbridge.mavlink import Codec
 START = 1_700_000_000_000_000
 
 
-def test_found_vanished_found(link):
+def test_found_vanished_found(link: Line) -> None:
     beat = {"type": 12, "autopilot": 3}
     assert link.texts(link.fly("HEARTBEAT", **beat)) == ["autopilot 1:1 found"]
     assert link.texts(link.to(4)) == []
@@ -24,7 +26,7 @@ def test_found_vanished_found(link):
     assert link.texts(link.fly("HEARTBEAT", **beat)) == ["autopilot 1:1 found"]
 
 
-def boots(link, codec, times):
+def boots(link: Line, codec: Codec, times: Iterable[int]) -> list[str]:
     said = []
     for i, boot_ms in enumerate(times):
         said += link.texts(link.to(1 + i * 0.1))
@@ -32,26 +34,26 @@ def boots(link, codec, times):
     return said
 
 
-def test_reboot(link):
+def test_reboot(link: Line) -> None:
     times = [*range(100_000, 101_000, 100), *range(500, 1500, 100)]
     assert boots(link, link.autopilot, times) == ["autopilot 1:1 rebooted"]
     assert link.component.vehicle.reboots == 1
 
 
-def test_stragglers_duplicates_and_the_wrap_are_no_reboot(link):
+def test_stragglers_duplicates_and_the_wrap_are_no_reboot(link: Line) -> None:
     end = (1 << 32) - 1000
     times = [end, end + 100, end + 100, end - 20_000, end + 200, end - 100, end + 300, *range(0, 1000, 100)]
     assert boots(link, link.autopilot, times) == []
     assert link.component.vehicle.reboots == 0
 
 
-def test_a_reboot_soon_after_a_boot(link):
+def test_a_reboot_soon_after_a_boot(link: Line) -> None:
     assert boots(link, link.autopilot, [*range(3000, 8000, 500), *range(500, 3000, 500)]) == [
         "autopilot 1:1 rebooted"
     ]
 
 
-def test_telemetry_that_is_sent_long_after_it_was_stamped_is_no_reboot(link):
+def test_telemetry_that_is_sent_long_after_it_was_stamped_is_no_reboot(link: Line) -> None:
     """Three positions at once, 1.5 s old, as from a controller that sends them on; attitudes are fresh."""
     link.fly("TIMESYNC", tc1=50_000_000_000, ts1=link.only(link.to(0.6), "TIMESYNC")[0].ts1)
     said = []
@@ -66,14 +68,14 @@ def test_telemetry_that_is_sent_long_after_it_was_stamped_is_no_reboot(link):
     assert link.component.vehicle.clock.known
 
 
-def test_two_autopilots_with_one_address(link):
+def test_two_autopilots_with_one_address(link: Line) -> None:
     times = [boot for i in range(20) for boot in (500_000 + 200 * i, 3_000 + 200 * i)]
     said = boots(link, link.autopilot, times)
     assert said[0] == "two autopilots speak as 1:1"
     assert link.component.vehicle.reboots == 0
 
 
-def test_two_autopilots_in_bursts(link):
+def test_two_autopilots_in_bursts(link: Line) -> None:
     times = [
         boot + 100 * i
         for i in range(12)
@@ -82,7 +84,7 @@ def test_two_autopilots_in_bursts(link):
     assert "two autopilots speak as 1:1" in boots(link, link.autopilot, times)
 
 
-def test_a_second_vehicle_is_told_once_and_ignored(link):
+def test_a_second_vehicle_is_told_once_and_ignored(link: Line) -> None:
     other = Codec(2, 1)
     said = []
     for i in range(5):
@@ -93,11 +95,11 @@ def test_a_second_vehicle_is_told_once_and_ignored(link):
     assert said == ["vehicle 2 is on the link too: ignored"]
 
 
-def test_a_ground_station_is_no_vehicle(link):
+def test_a_ground_station_is_no_vehicle(link: Line) -> None:
     assert link.texts(link.say("heartbeat", 6, 8, 0, 0, 0, 3)) == []
 
 
-def test_another_program_with_our_address(link):
+def test_another_program_with_our_address(link: Line) -> None:
     twin = Codec(1, 191)
     said = [
         text for _ in range(5) for text in link.texts(link.give(twin.pack("HEARTBEAT", type=18, autopilot=8)))
@@ -105,20 +107,27 @@ def test_another_program_with_our_address(link):
     assert said == ["another program speaks as 1:191"]
 
 
-def test_lost_frames_are_counted(link):
+def test_lost_frames_are_counted(link: Line) -> None:
     frames = [link.autopilot.pack("ATTITUDE", time_boot_ms=i) for i in range(600)]
     link.give(b"".join(frames[:100] + frames[107:400] + frames[400:410] + frames[405:600]))
     assert link.component.vehicle.frames_lost == 7
 
 
-def test_late_frames_are_not_lost(link):
+def test_late_frames_are_not_lost(link: Line) -> None:
     frames = [link.autopilot.pack("ATTITUDE", time_boot_ms=i) for i in range(400)]
     order = [four + i for four in range(0, 400, 4) for i in (2, 0, 3, 1)]
     link.give(b"".join(frames[i] for i in order if i not in (0, 1, 101, 203)))
     assert link.component.vehicle.frames_lost == 2
 
 
-def exchange(clock, rng, now_us, offset_us, slow=300.0, drift_ppm=0.0):
+def exchange(
+    clock: VehicleClock,
+    rng: random.Random,
+    now_us: int,
+    offset_us: float,
+    slow: float = 300.0,
+    drift_ppm: float = 0.0,
+) -> None:
     """One request and its answer over a link that delays each way by a random time."""
     there, back = (slow + rng.expovariate(1 / 2000) for _ in range(2))
     asked = clock.ask(now_us)
@@ -127,7 +136,7 @@ def exchange(clock, rng, now_us, offset_us, slow=300.0, drift_ppm=0.0):
 
 
 @pytest.mark.parametrize("drift_ppm", [0.0, 40.0, -100.0])
-def test_offset_through_jitter(drift_ppm):
+def test_offset_through_jitter(drift_ppm: float) -> None:
     rng, clock, offset = random.Random(4), VehicleClock(), -START + 5_000_000
     errors = []
     for i in range(300):
@@ -142,7 +151,7 @@ def test_offset_through_jitter(drift_ppm):
     assert clock.sigma < 1e-3
 
 
-def test_foreign_and_old_answers_are_ignored():
+def test_foreign_and_old_answers_are_ignored() -> None:
     clock = VehicleClock()
     clock.ask(START)
     clock.answer(5, 77, START + 10)
@@ -154,7 +163,7 @@ def test_foreign_and_old_answers_are_ignored():
     assert not clock.known
 
 
-def test_vehicle_times_are_unwrapped_and_never_in_the_future():
+def test_vehicle_times_are_unwrapped_and_never_in_the_future() -> None:
     rng, clock = random.Random(4), VehicleClock()
     boot = START - 3 * (1 << 32) - 1_000_000  # 3.6 h before
     for i in range(30):
@@ -166,7 +175,7 @@ def test_vehicle_times_are_unwrapped_and_never_in_the_future():
     assert clock.ours(now - boot + 1_000_000, now) == now
 
 
-def test_reboot_resets_the_clock(link):
+def test_reboot_resets_the_clock(link: Line) -> None:
     for i in range(5):
         for message in link.only(link.to(1 + i), "TIMESYNC"):
             link.fly("TIMESYNC", ts1=message.ts1, tc1=(50 + i) * 10**9)
@@ -176,7 +185,7 @@ def test_reboot_resets_the_clock(link):
 
 
 @pytest.mark.parametrize("now", [12_000_000, 6_700_000])
-def test_a_clock_that_was_set_is_learned_anew_at_once(now):
+def test_a_clock_that_was_set_is_learned_anew_at_once(now: int) -> None:
     rng, clock = random.Random(4), VehicleClock()
     for i in range(10):
         exchange(clock, rng, START + i * 1_000_000, 7_000_000)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import random
 import time
+from types import ModuleType
 
 import pytest
 from hypothesis import example, given
@@ -45,7 +46,7 @@ PIECES = st.one_of(
 @given(st.lists(PIECES, max_size=20).map(b"".join), st.lists(st.integers(0, 10_000), max_size=30))
 @example(b"\xfd" * 5000, [1, 2, 3])
 @example(bytes(3 * WINDOW) + stream(1)[0], [WINDOW, WINDOW + 1])
-def test_any_bytes_however_cut(data, places):
+def test_any_bytes_however_cut(data: bytes, places: list[int]) -> None:
     whole, one = parse([data])
     pieces, other = parse(cut(data, places))
     assert pieces == whole
@@ -60,7 +61,7 @@ def test_any_bytes_however_cut(data, places):
 
 
 @given(st.lists(PIECES, max_size=6).map(b"".join))
-def test_a_genuine_frame_survives_what_is_around_it(noise):
+def test_a_genuine_frame_survives_what_is_around_it(noise: bytes) -> None:
     noise = noise.replace(b"\xfd", b"\xfc").replace(b"\xfe", b"\xfc")[: WINDOW - 100]
     frames = stream(3)
     found, codec = parse([noise + frames[0] + noise + frames[1] + frames[2]])
@@ -69,7 +70,7 @@ def test_a_genuine_frame_survives_what_is_around_it(noise):
     assert codec.frames == 3
 
 
-def test_a_damaged_frame_does_not_take_the_next_with_it():
+def test_a_damaged_frame_does_not_take_the_next_with_it() -> None:
     first, second, third = stream(3)
     damaged = first[:15] + bytes((first[15] ^ 1,)) + first[16:]
     shortened = first[:-4]
@@ -80,7 +81,7 @@ def test_a_damaged_frame_does_not_take_the_next_with_it():
         assert codec.bytes_skipped == len(bad)
 
 
-def test_messages_outside_the_dialect_are_kept_when_another_frame_follows():
+def test_messages_outside_the_dialect_are_kept_when_another_frame_follows() -> None:
     codec = Codec(1, 191)
     frame = foreign(b"abc")
     assert codec.parse(frame) == []
@@ -89,7 +90,7 @@ def test_messages_outside_the_dialect_are_kept_when_another_frame_follows():
     assert heard.name == "ATTITUDE"
 
 
-def test_version_1_is_read(peer):
+def test_version_1_is_read(peer: ModuleType) -> None:
     station = peer.MAVLink(None, 1, 1)
     frame = peer.MAVLink_attitude_message(5, 0.5, 0, 0, 0, 0, 0).pack(station, force_mavlink1=True)
     (message,) = Codec(1, 191).parse(frame)
@@ -97,7 +98,7 @@ def test_version_1_is_read(peer):
     assert message.system == 1
 
 
-def test_pymavlink_reads_what_we_send_and_we_what_it_sends(peer):
+def test_pymavlink_reads_what_we_send_and_we_what_it_sends(peer: ModuleType) -> None:
     codec, station = Codec(1, 191), peer.MAVLink(None, 255, 190)
     for i in range(300):
         (message,) = station.parse_buffer(codec.pack("MAG_FIELD", time_usec=i, total_field=50_000.004))
@@ -108,7 +109,7 @@ def test_pymavlink_reads_what_we_send_and_we_what_it_sends(peer):
     assert (message["name"], message["value"]) == ("battpos", 0.25)
 
 
-def test_wrong_names_and_values_are_refused():
+def test_wrong_names_and_values_are_refused() -> None:
     codec = Codec(1, 191)
     with pytest.raises(KeyError, match="colour"):
         codec.pack("HEARTBEAT", colour=1)
@@ -117,7 +118,7 @@ def test_wrong_names_and_values_are_refused():
     assert codec.sequence == 0
 
 
-def test_garbage_is_cheap_even_byte_by_byte():
+def test_garbage_is_cheap_even_byte_by_byte() -> None:
     """A parser that starts anew at every byte would need minutes."""
     for garbage in (b"\xfd" * 20_000, b"\xfe\xff" * 10_000, random.Random(1).randbytes(20_000)):
         codec = Codec(1, 191)

@@ -6,33 +6,36 @@ import random
 import subprocess
 import sys
 from pathlib import Path
+from types import ModuleType
+from typing import Any
 
 import pytest
 from pymavlink.dialects.v20 import all as everything
 
 from magbridge.mavlink import Codec, spec
 from magbridge.mavlink.dialect import MAG_QUALITY, MESSAGES
+from magbridge.mavlink.messages import Field
 from magbridge.records import Quality
 
 ROOT = Path(__file__).parents[2]
 OURS = [number for number in MESSAGES if number >= 60100]
 
 
-def test_generated_module_agrees_with_the_xml():
+def test_generated_module_agrees_with_the_xml() -> None:
     done = subprocess.run([sys.executable, ROOT / "tools" / "dialect.py", "--check"], check=False)
     assert done.returncode == 0, "run tools/dialect.py"
 
 
-def test_flags_are_those_of_the_records():
+def test_flags_are_those_of_the_records() -> None:
     assert {flag.name: flag.value for flag in MAG_QUALITY} == {flag.name: flag.value for flag in Quality}
 
 
-def test_ids_are_in_the_free_range():
+def test_ids_are_in_the_free_range() -> None:
     assert min(OURS) == 60100  # up to 60099 everything is allocated
     assert max(OURS) <= 0xFFFF  # MESSAGE_INTERVAL has 16 bits for an id
 
 
-def test_our_fields_stand_in_the_order_of_the_wire(peer):
+def test_our_fields_stand_in_the_order_of_the_wire(peer: ModuleType) -> None:
     for number in OURS:
         assert list(spec(number).fields) == peer.mavlink_map[number].fieldnames
 
@@ -40,7 +43,7 @@ def test_our_fields_stand_in_the_order_of_the_wire(peer):
 LIMITS = {"b": 7, "B": 8, "h": 15, "H": 16, "i": 31, "I": 32, "q": 63, "Q": 64}
 
 
-def draw(field, rng):
+def draw(field: Field, rng: random.Random) -> tuple[Any, Any]:
     """Return a random value of a field as each of the two libraries takes it: ours, theirs."""
     if field.code == "s":
         text = "".join(rng.choices("abcdefghXYZ_0123456789", k=rng.randint(1, field.count or 1)))
@@ -56,7 +59,7 @@ def draw(field, rng):
 
 
 @pytest.mark.parametrize("dialect", ["ours", "everything"])
-def test_every_message_has_the_bytes_that_pymavlink_gives_it(peer, dialect):
+def test_every_message_has_the_bytes_that_pymavlink_gives_it(peer: ModuleType, dialect: str) -> None:
     module = peer if dialect == "ours" else everything
     rng = random.Random(7)
     codec, station = Codec(1, 191), module.MAVLink(None, 1, 191)
@@ -74,7 +77,7 @@ def test_every_message_has_the_bytes_that_pymavlink_gives_it(peer, dialect):
         station.seq = codec.sequence
 
 
-def test_every_message_reads_as_pymavlink_reads_it():
+def test_every_message_reads_as_pymavlink_reads_it() -> None:
     rng = random.Random(8)
     codec = Codec(1, 191)
     for number in everything.mavlink_map:
@@ -99,7 +102,7 @@ def test_every_message_reads_as_pymavlink_reads_it():
         assert ours.fields.keys() == layout.fields.keys()
 
 
-def test_import_is_light():
+def test_import_is_light() -> None:
     """The process has to start in 0.8 s within 90 MB; pymavlink's classes alone would take most of it."""
     program = (
         "import resource, time\n"

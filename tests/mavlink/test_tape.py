@@ -34,7 +34,7 @@ CHUNKS = st.lists(
 @example(
     [b"\xfd\xff\x00\x00\x00\x01\x01\x00\x00\x00" + GENUINE[0], b"\xfd" * 260, b"\xfd\xff" * 300, GENUINE[1]]
 )
-def test_the_log_brings_about_the_same_messages_at_the_same_moments(chunks):
+def test_the_log_brings_about_the_same_messages_at_the_same_moments(chunks: list[bytes]) -> None:
     live, again = Codec(1, 191), Codec(1, 191)
     writer, reader = TapeWriter(1, 191), TapeReader()
     for chunk in chunks:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import random
+from pathlib import Path
 
 import pytest
 from hypothesis import given
@@ -28,7 +29,7 @@ def read(data: bytes) -> tuple[list[bytes], LogReader]:
     return [pack_record(one.time_us, one.channel, one.frame) for one in reader], reader
 
 
-def test_round_trip():
+def test_round_trip() -> None:
     found, reader = read(b"".join(records(1000)))
     assert found == records(1000)
     assert (reader.records, reader.bytes_skipped, reader.damages) == (1000, 0, 0)
@@ -36,7 +37,7 @@ def test_round_trip():
     assert (one.time_us, one.channel, one.message["time_boot_ms"]) == (START + 8, 2, 2)
 
 
-def test_chunks_do_not_matter(monkeypatch):
+def test_chunks_do_not_matter(monkeypatch: pytest.MonkeyPatch) -> None:
     data = b"".join(records(200))
     damaged = data[:3000] + data[3010:5000] + b"\xfd\x00" * 30 + data[5000:-7]
     whole = read(damaged)[0]
@@ -46,13 +47,13 @@ def test_chunks_do_not_matter(monkeypatch):
 
 
 @given(st.binary(max_size=300))
-def test_any_bytes(data):
+def test_any_bytes(data: bytes) -> None:
     found, reader = read(data)
     assert sum(map(len, found)) + reader.bytes_skipped == len(data)
 
 
 @given(st.data())
-def test_damage_costs_only_the_records_it_touches(data):
+def test_damage_costs_only_the_records_it_touches(data: st.DataObject) -> None:
     all_records = records(30)
     whole = b"".join(all_records)
     begin = data.draw(st.integers(0, len(whole)))
@@ -68,7 +69,7 @@ def test_damage_costs_only_the_records_it_touches(data):
     ) + len(noise)
 
 
-def test_a_log_cut_anywhere_reads_to_its_last_whole_record():
+def test_a_log_cut_anywhere_reads_to_its_last_whole_record() -> None:
     all_records = records(5)
     data = b"".join(all_records)
     for end in range(len(data)):
@@ -77,7 +78,7 @@ def test_a_log_cut_anywhere_reads_to_its_last_whole_record():
         assert reader.bytes_skipped == end - sum(map(len, found)) < len(all_records[1])
 
 
-def test_a_megabyte_of_garbage_is_passed_over():
+def test_a_megabyte_of_garbage_is_passed_over() -> None:
     noise = random.Random(3).randbytes(1_500_000)
     found, reader = read(noise + b"".join(records(5)))
     assert found[-5:] == records(5)
@@ -86,7 +87,9 @@ def test_a_megabyte_of_garbage_is_passed_over():
 
 @pytest.mark.real
 @pytest.mark.parametrize(("name", "count", "damages"), [("small", 35912, 4), ("damaged", 50136, 1961)])
-def test_measured_logs_read_as_pymavlink_reads_them(real_data, name, count, damages):
+def test_measured_logs_read_as_pymavlink_reads_them(
+    real_data: Path, name: str, count: int, damages: int
+) -> None:
     path = real_data / "ardusub" / f"{name}.tlog"
     with path.open("rb") as file:
         reader = LogReader(file)
