@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import importlib.util
+import importlib
 import os
 import shutil
 import signal
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 # threads only wait for each other on matrices this narrow, above all beside those of a second worker
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -27,7 +27,7 @@ settings.load_profile("magbridge")
 @pytest.fixture(scope="session", autouse=True)
 def signals_are_heard() -> Iterator[None]:
     """A background job ignores Ctrl-C, one under nohup a closed terminal, and so does all that they start."""
-    wanted = {signal.SIGINT: signal.default_int_handler, signal.SIGHUP: signal.SIG_DFL}
+    wanted: dict[int, Any] = {signal.SIGINT: signal.default_int_handler, signal.SIGHUP: signal.SIG_DFL}
     before = {number: signal.signal(number, handler) for number, handler in wanted.items()}
     yield
     for number, handler in before.items():
@@ -55,8 +55,6 @@ def peer(tmp_path_factory: pytest.TempPathFactory) -> ModuleType:
         shutil.copy(Path(pymavlink.__file__).parent / "dialects" / "v20" / f"{name}.xml", folder)
     options = mavgen.Opts(str(folder / "magbridge_peer"), wire_protocol="2.0", language="Python3")
     assert mavgen.mavgen(options, [str(folder / "magbridge.xml")])
-    place = importlib.util.spec_from_file_location("magbridge_peer", folder / "magbridge_peer.py")
-    module = importlib.util.module_from_spec(place)
-    sys.modules["magbridge_peer"] = module
-    place.loader.exec_module(module)
-    return module
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(folder)
+        return importlib.import_module("magbridge_peer")

@@ -45,7 +45,7 @@ def public() -> dict[str, ast.FunctionDef]:
         bases = [classes[base.id] for base in one.bases if isinstance(base, ast.Name) and base.id in classes]
         return {n.name for base in bases for n in functions(base)}.union(*map(above, bases))
 
-    found = {}
+    found: dict[str, ast.FunctionDef] = {}
     for path, tree in trees().items():
         names = offered(tree)
         own = [n for n in functions(tree) if n.name in names]

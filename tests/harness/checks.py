@@ -34,7 +34,7 @@ def replays(rig: Rig) -> None:
         at += len(message.frame)
 
 
-def first_difference(one: bytes, other: bytes) -> tuple[object, object] | None:
+def first_difference(one: bytes | bytearray, other: bytes | bytearray) -> tuple[object, object] | None:
     """Return the first two messages in which two streams differ."""
     pairs = zip_longest(*(Codec(0, 0).parse(bytes(stream)) for stream in (one, other)))
     different = ((this and this.fields, that and that.fields) for this, that in pairs if this != that)

@@ -10,10 +10,10 @@ from scipy.spatial.transform import Rotation
 
 from magbridge.calibration.fitting.observations import Observations
 from sitl.instrument import Instrument
-from sitl.mission import CrissCross, Spirals
+from sitl.mission import LIMITS, CrissCross, Spirals
 from sitl.platform import Vehicle, draw_vehicle
 from sitl.signals import autoregressive
-from sitl.trajectory import LIMITS, fly
+from sitl.trajectory import fly
 
 FIELD_NED = np.array([16_200.0, -5_000.0, 49_200.0])
 FIELD = float(np.linalg.norm(FIELD_NED))
