@@ -8,6 +8,7 @@ import sys
 import threading
 import time
 from pathlib import Path
+from typing import Any
 
 from mavsdk import ComponentType, Configuration, Mavsdk
 from mavsdk.plugins.mavlink_direct import MavlinkDirect
@@ -23,7 +24,7 @@ def tell(name: str, what: object) -> None:
 
 station = Mavsdk(Configuration.create_with_component_type(ComponentType.GROUND_STATION))
 result = station.add_any_connection(url)
-systems = []
+systems: list[Any] = []
 while not systems or BRIDGE not in systems[0].component_ids():
     systems = station.get_systems()
     time.sleep(0.05)
@@ -39,10 +40,11 @@ tell(
 
 direct = MavlinkDirect(system)
 direct.load_custom_xml(xml.read_text())
-heard, ready = {}, threading.Event()
+heard: dict[str, Any] = {}
+ready = threading.Event()
 
 
-def hear(message: object, _: object) -> None:
+def hear(message: Any, _: object) -> None:
     heard[message.message_name] = json.loads(message.fields_json)
     # where the machine stands still, the sensor is silent for a moment
     speaks = heard.get("MAG_STATUS", {}).get("sensor_state") == 1

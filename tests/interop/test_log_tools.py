@@ -70,7 +70,8 @@ def test_mavlink_connection_with_our_dialect(log: Path, peer: ModuleType) -> Non
     reader = mavutil.mavlink_connection(str(log))
     reader.mav = peer.MAVLink(reader)
     reader.mav.robust_parsing = True
-    counts, last = Counter(), None
+    counts: Counter[str] = Counter()
+    last = None
     while (message := reader.recv_msg()) is not None:
         counts[message.get_type()] += 1
         last = message if message.get_type() == "MAG_FIELD" else last
