@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from pathlib import Path
+from typing import Literal
 
 import netCDF4
 import numpy as np
@@ -37,7 +38,7 @@ others = st.dictionaries(
 
 
 @st.composite
-def deployments(draw: st.DrawFn, width: int) -> xr.Dataset:
+def deployments(draw: st.DrawFn, width: Literal[32, 64]) -> xr.Dataset:
     """Columns of the table and of any other name, NaN anywhere; µs that fit what a record can say."""
     steps = draw(st.lists(st.integers(1, 10**8), min_size=1, max_size=12))
     time = (1_700_000_000_000_000 + np.cumsum(steps)) / 1e6
@@ -300,7 +301,7 @@ def test_longitudes_to_the_east_fit_a_telemetry_log(tmp_path: Path) -> None:
 
 
 def test_a_count_that_is_none_fits_a_telemetry_log(tmp_path: Path) -> None:
-    columns = {"mag_x": np.ones(4), "power_cycle": [3.0, np.inf, -1e300, np.nan]}
+    columns = {"mag_x": np.ones(4), "power_cycle": np.array([3.0, np.inf, -1e300, np.nan])}
     logs.write(deployment("made", np.arange(4.0), columns), tmp_path / "log.tlog")
     counted = logs.read(tmp_path / "log.tlog")["power_cycle"].to_numpy()
     np.testing.assert_array_equal(counted, [3.0, np.nan, np.nan, np.nan])

@@ -164,6 +164,6 @@ def test_seaglider_converted(seaglider: list[Path], suffix: str, tmp_path: Path)
     back = logs.read(tmp_path / f"dives{suffix}")
     for name in CHANNELS:
         np.testing.assert_array_equal(back[name], dives[name])  # counts: exact even as float32
-    for name in dives.variables:
-        np.testing.assert_allclose(back[name], dives[name], rtol=2e-7, atol=6e-4, err_msg=str(name))
+    for column in dives.variables:
+        np.testing.assert_allclose(back[column], dives[column], rtol=2e-7, atol=6e-4, err_msg=str(column))
     assert back.attrs["heading_reference"] == "magnetic"

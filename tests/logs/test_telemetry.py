@@ -182,9 +182,13 @@ def test_a_bridges_log_without_readings_gives_no_compass_instead(tmp_path: Path)
 def test_the_log_says_what_its_parameters_are(tmp_path: Path) -> None:
     """As a bridge does of its ``[telemetry]``: any field of any message, scaled, under its own name."""
     log = Log()
-    name = {"message": "NAMED_VALUE_FLOAT", "field": "value", "match": "name=batt"}
-    array = {"message": "DEBUG_FLOAT_ARRAY", "field": "data[3]", "match": "name=masses,array_id=7"}
-    servo = {"message": "SERVO_OUTPUT_RAW", "field": "servo2_raw"}
+    name: dict[str, Any] = {"message": "NAMED_VALUE_FLOAT", "field": "value", "match": "name=batt"}
+    array: dict[str, Any] = {
+        "message": "DEBUG_FLOAT_ARRAY",
+        "field": "data[3]",
+        "match": "name=masses,array_id=7",
+    }
+    servo: dict[str, Any] = {"message": "SERVO_OUTPUT_RAW", "field": "servo2_raw"}
     log.say(0, "MAG_COLUMN", column="battery_position", unit="in", scale=0.5, offset=1, **name)
     log.say(0, "MAG_COLUMN", column="ballast", unit="cc", scale=2, **array)
     log.say(0, "MAG_COLUMN", column="servo2", unit="deg", scale=0.1, offset=-150, **servo)

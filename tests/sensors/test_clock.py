@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise
 from math import nan
 from typing import Any
@@ -31,7 +32,7 @@ def stamps(
     clock: DeviceClock, device: Array, arrived: Array, sequence: list[int] | None = None
 ) -> list[Stamp]:
     times = (arrived * 1e6).astype(int) + EPOCH
-    numbers = sequence or [None] * device.size
+    numbers: Sequence[int | None] = sequence or [None] * device.size
     return [clock.update(d, a, s) for d, a, s in zip(device.tolist(), times.tolist(), numbers, strict=True)]
 
 
