@@ -12,8 +12,10 @@ from magbridge.field.grid import AnomalyGrid
 
 LON, LAT = np.linspace(10.0, 10.5, 51), np.linspace(54.0, 54.4, 41)
 
+Places = tuple[np.ndarray, np.ndarray]
 
-def hills(lon, lat):
+
+def hills(lon: np.ndarray, lat: np.ndarray) -> np.ndarray:
     return 40 * np.sin(lon * 40) * np.cos(lat * 35) + 5 * (lat - 54)
 
 
@@ -23,17 +25,17 @@ def grid() -> AnomalyGrid:
 
 
 @pytest.fixture(scope="module")
-def places():
+def places() -> Places:
     rng = np.random.default_rng(1)
     return rng.uniform(10.0, 10.5, 300), rng.uniform(54.0, 54.4, 300)
 
 
-def test_passes_through_its_nodes(grid):
+def test_passes_through_its_nodes(grid: AnomalyGrid) -> None:
     x, y = np.meshgrid(LON, LAT)
     np.testing.assert_allclose(grid.at(x.ravel(), y.ravel()), hills(x, y).ravel(), atol=1e-9)
 
 
-def test_agrees_with_scipys_spline_inside(grid):
+def test_agrees_with_scipys_spline_inside(grid: AnomalyGrid) -> None:
     rng = np.random.default_rng(2)
     x, y = rng.uniform(10.15, 10.35, 200), rng.uniform(54.15, 54.25, 200)
     other = RectBivariateSpline(LAT, LON, grid.anomaly)
@@ -44,7 +46,7 @@ def test_agrees_with_scipys_spline_inside(grid):
     np.testing.assert_allclose(local.east * per_lon, other(y, x, dy=1, grid=False), atol=0.1)
 
 
-def test_gradient_and_hessian_are_derivatives(grid, places):
+def test_gradient_and_hessian_are_derivatives(grid: AnomalyGrid, places: Places) -> None:
     """Central differences on metres: 1e-2 m step on the gradient, whose error is then rounding."""
     lon, lat = (p[5:50] * 0.9 + 0.1 * p.mean() for p in places)
     local = grid.evaluate(lon, lat)
@@ -60,21 +62,21 @@ def test_gradient_and_hessian_are_derivatives(grid, places):
         np.testing.assert_allclose((ahead.east - behind.east) / (2 * h), mixed, atol=2e-8)
 
 
-def test_one_place_and_many_are_the_same(grid, places):
+def test_one_place_and_many_are_the_same(grid: AnomalyGrid, places: Places) -> None:
     many = np.stack(grid.evaluate(*places), axis=1)
     one = np.array([grid.look_up(lon, lat) for lon, lat in zip(*map(np.ndarray.tolist, places), strict=True)])
     np.testing.assert_allclose(one, many, rtol=1e-10, atol=1e-13)
 
 
 @pytest.mark.parametrize("flip", [(1, -1), (-1, 1), (-1, -1)])
-def test_a_descending_axis_is_the_same_map(grid, places, flip):
+def test_a_descending_axis_is_the_same_map(grid: AnomalyGrid, places: Places, flip: tuple[int, int]) -> None:
     y, x = flip
     turned = AnomalyGrid(LON[::x], LAT[::y], grid.anomaly[::y, ::x], sigma=2.0)
     np.testing.assert_allclose(turned.at(*places), grid.at(*places), atol=1e-10)
 
 
 @pytest.mark.parametrize("start", [179.8, -180.2, 359.9])
-def test_longitude_goes_round(grid, places, start):
+def test_longitude_goes_round(grid: AnomalyGrid, places: Places, start: float) -> None:
     """The same hills, laid over the antimeridian or Greenwich, whichever way the axis counts there."""
     axis = LON - 10.0 + start
     for stored in (axis, (axis + 180) % 360 - 180, axis % 360):
@@ -87,7 +89,7 @@ def test_longitude_goes_round(grid, places, start):
             )
 
 
-def test_longitude_reads_as_usual(grid):
+def test_longitude_reads_as_usual(grid: AnomalyGrid) -> None:
     """Across the antimeridian it is unwound inside; a map of the whole globe reads as its file does."""
     for first, told in ((179.8, "179.8000 to -179.7000"), (190.0, "-170.0000 to -169.5000")):
         assert repr(AnomalyGrid(LON - 10.0 + first, LAT, grid.anomaly)).endswith(f"longitude {told})")
@@ -95,7 +97,7 @@ def test_longitude_reads_as_usual(grid):
     assert repr(around).endswith("longitude 0.0000 to 359.0000)")
 
 
-def test_a_hole_is_a_hole_and_no_more(grid):
+def test_a_hole_is_a_hole_and_no_more(grid: AnomalyGrid) -> None:
     values = grid.anomaly.copy()
     values[20, 25] = 1.70141e38
     holed = AnomalyGrid(LON, LAT, values)
@@ -106,7 +108,7 @@ def test_a_hole_is_a_hole_and_no_more(grid):
     assert np.isfinite(holed.look_up(10.265, 54.195).anomaly)
 
 
-def test_off_the_map_is_nan_or_refused(grid):
+def test_off_the_map_is_nan_or_refused(grid: AnomalyGrid) -> None:
     assert np.isnan(grid.evaluate([9.99, 10.1, np.nan], [54.1, 54.41, 54.1]).anomaly).all()
     assert np.isnan(grid.look_up(9.99, 54.1).north)
     assert np.isnan(grid.look_up(np.nan, 54.1).north)
@@ -114,13 +116,13 @@ def test_off_the_map_is_nan_or_refused(grid):
         grid.at([10.1, 10.1], [54.1, 54.41])
 
 
-def test_sigma_lies_between_its_nodes():
+def test_sigma_lies_between_its_nodes() -> None:
     grid = AnomalyGrid(LON, LAT, np.zeros((41, 51)), sigma=np.meshgrid(np.arange(51.0), LAT)[0])
     assert grid.look_up(10.105, 54.1).variance == pytest.approx((10**2 + 11**2) / 2)
     assert grid.evaluate(10.105, 54.1).variance[0] == pytest.approx((10**2 + 11**2) / 2)
 
 
-def test_roughness_of_a_known_map():
+def test_roughness_of_a_known_map() -> None:
     """exp(-r²/2L²) by summing many waves with Gaussian wavenumbers: L comes back to 10 %."""
     rng = np.random.default_rng(4)
     lon, lat = np.linspace(0, 0.5, 250), np.linspace(0, 0.5, 250)
@@ -146,17 +148,17 @@ def test_roughness_of_a_known_map():
         (LON, LAT, np.nan, "nothing but holes"),
     ],
 )
-def test_refuses_what_is_no_map(lon, lat, values, message):
+def test_refuses_what_is_no_map(lon: np.ndarray, lat: np.ndarray, values: float, message: str) -> None:
     with pytest.raises(FormatError, match=message):
         AnomalyGrid(lon, lat, np.full((len(lat), len(lon)), values).astype(float))
 
 
-def test_refuses_another_shape():
+def test_refuses_another_shape() -> None:
     with pytest.raises(FormatError, match="expected 41 rows of 51 values, found 51 x 41"):
         AnomalyGrid(LON, LAT, np.zeros((51, 41)))
 
 
-def test_offset_and_separation_are_inverse():
+def test_offset_and_separation_are_inverse() -> None:
     there = offset(60.0, 179.9, 12_000.0, 15_000.0)
     assert there[1] < -179
     assert separation(60.0, 179.9, *there) == pytest.approx((12_000.0, 15_000.0), abs=1e-6)
@@ -166,7 +168,7 @@ def test_offset_and_separation_are_inverse():
     np.testing.assert_allclose(separation(60.0, 179.9, *many), [north, east], atol=1e-6)
 
 
-def test_the_worse_axis_is_the_larger_eigenvalue():
+def test_the_worse_axis_is_the_larger_eigenvalue() -> None:
     roots = np.random.default_rng(3).normal(0.0, 100.0, (50, 2, 2))
     covariances = roots @ np.swapaxes(roots, 1, 2)
     expected = np.sqrt(np.linalg.eigvalsh(covariances)[:, 1])

@@ -14,8 +14,8 @@ from magbridge.field import igrf as module
 from magbridge.field.igrf import coverage, igrf, total_field
 
 
-def at(*date: int) -> float:
-    return datetime(*date, tzinfo=UTC).timestamp()
+def at(year: int, month: int, day: int) -> float:
+    return datetime(year, month, day, tzinfo=UTC).timestamp()
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +25,7 @@ def places() -> tuple[np.ndarray, ...]:
 
 
 @pytest.mark.parametrize("date", [(1903, 2, 3), (1960, 1, 1), (2013, 12, 5), (2024, 12, 31), (2027, 6, 1)])
-def test_agrees_with_ppigrf(places, date):
+def test_agrees_with_ppigrf(places: tuple[np.ndarray, ...], date: tuple[int, int, int]) -> None:
     """An independent program on the same coefficients; 1e-3 nT is its own rounding of the ellipsoid."""
     lon, lat, depth = places
     east, north, up = ppigrf.igrf(lon, lat, -depth / 1e3, datetime(*date))
@@ -33,7 +33,7 @@ def test_agrees_with_ppigrf(places, date):
     np.testing.assert_allclose(igrf(lon, lat, depth, at(*date)), oracle, atol=1e-3)
 
 
-def test_agrees_with_the_published_calculator():
+def test_agrees_with_the_published_calculator() -> None:
     """NOAA NCEI's Geomagnetic Calculator 0.5.1.11, model IGRF2020, 2020-01-01, 80 N, 5 km up.
 
     The model is the 13th generation. Six of the values that ppigrf's repository holds in
@@ -58,7 +58,7 @@ def test_agrees_with_the_published_calculator():
     np.testing.assert_allclose(field, golden[:, 1:], atol=0.5)
 
 
-def test_is_a_potential_field(places):
+def test_is_a_potential_field(places: tuple[np.ndarray, ...]) -> None:
     """Its divergence vanishes: three central differences over 1 km, against the field's own scale."""
     lon, lat, depth = places
     keep = np.abs(lat) < 80
@@ -75,18 +75,18 @@ def test_is_a_potential_field(places):
     assert np.abs(d_north + d_east + d_down + sphere).max() < 3e-4  # nT/m; 60000/6.4e6 x 1/300 of flattening
 
 
-def test_depth_counts():
+def test_depth_counts() -> None:
     deep = total_field(-57.9, 49.5, [0.0, 1000.0], at(2013, 12, 5))
     assert 20 < np.diff(deep)[0] < 30
 
 
-def test_is_finite_and_continuous_at_the_poles():
+def test_is_finite_and_continuous_at_the_poles() -> None:
     for sign in (1, -1):
         near = igrf(0.0, sign * 89.999999, 0.0, at(2020, 1, 1))
         np.testing.assert_allclose(igrf(0.0, sign * 90.0, 0.0, at(2020, 1, 1)), near, atol=0.01)
 
 
-def test_samples_are_independent_of_their_neighbours(places):
+def test_samples_are_independent_of_their_neighbours(places: tuple[np.ndarray, ...]) -> None:
     lon, lat, depth = places
     time = np.linspace(at(1950, 1, 1), at(2029, 1, 1), 200)
     together = igrf(lon, lat, depth, time)
@@ -94,16 +94,16 @@ def test_samples_are_independent_of_their_neighbours(places):
     np.testing.assert_allclose(together, alone, atol=1e-8)
 
 
-def test_longitude_turns():
+def test_longitude_turns() -> None:
     np.testing.assert_allclose(igrf(190.0, 10.0, 0, 0), igrf(-170.0, 10.0, 0, 0), atol=1e-8)
 
 
-def test_nothing_and_nan():
+def test_nothing_and_nan() -> None:
     assert igrf([], [], [], []).shape == (0, 3)
     assert np.isnan(igrf([0.0, np.nan], 1.0, 0.0, 0.0)).any(axis=1).tolist() == [False, True]
 
 
-def test_refuses_what_it_does_not_cover():
+def test_refuses_what_it_does_not_cover() -> None:
     start, end = coverage()
     with pytest.raises(OutOfRange, match=r"time = 2031-01-01: the IGRF covers 1900-01-01 to 20\d\d-01-01"):
         igrf(0, 0, 0, at(2031, 1, 1))
@@ -115,7 +115,7 @@ def test_refuses_what_it_does_not_cover():
         igrf(361, 0, 0, end)
 
 
-def test_a_million_samples_in_ten_seconds(places):
+def test_a_million_samples_in_ten_seconds(places: tuple[np.ndarray, ...]) -> None:
     n = 100_000
     lon, lat, depth = (np.resize(part, n) for part in places)
     started = time.process_time()

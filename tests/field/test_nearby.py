@@ -14,7 +14,7 @@ TIME = 1.7e9
 
 
 @pytest.mark.parametrize("place", [(49.5, -57.9), (-30.0, 10.0), (75.0, 179.9), (0.0, -70.0)])
-def test_is_the_series_within_its_reach(place):
+def test_is_the_series_within_its_reach(place: tuple[float, float]) -> None:
     """0.05 nT anywhere within 20 km, a dive and twenty days; and it goes along when the vehicle leaves."""
     rng = np.random.default_rng(0)
     nearby = NearbyField()
@@ -27,7 +27,7 @@ def test_is_the_series_within_its_reach(place):
             assert field == pytest.approx(total_field(there[1], there[0], depth, time)[0], abs=0.05)
 
 
-def test_its_slopes_are_its_own():
+def test_its_slopes_are_its_own() -> None:
     nearby = NearbyField()
     nearby.at(49.5, -57.9, 0.0, TIME)
     here = offset(49.5, -57.9, 5000.0, -6000.0)
@@ -38,7 +38,7 @@ def test_its_slopes_are_its_own():
         assert slope == pytest.approx((ahead - behind) / 100.0, abs=1e-5)
 
 
-def test_refuses_what_the_series_refuses():
+def test_refuses_what_the_series_refuses() -> None:
     with pytest.raises(OutOfRange, match="the IGRF covers"):
         NearbyField().at(0.0, 0.0, 0.0, 4e9)
     assert NearbyField().at(0.0, 0.0, 0.0, 1.89e9)[0] > 20_000  # less than LONG before the model's end

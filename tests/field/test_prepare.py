@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -22,7 +24,7 @@ def monopole(altitude: float, depth: float = 800.0) -> np.ndarray:
     return 2e8 * z / (x * x + y * y + z * z) ** 1.5
 
 
-def test_continuation_is_the_field_at_the_new_height():
+def test_continuation_is_the_field_at_the_new_height() -> None:
     """The edges of a finite map cost some nT; in its middle half the error is under 2 % of the peak."""
     low, high = AnomalyGrid(LON, LAT, monopole(60.0), altitude=60.0), monopole(260.0)
     raised = continue_upward(low, 200.0)
@@ -32,7 +34,7 @@ def test_continuation_is_the_field_at_the_new_height():
     assert np.abs(low.anomaly - high)[middle].max() > 0.3 * high.max()
 
 
-def test_continuation_keeps_a_constant_and_the_holes():
+def test_continuation_keeps_a_constant_and_the_holes() -> None:
     values = np.full((61, 81), 7.0)
     values[30, 40] = np.nan
     raised = continue_upward(AnomalyGrid(LON, LAT, values, altitude=0.0), 100.0)
@@ -72,12 +74,12 @@ def test_a_map_of_unknown_height_stays_as_it_is() -> None:
     assert continued(grid, 50.0) == (grid, 0.0, np.inf)
 
 
-def test_nothing_is_prepared_downward():
+def test_nothing_is_prepared_downward() -> None:
     with pytest.raises(OutOfRange, match="surveyed at 90 m: a field can only be continued upward"):
         prepare([AnomalyGrid(LON, LAT, monopole(90.0), altitude=90.0, name="a.grd")], altitude=60.0)
 
 
-def test_merge_is_the_mean_in_the_overlap():
+def test_merge_is_the_mean_in_the_overlap() -> None:
     west = AnomalyGrid(LON[:50], LAT, np.full((61, 50), 10.0), sigma=3.0)
     east = AnomalyGrid(LON[30:], LAT[10:], np.full((51, 51), 12.0), sigma=4.0)
     both = merge([west, east])
@@ -89,7 +91,7 @@ def test_merge_is_the_mean_in_the_overlap():
     assert np.isnan(both.look_up(-57.91, 49.455).anomaly)
 
 
-def test_surveys_that_disagree_are_not_exact():
+def test_surveys_that_disagree_are_not_exact() -> None:
     """Each of two that differ by 10 nT is off by 7 nT, alone; their mean is off by 5."""
     west = AnomalyGrid(LON[:50], LAT, np.full((61, 50), 10.0))
     east = AnomalyGrid(LON[30:], LAT, np.full((61, 51), 20.0), sigma=8.0)
@@ -98,7 +100,7 @@ def test_surveys_that_disagree_are_not_exact():
     assert sigma == pytest.approx([10.0 / np.sqrt(2.0), 5.0, 8.0])
 
 
-def test_it_is_told_how_far_surveys_are_apart():
+def test_it_is_told_how_far_surveys_are_apart() -> None:
     """Two by their difference, three by that of any two; apart in space, they are not apart in nT."""
 
     def merged(*surveys: AnomalyGrid) -> str:
@@ -113,7 +115,7 @@ def test_it_is_told_how_far_surveys_are_apart():
     assert merged(west, east) == "merged, no two of them overlap"
 
 
-def test_a_map_that_would_fill_the_memory_is_refused():
+def test_a_map_that_would_fill_the_memory_is_refused() -> None:
     """Two fine surveys of opposite coasts: what lies between them would be nodes as well."""
     west = AnomalyGrid(LON, LAT, monopole(60.0))
     east = AnomalyGrid(LON + 40.0, LAT + 10.0, monopole(60.0))
@@ -122,7 +124,7 @@ def test_a_map_that_would_fill_the_memory_is_refused():
     assert 1e6 < merge([west, east], spacing=0.01).anomaly.size < 1e7
 
 
-def test_merge_across_the_antimeridian():
+def test_merge_across_the_antimeridian() -> None:
     values = np.full((61, 50), 5.0)
     west = AnomalyGrid(LON[:50] + 238.0, LAT, values)
     east = AnomalyGrid(LON[:50] + 238.1 - 360.0, LAT, values)
@@ -130,7 +132,7 @@ def test_merge_across_the_antimeridian():
     np.testing.assert_allclose(both.at([179.95, -179.9], 49.5), 5.0, atol=1e-9)
 
 
-def test_hanning_is_the_plain_kernel_inside_and_keeps_constants_at_edges():
+def test_hanning_is_the_plain_kernel_inside_and_keeps_constants_at_edges() -> None:
     rng = np.random.default_rng(0)
     rough = rng.normal(size=(61, 81))
     smooth = hanning(AnomalyGrid(LON, LAT, rough), 1).anomaly
@@ -143,7 +145,7 @@ def test_hanning_is_the_plain_kernel_inside_and_keeps_constants_at_edges():
     np.testing.assert_allclose(kept[~np.isnan(flat)], 3.0)
 
 
-def test_the_whole_preparation_and_its_pictures(tmp_path):
+def test_the_whole_preparation_and_its_pictures(tmp_path: Path) -> None:
     low = AnomalyGrid(LON[:60], LAT, monopole(60.0)[:, :60], altitude=60.0, name="low.grd")
     high = AnomalyGrid(LON[40:], LAT, monopole(90.0)[:, 40:], altitude=90.0, name="high.grd")
     outline = [(-58.08, 49.46), (-57.92, 49.46), (-57.92, 49.54), (-58.08, 49.54)]
@@ -166,6 +168,6 @@ def test_the_whole_preparation_and_its_pictures(tmp_path):
     assert (tmp_path / "steps.png").stat().st_size > 20_000
 
 
-def test_a_mask_beside_the_map_is_refused():
+def test_a_mask_beside_the_map_is_refused() -> None:
     with pytest.raises(OutOfRange, match="no node of"):
         prepare([AnomalyGrid(LON, LAT, monopole(60.0))], mask=[(0, 0), (1, 0), (1, 1)])

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import struct
+from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,19 +23,19 @@ LON, LAT = np.linspace(10.0, 10.5, 11), np.linspace(54.0, 54.4, 9)
 MAP = 30 * np.sin(np.meshgrid(LON, LAT)[0] * 9) + 100 * (np.meshgrid(LON, LAT)[1] - 54)
 
 
-def surfer_text(path):
+def surfer_text(path: Path) -> None:
     head = f"DSAA\n{LON.size} {LAT.size}\n{LON[0]} {LON[-1]}\n{LAT[0]} {LAT[-1]}\n{MAP.min()} {MAP.max()}\n"
     path.write_text(head + "\n".join(" ".join(f"{v:.9g}" for v in row) for row in MAP))
 
 
-def surfer_6(path):
+def surfer_6(path: Path) -> None:
     head = struct.pack(
         "<4s2h6d", b"DSBB", LON.size, LAT.size, LON[0], LON[-1], LAT[0], LAT[-1], MAP.min(), MAP.max()
     )
     path.write_bytes(head + MAP.astype("<f4").tobytes())
 
 
-def surfer_7(path):
+def surfer_7(path: Path) -> None:
     step = LON[1] - LON[0], LAT[1] - LAT[0]
     grid = struct.pack(
         "<2i8d", LAT.size, LON.size, LON[0], LAT[0], *step, MAP.min(), MAP.max(), 0.0, 1.70141e38
@@ -51,7 +53,7 @@ def surfer_7(path):
     )
 
 
-def esri(path):
+def esri(path: Path) -> None:
     head = (
         f"ncols {LON.size}\n"
         f"nrows {LAT.size}\n"
@@ -63,7 +65,7 @@ def esri(path):
     path.write_text(head + "\n".join(" ".join(f"{v:.9g}" for v in row) for row in MAP[::-1]))
 
 
-def esri_corner(path):
+def esri_corner(path: Path) -> None:
     head = (
         f"NCOLS {LON.size}\n"
         f"NROWS {LAT.size}\n"
@@ -74,14 +76,16 @@ def esri_corner(path):
     path.write_text(head + "\n".join(" ".join(f"{v:.9g}" for v in row) for row in MAP[::-1]))
 
 
-def table(path, header="longitude,latitude,anomaly\n", delimiter=",", scale=1.0):
+def table(
+    path: Path, header: str = "longitude,latitude,anomaly\n", delimiter: str = ",", scale: float = 1.0
+) -> None:
     x, y = np.meshgrid(LON, LAT)
     rows = np.column_stack([x.ravel(), y.ravel(), MAP.ravel() * scale])
     np.random.default_rng(0).shuffle(rows)
     path.write_text(header + "\n".join(delimiter.join(f"{v:.9g}" for v in row) for row in rows))
 
 
-def geotiff(path):
+def geotiff(path: Path) -> None:
     tags = ImageFileDirectory_v2()
     tags[33550] = (0.05, 0.05, 0.0)
     tags[33922] = (0.0, 0.0, 0.0, LON[0] - 0.025, LAT[-1] + 0.025, 0.0)
@@ -91,18 +95,20 @@ def geotiff(path):
     Image.fromarray(MAP[::-1].astype(np.float32)).save(path, tiffinfo=tags)
 
 
-def cf(path, unit="nT", scale=1.0, names=("lat", "lon"), **attrs):
+def cf(
+    path: Path, unit: str = "nT", scale: float = 1.0, names: tuple[str, str] = ("lat", "lon"), **attrs: str
+) -> None:
     grid = xr.DataArray(MAP * scale, {names[0]: LAT, names[1]: LON}, names, attrs={"units": unit})
     grid[names[1]].attrs = attrs
     xr.Dataset({"tfa": grid, "survey_flag": ((), 1)}).to_netcdf(path)
 
 
-def gmt(path):
+def gmt(path: Path) -> None:
     """GMT's own netCDF: x, y, z, rows ascending; long names, no standard names."""
     cf(path, unit="", names=("y", "x"), long_name="longitude")
 
 
-def old_gmt(path):
+def old_gmt(path: Path) -> None:
     xr.Dataset(
         {
             "x_range": ("side", [LON[0], LON[-1]]),
@@ -113,7 +119,7 @@ def old_gmt(path):
     ).to_netcdf(path, format="NETCDF3_CLASSIC")
 
 
-def folder(path):
+def folder(path: Path) -> None:
     path.mkdir()
     for name, values in (("xx", LON[None]), ("yy", LAT[None]), ("alt", [[305.0]]), ("map", MAP)):
         np.savetxt(path / f"{name}.csv", values, delimiter=",")
@@ -139,7 +145,7 @@ def folder(path):
         ("magnav", folder),
     ],
 )
-def test_every_format_gives_the_same_map(tmp_path, name, write):
+def test_every_format_gives_the_same_map(tmp_path: Path, name: str, write: Callable[[Path], None]) -> None:
     write(tmp_path / name)
     grid = read_grid(tmp_path / name)
     np.testing.assert_allclose(grid.longitude, LON, atol=1e-6)
@@ -147,7 +153,7 @@ def test_every_format_gives_the_same_map(tmp_path, name, write):
     np.testing.assert_allclose(grid.anomaly, MAP, atol=1e-4)
 
 
-def test_what_is_saved_comes_back(tmp_path):
+def test_what_is_saved_comes_back(tmp_path: Path) -> None:
     holed = MAP.copy()
     holed[2, 3] = np.nan
     grid = AnomalyGrid(LON, LAT, holed, sigma=np.abs(MAP) / 10, altitude=90.0)
@@ -159,7 +165,7 @@ def test_what_is_saved_comes_back(tmp_path):
     assert list(tmp_path.iterdir()) == [tmp_path / "g.nc"]
 
 
-def test_a_table_over_the_antimeridian(tmp_path):
+def test_a_table_over_the_antimeridian(tmp_path: Path) -> None:
     x, y = np.meshgrid((LON + 169.75 + 180) % 360 - 180, LAT)
     np.savetxt(tmp_path / "a.xyz", np.column_stack([x.ravel(), y.ravel(), MAP.ravel()]))
     grid = read_grid(tmp_path / "a.xyz")
@@ -167,14 +173,14 @@ def test_a_table_over_the_antimeridian(tmp_path):
     assert grid.look_up(-179.9, 54.2).anomaly == pytest.approx(grid.look_up(180.1, 54.2).anomaly)
 
 
-def test_a_gap_in_a_table_is_a_hole(tmp_path):
+def test_a_gap_in_a_table_is_a_hole(tmp_path: Path) -> None:
     x, y = np.meshgrid(LON, LAT)
     rows = np.column_stack([x.ravel(), y.ravel(), MAP.ravel()])
     np.savetxt(tmp_path / "a.xyz", np.delete(rows, 45, axis=0))
     assert np.isnan(read_grid(tmp_path / "a.xyz").anomaly).sum() == 1
 
 
-def scattered(path):
+def scattered(path: Path) -> None:
     np.savetxt(path, np.random.default_rng(0).uniform(10, 11, (50, 3)))
 
 
@@ -202,7 +208,9 @@ def scattered(path):
         ("dir", lambda p: p.mkdir(), "expected xx.csv"),
     ],
 )
-def test_one_clear_line(tmp_path, name, write, message):
+def test_one_clear_line(
+    tmp_path: Path, name: str, write: Callable[[Path], object] | None, message: str
+) -> None:
     if write:
         write(tmp_path / name)
     with pytest.raises(FormatError, match=message) as caught:
@@ -211,7 +219,7 @@ def test_one_clear_line(tmp_path, name, write, message):
     assert str(tmp_path) in str(caught.value)
 
 
-def grid_or_one_line(path):
+def grid_or_one_line(path: Path) -> None:
     said = f"{path}: "
     try:
         assert read_grid(path).anomaly.size >= 16
@@ -227,7 +235,7 @@ WORDS = (
 )
 
 
-def test_a_polygon_may_have_a_header(tmp_path):
+def test_a_polygon_may_have_a_header(tmp_path: Path) -> None:
     corners = "10.1,54.1\n10.4,54.1\n10.2,54.3\n"
     for text in (corners, "\ufefflongitude,latitude\n" + corners):
         (tmp_path / "mask.csv").write_text(text, encoding="utf-8")
@@ -246,7 +254,9 @@ def test_a_polygon_may_have_a_header(tmp_path):
         st.lists(st.sampled_from([*WORDS.split(), b"\n"]), max_size=40).map(b" ".join),
     ),
 )
-def test_whatever_a_file_holds_the_answer_is_a_grid_or_one_line(tmp_path_factory, suffix, raw):
+def test_whatever_a_file_holds_the_answer_is_a_grid_or_one_line(
+    tmp_path_factory: pytest.TempPathFactory, suffix: str, raw: bytes
+) -> None:
     path = tmp_path_factory.mktemp("any") / f"a{suffix}"
     path.write_bytes(raw)
     grid_or_one_line(path)
@@ -255,7 +265,9 @@ def test_whatever_a_file_holds_the_answer_is_a_grid_or_one_line(tmp_path_factory
 @pytest.mark.real
 @settings(max_examples=60, deadline=None, derandomize=True)  # HDF5 itself may not live through any damage
 @given(places=st.lists(st.tuples(st.integers(0, 10**9), st.integers(0, 255)), min_size=1, max_size=30))
-def test_a_damaged_grid_is_a_grid_or_one_line(tmp_path_factory, places):
+def test_a_damaged_grid_is_a_grid_or_one_line(
+    tmp_path_factory: pytest.TempPathFactory, places: list[tuple[int, int]]
+) -> None:
     path = tmp_path_factory.mktemp("damaged") / "map.nc"
     AnomalyGrid(LON, LAT, MAP).save(path)
     content = bytearray(path.read_bytes())
@@ -265,7 +277,7 @@ def test_a_damaged_grid_is_a_grid_or_one_line(tmp_path_factory, places):
     grid_or_one_line(path)
 
 
-def test_magnavs_published_map_matches_its_own_flight(real_data):
+def test_magnavs_published_map_matches_its_own_flight(real_data: Path) -> None:
     """The example's compensated magnetometer against its map, at the true track: other programs made both."""
     grid = read_grid(real_data / "magnav_example" / "map")
     flight = np.genfromtxt(real_data / "magnav_example" / "xyz.csv", delimiter=",", names=True)

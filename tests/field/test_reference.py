@@ -23,13 +23,13 @@ def deployment(**columns: list[float]) -> xr.Dataset:
 PLACE = {"latitude": [49.5] * 6, "longitude": [-57.9] * 6, "depth": list(np.arange(6.0) * 100)}
 
 
-def test_is_the_main_field_at_each_depth_plus_anomaly_plus_bias():
+def test_is_the_main_field_at_each_depth_plus_anomaly_plus_bias() -> None:
     grid = AnomalyGrid(np.linspace(-58, -57.8, 9), np.linspace(49.4, 49.6, 9), np.full((9, 9), 33.0))
     expected = total_field(-57.9, 49.5, PLACE["depth"], TIME) + 33.0 - 4.0
     np.testing.assert_allclose(reference_field(deployment(**PLACE), grid, -4.0), expected, atol=1e-6)
 
 
-def test_a_map_flown_above_is_continued_to_the_depth():
+def test_a_map_flown_above_is_continued_to_the_depth() -> None:
     """A glider's dives over rough rock: most of the difference between aircraft's map and truth is height."""
     twin, rng = Twin.draw(load("demo"), 5), np.random.default_rng(5)
     flown = twin.anomaly_map()
@@ -43,7 +43,7 @@ def test_a_map_flown_above_is_continued_to_the_depth():
     assert error[1] < 0.4 * error[0]
 
 
-def test_a_given_reference_counts_where_it_is_given():
+def test_a_given_reference_counts_where_it_is_given() -> None:
     given = [50_000.0, np.nan, 50_002.0, np.nan, np.nan, np.nan]
     field = reference_field(deployment(reference_field=given, **PLACE))
     assert field[0] == 50_000.0
@@ -53,7 +53,7 @@ def test_a_given_reference_counts_where_it_is_given():
     assert np.isnan(alone).tolist() == np.isnan(given).tolist()
 
 
-def test_rows_without_a_position_get_one_from_their_neighbours():
+def test_rows_without_a_position_get_one_from_their_neighbours() -> None:
     gaps = deployment(
         latitude=[np.nan, 49.0, np.nan, np.nan, 49.3, np.nan],
         longitude=[np.nan, 179.9, np.nan, np.nan, -179.8, np.nan],
@@ -64,7 +64,7 @@ def test_rows_without_a_position_get_one_from_their_neighbours():
     assert not depth.any()
 
 
-def test_says_what_is_missing():
+def test_says_what_is_missing() -> None:
     with pytest.raises(FormatError, match="expected latitude and longitude, or reference_field"):
         reference_field(deployment(depth=[0.0] * 6))
     elsewhere = AnomalyGrid(np.linspace(0, 1, 9), np.linspace(0, 1, 9), np.zeros((9, 9)))
