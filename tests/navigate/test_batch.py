@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -22,12 +25,12 @@ PLACE = (49.5, -57.9)
 
 
 @pytest.fixture(scope="module")
-def ds(study, grid, options):
+def ds(study: ModuleType, grid: AnomalyGrid, options: Options) -> xr.Dataset:
     return study.voyage(grid, options, 6, hours=4.0)
 
 
 @pytest.fixture(scope="module")
-def result(ds, grid, options):
+def result(ds: xr.Dataset, grid: AnomalyGrid, options: Options) -> xr.Dataset:
     return navigate(ds, grid, options, start=PLACE)
 
 
@@ -35,7 +38,7 @@ def rms(result: xr.Dataset, prefix: str = "") -> float:
     return float(np.sqrt((result[f"{prefix}error_north"] ** 2 + result[f"{prefix}error_east"] ** 2).mean()))
 
 
-def test_the_track_and_the_backward_pass(result):
+def test_the_track_and_the_backward_pass(result: xr.Dataset) -> None:
     assert result.attrs["motion"] == "velocity"
     assert result.attrs["reference_track"] == "truth_"
     assert result.attrs["findings"] == ""
@@ -45,7 +48,9 @@ def test_the_track_and_the_backward_pass(result):
     assert {"units", "long_name"} <= set(result["bias"].attrs)
 
 
-def test_a_batch_is_the_live_filter(ds, grid, options, result):
+def test_a_batch_is_the_live_filter(
+    ds: xr.Dataset, grid: AnomalyGrid, options: Options, result: xr.Dataset
+) -> None:
     nav = Navigator(grid, options)
     time_us = np.round(ds["time"].to_numpy() * 1e6).astype(int)
     nav.fix(int(time_us[0]) - 1, *PLACE)
@@ -62,12 +67,12 @@ def test_a_batch_is_the_live_filter(ds, grid, options, result):
     np.testing.assert_array_equal([r.innovation for r in records], result["innovation"][:100])
 
 
-def test_its_picture(result, grid, tmp_path):
+def test_its_picture(result: xr.Dataset, grid: AnomalyGrid, tmp_path: Path) -> None:
     draw_navigation(result, grid, tmp_path / "track.png")
     assert (tmp_path / "track.png").stat().st_size > 40_000
 
 
-def test_what_is_drawn_is_the_anomaly_on_the_filters_track(result):
+def test_what_is_drawn_is_the_anomaly_on_the_filters_track(result: xr.Dataset) -> None:
     """What is recorded has the main field where dead reckoning was: five km north, that is 10 nT off."""
     moved = result.isel(time=slice(3)).assign(
         north=("time", [0.0, -5_000.0, 0.0]), east=("time", np.zeros(3))
@@ -81,13 +86,13 @@ def test_what_is_drawn_is_the_anomaly_on_the_filters_track(result):
     assert 5.0 < abs(other) < 30.0
 
 
-def test_a_shifted_map_is_recognised(ds, grid, options):
+def test_a_shifted_map_is_recognised(ds: xr.Dataset, grid: AnomalyGrid, options: Options) -> None:
     shifted = AnomalyGrid(grid.longitude + 300 / 72_400, grid.latitude + 400 / 111_200, grid.anomaly)
     findings = navigate(ds, shifted, options, start=PLACE).attrs["findings"]
     assert "the map fits best when moved 500 m (SW)" in findings
 
 
-def test_a_map_of_another_epoch_is_recognised(ds, grid, options):
+def test_a_map_of_another_epoch_is_recognised(ds: xr.Dataset, grid: AnomalyGrid, options: Options) -> None:
     other = AnomalyGrid(grid.longitude, grid.latitude, grid.anomaly - 85.0)
     findings = navigate(ds, other, options, start=PLACE).attrs["findings"]
     assert "the map does not explain the field" in findings
@@ -95,14 +100,16 @@ def test_a_map_of_another_epoch_is_recognised(ds, grid, options):
     assert "above the map's level: its main field may be of another epoch, or at another altitude" in findings
 
 
-def test_another_map_altogether_is_recognised(study, ds, options):
+def test_another_map_altogether_is_recognised(study: ModuleType, ds: xr.Dataset, options: Options) -> None:
     wrong = study.synthetic(study.Map(30, 1500), 4)
     result = navigate(ds, wrong, options, start=PLACE)
     assert "lost for" in result.attrs["findings"]
     assert float(result["vouched"][result["time"] > result["time"][0] + 1800].mean()) < 0.1
 
 
-def test_what_is_known_badly_says_nothing_about_the_map(ds, grid, options):
+def test_what_is_known_badly_says_nothing_about_the_map(
+    ds: xr.Dataset, grid: AnomalyGrid, options: Options
+) -> None:
     """While a mass moves the field is off by hundreds of nT, and says so: its sigma is as large."""
     moving = np.arange(ds.sizes["time"]) % 25 == 0
     off = ds.assign(
@@ -112,7 +119,7 @@ def test_what_is_known_badly_says_nothing_about_the_map(ds, grid, options):
     assert navigate(off, grid, options, start=PLACE).attrs["findings"] == ""
 
 
-def test_a_flat_map_is_recognised(study, options):
+def test_a_flat_map_is_recognised(study: ModuleType, options: Options) -> None:
     flat = study.synthetic(study.Map(0.2, 1500), 4)
     findings = navigate(study.voyage(flat, options, 5, hours=3.0), flat, options, start=PLACE).attrs[
         "findings"
@@ -123,21 +130,23 @@ def test_a_flat_map_is_recognised(study, options):
     )
 
 
-def test_a_map_that_the_vehicle_leaves_is_said(ds, grid, options):
+def test_a_map_that_the_vehicle_leaves_is_said(ds: xr.Dataset, grid: AnomalyGrid, options: Options) -> None:
     edge = int(np.searchsorted(grid.longitude, float(ds["truth_longitude"].quantile(0.6))))
     west = AnomalyGrid(grid.longitude[:edge], grid.latitude, grid.anomaly[:, :edge])
     findings = navigate(ds, west, options, start=PLACE).attrs["findings"]
     assert "off the map for" in findings
 
 
-def test_of_a_map_of_elsewhere_nothing_else_is_said(ds, grid, options):
+def test_of_a_map_of_elsewhere_nothing_else_is_said(
+    ds: xr.Dataset, grid: AnomalyGrid, options: Options
+) -> None:
     elsewhere = AnomalyGrid(grid.longitude + 5.0, grid.latitude, grid.anomaly)
     unsure = replace(options, start_sigma=5_000.0)
     findings = navigate(ds.isel(time=slice(0, 50)), elsewhere, unsure, start=PLACE).attrs["findings"]
     assert findings == "off the map for 100 % of the track, first after 0.0 h: dead reckoning only"
 
 
-def test_motion_from_what_the_log_has(ds, grid, options):
+def test_motion_from_what_the_log_has(ds: xr.Dataset, grid: AnomalyGrid, options: Options) -> None:
     inertial = ds.drop_vars(["velocity_north", "velocity_east"]).assign(
         dr_latitude=ds["truth_latitude"] - ds["away_north"] / 111_200,
         dr_longitude=ds["truth_longitude"] - ds["away_east"] / 72_400,
@@ -147,7 +156,9 @@ def test_motion_from_what_the_log_has(ds, grid, options):
     assert rms(result) < 400.0
 
 
-def test_a_gliders_log_is_told_from_another_vehicles(ds, grid, options):
+def test_a_gliders_log_is_told_from_another_vehicles(
+    ds: xr.Dataset, grid: AnomalyGrid, options: Options
+) -> None:
     """Depth, pitch and heading make a motion only where pitch makes the depth; else the log's track does."""
     depth = 40.0 + 30.0 * np.sin(np.arange(900) * 4 / 150)
     pitch = np.where(np.cos(np.arange(900) * 4 / 150) > 0, -26.0, 26.0)
@@ -177,17 +188,23 @@ def test_a_gliders_log_is_told_from_another_vehicles(ds, grid, options):
         (lambda ds: ds.assign(quality=ds["depth"] * 0 + 16), "none was usable"),
     ],
 )
-def test_one_clear_line(ds, grid, options, change, message):
+def test_one_clear_line(
+    ds: xr.Dataset,
+    grid: AnomalyGrid,
+    options: Options,
+    change: Callable[[xr.Dataset], xr.Dataset],
+    message: str,
+) -> None:
     with pytest.raises(FormatError, match=message):
         navigate(change(ds.isel(time=slice(0, 50))), grid, options, start=PLACE)
 
 
-def test_a_start_is_needed(ds, grid, options):
+def test_a_start_is_needed(ds: xr.Dataset, grid: AnomalyGrid, options: Options) -> None:
     with pytest.raises(FormatError, match="expected a position to start from"):
         navigate(ds.isel(time=slice(0, 50)), grid, options)
 
 
-def test_ten_thousand_samples_in_two_seconds(study, grid, options):
+def test_ten_thousand_samples_in_two_seconds(study: ModuleType, grid: AnomalyGrid, options: Options) -> None:
     long = study.voyage(grid, replace(options, start_sigma=50.0), 5, hours=10_000 / 3600, every=1.0)
     started = time.process_time()
     navigate(long, grid, replace(options, start_sigma=50.0), start=PLACE)
@@ -195,7 +212,7 @@ def test_ten_thousand_samples_in_two_seconds(study, grid, options):
 
 
 @pytest.mark.real
-def test_magnavs_published_flight(real_data):
+def test_magnavs_published_flight(real_data: Path) -> None:
     """100 s at 300 km/h with an inertial track: the example that MagNav.jl navigates.
 
     Its own filter's error on this flight is not stated with the data; asked here is that the field does no

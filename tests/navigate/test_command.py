@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -12,7 +14,9 @@ import xarray as xr
 from magbridge.calibration.file import save
 from magbridge.calibration.model import Noise, identity
 from magbridge.cli import main
+from magbridge.field.grid import AnomalyGrid
 from magbridge.logs import read, write
+from magbridge.navigate.model import Options
 
 PLAN = """time,latitude,longitude
 1386201600,49.48,-57.95
@@ -22,7 +26,9 @@ PLAN = """time,latitude,longitude
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory, study, grid, options):
+def folder(
+    tmp_path_factory: pytest.TempPathFactory, study: ModuleType, grid: AnomalyGrid, options: Options
+) -> Path:
     """A log of two hours whose channels are the field itself, its map, a calibration that changes nothing."""
     path = tmp_path_factory.mktemp("navigate")
     ds = study.voyage(grid, options, 6, hours=2.0)
@@ -48,12 +54,12 @@ def folder(tmp_path_factory, study, grid, options):
     return path
 
 
-def run(folder, *arguments: str, calibration: bool = True) -> int:
+def run(folder: Path, *arguments: str, calibration: bool = True) -> int:
     given = ["--calibration", str(folder / "cal.json")] if calibration else []
     return main(["navigate", *arguments, *given, "-o", str(folder / "out.nc")])
 
 
-def test_a_log_against_its_map(folder, capsys):
+def test_a_log_against_its_map(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     picture = folder / "track.png"
     code = run(
         folder,
@@ -74,7 +80,7 @@ def test_a_log_against_its_map(folder, capsys):
     assert picture.stat().st_size > 40_000
 
 
-def test_a_map_that_cannot_be_meant_is_one_line(folder, capsys):
+def test_a_map_that_cannot_be_meant_is_one_line(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with xr.open_dataset(folder / "grid.nc") as whole:
         whole.assign(anomaly=whole["anomaly"] + 52_000.0).to_netcdf(folder / "bad.nc")
     assert run(folder, str(folder / "log.nc"), "--map", str(folder / "bad.nc")) == 1
@@ -83,7 +89,7 @@ def test_a_map_that_cannot_be_meant_is_one_line(folder, capsys):
     assert line.count("\n") == 1
 
 
-def test_a_plan_is_told_what_the_map_is_worth(folder, capsys):
+def test_a_plan_is_told_what_the_map_is_worth(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     picture = folder / "bound.png"
     plan = (str(folder / "plan.csv"), "--map", str(folder / "grid.nc"), "--bound")
     assert run(folder, *plan, "--picture", str(picture), calibration=False) == 0
@@ -97,7 +103,9 @@ def test_a_plan_is_told_what_the_map_is_worth(folder, capsys):
     ("text", "answer"),
     [(PLAN.replace("1386216000", "1386201000"), "time"), (PLAN.replace("longitude", "x"), "longitude")],
 )
-def test_a_plan_that_cannot_be_flown_is_one_line(folder, capsys, text, answer):
+def test_a_plan_that_cannot_be_flown_is_one_line(
+    folder: Path, capsys: pytest.CaptureFixture[str], text: str, answer: str
+) -> None:
     (folder / "bad.csv").write_text(text)
     plan = (str(folder / "bad.csv"), "--map", str(folder / "grid.nc"), "--bound")
     assert run(folder, *plan, calibration=False) in {1, 2}
@@ -106,7 +114,7 @@ def test_a_plan_that_cannot_be_flown_is_one_line(folder, capsys, text, answer):
     assert line.count("\n") == 1
 
 
-def test_wrong_use_is_one_line(folder, capsys):
+def test_wrong_use_is_one_line(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(folder, str(folder / "log.nc"), "--map", str(folder / "grid.nc"), calibration=False) == 2
     assert "expected --calibration" in capsys.readouterr().err
     (folder / "other.toml").write_text("[navigation.options]\nstart_sgma = 1.0\n")

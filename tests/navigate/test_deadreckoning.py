@@ -11,7 +11,7 @@ from magbridge.navigate.deadreckoning import DeadReckoning
 START = (54.0, 15.0)
 
 
-def sailed(rows, end: float = 1000.0) -> tuple[float, float]:
+def sailed(rows: list[tuple[float, dict[str, float]]], end: float = 1000.0) -> tuple[float, float]:
     where = DeadReckoning()
     where.place(*START)
     for time, values in rows:
@@ -32,11 +32,11 @@ def sailed(rows, end: float = 1000.0) -> tuple[float, float]:
         ],
     ],
 )
-def test_each_kind_of_telemetry_leads_to_the_same_place(rows):
+def test_each_kind_of_telemetry_leads_to_the_same_place(rows: list[tuple[float, dict[str, float]]]) -> None:
     assert sailed(rows) == pytest.approx((300.0, 400.0), abs=1.0)
 
 
-def test_a_glider_moves_by_its_sink_rate_and_pitch():
+def test_a_glider_moves_by_its_sink_rate_and_pitch() -> None:
     """26 degrees down at 0.17 m/s of depth is 0.35 m/s along; after the turn the climb goes on alike."""
     rows = []
     for t in np.arange(0.0, 1000.0, 4.0):
@@ -51,12 +51,12 @@ def test_a_glider_moves_by_its_sink_rate_and_pitch():
     assert north == pytest.approx(0.0, abs=1e-6)
 
 
-def test_what_is_nan_or_old_changes_nothing():
+def test_what_is_nan_or_old_changes_nothing() -> None:
     calm = [(0.0, {"speed": 0.5, "heading": 0.0}), (1.0, {"heading": np.nan, "speed": np.nan})]
     assert sailed([*calm, (0.5, {})]) == pytest.approx((500.0, 0.0), abs=1e-6)
 
 
-def test_a_long_silence_is_not_sailed_through():
+def test_a_long_silence_is_not_sailed_through() -> None:
     where = DeadReckoning()
     where.place(*START)
     where.telemetry(0.0, {"speed": 1.0, "heading": 0.0})

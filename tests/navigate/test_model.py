@@ -14,7 +14,7 @@ from magbridge.field.grid import AnomalyGrid
 from magbridge.navigate.model import Options, block_length, informed, prior, resolution, transition
 
 
-def test_many_short_steps_are_one_long_step():
+def test_many_short_steps_are_one_long_step() -> None:
     options = Options()
     f, q = np.eye(6), np.zeros((6, 6))
     for _ in range(100):
@@ -25,20 +25,20 @@ def test_many_short_steps_are_one_long_step():
     np.testing.assert_allclose(q, long_q, rtol=0.01, atol=1e-9)
 
 
-def test_gauss_markov_states_keep_their_variance():
+def test_gauss_markov_states_keep_their_variance() -> None:
     options = Options()
     _, P = prior(options)
     f, q = transition(options, 600.0, 200.0)
     np.testing.assert_allclose((f @ P @ f.T + q)[2:, 2:], P[2:, 2:], rtol=1e-12)
 
 
-def test_no_time_is_no_motion():
+def test_no_time_is_no_motion() -> None:
     f, q = transition(Options(), 0.0, 0.0)
     np.testing.assert_array_equal(f, np.eye(6))
     np.testing.assert_array_equal(q, np.zeros((6, 6)))
 
 
-def test_resolution_follows_the_map(grid):
+def test_resolution_follows_the_map(grid: AnomalyGrid) -> None:
     fine, coarse = resolution(grid, Options(), 0.1), resolution(grid, Options(), 10.0)
     assert 0 < fine < coarse <= 0.25 * grid.correlation_length
     flat = AnomalyGrid(grid.longitude, grid.latitude, np.zeros_like(grid.anomaly))
@@ -46,13 +46,13 @@ def test_resolution_follows_the_map(grid):
     assert block_length(flat) == np.inf
 
 
-def test_options_refuse_what_they_do_not_know():
+def test_options_refuse_what_they_do_not_know() -> None:
     with pytest.raises(msgspec.ValidationError, match="unknown field `gait`"):
         msgspec.convert({"gait": 1.0}, Options)
     assert msgspec.convert({"gate": 9.0}, Options).gate == 9.0
 
 
-def test_a_calibration_tells_what_is_white_and_what_is_not():
+def test_a_calibration_tells_what_is_white_and_what_is_not() -> None:
     known = Options(bias_sigma=1.0)
     white = with_noise(Noise(2.0))
     assert informed(known, white, 2.0) == replace(known, noise=2.0)

@@ -3,22 +3,26 @@
 from __future__ import annotations
 
 from importlib import import_module
+from types import ModuleType
 
 import numpy as np
 import pytest
+import xarray as xr
 from msgspec.structs import replace
 
 from magbridge.field.earth import offset
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.igrf import total_field
-from magbridge.navigate import Navigator, Options, State
+from magbridge.navigate import Navigator, Options, Record, State
 from magbridge.records import Corrected, Quality
 
 PLACE = (49.5, -57.9)
 START_US = 1_386_201_600_000_000
 
+Followed = tuple[list[Record], np.ndarray]
 
-def feed(navigator: Navigator, ds, rows=slice(None)):
+
+def feed(navigator: Navigator, ds: xr.Dataset, rows: slice = slice(None)) -> Followed:
     """Run a voyage through the navigator; return records and errors (m)."""
     records, errors = [], []
     time_us = np.round(ds["time"].to_numpy()[rows] * 1e6).astype(int).tolist()
@@ -34,18 +38,18 @@ def feed(navigator: Navigator, ds, rows=slice(None)):
 
 
 @pytest.fixture(scope="module")
-def ds(study, grid, options):
+def ds(study: ModuleType, grid: AnomalyGrid, options: Options) -> xr.Dataset:
     return study.voyage(grid, options, 11, hours=3.0)
 
 
 @pytest.fixture(scope="module")
-def voyage(grid, options, ds):
+def voyage(grid: AnomalyGrid, options: Options, ds: xr.Dataset) -> Followed:
     navigator = Navigator(grid, options)
     navigator.fix(START_US, *PLACE)
     return feed(navigator, ds)
 
 
-def test_five_lines(grid):
+def test_five_lines(grid: AnomalyGrid) -> None:
     nav = Navigator(grid, Options(start_sigma=100.0, interval=4.0))
     nav.fix(START_US, *PLACE)
     nav.telemetry(START_US, heading=90.0, speed=0.35, depth=40.0)
@@ -55,7 +59,9 @@ def test_five_lines(grid):
     assert record.latitude == pytest.approx(PLACE[0], abs=0.01)
 
 
-def test_it_holds_the_position(study, grid, options, ds, voyage):
+def test_it_holds_the_position(
+    study: ModuleType, grid: AnomalyGrid, options: Options, ds: xr.Dataset, voyage: Followed
+) -> None:
     records, error = voyage
     score = study.sail(ds, grid, options).score()
     assert score.drms < 2.0 * score.bound  # one voyage: errors follow each other
@@ -67,13 +73,13 @@ def test_it_holds_the_position(study, grid, options, ds, voyage):
     assert 0.7 < z.mean() < 1.3
 
 
-def _fresh(grid, options):
+def _fresh(grid: AnomalyGrid, options: Options) -> Navigator:
     navigator = Navigator(grid, options)
     navigator.fix(START_US, *PLACE)
     return navigator
 
 
-def test_a_wide_start_is_found(study, grid, options):
+def test_a_wide_start_is_found(study: ModuleType, grid: AnomalyGrid, options: Options) -> None:
     wide = replace(options, start_sigma=1500.0)
     run = study.sail(study.voyage(grid, wide, 4, hours=4.0), grid, wide)
     assert run.error[0] > 300.0
@@ -83,13 +89,13 @@ def test_a_wide_start_is_found(study, grid, options):
     assert State.LOST not in run.state
 
 
-def test_carried_off_it_says_that_it_is_lost_and_finds_itself_again(study):
+def test_carried_off_it_says_that_it_is_lost_and_finds_itself_again(study: ModuleType) -> None:
     hours_vouched, hours_lost = import_module("voyages.lost").carried(study.Map(30, 1500), 3)
     assert 0.0 < hours_lost < 2.0
     assert hours_vouched < 0.5
 
 
-def test_samples_that_cannot_be_used(grid, options):
+def test_samples_that_cannot_be_used(grid: AnomalyGrid, options: Options) -> None:
     nav = _fresh(grid, options)
     nav.telemetry(START_US, heading=0.0, speed=0.35)
     bad = Corrected(9e4, 1.0, (0.0, 0.0, 0.0), (1.0, 1.0, 1.0), int(Quality.SATURATED))
@@ -103,7 +109,7 @@ def test_samples_that_cannot_be_used(grid, options):
     assert nav.dropped == 1
 
 
-def test_nothing_before_a_start(grid):
+def test_nothing_before_a_start(grid: AnomalyGrid) -> None:
     nav = Navigator(grid)
     assert nav.estimate.state is State.OFF
     nav.telemetry(START_US, heading=0.0, speed=0.35)
@@ -112,7 +118,9 @@ def test_nothing_before_a_start(grid):
     assert nav.estimate.state is State.OFF
 
 
-def test_a_fix_is_taken_in_and_a_contradiction_believed(grid, options, ds):
+def test_a_fix_is_taken_in_and_a_contradiction_believed(
+    grid: AnomalyGrid, options: Options, ds: xr.Dataset
+) -> None:
     nav = _fresh(grid, options)
     records, _ = feed(nav, ds, slice(0, 600))
     t = records[-1].time_us + 30_000_000
@@ -128,7 +136,9 @@ def test_a_fix_is_taken_in_and_a_contradiction_believed(grid, options, ds):
     )
 
 
-def test_off_the_map_it_reckons(study, grid, options, ds):
+def test_off_the_map_it_reckons(
+    study: ModuleType, grid: AnomalyGrid, options: Options, ds: xr.Dataset
+) -> None:
     small = AnomalyGrid(grid.longitude[:70], grid.latitude, grid.anomaly[:, :70])
     nav = _fresh(small, options)
     records, _ = feed(nav, ds, slice(0, 200))
@@ -138,7 +148,7 @@ def test_off_the_map_it_reckons(study, grid, options, ds):
     assert nav.estimate.P[0, 0] > options.start_sigma**2
 
 
-def test_a_flat_map_says_nothing(grid, options, ds):
+def test_a_flat_map_says_nothing(grid: AnomalyGrid, options: Options, ds: xr.Dataset) -> None:
     flat = AnomalyGrid(grid.longitude, grid.latitude, np.zeros_like(grid.anomaly))
     records, _ = feed(
         _fresh(flat, options), ds.assign(total_field=ds["total_field"] * 0 + 52_300.0), slice(0, 300)
@@ -146,7 +156,7 @@ def test_a_flat_map_says_nothing(grid, options, ds):
     assert not any(r.vouched for r in records)
 
 
-def test_across_the_antimeridian(study, options):
+def test_across_the_antimeridian(study: ModuleType, options: Options) -> None:
     """The same map and voyage moved to 180 degrees: the field differs by the main field only."""
     grid = study.synthetic(study.Map(30, 1500), 3)
     moved = AnomalyGrid(grid.longitude - PLACE[1] + 180.0, grid.latitude, grid.anomaly)
@@ -166,7 +176,9 @@ def test_across_the_antimeridian(study, options):
     assert all(np.isfinite(r.map_anomaly) for r in records)
 
 
-def test_the_main_field_is_that_of_the_day_to_which_the_clock_was_set(ds, grid, options) -> None:
+def test_the_main_field_is_that_of_the_day_to_which_the_clock_was_set(
+    ds: xr.Dataset, grid: AnomalyGrid, options: Options
+) -> None:
     """A computer without a clock of its own wakes up in 1970; the field there has lost 1.8 µT since."""
     innovations = []
     for offset_us in (0, START_US):

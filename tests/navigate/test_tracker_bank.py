@@ -4,35 +4,40 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from scipy.stats import multivariate_normal
 
 from magbridge.field.earth import metres_per_degree, offset
-from magbridge.field.grid import AnomalyGrid
+from magbridge.field.grid import AnomalyGrid, Local
 from magbridge.navigate.bank import Bank, widest
 from magbridge.navigate.model import Block, Options, prior, transition
 from magbridge.navigate.tracker import Tracker
 
 PLACE = (49.5, -57.9)
 
+Moments = tuple[np.ndarray, np.ndarray]
+
 
 def block(anomaly: float, variance: float = 1.0) -> Block:
     return Block(0, *PLACE, anomaly, variance, 0.0, 0.0)
 
 
-def around(grid: AnomalyGrid, north, east):
+def around(
+    grid: AnomalyGrid, north: np.ndarray | float, east: np.ndarray | float
+) -> Local[NDArray[np.float64]]:
     per_lat, per_lon = metres_per_degree(PLACE[0])
     return grid.evaluate(PLACE[1] + np.asarray(east) / per_lon, PLACE[0] + np.asarray(north) / per_lat)
 
 
 @pytest.fixture
-def correlated() -> tuple[np.ndarray, np.ndarray]:
+def correlated() -> Moments:
     rng = np.random.default_rng(0)
     x, P = prior(Options(start_sigma=60.0))
     root = np.linalg.cholesky(P) @ (np.eye(6) + 0.2 * rng.normal(size=(6, 6)))
     return x + 0.3 * np.sqrt(np.diag(P)) * rng.normal(size=6), root @ root.T
 
 
-def test_the_tracker_is_the_second_order_filter(grid, correlated):
+def test_the_tracker_is_the_second_order_filter(grid: AnomalyGrid, correlated: Moments) -> None:
     """The textbook equations, with the whole covariance, in the plainest code."""
     x, P = correlated
     tracker = Tracker(grid, x, P, gate=25.0)
@@ -55,7 +60,7 @@ def test_the_tracker_is_the_second_order_filter(grid, correlated):
     assert seen.accepted
 
 
-def test_shapes_stay_fixed_and_the_covariance_stays_one(grid, correlated):
+def test_shapes_stay_fixed_and_the_covariance_stays_one(grid: AnomalyGrid, correlated: Moments) -> None:
     tracker = Tracker(grid, *correlated, gate=1e9)
     moved = transition(Options(), 20.0, 7.0)
     rng = np.random.default_rng(1)
@@ -68,7 +73,7 @@ def test_shapes_stay_fixed_and_the_covariance_stays_one(grid, correlated):
     assert np.linalg.eigvalsh(tracker.P).min() > 0
 
 
-def test_the_gate_keeps_an_outlier_out(grid, correlated):
+def test_the_gate_keeps_an_outlier_out(grid: AnomalyGrid, correlated: Moments) -> None:
     tracker = Tracker(grid, *correlated, gate=16.0)
     before = tracker.x.copy()
     seen = tracker.update(block(5_000.0))
@@ -77,12 +82,12 @@ def test_the_gate_keeps_an_outlier_out(grid, correlated):
     np.testing.assert_array_equal(tracker.x, before)
 
 
-def test_off_the_map_nothing_is_compared(grid, correlated):
+def test_off_the_map_nothing_is_compared(grid: AnomalyGrid, correlated: Moments) -> None:
     x, P = correlated
     assert Tracker(grid, x + 1e6 * np.eye(6)[0], P, 16.0).update(block(0.0)) is None
 
 
-def test_a_bank_of_one_is_the_tracker(grid, correlated):
+def test_a_bank_of_one_is_the_tracker(grid: AnomalyGrid, correlated: Moments) -> None:
     tracker, bank = Tracker(grid, *correlated, gate=16.0), Bank(grid, *correlated, resolution=1e4, gate=16.0)
     moved = transition(Options(), 20.0, 7.0)
     rng = np.random.default_rng(2)
@@ -101,7 +106,7 @@ def test_a_bank_of_one_is_the_tracker(grid, correlated):
     np.testing.assert_allclose(bank.x[:, 0], tracker.x, rtol=1e-7, atol=1e-9)
 
 
-def test_a_cut_gaussian_is_still_that_gaussian(grid, correlated):
+def test_a_cut_gaussian_is_still_that_gaussian(grid: AnomalyGrid, correlated: Moments) -> None:
     """1 %: what a lattice of 1.2 sigma spacing loses; 3 % for the tails beyond 3.5 sigma."""
     x, P = correlated
     bank = Bank(grid, x, P, resolution=15.0, gate=16.0)
@@ -114,7 +119,7 @@ def test_a_cut_gaussian_is_still_that_gaussian(grid, correlated):
     assert np.linalg.eigvalsh(np.moveaxis(bank.P, 2, 0)).min() > 0
 
 
-def test_splitting_and_merging_keep_mean_and_covariance(grid, correlated):
+def test_splitting_and_merging_keep_mean_and_covariance(grid: AnomalyGrid, correlated: Moments) -> None:
     bank = Bank(grid, *correlated, resolution=30.0, gate=16.0)
     before = bank.moments()
     bank._split(np.ones(len(bank), bool))
@@ -128,7 +133,7 @@ def test_splitting_and_merging_keep_mean_and_covariance(grid, correlated):
         np.testing.assert_allclose(now, then, rtol=1e-6, atol=1e-6)
 
 
-def test_the_bank_is_bayes_on_a_wide_start(grid):
+def test_the_bank_is_bayes_on_a_wide_start(grid: AnomalyGrid) -> None:
     """Places of the prior, weighted by the likelihood, against the bank: mean, spread and evidence.
 
     Places need no line through the map: what is left is the bank's own. Bias and map error, which both
@@ -158,7 +163,7 @@ def test_the_bank_is_bayes_on_a_wide_start(grid):
     assert evidence == pytest.approx(np.log(w.mean()) + log_w.max(), abs=0.03)
 
 
-def test_hypotheses_off_the_map_stay_in_the_running(grid):
+def test_hypotheses_off_the_map_stay_in_the_running(grid: AnomalyGrid) -> None:
     """A vehicle at the edge: those outside expect anything, so they neither win nor vanish at once."""
     x, P = prior(Options(start_sigma=800.0))
     bank = Bank(grid, x + 16_000.0 * np.eye(6)[0], P, resolution=200.0, gate=16.0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from importlib import import_module
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -10,13 +11,13 @@ from msgspec.structs import replace
 
 from magbridge.field.earth import metres_per_degree
 from magbridge.field.grid import AnomalyGrid
-from magbridge.navigate.model import any_level, transition
+from magbridge.navigate.model import Options, any_level, transition
 
 PERIOD = 700.0
 
 
 @pytest.fixture(scope="module")
-def alike(study) -> AnomalyGrid:
+def alike(study: ModuleType) -> AnomalyGrid:
     """A map on which every place has a twin 700 m away: nothing that is measured can tell them apart."""
     per_latitude, per_longitude = metres_per_degree(study.PLACE[0])
     metres = np.arange(-6_000.0, 6_001.0, 50.0)
@@ -28,7 +29,9 @@ def alike(study) -> AnomalyGrid:
     )
 
 
-def test_what_nothing_can_tell_apart_is_never_vouched_for(study, alike, options):
+def test_what_nothing_can_tell_apart_is_never_vouched_for(
+    study: ModuleType, alike: AnomalyGrid, options: Options
+) -> None:
     """The filter tracks, and is right, but has only its claim to know in which of the twins it is."""
     claimed = replace(options, start_sigma=40.0)
     run = study.sail(study.voyage(alike, claimed, 3, hours=2.0), alike, claimed)
@@ -36,7 +39,9 @@ def test_what_nothing_can_tell_apart_is_never_vouched_for(study, alike, options)
     assert not run.vouched.any()
 
 
-def test_a_start_as_wide_as_its_rivals_needs_none(study, grid, options):
+def test_a_start_as_wide_as_its_rivals_needs_none(
+    study: ModuleType, grid: AnomalyGrid, options: Options
+) -> None:
     """What narrows it down is then the field alone: it is vouched for as soon as one place is left."""
     wide = replace(options, start_sigma=1500.0)
     run = study.sail(study.voyage(grid, wide, 4, hours=3.0), grid, wide)
@@ -47,7 +52,9 @@ def test_a_start_as_wide_as_its_rivals_needs_none(study, grid, options):
 
 
 @pytest.mark.parametrize("level", [60.0, -60.0])
-def test_a_calibration_that_is_off_is_not_answered_by_another_place(study, grid, options, level):
+def test_a_calibration_that_is_off_is_not_answered_by_another_place(
+    study: ModuleType, grid: AnomalyGrid, options: Options, level: float
+) -> None:
     """60 nT where 1 nT is claimed: lost at once, and the level found with the place, not instead of it."""
     ds = study.voyage(grid, options, 11, hours=3.0)
     run = study.sail(ds.assign(total_field=ds["total_field"] + level), grid, options)
@@ -55,13 +62,13 @@ def test_a_calibration_that_is_off_is_not_answered_by_another_place(study, grid,
     assert not (run.vouched & (run.nees > study.OUTSIDE)).any()
 
 
-def test_a_misled_filter_does_not_stand_by_it(study):
+def test_a_misled_filter_does_not_stand_by_it(study: ModuleType) -> None:
     hours_vouched, hours_lost = import_module("voyages.lost").misled(study.Map(30, 1500), 6)
     assert hours_lost > 0.0
     assert hours_vouched < 0.5
 
 
-def test_a_level_that_may_be_any_wanders_no_faster(grid, options):
+def test_a_level_that_may_be_any_wanders_no_faster(grid: AnomalyGrid, options: Options) -> None:
     loose = any_level(options, grid)
     assert loose.bias_sigma == grid.rms
     assert any_level(loose, grid) == loose
