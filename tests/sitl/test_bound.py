@@ -19,27 +19,29 @@ SCENARIO = msgspec.structs.replace(
 
 
 @pytest.fixture(scope="module")
-def flight() -> tuple[Twin, xr.Dataset, xr.Dataset]:
+def flight() -> tuple[Vehicle, xr.Dataset, xr.Dataset]:
     parts = segments(simulate(SCENARIO, 1))
-    return Twin.draw(SCENARIO, 1), parts["calibration"], parts["survey"]
+    vehicle = Twin.draw(SCENARIO, 1).vehicle
+    assert isinstance(vehicle, Vehicle)
+    return vehicle, parts["calibration"], parts["survey"]
 
 
-def test_who_knows_the_vehicle_is_left_with_the_noise(flight: tuple[Twin, xr.Dataset, xr.Dataset]) -> None:
-    twin, calibration, survey = flight
-    error = oracle(twin.vehicle, survey) - survey["truth_total_field"].to_numpy()
-    _, floor = information_bound(twin.vehicle, calibration, survey, sigma=1.0)
+def test_who_knows_the_vehicle_is_left_with_the_noise(flight: tuple[Vehicle, xr.Dataset, xr.Dataset]) -> None:
+    vehicle, calibration, survey = flight
+    error = oracle(vehicle, survey) - survey["truth_total_field"].to_numpy()
+    _, floor = information_bound(vehicle, calibration, survey, sigma=1.0)
     assert rms(error) == pytest.approx(rms(floor), rel=0.06)
 
 
 def test_no_calibration_beats_the_noise_and_more_knowledge_helps(
-    flight: tuple[Twin, xr.Dataset, xr.Dataset],
+    flight: tuple[Vehicle, xr.Dataset, xr.Dataset],
 ) -> None:
-    twin, calibration, survey = flight
-    bound, floor = information_bound(twin.vehicle, calibration, survey, 1.0)
+    vehicle, calibration, survey = flight
+    bound, floor = information_bound(vehicle, calibration, survey, 1.0)
     assert np.all(bound > floor)
-    vague, _ = information_bound(twin.vehicle, calibration, survey, 1.0, at_sigma=0.5)
+    vague, _ = information_bound(vehicle, calibration, survey, 1.0, at_sigma=0.5)
     assert np.all(vague >= bound - 1e-9)
-    fewer, _ = information_bound(twin.vehicle, calibration.isel(time=slice(0, None, 2)), survey, 1.0)
+    fewer, _ = information_bound(vehicle, calibration.isel(time=slice(0, None, 2)), survey, 1.0)
     assert np.all(fewer >= bound - 1e-9)
 
 

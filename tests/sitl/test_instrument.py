@@ -5,13 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sitl.instrument import Instrument, rotation
+from sitl.instrument import Instrument, Samples, rotation
 
 FIELD = np.array([17000.0, -6000.0, 49600.0])
 IDEAL = Instrument(noise_sigma=0.0, corner=0.0)
 
 
-def measure(instrument: Instrument, field: np.ndarray, water: np.ndarray, when: np.ndarray, seed: int = 0):
+def measure(
+    instrument: Instrument, field: np.ndarray, water: np.ndarray, when: np.ndarray, seed: int = 0
+) -> Samples:
     return instrument.measure(field, water, 0.5, when, np.random.default_rng(seed))
 
 
