@@ -13,7 +13,9 @@ from magbridge.errors import CalibrationError, FormatError
 def test_a_deployment_s_columns_become_observations() -> None:
     n = 50
     rng = np.random.default_rng(0)
-    columns = {f"mag_{axis}": ("time", rng.normal(0, 3e4, n)) for axis in "xyz"}
+    columns: dict[str, tuple[object, ...]] = {
+        f"mag_{axis}": ("time", rng.normal(0, 3e4, n)) for axis in "xyz"
+    }
     columns |= {
         "battpos": ("time", rng.normal(0, 1, n), {"units": "in"}),
         "reference_field": ("time", np.full(n, 5e4)),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -14,18 +15,22 @@ from magbridge.calibration.dipole import Dipole
 from magbridge.calibration.effects import ChannelEffect
 from magbridge.calibration.forward import forward
 from magbridge.calibration.model import Boresight, Calibration, Noise, Parameter, Reference, identity
-from magbridge.calibration.terms import Effect, Polynomial, Term, full_order
+from magbridge.calibration.terms import Effect, Polynomial, PositionTerm, full_order
 from magbridge.errors import CalibrationError
 from magbridge.records import Quality
 
 F_0 = 50_000.0
 
 
+def turned(rotation: tuple[float, float, float], covariance: np.ndarray) -> Boresight:
+    return msgspec.convert({"rotation": rotation, "covariance": covariance.tolist()}, Boresight)
+
+
 def random_calibration(
     seed: int, k: int = 2, order: int = 3, *, boresight: bool = False, extra: bool = False
 ) -> Calibration:
     rng = np.random.default_rng(seed)
-    terms: tuple[Term, ...] = (Polynomial(exponents=full_order(k, order)),)
+    terms: tuple[PositionTerm, ...] = (Polynomial(exponents=full_order(k, order)),)
     effects: tuple[Effect, ...] = ()
     if extra:
         terms += (
@@ -50,9 +55,7 @@ def random_calibration(
         covariance=root @ root.T,
         noise=Noise(1.5),
         reference=Reference(F_0),
-        boresight=Boresight((0.01, -0.02, 0.3), tuple(map(tuple, (np.eye(3) * 1e-5).tolist())))
-        if boresight
-        else None,
+        boresight=turned((0.01, -0.02, 0.3), np.eye(3) * 1e-5) if boresight else None,
         method="auto",
     )
 
@@ -67,9 +70,10 @@ def random_samples(seed: int, n: int, channels: int) -> tuple[np.ndarray, np.nda
 def naive(cal: Calibration, c: np.ndarray, h: np.ndarray, p: np.ndarray) -> np.ndarray:
     """b = A (h - T), as the equation stands, one sample, polynomials only."""
     x = np.array([(v - par.centre) / par.scale for v, par in zip(p, cal.parameters, strict=True)])
-    theta = sum(
-        np.prod(x ** np.array(e)) * c[9 * m : 9 * m + 9] for m, e in enumerate(cal.terms[0].exponents)
-    )
+    (polynomial,) = cal.terms
+    assert isinstance(polynomial, Polynomial)
+    monomials = np.array([np.prod(x ** np.array(e)) for e in polynomial.exponents])
+    theta = monomials @ c.reshape(-1, 9)
     a = theta[:6] / F_0
     A = np.eye(3) + np.array([[a[0], a[3], a[4]], [a[3], a[1], a[5]], [a[4], a[5], a[2]]])
     return A @ (h - theta[6:])
@@ -210,7 +214,7 @@ def test_the_boresight_s_covariance_turns_the_vector() -> None:
     field, positions, time = random_samples(8, 5, 2)
     root = np.array([[2.0, 0.0, 0.0], [0.7, 1.0, 0.0], [-0.5, 0.4, 1.5]]) * 1e-3
     sharp = replace(random_calibration(8), boresight=Boresight((0.0, 0.0, 0.0), ((0.0,) * 3,) * 3))
-    loose = replace(sharp, boresight=Boresight((0.0, 0.0, 0.0), tuple(map(tuple, (root @ root.T).tolist()))))
+    loose = replace(sharp, boresight=turned((0.0, 0.0, 0.0), root @ root.T))
     before, after = (correct(cal, field, positions, time) for cal in (sharp, loose))
     np.testing.assert_array_equal(after.sigma, before.sigma)
     for b, one, other in zip(before.vector, before.vector_sigma, after.vector_sigma, strict=True):

@@ -131,7 +131,7 @@ def test_functions_of_time() -> None:
         for shape in ("step", "drift", "tone")
     )
     np.testing.assert_array_equal(step[:, 0], [0, 0, 1, 1, 1])
-    np.testing.assert_allclose(drift, [[-1, 1], [-0.5, 0.25], [0, 0], [0.25, 0.0625], [1, 1]])
+    np.testing.assert_allclose(drift, [[-1.0, 1.0], [-0.5, 0.25], [0.0, 0.0], [0.25, 0.0625], [1.0, 1.0]])
     np.testing.assert_allclose(tone, [[1, 0], [-1, 0], [1, 0], [0, 1], [1, 0]], atol=1e-6)
 
 

@@ -144,7 +144,7 @@ def test_auto_is_near_the_noise_floor_out_of_sample(
             }
             for name, mass in one.vehicle.mass.items()
         }
-        found = fit(one.runs, **({"vehicle": vehicle} if geometry else {}))
+        found = fit(one.runs, vehicle=vehicle if geometry else None)
         ratio, spread = survey_error(found.calibration, one)
         ratios.append(ratio)
         spreads.append(spread)
