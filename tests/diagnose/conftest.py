@@ -50,7 +50,7 @@ def _right(rows: int) -> Problem:
     rng = np.random.default_rng(4)
     d = rng.normal(size=(rows, 3))
     survey = Survey(
-        time=1.7e9 + 4.0 * np.arange(rows), field=5e4 * d / np.linalg.norm(d, axis=1)[:, None],
+        time=1.7e9 + 4.0 * np.arange(float(rows)), field=5e4 * d / np.linalg.norm(d, axis=1)[:, None],
         reference=np.full(rows, 5e4), still=(), steps=np.where(np.arange(rows) > 0, 1, FAR),
         dive=np.arange(rows) // 50, place=None, attitude=None, learned=np.zeros(rows, bool),
         cycles=np.empty(0), source="made",

@@ -25,7 +25,7 @@ def test_names_within_20_to_1_of_a_description_stay(right: Callable[[int], Probl
     acts = np.sign(np.sin(t / 9.0))
     said = {"a": acts, "like a": acts + 0.1 * rng.normal(size=ROWS), "b": rng.normal(size=ROWS)}
     candidates = [
-        Candidate(cause, None, lambda rows, x=x: x[rows, None], np.ones(1), ("b",), ("nT",))
+        Candidate(cause, None, x[:, None].__getitem__, np.ones(1), ("b",), ("nT",))
         for cause, x in said.items()
     ]
     outcome = search(replace(right(ROWS), residual=0.5 * acts + rng.normal(size=ROWS)), candidates, 3)

@@ -14,10 +14,11 @@ import xarray as xr
 from scipy.interpolate import CubicSpline
 from study import stage
 from study.cases import alike, case
-from study.noise import GLIDER, LOSSES, NOISES
+from study.noise import GLIDER, LOSSES, NOISES, whiten
 from study.rates import worse
 
 from magbridge.calibration.file import load
+from magbridge.calibration.model import Calibration
 from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.gain import Gain
 from magbridge.diagnose.report.doubts import useful
@@ -82,7 +83,7 @@ def test_a_lag_imitates_an_early_clock_beside_the_telemetry_that_is_there() -> N
         **{name: CubicSpline(t, getattr(own.track, name))(fine) for name in way},
     )
     e = [stage.compare(disturb(own.twin, one, track, own.when), own.calibration)[0] for one in ((lag,), ())]
-    true = stage.whiten(e[0] - e[1], "white", stall.rows)
+    true = whiten(e[0] - e[1], "white", stall.rows)
     off = {
         name: np.linalg.norm(shape - true) / np.linalg.norm(true)
         for name, shape in (
@@ -144,20 +145,22 @@ def test_what_no_cause_explains_is_called_unexplained() -> None:
 
 
 @pytest.fixture(scope="module")
-def warm(short: None) -> tuple[xr.Dataset, object]:
+def warm(short: None) -> tuple[xr.Dataset, Calibration]:
     here = stage.Stall.of(stage.vehicle(0), 24, "white")
     return here.log(here.hide("current_field", 60.0, 24).ds), here.stage.calibration
 
 
 @pytest.fixture(scope="module")
-def written(warm: tuple[xr.Dataset, object], tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+def written(
+    warm: tuple[xr.Dataset, Calibration], tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, str]:
     """The folder of a diagnosis and the channel that it names."""
     ds, calibration = warm
     out = tmp_path_factory.mktemp("diagnosis")
     return out, diagnose([ds], calibration, out / "out").findings[0].candidate.channel
 
 
-def test_what_is_written(warm: tuple[xr.Dataset, object], written: tuple[Path, str]) -> None:
+def test_what_is_written(warm: tuple[xr.Dataset, Calibration], written: tuple[Path, str]) -> None:
     """The contract's three files; the calibration is an ordinary one, and mends what it says it mends."""
     ds, tmp_path = warm[0], written[0]
     found = json.loads((tmp_path / "out" / "findings.json").read_text())
@@ -190,7 +193,9 @@ def test_a_maps_error_is_told_by_its_size(short: None) -> None:
     assert 0.0 < numbers["rms"]["sigma"] < 0.2 * numbers["rms"]["value"]
 
 
-def test_a_channels_name_does_not_decide(warm: tuple[xr.Dataset, object], written: tuple[Path, str]) -> None:
+def test_a_channels_name_does_not_decide(
+    warm: tuple[xr.Dataset, Calibration], written: tuple[Path, str]
+) -> None:
     ds, calibration = warm
     renamed = ds.rename({written[1]: "zz"})
     found = diagnose([renamed], calibration)
@@ -203,7 +208,7 @@ def test_a_channels_name_does_not_decide(warm: tuple[xr.Dataset, object], writte
     assert useful(replace(found, findings=both)).endswith("is without: diurnal variation.</p>")
 
 
-def test_bad_input_is_one_line(warm: tuple[xr.Dataset, object]) -> None:
+def test_bad_input_is_one_line(warm: tuple[xr.Dataset, Calibration]) -> None:
     ds, calibration = warm
     bare = ds.drop_vars(["reference_field", "latitude", "longitude"])
     for wrong, message in (

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from magbridge.diagnose.compare.columns import Interpolated, Mixture, beside, parts, times, together
+from magbridge.diagnose.compare.columns import Columns, Interpolated, Mixture, beside, parts, times, together
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference import design
 from magbridge.diagnose.inference.information import information
@@ -56,7 +56,11 @@ def test_coefficients_leave_the_same_without_their_columns(table: FloatArray) ->
 def test_strangers_say_what_they_say_among_others(right: Callable[[int], Problem]) -> None:
     problem, made = right(400), np.random.default_rng(2).normal(size=(400, 7))
     one, other, model = (made[:, own].__getitem__ for own in (slice(3), slice(3, 5), slice(5, 7)))
-    columns = [Mixture(((one, np.eye(3)[:, :2]), (other, np.eye(2)))), made[:, 1:3].__getitem__, model]
+    columns: list[Columns] = [
+        Mixture(((one, np.eye(3)[:, :2]), (other, np.eye(2)))),
+        made[:, 1:3].__getitem__,
+        model,
+    ]
     fit = fit_joint(problem, [model], 1)
     apart, whole = (information(problem, fit.noise, fit, columns, k).fitted(fit) for k in (2, 0))
     for own in (slice(2), slice(2, 4)):

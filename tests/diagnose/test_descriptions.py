@@ -97,7 +97,7 @@ def followed(time: np.ndarray, x: np.ndarray, lag: float) -> np.ndarray:
 
 def test_a_slab_that_follows_a_temperature_is_described() -> None:
     """Its centre's two slowest modes (Carslaw & Jaeger 1959, sec. 3.4), the water as dives change it."""
-    time = 4.0 * np.arange(5400)
+    time = 4.0 * np.arange(5400.0)
     water = np.tanh(3.0 * np.sin(2.0 * np.pi * time / 5500.0)) + time / time[-1]
     core = followed(time, water, 1800.0) - followed(time, water, 200.0) / 3.0
     X = delayed(time, water)(slice(None))
@@ -107,14 +107,14 @@ def test_a_slab_that_follows_a_temperature_is_described() -> None:
 
 @pytest.mark.parametrize("lag", [5.0, 20.0])
 def test_what_swings_out_in_turns_is_described(lag: float) -> None:
-    time = 4.0 * np.arange(3000)
+    time = 4.0 * np.arange(3000.0)
     rate = np.where(time % 700.0 < 60.0, np.where(time % 1400.0 < 700.0, 1.0, -0.4), 0.0)
     swung = followed(time, rate, lag)
     assert left_of(swung - 0.5 * swung**2, swings(time, rate)(slice(None))) < 0.05
 
 
 def test_what_the_sun_warms_at_the_surface_is_described() -> None:
-    time = 4.0 * np.arange(5400)
+    time = 4.0 * np.arange(5400.0)
     depth = np.abs((time % 5000.0) - 2500.0) * 0.08
     warm = followed(time, np.exp(-depth / 8.0), 500.0)
     assert left_of(warm, near_surface(time, depth)(slice(None))) < 0.02

@@ -53,7 +53,7 @@ EFFECTS: list[Effect] = [
 def survey() -> Survey:
     rng = np.random.default_rng(5)
     n = 300
-    t = T0 + 4.0 * np.arange(n)
+    t = T0 + 4.0 * np.arange(float(n))
     d = rng.normal(size=(n, 3)).cumsum(axis=0) * 0.1 + [0.3, 0.1, 0.9]
     field = FIELD * d / np.linalg.norm(d, axis=1)[:, None] + [300.0, -200.0, 500.0]
     p = np.sin(np.arange(n) / 20.0)
@@ -207,7 +207,7 @@ def test_a_play_of_an_older_file_is_read(survey: Survey, calibration: Calibratio
         (ResponseEffect(cause="nonlinearity", unit=0.0, power=2), "unit: Expected `float` >= 1"),
         (ChannelEffect(cause="temperature_offset", channel="p", lag=-1.0), "lag: Expected `float` >= 0"),
     ],
-    ids=lambda v: v.cause if isinstance(v, Effect) else v,
+    ids=lambda v: v if isinstance(v, str) else v.cause,
 )  # fmt: skip
 def test_a_number_that_cannot_be_is_one_line(effect: Effect, line: str, calibration: Calibration) -> None:
     """Edited by hand; a division by it would end the bridge in a traceback."""

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+from scipy.linalg import inv
 
 from magbridge.calibration.correct import correct
 from magbridge.calibration.instrument_effects import RateEffect, TimeEffect
@@ -39,9 +40,7 @@ def fit(coefficients: np.ndarray, calibration: int = 4) -> Joint:
     size = calibration + len(coefficients)
     X = rng.standard_normal((200, size)) @ (np.eye(size) + 0.3 * rng.standard_normal((size, size)))
     noise = fit_noise(rng.standard_normal(50), Past(np.ones(50, int), 1))
-    return Joint(
-        0.0, np.zeros(calibration), coefficients, np.linalg.inv(X.T @ X), noise, noise.scale, np.ones(size)
-    )
+    return Joint(0.0, np.zeros(calibration), coefficients, inv(X.T @ X), noise, noise.scale, np.ones(size))
 
 
 def test_a_misfit_grows_with_the_effect_and_points_anywhere() -> None:

@@ -28,9 +28,10 @@ def problem() -> Problem:
     field = 5e4 * d / np.linalg.norm(d, axis=1)[:, None]
     p = np.sin(np.arange(n) / 9.0)
     survey = Survey(
-        time=1.7e9 + 4.0 * np.arange(n), field=field + rng.normal(size=(n, 3)), reference=np.full(n, 5e4),
-        still=(), steps=np.where(np.arange(n) % 40 > 0, 1, FAR), dive=np.arange(n) // 40, place=None,
-        attitude=None, learned=np.zeros(n, bool), cycles=np.empty(0), source="made",
+        time=1.7e9 + 4.0 * np.arange(float(n)), field=field + rng.normal(size=(n, 3)),
+        reference=np.full(n, 5e4), still=(), steps=np.where(np.arange(n) % 40 > 0, 1, FAR),
+        dive=np.arange(n) // 40, place=None, attitude=None, learned=np.zeros(n, bool),
+        cycles=np.empty(0), source="made",
         channels={"p": Channel(p, "in", ("position",))},
     )  # fmt: skip
     calibration = Calibration(

@@ -27,7 +27,7 @@ def problem() -> Problem:
     """Half an hour of turning: a gap, jitter, a mass that rests and moves, a temperature and a current."""
     rng = np.random.default_rng(1)
     n = 450
-    t = 1.7e9 + 4.0 * np.arange(n) + np.where(np.arange(n) > 300, 500.0, 0.0)
+    t = 1.7e9 + 4.0 * np.arange(float(n)) + np.where(np.arange(n) > 300, 500.0, 0.0)
     t[200:204] += rng.uniform(-0.5, 0.5, 4)
     d = rng.normal(size=(n, 3)).cumsum(axis=0) * 0.1 + [0.3, 0.1, 0.9]
     p = np.interp(
@@ -212,7 +212,7 @@ def test_a_mass_that_stops_while_another_goes_on_has_no_rate(problem: Problem) -
 def test_lags_in_series_follow_conduction_more_closely_than_one() -> None:
     """A slab whose faces follow the water, by finite differences: its centre against one lag and two."""
     dt, cells, rng = 4.0, 8, np.random.default_rng(4)
-    t = dt * np.arange(4000)
+    t = dt * np.arange(4000.0)
     water = np.convolve(rng.normal(size=len(t)).cumsum(), np.ones(100) / 100.0, mode="same")
     slab = np.full(cells, water[0])
     centre = []

@@ -282,7 +282,7 @@ def test_a_cluster_that_is_there_and_a_study_that_goes_on(scheduler: str, tmp_pa
     outcome = {"verdict": "nothing_found", "found": [], "unexplained": None, "scores": [], "theory": []}
     before = json.dumps(plan(15, ("null",))[0] | outcome | {"worker": 0}) + "\n"
     log.write_text(before + '{"number": 7')
-    command = [TOOLS / "blind.py", "--cases", "15", "--part", "null", "--out", tmp_path]
+    command: list[str | Path] = [TOOLS / "blind.py", "--cases", "15", "--part", "null", "--out", tmp_path]
     done = subprocess.run(
         [sys.executable, *command, "--scheduler", scheduler, "--wait-for", "2"],
         capture_output=True, text=True, timeout=240, check=False,
