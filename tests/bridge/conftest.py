@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from rig import Rig
@@ -45,7 +46,7 @@ def make_rig(tmp_path: Path) -> Iterator[Callable[..., Rig]]:
     """Make bridges that end with the test."""
     made: list[Rig] = []
 
-    def make(*arguments: object, **settings: object) -> Rig:
+    def make(*arguments: Any, **settings: Any) -> Rig:
         folder = tmp_path / f"rig{len(made)}"
         folder.mkdir()
         made.append(Rig(folder, *arguments, **settings))

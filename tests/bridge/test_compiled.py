@@ -43,7 +43,7 @@ def outcome(folder: Path, *places: Path) -> list[str]:
 
 
 @pytest.mark.skipif(str(align.__file__).endswith(".py"), reason="nothing is compiled here")
-def test_the_same_bytes_as_in_plain_python(tmp_path):
+def test_the_same_bytes_as_in_plain_python(tmp_path: Path) -> None:
     compiled = outcome(tmp_path, ROOT / "tools")
     plain = outcome(tmp_path, ROOT / "tools", ROOT)
     assert plain[0] == ".py" != compiled[0]

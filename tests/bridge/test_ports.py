@@ -13,6 +13,7 @@ import termios
 import threading
 import time
 import tty
+from pathlib import Path
 
 import pytest
 from standstill import standstill
@@ -296,7 +297,7 @@ def test_a_kind_of_link_that_is_none(url: str) -> None:
         open_link(url, 0)
 
 
-def test_a_port_that_cannot_be_opened_says_why(tmp_path) -> None:
+def test_a_port_that_cannot_be_opened_says_why(tmp_path: Path) -> None:
     for name in (str(tmp_path / "ttyUSB*"), str(tmp_path / "ttyUSB0")):
         with pytest.raises(PortError, match=r"[Nn]o such (device|file)"):
             open_link(name, 9600).open()

@@ -106,7 +106,7 @@ def test_second_bridge_on_the_same_sensor(rig: Rig, table: Row) -> None:
             '"cal.json"', '"../cal.json"'
         )
         config.write_text(text)
-        ear, texts = Codec(0, 0), []
+        ear, texts = Codec(0, 0), list[str]()
 
         def refused() -> bool:
             try:

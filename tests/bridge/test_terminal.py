@@ -54,10 +54,11 @@ def test_a_service_tells_the_journal_how_severe_it_is(tmp_path: Path) -> None:
     """To systemd's journal, standard error is a socket that JOURNAL_STREAM names."""
     (tmp_path / "bridge.toml").write_text(CONFIG)
     ours, theirs = socket.socketpair()
-    status = os.fstat(theirs.fileno())
+    end = theirs.fileno()
+    status = os.fstat(end)
     environment = os.environ | {"JOURNAL_STREAM": f"{status.st_dev}:{status.st_ino}"}
     command = [sys.executable, "-m", "magbridge", "run", "--config", "bridge.toml"]
-    with subprocess.Popen(command, cwd=tmp_path, stderr=theirs, env=environment) as process, theirs, ours:
+    with subprocess.Popen(command, cwd=tmp_path, stderr=end, env=environment) as process, theirs, ours:
         try:
             read_until(ours.fileno(), ("<4>no calibration: raw field\n", "<3>hmr2300 lost: No such file or"))
         finally:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import select
 import socket
 import time
+from typing import Any
 
 import pytest
 
@@ -28,7 +29,7 @@ def test_a_named_host_that_gets_another_address_is_found_again(monkeypatch: pyte
     """While it is heard it is not looked up; the silence counts from the last packet, or the last look."""
     host, look_up, looks = ["127.0.0.1"], socket.getaddrinfo, []
 
-    def resolver(name: str, *rest: object, **options: object) -> object:
+    def resolver(name: str, *rest: Any, **options: Any) -> object:
         looks.append(name)
         return look_up(host[0], *rest, **options)
 

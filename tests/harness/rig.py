@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from devices import TRUTH, TURN, Autopilot, Fluxgate
@@ -264,12 +264,12 @@ class Rig:
         return max(after - before for before, after in pairwise([when - 1.0, *sent, when]))
 
     @property
-    def status(self) -> dict[str, object]:
+    def status(self) -> dict[str, Any]:
         """The latest MAG_STATUS, fresh."""
         found = self.of("MAG_STATUS")
         return found[-1].fields if found else {}
 
-    def fresh_status(self) -> dict[str, object]:
+    def fresh_status(self) -> dict[str, Any]:
         """Wait for the next MAG_STATUS."""
         return self.until_status(lambda _: True).fields
 
