@@ -1,32 +1,22 @@
-"""Faults that need their own bridge: another link, another clock, a key, a disk, an abrupt end."""
+"""Faults that need their own bridge: a start with nothing there, another device, link or clock, a key."""
 
 from __future__ import annotations
 
 import os
-import resource
-import shutil
-import signal
-import subprocess
 import time
-from collections.abc import Callable, Iterator
-from contextlib import suppress
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from checks import Row, first_difference, replays
+from checks import Row, replays
 from devices import open_line
 from rig import Rig
 
 from magbridge.bridge.events import Clock
-from magbridge.logs import read
 from magbridge.mavlink import Codec, LogReader, Signing
-from magbridge.records import Channel
-from sitl.own_log import is_own_log, runs
-from sitl.replay import agreement
 
 MakeRig = Callable[..., Rig]
 KEY = bytes(range(32))
-LOG_OK, LOG_FAILED = 1, 2
 
 
 def test_neither_sensor_nor_autopilot_at_the_start(make_rig: MakeRig, table: Row) -> None:
@@ -221,193 +211,3 @@ def test_forged_signed_packets(make_rig: MakeRig, table: Row) -> None:
         f"the forged packets: `link_refused` {len(wrong)}",
     )
     replays(rig)
-
-
-@pytest.fixture
-def small_disk(tmp_path: Path) -> Iterator[Path | None]:
-    """A file system of 128 kB; None without the right to mount one."""
-    disk = tmp_path / "disk"
-    disk.mkdir()
-    mount = ["mount", "-t", "tmpfs", "-o", "size=128k", "tmpfs", str(disk)]
-    if shutil.which("mount") is None or subprocess.run(mount, check=False, capture_output=True).returncode:
-        yield None
-        return
-    yield disk
-    subprocess.run(["umount", "-l", str(disk)], check=True)
-
-
-def ballast(disk: Path) -> tuple[Callable[[], None], Callable[[], None]]:
-    """Return what fills a disk, and what makes room on it again."""
-    file = disk / "ballast"
-
-    def fill() -> None:
-        with suppress(OSError), file.open("wb", buffering=0) as open_file:
-            while open_file.write(bytes(4096)):
-                pass
-
-    return fill, file.unlink
-
-
-def limit(rig: Rig) -> tuple[Callable[[], None], Callable[[], None]]:
-    """Return what any user can do instead: limit the size of the process's files, and lift that again."""
-
-    def allow(size: int) -> None:
-        assert rig.process is not None
-        resource.prlimit(rig.process.pid, resource.RLIMIT_FSIZE, (size, resource.RLIM_INFINITY))
-
-    return lambda: allow(rig.logs[-1].stat().st_size + 1000), lambda: allow(resource.RLIM_INFINITY)
-
-
-def test_disk_full(make_rig: MakeRig, small_disk: Path | None, table: Row) -> None:
-    rig = make_rig()
-    if small_disk is not None:
-        rig.config.write_text(rig.config.read_text().replace('"logs"', f'"{small_disk}"'))
-        (rig.folder / "logs").symlink_to(small_disk)
-    fill, make_room = ballast(small_disk) if small_disk is not None else limit(rig)
-    rig.start()
-    mark = rig.mark
-    fill()
-    rig.until_status(lambda status: status["log_state"] == LOG_FAILED)
-    rig.until(lambda: any(line.startswith("log: ") for line in rig.said(mark)))
-    lost = rig.until_status(lambda status: status["log_lost"] > 0)["log_lost"]
-    rig.until_status(lambda status: status["log_lost"] > lost)
-    make_room()
-    mended = rig.until(lambda: rig.status["log_state"] == LOG_OK)
-    rig.until_said("log: being written", mark)
-    assert rig.undue_flags(mark) == ""
-    fields = [message["sequence"] for message in rig.of("MAG_FIELD")]
-    assert fields == list(range(fields[0], fields[0] + len(fields)))
-    lost = rig.fresh_status()["log_lost"]
-    assert rig.stop() == 0
-    for path in rig.logs:
-        with path.open("rb") as file:
-            reader = LogReader(file)
-            assert sum(1 for _ in reader) > 0, path
-            assert reader.damages == 0
-    recorded, published = rig.replay(rig.logs[:1])
-    assert first_difference(published[: len(recorded.published)], recorded.published) is None
-    said = next(line for line in rig.said(mark) if line.startswith("log: ") and "written" not in line)
-    assert said == ("log: No space left on device" if small_disk is not None else "log: File too large")
-    table(
-        "disk full, then room again",
-        f'the field goes on without a flag; STATUSTEXT "{said}", `log_state` failed',
-        f"{mended:.1f} s, in a new file",
-        f"the log in between: `log_lost` {lost} records; what was written before can be read to its end",
-    )
-
-
-def test_a_log_that_is_removed(make_rig: MakeRig, table: Row) -> None:
-    rig = make_rig()
-    rig.start()
-    mark = rig.mark
-    set_parameter(rig)
-    (gone,) = rig.logs
-    gone.unlink()
-    rig.until_status(lambda status: status["log_state"] == LOG_FAILED)
-    mended = rig.until(lambda: rig.status["log_state"] == LOG_OK)
-    rig.until_said("log: being written", mark)
-    rig.run(1.0)
-    assert rig.undue_flags(mark) == ""
-    assert rig.stop() == 0
-    (anew,) = rig.logs
-    assert anew != gone
-    assert read(anew).sizes["time"] > 0
-    recorded, published = rig.replay([anew])
-    assert recorded.late > 5.0
-    assert recorded.start.parameters == {"MB_GAP_FACTOR": 3.0}
-    again = agreement(bytearray(published), recorded)
-    assert again["samples"] > 50
-    (said,) = {line for line in rig.said(mark) if line.startswith("log: ") and "written" not in line}
-    table(
-        "somebody deletes the log while it is being written",
-        f'the field goes on without a flag; STATUSTEXT "{said}", `log_state` failed',
-        f"{mended:.1f} s, in a new file",
-        f"the deleted log and the records until the new one: `log_lost` {rig.status['log_lost']} records; "
-        "the new one lacks what the bridge knew when it began; its replay says so, and in how many samples "
-        "the field is the same",
-    )
-
-
-def set_parameter(rig: Rig) -> None:
-    """Set a parameter as a station would."""
-    mark = rig.mark
-    to = {"target_system": 1, "target_component": 191}
-    rig.autopilot.say("PARAM_SET", **to, param_id="MB_GAP_FACTOR", param_value=3.0, param_type=9)
-    rig.until(lambda: rig.of("PARAM_VALUE", mark))
-
-
-def test_killed_without_warning(make_rig: MakeRig, table: Row) -> None:
-    rig = make_rig()
-    rig.start()
-    set_parameter(rig)
-    rig.run(1.0)
-    assert rig.process is not None
-    rig.process.kill()
-    rig.process.wait()
-    rig.run(0.1)
-    (log,) = rig.logs
-    recorded, published = rig.replay()
-    assert recorded.damages <= 1
-    assert first_difference(published[: len(recorded.published)], recorded.published) is None
-    heard = [message.frame for _, message in rig.heard]
-    missing = [frame for frame in heard[-200:] if frame not in recorded.published]
-    assert len(missing) <= 20, "more than the last event"
-    assert missing == heard[len(heard) - len(missing) :]
-    with log.open("rb") as file:
-        channels = {record.channel for record in LogReader(file)}
-    assert channels == set(Channel)
-
-    mark = rig.mark
-    back = rig.again()
-    assert len(rig.logs) == 2
-    rig.autopilot.say(
-        "PARAM_REQUEST_READ", target_system=1, target_component=191, param_id="MB_GAP_FACTOR", param_index=-1
-    )
-    rig.until(lambda: rig.of("PARAM_VALUE", mark))
-    assert rig.of("PARAM_VALUE", mark)[-1]["param_value"] == 3.0
-    table(
-        "`kill -9`, started again",
-        "nothing, then a normal start. Parameters set over the link are kept",
-        f"{back:.1f} s after the start",
-        f"at most the last event of the log: {len(missing)} messages here; the rest replays to the same "
-        "bytes",
-    )
-
-
-def test_two_bridges_in_one_folder(make_rig: MakeRig) -> None:
-    """Each keeps its own parameters, and the files of its log stand together."""
-    rig = make_rig(more="max_size = 0.02\n")
-    rig.start()
-    set_parameter(rig)
-    other = rig.folder / "other.toml"
-    other.write_text(
-        rig.config.read_text().replace("ttyUSB*", "ttyNone").replace(rig.url, "udpout:127.0.0.1:9")
-    )
-    second = rig.spawn(other)
-    begun = len(rig.logs)
-    rig.until(lambda: len(rig.logs) >= begun + 4 and sum(map(is_own_log, rig.logs)) == 2)
-    rig.run(1.0)
-    assert rig.stop() == 0
-    second.terminate()
-    assert second.wait(10) == 0
-    assert {path.name for path in rig.folder.glob("*.json")} == {"cal.json", "bridge.parameters.json"}
-    for files, kept in zip(runs(rig.logs), ({"MB_GAP_FACTOR": 3.0}, {}), strict=True):
-        recorded, published = rig.replay(files)
-        assert recorded.damages == 0
-        assert rig.of("PARAM_VALUE")[-1].frame in recorded.published or not kept
-        assert first_difference(published, recorded.published) is None
-
-
-def test_stopped_by_hand_with_a_log_in_many_files(make_rig: MakeRig) -> None:
-    rig = make_rig("udpin", more="max_size = 0.02\n")
-    rig.start()
-    rig.until(lambda: len(rig.logs) >= 3)
-    assert rig.process is not None
-    begun = time.monotonic()
-    os.kill(rig.process.pid, signal.SIGINT)
-    assert rig.process.wait(5) == 0
-    assert rig.since(begun) < 2.0
-    assert all(path.stat().st_size <= 20_000 for path in rig.logs)
-    recorded, published = rig.replay()
-    assert recorded.damages == 0
-    assert first_difference(published, recorded.published) is None
