@@ -81,7 +81,7 @@ def started(command: Callable[[str, int], list[str]]) -> Iterator[Stage]:
     link.settimeout(30.0)
     line = command(os.ttyname(slave), link.getsockname()[1])
     begun = time.perf_counter()
-    process = subprocess.Popen(line)
+    process = subprocess.Popen(line, stderr=subprocess.DEVNULL)  # what the bridge announces
     try:
         first, peer = link.recvfrom(65536)
         link.setblocking(False)
