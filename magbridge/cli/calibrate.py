@@ -35,7 +35,7 @@ def calibrate(
     output: Output,
     parameter: tuple[str, ...] = (),
     order: Annotated[Whole, Parameter(validator=validators.Number(gte=1, lte=6))] = 3,
-    method: Literal["auto", "nominal", "cubic"] = "auto",
+    method: Literal["auto", "nominal", "cubic", "runs", "horizontal"] = "auto",
     vehicle: Path | None = None,
     grid: Path | None = None,
     site_bias: Annotated[float, Parameter(validator=validators.Number(gte=0, lte=1e5))] = 0.0,
@@ -58,8 +58,9 @@ def calibrate(
     order
         Highest total degree of the polynomials in the parameters.
     method
-        auto is the one to use; nominal (one ellipsoid for all positions) and cubic (the paper's) are for
-        comparison.
+        auto is the one to use. For comparison: nominal (one ellipsoid for all positions), cubic (the
+        paper's), runs (an ellipsoid for each run, then polynomials through them: the paper's first stage),
+        horizontal (one ellipsoid, levelled by roll and pitch: the alternative that the paper names).
     vehicle
         A vehicle.toml with the positions of the moving masses relative to the sensor (method auto).
     grid

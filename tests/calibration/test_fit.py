@@ -235,6 +235,8 @@ def test_bad_data_is_one_clear_line(glider: Gliders) -> None:
     refused("expected positive", reference=np.zeros(k))
     with pytest.raises(CalibrationError, match="only 5 of 5"):
         runs.part(np.arange(k) < 5)
+    with pytest.raises(CalibrationError, match="horizontal: needs roll"):
+        fit(replace(runs, attitude=None), "horizontal")
 
 
 def test_a_collapsed_fit_is_refused() -> None:

@@ -19,7 +19,7 @@ from magbridge.calibration.residual import residuals_of
 from magbridge.calibration.terms import full_order
 from magbridge.errors import CalibrationError
 
-__all__ = ["fit_cubic"]
+__all__ = ["ANYTHING", "fit_cubic"]
 
 PLAIN = 1e4
 """kappa at which all noise counts as the reference's: the residual is the paper's ``|A(H_r - T)| - H_e``."""

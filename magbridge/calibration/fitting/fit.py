@@ -30,6 +30,8 @@ METHODS: dict[str, str] = {
     "auto": "magbridge.calibration.fitting.auto:fit_auto",
     "nominal": "magbridge.calibration.fitting.nominal:fit_nominal",
     "cubic": "magbridge.calibration.fitting.cubic:fit_cubic",
+    "runs": "magbridge.calibration.fitting.per_run:fit_per_run",
+    "horizontal": "magbridge.calibration.fitting.horizontal:fit_horizontal",
 }
 """Name -> ``module:function``, each ``(observations, order, **options) -> Fit``."""
 

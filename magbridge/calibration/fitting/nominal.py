@@ -22,7 +22,15 @@ from magbridge.calibration.fitting.solve import Prior, covariance_of, gauss_newt
 from magbridge.calibration.residual import Samples, residuals_of, scales_and_offsets
 from magbridge.errors import CalibrationError
 
-__all__ = ["check_scales", "fit_nominal", "nominal", "nominal_samples", "starts"]
+__all__ = [
+    "HARD_IRON_SIGMA",
+    "SCALE_SIGMA",
+    "check_scales",
+    "fit_nominal",
+    "nominal",
+    "nominal_samples",
+    "starts",
+]
 
 FloatArray = NDArray[np.float64]
 
