@@ -21,8 +21,8 @@ TYPE_CHECKING = False  # type checkers take it for true
 if TYPE_CHECKING:
     from magbridge.calibration.correct import Corrector, correct
     from magbridge.calibration.file import load, save
-    from magbridge.calibration.fitting.columns import observations
     from magbridge.calibration.fitting.fit import fit
+    from magbridge.calibration.fitting.observe import observations
     from magbridge.calibration.model import Calibration
     from magbridge.correction import Correction, correct_rows
     from magbridge.errors import MagbridgeError
@@ -57,7 +57,7 @@ _HOMES = {
     "correct_rows": "correction",
     "fit": "calibration.fitting.fit",
     "load": "calibration.file",
-    "observations": "calibration.fitting.columns",
+    "observations": "calibration.fitting.observe",
     "read": "logs",
     "read_grid": "field.read",
     "reference_field": "field.reference",

@@ -6,7 +6,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from sitl.columns import segments
+    from sitl.dataset import segments
     from sitl.like import simulate_like
     from sitl.scenario import Scenario, load
     from sitl.twin import Twin, simulate
@@ -18,7 +18,7 @@ _HOMES = {
     "Scenario": "sitl.scenario",
     "Twin": "sitl.twin",
     "load": "sitl.scenario",
-    "segments": "sitl.columns",
+    "segments": "sitl.dataset",
     "simulate": "sitl.twin",
     "simulate_like": "sitl.like",
 }

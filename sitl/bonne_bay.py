@@ -11,14 +11,14 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from magbridge.calibration.fitting.columns import observations
 from magbridge.calibration.fitting.fit import fit
+from magbridge.calibration.fitting.observe import observations
 from magbridge.calibration.residual import rms
 from magbridge.columns import CHANNEL_TIMES, CHANNELS
 from magbridge.errors import CalibrationError
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.reference import reference_field
-from sitl.columns import at_rest, corrected, segments
+from sitl.dataset import at_rest, corrected, segments
 from sitl.scenario import load
 from sitl.twin import Twin
 

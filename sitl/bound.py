@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from sitl.columns import channels
+from sitl.dataset import channels
 from sitl.platform import HARD_IRON, MOMENT, SOFT_IRON, VOLUME_SPREAD, Vehicle
 
 __all__ = ["information_bound", "informed_error", "oracle"]

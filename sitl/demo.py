@@ -14,14 +14,14 @@ from numpy.typing import NDArray
 
 from magbridge.bridge.events import Start
 from magbridge.calibration.file import save
-from magbridge.calibration.fitting.columns import observations
 from magbridge.calibration.fitting.fit import Fit, fit
 from magbridge.calibration.fitting.lowpass import unfiltered
+from magbridge.calibration.fitting.observe import observations
 from magbridge.calibration.residual import rms
 from magbridge.config import load as load_config
 from magbridge.logs import write
 from magbridge.records import Quality
-from sitl.columns import channels, corrected, segments
+from sitl.dataset import channels, corrected, segments
 from sitl.emulation import emulate, start_us
 from sitl.listener import Listener
 from sitl.replay_setup import bridge_toml

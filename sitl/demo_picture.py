@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from magbridge.calibration.residual import rms
 from magbridge.files import atomic_path
-from sitl.columns import channels
+from sitl.dataset import channels
 
 mpl.use("agg")
 import matplotlib.pyplot as plt

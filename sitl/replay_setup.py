@@ -16,8 +16,8 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from magbridge.calibration.file import save
-from magbridge.calibration.fitting.columns import observations
 from magbridge.calibration.fitting.fit import fit
+from magbridge.calibration.fitting.observe import observations
 from magbridge.columns import CHANNELS, COLUMNS
 from magbridge.errors import CalibrationError, FormatError
 from magbridge.field.reference import reference_field

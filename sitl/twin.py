@@ -20,7 +20,7 @@ from magbridge.errors import WrongUse
 from magbridge.field.earth import offset, separation
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.igrf import total_field
-from sitl.columns import dataset
+from sitl.dataset import dataset
 from sitl.instrument import Samples, rotation
 from sitl.platform import Calibrated, Vehicle, draw_vehicle
 from sitl.scenario import Scenario

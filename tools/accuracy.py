@@ -36,15 +36,15 @@ from rich.progress import track
 from scipy.optimize import least_squares
 from terminal import command_line, table
 
-from magbridge.calibration.fitting.columns import observations
 from magbridge.calibration.fitting.fit import fit
+from magbridge.calibration.fitting.observe import observations
 from magbridge.calibration.residual import rms
 from magbridge.errors import CalibrationError
 from magbridge.field.reference import main_field
 from sitl import Twin, load, segments, simulate
 from sitl.bonne_bay import METHODS
 from sitl.bound import information_bound, informed_error, oracle
-from sitl.columns import at_rest, channels, corrected, side_by_side
+from sitl.dataset import at_rest, channels, corrected, side_by_side
 from sitl.instrument import rotation
 from sitl.platform import Vehicle
 

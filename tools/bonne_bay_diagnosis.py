@@ -17,12 +17,12 @@ import xarray as xr
 from study.stage import CHARTS
 from terminal import command_line
 
-from magbridge.calibration.fitting.columns import observations
 from magbridge.calibration.fitting.fit import fit
+from magbridge.calibration.fitting.observe import observations
 from magbridge.calibration.residual import rms
 from magbridge.diagnose.run import diagnose
 from sitl.bonne_bay import MASSES, PAPER, measure
-from sitl.columns import corrected
+from sitl.dataset import corrected
 from sitl.scenario import load
 from sitl.twin import Twin
 

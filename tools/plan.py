@@ -20,17 +20,17 @@ from rich.console import Console
 from rich.progress import track
 from terminal import command_line, table
 
-from magbridge.calibration.fitting.columns import observations
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.mission import Mission
 from magbridge.calibration.fitting.observations import Observations
+from magbridge.calibration.fitting.observe import observations
 from magbridge.calibration.planning.limits import Limits, PlannedRun, settled, trim_of
 from magbridge.calibration.planning.plan import Plan, evaluate_runs, expected_calibration, plan
 from magbridge.calibration.residual import rms
 from magbridge.field.reference import main_field
 from sitl import Twin, load, segments, simulate
 from sitl.bound import oracle
-from sitl.columns import at_rest, corrected
+from sitl.dataset import at_rest, corrected
 from sitl.mission import TABLE_1, Run, Spirals
 from sitl.platform import Vehicle
 from sitl.scenario import Scenario

@@ -15,7 +15,7 @@ import numpy as np
 from rich.console import Console
 from terminal import command_line, table
 
-from magbridge.calibration.fitting.columns import observations
+from magbridge.calibration.fitting.observe import observations
 from magbridge.calibration.fitting.validate import HeldOut, leave_runs_out
 from magbridge.errors import CalibrationError
 from magbridge.field.declination import with_true_heading

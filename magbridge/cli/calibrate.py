@@ -81,10 +81,10 @@ def calibrate(
         Print the result as JSON, with the paper's M, S and T at the middle of each parameter's range.
     """
     from magbridge.calibration.file import save
-    from magbridge.calibration.fitting.columns import observations
     from magbridge.calibration.fitting.fit import fit
     from magbridge.calibration.fitting.lowpass import unfiltered
     from magbridge.calibration.fitting.mounted_masses import read_vehicle
+    from magbridge.calibration.fitting.observe import observations
     from magbridge.columns import CHANNELS
     from magbridge.field.declination import with_true_heading
     from magbridge.field.read import read_grid

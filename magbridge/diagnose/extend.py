@@ -14,8 +14,8 @@ from magbridge.calibration.mass_effects import ClockEffect
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.residual import residuals, residuals_of, robust_scale
 from magbridge.diagnose.causes.candidates import Candidate, slices
-from magbridge.diagnose.compare.columns import Columns
 from magbridge.diagnose.compare.derivatives import derivatives
+from magbridge.diagnose.compare.design_columns import Columns
 from magbridge.diagnose.compare.prior import isotropic
 from magbridge.diagnose.compare.problem import DELAYS, Problem, samples_of
 from magbridge.diagnose.compare.survey import Survey

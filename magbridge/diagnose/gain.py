@@ -24,7 +24,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from magbridge.diagnose.compare.columns import Columns
+from magbridge.diagnose.compare.design_columns import Columns
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.design import Design, precomputed
 from magbridge.diagnose.inference.joint import Joint

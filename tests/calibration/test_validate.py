@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from gliders import Gliders
 
-from magbridge.calibration.fitting.columns import observations
+from magbridge.calibration.fitting.observe import observations
 from magbridge.calibration.fitting.validate import leave_runs_out
 from magbridge.errors import CalibrationError
 from magbridge.field.declination import with_true_heading

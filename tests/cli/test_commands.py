@@ -14,7 +14,7 @@ import pytest
 
 from magbridge.calibration.file import load as load_calibration
 from magbridge.calibration.file import save as save_calibration
-from magbridge.calibration.fitting.columns import observations
+from magbridge.calibration.fitting.observe import observations
 from magbridge.calibration.model import Parameter, identity
 from magbridge.calibration.planning.plan import expected_calibration
 from magbridge.cli import main

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from magbridge.calibration.fitting.columns import observations
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.lowpass import unfiltered
+from magbridge.calibration.fitting.observe import observations
 from magbridge.calibration.model import Calibration, Noise, Parameter, Reference
 from magbridge.calibration.terms import Polynomial
 from magbridge.diagnose.compare.past import FAR
@@ -22,7 +22,7 @@ from magbridge.diagnose.compare.take import take
 from magbridge.diagnose.inference.descriptions import Description, descriptions
 from magbridge.diagnose.inference.joint import fit_joint
 from sitl import load, simulate
-from sitl.columns import segments
+from sitl.dataset import segments
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
 

@@ -12,8 +12,8 @@ import pytest
 import xarray as xr
 
 from magbridge.calibration.file import save
-from magbridge.calibration.fitting.columns import observations
 from magbridge.calibration.fitting.fit import fit
+from magbridge.calibration.fitting.observe import observations
 from magbridge.calibration.model import Calibration, Sensor
 from magbridge.cli import main
 from magbridge.diagnose.compare.take import take

@@ -25,7 +25,7 @@ from magbridge.diagnose.report.doubts import useful
 from magbridge.diagnose.report.findings import parameters
 from magbridge.diagnose.run import diagnose
 from magbridge.errors import DataError
-from sitl.columns import corrected
+from sitl.dataset import corrected
 from sitl.inject import Hidden, disturb
 
 SAFE = 0.97

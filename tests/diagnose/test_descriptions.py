@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from magbridge.calibration.fitting.columns import observations
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.lowpass import unfiltered
+from magbridge.calibration.fitting.observe import observations
 from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.causes.masses import actuator_order, hysteresis
 from magbridge.diagnose.compare.problem import Problem
@@ -17,7 +17,7 @@ from magbridge.diagnose.inference.shapes import bends, crossing, delayed, near_s
 from magbridge.diagnose.inference.statistic import SIZES, Statistic
 from magbridge.diagnose.run import diagnose
 from sitl import load, simulate
-from sitl.columns import segments
+from sitl.dataset import segments
 
 
 def test_ridge_is_the_marginal_likelihood_of_a_common_size() -> None:

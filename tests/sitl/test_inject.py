@@ -14,7 +14,7 @@ import xarray as xr
 
 import sitl.inject
 from sitl import Twin, load
-from sitl.columns import channels
+from sitl.dataset import channels
 from sitl.inject import EFFECTS, FOREIGN, Hidden, disturb
 from sitl.inject.scene import soaked
 from sitl.mission import CrissCross

@@ -16,7 +16,7 @@ from magbridge.calibration.model import Parameter, identity
 from magbridge.errors import ConfigError, FormatError, WrongUse
 from magbridge.field.igrf import igrf
 from sitl import Scenario, Twin, load, segments, simulate, simulate_like
-from sitl.columns import channels
+from sitl.dataset import channels
 from sitl.instrument import Instrument
 from sitl.mission import Leg, Legs, Spirals
 from sitl.platform import Vehicle

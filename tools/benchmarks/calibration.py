@@ -15,9 +15,9 @@ from scipy.optimize import least_squares
 from threadpoolctl import threadpool_limits
 
 from magbridge.calibration.correct import CHUNK, Corrector, correct
-from magbridge.calibration.fitting.columns import observations
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.observations import Observations, polynomial_samples
+from magbridge.calibration.fitting.observe import observations
 from magbridge.calibration.kernel import Kernel
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.residual import residuals_of

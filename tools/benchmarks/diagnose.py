@@ -10,8 +10,8 @@ import xarray as xr
 from benchmarks.measure import in_own_process
 from benchmarks.row import Row
 
-from magbridge.calibration.fitting.columns import observations
 from magbridge.calibration.fitting.fit import fit
+from magbridge.calibration.fitting.observe import observations
 from magbridge.calibration.model import Calibration
 from sitl import load, segments, simulate
 from sitl.mission import CrissCross

@@ -11,7 +11,7 @@ from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.diagnosis import Diagnosis
 from magbridge.diagnose.extend import extend, relinearised, with_misfit
 from magbridge.diagnose.inference.search import search
-from sitl.columns import corrected
+from sitl.dataset import corrected
 from sitl.inject import Hidden
 from study.noise import add_noise
 from study.stage import DAY, Stall, again

@@ -14,8 +14,8 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from magbridge.calibration.correct import regressors
-from magbridge.calibration.fitting.columns import observations
 from magbridge.calibration.fitting.fit import fit
+from magbridge.calibration.fitting.observe import observations
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.residual import Samples, jacobian, residuals
 from magbridge.diagnose.compare.prior import floor

@@ -8,15 +8,15 @@ import numpy as np
 from accuracy import total
 from msgspec.structs import replace as with_options
 
-from magbridge.calibration.fitting.columns import observations
 from magbridge.calibration.fitting.fit import fit
+from magbridge.calibration.fitting.observe import observations
 from magbridge.calibration.residual import rms
 from magbridge.correction import Correction, correct_rows
 from magbridge.field.earth import separation
 from magbridge.navigate.model import informed
 from sitl import load, segments, simulate
 from sitl.bonne_bay import MASSES, METHODS
-from sitl.columns import at_rest
+from sitl.dataset import at_rest
 from voyages.simulated import GLIDER, PLACE, Map, Score, adrift, sail, synthetic
 
 

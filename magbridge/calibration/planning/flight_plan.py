@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from magbridge.calibration.fitting.columns import observations
 from magbridge.calibration.fitting.mission import Mission
+from magbridge.calibration.fitting.observe import observations
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.planning.limits import Limits, settled, trim_of
 from magbridge.calibration.planning.plan import Plan, plan

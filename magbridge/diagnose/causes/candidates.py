@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magbridge.calibration.terms import Effect
-from magbridge.diagnose.compare.columns import Columns, Mixture, Since, parts, together
+from magbridge.diagnose.compare.design_columns import Columns, Mixture, Since, parts, together
 from magbridge.diagnose.compare.problem import Problem, effect_columns, history
 
 __all__ = ["AXES", "Candidate", "of_effect", "of_reference", "per", "since", "slices"]

@@ -11,7 +11,7 @@ from scipy.sparse import csr_array, diags_array
 from scipy.spatial.distance import cdist
 
 from magbridge.diagnose.causes.candidates import Candidate
-from magbridge.diagnose.compare.columns import Interpolated
+from magbridge.diagnose.compare.design_columns import Interpolated
 from magbridge.diagnose.compare.problem import Problem
 
 __all__ = ["map_error"]

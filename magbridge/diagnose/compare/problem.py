@@ -36,8 +36,8 @@ from magbridge.calibration.correct import regressors
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.residual import Samples, residuals
 from magbridge.calibration.terms import Effect
-from magbridge.diagnose.compare.columns import Mixture
 from magbridge.diagnose.compare.derivatives import CHUNK, derivatives
+from magbridge.diagnose.compare.design_columns import Mixture
 from magbridge.diagnose.compare.interpolation import interpolation_error
 from magbridge.diagnose.compare.prior import level, loosened, prior
 from magbridge.diagnose.compare.survey import Survey

@@ -12,7 +12,7 @@ from magbridge.calibration.mass_effects import ClockEffect
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.causes.regressors import powers
 from magbridge.diagnose.causes.timing import field_rates, mass_rates
-from magbridge.diagnose.compare.columns import Columns
+from magbridge.diagnose.compare.design_columns import Columns
 from magbridge.diagnose.compare.interpolation import rates
 from magbridge.diagnose.compare.problem import Problem, effect_columns
 from magbridge.diagnose.compare.survey import Channel

@@ -11,7 +11,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from magbridge.diagnose.compare.columns import Columns, beside, times
+from magbridge.diagnose.compare.design_columns import Columns, beside, times
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.noise import Noise
 

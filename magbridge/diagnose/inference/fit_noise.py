@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from scipy.special import gammaln
 
 from magbridge.calibration.residual import robust_scale
-from magbridge.diagnose.compare.columns import Columns
 from magbridge.diagnose.compare.derivatives import CHUNK
+from magbridge.diagnose.compare.design_columns import Columns
 from magbridge.diagnose.compare.past import Past
 from magbridge.diagnose.inference.noise import Noise, Predictors
 

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from magbridge.diagnose.compare.columns import Columns, beside, parts, together
+from magbridge.diagnose.compare.design_columns import Columns, beside, parts, together
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.design import ALL, normal
 from magbridge.diagnose.inference.joint import Joint

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magbridge.calibration.residual import robust_scale
-from magbridge.diagnose.compare.columns import Columns
+from magbridge.diagnose.compare.design_columns import Columns
 from magbridge.diagnose.compare.problem import DELAYS, Problem
 from magbridge.diagnose.inference.design import Design, in_threads, normal, precomputed
 from magbridge.diagnose.inference.fit_noise import fit_noise

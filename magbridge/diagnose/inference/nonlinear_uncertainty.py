@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magbridge.diagnose.causes.candidates import Candidate, slices
-from magbridge.diagnose.compare.columns import Columns
+from magbridge.diagnose.compare.design_columns import Columns
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.evidence import score
 from magbridge.diagnose.inference.information import Information, information

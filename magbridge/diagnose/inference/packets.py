@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import ifft, irfft, next_fast_len, rfft
 
-from magbridge.diagnose.compare.columns import Columns
+from magbridge.diagnose.compare.design_columns import Columns
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.design import in_threads
 from magbridge.diagnose.inference.evidence import log_bayes

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.special import fdtrc
 
 from magbridge.diagnose.causes.candidates import Candidate, slices
-from magbridge.diagnose.compare.columns import Columns, Mixture, parts, together
+from magbridge.diagnose.compare.design_columns import Columns, Mixture, parts, together
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.design import in_threads, precomputed
 from magbridge.diagnose.inference.evidence import Score, evidence_of, log_odds, regressor_error, score, trials

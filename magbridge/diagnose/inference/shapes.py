@@ -1,7 +1,7 @@
 """The functions of which descriptions without a name are made, and their prior widths.
 
 Arguments are histories of the log's n samples, (n,) or (n, 3); what is returned is a block of columns,
-(m, k) of m rows: :mod:`magbridge.diagnose.compare.columns`.
+(m, k) of m rows: :mod:`magbridge.diagnose.compare.design_columns`.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magbridge.diagnose.causes.regressors import lagged, play, powers
-from magbridge.diagnose.compare.columns import Columns
+from magbridge.diagnose.compare.design_columns import Columns
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.design import pieces
 

@@ -20,7 +20,7 @@ from scipy.stats import chi2
 
 from magbridge.calibration.residual import robust_scale
 from magbridge.diagnose.causes.candidates import Candidate
-from magbridge.diagnose.compare.columns import Columns
+from magbridge.diagnose.compare.design_columns import Columns
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.descriptions import Description, descriptions
 from magbridge.diagnose.inference.design import Design, in_threads, precomputed

@@ -1,4 +1,4 @@
-"""Columns of the linear problem, and mixtures of columns that share parts."""
+"""Columns of a design matrix, made row by row, and mixtures of columns that share parts."""
 
 from __future__ import annotations
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from magbridge.calibration.fitting.columns import observations
+from magbridge.calibration.fitting.observe import observations
 from magbridge.errors import CalibrationError, FormatError
 
 

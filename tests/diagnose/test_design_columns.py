@@ -9,7 +9,15 @@ import pytest
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from magbridge.diagnose.compare.columns import Columns, Interpolated, Mixture, beside, parts, times, together
+from magbridge.diagnose.compare.design_columns import (
+    Columns,
+    Interpolated,
+    Mixture,
+    beside,
+    parts,
+    times,
+    together,
+)
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference import design
 from magbridge.diagnose.inference.information import information

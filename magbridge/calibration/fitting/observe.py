@@ -1,4 +1,4 @@
-"""From a deployment's columns to the observations of a fit."""
+"""Observe: from a deployment's columns to the observations of a fit."""
 
 from __future__ import annotations
 
