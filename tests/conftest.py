@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import importlib
 import os
-import shutil
 import signal
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,10 +12,9 @@ from typing import Any
 # threads only wait for each other on matrices this narrow, above all beside those of a second worker
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-import pymavlink
 import pytest
+from benchmarks.peer import classes
 from hypothesis import settings
-from pymavlink.generator import mavgen
 
 # the same examples every time, and none fails because the machine is busy
 settings.register_profile("magbridge", deadline=None, derandomize=True)
@@ -47,14 +44,6 @@ def real_data() -> Path:
 
 
 @pytest.fixture(scope="session")
-def peer(tmp_path_factory: pytest.TempPathFactory) -> ModuleType:
+def peer() -> ModuleType:
     """Our dialect as a ground station has it: classes that pymavlink's mavgen makes from our XML."""
-    folder = tmp_path_factory.mktemp("peer")
-    shutil.copy(Path(__file__).parents[1] / "magbridge" / "mavlink" / "magbridge.xml", folder)
-    for name in ("common", "standard", "minimal"):
-        shutil.copy(Path(pymavlink.__file__).parent / "dialects" / "v20" / f"{name}.xml", folder)
-    options = mavgen.Opts(str(folder / "magbridge_peer"), wire_protocol="2.0", language="Python3")
-    assert mavgen.mavgen(options, [str(folder / "magbridge.xml")])
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(folder)
-        return importlib.import_module("magbridge_peer")
+    return classes()

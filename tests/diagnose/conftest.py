@@ -1,11 +1,9 @@
-"""What tests of a diagnosis share; the study's rooms are tools, found beside the package."""
+"""What tests of a diagnosis share."""
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -23,8 +21,6 @@ from magbridge.diagnose.inference.descriptions import Description, descriptions
 from magbridge.diagnose.inference.joint import fit_joint
 from sitl import load, simulate
 from sitl.dataset import segments
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
 
 
 @pytest.fixture(scope="session")

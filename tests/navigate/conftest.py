@@ -2,25 +2,19 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Iterator
-from importlib import import_module
-from pathlib import Path
 from types import ModuleType
 
 import pytest
+from voyages import simulated
 
 from magbridge.field.grid import AnomalyGrid
 from magbridge.navigate.model import Options
 
 
 @pytest.fixture(scope="session")
-def study() -> Iterator[ModuleType]:
-    """tools/voyages/simulated.py, with the others beside it."""
-    tools = str(Path(__file__).parents[2] / "tools")
-    sys.path.insert(0, tools)
-    yield import_module("voyages.simulated")
-    sys.path.remove(tools)
+def study() -> ModuleType:
+    """tools/voyages/simulated.py."""
+    return simulated
 
 
 @pytest.fixture(scope="session")

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from importlib import import_module
 from math import hypot
 from types import ModuleType
 
 import numpy as np
 import pytest
+from voyages.dived import dived
 
 from magbridge.field.continuation import continued
 from magbridge.field.grid import AnomalyGrid
@@ -27,10 +27,9 @@ def test_errors_of_the_map_add_up(study: ModuleType) -> None:
     assert at_depth(drawn, options, depth) == (drawn, options), "an altitude that nobody knows"
 
 
-@pytest.mark.usefixtures("study")  # finds the tools
 def test_a_glider_that_dives_under_it_is_found() -> None:
     """Taken for the field below it, the map leads the filter away; continued to the depth, it does not."""
-    flown, below = import_module("voyages.dived").dived(2)
+    flown, below = dived(2)
     assert below.error < 0.2 * flown.error
     assert below.nees < 2.0
     assert below.vouched > 0.5

@@ -1,4 +1,4 @@
-"""The floor: the same MAVLink messages by the classes that pymavlink generates from our XML."""
+"""The same MAVLink messages by the classes that pymavlink generates from our XML: floor of the benchmarks."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from pymavlink.generator import mavgen
 
 import magbridge.mavlink
 
-__all__ = ["Peer"]
+__all__ = ["Peer", "classes"]
 
 
 @cache
