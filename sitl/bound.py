@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple
+from collections.abc import Iterator
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from sitl.dataset import channels
 from sitl.platform import HARD_IRON, MOMENT, SOFT_IRON, VOLUME_SPREAD, Vehicle
 
-__all__ = ["information_bound", "informed_error", "oracle"]
+__all__ = ["BestFit", "oracle"]
 
 Array = NDArray[np.float64]
 
@@ -29,30 +29,8 @@ def oracle(vehicle: Vehicle, deployment: xr.Dataset) -> Array:
     return np.asarray(np.linalg.norm(np.linalg.solve(D, (raw - T)[..., None])[..., 0], axis=1))
 
 
-class _Posterior(NamedTuple):
-    """What the calibration data tell of the k parameters θ, each in units of its prior's width."""
-
-    covariance: Array
-    """(k, k), of θ."""
-    calibration: Array
-    """(m, k), g of the calibration's samples, whitened."""
-    whiten: Callable[[Array], Array]
-    """Whitens columns (m, j), nT, on the calibration's samples."""
-    survey: Array
-    """(n, k), nT, of the survey's corrected magnitude by θ."""
-    floor: Array
-    """(n,), nT, the noise of the survey's corrected magnitude."""
-
-
-def information_bound(
-    vehicle: Vehicle,
-    calibration: xr.Dataset,
-    survey: xr.Dataset,
-    sigma: float,
-    memory: float = 0.0,
-    at_sigma: float = 0.05,
-) -> tuple[Array, Array]:
-    r"""Return the least standard deviation of the corrected total field that the calibration data allow.
+class BestFit:
+    r"""A fit that reaches the Cramér-Rao bound: the least error that the calibration data allow.
 
     Parameters
     ----------
@@ -60,18 +38,18 @@ def information_bound(
         The truth: dipoles with a permanent moment, a three-axis induced moment and a position each. The prior
         is the distribution that such vehicles are drawn from.
     calibration, survey : Dataset (time)
-        Deployments of :func:`sitl.simulate`.
+        Deployments of :func:`sitl.simulate`, of m and n samples.
     sigma, memory : float
         nT of a channel's noise, and samples over which its correlation falls by e.
     at_sigma : float
         m, how well the masses' positions are known beforehand.
 
-    Returns
-    -------
-    bound : array (n,)
-        nT, at each sample of the survey, noise included.
-    floor : array (n,)
-        nT, the noise alone.
+    Attributes
+    ----------
+    bound : (n,) array
+        nT, standard deviation of the survey's corrected total field, noise included.
+    floor : (n,) array
+        nT, of the noise alone.
 
     Notes
     -----
@@ -82,66 +60,57 @@ def information_bound(
     noise's memory, the information is :math:`\sum \mathbf g \mathbf g^T` plus the prior's (Kay 1993,
     *Estimation Theory*, ch. 3 and 15).
     """
-    known = _posterior(vehicle, calibration, survey, sigma, memory, at_sigma)
-    h, floor = known.survey, known.floor
-    return np.sqrt(np.einsum("ni,ij,nj->n", h, known.covariance, h) + floor**2), floor
+
+    def __init__(
+        self,
+        vehicle: Vehicle,
+        calibration: xr.Dataset,
+        survey: xr.Dataset,
+        sigma: float,
+        memory: float = 0.0,
+        at_sigma: float = 0.05,
+    ) -> None:
+        self._vehicle, self._calibration, self._survey = vehicle, calibration, survey
+        self._phi = np.exp(-1 / memory) if memory else 0.0
+        scale = _widths(vehicle, at_sigma)  # θ in units of its prior: the information is then well scaled
+        g, self._learned_floor = _sensitivity(vehicle, calibration, sigma)
+        self._g = self._whitened(g) * scale
+        self._covariance = np.linalg.inv(self._g.T @ self._g + np.eye(len(scale)))
+        h, self.floor = _sensitivity(vehicle, survey, sigma)
+        self._h = h * scale
+        self.bound = np.sqrt(np.einsum("ni,ij,nj->n", self._h, self._covariance, self._h) + self.floor**2)
+
+    def error(self, rng: np.random.Generator) -> Array:
+        r"""Return the survey's error (n,), nT, on these very data; the bound is its size on average.
+
+        Notes
+        -----
+        Linear about the truth: with :math:`\mathbf e` the whitened noise of the calibration and a prior whose
+        centre is :math:`\mathbf p` of its widths off the truth,
+        :math:`dθ = P (\mathbf g^T \mathbf e + \mathbf p)`.
+        """
+        noise, after = (
+            oracle(self._vehicle, part) - part["truth_total_field"].to_numpy()
+            for part in (self._calibration, self._survey)
+        )
+        e = self._whitened(noise[:, None])[:, 0]
+        off = self._covariance @ (self._g.T @ e + rng.normal(size=len(self._covariance)))
+        return np.asarray(after - self._h @ off)
+
+    def _whitened(self, values: Array) -> Array:
+        """Whiten columns (m, j), nT, on the calibration's samples; each run begins anew."""
+        values = values / self._learned_floor[:, None]
+        follows = (np.diff(self._calibration["run"].to_numpy(), prepend=np.nan) == 0)[:, None]
+        innovations = (values - self._phi * np.roll(values, 1, axis=0)) / np.sqrt(1 - self._phi**2)
+        return np.where(follows, innovations, values)
 
 
-def informed_error(
-    vehicle: Vehicle,
-    calibration: xr.Dataset,
-    survey: xr.Dataset,
-    sigma: float,
-    memory: float = 0.0,
-    at_sigma: float = 0.05,
-    *,
-    rng: np.random.Generator,
-) -> Array:
-    r"""Return the survey's error (n,), nT, of a fit that reaches :func:`information_bound` on these data.
-
-    The bound is such a fit's error on average over noise and vehicles; this is its error on one draw of them.
-    Arguments as there.
-
-    Notes
-    -----
-    Linear about the truth: with :math:`\mathbf e` the whitened noise of the calibration and a prior whose
-    centre is :math:`\mathbf p` of its widths off the truth,
-    :math:`dθ = P (\mathbf g^T \mathbf e + \mathbf p)`.
-    """
-    known = _posterior(vehicle, calibration, survey, sigma, memory, at_sigma)
-    noise, after = (
-        oracle(vehicle, part) - part["truth_total_field"].to_numpy() for part in (calibration, survey)
-    )
-    whitened = known.whiten(noise[:, None])[:, 0]
-    off = known.covariance @ (known.calibration.T @ whitened + rng.normal(size=len(known.covariance)))
-    return np.asarray(after - known.survey @ off)
-
-
-def _posterior(
-    vehicle: Vehicle,
-    calibration: xr.Dataset,
-    survey: xr.Dataset,
-    sigma: float,
-    memory: float,
-    at_sigma: float,
-) -> _Posterior:
-    """Return what the calibration data tell; arguments as for :func:`information_bound`."""
-    g, floor = _sensitivity(vehicle, calibration, sigma)
-    follows = (np.diff(calibration["run"].to_numpy(), prepend=np.nan) == 0)[:, None]
-    phi = np.exp(-1 / memory) if memory else 0.0
-
-    def whiten(values: Array) -> Array:
-        values = values / floor[:, None]
-        return np.where(follows, (values - phi * np.roll(values, 1, axis=0)) / np.sqrt(1 - phi**2), values)
-
+def _widths(vehicle: Vehicle, at_sigma: float) -> Array:
+    """Return the prior's width of each parameter, (k,), in the order of :func:`_neighbours`."""
     widths = [*[SOFT_IRON] * 9, *[HARD_IRON] * 3]
     for mass in vehicle.mass.values():
         widths += [*[MOMENT] * 3, *(VOLUME_SPREAD * volume for volume in mass.volume), *[at_sigma] * 3]
-    scale = np.array(widths)
-    g = whiten(g) * scale  # θ in units of its prior: the information matrix is then well scaled
-    covariance = np.linalg.inv(g.T @ g + np.eye(len(scale)))
-    h, survey_floor = _sensitivity(vehicle, survey, sigma)
-    return _Posterior(covariance, g, whiten, h * scale, survey_floor)
+    return np.array(widths)
 
 
 def _sensitivity(vehicle: Vehicle, deployment: xr.Dataset, sigma: float) -> tuple[Array, Array]:

@@ -43,7 +43,7 @@ from magbridge.errors import CalibrationError
 from magbridge.field.reference import main_field
 from sitl import Twin, load, segments, simulate
 from sitl.bonne_bay import METHODS
-from sitl.bound import information_bound, informed_error, oracle
+from sitl.bound import BestFit, oracle
 from sitl.dataset import at_rest, channels, corrected, side_by_side
 from sitl.instrument import rotation
 from sitl.platform import Vehicle
@@ -107,11 +107,9 @@ def run(case: Case) -> list[Row]:
             continue
         add(method, residual, rms(error), float(np.std(error / sigma)))
     for at_sigma, name in ((0.5, "oracle"), (TAPE, "oracle, positions to 5 cm")):
-        data = vehicle, runs, survey, noise, memory, at_sigma
-        bound, noise_alone = information_bound(*data)
-        add(f"{name}: bound", rms(noise_alone), rms(bound) / rms(noise_alone) * floor)
-        reached = informed_error(*data, rng=np.random.default_rng([case.seed, 98]))
-        add(f"{name}: reached", np.nan, rms(reached))
+        best = BestFit(vehicle, runs, survey, noise, memory, at_sigma)
+        add(f"{name}: bound", rms(best.floor), rms(best.bound) / rms(best.floor) * floor)
+        add(f"{name}: reached", np.nan, rms(best.error(np.random.default_rng([case.seed, 98]))))
     for name, (A, T, failed) in strangers(runs, case.peers):
         add(name, rms(left(A, T, runs)), rms(left(A, T, survey)), failed=failed)
     return rows

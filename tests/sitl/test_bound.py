@@ -9,7 +9,7 @@ import xarray as xr
 
 from magbridge.calibration.residual import rms
 from sitl import Twin, load, segments, simulate
-from sitl.bound import information_bound, oracle
+from sitl.bound import BestFit, oracle
 from sitl.mission import CrissCross, Spirals
 from sitl.platform import Vehicle
 
@@ -29,20 +29,27 @@ def flight() -> tuple[Vehicle, xr.Dataset, xr.Dataset]:
 def test_who_knows_the_vehicle_is_left_with_the_noise(flight: tuple[Vehicle, xr.Dataset, xr.Dataset]) -> None:
     vehicle, calibration, survey = flight
     error = oracle(vehicle, survey) - survey["truth_total_field"].to_numpy()
-    _, floor = information_bound(vehicle, calibration, survey, sigma=1.0)
-    assert rms(error) == pytest.approx(rms(floor), rel=0.06)
+    best = BestFit(vehicle, calibration, survey, sigma=1.0)
+    assert rms(error) == pytest.approx(rms(best.floor), rel=0.06)
 
 
 def test_no_calibration_beats_the_noise_and_more_knowledge_helps(
     flight: tuple[Vehicle, xr.Dataset, xr.Dataset],
 ) -> None:
     vehicle, calibration, survey = flight
-    bound, floor = information_bound(vehicle, calibration, survey, 1.0)
-    assert np.all(bound > floor)
-    vague, _ = information_bound(vehicle, calibration, survey, 1.0, at_sigma=0.5)
-    assert np.all(vague >= bound - 1e-9)
-    fewer, _ = information_bound(vehicle, calibration.isel(time=slice(0, None, 2)), survey, 1.0)
-    assert np.all(fewer >= bound - 1e-9)
+    best = BestFit(vehicle, calibration, survey, 1.0)
+    assert np.all(best.bound > best.floor)
+    vague = BestFit(vehicle, calibration, survey, 1.0, at_sigma=0.5)
+    assert np.all(vague.bound >= best.bound - 1e-9)
+    fewer = BestFit(vehicle, calibration.isel(time=slice(0, None, 2)), survey, 1.0)
+    assert np.all(fewer.bound >= best.bound - 1e-9)
+
+
+def test_a_best_fit_s_error_is_its_bound(flight: tuple[Vehicle, xr.Dataset, xr.Dataset]) -> None:
+    """On average over vehicles; the noise of the survey is the same in all of them."""
+    best, rng = BestFit(*flight, sigma=1.0), np.random.default_rng(1)
+    errors = [best.error(rng) for _ in range(200)]
+    assert rms(np.array(errors)) == pytest.approx(rms(best.bound), rel=0.06)
 
 
 def test_with_only_the_hard_iron_unknown_the_bound_is_three_sines(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -56,7 +63,7 @@ def test_with_only_the_hard_iron_unknown_the_bound_is_three_sines(monkeypatch: p
         for name in ("calibration", "survey")
     )
     u, v = (field / np.linalg.norm(field, axis=1, keepdims=True) for field in (u, v))
-    bound, floor = information_bound(Vehicle(), parts["calibration"], parts["survey"], sigma=5.0)
+    best = BestFit(Vehicle(), parts["calibration"], parts["survey"], sigma=5.0)
     expected = 25.0 * (1 + np.einsum("ni,ij,nj->n", v, np.linalg.inv(u.T @ u), v))
-    np.testing.assert_allclose(floor, 5.0)
-    np.testing.assert_allclose(bound**2, expected, rtol=1e-6)
+    np.testing.assert_allclose(best.floor, 5.0)
+    np.testing.assert_allclose(best.bound**2, expected, rtol=1e-6)
