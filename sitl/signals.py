@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-__all__ = ["autoregressive", "first_order", "first_order_at"]
+__all__ = ["autoregressive", "correlated", "first_order", "first_order_at"]
 
 Array = NDArray[np.float64]
 
@@ -84,8 +84,10 @@ def autoregressive(rng: np.random.Generator, shape: tuple[int, ...], sigma: floa
     is white noise.
     """
     white = rng.normal(0.0, sigma, shape)
-    if memory == 0:
-        return white
-    phi = np.exp(-1.0 / memory)
-    white[1:] *= np.sqrt(1 - phi**2)
-    return np.asarray(lfilter([1.0], [1.0, -phi], white, axis=0), dtype=np.float64)
+    return correlated(white, np.exp(-1.0 / memory)) if memory else white
+
+
+def correlated(white: Array, phi: float) -> Array:
+    """Make stationary white noise (n, ...) autoregressive: neighbours correlate by `phi`, the size stays."""
+    driven = np.concatenate([white[:1], np.sqrt(1 - phi**2) * white[1:]])
+    return np.asarray(lfilter([1.0], [1.0, -phi], driven, axis=0), dtype=np.float64)

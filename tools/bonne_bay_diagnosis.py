@@ -14,7 +14,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "2")
 
 import msgspec
 import xarray as xr
-from study.stage import CHARTS
+from study.deployment import CHARTS
 from terminal import command_line
 
 from magbridge.calibration.fitting.fit import fit

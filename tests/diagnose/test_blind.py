@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from scipy.interpolate import CubicSpline
-from study import stage
+from study import deployment
 from study.cases import alike, case
 from study.noise import GLIDER, LOSSES, NOISES, whiten
 from study.rates import worse
@@ -37,11 +37,11 @@ FAR = 8.0
 @pytest.fixture(scope="module", autouse=True)
 def short() -> Iterator[None]:
     """Two hours where the study has six."""
-    hours, stage.HOURS = stage.HOURS, 2.0
-    stage.vehicle.cache_clear()
+    hours, deployment.HOURS = deployment.HOURS, 2.0
+    deployment.vehicle.cache_clear()
     yield
-    stage.HOURS = hours
-    stage.vehicle.cache_clear()
+    deployment.HOURS = hours
+    deployment.vehicle.cache_clear()
 
 
 def blind(
@@ -65,11 +65,11 @@ def test_a_hidden_effect_is_found_and_named(name: str) -> None:
 
 def test_a_lag_imitates_an_early_clock_beside_the_telemetry_that_is_there() -> None:
     """By a vehicle whose masses are where telemetry has them, on a grid that a delay cannot slip through."""
-    own = stage.vehicle(0)
-    stall = stage.Stall.of(own, 24, "white")
+    own = deployment.vehicle(0)
+    background = deployment.Background.of(own, 24, "white")
     late, finer = 0.1, 20
     clock = next(
-        one for seed in range(9) if _delay(one := stall.show(Hidden("clock_offset", late, seed))) < 0.0
+        one for seed in range(9) if _delay(one := background.show(Hidden("clock_offset", late, seed))) < 0.0
     )
     lag = Hidden("filter_lag", late, 0)
     t = own.track.elapsed
@@ -82,20 +82,23 @@ def test_a_lag_imitates_an_early_clock_beside_the_telemetry_that_is_there() -> N
         parameters={k: np.interp(fine + late, t, values) for k, values in own.track.parameters.items()},
         **{name: CubicSpline(t, getattr(own.track, name))(fine) for name in way},
     )
-    e = [stage.compare(disturb(own.twin, one, track, own.when), own.calibration)[0] for one in ((lag,), ())]
-    true = whiten(e[0] - e[1], "white", stall.rows)
+    e = [
+        deployment.compare(disturb(own.twin, one, track, own.when), own.calibration)[0]
+        for one in ((lag,), ())
+    ]
+    true = whiten(e[0] - e[1], "white", background.rows)
     off = {
         name: np.linalg.norm(shape - true) / np.linalg.norm(true)
         for name, shape in (
-            ("alike", alike("filter_lag", clock, stall)),
+            ("alike", alike("filter_lag", clock, background)),
             ("the clock's own", clock.signature),
-            ("beside another telemetry", stall.show(lag).signature),
+            ("beside another telemetry", background.show(lag).signature),
         )
     }
     assert off.pop("alike") < 0.05 < 0.08 < min(off.values())
 
 
-def _delay(one: stage.Found) -> float:
+def _delay(one: deployment.Injected) -> float:
     return float(json.loads(one.ds.attrs["truth"])["delay"])
 
 
@@ -146,8 +149,8 @@ def test_what_no_cause_explains_is_called_unexplained() -> None:
 
 @pytest.fixture(scope="module")
 def warm(short: None) -> tuple[xr.Dataset, Calibration]:
-    here = stage.Stall.of(stage.vehicle(0), 24, "white")
-    return here.log(here.hide("current_field", 60.0, 24).ds), here.stage.calibration
+    here = deployment.Background.of(deployment.vehicle(0), 24, "white")
+    return here.log(here.hide("current_field", 60.0, 24).ds), here.deployment.calibration
 
 
 @pytest.fixture(scope="module")
@@ -182,9 +185,9 @@ def test_what_is_written(warm: tuple[xr.Dataset, Calibration], written: tuple[Pa
 
 def test_a_maps_error_is_told_by_its_size(short: None) -> None:
     """A hundred functions of the place say nothing to anyone; their RMS does."""
-    here = stage.Stall.of(stage.vehicle(0), 24, "white")
+    here = deployment.Background.of(deployment.vehicle(0), 24, "white")
     hidden = here.hide("map_error", 40.0, 24)
-    diagnosis = diagnose([here.log(hidden.ds)], here.stage.calibration)
+    diagnosis = diagnose([here.log(hidden.ds)], here.deployment.calibration)
     (named,) = [one for one in diagnosis.findings if one.candidate.cause == "map_error"]
     numbers = parameters(named, len(diagnosis.problem))
     assert set(numbers) == {"rms"}

@@ -17,16 +17,17 @@ import pytest
 from scipy.stats import norm
 from study.both import by_causes, held, named, weighed
 from study.cases import PARTS, plan
+from study.deployment import CHARTS, charted, drawn, project
 from study.draws import SHOWN, Draws, Span, evidence, log_bayes, with_another
 from study.nameless import against, nameless
-from study.noise import LOSSES, MEMORY, autoregression, left, whiten
+from study.noise import LOSSES, MEMORY, left, whiten
 from study.rates import beside_ideal, efficiency, share
-from study.stage import CHARTS, charted, drawn, project
 from study.table import lines
 from study.theory import SIZES
 
 from magbridge.diagnose.inference.descriptions import Description
 from sitl import Twin, load
+from sitl.signals import correlated
 
 TOOLS = Path(__file__).parents[2] / "tools"
 
@@ -42,7 +43,7 @@ def test_what_a_free_calibration_absorbs_against_the_naive_way() -> None:
 
 def test_whitened_noise_is_white() -> None:
     rng = np.random.default_rng(2)
-    noise = autoregression(rng.normal(size=(20_000, 1)), MEMORY)[:, 0]
+    noise = correlated(rng.normal(size=(20_000, 1)), MEMORY)[:, 0]
     assert np.std(noise) == pytest.approx(1.0, abs=0.03)
     for losses in ("", *LOSSES):
         rows = left(losses, len(noise), 3)

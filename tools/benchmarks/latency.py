@@ -53,8 +53,8 @@ class Sent(NamedTuple):
     """MB"""
 
 
-class Stage(NamedTuple):
-    """A process on a pty and a socket."""
+class Running(NamedTuple):
+    """A process that runs between a pty and a socket."""
 
     process: subprocess.Popen[bytes]
     master: int
@@ -71,7 +71,7 @@ class Stage(NamedTuple):
 
 
 @contextmanager
-def started(command: Callable[[str, int], list[str]]) -> Iterator[Stage]:
+def started(command: Callable[[str, int], list[str]]) -> Iterator[Running]:
     """Start a process between a new pty and a new socket; `command` takes the tty's name and the port."""
     master, slave = pty.openpty()
     tty.setraw(slave)
@@ -85,7 +85,7 @@ def started(command: Callable[[str, int], list[str]]) -> Iterator[Stage]:
     try:
         first, peer = link.recvfrom(65536)
         link.setblocking(False)
-        yield Stage(process, master, link, peer, time.perf_counter() - begun, first)
+        yield Running(process, master, link, peer, time.perf_counter() - begun, first)
     finally:
         process.terminate()
         process.wait(10.0)
@@ -143,9 +143,9 @@ def _rows(hertz: int, bridge: list[Sent], echo: list[Sent]) -> list[Row]:
     return rows
 
 
-def _play(stage: Stage, feed: Feed, hertz: int, sequences: Callable[[bytes], list[int]]) -> Sent:
+def _play(running: Running, feed: Feed, hertz: int, sequences: Callable[[bytes], list[int]]) -> Sent:
     """Send readings and telemetry for a while; match what comes back by sequence number."""
-    clock, send, recv = time.perf_counter, stage.link.sendto, stage.link.recv
+    clock, send, recv = time.perf_counter, running.link.sendto, running.link.recv
     heard: list[tuple[float, bytes]] = []
     written: dict[int, float] = {}
     driver = open_driver("digitizer", OPTIONS)
@@ -157,7 +157,7 @@ def _play(stage: Stage, feed: Feed, hertz: int, sequences: Callable[[bytes], lis
             except BlockingIOError:
                 continue
 
-    cpu = processor_time(stage.process.pid)
+    cpu = processor_time(running.process.pid)
     begun = clock() + 0.01
     messages, every = 0, hertz // TELEMETRY_HZ
     for sample in range(round(hertz * SECONDS)):
@@ -166,21 +166,21 @@ def _play(stage: Stage, feed: Feed, hertz: int, sequences: Callable[[bytes], lis
         due = begun + sample / hertz
         if sample % every == every // 2:
             listen(due - 0.5 / hertz)
-            send(feed.message(time.time_ns() // 1000), stage.peer)
+            send(feed.message(time.time_ns() // 1000), running.peer)
             messages += 1
             if messages % TELEMETRY_HZ == 0:
-                send(feed.heartbeat(), stage.peer)
+                send(feed.heartbeat(), running.peer)
         listen(due)
         written[sequence or 0] = clock()
-        stage.write(frame)
+        running.write(frame)
     listen(clock() + GRACE)
-    cpu = processor_time(stage.process.pid) - cpu
+    cpu = processor_time(running.process.pid) - cpu
     came: dict[int, float] = {}
     for when, data in heard:
         for sequence in sequences(data):
             came.setdefault(sequence, when)
     late = [1e3 * (came.get(sequence, np.nan) - when) for sequence, when in written.items()]
-    return Sent(np.array(late[round(WARM_UP * hertz) :]), cpu, resident(stage.process.pid)["VmRSS"])
+    return Sent(np.array(late[round(WARM_UP * hertz) :]), cpu, resident(running.process.pid)["VmRSS"])
 
 
 def _sequences_of_messages() -> Callable[[bytes], list[int]]:

@@ -22,17 +22,19 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from magbridge.diagnose.inference.evidence import ODDS
+from study.deployment import Background, Injected
 from study.draws import SHOWN, Draws, Span, evidence
-from study.stage import Found, Stall
 from study.theory import Setting, best_of, information, own_span, true_span
 
 Array = NDArray[np.float64]
 Wholes = dict[frozenset[str], Array]
 
 
-def both(hidden: Sequence[Found], stall: Stall, ds: xr.Dataset, setting: Setting) -> dict[str, float]:
+def both(
+    hidden: Sequence[Injected], background: Background, ds: xr.Dataset, setting: Setting
+) -> dict[str, float]:
     """Chances of the module's notes; see :func:`study.theory.ideal`."""
-    spans, S, _ = information(hidden, stall, ds, setting)
+    spans, S, _ = information(hidden, background, ds, setting)
     draws, table = Draws.of(S), {span for span in spans if span.channel != SHOWN}
     truth = frozenset(one.hidden.name for one in hidden)
     likely, last = [*best_of(S, spans).values()], len(S) - 1 - len(hidden)

@@ -19,9 +19,9 @@ from magbridge.diagnose.report.findings import findings
 from magbridge.diagnose.run import diagnose
 from sitl.inject import EFFECTS, FOREIGN, Hidden
 from study.both import both
+from study.deployment import CHARTS, SEEDS, Background, Injected, deployment_of
 from study.gain import DELAYS, gain, harm
 from study.noise import GLIDER, LOSSES, NOISES
-from study.stage import CHARTS, SEEDS, Found, Stall, stage_of
 from study.theory import Setting, ideal
 
 Row = dict[str, Any]
@@ -158,13 +158,13 @@ def case(entry: Row) -> Row:
     """Hide the effects of an entry, diagnose the log, and return the outcome beside theory's prediction."""
     began = time.process_time()
     number, noise, names, without = entry["number"], entry["noise"], entry["names"], entry.get("without", "")
-    stage = stage_of(number, noise, entry.get("reference", "true"))
-    stall = Stall.of(stage, number, noise, entry["losses"])
-    hidden = [stall.hide(name, entry["wanted"], number + 7919 * k) for k, name in enumerate(names)]
-    whole = hidden[0].ds if len(hidden) == 1 else stall.measure(*(one.hidden for one in hidden))
-    ds = stall.log(whole)
+    deployment = deployment_of(number, noise, entry.get("reference", "true"))
+    background = Background.of(deployment, number, noise, entry["losses"])
+    hidden = [background.hide(name, entry["wanted"], number + 7919 * k) for k, name in enumerate(names)]
+    whole = hidden[0].ds if len(hidden) == 1 else background.measure(*(one.hidden for one in hidden))
+    ds = background.log(whole)
     table = {name: cause for name, cause in CAUSES.items() if name != without}
-    result = diagnose([ds], stage.calibration, learned_from=stage.learned, causes=table)
+    result = diagnose([ds], deployment.calibration, learned_from=deployment.learned, causes=table)
     found = findings(result, table)
     row = entry | {
         "sizes": [one.hidden.size for one in hidden],
@@ -176,12 +176,12 @@ def case(entry: Row) -> Row:
         ],
         "p_value": min((p for p, _ in result.outcome.tested.values()), default=1.0),
         "scores": _scores(found, names, whole),
-        "theory": _theory(entry["part"], hidden, stall, ds, result),
+        "theory": _theory(entry["part"], hidden, background, ds, result),
     }
     if entry["part"] == "gain":
-        row["gain"] = gain(hidden[0].hidden, stall, ds, result)
+        row["gain"] = gain(hidden[0].hidden, background, ds, result)
     if entry["part"] == "charted":
-        row["gain"] = harm(tuple(one.hidden for one in hidden), stall, ds, result)
+        row["gain"] = harm(tuple(one.hidden for one in hidden), background, ds, result)
     return row | {"seconds": time.process_time() - began, "worker": os.getpid()}
 
 
@@ -199,7 +199,7 @@ def _scores(found: Row, names: tuple[str, ...], whole: xr.Dataset) -> list[float
 
 
 def _theory(
-    part: str, hidden: list[Found], stall: Stall, ds: xr.Dataset, result: Diagnosis
+    part: str, hidden: list[Injected], background: Background, ds: xr.Dataset, result: Diagnosis
 ) -> list[dict[str, Any]]:
     """Return theory's prediction for a case of one hidden effect, or of two at once."""
     names = [one.hidden.name for one in hidden]
@@ -207,7 +207,7 @@ def _theory(
         return []
     late = next((one for one in hidden if one.hidden.name in DELAYS), hidden[0])
     others = {
-        other: alike(other, late, stall)
+        other: alike(other, late, background)
         for other in DELAYS
         if late.hidden.name in DELAYS and other not in names
     }
@@ -216,10 +216,12 @@ def _theory(
         tones = CAUSES[names[0]].candidates(result.problem) if names[0] == "interference_tone" else []
         free = descriptions(result.problem, result.outcome.null, *tones[:1])
     setting = Setting(CAUSES, result.outcome.trials, free, others)
-    return [both(hidden, stall, ds, setting) if len(hidden) > 1 else ideal(hidden[0], stall, ds, setting)]
+    if len(hidden) > 1:
+        return [both(hidden, background, ds, setting)]
+    return [ideal(hidden[0], background, ds, setting)]
 
 
-def alike(other: str, late: Found, stall: Stall) -> Array:
+def alike(other: str, late: Injected, background: Background) -> Array:
     """Signature of the other delay cause, at this delay, in the log that hides `late`, of a possible sign.
 
     A field that is late looks like a clock that is early, except where a mass starts or stops within the
@@ -230,5 +232,5 @@ def alike(other: str, late: Found, stall: Stall) -> Array:
     d = late.signature
     if other == "clock_offset":
         return d
-    f = stall.show(Hidden(other, late.hidden.size, stall.number)).signature
+    f = background.show(Hidden(other, late.hidden.size, background.number)).signature
     return d + np.exp(-1.0) * (f - d) if f @ d > 0.0 else f

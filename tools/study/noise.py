@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
-from scipy.signal import lfilter
+
+from sitl.signals import correlated
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.intp]
@@ -28,12 +29,6 @@ def statistics(noise: str) -> tuple[float, float]:
     return (MEMORY if noise in ("ar", GLIDER) else 0.0), {"half": 1.5, GLIDER: 8.0}.get(noise, 1.0)
 
 
-def autoregression(white: Array, memory: float) -> Array:
-    """Make white noise of unit variance (n, k) autoregressive, of the same variance."""
-    driven = np.vstack([white[:1], white[1:] * np.sqrt(1 - memory**2)])
-    return np.asarray(lfilter([1.0], [1.0, -memory], driven, axis=0))
-
-
 def add_noise(ds: xr.Dataset, kind: str, seed: int) -> xr.Dataset:
     """Add noise of its `kind` to each channel, of unit variance unless the kind says otherwise."""
     rng = np.random.default_rng([seed, 99])
@@ -42,9 +37,9 @@ def add_noise(ds: xr.Dataset, kind: str, seed: int) -> xr.Dataset:
     if kind == "heavy":
         noise = rng.standard_t(4.0, (n, 3)) / np.sqrt(2.0)
     if kind in ("ar", GLIDER):
-        noise = autoregression(noise, MEMORY)
+        noise = correlated(noise, MEMORY)
     if kind == "mixed":
-        noise = np.sqrt(2 / 3) * noise + np.sqrt(1 / 3) * autoregression(rng.standard_normal((n, 3)), SLOWER)
+        noise = np.sqrt(2 / 3) * noise + np.sqrt(1 / 3) * correlated(rng.standard_normal((n, 3)), SLOWER)
     if kind == "uneven":
         noise *= np.repeat(np.exp(rng.normal(0, 0.5, n // 300 + 1)), 300)[:n, None]
     out = ds.copy()

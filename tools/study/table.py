@@ -11,6 +11,7 @@ import numpy as np
 
 from sitl.inject import EFFECTS
 from study.by_cause import by_cause
+from study.deployment import CHARTS
 from study.noise import LOSSES, NOISES
 from study.rates import (
     Row,
@@ -36,7 +37,6 @@ from study.rates import (
     unlike,
     worse,
 )
-from study.stage import CHARTS
 
 Parts = dict[str, list[Row]]
 OFF = 0.15

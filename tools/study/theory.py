@@ -30,10 +30,10 @@ from magbridge.diagnose.compare.problem import pose
 from magbridge.diagnose.compare.take import take
 from magbridge.diagnose.inference.descriptions import Description
 from magbridge.diagnose.inference.evidence import LEVEL, ODDS
+from study.deployment import Background, Injected, compare, project
 from study.draws import SHOWN, Draws, Span, by_cause, evidence, explained, log_bayes, numbers, with_another
 from study.nameless import against, nameless
 from study.noise import whiten
-from study.stage import Found, Stall, compare, project
 
 Array = NDArray[np.float64]
 SIZES = np.linspace(1.0, 12.0, 45)
@@ -61,14 +61,14 @@ class Setting(NamedTuple):
     others: Mapping[str, Array]
 
 
-def ideal(one: Found, stall: Stall, ds: xr.Dataset, setting: Setting) -> dict[str, Any]:
+def ideal(one: Injected, background: Background, ds: xr.Dataset, setting: Setting) -> dict[str, Any]:
     """Chances of an ideal detector.
 
     Parameters
     ----------
-    one : Found
+    one : Injected
         The hidden effect.
-    stall : Stall
+    background : Background
         The log that it is hidden in.
     ds : Dataset
         The deployment that is diagnosed.
@@ -86,7 +86,7 @@ def ideal(one: Found, stall: Stall, ds: xr.Dataset, setting: Setting) -> dict[st
         :mod:`study.nameless`.
     """
     name = one.hidden.name
-    spans, S, noise = information([one], stall, ds, setting)
+    spans, S, noise = information([one], background, ds, setting)
     draws, rivals = Draws.of(S), [span for span in spans if span.cause != name]
     best = best_of(S, rivals)
     own = own_span(S, spans, name)
@@ -120,21 +120,17 @@ def ideal(one: Found, stall: Stall, ds: xr.Dataset, setting: Setting) -> dict[st
 
 
 def information(
-    hidden: Sequence[Found], stall: Stall, ds: xr.Dataset, setting: Setting
+    hidden: Sequence[Injected], background: Background, ds: xr.Dataset, setting: Setting
 ) -> tuple[list[Span], Array, Array]:
     """Return spans, Fisher information (m, m) of all columns, and scores (m, 1) of the log's own noise.
 
     The hidden signatures are the last columns: each one and, if there are several, their sum.
     """
-    problem = pose(take([ds], stall.stage.calibration), stall.stage.calibration)
+    noise, rows, calibration = background.noise, background.rows, background.deployment.calibration
+    problem = pose(take([ds], calibration), calibration)
     candidates = [c for cause in setting.causes.values() for c in cause.candidates(problem)]
-    table = whiten(
-        np.hstack([c.columns(slice(0, len(problem))) for c in candidates]), stall.noise, stall.rows
-    )
-    free = [
-        whiten(description.columns(slice(0, len(problem))), stall.noise, stall.rows)
-        for description in setting.free
-    ]
+    table = whiten(np.hstack([c.columns(slice(0, len(problem))) for c in candidates]), noise, rows)
+    free = [whiten(description.columns(slice(0, len(problem))), noise, rows) for description in setting.free]
     truth = [one.signature for one in hidden]
     every = [sum(truth)] if len(truth) > 1 else []
     X = np.column_stack([*free, table, *setting.others.values(), *truth, *every])
@@ -148,8 +144,8 @@ def information(
         Span(cause, SHOWN, slice(k, k + 1), positive=cause == "filter_lag")
         for k, cause in enumerate(setting.others, first + table.shape[1])
     ]
-    projected = project(X, stall.columns, stall.stage.prior)
-    measured = whiten(compare(ds, stall.stage.calibration)[0], stall.noise, stall.rows)
+    projected = project(X, background.columns, background.deployment.prior)
+    measured = whiten(compare(ds, calibration)[0], noise, rows)
     return spans, X.T @ projected, projected.T @ (measured - sum(truth))[:, None]
 
 

@@ -60,7 +60,7 @@ class Remembered(World):
         return self.known[way]
 
 
-class Stage(NamedTuple):
+class Deployment(NamedTuple):
     """A vehicle with its calibration, and a deployment's track with the times of its rows.
 
     `prior` (K, K) is the prior covariance of the calibration's coefficients in a diagnosis: its own, and the
@@ -83,7 +83,7 @@ class Stage(NamedTuple):
 
 
 @lru_cache(maxsize=VEHICLES)
-def vehicle(seed: int, rms: float = 60.0, reference: str = "true") -> Stage:
+def vehicle(seed: int, rms: float = 60.0, reference: str = "true") -> Deployment:
     """Draw a vehicle, calibrate it on a log of its own, fly its survey; `rms` (nT) is the rock's field.
 
     Where the reference is a map, one of :data:`CHARTS`, it is a glider like the paper's: its noise is larger,
@@ -132,14 +132,14 @@ def calibrated(spirals: xr.Dataset) -> Calibration:
     return fit(observations(spirals, ["battpos", "ballast"]), "auto").calibration
 
 
-def again(stage: Stage, later: timedelta = timedelta()) -> Stage:
+def again(deployment: Deployment, later: timedelta = timedelta()) -> Deployment:
     """Return another deployment of the same vehicle in the same waters, with the true field as reference."""
-    scenario = msgspec.structs.replace(stage.twin.scenario, start=stage.twin.scenario.start + later)
-    twin = replace(stage.twin, scenario=scenario, seed=stage.twin.seed + 1000)
-    return _flown(twin, stage.calibration)
+    scenario = msgspec.structs.replace(deployment.twin.scenario, start=deployment.twin.scenario.start + later)
+    twin = replace(deployment.twin, scenario=scenario, seed=deployment.twin.seed + 1000)
+    return _flown(twin, deployment.calibration)
 
 
-def _flown(twin: Twin, calibration: Calibration) -> Stage:
+def _flown(twin: Twin, calibration: Calibration) -> Deployment:
     twin = replace(twin, world=Remembered(twin.world.origin, twin.world.rock, twin.world.water))
     track = twin.fly()
     # a hull has inertia: without it the attitude has no rate of change, and a delay of a millisecond would
@@ -150,11 +150,11 @@ def _flown(twin: Twin, calibration: Calibration) -> Stage:
     )
     track = replace(track, roll=roll, pitch=pitch, heading=heading)
     when = np.arange(0.0, track.elapsed[-1] - 30.0, 1 / twin.scenario.instrument.rate)
-    return Stage(twin, track, when, calibration, calibration.covariance + floor(calibration))
+    return Deployment(twin, track, when, calibration, calibration.covariance + floor(calibration))
 
 
-def stage_of(number: int, noise: str, reference: str = "true") -> Stage:
-    """Return the stage of a case."""
+def deployment_of(number: int, noise: str, reference: str = "true") -> Deployment:
+    """Return the deployment of a case."""
     seed, place = divmod(number, SEEDS)
     rms = {"map": 300.0, GLIDER: 120.0}.get(noise, 60.0)
     return vehicle(VEHICLES * seed + place % VEHICLES, rms, reference)
@@ -194,21 +194,21 @@ def size_of(name: str, d: Array, A: Array, covariance: Array) -> float:
     return float(np.sqrt(max(float(d @ left), 0.0)))
 
 
-class Found(NamedTuple):
-    """An effect of the wanted size, its whitened signature in the residual, and the log with it."""
+class Injected(NamedTuple):
+    """A hidden effect of the wanted size, its whitened signature in the residual, and the log with it."""
 
     hidden: Hidden
     signature: Array
     ds: xr.Dataset
 
 
-class Stall(NamedTuple):
+class Background(NamedTuple):
     """What does not depend on the effect: a log's rows, its residual without one, the calibration's columns.
 
     The columns (of `rows` only) are whitened; the residual (of all rows) is not.
     """
 
-    stage: Stage
+    deployment: Deployment
     number: int
     noise: str
     rows: Rows
@@ -216,33 +216,33 @@ class Stall(NamedTuple):
     columns: Array
 
     @classmethod
-    def of(cls, stage: Stage, number: int, noise: str, losses: str = "") -> Stall:
+    def of(cls, deployment: Deployment, number: int, noise: str, losses: str = "") -> Background:
         """Set up; `number` seeds the unneeded telemetry, and which samples are lost."""
-        clean = stage.measure((), number)
-        rows = left(losses, len(stage.when), number)
-        e, J = compare(clean, stage.calibration)
-        return cls(stage, number, noise, rows, e, whiten(J[rows], noise, rows))
+        clean = deployment.measure((), number)
+        rows = left(losses, len(deployment.when), number)
+        e, J = compare(clean, deployment.calibration)
+        return cls(deployment, number, noise, rows, e, whiten(J[rows], noise, rows))
 
     def measure(self, *hidden: Hidden) -> xr.Dataset:
         """The log with effects, before its noise and its losses."""
-        return self.stage.measure(hidden, self.number)
+        return self.deployment.measure(hidden, self.number)
 
-    def show(self, hidden: Hidden) -> Found:
+    def show(self, hidden: Hidden) -> Injected:
         """Return an effect's signature and log here."""
         ds = self.measure(hidden)
-        d = compare(ds, self.stage.calibration)[0] - self.residual
-        return Found(hidden, whiten(d[self.rows], self.noise, self.rows), ds)
+        d = compare(ds, self.deployment.calibration)[0] - self.residual
+        return Injected(hidden, whiten(d[self.rows], self.noise, self.rows), ds)
 
     def log(self, ds: xr.Dataset) -> xr.Dataset:
         """Return the log to be diagnosed: with noise, and without the lost samples."""
         return add_noise(ds, self.noise, self.number).isel(time=self.rows)
 
-    def hide(self, name: str, wanted: float, seed: int) -> Found:
+    def hide(self, name: str, wanted: float, seed: int) -> Injected:
         """Find the size at which the effect has the signal-to-noise that is wanted."""
         size = 1.0
         for _ in range(6):
             made = self.show(Hidden(name, size, seed))
-            found = size_of(name, made.signature, self.columns, self.stage.prior)
+            found = size_of(name, made.signature, self.columns, self.deployment.prior)
             if abs(found / wanted - 1.0) < 0.02:
                 return made
             size *= wanted / max(found, 1e-9)
