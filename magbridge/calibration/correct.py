@@ -201,7 +201,7 @@ def correct(
     channels : (n, k) array
         ``calibration.channels``, in that order; NaN where unknown.
     time : (n,) array
-        s since 1970 UTC, ascending: effects may have a memory.
+        s since 1970 UTC, ascending: effects may have a state.
 
     Returns
     -------

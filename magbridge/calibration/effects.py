@@ -1,4 +1,4 @@
-"""Effects: terms that depend on something other than the positions, some with a memory.
+"""Effects: terms that depend on something other than the positions, some with a state.
 
 An effect names its channels, says what its coefficients do with its regressors (`columns`), and computes the
 regressors sample by sample (`begin` returns a stepper with a fresh state). Live and batch run the same

@@ -23,8 +23,9 @@ __all__ = ["FORMAT", "calibration_id", "decode_calibration", "encode_calibration
 
 FloatArray = NDArray[np.float64]
 
-FORMAT = 1
-"""Version of the layout; a reader takes this one and all before it."""
+FORMAT = 2
+"""Version of the layout; a reader takes this one and all before it. In 1, the noise's
+``autocorrelation`` was called ``memory``."""
 
 
 class _File(msgspec.Struct, forbid_unknown_fields=True):
@@ -96,7 +97,10 @@ def decode_calibration(data: bytes, file: str | Path = "cal.json") -> Calibratio
             raise FormatError(
                 file, f"written by a newer magbridge (format {version}; this one reads up to {FORMAT})"
             )
-        content = msgspec.json.decode(data, type=_File)
+        raw = msgspec.json.decode(data)
+        if version < 2 and isinstance(raw.get("noise"), dict) and "memory" in raw["noise"]:
+            raw["noise"]["autocorrelation"] = raw["noise"].pop("memory")
+        content = msgspec.convert(raw, _File)
         terms = tuple(_term_in(term, file) for term in content.terms)
         effects = tuple(_term_in(effect, file) for effect in content.effects)
     except (msgspec.DecodeError, UnicodeDecodeError) as problem:

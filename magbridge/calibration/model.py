@@ -69,14 +69,14 @@ UNKNOWN = Sensor()
 
 
 class Noise(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Noise of the samples: 1-sigma of each channel (nT), of the reference (nT), memory.
+    """Noise of the samples: 1-sigma of each channel (nT), of the reference (nT), autocorrelation.
 
-    `memory` is the correlation of a sample's noise with the next one's, `interval` s later.
+    `autocorrelation` is that of a sample's noise with the next one's, `interval` s later.
     """
 
     sensor: float
     reference: float = 0.0
-    memory: float = 0.0
+    autocorrelation: float = 0.0
     interval: float = 0.0
 
 

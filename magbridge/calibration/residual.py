@@ -13,7 +13,7 @@ own nanotesla::
     w^T dw = w^T dA u + y^T dA d - y^T A dT,   y = (I - u u^T) A w / F
 
 Each coefficient is a polynomial, so a row of the Jacobian is ``phi (x) g`` with g the derivative by the
-nine. Noise with memory rho is whitened within a run: ``(e_i - rho e_(i-1)) / sqrt(1 - rho^2)``.
+nine. AR(1) noise of autocorrelation rho is whitened within a run: ``(e_i - rho e_(i-1)) / sqrt(1 - rho^2)``.
 """
 
 from __future__ import annotations
@@ -158,7 +158,7 @@ def _times(A: FloatArray, x: FloatArray) -> FloatArray:
 
 
 def normal_equations(
-    samples: Samples, coefficients: FloatArray, weight: FloatArray | None = None, memory: float = 0.0
+    samples: Samples, coefficients: FloatArray, weight: FloatArray | None = None, rho: float = 0.0
 ) -> NormalEquations:
     """Sum up the normal equations of the whitened residual, in bounded memory.
 
@@ -170,8 +170,8 @@ def normal_equations(
         nT, monomial by monomial: where to linearise.
     weight : (n,) array, optional
         Of each whitened residual (robust fits); 1 if not given.
-    memory : float
-        rho, the correlation of the noise of successive samples in a run.
+    rho : float
+        Autocorrelation of the noise at one sampling interval.
     """
     size = coefficients.size
     hessian, gradient, cost = np.zeros((size, size)), np.zeros(size), 0.0
@@ -180,8 +180,8 @@ def normal_equations(
         part = samples.part(slice(first, start + CHUNK))
         e, g = residuals(part, coefficients)
         J = jacobian(part.phi, g)
-        if memory:
-            e, J = whiten(e, part.steps, memory), whiten(J, part.steps, memory)
+        if rho:
+            e, J = whiten(e, part.steps, rho), whiten(J, part.steps, rho)
         e, J = e[start - first :], J[start - first :]
         if weight is not None:
             root = np.sqrt(weight[start : start + CHUNK])
@@ -192,10 +192,10 @@ def normal_equations(
     return NormalEquations(hessian, gradient, cost)
 
 
-def whiten(values: FloatArray, steps: FloatArray, memory: float) -> FloatArray:
-    """Whiten AR(1) noise (n, ...), gaps too: ``(v_i - r v_(i-1)) / sqrt(1 - r^2)``, r = memory^steps (n,)."""
-    white, r, gaps = values.copy(), np.full(len(values) - 1, memory), np.flatnonzero(steps[1:] != 1)
-    r[gaps] = memory ** steps[1:][gaps]
+def whiten(values: FloatArray, steps: FloatArray, rho: float) -> FloatArray:
+    """Whiten AR(1) noise (n, ...), gaps too: ``(v_i - r v_(i-1)) / sqrt(1 - r^2)``, r = rho^steps (n,)."""
+    white, r, gaps = values.copy(), np.full(len(values) - 1, rho), np.flatnonzero(steps[1:] != 1)
+    r[gaps] = rho ** steps[1:][gaps]
     r = r.reshape(-1, *(1,) * (values.ndim - 1))
     white[1:] = (values[1:] - r * values[:-1]) / np.sqrt(1.0 - r**2)
     return white

@@ -55,7 +55,7 @@ class Collector:
     """
 
     def __init__(self, options: Options, step: float) -> None:
-        self._interval_us, self._step, self._lasts = options.interval * 1e6, step, 2.0 * options.memory
+        self._interval_us, self._step, self._lasts = options.interval * 1e6, step, 2.0 * options.noise_time
         self._white = inf if options.noise is None else options.noise**2
         self._bias = options.bias_sigma**2
         self._main_field = NearbyField()

@@ -70,7 +70,7 @@ class Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     noise : float or None
         nT, the part of a sample's sigma that is white; of the rest, what goes beyond ``bias_sigma`` does not
         average out. None: all of it is white.
-    memory : float
+    noise_time : float
         s, correlation time of that noise; noise that lasts longer than a few intervals belongs to the bias.
     gate : float
         Largest innovation squared over its variance that is taken in.
@@ -92,7 +92,7 @@ class Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     map_sigma: NotNegative = 2.0
     map_length: Positive = 1_000.0
     noise: NotNegative | None = None
-    memory: NotNegative = 0.0
+    noise_time: NotNegative = 0.0
     gate: Positive = 16.0
     interval: NotNegative = 20.0
     vouch_sigma: Positive = 500.0
@@ -149,15 +149,16 @@ def informed(options: Options, calibration: Calibration, sigma: float) -> Option
     """
     noise = calibration.noise
     white = noise.sensor
-    memory = -noise.interval / log(noise.memory) if 0.0 < noise.memory < 1.0 else 0.0
+    rho = noise.autocorrelation
+    noise_time = -noise.interval / log(rho) if 0.0 < rho < 1.0 else 0.0
     lasts = LEG
-    if memory > LASTING * options.interval:
-        white, lasts, memory = white * sqrt(1.0 - noise.memory**2), memory, 0.0
+    if noise_time > LASTING * options.interval:
+        white, lasts, noise_time = white * sqrt(1.0 - rho**2), noise_time, 0.0
     slow = sqrt(max(0.0, sigma**2 - white**2))
     return replace(
         options,
         noise=white,
-        memory=memory,
+        noise_time=noise_time,
         bias_sigma=hypot(options.bias_sigma, slow),
         bias_time=min(options.bias_time, lasts) if slow > options.bias_sigma else options.bias_time,
     )

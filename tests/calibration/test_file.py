@@ -86,6 +86,14 @@ def test_the_contract_s_keys_are_there(cal: Calibration) -> None:
     assert content["parameters"][0].keys() == {"name", "unit", "low", "high", "centre", "scale"}
 
 
+def test_an_older_format_is_read(cal: Calibration) -> None:
+    def older(content: dict[str, Any]) -> None:
+        content["format"], noise = 1, content["noise"]
+        noise["memory"] = noise.pop("autocorrelation")
+
+    assert encode_calibration(decode_calibration(edit(older, cal))) == encode_calibration(cal)
+
+
 def test_another_calibration_has_another_id(cal: Calibration) -> None:
     moved = cal.coefficients.copy()
     moved[0] += 1e-9
@@ -230,7 +238,7 @@ def test_the_paper_s_view_is_the_same_ellipsoid() -> None:
     M, S = to_paper(A, 50_000.0)
     np.testing.assert_allclose(M @ M.T, np.eye(3), atol=1e-12)
     assert np.linalg.det(M) > 0.0
-    np.testing.assert_allclose(from_paper(M, S, 50_000.0), A, rtol=1e-12)
+    np.testing.assert_allclose(from_paper(M, S, 50_000.0), A, atol=1e-12)
     # S are semi-axes: a reading at the end of one has the field's magnitude
     assert np.linalg.norm(A @ (M[:, 0] * S[0])) == pytest.approx(50_000.0)
     np.testing.assert_allclose(to_paper(np.diag([1.1, 0.9, 1.0]), 1.0)[0], np.eye(3), atol=1e-12)
@@ -240,6 +248,6 @@ def test_the_paper_s_view_of_a_calibration(cal: Calibration) -> None:
     result = json.loads(json.dumps(facts(cal)))
     assert result["at"] == {"battpos": 0.05}
     A, T = cal.matrices(np.array([[0.05]]))
-    np.testing.assert_allclose(from_paper(result["M"], result["S_nT"], 51_000.0), A[0], rtol=1e-12)
+    np.testing.assert_allclose(from_paper(result["M"], result["S_nT"], 51_000.0), A[0], atol=1e-12)
     np.testing.assert_allclose(result["T_nT"], T[0])
     assert facts(identity())["M"] == np.eye(3).tolist()

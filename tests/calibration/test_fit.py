@@ -132,7 +132,7 @@ def test_errors_in_variables_take_the_bias_away() -> None:
 def test_auto_is_near_the_noise_floor_out_of_sample(
     glider: Gliders, masses: int, noise: float, memory: float, geometry: bool
 ) -> None:
-    ratios, spreads, memories = [], [], []
+    ratios, spreads, correlations = [], [], []
     for seed in range(4):
         one = glider(seed, masses, noise, memory)
         rng = np.random.default_rng(seed)
@@ -148,13 +148,13 @@ def test_auto_is_near_the_noise_floor_out_of_sample(
         ratio, spread = survey_error(found.calibration, one)
         ratios.append(ratio)
         spreads.append(spread)
-        memories.append(found.calibration.noise.memory)
-    # under noise with memory the bound itself is 1.06, and four gliders are few
+        correlations.append(found.calibration.noise.autocorrelation)
+    # under correlated noise the bound itself is 1.06, and four gliders are few
     assert np.median(ratios) < (1.13 if memory else 1.10)
     assert max(ratios) < 1.5
     # what the fit takes out of the residuals is counted: their memory alone is 0.01 to 0.02 shorter
     # than the noise's
-    assert np.mean(memories) == pytest.approx(np.exp(-1.0 / memory) if memory else 0.0, abs=0.01)
+    assert np.mean(correlations) == pytest.approx(np.exp(-1.0 / memory) if memory else 0.0, abs=0.01)
     assert 0.8 < np.median(spreads) < 1.25
 
 

@@ -182,14 +182,14 @@ def test_functions_of_the_direction_and_of_the_reading_hold_a_bend(
         assert not one.covers([])
 
 
-def test_a_curve_through_a_mass_position_covers_its_order_and_its_memory_the_hysteresis(
+def test_a_curve_through_a_mass_position_covers_its_order_and_its_past_the_hysteresis(
     problem: Problem, listed: list[Description]
 ) -> None:
     order = actuator_order(problem)[0]
     back = next(one for one in hysteresis(problem) if one.channel == "battpos")
-    curve, memory, *late = (one for one in listed if one.channel == "battpos")
+    curve, past, *late = (one for one in listed if one.channel == "battpos")
     assert (curve.covers([order]), curve.covers([back])) == (True, False)
-    assert (memory.covers([order]), memory.covers([back])) == (False, True)
+    assert (past.covers([order]), past.covers([back])) == (False, True)
     assert not any(one.covers([order]) or one.covers([back]) for one in late)
 
 

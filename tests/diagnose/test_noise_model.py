@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from magbridge.diagnose.compare.past import FAR, Past
-from magbridge.diagnose.inference.fit_noise import LONGEST, certainty, fit_noise, memory_order
+from magbridge.diagnose.inference.fit_noise import LONGEST, autoregressive_order, certainty, fit_noise
 from magbridge.diagnose.inference.noise import Noise
 
 
@@ -25,13 +25,13 @@ def made(kind: str, n: int = 6000, rho: float = 0.0, seed: int = 1) -> tuple[np.
 
 
 @pytest.mark.parametrize("rho", [0.0, 0.5, 0.95])
-def test_memory_and_level_are_found(rho: float) -> None:
+def test_autoregression_and_level_are_found(rho: float) -> None:
     r, steps = made("white", rho=rho)
     noise = fit_noise(r, Past(steps, 1))
-    assert noise.memory[0] == pytest.approx(rho, abs=0.04)
+    assert noise.ar[0] == pytest.approx(rho, abs=0.04)
     assert float(np.median(noise.scale)) == pytest.approx(1.0, abs=0.04)
     assert noise.nu > 10
-    assert memory_order(r, np.cumsum(steps)) == 1
+    assert autoregressive_order(r, np.cumsum(steps)) == 1
 
 
 def test_noise_is_no_slower_than_a_log_can_tell() -> None:
@@ -40,28 +40,28 @@ def test_noise_is_no_slower_than_a_log_can_tell() -> None:
     steps = np.ones(len(v), int)
     steps[0] = FAR
     noise = fit_noise(np.cumsum(v), Past(steps, 5))
-    assert np.abs(np.roots(np.append(1.0, -noise.memory))).max() == pytest.approx(1.0 - 20.0 / len(v))
+    assert np.abs(np.roots(np.append(1.0, -noise.ar))).max() == pytest.approx(1.0 - 20.0 / len(v))
     slow, _ = made("white", len(v), 0.98)
-    assert fit_noise(slow, Past(steps, 1)).memory[0] == pytest.approx(0.98, abs=0.01)
+    assert fit_noise(slow, Past(steps, 1)).ar[0] == pytest.approx(0.98, abs=0.01)
 
 
 @pytest.mark.parametrize("lost", [0.0, 0.05, 0.125])
-def test_a_memory_is_taken_for_no_shorter_where_few_samples_have_all_of_their_past(lost: float) -> None:
-    """White noise upon a slow one: too short a memory would make structure out of it."""
+def test_a_correlation_is_taken_for_no_shorter_where_few_samples_have_all_of_their_past(lost: float) -> None:
+    """White noise upon a slow one: too low an order would make structure out of it."""
     rng = np.random.default_rng(5)
     n = 6000
     slow, _ = made("white", n, 0.95, seed=6)
     here = np.flatnonzero(rng.random(n) >= lost)
     r = (1.4 * rng.normal(size=n) + np.sqrt(1.0 - 0.95**2) * slow)[here]
-    assert memory_order(r, here) == LONGEST
+    assert autoregressive_order(r, here) == LONGEST
 
 
-def test_a_memory_is_no_longer_than_what_samples_with_a_whole_past_can_tell() -> None:
+def test_a_correlation_is_no_longer_than_what_samples_with_a_whole_past_can_tell() -> None:
     """As of a glider that samples fast near the surface only."""
     slow, _ = made("white", 6000, 0.95, seed=6)
     r = 1.4 * np.random.default_rng(5).normal(size=6000) + np.sqrt(1.0 - 0.95**2) * slow
     here = np.flatnonzero((np.arange(6000) % 1000 < 60) | (np.arange(6000) % 4 == 0))
-    assert 1 < memory_order(r[here], here) < LONGEST
+    assert 1 < autoregressive_order(r[here], here) < LONGEST
 
 
 def test_heavy_tails_are_found_and_the_score_is_of_unit_variance() -> None:
@@ -88,27 +88,27 @@ def test_filtering_in_pieces_is_filtering_the_whole() -> None:
     np.testing.assert_allclose(noise.filter(X[:2]), whole[:2])
 
 
-def covariance(memory: np.ndarray, reach: int) -> np.ndarray:
+def covariance(ar: np.ndarray, reach: int) -> np.ndarray:
     """(reach,) of an autoregression, from its response to an impulse."""
     impulse = np.append(1.0, np.zeros(4000))
     for k in range(1, len(impulse)):
-        before = impulse[max(k - len(memory), 0) : k][::-1]
-        impulse[k] = memory[: len(before)] @ before
+        before = impulse[max(k - len(ar), 0) : k][::-1]
+        impulse[k] = ar[: len(before)] @ before
     return np.array([impulse[: len(impulse) - lag] @ impulse[lag:] for lag in range(reach)])
 
 
 @pytest.mark.parametrize(
-    ("memory", "breaks", "lost"),
+    ("ar", "breaks", "lost"),
     [
         ((0.9, -0.5, 0.3), (0, 2, 70, 71, 150), ()),
         ((0.97,), (0, 90), (4, 5, 6, 30, 31, 77, 100, 150, 152, 154)),
     ],
 )
 def test_least_squares_of_the_filtered_is_generalised_least_squares(
-    memory: tuple[float, ...], breaks: tuple[int, ...], lost: tuple[int, ...]
+    ar: tuple[float, ...], breaks: tuple[int, ...], lost: tuple[int, ...]
 ) -> None:
     """Against the naive oracle, the full covariance inverted: of separate stretches, and beside gaps."""
-    a, p = np.array(memory), len(memory)
+    a, p = np.array(ar), len(ar)
     place = np.setdiff1d(np.arange(200), lost)
     n, stretch = len(place), np.searchsorted(breaks, place, "right")
     steps = np.where(np.diff(stretch, prepend=-1) > 0, FAR, np.diff(place, prepend=0))
@@ -125,7 +125,7 @@ def test_least_squares_of_the_filtered_is_generalised_least_squares(
 
 @pytest.mark.parametrize("lost", ["every 24th", "one in twelve", "76 of 100"])
 def test_what_says_how_much_a_constant_pulls_is_right_beside_gaps(lost: str) -> None:
-    """Under white noise upon one that remembers 40 samples, fitted with a memory of 8."""
+    """Under white noise upon one that remembers 40 samples, fitted with 8 coefficients."""
     pulls = []
     for seed in range(60):
         rng = np.random.default_rng(seed)

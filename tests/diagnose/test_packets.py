@@ -18,12 +18,12 @@ from magbridge.diagnose.inference.shapes import lower_end, repeated
 from magbridge.diagnose.inference.statistic import Ridge, Statistic
 
 
-def drawn(problem: Problem, memory: float, rng: np.random.Generator) -> NDArray[np.float64]:
+def drawn(problem: Problem, rho: float, rng: np.random.Generator) -> NDArray[np.float64]:
     """Noise of unit variance, of which a log with gaps has a part."""
     place = np.cumsum(np.append(0, problem.survey.steps[1:]))
     r = rng.normal(size=int(place[-1]) + 1)
     for k in range(1, len(r)):
-        r[k] = memory * r[k - 1] + np.sqrt(1.0 - memory**2) * r[k]
+        r[k] = rho * r[k - 1] + np.sqrt(1.0 - rho**2) * r[k]
     return np.asarray(r[place])
 
 
@@ -36,14 +36,16 @@ def fitted(given: Problem) -> tuple[Packets, Ridge]:
     return found, Statistic(info.matrix, np.ones((1, 2 * found.number))).best(info.score)
 
 
-@pytest.mark.parametrize("memory", [0.0, 0.8])
-def test_two_packets_are_found_where_they_are_in_noise_of_any_memory(problem: Problem, memory: float) -> None:
+@pytest.mark.parametrize("rho", [0.0, 0.8])
+def test_two_packets_are_found_where_they_are_in_noise_of_any_correlation(
+    problem: Problem, rho: float
+) -> None:
     n, rng = len(problem), np.random.default_rng(3)
     t = np.arange(n)
     planted = np.zeros(n)
     for moment, period, length in ((0.3 * n, 40.0, 90.0), (0.7 * n, 25.0, 30.0)):
         planted += 2.5 * np.exp(-0.5 * ((t - moment) / length) ** 2) * np.cos(2 * np.pi * t / period + 1.0)
-    noise = drawn(problem, memory, rng)
+    noise = drawn(problem, rho, rng)
     given = replace(problem, residual=problem.gain * planted + noise)
     found, best = fitted(given)
     estimate = found.columns(slice(None)) @ best.estimate
@@ -53,12 +55,12 @@ def test_two_packets_are_found_where_they_are_in_noise_of_any_memory(problem: Pr
     assert 20.0 < found.period / np.median(np.diff(problem.survey.time)) < 50.0
 
 
-@pytest.mark.parametrize("memory", [0.0, 0.8])
-def test_noise_has_no_packet_that_is_worth_its_place(problem: Problem, memory: float) -> None:
+@pytest.mark.parametrize("rho", [0.0, 0.8])
+def test_noise_has_no_packet_that_is_worth_its_place(problem: Problem, rho: float) -> None:
     rng = np.random.default_rng(4)
     worth = []
     for _ in range(10):
-        given = replace(problem, residual=drawn(problem, memory, rng))
+        given = replace(problem, residual=drawn(problem, rho, rng))
         found = packets(given, fit_joint(given, [], 1))
         worth.append(found is not None)
     assert sum(worth) <= 2

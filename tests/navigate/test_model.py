@@ -59,12 +59,12 @@ def test_a_calibration_tells_what_is_white_and_what_is_not() -> None:
     slow = informed(known, white, 10.0)
     assert slow.bias_sigma == pytest.approx(np.sqrt(1.0 + 100.0 - 4.0))
     assert slow.bias_time < known.bias_time
-    lasting = informed(known, with_noise(Noise(10.0, memory=0.99, interval=4.0)), 10.0)
+    lasting = informed(known, with_noise(Noise(10.0, autocorrelation=0.99, interval=4.0)), 10.0)
     assert lasting.noise == pytest.approx(10.0 * np.sqrt(1.0 - 0.99**2))
     assert lasting.bias_sigma == pytest.approx(np.hypot(1.0, 10.0 * 0.99))
-    assert informed(known, with_noise(Noise(5.0, memory=0.9, interval=4.0)), 5.0).memory == pytest.approx(
-        38, 0.01
-    )
+    assert informed(
+        known, with_noise(Noise(5.0, autocorrelation=0.9, interval=4.0)), 5.0
+    ).noise_time == pytest.approx(38, 0.01)
 
 
 def with_noise(noise: Noise) -> Calibration:

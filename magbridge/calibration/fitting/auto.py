@@ -107,7 +107,7 @@ def _best(samples: Samples, structure: Structure) -> _Answer:
     for answer in sorted(answers, key=lambda answer: -answer.score):
         last = answer
         if few is not samples:
-            noise = NoiseModel(answer.noise.sigma, answer.noise.memory)
+            noise = NoiseModel(answer.noise.sigma, answer.noise.autocorrelation)
             last = _climb(samples, answer.structure, answer.solution.z, answer.widths.eta, noise)
         if last.solution.settled and is_maximum(last.quadratic, last.structure, last.widths):
             return last
@@ -148,9 +148,11 @@ def _climb(
         still = step > 0 and abs(score - last) < 1e-2 and solution.steps <= 1
         if still and not white:
             break
-        # the residuals of a wrong model look like noise with a long memory, so memory waits until it settles
+        # residuals of a wrong model look correlated for long, so the autocorrelation waits until it settles
         white = white and not still and step < ROUNDS // 2
-        if step < ROUNDS - 4:  # after that the noise's memory and outliers are kept, so that the rest settles
+        if (
+            step < ROUNDS - 4
+        ):  # after that the noise's correlation and outliers are kept, so that the rest settles
             e = residuals_of(samples, structure.coefficients(z))
             doubt = (0.0, 0.0) if white else _doubt(samples, _prior(structure, eta), solution, noise)
             shape = estimate_noise(e, np.where(white, np.inf, samples.steps), widths.determined, doubt)
@@ -184,7 +186,7 @@ def _approach(samples: Samples, prior: Prior, z: FloatArray) -> tuple[FloatArray
 def _score(widths: Widths, noise: NoiseModel, samples: Samples) -> float:
     """Log evidence of all samples: an outlier counts as one just at the limit, whitening by its Jacobian."""
     outlier = np.log(widths.sigma) + 0.5 * OUTLIER**2
-    whitening = 0.5 * np.log(1.0 - noise.memory ** (2.0 * samples.steps)).sum()
+    whitening = 0.5 * np.log(1.0 - noise.autocorrelation ** (2.0 * samples.steps)).sum()
     return float(widths.log_evidence - noise.rejected * outlier - whitening)
 
 

@@ -237,7 +237,7 @@ def assemble(
         noise=Noise(
             noise.sigma,
             samples.kappa * noise.sigma,
-            noise.memory,
+            noise.autocorrelation,
             float(np.median(steps)) if steps.size else 0.0,
         ),
         reference=Reference(samples.F_0, data.model),

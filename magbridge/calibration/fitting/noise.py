@@ -25,14 +25,14 @@ class NoiseModel:
     ----------
     sigma : float
         nT, in the sensor's own units, of a single sample.
-    memory : float
-        Correlation of successive samples in a run (AR(1)).
+    autocorrelation : float
+        Of successive samples in a run: rho of AR(1).
     weight : (n,) array or None
         1 for a sample that counts, 0 for an outlier; None when all count.
     """
 
     sigma: float
-    memory: float = 0.0
+    autocorrelation: float = 0.0
     weight: FloatArray | None = None
 
     @property
@@ -60,12 +60,12 @@ def estimate_noise(
         P: posterior covariance of the coefficients).
     """
     scale = _robust(e)
-    memory = _memory(np.clip(e, -3.0 * scale, 3.0 * scale), steps == 1, doubt)
-    white = whiten(e, steps, memory)
+    rho = _autocorrelation(np.clip(e, -3.0 * scale, 3.0 * scale), steps == 1, doubt)
+    white = whiten(e, steps, rho)
     weight = (np.abs(white) <= OUTLIER * _robust(white)).astype(float)
     kept = weight.sum()
     sigma = float(np.sqrt((weight * white * white).sum() / max(kept - free, 1.0)))
-    return NoiseModel(sigma or 1e-9, memory, None if weight.all() else weight)
+    return NoiseModel(sigma or 1e-9, rho, None if weight.all() else weight)
 
 
 def _robust(e: FloatArray) -> float:
@@ -73,8 +73,8 @@ def _robust(e: FloatArray) -> float:
     return robust_scale(e) or float(np.abs(e).mean()) or 1e-9
 
 
-def _memory(e: FloatArray, follows: NDArray[np.bool_], doubt: tuple[float, float]) -> float:
-    """Return the correlation of successive residuals; 0 if it is below three of its standard errors."""
+def _autocorrelation(e: FloatArray, follows: NDArray[np.bool_], doubt: tuple[float, float]) -> float:
+    """Return that of successive residuals; 0 if it is below three of its standard errors."""
     late, early = e[1:][follows[1:]], e[:-1][follows[1:]]
     if len(late) < 30:
         return 0.0

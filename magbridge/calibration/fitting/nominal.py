@@ -105,16 +105,16 @@ def nominal(
             z = found.z
             # the moving masses are still in the residual: do not whiten, but count fewer independent samples
             noise = estimate_noise(residuals_of(samples, E @ z), samples.steps, len(keep))
-            memory, noise = noise.memory, replace(noise, memory=0.0)
+            rho, noise = noise.autocorrelation, replace(noise, autocorrelation=0.0)
         value = found.normal.cost
         if found.settled and (best is None or value < 0.999 * best[0]):
-            best = (value, found, noise, memory)
+            best = (value, found, noise, rho)
     if best is None:
         check_scales(samples, E @ z)  # a fit on its way to collapse never settles: that is the better message
         raise CalibrationError("nominal: no start settled; are the samples those of one sensor?")
-    _, found, noise, memory = best
-    noise = replace(noise, memory=memory)
-    witnesses = (1.0 - memory) / (1.0 + memory)
+    _, found, noise, rho = best
+    noise = replace(noise, autocorrelation=rho)
+    witnesses = (1.0 - rho) / (1.0 + rho)
     precision = found.normal.hessian * witnesses / noise.sigma**2 + prior.precision
     covariance = E @ covariance_of(precision) @ E.T
     coefficients = E @ found.z

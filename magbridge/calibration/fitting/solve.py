@@ -80,7 +80,9 @@ def gauss_newton(
     z = np.array(start, float)
 
     def normal_at(z: FloatArray) -> NormalEquations:
-        return prior.reduce(normal_equations(samples, prior.coefficients(z), noise.weight, noise.memory))
+        return prior.reduce(
+            normal_equations(samples, prior.coefficients(z), noise.weight, noise.autocorrelation)
+        )
 
     normal = normal_at(z)
     value = _objective(normal, prior, noise, z)

@@ -118,8 +118,8 @@ class _Design:
         attitude = np.column_stack([np.radians([[run.roll, run.pitch]] * HEADINGS), turn])
         truth = field_body(attitude, np.tile(self.field_ned, (HEADINGS, 1)))
         phi, g = self.derivative(truth, np.tile(run.parameters, (HEADINGS, 1)))
-        noise, memory = self.calibration.noise.sensor, self.calibration.noise.memory
-        weight = SAMPLES / HEADINGS / noise**2 * (1.0 - memory) / (1.0 + memory)
+        noise, rho = self.calibration.noise.sensor, self.calibration.noise.autocorrelation
+        weight = SAMPLES / HEADINGS / noise**2 * (1.0 - rho) / (1.0 + rho)
         values, vectors = np.linalg.eigh(g.T @ g * weight)
         return np.asarray(np.kron(phi[:1].T, vectors * np.sqrt(np.maximum(values, 0.0))), np.float64)
 

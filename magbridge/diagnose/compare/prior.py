@@ -98,7 +98,7 @@ def prior(
     noise = calibration.noise
     steps = np.asarray(survey.steps[learned] * (survey.interval / noise.interval if noise.interval else 1.0))
     white = np.column_stack([J, e[learned]])
-    white = whiten(white, steps, noise.memory) / level(calibration, e)
+    white = whiten(white, steps, noise.autocorrelation) / level(calibration, e)
     A, y = white[:, :-1], white[:, -1]
     values, vectors = np.linalg.eigh(np.eye(len(centre)) - A.T @ A)
     held = values > 0.1  # other directions were learned from the repeated samples alone, which count anyway

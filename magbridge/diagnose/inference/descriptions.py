@@ -27,8 +27,8 @@ from magbridge.diagnose.inference.shapes import (
     curve,
     delayed,
     direction,
+    hysteresis,
     lower_end,
-    memory,
     near_surface,
     repeated,
     response,
@@ -168,7 +168,7 @@ def _of_channels(problem: Problem) -> list[Description]:
     for name, channel in problem.survey.channels.items():
         if name not in problem.survey.still:
             held = ("actuator_order",) if name in own else ()
-            now, before = curve(channel.values), memory(channel.values)
+            now, before = curve(channel.values), hysteresis(channel.values)
             listed += [
                 _of("broadband", _along_axes(problem, now), 12, channel=name, turned=True, holds=held),
                 _of("broadband", _along_axes(problem, before), 24, channel=name, turned=True, remembers=True),

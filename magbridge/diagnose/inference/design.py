@@ -100,7 +100,7 @@ def normal(
     always in the same way, so any machine returns the same numbers. Of ``X^T X`` only the blocks that are
     `asked` for are computed, and their transposes; the others are zero.
     """
-    past = 0 if noise is None else len(noise.memory)
+    past = 0 if noise is None else len(noise.ar)
 
     def share(starts: Sequence[int]) -> tuple[FloatArray, FloatArray]:
         P, b = np.zeros((0, 0)), np.zeros(0)

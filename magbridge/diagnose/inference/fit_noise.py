@@ -1,4 +1,4 @@
-"""Fit the noise model to a residual: memory, tails and level in turn, each the likeliest given the others."""
+"""Fit the noise model to a residual: autoregression, tails and level in turn, each given the others."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from magbridge.diagnose.compare.design_columns import Columns
 from magbridge.diagnose.compare.past import Past
 from magbridge.diagnose.inference.noise import Noise, Predictors
 
-__all__ = ["LONGEST", "TAILS", "certainty", "fit_noise", "longest", "memory_order"]
+__all__ = ["LONGEST", "TAILS", "autoregressive_order", "certainty", "fit_noise", "longest"]
 
 FloatArray = NDArray[np.float64]
 
@@ -36,7 +36,7 @@ about p / n to the variance of the prediction."""
 NEAR = 0.9999
 """Largest partial correlation."""
 TIMES = 20.0
-"""Time constants of the memory that a log holds at least. Slower noise would swallow slow effects, and so few
+"""Time constants of the noise that a log holds at least. Slower noise would swallow slow effects, and so few
 repetitions cannot show its level."""
 BRIEFEST, SLOWEST = 20.0, 2000.0
 """Samples, the least and the most of the longest time constant, in short and in long logs."""
@@ -44,10 +44,10 @@ PIECE, PIECES = 600, 64
 """Pieces of a column from which its power spectrum is estimated: their length in samples, and most pieces."""
 
 
-def memory_order(residual: FloatArray, slots: NDArray[np.int64]) -> int:
+def autoregressive_order(residual: FloatArray, slots: NDArray[np.int64]) -> int:
     r"""Choose p by Akaike's criterion on a residual clipped against outliers; `slots` (n,) count intervals.
 
-    Whitening with too long a memory costs little; with too short a one, noise passes for structure.
+    Whitening with too high an order costs little; with too low a one, noise passes for structure.
 
     Notes
     -----
@@ -83,7 +83,7 @@ def certainty(residual: FloatArray, noise: Noise, columns: Sequence[Columns]) ->
 
     Notes
     -----
-    The fitted memory a has the covariance ``C = (L^T L)^-1`` of its regression, with L the p preceding
+    The fitted coefficients a have the covariance ``C = (L^T L)^-1`` of its regression, with L the p preceding
     residuals in units of s. A column x has the information ``|w|^2``,
     ``w_t = x_t - sum_k a_k x_(t-k)``:
 
@@ -93,7 +93,7 @@ def certainty(residual: FloatArray, noise: Noise, columns: Sequence[Columns]) ->
     The log of a variance estimated with f degrees of freedom has the variance 2 / f. At low frequencies the
     level is known worst.
     """
-    n, p = len(residual), len(noise.memory)
+    n, p = len(residual), len(noise.ar)
     rows = np.flatnonzero(noise.past.whole)
     if len(rows) <= 2 * p:
         return [float(n)] * len(columns)
@@ -106,7 +106,7 @@ def certainty(residual: FloatArray, noise: Noise, columns: Sequence[Columns]) ->
         for start in pieces:
             x = column(slice(start, start + PIECE))
             lags = np.array([x[p - k : len(x) - k] for k in range(1, p + 1)])
-            w = x[p:] - np.tensordot(noise.memory, lags, 1)
+            w = x[p:] - np.tensordot(noise.ar, lags, 1)
             power += float(np.sum(w * w))
             slope += np.tensordot(lags, w, 2)
         D = -2.0 * slope / power
@@ -130,31 +130,31 @@ def fit_noise(
     residual : (n,) array
         nT.
     past : Past
-        The samples before each one; its order is that of the noise's memory.
+        The samples before each one; its order is that of the autoregression.
     blocks : bool, optional
         Let the level change from block to block; decided by the data if not given.
     like : Noise, optional
         A noise that it will resemble: the fit begins from its level and tails.
     rounds : int
-        Of the alternation between memory, tails and level.
+        Of the alternation between autoregression, tails and level.
     brief : bool
-        Allow no longer memory than :data:`BRIEFEST`.
+        Allow no longer time constant than :data:`BRIEFEST`.
     """
     n, order, whole = len(residual), past.order, past.whole
     count = _counts(n)
     # a view of the p samples before each, which takes no memory
     lags = sliding_window_view(np.append(np.zeros(order), residual), order)[:n, ::-1]
-    memory, nu = np.zeros(order), 12.0
+    ar, nu = np.zeros(order), 12.0
     if like is None:
         weight, scale = np.ones(n), np.full(n, robust_scale(residual) + 1e-12)
     else:
         nu, scale = like.nu, like.scale
-        weight = (nu + 1.0) / (nu + ((residual - lags @ like.memory) / scale) ** 2)
+        weight = (nu + 1.0) / (nu + ((residual - lags @ like.ar) / scale) ** 2)
     v, log_likelihood = residual, -np.inf
     for _ in range(rounds):
         if whole.sum() > 2 * order:
-            memory = _stable(_regressed(lags, residual, whole * weight / scale**2), 0 if brief else n)
-        beside_gaps = Predictors(past, memory)
+            ar = _stable(_regressed(lags, residual, whole * weight / scale**2), 0 if brief else n)
+        beside_gaps = Predictors(past, ar)
         v = beside_gaps.innovations(residual)
         if blocks is None:
             blocks = _uneven(v, count)
@@ -164,7 +164,7 @@ def fit_noise(
         weight = (nu + 1.0) / (nu + (v / scale) ** 2)
         if abs(log_likelihood - before) < SETTLED:
             break
-    return Noise(memory, scale, nu, past, log_likelihood, v / scale)
+    return Noise(ar, scale, nu, past, log_likelihood, v / scale)
 
 
 def _regressed(lags: FloatArray, r: FloatArray, weight: FloatArray) -> FloatArray:
@@ -192,12 +192,12 @@ def longest(n: int) -> float:
     return float(np.clip(n / TIMES, BRIEFEST, SLOWEST))
 
 
-def _stable(memory: FloatArray, n: int) -> FloatArray:
+def _stable(ar: FloatArray, n: int) -> FloatArray:
     """Move roots that lie outside the unit circle, or too close to it for n samples, back inside."""
-    roots = np.roots(np.append(1.0, -memory))
+    roots = np.roots(np.append(1.0, -ar))
     size, largest = np.abs(roots), 1.0 - 1.0 / longest(n)
     if size.max(initial=0.0) < largest:
-        return memory
+        return ar
     return np.asarray(-np.real(np.poly(roots * np.where(size > largest, largest / size, 1.0)))[1:])
 
 

@@ -84,7 +84,7 @@ def fit_joint(
     columns : sequence of Columns
         The effects'.
     order : int
-        Of the noise's memory.
+        Of the noise's autoregression.
     *starts : (q + k,) array
         Starting points, of which the best is taken; without any, the prior mean.
     plain : bool
@@ -117,8 +117,8 @@ def fit_joint(
     def value(c: FloatArray, noise: Noise) -> float:
         return noise.log_likelihood - 0.5 * float(prior @ (c - centre) ** 2)
 
-    # noise with a long memory absorbs a slow effect, and no later step finds it again: so one start is fitted
-    # as if the noise had no memory
+    # noise of a long correlation absorbs a slow effect, and no later step finds it again: so one start is
+    # fitted as if the noise were white
     first = [*(starts or [centre])]
     if plain:
         first.append(_plain(X, problem.residual, prior, centre))

@@ -2,7 +2,7 @@ r"""The noise of a residual: autoregressive, heavy-tailed, and louder at some ti
 
 Notes
 -----
-A residual r has p autoregressive coefficients a (its memory) and innovations v, which have Student's
+A residual r has p autoregressive coefficients a and innovations v, which have Student's
 distribution of nu degrees of freedom and a scale s that may change from block to block::
 
     v_t = f_t (r_t - sum_k a_k r_(t-k)),   v_t / s_t ~ t_nu
@@ -49,7 +49,7 @@ class Noise:
 
     Attributes
     ----------
-    memory : (p,) array
+    ar : (p,) array
         Autoregressive coefficients.
     scale : (n,) array
         nT, s of every sample.
@@ -62,7 +62,7 @@ class Noise:
         v / s.
     """
 
-    memory: FloatArray
+    ar: FloatArray
     scale: FloatArray
     nu: float
     past: Past
@@ -77,18 +77,18 @@ class Noise:
     @property
     def independent(self) -> float:
         """Number of independent samples that determine a constant as well: ``n (1 - sum a)^2 C(0)``."""
-        return float(len(self.scale) * (1.0 - self.memory.sum()) ** 2 * autocovariance(self.memory, 0)[0])
+        return float(len(self.scale) * (1.0 - self.ar.sum()) ** 2 * autocovariance(self.ar, 0)[0])
 
     @property
     def slowest(self) -> float:
-        """Longest time constant of its memory, in samples."""
-        size = np.abs(np.roots(np.append(1.0, -self.memory))).max(initial=0.0)
+        """Longest time constant of the autoregression, in samples."""
+        size = np.abs(np.roots(np.append(1.0, -self.ar))).max(initial=0.0)
         return 1.0 / (1.0 - float(size))
 
     @cached_property
     def beside_gaps(self) -> Predictors:
         """Predictors of the samples shortly after a gap."""
-        return Predictors(self.past, self.memory)
+        return Predictors(self.past, self.ar)
 
     def filter(self, values: FloatArray, start: int = 0, skip: int = 0) -> FloatArray:
         """Whiten columns for least squares: a product with a band matrix, computed band by band.
@@ -107,7 +107,7 @@ class Noise:
         (m - skip, k) array
             Stored column by column.
         """
-        p, k, own = len(self.memory), values.shape[1], len(values) - skip
+        p, k, own = len(self.ar), values.shape[1], len(values) - skip
         count = -(-own // BAND)
         V = np.asfortranarray(values).T[:, max(skip - p, 0) :]
         lacking = max(p - skip, 0), BAND * count - own
@@ -130,7 +130,7 @@ class Noise:
     def _weights(self, rows: slice) -> FloatArray:
         """(m, p + 1) weights of each of `rows`, and of the p rows before it, in :meth:`filter`."""
         past, gaps = self.past, self.beside_gaps
-        weights = np.tile(np.append(1.0, -self.memory), (rows.stop - rows.start, 1))
+        weights = np.tile(np.append(1.0, -self.ar), (rows.stop - rows.start, 1))
         some = slice(*np.searchsorted(past.rows, [rows.start, rows.stop]))
         weights[past.rows[some] - rows.start] = gaps.weights[past.pattern[some]]
         weights *= (np.sqrt(self.kappa) / self.scale[rows])[:, None]
@@ -147,7 +147,7 @@ class Noise:
         whole = np.where(self.past.whole, y, 0.0)
         out = whole.copy()
         out[early] = gaps.f[self.past.pattern] * y[early]
-        for k, weight in enumerate(self.memory, 1):
+        for k, weight in enumerate(self.ar, 1):
             out[:-k] -= weight * whole[k:]
             # a is 0 for samples that do not exist
             out[early - k] -= (gaps.f * gaps.a[:, k - 1])[self.past.pattern] * y[early]
@@ -165,11 +165,11 @@ class Predictors:
     Parameters
     ----------
     past : Past
-    memory : (p,) array
+    ar : (p,) array
 
     Attributes
     ----------
-    past, memory
+    past, ar
     a : (l, p) array
         a of the module's notes, for each pattern of lags.
     f : (l,) array
@@ -178,10 +178,10 @@ class Predictors:
         Of a sample, f, and of those before it, ``-f a``.
     """
 
-    def __init__(self, past: Past, memory: FloatArray) -> None:
-        self.past, self.memory, lags = past, memory, past.lags
+    def __init__(self, past: Past, ar: FloatArray) -> None:
+        self.past, self.ar, lags = past, ar, past.lags
         here = lags < FAR
-        C = autocovariance(memory, int(lags[here].max(initial=0)))
+        C = autocovariance(ar, int(lags[here].max(initial=0)))
         self.a, self.f = np.zeros(lags.shape), np.ones(len(lags))
         own = np.arange(lags.shape[1])
         for start in range(0, len(lags), SOLVED):
@@ -197,23 +197,23 @@ class Predictors:
 
     def innovations(self, residual: FloatArray) -> FloatArray:
         """(n,) innovations v of a residual (n,)."""
-        past, p = self.past, len(self.memory)
+        past, p = self.past, len(self.ar)
         # a view of the p samples before each, which takes no memory
         lags = sliding_window_view(np.append(np.zeros(p), residual), p)[:-1, ::-1]
-        v = np.asarray(residual - lags @ self.memory)
+        v = np.asarray(residual - lags @ self.ar)
         # a is 0 for samples that do not exist
         own = residual[np.maximum(past.rows[:, None] - np.arange(p + 1), 0)]
         v[past.rows] = np.einsum("ij,ij->i", self.weights[past.pattern], own)
         return v
 
 
-def autocovariance(memory: FloatArray, reach: int) -> FloatArray:
+def autocovariance(ar: FloatArray, reach: int) -> FloatArray:
     """(reach + 1,) C of an autoregression whose innovations have variance 1.
 
     Levinson's recursion backwards gives the best coefficients for 0, 1, ... p samples (Brockwell & Davis
     1991, sec. 5.2).
     """
-    p, shorter, variance = len(memory), [memory], 1.0
+    p, shorter, variance = len(ar), [ar], 1.0
     while shorter[-1].size:
         a = shorter[-1]
         k = a[-1]
@@ -224,6 +224,6 @@ def autocovariance(memory: FloatArray, reach: int) -> FloatArray:
     for m in range(1, p + 1):
         C[m] = shorter[p - m] @ C[m - 1 :: -1][:m]
     if reach > p:
-        tail = lfiltic([1.0], np.append(1.0, -memory), C[p:0:-1])
-        C[p + 1 :] = lfilter([1.0], np.append(1.0, -memory), np.zeros(reach - p), zi=tail)[0]
+        tail = lfiltic([1.0], np.append(1.0, -ar), C[p:0:-1])
+        C[p + 1 :] = lfilter([1.0], np.append(1.0, -ar), np.zeros(reach - p), zi=tail)[0]
     return C[: reach + 1]

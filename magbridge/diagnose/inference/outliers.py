@@ -44,7 +44,7 @@ def outliers(fit: Joint, causes: int) -> Outliers | None:
     rows = np.flatnonzero(member > 0.5)
     if p_value >= LEVEL or not rows.size or rows.size > 0.05 * n:
         return None
-    # through the noise's memory a wrong sample also spoils the innovations after it
+    # through the noise's autoregression a wrong sample also spoils the innovations after it
     first = rows[np.insert(np.diff(rows) > 1, 0, True)]
     return Outliers(first, ratio, p_value)
 

@@ -182,7 +182,7 @@ def _passed(noise: Noise, frequency: FloatArray) -> FloatArray:
     """(2, k) power gain of whitening at frequencies (k,), per sample: away from gaps, and after them."""
     past, gaps = noise.past, noise.beside_gaps
     lags = np.arange(1, past.order + 1)
-    whole = np.abs(1.0 - np.exp(-2j * np.pi * np.outer(frequency, lags)) @ noise.memory) ** 2
+    whole = np.abs(1.0 - np.exp(-2j * np.pi * np.outer(frequency, lags)) @ noise.ar) ** 2
     waves = np.exp(-2j * np.pi * frequency[:, None, None] * past.lags)
     early = np.abs(gaps.f * (1.0 - np.sum(gaps.a * waves, axis=2))) ** 2
     return np.stack([whole, early @ np.bincount(past.pattern) / max(len(past.rows), 1)])

@@ -102,7 +102,7 @@ class State:
     groups : dict
         Cause and channel -> places of its candidates.
     brief : bool
-        Whether noise may have a short memory only: :meth:`beside_brief_noise`.
+        Whether noise may be correlated for a short time only: :meth:`beside_brief_noise`.
     """
 
     def __init__(self, problem: Problem, candidates: Sequence[Candidate], order: int, causes: int) -> None:
@@ -120,7 +120,7 @@ class State:
             self.groups.setdefault(key(candidate), []).append(k)
 
     def beside_brief_noise(self) -> State:
-        """Return the same search, with noise whose memory is too short to pass for a slow cause."""
+        """Return the same search, with noise whose correlation is too short to pass for a slow cause."""
         brief = copy(self)
         brief.brief, brief.last = True, (None, None)
         brief.null = brief.fit([])

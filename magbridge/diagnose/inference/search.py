@@ -10,7 +10,7 @@ causes are exchanged for their rivals (:mod:`.exchange`). Last, causes that late
 are dropped.
 
 Noise that ends up as slow as it may be may have absorbed what several causes do together: then none alone
-stands out from it. So a second start finds causes beside noise of a short memory. What they are worth is
+stands out from it. So a second start finds causes beside noise of a short correlation. What they are worth is
 judged beside noise of any.
 
 The rivals of each cause are read off one matrix at the end: the information of all candidates under the noise
@@ -29,7 +29,7 @@ from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.evidence import LEVEL, REMNANT, evidence_of, regressor_error
 from magbridge.diagnose.inference.exchange import exchanged
-from magbridge.diagnose.inference.fit_noise import longest, memory_order
+from magbridge.diagnose.inference.fit_noise import autoregressive_order, longest
 from magbridge.diagnose.inference.information import Information
 from magbridge.diagnose.inference.joint import Joint, fit_joint
 from magbridge.diagnose.inference.profile_likelihood import refined, sharpen
@@ -60,7 +60,7 @@ class Outcome:
     null, fit : Joint
         Fits without any cause, and with the chosen ones.
     order : int
-        Order of the noise's memory.
+        Order of the noise's autoregression.
     tested : dict
         Cause -> (smallest p-value, ratio) of the first round.
     info : Information
@@ -92,7 +92,7 @@ def search(problem: Problem, candidates: Sequence[Candidate], causes: int) -> Ou
         How many causes were asked about.
     """
     rough = fit_joint(problem, [], 1, rounds=2)
-    order = memory_order(rough.left, problem.survey.slots)
+    order = autoregressive_order(rough.left, problem.survey.slots)
     state = State(problem, candidates, order, causes)
     null = state.null = state.fit([])
     state.blocks = bool(np.ptp(null.noise.scale))  # likelihoods are comparable only under one kind of noise
@@ -110,7 +110,7 @@ def search(problem: Problem, candidates: Sequence[Candidate], causes: int) -> Ou
 
 
 def _likeliest(state: State, null: Joint, first: list[Hypothesis]) -> tuple[list[Candidate], Joint]:
-    """Return the likelier of the models found beside noise of any memory, and of a short one if need be."""
+    """Return the likelier of the models found beside any noise, and beside a short-lived one if need be."""
     model, base = _forward_selection(state, null, first)
     if model:
         model, base = exchanged(state, model, base)
@@ -122,7 +122,7 @@ def _likeliest(state: State, null: Joint, first: list[Hypothesis]) -> tuple[list
 
 
 def _beside_brief_noise(state: State) -> list[Candidate]:
-    """Return the causes found one by one beside noise whose memory is too short to pass for a slow cause."""
+    """Return the causes found one by one beside noise correlated too briefly to pass for a slow cause."""
     brief = state.beside_brief_noise()
     return _forward_selection(brief, brief.null, brief.round([], brief.null))[0]
 

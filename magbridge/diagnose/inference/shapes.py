@@ -24,8 +24,8 @@ __all__ = [
     "curve",
     "delayed",
     "direction",
+    "hysteresis",
     "lower_end",
-    "memory",
     "near_surface",
     "repeated",
     "response",
@@ -54,7 +54,7 @@ SLOPES = (0.0, 0.1, 0.2)
 
 
 def spectra(count: int, axes: int) -> tuple[tuple[str, FloatArray], ...]:
-    """Prior widths of half waves for an exponential memory (relaxation, switching), by kind.
+    """Prior widths of half waves for an exponential correlation (relaxation, switching), by kind.
 
     The k-th has ``1 / sqrt(1 + (k / k_0)^2)``, k_0 the corner of the kind.
     """
@@ -119,7 +119,7 @@ def curve(values: FloatArray) -> Columns:
     return _centred(lambda rows: powers(y[rows], 4).T, len(y))
 
 
-def memory(values: FloatArray) -> Columns:
+def hysteresis(values: FloatArray) -> Columns:
     """Functions of a channel's past (n,): curved branches of hysteresis, narrow and wide; its direction."""
     y = _scaled(values)
     plays = [play(y, width) for width in PLAYS]

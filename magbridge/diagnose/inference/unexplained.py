@@ -181,10 +181,10 @@ def _scored(
 def _calm(
     problem: Problem, model: Sequence[Columns], fit: Joint, order: int, slow: Sequence[Description]
 ) -> Noise:
-    """Return the noise that is left when slow curves are fitted, beginning with a noise without memory."""
+    """Return the noise that is left when slow curves are fitted, beginning with white noise."""
     level = robust_scale(np.diff(fit.left)) / np.sqrt(2.0) + 1e-12
     white = np.full(len(problem), level)
-    noise = replace(fit.noise, memory=np.zeros(order), scale=white, nu=1e6, innovations=fit.left / level)
+    noise = replace(fit.noise, ar=np.zeros(order), scale=white, nu=1e6, innovations=fit.left / level)
     width = np.concatenate([one.widths[1][1] for one in slow])
     past, blocks = problem.survey.past(order), bool(np.ptp(fit.noise.scale))
     for _ in range(CALM):

@@ -138,9 +138,9 @@ def spectrum(diagnosis: Diagnosis) -> str:
         )
     noise = diagnosis.fit.noise
     frequency = np.geomspace(1.0 / float(np.ptp(survey.time)), 0.5 / interval, 200)
-    lags = np.exp(-2j * np.pi * frequency[:, None] * interval * np.arange(1, len(noise.memory) + 1))
+    lags = np.exp(-2j * np.pi * frequency[:, None] * interval * np.arange(1, len(noise.ar) + 1))
     spread = float(np.median(noise.scale)) * (np.sqrt(noise.nu / (noise.nu - 2.0)) if noise.nu < 1e5 else 1.0)
-    density = spread * np.sqrt(2.0 * interval) / np.abs(1.0 - lags @ noise.memory)
+    density = spread * np.sqrt(2.0 * interval) / np.abs(1.0 - lags @ noise.ar)
     axis.loglog(frequency, density, "--", color=INK, linewidth=1, label="noise model")
     axis.yaxis.set_major_formatter(LogFormatter())
     axis.yaxis.set_minor_formatter(LogFormatter(minor_thresholds=(1.5, 0.6)))

@@ -167,15 +167,15 @@ def _left(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> str:
     rest, noise = diagnosis.unexplained, diagnosis.fit.noise
     tails = "Gaussian" if noise.nu > 1e5 else f"tails like Student's t with {noise.nu:g} degrees of freedom"
     samples = len(noise.scale)
-    memory = (
+    correlation = (
         f"correlated in time, so that {samples} samples determine a constant as well as "
         f"{noise.independent:.0f} independent ones would"
         if noise.independent < 0.95 * samples
         else "practically uncorrelated in time"
     )
     model = (
-        f"The remaining noise: {number(float(np.median(noise.scale)))} nT per sample, {tails}; {memory}. "
-        f"The calibration states {number(diagnosis.problem.calibration.noise.sensor)} nT."
+        f"The remaining noise: {number(float(np.median(noise.scale)))} nT per sample, {tails}; {correlation}."
+        f" The calibration states {number(diagnosis.problem.calibration.noise.sensor)} nT."
     )
     if rest is None:
         return (
