@@ -5,8 +5,8 @@
 accuracy      error over the posterior Cramér-Rao bound, lost runs, consistency, for narrow and wide starts,
               with the remaining errors of an auto calibration
 nominal       the same, with the remaining errors of a nominal calibration
-watch         how long a filter that is in the wrong place vouches for it
-misinformed   whether a filter vouches for its position when the level is wrong, or half of the map is
+watch         how long a wrong position counts as valid
+misinformed   whether a position counts as valid when the level is wrong, or half of the map is
 dived         gliders that dive under a map flown 90 m above the sea, without and with its continuation
 calibrations  simulated gliders, each calibrated by nominal, cubic and auto, that fly the same survey
 speed         one update, 100,000 samples, the start
@@ -28,8 +28,8 @@ lost %        the truth was outside the 99.99 % ellipse for half an hour on end
 NEES/2        mean of the squared error over its covariance, 1 when consistent; then how many of 4 instants
               have the mean of the runs within its 99 % chi-square limits
 false alarm % the filter reported to be lost, and was not
-vouched %     of the time
-after h       median over the runs of when it first vouched for its position
+valid %       of the time
+after h       median over the runs of when its position was first valid
 """
 
 from __future__ import annotations
@@ -103,7 +103,7 @@ class Runs(NamedTuple):
 
 HEAD = (
     "map, start", "DRMS m", "bound m", "ratio", "90 %", "RMS ratio", "alone m", "lost %", "NEES/2",
-    "in limits", "false alarm %", "vouched %", "after h", "ms/sample",
+    "in limits", "false alarm %", "valid %", "after h", "ms/sample",
 )  # fmt: skip
 
 
@@ -130,7 +130,7 @@ def row(label: str, runs: Sequence[Score]) -> list[str]:
         f"{nees.mean():.2f}",
         f"{np.sum((at_hours > low) & (at_hours < high))}/{len(AT_HOURS)}",
         f"{100 * np.mean([run.false_alarm for run in runs]):.0f}",
-        f"{100 * np.mean([run.vouched for run in runs]):.0f}",
+        f"{100 * np.mean([run.valid for run in runs]):.0f}",
         f"{np.median([run.waited for run in runs]):.1f}",
         f"{1e3 * np.mean([run.seconds for run in runs]):.2f}",
     ]
@@ -173,12 +173,12 @@ def calibrations(runs: Runs, _asked: argparse.Namespace) -> None:
 
 
 def watch(runs: Runs, _asked: argparse.Namespace) -> None:
-    """How soon a lost filter stops vouching for itself."""
+    """How soon a wrong position no longer counts as valid."""
     print(
         "\n"
         f"## A lost filter says so: {runs.number} runs of 6 h a row. Lost: the truth is outside the 99.99 % "
         "ellipse, and a quarter of\n"
-        "a correlation length away or more. Flagged: it no longer vouches for its position\n"
+        "a correlation length away or more. Flagged: its position is no longer valid\n"
     )
     table: Table = [("how, map", "lost %", "flagged in 30 min %", "95 % within min", "found in 2 h %")]
     for how in (carried, misled):
@@ -202,12 +202,12 @@ def watch(runs: Runs, _asked: argparse.Namespace) -> None:
 
 
 def misinformed(runs: Runs, _asked: argparse.Namespace) -> None:
-    """Whether a filter vouches for its position when the map or the calibration is worse than it claims."""
+    """Whether a position counts as valid when the map or the calibration is worse than it claims."""
     print(
         "\n"
         f"## Told wrong: {runs.number} runs of 6 h a row, on a field {LEVEL:g} nT off, or of which the map "
         "knows half the variance.\n"
-        "Share of the time that it vouches for where it is, and for where it is not\n"
+        "Share of the time in which a right position counts as valid, and a wrong one\n"
     )
     table: Table = [("how, map", "rightly %", "wrongly %", "95 % of runs, wrongly %")]
     for how in (level, half):
@@ -225,13 +225,13 @@ def dives(runs: Runs, _asked: argparse.Namespace) -> None:
         f"## Under a map from 90 m up: {runs.number} worlds, 4 h, dives of 140 m, 54 nT of rock 350 m down\n"
     )
     found = np.array(runs(partial(dived)))
-    table: Table = [("map", "error m: median", "90 %", "worst", "NEES/2", "vouched %")]
+    table: Table = [("map", "error m: median", "90 %", "worst", "NEES/2", "valid %")]
     for name, column in zip(
         ("as it was flown", "at the glider's depth"), found.transpose(1, 2, 0), strict=True
     ):
-        error, nees, vouched = column
+        error, nees, valid = column
         cells = (np.median(error), np.percentile(error, 90), error.max())
-        ends = f"{np.median(nees):.2f}", f"{100 * vouched.mean():.0f}"
+        ends = f"{np.median(nees):.2f}", f"{100 * valid.mean():.0f}"
         table.append((name, *(f"{cell:.0f}" for cell in cells), *ends))
         show(table)
 

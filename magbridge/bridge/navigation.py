@@ -108,7 +108,7 @@ class Navigation:
         return self.navigator.fix(time_us, latitude, longitude, accuracy if accuracy > 0.0 else None)
 
     def _tell(self, record: Record | None) -> None:
-        """Send an update; and a fix, if the filter vouches for it and fixes have no rate of their own."""
+        """Send an update; and a fix, if it is valid and fixes have no rate of their own."""
         if record is None:
             return
         component = self._component
@@ -136,11 +136,11 @@ class Navigation:
                 state=int(record.state),
                 accepted=int(record.accepted),
             )
-        if record.vouched and self._fix.rate == 0.0:
+        if record.valid and self._fix.rate == 0.0:
             self._send(record)
 
     def _between(self, time_us: int) -> None:
-        """Send the position dead-reckoned to `time_us` as a fix, if the filter vouches for it."""
+        """Send the position dead-reckoned to `time_us` as a fix, if it is valid."""
         if (now := self.navigator.reckon(time_us)) is not None:
             self._send(now)
 

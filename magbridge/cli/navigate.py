@@ -114,20 +114,20 @@ def _judged(track: xr.Dataset) -> tuple[dict[str, Any], str]:
     """Return a track's accuracy: by the filter's own sigma, and by the true track where the log has it."""
     from magbridge.navigate.reference_track import errors
 
-    vouched, rows = float(track["vouched"].mean()), track.sizes["time"]
+    valid, rows = float(track["valid"].mean()), track.sizes["time"]
     sigma = float((track["covariance_nn"] + track["covariance_ee"])[-1]) ** 0.5
     error, reckoned = (float((one**2).mean()) ** 0.5 for one in errors(track))
     judged = isfinite(error)
     off = f"; off by {error:.0f} m RMS, dead reckoning alone by {reckoned:.0f} m" if judged else ""
     facts = {
         "rows": rows,
-        "vouched": vouched,
+        "valid": valid,
         "sigma_m": sigma,
         "error_m": error if judged else None,
         "dead_reckoning_error_m": reckoned if judged else None,
         **track.attrs,
     }
-    return facts, f"{rows} updates, vouched for {vouched:.0%}, 1-sigma {sigma:.0f} m at the end{off}"
+    return facts, f"{rows} updates, {valid:.0%} valid, 1-sigma {sigma:.0f} m at the end{off}"
 
 
 def _bound(

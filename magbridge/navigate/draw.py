@@ -176,15 +176,15 @@ def _tracks(axis: Axes, result: xr.Dataset) -> list[Array]:
         return np.stack([longitude - result[east] / per_longitude, latitude - result[north] / per_latitude])
 
     here = np.stack([longitude, latitude])
-    sure = np.where(result["vouched"] > 0, here, np.nan)
+    sure = np.where(result["valid"] > 0, here, np.nan)
     smoothed = np.stack(
         [np.unwrap(result["smoothed_longitude"].to_numpy(), period=360.0), result["smoothed_latitude"]]
     )
     smoothed[0] += 360.0 * np.round((longitude.mean() - smoothed[0].mean()) / 360.0)
     reckoned = back("north", "east")
     axis.plot(*reckoned, color="0.35", ls="--", lw=1, label="dead reckoning")
-    axis.plot(*here, ".", color="0.35", ms=1.5, label="filter, not vouched for")
-    axis.plot(*sure, color="k", lw=1.5, label="filter, vouched for")
+    axis.plot(*here, ".", color="0.35", ms=1.5, label="filter, not valid")
+    axis.plot(*sure, color="k", lw=1.5, label="filter, valid")
     axis.plot(*smoothed, color="C2", lw=1.5, label="smoothed")
     tracks = [reckoned, sure, smoothed]
     if "error_north" in result:

@@ -52,8 +52,8 @@ class Estimate:
         µs, of the last start, fix or measurement.
     x, P : ndarray, (6,), (6, 6)
         Estimate and covariance, of :mod:`~magbridge.navigate.model`'s states.
-    vouched : bool
-        The position can be trusted: the map has described the field at odds of ``options.doubt``; the
+    valid : bool
+        The position can be used: the map has described the field at odds of ``options.doubt``; the
         filter began as wide as its rivals do, or they have since come to the same place; and nothing speaks
         against it now.
     moved : tuple of ndarray
@@ -66,7 +66,7 @@ class Estimate:
         self.grid, self.options, self._claimed = grid, options, options
         self.state = State.OFF
         self.x, self.P = prior(options)
-        self.vouched = False
+        self.valid = False
         self.moved = np.eye(6), np.zeros((6, 6))
         self.jumps: list[Jump] = []
         self.time_us, self._travelled = 0, 0.0
@@ -138,8 +138,8 @@ class Estimate:
             self._judge(block, seconds, metres, seen.log_likelihood)
         self._choose(on_the_map)
         proven = self._confirmed and self._described
-        doubted = self.odds > DOUBTFUL or self._nowhere > 0.0 or widest(self.P) > self.options.vouch_sigma
-        self.vouched = self.state is State.TRACKING and proven and not doubted
+        doubted = self.odds > DOUBTFUL or self._nowhere > 0.0 or widest(self.P) > self.options.sigma_limit
+        self.valid = self.state is State.TRACKING and proven and not doubted
         return seen
 
     def predict(self, time_us: int, travelled: float) -> tuple[float, float]:

@@ -77,8 +77,8 @@ class Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     interval : float
         s, samples within are averaged to one update; sooner if the vehicle has moved 2 % of the map's
         correlation length.
-    vouch_sigma : float
-        m, the largest 1-sigma of a position that is vouched for.
+    sigma_limit : float
+        m, the largest 1-sigma of a valid position.
     doubt : float
         Odds at which another explanation of the field replaces the filter's.
     """
@@ -95,7 +95,7 @@ class Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     noise_time: NotNegative = 0.0
     gate: Positive = 16.0
     interval: NotNegative = 20.0
-    vouch_sigma: Positive = 500.0
+    sigma_limit: Positive = 500.0
     doubt: Positive = 2_000.0
 
 

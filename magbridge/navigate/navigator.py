@@ -123,15 +123,15 @@ class Navigator:
     def reckon(self, time_us: int) -> Reckoned | None:
         """Return the position at a time after the last update, dead-reckoned from there; nothing is changed.
 
-        None if the filter does not vouch for it: the last update was not vouched for, or is too long ago.
+        None if it is not valid: the last update was not, or is too long ago.
         """
         last = self.estimate
         elapsed = (time_us - last.time_us) * 1e-6
-        if not last.vouched or elapsed > FRESH * last.options.interval:
+        if not last.valid or elapsed > FRESH * last.options.interval:
             return None
         F, Q = transition(last.options, max(elapsed, 0.0), 0.0)
         x, P = F @ last.x, F @ last.P @ F.T + Q
-        if widest(P) > last.options.vouch_sigma:
+        if widest(P) > last.options.sigma_limit:
             return None
         place = offset(*self._reckoning.ahead(time_us * 1e-6), float(x[0]), float(x[1]))
         (nn, ne), (_, ee) = P[:2, :2].tolist()
@@ -146,7 +146,7 @@ class Navigator:
         return Record(
             time_us=block.time_us,
             state=now.state,
-            vouched=now.vouched,
+            valid=now.valid,
             latitude=latitude,
             longitude=longitude,
             covariance_nn=nn,

@@ -33,8 +33,8 @@ class Record(msgspec.Struct, frozen=True, gc=False):
     time_us : int
         µs since 1970 UTC, at which the rest holds: the mean time of the samples that went in.
     state : State
-    vouched : bool
-        The position can be trusted: it may be sent as a fix.
+    valid : bool
+        The position can be used: it may be sent as a fix.
     latitude, longitude : float
         deg.
     covariance_nn, covariance_ne, covariance_ee : float
@@ -66,7 +66,7 @@ class Record(msgspec.Struct, frozen=True, gc=False):
 
     time_us: int
     state: State
-    vouched: bool
+    valid: bool
     latitude: float
     longitude: float
     covariance_nn: float

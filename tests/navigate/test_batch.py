@@ -104,7 +104,7 @@ def test_another_map_altogether_is_recognised(study: ModuleType, ds: xr.Dataset,
     wrong = study.synthetic(study.Map(30, 1500), 4)
     result = navigate(ds, wrong, options, start=PLACE)
     assert "lost for" in result.attrs["findings"]
-    assert float(result["vouched"][result["time"] > result["time"][0] + 1800].mean()) < 0.1
+    assert float(result["valid"][result["time"] > result["time"][0] + 1800].mean()) < 0.1
 
 
 def test_what_is_known_badly_says_nothing_about_the_map(

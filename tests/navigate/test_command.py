@@ -75,7 +75,7 @@ def test_a_log_against_its_map(folder: Path, capsys: pytest.CaptureFixture[str])
     assert result["error_m"] == pytest.approx(float((error**2).mean()) ** 0.5)
     alone = np.hypot(track["error_north"] - track["north"], track["error_east"] - track["east"])
     assert result["dead_reckoning_error_m"] == pytest.approx(float((alone**2).mean()) ** 0.5)
-    assert 0.0 < result["vouched"] <= 1.0
+    assert 0.0 < result["valid"] <= 1.0
     assert float(error[-100:].mean()) < 150.0
     assert picture.stat().st_size > 40_000
 

@@ -32,4 +32,4 @@ def test_a_glider_that_dives_under_it_is_found() -> None:
     flown, below = dived(2)
     assert below.error < 0.2 * flown.error
     assert below.nees < 2.0
-    assert below.vouched > 0.5
+    assert below.valid > 0.5

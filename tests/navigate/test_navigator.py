@@ -90,9 +90,9 @@ def test_a_wide_start_is_found(study: ModuleType, grid: AnomalyGrid, options: Op
 
 
 def test_carried_off_it_says_that_it_is_lost_and_finds_itself_again(study: ModuleType) -> None:
-    hours_vouched, hours_lost = import_module("voyages.lost").carried(study.Map(30, 1500), 3)
+    hours_valid, hours_lost = import_module("voyages.lost").carried(study.Map(30, 1500), 3)
     assert 0.0 < hours_lost < 2.0
-    assert hours_vouched < 0.5
+    assert hours_valid < 0.5
 
 
 def test_samples_that_cannot_be_used(grid: AnomalyGrid, options: Options) -> None:
@@ -144,7 +144,7 @@ def test_off_the_map_it_reckons(
     records, _ = feed(nav, ds, slice(0, 200))
     assert np.isnan(small.look_up(PLACE[1], PLACE[0]).anomaly)
     assert {r.state for r in records} <= {State.DEAD_RECKONING, State.SEARCHING}
-    assert not any(r.vouched for r in records)
+    assert not any(r.valid for r in records)
     assert nav.estimate.P[0, 0] > options.start_sigma**2
 
 
@@ -153,7 +153,7 @@ def test_a_flat_map_says_nothing(grid: AnomalyGrid, options: Options, ds: xr.Dat
     records, _ = feed(
         _fresh(flat, options), ds.assign(total_field=ds["total_field"] * 0 + 52_300.0), slice(0, 300)
     )
-    assert not any(r.vouched for r in records)
+    assert not any(r.valid for r in records)
 
 
 def test_across_the_antimeridian(study: ModuleType, options: Options) -> None:

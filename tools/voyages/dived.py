@@ -16,11 +16,11 @@ __all__ = ["Dived", "dived"]
 
 
 class Dived(NamedTuple):
-    """RMS error (m), mean squared error over covariance of two axes, share of the time vouched for."""
+    """RMS error (m), mean squared error over covariance of two axes, share of the time it is valid."""
 
     error: float
     nees: float
-    vouched: float
+    valid: float
 
 
 def dived(seed: int) -> tuple[Dived, Dived]:
@@ -42,5 +42,5 @@ def _score(track: xr.Dataset) -> Dived:
     return Dived(
         float(np.sqrt(np.mean(np.sum(error**2, axis=1)))),
         float(squared.mean()) / 2,
-        float(track["vouched"].mean()),
+        float(track["valid"].mean()),
     )

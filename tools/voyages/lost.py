@@ -1,4 +1,4 @@
-"""Voyages on which a filter is in the wrong place or has the wrong map, and how long it vouches for that."""
+"""Voyages on which a filter is in the wrong place or has the wrong map, and how long it is called valid."""
 
 from __future__ import annotations
 
@@ -52,10 +52,10 @@ def outside(run: Run) -> NDArray[np.bool_]:
 
 
 def silence(run: Run) -> tuple[float, float]:
-    """Return the longest spells (hours) in which the filter vouched for a wrong place, and was at one."""
-    return longest(outside(run) & run.vouched, run.hours), longest(outside(run), run.hours)
+    """Return the longest spells (hours) in which a wrong position counted as valid, and of being wrong."""
+    return longest(outside(run) & run.valid, run.hours), longest(outside(run), run.hours)
 
 
 def standing(run: Run) -> tuple[float, float]:
-    """Return the share of the time that the filter vouched for where it was, and for where it was not."""
-    return float(np.mean(run.vouched & ~outside(run))), float(np.mean(run.vouched & outside(run)))
+    """Return the share of the time in which a right position counted as valid, and a wrong one."""
+    return float(np.mean(run.valid & ~outside(run))), float(np.mean(run.valid & outside(run)))

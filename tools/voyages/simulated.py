@@ -176,7 +176,7 @@ class Run:
     error: Array  # m
     nees: Array  # squared distance of the truth, two degrees of freedom
     state: NDArray[np.int64]
-    vouched: NDArray[np.bool_]
+    valid: NDArray[np.bool_]
     bound: float  # m, RMS of the second half
     unaided: float  # m, the same of dead reckoning alone
     length: float  # m, correlation length of the map
@@ -199,8 +199,8 @@ class Run:
             nees=float(np.mean(self.nees[half])) / 2,
             at_hours=tuple(self.nees[np.searchsorted(self.hours, AT_HOURS) - 1].tolist()),
             false_alarm=bool((self.state == State.LOST).any()) and away <= 0.1,
-            vouched=float(np.mean(self.vouched)),
-            waited=float(self.hours[self.vouched][0]) if self.vouched.any() else inf,
+            valid=float(np.mean(self.valid)),
+            waited=float(self.hours[self.valid][0]) if self.valid.any() else inf,
             seconds=self.seconds,
         )
 
@@ -215,8 +215,8 @@ class Score(NamedTuple):
     nees: float
     at_hours: tuple[float, ...]  # NEES at AT_HOURS
     false_alarm: bool  # said to be lost, and the truth was never outside for more than 6 minutes
-    vouched: float  # share of the time
-    waited: float  # hours, until it first vouched for its position
+    valid: float  # share of the time
+    waited: float  # hours, until its position was first valid
     seconds: float  # of a processor, a sample
 
 
@@ -239,7 +239,7 @@ def sail(ds: xr.Dataset, grid: AnomalyGrid, options: Options) -> Run:
         record = navigator.measure(round(1e6 * t), field, sigma)
         if record is not None:
             place, spread = navigator.estimate.x[:2], navigator.estimate.P[:2, :2].ravel()
-            found.append((record.time_us * 1e-6, *place, *spread, record.state, record.vouched))
+            found.append((record.time_us * 1e-6, *place, *spread, record.state, record.valid))
     seconds = clock.process_time() - begun
     table = np.array(found, float)
     away = np.stack(

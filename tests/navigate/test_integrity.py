@@ -1,4 +1,4 @@
-"""When the navigator vouches for a position: only once the field could tell, and not against the field."""
+"""When a position is valid: only once the field could tell, and not against the field."""
 
 from __future__ import annotations
 
@@ -29,26 +29,26 @@ def alike(study: ModuleType) -> AnomalyGrid:
     )
 
 
-def test_what_nothing_can_tell_apart_is_never_vouched_for(
+def test_what_nothing_can_tell_apart_is_never_valid(
     study: ModuleType, alike: AnomalyGrid, options: Options
 ) -> None:
     """The filter tracks, and is right, but has only its claim to know in which of the twins it is."""
     claimed = replace(options, start_sigma=40.0)
     run = study.sail(study.voyage(alike, claimed, 3, hours=2.0), alike, claimed)
     assert np.median(run.error) < 100.0
-    assert not run.vouched.any()
+    assert not run.valid.any()
 
 
 def test_a_start_as_wide_as_its_rivals_needs_none(
     study: ModuleType, grid: AnomalyGrid, options: Options
 ) -> None:
-    """What narrows it down is then the field alone: it is vouched for as soon as one place is left."""
+    """What narrows it down is then the field alone: it is valid as soon as one place is left."""
     wide = replace(options, start_sigma=1500.0)
     run = study.sail(study.voyage(grid, wide, 4, hours=3.0), grid, wide)
     tracking = run.state == study.State.TRACKING
-    assert run.vouched.any()
-    assert run.vouched.sum() > 0.9 * tracking.sum()
-    assert not (run.vouched & (run.nees > study.OUTSIDE)).any()
+    assert run.valid.any()
+    assert run.valid.sum() > 0.9 * tracking.sum()
+    assert not (run.valid & (run.nees > study.OUTSIDE)).any()
 
 
 @pytest.mark.parametrize("level", [60.0, -60.0])
@@ -59,13 +59,13 @@ def test_a_calibration_that_is_off_is_not_answered_by_another_place(
     ds = study.voyage(grid, options, 11, hours=3.0)
     run = study.sail(ds.assign(total_field=ds["total_field"] + level), grid, options)
     assert study.State.LOST in run.state
-    assert not (run.vouched & (run.nees > study.OUTSIDE)).any()
+    assert not (run.valid & (run.nees > study.OUTSIDE)).any()
 
 
 def test_a_misled_filter_does_not_stand_by_it(study: ModuleType) -> None:
-    hours_vouched, hours_lost = import_module("voyages.lost").misled(study.Map(30, 1500), 6)
+    hours_valid, hours_lost = import_module("voyages.lost").misled(study.Map(30, 1500), 6)
     assert hours_lost > 0.0
-    assert hours_vouched < 0.5
+    assert hours_valid < 0.5
 
 
 def test_a_level_that_may_be_any_wanders_no_faster(grid: AnomalyGrid, options: Options) -> None:
