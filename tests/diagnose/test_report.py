@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,11 +15,21 @@ from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.compare.prior import isotropic
 from magbridge.diagnose.compare.problem import Problem
+from magbridge.diagnose.compare.survey import Channel
 from magbridge.diagnose.gain import Gain
 from magbridge.diagnose.inference.rivals import Rival
 from magbridge.diagnose.inference.search import Hypothesis
 from magbridge.diagnose.inference.unexplained import Leftover
-from magbridge.diagnose.report.doubts import IMPLAUSIBLE, gained, implausible, nameless, no_gain, unsettled
+from magbridge.diagnose.report import figures
+from magbridge.diagnose.report.doubts import (
+    IMPLAUSIBLE,
+    gained,
+    implausible,
+    nameless,
+    no_gain,
+    rivalled,
+    unsettled,
+)
 from magbridge.diagnose.report.found import _folded
 from magbridge.diagnose.report.words import chance, measured, number, physics, row, sizes
 from magbridge.diagnose.run import _verdict
@@ -153,6 +165,49 @@ def test_names_that_something_unexplained_keeps_are_told() -> None:
     assert "Not ruled out: offset drift, current field (motor&lt;1&gt;)." in said
     assert CAUSES["offset_drift"].separated_by in said
     assert nameless(rest._replace(within=()), CAUSES) == "It fits no known cause, so it has no name."
+
+
+def test_a_rival_on_another_channel_is_no_other_cause() -> None:
+    """Theory's chance is of no other cause: that a second thermometer does as well is no failure of it."""
+    own, twin, other = (
+        Candidate(cause, channel, lambda _: np.ones((1, 1)), np.ones(1), ("x",), ("nT",))
+        for cause, channel in (
+            ("temperature_offset", "hull"), ("temperature_offset", "water"), ("offset_drift", None)
+        )
+    )  # fmt: skip
+    cause = CAUSES["temperature_offset"]
+    alone, channels, causes = (
+        rivalled(own, cause, [Rival(one, 1.0) for one in rivals], 0.97)
+        for rivals in ([], [twin], [twin, other])
+    )
+    assert "water would do nearly as well" in channels
+    for said in (alone, channels):
+        assert "No other known cause comes within" in said
+        assert said.endswith("a 97 % chance of being named beside no other cause.</p>")
+    assert "cannot tell it from temperature offset (water), offset drift" in causes
+    assert cause.separated_by in causes
+    assert causes.endswith("here it was not.</p>")
+
+
+def test_of_many_channels_the_difference_s_own_are_drawn(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    rng = np.random.default_rng(1)
+    names = [f"c{k:02}" for k in range(30)]
+    values = {name: rng.normal(size=2000) for name in names}
+    survey = SimpleNamespace(
+        channels={name: Channel(x, "V", ()) for name, x in values.items()}, still=(),
+        attitude=rng.normal(size=(2000, 3)),
+    )  # fmt: skip
+    before = values["c29"] + rng.normal(size=2000)
+    monkeypatch.setattr(figures, "_png", lambda figure: figure)
+    diagnosis: Any = SimpleNamespace(
+        problem=SimpleNamespace(survey=survey), findings=(1,), before=before, after=before
+    )
+    drawn: Any = figures.channels(diagnosis)
+    shown = [axis.get_xlabel() for axis in drawn.axes if axis.get_visible()]
+    assert len(shown) == figures.CHANNELS
+    assert "c29 (V)" in shown
 
 
 def test_powers_have_units_of_their_own(problem: Problem) -> None:

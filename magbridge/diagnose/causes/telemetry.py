@@ -75,9 +75,9 @@ def _warmed(
 
 
 def temperature_offset(problem: Problem) -> list[Candidate]:
-    """Core and electronics have an offset that follows temperature: ``T += b (theta_2 - theta_0)``.
+    """Core and electronics have an offset that follows temperature: ``T += b (theta_2 - origin)``.
 
-    The core's temperature follows through the heat capacity of the hull:
+    The core's temperature theta_2 follows through the heat capacity of the hull:
     ``dtheta_1/dt = 2 (theta - theta_1) / lag``, ``dtheta_2/dt = 2 (theta_1 - theta_2) / lag``. Typically
     0.1 nT/degC for a good fluxgate, several for a low-power one (Primdahl 1979, J. Phys. E 12:241). Separated
     from depth by the thermal hysteresis of dive and climb.
@@ -86,7 +86,7 @@ def temperature_offset(problem: Problem) -> list[Candidate]:
 
 
 def temperature_scale(problem: Problem) -> list[Candidate]:
-    """Coil and resistances follow temperature: ``A += diag(b) (theta_2 - theta_0)``, 10-100 ppm/degC."""
+    """Coil and resistances follow temperature: ``A += diag(b) (theta_2 - origin)``, 10-100 ppm/degC."""
     return _thermal(problem, "scale")
 
 

@@ -56,17 +56,18 @@ def eddy_current(problem: Problem) -> list[Candidate]:
 
 
 def channel_skew(problem: Problem) -> list[Candidate]:
-    """One digitiser takes the channels in turn: ``T_i += tau_i dH_i/dt`` (paper, section 3)."""
+    """One digitiser takes the channels in turn: ``T_i += tau_i dH_i/dt``."""
     effect = RateEffect(cause="channel_skew", on="skew")
     return [of_effect(problem, effect, 0.5, "s", phi=field_rates(problem))]
 
 
 def filter_lag(problem: Problem) -> list[Candidate]:
-    """The anti-alias filter: ``T += -tau dH/dt + (variance / 2) d^2H/dt^2`` (paper, section 3).
+    """The anti-alias filter: ``T += -tau dH/dt + (variance / 2) d^2H/dt^2``.
 
     It holds the field back, not the telemetry. In a uniform field ``|H|`` shows the delay only where masses
-    move: ``u^T A dH_r/dt = -dF/dtheta dtheta/dt``. That is the signature of a clock offset of the opposite
-    sign, and the same correction removes it. The only difference is that a filter's delay cannot be negative.
+    move: ``u^T A dH_r/dt = -dF/dtheta dtheta/dt``, theta the nine coefficients. That is the signature of a
+    clock offset of the opposite sign, and the same correction removes it. The only difference is that a
+    filter's delay cannot be negative.
 
     It also shortens a field that turns. From turning calibration runs that has gone into the calibration, so
     it shows where these are compared with a survey that turns less.
@@ -97,7 +98,7 @@ def _shortened(problem: Problem) -> Candidate:
 
 
 def clock_offset(problem: Problem) -> list[Candidate]:
-    """Telemetry stamped by another clock: ``theta += tau dtheta/dp dp/dt``."""
+    """Telemetry stamped by another clock: ``T += tau dT/dp dp/dt``, and A alike."""
     return _delay(problem, ClockEffect(), 5.0)
 
 

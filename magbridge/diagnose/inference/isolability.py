@@ -143,7 +143,7 @@ def _visible(candidate: Candidate, info: Information, own: slice, hypotheses: fl
     power = np.diag(info.matrix[own, own])
     if candidate.spectra is not None:  # what counts is what all of them do together
         x = sure / float(np.sqrt(max(power.sum(), 1e-300)))
-        sizes = {"size": (_plausible(x), "of a plausible one")}
+        sizes = {"size": (_plausible(x), "times the usual one")}
     else:
         size = sure / np.sqrt(np.maximum(power, 1e-300))
         sizes = {

@@ -183,19 +183,24 @@ def outshone(finding: Finding, rest: Leftover | None) -> str:
     return "<p>The unexplained rest is stronger than this cause, and may have caused part of it.</p>"
 
 
-def rivalled(cause: Cause, rivals: Sequence[Rival], chance: float) -> str:
+def rivalled(candidate: Candidate, cause: Cause, rivals: Sequence[Rival], chance: float) -> str:
     """Say which causes could take its place, what would tell them apart, and what theory expects."""
+    theory = (
+        f"<p>In a log like this one, theory gives it a {100 * chance:.0f} % chance of being named beside no "
+        "other cause"
+    )
     if not rivals:
+        return f"<p>No other known cause comes within odds of 20:1.</p>{theory}.</p>"
+    if all(rival.cause == candidate.cause for rival in rivals):
+        channels = ", ".join(escape(str(rival.channel)) for rival in rivals)
         return (
-            "<p>No other known cause comes within odds of 20:1.</p>"
-            f"<p>In a log like this one, theory gives it a {100 * chance:.0f} % chance of being named "
-            "alone.</p>"
+            "<p>No other known cause comes within odds of 20:1. Which channel it follows is less sure: "
+            f"{channels} would do nearly as well (odds below 20:1). A log in which these channels differ "
+            f"more would tell.</p>{theory}.</p>"
         )
     return (
         f"<p>The data cannot tell it from {listed(rivals)} (odds below 20:1). To tell them apart: "
-        f"{escape(cause.separated_by)}.</p>"
-        f"<p>In a log like this one, theory gives it a {100 * chance:.0f} % chance of being named alone; "
-        "here it was not.</p>"
+        f"{escape(cause.separated_by)}.</p>{theory}; here it was not.</p>"
     )
 
 

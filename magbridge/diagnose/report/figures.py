@@ -27,6 +27,8 @@ POINTS = 4000
 """Points drawn per curve; more only make the page heavy."""
 GAP = 20.0
 """Median steps between two points beyond which no line joins them."""
+CHANNELS, BINS = 12, 20
+"""Channels drawn, and bins of each."""
 MANY = 60
 """Dives from which on no lines separate them."""
 
@@ -152,34 +154,29 @@ def spectrum(diagnosis: Diagnosis) -> str:
 
 
 def channels(diagnosis: Diagnosis) -> str:
-    """Draw the difference against each channel: mean and scatter in twenty bins, all at one scale."""
-    survey = diagnosis.problem.survey
-    shown = {
-        name: (channel.values, channel.unit)
-        for name, channel in survey.channels.items()
-        if name not in survey.still
-    }
+    """Draw the difference against the channels that it follows most: mean and scatter, all at one scale."""
+    survey, sides = diagnosis.problem.survey, _sides(diagnosis)
+    units = {name: channel.unit for name, channel in survey.channels.items() if name not in survey.still}
+    values = {name: survey.channels[name].values for name in units}
     if survey.attitude is not None:
-        shown |= {name: (survey.attitude[:, k], "deg") for k, name in enumerate(("roll", "pitch", "heading"))}
-    names = list(shown)[:12]
+        angles = ("roll", "pitch", "heading")
+        units |= dict.fromkeys(angles, "deg")
+        values |= dict(zip(angles, survey.attitude.T, strict=True))
+    binned = {name: [_binned(values[name], left) for left, _ in sides.values()] for name in units}
+    power = {name: float(np.nansum(count * mean**2)) for name, [(count, mean, _), _] in binned.items()}
+    most = sorted(power, key=power.__getitem__)[-CHANNELS:]
+    names = [name for name in units if name in most]
     columns = min(3, max(len(names), 1))
     rows = max(-(-len(names) // columns), 1)
     figure, axes = _figure(10, 2.3 * rows, rows, columns, sharey=True)
     ends = []
     for axis, name in zip(axes.flat, names, strict=False):
-        values, unit = shown[name]
-        edges = np.linspace(values.min(), values.max(), 21)
-        bins = np.clip(np.searchsorted(edges, values) - 1, 0, 19)
-        count = np.bincount(bins, minlength=20)
-        count = np.where(count > 3, count, np.nan)  # no line through what was not visited
-        middle = 0.5 * (edges[1:] + edges[:-1])
-        for left, colour in _sides(diagnosis).values():
-            mean = np.bincount(bins, left, 20) / count
-            spread = np.sqrt(np.maximum(np.bincount(bins, left**2, 20) / count - mean**2, 0.0))
+        middle = np.linspace(values[name].min(), values[name].max(), 2 * BINS + 1)[1::2]
+        for (_, mean, spread), (side, (_, colour)) in zip(binned[name], sides.items(), strict=True):
             axis.vlines(middle, mean - spread, mean + spread, color=colour, alpha=0.2, linewidth=5)
-            axis.plot(middle, mean, "o-", color=colour, markersize=2.5, linewidth=1)
+            axis.plot(middle, mean, "o-", color=colour, markersize=2.5, linewidth=1, label=side)
             ends += [mean - spread, mean + spread]
-        axis.set_xlabel(f"{name} ({unit or '1'})", fontsize=8)
+        axis.set_xlabel(f"{name} ({units[name] or '1'})", fontsize=8)
         axis.xaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
     for axis in axes.flat[len(names) :]:
         axis.set_visible(False)
@@ -188,7 +185,19 @@ def channels(diagnosis: Diagnosis) -> str:
     if ends:  # a bin or two of wild samples do not set the scale
         low, high = np.nanquantile(ends, [0.02, 0.98])
         axes[0, 0].set_ylim(low - 0.1 * (high - low), high + 0.1 * (high - low))
+        handles = axes[0, 0].get_legend_handles_labels()
+        figure.legend(*handles, fontsize=8, frameon=False, loc="outside upper right", ncols=2)
     return _png(figure)
+
+
+def _binned(values: FloatArray, left: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return count, mean and scatter of `left` in bins of a channel; NaN where it hardly was."""
+    edges = np.linspace(values.min(), values.max(), BINS + 1)
+    bins = np.clip(np.searchsorted(edges, values) - 1, 0, BINS - 1)
+    number = np.bincount(bins, minlength=BINS)
+    count = np.where(number > 3, number, np.nan)
+    mean = np.bincount(bins, left, BINS) / count
+    return count, mean, np.sqrt(np.maximum(np.bincount(bins, left**2, BINS) / count - mean**2, 0.0))
 
 
 def track(diagnosis: Diagnosis) -> str | None:

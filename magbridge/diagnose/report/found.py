@@ -28,6 +28,12 @@ if TYPE_CHECKING:
 
 __all__ = ["found", "overview"]
 
+SYMBOLS = (
+    '<p class="faint">The corrected field is <code>A (H - T)</code>, with H the reading of the channels (x '
+    "forward, y starboard, z down). A cause adds to T or to A as its formula says, with the terms of its "
+    "table; t is the time, p the position of a mass.</p>"
+)
+
 
 def found(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> list[str]:
     """Return the section on what was found: each cause, and isolated wrong samples.
@@ -43,7 +49,7 @@ def found(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> list[str]:
         if diagnosis.unexplained is not None:
             return ["<p>An effect is present, but no name is asserted: see what is left.</p>"]
         return ["<p>No cause passes the test at a family-wise false-alarm rate of 1 %.</p>"]
-    parts = [figure(figures.terms(diagnosis), "What each cause adds to the total field.")]
+    parts = [figure(figures.terms(diagnosis), "What each cause adds to the total field."), SYMBOLS]
     for k, finding in enumerate(diagnosis.findings):
         parts += [f'<h3 id="cause{k}">{bold(finding.candidate)}</h3>']
         parts += _cause(diagnosis, finding, causes[finding.candidate.cause])
@@ -84,9 +90,9 @@ def _cause(diagnosis: Diagnosis, finding: Finding, cause: Cause) -> list[str]:
         (
             f"<p>Signal-to-noise {finding.signal_to_noise:.1f} with the calibration refitted. The chance "
             "that any of the causes tried would look this strong by noise alone is "
-            f"{chance(finding.hypothesis.p_value)}. Without this cause the held-out RMS is "
-            f"{1 / max(gain.ratio, 1e-9):.2f} times as large (95 %: {1 / max(gain.interval[1], 1e-9):.2f} to "
-            f"{1 / max(gain.interval[0], 1e-9):.2f}).</p>"
+            f"{chance(finding.hypothesis.p_value)}. Without this cause, all else fitted anew, the held-out "
+            f"RMS is {1 / max(gain.ratio, 1e-9):.2f} times as large (95 %: "
+            f"{1 / max(gain.interval[1], 1e-9):.2f} to {1 / max(gain.interval[0], 1e-9):.2f}).</p>"
         ),
         _folded(
             f"<table><tr><th>term</th><th>value</th><th>1 sigma</th><th>unit</th></tr>{rows}</table>",
@@ -98,7 +104,7 @@ def _cause(diagnosis: Diagnosis, finding: Finding, cause: Cause) -> list[str]:
         in_motion(diagnosis, finding),
         grounded(diagnosis, candidate),
         shortened(finding),
-        rivalled(cause, finding.rivals, chance_alone(diagnosis, finding.hypothesis)),
+        rivalled(candidate, cause, finding.rivals, chance_alone(diagnosis, finding.hypothesis)),
         no_gain(gain),
         outshone(finding, diagnosis.unexplained),
     ]

@@ -75,7 +75,7 @@ def _verdict(diagnosis: Diagnosis, remarks: Sequence[str]) -> list[str]:
     return [
         (
             f'<p class="faint">{first} to {last} UTC · {len(survey)} samples{dives} · '
-            f"calibration: {escape(diagnosis.problem.calibration.method or 'unnamed')}, "
+            f"calibration by method {escape(diagnosis.problem.calibration.method or 'unnamed')}, "
             f"{diagnosis.problem.calibration.coefficients.size} coefficients</p>"
         ),
         f'<p class="verdict">{_sentence(diagnosis)}</p>',
@@ -118,8 +118,8 @@ def _compared(diagnosis: Diagnosis) -> list[str]:
         "</div>",
         figure(
             figures.channels(diagnosis),
-            "The difference against each channel: mean and scatter in twenty bins. A line that is not flat "
-            "is an effect that the model lacks.",
+            "The difference against the channels that it follows most: mean and scatter in twenty bins. A "
+            "line that is not flat is an effect that the model lacks.",
         ),
         figure(
             figures.track(diagnosis),
@@ -182,10 +182,10 @@ def _left(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> str:
             "<p>No further structure was found: no slow curve, no steps, no function of attitude. "
             f"{model}</p>"
         )
-    goes = f", and correlates best with <code>{escape(rest.best_channel)}</code>" if rest.best_channel else ""
+    goes = f"; it follows <code>{escape(rest.best_channel)}</code> best" if rest.best_channel else ""
     period = f" of period {rest.period_s:.4g} s" if rest.period_s else ""
     return (
-        f"<p><b>{KINDS[rest.kind]}</b>{period} is left, with signal-to-noise "
+        f"<p><b>{KINDS[rest.kind]}</b>{period} is left, of signal-to-noise "
         f"{rest.signal_to_noise:.1f}{goes}. {nameless(rest, causes)} {model}</p>"
     )
 
@@ -215,8 +215,8 @@ def _isolability(diagnosis: Diagnosis) -> list[str]:
             "one).</p>"
         ),
         (
-            "<table><tr><th>cause</th><th>50 % at S/N</th><th>95 % at S/N</th>"
-            f"<th>smallest visible size</th></tr>{rows}</table>"
+            "<table><tr><th>cause</th><th>S/N found in 50 %</th><th>in 95 %</th>"
+            f"<th>smallest size found in 95 %</th></tr>{rows}</table>"
         ),
         "<h3>Causes that look alike</h3>"
         f"<table><tr><th>one</th><th>another</th><th>correlation</th></tr>{pairs}</table>"
