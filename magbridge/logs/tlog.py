@@ -14,12 +14,13 @@ so a replay knows that records are missing.
 from __future__ import annotations
 
 import os
-from collections import deque
+import time
 from collections.abc import Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
-from threading import Event, Thread
+from queue import SimpleQueue
+from threading import Thread
 from types import TracebackType
 from typing import Self
 
@@ -35,8 +36,8 @@ WINDOW = 0.005
 """s between two writes: up to 200 events a second each is written at once, and ``kill -9`` costs at most the
 last one; at higher rates it costs the events of 5 ms. The latency is the same; the writing thread takes 66 us
 per sample at 100 Hz, where every event has a write of its own, and 19 us at 1,000 Hz."""
-QUEUE = 100_000
-"""Records (some 10 MB) that wait for a stalled disk before they are dropped."""
+QUEUE = 50_000
+"""Events (some 10 MB) whose records wait for a stalled disk; those that follow are dropped."""
 RETRY_US = 2_000_000
 """µs of the events' time after which a log that failed is tried again, in a new file."""
 SYNC_US = 5_000_000
@@ -89,11 +90,10 @@ class TlogWriter:
         self._head, self.beginning = tuple(head), beginning
         self.records, self.failure = 0, ""
         # used by the live thread
-        self._queue: deque[Sequence[Record]] = deque()
-        self._put = self._refused = 0
-        self._idle, self._wake, self._closing = True, Event(), Event()
+        self._queue: SimpleQueue[Sequence[Record]] = SimpleQueue()
+        self._refused = 0
         # used by the writing thread
-        self._taken = self._dropped = 0
+        self._dropped = 0
         self._file, self._name = -1, self._directory
         self._size = self._index = self._begin_s = 0
         self._torn = False
@@ -122,19 +122,14 @@ class TlogWriter:
 
     def extend(self, records: Sequence[Record]) -> None:
         """Log the frames of an event, as :meth:`write` does; the caller must not change the list later."""
-        if self._put - self._taken > QUEUE:
+        if self._queue.qsize() < QUEUE:
+            self._queue.put(records)
+        else:
             self._refused += len(records)
-            return
-        self._put += len(records)
-        self._queue.append(records)
-        if self._idle:
-            self._idle = False
-            self._wake.set()
 
     def close(self, timeout: float = 5.0) -> None:
         """Write the queue and end; wait for a stalled disk at most `timeout` s."""
-        self._closing.set()
-        self._wake.set()
+        self._queue.put(())
         self._thread.join(timeout)
 
     def __enter__(self) -> Self:
@@ -146,24 +141,18 @@ class TlogWriter:
         self.close()
 
     def _run(self) -> None:
-        while True:
-            self._wake.wait()
-            self._wake.clear()
-            while self._queue:
-                self._drain()
-                self._closing.wait(WINDOW)
-            self._idle = True
-            if self._queue:  # came between the loop's last check and the line above
-                self._wake.set()
-            elif self._closing.is_set():
-                break
+        """Write what has come, until an event without records ends it."""
+        events: list[Sequence[Record]] = []
+        while not events or events[-1]:
+            events = [self._queue.get()]
+            events += [self._queue.get() for _ in range(self._queue.qsize())]
+            if records := [record for event in events for record in event]:
+                self._put_all(records)
+            time.sleep(WINDOW)
         self._end_file()
 
-    def _drain(self) -> None:
-        records: list[Record] = []
-        for _ in range(len(self._queue)):
-            records += self._queue.popleft()
-        self._taken += len(records)
+    def _put_all(self, records: list[Record]) -> None:
+        """Write records, where they do not fit the file one by one and into the next."""
         data = _packed(records)
         if self._fits(len(data), records[-1][0]):
             self._put_down(data, records)
@@ -220,13 +209,13 @@ class TlogWriter:
                 self._name.stat()  # raises if the file was deleted: writing to it would go on, and be lost
                 self._synced_us = time_us
         except OSError as error:
-            self._dropped += len(records)
             self._fail(error, time_us)
+            self._dropped += len(records)
             return
         self._size += len(data)
         self._torn = False
-        self.records += len(records)
         self.failure = ""
+        self.records += len(records)
 
     def _fail(self, error: OSError, time_us: int) -> None:
         self._torn = True

@@ -55,7 +55,7 @@ def test_a_log_after_a_loss_is_replayed_as_far_as_it_can_be(tmp_path: Path) -> N
             for event in events(pipeline, begin, end):
                 pipeline.feed(event)
                 log.extend(pipeline.journal.drain())
-            while log._taken < log._put or not log._idle:
+            while log.records + log.lost < pipeline.journal.count:
                 time.sleep(0.002)
 
         play(0, 400)

@@ -115,7 +115,7 @@ def put(n, step):
         log.write({T0} + step * k, 0, frame)
         k += 1
         time.sleep(0.0005)
-    while not log._idle:
+    while log.records + log.lost < k:
         time.sleep(0.001)
 put(100, 4)
 assert log.failure == 'File too large', log.failure
@@ -142,8 +142,9 @@ def test_a_log_that_is_removed_is_missed(tmp_path: Path, removed: str) -> None:
     """It can still be written to, as any file that is open; whoever looks for it later finds nothing."""
 
     def write(time_us: int) -> tuple[int, int, str]:
+        before = log.records + log.lost
         log.write(time_us, Channel.SENT, FRAME)
-        while not log._idle:
+        while log.records + log.lost == before:
             time.sleep(0.001)
         return log.records, log.lost, log.failure
 
@@ -165,7 +166,6 @@ def test_a_file_after_a_loss_begins_with_the_beginning_and_one_in_turn_does_not(
     with TlogWriter(folder, head=[head], beginning=[begin], max_age=1e-3) as log:
         for k in (0, 1, 2):
             log.write(T0 + k * 4_000_000, 0, FRAME)
-        log._wake.set()
         while log.records < 3:
             time.sleep(0.001)
         folder.rename(aside)
