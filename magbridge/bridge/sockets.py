@@ -24,15 +24,19 @@ __all__ = ["LINKS", "TcpClient", "TcpServer", "UdpPort", "open_link"]
 
 UNSENT = 4096
 """Bytes that may wait in the system for a slow connection; the rest waits here, where it can be dropped."""
+SHARE = 8192
+"""Bytes of a connection that are read before the sensor's turn: a flood of them is parsed in some 10 ms."""
 PEER_TIMEOUT = 30.0
 """s without a packet after which a UDP peer is forgotten, or connected anew."""
+PEERS = 16
+"""Stations that ``udpin`` answers; of more, those heard last."""
 AWAY = (errno.ECONNREFUSED, errno.ENETUNREACH, errno.EHOSTUNREACH, errno.ENETDOWN, errno.EPERM)
 """What a UDP socket reports when nobody listens (yet): no fault of the port."""
 ADDRESS = re.compile(r"(?://)?(?:\[(?P<ipv6>.+)\]|(?P<host>[^:]*)):(?P<port>[0-9]{1,5})")
 
 
 class UdpPort(Port):
-    """``udpout`` sends to one address; ``udpin`` answers everyone it has heard from lately."""
+    """``udpout`` sends to one address; ``udpin`` answers the stations that it has heard from lately."""
 
     def __init__(self, name: str, address: tuple[str, int], *, listen: bool) -> None:
         super().__init__(name)
@@ -101,7 +105,10 @@ class UdpPort(Port):
                 raise self.lost(error.strerror) from error
             self._heard = time.monotonic()
             if self._listen:
+                self._peers.pop(peer, None)  # so that the dict is in the order in which they were heard last
                 self._peers[peer] = self._heard
+                if len(self._peers) > PEERS:
+                    del self._peers[next(iter(self._peers))]
             data += datagram
             if not datagram:
                 break  # empty datagrams could keep this loop running for ever
@@ -157,7 +164,7 @@ class _Connection(Stream):
         """Return what has come."""
         assert self._connection is not None
         try:
-            data = self._connection.recv(CHUNK)
+            data = self._connection.recv(SHARE)
         except BlockingIOError:
             return b""
         except OSError as error:
