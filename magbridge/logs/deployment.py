@@ -20,6 +20,7 @@ __all__ = [
     "deployment",
     "increasing",
     "join",
+    "lasting",
     "passed_over",
     "plausible",
     "same_columns",
@@ -31,6 +32,8 @@ Floats = NDArray[np.float64]
 
 MEANING = {"heading_reference": "true", "time_reference": "utc"}
 """Attributes that change what values mean, and their defaults."""
+SETTINGS = "align.", "telemetry."
+"""What the names of the numbers begin with by which a bridge corrected, as its log declares them."""
 YEAR_10000 = 253_402_300_800.0
 """s since 1970: a later time is in another unit, and no calendar goes beyond it."""
 MOST = {"latitude": 90.0, **dict.fromkeys(("longitude", "roll", "pitch", "heading"), 540.0), "depth": 1e5}
@@ -242,6 +245,15 @@ def join(parts: Sequence[xr.Dataset]) -> xr.Dataset:
     return xr.Dataset(
         variables, coords={"time": ("time", time[order][starts], parts[0]["time"].attrs)}, attrs=attrs
     )
+
+
+def lasting(attrs: Mapping[Any, Any]) -> dict[str, str | float]:
+    """Return what a format that cannot keep all attributes must: those of :data:`MEANING`, and settings."""
+    return {
+        str(name): value
+        for name, value in attrs.items()
+        if name in MEANING or (isinstance(value, (int, float)) and str(name).startswith(SETTINGS))
+    }
 
 
 def uncounted(dataset: xr.Dataset) -> xr.Dataset:

@@ -21,7 +21,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from magbridge.columns import CHANNEL_TIMES, CHANNELS, CORRECTED
-from magbridge.logs.deployment import MEANING
+from magbridge.logs.deployment import lasting
 from magbridge.logs.telemetry_fields import POWER_CYCLE, UNKNOWN_INT
 from magbridge.mavlink import Codec, Spec, pack_record, spec
 from magbridge.mavlink.messages import east_e7
@@ -78,7 +78,8 @@ class FileWriter:
 
     def _declare(self, dataset: xr.Dataset) -> None:
         said: list[dict[str, Any]] = [
-            {"column": key, "unit": str(dataset.attrs[key])} for key in MEANING if key in dataset.attrs
+            {"column": key, "unit" if isinstance(value, str) else "scale": value}
+            for key, value in lasting(dataset.attrs).items()
         ]
         taken: set[str] = set()
         for name in map(str, dataset.data_vars):

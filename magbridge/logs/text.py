@@ -3,8 +3,9 @@
 A heading is ``name`` or ``name [unit]``: ``battpos [in]``. Columns of :data:`magbridge.columns.COLUMNS` need
 no unit; those in another known unit (``mag_x [uT]``, ``roll [rad]``) are converted. Before the header there
 may be lines such as ``# heading_reference = magnetic``, and ``# fill_value = -9999`` where that number stands
-for a missing value. ``quality`` holds the names of the flags, separated by spaces. Numbers are written with
-as many digits as it takes to read back the same float64.
+for a missing value; from a bridge's log, also the settings by which it corrected. ``quality`` holds the names
+of the flags, separated by spaces. Numbers are written with as many digits as it takes to read back the same
+float64.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ import xarray as xr
 
 from magbridge.columns import COLUMNS
 from magbridge.errors import FormatError
-from magbridge.logs.deployment import MEANING, deployment, increasing, plausible
+from magbridge.logs.deployment import SETTINGS, deployment, increasing, lasting, plausible
 from magbridge.records import Quality
 
 __all__ = ["FileWriter", "chunks"]
@@ -30,7 +31,7 @@ __all__ = ["FileWriter", "chunks"]
 HEADING = re.compile(r"(?P<name>.*?)\s*(?:\[(?P<unit>[^\]]*)\])?")
 LONGEST = 1 << 20
 """Characters of the longest line that is read."""
-ATTRIBUTE = re.compile(r"#\s*(\w+)\s*=\s*(.*?)\s*")
+ATTRIBUTE = re.compile(r"#\s*([\w.-]+)\s*=\s*(.*?)\s*")
 
 
 def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
@@ -53,24 +54,26 @@ def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
 class _Header(NamedTuple):
     """What precedes the rows, and the number of the header's line."""
 
-    attrs: dict[str, str]
+    attrs: dict[str, str | float]
     fill: float
     names: list[str]
     units: dict[str, str]
     row: int
 
 
-def _header(path: Path, text: Iterator[str]) -> _Header:
+def _header(path: Path, lines: Iterator[str]) -> _Header:
     """Read the comments and the names of the columns from the first lines."""
-    attrs: dict[str, str] = {}
+    attrs: dict[str, str | float] = {}
     fill = nan
-    line, row = next(text, ""), 1
+    line, row = next(lines, ""), 1
     while line.startswith("#"):
         if match := ATTRIBUTE.fullmatch(line.rstrip("\r\n")):
-            attrs[match[1]] = match[2]
-            if match[1] == "fill_value":
-                (fill,) = _numbers(path, match[1], [attrs.pop(match[1])], [row])
-        line, row = next(text, ""), row + 1
+            name, text = match.groups()
+            if name == "fill_value":
+                (fill,) = _numbers(path, name, [text], [row])
+            else:
+                attrs[name] = _numbers(path, name, [text], [row])[0] if name.startswith(SETTINGS) else text
+        line, row = next(lines, ""), row + 1
     if not line.strip():
         raise FormatError(path, "expected a header row, the file is empty", row=row)
     matches = [HEADING.fullmatch(heading.strip()) for heading in next(csv.reader([line]))]
@@ -157,9 +160,8 @@ class FileWriter:
     def append(self, dataset: xr.Dataset, *, first: bool) -> None:
         """Write the rows, and before the first ones the header."""
         if first:
-            for key in MEANING:
-                if key in dataset.attrs:
-                    self._file.write(f"# {key} = {dataset.attrs[key]}\n")
+            for key, value in lasting(dataset.attrs).items():
+                self._file.write(f"# {key} = {value}\n")
             self._csv.writerow(["time", *(_heading(dataset[name]) for name in dataset.data_vars)])
         columns = [_texts("time", dataset["time"].values)]
         columns += [_texts(str(name), dataset[name].values) for name in dataset.data_vars]
