@@ -16,7 +16,7 @@ from magbridge.diagnose.inference.joint import Joint
 from magbridge.diagnose.inference.outliers import Outliers
 from magbridge.diagnose.inference.rivals import Rival
 from magbridge.diagnose.inference.search import Hypothesis, Outcome
-from magbridge.diagnose.inference.unexplained import Leftover
+from magbridge.diagnose.unexplained.leftover import Leftover
 
 __all__ = ["Diagnosis", "Finding"]
 

@@ -1,4 +1,4 @@
-"""The whole of a diagnosis: compare, search, extend, measure the gain."""
+"""The whole of a diagnosis: compare, search, weigh names against descriptions, extend, measure the gain."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from threadpoolctl import threadpool_limits
 
 from magbridge.calibration.instrument_effects import TimeEffect
 from magbridge.calibration.model import Calibration
+from magbridge.diagnose.accept import accept
 from magbridge.diagnose.causes import CAUSES, Cause
 from magbridge.diagnose.causes.candidates import Candidate, since, slices
 from magbridge.diagnose.compare.problem import Problem, pose
@@ -22,7 +23,6 @@ from magbridge.diagnose.compare.take import take
 from magbridge.diagnose.diagnosis import Diagnosis, Finding
 from magbridge.diagnose.extend import extend, flyable, relinearised, with_map_error, with_misfit
 from magbridge.diagnose.gain import Gain, held_out, paired
-from magbridge.diagnose.inference.accept import accept
 from magbridge.diagnose.inference.evidence import ODDS, REMNANT
 from magbridge.diagnose.inference.isolability import isolability
 from magbridge.diagnose.inference.joint import Joint
@@ -30,7 +30,7 @@ from magbridge.diagnose.inference.nonlinear_uncertainty import loosened
 from magbridge.diagnose.inference.outliers import Outliers, outliers
 from magbridge.diagnose.inference.rivals import Rival
 from magbridge.diagnose.inference.search import Hypothesis, search
-from magbridge.diagnose.inference.unexplained import Leftover, leftover
+from magbridge.diagnose.unexplained.leftover import Leftover, leftover
 from magbridge.errors import DataError
 from magbridge.field.grid import AnomalyGrid
 
@@ -111,14 +111,11 @@ def _examine(
     progress("searching")
     outcome = search(problem, candidates, len(causes))
     progress("what is left")
-    wrong = outliers(outcome.fit, len(causes))
-    tones = [] if "interference_tone" in causes else CAUSES["interference_tone"].candidates(problem)
-    tone = tones[0] if tones else None
+    tone = _strongest_tone(problem, causes)
     stand, rest = accept(problem, outcome, tone)
     named, rivals, fit = (outcome.chosen, outcome.rivals, outcome.fit) if stand else ((), (), outcome.null)
     model = [h.candidate for h in named]
-    if wrong is not None and named and wrong.ratio < (REMNANT * max(h.signal_to_noise for h in named)) ** 2:
-        wrong = None  # a remnant of the strongest cause's idealised regressor
+    wrong = _wrong(outcome.fit, named, len(causes))
     progress("extending the calibration")
     settled, columns, fit = relinearised(problem, model, fit, outcome.order)
     fit = with_misfit(model, loosened(settled, model, columns, fit, candidates))
@@ -180,6 +177,19 @@ def _whenever(candidates: Sequence[Candidate], learned: NDArray[np.bool_]) -> li
     timed = [any(isinstance(effect, TimeEffect) for effect in candidate.effects) for candidate in candidates]
     lasting = [c for c, has_time in zip(candidates, timed, strict=True) if c.effects and not has_time]
     return [*candidates, *(since(candidate, learned) for candidate in lasting)]
+
+
+def _strongest_tone(problem: Problem, causes: Mapping[str, Cause]) -> Candidate | None:
+    """Return the strongest tone, to describe what is left, where tones are not among the causes."""
+    tones = [] if "interference_tone" in causes else CAUSES["interference_tone"].candidates(problem)
+    return tones[0] if tones else None
+
+
+def _wrong(fit: Joint, named: Sequence[Hypothesis], causes: int) -> Outliers | None:
+    """Return the isolated wrong samples, unless they may be a remnant of the strongest cause."""
+    wrong = outliers(fit, causes)
+    strongest = max((h.signal_to_noise for h in named), default=0.0)
+    return wrong if wrong is not None and wrong.ratio >= (REMNANT * strongest) ** 2 else None
 
 
 def _counted(problem: Problem, wrong: Outliers | None) -> NDArray[np.bool_]:

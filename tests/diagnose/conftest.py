@@ -17,8 +17,8 @@ from magbridge.diagnose.compare.past import FAR
 from magbridge.diagnose.compare.problem import Problem, pose
 from magbridge.diagnose.compare.survey import Channel, Survey
 from magbridge.diagnose.compare.take import take
-from magbridge.diagnose.inference.descriptions import Description, descriptions
 from magbridge.diagnose.inference.joint import fit_joint
+from magbridge.diagnose.unexplained.descriptions import Description, descriptions
 from sitl import load, simulate
 from sitl.dataset import segments
 

@@ -8,13 +8,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from magbridge.diagnose.accept import _within, accept
 from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.compare.problem import Problem
-from magbridge.diagnose.inference.accept import _within, accept
 from magbridge.diagnose.inference.evidence import ODDS
 from magbridge.diagnose.inference.search import search
-from magbridge.diagnose.inference.varying import varying
+from magbridge.diagnose.unexplained.varying import varying
 
 ROWS = 300
 

@@ -12,10 +12,10 @@ from magbridge.calibration.fitting.observe import observations
 from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.causes.masses import actuator_order, hysteresis
 from magbridge.diagnose.compare.problem import Problem
-from magbridge.diagnose.inference.descriptions import Description
-from magbridge.diagnose.inference.shapes import bends, crossing, delayed, near_surface, response, swings
 from magbridge.diagnose.inference.statistic import SIZES, Statistic
 from magbridge.diagnose.run import diagnose
+from magbridge.diagnose.unexplained.descriptions import Description
+from magbridge.diagnose.unexplained.shapes import bends, crossing, delayed, near_surface, response, swings
 from sitl import load, simulate
 from sitl.dataset import segments
 

@@ -13,9 +13,9 @@ from magbridge.diagnose.compare.problem import Problem, pose
 from magbridge.diagnose.compare.survey import Survey
 from magbridge.diagnose.inference.information import information
 from magbridge.diagnose.inference.joint import fit_joint
-from magbridge.diagnose.inference.packets import Packets, packets
-from magbridge.diagnose.inference.shapes import lower_end, repeated
 from magbridge.diagnose.inference.statistic import Ridge, Statistic
+from magbridge.diagnose.unexplained.packets import Packets, packets
+from magbridge.diagnose.unexplained.shapes import lower_end, repeated
 
 
 def drawn(problem: Problem, rho: float, rng: np.random.Generator) -> NDArray[np.float64]:

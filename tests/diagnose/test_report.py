@@ -19,7 +19,6 @@ from magbridge.diagnose.compare.survey import Channel
 from magbridge.diagnose.gain import Gain
 from magbridge.diagnose.inference.rivals import Rival
 from magbridge.diagnose.inference.search import Hypothesis
-from magbridge.diagnose.inference.unexplained import Leftover
 from magbridge.diagnose.report import figures
 from magbridge.diagnose.report.doubts import (
     IMPLAUSIBLE,
@@ -33,6 +32,7 @@ from magbridge.diagnose.report.doubts import (
 from magbridge.diagnose.report.found import _folded
 from magbridge.diagnose.report.words import chance, measured, number, physics, row, sizes
 from magbridge.diagnose.run import _verdict
+from magbridge.diagnose.unexplained.leftover import Leftover
 
 
 @pytest.mark.parametrize("cause", CAUSES)

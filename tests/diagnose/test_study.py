@@ -25,7 +25,7 @@ from study.rates import beside_ideal, efficiency, share
 from study.table import lines
 from study.theory import SIZES
 
-from magbridge.diagnose.inference.descriptions import Description
+from magbridge.diagnose.unexplained.descriptions import Description
 from sitl import Twin, load
 from sitl.signals import correlated
 

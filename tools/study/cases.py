@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.diagnosis import Diagnosis
-from magbridge.diagnose.inference.descriptions import Description, descriptions
 from magbridge.diagnose.report.findings import findings
 from magbridge.diagnose.run import diagnose
+from magbridge.diagnose.unexplained.descriptions import Description, descriptions
 from sitl.inject import EFFECTS, FOREIGN, Hidden
 from study.both import both
 from study.deployment import CHARTS, SEEDS, Background, Injected, deployment_of

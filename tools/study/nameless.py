@@ -28,8 +28,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from magbridge.diagnose.inference.descriptions import Description
 from magbridge.diagnose.inference.evidence import ODDS
+from magbridge.diagnose.unexplained.descriptions import Description
 from study.draws import Draws, Span, log_bayes
 
 Array = NDArray[np.float64]

@@ -28,8 +28,8 @@ from scipy.special import chdtrc
 from magbridge.diagnose.causes import Cause
 from magbridge.diagnose.compare.problem import pose
 from magbridge.diagnose.compare.take import take
-from magbridge.diagnose.inference.descriptions import Description
 from magbridge.diagnose.inference.evidence import LEVEL, ODDS
+from magbridge.diagnose.unexplained.descriptions import Description
 from study.deployment import Background, Injected, compare, project
 from study.draws import SHOWN, Draws, Span, by_cause, evidence, explained, log_bayes, numbers, with_another
 from study.nameless import against, nameless

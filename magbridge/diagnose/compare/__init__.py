@@ -1,1 +1,5 @@
-"""The comparison: what was measured against what the forward model predicts, as a linear problem."""
+"""The comparison: what was measured against what the forward model predicts, as a linear problem.
+
+:mod:`.take` gathers deployments into a :mod:`.survey`. :mod:`.problem` linearises it about the calibration,
+whose coefficients stay free (:mod:`.prior`). Every hypothesis adds :mod:`.design_columns` to that problem.
+"""

@@ -1,1 +1,15 @@
-"""Inference: likelihood and noise, the search for causes, the unexplained rest, what can be told apart."""
+"""Inference: which candidates the data support.
+
+*The likelihood.* :mod:`.noise` whitens, and :mod:`.fit_noise` fits it to a residual; :mod:`.design` holds the
+columns of a hypothesis, and :mod:`.joint` fits them together with calibration and noise.
+
+*One candidate.* :mod:`.information` has scores and Fisher information of all candidates at once;
+:mod:`.statistic` is their likelihood ratio, :mod:`.evidence` what it is worth as evidence and as a test.
+
+*The search.* :mod:`.search` adds cause after cause, each in one of the :mod:`.rounds`.
+:mod:`.profile_likelihood` refines nonlinear parameters, :mod:`.exchange` replaces causes by their
+:mod:`.rivals`, also in :mod:`.pairs`.
+
+*What it is worth.* :mod:`.nonlinear_uncertainty` widens the covariance, :mod:`.outliers` tests for isolated
+wrong samples, and :mod:`.isolability` and :mod:`.naming` say what such a log could have shown at all.
+"""

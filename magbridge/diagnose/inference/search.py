@@ -33,9 +33,8 @@ from magbridge.diagnose.inference.fit_noise import autoregressive_order, longest
 from magbridge.diagnose.inference.information import Information
 from magbridge.diagnose.inference.joint import Joint, fit_joint
 from magbridge.diagnose.inference.profile_likelihood import refined, sharpen
-from magbridge.diagnose.inference.rivals import Rival
+from magbridge.diagnose.inference.rivals import Rival, sets_of
 from magbridge.diagnose.inference.rounds import Hypothesis, State
-from magbridge.diagnose.inference.sets import sets_of
 
 __all__ = ["Hypothesis", "Outcome", "search"]
 

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from magbridge.diagnose.diagnosis import Diagnosis, Finding
     from magbridge.diagnose.gain import Gain
     from magbridge.diagnose.inference.rivals import Rival
-    from magbridge.diagnose.inference.unexplained import Leftover
+    from magbridge.diagnose.unexplained.leftover import Leftover
 
 __all__ = [
     "gained",

@@ -17,9 +17,9 @@ from magbridge.diagnose.compare.interpolation import rates
 from magbridge.diagnose.compare.problem import Problem, effect_columns
 from magbridge.diagnose.compare.survey import Channel
 from magbridge.diagnose.inference.joint import Joint
-from magbridge.diagnose.inference.packets import packets
-from magbridge.diagnose.inference.passage import passage
-from magbridge.diagnose.inference.shapes import (
+from magbridge.diagnose.unexplained.packets import packets
+from magbridge.diagnose.unexplained.passage import passage
+from magbridge.diagnose.unexplained.shapes import (
     REPEATED,
     SLOPES,
     bends,

@@ -12,8 +12,8 @@ from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.evidence import ODDS, REMNANT, log_odds
 from magbridge.diagnose.inference.rivals import Rival
 from magbridge.diagnose.inference.search import Hypothesis, Outcome
-from magbridge.diagnose.inference.unexplained import Leftover, leftover
-from magbridge.diagnose.inference.varying import varying
+from magbridge.diagnose.unexplained.leftover import Leftover, leftover
+from magbridge.diagnose.unexplained.varying import varying
 
 __all__ = ["accept"]
 

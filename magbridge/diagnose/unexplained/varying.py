@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.compare.problem import Problem
-from magbridge.diagnose.inference.descriptions import Description
 from magbridge.diagnose.inference.design import pieces
+from magbridge.diagnose.unexplained.descriptions import Description
 
 __all__ = ["varying"]
 

@@ -3,9 +3,9 @@
 Notes
 -----
 A free description has more coefficients than the data can determine, so they have one common free size
-(:mod:`.statistic`). Noise that was fitted without an effect may have absorbed it. So descriptions are scored
-under the noise of the fit and under that which is left when slow curves are fitted as well; the best are then
-weighed by the whole likelihood, with the noise fitted anew.
+(:mod:`~.inference.statistic`). Noise that was fitted without an effect may have absorbed it. So descriptions
+are scored under the noise of the fit and under that which is left when slow curves are fitted as well; the
+best are then weighed by the whole likelihood, with the noise fitted anew.
 """
 
 from __future__ import annotations
@@ -22,7 +22,6 @@ from magbridge.calibration.residual import robust_scale
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.compare.design_columns import Columns
 from magbridge.diagnose.compare.problem import Problem
-from magbridge.diagnose.inference.descriptions import Description, descriptions
 from magbridge.diagnose.inference.design import Design, in_threads, precomputed
 from magbridge.diagnose.inference.evidence import LEVEL
 from magbridge.diagnose.inference.fit_noise import fit_noise
@@ -31,6 +30,7 @@ from magbridge.diagnose.inference.joint import Joint
 from magbridge.diagnose.inference.noise import Noise
 from magbridge.diagnose.inference.rivals import Rival
 from magbridge.diagnose.inference.statistic import Ridge, Statistic
+from magbridge.diagnose.unexplained.descriptions import Description, descriptions
 
 __all__ = ["Leftover", "leftover"]
 
@@ -99,7 +99,8 @@ def along_one_direction(S: FloatArray, b: FloatArray, width: FloatArray, whole: 
     """Estimate one curve along one direction of the body, ``c = f d^T``, instead of one curve for each axis.
 
     In turn f is estimated along d, and d by least squares given f, beginning with the direction of the
-    `whole` estimate. The two free numbers of the direction pay as in :func:`~.evidence.log_bayes`.
+    `whole` estimate. The two free numbers of the direction pay as in
+    :func:`~.inference.evidence.log_bayes`.
     """
     count = len(width) // 3
     direction = np.linalg.svd(whole.estimate.reshape(count, 3), full_matrices=False)[2][0]
