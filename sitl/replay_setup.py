@@ -20,7 +20,6 @@ from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.observe import observations
 from magbridge.columns import CHANNELS, COLUMNS
 from magbridge.errors import CalibrationError, FormatError
-from magbridge.field.reference import reference_field
 from magbridge.logs import read
 from magbridge.logs.telemetry_writer import short_name
 from sitl.like import simulate_like
@@ -126,10 +125,7 @@ def _calibrate(deployment: xr.Dataset, parts: Sequence[Part], path: Path) -> str
     """Fit the nominal calibration on all but the last part; return how, or why there is none."""
     held_out = rows_of(parts[-1], deployment["time"].to_numpy())
     try:
-        data = observations(
-            deployment.isel(time=~held_out), (), reference=lambda ds: (reference_field(ds), None, "IGRF")
-        )
-        found = fit(data, "nominal")
+        found = fit(observations(deployment.isel(time=~held_out), ()), "nominal")
     except (CalibrationError, FormatError) as error:
         return f"none: {error}"
     save(found.calibration, path)

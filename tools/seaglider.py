@@ -18,8 +18,6 @@ from terminal import command_line, table
 from magbridge.calibration.fitting.observe import observations
 from magbridge.calibration.fitting.validate import HeldOut, leave_runs_out
 from magbridge.errors import CalibrationError
-from magbridge.field.declination import with_true_heading
-from magbridge.field.reference import earth_field
 from magbridge.logs import read
 
 COUNT = 100.0
@@ -42,7 +40,7 @@ def main() -> None:
     parser = command_line(__doc__)
     parser.add_argument("files", nargs="+", type=Path, help="a Seaglider's dives, netCDF")
     files = parser.parse_args().files
-    deployment = with_true_heading(read(sorted(files)))
+    deployment = read(sorted(files))
     shown = table(
         f"{len(files)} dives, each left out of its calibration",
         "method", "order", "masses", "left out, nT", "over nominal: by dive", "sigma",
@@ -50,7 +48,7 @@ def main() -> None:
     )  # fmt: skip
     nominal: HeldOut | None = None
     for method, masses, order in CHOICES:
-        data = observations(deployment, list(masses), reference=earth_field)
+        data = observations(deployment, list(masses))
         try:
             found = leave_runs_out(data, method, order)
         except CalibrationError as refusal:

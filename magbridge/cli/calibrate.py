@@ -88,7 +88,6 @@ def calibrate(
     from magbridge.columns import CHANNELS
     from magbridge.field.declination import with_true_heading
     from magbridge.field.read import read_grid
-    from magbridge.field.reference import earth_field
     from magbridge.logs import read
 
     check_inputs(files, output, vehicle, grid)
@@ -97,8 +96,7 @@ def calibrate(
     anomalies = read_grid(grid) if grid else None
     deployment = with_true_heading(read(files, required=(*CHANNELS, *parameter)), heading_reference)
     note_losses(deployment.attrs)
-    data = observations(deployment, parameter, reference=lambda ds: earth_field(ds, anomalies))
-    data = replace(data, inputs=_digests(files))
+    data = replace(observations(deployment, parameter, grid=anomalies), inputs=_digests(files))
     if filter_corner:
         data = unfiltered(data, filter_corner)
     options: dict[str, Any] = {"vehicle": read_vehicle(vehicle)} if vehicle else {}
@@ -182,12 +180,11 @@ def plan(
     from magbridge.calibration.file import load
     from magbridge.calibration.planning import flight_plan
     from magbridge.field.declination import with_true_heading
-    from magbridge.field.reference import earth_field
     from magbridge.logs import read
 
     deployment = with_true_heading(read(mission), heading_reference)
     note_losses(deployment.attrs)
     known = load(calibration)
     with waiting("planning"):
-        found = flight_plan.flight_plan(known, deployment, earth_field(deployment)[1], runs=runs, roll=roll)
+        found = flight_plan.flight_plan(known, deployment, runs=runs, roll=roll)
     print_result(flight_plan.facts(found, known), flight_plan.summary(found, known), json)

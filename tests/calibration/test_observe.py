@@ -6,8 +6,11 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.observe import observations
 from magbridge.errors import CalibrationError, FormatError
+from magbridge.field.declination import with_true_heading
+from sitl import load, simulate
 
 
 def test_a_deployment_s_columns_become_observations() -> None:
@@ -29,3 +32,19 @@ def test_a_deployment_s_columns_become_observations() -> None:
         observations(ds, ["fin"])
     with pytest.raises(CalibrationError, match="'battpos': expected numbers"):
         observations(ds.assign(battpos=("time", np.array(["a"] * n))), ["battpos"])
+
+
+@pytest.mark.parametrize("north", ["true", "magnetic"])
+def test_a_log_with_its_own_reference_has_a_boresight_too(north: str) -> None:
+    deployment = simulate(load("demo"), 5)
+    assert "reference_field" in deployment
+    expected = fit(observations(deployment, ("battpos", "ballast")))
+    if north == "magnetic":
+        declination = with_true_heading(deployment, "magnetic")["heading"] - deployment["heading"]
+        deployment = deployment.assign(heading=(deployment["heading"] - declination) % 360.0)
+        deployment.attrs["heading_reference"] = "magnetic"
+    found = fit(observations(deployment, ("battpos", "ballast")))
+    assert expected.calibration.boresight is not None
+    assert found.calibration.boresight is not None
+    turn = found.calibration.boresight.matrix() @ expected.calibration.boresight.matrix().T
+    np.testing.assert_allclose(turn, np.eye(3), atol=1e-6)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,10 +11,13 @@ from numpy.typing import NDArray
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.columns import CHANNELS, COLUMNS, require
 from magbridge.errors import CalibrationError
+from magbridge.field.declination import with_true_heading
 from magbridge.field.reference import earth_field
 
 if TYPE_CHECKING:
     import xarray as xr
+
+    from magbridge.field.grid import AnomalyGrid
 
 __all__ = ["observations"]
 
@@ -24,23 +27,19 @@ FOLLOWED = ("sensor_temperature", "depth")
 
 
 def observations(
-    ds: xr.Dataset,
-    parameters: Sequence[str],
-    *,
-    reference: Callable[[xr.Dataset], tuple[FloatArray, FloatArray | None, str]] | None = None,
+    ds: xr.Dataset, parameters: Sequence[str], *, grid: AnomalyGrid | None = None
 ) -> Observations:
     """Make the observations of a fit from a deployment's columns.
 
     Parameters
     ----------
     ds : Dataset
-        A deployment (columns as in the contract).
+        A deployment. Its reference is :func:`~magbridge.field.reference.earth_field`; headings that it
+        declares to be magnetic are made true.
     parameters : sequence of str
         Columns that move masses.
-    reference : callable, optional
-        ``ds -> (total (n,) nT, vector (n, 3) NED nT or None, name)``. Where the deployment has the column
-        ``reference_field``, that is the total. If not given: that column alone, or without it
-        :func:`~magbridge.field.reference.earth_field`.
+    grid : AnomalyGrid, optional
+        Added to the IGRF where there is no ``reference_field``.
 
     Raises
     ------
@@ -53,17 +52,8 @@ def observations(
         raise CalibrationError(f"parameter {others[0]!r} is {COLUMNS[others[0]].long_name}: it moves no mass")
     names = (*CHANNELS, *parameters)
     columns = {name: _column(ds, name) for name in names}
-    vector: FloatArray | None = None
-    model = "reference_field"
-    if reference is None and model not in ds:
-        reference = earth_field
-    if reference is not None:
-        total, vector, model = reference(ds)
-        if "reference_field" in ds:
-            own = _column(ds, "reference_field")
-            total = np.where(np.isfinite(own), own, total)
-    else:
-        total = _column(ds, "reference_field")
+    total, vector, model = earth_field(ds, grid)
+    ds = with_true_heading(ds)
     attitude = None
     if all(name in ds for name in ("roll", "pitch", "heading")):
         attitude = np.radians(np.stack([_column(ds, name) for name in ("roll", "pitch", "heading")], axis=1))

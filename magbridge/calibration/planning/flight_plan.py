@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from magbridge.calibration.fitting.mission import Mission
 from magbridge.calibration.fitting.observe import observations
@@ -20,17 +19,8 @@ if TYPE_CHECKING:
 
 __all__ = ["facts", "flight_plan", "summary"]
 
-FloatArray = NDArray[np.float64]
 
-
-def flight_plan(
-    calibration: Calibration,
-    mission: xr.Dataset,
-    field_ned: FloatArray | None,
-    *,
-    runs: int = 10,
-    roll: float = 10.0,
-) -> Plan:
+def flight_plan(calibration: Calibration, mission: xr.Dataset, *, runs: int = 10, roll: float = 10.0) -> Plan:
     """Choose runs for a mission.
 
     Parameters
@@ -39,8 +29,6 @@ def flight_plan(
         What is known so far.
     mission : Dataset (time)
         Attitude, position and masses as the mission will have them; magnetometer columns are not needed.
-    field_ned : (n, 3) array or None
-        nT, north-east-down, the Earth's field along it.
     runs : int
         How many to choose.
     roll : float
@@ -53,20 +41,15 @@ def flight_plan(
     FormatError
         It lacks a parameter of the calibration, or has it in another unit.
     """
-    if field_ned is None:
-        raise CalibrationError("the mission needs latitude and longitude, to know the Earth's field there")
-    total = np.linalg.norm(field_ned, axis=1)
     some = ("time", np.ones(mission.sizes["time"]))  # placeholder readings; zeros would count as missing
     require_units(mission, calibration.units)
     names = tuple(calibration.units)
-    data = observations(
-        mission.assign({f"mag_{axis}": some for axis in "xyz"}).drop_vars("reference_field", errors="ignore"),
-        names,
-        reference=lambda _: (total, field_ned, "IGRF"),
-    )
+    data = observations(mission.assign({f"mag_{axis}": some for axis in "xyz"}), names)
+    if data.reference_ned is None:
+        raise CalibrationError("the mission needs latitude and longitude, to know the Earth's field there")
     flown = settled(data) if names else None
     limits = Limits(roll=(-roll, roll), pitch_at=trim_of(data), flown=flown)
-    return plan(calibration, Mission.of(data), np.nanmean(field_ned, axis=0), limits, runs=runs)
+    return plan(calibration, Mission.of(data), np.nanmean(data.reference_ned, axis=0), limits, runs=runs)
 
 
 def facts(found: Plan, calibration: Calibration) -> dict[str, Any]:
