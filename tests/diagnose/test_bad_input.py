@@ -21,7 +21,7 @@ from magbridge.diagnose.diagnosis import Diagnosis
 from magbridge.diagnose.report import files
 from magbridge.diagnose.run import diagnose
 from magbridge.errors import DataError, WriteError
-from magbridge.field.earth import wrap
+from magbridge.field.earth import offset, wrap
 from magbridge.logs import write
 from sitl import load, segments, simulate
 
@@ -161,6 +161,17 @@ def test_a_track_across_the_date_line_is_one_track(plain: tuple[xr.Dataset, Cali
     assert moved.min() < -179.0 < 179.0 < moved.max()
     there, here = (take([one], calibration).place for one in (ds.assign(longitude=("time", moved)), ds))
     np.testing.assert_allclose(there, here, atol=1e-4)
+
+
+def test_a_place_is_in_metres_on_the_ellipsoid(plain: tuple[xr.Dataset, Calibration]) -> None:
+    """A sphere would be 56 m off in 10 km on the equator."""
+    ds, calibration = plain
+    track = np.linspace([-5e3, 10e3], [5e3, -10e3], ds.sizes["time"])
+    latitude, longitude = offset(0.0, 10.0, *track.T)
+    survey = take([ds.assign(latitude=("time", latitude), longitude=("time", longitude))], calibration)
+    track = track[np.isin(ds["time"], survey.time)]
+    assert survey.place is not None
+    np.testing.assert_allclose(survey.place[:, :2], track - np.median(track, axis=0), atol=0.1)
 
 
 def test_where_there_are_no_dives_it_is_not_said_that_dives_were_left_out(

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from magbridge.columns import AGE
 from magbridge.diagnose.compare.past import FAR, Past
 from magbridge.errors import DataError
-from magbridge.field.earth import wrap
+from magbridge.field.earth import separation, wrap
 
 __all__ = ["FEWEST", "Channel", "Survey", "assemble"]
 
@@ -212,10 +212,10 @@ def _place(table: dict[str, FloatArray]) -> FloatArray | None:
     """(n, 3) m north and east of the middle, and below the surface; None without positions."""
     if not {"latitude", "longitude"} <= set(table):
         return None
-    middle = np.median(table["latitude"])
-    north = np.radians(table["latitude"] - middle) * 6.3712e6
-    along = wrap(table["longitude"] - table["longitude"][0])  # also across the date line
-    east = np.radians(along - np.median(along)) * 6.3712e6 * np.cos(np.radians(middle))
+    latitude, longitude = table["latitude"], table["longitude"]
+    along = wrap(longitude - longitude[0])  # also across the date line
+    middle = float(np.median(latitude)), float(longitude[0] + np.median(along))
+    north, east = separation(*middle, latitude, longitude)
     down = _held(table["depth"]) if "depth" in table else np.zeros_like(north)
     return np.stack([north, east, down], axis=1)
 
