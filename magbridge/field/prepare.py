@@ -190,8 +190,8 @@ def draw_steps(steps: Sequence[Step], path: str | Path) -> None:
     for axis in axes[len(steps) :]:
         axis.set_axis_off()
     figure.colorbar(image, ax=axes, label="anomaly, nT", shrink=0.8)
-    figure.supxlabel("longitude, deg")
-    figure.supylabel("latitude, deg")
+    figure.supxlabel("longitude, deg", fontsize="medium")
+    figure.supylabel("latitude, deg", fontsize="medium")
     with atomic_path(path) as beside:
         figure.savefig(beside, dpi=110)
 

@@ -91,7 +91,7 @@ def _positions(calibration: Calibration, data: Observations) -> Iterator[str]:
         if len(groups) <= min(order, 3):
             places = " and ".join(f"{np.median(g):.4g}" for g in groups)
             yield (
-                f"{parameter.name} was only ever at {len(groups)} position{'s' * (len(groups) != 1)} "
+                f"{parameter.name} was nearly always at {len(groups)} position{'s' * (len(groups) != 1)} "
                 f"({places} {parameter.unit}".rstrip()
                 + "): elsewhere the correction rests on the physical model, "
                 "not on measurements; fly a run with it at another position"

@@ -66,7 +66,10 @@ def fit_per_run(data: Observations, order: int = 3) -> Fit:
         precision += np.kron(np.outer(typical, typical), Lambda)
         right += np.kron(typical, Lambda @ prior.coefficients(z))
     if runs <= order:
-        raise CalibrationError(f"runs: {runs} runs of {FEWEST} samples; order {order} needs {order + 1}")
+        raise CalibrationError(
+            f"method runs: {runs} runs with {FEWEST} samples or more at one position of the masses; order "
+            f"{order} needs {order + 1}: fly runs with the masses at rest"
+        )
     covariance = covariance_of(precision)
     coefficients = covariance @ right
     check_scales(samples, coefficients)
