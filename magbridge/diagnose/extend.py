@@ -31,8 +31,6 @@ STEPS = 4
 MODES = 64
 """Directions among which the misfit of an idealised regressor is spread; measured in the blind study."""
 
-FloatArray = NDArray[np.float64]
-
 
 def extend(problem: Problem, model: Sequence[Candidate], fit: Joint) -> Calibration:
     """Return the calibration with the effects of `model` added, at the values of `fit`.

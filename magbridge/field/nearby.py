@@ -9,14 +9,12 @@ from __future__ import annotations
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
 from magbridge.field.earth import offset, separation
 from magbridge.field.igrf import coverage, total_field
 
 __all__ = ["NearbyField"]
 
-Array = NDArray[np.float64]
 
 REACH = 20_000.0
 """m from the middle of the box to its edge."""

@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sitl.inject.scene import Generator, Scene, direction
-
-Array = NDArray[np.float64]
 
 
 def ionosphere(scene: Scene, size: float, rng: Generator) -> None:

@@ -17,14 +17,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri, chndtrinc
-from scipy.stats import norm
 
 from magbridge.diagnose.causes.candidates import Candidate, slices
 from magbridge.diagnose.inference.evidence import LEVEL, score
 from magbridge.diagnose.inference.information import Information
 from magbridge.diagnose.inference.naming import NamingTheory
 
-__all__ = ["Isolability", "Visible", "confusion", "isolability", "threshold"]
+__all__ = ["Isolability", "Visible", "isolability"]
 
 FloatArray = NDArray[np.float64]
 CONFOUNDED = 0.85
@@ -63,7 +62,7 @@ class Isolability:
     Attributes
     ----------
     visible : tuple of Visible
-    pairs : tuple of (str, str, float)
+    pairs : tuple of (Visible, Visible, float)
         Causes that look alike, with their correlation.
     untestable : dict
         Cause that this log cannot test -> what a log would need for it.
@@ -74,17 +73,13 @@ class Isolability:
     """
 
     visible: tuple[Visible, ...]
-    pairs: tuple[tuple[str, str, float], ...]
+    pairs: tuple[tuple[Visible, Visible, float], ...]
     untestable: dict[str, str]
     correlation: FloatArray
     naming: NamingTheory
 
-    def alone(self, cause: str, signal_to_noise: float) -> float:
-        """Chance that `cause`, at this signal-to-noise, is named and nothing beside it."""
-        return self.naming.alone(cause, signal_to_noise)
 
-
-def threshold(freedom: int, hypotheses: float, chance: float) -> float:
+def _threshold(freedom: int, hypotheses: float, chance: float) -> float:
     """Signal-to-noise at which an effect of `freedom` numbers, among so many, is found with `chance`."""
     limit = chdtri(freedom, LEVEL / hypotheses)
     return float(np.sqrt(chndtrinc(limit, freedom, 1.0 - chance)))
@@ -110,11 +105,9 @@ def isolability(
     for i, a in enumerate(picked):
         for j, b in enumerate(picked[:i]):
             R[i, j] = R[j, i] = _likeness(info, candidates[a], at[a], candidates[b], at[b])
-    names = [f"{v.cause} ({v.channel})" if v.channel else v.cause for v in visible]
     pairs = [
-        (names[j], names[i], float(R[i, j]))
-        for i in range(len(names))
-        for j in range(i)
+        (visible[j], visible[i], float(R[i, j]))
+        for i, j in zip(*np.tril_indices(len(R), -1), strict=True)
         if R[i, j] > CONFOUNDED and visible[i].cause != visible[j].cause
     ]
     return Isolability(
@@ -139,7 +132,7 @@ def _most_visible(candidates: Sequence[Candidate], info: Information, at: Sequen
 def _visible(candidate: Candidate, info: Information, own: slice, hypotheses: float) -> Visible:
     """Return the signal-to-noise and the sizes at which a candidate is found among so many hypotheses."""
     freedom = max(score(info, own, candidate).freedom, 1)
-    half, sure = threshold(freedom, hypotheses, 0.5), threshold(freedom, hypotheses, 0.95)
+    half, sure = _threshold(freedom, hypotheses, 0.5), _threshold(freedom, hypotheses, 0.95)
     power = np.diag(info.matrix[own, own])
     if candidate.spectra is not None:  # what counts is what all of them do together
         x = sure / float(np.sqrt(max(power.sum(), 1e-300)))
@@ -166,16 +159,3 @@ def _likeness(info: Information, one: Candidate, a: slice, other: Candidate, b: 
     N = C.T @ np.linalg.solve(A + p * np.eye(len(A)), C)
     shares = [float(np.trace(X) / (np.trace(Y) + 1e-12)) for X, Y in ((M, A), (N, B))]
     return float(np.sqrt(np.clip(max(shares), 0.0, 1.0)))
-
-
-def confusion(correlation: FloatArray, signal_to_noise: float) -> FloatArray:
-    """(m, m) chance that the cause of the row is named as that of the column, at a signal-to-noise.
-
-    These are the pairwise chances, scaled down where those of a row add up to more than one.
-    """
-    wrong = norm.cdf(-0.5 * signal_to_noise * np.sqrt(2.0 * np.clip(1.0 - correlation, 0.0, None)))
-    np.fill_diagonal(wrong, 0.0)
-    excess = np.maximum(wrong.sum(axis=1, keepdims=True), 1.0)
-    wrong = wrong / excess
-    np.fill_diagonal(wrong, 1.0 - wrong.sum(axis=1))
-    return np.asarray(wrong)

@@ -28,7 +28,6 @@ from magbridge.diagnose.inference.statistic import Statistic
 __all__ = ["NamingTheory"]
 
 FloatArray = NDArray[np.float64]
-DRAWS = 12
 
 
 class NamingTheory:
@@ -93,27 +92,3 @@ class NamingTheory:
             detected = float(ncx2.sf(self.limit[k], k_free, max(ratio, 1e-9)))
             chances[candidate.cause] = min(chances.get(candidate.cause, 1.0), 1.0 - (1.0 - wins) * detected)
         return float(np.prod(list(chances.values())))
-
-    def alone(self, cause: str, signal_to_noise: float) -> float:
-        """Chance that `cause` is named alone: the mean over its plausible directions and channels.
-
-        Parameters
-        ----------
-        cause : str
-            By its public name.
-        signal_to_noise : float
-            Of the effect, after projection.
-        """
-        rng = np.random.default_rng(20131214)
-        best: dict[str | None, tuple[float, int]] = {}
-        for k, candidate in enumerate(self.candidates):
-            seen = float(np.trace(self.S[self.at[k], self.at[k]])) / candidate.size
-            if candidate.cause == cause and seen > best.get(candidate.channel, (0.0, 0))[0]:
-                best[candidate.channel] = (seen, k)
-        found = []
-        for _, k in best.values():
-            own = np.arange(self.at[k].start, self.at[k].stop)
-            for b in rng.standard_normal((DRAWS, len(own))):
-                b = np.abs(b) if self.candidates[k].positive else b  # noqa: PLW2901  (the same draw)
-                found.append(self.chance(cause, own, b, signal_to_noise))
-        return float(np.mean(found)) if found else 0.0

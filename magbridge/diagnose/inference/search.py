@@ -23,7 +23,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.compare.problem import Problem
@@ -37,8 +36,6 @@ from magbridge.diagnose.inference.rivals import Rival, sets_of
 from magbridge.diagnose.inference.rounds import Hypothesis, State
 
 __all__ = ["Hypothesis", "Outcome", "search"]
-
-FloatArray = NDArray[np.float64]
 
 MOST = 6
 """Regressors found one by one in a log, at most."""

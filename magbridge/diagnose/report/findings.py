@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from magbridge.diagnose.inference.design import normal
 from magbridge.diagnose.inference.rivals import Rival
@@ -20,8 +19,6 @@ if TYPE_CHECKING:
     from magbridge.diagnose.gain import Gain
 
 __all__ = ["chance_alone", "findings", "findings_json", "parameters"]
-
-FloatArray = NDArray[np.float64]
 
 LEVEL = 0.95
 

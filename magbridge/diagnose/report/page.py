@@ -13,7 +13,7 @@ import numpy as np
 from magbridge.diagnose.report import figures
 from magbridge.diagnose.report.doubts import gained, late, nameless, unsettled, useful
 from magbridge.diagnose.report.found import found, overview
-from magbridge.diagnose.report.words import bold, figure, label, listed, number, plain, sizes
+from magbridge.diagnose.report.words import bold, figure, label, listed, number, sizes
 
 if TYPE_CHECKING:
     from magbridge.diagnose.causes import Cause
@@ -199,7 +199,8 @@ def _isolability(diagnosis: Diagnosis) -> list[str]:
         for v in report.visible
     )
     pairs = "".join(
-        f'<tr><td>{plain(a)}</td><td>{plain(b)}</td><td class="n">{100 * rho:.0f} %</td></tr>'
+        f"<tr><td>{escape(label(a.cause, a.channel))}</td><td>{escape(label(b.cause, b.channel))}</td>"
+        f'<td class="n">{100 * rho:.0f} %</td></tr>'
         for a, b, rho in report.pairs[:20]
     )
     missing = "; ".join(

@@ -26,7 +26,6 @@ __all__ = [
     "measured",
     "number",
     "physics",
-    "plain",
     "row",
     "sizes",
 ]
@@ -39,12 +38,6 @@ MANY = 12
 def label(cause: str, channel: str | None) -> str:
     """Return a cause as people read it."""
     return cause.replace("_", " ") + (f" ({channel})" if channel else "")
-
-
-def plain(labelled: str) -> str:
-    """Return a cause with its channel, ``cause (channel)``, as people read it."""
-    cause, bracket, channel = labelled.partition(" (")
-    return escape(cause.replace("_", " ") + bracket + channel)
 
 
 def bold(candidate: Candidate) -> str:

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sitl.inject.scene import Generator, Scene, direction
 from sitl.instrument import rotation
 from sitl.signals import autoregressive, first_order
 from sitl.world import MU_0_OVER_4_PI, dipole_field
-
-Array = NDArray[np.float64]
 
 
 def relay(scene: Scene, size: float, rng: Generator) -> None:
