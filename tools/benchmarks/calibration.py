@@ -172,7 +172,6 @@ def many(count: int) -> Observations:
     runs = table_1(0.0)
     rng = np.random.default_rng(2)
     pick = np.arange(count) % len(runs)
-    assert runs.runs is not None
     return Observations(
         field=runs.field[pick] + rng.normal(0.0, 1.0, (count, 3)),
         reference=runs.reference[pick],

@@ -61,8 +61,6 @@ def find_boresight(calibration: Calibration, data: Observations) -> Boresight | 
     part = data.part(np.asarray(known))
     assert part.attitude is not None
     assert part.reference_ned is not None
-    assert part.time is not None
-    assert part.runs is not None
     k = len(calibration.parameters)
     b = correct(replace(calibration, boresight=None), part.field, part.parameters[:, :k], part.time).vector
     v = field_body(part.attitude, part.reference_ned)

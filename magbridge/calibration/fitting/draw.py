@@ -34,7 +34,6 @@ def draw_fit(calibration: Calibration, data: Observations, path: str | Path) -> 
     WriteError
         The file cannot be written.
     """
-    assert data.runs is not None
     read = np.linalg.norm(data.field, axis=1) - data.reference
     left, _ = in_sensor_units(calibration, data)
     part = slice(None, None, max(1, len(data) // POINTS))
@@ -76,7 +75,6 @@ def draw_fit(calibration: Calibration, data: Observations, path: str | Path) -> 
 
 def _abscissae(data: Observations) -> dict[str, FloatArray]:
     """Return the quantities that deviations are drawn against, by name and unit."""
-    assert data.time is not None
     shown = {"hours": (data.time - data.time[0]) / 3600.0}
     if data.attitude is not None and np.isfinite(data.attitude[:, 2]).any():
         shown["heading, deg"] = np.degrees(data.attitude[:, 2]) % 360.0

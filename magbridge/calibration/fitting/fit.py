@@ -227,7 +227,6 @@ def assemble(
         As :class:`Fit` and its calibration have them.
     """
     e = residuals_of(samples, coefficients)
-    assert data.time is not None
     steps = np.diff(data.time)
     calibration = Calibration(
         parameters=parameters,
@@ -252,7 +251,6 @@ def assemble(
 
 def _runs(data: Observations, e: FloatArray) -> tuple[Run, ...]:
     """Return each run's samples, RMS residual (nT) and mean positions."""
-    assert data.runs is not None
     labels, which = np.unique(data.runs, return_inverse=True)
     count = np.bincount(which)
     squares = np.bincount(which, e * e)

@@ -157,7 +157,7 @@ def _widest_gap(heading: FloatArray) -> tuple[float, float]:
 
 
 def _runs(calibration: Calibration, data: Observations) -> Iterator[str]:
-    count = len(np.unique(data.runs)) if data.runs is not None else 1
+    count = len(np.unique(data.runs))
     if calibration.parameters and count < 4:
         yield f"only {count} run{'s' * (count != 1)}: too few to validate the fit on runs left out"
 

@@ -66,7 +66,6 @@ def nearby_mission(calibration: Calibration, data: Observations) -> Mission:
     rows = np.arange(0, len(data), max(3 * len(data) // POINTS, 1))
     k = len(calibration.parameters)
     positions = data.parameters[rows, :k]
-    assert data.time is not None
     b = correct(calibration, data.field[rows], positions, data.time[rows]).vector
     met = [Rotation.from_euler("X", angle, degrees=True).apply(b) for angle in (-ROLL, 0.0, ROLL)]
     places = [positions] * len(met)

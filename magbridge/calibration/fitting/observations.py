@@ -25,6 +25,10 @@ COMMON and 1 - COMMON."""
 _PER_SAMPLE = ("field", "reference", "parameters", "runs", "time", "attitude", "reference_ned")
 
 
+def _nothing() -> FloatArray:
+    return np.empty(0)
+
+
 @dataclass(frozen=True, eq=False)
 class Observations:
     """Calibration data as arrays, without the rows that lack a value or hold an impossible field.
@@ -40,7 +44,7 @@ class Observations:
     names, units : tuple of str
         Of the parameters.
     runs : (n,) array
-        A label for each sample: dive, spiral, file. Validation leaves out whole runs.
+        A label for each sample: dive, spiral, file. Validation leaves out whole runs. If not given, one run.
     time : (n,) array
         s since 1970 UTC; if not given, one sample a second.
     attitude : (n, 3) array, optional
@@ -59,8 +63,8 @@ class Observations:
     parameters: FloatArray
     names: tuple[str, ...] = ()
     units: tuple[str, ...] = ()
-    runs: NDArray[np.generic] | None = None
-    time: FloatArray | None = None
+    runs: NDArray[np.generic] = attribute(default_factory=_nothing)
+    time: FloatArray = attribute(default_factory=_nothing)
     attitude: FloatArray | None = None
     reference_ned: FloatArray | None = None
     sensor: str = ""
@@ -82,8 +86,8 @@ class Observations:
             if name in self.names[:i]:
                 raise CalibrationError(f"parameter {name!r} is named twice")
         reference = np.broadcast_to(np.asarray(self.reference, float), n)
-        time = np.arange(n, dtype=float) if self.time is None else np.asarray(self.time, float)
-        runs = np.zeros(n, int) if self.runs is None else np.asarray(self.runs)
+        time = np.asarray(self.time, float) if len(self.time) else np.arange(n, dtype=float)
+        runs = np.asarray(self.runs) if len(self.runs) else np.zeros(n, int)
         field = np.asarray(self.field, float)
         absent = (field == 0.0).all(axis=1, keepdims=True)  # what an absent sensor reads
         field = np.where((np.abs(field) < BEYOND) & ~absent, field, np.nan)
@@ -116,8 +120,6 @@ class Observations:
         A shorter step counts as one interval: the noise's correlation is estimated at one interval, and not
         extrapolated to less.
         """
-        assert self.time is not None
-        assert self.runs is not None
         steps = np.full(len(self), np.inf)
         apart = np.diff(self.time)
         if apart.size:

@@ -49,7 +49,6 @@ def fit_per_run(data: Observations, order: int = 3) -> Fit:
     prior = Prior(np.diag((WIDTHS * samples.F_0) ** -2.0), np.eye(9), middle)
     size = 9 * len(exponents)
     precision, right, runs = np.eye(size) / ANYTHING**2, np.zeros(size), 0
-    assert data.runs is not None
     for label in np.unique(data.runs):
         rows = data.runs == label
         typical = np.median(samples.phi[rows], axis=0)

@@ -63,7 +63,6 @@ def leave_runs_out(data: Observations, method: str = "auto", order: int = 3, **o
     CalibrationError
         There are not two runs, or what is left without one cannot be fitted.
     """
-    assert data.runs is not None
     labels, counts = np.unique(data.runs, return_counts=True)
     labels = labels[counts >= FEWEST]
     if len(labels) < 2:
@@ -82,7 +81,6 @@ def in_sensor_units(calibration: Calibration, data: Observations) -> tuple[Float
     A fit that shrinks A shrinks every error of the corrected field, but gains nothing in the sensor's units.
     """
     k = len(calibration.parameters)
-    assert data.time is not None
     positions = data.parameters[:, :k]
     got = correct(calibration, data.field, positions, data.time)
     A, T = calibration.matrices(positions)
