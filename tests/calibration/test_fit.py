@@ -16,7 +16,7 @@ from magbridge.calibration.fitting.evidence import Quadratic, evidence
 from magbridge.calibration.fitting.fit import METHODS, fit
 from magbridge.calibration.fitting.nominal import nominal, nominal_samples
 from magbridge.calibration.fitting.observations import Observations, polynomial_samples
-from magbridge.calibration.fitting.prior import free_structure
+from magbridge.calibration.fitting.prior import polynomial_prior
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.residual import Samples, normal_equations, residuals, whiten
 from magbridge.calibration.terms import full_order
@@ -83,16 +83,13 @@ def test_normal_equations_in_pieces_are_those_of_all(
 def test_evidence_has_the_slope_it_says(glider: Gliders) -> None:
     exponents = full_order(2, 2)
     samples = polynomial_samples(glider(0).runs, exponents)
-    structure = free_structure(exponents, ("a", "b"), samples.F_0)
+    family = polynomial_prior(exponents, ("a", "b"), samples.F_0)
     normal = normal_equations(samples, np.zeros(54))
     quadratic = Quadratic.about(np.zeros(54), normal, 2250.0)
-    x = np.append(structure.centre, np.log(30.0))
-    _, slope, *_ = evidence(quadratic, structure, x[:-1], x[-1])
+    x = np.append(family.centre, np.log(30.0))
+    _, slope, *_ = evidence(quadratic, family, x[:-1], x[-1])
     numeric = [
-        (
-            evidence(quadratic, structure, up[:-1], up[-1])[0]
-            - evidence(quadratic, structure, dn[:-1], dn[-1])[0]
-        )
+        (evidence(quadratic, family, up[:-1], up[-1])[0] - evidence(quadratic, family, dn[:-1], dn[-1])[0])
         / 2e-4
         for up, dn in ((x + h, x - h) for h in 1e-4 * np.eye(len(x)))
     ]

@@ -23,12 +23,12 @@ from numpy.typing import NDArray
 
 from magbridge.calibration.fitting.evidence import Quadratic, Widths, is_maximum, maximise
 from magbridge.calibration.fitting.fit import Fit, assemble
-from magbridge.calibration.fitting.mounted_masses import Mounting, mounted_structure
+from magbridge.calibration.fitting.mounted_masses import Mounting, mounted_prior
 from magbridge.calibration.fitting.noise import OUTLIER, NoiseModel, estimate_noise
 from magbridge.calibration.fitting.nominal import check_scales, starts
 from magbridge.calibration.fitting.observations import Observations, polynomial_samples
-from magbridge.calibration.fitting.prior import Structure, free_structure
-from magbridge.calibration.fitting.solve import Prior, Solution, covariance_of, gauss_newton
+from magbridge.calibration.fitting.prior import Prior, PriorFamily, polynomial_prior
+from magbridge.calibration.fitting.solve import Solution, covariance_of, gauss_newton
 from magbridge.calibration.residual import Samples, jacobian, residuals, residuals_of
 from magbridge.calibration.terms import full_order
 from magbridge.errors import CalibrationError
@@ -48,7 +48,7 @@ class _Answer:
     solution: Solution
     widths: Widths
     noise: NoiseModel
-    structure: Structure
+    family: PriorFamily
     quadratic: Quadratic
     score: float
 
@@ -75,41 +75,38 @@ def fit_auto(
     ranges = data.ranges()
     exponents = full_order(len(ranges), order)
     samples = polynomial_samples(data, exponents)
-    structure = free_structure(exponents, data.names, samples.F_0)
+    family = polynomial_prior(exponents, data.names, samples.F_0)
     if vehicle:
-        structure = mounted_structure(structure, exponents, ranges, vehicle)
-    best = _best(samples, structure)
-    prior = _prior(best.structure, best.widths.eta)
+        family = mounted_prior(family, exponents, ranges, vehicle)
+    best = _best(samples, family)
+    prior = best.family.at(best.widths.eta)
     precision = best.solution.normal.hessian / best.noise.sigma**2 + prior.precision
     coefficients = prior.coefficients(best.solution.z)
     check_scales(samples, coefficients)
-    E = best.structure.E
     return assemble(
-        data, samples, ranges, exponents, coefficients, E @ covariance_of(precision) @ E.T,
+        data, samples, ranges, exponents, coefficients, prior.E @ covariance_of(precision) @ prior.E.T,
         best.noise, "auto", details={
             "log_evidence": best.score,
             "determined": best.widths.determined,
             "outliers": best.noise.rejected,
-            "widths_nT": dict(zip(structure.names, np.exp(best.widths.eta).tolist(), strict=True)),
+            "widths_nT": dict(zip(family.names, np.exp(best.widths.eta).tolist(), strict=True)),
         },
     )  # fmt: skip
 
 
-def _best(samples: Samples, structure: Structure) -> _Answer:
+def _best(samples: Samples, family: PriorFamily) -> _Answer:
     """Return the answer with the largest evidence among several starts."""
     few = _thinned(samples)
     answers = []
     for start in starts(few):
-        z = structure.E[:9].T @ start
-        answers += [
-            _climb(few, structure, z, structure.centre + shift * structure.spread) for shift in (0.0, 1.5)
-        ]
+        z = family.E[:9].T @ start
+        answers += [_climb(few, family, z, family.centre + shift * family.spread) for shift in (0.0, 1.5)]
     for answer in sorted(answers, key=lambda answer: -answer.score):
         last = answer
         if few is not samples:
             noise = NoiseModel(answer.noise.sigma, answer.noise.autocorrelation)
-            last = _climb(samples, answer.structure, answer.solution.z, answer.widths.eta, noise)
-        if last.solution.settled and is_maximum(last.quadratic, last.structure, last.widths):
+            last = _climb(samples, answer.family, answer.solution.z, answer.widths.eta, noise)
+        if last.solution.settled and is_maximum(last.quadratic, last.family, last.widths):
             return last
     raise CalibrationError("auto: no start reached a maximum of the evidence; the data contradict themselves")
 
@@ -128,20 +125,20 @@ def _thinned(samples: Samples) -> Samples:
 
 
 def _climb(
-    samples: Samples, structure: Structure, z: FloatArray, eta: FloatArray, noise: NoiseModel | None = None
+    samples: Samples, family: PriorFamily, z: FloatArray, eta: FloatArray, noise: NoiseModel | None = None
 ) -> _Answer:
     """Alternate coefficients, widths and noise until the evidence settles; give `noise` if z is near that."""
     score, white = -np.inf, noise is None
     if noise is None:
-        z, noise = _approach(samples, _prior(structure, eta), z)
+        z, noise = _approach(samples, family.at(eta), z)
     for step in range(ROUNDS):
-        if structure.renew is not None and step:
-            structure, z = structure.renew(z)
+        if family.renew is not None and step:
+            family = family.renew(z)
         # the first widths are a guess, and not worth settling at
-        solution = gauss_newton(samples, _prior(structure, eta), noise, z, steps=50 if step else 3)
+        solution = gauss_newton(samples, family.at(eta), noise, z, steps=50 if step else 3)
         kept = len(samples.field) - noise.rejected
         quadratic = Quadratic.about(solution.z, solution.normal, kept)
-        widths = maximise(quadratic, structure, eta, noise.sigma)
+        widths = maximise(quadratic, family, eta, noise.sigma)
         eta, z = widths.eta, solution.z
         last, score = score, _score(widths, noise, samples)
         noise = replace(noise, sigma=widths.sigma)
@@ -150,14 +147,14 @@ def _climb(
             break
         # residuals of a wrong model look correlated for long, so the autocorrelation waits until it settles
         white = white and not still and step < ROUNDS // 2
-        if (
-            step < ROUNDS - 4
-        ):  # after that the noise's correlation and outliers are kept, so that the rest settles
-            e = residuals_of(samples, structure.coefficients(z))
-            doubt = (0.0, 0.0) if white else _doubt(samples, _prior(structure, eta), solution, noise)
+        # at last the noise's autocorrelation and outliers are kept, so that the rest settles
+        if step < ROUNDS - 4:
+            prior = family.at(eta)
+            e = residuals_of(samples, prior.coefficients(z))
+            doubt = (0.0, 0.0) if white else _doubt(samples, prior, solution, noise)
             shape = estimate_noise(e, np.where(white, np.inf, samples.steps), widths.determined, doubt)
             noise = replace(shape, sigma=widths.sigma)
-    return _Answer(solution, widths, noise, structure, quadratic, score)
+    return _Answer(solution, widths, noise, family, quadratic, score)
 
 
 def _doubt(samples: Samples, prior: Prior, solution: Solution, noise: NoiseModel) -> tuple[float, float]:
@@ -188,7 +185,3 @@ def _score(widths: Widths, noise: NoiseModel, samples: Samples) -> float:
     outlier = np.log(widths.sigma) + 0.5 * OUTLIER**2
     whitening = 0.5 * np.log(1.0 - noise.autocorrelation ** (2.0 * samples.steps)).sum()
     return float(widths.log_evidence - noise.rejected * outlier - whitening)
-
-
-def _prior(structure: Structure, eta: FloatArray) -> Prior:
-    return Prior(np.diag(structure.widths(eta) ** -2.0), structure.E, structure.offset)

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
 from scipy.optimize import minimize
 
-from magbridge.calibration.fitting.prior import Structure
+from magbridge.calibration.fitting.prior import PriorFamily
 from magbridge.calibration.residual import NormalEquations
 
 __all__ = ["Quadratic", "Widths", "evidence", "is_maximum", "maximise"]
@@ -60,28 +60,26 @@ class Widths:
     log_evidence: float
     determined: float
     """How many numbers the data, not the prior, determined: ``q - tr M^-1``."""
-    mean: FloatArray
-    """Posterior mean of z (q,)."""
 
 
 def evidence(
-    quadratic: Quadratic, structure: Structure, eta: FloatArray, log_sigma: float
-) -> tuple[float, FloatArray, FloatArray, float]:
-    """Return log evidence, its gradient by (eta, log sigma), the posterior mean, and `Widths.determined`.
+    quadratic: Quadratic, family: PriorFamily, eta: FloatArray, log_sigma: float
+) -> tuple[float, FloatArray, float]:
+    """Return log evidence, its gradient by (eta, log sigma), and `Widths.determined`.
 
-    `eta` is (h,), the gradient (h + 1,), the mean of z (q,); `log_sigma` is that of the noise in sensor nT.
-    With no finite evidence the first is -inf and the others are zero.
+    `eta` is (h,), the gradient (h + 1,); `log_sigma` that of the noise in sensor nT. With no finite evidence
+    the first is -inf and the others are zero.
     """
-    w = structure.widths(eta)
+    w = family.widths(eta)
     s2 = np.exp(2.0 * log_sigma)
     M = (w[:, None] * quadratic.H * w) / s2
     M.flat[:: len(w) + 1] += 1.0
     factor, info = dpotrf(M, overwrite_a=True)
     if info:
-        return -np.inf, np.zeros(len(eta) + 1), np.zeros(len(w)), 0.0
+        return -np.inf, np.zeros(len(eta) + 1), 0.0
     Wb = w * quadratic.b / s2
     y = dpotrs(factor, Wb)[0]
-    off = (eta - structure.centre) / structure.spread
+    off = (eta - family.centre) / family.spread
     value = (
         -quadratic.n * log_sigma
         - 0.5 * quadratic.c_0 / s2
@@ -93,35 +91,35 @@ def evidence(
     z = w * y
     cost = quadratic.c_0 - 2.0 * quadratic.b @ z + z @ quadratic.H @ z
     determined = float(len(w) - inverse.sum())
-    by_eta = structure.design.T @ (y * y + inverse - 1.0) - off / structure.spread
-    return float(value), np.append(by_eta, -quadratic.n + cost / s2 + determined), z, determined
+    by_eta = family.design.T @ (y * y + inverse - 1.0) - off / family.spread
+    return float(value), np.append(by_eta, -quadratic.n + cost / s2 + determined), determined
 
 
-def maximise(quadratic: Quadratic, structure: Structure, eta: FloatArray, sigma: float) -> Widths:
+def maximise(quadratic: Quadratic, family: PriorFamily, eta: FloatArray, sigma: float) -> Widths:
     """Climb from `eta` (h,) and `sigma` (sensor nT) to where the evidence is largest."""
-    middle = np.append(structure.centre, np.log(sigma))
-    scale = np.append(structure.spread, SIGMA_STEP)
+    middle = np.append(family.centre, np.log(sigma))
+    scale = np.append(family.spread, SIGMA_STEP)
 
     def downhill(x: FloatArray) -> tuple[float, FloatArray]:
         if np.abs(x[:-1]).max() > FARTHEST:
             return 1e300, 0.0 * x
         at = middle + scale * x
-        value, slope, *_ = evidence(quadratic, structure, at[:-1], at[-1])
+        value, slope, _ = evidence(quadratic, family, at[:-1], at[-1])
         return (-value if np.isfinite(value) else 1e300), -slope * scale
 
-    start = np.append((eta - structure.centre) / structure.spread, 0.0)
+    start = np.append((eta - family.centre) / family.spread, 0.0)
     x = middle + scale * minimize(downhill, start, jac=True, method="BFGS", options={"gtol": 1e-2}).x
-    value, _, z, determined = evidence(quadratic, structure, x[:-1], x[-1])
-    return Widths(x[:-1], float(np.exp(x[-1])), value, determined, z)
+    value, _, determined = evidence(quadratic, family, x[:-1], x[-1])
+    return Widths(x[:-1], float(np.exp(x[-1])), value, determined)
 
 
-def is_maximum(quadratic: Quadratic, structure: Structure, widths: Widths) -> bool:
+def is_maximum(quadratic: Quadratic, family: PriorFamily, widths: Widths) -> bool:
     """Return whether the evidence curves down in every direction and a Newton step would gain nothing."""
     x = np.append(widths.eta, np.log(widths.sigma))
-    scale = np.append(structure.spread, SIGMA_STEP)
+    scale = np.append(family.spread, SIGMA_STEP)
 
     def slope(at: FloatArray) -> FloatArray:
-        return np.asarray(evidence(quadratic, structure, at[:-1], at[-1])[1] * scale)
+        return np.asarray(evidence(quadratic, family, at[:-1], at[-1])[1] * scale)
 
     bend = np.array([(slope(x + h) - slope(x - h)) / 2e-3 for h in 1e-3 * np.diag(scale)])
     values, vectors = np.linalg.eigh(-0.5 * (bend + bend.T))

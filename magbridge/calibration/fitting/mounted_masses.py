@@ -23,13 +23,13 @@ from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
 
 from magbridge.calibration.dipole import dipole_columns, expand_dipole
-from magbridge.calibration.fitting.prior import FACTOR_MASS, Structure, gain_rotation
+from magbridge.calibration.fitting.prior import FACTOR_MASS, PriorFamily, gain_rotation
 from magbridge.calibration.model import Parameter
 from magbridge.calibration.terms import Exponents
 from magbridge.errors import CalibrationError
 from magbridge.toml import check_entries, convert, load_toml
 
-__all__ = ["Mounting", "mounted_structure", "read_vehicle"]
+__all__ = ["Mounting", "mounted_prior", "read_vehicle"]
 
 FloatArray = NDArray[np.float64]
 Vector = tuple[float, float, float]
@@ -105,18 +105,18 @@ class _Mass:
         return np.moveaxis(powers, 0, -1), np.tensordot(latent[:6], powers[:6], 1)
 
 
-def mounted_structure(
-    free: Structure,
+def mounted_prior(
+    free: PriorFamily,
     exponents: tuple[Exponents, ...],
     parameters: tuple[Parameter, ...],
     vehicle: Mapping[str, Mounting | Mapping[str, Any]],
-) -> Structure:
+) -> PriorFamily:
     """Add to the free polynomials a dipole for each mass of `vehicle`.
 
     Parameters
     ----------
-    free : Structure
-        The result of :func:`~magbridge.calibration.fitting.prior.free_structure`.
+    free : PriorFamily
+        The result of :func:`~magbridge.calibration.fitting.prior.polynomial_prior`.
     exponents : tuple of tuple of int
         Its monomials.
     parameters : tuple of Parameter
@@ -148,7 +148,7 @@ def mounted_structure(
     for name in vehicle:
         k = 3 + 3 * names.index(name)
         centre[k], centre[k + 1] = np.log(REST_T), np.log(REST_A)
-    whole = Structure(
+    whole = PriorFamily(
         E=free.E,
         offset=free.offset,
         constant=constant,
@@ -157,7 +157,7 @@ def mounted_structure(
         spread=np.append(free.spread, np.full(extra, FACTOR_MASS)),
         names=free.names + labels,
     )
-    return _linearised(whole, free.E, masses, np.zeros((len(masses), LATENT)))
+    return _linearised(whole, masses, np.zeros((len(masses), LATENT)))
 
 
 def _mass(
@@ -181,11 +181,11 @@ def _mass(
     return _Mass(np.array(rows), np.array(mounting.at), travel, mounting.at_sigma, parameter)
 
 
-def _linearised(whole: Structure, E: FloatArray, masses: list[_Mass], latent: FloatArray) -> Structure:
-    """Return the structure with the dipoles linearised about `latent`: ``c(l) ~ c(l_0) + J (l - l_0)``."""
-    size, q = len(E), E.shape[1]
+def _linearised(whole: PriorFamily, masses: list[_Mass], latent: FloatArray) -> PriorFamily:
+    """Return the prior with the dipoles linearised about `latent`: ``c(l) ~ c(l_0) + J (l - l_0)``."""
+    size, q = whole.E.shape
     J = np.zeros((size, q + LATENT * len(masses)))
-    J[:, :q] = E
+    J[:, :q] = whole.E
     offset = np.zeros(size)
     for i, (mass, at) in enumerate(zip(masses, latent, strict=True)):
         by, value = mass.columns(at)
@@ -193,7 +193,7 @@ def _linearised(whole: Structure, E: FloatArray, masses: list[_Mass], latent: Fl
         J[place, q + LATENT * i : q + LATENT * (i + 1)] = by.reshape(-1, LATENT)
         offset[place] += (value - by @ at).ravel()
 
-    def renew(z: FloatArray) -> tuple[Structure, FloatArray]:
-        return _linearised(whole, E, masses, z[q:].reshape(-1, LATENT)), z
+    def renew(z: FloatArray) -> PriorFamily:
+        return _linearised(whole, masses, z[q:].reshape(-1, LATENT))
 
     return replace(whole, E=J, offset=offset, renew=renew)

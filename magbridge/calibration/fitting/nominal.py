@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from magbridge.calibration.fitting.fit import Fit, assemble
 from magbridge.calibration.fitting.noise import NoiseModel, estimate_noise
 from magbridge.calibration.fitting.observations import Observations
-from magbridge.calibration.fitting.solve import Prior, covariance_of, gauss_newton
+from magbridge.calibration.fitting.prior import Prior
+from magbridge.calibration.fitting.solve import covariance_of, gauss_newton
 from magbridge.calibration.residual import Samples, residuals_of, scales_and_offsets
 from magbridge.errors import CalibrationError
 

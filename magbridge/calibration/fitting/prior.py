@@ -22,9 +22,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from magbridge.calibration.residual import NormalEquations
 from magbridge.calibration.terms import Exponents
 
-__all__ = ["FACTOR_MASS", "Structure", "free_structure", "gain_rotation"]
+__all__ = ["FACTOR_MASS", "Prior", "PriorFamily", "gain_rotation", "polynomial_prior"]
 
 FloatArray = NDArray[np.float64]
 
@@ -41,8 +42,25 @@ FACTOR_FIXED, FACTOR_MASS, FACTOR_RATIO = np.log(2.0), np.log(3.3), np.log(1.8)
 
 
 @dataclass(frozen=True, eq=False)
-class Structure:
-    """How coefficients follow from latent numbers z, and the prior widths of z.
+class Prior:
+    """Gaussian prior of z about 0 with its precision (q, q); and ``c = E z + offset``, E (K, q)."""
+
+    precision: FloatArray
+    E: FloatArray
+    offset: FloatArray | float = 0.0
+
+    def coefficients(self, z: FloatArray) -> FloatArray:
+        """(K,) ``c = E z + offset`` of z (q,)."""
+        return np.asarray(self.E @ z + self.offset)
+
+    def reduce(self, normal: NormalEquations) -> NormalEquations:
+        """Return normal equations in c (K) as those in z (q)."""
+        return NormalEquations(self.E.T @ normal.hessian @ self.E, self.E.T @ normal.gradient, normal.cost)
+
+
+@dataclass(frozen=True, eq=False)
+class PriorFamily:
+    """A hierarchical prior: coefficients follow from latent numbers z, whose widths follow from eta.
 
     Attributes
     ----------
@@ -56,7 +74,7 @@ class Structure:
     names : tuple of str
         What ``exp(eta)`` is the width of, number by number.
     renew : callable, optional
-        ``z -> (Structure, z)``: the structure linearised anew at z, and z in it.
+        ``z -> PriorFamily``: the family linearised anew at z.
     """
 
     E: FloatArray
@@ -66,15 +84,15 @@ class Structure:
     centre: FloatArray
     spread: FloatArray
     names: tuple[str, ...]
-    renew: Callable[[FloatArray], tuple[Structure, FloatArray]] | None = None
+    renew: Callable[[FloatArray], PriorFamily] | None = None
 
     def widths(self, eta: FloatArray) -> FloatArray:
         """(q,) prior 1-sigma of z at `eta` (h,)."""
         return np.asarray(np.exp(self.constant + self.design @ eta))
 
-    def coefficients(self, z: FloatArray) -> FloatArray:
-        """(K,) ``c = E z + offset`` of z (q,)."""
-        return np.asarray(self.E @ z + self.offset)
+    def at(self, eta: FloatArray) -> Prior:
+        """Return the family's prior at `eta` (h,)."""
+        return Prior(np.diag(self.widths(eta) ** -2.0), self.E, self.offset)
 
 
 def gain_rotation() -> FloatArray:
@@ -82,8 +100,8 @@ def gain_rotation() -> FloatArray:
     return np.array([[1, 1, 1], [1, -1, 0], [1, 1, -2]]).T / np.sqrt([3.0, 2.0, 6.0])
 
 
-def free_structure(exponents: tuple[Exponents, ...], names: tuple[str, ...], F_0: float) -> Structure:
-    """Return the structure of polynomials with physical widths, the masses' places being unknown.
+def polynomial_prior(exponents: tuple[Exponents, ...], names: tuple[str, ...], F_0: float) -> PriorFamily:
+    """Return the prior of polynomials with physical widths, the masses' places being unknown.
 
     Parameters
     ----------
@@ -109,7 +127,7 @@ def free_structure(exponents: tuple[Exponents, ...], names: tuple[str, ...], F_0
         _log_widths(powers, constant[m], design[m])
     E = np.eye(9 * len(exponents))
     E[:3, :3] = gain_rotation()
-    return Structure(
+    return PriorFamily(
         E=E,
         offset=np.zeros(len(E)),
         constant=constant.ravel(),

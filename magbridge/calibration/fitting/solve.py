@@ -20,29 +20,13 @@ from scipy.linalg import cho_factor, cho_solve, solve_triangular
 from scipy.linalg.lapack import dpotrf
 
 from magbridge.calibration.fitting.noise import NoiseModel
+from magbridge.calibration.fitting.prior import Prior
 from magbridge.calibration.residual import NormalEquations, Samples, normal_equations
 from magbridge.errors import CalibrationError
 
-__all__ = ["Prior", "Solution", "covariance_of", "gauss_newton"]
+__all__ = ["Solution", "covariance_of", "gauss_newton"]
 
 FloatArray = NDArray[np.float64]
-
-
-@dataclass(frozen=True, eq=False)
-class Prior:
-    """Gaussian prior of z about 0 with its precision (q, q); and ``c = E z + offset``, E (K, q)."""
-
-    precision: FloatArray
-    E: FloatArray
-    offset: FloatArray | float = 0.0
-
-    def coefficients(self, z: FloatArray) -> FloatArray:
-        """(K,) ``c = E z + offset`` of z (q,)."""
-        return np.asarray(self.E @ z + self.offset)
-
-    def reduce(self, normal: NormalEquations) -> NormalEquations:
-        """Return normal equations in c (K) as those in z (q)."""
-        return NormalEquations(self.E.T @ normal.hessian @ self.E, self.E.T @ normal.gradient, normal.cost)
 
 
 @dataclass(frozen=True, eq=False)

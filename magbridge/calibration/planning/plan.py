@@ -24,7 +24,7 @@ from threadpoolctl import threadpool_limits
 from magbridge.calibration.fitting.boresight import field_body
 from magbridge.calibration.fitting.mission import Mission
 from magbridge.calibration.fitting.observations import monomials
-from magbridge.calibration.fitting.prior import free_structure
+from magbridge.calibration.fitting.prior import polynomial_prior
 from magbridge.calibration.forward import forward
 from magbridge.calibration.model import Calibration, Noise, Parameter, Reference
 from magbridge.calibration.planning.limits import Limits, PlannedRun, candidate_runs
@@ -75,8 +75,8 @@ def expected_calibration(
         Highest total degree.
     """
     exponents = full_order(len(parameters), order)
-    structure = free_structure(exponents, tuple(p.name for p in parameters), field)
-    E = structure.E * structure.widths(structure.centre)
+    family = polynomial_prior(exponents, tuple(p.name for p in parameters), field)
+    E = family.E * family.widths(family.centre)
     return Calibration(
         parameters=parameters,
         terms=(Polynomial(exponents=exponents),),
