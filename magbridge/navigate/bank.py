@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magbridge.field.earth import metres_per_degree, worse_axis
-from magbridge.field.grid import AnomalyGrid
-from magbridge.navigate.model import N_STATES, Block
+from magbridge.field.grid import AnomalyGrid, Local
+from magbridge.navigate.model import N_STATES, Block, curvature
 
 __all__ = ["Bank", "widest"]
 
@@ -130,15 +130,12 @@ class Bank:
             block.longitude + east / per_longitude, block.latitude + north / per_latitude, block.depth
         )
         off = np.isnan(local.anomaly)
-        anomaly, gn, ge, hnn, hne, hee, v = np.where(off, 0.0, local) if off.any() else np.array(local)
-        pnn, pne, pee = self.P[0, 0], self.P[0, 1], self.P[1, 1]
-        a, b = hnn * pnn + hne * pne, hnn * pne + hne * pee
-        c, d = hne * pnn + hee * pne, hne * pne + hee * pee
-        anomaly += block.slope_north * north + block.slope_east * east + 0.5 * (a + d)
-        bent = 0.5 * (a * a + 2.0 * b * c + d * d)
-        self.curvature_variance = float(self.w @ bent)
-        v = v + block.variance + bent
-        slopes = np.where(off, 0.0, (gn + block.slope_north, ge + block.slope_east))
+        local = Local(*np.where(off, 0.0, local))
+        bent, spread = curvature(local, self.P[0, 0], self.P[0, 1], self.P[1, 1])
+        self.curvature_variance = float(self.w @ spread)
+        anomaly = local.anomaly + (block.slope_north * north + block.slope_east * east + bent)
+        v = local.variance + block.variance + spread
+        slopes = np.where(off, 0.0, (local.north + block.slope_north, local.east + block.slope_east))
         gain = slopes[0] * self.P[0] + slopes[1] * self.P[1] + self.P[4] + self.P[5]
         s = slopes[0] * gain[0] + slopes[1] * gain[1] + gain[4] + gain[5]
         anomaly[off], v[off] = self._elsewhere[0], block.variance + self._elsewhere[1]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from magbridge.field.earth import metres_per_degree
 from magbridge.field.grid import AnomalyGrid
-from magbridge.navigate.model import N_STATES, Block, measurement_row
+from magbridge.navigate.model import N_STATES, Block, curvature, measurement_row
 
 __all__ = ["Innovation", "Tracker"]
 
@@ -64,9 +64,8 @@ class Tracker:
 
         Notes
         -----
-        ``h = a(p) + ∇F·δ + b + m + tr(C P)/2`` and ``R = r + map variance + tr((C P)²)/2``, with C the map's
-        Hessian and P the position's covariance: mean and variance, to second order, of the map under the
-        spread (the second-order filter of Bar-Shalom et al. 2001, sec. 10.3).
+        ``h = a(p) + ∇F·δ + b + m`` and ``R = r + map variance``, both with what the map's curvature adds
+        (:func:`~magbridge.navigate.model.curvature`).
         """
         north, east = float(self.x[0]), float(self.x[1])
         per_latitude, per_longitude = metres_per_degree(block.latitude)
@@ -76,16 +75,10 @@ class Tracker:
         if isnan(local.anomaly):
             return None
         (pnn, pne), (_, pee) = self.P[:2, :2].tolist()
-        a, b = (
-            local.north_north * pnn + local.north_east * pne,
-            local.north_north * pne + local.north_east * pee,
-        )
-        c, d = local.north_east * pnn + local.east_east * pne, local.north_east * pne + local.east_east * pee
-        slopes = local.north + block.slope_north, local.east + block.slope_east
-        expected = local.anomaly + block.slope_north * north + block.slope_east * east + 0.5 * (a + d)
-        self.curvature_variance = 0.5 * (a * a + 2.0 * b * c + d * d)
+        bent, self.curvature_variance = curvature(local, pnn, pne, pee)
+        expected = local.anomaly + block.slope_north * north + block.slope_east * east + bent
         variance = block.variance + local.variance + self.curvature_variance
-        row = measurement_row(*slopes)
+        row = measurement_row(local.north + block.slope_north, local.east + block.slope_east)
         innovation = self._observe(block.anomaly, expected + float(self.x[4] + self.x[5]), row, variance)
         return innovation._replace(anomaly=local.anomaly)
 
