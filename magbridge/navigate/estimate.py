@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import inf, isfinite, log, nan
+from math import inf, isfinite, log
 
 import numpy as np
 from numpy.typing import NDArray
@@ -157,7 +157,7 @@ class Estimate:
 
     def _take_in(self, block: Block) -> Innovation:
         if isinstance(self._filter, Tracker):
-            return self._filter.update(block) or Innovation(nan, nan, 0.0, accepted=False)
+            return self._filter.update(block)
         assert self._filter is not None
         innovation, variance, likelihood = self._filter.update(block)
         best = self._filter.x[:, int(self._filter.w.argmax())]

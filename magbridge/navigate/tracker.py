@@ -19,7 +19,10 @@ Array = NDArray[np.float64]
 
 
 class Innovation(NamedTuple):
-    """Innovation of a measurement: ``value`` nT (or m), ``variance``, log-likelihood, whether it was used."""
+    """Innovation of a measurement: ``value`` nT (or m), ``variance``, log-likelihood, whether it was used.
+
+    Off the map, where there is nothing to compare with, it is NaN and was not used.
+    """
 
     value: float
     variance: float
@@ -59,8 +62,8 @@ class Tracker:
         self._filter.F, self._filter.Q = F, Q
         self._filter.predict()
 
-    def update(self, block: Block) -> Innovation | None:
-        """Take in one measurement of the field; None off the map, where there is nothing to compare with.
+    def update(self, block: Block) -> Innovation:
+        """Take in one measurement of the field.
 
         Notes
         -----
@@ -73,7 +76,7 @@ class Tracker:
             block.longitude + east / per_longitude, block.latitude + north / per_latitude, block.depth
         )
         if isnan(local.anomaly):
-            return None
+            return Innovation(nan, nan, 0.0, accepted=False)
         (pnn, pne), (_, pee) = self.P[:2, :2].tolist()
         bent, self.curvature_variance = curvature(local, pnn, pne, pee)
         expected = local.anomaly + block.slope_north * north + block.slope_east * east + bent
