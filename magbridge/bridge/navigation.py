@@ -20,7 +20,7 @@ from magbridge.mavlink import Message, spec
 from magbridge.mavlink.dialect import MAV_SEVERITY
 from magbridge.navigate import Navigator, Options, Record, State
 from magbridge.navigate.depth import at_depth
-from magbridge.navigate.model import informed
+from magbridge.navigate.options import informed
 from magbridge.navigate.record import Reckoned
 from magbridge.records import Corrected
 from magbridge.toml import convert

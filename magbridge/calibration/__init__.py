@@ -1,5 +1,18 @@
 """The model of a vehicle's own magnetism: fit it, keep it, correct with it, simulate with it.
 
-The live path needs :mod:`.correct` and :mod:`.file` only; neither imports scipy or xarray. :mod:`.fitting`
-makes a calibration from logs, :mod:`.planning` says which calibration runs to fly next.
+::
+
+    logs --> fitting --> Calibration (model) <--> cal.json (file)
+                              |
+                              +--> compilation --> Kernel (kernel, arithmetic)
+                                                     |
+    raw channels, telemetry --> correct <------------+--> forward <-- true field, telemetry
+                                   |                         |
+              total field, vector, sigmas, flags       what the sensor reads
+
+A calibration is a list of :mod:`.terms` with their coefficients and covariance: polynomials in the positions
+of the masses, a :mod:`.dipole` that is expanded into one, and effects, which depend on anything else
+(:mod:`.effects`, :mod:`.mass_effects`, :mod:`.instrument_effects`). Fits minimise the :mod:`.residual`;
+:mod:`.paper` gives the result in the paper's terms, and :mod:`.planning` says which calibration runs to fly
+next. The live path needs :mod:`.correct` and :mod:`.file` only; neither imports scipy or xarray.
 """

@@ -88,7 +88,7 @@ def navigate(
     from magbridge.logs import read, write
     from magbridge.navigate import Options
     from magbridge.navigate.batch import navigate as find_way
-    from magbridge.navigate.model import informed
+    from magbridge.navigate.options import informed
 
     deployment = with_true_heading(read(files, required=CHANNELS), heading_reference)
     note_losses(deployment.attrs)

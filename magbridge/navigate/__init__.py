@@ -1,8 +1,24 @@
-"""Position from the corrected field and an anomaly map, where there is no GPS."""
+"""Position from the corrected field and an anomaly map, where there is no GPS.
+
+::
+
+    telemetry --> deadreckoning --+
+                                  +--> collect --> estimate --> record
+    corrected samples ------------+    (blocks)    (tracker or bank, integrity)
+
+A :class:`Navigator` takes both in, in order of time. :mod:`.deadreckoning` moves a position along, and
+:mod:`.collect` averages the samples between which the map is linear. :mod:`.estimate` finds how far off dead
+reckoning is, on the states of :mod:`.model`: by one Kalman filter where the position is narrow enough
+(:mod:`.tracker`), else by many (:mod:`.bank`); :mod:`.integrity` says whether to believe it. Each update is a
+:mod:`.record`. :mod:`.options` say what is known beforehand, and :mod:`.depth` brings the map to the vehicle.
+
+Ashore, :mod:`.batch` runs the same navigator over a log and smooths the track; :mod:`.reference_track`,
+:mod:`.findings` and :mod:`.draw` say how good it is. :mod:`.bound` says what a map is worth before the dive.
+"""
 
 from magbridge.navigate.bound import Bound, position_bound
-from magbridge.navigate.model import Options
 from magbridge.navigate.navigator import Navigator
+from magbridge.navigate.options import Options
 from magbridge.navigate.record import Record, State
 
 __all__ = ["Bound", "Navigator", "Options", "Record", "State", "position_bound"]

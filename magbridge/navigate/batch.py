@@ -15,8 +15,8 @@ from magbridge.field.earth import offset
 from magbridge.field.grid import AnomalyGrid
 from magbridge.navigate.deadreckoning import GLIDE
 from magbridge.navigate.findings import findings_of
-from magbridge.navigate.model import Options
 from magbridge.navigate.navigator import UNUSABLE, Navigator
+from magbridge.navigate.options import Options
 from magbridge.navigate.record import Record
 from magbridge.navigate.reference_track import REFERENCES, reference_track, with_errors
 from magbridge.progress import track

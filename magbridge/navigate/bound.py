@@ -12,7 +12,8 @@ from magbridge.errors import OutOfRange
 from magbridge.field.earth import metres_per_degree, separation, wrap
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.igrf import total_field
-from magbridge.navigate.model import Options, block_length, measurement_row, prior, transition
+from magbridge.navigate.model import block_length, measurement_row, prior, transition
+from magbridge.navigate.options import Options
 
 if TYPE_CHECKING:
     import xarray as xr

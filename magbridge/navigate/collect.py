@@ -8,7 +8,8 @@ from typing import NamedTuple
 from magbridge.field.earth import wrap
 from magbridge.field.nearby import NearbyField
 from magbridge.navigate.deadreckoning import DeadReckoning
-from magbridge.navigate.model import Block, Options
+from magbridge.navigate.model import Block
+from magbridge.navigate.options import Options
 
 __all__ = ["Collector"]
 

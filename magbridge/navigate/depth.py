@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from magbridge.field.continuation import continued
 from magbridge.field.grid import AnomalyGrid
-from magbridge.navigate.model import Options
+from magbridge.navigate.options import Options
 
 __all__ = ["at_depth"]
 

@@ -11,7 +11,8 @@ from magbridge.field.earth import offset
 from magbridge.field.grid import AnomalyGrid
 from magbridge.navigate.bank import Bank, widest
 from magbridge.navigate.integrity import IntegrityMonitor, Unmapped, Verdict, squared_mahalanobis
-from magbridge.navigate.model import Block, Options, any_level, prior, resolution, transition
+from magbridge.navigate.model import Block, prior, resolution, transition
+from magbridge.navigate.options import Options, any_level
 from magbridge.navigate.record import Jump, State
 from magbridge.navigate.tracker import Innovation, Tracker
 

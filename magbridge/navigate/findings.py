@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from magbridge.field.earth import metres_per_degree
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.igrf import total_field
-from magbridge.navigate.model import Options
+from magbridge.navigate.options import Options
 from magbridge.navigate.record import Jump, State
 
 __all__ = ["Shift", "best_shift", "findings_of"]

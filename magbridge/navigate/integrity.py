@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 from magbridge.field.earth import wrap
 from magbridge.field.grid import AnomalyGrid
 from magbridge.navigate.bank import Bank, widest
-from magbridge.navigate.model import Block, Options, block_length, transition
+from magbridge.navigate.model import Block, block_length, transition
+from magbridge.navigate.options import Options
 
 __all__ = ["IntegrityMonitor", "Unmapped", "Verdict", "squared_mahalanobis"]
 

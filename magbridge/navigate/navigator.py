@@ -21,7 +21,8 @@ from magbridge.navigate.bank import widest
 from magbridge.navigate.collect import Collector
 from magbridge.navigate.deadreckoning import DeadReckoning
 from magbridge.navigate.estimate import Estimate
-from magbridge.navigate.model import Block, Options, block_length, transition
+from magbridge.navigate.model import Block, block_length, transition
+from magbridge.navigate.options import Options
 from magbridge.navigate.record import Reckoned, Record, State
 from magbridge.records import Corrected, Quality
 

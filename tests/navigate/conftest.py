@@ -8,7 +8,7 @@ import pytest
 from voyages import simulated
 
 from magbridge.field.grid import AnomalyGrid
-from magbridge.navigate.model import Options
+from magbridge.navigate.options import Options
 
 
 @pytest.fixture(scope="session")

@@ -16,7 +16,7 @@ from magbridge.calibration.model import Noise, identity
 from magbridge.cli import main
 from magbridge.field.grid import AnomalyGrid
 from magbridge.logs import read, write
-from magbridge.navigate.model import Options
+from magbridge.navigate.options import Options
 
 PLAN = """time,latitude,longitude
 1386201600,49.48,-57.95

@@ -12,7 +12,7 @@ from voyages.dived import dived
 from magbridge.field.continuation import continued
 from magbridge.field.grid import AnomalyGrid
 from magbridge.navigate.depth import at_depth
-from magbridge.navigate.model import Options
+from magbridge.navigate.options import Options
 
 
 def test_errors_of_the_map_add_up(study: ModuleType) -> None:

@@ -11,7 +11,8 @@ from msgspec.structs import replace
 
 from magbridge.field.earth import metres_per_degree
 from magbridge.field.grid import AnomalyGrid
-from magbridge.navigate.model import Options, any_level, transition
+from magbridge.navigate.model import transition
+from magbridge.navigate.options import Options, any_level
 
 PERIOD = 700.0
 

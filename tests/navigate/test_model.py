@@ -11,7 +11,8 @@ from msgspec.structs import replace
 
 from magbridge.calibration.model import Calibration, Noise, identity
 from magbridge.field.grid import AnomalyGrid
-from magbridge.navigate.model import Options, block_length, informed, prior, resolution, transition
+from magbridge.navigate.model import block_length, prior, resolution, transition
+from magbridge.navigate.options import Options, informed
 
 
 def test_many_short_steps_are_one_long_step() -> None:

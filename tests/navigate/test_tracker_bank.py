@@ -10,7 +10,8 @@ from scipy.stats import multivariate_normal
 from magbridge.field.earth import metres_per_degree, offset
 from magbridge.field.grid import AnomalyGrid, Local
 from magbridge.navigate.bank import Bank, widest
-from magbridge.navigate.model import Block, Options, prior, transition
+from magbridge.navigate.model import Block, prior, transition
+from magbridge.navigate.options import Options
 from magbridge.navigate.tracker import Tracker
 
 PLACE = (49.5, -57.9)

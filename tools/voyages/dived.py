@@ -9,7 +9,7 @@ import xarray as xr
 
 from magbridge.navigate.batch import navigate
 from magbridge.navigate.depth import at_depth
-from magbridge.navigate.model import Options
+from magbridge.navigate.options import Options
 from sitl import Twin, load, simulate
 
 __all__ = ["Dived", "dived"]

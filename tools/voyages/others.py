@@ -14,7 +14,8 @@ from magbridge.field.earth import metres_per_degree, separation
 from magbridge.field.igrf import total_field
 from magbridge.field.read import read_grid
 from magbridge.navigate.batch import navigate
-from magbridge.navigate.model import Options, prior, transition
+from magbridge.navigate.model import prior, transition
+from magbridge.navigate.options import Options
 from voyages.simulated import PLACE, START, Map, blocks, sail, synthetic, voyage
 
 

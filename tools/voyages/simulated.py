@@ -20,8 +20,9 @@ from magbridge.field.igrf import total_field
 from magbridge.navigate.bound import position_bound
 from magbridge.navigate.collect import Collector
 from magbridge.navigate.deadreckoning import DeadReckoning
-from magbridge.navigate.model import Block, Options, block_length
+from magbridge.navigate.model import Block, block_length
 from magbridge.navigate.navigator import Navigator
+from magbridge.navigate.options import Options
 from magbridge.navigate.record import State
 from sitl.signals import autoregressive
 

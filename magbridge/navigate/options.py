@@ -1,0 +1,118 @@
+"""Options: how well start, current, calibration and map are known before anything is measured."""
+
+from __future__ import annotations
+
+from math import hypot, log, sqrt
+
+import msgspec
+from msgspec.structs import replace
+
+from magbridge.calibration.model import Calibration
+from magbridge.config import NotNegative, Positive
+from magbridge.field.grid import AnomalyGrid
+
+__all__ = ["Options", "any_level", "informed"]
+
+LASTING = 3.0
+"""Intervals: noise with a longer correlation time becomes a bias."""
+LEG = 1_800.0
+"""s, between turns or from dive to climb."""
+
+
+class Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """How well things are known beforehand; all 1-sigma.
+
+    Attributes
+    ----------
+    start_sigma : float
+        m, of the first position, each axis.
+    current_sigma, current_time : float
+        m/s and s: the current, and its correlation time.
+    drift : float
+        m/sqrt(s), random walk of the dead reckoning.
+    bias_sigma, bias_time : float
+        nT and s: the error that the calibration leaves, and its correlation time.
+    map_sigma, map_length : float
+        nT and m: the map's error, and its correlation length. Independent errors of single nodes are the
+        grid's own sigma.
+    noise : float or None
+        nT, the part of a sample's sigma that is white; of the rest, what goes beyond ``bias_sigma`` does not
+        average out. None: all of it is white.
+    noise_time : float
+        s, correlation time of that noise; noise that lasts longer than a few intervals belongs to the bias.
+    gate : float
+        Largest innovation squared over its variance that is taken in.
+    interval : float
+        s, samples within are averaged to one update; sooner if the vehicle has moved 2 % of the map's
+        correlation length.
+    sigma_limit : float
+        m, the largest 1-sigma of a valid position.
+    doubt : float
+        Odds at which another explanation of the field replaces the filter's.
+    """
+
+    start_sigma: Positive = 50.0
+    current_sigma: NotNegative = 0.1
+    current_time: Positive = 21_600.0
+    drift: NotNegative = 0.2
+    bias_sigma: NotNegative = 5.0
+    bias_time: Positive = 21_600.0
+    map_sigma: NotNegative = 2.0
+    map_length: Positive = 1_000.0
+    noise: NotNegative | None = None
+    noise_time: NotNegative = 0.0
+    gate: Positive = 16.0
+    interval: NotNegative = 20.0
+    sigma_limit: Positive = 500.0
+    doubt: Positive = 2_000.0
+
+
+def informed(options: Options, calibration: Calibration, sigma: float) -> Options:
+    """Return options that include a calibration's own errors.
+
+    Parameters
+    ----------
+    options : Options
+        Their bias is that of all other sources: the map's level, the field's variation in time.
+    calibration : Calibration
+        Of the total field that will be taken in.
+    sigma : float
+        nT, 1-sigma that the calibration claims for a typical sample.
+
+    Notes
+    -----
+    The white part is the noise of the calibration runs. If that noise was correlated for longer than a few
+    updates, it does not average out: it becomes a bias with the same correlation time, and the white part
+    is what drives it, ``σ √(1 - ρ²)`` with ρ the correlation from sample to sample. A calibration's other
+    errors depend on attitude and masses, and last for a leg.
+    """
+    noise = calibration.noise
+    white = noise.sensor
+    rho = noise.autocorrelation
+    noise_time = -noise.interval / log(rho) if 0.0 < rho < 1.0 else 0.0
+    lasts = LEG
+    if noise_time > LASTING * options.interval:
+        white, lasts, noise_time = white * sqrt(1.0 - rho**2), noise_time, 0.0
+    slow = sqrt(max(0.0, sigma**2 - white**2))
+    return replace(
+        options,
+        noise=white,
+        noise_time=noise_time,
+        bias_sigma=hypot(options.bias_sigma, slow),
+        bias_time=min(options.bias_time, lasts) if slow > options.bias_sigma else options.bias_time,
+    )
+
+
+def any_level(options: Options, grid: AnomalyGrid) -> Options:
+    """Return options with which the field's level carries no information, and its changes as much as before.
+
+    Notes
+    -----
+    The driving noise of a Gauss-Markov process is ``2σ²/τ`` (nT²/s). σ is raised to the map's RMS, and τ in
+    proportion to σ², so that it stays the same.
+    """
+    o = options
+    if o.bias_sigma >= grid.rms:
+        return o
+    lasts = o.bias_time * (grid.rms / max(o.bias_sigma, 1e-3 * grid.rms)) ** 2
+    return replace(o, bias_sigma=grid.rms, bias_time=lasts)
