@@ -19,7 +19,7 @@ from magbridge.errors import FormatError, OutOfRange
 from magbridge.field.earth import metres_per_degree, usual, wrap
 from magbridge.field.spline import WEIGHTS, coefficients, weights
 
-__all__ = ["AnomalyGrid", "Local", "filled"]
+__all__ = ["AnomalyGrid", "Local", "curvature", "filled"]
 
 Array = NDArray[np.float64]
 T = TypeVar("T", float, Array)
@@ -54,6 +54,25 @@ class Local(NamedTuple, Generic[T]):
 
 
 OFF_THE_MAP: Local[float] = Local(nan, nan, nan, nan, nan, nan, nan)
+
+
+def curvature(local: Local[T], nn: T, ne: T, ee: T) -> tuple[T, T]:
+    """Return what curvature adds to mean (nT) and variance (nT²) of the map under a position's spread.
+
+    Parameters
+    ----------
+    local : Local
+        The map at the position's mean.
+    nn, ne, ee : float or (n,) array
+        m², covariance P of the position.
+
+    Notes
+    -----
+    ``tr(C P)/2`` and ``tr((C P)²)/2``, C the Hessian (second-order filter, Bar-Shalom et al. 2001, sec. 10.3).
+    """
+    a, b = local.north_north * nn + local.north_east * ne, local.north_north * ne + local.north_east * ee
+    c, d = local.north_east * nn + local.east_east * ne, local.north_east * ne + local.east_east * ee
+    return 0.5 * (a + d), 0.5 * (a * a + 2.0 * b * c + d * d)
 
 
 class AnomalyGrid:

@@ -21,14 +21,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from magbridge.field.grid import AnomalyGrid, Local, T
+from magbridge.field.grid import AnomalyGrid
 from magbridge.navigate.options import Options
 
 __all__ = [
     "N_STATES",
     "Block",
     "block_length",
-    "curvature",
     "measurement_row",
     "prior",
     "resolution",
@@ -108,29 +107,6 @@ def transition(options: Options, seconds: float, metres: float) -> tuple[Array, 
 def measurement_row(north: float, east: float) -> Array:
     """Return H (1, 6): the field's slopes at the position, and 1 for calibration bias and map error."""
     return np.array([[north, east, 0.0, 0.0, 1.0, 1.0]])
-
-
-def curvature(local: Local[T], pnn: T, pne: T, pee: T) -> tuple[T, T]:
-    """Return what a map's curvature adds to its mean (nT) and variance (nT²) under a position's spread.
-
-    Parameters
-    ----------
-    local : Local
-        The map at the mean of the position.
-    pnn, pne, pee : float or (n,) array
-        m², covariance of the position.
-
-    Notes
-    -----
-    ``tr(C P)/2`` and ``tr((C P)²)/2``, with C the map's Hessian and P the covariance, to second order (the
-    second-order filter of Bar-Shalom et al. 2001, sec. 10.3).
-    """
-    a, b = (
-        local.north_north * pnn + local.north_east * pne,
-        local.north_north * pne + local.north_east * pee,
-    )
-    c, d = local.north_east * pnn + local.east_east * pne, local.north_east * pne + local.east_east * pee
-    return 0.5 * (a + d), 0.5 * (a * a + 2.0 * b * c + d * d)
 
 
 def block_length(grid: AnomalyGrid) -> float:
