@@ -68,7 +68,7 @@ def curvature(local: Local[T], nn: T, ne: T, ee: T) -> tuple[T, T]:
 
     Notes
     -----
-    ``tr(C P)/2`` and ``tr((C P)²)/2``, C the Hessian (second-order filter, Bar-Shalom et al. 2001, sec. 10.3).
+    ``tr(C P)/2`` and ``tr((C P)²)/2``, C the Hessian (second-order filter; Bar-Shalom et al. 2001, 10.3).
     """
     a, b = local.north_north * nn + local.north_east * ne, local.north_north * ne + local.north_east * ee
     c, d = local.north_east * nn + local.east_east * ne, local.north_east * ne + local.east_east * ee
