@@ -22,11 +22,11 @@ from magbridge.config import load as load_config
 from magbridge.logs import write
 from magbridge.records import Quality
 from sitl.dataset import channels, corrected, segments
-from sitl.emulation import emulate, start_us
-from sitl.listener import Listener
-from sitl.replay_setup import bridge_toml
+from sitl.replay.emulation import emulate, start_us
+from sitl.replay.listener import Listener
+from sitl.replay.setup import bridge_toml
+from sitl.replay.stage import Stage
 from sitl.scenario import load
-from sitl.stage import Stage
 from sitl.twin import simulate
 
 __all__ = ["demo", "summary"]

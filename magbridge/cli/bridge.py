@@ -92,11 +92,11 @@ def replay(
     json
         Print the result as JSON.
     """
-    from sitl import replay as replaying
-    from sitl.replay_summary import summary
+    from sitl.replay.run import replay as played
+    from sitl.replay.summary import summary
 
     with new_folder(log) if log else nullcontext():
-        result = replaying.replay(check_inputs(files), config, speed_of(speed), log)
+        result = played(check_inputs(files), config, speed_of(speed), log)
     print_result(result, summary(result), json)
     if not all(run["identical"] for run in result.get("runs", ())):
         raise DataError("the replay did not publish what the log holds")

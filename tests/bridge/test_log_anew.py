@@ -16,9 +16,9 @@ from magbridge.calibration.model import Parameter
 from magbridge.logs.tlog import TlogWriter
 from magbridge.mavlink import Codec
 from magbridge.records import Channel
-from sitl.own_log import Recorded, is_own_log, runs
-from sitl.replay import agreement
-from sitl.replay_summary import summary
+from sitl.replay.own_log import Recorded, is_own_log, runs
+from sitl.replay.run import agreement
+from sitl.replay.summary import summary
 
 BOOT = START - 77_000_000
 

@@ -19,8 +19,8 @@ from rig import Rig
 from magbridge.logs import read
 from magbridge.mavlink import LogReader
 from magbridge.records import Channel
-from sitl.own_log import is_own_log, runs
-from sitl.replay import agreement
+from sitl.replay.own_log import is_own_log, runs
+from sitl.replay.run import agreement
 
 MakeRig = Callable[..., Rig]
 LOG_OK, LOG_FAILED = 1, 2

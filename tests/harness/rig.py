@@ -26,8 +26,8 @@ from magbridge.calibration.terms import Polynomial
 from magbridge.config import load
 from magbridge.mavlink import Codec, Message, Signing
 from magbridge.records import Quality
-from sitl.own_log import Recorded
-from sitl.stage import Stage
+from sitl.replay.own_log import Recorded
+from sitl.replay.stage import Stage
 
 CONFIG = """\
 [sensor]

@@ -19,13 +19,13 @@ from magbridge.logs import read, write
 from magbridge.mavlink import Codec, LogReader
 from magbridge.records import Channel
 from sitl import Twin, load, segments, simulate
-from sitl.autopilot import Autopilot
 from sitl.demo import demo
 from sitl.motion import with_motion
-from sitl.own_log import Recorded, is_own_log
-from sitl.replay import replay
-from sitl.replay_setup import bridge_toml, short_names
-from sitl.replay_summary import summary
+from sitl.replay.autopilot import Autopilot
+from sitl.replay.own_log import Recorded, is_own_log
+from sitl.replay.run import replay
+from sitl.replay.setup import bridge_toml, short_names
+from sitl.replay.summary import summary
 
 
 @pytest.fixture(scope="module")

@@ -22,9 +22,9 @@ from benchmarks.workload import write_config
 from magbridge.bridge.events import Start
 from magbridge.config import load
 from magbridge.records import Channel
-from sitl.emulation import emulate, start_us
-from sitl.listener import Listener
-from sitl.stage import Stage
+from sitl.replay.emulation import emulate, start_us
+from sitl.replay.listener import Listener
+from sitl.replay.stage import Stage
 
 __all__ = ["replay"]
 

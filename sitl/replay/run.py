@@ -21,11 +21,11 @@ from magbridge.field.reference import reference_field
 from magbridge.logs import read
 from magbridge.logs.deployment import passed_over
 from magbridge.progress import track
-from sitl.emulation import emulate, start_us
-from sitl.listener import Listener
-from sitl.own_log import Recorded, is_own_log, runs
-from sitl.replay_setup import Part, prepare, rows_of
-from sitl.stage import Stage
+from sitl.replay.emulation import emulate, start_us
+from sitl.replay.listener import Listener
+from sitl.replay.own_log import Recorded, is_own_log, runs
+from sitl.replay.setup import Part, prepare, rows_of
+from sitl.replay.stage import Stage
 
 __all__ = ["agreement", "replay"]
 

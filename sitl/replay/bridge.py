@@ -1,6 +1,6 @@
 """The process in which the bridge runs during a replay: its real ports, and the timetable's clock.
 
-Run by :class:`sitl.stage.Stage`; not a command of its own.
+Run by :class:`sitl.replay.stage.Stage`; not a command of its own.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from magbridge.config import Log, load
 from magbridge.errors import MagbridgeError, WriteError
 from magbridge.logs.tlog import TlogWriter
 from magbridge.records import Channel
-from sitl.timetable import read_entries
+from sitl.replay.timetable import read_entries
 
 __all__ = ["ScriptedEdge"]
 

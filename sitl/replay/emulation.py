@@ -19,8 +19,8 @@ from magbridge.config import Config
 from magbridge.mavlink.dialect import MAG_PORT_NAME
 from magbridge.records import Channel, Reading
 from magbridge.sensors import open_driver
-from sitl.autopilot import Autopilot
 from sitl.fluxgate import Encoder, open_encoder
+from sitl.replay.autopilot import Autopilot
 
 __all__ = ["emulate", "start_us"]
 

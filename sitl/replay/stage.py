@@ -22,7 +22,7 @@ import msgspec
 from magbridge.bridge.events import Event, Start
 from magbridge.errors import MagbridgeError, PortError, WrongUse
 from magbridge.records import Channel
-from sitl.timetable import Entry, pace
+from sitl.replay.timetable import Entry, pace
 
 __all__ = ["Stage"]
 
@@ -56,7 +56,7 @@ class Stage:
         server.settimeout(CONNECT_TIMEOUT)
         times_out, self._times = os.pipe()
         command = [
-            sys.executable, "-m", "sitl.replayed_bridge", str(config),
+            sys.executable, "-m", "sitl.replay.bridge", str(config),
             "--sensor", os.ttyname(self._slave),
             "--link", f"tcp:127.0.0.1:{server.getsockname()[1]}",
             "--timetable", str(times_out),
