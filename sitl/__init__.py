@@ -1,4 +1,12 @@
-"""The other end of every line: a simulated world, and emulated devices that speak real protocols."""
+"""The other end of every line: a simulated world, and emulated devices that speak real protocols.
+
+A :mod:`.scenario` says what is simulated. In its :mod:`.world` a vehicle (:mod:`.platform`) with an
+:mod:`.instrument` flies a :mod:`.mission` along a :mod:`.trajectory`; the :mod:`.twin` is all of them
+together, and its log a :mod:`.dataset`. :mod:`.like` flies the way of a real log instead, :mod:`.inject`
+hides effects, and :mod:`.bound` says how well a calibration could do. :mod:`.fluxgate` speaks the sensors'
+protocols, and :mod:`.replay` plays deployments to the bridge. :mod:`.demo` does the main job, and
+:mod:`.bonne_bay` is the paper's trials.
+"""
 
 from __future__ import annotations
 

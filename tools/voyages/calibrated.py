@@ -21,10 +21,9 @@ from voyages.simulated import GLIDER, PLACE, Map, Score, adrift, sail, synthetic
 
 
 class Flown(NamedTuple):
-    """RMS error (nT) of the corrected field on the survey, the median claimed sigma, the navigation."""
+    """RMS error (nT) of the corrected field on the survey, and the navigation."""
 
     error: float
-    claimed: float
     score: Score
 
 
@@ -46,5 +45,5 @@ def flown(kinds: tuple[Map, ...], seed: int) -> dict[tuple[int, str], Flown]:
             known = with_options(GLIDER, start_sigma=grid.correlation_length)
             known = informed(known, fitted, float(np.median(sigma)))
             ds = adrift(grid, known, np.random.default_rng(seed), velocity, error, sigma, every=every)
-            found[k, method] = Flown(rms(error), float(np.median(sigma)), sail(ds, grid, known).score())
+            found[k, method] = Flown(rms(error), sail(ds, grid, known).score())
     return found
