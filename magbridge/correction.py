@@ -16,7 +16,7 @@ import numpy as np
 from magbridge.align import Aligner, Input, Sample
 from magbridge.calibration.correct import Corrector
 from magbridge.calibration.model import Calibration, identity
-from magbridge.columns import AGE, COLUMNS, CORRECTED
+from magbridge.columns import AGE, CHANNELS, COLUMNS, CORRECTED, require
 from magbridge.config import Align
 from magbridge.field.igrf import magnitude
 from magbridge.field.reference import main_field
@@ -125,11 +125,14 @@ def correct_rows(correction: Correction, deployment: xr.Dataset) -> xr.Dataset:
 
     Raises
     ------
+    FormatError
+        A channel is missing.
     OutOfRange
         A date that the IGRF does not cover.
     """
     import xarray as xr  # noqa: PLC0415 - the live path runs without it
 
+    require(deployment, CHANNELS)
     correction.as_declared(deployment.attrs)
     rows = [correction.reading(*row)[1] for row in _readings(correction, deployment)]
     results = np.array(

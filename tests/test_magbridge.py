@@ -51,6 +51,8 @@ def test_from_a_log_to_corrected_samples(tmp_path: Path, lacking: list[str]) -> 
     found = mb.fit(mb.observations(mb.read(runs), ("battpos", "ballast")))
     mb.save(found.calibration, tmp_path / "cal.json")
     corrected = mb.correct_rows(mb.Correction(mb.load(tmp_path / "cal.json")), mb.read(survey))
+    with pytest.raises(mb.MagbridgeError, match="column 'mag_y': expected this column"):
+        mb.correct_rows(mb.Correction(found.calibration), mb.read(survey).drop_vars("mag_y"))
     truth = mb.read(survey)["truth_total_field"].to_numpy()
     at_rest = corrected["quality"].to_numpy() == int(corrected["quality"].min())
     error = corrected["total_field"].to_numpy() - truth

@@ -234,6 +234,8 @@ def test_bad_data_is_one_clear_line(glider: Gliders) -> None:
         runs.part(np.arange(k) < 5)
     with pytest.raises(CalibrationError, match="horizontal: needs roll"):
         fit(replace(runs, attitude=None), "horizontal")
+    with pytest.raises(CalibrationError, match=r"method runs: 3 runs .* order 3 needs 4: fly runs"):
+        fit(runs.part(np.isin(runs.runs, [0, 1, 2])), "runs")
 
 
 def test_a_collapsed_fit_is_refused() -> None:

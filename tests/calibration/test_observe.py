@@ -25,7 +25,7 @@ def test_a_deployment_s_columns_become_observations() -> None:
     }
     ds = xr.Dataset(columns, coords={"time": np.arange(n) * 4.0})
     data = observations(ds, ["battpos"])
-    assert data.names == ("battpos",)
+    assert data.names == ("battpos",) == observations(ds, "battpos").names
     assert data.units == ("in",)
     assert len(data) == n
     with pytest.raises(FormatError, match=r"column 'fin': expected .*; there are: .* battpos"):

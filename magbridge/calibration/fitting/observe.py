@@ -27,7 +27,7 @@ FOLLOWED = ("sensor_temperature", "depth")
 
 
 def observations(
-    ds: xr.Dataset, parameters: Sequence[str], *, grid: AnomalyGrid | None = None
+    ds: xr.Dataset, parameters: str | Sequence[str], *, grid: AnomalyGrid | None = None
 ) -> Observations:
     """Make the observations of a fit from a deployment's columns.
 
@@ -36,7 +36,7 @@ def observations(
     ds : Dataset
         A deployment. Its reference is :func:`~magbridge.field.reference.earth_field`; headings that it
         declares to be magnetic are made true.
-    parameters : sequence of str
+    parameters : str or sequence of str
         Columns that move masses.
     grid : AnomalyGrid, optional
         Added to the IGRF where there is no ``reference_field``.
@@ -48,6 +48,7 @@ def observations(
     CalibrationError
         A column does not hold numbers; a parameter is a column with another meaning.
     """
+    parameters = (parameters,) if isinstance(parameters, str) else tuple(parameters)
     if others := [name for name in parameters if name in COLUMNS and name not in FOLLOWED]:
         raise CalibrationError(f"parameter {others[0]!r} is {COLUMNS[others[0]].long_name}: it moves no mass")
     names = (*CHANNELS, *parameters)
@@ -64,7 +65,7 @@ def observations(
         parameters=np.stack([columns[name] for name in parameters], axis=1)
         if parameters
         else np.empty((len(time), 0)),
-        names=tuple(parameters),
+        names=parameters,
         units=tuple(str(ds[name].attrs.get("units", "")) for name in parameters),
         runs=_runs(ds, time),
         time=time,
