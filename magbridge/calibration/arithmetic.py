@@ -33,7 +33,7 @@ __all__ = [
     "apply",
     "combined",
     "for_arrays",
-    "powers",
+    "monomials",
     "prepare",
     "split",
 ]
@@ -60,7 +60,7 @@ def for_arrays() -> Any:
     return module
 
 
-def powers(
+def monomials(
     values: Sequence[Any],
     centres: tuple[float, ...],
     scales: tuple[float, ...],

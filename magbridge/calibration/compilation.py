@@ -54,7 +54,6 @@ def compile_kernel(calibration: Calibration) -> Kernel:
         centre=tuple(parameter.centre for parameter in calibration.parameters),
         scale=tuple(parameter.scale for parameter in calibration.parameters),
         parents=tuple((row[_parent(e)[0]], _parent(e)[1]) for e in exponents[1:]),
-        monomials=len(exponents),
         weights=W,
         units=tuple(units.tolist()) if calibration.effects else None,
         first=first,

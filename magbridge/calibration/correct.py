@@ -123,7 +123,7 @@ class Corrector:
         values = tuple(values)
         if values != self._values or self._steps:
             self._values, self._flags = values, self._flags_of(values)
-            regressors = self._kernel.powers(values, 1.0)
+            regressors = self._kernel.monomials(values, 1.0)
             for effect in self._steps:
                 regressors += effect(time_us, hx, hy, hz, values)
             if regressors != self._last:
@@ -170,7 +170,7 @@ class Corrector:
 
     def _linear(self, positions: tuple[float, ...], index: int, value: float) -> list[float]:
         """Return A's six entries and T with position `index` at `value`; NaN if that is too far off."""
-        phi = self._kernel.powers((*positions[:index], value, *positions[index + 1 :]), 1.0)
+        phi = self._kernel.monomials((*positions[:index], value, *positions[index + 1 :]), 1.0)
         if not max(map(abs, phi)) < FARTHEST:
             return [nan] * len(self._weights)
         return [combined(phi, column) for column in self._weights]
@@ -246,7 +246,7 @@ def _regressors(
     kernel: Kernel, steps: list[Step], field: FloatArray, channels: FloatArray, time: FloatArray
 ) -> FloatArray:
     """Return (m, n) regressors: monomials vectorised; effects sample by sample, because they have a state."""
-    phi = kernel.powers(list(channels.T), np.ones(len(field)))
+    phi = kernel.monomials(list(channels.T), np.ones(len(field)))
     if steps:
         times = np.rint(np.asarray(time) * 1e6).astype(np.int64).tolist()
         samples = list(zip(times, *field.T.tolist(), channels.tolist(), strict=True))

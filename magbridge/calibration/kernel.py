@@ -29,7 +29,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from magbridge.calibration.arithmetic import BITS, COARSE, FINE, powers, split
+from magbridge.calibration.arithmetic import BITS, COARSE, FINE, monomials, split
 
 __all__ = ["COLUMNS", "FARTHEST", "Kernel"]
 
@@ -55,10 +55,8 @@ class Kernel:
         Of each parameter.
     parents : tuple of (int, int)
         Monomial ``i + 1`` is monomial ``parents[i][0]`` times position ``parents[i][1]``.
-    monomials : int
-        Number of monomials; the remaining regressors belong to effects.
     weights : (m, 9) array
-        W, with ``A`` itself (not ``a``) in the first six.
+        W, with ``A`` itself (not ``a``) in the first six; the rows of monomials, then those of effects.
     units : tuple of float or None
         Powers of two that the regressors are multiplied by; None where all are 1.
     first, second : (q,) int arrays
@@ -71,7 +69,6 @@ class Kernel:
     centre: tuple[float, ...]
     scale: tuple[float, ...]
     parents: tuple[tuple[int, int], ...]
-    monomials: int
     weights: FloatArray
     units: tuple[float, ...] | None
     first: NDArray[np.intp]
@@ -123,13 +120,18 @@ class Kernel:
         """(81, 2 q) `coarse` beside `fine`, to multiply the fine parts of psi and then its coarse parts."""
         return np.concatenate([self.coarse, self.fine], axis=1)
 
-    def powers(self, values: Sequence[Any], one: Any) -> list[Any]:
+    @property
+    def position_weights(self) -> FloatArray:
+        """(m, 9) rows of W that belong to the m monomials."""
+        return self.weights[: len(self.parents) + 1]
+
+    def monomials(self, values: Sequence[Any], one: Any) -> list[Any]:
         """Return the monomials, of floats or of arrays: the same multiplications in the same order."""
-        return powers(values, self.centre, self.scale, self.parents, one)
+        return monomials(values, self.centre, self.scale, self.parents, one)
 
     def monomials_of(self, positions: FloatArray) -> FloatArray:
         """(m, n) monomials of (n, k) positions."""
-        return np.stack(self.powers(list(positions.T), np.ones(len(positions))))
+        return np.stack(self.monomials(list(positions.T), np.ones(len(positions))))
 
 
 def _scales(phi: FloatArray) -> FloatArray:

@@ -245,13 +245,13 @@ class ClockEffect(Effect, frozen=True, kw_only=True):
     def begin(self, calibration: Calibration) -> Step:
         """Return a stepper; rates are differences from the previous sample over the time between."""
         kernel, field = calibration.kernel, calibration.reference.field
-        W = kernel.weights[: kernel.monomials] * np.array([field] * 6 + [1.0] * 3)
+        W = kernel.position_weights * np.array([field] * 6 + [1.0] * 3)
         last: list[float] = []
         still, weights, then = (0.0,) * 9, W.T.tolist(), 0
 
         def step(time_us: int, hx: float, hy: float, hz: float, values: Sequence[float]) -> tuple[float, ...]:
             nonlocal last, then
-            now, before, apart = kernel.powers(values, 1.0), last, time_us - then
+            now, before, apart = kernel.monomials(values, 1.0), last, time_us - then
             last, then = now, time_us
             if now == before or not before or not 0 < apart < MAX_INTERVAL:
                 return still

@@ -209,7 +209,7 @@ class Calibration:
         T : (n, 3) array
             nT.
         """
-        theta = self.kernel.monomials_of(positions).T @ self.kernel.weights[: self.kernel.monomials]
+        theta = self.kernel.monomials_of(positions).T @ self.kernel.position_weights
         return symmetric(theta), theta[:, 6:]
 
 

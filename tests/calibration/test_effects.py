@@ -49,7 +49,7 @@ def stepped(
     if values is not None:
         channels[:, -1] = values
     field = np.full((n, 3), 3e4) if field is None else field
-    return regressors(cal, field, channels, START + time)[cal.kernel.monomials :].T
+    return regressors(cal, field, channels, START + time)[len(cal.kernel.position_weights) :].T
 
 
 def test_a_lag_approaches_a_new_temperature_as_heat_stores_do() -> None:

@@ -115,8 +115,8 @@ def nominal(
         raise CalibrationError("nominal: no start settled; are the samples those of one sensor?")
     _, found, noise, rho = best
     noise = replace(noise, autocorrelation=rho)
-    witnesses = (1.0 - rho) / (1.0 + rho)
-    precision = found.normal.hessian * witnesses / noise.sigma**2 + prior.precision
+    independent = (1.0 - rho) / (1.0 + rho)
+    precision = found.normal.hessian * independent / noise.sigma**2 + prior.precision
     covariance = E @ covariance_of(precision) @ E.T
     coefficients = E @ found.z
     check_scales(samples, coefficients)

@@ -37,7 +37,7 @@ def mass_rates(problem: Problem) -> FloatArray:
     """
     survey, calibration = problem.survey, problem.calibration
     kernel = calibration.kernel
-    W = kernel.weights[: kernel.monomials] * np.array([calibration.reference.field] * 6 + [1.0] * 3)
+    W = kernel.position_weights * np.array([calibration.reference.field] * 6 + [1.0] * 3)
     p, t = survey.values([parameter.name for parameter in calibration.parameters]), survey.time
     after = np.diff(p, axis=0, append=p[-1:]) / np.diff(t, append=t[-1] + 1.0)[:, None]
     after[:-1] *= survey.follows(LOST)[1:, None]
