@@ -17,6 +17,7 @@ from magbridge.records import Quality
 __all__ = [
     "COUNTERS",
     "MEANING",
+    "SETTINGS",
     "deployment",
     "increasing",
     "join",
