@@ -45,17 +45,17 @@ DRAWN = {
     "stuck": 112.6, "sounder": 93.7, "gradient": 46.64, "squeezed": 36.07, "flare": 67.93, "swarf": 78.9,
     "ageing": 58.37, "crossfield": 373.1, "railway": 21.51, "rudder": 23.16,
 }  # fmt: skip
-"""Norm (nT) of what each does to the log of :func:`stage`, as first drawn.
+"""Norm (nT) of what each does to the log of :func:`flight`, as first drawn.
 
 A case of the blind study is the same in every study: whoever changes an effect's physics or the order of its
 draws on purpose replaces its number, and the cases of earlier studies are then others. The tolerance is that
 of the printed digits; another draw changes the first of them.
 """
-Stage = tuple[Twin, Track, np.ndarray]
+Flight = tuple[Twin, Track, np.ndarray]
 
 
 @pytest.fixture(scope="module")
-def stage() -> Stage:
+def flight() -> Flight:
     swap = msgspec.structs.replace
     base = load("demo")
     exact = swap(
@@ -67,17 +67,17 @@ def stage() -> Stage:
 
 
 @pytest.fixture(scope="module")
-def clean(stage: Stage) -> xr.Dataset:
-    return seen(stage)
+def clean(flight: Flight) -> xr.Dataset:
+    return seen(flight)
 
 
-def seen(stage: Stage, *hidden: Hidden) -> xr.Dataset:
-    return disturb(stage[0], hidden, *stage[1:], seed=3)
+def seen(flight: Flight, *hidden: Hidden) -> xr.Dataset:
+    return disturb(flight[0], hidden, *flight[1:], seed=3)
 
 
-def effect(stage: Stage, clean: xr.Dataset, name: str, times: float = 1.0) -> tuple[np.ndarray, xr.Dataset]:
+def effect(flight: Flight, clean: xr.Dataset, name: str, times: float = 1.0) -> tuple[np.ndarray, xr.Dataset]:
     """What it does to the channels (n, 3), and the log."""
-    ds = seen(stage, Hidden(name, times * SIZE.get(name, 5.0), 11))
+    ds = seen(flight, Hidden(name, times * SIZE.get(name, 5.0), 11))
     return channels(ds) - channels(clean), ds
 
 
@@ -100,9 +100,9 @@ def test_it_knows_nothing_of_the_detector() -> None:
         assert not [name for name in imported(path) if name.startswith(forbidden)], path
 
 
-def test_a_filter_shows_a_turning_field_as_it_was(stage: Stage) -> None:
+def test_a_filter_shows_a_turning_field_as_it_was(flight: Flight) -> None:
     """Between simulated points a turning field is an arc: its chord, 0.5 nT off, would betray a delay."""
-    twin, track, when = stage
+    twin, track, when = flight
     delay, rate = 0.05, 3.0
     still = {name: np.full_like(values, values[0]) for name, values in track.parameters.items()}
     track = replace(track, parameters=still, roll=0.0 * track.roll, pitch=0.0 * track.pitch)
@@ -111,17 +111,17 @@ def test_a_filter_shows_a_turning_field_as_it_was(stage: Stage) -> None:
     np.testing.assert_allclose(filtered[1:], channels(disturb(twin, (), late, when, 3))[1:], atol=0.2)
 
 
-def test_nothing_hidden_is_the_twins_own_measurement(stage: Stage, clean: xr.Dataset) -> None:
-    twin, track, when = stage
+def test_nothing_hidden_is_the_twins_own_measurement(flight: Flight, clean: xr.Dataset) -> None:
+    twin, track, when = flight
     np.testing.assert_array_equal(channels(clean), channels(twin.measure(track, when)))
 
 
 @pytest.mark.parametrize("name", [*EFFECTS, *FOREIGN])
 def test_twice_the_size_does_twice_as_much_and_the_seed_decides_the_rest(
-    stage: Stage, clean: xr.Dataset, name: str
+    flight: Flight, clean: xr.Dataset, name: str
 ) -> None:
     def change(times: float) -> np.ndarray:
-        own, ds = effect(stage, clean, name, times)
+        own, ds = effect(flight, clean, name, times)
         others = [ds[c] - clean[c] for c in ("reference_field", "battpos", "ballast")]
         return np.column_stack([own, *others])
 
@@ -132,16 +132,16 @@ def test_twice_the_size_does_twice_as_much_and_the_seed_decides_the_rest(
     np.testing.assert_array_equal(change(1.0), one)
 
 
-def test_several_add_up(stage: Stage, clean: xr.Dataset) -> None:
+def test_several_add_up(flight: Flight, clean: xr.Dataset) -> None:
     a, b = Hidden("current_field", 3.0, 1), Hidden("offset_step", 4.0, 2)
-    both, *each = (channels(seen(stage, *hidden)) - channels(clean) for hidden in ((a, b), (a,), (b,)))
+    both, *each = (channels(seen(flight, *hidden)) - channels(clean) for hidden in ((a, b), (a,), (b,)))
     np.testing.assert_allclose(both, sum(each), atol=1e-3)
 
 
 @pytest.mark.parametrize("name", ["current_field", "pressure_offset"])
-def test_a_vehicles_field_is_the_same_on_another_track(stage: Stage, name: str) -> None:
+def test_a_vehicles_field_is_the_same_on_another_track(flight: Flight, name: str) -> None:
     """What the truth says per unit of a channel is what a fit without noise finds, on either track."""
-    twin, *_ = stage
+    twin, *_ = flight
     for seed in (4, 5):
         track = Twin.draw(twin.scenario, seed).fly()
         there = (twin, track, np.arange(0.0, track.elapsed[-1] - 30.0, 4.0))
@@ -152,21 +152,21 @@ def test_a_vehicles_field_is_the_same_on_another_track(stage: Stage, name: str) 
             assert min(abs(s / truth[axis] - 1.0) for s in slopes) < 0.03
 
 
-def test_a_late_clock_shifts_the_telemetry_only(stage: Stage, clean: xr.Dataset) -> None:
-    own, ds = effect(stage, clean, "clock_offset", 20.0)
+def test_a_late_clock_shifts_the_telemetry_only(flight: Flight, clean: xr.Dataset) -> None:
+    own, ds = effect(flight, clean, "clock_offset", 20.0)
     assert not own.any()
-    _, track, when = stage
+    _, track, when = flight
     late = json.loads(ds.attrs["truth"])["delay"]
     assert abs(late) == pytest.approx(1.0)
     then = np.interp(when - late, track.elapsed, track.parameters["ballast"])
     assert ds["ballast"].to_numpy()[1:] == pytest.approx(then[1:])
 
 
-def test_skew_reads_each_channel_in_its_own_time(stage: Stage) -> None:
+def test_skew_reads_each_channel_in_its_own_time(flight: Flight) -> None:
     size = 0.5  # the simulation's own step
-    ds = seen(stage, Hidden("channel_skew", size, 11))
+    ds = seen(flight, Hidden("channel_skew", size, 11))
     truth = json.loads(ds.attrs["truth"])
-    twin, track, when = stage
+    twin, track, when = flight
     for axis in "xyz":
         later = disturb(twin, (), track, when + truth[axis], 3)
         np.testing.assert_allclose(ds[f"mag_{axis}"], later[f"mag_{axis}"], atol=1e-3)
@@ -174,8 +174,8 @@ def test_skew_reads_each_channel_in_its_own_time(stage: Stage) -> None:
     assert not {"mag_time_x", "mag_time_z"} & set(ds.data_vars)  # nobody says so
 
 
-def test_a_ring_couples_across_axes_only(stage: Stage, clean: xr.Dataset) -> None:
-    own, ds = effect(stage, clean, "eddy_current")
+def test_a_ring_couples_across_axes_only(flight: Flight, clean: xr.Dataset) -> None:
+    own, ds = effect(flight, clean, "eddy_current")
     truth = json.loads(ds.attrs["truth"])
     rate = np.gradient(channels(clean), 4.0, axis=0)
     # it turns the field of one axis into that of the others
@@ -185,12 +185,12 @@ def test_a_ring_couples_across_axes_only(stage: Stage, clean: xr.Dataset) -> Non
     assert np.std(own[:, j]) < 0.2 * np.std(own[:, i])
 
 
-def test_steel_remembers_where_the_mass_came_from(stage: Stage, clean: xr.Dataset) -> None:
+def test_steel_remembers_where_the_mass_came_from(flight: Flight, clean: xr.Dataset) -> None:
     """At one place it is magnetised one way or the other, by where the mass came from."""
-    _, track, _ = stage
+    _, track, _ = flight
     x = track.parameters["battpos"]
-    own, _ = effect(stage, clean, "hysteresis")
-    at = np.interp(stage[2], track.elapsed, x)
+    own, _ = effect(flight, clean, "hysteresis")
+    at = np.interp(flight[2], track.elapsed, x)
     rising = np.gradient(at) > 1e-3
     falling = np.gradient(at) < -1e-3
     middle = np.abs(at - np.median(at)) < 0.15
@@ -209,8 +209,8 @@ def test_heat_soaks_in_later_than_one_lag_and_all_the_way() -> None:
     assert core[np.searchsorted(t, 0.1 * lag)] < 0.5 * (1.0 - np.exp(-0.1))
 
 
-def test_foreign_effects_are_no_ones(stage: Stage, clean: xr.Dataset) -> None:
+def test_foreign_effects_are_no_ones(flight: Flight, clean: xr.Dataset) -> None:
     assert not set(EFFECTS) & set(FOREIGN)
-    relay, _ = effect(stage, clean, "relay")
+    relay, _ = effect(flight, clean, "relay")
     levels = np.unique(np.round(np.linalg.norm(relay, axis=1), 2))
     assert len(levels) == 2
