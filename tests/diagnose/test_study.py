@@ -171,9 +171,9 @@ def test_two_are_named_unless_another_whole_says_the_same() -> None:
     assert chances(("c", both), ("d", else_)) == (0.0, 0.0)
 
 
-def nameless_chances(apart: float, k: int = 3, wanted: float = 10.0) -> dict[str, float]:
-    """Of a truth of k numbers one name of three leaves so much; 27 hold it in twenty ways."""
-    X = np.zeros((31, 31))
+def nameless_chances(apart: float) -> dict[str, float]:
+    """Of a truth of three numbers, at S/N 10, one name of three leaves so much; 27 hold it in twenty ways."""
+    wanted, X = 10.0, np.zeros((31, 31))
     X[:30, :30] = np.eye(30)
     X[27, 30], X[0, 30] = np.sqrt(wanted**2 - apart**2), apart
     X[:, 0] = X[:, 30] / wanted
@@ -181,7 +181,7 @@ def nameless_chances(apart: float, k: int = 3, wanted: float = 10.0) -> dict[str
     ratio, freedom = draws.ratio(name)
     needed = against(draws, {"other": log_bayes(ratio, freedom)}, [], {})
     free = Description(lambda rows: X[rows, :27], (("drift", np.ones(27)),) * 20)
-    truth = Span("truth", SHOWN, slice(30, 31), more=k - 1)
+    truth = Span("truth", SHOWN, slice(30, 31), more=2)
     return nameless(draws, evidence(truth, *draws.ratio(truth)), needed, [free])
 
 

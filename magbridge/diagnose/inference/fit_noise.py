@@ -26,6 +26,8 @@ ORDERS = (1, 2, 3, 5, 8, 13)
 LONGEST = ORDERS[-1]
 GAUSSIAN = 1e5
 """Degrees of freedom from which on the tails are taken for Gaussian."""
+ROUNDS = 3
+"""Rounds of fitting autoregression, tails and level in turn, at most."""
 ALTERNATIONS = 6
 """Alternations between the weights of the samples and the level, at most."""
 SETTLED = 0.01
@@ -120,7 +122,6 @@ def fit_noise(
     *,
     blocks: bool | None = None,
     like: Noise | None = None,
-    rounds: int = 3,
     brief: bool = False,
 ) -> Noise:
     """Fit the noise model.
@@ -135,8 +136,6 @@ def fit_noise(
         Let the level change from block to block; decided by the data if not given.
     like : Noise, optional
         A noise that it will resemble: the fit begins from its level and tails.
-    rounds : int
-        Of the alternation between autoregression, tails and level.
     brief : bool
         Allow no longer time constant than :data:`BRIEFEST`.
     """
@@ -151,7 +150,7 @@ def fit_noise(
         nu, scale = like.nu, like.scale
         weight = (nu + 1.0) / (nu + ((residual - lags @ like.ar) / scale) ** 2)
     v, log_likelihood = residual, -np.inf
-    for _ in range(rounds):
+    for _ in range(ROUNDS):
         if whole.sum() > 2 * order:
             ar = _stable(_regressed(lags, residual, whole * weight / scale**2), 0 if brief else n)
         beside_gaps = Predictors(past, ar)
