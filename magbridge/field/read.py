@@ -8,6 +8,7 @@ their first bytes.
 from __future__ import annotations
 
 from collections.abc import Callable
+from math import isfinite, nan
 from pathlib import Path
 from typing import Any
 
@@ -83,16 +84,26 @@ def read_polygon(path: str | Path) -> Array:
         It cannot be read or is not a polygon.
     """
     try:
-        with Path(path).open(encoding="utf-8-sig") as file:
-            header = file.readline().lower().startswith("longitude")
-        polygon = np.loadtxt(path, delimiter=",", ndmin=2, encoding="utf-8-sig", skiprows=int(header))
+        lines = Path(path).read_text(encoding="utf-8-sig").splitlines()
     except OSError as error:
         raise FormatError(path, f"cannot be read: {error.strerror or error}") from error
-    except ValueError as error:
-        raise FormatError(path, f"expected longitude,latitude in every row: {error}") from error
-    if polygon.shape[1:] != (2,) or len(polygon) < 3 or not np.isfinite(polygon).all():
+    except UnicodeDecodeError:
+        raise FormatError(path, "expected text in UTF-8") from None
+    corners = []
+    for row, line in enumerate(lines, 1):
+        text = line.partition("#")[0].strip()
+        if not text or (row == 1 and text.lower().startswith("longitude")):
+            continue
+        try:
+            longitude, latitude = map(float, text.split(","))
+        except ValueError:
+            longitude = latitude = nan
+        if not (isfinite(longitude) and isfinite(latitude)):
+            raise FormatError(path, f"expected longitude,latitude (deg), not {text!r}", row=row)
+        corners.append((longitude, latitude))
+    if len(corners) < 3:
         raise FormatError(path, "expected longitude,latitude (deg) in at least three rows")
-    return polygon
+    return np.array(corners)
 
 
 def _scale(path: Path, unit: str | None) -> float:

@@ -76,7 +76,10 @@ def _header(path: Path, lines: Iterator[str]) -> _Header:
         line, row = next(lines, ""), row + 1
     if not line.strip():
         raise FormatError(path, "expected a header row, the file is empty", row=row)
-    matches = [HEADING.fullmatch(heading.strip()) for heading in next(csv.reader([line]))]
+    headings = next(csv.reader([line]))
+    if len(headings) == 1 and {";", "\t"} & set(line.strip()):
+        raise FormatError(path, "expected columns separated by commas, and points in decimals", row=row)
+    matches = [HEADING.fullmatch(heading.strip()) for heading in headings]
     names = [match["name"] if match else "" for match in matches]
     units = {match["name"]: match["unit"] for match in matches if match and match["unit"]}
     for k, name in enumerate(names):

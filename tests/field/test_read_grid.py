@@ -243,7 +243,15 @@ def test_a_polygon_may_have_a_header(tmp_path: Path) -> None:
             read_polygon(tmp_path / "mask.csv"), [[10.1, 54.1], [10.4, 54.1], [10.2, 54.3]]
         )
     (tmp_path / "mask.csv").write_text("place,longitude,latitude\n")
-    with pytest.raises(FormatError, match=r"mask.csv: expected longitude,latitude in every row: could not"):
+    with pytest.raises(
+        FormatError, match=r"mask.csv: row 1: expected longitude,latitude \(deg\), not .place"
+    ):
+        read_polygon(tmp_path / "mask.csv")
+    (tmp_path / "mask.csv").write_text(corners + "10.2,nan\n")
+    with pytest.raises(FormatError, match=r"mask.csv: row 4: expected .* not '10.2,nan'"):
+        read_polygon(tmp_path / "mask.csv")
+    (tmp_path / "mask.csv").write_text(corners[:10])
+    with pytest.raises(FormatError, match="at least three rows"):
         read_polygon(tmp_path / "mask.csv")
 
 
