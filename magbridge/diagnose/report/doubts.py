@@ -150,7 +150,7 @@ def useful(diagnosis: Diagnosis) -> str:
         return ""
     stays = [c for c in diagnosis.named if not c.effects or any(effect not in added for effect in c.effects)]
     others = ", ".join(escape(label(candidate.cause, candidate.channel)) for candidate in stays)
-    but = f" It leaves in the field what the RMS above is without: {others}." if stays else ""
+    but = f" It leaves {others} in the field, which the RMS above has removed." if stays else ""
     verdict = (
         "corrects for what belongs to the vehicle and its sensor"
         if diagnosis.total.shown
