@@ -228,6 +228,12 @@ def test_bad_data_is_one_clear_line(glider: Gliders) -> None:
             fit(replace(runs, **changes), method)
 
     refused(r"'ballast' has 0", parameters=np.column_stack([runs.parameters[:, 0], np.full(k, np.nan)]))
+    turns = np.arange(k)[:, None] % 2 == 0
+    refused(
+        "different rows: interpolate",
+        parameters=np.where(turns, runs.parameters, np.nan),
+        field=np.where(turns, np.nan, runs.field),
+    )
     refused("not known", "magic")
     refused("expected positive", reference=np.zeros(k))
     with pytest.raises(CalibrationError, match="only 5 of 5"):

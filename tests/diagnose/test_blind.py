@@ -208,7 +208,9 @@ def test_a_channels_name_does_not_decide(
     first = found.findings[0]
     sun = replace(first.candidate, cause="diurnal_variation", channel=None, effects=())
     both = (first, replace(first, hypothesis=replace(first.hypothesis, candidate=sun)))
-    assert useful(replace(found, findings=both)).endswith("It leaves diurnal variation in the field, which the RMS above has removed.</p>")
+    assert useful(replace(found, findings=both)).endswith(
+        "It leaves diurnal variation in the field, which the RMS above has removed.</p>"
+    )
 
 
 def test_bad_input_is_one_line(warm: tuple[xr.Dataset, Calibration]) -> None:

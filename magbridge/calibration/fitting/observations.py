@@ -167,6 +167,8 @@ def _enough(
     counts = {name: int(np.isfinite(column).sum()) for name, column in columns}
     reasons = [f"{name!r} has {count}" for name, count in counts.items() if count < min(n, 10)]
     because = f" ({', '.join(reasons)} numbers)" if reasons else ""
+    if n >= 10 and not reasons:
+        because = " (the columns have theirs in different rows: interpolate all to the times of mag_x)"
     raise CalibrationError(
         f"only {int(whole.sum())} of {n} samples have every value{because}: at least 10 needed"
     )
