@@ -5,8 +5,8 @@ The science file of the same name beside a flight file is joined to it, and the 
 or both, give the same deployment. The list of sensors is read from the file ``<crc>.cac`` beside the file.
 
 Angles are converted to degrees; ``heading`` is the compass's, magnetic. A Slocum logs no vector magnetometer
-of its own, so there is no ``mag_x``: the log can drive a simulated one. To correct the log of an instrument that
-was carried along, give both; to calibrate it, interpolate this log's columns to the instrument's times.
+of its own, so there is no ``mag_x``: the log can drive a simulated one. To correct the log of an instrument
+that was carried along, give both; to calibrate it, interpolate this log's columns to the instrument's times.
 """
 
 from __future__ import annotations
