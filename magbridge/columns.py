@@ -59,6 +59,13 @@ COLUMNS: dict[str, Column] = {
     "longitude": Column("deg", "longitude, east positive (WGS84)"),
     "depth": Column("m", "depth below the surface"),
     "reference_field": Column("nT", "true total magnetic field"),
+    "velocity_north": Column("m/s", "velocity by dead reckoning, north"),
+    "velocity_east": Column("m/s", "velocity by dead reckoning, east"),
+    "water_speed": Column("m/s", "speed through the water"),
+    "local_north": Column("m", "local position, north"),
+    "local_east": Column("m", "local position, east"),
+    "dr_latitude": Column("deg", "dead-reckoned latitude"),
+    "dr_longitude": Column("deg", "dead-reckoned longitude"),
     "total_field": Column("nT", "corrected total magnetic field"),
     "total_field_sigma": Column("nT", "1-sigma of the corrected total field"),
     "field_x": Column("nT", "corrected magnetic field, body x (forward)"),
@@ -90,6 +97,7 @@ _FACTORS = {
     ("rad", "deg"): 57.29577951308232,
     ("cm", "m"): 1e-2,
     ("km", "m"): 1e3,
+    ("cm/s", "m/s"): 1e-2,
 }
 _SAME = {
     "degrees": "deg",
@@ -101,6 +109,8 @@ _SAME = {
     "meters": "m",
     "metre": "m",
     "meter": "m",
+    "m s-1": "m/s",
+    "cm s-1": "cm/s",
     "seconds": "s",
     "sec": "s",
     "Celsius": "degC",
@@ -127,9 +137,10 @@ _SAME = {
 def factor(unit: str, column: str) -> float | None:
     """Return the factor from `unit` to the unit of `column`; None where there is no conversion.
 
-    A column that is not in :data:`COLUMNS` keeps the unit it declares: its factor is 1.
+    A column that is not in :data:`COLUMNS` keeps the unit it declares: its factor is 1. So is that of a unit
+    which is undeclared (empty, or the 1 that is then written).
     """
-    if column not in COLUMNS or not unit:
+    if column not in COLUMNS or unit in ("", "1"):
         return 1.0
     wanted, unit = COLUMNS[column].unit, usual(unit)
     return 1.0 if unit == wanted else _FACTORS.get((unit, wanted))

@@ -25,6 +25,7 @@ BAD_CSV = {
     "time,mag_x\n": "row 2: expected rows after the header",
     "t,mag_x\n1,2\n": "row 1, column 'time': expected this column; there are: t mag_x",
     "time;mag_x\n1;2\n": "row 1: expected columns separated by commas, and points in decimals",
+    "time,water_speed [kn]\n1,2\n": "column 'water_speed': expected m/s, not kn",
     "time\tmag_x\n1\t2\n": "row 1: expected columns separated by commas, and points in decimals",
     "time,,mag_x\n1,2,3\n": "row 1: expected a name of its own for column 2, not ''",
     "time,mag_x,mag_x\n1,2,3\n": "row 1: expected a name of its own for column 3, not 'mag_x'",
