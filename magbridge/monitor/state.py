@@ -108,7 +108,7 @@ class State:
         self.parameters: dict[str, Parameter] = {}
         self._count = self._lost_before = 0
         self._sequence = -1
-        self._piece = (0, 0)
+        self._piece = (0, -1)
         self._beat = self._asked = -inf
 
     def hear(self, message: Message, now: float) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from enum import IntEnum
 from math import hypot, isfinite, nan, sqrt
 
 from magbridge.field.earth import worse_axis
@@ -62,13 +63,12 @@ def measured(state: State) -> dict[str, tuple[str, str]]:
 def health(state: State) -> dict[str, tuple[str, bool]]:
     """Return the bridge's condition: name of each item to its text, and whether it is in order."""
     field, get = state.field.get, state.status.get
-    sensor, autopilot = (MAG_PORT_STATE(get(f"{line}_state", 0)) for line in ("sensor", "autopilot"))
-    log = MAG_LOG_STATE(get("log_state", 0))
+    sensor, autopilot, log = (get(f"{line}_state", 0) for line in ("sensor", "autopilot", "log"))
     losses = {name: get(counter, 0) for name, counter in LOSSES.items()}
     return {
-        "Sensor": (sensor.name.lower(), sensor == MAG_PORT_STATE.OK),
-        "Autopilot": (autopilot.name.lower(), autopilot == MAG_PORT_STATE.OK),
-        "Log": (log.name.lower(), log != MAG_LOG_STATE.FAILED),
+        "Sensor": (_word(MAG_PORT_STATE, sensor), sensor == MAG_PORT_STATE.OK),
+        "Autopilot": (_word(MAG_PORT_STATE, autopilot), autopilot == MAG_PORT_STATE.OK),
+        "Log": (_word(MAG_LOG_STATE, log), log in (MAG_LOG_STATE.OFF, MAG_LOG_STATE.OK)),
         "Sample rate": (_number(get("sample_rate", nan), ".2f", unit="Hz")[0], True),
         "Latency": (_number(1e3 * field("latency", nan), ".1f", unit="ms")[0], True),
         "Telemetry age": (
@@ -88,12 +88,12 @@ def health(state: State) -> dict[str, tuple[str, bool]]:
 def whereabouts(state: State) -> dict[str, tuple[str, bool]]:
     """Return the position filter's condition: name of each item to its text, and whether it is in order."""
     get = state.navigation.get
-    mode = MAG_NAVIGATION_STATE(get("state", 0))
+    mode = get("state", 0)
     nn, ne, ee = (get(f"covariance_{axes}", nan) for axes in ("nn", "ne", "ee"))
     sigma = worse_axis(nn, ne, ee) if nn + ee > 0.0 else nan
     innovation, variance = get("innovation", nan), get("innovation_variance", nan)
     return {
-        "State": (mode.name.lower().replace("_", " "), mode != MAG_NAVIGATION_STATE.LOST),
+        "State": (_word(MAG_NAVIGATION_STATE, mode), mode != MAG_NAVIGATION_STATE.LOST),
         "Position": (f"{get('lat', 0) * 1e-7:.5f}, {get('lon', 0) * 1e-7:.5f}", True),
         "1σ of the longer axis": (_number(sigma, ".0f", unit="m")[0], True),
         "Innovation ± 2σ": (
@@ -106,6 +106,12 @@ def whereabouts(state: State) -> dict[str, tuple[str, bool]]:
             True,
         ),
     }
+
+
+def _word(states: type[IntEnum], value: int) -> str:
+    """Return the word for a state; a newer bridge may have one that is not known here."""
+    known = {int(state): state.name.lower().replace("_", " ") for state in states}
+    return known.get(value, f"state {value}")
 
 
 def _count(count: int) -> str:

@@ -107,6 +107,16 @@ def test_the_position_by_the_field(air: Air) -> None:
     assert items["Innovation ± 2σ"] == ("+2.5 ± 2.0", False)
 
 
+def test_what_a_newer_bridge_says_is_shown_as_far_as_it_is_known(air: Air) -> None:
+    air.say(NOW, "MAG_STATUS", sensor_state=200, log_state=201)
+    air.say(NOW, "MAG_NAVIGATION", state=202)
+    air.say(NOW, "STATUSTEXT", chunk_seq=1, text="the end of what was not heard")
+    assert health(air.state)["Sensor"] == ("state 200", False)
+    assert health(air.state)["Log"] == ("state 201", False)
+    assert whereabouts(air.state)["State"][0] == "state 202"
+    assert [said.text for said in air.state.texts] == ["the end of what was not heard"]
+
+
 def test_only_the_first_bridge_is_heard(air: Air) -> None:
     air.give(Codec(1, 1).pack("STATUSTEXT", text="autopilot", severity=4), NOW)
     before = air.state.bridge
