@@ -11,6 +11,7 @@ from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.evidence import ODDS, REMNANT, log_odds
 from magbridge.diagnose.inference.rivals import Rival
+from magbridge.diagnose.inference.rounds import shaped_ratio
 from magbridge.diagnose.inference.search import Hypothesis, Outcome
 from magbridge.diagnose.unexplained.leftover import Leftover, leftover
 from magbridge.diagnose.unexplained.varying import varying
@@ -33,7 +34,8 @@ def accept(problem: Problem, outcome: Outcome, tone: Candidate | None) -> tuple[
     if not model:
         return False, rest
     ratio = 2.0 * (outcome.fit.log_likelihood - outcome.null.log_likelihood)
-    names = log_odds(ratio, model, outcome.trials) - float(np.log(len(outcome.trials)))
+    shaped = shaped_ratio(ratio, model, outcome.fit)
+    names = log_odds(ratio, model, outcome.trials, shaped) - float(np.log(len(outcome.trials)))
     if rest is not None:
         names += rest.among
         if rest.signal_to_noise < REMNANT * max(h.signal_to_noise for h in outcome.chosen):

@@ -50,13 +50,22 @@ def test_a_size_that_cannot_be_negative_has_one_tail(one: Candidate, least: floa
 def test_numbers_of_one_size_are_not_weighed_twice() -> None:
     one = candidate("map_error", 40, spectra=np.ones((4, 40)))
     assert evidence_of(one, 30.0, 1) == pytest.approx(15.0 - np.log(4.0))
-    assert log_odds(30.0, [one], {"map_error": 1.0}) == pytest.approx(evidence_of(one, 30.0, 1))
+    assert log_odds(30.0, [one], {"map_error": 1.0}, 0.0) == pytest.approx(evidence_of(one, 30.0, 1))
 
 
 def test_a_second_regressor_pays_for_its_choice_and_for_the_odds() -> None:
     model = [candidate("clock_offset"), candidate("reference_bias")]
     trials = {"clock_offset": 1.0, "reference_bias": 3.0}
-    assert log_bayes(200.0, 2) - log_odds(200.0, model, trials) == pytest.approx(np.log(20.0 * 2.0 * 3.0))
+    price = log_bayes(200.0, 2) - log_odds(200.0, model, trials, 200.0)
+    assert price == pytest.approx(np.log(20.0 * 2.0 * 3.0))
+
+
+def test_a_map_that_is_wrong_makes_no_size_of_the_vehicles_likelier() -> None:
+    """What takes any shape has a prior of its own: beside it a cause is worth what it is alone."""
+    step, chart = candidate("offset_step", 3), candidate("map_error", 6, spectra=np.ones((1, 6)))
+    trials = {"offset_step": 1.0, "map_error": 1.0}
+    worth = log_odds(225.0, [step, chart], trials, 25.0) - log_odds(200.0, [chart], trials, 0.0)
+    assert worth == pytest.approx(log_bayes(25.0, 3) - np.log(20.0 * 2.0))
 
 
 def counted(S: np.ndarray, sizes: list[int]) -> float:

@@ -15,6 +15,7 @@ from magbridge.calibration.terms import Polynomial
 from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.causes.masses import actuator_order
 from magbridge.diagnose.causes.regressors import lagged
+from magbridge.diagnose.causes.time_dependent import offset_step
 from magbridge.diagnose.causes.timing import field_rates, mass_rates
 from magbridge.diagnose.compare.interpolation import rates
 from magbridge.diagnose.compare.past import FAR
@@ -177,6 +178,19 @@ def test_a_candidate_profiled_again_stays_its_own_channels(problem: Problem) -> 
             np.testing.assert_array_equal(twice.columns(slice(0, 100)), candidate.columns(slice(0, 100)))
             seen += 1
     assert seen > 50
+
+
+def test_a_step_is_as_likely_at_a_power_cycle_as_at_all_other_times(problem: Problem) -> None:
+    """Between the calibration's own logs and these there has been one, too."""
+    t = problem.survey.time
+    learned = replace(problem.survey, learned=np.arange(len(t)) < 100, cycles=t[[300]])
+    grid = offset_step(replace(problem, survey=learned))
+    odds = {candidate.shape["onset"][0]: np.exp(candidate.likelier) for candidate in grid}
+    assert odds[t[100] - 1.0] + odds[t[300]] == pytest.approx(0.5 * len(grid))
+    assert sum(odds.values()) == pytest.approx(len(grid))
+    assert grid[0].again is not None
+    assert [grid[0].again(t[at]).likelier > 0.0 for at in (99, 101, 300)] == [True, False, True]
+    assert {candidate.likelier for candidate in offset_step(problem)} == {0.0}
 
 
 def test_a_cause_found_twice_is_one(problem: Problem) -> None:

@@ -13,6 +13,7 @@ from scipy.signal import lfilter
 from magbridge.calibration.instrument_effects import TimeEffect
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.compare.problem import Problem
+from magbridge.diagnose.inference.exchange import exchanged
 from magbridge.diagnose.inference.rounds import State
 from magbridge.diagnose.inference.search import search
 
@@ -44,6 +45,19 @@ def test_noise_does_not_swallow_what_two_causes_do_together(right: Callable[[int
     outcome = search(problem, [candidate("temperature_offset", warming, 10.0), step, chart], 3)
     assert {h.candidate.cause for h in outcome.chosen} == {"temperature_offset", "map_error"}
     assert outcome.fit.noise.slowest < 10.0 < 100.0 < outcome.null.noise.slowest
+
+
+def test_a_regressor_that_later_ones_made_needless_is_dropped(right: Callable[[int], Problem]) -> None:
+    """A step at one time is found for one at another, which is found beside it."""
+    rng = np.random.default_rng(1)
+    n = 600
+    early, late = (candidate("offset_step", (np.arange(n) >= at).astype(float), 10.0) for at in (60, 500))
+    problem = replace(right(n), residual=5.0 * (np.arange(n) >= 60) + rng.normal(size=n))
+    state = State(problem, [early, late], 1, 1)
+    state.null = state.fit([])
+    state.round([], state.null)
+    both = early.with_(late)
+    assert exchanged(state, [both], state.fit([both]))[0] == [early]
 
 
 def test_what_nature_cannot_do_is_the_vehicles(right: Callable[[int], Problem]) -> None:

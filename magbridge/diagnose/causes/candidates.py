@@ -45,6 +45,8 @@ class Candidate:
         Number of independent hypotheses that this one was picked from (frequencies searched).
     positive : bool
         Its coefficients cannot be negative.
+    likelier : float
+        Log of its prior probability, relative to the mean of its grid.
     narrow : float
         Log of how much narrower than their grid's cells its nonlinear parameters are by the data.
     cells : tuple of float
@@ -69,6 +71,7 @@ class Candidate:
     again: Callable[..., Candidate] | None = None
     trials: float = 1.0
     positive: bool = False
+    likelier: float = 0.0
     narrow: float = 0.0
     cells: tuple[float, ...] = ()
     parts: tuple[Candidate, ...] = ()
@@ -115,6 +118,7 @@ class Candidate:
             effects=self.effects + other.effects,
             shape=self.shape | {name + mark: value for name, value in other.shape.items()},
             again=None,
+            likelier=self.likelier + other.likelier,
             narrow=self.narrow + other.narrow,
             parts=(*self.pieces, *other.pieces),
         )

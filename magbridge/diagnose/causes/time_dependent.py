@@ -18,18 +18,29 @@ ONSETS = 40
 
 
 def offset_step(problem: Problem) -> list[Candidate]:
-    """The offset jumps, by a power cycle, a shock or a magnet: ``T += b H(t - t_0)``."""
+    """The offset jumps, by a power cycle, a shock or a magnet: ``T += b H(t - t_0)``.
+
+    As likely at a power cycle as at all other times together. Between the calibration's own logs and these
+    there has been one.
+    """
     survey = problem.survey
     t = survey.time
     fresh = t[~survey.learned]
     onsets = np.quantile(fresh, np.linspace(0.02, 0.98, ONSETS)) if fresh.size else t[:0]
+    first = fresh.min() - 1.0
+    cycles = {*survey.cycles, *([first] if survey.learned.any() else [])}
+    grid = np.unique([first, *onsets, *cycles])
 
     def again(onset: float) -> Candidate:
         effect = TimeEffect(cause="offset_step", shape="step", start=onset)
         phi = lambda rows: (t[rows] >= onset)[None].astype(float)  # noqa: E731  (a regressor is one line)
-        return of_effect(problem, effect, 100.0, "nT", shape={"onset": (onset, "s")}, again=again, phi=phi)
+        alike = len(cycles) if max(onset, first) in cycles else len(grid) - len(cycles)
+        return of_effect(
+            problem, effect, 100.0, "nT", shape={"onset": (onset, "s")}, again=again, phi=phi,
+            likelier=float(np.log(0.5 * len(grid) / alike)) if cycles else 0.0,
+        )  # fmt: skip
 
-    return [again(float(onset)) for onset in np.unique([fresh.min() - 1.0, *onsets, *survey.cycles])]
+    return [again(float(onset)) for onset in grid]
 
 
 def offset_drift(problem: Problem) -> list[Candidate]:

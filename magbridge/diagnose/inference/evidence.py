@@ -101,7 +101,7 @@ def evidence_of(candidate: Candidate, ratio: float, freedom: int) -> float:
     if candidate.spectra is not None:
         return 0.5 * ratio - float(np.log(len(candidate.spectra)))
     sided = float(np.log(2.0) + log_ndtr(np.sqrt(ratio))) if candidate.positive else 0.0
-    return log_bayes(ratio, freedom) + sided
+    return log_bayes(ratio, freedom) + sided + candidate.likelier
 
 
 def log_bayes(ratio: float, freedom: int) -> float:
@@ -166,8 +166,11 @@ def _independent(S: FloatArray, places: Sequence[slice], level: float) -> float:
     return len(seen) * float(np.mean(1.0 / np.sum(passed, axis=0)))
 
 
-def log_odds(ratio: float, model: Sequence[Candidate], trials: Mapping[str, float]) -> float:
+def log_odds(ratio: float, model: Sequence[Candidate], trials: Mapping[str, float], shaped: float) -> float:
     """Log posterior odds of a whole model of this likelihood ratio against no effect.
+
+    `shaped` is the part of it that is left beside causes that take any shape (:func:`~.rounds.shaped_ratio`).
+    The others' size is judged by that part, as beside the calibration.
 
     Every regressor pays for the number of hypotheses of its cause. Each after the first also pays for the
     prior odds of a further fault in one log, and for its choice among the causes. How narrowly the data
@@ -178,14 +181,15 @@ def log_odds(ratio: float, model: Sequence[Candidate], trials: Mapping[str, floa
         ODDS + float(np.log(len(trials)))
     )
     grids = sum(len(candidate.pieces) * float(np.log(trials[candidate.cause])) for candidate in model)
-    return evidence_of_all(ratio, model) - further - grids
+    return 0.5 * (ratio - shaped) + evidence_of_all(shaped, model) - further - grids
 
 
 def evidence_of_all(ratio: float, model: Sequence[Candidate]) -> float:
     """Log evidence of a whole model, its nonlinear parameters given."""
     free = sum(candidate.size for candidate in model if candidate.spectra is None)
     sided = float(np.log(2.0)) * sum(candidate.positive for candidate in model)
+    likelier = sum(candidate.likelier for candidate in model)
     spectra = sum(
         float(np.log(len(candidate.spectra))) for candidate in model if candidate.spectra is not None
     )
-    return (log_bayes(ratio, free) if free else 0.5 * ratio) + sided - spectra
+    return (log_bayes(ratio, free) if free else 0.5 * ratio) + sided + likelier - spectra

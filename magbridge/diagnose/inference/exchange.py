@@ -1,4 +1,4 @@
-"""Exchange causes for their rivals, since those found first were chosen without those found later."""
+"""Exchange causes for their rivals, or drop them: those found first were chosen without those found later."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ TRIED = 3
 
 
 def exchanged(state: State, model: list[Candidate], base: Joint) -> tuple[list[Candidate], Joint]:
-    """Replace one cause or two by others, profiled anew, while the evidence of the whole model grows."""
+    """Replace one regressor or two by others, or drop one, while the evidence of the whole model grows."""
     pieces = [piece for candidate in model for piece in candidate.pieces]
     for _ in range(CHANGES):
         best, better = state.value(pieces, base), (pieces, base)
@@ -39,7 +39,7 @@ def exchanged(state: State, model: list[Candidate], base: Joint) -> tuple[list[C
 
 
 def _changes(state: State, pieces: list[Candidate], base: Joint) -> list[tuple[list[Candidate], list[int]]]:
-    """List replacements and the places they would take, the likeliest first."""
+    """List replacements and the places they would take: first none in each place, then the likeliest."""
     info = state.beside(pieces, base)
     found = []
     if len(pieces) == 1:
@@ -50,7 +50,9 @@ def _changes(state: State, pieces: list[Candidate], base: Joint) -> list[tuple[l
             new = [c for c in (pair.first, pair.second) if not any(c is pieces[n] for n in kept)]
             found.append((pair.behind, new, [n for n in places if n not in kept]))
     found = [entry for entry in found if _separate(entry[1], pieces, entry[2])]
-    return [entry[1:] for entry in sorted(found, key=lambda entry: entry[0])[:TRIED]]
+    found = sorted(found, key=lambda entry: entry[0])[:TRIED]
+    needless = range(len(pieces) if len(pieces) > 1 else 0)
+    return [*(([], [n]) for n in needless), *(entry[1:] for entry in found)]
 
 
 def _separate(new: list[Candidate], pieces: list[Candidate], at: list[int]) -> bool:

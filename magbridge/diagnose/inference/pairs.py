@@ -60,6 +60,7 @@ class _Stack:
         self.places = np.array(places)
         self.index = np.array([np.r_[at[k]] for k in places])
         self.positive = np.array([candidates[k].positive for k in places])
+        self.likelier = np.array([candidates[k].likelier for k in places])
         self.S = info.matrix[self.index[:, :, None], self.index[:, None, :]]
         self.b = info.score[self.index]
 
@@ -87,7 +88,7 @@ class _Stack:
         over = np.maximum(ratio / np.maximum(freedom, 1), 1.0)
         evidence = 0.5 * freedom * (over - 1.0 - np.log(over))
         evidence += np.where(self.positive & (ratio > 0.0), np.log(2.0) + log_ndtr(np.sqrt(ratio)), 0.0)
-        return evidence, ratio, freedom
+        return evidence + self.likelier, ratio, freedom
 
 
 def pairs_of(

@@ -22,7 +22,7 @@ from magbridge.diagnose.inference.information import Information, information
 from magbridge.diagnose.inference.joint import RIDGE, Joint, fit_joint, volume_of
 from magbridge.diagnose.inference.noise import Noise
 
-__all__ = ["Hypothesis", "State", "key"]
+__all__ = ["Hypothesis", "State", "key", "shaped_ratio"]
 
 FloatArray = NDArray[np.float64]
 
@@ -79,6 +79,19 @@ def wald(fit: Joint, size: int) -> float:
     """Wald's statistic of the last coefficients."""
     b, own = fit.coefficients[-size:], fit.covariance[-size:, -size:]
     return float(b @ np.linalg.solve(own, b))
+
+
+def shaped_ratio(ratio: float, model: Sequence[Candidate], fit: Joint) -> float:
+    """Likelihood ratio of the causes of a model that have a shape, beside those that take any.
+
+    `ratio` is that of the whole model.
+    """
+    free = np.repeat([candidate.shapeless for candidate in model], [candidate.size for candidate in model])
+    if not free.any():
+        return ratio
+    own = np.flatnonzero(~free)
+    b, at = fit.coefficients[own], len(fit.z) + own
+    return min(ratio, float(b @ np.linalg.solve(fit.covariance[np.ix_(at, at)], b)))
 
 
 def wald_ratio(fit: Joint, candidate: Candidate) -> float:
@@ -148,8 +161,8 @@ class State:
     def value(self, model: Sequence[Candidate], fit: Joint) -> float:
         """Log evidence of a model; each cause must also outweigh what idealised regressors may leave."""
         ratio, causes = self.ratio(fit), {candidate.cause for candidate in model}
-        narrow = sum(candidate.narrow for candidate in model)
-        return log_odds(ratio, model, self.trials) - narrow - len(causes) * regressor_error(ratio)
+        narrow, shaped = sum(candidate.narrow for candidate in model), shaped_ratio(ratio, model, fit)
+        return log_odds(ratio, model, self.trials, shaped) - narrow - len(causes) * regressor_error(shaped)
 
     def scores(self, info: Information) -> list[Score]:
         """Score every candidate."""
@@ -249,7 +262,8 @@ class State:
 
         The noise's level is estimated, too, so the distribution is Fisher's F.
         """
-        tests = candidate.tail * self.trials.get(candidate.cause, 1.0) * self.causes
+        hypotheses = self.trials.get(candidate.cause, 1.0) * float(np.exp(-candidate.likelier))
+        tests = candidate.tail * hypotheses * self.causes
         freedom, certain = max(freedom, 1), self.certain.get(key(candidate), np.inf)
         return min(1.0, tests * float(fdtrc(freedom, certain, ratio / freedom)))
 

@@ -33,7 +33,7 @@ from magbridge.diagnose.inference.information import Information
 from magbridge.diagnose.inference.joint import Joint, fit_joint
 from magbridge.diagnose.inference.profile_likelihood import refined, sharpen
 from magbridge.diagnose.inference.rivals import Rival, sets_of
-from magbridge.diagnose.inference.rounds import Hypothesis, State
+from magbridge.diagnose.inference.rounds import Hypothesis, State, shaped_ratio
 
 __all__ = ["Hypothesis", "Outcome", "search"]
 
@@ -134,7 +134,7 @@ def _forward_selection(state: State, null: Joint, first: list[Hypothesis]) -> tu
         grown = [
             h for h in found if h.candidate.cause not in (whole if h.candidate.spectra is None else strengths)
         ]
-        best = _next(grown, strengths, state.ratio(base))
+        best = _next(grown, strengths, shaped_ratio(state.ratio(base), model, base))
         if best is None:
             break
         best = sharpen(state, model, best, base)
@@ -149,9 +149,9 @@ def _forward_selection(state: State, null: Joint, first: list[Hypothesis]) -> tu
 def _next(found: list[Hypothesis], strengths: Mapping[str, float], ratio: float) -> Hypothesis | None:
     """Pick the best that passes, unless it is so weak that other causes' idealised regressors may leave it.
 
-    `strengths` holds the signal-to-noise of the causes that are in the model, `ratio` is the model's
-    likelihood ratio. Among candidates whose evidence differs by less than the regressors' errors may account
-    for, the one with the fewest coefficients is preferred.
+    `strengths` holds the signal-to-noise of the causes that are in the model, `ratio` is the likelihood ratio
+    of those that have a shape. Among candidates whose evidence differs by less than the regressors' errors
+    may account for, the one with the fewest coefficients is preferred.
     """
 
     def remnant(cause: str) -> float:
