@@ -44,6 +44,7 @@ DRAWN = {
     "dynamo": 74.55, "hvdc": 69.44, "dew": 108.6, "sampler": 126, "substorm": 227.3, "litter": 25.65,
     "stuck": 112.6, "sounder": 93.7, "gradient": 46.64, "squeezed": 36.07, "flare": 67.93, "swarf": 78.9,
     "ageing": 58.37, "crossfield": 373.1, "railway": 21.51, "rudder": 23.16,
+    "latch": 122.4, "recovery": 100.9, "clamp": 25.67, "seiche": 42.82,
 }  # fmt: skip
 """Norm (nT) of what each does to the log of :func:`flight`, as first drawn.
 

@@ -67,5 +67,9 @@ FOREIGN: dict[str, Effect] = {
     "crossfield": sensor.crossfield,
     "railway": surroundings.railway,
     "rudder": vehicle.rudder,
+    "latch": vehicle.latch,
+    "recovery": vehicle.recovery,
+    "clamp": sensor.clamp,
+    "seiche": surroundings.seiche,
 }
 """Effect, by its name."""

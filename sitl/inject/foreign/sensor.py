@@ -166,3 +166,15 @@ def crossfield(scene: Scene, size: float, rng: Generator) -> None:
     across = np.roll(scene.field, 1, axis=1) ** 2 + np.roll(scene.field, 2, axis=1) ** 2
     loss = 1e-4 * size * rng.uniform(0.3, 1.7, 3) * across / (across + 5e4**2) * 2.0
     scene.field = scene.field * (1.0 - loss)
+
+
+def clamp(scene: Scene, size: float, rng: Generator) -> None:
+    """A clamp holds the cores until the housing's strain exceeds its grip; size in nT at 1 degC."""
+    housing = soaked(scene.water, scene.track.step, float(rng.uniform(100.0, 600.0)))
+    grip = rng.uniform(0.15, 0.4) * np.ptp(housing)
+    held, slipped = housing[0], np.empty(len(housing))
+    for k, strain in enumerate(housing):
+        if abs(strain - held) > grip:  # creaks, and comes to rest beyond the middle
+            held = strain + 0.2 * np.sign(strain - held) * grip
+        slipped[k] = strain - held
+    scene.add(slipped, size * direction(rng))

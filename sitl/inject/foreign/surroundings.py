@@ -142,6 +142,15 @@ def railway(scene: Scene, size: float, rng: Generator) -> None:
     scene.earth = scene.earth + size * np.outer(spread, direction(rng))
 
 
+def seiche(scene: Scene, size: float, rng: Generator) -> None:
+    """After a wind the basin's water sloshes to and fro, and induces currents as it does; size in nT."""
+    since = scene.t - rng.uniform(0.0, 0.4) * scene.t[-1]
+    period, calms = rng.uniform(1200.0, 3600.0), rng.uniform(0.3, 1.0) * scene.t[-1]
+    sloshes = (since > 0.0) * np.exp(-np.maximum(since, 0.0) / calms) * np.sin(2.0 * np.pi * since / period)
+    deeper = 1.0 - 0.3 * scene.track.depth / scene.track.depth.max()
+    scene.earth = scene.earth + size * np.outer(sloshes * deeper, direction(rng))
+
+
 def _cable(scene: Scene, rng: Generator) -> tuple[Array, Array, Array]:
     """Lay a straight cable below the track: m aside and above (n,), and north-east-down across it."""
     track = scene.track

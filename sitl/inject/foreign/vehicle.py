@@ -269,3 +269,21 @@ def rudder(scene: Scene, size: float, rng: Generator) -> None:
     angle = np.radians(35.0) * np.tanh(turning / rng.uniform(0.5, 2.0) + hunts)
     a, b = direction(rng), direction(rng)
     scene.field = scene.field + size * (np.outer(np.cos(angle) - 1.0, a) + np.outer(np.sin(angle), b))
+
+
+def latch(scene: Scene, size: float, rng: Generator) -> None:
+    """A latching valve is thrown over near the surface, and its core stays magnetised; size in nT."""
+    shallow = scene.track.depth < rng.uniform(0.05, 0.15) * scene.track.depth.max()
+    surfaced = np.cumsum(np.diff(shallow, prepend=bool(shallow[0])) & shallow)
+    fails = rng.random(surfaced[-1] + 1) < rng.uniform(0.0, 0.4)
+    over = np.cumsum(~fails)[surfaced] % 2
+    scene.add(over.astype(float), size * direction(rng))
+
+
+def recovery(scene: Scene, size: float, rng: Generator) -> None:
+    """Strings of the battery share a load unequally, and exchange charge for long afterwards; size in nT."""
+    step = scene.track.step
+    pumps = (np.abs(np.gradient(scene.track.parameters["ballast"], step)) > 1.0).astype(float)
+    owed = first_order(pumps, step, float(rng.uniform(600.0, 2400.0)))
+    evens = owed / max(owed.max(), 1e-9) - rng.uniform(0.2, 0.5) * first_order(pumps, step, 2.0)
+    scene.add(evens, size * direction(rng))
