@@ -121,7 +121,10 @@ class TlogWriter:
         self.extend([(time_us, channel, frame)])
 
     def extend(self, records: Sequence[Record]) -> None:
-        """Log the frames of an event, as :meth:`write` does; the caller must not change the list later."""
+        """Log the frames of an event, as :meth:`write` does.
+
+        There must be at least one, since none ends the writing thread. The caller must not change the list.
+        """
         if self._queue.qsize() < QUEUE:
             self._queue.put(records)
         else:
