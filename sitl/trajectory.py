@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import accumulate
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,7 +39,7 @@ class Motion(Table, frozen=True):
     current : tuple of 2 float
         m/s north, east of the water.
     max_depth : float
-        m.
+        m, where the vehicle stays until it climbs.
     """
 
     speed: Positive = 0.35
@@ -152,9 +153,7 @@ def fly(
     heading = settled(_headings(legs, ends, t, leg_of)) + wander[:, 2]
 
     path = np.radians(pitch + motion.angle_of_attack * np.tanh(pitch / 5))
-    sink = np.cumsum(-motion.speed * np.sin(path)) * step
-    # floats at the surface
-    depth = np.minimum(sink - np.minimum(np.minimum.accumulate(sink), 0.0), motion.max_depth)
+    sink = -motion.speed * np.sin(path) * step
     ahead = motion.speed * np.cos(path)
     north = np.cumsum(ahead * np.cos(np.radians(heading)) + motion.current[0]) * step
     east = np.cumsum(ahead * np.sin(np.radians(heading)) + motion.current[1]) * step
@@ -165,13 +164,20 @@ def fly(
         step=step,
         latitude=latitude,
         longitude=longitude,
-        depth=depth,
+        depth=_depth(sink, motion.max_depth),
         roll=roll,
         pitch=pitch,
         heading=heading,
         parameters={name: _mass_motion(name, legs, ends, t, leg_of, limits) for name in names},
         run=1 + leg_of.astype(np.float64),
         segments=_segments(legs, ends),
+    )
+
+
+def _depth(sink: Array, deepest: float) -> Array:
+    """(n,) m: it floats at the surface until it sinks, and stays at its greatest depth until it climbs."""
+    return np.array(
+        [*accumulate(sink.tolist(), lambda depth, by: min(max(depth + by, 0.0), deepest), initial=0.0)][1:]
     )
 
 

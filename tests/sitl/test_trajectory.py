@@ -43,6 +43,20 @@ def test_depth_follows_the_path() -> None:
     assert climb.depth[-1] == 0
 
 
+def test_from_its_greatest_depth_it_climbs_at_once() -> None:
+    down, up = Leg(duration=600, pitch=-26), Leg(duration=300, pitch=26)
+    track = fly_legs(down, up, down, up, motion=Motion(wander=(0.0, 0.0, 0.0), max_depth=60.0))
+    assert track.depth[[1199, 2999]].tolist() == [60.0, 60.0]  # the dives would end at 100 m
+    assert track.depth[[1799, 3599]] == pytest.approx(60.0 - 300 * 0.35 * np.sin(np.radians(29)), abs=8.0)
+
+
+def test_in_a_month_it_meets_the_thermocline_as_often_late_as_early() -> None:
+    legs = CrissCross(hours=720.0, pitch=(25.0, 2.5)).legs(np.random.default_rng(3), GLIDER)
+    depth = fly(legs, START, 4.0, np.random.default_rng(4)).depth
+    shallow = [np.mean(third < 40.0) for third in np.array_split(depth, 3)]
+    assert min(shallow) > 0.08
+
+
 def test_a_current_carries_the_vehicle() -> None:
     drift = Motion(wander=(0.0, 0.0, 0.0), current=(0.1, -0.2))
     still, carried = (
