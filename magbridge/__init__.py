@@ -10,12 +10,8 @@ From logs of calibration runs to corrected samples::
 
 :func:`magbridge.diagnose.run.diagnose` and :func:`magbridge.navigate.batch.navigate` go on from there. Each
 name is imported when it is first asked for: the bridge itself needs few of them. And since the program begins
-here, too, where Ctrl-C would still print a traceback, not even :mod:`typing` is imported at once.
+here, too, where Ctrl-C would still print a traceback, nothing at all is imported at once.
 """
-
-from __future__ import annotations
-
-from magbridge.version import __version__
 
 TYPE_CHECKING = False  # type checkers take it for true
 if TYPE_CHECKING:
@@ -29,6 +25,7 @@ if TYPE_CHECKING:
     from magbridge.field.read import read_grid
     from magbridge.field.reference import reference_field
     from magbridge.logs import read, write
+    from magbridge.version import __version__
 
 __all__ = [
     "Calibration",
@@ -53,6 +50,7 @@ _HOMES = {
     "Correction": "correction",
     "Corrector": "calibration.correct",
     "MagbridgeError": "errors",
+    "__version__": "version",
     "correct": "calibration.correct",
     "correct_rows": "correction",
     "fit": "calibration.fitting.fit",

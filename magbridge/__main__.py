@@ -1,7 +1,5 @@
 """The program: ``magbridge``, or ``python -m magbridge``."""
 
-from __future__ import annotations
-
 import sys
 
 __all__ = ["main"]

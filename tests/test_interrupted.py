@@ -38,7 +38,7 @@ def test_stopped_in_the_middle_leaves_nothing(tmp_path: Path, number: signal.Sig
     assert [path.name for path in tmp_path.iterdir()] == ["long.nc"]
 
 
-@pytest.mark.parametrize("library", ["cyclopts", "typing"])
+@pytest.mark.parametrize("library", ["cyclopts", "typing", "__future__"])
 def test_interrupted_while_libraries_are_loaded(tmp_path: Path, library: str) -> None:
     (tmp_path / f"{library}.py").write_text("import signal; signal.raise_signal(signal.SIGINT)")
     ended = subprocess.run(
