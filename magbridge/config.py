@@ -49,8 +49,8 @@ class Sensor(Table, frozen=True):
         A name from the driver table (:data:`magbridge.sensors.DRIVERS`).
     port : str
         A device, a pattern (``/dev/ttyUSB*``: the first on which a reading comes within `timeout`, so that
-        a sensor that comes back under another name is found again) or a pyserial URL (``socket://``,
-        ``rfc2217://``, ``loop://``).
+        a sensor that comes back under another name is found again; one that sends NMEA 0183 and no readings
+        gets no start-up commands) or a pyserial URL (``socket://``, ``rfc2217://``, ``loop://``).
     baudrate : int
         bit/s.
     timeout : float

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping
+from glob import has_magic
 from math import nan
 from typing import TYPE_CHECKING
 
@@ -110,6 +111,7 @@ class Pipeline:
             self.component.announcer,
             self.component.timers,
             start.time_us,
+            searching=has_magic(config.sensor.port),
         )
         self.journal = Journal(config.link.system, config.link.component, active=config.log is not None)
         self.navigation: Navigation | None = None
@@ -159,7 +161,7 @@ class Pipeline:
     def _hear_sensor(self, event: Event) -> None:
         readings = self._driver.feed(event.data)
         if not readings:
-            self.sensor.mumbled(event.time_us)
+            self.sensor.mumbled(event.data, event.time_us)
             return
         self.sensor.spoke(event.time_us)
         stamps = self._clock.stamp(readings, event.time_us)

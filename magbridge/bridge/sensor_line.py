@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 
 from magbridge.link.announcer import Announcer
@@ -13,6 +14,12 @@ __all__ = ["SensorLine"]
 
 COMMAND_GAP_US = 100_000
 """µs between two commands to a sensor."""
+LISTEN_US = 1_200_000
+"""µs for which a line that may be another instrument's is listened to: a GPS sends every second."""
+NMEA = re.compile(rb"[$!][A-OQ-Z][A-Z]{4},[ -~]*\*[0-9A-Fa-f]{2}\r?\n")
+"""A sentence of NMEA 0183, but none that a maker has defined (``$P...``)."""
+SENTENCE = 128
+"""Bytes, the longest sentence and a margin."""
 SAME_US, SAME = 60_000_000, 10
 """µs, and number of readings, after which one that repeats is announced: the sensor may hang. It has no flag,
 because one that counts in steps of 100 nT may as well be at rest."""
@@ -31,6 +38,9 @@ class SensorLine:
         To be called whenever the line was opened; returns the commands that start the sensor.
     timeout_us : int
         µs without a reading after which it counts as silent.
+    searching : bool
+        The line may be another instrument's: it is listened to before it gets commands, and it gets none if
+        it sends NMEA 0183 and no readings.
     announcer, timers
         The link's.
     start_us : int
@@ -42,8 +52,8 @@ class SensorLine:
     to_send : list of bytes
         Commands that are due; the caller of the pipeline sends them and empties the list.
     stranger : bool
-        No reading has come since the line was opened: it may be another instrument's. Whoever opened the line
-        tries another one, if there is one, and sets this back.
+        No reading has come since the line was opened, but a timeout or NMEA 0183 has: it may be another
+        instrument's. Whoever opened the line tries another one, if there is one, and sets this back.
     """
 
     def __init__(
@@ -54,6 +64,8 @@ class SensorLine:
         announcer: Announcer,
         timers: Timers,
         start_us: int,
+        *,
+        searching: bool = False,
     ) -> None:
         self._name, self._start, self._timeout_us = name, start, timeout_us
         self._announcer, self._timers = announcer, timers
@@ -61,7 +73,10 @@ class SensorLine:
         self.to_send: list[bytes] = []
         self.stranger = self._known = False
         self._heard_us = start_us
+        # no longer than until the line is taken for silent, so that what is said of it does not depend on it
+        self._listen_us = min(LISTEN_US, timeout_us // 2) if searching else 0
         self._commands: tuple[bytes, ...] = ()
+        self._tail = b""
         self._mumbled_us = 0
         self._field: Vector | None = None
         self._repeats = self._since_us = 0
@@ -89,14 +104,20 @@ class SensorLine:
             text = f"{self._name} sends the same reading for {SAME_US // 1_000_000} s"
             self._announcer.state("reading", text, MAV_SEVERITY.WARNING)
 
-    def mumbled(self, time_us: int) -> None:
+    def mumbled(self, data: bytes, time_us: int) -> None:
         """Take note of bytes that complete no reading."""
         self._mumbled_us = time_us
+        if self._listen_us and not self._known:
+            heard = self._tail + data
+            self._tail = heard[-SENTENCE:]
+            if NMEA.search(heard):
+                self._commands, self.stranger = (), True
+                self._timers.cancel("command")
 
     def opened(self, time_us: int) -> None:
         """Begin to send the start-up commands: it may have been without power. SILENT until it sends."""
-        self._commands, self._known = self._start(), False
-        self._wake(time_us)
+        self._commands, self._known, self._tail = self._start(), False, b""
+        self._wake(time_us, self._listen_us)
 
     def lost(self, reason: str) -> None:
         """Take note that the port is gone."""
@@ -113,9 +134,12 @@ class SensorLine:
         self.stranger = not self._known
         self._wake(time_us)
 
-    def _wake(self, time_us: int) -> None:
+    def _wake(self, time_us: int, listen_us: int = 0) -> None:
         self.state, self._heard_us = MAG_PORT_STATE.SILENT, time_us
-        self._command(time_us, self._commands)
+        if listen_us:
+            self._timers.at("command", time_us + listen_us, lambda t: self._command(t, self._commands))
+        else:
+            self._command(time_us, self._commands)
 
     def _command(self, time_us: int, commands: tuple[bytes, ...]) -> None:
         if commands:

@@ -10,7 +10,11 @@ from small import START, small_bridge
 from magbridge.bridge import states
 from magbridge.bridge.events import Event, Start
 from magbridge.bridge.pipeline import Pipeline
+from magbridge.bridge.sensor_line import SensorLine
 from magbridge.calibration.model import Parameter
+from magbridge.link.announcer import Announcer
+from magbridge.link.outbox import Outbox
+from magbridge.link.timers import Timers
 from magbridge.mavlink import Codec
 from magbridge.mavlink.dialect import MAG_PORT_NAME
 from magbridge.records import Channel
@@ -88,3 +92,35 @@ def test_an_instrument_that_speaks_otherwise_is_not_silent(bench: Bench) -> None
     assert bench.said[-1] == "ascii sends, but no readings: baud rate?"
     bench.feed(45.0, Channel.STATE, b"")
     assert bench.said[-1] == "ascii is silent"
+
+
+GGA = b"$GPGGA,123519,4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,*47\r\n"
+
+
+@pytest.mark.parametrize(
+    ("searching", "heard", "sent"),
+    [
+        (True, GGA[30:] + GGA, []),  # a GPS, in the middle of a sentence
+        (True, GGA.replace(b"GPGGA", b"PMAGN"), [1.3]),  # a maker's own sentence: maybe the sensor's
+        (True, b"\x00\xff$GPGGA,\x80", [1.3]),  # at another baud rate, at which it reads no commands either
+        (True, b"", [1.3]),
+        (False, GGA, [0.0]),
+    ],
+)
+def test_a_line_found_by_a_pattern_is_listened_to_before_it_gets_commands(
+    searching: bool, heard: bytes, sent: list[float]
+) -> None:
+    timers, codec = Timers(), Codec(1, 191)
+    announcer = Announcer(Outbox(codec), timers)
+    line = SensorLine("hmr2300", lambda: (b"go",), 10_000_000, announcer, timers, 0, searching=searching)
+    line.opened(0)
+    times = []
+    for k in range(50):
+        timers.advance(100_000 * k, lambda _: None)
+        times += [0.1 * k for _ in line.to_send]
+        line.to_send.clear()
+        if heard and k % 10 == 7:
+            line.mumbled(heard[:11], 100_000 * k)
+            line.mumbled(heard[11:], 100_000 * k)
+    assert times == pytest.approx(sent, abs=0.11)
+    assert line.stranger == (sent == [])
