@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
@@ -12,9 +14,10 @@ from magbridge.calibration.fitting.observe import observations
 from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.causes.masses import actuator_order, hysteresis
 from magbridge.diagnose.compare.problem import Problem
+from magbridge.diagnose.inference.joint import fit_joint
 from magbridge.diagnose.inference.statistic import SIZES, Statistic
 from magbridge.diagnose.run import diagnose
-from magbridge.diagnose.unexplained.descriptions import Description
+from magbridge.diagnose.unexplained.descriptions import Description, descriptions
 from magbridge.diagnose.unexplained.shapes import bends, crossing, delayed, near_surface, response, swings
 from sitl import load, simulate
 from sitl.dataset import segments
@@ -62,7 +65,7 @@ def test_a_converter_whose_steps_differ_is_described() -> None:
     code = np.round(reading / 4000.0).astype(int)
     bent = np.sum(slopes * np.take_along_axis(rng.normal(size=(26, 3)), code % 26, axis=0), axis=1)
     given = 10.0 * bent / np.linalg.norm(bent) + rng.normal(size=4000)
-    X = response(reading, slopes)(slice(None))
+    X = response(reading, slopes.__getitem__)(slice(None))
     S, b = X.T @ X, X.T @ given
     assert Statistic(S, np.array([width**2 for _, width in bends()])).best(b).ratio > 2.0 * 10.0
 
@@ -74,7 +77,7 @@ def test_a_feedback_that_falters_at_zero_is_described(width: float) -> None:
     reading = rng.uniform(-5e4, 5e4, (20_000, 3))
     x = reading[:, :1] / width
     dead = np.tanh(x) * np.exp(-np.abs(x))
-    X = crossing(reading, np.eye(3)[np.zeros(len(x), dtype=int)])(slice(None))
+    X = crossing(reading, np.eye(3)[np.zeros(len(x), dtype=int)].__getitem__)(slice(None))
     gain = np.column_stack([np.ones_like(x), x])
     X, y = (a - gain @ np.linalg.lstsq(gain, a, rcond=None)[0] for a in (X, dead[:, 0]))
     left = y - X @ np.linalg.lstsq(X, y, rcond=None)[0]
@@ -198,3 +201,14 @@ def test_every_description_has_as_many_columns_as_widths(listed: list[Descriptio
         columns = one.columns(slice(0, 50))
         assert np.isfinite(columns).all()
         assert {columns.shape[1]} == {len(width) for _, width in one.widths}
+
+
+def test_descriptions_of_a_long_log_do_not_fill_the_memory(problem: Problem) -> None:
+    fit = fit_joint(problem, [], 1)
+    descriptions(problem, fit)  # what causes share is cached now
+    tracemalloc.start()
+    listed = descriptions(problem, fit)
+    held, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    columns = sum(len(one.widths[0][1]) for one in listed)
+    assert held < 45 * problem.residual.nbytes < columns * problem.residual.nbytes / 10

@@ -119,8 +119,8 @@ def _between(place: FloatArray, side: float) -> tuple[csr_array, FloatArray]:
     steps = list(np.ndindex((2,) * place.shape[1]))
     share = np.concatenate([np.prod(np.where(step, high, 1.0 - high), axis=1) for step in steps])
     corners, of = _each(np.concatenate([low + step for step in steps]))
-    rows = np.tile(np.arange(len(place)), len(steps))
-    return csr_array((share, (rows, of)), (len(place), len(corners))), corners * side
+    rows = np.tile(np.arange(len(place), dtype=np.int32), len(steps))
+    return csr_array((share, (rows, of.astype(np.int32))), (len(place), len(corners))), corners * side
 
 
 def _lacking(a: FloatArray, b: FloatArray, d: float) -> FloatArray:

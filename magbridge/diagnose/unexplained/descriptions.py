@@ -124,12 +124,12 @@ def descriptions(problem: Problem, fit: Joint, tone: Candidate | None = None) ->
 
 def _in_time(problem: Problem, fit: Joint) -> list[Description]:
     """Slow curves in body axes and along the field, a constant, a passing source."""
-    u = problem.survey.time - problem.survey.time[0]
-    turning = np.exp(1j * np.pi * u / max(float(u[-1]), 1.0))
+    time = problem.survey.time
+    whole = max(float(time[-1] - time[0]), 1.0)
     fresh = ~problem.survey.learned
 
     def waves(count: int) -> Columns:
-        return lambda rows: powers(turning[rows], count).real.T
+        return lambda rows: powers(np.exp(1j * np.pi * (time[rows] - time[0]) / whole), count).real.T
 
     passing, times = passage(problem, fit)
     return [
@@ -223,9 +223,9 @@ def _repeating(problem: Problem, fit: Joint, tone: Candidate | None) -> list[Des
     return listed
 
 
-def _body(problem: Problem) -> FloatArray:
-    """(n, 3) what an offset of one nT along each axis of the body adds to the residual."""
-    return -problem.slopes[:, 6:]
+def _body(problem: Problem) -> Columns:
+    """(m, 3) what an offset of one nT along each axis of the body adds to the residual."""
+    return lambda rows: -problem.slopes[rows, 6:]
 
 
 def _along_axes(problem: Problem, basis: Columns, *, scales: bool = False) -> Columns:

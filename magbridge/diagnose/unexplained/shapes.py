@@ -1,7 +1,8 @@
 """The functions of which descriptions without a name are made, and their prior widths.
 
 Arguments are histories of the log's n samples, (n,) or (n, 3); what is returned is a block of columns,
-(m, k) of m rows: :mod:`magbridge.diagnose.compare.design_columns`.
+(m, k) of m rows: :mod:`magbridge.diagnose.compare.design_columns`. Whole histories of a long log fill the
+memory: what can be computed row by row is not kept.
 """
 
 from __future__ import annotations
@@ -63,30 +64,31 @@ def spectra(count: int, axes: int) -> tuple[tuple[str, FloatArray], ...]:
     return tuple((kind, 10.0 / np.sqrt(1.0 + (k / corner) ** 2)) for kind, corner in corners.items())
 
 
-def direction(body: FloatArray) -> Columns:
-    """Functions up to quartic of the field's direction in the body, that of `body` (n, 3)."""
-    unit = body / np.linalg.norm(body, axis=1)[:, None]
+def direction(body: Columns) -> Columns:
+    """Functions up to quartic of the field's direction in the body, that of `body` (m, 3)."""
     exponents = [(i, j, d - i - j) for d in (1, 2, 3, 4) for i in range(d + 1) for j in range(d + 1 - i)]
 
     def columns(rows: slice) -> FloatArray:
-        part = unit[rows].T
+        part = body(rows)
+        part = (part / np.linalg.norm(part, axis=1)[:, None]).T
         table = np.concatenate([np.ones((1, *part.shape)), powers(part, 4)])
         return np.stack([table[i, 0] * table[j, 1] * table[k, 2] for i, j, k in exponents]).T
 
     return columns
 
 
-def response(reading: FloatArray, slopes: FloatArray) -> Columns:
+def response(reading: FloatArray, slopes: Columns) -> Columns:
     """Each channel's error as any smooth function of its own reading (n, 3): Chebyshev polynomials.
 
-    `slopes` (n, 3) are what one nT in each channel adds to the residual.
+    `slopes` (m, 3) are what one nT in each channel adds to the residual.
     """
-    x = np.clip([_scaled(channel) for channel in reading.T], -1.0, 1.0)
-    turning = x + 1j * np.sqrt(1.0 - x**2)  # cos k theta = T_k(x), with x = cos theta
+    channels = [_scaled(channel) for channel in reading.T]
 
     def columns(rows: slice) -> FloatArray:
-        waves = powers(turning[:, rows], BEND).real.swapaxes(0, 1)
-        return (slopes.T[:, None, rows] * waves).reshape(3 * BEND, -1).T
+        x = np.clip([channel(rows) for channel in channels], -1.0, 1.0)
+        turning = x + 1j * np.sqrt(1.0 - x**2)  # cos k theta = T_k(x), with x = cos theta
+        waves = powers(turning, BEND).real.swapaxes(0, 1)
+        return (slopes(rows).T[:, None] * waves).reshape(3 * BEND, -1).T
 
     return columns
 
@@ -99,7 +101,7 @@ def bends() -> tuple[tuple[str, FloatArray], ...]:
     )
 
 
-def crossing(reading: FloatArray, slopes: FloatArray) -> Columns:
+def crossing(reading: FloatArray, slopes: Columns) -> Columns:
     """Each channel's error where it passes zero (Hermite's functions); arguments as of :func:`response`.
 
     There the feedback current changes sign, or a converter's first bit flips.
@@ -108,7 +110,7 @@ def crossing(reading: FloatArray, slopes: FloatArray) -> Columns:
     def columns(rows: slice) -> FloatArray:
         x = reading[rows].T[:, None] / np.array(ZERO)[:, None]
         odd = x * np.exp(-0.5 * x * x)
-        return np.asarray((slopes.T[:, None, rows] * odd).reshape(3 * len(ZERO), -1).T)
+        return np.asarray((slopes(rows).T[:, None] * odd).reshape(3 * len(ZERO), -1).T)
 
     return columns
 
@@ -116,27 +118,28 @@ def crossing(reading: FloatArray, slopes: FloatArray) -> Columns:
 def curve(values: FloatArray) -> Columns:
     """Powers of a channel (n,)."""
     y = _scaled(values)
-    return _centred(lambda rows: powers(y[rows], 4).T, len(y))
+    return _centred(lambda rows: powers(y(rows), 4).T, len(values))
 
 
 def hysteresis(values: FloatArray) -> Columns:
     """Functions of a channel's past (n,): curved branches of hysteresis, narrow and wide; its direction."""
-    y = _scaled(values)
+    scaled = _scaled(values)
+    y = scaled(slice(None))
     plays = [play(y, width) for width in PLAYS]
     change = np.diff(y, prepend=y[0])
-    way = np.where(np.abs(change) > 1e-3, np.sign(change), 0.0)
+    way = np.where(np.abs(change) > 1e-3, np.sign(change), 0.0).astype(np.int8)
 
     def columns(rows: slice) -> FloatArray:
-        v, w = y[rows], way[rows]
+        v, w = scaled(rows), way[rows]
         branches = [powers(x[rows], 3) - powers(v, 3) for x in plays]
         return np.concatenate([*branches, [w, w * v]]).T
 
-    return _centred(columns, len(y))
+    return _centred(columns, len(values))
 
 
 def delayed(time: FloatArray, values: FloatArray) -> Columns:
     """Return a channel (n,) with each of :data:`LAGS`: mixed, they make any smooth response to it."""
-    return _centred(_followed(time, _scaled(values)[None], LAGS), len(values))
+    return _centred(_followed(time, _scaled(values)(slice(None))[None], LAGS), len(values))
 
 
 def swings(time: FloatArray, rate: FloatArray) -> Columns:
@@ -161,8 +164,7 @@ def repeated(problem: Problem) -> Columns:
     # the median: a long last dive must not stretch the others
     usual = max(float(np.median([since[end - 1] for end in [*start[1:], len(dive)]])), 1.0)
     u = np.minimum(since / usual, 1.0)
-    turning = np.exp(1j * np.pi * u)
-    return _centred(lambda rows: powers(turning[rows], REPEATED).real.T, len(u))
+    return _centred(lambda rows: powers(np.exp(1j * np.pi * u[rows]), REPEATED).real.T, len(u))
 
 
 def lower_end(down: FloatArray) -> Columns:
@@ -174,8 +176,8 @@ def lower_end(down: FloatArray) -> Columns:
     sides = []
     for slope in SLOPES:
         last = np.maximum.accumulate(np.where(np.abs(down) > slope, place, 0))
-        sides.append(np.sign(down[last]))
-    return _centred(lambda rows: np.stack([side[rows] for side in sides]).T, len(down))
+        sides.append(np.sign(down[last]).astype(np.int8))
+    return _centred(lambda rows: np.stack([side[rows] for side in sides]).T.astype(float), len(down))
 
 
 def _followed(time: FloatArray, values: FloatArray, lags: Sequence[float]) -> Columns:
@@ -189,5 +191,7 @@ def _centred(columns: Columns, n: int) -> Columns:
     return lambda rows: columns(rows) - mean
 
 
-def _scaled(values: FloatArray) -> FloatArray:
-    return np.asarray(2.0 * (values - values.min()) / max(float(np.ptp(values)), 1e-12) - 1.0)
+def _scaled(values: FloatArray) -> Columns:
+    """Values (n,) moved to the range -1 to 1, (m,) of m rows."""
+    low, span = values.min(), max(float(np.ptp(values)), 1e-12)
+    return lambda rows: np.asarray(2.0 * (values[rows] - low) / span - 1.0)
