@@ -5,5 +5,6 @@
     port <--> link <--> state --> words --> page --> browser
 
 :mod:`.link` listens on a thread of its own, :mod:`.state` knows what the messages said and which requests are
-open, :mod:`.words` puts that into words and figures, and :mod:`.page` shows it in NiceGUI.
+open, :mod:`.words` and :mod:`.chart` put that into words, figures and a curve, and :mod:`.page` shows it in
+NiceGUI.
 """

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from copy import deepcopy
 from functools import partial
-from math import ceil, floor, isfinite, log10, nan
+from math import nan
 from typing import Any
 
 from nicegui import ui
@@ -19,33 +19,22 @@ from magbridge.config import Align
 from magbridge.errors import PortError
 from magbridge.link import alignment
 from magbridge.mavlink.dialect import MAV_SEVERITY
+from magbridge.monitor.chart import CHART, curves, reach
 from magbridge.monitor.link import StationLink, now
-from magbridge.monitor.state import Point
 from magbridge.monitor.words import FLAGS, ago, health, measured, silence, whereabouts
 
 __all__ = ["serve"]
 
-BREAK = 10.0
-"""s without a sample that interrupt the curve, unless the interval before was at least a third as long."""
 TUNABLES = {one.name: one for one in alignment(Align())}
 """Parameters that every bridge has, with the unit and range that a PARAM_VALUE does not carry."""
-INK, BLUE, GREEN, AMBER, RED = "#1e293b", "#1d4ed8", "#15803d", "#b45309", "#b91c1c"
-LINE = {"type": "line", "symbol": "none", "animation": False, "color": BLUE}
-BAND = {**LINE, "stack": "band", "stackStrategy": "all", "lineStyle": {"opacity": 0}}
-ROOM, LEAST = 5.0, 50.0
-"""Above and below the curve, the axis leaves at most `ROOM` times the curve's range plus `LEAST` nT for the
-band: with more, the curve would look like a straight line."""
-ROUND = {"showMinLabel": False, "showMaxLabel": False}
-"""No labels at the ends of an axis: they would be written over the round numbers beside them."""
-APART = "value => value.toLocaleString('en').replaceAll(',', '\N{NARROW NO-BREAK SPACE}')"
-"""Separates thousands, as everywhere on the page."""
-CHART: dict[str, Any] = {
-    "useUTC": True,
-    "grid": {"left": 70, "right": 32, "top": 12, "bottom": 28},
-    "xAxis": {"type": "time", "axisLabel": {"hideOverlap": True, **ROUND}},
-    "yAxis": {"type": "value", "scale": True, "axisLabel": {":formatter": APART, **ROUND}},
-    "series": [BAND, {**BAND, "areaStyle": {"opacity": 0.2}}, {**LINE, "lineStyle": {"width": 1.5}}],
-}
+STYLE = """
+:root, .q-header {--ink: #1e293b; --good: #15803d; --doubt: #b45309; --bad: #b91c1c}
+body.body--dark {--ink: #e2e8f0; --good: #4ade80; --doubt: #fbbf24; --bad: #f87171}
+body.body--dark {color-scheme: dark; --q-negative: var(--bad) !important}
+"""
+"""Colours by day and, where the browser asks for it, by night; the header is the same at both."""
+INK, GREEN, AMBER, RED = "var(--ink)", "var(--good)", "var(--doubt)", "var(--bad)"
+MUTED = "text-slate-500 dark:text-slate-400"
 GRID = "w-full grid gap-4 grid-cols-1"
 
 
@@ -70,7 +59,7 @@ def serve(
     print(f"listening on {link}; the page is http://{place}", file=sys.stderr)
     options: dict[str, Any] = {"title": "magbridge", "favicon": "🧲", "show_welcome_message": False}
     with suppress(KeyboardInterrupt):  # Ctrl-C is how it ends
-        ui.run(partial(Page, station), host=host, port=port, show=show, reload=False, **options)
+        ui.run(partial(Page, station), host=host, port=port, show=show, reload=False, dark=None, **options)
 
 
 class Page:
@@ -80,7 +69,8 @@ class Page:
         self._station, self._state = station, station.state
         self._shown: dict[str, Any] = {}
         self._inputs: dict[str, ui.number] = {}
-        ui.query("body").classes("bg-slate-100").style(f"color: {INK}")
+        ui.add_css(STYLE)
+        ui.query("body").classes("bg-slate-100 dark:bg-slate-900").style(f"color: {INK}")
         with ui.header().classes("items-center gap-x-4 gap-y-1 px-6 py-2 bg-slate-800"):
             ui.label("magbridge").classes("text-lg font-semibold")
             self._from = ui.label().classes("text-sm text-slate-300 max-sm:order-last max-sm:w-full")
@@ -88,7 +78,7 @@ class Page:
             self._stream = ui.label().classes("text-sm px-3 py-1 rounded-full")
         facts = list(health(self._state))
         with ui.column().classes("w-full max-w-screen-2xl mx-auto gap-4") as self._body:
-            with ui.element().classes(f"{GRID} md:grid-cols-[18rem_1fr]"):
+            with ui.element().classes(f"{GRID} md:grid-cols-[18rem_1fr]") as self._field:
                 with _card("Field, nT ± 2σ"):
                     self._measured = [_quantity(name) for name in measured(self._state)]
                 with _card("Total field, nT ± 2σ, of the last ten minutes, UTC"):
@@ -134,7 +124,9 @@ class Page:
         flagged = self._state.flags.keys() - {"no_boresight"}
         self._stream.set_text(trouble or ("live, flagged" if flagged else "live"))
         self._stream.style(f"background: {RED if trouble else AMBER if flagged else GREEN}")
-        self._body.style(f"opacity: {0.45 if trouble else 1}")
+        field = trouble.startswith("no field")  # then the rest of the page says why
+        self._body.style(f"opacity: {0.45 if trouble and not field else 1}")
+        self._field.style(f"opacity: {0.45 if field else 1}")
 
     def _tell_figures(self) -> None:
         for labels, texts in zip(self._measured, measured(self._state).values(), strict=True):
@@ -159,7 +151,7 @@ class Page:
                 color = AMBER if name == "no_boresight" else RED
                 with ui.column().classes("gap-0 border-l-4 pl-3").style(f"border-color: {color}"):
                     ui.label(FLAGS[name]).classes("leading-tight")
-                    ui.label(f"{name}, {since}").classes("text-xs text-slate-500")
+                    ui.label(f"{name}, {since}").classes(f"text-xs {MUTED}")
 
     def _tell_texts(self) -> None:
         if not self._new("texts", list(self._state.texts), self._texts):
@@ -176,7 +168,7 @@ class Page:
                     else INK
                 )
                 with ui.row().classes("w-full gap-3 text-sm flex-nowrap items-baseline"):
-                    ui.label(_clock(when)).classes("text-slate-500 tabular-nums")
+                    ui.label(_clock(when)).classes(f"{MUTED} tabular-nums")
                     word = MAV_SEVERITY(severity & 7).name.lower()
                     ui.label(word).classes("w-20 shrink-0").style(f"color: {color}")
                     ui.label(text).classes("min-w-0 break-words")
@@ -207,16 +199,17 @@ class Page:
     def _set(self, name: str) -> None:
         with self._station.lock:
             if name in self._state.parameters:
+                self._shown.pop(name, None)  # so that the answer is shown, even if it is the same as before
                 value = self._inputs[name].value
                 self._state.set(name, nan if value is None else value)
 
     def _draw(self) -> None:
         trace = self._state.trace
         if trace and self._new("trace", trace[-1].time):
-            curves = zip(*_curves(list(trace)), strict=True)
-            for series, data in zip(self._chart.options["series"], curves, strict=True):
+            shown = zip(*curves(trace), strict=True)
+            for series, data in zip(self._chart.options["series"], shown, strict=True):
                 series["data"] = data
-            self._chart.options["yAxis"] |= _reach(list(trace))
+            self._chart.options["yAxis"] |= reach(trace)
             self._chart.update()
 
     def _new(self, key: str, value: Any, box: ui.element | None = None) -> bool:
@@ -228,54 +221,29 @@ class Page:
         return new
 
 
-def _curves(trace: list[Point]) -> Iterator[list[tuple[float, float]]]:
-    """Yield (ms, nT) of the band's lower edge, its width and the mean; NaN where the curve is interrupted."""
-    last, usual = trace[0].time, 0.0
-    for point in trace:
-        ms, gap = 1e3 * point.time, point.time - last
-        if gap > max(BREAK, 3 * usual):
-            yield [(ms - 1.0, nan)] * 3
-        last, usual = point.time, gap
-        yield [(ms, point.low), (ms, point.high - point.low), (ms, point.sum / point.count)]
-
-
-def _reach(trace: list[Point]) -> dict[str, float]:
-    """Return round ends of the axis in nT: all of the curve, and as much of the band as leaves it visible."""
-    curve = [point.sum / point.count for point in trace if isfinite(point.sum)]
-    if not curve:
-        return {}
-    low, high = min(curve), max(curve)
-    room = ROOM * (high - low) + LEAST
-    low, high = max(low - room, min(p.low for p in trace)), min(high + room, max(p.high for p in trace))
-    step = 10.0 ** floor(log10(max(high - low, 1.0)) - 0.5)
-    return {"min": floor(low / step) * step, "max": ceil(high / step) * step}
-
-
 @contextmanager
 def _card(title: str) -> Iterator[None]:
-    with ui.card().classes("w-full gap-2 p-4 shadow-sm rounded-lg"):
-        ui.label(title).classes("text-sm font-semibold text-slate-500")
+    with ui.card().classes("w-full gap-2 p-4 shadow-sm rounded-lg dark:bg-slate-800"):
+        ui.label(title).classes(f"text-sm font-semibold {MUTED}")
         yield
 
 
 def _quantity(name: str) -> tuple[ui.label, ui.label]:
     with ui.column().classes("gap-0"):
-        ui.label(name).classes("text-xs text-slate-500")
+        ui.label(name).classes(f"text-xs {MUTED}")
         with ui.row().classes("items-baseline gap-2"):
             size = "text-3xl" if name == "Total field" else "text-xl"
-            return ui.label().classes(f"{size} tabular-nums"), ui.label().classes(
-                "text-slate-500 tabular-nums"
-            )
+            return ui.label().classes(f"{size} tabular-nums"), ui.label().classes(f"{MUTED} tabular-nums")
 
 
 def _fact(name: str) -> ui.label:
     with ui.row().classes("w-full justify-between text-sm"):
-        ui.label(name).classes("text-slate-600")
+        ui.label(name).classes(MUTED)
         return ui.label().classes("font-medium tabular-nums")
 
 
 def _nothing() -> None:
-    ui.label("None yet").classes("text-sm text-slate-500")
+    ui.label("None yet").classes(f"text-sm {MUTED}")
 
 
 def _clock(when: float) -> str:

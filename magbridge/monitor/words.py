@@ -75,13 +75,17 @@ def health(state: State) -> dict[str, tuple[str, bool]]:
             _number(field("telemetry_age", nan), ".1f", unit="s")[0],
             "stale_telemetry" not in state.flags,
         ),
-        "Calibration": (f"{field('calibration_id', 0):08x}".replace("0" * 8, "none"), True),
+        "Calibration": (
+            f"{field('calibration_id', 0):08x}".replace("0" * 8, "none") if state.field else "–",
+            True,
+        ),
         "Uptime": (ago(get("uptime", 0)), True),
         "Messages lost on the link": (
             f"{_count(state.lost)} of {_count(state.lost + state.received)}",
             not state.lost,
         ),
-        **{name: (_count(count), not count) for name, count in losses.items()},
+        # of a stream that is joined in the middle of a frame, some bytes are always skipped
+        **{name: (_count(count), not count or name.startswith("Bytes")) for name, count in losses.items()},
     }
 
 

@@ -18,6 +18,7 @@ import pytest
 
 from magbridge.cli import main
 from magbridge.mavlink import Codec, Signing
+from magbridge.monitor.chart import reach
 from magbridge.monitor.state import Point
 
 pytest.importorskip("nicegui")
@@ -102,6 +103,7 @@ def test_page(page: tuple[str, tuple[str, int]]) -> None:
         while missing := [text for text in shown if text not in (html := get(url))]:
             assert time.monotonic() < deadline, missing
             sender.sendto(bridge.pack("MAG_FIELD", **field), link)
+    assert 'content="normal"' in html  # light or dark, as the browser asks
     assert 'src="http' not in html  # it must show without a network
     assert 'href="http' not in html
 
@@ -169,10 +171,8 @@ def test_a_missing_extra_is_named(
 
 
 def test_the_axis_shows_the_curve_whatever_its_band() -> None:
-    from magbridge.monitor.page import _reach  # noqa: PLC0415 - it needs NiceGUI
-
     near = [Point(k, 52_000.0 + k, 1, 51_998.0 + k, 52_002.0 + k) for k in range(5)]
-    assert _reach(near) == {"min": 51_998.0, "max": 52_006.0}
+    assert reach(near) == {"min": 51_998.0, "max": 52_006.0}
     wide = [Point(k, 52_000.0 + k, 1, -90_000.0, float("inf")) for k in range(5)]
-    assert _reach(wide) == {"min": 51_930.0, "max": 52_080.0}
-    assert _reach([Point(0.0, float("nan"), 1)]) == {}
+    assert reach(wide) == {"min": 51_930.0, "max": 52_080.0}
+    assert reach([Point(0.0, float("nan"), 1)]) == {}

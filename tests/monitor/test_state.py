@@ -86,6 +86,7 @@ def test_figures(air: Air) -> None:
     assert shown["Forward"] == ("-4\u202f203.0", "± 2.2")
     assert shown["Anomaly"][0] == shown["Starboard"][0] == "–"
     air.say(NOW, "MAG_STATUS", sensor_state=3, autopilot_state=1, log_state=2, samples_lost=7, uptime=4)
+    assert health(State())["Calibration"] == ("–", True)
     items = health(air.state)
     assert items["Sensor"] == ("lost", False)
     assert items["Autopilot"] == ("ok", True)
