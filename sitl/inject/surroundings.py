@@ -38,7 +38,7 @@ def wrong_level(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def hum(scene: Scene, size: float, rng: Generator) -> None:
-    """A machine's field at a steady frequency, and its second harmonic, seen by the sampling; size in nT."""
+    """A machine's field of a steady frequency, turning in an ellipse, seen by the sampling; size in nT."""
     f = rng.uniform(0.1, 0.4) * scene.instrument.rate
     phase = 2 * np.pi * f * scene.t + 0.1 * np.sin(scene.t / 3000.0)
     a, b = direction(rng), direction(rng)

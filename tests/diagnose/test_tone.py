@@ -1,0 +1,24 @@
+"""Tones: their frequency is found between those of a discrete spectrum."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from magbridge.diagnose.causes.time_dependent import interference_tone
+from magbridge.diagnose.compare.problem import Problem
+
+
+@pytest.mark.parametrize("place", [700.0, 700.5, 2048.0])
+def test_a_tone_between_two_frequencies_is_found_there(place: float, right: Callable[[int], Problem]) -> None:
+    """Half a bin off it would have lost a tenth of its power; the last bin has one neighbour only."""
+    quiet = right(1800)
+    t = quiet.survey.time
+    f = place / 4096 / 4.0
+    noise = np.random.default_rng(3).normal(size=len(t))
+    residual = 10.0 * quiet.slopes[:, 6] * np.cos(2.0 * np.pi * f * (t - t[0])) + 0.1 * noise
+    first = interference_tone(replace(quiet, residual=residual))[0]
+    assert 1.0 / first.shape["period"][0] == pytest.approx(f, abs=0.1 / 4096 / 4.0)
