@@ -34,6 +34,8 @@ __all__ = ["Edge", "declared", "drive", "run", "set_up"]
 
 KEEP_US = 60_000_000
 """µs between two savings of the signing time stamp; the next run adds as much to the saved one."""
+SAVE_US = 1_000_000
+"""µs between two savings of parameters: each waits for the disk, and the sensor for it."""
 SWITCH = 0.0005
 """s the log's thread may hold up the bridge (Python's switch interval); 5 ms would show in the latency."""
 TELL = 0.2
@@ -230,12 +232,12 @@ class Keeper:
         return Start(time_us, self._kept.parameters, stamp + self.MARGIN if stamp else 0)
 
     def look(self, pipeline: Pipeline, time_us: int) -> None:
-        """Save changed parameters at once, the time stamp every `KEEP_US`."""
+        """Save changed parameters within `SAVE_US`, the time stamp every `KEEP_US`."""
         revision = pipeline.component.parameters.revision
         due = self._signs and time_us - self._saved_us > KEEP_US
         if time_us < self._retry_us or (revision == self._revision and not due):
             return
-        self._revision, self._saved_us = revision, time_us
+        self._revision, self._saved_us, self._retry_us = revision, time_us, time_us + SAVE_US
         if not self.save(pipeline):
             self._revision, self._retry_us = -1, time_us + KEEP_US
 

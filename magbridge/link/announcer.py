@@ -51,13 +51,18 @@ class Announcer:
                 chunk_seq=i,
             )
 
-    def state(self, key: str, text: str, severity: MAV_SEVERITY = MAV_SEVERITY.INFO) -> None:
-        """Announce that the state of `key` is now `text`, unless that was announced last."""
+    def state(
+        self, key: str, text: str, severity: MAV_SEVERITY = MAV_SEVERITY.INFO, *, again: bool = False
+    ) -> None:
+        """Announce that the state of `key` is now `text`, unless that was announced last.
+
+        An event that may happen `again` is announced again, but not within `PAUSE_US`.
+        """
         now_us = self._outbox.codec.now_us
         said, when_us = self._last.get(key, ("", now_us - PAUSE_US))
         timer = f"say {key}"
         self._timers.cancel(timer)
-        if said == text:
+        if said == text and not (again and now_us - when_us >= PAUSE_US):
             return
         if now_us - when_us < PAUSE_US:
             self._timers.at(timer, when_us + PAUSE_US, lambda _: self.state(key, text, severity))

@@ -79,12 +79,14 @@ class ParameterService:
         if row is None:
             return
         if message["param_type"] != MAV_PARAM_TYPE.REAL32:
-            self._announcer.say(f"{name}: only REAL32 is taken", MAV_SEVERITY.WARNING)
+            self._refuse(name, "only REAL32 is taken")
         elif not self._parameters.set(name, value):
-            self._announcer.say(
-                f"{name}: {value:.6g} is not within {row.low:.6g} to {row.high:.6g} {row.unit}".rstrip(),
-                MAV_SEVERITY.WARNING,
+            self._refuse(
+                name, f"{value:.6g} is not within {row.low:.6g} to {row.high:.6g} {row.unit}".rstrip()
             )
         else:
             self._on_change(name)
         self.send(name)
+
+    def _refuse(self, name: str, why: str) -> None:
+        self._announcer.state(f"refused {name}", f"{name}: {why}", MAV_SEVERITY.WARNING, again=True)

@@ -78,6 +78,19 @@ def test_out_of_range_is_refused_and_said(link: Line, value: float) -> None:
     assert link.component.parameters.changed() == {}
 
 
+def test_refusals_are_said_once_a_second(link: Line) -> None:
+    """Each is answered with the value; the same one, later, is said again."""
+    heard = [
+        message for value in (0.5, 0.5, 0.25, 0.5, 0.75) for message in write(link, "MB_GAP_FACTOR", value)
+    ]
+    assert len(link.only(heard, "PARAM_VALUE")) == 5
+    assert "".join(link.texts(heard)) == "MB_GAP_FACTOR: 0.5 is not within 1.01 to 1000"
+    assert "".join(link.texts(link.to(2))) == "MB_GAP_FACTOR: 0.75 is not within 1.01 to 1000"
+    for later in (4, 6):
+        link.to(later)
+        assert "".join(link.texts(write(link, "MB_GAP_FACTOR", 0.75))).startswith("MB_GAP_FACTOR: 0.75")
+
+
 def test_only_real32(link: Line) -> None:
     heard = write(link, "MB_GAP_FACTOR", 4.0, kind=6)
     assert link.texts(heard) == ["MB_GAP_FACTOR: only REAL32 is taken"]
