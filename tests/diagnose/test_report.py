@@ -15,7 +15,7 @@ from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.compare.prior import isotropic
 from magbridge.diagnose.compare.problem import Problem
-from magbridge.diagnose.compare.survey import Channel
+from magbridge.diagnose.compare.survey import Channel, _channels
 from magbridge.diagnose.gain import Gain
 from magbridge.diagnose.inference.rivals import Rival
 from magbridge.diagnose.inference.search import Hypothesis
@@ -29,7 +29,7 @@ from magbridge.diagnose.report.doubts import (
     rivalled,
     unsettled,
 )
-from magbridge.diagnose.report.found import _folded
+from magbridge.diagnose.report.found import _folded, _outliers
 from magbridge.diagnose.report.words import chance, measured, number, physics, row, sizes
 from magbridge.diagnose.run import _verdict
 from magbridge.diagnose.unexplained.leftover import Leftover
@@ -139,6 +139,31 @@ def test_a_long_table_of_terms_is_folded_to_a_line() -> None:
     assert _folded("table", dict(list(terms.items())[:9])) == "table"
 
 
+def test_the_times_of_wrong_samples_are_all_or_the_first() -> None:
+    few, many = (_outliers(np.linspace(1780300800.0, 1780300799.0 + n, n)) for n in (2, 13))
+    assert "2 isolated samples are wrong, at 08:00:00, 08:00:01 UTC;" in few
+    assert "13 isolated samples are wrong, the first 12 at 08:00:00, " in many
+    assert "1 isolated sample is wrong, at 08:00:00 UTC; the figures above leave it out." in _outliers(
+        np.array([1780300800.0])
+    )
+
+
+@pytest.mark.parametrize("unit", ["", "1"])
+def test_a_channel_without_a_unit_shows_none(right: Callable[[int], Problem], unit: str) -> None:
+    """Not "nT/1" nor "nT per 0.3 1"."""
+    problem = right(100)
+    lights = np.linspace(0.0, 0.6, len(problem.survey))
+    columns = {"time": problem.survey.time, "Lights1": lights}
+    channels, _ = _channels(columns, {"Lights1": unit}, ())
+    shown = replace(problem, survey=replace(problem.survey, channels=problem.survey.channels | channels))
+    made = [
+        one for cause in ("unmodelled_actuator", "current_field") for one in CAUSES[cause].candidates(shown)
+    ]
+    units = {unit for one in made if one.channel == "Lights1" for unit in one.units}
+    assert {"nT per 0.3", "nT per 1"} <= units
+    assert not any(unit.endswith((" 1)", "/1", ".3 1")) for unit in units)
+
+
 def test_a_shift_of_the_whole_field_beside_a_wrong_reference_is_told(right: Callable[[int], Problem]) -> None:
     """A constant may belong to either; beside a true reference it is the vehicle's."""
     problem = right(100)
@@ -184,7 +209,7 @@ def test_a_rival_on_another_channel_is_no_other_cause() -> None:
     for said in (alone, channels):
         assert "No other known cause comes within" in said
         assert said.endswith("a 97 % chance of being named beside no other cause.</p>")
-    assert "cannot tell it from temperature offset (water), offset drift" in causes
+    assert "cannot tell it from temperature offset (water) or offset drift (" in causes
     assert cause.separated_by in causes
     assert causes.endswith("here it was not.</p>")
 

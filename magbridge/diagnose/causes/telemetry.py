@@ -111,7 +111,8 @@ def _proportional(problem: Problem, cause: str, kind: str, largest: float) -> li
     for name in channels_of(problem, kind):
         low, high = extent(problem, name)
         effect = ChannelEffect(cause=cause, channel=name)
-        unit = f"nT/{problem.survey.channels[name].unit or '1'}"
+        of = problem.survey.channels[name].unit
+        unit = f"nT/{of}" if of else "nT per 1"
         width = largest / max(abs(low), abs(high))
         made.append(of_effect(problem, effect, width, unit, channel=name, phi=_level(problem, name)))
     return made

@@ -18,7 +18,7 @@ ONSETS = 40
 
 
 def offset_step(problem: Problem) -> list[Candidate]:
-    """The offset jumps, by a power cycle, a shock or a magnet: ``T += b H(t - t_0)``.
+    """The offset jumps, by a power cycle, a shock or a magnet: ``T += b`` from its onset on.
 
     As likely at a power cycle as at all other times together. Between the calibration's own logs and these
     there has been one.
@@ -56,7 +56,8 @@ def offset_drift(problem: Problem) -> list[Candidate]:
         def phi(rows: slice, order: int = order, effect: TimeEffect = effect) -> FloatArray:
             return powers((t[rows] - effect.start) / effect.period, order)
 
-        units = [per(f"{period / 3600:.3g} h", power) for power in range(1, order + 1)]
+        step = f"{period / 3600:.3g} h" if period > 600 else f"{period:.3g} s"
+        units = [per(step, power) for power in range(1, order + 1)]
         made.append(of_effect(problem, effect, 50.0, units, phi=phi))
     return made
 

@@ -196,6 +196,7 @@ def _channels(
         if name in NOT_TELEMETRY or name.startswith(OURS):
             continue
         values, unit = table[name], units.get(name, "")
+        unit = "" if unit == "1" else unit
         if unit in FIELDS and name not in needed:
             continue
         known = values[np.isfinite(values)]
@@ -223,7 +224,7 @@ def _place(table: dict[str, FloatArray]) -> FloatArray | None:
 def _kinds(name: str, unit: str) -> tuple[str, ...]:
     if unit in KINDS:
         return (KINDS[unit],)
-    if unit in ("", "1"):
+    if not unit:
         hinted = tuple(kind for hint, kind in HINTS if hint in name.lower())
         return hinted or ("temperature", "current", "pressure", "position")
     return ("position",)

@@ -65,9 +65,9 @@ def late(problem: Problem, fit: Joint) -> str:
         "<p>The channels look as if they were sampled in turn and interpolated to the time of each row: y "
         f"{y} and z {z} later than x (a channel that is noisier than the others would look the same). The "
         f"{number(taken)} nT RMS that this causes is removed from what follows. To avoid it, sample all "
-        "three channels at once, or faster than the vehicle sways. A log of the channels as read, each with "
-        "its own time (mag_time_x, mag_time_y, mag_time_z), loses less than one that has interpolated "
-        "them.</p>"
+        "three channels at once, or faster than the vehicle sways. A log that gives each channel's own time "
+        "(mag_time_x, mag_time_y, mag_time_z) loses less, because its channels are interpolated here, to "
+        "third order; of such a log, these delays are only what that leaves.</p>"
     )
 
 
@@ -199,7 +199,7 @@ def rivalled(candidate: Candidate, cause: Cause, rivals: Sequence[Rival], chance
             f"more would tell.</p>{theory}.</p>"
         )
     return (
-        f"<p>The data cannot tell it from {listed(rivals)} (odds below 20:1). To tell them apart: "
+        f"<p>The data cannot tell it from {listed(rivals, ' or ')} (odds below 20:1). To tell them apart: "
         f"{escape(cause.separated_by)}.</p>{theory}; here it was not.</p>"
     )
 

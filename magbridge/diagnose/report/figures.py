@@ -176,7 +176,7 @@ def channels(diagnosis: Diagnosis) -> str:
             axis.vlines(middle, mean - spread, mean + spread, color=colour, alpha=0.2, linewidth=5)
             axis.plot(middle, mean, "o-", color=colour, markersize=2.5, linewidth=1, label=side)
             ends += [mean - spread, mean + spread]
-        axis.set_xlabel(f"{name} ({units[name] or '1'})", fontsize=8)
+        axis.set_xlabel(f"{name} ({units[name]})" if units[name] else name, fontsize=8)
         axis.xaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
     for axis in axes.flat[len(names) :]:
         axis.set_visible(False)

@@ -6,6 +6,9 @@ from collections.abc import Mapping
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from magbridge.calibration.residual import rms
 from magbridge.diagnose.report import figures
 from magbridge.diagnose.report.doubts import (
@@ -54,14 +57,7 @@ def found(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> list[str]:
         parts += [f'<h3 id="cause{k}">{bold(finding.candidate)}</h3>']
         parts += _cause(diagnosis, finding, causes[finding.candidate.cause])
     if diagnosis.wrong is not None:
-        rows_at = ", ".join(
-            datetime.fromtimestamp(float(t), UTC).strftime("%H:%M:%S")
-            for t in diagnosis.problem.survey.time[diagnosis.wrong.rows[:12]]
-        )
-        parts.append(
-            f"<h3><b>outliers</b></h3><p>{diagnosis.wrong.rows.size} isolated samples are wrong, "
-            f"the first at {rows_at} UTC; the figures above leave them out.</p>"
-        )
+        parts.append(_outliers(diagnosis.problem.survey.time[diagnosis.wrong.rows]))
     return parts
 
 
@@ -108,6 +104,17 @@ def _cause(diagnosis: Diagnosis, finding: Finding, cause: Cause) -> list[str]:
         no_gain(gain),
         outshone(finding, diagnosis.unexplained),
     ]
+
+
+def _outliers(time: NDArray[np.float64]) -> str:
+    """Say how many samples are wrong, and when: `time` (k,) in s since 1970."""
+    when = ", ".join(datetime.fromtimestamp(float(t), UTC).strftime("%H:%M:%S") for t in time[:MANY])
+    wrong = "1 isolated sample is wrong" if time.size == 1 else f"{time.size} isolated samples are wrong"
+    first = f"the first {MANY} " if time.size > MANY else ""
+    left = "it" if time.size == 1 else "them"
+    return (
+        f"<h3><b>outliers</b></h3><p>{wrong}, {first}at {when} UTC; the figures above leave {left} out.</p>"
+    )
 
 
 def _folded(table: str, numbers: Mapping[str, Mapping[str, Any]]) -> str:

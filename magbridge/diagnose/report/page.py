@@ -136,7 +136,7 @@ def _sentence(diagnosis: Diagnosis) -> str:
     ]
     if diagnosis.wrong is not None:
         causes.append(f"<b>outliers</b> ({diagnosis.wrong.rows.size} wrong samples)")
-    names = f"Found: {', '.join(causes)}. {gained(total, diagnosis.problem.survey.parts)}"
+    names = f"Found: {'; '.join(causes)}. {gained(total, diagnosis.problem.survey.parts)}"
     rest = diagnosis.unexplained
     withheld = rest.within if rest else ()
     nothing_else = "Nothing else stands out of the noise."
@@ -160,7 +160,9 @@ def _sentence(diagnosis: Diagnosis) -> str:
 
 def _others(finding: Finding) -> str:
     """Return the rivals of a cause, or how many there are."""
-    return listed(finding.rivals) if len(finding.rivals) < 3 else f"one of {len(finding.rivals)} others"
+    return (
+        listed(finding.rivals, " or ") if len(finding.rivals) < 3 else f"one of {len(finding.rivals)} others"
+    )
 
 
 def _left(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> str:

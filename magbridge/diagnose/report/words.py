@@ -46,9 +46,9 @@ def bold(candidate: Candidate) -> str:
     return f"<b>{candidate.cause.replace('_', ' ')}</b>" + (f" ({escape(channel)})" if channel else "")
 
 
-def listed(rivals: Sequence[Rival]) -> str:
+def listed(rivals: Sequence[Rival], joint: str = ", ") -> str:
     """Return causes as a list in words, the likeliest first."""
-    return ", ".join(escape(label(rival.cause, rival.channel)) for rival in rivals)
+    return joint.join(escape(label(rival.cause, rival.channel)) for rival in rivals)
 
 
 def physics(cause: Cause) -> str:
