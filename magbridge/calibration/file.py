@@ -104,7 +104,9 @@ def decode_calibration(data: bytes, file: str | Path = "cal.json") -> Calibratio
         terms = tuple(_term_in(term, file) for term in content.terms)
         effects = tuple(_term_in(effect, file) for effect in content.effects)
     except (msgspec.DecodeError, UnicodeDecodeError) as problem:
-        raise FormatError(file, f"not a calibration: {_plain(problem)}") from problem
+        raise FormatError(
+            file, f"not a calibration as magbridge calibrate writes it: {_plain(problem)}"
+        ) from problem
     try:
         return _checked(content, terms, effects)
     except CalibrationError as problem:

@@ -68,7 +68,12 @@ def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
             elif DIMENSION in file.dimensions:
                 yield from _chunks(path, file, rows)
             else:
-                raise FormatError(path, f"expected the dimension {DIMENSION} (OG1.0) or a Seaglider's file")
+                there = ", ".join(file.dimensions) or "none"
+                raise FormatError(
+                    path,
+                    f"expected a log: the dimension {DIMENSION} (OG1.0), or a Seaglider's file; "
+                    f"there are: {there}",
+                )
     except (OSError, RuntimeError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or error
         raise FormatError(path, f"expected a whole netCDF file: {reason}") from None

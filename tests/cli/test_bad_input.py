@@ -154,7 +154,8 @@ def test_a_position_in_another_unit_is_refused(
         ),
         (["simulate", "none.toml", "-o", "x.csv"], 2, "none.toml: No such file"),
         (["correct", "{d}", "--calibration", "none.json", "-o", "x.csv"], 1, "none.json: cannot be read"),
-        (["correct", "{d}", "--calibration", "{d}", "-o", "x.csv"], 1, "not a calibration"),
+        (["correct", "{d}", "--calibration", "{d}", "-o", "x.csv"], 1, "not a calibration as magbridge "),
+        (["simulate", "seaglider", "-o", "x.nc"], 2, "has no mission: drive it with a log (--like)"),
         (["calibrate", "{d}", "--parameter", "nose", "-o", "x.json"], 1, "column 'nose'"),
         (
             ["calibrate", "{d}", "--parameter", "mag_x", "-o", "x.json"],

@@ -183,7 +183,7 @@ def test_netcdf_of_another_shape(tmp_path: Path) -> None:
     with netCDF4.Dataset(path, "w") as file:
         file.createDimension("obs", 3)
     with pytest.raises(
-        FormatError, match=r"expected the dimension N_MEASUREMENTS \(OG1.0\) or a Seaglider's file"
+        FormatError, match=r"expected a log: the dimension N_MEASUREMENTS \(OG1.0\), .*; there are: \w+"
     ):
         logs.read(path)
     with netCDF4.Dataset(path, "w") as file:

@@ -94,6 +94,9 @@ def _compared(diagnosis: Diagnosis) -> list[str]:
         if diagnosis.findings
         else "as calibrated, and with the calibration refitted within its own uncertainty"
     )
+    lacks = "A line that is not flat is an effect that the model lacks" + (
+        "." if diagnosis.findings else ", unless it is flat once the calibration is refitted."
+    )
     return [
         (
             "<p>The calibration describes what the vehicle's own magnetism and the sensor's errors do to "
@@ -118,8 +121,8 @@ def _compared(diagnosis: Diagnosis) -> list[str]:
         "</div>",
         figure(
             figures.channels(diagnosis),
-            "The difference against the channels that it follows most: mean and scatter in twenty bins. A "
-            "line that is not flat is an effect that the model lacks.",
+            "The difference against the channels that it follows most: mean and scatter in twenty bins. "
+            + lacks,
         ),
         figure(
             figures.track(diagnosis),
