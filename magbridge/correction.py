@@ -20,7 +20,7 @@ from magbridge.columns import AGE, CHANNELS, COLUMNS, CORRECTED, require
 from magbridge.config import Align
 from magbridge.field.igrf import magnitude
 from magbridge.field.reference import main_field
-from magbridge.records import BEYOND, Corrected, Reading
+from magbridge.records import BEYOND, Corrected, Quality, Reading
 from magbridge.toml import convert
 
 if TYPE_CHECKING:
@@ -121,7 +121,8 @@ def correct_rows(correction: Correction, deployment: xr.Dataset) -> xr.Dataset:
     Dataset (time)
         ``total_field total_field_sigma field_x field_y field_z anomaly quality``; ``time`` as in the input.
         The field is in body axes. The anomaly is the total field minus the IGRF, NaN where there is no
-        position. All in nT, but for ``quality``, the bits of :class:`~magbridge.records.Quality`.
+        position. All in nT, but for ``quality``, the bits of :class:`~magbridge.records.Quality`. A row
+        without any channel is not a sample but telemetry: NaN there, with ``gap``.
 
     Raises
     ------
@@ -134,10 +135,11 @@ def correct_rows(correction: Correction, deployment: xr.Dataset) -> xr.Dataset:
 
     require(deployment, CHANNELS)
     correction.as_declared(deployment.attrs)
-    rows = [correction.reading(*row)[1] for row in _readings(correction, deployment)]
-    results = np.array(
-        [(row.total_field, row.total_field_sigma, *row.field, nan, row.quality) for row in rows], dtype=float
-    ).reshape(-1, len(CORRECTED))
+    results = np.full((deployment.sizes["time"], len(CORRECTED)), nan)
+    results[:, CORRECTED.index("quality")] = Quality.GAP
+    for row, reading, stamp in _readings(correction, deployment):
+        one = correction.reading(reading, stamp)[1]
+        results[row] = one.total_field, one.total_field_sigma, *one.field, nan, one.quality
     columns = dict(zip(CORRECTED, results.T, strict=True))
     columns["anomaly"] = columns["total_field"] - magnitude(main_field(deployment))
     return xr.Dataset(
@@ -150,8 +152,8 @@ def correct_rows(correction: Correction, deployment: xr.Dataset) -> xr.Dataset:
     )
 
 
-def _readings(correction: Correction, deployment: xr.Dataset) -> Iterator[tuple[Reading, int]]:
-    """Yield each row as a reading and its time (µs), after passing the row's telemetry to `correction`."""
+def _readings(correction: Correction, deployment: xr.Dataset) -> Iterator[tuple[int, Reading, int]]:
+    """Yield each sample's row, reading and time (µs), after passing the telemetry so far to `correction`."""
 
     def column(name: str) -> list[float]:
         if name in deployment:
@@ -171,5 +173,10 @@ def _readings(correction: Correction, deployment: xr.Dataset) -> Iterator[tuple[
                 correction.telemetry(name, values[row], stamp - round(ages[row] * 1e6))
             elif isfinite(values[row]):  # an empty cell is not a message that the value is unknown
                 correction.telemetry(name, values[row], stamp)
-        power_cycle = int(cycle) if isfinite(cycle) else None
-        yield Reading(field, channel_delay=delay, temperature=temperature, power_cycle=power_cycle), stamp
+        if field[0] == field[0] or field[1] == field[1] or field[2] == field[2]:  # not all NaN
+            power_cycle = int(cycle) if isfinite(cycle) else None
+            yield (
+                row,
+                Reading(field, channel_delay=delay, temperature=temperature, power_cycle=power_cycle),
+                stamp,
+            )

@@ -166,7 +166,8 @@ def correct(*files: Path, calibration: Path, output: Log, json: Json = False) ->
     a bridge's own log (also converted to .nc or .parquet) these are MAG_RAW with the latest telemetry before
     each and its age; [align] and every max_age are known as they were when the log began. The bridge itself
     uses every message about a moving mass, and the channels of a sensor that has no counts are float32 here
-    (to 0.002 nT of 50,000 nT). Of another log, telemetry counts as new in every row that has it. For what the
+    (to 0.002 nT of 50,000 nT). Of another log, telemetry counts as new in every row that has it, and rows
+    that have nothing else are not samples: they are left out of the output. For what the
     bridge would have published bit for bit, put the calibration into a bridge.toml and run: magbridge
     replay LOG --config bridge.toml --log DIR. The replay also reports that this differs from what was
     published at the time.
@@ -192,7 +193,7 @@ def correct(*files: Path, calibration: Path, output: Log, json: Json = False) ->
     check_inputs(files, output, calibration)
     known = load(calibration)
     correction = Correction(known)
-    rows, flagged, whole = 0, 0, False
+    rows, flagged, left_out, whole = 0, 0, 0, False
     pieces: list[dict[str, Any]] = []
     flags: Counter[str] = Counter()
     doubtful = ~Quality.NO_BORESIGHT  # without a boresight, the total field is just as good
@@ -201,12 +202,14 @@ def correct(*files: Path, calibration: Path, output: Log, json: Json = False) ->
             if not pieces:
                 note_missing(known, part)
             pieces.append(part.attrs)
-            corrected = correct_rows(correction, part)
+            sampled = part[list(CHANNELS)].to_array().notnull()
+            corrected = correct_rows(correction, part).isel(time=sampled.any("variable").to_numpy())
             writer.append(corrected)
-            rows += part.sizes["time"]
+            rows += corrected.sizes["time"]
+            left_out += part.sizes["time"] - corrected.sizes["time"]
             if not whole:
                 refuse_unsuited(known, part)
-                whole = bool(part[list(CHANNELS)].to_array().notnull().all("variable").any())
+                whole = bool(sampled.all("variable").any())
             quality = corrected["quality"].to_numpy().astype(int)
             flagged += int((quality & doubtful != 0).sum())
             flags.update({flag.names(): int((quality & flag != 0).sum()) for flag in doubtful})
@@ -215,7 +218,8 @@ def correct(*files: Path, calibration: Path, output: Log, json: Json = False) ->
                 f"{', '.join(str(file) for file in files)}: no row has all of {' '.join(CHANNELS)}"
             )
     note_losses(*pieces)
-    facts = {"file": str(output), "rows": rows, "flagged": flagged, "flags": +flags}
+    facts = {"file": str(output), "rows": rows, "flagged": flagged, "flags": +flags, "left_out": left_out}
     named = ", ".join(f"{name} {count}" for name, count in (+flags).items())
     summary = f"{output}: {rows} samples, {flagged} of them flagged" + (f" ({named})" if named else "")
+    summary += f"; {left_out} rows without any of {' '.join(CHANNELS)} left out" if left_out else ""
     print_result(facts, summary, json)

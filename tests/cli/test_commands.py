@@ -23,6 +23,7 @@ from magbridge.field.igrf import total_field
 from magbridge.field.read import read_grid
 from magbridge.logs import read, write
 from magbridge.progress import waiting
+from magbridge.records import Quality
 
 FEW = 40  # rows, which a diagnosis refuses: what it says before is said all the same
 
@@ -221,3 +222,24 @@ def test_what_takes_long_says_that_it_is_at_work(monkeypatch: pytest.MonkeyPatch
         shown += os.read(master, 65536)
     os.close(master)
     assert b"\x1b[2K" in shown.rpartition(b"judging")[2]
+
+
+def test_only_what_the_sensor_measured_is_corrected(
+    deployment: Path, calibration: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The vehicle's telemetry in a file of its own, at times of its own, makes no samples and no gaps."""
+    rows = read(deployment).isel(time=slice(0, 300))
+    whole = correct_rows(Correction(load_calibration(calibration)), rows)
+    masses = rows[["battpos", "ballast"]]
+    write(masses.assign_coords(time=rows["time"] - 0.5), tmp_path / "vehicle.csv")
+    write(rows.drop_vars(masses), tmp_path / "instrument.csv")
+    command = ["correct", str(tmp_path / "vehicle.csv"), str(tmp_path / "instrument.csv"), "--json"]
+    assert main([*command, "--calibration", str(calibration), "-o", str(tmp_path / "out.nc")]) == 0
+    result, out = json.loads(capsys.readouterr().out), read(tmp_path / "out.nc")
+    assert (result["rows"], result["left_out"]) == (300, 300)
+    np.testing.assert_allclose(out["time"], rows["time"], atol=1e-5)
+    before, after = (one["quality"].to_numpy().astype(int) for one in (whole, out))
+    np.testing.assert_array_equal(before & Quality.GAP, after & Quality.GAP)
+    calm = (before | after) & Quality.MOVING == 0
+    assert calm.sum() > 200
+    np.testing.assert_allclose(out["total_field"][calm], whole["total_field"][calm], atol=0.1)
