@@ -64,12 +64,14 @@ def test_when_something_began_is_a_date() -> None:
     cells = '<td class="n">2026-06-01 11:50:41</td><td class="n"></td><td>UTC</td>'
     assert row("onset (2)", 1780314641.5, None, "s") == f"<tr><td>onset (2)</td>{cells}</tr>"
     assert '<td class="n">± 0.50</td><td>nT/A</td>' in row("x", 12.0, 0.5, "nT/A")
+    assert '<td class="n">12</td>' in row("count", 12, None, "")
 
 
 @pytest.mark.parametrize(
-    ("value", "text"), [(1073.2, "1070"), (0.0768, "0.0768"), (900.0, "900"), (2, "2"), (0.0, "0")]
+    ("value", "text"),
+    [(1073.2, "1070"), (0.0768, "0.0768"), (900.0, "900"), (2, "2.00"), (0.5, "0.500"), (0.0, "0")],
 )
-def test_a_size_is_written_without_an_exponent(value: float, text: str) -> None:
+def test_a_size_is_written_to_its_digits_without_an_exponent(value: float, text: str) -> None:
     assert number(value) == text
 
 
@@ -100,7 +102,7 @@ def test_sizes_of_one_unit_name_it_once() -> None:
         "z": (0.2, "nT/degC"),
         "delay": (1.0, "s"),
     }
-    assert sizes(smallest) == "x 0.555, z 0.2 nT/degC, delay 1 s"
+    assert sizes(smallest) == "x 0.555, z 0.200 nT/degC, delay 1.00 s"
     assert sizes({f"c{k}": (1.0, "nT") for k in range(30)}) == "c0 1, c1 1, c2 1 nT, and 27 more"
     assert sizes({"x": (np.inf, "nT")}) == "no plausible size reaches it"
 

@@ -59,14 +59,17 @@ def physics(cause: Cause) -> str:
 
 
 def number(value: float, digits: int = 3) -> str:
-    """Write a number to so many digits without an exponent: 1070, not 1.07e+03."""
-    return f"{float(f'{value:.{digits}g}'):g}"
+    """Write a number to so many significant digits without an exponent: 1070, not 1.07e+03; 2.00, not 2."""
+    rounded = float(f"{value:.{digits}g}")
+    if not rounded or not isfinite(rounded):
+        return f"{rounded:g}"
+    return f"{rounded:.{max(digits - 1 - floor(log10(abs(rounded))), 0)}f}"
 
 
 def measured(value: float, sigma: float | None) -> str:
-    """Write a number to the second digit of its sigma."""
+    """Write a number to the second digit of its sigma; without one, as a count or a period, to four digits."""
     if not sigma or not isfinite(sigma):
-        return number(value, 4)
+        return f"{float(f'{value:.4g}'):g}"
     places = 1 - floor(log10(sigma))
     # an added 0 turns what was rounded to -0 into 0
     return f"{round(value, places) + 0.0:.{max(places, 0)}f}".replace("-", "\N{MINUS SIGN}")
