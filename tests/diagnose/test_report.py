@@ -103,7 +103,7 @@ def test_sizes_of_one_unit_name_it_once() -> None:
         "delay": (1.0, "s"),
     }
     assert sizes(smallest) == "x 0.555, z 0.200 nT/degC, delay 1.00 s"
-    assert sizes({f"c{k}": (1.0, "nT") for k in range(30)}) == "c0 1, c1 1, c2 1 nT, and 27 more"
+    assert sizes({f"c{k}": (1.0, "nT") for k in range(30)}) == "c0 1.00, c1 1.00, c2 1.00 nT, and 27 more"
     assert sizes({"x": (np.inf, "nT")}) == "no plausible size reaches it"
 
 

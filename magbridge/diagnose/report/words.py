@@ -67,7 +67,7 @@ def number(value: float, digits: int = 3) -> str:
 
 
 def measured(value: float, sigma: float | None) -> str:
-    """Write a number to the second digit of its sigma; without one, as a count or a period, to four digits."""
+    """Write a number to the second digit of its sigma; without one (a count, a period), to four digits."""
     if not sigma or not isfinite(sigma):
         return f"{float(f'{value:.4g}'):g}"
     places = 1 - floor(log10(sigma))
