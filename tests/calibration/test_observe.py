@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from magbridge.calibration.fitting.draw import _abscissae
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.observe import observations
 from magbridge.errors import CalibrationError, FormatError
@@ -28,6 +29,7 @@ def test_a_deployment_s_columns_become_observations() -> None:
     assert data.names == ("battpos",) == observations(ds, "battpos").names
     assert data.units == ("in",)
     assert len(data) == n
+    assert list(_abscissae(data)) == ["minutes", "battpos, in"]
     with pytest.raises(FormatError, match=r"column 'fin': expected .*; there are: .* battpos"):
         observations(ds, ["fin"])
     with pytest.raises(CalibrationError, match="'battpos': expected numbers"):

@@ -63,19 +63,22 @@ def draw_fit(calibration: Calibration, data: Observations, path: str | Path) -> 
         axis.set_xlabel(name)
     axes[0, 0].set_ylabel(f"as read, nT: {rms(read):.0f} RMS")
     axes[1, 0].set_ylabel(f"corrected, nT: {rms(left):.2f} RMS")
-    legend = {"a colour for each run": dots, "2 sigma of the sensor's noise": band}
+    legend = {"a colour for each run": dots} if run.max() else {}
+    legend["2 sigma of the sensor's noise"] = band
     if beyond.any():
         legend[f"beyond the scale: {beyond.sum()} of {len(data)}, up to {np.abs(left).max():.0f} nT"] = above
     figure.legend(
-        legend.values(), legend, loc="outside upper right", ncols=len(legend), fontsize=8, frameon=False
-    )
+        legend.values(), legend, loc="outside upper right", ncols=len(legend), fontsize=8, frameon=False,
+        markerscale=2,
+    )  # fmt: skip
     with atomic_path(path) as partial:
         figure.savefig(partial, dpi=110)
 
 
 def _abscissae(data: Observations) -> dict[str, FloatArray]:
     """Return the quantities that deviations are drawn against, by name and unit."""
-    shown = {"hours": (data.time - data.time[0]) / 3600.0}
+    since = data.time - data.time[0]
+    shown = {"hours": since / 3600.0} if since.max() > 7200.0 else {"minutes": since / 60.0}
     if data.attitude is not None and np.isfinite(data.attitude[:, 2]).any():
         shown["heading, deg"] = np.degrees(data.attitude[:, 2]) % 360.0
     units = (f", {unit}" if unit else "" for unit in data.units)
