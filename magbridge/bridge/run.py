@@ -17,10 +17,10 @@ from typing import Protocol
 from magbridge.bridge import states
 from magbridge.bridge.events import Clock, Event, Start
 from magbridge.bridge.journal import declarations
+from magbridge.bridge.links import open_link
 from magbridge.bridge.live import LiveEdge
 from magbridge.bridge.pipeline import Pipeline
 from magbridge.bridge.serial_port import serial_line
-from magbridge.bridge.sockets import open_link
 from magbridge.calibration import file as calibration_file
 from magbridge.config import Config, load
 from magbridge.errors import FormatError

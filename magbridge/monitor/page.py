@@ -14,7 +14,7 @@ from typing import Any
 
 from nicegui import ui
 
-from magbridge.bridge.sockets import open_link
+from magbridge.bridge.links import open_link
 from magbridge.config import Align
 from magbridge.errors import PortError
 from magbridge.link import alignment

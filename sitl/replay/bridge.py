@@ -15,10 +15,10 @@ from pathlib import Path
 import msgspec
 
 from magbridge.bridge.events import Event, Start
+from magbridge.bridge.links import open_link
 from magbridge.bridge.port import Port
 from magbridge.bridge.run import declared, drive, set_up
 from magbridge.bridge.serial_port import SerialPort
-from magbridge.bridge.sockets import open_link
 from magbridge.config import Log, load
 from magbridge.errors import MagbridgeError, WriteError
 from magbridge.logs.tlog import TlogWriter

@@ -19,10 +19,11 @@ import pytest
 from standstill import standstill
 
 from magbridge.bridge.events import Clock
+from magbridge.bridge.links import open_link
 from magbridge.bridge.live import LiveEdge
 from magbridge.bridge.serial_port import SerialPort
-from magbridge.bridge.sockets import TcpServer, open_link
 from magbridge.bridge.stream import LATE, MOST
+from magbridge.bridge.tcp import TcpServer
 from magbridge.errors import ConfigError, PortError
 from magbridge.mavlink import Codec, Message, Signing
 from magbridge.records import Channel

@@ -11,7 +11,8 @@ from typing import Any
 
 import pytest
 
-from magbridge.bridge.sockets import PEERS, open_link
+from magbridge.bridge.links import open_link
+from magbridge.bridge.udp import PEERS
 
 
 def test_a_udp_peer_that_is_not_there_is_no_fault() -> None:
@@ -49,7 +50,7 @@ def test_a_named_host_that_gets_another_address_is_found_again(monkeypatch: pyte
         port.write(b"1")
         _, peer = before.recvfrom(9)
         host[0] = "127.0.0.2"
-        monkeypatch.setattr("magbridge.bridge.sockets.PEER_TIMEOUT", 0.3)
+        monkeypatch.setattr("magbridge.bridge.udp.PEER_TIMEOUT", 0.3)
         for _ in range(4):
             time.sleep(0.1)
             before.sendto(b"here", peer)
