@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Sequence
 from math import isnan, tanh
 from operator import sub
@@ -46,7 +47,27 @@ class MassEffect(SingleChannelEffect, frozen=True, kw_only=True):
         return offsets(self.size // 3)
 
 
-class PowersEffect(MassEffect, frozen=True, kw_only=True):
+class PathEffect(MassEffect, frozen=True, kw_only=True):
+    """Offsets that depend on nothing but where the mass is, ``x = (p - centre) / scale``."""
+
+    @abstractmethod
+    def regressors(self, x: float) -> tuple[float, ...]:
+        """Return the regressors at x."""
+
+    def begin(self, calibration: Calibration) -> Step:
+        """Return a stepper; while the value is missing, the last one holds."""
+        index, x = calibration.channels.index(self.channel), 0.0
+
+        def step(time_us: int, hx: float, hy: float, hz: float, values: Sequence[float]) -> tuple[float, ...]:
+            nonlocal x
+            if not isnan(values[index]):
+                x = (values[index] - self.centre) / self.scale
+            return self.regressors(x)
+
+        return step
+
+
+class PowersEffect(PathEffect, frozen=True, kw_only=True):
     """A mass that another channel moves: ``T += sum_k c_k x^k``, ``x = (p - centre) / scale``.
 
     A permanent moment on a mass at ``r(p)`` gives ``G(r(p)) m`` (see :mod:`.dipole`), a power series in p.
@@ -65,21 +86,12 @@ class PowersEffect(MassEffect, frozen=True, kw_only=True):
         """Three coefficients (nT) for each power."""
         return 3 * self.order
 
-    def begin(self, calibration: Calibration) -> Step:
-        """Return a stepper; while the value is missing, the last one holds."""
-        index, order = calibration.channels.index(self.channel), self.order
-        centre, scale, x = self.centre, self.scale, 0.0
-
-        def step(time_us: int, hx: float, hy: float, hz: float, values: Sequence[float]) -> tuple[float, ...]:
-            nonlocal x
-            if not isnan(values[index]):
-                x = (values[index] - centre) / scale
-            return powers(x, order)
-
-        return step
+    def regressors(self, x: float) -> tuple[float, ...]:
+        """Return x to x^order."""
+        return powers(x, self.order)
 
 
-class SourcesEffect(MassEffect, frozen=True, kw_only=True):
+class SourcesEffect(PathEffect, frozen=True, kw_only=True):
     """Iron that a mass passes on its path: ``T += sum_k c_k (1 + x_k^2)^(-3/2)``.
 
     Here ``x_k = (p - centre) / scale - k apart``. Iron that the mass magnetises, or that magnetises the
@@ -105,18 +117,9 @@ class SourcesEffect(MassEffect, frozen=True, kw_only=True):
         """Three coefficients (nT) for each source."""
         return 3 * self.count
 
-    def begin(self, calibration: Calibration) -> Step:
-        """Return a stepper; while the value is missing, the last one holds."""
-        index, count, apart = calibration.channels.index(self.channel), self.count, self.apart
-        centre, scale, x = self.centre, self.scale, 0.0
-
-        def step(time_us: int, hx: float, hy: float, hz: float, values: Sequence[float]) -> tuple[float, ...]:
-            nonlocal x
-            if not isnan(values[index]):
-                x = (values[index] - centre) / scale
-            return tuple((1.0 + (x - apart * k) ** 2) ** -1.5 for k in range(count))
-
-        return step
+    def regressors(self, x: float) -> tuple[float, ...]:
+        """Return what each source does."""
+        return tuple((1.0 + (x - self.apart * k) ** 2) ** -1.5 for k in range(self.count))
 
 
 class MonomialEffect(Effect, frozen=True, kw_only=True):
