@@ -7,14 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from gliders import Gliders
+from seaglider import COUNT, leave_runs_out
 
 from magbridge.calibration.fitting.observe import observations
-from magbridge.calibration.fitting.validate import leave_runs_out
 from magbridge.errors import CalibrationError
 from magbridge.logs import read
-
-COUNT = 100.0
-"""nT, the sensor's quantisation."""
 
 
 @pytest.mark.real
