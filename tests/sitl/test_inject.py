@@ -45,6 +45,7 @@ DRAWN = {
     "stuck": 112.6, "sounder": 93.7, "gradient": 46.64, "squeezed": 36.07, "flare": 67.93, "swarf": 78.9,
     "ageing": 58.37, "crossfield": 373.1, "railway": 21.51, "rudder": 23.16,
     "latch": 122.4, "recovery": 100.9, "clamp": 25.67, "seiche": 42.82,
+    "accumulator": 131, "modem": 82.22, "rezero": 105, "pipeline": 187.1,
 }  # fmt: skip
 """Norm (nT) of what each does to the log of :func:`flight`, as first drawn.
 

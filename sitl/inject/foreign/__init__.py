@@ -71,5 +71,9 @@ FOREIGN: dict[str, Effect] = {
     "recovery": vehicle.recovery,
     "clamp": sensor.clamp,
     "seiche": surroundings.seiche,
+    "accumulator": vehicle.accumulator,
+    "modem": vehicle.modem,
+    "rezero": sensor.rezero,
+    "pipeline": surroundings.pipeline,
 }
 """Effect, by its name."""

@@ -178,3 +178,11 @@ def clamp(scene: Scene, size: float, rng: Generator) -> None:
             held = strain + 0.2 * np.sign(strain - held) * grip
         slipped[k] = strain - held
     scene.add(slipped, size * direction(rng))
+
+
+def rezero(scene: Scene, size: float, rng: Generator) -> None:
+    """The sensor zeroes itself by the clock, and its offset warms away in between; size in nT at 1 degC."""
+    warm = soaked(scene.water, scene.track.step, float(rng.uniform(200.0, 1200.0)))
+    every = round(rng.uniform(1800.0, 7200.0) / scene.track.step)
+    zeroed = np.arange(len(warm)) // every * every
+    scene.add(warm - warm[zeroed], size * direction(rng))

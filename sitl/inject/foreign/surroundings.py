@@ -97,8 +97,7 @@ def hvdc(scene: Scene, size: float, rng: Generator) -> None:
     aside, above, across = _cable(scene, rng)
     traded = rng.uniform(-0.3, 1.0, int(scene.t[-1] // 1800.0) + 1)
     load = first_order(traded[(scene.t // 1800.0).astype(int)], scene.track.step, 60.0)
-    around = np.outer(above, across) - np.outer(aside, [0.0, 0.0, 1.0])
-    scene.earth = scene.earth + size * 100.0 * (load / (aside**2 + above**2))[:, None] * around
+    scene.earth = scene.earth + size * load[:, None] * _around(aside, above, across)
 
 
 def substorm(scene: Scene, size: float, rng: Generator) -> None:
@@ -151,6 +150,13 @@ def seiche(scene: Scene, size: float, rng: Generator) -> None:
     scene.earth = scene.earth + size * np.outer(sloshes * deeper, direction(rng))
 
 
+def pipeline(scene: Scene, size: float, rng: Generator) -> None:
+    """A pipeline's protection current is interrupted for a survey of its own; size in nT at 100 m."""
+    aside, above, across = _cable(scene, rng)
+    flows = (scene.t + rng.uniform(0.0, 15.0)) % 15.0 < 12.0
+    scene.earth = scene.earth + size * flows[:, None] * _around(aside, above, across)
+
+
 def _cable(scene: Scene, rng: Generator) -> tuple[Array, Array, Array]:
     """Lay a straight cable below the track: m aside and above (n,), and north-east-down across it."""
     track = scene.track
@@ -159,3 +165,9 @@ def _cable(scene: Scene, rng: Generator) -> tuple[Array, Array, Array]:
     aside = (east - east[k]) * np.cos(course) - (north - north[k]) * np.sin(course)
     above = track.depth.max() + rng.uniform(20.0, 60.0) - track.depth
     return aside, above, np.array([-np.sin(course), np.cos(course), 0.0])
+
+
+def _around(aside: Array, above: Array, across: Array) -> Array:
+    """Field (n, 3) of a cable's current, 1 at 100 m."""
+    rings = np.outer(above, across) - np.outer(aside, [0.0, 0.0, 1.0])
+    return np.asarray(100.0 / (aside**2 + above**2)[:, None] * rings)

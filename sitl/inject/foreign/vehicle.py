@@ -287,3 +287,25 @@ def recovery(scene: Scene, size: float, rng: Generator) -> None:
     owed = first_order(pumps, step, float(rng.uniform(600.0, 2400.0)))
     evens = owed / max(owed.max(), 1e-9) - rng.uniform(0.2, 0.5) * first_order(pumps, step, 2.0)
     scene.add(evens, size * direction(rng))
+
+
+def accumulator(scene: Scene, size: float, rng: Generator) -> None:
+    """Gas shrinks with pressure (Boyle), and a steel piston follows it in jerks; size in nT."""
+    charge, grip = rng.uniform(10.0, 60.0), rng.uniform(0.02, 0.1)
+    piston, places = 0.0, np.empty(len(scene.t))
+    for k, wanted in enumerate(scene.track.depth / (charge + scene.track.depth)):
+        if abs(wanted - piston) > grip:
+            piston = wanted
+        places[k] = piston
+    scene.add(places, size * direction(rng))
+
+
+def modem(scene: Scene, size: float, rng: Generator) -> None:
+    """An unlogged acoustic modem talks to a mooring, while that is within range; size in nT."""
+    track = scene.track
+    north, east = track.local(track.latitude, track.longitude)
+    k = rng.integers(len(north))
+    away = np.hypot(north - north[k], east - east[k])
+    heard = away < np.quantile(away, rng.uniform(0.3, 0.6))
+    talks = (scene.t / rng.uniform(60.0, 240.0)) % 1.0 < rng.uniform(0.2, 0.6)
+    scene.add((heard & talks).astype(float), size * direction(rng))
