@@ -20,7 +20,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magbridge.field.earth import metres_per_degree
-from magbridge.field.grid import AnomalyGrid, filled
+from magbridge.field.grid import AnomalyGrid
+from magbridge.field.spline import filled
 
 __all__ = ["Continued", "continued"]
 

@@ -10,19 +10,18 @@ from __future__ import annotations
 from functools import cached_property
 from math import inf, nan, sqrt
 from pathlib import Path
-from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magbridge.errors import FormatError, OutOfRange
 from magbridge.field.earth import metres_per_degree, usual, wrap
-from magbridge.field.spline import WEIGHTS, coefficients, weights
+from magbridge.field.local import OFF_THE_MAP, Local
+from magbridge.field.spline import WEIGHTS, coefficients, filled, weights
 
-__all__ = ["AnomalyGrid", "Local", "curvature", "filled"]
+__all__ = ["AnomalyGrid"]
 
 Array = NDArray[np.float64]
-T = TypeVar("T", float, Array)
 
 EVEN = 1e-3
 """Share of a step by which rounded coordinates may deviate from an even spacing."""
@@ -35,44 +34,6 @@ NOT_AN_ANOMALY = 15_000.0
 
 DOWN, ACROSS = [0, 1, 0, 2, 1, 0], [0, 0, 1, 0, 1, 2]
 """Orders of derivative, north and east, in the order of Local."""
-
-
-class Local(NamedTuple, Generic[T]):
-    """The map around one place or n places; NaN outside the map and in its holes.
-
-    ``anomaly`` nT; ``north``, ``east`` nT/m, its gradient; ``north_north``, ``north_east``, ``east_east``
-    nT/m², its Hessian; ``variance`` nT², of the map's own error there.
-    """
-
-    anomaly: T
-    north: T
-    east: T
-    north_north: T
-    north_east: T
-    east_east: T
-    variance: T
-
-
-OFF_THE_MAP: Local[float] = Local(nan, nan, nan, nan, nan, nan, nan)
-
-
-def curvature(local: Local[T], nn: T, ne: T, ee: T) -> tuple[T, T]:
-    """Return what curvature adds to mean (nT) and variance (nT²) of the map under a position's spread.
-
-    Parameters
-    ----------
-    local : Local
-        The map at the position's mean.
-    nn, ne, ee : float or (n,) array
-        m², covariance P of the position.
-
-    Notes
-    -----
-    ``tr(C P)/2`` and ``tr((C P)²)/2``, C the Hessian (second-order filter; Bar-Shalom et al. 2001, 10.3).
-    """
-    a, b = local.north_north * nn + local.north_east * ne, local.north_north * ne + local.north_east * ee
-    c, d = local.north_east * nn + local.east_east * ne, local.north_east * ne + local.east_east * ee
-    return 0.5 * (a + d), 0.5 * (a * a + 2.0 * b * c + d * d)
 
 
 class AnomalyGrid:
@@ -232,8 +193,7 @@ class AnomalyGrid:
         parts[3:] *= north * north, north * east, east * east
         if not inside.all():
             parts[:, ~inside] = variance[~inside] = nan
-        value, slope_north, slope_east, north_north, north_east, east_east = parts
-        return Local(value, slope_north, slope_east, north_north, north_east, east_east, variance)
+        return Local._make([*parts, variance])
 
     def at(self, longitude: ArrayLike, latitude: ArrayLike, depth: ArrayLike = nan) -> Array:
         """Return the anomaly at n places, nT, (n,): see :meth:`evaluate`.
@@ -294,18 +254,6 @@ class AnomalyGrid:
             f"{self.name} (latitude {self.latitude[0]:.4f} to {self.latitude[-1]:.4f},"
             f" longitude {west:.4f} to {east:.4f})"
         )
-
-
-def filled(values: Array) -> Array:
-    """Return values (ny, nx), each hole (NaN) filled from the nearest node: a transform takes no holes."""
-    hole = np.isnan(values)
-    if not hole.any():
-        return values
-    from scipy.ndimage import distance_transform_edt  # noqa: PLC0415  the live path runs without scipy
-
-    nearest = distance_transform_edt(hole, return_distances=False, return_indices=True)
-    patched: Array = values[tuple(nearest)]
-    return patched
 
 
 def _axis(values: ArrayLike, name: str, what: str) -> tuple[Array, bool]:

@@ -1,11 +1,11 @@
-"""Cubic B-splines through the nodes of a uniform grid: their coefficients, and the weights of four nodes."""
+"""Cubic B-splines through the nodes of a uniform grid without holes: coefficients, weights of four nodes."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["WEIGHTS", "coefficients", "weights"]
+__all__ = ["WEIGHTS", "coefficients", "filled", "weights"]
 
 Array = NDArray[np.float64]
 
@@ -18,6 +18,18 @@ SLOPE = np.array([[-3, 6, -3, 0], [0, -12, 9, 0], [3, 6, -9, 0], [0, 0, 3, 0]]) 
 CURVATURE = np.array([[6, -6, 0, 0], [-12, 18, 0, 0], [6, -18, 0, 0], [0, 6, 0, 0]]) / 6.0
 WEIGHTS = np.concatenate([VALUE, SLOPE, CURVATURE])
 """Weights of four nodes for value, slope and curvature, (12, 4), times powers of t."""
+
+
+def filled(values: Array) -> Array:
+    """Return values (ny, nx), each hole (NaN) filled from the nearest node: a transform takes no holes."""
+    hole = np.isnan(values)
+    if not hole.any():
+        return values
+    from scipy.ndimage import distance_transform_edt  # noqa: PLC0415  the live path runs without scipy
+
+    nearest = distance_transform_edt(hole, return_distances=False, return_indices=True)
+    patched: Array = values[tuple(nearest)]
+    return patched
 
 
 def coefficients(values: Array) -> Array:

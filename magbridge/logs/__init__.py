@@ -221,11 +221,8 @@ class Writer:
         FormatError
             Time does not increase, or a column was not in the first deployment.
         """
-        from magbridge.logs.deployment import (  # noqa: PLC0415 - xarray is for ashore
-            increasing,
-            same_columns,
-            uncounted,
-        )
+        from magbridge.logs.checks import increasing  # noqa: PLC0415 - xarray is for ashore
+        from magbridge.logs.deployment import same_columns, uncounted  # noqa: PLC0415
 
         first = not self._columns
         if first:

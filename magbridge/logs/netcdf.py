@@ -25,7 +25,8 @@ from magbridge.errors import FormatError, MissingExtra
 from magbridge.files import systems_reason
 from magbridge.logs import seaglider
 from magbridge.logs.cf import floats
-from magbridge.logs.deployment import deployment, increasing, plausible, sliced
+from magbridge.logs.checks import increasing, plausible
+from magbridge.logs.deployment import deployment, sliced
 
 try:
     import netCDF4

@@ -12,7 +12,8 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from magbridge.errors import FormatError, MissingExtra
-from magbridge.logs.deployment import deployment, increasing, plausible
+from magbridge.logs.checks import increasing, plausible
+from magbridge.logs.deployment import deployment
 
 try:
     import pyarrow as pa

@@ -22,7 +22,8 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from magbridge.errors import FormatError, MissingExtra
-from magbridge.logs.deployment import deployment, increasing, sliced
+from magbridge.logs.checks import increasing
+from magbridge.logs.deployment import deployment, sliced
 from magbridge.logs.resample import latest
 
 try:

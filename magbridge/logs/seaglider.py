@@ -28,7 +28,8 @@ from numpy.typing import NDArray
 
 from magbridge.errors import FormatError
 from magbridge.logs.cf import floats
-from magbridge.logs.deployment import deployment, increasing
+from magbridge.logs.checks import increasing
+from magbridge.logs.deployment import deployment
 from magbridge.logs.resample import CIRCLES, linear
 
 __all__ = ["DIMENSION", "NT_PER_COUNT", "dive"]

@@ -24,7 +24,8 @@ from numpy.typing import NDArray
 
 from magbridge.errors import FormatError, MissingExtra
 from magbridge.logs import FLIGHT
-from magbridge.logs.deployment import deployment, increasing, sliced
+from magbridge.logs.checks import increasing
+from magbridge.logs.deployment import deployment, sliced
 from magbridge.logs.resample import CIRCLES, linear
 
 __all__ = ["chunks"]

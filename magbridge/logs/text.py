@@ -23,7 +23,8 @@ import xarray as xr
 
 from magbridge.columns import COLUMNS
 from magbridge.errors import FormatError
-from magbridge.logs.deployment import SETTINGS, deployment, increasing, lasting, plausible
+from magbridge.logs.checks import increasing, plausible
+from magbridge.logs.deployment import SETTINGS, deployment, lasting
 from magbridge.records import Quality
 
 __all__ = ["FileWriter", "chunks"]

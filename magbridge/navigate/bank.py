@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magbridge.field.earth import metres_per_degree, worse_axis
-from magbridge.field.grid import AnomalyGrid, Local, curvature
+from magbridge.field.grid import AnomalyGrid
+from magbridge.field.local import Local, curvature
 from magbridge.navigate.model import N_STATES, Block
 
 __all__ = ["Bank", "widest"]

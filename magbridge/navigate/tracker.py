@@ -10,7 +10,8 @@ from filterpy.kalman import ExtendedKalmanFilter
 from numpy.typing import NDArray
 
 from magbridge.field.earth import metres_per_degree
-from magbridge.field.grid import AnomalyGrid, curvature
+from magbridge.field.grid import AnomalyGrid
+from magbridge.field.local import curvature
 from magbridge.navigate.model import N_STATES, Block, measurement_row
 
 __all__ = ["Innovation", "Tracker"]
@@ -68,7 +69,7 @@ class Tracker:
         Notes
         -----
         ``h = a(p) + ∇F·δ + b + m`` and ``R = r + map variance``, both with what the map's curvature adds
-        (:func:`~magbridge.field.grid.curvature`).
+        (:func:`~magbridge.field.local.curvature`).
         """
         north, east = float(self.x[0]), float(self.x[1])
         per_latitude, per_longitude = metres_per_degree(block.latitude)

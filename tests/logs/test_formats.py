@@ -15,7 +15,8 @@ from hypothesis import strategies as st
 
 from magbridge import logs
 from magbridge.columns import CHANNEL_TIMES, COLUMNS
-from magbridge.logs.deployment import APART, FIELDS, LEAST, MOST, deployment, join
+from magbridge.logs.checks import APART, FIELDS, LEAST, MOST
+from magbridge.logs.deployment import deployment, join
 
 EXACT = [".csv", ".nc", ".parquet"]
 WRITABLE = [*EXACT, ".tlog"]

@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 from scipy.stats import multivariate_normal
 
 from magbridge.field.earth import metres_per_degree, offset
-from magbridge.field.grid import AnomalyGrid, Local
+from magbridge.field.grid import AnomalyGrid
+from magbridge.field.local import Local
 from magbridge.navigate.bank import Bank, widest
 from magbridge.navigate.model import Block, prior, transition
 from magbridge.navigate.options import Options
