@@ -1,8 +1,9 @@
-"""Diagnosing: a night's deployment with every cause, and a month's, in a process of its own each."""
+"""Diagnosing: a night's deployment and a month's with every cause, from their logs, in a process each."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -10,37 +11,48 @@ import xarray as xr
 from benchmarks.measure import in_own_process
 from benchmarks.row import Row
 
+from magbridge.calibration.file import save
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.observe import observations
 from magbridge.calibration.model import Calibration
+from magbridge.logs import write
 from sitl import load, segments, simulate
 from sitl.mission import CrissCross
 
-__all__ = ["diagnosing", "long_survey"]
+__all__ = ["diagnosing", "long_survey", "survey_in"]
 
-MONTH = 648_000
-"""Samples of 30 days at 0.25 Hz."""
+NIGHT, MONTH = 12.0, 720.0
+"""h."""
 NIGHTLY, MONTHLY = 10.0, 1.0
-"""nT/degC, in a night and in a month: either makes a signal-to-noise ratio of 30 to 40."""
+"""nT/degC, in a night and in a month: either makes a signal-to-noise ratio of 30 to 45."""
 
-IN_ANOTHER = """
+# flying a month takes more memory than diagnosing it
+SIMULATED = """
+import sys
+from pathlib import Path
+from benchmarks.diagnose import survey_in
+survey_in(Path(sys.argv[1]), float(sys.argv[2]), float(sys.argv[3]))
+"""
+DIAGNOSED = """
 import json, resource, sys, time
-from benchmarks.diagnose import long_survey
+from pathlib import Path
+from magbridge import load, read
 from magbridge.diagnose.run import diagnose
-survey, calibration = long_survey(float(sys.argv[1]), int(sys.argv[2]), float(sys.argv[3]))
+folder = Path(sys.argv[1])
+survey, calibration = read(folder / "survey.nc"), load(folder / "calibration.json")
 begun, used = time.monotonic(), time.process_time()
 found = diagnose([survey], calibration)
 causes = [h.candidate.cause for h in found.findings]
 print(json.dumps([time.monotonic() - begun, time.process_time() - used, len(found.problem), found.verdict,
-                  causes, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3]))
+                  causes, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1.024e-3]))
 """
 
 
-def diagnosing(folder: Path, repetitions: int) -> list[Row]:  # noqa: ARG001  (others write there and repeat)
+def diagnosing(folder: Path, repetitions: int) -> list[Row]:  # noqa: ARG001  (others repeat)
     """Time `diagnose` without its figures: 12 h and 30 days, plain and with an effect."""
     night, found, month, loud = (
-        in_own_process(IN_ANOTHER, 12, count, size)
-        for size, count in ((0.0, 0), (NIGHTLY, 0), (0.0, MONTH), (MONTHLY, MONTH))
+        _diagnosed(folder, hours, size)
+        for hours, size in ((NIGHT, 0.0), (NIGHT, NIGHTLY), (MONTH, 0.0), (MONTH, MONTHLY))
     )
     fields = ("seconds", "processor seconds", "samples", "verdict", "causes", "MB")
     detail = {name: [run[k] for run in (night, found, month, loud)] for k, name in enumerate(fields)}
@@ -59,45 +71,36 @@ def diagnosing(folder: Path, repetitions: int) -> list[Row]:  # noqa: ARG001  (o
     ]  # fmt: skip
 
 
-def long_survey(hours: float, count: int = 0, size: float = 0.0) -> tuple[xr.Dataset, Calibration]:
+def _diagnosed(folder: Path, hours: float, size: float) -> Any:
+    in_own_process(SIMULATED, folder, hours, size)
+    return in_own_process(DIAGNOSED, folder)
+
+
+def survey_in(folder: Path, hours: float, size: float) -> None:
+    """Write a survey's log and its calibration; arguments as of :func:`long_survey`."""
+    survey, calibration = long_survey(hours, size)
+    write(survey, folder / "survey.nc")
+    save(calibration, folder / "calibration.json")
+
+
+def long_survey(hours: float, size: float = 0.0) -> tuple[xr.Dataset, Calibration]:
     """Return a glider's survey with its calibration.
 
     Parameters
     ----------
     hours : float
         How long it lasts.
-    count : int
-        Number of samples: the survey is repeated, each time with new noise; 0: flown once.
     size : float
         nT/degC of an offset proportional to the logged temperature.
     """
     scenario = load("random_glider")
-    replace = msgspec.structs.replace
-    parts = (
-        scenario.mission[0],
-        CrissCross(hours=hours, roll=(1.0, 2.0), pitch=(25.0, 2.5), battery_spread=0.1),
-    )
-    whole = segments(simulate(replace(scenario, mission=parts), 3))
-    calibration = fit(observations(whole["calibration"], ["battpos", "ballast"]), "auto").calibration
-    # a survey that is repeated must not repeat its noise: that would be a tone
-    quiet = replace(
-        scenario,
-        instrument=replace(scenario.instrument, noise_sigma=0.0, channel_delay=(0.0, 0.0, 0.0)),
-        mission=parts,
-    )
-    survey, rng = segments(simulate(quiet, 3))["survey"], np.random.default_rng(4)
-    n = survey.sizes["time"]
-    if count:
-        time = survey["time"].to_numpy()
-        times = -(-count // n)
-        late = np.repeat(np.arange(times) * (time[-1] - time[0] + 4.0), n)[:count]
-        survey = survey.isel(time=np.tile(np.arange(n), times)[:count])
-        survey = survey.assign_coords(time=survey["time"].to_numpy() + late)
-    warm = survey["sensor_temperature"].to_numpy()
-    survey["amps"] = ("time", (rng.uniform(size=len(warm)) > 0.7).astype(float), {"units": "A"})
+    survey = CrissCross(hours=hours, roll=(1.0, 2.0), pitch=(25.0, 2.5), battery_spread=0.1)
+    scenario = msgspec.structs.replace(scenario, mission=(scenario.mission[0], survey))
+    flown, rng = segments(simulate(scenario, 3)), np.random.default_rng(4)
+    calibration = fit(observations(flown["calibration"], ["battpos", "ballast"]), "auto").calibration
+    log = flown["survey"].drop_vars([name for name in flown["survey"] if str(name).startswith("truth_")])
+    warm = log["sensor_temperature"].to_numpy()
+    log["amps"] = ("time", (rng.uniform(size=len(warm)) > 0.7).astype(float), {"units": "A"})
     for axis, share in zip("xyz", (0.5, -0.3, 0.8), strict=True):
-        again = rng.normal(0.0, scenario.instrument.noise_sigma, len(warm)) + size * share * (
-            warm - warm.mean()
-        )
-        survey[f"mag_{axis}"] = survey[f"mag_{axis}"] + again
-    return survey, calibration
+        log[f"mag_{axis}"] = log[f"mag_{axis}"] + size * share * (warm - warm.mean())
+    return log, calibration

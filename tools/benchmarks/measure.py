@@ -14,11 +14,11 @@ __all__ = ["in_own_process", "processor_time"]
 
 
 def in_own_process(script: str, *arguments: object) -> Any:
-    """Run a script, which finds the arguments in ``sys.argv``; return what it prints as JSON."""
+    """Run a script, which finds the arguments in ``sys.argv``; return what it prints as JSON, if anything."""
     command = [sys.executable, "-c", script, *map(str, arguments)]
     place = Path(__file__).parents[1]
     done = subprocess.run(command, cwd=place, capture_output=True, text=True, check=True)
-    return json.loads(done.stdout)
+    return json.loads(done.stdout or "null")
 
 
 def processor_time(work: Callable[[], object]) -> float:
