@@ -18,6 +18,7 @@ from magbridge.cli.common import (
     Whole,
     app,
     check_inputs,
+    complain,
     file_to_write,
     note_losses,
     note_missing,
@@ -187,13 +188,14 @@ def correct(*files: Path, calibration: Path, output: Log, json: Json = False) ->
     from magbridge.columns import CHANNELS
     from magbridge.correction import Correction, correct_rows
     from magbridge.errors import DataError
+    from magbridge.field.reference import EARTHS
     from magbridge.logs import Writer, read_chunks
     from magbridge.records import Quality
 
     check_inputs(files, output, calibration)
     known = load(calibration)
     correction = Correction(known)
-    rows, flagged, left_out, whole = 0, 0, 0, False
+    rows, flagged, left_out, beyond, whole = 0, 0, 0, 0, False
     pieces: list[dict[str, Any]] = []
     flags: Counter[str] = Counter()
     doubtful = ~Quality.NO_BORESIGHT  # without a boresight, the total field is just as good
@@ -207,6 +209,8 @@ def correct(*files: Path, calibration: Path, output: Log, json: Json = False) ->
             writer.append(corrected)
             rows += corrected.sizes["time"]
             left_out += part.sizes["time"] - corrected.sizes["time"]
+            total = corrected["total_field"]
+            beyond += int(((total < EARTHS[0]) | (total > EARTHS[1])).sum())
             if not whole:
                 refuse_unsuited(known, part)
                 whole = bool(sampled.all("variable").any())
@@ -218,6 +222,12 @@ def correct(*files: Path, calibration: Path, output: Log, json: Json = False) ->
                 f"{', '.join(str(file) for file in files)}: no row has all of {' '.join(CHANNELS)}"
             )
     note_losses(*pieces)
+    if beyond > rows / 2:
+        low, high = (f"{limit:,.0f}" for limit in EARTHS)
+        complain(
+            f"{calibration}: another vehicle's? {beyond} of {rows} corrected total fields are none of the "
+            f"Earth's, {low} to {high} nT"
+        )
     facts = {"file": str(output), "rows": rows, "flagged": flagged, "flags": +flags, "left_out": left_out}
     named = ", ".join(f"{name} {count}" for name, count in (+flags).items())
     summary = f"{output}: {rows} samples, {flagged} of them flagged" + (f" ({named})" if named else "")

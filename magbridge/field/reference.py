@@ -16,9 +16,12 @@ from magbridge.field.igrf import igrf, magnitude, total_field
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["earth_field", "main_field", "other_units", "positions", "reference_field"]
+__all__ = ["EARTHS", "earth_field", "main_field", "other_units", "positions", "reference_field"]
 
 Array = NDArray[np.float64]
+
+EARTHS = 20_000.0, 70_000.0
+"""nT: the main field at the surface is 22,000 to 67,000 (IGRF), and the crust adds thousands at most."""
 
 
 def reference_field(deployment: xr.Dataset, grid: AnomalyGrid | None = None, site_bias: float = 0.0) -> Array:

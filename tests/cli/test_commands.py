@@ -108,6 +108,19 @@ def test_correct_writes_what_the_contract_names(
     assert np.sqrt(np.mean(error**2)) < 1000.0
 
 
+def test_a_field_that_the_earth_does_not_have_is_said(
+    deployment: Path, calibration: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As with another vehicle's calibration: the magnets that it knows of are not those of this one."""
+    own = read(deployment).isel(time=slice(0, 100))
+    for name, iron in (("own.nc", 0.0), ("other.nc", 50_000.0)):
+        write(own.assign(mag_z=own["mag_z"] + iron), tmp_path / name)
+        command = ["correct", str(tmp_path / name), "--calibration", str(calibration)]
+        assert main([*command, "-o", str(tmp_path / "out.nc")]) == 0
+        said = "another vehicle's? 100 of 100 corrected total fields are none of the Earth's"
+        assert (said in capsys.readouterr().err) == bool(iron)
+
+
 def test_correct_gives_the_same_in_pieces(deployment: Path, calibration: Path, tmp_path: Path) -> None:
     """A month is corrected in pieces: the state goes on from one to the next."""
     rows = read(deployment)
