@@ -81,7 +81,7 @@ class Correction:
         self, reading: Reading, time_us: int, *, restarted: bool = False, missing: int = 0
     ) -> tuple[Sample, Corrected]:
         """Align and correct one reading; arguments as :meth:`magbridge.align.Aligner.reading`."""
-        if self._wants_temperature:
+        if self._wants_temperature and isfinite(reading.temperature):  # not every reading need have one
             self.aligner.telemetry(TEMPERATURE, time_us, reading.temperature)
         sample = self.aligner.reading(reading, time_us, restarted=restarted, missing=missing)
         corrected = self._corrector.step(sample.time_us, sample.field, sample.values, sample.quality)
@@ -180,3 +180,5 @@ def _readings(correction: Correction, deployment: xr.Dataset) -> Iterator[tuple[
                 Reading(field, channel_delay=delay, temperature=temperature, power_cycle=power_cycle),
                 stamp,
             )
+        elif isfinite(temperature):  # of another log than the readings
+            correction.telemetry(TEMPERATURE, temperature, stamp)

@@ -6,11 +6,12 @@ from math import hypot, nan
 
 import numpy as np
 import pytest
+import xarray as xr
 
 from magbridge.calibration.model import Calibration, Noise, Parameter, Reference
 from magbridge.calibration.terms import Polynomial, full_order
 from magbridge.config import Align
-from magbridge.correction import Correction
+from magbridge.correction import Correction, correct_rows
 from magbridge.records import Quality, Reading
 
 START, SECOND = 1_780_000_000_000_000, 1_000_000
@@ -21,8 +22,12 @@ LINE, T_X = 3_000.0, 9 + 6
 
 @pytest.fixture
 def calibration() -> Calibration:
+    return follows("battpos", "in")
+
+
+def follows(channel: str, unit: str) -> Calibration:
     return Calibration(
-        parameters=(Parameter("battpos", "in", -1.0, 1.0, 0.0, 1.0),),
+        parameters=(Parameter(channel, unit, -1.0, 1.0, 0.0, 1.0),),
         terms=(Polynomial(exponents=full_order(1, 1)),),
         coefficients=np.where(np.arange(18) == T_X, LINE, 0.0),
         covariance=np.eye(18) * 1e-6,
@@ -63,3 +68,28 @@ def test_a_mass_at_rest_adds_nothing(calibration: Calibration) -> None:
     _, corrected = correction.reading(Reading(FIELD, temperature=nan), START + 2 * SECOND)
     assert corrected.total_field_sigma == pytest.approx(1.0, rel=1e-3)
     assert corrected.quality == Quality.NO_BORESIGHT
+
+
+def test_not_every_reading_need_have_a_temperature() -> None:
+    correction = Correction(follows("sensor_temperature", "degC"))
+    for k, temperature in enumerate((0.3, nan)):
+        _, corrected = correction.reading(Reading(FIELD, temperature=temperature), START + k * SECOND)
+        assert not corrected.quality & Quality.STALE_TELEMETRY
+        assert corrected.total_field == pytest.approx(total(0.3))
+    _, corrected = correction.reading(Reading(FIELD, temperature=nan), START + 60 * SECOND)
+    assert corrected.quality & Quality.STALE_TELEMETRY
+
+
+def test_the_temperature_may_be_in_rows_of_another_log() -> None:
+    measured = np.arange(6) % 2 == 1
+    columns = {
+        f"mag_{axis}": np.where(measured, value, nan) for axis, value in zip("xyz", FIELD, strict=True)
+    }
+    columns["sensor_temperature"] = np.where(measured, nan, 0.3)
+    rows = xr.Dataset(
+        {name: ("time", column) for name, column in columns.items()}, coords={"time": 1.78e9 + np.arange(6.0)}
+    )
+    corrected = correct_rows(Correction(follows("sensor_temperature", "degC")), rows)
+    quality = corrected["quality"].to_numpy().astype(int)[measured]
+    assert not (quality & Quality.STALE_TELEMETRY).any()
+    np.testing.assert_allclose(corrected["total_field"][measured], total(0.3))
