@@ -15,7 +15,7 @@ from magbridge.diagnose.compare.design_columns import Columns
 from magbridge.diagnose.compare.past import Past
 from magbridge.diagnose.inference.noise import Noise, Predictors
 
-__all__ = ["LONGEST", "TAILS", "autoregressive_order", "certainty", "fit_noise", "longest"]
+__all__ = ["BRIEFEST", "LONGEST", "TAILS", "autoregressive_order", "certainty", "fit_noise"]
 
 FloatArray = NDArray[np.float64]
 
@@ -186,7 +186,7 @@ def _counts(n: int) -> NDArray[np.int64]:
     return count
 
 
-def longest(n: int) -> float:
+def _longest(n: int) -> float:
     """Return the longest time constant that noise of n samples may have, in samples."""
     return float(np.clip(n / TIMES, BRIEFEST, SLOWEST))
 
@@ -194,7 +194,7 @@ def longest(n: int) -> float:
 def _stable(ar: FloatArray, n: int) -> FloatArray:
     """Move roots that lie outside the unit circle, or too close to it for n samples, back inside."""
     roots = np.roots(np.append(1.0, -ar))
-    size, largest = np.abs(roots), 1.0 - 1.0 / longest(n)
+    size, largest = np.abs(roots), 1.0 - 1.0 / _longest(n)
     if size.max(initial=0.0) < largest:
         return ar
     return np.asarray(-np.real(np.poly(roots * np.where(size > largest, largest / size, 1.0)))[1:])

@@ -28,7 +28,7 @@ from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.evidence import LEVEL, REMNANT, evidence_of, regressor_error
 from magbridge.diagnose.inference.exchange import exchanged
-from magbridge.diagnose.inference.fit_noise import autoregressive_order, longest
+from magbridge.diagnose.inference.fit_noise import BRIEFEST, autoregressive_order
 from magbridge.diagnose.inference.information import Information
 from magbridge.diagnose.inference.joint import Joint, fit_joint
 from magbridge.diagnose.inference.profile_likelihood import refined, sharpen
@@ -39,8 +39,6 @@ __all__ = ["Hypothesis", "Outcome", "search"]
 
 MOST = 6
 """Regressors found one by one in a log, at most."""
-SLOW = 0.5
-"""Share of the longest time constant that noise may have. Slower noise may have absorbed causes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,8 +108,7 @@ def _likeliest(state: State, null: Joint, first: list[Hypothesis]) -> tuple[list
     model, base = _forward_selection(state, null, first)
     if model:
         model, base = exchanged(state, model, base)
-    swallowed = base.noise.slowest > SLOW * longest(len(state.problem))
-    if swallowed and (slow := _beside_brief_noise(state)):
+    if base.noise.slowest > BRIEFEST and (slow := _beside_brief_noise(state)):  # it may have absorbed causes
         start = refined(state, slow, state.fit(slow, rounds=6))
         model, base = max((model, base), exchanged(state, *start), key=lambda entry: state.value(*entry))
     return model, base
