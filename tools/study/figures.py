@@ -99,4 +99,4 @@ def _halves(axis: Axes, rows: Sequence[Row]) -> None:
     axis.axvline(0.0, color="0.4")
     axis.set_yticks(range(len(off)), [name.replace("_", " ") for name in off])
     axis.invert_yaxis()
-    axis.set_xlabel("signal-to-noise needed on the same logs,\n% beyond theory's (grey: asked)")
+    axis.set_xlabel("signal-to-noise needed on the same logs,\n% beyond theory's (grey: target)")
