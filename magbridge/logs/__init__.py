@@ -28,6 +28,7 @@ from contextlib import ExitStack
 from functools import cache, partial
 from importlib import import_module
 from importlib.metadata import entry_points
+from itertools import accumulate
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
@@ -108,9 +109,20 @@ def _chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
     try:
         for part in _module(path).chunks(path, rows):
             source = str(part.attrs["source"])
-            yield part if path.name in source else part.assign_attrs(source=f"{path.name} ({source})")
+            if source != path.name:
+                source = f"{path.name} ({_origin(source)})"
+            yield part.assign_attrs(source=source)
     except OSError as error:
         raise FormatError(path, f"cannot be read: {error.strerror or error}") from error
+
+
+def _origin(source: str) -> str:
+    """Return what the file that `source` names was made from, ``a.csv`` of ``b.nc (a.csv)``; else `source`."""
+    name, opened, inside = source.partition(" (")
+    depths = accumulate((char == "(") - (char == ")") for char in inside)
+    closed = next((k for k, depth in enumerate(depths) if depth < 0), None)
+    one = opened and "," not in name and closed == len(inside) - 1  # not several files
+    return inside[:-1] if one else source
 
 
 def read(paths: Paths, *, required: Iterable[str] = ()) -> xr.Dataset:

@@ -213,7 +213,7 @@ def _join_attrs(all_attrs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     joined: dict[str, Any] = {}
     sources: dict[str, None] = {}
     for attrs in all_attrs:
-        sources |= dict.fromkeys(str(attrs.get("source", "")).split(", "))
+        sources[str(attrs.get("source", ""))] = None
         for key, value in attrs.items():
             if key in COUNTERS and key in joined:
                 joined[key] += value
