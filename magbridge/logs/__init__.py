@@ -117,7 +117,7 @@ def _chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
 
 
 def _origin(source: str) -> str:
-    """Return what the file that `source` names was made from, ``a.csv`` of ``b.nc (a.csv)``; else `source`."""
+    """Return what the file named in `source` was made from (of ``b.nc (a.csv)``: ``a.csv``), or `source`."""
     name, opened, inside = source.partition(" (")
     depths = accumulate((char == "(") - (char == ")") for char in inside)
     closed = next((k for k, depth in enumerate(depths) if depth < 0), None)
