@@ -2,19 +2,11 @@
 
 from __future__ import annotations
 
-from types import ModuleType
-
 import pytest
-from voyages import simulated
+from voyages.simulated import Map, synthetic
 
 from magbridge.field.grid import AnomalyGrid
 from magbridge.navigate.options import Options
-
-
-@pytest.fixture(scope="session")
-def study() -> ModuleType:
-    """tools/voyages/simulated.py."""
-    return simulated
 
 
 @pytest.fixture(scope="session")
@@ -23,7 +15,6 @@ def options() -> Options:
 
 
 @pytest.fixture(scope="session")
-def grid(study: ModuleType) -> AnomalyGrid:
+def grid() -> AnomalyGrid:
     """30 nT rms, 1,500 m."""
-    made: AnomalyGrid = study.synthetic(study.Map(30, 1500), 3)
-    return made
+    return synthetic(Map(30, 1500), 3)

@@ -5,28 +5,26 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import pytest
 import xarray as xr
 from msgspec.structs import replace
+from voyages.others import flight
+from voyages.simulated import PLACE, Map, synthetic, voyage
 
 from magbridge.errors import FormatError
 from magbridge.field.earth import metres_per_degree
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.igrf import total_field
-from magbridge.field.read import read_grid
 from magbridge.navigate import Navigator, Options
 from magbridge.navigate.batch import navigate
 from magbridge.navigate.draw import draw_navigation, measured_on_track
 
-PLACE = (49.5, -57.9)
-
 
 @pytest.fixture(scope="module")
-def ds(study: ModuleType, grid: AnomalyGrid, options: Options) -> xr.Dataset:
-    return study.voyage(grid, options, 6, hours=4.0)
+def ds(grid: AnomalyGrid, options: Options) -> xr.Dataset:
+    return voyage(grid, options, 6, hours=4.0)
 
 
 @pytest.fixture(scope="module")
@@ -100,8 +98,8 @@ def test_a_map_of_another_epoch_is_recognised(ds: xr.Dataset, grid: AnomalyGrid,
     assert "above the map's level: its main field may be of another epoch, or at another altitude" in findings
 
 
-def test_another_map_altogether_is_recognised(study: ModuleType, ds: xr.Dataset, options: Options) -> None:
-    wrong = study.synthetic(study.Map(30, 1500), 4)
+def test_another_map_altogether_is_recognised(ds: xr.Dataset, options: Options) -> None:
+    wrong = synthetic(Map(30, 1500), 4)
     result = navigate(ds, wrong, options, start=PLACE)
     assert "lost for" in result.attrs["findings"]
     assert float(result["valid"][result["time"] > result["time"][0] + 1800].mean()) < 0.1
@@ -119,11 +117,10 @@ def test_what_is_known_badly_says_nothing_about_the_map(
     assert navigate(off, grid, options, start=PLACE).attrs["findings"] == ""
 
 
-def test_a_flat_map_is_recognised(study: ModuleType, options: Options) -> None:
-    flat = study.synthetic(study.Map(0.2, 1500), 4)
-    findings = navigate(study.voyage(flat, options, 5, hours=3.0), flat, options, start=PLACE).attrs[
-        "findings"
-    ]
+def test_a_flat_map_is_recognised(options: Options) -> None:
+    flat = synthetic(Map(0.2, 1500), 4)
+    result = navigate(voyage(flat, options, 5, hours=3.0), flat, options, start=PLACE)
+    findings = result.attrs["findings"]
     assert "the field carries no information for" in findings
     assert (
         "the map is flat there (0.2 nT RMS, where calibration and map are known only to 1.4 nT)" in findings
@@ -204,8 +201,8 @@ def test_a_start_is_needed(ds: xr.Dataset, grid: AnomalyGrid, options: Options) 
         navigate(ds.isel(time=slice(0, 50)), grid, options)
 
 
-def test_ten_thousand_samples_in_two_seconds(study: ModuleType, grid: AnomalyGrid, options: Options) -> None:
-    long = study.voyage(grid, replace(options, start_sigma=50.0), 5, hours=10_000 / 3600, every=1.0)
+def test_ten_thousand_samples_in_two_seconds(grid: AnomalyGrid, options: Options) -> None:
+    long = voyage(grid, replace(options, start_sigma=50.0), 5, hours=10_000 / 3600, every=1.0)
     started = time.process_time()
     navigate(long, grid, replace(options, start_sigma=50.0), start=PLACE)
     assert time.process_time() - started < 4.0  # 0.8 s when nothing else runs
@@ -218,20 +215,7 @@ def test_magnavs_published_flight(real_data: Path) -> None:
     Its own filter's error on this flight is not stated with the data; asked here is that the field does no
     harm over so short a time, and that the innovations agree with what was claimed.
     """
-    grid = read_grid(real_data / "magnav_example" / "map")
-    flight = np.genfromtxt(real_data / "magnav_example" / "xyz.csv", delimiter=",", names=True)
-    time = 1.5e9 + flight["tt"]
-    main = total_field(flight["lon"], flight["lat"], -flight["alt"], time)
-    columns = {
-        "total_field": main + flight["mag_1_c"],
-        "total_field_sigma": np.full(time.size, 1.0),
-        "dr_latitude": flight["ins_lat"],
-        "dr_longitude": flight["ins_lon"],
-        "depth": -flight["alt"],
-        "gps_latitude": flight["lat"],
-        "gps_longitude": flight["lon"],
-    }
-    ds = xr.Dataset({k: ("time", v) for k, v in columns.items()}, {"time": time})
+    grid, ds = flight(real_data / "magnav_example")
     options = Options(start_sigma=10.0, current_sigma=0.5, bias_sigma=5.0, map_sigma=3.0, drift=0.1)
     result = navigate(ds, grid, options)
     assert rms(result) < 60.0

@@ -5,11 +5,11 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import pytest
 import xarray as xr
+from voyages.simulated import voyage
 
 from magbridge.calibration.file import save
 from magbridge.calibration.model import Noise, identity
@@ -26,12 +26,10 @@ PLAN = """time,latitude,longitude
 
 
 @pytest.fixture(scope="module")
-def folder(
-    tmp_path_factory: pytest.TempPathFactory, study: ModuleType, grid: AnomalyGrid, options: Options
-) -> Path:
+def folder(tmp_path_factory: pytest.TempPathFactory, grid: AnomalyGrid, options: Options) -> Path:
     """A log of two hours whose channels are the field itself, its map, a calibration that changes nothing."""
     path = tmp_path_factory.mktemp("navigate")
-    ds = study.voyage(grid, options, 6, hours=2.0)
+    ds = voyage(grid, options, 6, hours=2.0)
     field = ds["total_field"].to_numpy()
     unit = {"units": "nT"}
     channels = {"mag_x": 0.6 * field, "mag_y": 0.0 * field, "mag_z": 0.8 * field}

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from math import hypot
-from types import ModuleType
 
 import numpy as np
 import pytest
 from voyages.dived import dived
+from voyages.simulated import Map, synthetic
 
 from magbridge.field.continuation import continued
 from magbridge.field.grid import AnomalyGrid
@@ -15,8 +15,8 @@ from magbridge.navigate.depth import at_depth
 from magbridge.navigate.options import Options
 
 
-def test_errors_of_the_map_add_up(study: ModuleType) -> None:
-    drawn = study.synthetic(study.Map(30, 1500), 3)
+def test_errors_of_the_map_add_up() -> None:
+    drawn = synthetic(Map(30, 1500), 3)
     flown = AnomalyGrid(drawn.longitude, drawn.latitude, drawn.anomaly, altitude=90.0)
     depth, options = np.append(np.linspace(0.0, 120.0, 50), np.nan), Options(map_sigma=1.5, map_length=800.0)
     there, known = at_depth(flown, options, depth)

@@ -2,69 +2,65 @@
 
 from __future__ import annotations
 
-from importlib import import_module
-from types import ModuleType
-
 import numpy as np
 import pytest
 from msgspec.structs import replace
+from voyages.lost import misled
+from voyages.simulated import OUTSIDE, PLACE, Map, sail, voyage
 
 from magbridge.field.earth import metres_per_degree
 from magbridge.field.grid import AnomalyGrid
 from magbridge.navigate.model import transition
 from magbridge.navigate.options import Options, any_level
+from magbridge.navigate.record import State
 
 PERIOD = 700.0
 
 
 @pytest.fixture(scope="module")
-def alike(study: ModuleType) -> AnomalyGrid:
+def alike() -> AnomalyGrid:
     """A map on which every place has a twin 700 m away: nothing that is measured can tell them apart."""
-    per_latitude, per_longitude = metres_per_degree(study.PLACE[0])
+    per_latitude, per_longitude = metres_per_degree(PLACE[0])
     metres = np.arange(-6_000.0, 6_001.0, 50.0)
     waves = np.cos(2.0 * np.pi * metres / PERIOD)
     return AnomalyGrid(
-        study.PLACE[1] + metres / per_longitude,
-        study.PLACE[0] + metres / per_latitude,
+        PLACE[1] + metres / per_longitude,
+        PLACE[0] + metres / per_latitude,
         40.0 * (waves[:, None] + waves[None, :]),
     )
 
 
-def test_what_nothing_can_tell_apart_is_never_valid(
-    study: ModuleType, alike: AnomalyGrid, options: Options
-) -> None:
+def test_what_nothing_can_tell_apart_is_never_valid(alike: AnomalyGrid, options: Options) -> None:
     """The filter tracks, and is right, but has only its claim to know in which of the twins it is."""
     claimed = replace(options, start_sigma=40.0)
-    run = study.sail(study.voyage(alike, claimed, 3, hours=2.0), alike, claimed)
+    run = sail(voyage(alike, claimed, 3, hours=2.0), alike, claimed)
     assert np.median(run.error) < 100.0
     assert not run.valid.any()
 
 
-def test_a_start_as_wide_as_its_rivals_needs_none(
-    study: ModuleType, grid: AnomalyGrid, options: Options
-) -> None:
+def test_a_start_as_wide_as_its_rivals_needs_none(grid: AnomalyGrid, options: Options) -> None:
     """What narrows it down is then the field alone: it is valid as soon as one place is left."""
     wide = replace(options, start_sigma=1500.0)
-    run = study.sail(study.voyage(grid, wide, 4, hours=3.0), grid, wide)
-    tracking = run.state == study.State.TRACKING
+    run = sail(voyage(grid, wide, 4, hours=3.0), grid, wide)
+    tracking = run.state == State.TRACKING
     assert run.valid.any()
     assert run.valid.sum() > 0.9 * tracking.sum()
-    assert not (run.valid & (run.nees > study.OUTSIDE)).any()
+    assert not (run.valid & (run.nees > OUTSIDE)).any()
 
 
 @pytest.mark.parametrize("level", [60.0, -60.0])
 def test_a_calibration_that_is_off_is_not_answered_by_another_place(
-    study: ModuleType, grid: AnomalyGrid, options: Options, level: float
+    grid: AnomalyGrid, options: Options, level: float
 ) -> None:
     """60 nT where 1 nT is claimed: lost at once, and the level found with the place, not instead of it."""
-    ds = study.voyage(grid, options, 11, hours=3.0)
-    run = study.sail(ds.assign(total_field=ds["total_field"] + level), grid, options)
-    assert study.State.LOST in run.state
-    assert not (run.valid & (run.nees > study.OUTSIDE)).any()
+    ds = voyage(grid, options, 11, hours=3.0)
+    run = sail(ds.assign(total_field=ds["total_field"] + level), grid, options)
+    assert State.LOST in run.state
+    assert not (run.valid & (run.nees > OUTSIDE)).any()
 
 
-def test_a_misled_filter_does_not_stand_by_it(study: ModuleType) -> None:
-    hours_valid, hours_lost = import_module("voyages.lost").misled(study.Map(30, 1500), 6)
+def test_a_misled_filter_does_not_stand_by_it() -> None:
+    hours_valid, hours_lost = misled(Map(30, 1500), 6)
     assert hours_lost > 0.0
     assert hours_valid < 0.5
 

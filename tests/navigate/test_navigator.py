@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from importlib import import_module
-from types import ModuleType
-
 import numpy as np
 import pytest
 import xarray as xr
 from msgspec.structs import replace
+from voyages.lost import carried
+from voyages.simulated import PLACE, Map, sail, voyage
 
 from magbridge.field.earth import offset
 from magbridge.field.grid import AnomalyGrid
@@ -16,7 +15,6 @@ from magbridge.field.igrf import total_field
 from magbridge.navigate import Navigator, Options, Record, State
 from magbridge.records import Corrected, Quality
 
-PLACE = (49.5, -57.9)
 START_US = 1_386_201_600_000_000
 
 Followed = tuple[list[Record], np.ndarray]
@@ -38,12 +36,12 @@ def feed(navigator: Navigator, ds: xr.Dataset, rows: slice = slice(None)) -> Fol
 
 
 @pytest.fixture(scope="module")
-def ds(study: ModuleType, grid: AnomalyGrid, options: Options) -> xr.Dataset:
-    return study.voyage(grid, options, 11, hours=3.0)
+def ds(grid: AnomalyGrid, options: Options) -> xr.Dataset:
+    return voyage(grid, options, 11, hours=3.0)
 
 
 @pytest.fixture(scope="module")
-def voyage(grid: AnomalyGrid, options: Options, ds: xr.Dataset) -> Followed:
+def followed(grid: AnomalyGrid, options: Options, ds: xr.Dataset) -> Followed:
     navigator = Navigator(grid, options)
     navigator.fix(START_US, *PLACE)
     return feed(navigator, ds)
@@ -60,10 +58,10 @@ def test_five_lines(grid: AnomalyGrid) -> None:
 
 
 def test_it_holds_the_position(
-    study: ModuleType, grid: AnomalyGrid, options: Options, ds: xr.Dataset, voyage: Followed
+    grid: AnomalyGrid, options: Options, ds: xr.Dataset, followed: Followed
 ) -> None:
-    records, error = voyage
-    score = study.sail(ds, grid, options).score()
+    records, error = followed
+    score = sail(ds, grid, options).score()
     assert score.drms < 2.0 * score.bound  # one voyage: errors follow each other
     assert score.drms < 0.5 * score.unaided
     assert sum(r.state is State.TRACKING for r in records) > 0.7 * len(records)
@@ -79,9 +77,9 @@ def _fresh(grid: AnomalyGrid, options: Options) -> Navigator:
     return navigator
 
 
-def test_a_wide_start_is_found(study: ModuleType, grid: AnomalyGrid, options: Options) -> None:
+def test_a_wide_start_is_found(grid: AnomalyGrid, options: Options) -> None:
     wide = replace(options, start_sigma=1500.0)
-    run = study.sail(study.voyage(grid, wide, 4, hours=4.0), grid, wide)
+    run = sail(voyage(grid, wide, 4, hours=4.0), grid, wide)
     assert run.error[0] > 300.0
     assert run.score().drms < 200.0
     assert run.state[0] == State.SEARCHING or run.state[0] == State.DEAD_RECKONING
@@ -89,8 +87,8 @@ def test_a_wide_start_is_found(study: ModuleType, grid: AnomalyGrid, options: Op
     assert State.LOST not in run.state
 
 
-def test_carried_off_it_says_that_it_is_lost_and_finds_itself_again(study: ModuleType) -> None:
-    hours_valid, hours_lost = import_module("voyages.lost").carried(study.Map(30, 1500), 3)
+def test_carried_off_it_says_that_it_is_lost_and_finds_itself_again() -> None:
+    hours_valid, hours_lost = carried(Map(30, 1500), 3)
     assert 0.0 < hours_lost < 2.0
     assert hours_valid < 0.5
 
@@ -136,9 +134,7 @@ def test_a_fix_is_taken_in_and_a_contradiction_believed(
     )
 
 
-def test_off_the_map_it_reckons(
-    study: ModuleType, grid: AnomalyGrid, options: Options, ds: xr.Dataset
-) -> None:
+def test_off_the_map_it_reckons(grid: AnomalyGrid, options: Options, ds: xr.Dataset) -> None:
     small = AnomalyGrid(grid.longitude[:70], grid.latitude, grid.anomaly[:, :70])
     nav = _fresh(small, options)
     records, _ = feed(nav, ds, slice(0, 200))
@@ -156,9 +152,8 @@ def test_a_flat_map_says_nothing(grid: AnomalyGrid, options: Options, ds: xr.Dat
     assert not any(r.valid for r in records)
 
 
-def test_across_the_antimeridian(study: ModuleType, options: Options) -> None:
+def test_across_the_antimeridian(grid: AnomalyGrid, options: Options) -> None:
     """The same map and voyage moved to 180 degrees: the field differs by the main field only."""
-    grid = study.synthetic(study.Map(30, 1500), 3)
     moved = AnomalyGrid(grid.longitude - PLACE[1] + 180.0, grid.latitude, grid.anomaly)
     nav = Navigator(moved, replace(options, start_sigma=20.0))
     nav.fix(START_US, PLACE[0], 179.9999)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.stats import multivariate_normal
+from voyages.simulated import PLACE
 
 from magbridge.field.earth import metres_per_degree, offset
 from magbridge.field.grid import AnomalyGrid
@@ -14,8 +15,6 @@ from magbridge.navigate.bank import Bank, widest
 from magbridge.navigate.model import Block, prior, transition
 from magbridge.navigate.options import Options
 from magbridge.navigate.tracker import Tracker
-
-PLACE = (49.5, -57.9)
 
 Moments = tuple[np.ndarray, np.ndarray]
 

@@ -11,6 +11,7 @@ import xarray as xr
 from msgspec.structs import replace as with_options
 
 from magbridge.field.earth import metres_per_degree, separation
+from magbridge.field.grid import AnomalyGrid
 from magbridge.field.igrf import total_field
 from magbridge.field.read import read_grid
 from magbridge.navigate.batch import navigate
@@ -68,6 +69,23 @@ def stone_soup(python: str, kind: Map, glider: Options, share: float, seed: int)
     return *row, 1e3 * float(theirs["particles_seconds"]) / len(found)
 
 
+def flight(folder: Path) -> tuple[AnomalyGrid, xr.Dataset]:
+    """Return the map of MagNav.jl's simple example, and its flight: field, inertial and true track."""
+    log = np.genfromtxt(folder / "xyz.csv", delimiter=",", names=True)
+    time = 1.5e9 + log["tt"]
+    columns = {
+        "total_field": total_field(log["lon"], log["lat"], -log["alt"], time) + log["mag_1_c"],
+        "total_field_sigma": np.full(time.size, 3.0),
+        "dr_latitude": log["ins_lat"],
+        "dr_longitude": log["ins_lon"],
+        "gps_latitude": log["lat"],
+        "gps_longitude": log["lon"],
+        "depth": -log["alt"],
+    }
+    ds = xr.Dataset({name: ("time", values) for name, values in columns.items()}, {"time": time})
+    return read_grid(folder / "map"), ds
+
+
 def magnav(folder: Path) -> None:
     """Fly MagNav.jl's simple example: its map, its compensated magnetometer, its inertial track.
 
@@ -75,37 +93,19 @@ def magnav(folder: Path) -> None:
     it is given is 2 m off over these 100 s. The errors of the position can be compared; the filters cannot,
     because its filter estimates the errors of the inertial unit.
     """
-    grid = read_grid(folder / "map")
-    flight = np.genfromtxt(folder / "xyz.csv", delimiter=",", names=True)
-    time = 1.5e9 + flight["tt"]
-    columns = {
-        "total_field": total_field(flight["lon"], flight["lat"], -flight["alt"], time) + flight["mag_1_c"],
-        "total_field_sigma": np.full(time.size, 3.0),
-        "dr_latitude": flight["ins_lat"],
-        "dr_longitude": flight["ins_lon"],
-        "gps_latitude": flight["lat"],
-        "gps_longitude": flight["lon"],
-        "depth": -flight["alt"],
-    }
-    ds = xr.Dataset({name: ("time", values) for name, values in columns.items()}, {"time": time})
+    grid, ds = flight(folder)
     print("\n## MagNav.jl's published flight: 100 s, 83 m/s; its script promises 7 m\n")
-    inertial = [
-        separation(*a) for a in zip(*(flight[k] for k in ("lat", "lon", "ins_lat", "ins_lon")), strict=True)
-    ]
+    names = ("gps_latitude", "gps_longitude", "dr_latitude", "dr_longitude")
+    inertial_start = float(ds["dr_latitude"][0]), float(ds["dr_longitude"][0])
+    inertial = [separation(*a) for a in zip(*(ds[name].to_numpy() for name in names), strict=True)]
     print(f"{'inertial track as given':<44}{np.sqrt(np.mean(np.sum(np.square(inertial), axis=1))):6.1f} m")
     for label, start, current, drift in (
         ("start 3 m, inertial 0.01 m/s (its settings)", 3.0, 0.01, 0.01),
         ("start 100 m, inertial 0.5 m/s", 100.0, 0.5, 0.1),
     ):
-        options = Options(
-            start_sigma=start,
-            current_sigma=current,
-            drift=drift,
-            bias_sigma=3.0,
-            bias_time=600.0,
-            map_sigma=3.0,
-        )
-        result = navigate(ds, grid, options, start=(float(flight["ins_lat"][0]), float(flight["ins_lon"][0])))
+        motion = {"start_sigma": start, "current_sigma": current, "drift": drift}
+        options = Options(bias_sigma=3.0, bias_time=600.0, map_sigma=3.0, **motion)
+        result = navigate(ds, grid, options, start=inertial_start)
         error, smooth = (
             float(np.sqrt((result[f"{p}error_north"] ** 2 + result[f"{p}error_east"] ** 2).mean()))
             for p in ("", "smoothed_")
