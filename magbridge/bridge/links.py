@@ -7,7 +7,7 @@ from functools import partial
 
 from magbridge.bridge.address import parse
 from magbridge.bridge.port import Port
-from magbridge.bridge.serial_port import serial_line
+from magbridge.bridge.serial_port import may_be_device, serial_line
 from magbridge.bridge.tcp import TcpClient, TcpServer
 from magbridge.bridge.udp import UdpPort
 from magbridge.errors import ConfigError
@@ -29,12 +29,13 @@ def open_link(url: str, baudrate: int, source: str = "bridge.toml", key: str = "
     Raises
     ------
     ConfigError
-        An unknown kind of link or of serial URL, or an address that is not HOST:PORT; it names `source` and
-        `key`.
+        An unknown kind of link or of serial URL, no device's name, or an address that is not HOST:PORT; it
+        names `source` and `key`.
     """
     kind, colon, address = url.partition(":")
     if kind not in LINKS:
-        if colon and kind.isalnum() and kind != "serial" and not address.startswith("//"):
+        named = kind == "serial" or address.startswith("//")
+        if not named and ((colon and kind.isalnum()) or not may_be_device(url)):
             known = ", ".join(LINKS)
             raise ConfigError(source, key, f"expected {known} or a serial device, got {url!r}")
         return serial_line(url.removeprefix("serial:"), baudrate, source, key)

@@ -11,6 +11,7 @@ import time
 from contextlib import suppress
 from importlib.util import find_spec
 from math import inf
+from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -20,7 +21,7 @@ from magbridge.bridge.port import CHUNK
 from magbridge.bridge.stream import Stream
 from magbridge.errors import ConfigError, PortError
 
-__all__ = ["SerialPort", "serial_line"]
+__all__ = ["SerialPort", "may_be_device", "serial_line"]
 
 PIECE = 4095
 """Bytes that one read of a terminal device returns at most, however many are waiting."""
@@ -177,12 +178,13 @@ def serial_line(name: str, baudrate: int, source: str, key: str) -> SerialPort:
     Raises
     ------
     ConfigError
-        No name, a URL of a kind that pyserial does not know, or one of a socket without HOST:PORT.
+        No device's name, a URL of a kind that pyserial does not know, or one of a socket without HOST:PORT.
     """
     kind, url, _ = name.partition("://")
     known = kind.isalnum() and find_spec(f"serial.urlhandler.protocol_{kind.lower()}")
-    if not name or (url and not known):
-        raise ConfigError(source, key, f"expected a device, socket://, rfc2217:// or loop://, got {name!r}")
+    if not (known if url else may_be_device(name)):
+        expected = "expected a device (/dev/...), socket://, rfc2217:// or loop://"
+        raise ConfigError(source, key, f"{expected}, got {name!r}")
     if kind in ("socket", "rfc2217"):
         try:
             whole = urlsplit(name).hostname and urlsplit(name).port
@@ -191,6 +193,14 @@ def serial_line(name: str, baudrate: int, source: str, key: str) -> SerialPort:
         if not whole:
             raise ConfigError(source, key, f"expected {kind}://HOST:PORT, got {name!r}")
     return SerialPort(name, baudrate)
+
+
+def may_be_device(name: str) -> bool:
+    """Say whether a device has this name, or may get it later: a word, a file or a folder never does."""
+    path = Path(name)
+    if path.exists():
+        return not (path.is_file() or path.is_dir())
+    return "/" in name or os.name == "nt"  # where they are called COM3
 
 
 def _reason(error: Exception) -> str:

@@ -286,13 +286,16 @@ def test_an_address_that_is_none(url: str) -> None:
         open_link(url, 0)
 
 
-@pytest.mark.parametrize("url", ["foo://x", "serial:", "f.o://x"])
+@pytest.mark.parametrize("url", ["foo://x", "serial:", "f.o://x", "serial:ttyUSB0", "serial:/"])
 def test_a_serial_line_that_is_none(url: str) -> None:
-    with pytest.raises(ConfigError, match=r"link.url: expected a device, socket://, rfc2217:// or"):
+    with pytest.raises(ConfigError, match=r"link.url: expected a device .*, socket://, rfc2217:// or"):
         open_link(url, 0)
 
 
-@pytest.mark.parametrize("url", ["udpot:192.0.2.1:14550", "http:example"])
+NONE = ["udpot:192.0.2.1:14550", "http:example", "nonsense", "ttyUSB0", "192.0.2.1:14550", __file__, ""]
+
+
+@pytest.mark.parametrize("url", NONE)
 def test_a_kind_of_link_that_is_none(url: str) -> None:
     with pytest.raises(ConfigError, match="expected udpin, udpout, tcp, tcpin or a serial device"):
         open_link(url, 0)

@@ -19,13 +19,13 @@ import pytest
 CONFIG = """
 [sensor]
 driver = "hmr2300"
-port = "ttyNone"
+port = "/dev/ttyNo"
 [link]
 url = "udpout:127.0.0.1:9"
 """
 
 
-WANTED = ("until Ctrl-C", "no calibration: raw field", "hmr2300 lost: No such file or directory: ttyNone")
+WANTED = ("until Ctrl-C", "no calibration: raw field", "hmr2300 lost: No such file or directory: /dev/ttyNo")
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])

@@ -149,6 +149,7 @@ def test_bad_input_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
         for arguments, code, expected in (
             (["udpin:nowhere"], 2, "magbridge monitor: LINK: expected HOST:PORT or [IPV6]:PORT"),
             (["/dev/nowhere"], 1, "/dev/nowhere: "),
+            (["nonsense"], 2, "LINK: expected udpin, udpout, tcp, tcpin or a serial device"),
             (["udpin:127.0.0.1:0", "--port", port], 1, f"127.0.0.1:{port}: Address already in use"),
             (["--port", "99999"], 2, "99999"),
             (["--signing-key", "/nowhere"], 2, "/nowhere: No such file or directory"),
