@@ -74,8 +74,7 @@ def held_out(problem: Problem, columns: Sequence[Columns], fit: Joint) -> HeldOu
     of = np.searchsorted(ends, problem.survey.dive)
     P, b = np.zeros((len(folds), c.size, c.size)), np.zeros((len(folds), c.size))
     for rows in X.pieces:
-        first = max(rows.start - len(noise.ar), 0)
-        A = noise.filter(X.rows(slice(first, rows.stop)), first, rows.start - first)
+        A = noise.whitened(X.rows, rows)
         for k in np.unique(of[rows]):
             fold_rows = A[of[rows] == k]
             P[k] += fold_rows.T @ fold_rows

@@ -18,13 +18,14 @@ from scipy.stats import norm
 from study.both import by_causes, held, named, weighed
 from study.cases import PARTS, plan
 from study.deployment import CHARTS, charted, drawn, project
-from study.draws import SHOWN, Draws, Span, evidence, log_bayes, with_another
+from study.draws import SHOWN, Draws, Span, evidence, with_another
 from study.nameless import against, nameless
 from study.noise import LOSSES, MEMORY, left, whiten
 from study.rates import beside_ideal, efficiency, share
 from study.table import lines
 from study.theory import SIZES
 
+from magbridge.diagnose.inference.evidence import log_bayes
 from magbridge.diagnose.unexplained.descriptions import Description
 from sitl import Twin, load
 from sitl.signals import correlated

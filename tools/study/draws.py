@@ -11,8 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtr
 
+from magbridge.diagnose.inference.evidence import log_bayes, one_sided
 from magbridge.diagnose.inference.statistic import Statistic
 
 Array = NDArray[np.float64]
@@ -84,7 +84,7 @@ class Draws(NamedTuple):
             value = value + 2.0 * np.random.default_rng(20131213).standard_gamma(0.5 * span.more, DRAWS)
         if span.positive:
             value = np.where(scores[0] > 0.0, value, 0.0)
-        return value, statistic.freedom + span.more
+        return value, float(statistic.freedom + span.more)
 
     def beside(self, span: Span) -> Draws:
         """Return the draws with one hypothesis projected out."""
@@ -100,20 +100,12 @@ def explained(S: Array, span: Span) -> float:
     return float(np.sum((root_of(S, span).T @ S[span.own, -1]) ** 2))
 
 
-def log_bayes(ratio: Array, freedom: float) -> Array:
-    """Log evidence of likelihood ratios of `freedom` free coefficients (Liang et al. 2008, sec. 2.4)."""
-    if not freedom:
-        return np.zeros_like(ratio)
-    more = np.maximum(ratio, freedom)
-    return np.asarray(0.5 * (more - freedom) - 0.5 * freedom * np.log(more / freedom))
-
-
 def evidence(span: Span, ratio: Array, freedom: float) -> Array:
     """Log evidence of likelihood ratios; coefficients of one common size are already integrated out."""
     if span.spectra is not None:
         return np.asarray(0.5 * ratio - np.log(len(span.spectra)))
     # of a known sign: the share of the posterior that has it, over half of the prior
-    return log_bayes(ratio, freedom) + (np.log(2.0 * ndtr(np.sqrt(ratio))) if span.positive else 0.0)
+    return log_bayes(ratio, freedom) + (one_sided(ratio) if span.positive else 0.0)
 
 
 def with_another(draws: Draws, first: Span, spans: Sequence[Span]) -> dict[str, tuple[float, Span]]:

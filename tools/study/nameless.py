@@ -28,9 +28,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from magbridge.diagnose.inference.evidence import ODDS
+from magbridge.diagnose.inference.evidence import ODDS, log_bayes
 from magbridge.diagnose.unexplained.descriptions import Description
-from study.draws import Draws, Span, log_bayes
+from study.draws import Draws, Span
 
 Array = NDArray[np.float64]
 

@@ -26,12 +26,13 @@ from numpy.typing import NDArray
 from scipy.special import chdtrc
 
 from magbridge.diagnose.causes import Cause
+from magbridge.diagnose.causes.candidates import slices
 from magbridge.diagnose.compare.problem import pose
 from magbridge.diagnose.compare.take import take
-from magbridge.diagnose.inference.evidence import LEVEL, ODDS
+from magbridge.diagnose.inference.evidence import LEVEL, ODDS, log_bayes
 from magbridge.diagnose.unexplained.descriptions import Description
 from study.deployment import Background, Injected, compare, project
-from study.draws import SHOWN, Draws, Span, by_cause, evidence, explained, log_bayes, numbers, with_another
+from study.draws import SHOWN, Draws, Span, by_cause, evidence, explained, numbers, with_another
 from study.nameless import against, nameless
 from study.noise import whiten
 
@@ -135,10 +136,9 @@ def information(
     every = [sum(truth)] if len(truth) > 1 else []
     X = np.column_stack([*free, table, *setting.others.values(), *truth, *every])
     first = sum(columns.shape[1] for columns in free)
-    ends = (first + np.cumsum([c.size for c in candidates])).tolist()
     spans = [
-        Span(c.cause, c.channel, slice(end - c.size, end), float(np.log(c.trials)), c.positive, c.spectra)
-        for c, end in zip(candidates, ends, strict=True)
+        Span(c.cause, c.channel, own, float(np.log(c.trials)), c.positive, c.spectra)
+        for c, own in zip(candidates, slices(candidates, first), strict=True)
     ]
     spans += [
         Span(cause, SHOWN, slice(k, k + 1), positive=cause == "filter_lag")
@@ -175,7 +175,7 @@ def best_of(S: Array, spans: Sequence[Span]) -> dict[str, Span]:
 def _worth(S: Array, span: Span) -> float:
     """Log evidence of a hypothesis at its mean likelihood ratio."""
     freedom = numbers(S, span)
-    return float(log_bayes(np.array(explained(S, span) + freedom), freedom))
+    return float(log_bayes(explained(S, span) + freedom, freedom))
 
 
 def p_values(draws: Draws, spans: Sequence[Span], setting: Setting) -> Array:

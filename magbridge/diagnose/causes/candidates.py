@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magbridge.calibration.terms import Effect
-from magbridge.diagnose.compare.design_columns import Columns, Mixture, Since, parts, together
+from magbridge.diagnose.compare.design_columns import Columns, Mixture, Since, parts, places, together
 from magbridge.diagnose.compare.problem import Problem, effect_columns, history
 
 __all__ = ["AXES", "Candidate", "of_effect", "of_reference", "per", "since", "slices"]
@@ -124,12 +124,9 @@ class Candidate:
         )
 
 
-def slices(candidates: Sequence[Candidate]) -> list[slice]:
-    """Return where the coefficients of each candidate are among those of all."""
-    ends = np.cumsum([candidate.size for candidate in candidates])
-    return [
-        slice(int(end) - candidate.size, int(end)) for end, candidate in zip(ends, candidates, strict=True)
-    ]
+def slices(candidates: Sequence[Candidate], first: int = 0) -> list[slice]:
+    """Return where the coefficients of each candidate are among those of all, the first's from `first` on."""
+    return places((candidate.size for candidate in candidates), first)
 
 
 def since(candidate: Candidate, learned: NDArray[np.bool_]) -> Candidate:

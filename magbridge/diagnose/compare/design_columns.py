@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
+from itertools import accumulate, pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-__all__ = ["Columns", "Interpolated", "Mixture", "Since", "beside", "parts", "times", "together"]
+__all__ = [
+    "Columns", "Interpolated", "Mixture", "Since", "beside", "number", "parts", "places", "times", "together",
+]  # fmt: skip
 
 FloatArray = NDArray[np.float64]
 Columns = Callable[[slice], FloatArray]
@@ -77,7 +80,17 @@ def parts(columns: Columns) -> tuple[tuple[Columns, FloatArray], ...]:
     """Return the pairs (X_i, M_i (p_i, k)) of a mixture; other columns are their own only part, M = I."""
     if isinstance(columns, Mixture):
         return columns.parts
-    return ((columns, np.eye(columns(slice(0, 1)).shape[1])),)
+    return ((columns, np.eye(number(columns))),)
+
+
+def number(columns: Columns) -> int:
+    """Return how many columns there are."""
+    return len(columns(slice(0, 1)).T)
+
+
+def places(sizes: Iterable[int], first: int = 0) -> list[slice]:
+    """Return where blocks of so many columns each stand side by side, from `first` on."""
+    return [slice(*ends) for ends in pairwise(accumulate(sizes, initial=first))]
 
 
 def times(columns: Columns, rows: slice, c: FloatArray) -> FloatArray:
@@ -92,12 +105,11 @@ def times(columns: Columns, rows: slice, c: FloatArray) -> FloatArray:
 def together(columns: Sequence[Columns]) -> Mixture:
     """Return all columns side by side as one mixture, in which shared parts occur once."""
     listed = [parts(one) for one in columns]
-    ends = np.cumsum([0, *(blocks[0][1].shape[1] for blocks in listed)])
+    sizes = [blocks[0][1].shape[1] for blocks in listed]
     found: dict[Columns, FloatArray] = {}
-    for blocks, start, end in zip(listed, ends, ends[1:], strict=False):
+    for blocks, own in zip(listed, places(sizes), strict=True):
         for X, M in blocks:
-            whole = found.setdefault(X, np.zeros((len(M), ends[-1])))
-            whole[:, start:end] += M
+            found.setdefault(X, np.zeros((len(M), sum(sizes))))[:, own] += M
     return Mixture(tuple(found.items()))
 
 

@@ -11,7 +11,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from magbridge.diagnose.compare.design_columns import Columns, beside, times
+from magbridge.diagnose.compare.design_columns import Columns, beside, number, places, times
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.noise import Noise
 
@@ -33,7 +33,7 @@ THREADS, LONG, POOL = 2, 32768, "diagnose"
 
 def precomputed(n: int, columns: Sequence[Columns]) -> list[Columns]:
     """Return the columns of n rows precomputed, or unchanged where that would fill the memory."""
-    if n * sum(column(slice(0, 1)).shape[1] for column in columns) > KEPT:
+    if n * sum(map(number, columns)) > KEPT:
         return list(columns)
 
     def whole(column: Columns) -> FloatArray:
@@ -60,10 +60,8 @@ class Design:
     def __init__(self, problem: Problem, columns: Sequence[Columns]) -> None:
         self.free, self.columns = problem.free, columns
         self.pieces = pieces(len(problem))
-        sizes = [column(slice(0, 1)).shape[1] for column in self.columns]
-        ends = self.free.shape[1] + np.cumsum([0, *sizes]).astype(int)
-        self.at = [slice(*own) for own in zip(ends.tolist(), ends.tolist()[1:], strict=False)]
-        self.effects = sum(sizes)
+        sizes = [number(column) for column in columns]
+        self.at, self.effects = places(sizes, self.free.shape[1]), sum(sizes)
 
     def rows(self, rows: slice) -> FloatArray:
         """(m, q + k) rows of all columns."""
@@ -81,15 +79,6 @@ class Design:
 
         return np.concatenate(in_threads(len(self.free), piece, self.pieces))
 
-    def against(self, y: FloatArray) -> FloatArray:
-        """(q + k,) ``X^T y``."""
-
-        def piece(rows: slice) -> FloatArray:
-            blocks = [self.free[rows], *(column(rows) for column in self.columns)]
-            return np.concatenate([block.T @ y[rows] for block in blocks])
-
-        return np.asarray(sum(in_threads(len(y), piece, self.pieces)))
-
 
 def normal(
     X: Columns, y: FloatArray, noise: Noise | None = None, asked: Sequence[tuple[slice, slice]] = ALL
@@ -100,29 +89,24 @@ def normal(
     always in the same way, so any machine returns the same numbers. Of ``X^T X`` only the blocks that are
     `asked` for are computed, and their transposes; the others are zero.
     """
-    past = 0 if noise is None else len(noise.ar)
+    k = number(X)
 
-    def share(starts: Sequence[int]) -> tuple[FloatArray, FloatArray]:
-        P, b = np.zeros((0, 0)), np.zeros(0)
-        for start in starts:
-            first, end = max(start - past, 0), min(start + CHUNK, len(y))
-            A = X(slice(first, end))
-            if noise is not None:
-                A = noise.filter(A, first, start - first)
-            if not b.size:
-                P, b = np.zeros((A.shape[1],) * 2), np.zeros(A.shape[1])
+    def share(some: Sequence[slice]) -> tuple[FloatArray, FloatArray]:
+        P, b = np.zeros((k, k)), np.zeros(k)
+        for rows in some:
+            A = X(rows) if noise is None else noise.whitened(X, rows)
             for own, others in asked:
                 P[own, others] += A[:, own].T @ A[:, others]
-            b += A.T @ y[start:end]
+            b += A.T @ y[rows]
         return P, b
 
-    starts = range(0, len(y), CHUNK)
-    each = -(-len(starts) // THREADS) if len(y) > LONG else len(starts)
-    parts = in_threads(len(y), share, [starts[k : k + each] for k in range(0, len(starts), each)])
-    P = np.asarray(sum(P for P, _ in parts))
+    every = pieces(len(y))
+    each = -(-len(every) // THREADS) if len(y) > LONG else len(every)
+    shares = in_threads(len(y), share, [every[n : n + each] for n in range(0, len(every), each)])
+    P = np.asarray(sum(P for P, _ in shares))
     for own, others in asked:
         P[others, own] = P[own, others].T
-    return P, np.asarray(sum(b for _, b in parts))
+    return P, np.asarray(sum(b for _, b in shares))
 
 
 def in_threads(n: int, function: Callable[[S], T], given: Iterable[S]) -> list[T]:

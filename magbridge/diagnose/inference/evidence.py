@@ -47,6 +47,7 @@ __all__ = [
     "log_bayes",
     "log_odds",
     "margin",
+    "one_sided",
     "regressor_error",
     "score",
     "trials",
@@ -84,7 +85,7 @@ class Score:
 def score(info: Information, at: slice, candidate: Candidate) -> Score:
     """Score the candidate whose columns stand at `at`; one of the wrong sign scores zero."""
     b, statistic = info.score[at], Statistic(info.matrix[at, at], candidate.spectra)
-    freedom = statistic.freedom
+    freedom = int(statistic.freedom)
     if not freedom or (candidate.positive and b.min() < 0.0):
         return Score(0.0, freedom, 0.0, np.zeros(len(b)), np.ones(len(b)))
     if candidate.spectra is not None:
@@ -100,15 +101,19 @@ def evidence_of(candidate: Candidate, ratio: float, freedom: int) -> float:
     """Log evidence of one candidate's likelihood ratio, by the prior that its numbers have."""
     if candidate.spectra is not None:
         return 0.5 * ratio - float(np.log(len(candidate.spectra)))
-    sided = float(np.log(2.0) + log_ndtr(np.sqrt(ratio))) if candidate.positive else 0.0
-    return log_bayes(ratio, freedom) + sided + candidate.likelier
+    sided = float(one_sided(ratio)) if candidate.positive else 0.0
+    return float(log_bayes(ratio, freedom)) + sided + candidate.likelier
 
 
-def log_bayes(ratio: float, freedom: int) -> float:
-    """Log evidence (Bayes factor against no effect) of a likelihood ratio of `freedom` free coefficients."""
-    if ratio <= freedom or not freedom:
-        return 0.0
-    return 0.5 * (ratio - freedom) - 0.5 * freedom * float(np.log(ratio / freedom))
+def log_bayes(ratio: float | FloatArray, freedom: float | FloatArray) -> FloatArray:
+    """Log evidence (Bayes factor against no effect) of likelihood ratios (...,) of `freedom` coefficients."""
+    over = np.maximum(ratio / np.maximum(freedom, 1e-12), 1.0)
+    return np.asarray(0.5 * freedom * (over - 1.0 - np.log(over)))
+
+
+def one_sided(ratio: float | FloatArray) -> FloatArray:
+    """Log evidence (...,) that half a prior of twice the density adds where the estimate has its sign."""
+    return np.asarray(np.log(2.0) + log_ndtr(np.sqrt(ratio)))
 
 
 def margin(ratio: float) -> float:
@@ -130,9 +135,8 @@ def trials(info: Information, candidates: Sequence[Candidate], at: Sequence[slic
     found = {}
     for cause in causes:
         members = [k for k, candidate in enumerate(candidates) if candidate.cause == cause]
-        index = np.concatenate([np.arange(at[k].start, at[k].stop) for k in members])
-        places = slices([candidates[k] for k in members])
-        free = [place for k, place in zip(members, places, strict=True) if candidates[k].spectra is None]
+        index, own = np.r_[*(at[k] for k in members)], slices([candidates[k] for k in members])
+        free = [place for k, place in zip(members, own, strict=True) if candidates[k].spectra is None]
         count = _independent(info.matrix[np.ix_(index, index)], free, LEVEL / len(causes))
         # candidates of one common size count as independent: an upper bound
         count += len(members) - len(free)
@@ -192,4 +196,4 @@ def evidence_of_all(ratio: float, model: Sequence[Candidate]) -> float:
     spectra = sum(
         float(np.log(len(candidate.spectra))) for candidate in model if candidate.spectra is not None
     )
-    return (log_bayes(ratio, free) if free else 0.5 * ratio) + sided + likelier - spectra
+    return (float(log_bayes(ratio, free)) if free else 0.5 * ratio) + sided + likelier - spectra

@@ -7,7 +7,7 @@ from itertools import combinations
 
 import numpy as np
 
-from magbridge.diagnose.causes.candidates import Candidate
+from magbridge.diagnose.causes.candidates import Candidate, slices
 from magbridge.diagnose.inference.joint import Joint
 from magbridge.diagnose.inference.pairs import pairs_of
 from magbridge.diagnose.inference.profile_likelihood import refined
@@ -67,8 +67,8 @@ def _gathered(state: State, pieces: list[Candidate], base: Joint) -> tuple[list[
     causes = list(dict.fromkeys(piece.cause for piece in pieces))
     if len(causes) == len(pieces):
         return pieces, base
-    ends = np.cumsum([0, *(piece.size for piece in pieces)])
+    at = slices(pieces)
     order = sorted(range(len(pieces)), key=lambda n: causes.index(pieces[n].cause))
-    c = np.concatenate([base.coefficients[ends[n] : ends[n + 1]] for n in order])
+    c = base.coefficients[np.r_[*(at[n] for n in order)]]
     model = [reduce(Candidate.with_, [p for p in pieces if p.cause == cause]) for cause in causes]
     return model, state.fit(model, np.append(base.z, c), plain=False, like=base, rounds=1)

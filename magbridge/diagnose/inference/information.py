@@ -11,13 +11,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from magbridge.diagnose.compare.design_columns import Columns, beside, parts, together
+from magbridge.diagnose.compare.design_columns import Columns, beside, parts, places, together
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.design import ALL, normal
 from magbridge.diagnose.inference.joint import Joint
@@ -45,9 +44,9 @@ class Information:
     score: FloatArray
     shift: FloatArray
 
-    def moved(self, base: Joint, index: NDArray[np.intp], taken: FloatArray) -> FloatArray:
-        """Return the likeliest calibration and model (q + k,) if coefficients at `index` (i,) are `taken`."""
-        return np.append(base.z, base.coefficients) - self.shift[:, index] @ taken
+    def moved(self, base: Joint, at: slice | NDArray[np.intp], taken: FloatArray) -> FloatArray:
+        """Return the likeliest calibration and model (q + k,) if the coefficients `at` these are `taken`."""
+        return np.append(base.z, base.coefficients) - self.shift[:, at] @ taken
 
     def without(self, index: NDArray[np.intp], prior: FloatArray) -> Information:
         """Project out the coefficients at `index` as well, with their prior precision (i,)."""
@@ -91,10 +90,9 @@ def information(
     computed.
     """
     q, shared = problem.free.shape[1], together(columns).parts
-    sizes = [sum(len(M) for _, M in parts(one)) for one in columns[:strangers]]
-    ends = (q + np.cumsum([0, *sizes])).tolist()
-    alone = [(slice(*pair), slice(*pair)) for pair in pairwise(ends)]
-    asked = [(slice(q), slice(None)), *alone, (slice(ends[-1], None), slice(q, None))]
+    alone = places((sum(len(M) for _, M in parts(one)) for one in columns[:strangers]), q)
+    others = slice(alone[-1].stop if alone else q, None)
+    asked = [(slice(q), slice(None)), *zip(alone, alone, strict=True), (others, slice(q, None))]
     G, b = normal(
         lambda rows: beside([problem.free[rows], *(X(rows) for X, _ in shared)]),
         noise.response(base.left),

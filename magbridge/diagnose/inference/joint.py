@@ -170,6 +170,5 @@ def _plain(X: Design, residual: FloatArray, prior: FloatArray, centre: FloatArra
     left = residual - X.times(c)
     level = robust_scale(left) + 1e-12
     cut = np.clip(left, *(np.median(left) + np.array([-8.0, 8.0]) * level))
-    return np.asarray(
-        c + np.linalg.solve(P / level**2 + np.diag(prior), X.against(cut) / level**2 - prior * (c - centre))
-    )
+    b = normal(X.rows, cut, asked=())[1]
+    return np.asarray(c + np.linalg.solve(P / level**2 + np.diag(prior), b / level**2 - prior * (c - centre)))

@@ -31,6 +31,7 @@ from numpy.lib.stride_tricks import as_strided, sliding_window_view
 from numpy.typing import NDArray
 from scipy.signal import lfilter, lfiltic
 
+from magbridge.diagnose.compare.design_columns import Columns
 from magbridge.diagnose.compare.past import FAR, Past
 
 __all__ = ["Noise", "Predictors", "autocovariance"]
@@ -89,6 +90,11 @@ class Noise:
     def beside_gaps(self) -> Predictors:
         """Predictors of the samples shortly after a gap."""
         return Predictors(self.past, self.ar)
+
+    def whitened(self, columns: Columns, rows: slice) -> FloatArray:
+        """(m, k) these rows of whitened columns, stored column by column."""
+        first = max(rows.start - len(self.ar), 0)
+        return self.filter(columns(slice(first, rows.stop)), first, rows.start - first)
 
     def filter(self, values: FloatArray, start: int = 0, skip: int = 0) -> FloatArray:
         """Whiten columns for least squares: a product with a band matrix, computed band by band.

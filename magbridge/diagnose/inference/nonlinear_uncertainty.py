@@ -136,10 +136,10 @@ def _elsewhere(info: Information, fit: Joint, placed_piece: Placed, points: Sequ
     piece, own = placed_piece
     q, first = len(fit.z), len(info.score) - fit.coefficients.size
     here = slice(own.start - first, own.stop - first)
-    rest = np.setdiff1d(np.arange(first, len(info.score)), np.arange(own.start, own.stop))
+    rest = np.setdiff1d(np.arange(first, len(info.score)), np.r_[own])
     prior = np.diag(fit.prior[q + rest - first])
     K = np.linalg.solve(info.matrix[np.ix_(rest, rest)] + prior, info.matrix[rest])
-    alone = info.instead(fit, np.arange(own.start, own.stop))
+    alone = info.instead(fit, np.r_[own])
 
     def moments(candidate: Candidate, place: slice) -> tuple[float, FloatArray, FloatArray]:
         """Return evidence, all coefficients and their covariance, each up to what is common to all points."""

@@ -19,14 +19,14 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import log_ndtr, logsumexp
+from scipy.special import logsumexp
 
-from magbridge.diagnose.causes.candidates import Candidate
-from magbridge.diagnose.inference.evidence import LEVEL, REMNANT, margin, score
+from magbridge.diagnose.causes.candidates import Candidate, slices
+from magbridge.diagnose.inference.evidence import LEVEL, REMNANT, log_bayes, margin, one_sided, score
 from magbridge.diagnose.inference.information import Information
 from magbridge.diagnose.inference.joint import Joint
 from magbridge.diagnose.inference.rounds import State, key
-from magbridge.diagnose.inference.statistic import VISIBLE
+from magbridge.diagnose.inference.statistic import Statistic
 
 __all__ = ["Pair", "pairs_of"]
 
@@ -79,16 +79,11 @@ class _Stack:
         U = rows[:, self.index]
         S = self.S - np.einsum("amk,aml->mkl", U, K[:, self.index])
         b = self.b - np.einsum("amk,a->mk", U, taken)
-        values, vectors = np.linalg.eigh(S)
-        seen = values > VISIBLE
-        y = np.einsum("mij,mi->mj", vectors, b)
-        ratio = np.sum(np.where(seen, y**2 / np.where(seen, values, 1.0), 0.0), axis=1)
+        statistic = Statistic(S)
+        ratio = statistic.ratio(b[:, :, None])[:, 0]
         ratio[self.positive & (b.min(axis=1) < 0.0)] = 0.0
-        freedom = seen.sum(axis=1, dtype=np.float64)
-        over = np.maximum(ratio / np.maximum(freedom, 1), 1.0)
-        evidence = 0.5 * freedom * (over - 1.0 - np.log(over))
-        evidence += np.where(self.positive & (ratio > 0.0), np.log(2.0) + log_ndtr(np.sqrt(ratio)), 0.0)
-        return evidence + self.likelier, ratio, freedom
+        evidence = log_bayes(ratio, statistic.freedom) + np.where(self.positive, one_sided(ratio), 0.0)
+        return evidence + self.likelier, ratio, statistic.freedom
 
 
 def pairs_of(
@@ -121,10 +116,10 @@ class _Table:
     def __init__(
         self, state: State, info: Information, model: Sequence[Candidate], base: Joint, places: Sequence[int]
     ) -> None:
-        ends = state.at[-1].stop + np.cumsum([0, *(candidate.size for candidate in model)])
-        here = [slice(int(ends[n]), int(ends[n + 1])) for n in places]
+        first = state.at[-1].stop
+        here = [slices(model, first)[n] for n in places]
         self.info = info.instead(base, np.r_[*here])
-        self.signals = [self.info.matrix[:, at] @ base.coefficients[np.r_[at] - ends[0]] for at in here]
+        self.signals = [self.info.matrix[:, at] @ base.coefficients[np.r_[at] - first] for at in here]
         self.state, self.base, self.standing = state, base, [model[n] for n in places]
         self.candidates = [*state.candidates, *self.standing]
         self.at = [*state.at, *here]

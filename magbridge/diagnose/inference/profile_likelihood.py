@@ -73,8 +73,7 @@ def _profiled(
             narrower = max(-float(np.log(share)), 0.0)
         low, high = values[k], values[k + 2]
     there = scores[k].estimate
-    moved = info.moved(base, np.arange(at[k].start, at[k].stop), there)
-    return made[k], np.append(moved, there), narrower
+    return made[k], np.append(info.moved(base, at[k], there), there), narrower
 
 
 def _bracket(state: State, candidate: Candidate, name: str) -> tuple[float, float]:

@@ -8,7 +8,7 @@ from itertools import combinations
 
 import numpy as np
 
-from magbridge.diagnose.causes.candidates import Candidate
+from magbridge.diagnose.causes.candidates import Candidate, slices
 from magbridge.diagnose.inference.evidence import LEVEL, margin, score
 from magbridge.diagnose.inference.information import Information
 from magbridge.diagnose.inference.joint import Joint
@@ -47,10 +47,9 @@ def rivals_of(
     state: State, info: Information, model: list[Candidate], base: Joint, k: int
 ) -> tuple[Rival, ...]:
     """Return the rivals of the k-th cause of `model`, whose columns are the last of `info`."""
-    ends = state.at[-1].stop + np.cumsum([0, *(candidate.size for candidate in model)])
-    own = np.arange(ends[k], ends[k + 1])
-    alone = info.instead(base, own)
-    standing = score(alone, slice(int(own[0]), int(own[-1]) + 1), model[k])
+    own = slices(model, state.at[-1].stop)[k]
+    alone = info.instead(base, np.r_[own])
+    standing = score(alone, own, model[k])
     scores = state.scores(alone)
     rivals = []
     best = state.best(scores)

@@ -213,7 +213,7 @@ class State:
             if s.evidence > top.get(self.candidates[k].cause, (-np.inf, 0))[0]:
                 top[self.candidates[k].cause] = (s.evidence, k)
         pool = [k for _, k in top.values()]
-        index = np.concatenate([np.arange(self.at[k].start, self.at[k].stop) for k in pool])
+        index = np.r_[*(self.at[k] for k in pool)]
         taken = np.linalg.solve(info.matrix[np.ix_(index, index)] + np.eye(len(index)), info.score[index])
         every = [*model, *(self.candidates[k] for k in pool)]
         everything = fit_joint(
@@ -240,9 +240,10 @@ class State:
         """Fit one cause jointly at the grid points that won under either noise."""
         found = []
         for k in {best.place for best in won}:
-            candidate, index = self.candidates[k], np.arange(self.at[k].start, self.at[k].stop)
-            here = [best for best in won if best.place == k]
-            starts = [np.append(info.moved(base, index, s.estimate), s.estimate) for _, _, s, info in here]
+            candidate, here = self.candidates[k], [best for best in won if best.place == k]
+            starts = [
+                np.append(info.moved(base, self.at[k], s.estimate), s.estimate) for _, _, s, info in here
+            ]
             fit = self.fit([*model, candidate], *starts, like=base, rounds=2)
             ratio = max(0.0, 2.0 * (fit.log_likelihood - base.log_likelihood))
             if candidate.positive and fit.coefficients[-1] < 0.0:

@@ -23,7 +23,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["VISIBLE", "Ridge", "Statistic"]
+__all__ = ["Ridge", "Statistic"]
 
 FloatArray = NDArray[np.float64]
 
@@ -61,7 +61,8 @@ class Statistic:
 
     Parameters
     ----------
-    S : (k, k) array
+    S : (..., k, k) array
+        Of one candidate or, without spectra, of several with as many coefficients.
     spectra : (l, k) array, optional
         Alternatives for the prior variances, up to a common factor; without any, each coefficient is free.
     """
@@ -69,20 +70,20 @@ class Statistic:
     def __init__(self, S: FloatArray, spectra: FloatArray | None = None) -> None:
         self.spectra = spectra
         if spectra is None:
-            values, vectors = np.linalg.eigh(S)
-            seen = values > VISIBLE
-            self.values, self.vectors = values[seen], vectors[:, seen]
-            self.freedom = len(self.values)
+            values, self.vectors = np.linalg.eigh(S)
+            self.values = np.where(values > VISIBLE, values, np.inf)  # what is hardly seen says nothing
+            self.freedom = np.asarray(np.isfinite(self.values).sum(axis=-1))
             return
         root = np.sqrt(spectra)
         values, vectors = np.linalg.eigh(S * root[:, :, None] * root[:, None, :])
         self.values, self.vectors = np.maximum(values, 0.0), root[:, :, None] * vectors
-        self.freedom = 1
+        self.freedom = np.asarray(1)
 
     def ratio(self, b: FloatArray) -> FloatArray:
-        """(m,) likelihood ratios of scores b (k, m)."""
+        """(..., m) likelihood ratios of scores b (..., k, m)."""
         if self.spectra is None:
-            return np.asarray(np.sum((self.vectors.T @ b) ** 2 / self.values[:, None], axis=0))
+            y = np.swapaxes(self.vectors, -1, -2) @ b
+            return np.asarray(np.sum(y**2 / self.values[..., None], axis=-2))
         return np.asarray(
             2.0 * np.max([self._evidences(k, b).max(axis=0) for k in range(len(self.spectra))], axis=0)
         )

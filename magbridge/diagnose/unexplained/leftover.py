@@ -20,7 +20,7 @@ from scipy.stats import chi2
 
 from magbridge.calibration.residual import robust_scale
 from magbridge.diagnose.causes.candidates import Candidate
-from magbridge.diagnose.compare.design_columns import Columns
+from magbridge.diagnose.compare.design_columns import Columns, places
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.design import Design, in_threads, precomputed
 from magbridge.diagnose.inference.evidence import LEVEL
@@ -168,9 +168,7 @@ def _scored(
     """Score each description with each of its widths under `noise`."""
     columns = [*(one.columns for one in listed), *model]
     info = information(problem, noise, fit, columns, strangers=len(listed)).fitted(fit)
-    ends = np.cumsum([0, *(one.widths[0][1].size for one in listed)]).tolist()
-    for one, start, end in zip(listed, ends, ends[1:], strict=False):
-        at = slice(start, end)
+    for one, at in zip(listed, places(one.widths[0][1].size for one in listed), strict=True):
         for kind, width in one.widths:
             S, b = info.matrix[at, at], info.score[at]
             best = Statistic(S, width[None] ** 2).best(b)
