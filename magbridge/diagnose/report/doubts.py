@@ -15,6 +15,7 @@ from magbridge.diagnose.compare.derivatives import CHUNK, derivatives
 from magbridge.diagnose.compare.problem import DELAY, DELAYS, Problem, samples_of
 from magbridge.diagnose.inference.evidence import LEVEL
 from magbridge.diagnose.inference.joint import Joint
+from magbridge.diagnose.report.findings import chance_alone
 from magbridge.diagnose.report.words import label, listed, measured, number
 
 if TYPE_CHECKING:
@@ -26,27 +27,45 @@ if TYPE_CHECKING:
     from magbridge.diagnose.inference.rivals import Rival
     from magbridge.diagnose.unexplained.leftover import Leftover
 
-__all__ = [
-    "gained",
-    "grounded",
-    "implausible",
-    "in_motion",
-    "late",
-    "nameless",
-    "no_gain",
-    "outshone",
-    "recent",
-    "rivalled",
-    "several",
-    "shortened",
-    "unsettled",
-    "useful",
-]
+__all__ = ["doubts", "gained", "late", "nameless", "unsettled", "useful"]
 
 REFERENCE = ("map_error", "reference_bias", "diurnal_variation")
 """Causes that are errors of the reference."""
 IMPLAUSIBLE = 5.0
 """Multiple of its plausible size above which a cause is doubted."""
+SEVERAL = (
+    '<p class="faint">A number in brackets: several such terms were needed to describe the cause; they act '
+    "together.</p>"
+)
+RECENT = (
+    "It is best described as absent from the logs that the calibration was fitted to: it may have appeared "
+    "since."
+)
+GROUNDED = (
+    "It is not in the extended calibration: live, a rate of change is a backward difference, whose noise "
+    "would exceed what the correction gains."
+)
+NO_GAIN = "It shows no gain on what was left out of the fit: it may be a remnant of another effect."
+OUTSHONE = "The unexplained rest is stronger than this cause, and may have caused part of it."
+
+
+def doubts(diagnosis: Diagnosis, finding: Finding, cause: Cause) -> list[str]:
+    """Return the paragraphs on one finding; `cause` is its row in the table of causes."""
+    candidate, rest = finding.candidate, diagnosis.unexplained
+    said = {
+        RECENT: any(piece.since for piece in candidate.pieces),
+        GROUNDED: not set(candidate.effects) <= set(diagnosis.calibration.effects),
+        NO_GAIN: not finding.gain.shown,
+        OUTSHONE: rest is not None and rest.signal_to_noise >= finding.signal_to_noise,
+    }
+    return [
+        SEVERAL * any(name.endswith(")") for name in candidate.names),
+        implausible(candidate, finding.coefficients),
+        in_motion(diagnosis, finding),
+        shortened(finding),
+        rivalled(candidate, cause, finding.rivals, chance_alone(diagnosis, finding.hypothesis)),
+        *(f"<p>{text}</p>" for text, so in said.items() if so),
+    ]
 
 
 def late(problem: Problem, fit: Joint) -> str:
@@ -71,16 +90,6 @@ def late(problem: Problem, fit: Joint) -> str:
     )
 
 
-def several(names: tuple[str, ...]) -> str:
-    """Explain the numbers in brackets."""
-    if not any(name.endswith(")") for name in names):
-        return ""
-    return (
-        '<p class="faint">A number in brackets: several such terms were needed to describe the cause; they '
-        "act together.</p>"
-    )
-
-
 def implausible(candidate: Candidate, b: NDArray[np.float64]) -> str:
     """Say so when a cause's b (k,), in units of its widths, is implausibly large, as if two cancelled."""
     times = float(np.abs(b).max())
@@ -90,16 +99,6 @@ def implausible(candidate: Candidate, b: NDArray[np.float64]) -> str:
         f"<p>This is {number(times, 2)} times the usual size of such a cause. Two causes that cancel each "
         "other can grow this large: check the extended calibration against another reference before it is "
         "flown.</p>"
-    )
-
-
-def grounded(diagnosis: Diagnosis, candidate: Candidate) -> str:
-    """Say so when a cause is named but left out of the extended calibration."""
-    if all(effect in diagnosis.calibration.effects for effect in candidate.effects):
-        return ""
-    return (
-        "<p>It is not in the extended calibration: live, a rate of change is a backward difference, whose "
-        "noise would exceed what the correction gains.</p>"
     )
 
 
@@ -157,30 +156,6 @@ def useful(diagnosis: Diagnosis) -> str:
         else "shows no gain on what it was not fitted to: do not fly it before another log does"
     )
     return f"<p>The extended calibration, <code>calibration.json</code> beside this page, {verdict}.{but}</p>"
-
-
-def recent(candidate: Candidate) -> str:
-    """Say so when a cause is best described as absent from the logs that the calibration was fitted to."""
-    if not any(piece.since for piece in candidate.pieces):
-        return ""
-    return (
-        "<p>It is best described as absent from the logs that the calibration was fitted to: it may have "
-        "appeared since.</p>"
-    )
-
-
-def no_gain(gain: Gain) -> str:
-    """Say so when what was left out of the fit shows no gain."""
-    if gain.shown:
-        return ""
-    return "<p>It shows no gain on what was left out of the fit: it may be a remnant of another effect.</p>"
-
-
-def outshone(finding: Finding, rest: Leftover | None) -> str:
-    """Say so when the unexplained rest is stronger than a named cause."""
-    if rest is None or rest.signal_to_noise < finding.signal_to_noise:
-        return ""
-    return "<p>The unexplained rest is stronger than this cause, and may have caused part of it.</p>"
 
 
 def rivalled(candidate: Candidate, cause: Cause, rivals: Sequence[Rival], chance: float) -> str:

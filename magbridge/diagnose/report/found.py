@@ -11,18 +11,8 @@ from numpy.typing import NDArray
 
 from magbridge.calibration.residual import rms
 from magbridge.diagnose.report import figures
-from magbridge.diagnose.report.doubts import (
-    grounded,
-    implausible,
-    in_motion,
-    no_gain,
-    outshone,
-    recent,
-    rivalled,
-    several,
-    shortened,
-)
-from magbridge.diagnose.report.findings import chance_alone, parameters
+from magbridge.diagnose.report.doubts import doubts
+from magbridge.diagnose.report.findings import parameters
 from magbridge.diagnose.report.words import MANY, bold, chance, figure, listed, number, physics, row
 
 if TYPE_CHECKING:
@@ -78,8 +68,7 @@ def overview(diagnosis: Diagnosis) -> str:
 
 def _cause(diagnosis: Diagnosis, finding: Finding, cause: Cause) -> list[str]:
     """Tell of one cause: its physics, the evidence, its numbers, and what speaks against it."""
-    candidate, gain = finding.candidate, finding.gain
-    numbers = parameters(finding, len(diagnosis.problem))
+    gain, numbers = finding.gain, parameters(finding, len(diagnosis.problem))
     rows = "".join(row(name, **value) for name, value in numbers.items())
     return [
         f'<p class="faint">{physics(cause)}</p>',
@@ -94,15 +83,7 @@ def _cause(diagnosis: Diagnosis, finding: Finding, cause: Cause) -> list[str]:
             f"<table><tr><th>term</th><th>value</th><th>1 sigma</th><th>unit</th></tr>{rows}</table>",
             numbers,
         ),
-        several(candidate.names),
-        implausible(candidate, finding.coefficients),
-        recent(candidate),
-        in_motion(diagnosis, finding),
-        grounded(diagnosis, candidate),
-        shortened(finding),
-        rivalled(candidate, cause, finding.rivals, chance_alone(diagnosis, finding.hypothesis)),
-        no_gain(gain),
-        outshone(finding, diagnosis.unexplained),
+        *doubts(diagnosis, finding, cause),
     ]
 
 
