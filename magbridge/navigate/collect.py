@@ -2,39 +2,19 @@
 
 from __future__ import annotations
 
-from math import inf, sqrt
-from typing import NamedTuple
+from math import inf
 
-from magbridge.field.earth import wrap
+import numpy as np
+
 from magbridge.field.nearby import NearbyField
 from magbridge.navigate.deadreckoning import DeadReckoning
-from magbridge.navigate.model import Block
+from magbridge.navigate.model import Block, average
 from magbridge.navigate.options import Options
 
 __all__ = ["Collector"]
 
 LEAST = 1e-3
 """nT: a smaller sigma is not believed."""
-
-
-class Sums(NamedTuple):
-    """Weighted sums over the block's samples so far; time and position relative to the first sample."""
-
-    start_us: int
-    latitude: float
-    longitude: float
-    travelled: float
-    weight: float = 0.0
-    time: float = 0.0
-    d_latitude: float = 0.0
-    d_longitude: float = 0.0
-    anomaly: float = 0.0
-    white: float = 0.0
-    together: float = 0.0
-    slow: float = 0.0
-    slope_north: float = 0.0
-    slope_east: float = 0.0
-    depth: float = 0.0
 
 
 class Collector:
@@ -60,8 +40,8 @@ class Collector:
         self._white = inf if options.noise is None else options.noise**2
         self._bias = options.bias_sigma**2
         self._main_field = NearbyField()
-        self._sums: Sums | None = None
-        self._seconds = 0.0  # from its first sample to its last
+        self._samples: list[Block] = []  # a block of one sample each
+        self._begun = 0.0  # m travelled until the first of them
 
     def add(
         self, time_us: int, where: DeadReckoning, total_field: float, sigma: float, utc_offset_us: int = 0
@@ -77,48 +57,27 @@ class Collector:
         total_field, sigma : float
             nT.
         """
-        s = self._sums or Sums(time_us, where.latitude, where.longitude, where.travelled)
         main, slope_north, slope_east = self._main_field.at(
             where.latitude, where.longitude, where.depth, (time_us + utc_offset_us) * 1e-6
         )
-        variance = max(sigma, LEAST) ** 2
-        white, w = min(self._white, variance), 1.0 / variance
-        self._sums = Sums(
-            s.start_us,
-            s.latitude,
-            s.longitude,
-            s.travelled,
-            s.weight + w,
-            s.time + w * (time_us - s.start_us),
-            s.d_latitude + w * (where.latitude - s.latitude),
-            s.d_longitude + w * wrap(where.longitude - s.longitude),
-            s.anomaly + w * (total_field - main),
-            s.white + w * w * white,
-            s.together + w * sqrt(white),
-            s.slow + w * sqrt(max(0.0, variance - white - self._bias)),
-            s.slope_north + w * slope_north,
-            s.slope_east + w * slope_east,
-            s.depth + w * where.depth,
-        )
-        full = time_us - s.start_us >= self._interval_us or where.travelled - s.travelled >= self._step
-        self._seconds = (time_us - s.start_us) * 1e-6
+        if not self._samples:
+            self._begun = where.travelled
+        anomaly, variance = total_field - main, max(sigma, LEAST) ** 2
+        place = where.latitude, where.longitude
+        self._samples.append(Block(time_us, *place, anomaly, variance, slope_north, slope_east, where.depth))
+        lasts_us = time_us - self._samples[0].time_us
+        full = lasts_us >= self._interval_us or where.travelled - self._begun >= self._step
         return self.flush() if full else None
 
     def flush(self) -> Block | None:
         """Return the block of the samples collected so far; None if there are none."""
-        s, self._sums = self._sums, None
-        if s is None:
+        samples, self._samples = self._samples, []
+        if not samples:
             return None
-        w = s.weight
-        lasting = self._lasts / (self._seconds + self._lasts) if self._lasts else 0.0
-        white = max(s.white, lasting * s.together**2)
-        return Block(
-            s.start_us + round(s.time / w),
-            s.latitude + s.d_latitude / w,
-            wrap(s.longitude + s.d_longitude / w),
-            s.anomaly / w,
-            (white + s.slow**2) / w**2,
-            s.slope_north / w,
-            s.slope_east / w,
-            s.depth / w,
-        )
+        variance = np.array([sample.variance for sample in samples])
+        w, white = 1.0 / variance, np.minimum(self._white, variance)
+        seconds = (samples[-1].time_us - samples[0].time_us) * 1e-6
+        lasting = self._lasts / (seconds + self._lasts) if self._lasts else 0.0
+        noise = max(w * w @ white, lasting * (w @ np.sqrt(white)) ** 2)
+        slow = w @ np.sqrt(np.maximum(variance - white - self._bias, 0.0))
+        return average(samples)._replace(variance=float((noise + slow**2) / w.sum() ** 2))

@@ -18,10 +18,9 @@ from math import exp, expm1, log, pi, sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from magbridge.field.earth import wrap
 from magbridge.field.grid import AnomalyGrid
 from magbridge.navigate.bank import Bank, widest
-from magbridge.navigate.model import Block, block_length, transition
+from magbridge.navigate.model import Block, average, block_length, transition
 from magbridge.navigate.options import Options
 
 __all__ = ["IntegrityMonitor", "Unmapped", "Verdict", "squared_mahalanobis"]
@@ -193,34 +192,3 @@ def squared_mahalanobis(apart: Array, P: Array) -> float:
         m², covariance.
     """
     return float(apart[:2] @ np.linalg.solve(P[:2, :2], apart[:2]))
-
-
-def average(blocks: list[Block]) -> Block:
-    """Return several blocks as one: their mean, by weight of their precision."""
-    first = blocks[0]
-    precision = np.array([1.0 / b.variance for b in blocks])
-    columns = np.array(
-        [
-            (
-                b.time_us - first.time_us,
-                b.latitude,
-                wrap(b.longitude - first.longitude),
-                b.anomaly,
-                b.slope_north,
-                b.slope_east,
-                b.depth,
-            )
-            for b in blocks
-        ]
-    )
-    time, latitude, longitude, anomaly, north, east, depth = (precision @ columns / precision.sum()).tolist()
-    return Block(
-        first.time_us + round(time),
-        latitude,
-        wrap(first.longitude + longitude),
-        anomaly,
-        1.0 / float(precision.sum()),
-        north,
-        east,
-        depth,
-    )

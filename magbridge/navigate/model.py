@@ -15,18 +15,21 @@ vehicle does, and one model serves every estimator, the smoother and the bound:
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from math import exp, nan
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from magbridge.field.earth import wrap
 from magbridge.field.grid import AnomalyGrid
 from magbridge.navigate.options import Options
 
 __all__ = [
     "N_STATES",
     "Block",
+    "average",
     "block_length",
     "measurement_row",
     "prior",
@@ -70,6 +73,17 @@ class Block(NamedTuple):
     depth: float = nan
 
 
+def average(blocks: Sequence[Block]) -> Block:
+    """Return several blocks as one: their mean, by weight of their precision, as if they were independent."""
+    first, rows = blocks[0], np.array(blocks)
+    precision = 1.0 / rows[:, 4]
+    rows[:, 0] -= first.time_us
+    rows[:, 2] = wrap(rows[:, 2] - first.longitude)
+    time, latitude, east, anomaly, _, *rest = (precision @ rows / precision.sum()).tolist()
+    where = first.time_us + round(time), latitude, wrap(first.longitude + east)
+    return Block(*where, anomaly, 1.0 / float(precision.sum()), *rest)
+
+
 def prior(options: Options, position_sigma: float | None = None) -> tuple[Array, Array]:
     """Return mean (6,) and covariance (6, 6) before anything was measured."""
     o = options
@@ -95,10 +109,8 @@ def transition(options: Options, seconds: float, metres: float) -> tuple[Array, 
         q[p, p] = o.drift**2 * seconds + gained * seconds * seconds / 3.0
         q[p, c] = q[c, p] = gained * seconds / 2.0
         q[c, c] = gained
-    for i, sigma, decay in (
-        (4, o.bias_sigma, seconds / o.bias_time),
-        (5, o.map_sigma, metres / o.map_length),
-    ):
+    slow = (4, o.bias_sigma, seconds / o.bias_time), (5, o.map_sigma, metres / o.map_length)
+    for i, sigma, decay in slow:
         f[i, i] = exp(-decay)
         q[i, i] = sigma**2 * (1.0 - f[i, i] ** 2)
     return f, q
