@@ -20,6 +20,8 @@ NMEA = re.compile(rb"[$!][A-OQ-Z][A-Z]{4},[ -~]*\*[0-9A-Fa-f]{2}\r?\n")
 """A sentence of NMEA 0183, but none that a maker has defined (``$P...``)."""
 SENTENCE = 128
 """Bytes, the longest sentence and a margin."""
+TEXT = re.compile(rb"[\t\r\n -~]+")
+NOT_A_NUMBER = re.compile(rb"\bnan\b", re.IGNORECASE)
 SAME_US, SAME = 60_000_000, 10
 """µs, and number of readings, after which one that repeats is announced: the sensor may hang. It has no flag,
 because one that counts in steps of 100 nT may as well be at rest."""
@@ -107,12 +109,11 @@ class SensorLine:
     def mumbled(self, data: bytes, time_us: int) -> None:
         """Take note of bytes that complete no reading."""
         self._mumbled_us = time_us
-        if self._listen_us and not self._known:
-            heard = self._tail + data
-            self._tail = heard[-SENTENCE:]
-            if NMEA.search(heard):
-                self._commands, self.stranger = (), True
-                self._timers.cancel("command")
+        heard = self._tail + data
+        self._tail = heard[-SENTENCE:]
+        if self._listen_us and not self._known and NMEA.search(heard):
+            self._commands, self.stranger = (), True
+            self._timers.cancel("command")
 
     def opened(self, time_us: int) -> None:
         """Begin to send the start-up commands: it may have been without power. SILENT until it sends."""
@@ -129,10 +130,18 @@ class SensorLine:
         if time_us - self._heard_us < self._timeout_us or self.state == MAG_PORT_STATE.LOST:
             return
         mumbles = time_us - self._mumbled_us < self._timeout_us // 2
-        what = "sends, but no readings: baud rate?" if mumbles else "is silent"
+        what = self._mumble() if mumbles else "is silent"
         self._announcer.state("sensor", f"{self._name} {what}", MAV_SEVERITY.ERROR)
         self.stranger = not self._known
         self._wake(time_us)
+
+    def _mumble(self) -> str:
+        """Say what comes instead of readings: at a wrong baud rate, bytes that are no text."""
+        if not TEXT.fullmatch(self._tail):
+            return "sends, but no readings: baud rate?"
+        if NOT_A_NUMBER.search(self._tail):
+            return "sends NaN, but no readings"
+        return "sends text, but no readings: sensor.options?"
 
     def _wake(self, time_us: int, listen_us: int = 0) -> None:
         self.state, self._heard_us = MAG_PORT_STATE.SILENT, time_us

@@ -85,16 +85,25 @@ def test_an_instrument_that_hangs_is_told(bench: Bench) -> None:
     assert hangs == ["ascii sends the same reading for 60 s", "ascii's readings change again"]
 
 
-def test_an_instrument_that_speaks_otherwise_is_not_silent(bench: Bench) -> None:
-    for k in range(21):
-        bench.hear(k, b"$GPGGA,123519,4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,*47\r\n")
-    assert not bench.raw
-    assert bench.said[-1] == "ascii sends, but no readings: baud rate?"
-    bench.feed(45.0, Channel.STATE, b"")
-    assert bench.said[-1] == "ascii is silent"
-
-
 GGA = b"$GPGGA,123519,4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,*47\r\n"
+
+
+@pytest.mark.parametrize(
+    ("line", "what"),
+    [
+        (GGA, "sends text, but no readings: sensor.options?"),
+        (b"nan NaN nan 4.0 1.0 7\r\n", "sends NaN, but no readings"),
+        (bytes(range(250, 256)) + b"\r\n", "sends, but no readings: baud rate?"),
+    ],
+)
+def test_an_instrument_that_speaks_otherwise_is_not_silent(bench: Bench, line: bytes, what: str) -> None:
+    for k in range(41):
+        bench.hear(k, line)
+    assert not bench.raw
+    assert bench.said[-1] == f"ascii {what}"
+    assert len([text for text in bench.said if "readings" in text]) == 1
+    bench.feed(65.0, Channel.STATE, b"")
+    assert bench.said[-1] == "ascii is silent"
 
 
 @pytest.mark.parametrize(
