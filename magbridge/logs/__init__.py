@@ -11,8 +11,9 @@ magnetometer sample; every other column holds what was known at that time:
 
 The formats are :mod:`.text` (CSV), :mod:`.netcdf` (with :mod:`.seaglider` and :mod:`.cf`), :mod:`.parquet`,
 :mod:`.telemetry` (with its ``telemetry_*``), :mod:`.ardupilot`, :mod:`.px4` and :mod:`.slocum`. They
-share :mod:`.resample` (telemetry brought to the rows) and :mod:`.deployment` (what they return, made and
-checked); :mod:`.merge` makes one stream of several. :mod:`.tlog` stands apart: it writes the bridge's log.
+share :mod:`.resample` (telemetry brought to the rows; :mod:`.autopilot` does so for both autopilots),
+:mod:`.deployment` (what they return) and :mod:`.checks`; :mod:`.merge` makes one stream of several.
+:mod:`.tlog` stands apart: it writes the bridge's log.
 
 Each format has ``chunks(path, rows)``, which yields deployments of at most `rows` rows in the order of the
 file, and, where the format can be written, ``FileWriter(path)`` with ``append(dataset, first=...)`` and

@@ -1,12 +1,10 @@
 """ArduPilot's own logs (``.BIN``), through pymavlink.
 
-A row is a sample of the first magnetometer that the log has; every other column is the last value before it.
 The log holds the field with the autopilot's offsets and motor compensation applied; these are in the log,
 too, and are subtracted again, so ``mag_x`` is the raw channel (mG, so steps of 100 nT). The scale factors in
 ``COMPASS_DIA`` and ``COMPASS_ODI`` are not undone.
 
-Time is UTC once the log has a GPS fix; a log without one counts from the boot, and says so in the attribute
-``time_reference = "boot"``. Damaged bytes are skipped and counted in ``bytes_skipped``.
+UTC is that of the first GPS fix. Damaged bytes are skipped and counted in ``bytes_skipped``.
 
 References
 ----------
@@ -24,20 +22,17 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from magbridge.errors import FormatError, MissingExtra
-from magbridge.logs.checks import increasing
-from magbridge.logs.deployment import deployment, sliced
-from magbridge.logs.resample import latest
+from magbridge.logs.autopilot import Fields, Floats, pieces, values_of
 
 __all__ = ["chunks"]
 
-Floats = NDArray[np.float64]
+Table = dict[str, Floats]
+Tables = dict[str, Table]
 
 NT_PER_MG = 100.0
-FIELDS: dict[str, tuple[tuple[str, str, str, float], ...]] = {
-    # record: (column, field, unit, factor); '#' is the number of the instance where it is not the first
+FIELDS: Fields = {
     "ATT": (("roll", "Roll", "deg", 1.0), ("pitch", "Pitch", "deg", 1.0), ("heading", "Yaw", "deg", 1.0)),
     "POS": (
         ("latitude", "Lat", "deg", 1.0),
@@ -79,47 +74,34 @@ def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
         No magnetometer in it.
     """
     tables, skipped = _tables(path)
-    offset = _utc_offset(tables)
-    found = _instances(tables, "MAG", offset)
-    mags = {number: one for number, one in found.items() if {"MagX", "MagY", "MagZ"} <= one[1].keys()}
+    mags = {
+        number: (time, _field(mag))
+        for number, (time, mag) in _instances(tables, "MAG").items()
+        if {"MagX", "MagY", "MagZ"} <= mag.keys()
+    }
     if not mags:
         raise FormatError(path, "expected an ArduPilot log with MAG records")
-    first = min(mags)
-    time, mag = mags.pop(first)
-    keep = np.diff(time, prepend=-np.inf) > 0
-    time = time[keep]
-    increasing(path, time)
-    columns = {name: values[keep] for name, values in _field(mag, "mag").items()}
-    units = {}
-    for number, (when, other) in mags.items():
-        for name, values in _field(other, f"mag{number + 1}").items():
-            columns[name], units[name] = latest(time, when, values), "nT"
-    for record, fields in FIELDS.items():
-        for number, (when, table) in _instances(tables, record, offset).items():
-            for column, field, unit, factor in fields:
-                name = column.replace("#", str(number + 1) if number else "")
-                if field not in table or name in columns or (record == "RCOU" and not np.any(table[field])):
-                    continue  # an output that is always 0 is not in use
-                columns[name] = latest(time, when, table[field] * factor)
-                units[name] = unit
-    attrs: dict[str, Any] = {"bytes_skipped": skipped}
-    if not offset:
-        attrs["time_reference"] = "boot"
-    yield from sliced(deployment(path, time, columns, units, attrs), rows)
+    yield from pieces(path, rows, _utc_offset(tables), mags, _telemetry(tables), {"bytes_skipped": skipped})
 
 
-def _field(mag: dict[str, Floats], prefix: str) -> dict[str, Floats]:
+def _telemetry(tables: Tables) -> Iterator[tuple[Floats, str, str, Floats]]:
+    """Yield times, column, unit and values of everything but the magnetometers."""
+    for record in FIELDS:
+        for number, (time, table) in _instances(tables, record).items():
+            for column, unit, values in values_of(FIELDS, record, number, table):
+                if record != "RCOU" or np.any(values):  # an output that is always 0 is not in use
+                    yield time, column, unit, values
+
+
+def _field(mag: Table) -> Table:
     """Return the raw channels in nT: the logged field less the offsets and the motor compensation."""
     return {
-        f"{prefix}_{axis.lower()}": NT_PER_MG
-        * (mag[f"Mag{axis}"] - mag.get(f"Ofs{axis}", 0) - mag.get(f"MO{axis}", 0))
+        axis.lower(): NT_PER_MG * (mag[f"Mag{axis}"] - mag.get(f"Ofs{axis}", 0) - mag.get(f"MO{axis}", 0))
         for axis in "XYZ"
     }
 
 
-def _instances(
-    tables: dict[str, dict[str, Floats]], record: str, offset: float
-) -> dict[int, tuple[Floats, dict[str, Floats]]]:
+def _instances(tables: Tables, record: str) -> dict[int, tuple[Floats, Table]]:
     """Return time and fields of each instance of a record, also if its number is in the name (``MAG2``)."""
     found = {}
     for number, name in enumerate((record, f"{record}2", f"{record}3")):
@@ -130,11 +112,11 @@ def _instances(
         )
         for k in np.unique(which[np.isfinite(which)]):
             fields = {field: values[which == k] for field, values in table.items()}
-            found[int(k)] = fields["TimeUS"] * 1e-6 + offset, fields
+            found[int(k)] = fields["TimeUS"] * 1e-6, fields
     return found
 
 
-def _utc_offset(tables: dict[str, dict[str, Floats]]) -> float:
+def _utc_offset(tables: Tables) -> float:
     """Return UTC minus time since boot in s, from the first GPS fix; 0 without one."""
     gps = tables.get("GPS")
     if gps is None or not {"GWk", "GMS", "TimeUS"} <= gps.keys():
@@ -148,7 +130,7 @@ def _utc_offset(tables: dict[str, dict[str, Floats]]) -> float:
     return float(utc - leap - gps["TimeUS"][k] * 1e-6)
 
 
-def _tables(path: Path) -> tuple[dict[str, dict[str, Floats]], int]:
+def _tables(path: Path) -> tuple[Tables, int]:
     """Return every kind of record that we use as columns, and the bytes that belonged to no record."""
     try:
         from pymavlink.DFReader import DFReader_binary  # noqa: PLC0415 - a slow import

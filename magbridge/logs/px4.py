@@ -1,9 +1,8 @@
 """PX4's logs (``.ulg``), through pyulog.
 
-A row is a sample of the first ``sensor_mag`` (gauss, as the driver gives it: before PX4's own calibration);
-every other column is the last value before it. ``heading`` is the estimator's yaw. ``depth`` is the local
-position's z, down from where the vehicle was switched on. Time is UTC if a GPS message in the log gives it;
-otherwise it counts from the boot, and the attribute ``time_reference = "boot"`` says so.
+``sensor_mag`` is in gauss, as the driver gives it: before PX4's own calibration. ``heading`` is the
+estimator's yaw. ``depth`` is the local position's z, down from where the vehicle was switched on. UTC is that
+of the first GPS message that has it.
 
 References
 ----------
@@ -15,16 +14,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import redirect_stdout
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from magbridge.errors import FormatError, MissingExtra
-from magbridge.logs.checks import increasing
-from magbridge.logs.deployment import deployment, sliced
-from magbridge.logs.resample import latest
+from magbridge.logs.autopilot import Fields, Floats, pieces, values_of
 
 try:
     from pyulog import ULog
@@ -34,11 +29,11 @@ except ImportError:
 
 __all__ = ["chunks"]
 
-Floats = NDArray[np.float64]
+Table = dict[str, Floats]
+Topics = dict[str, dict[int, Table]]
 
 NT_PER_GAUSS = 1e5
-FIELDS: dict[str, tuple[tuple[str, str, str, float], ...]] = {
-    # topic: (column, field, unit, factor); '#' is the number of the instance where it is not the first
+FIELDS: Fields = {
     "vehicle_global_position": (("latitude", "lat", "deg", 1.0), ("longitude", "lon", "deg", 1.0)),
     "vehicle_local_position": (("depth", "z", "m", 1.0),),
     "battery_status": (
@@ -72,61 +67,41 @@ def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
             log = ULog(file, [*FIELDS, *OTHERS])
     except (ULogException, ValueError, KeyError, IndexError, TypeError) as error:
         raise FormatError(path, f"expected a PX4 log: {error}") from None
-    topics: dict[str, dict[int, dict[str, Floats]]] = {}
+    topics: Topics = {}
     for one in log.data_list:
         fields = {name: values.astype(np.float64) for name, values in one.data.items()}
         if NEEDED.get(one.name, {"timestamp"}) <= fields.keys():
             topics.setdefault(one.name, {})[one.multi_id] = fields
-    mags = topics.get("sensor_mag")
+    mags = {
+        number: (_time(mag), {axis: NT_PER_GAUSS * mag[axis] for axis in "xyz"})
+        for number, mag in topics.get("sensor_mag", {}).items()
+    }
     if not mags:
         raise FormatError(path, "expected a PX4 log with sensor_mag")
-    offset = _utc_offset(topics)
-    first = mags.pop(min(mags))
-    time = _time(first, offset)
-    keep = np.diff(time, prepend=-np.inf) > 0
-    time = time[keep]
-    increasing(path, time)
-    columns = {f"mag_{axis}": NT_PER_GAUSS * first[axis][keep] for axis in "xyz"}
-    units: dict[str, str] = {}
-    for number, mag in mags.items():
-        for axis in "xyz":
-            column = f"mag{number + 1}_{axis}"
-            columns[column], units[column] = (
-                latest(time, _time(mag, offset), NT_PER_GAUSS * mag[axis]),
-                "nT",
-            )
-    for column, unit, when, values in _telemetry(topics, offset):
-        if column not in columns and (np.any(values) or not column.startswith(UNUSED)):
-            columns[column], units[column] = latest(time, when, values), unit
-    attrs: dict[str, Any] = {"dropouts": len(log.dropouts)}
-    if not offset:
-        attrs["time_reference"] = "boot"
-    yield from sliced(deployment(path, time, columns, units, attrs), rows)
+    dropouts = {"dropouts": len(log.dropouts)}
+    yield from pieces(path, rows, _utc_offset(topics), mags, _telemetry(topics), dropouts)
 
 
-def _telemetry(
-    topics: dict[str, dict[int, dict[str, Floats]]], offset: float
-) -> Iterator[tuple[str, str, Floats, Floats]]:
-    """Yield column, unit, times and values of everything but the magnetometers."""
+def _telemetry(topics: Topics) -> Iterator[tuple[Floats, str, str, Floats]]:
+    """Yield times, column, unit and values of everything but the magnetometers."""
     for attitude in topics.get("vehicle_attitude", {}).values():
         for column, values in zip(("roll", "pitch", "heading"), _angles(attitude), strict=True):
-            yield column, "deg", _time(attitude, offset), values
-    for topic, fields in FIELDS.items():
+            yield _time(attitude), column, "deg", values
+    for topic in FIELDS:
         for number, table in topics.get(topic, {}).items():
-            for column, field, unit, factor in fields:
-                if field in table:
-                    name = column.replace("#", str(number + 1) if number else "")
-                    yield name, unit, _time(table, offset), table[field] * factor
+            for column, unit, values in values_of(FIELDS, topic, number, table):
+                if np.any(values) or not column.startswith(UNUSED):
+                    yield _time(table), column, unit, values
     for table in topics.get("debug_key_value", {}).values():
         letters = [table[f"key[{k}]"].astype(np.uint8) for k in range(10) if f"key[{k}]" in table]
         names = np.array(
             [bytes(key).split(b"\0")[0].decode("ascii", "replace") for key in zip(*letters, strict=True)]
         )
         for name in dict.fromkeys(names.tolist()):
-            yield name, "1", _time(table, offset)[names == name], table["value"][names == name]
+            yield _time(table)[names == name], name, "1", table["value"][names == name]
 
 
-def _angles(attitude: dict[str, Floats]) -> tuple[Floats, Floats, Floats]:
+def _angles(attitude: Table) -> tuple[Floats, Floats, Floats]:
     """Return roll, pitch and heading (deg) of the quaternion (w, x, y, z) from body to north-east-down."""
     w, x, y, z = (attitude[f"q[{k}]"] for k in range(4))
     roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
@@ -135,11 +110,11 @@ def _angles(attitude: dict[str, Floats]) -> tuple[Floats, Floats, Floats]:
     return np.degrees(roll), np.degrees(pitch), np.degrees(heading) % 360.0
 
 
-def _time(table: dict[str, Floats], offset: float) -> Floats:
-    return table.get("timestamp_sample", table["timestamp"]) * 1e-6 + offset
+def _time(table: Table) -> Floats:
+    return table.get("timestamp_sample", table["timestamp"]) * 1e-6
 
 
-def _utc_offset(topics: dict[str, dict[int, dict[str, Floats]]]) -> float:
+def _utc_offset(topics: Topics) -> float:
     """Return UTC minus time since boot in s, from the first GPS message that has UTC; 0 without one."""
     for topic in ("vehicle_gps_position", "sensor_gps"):
         for gps in topics.get(topic, {}).values():

@@ -1,0 +1,61 @@
+"""An autopilot's own log as a deployment: what ArduPilot's and PX4's have in common.
+
+A row is a sample of the first magnetometer that the log has; every other column is the last value before it.
+A log that does not tell UTC counts from the boot, and says so in the attribute ``time_reference = "boot"``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from magbridge.logs.checks import increasing
+from magbridge.logs.deployment import deployment, sliced
+from magbridge.logs.resample import latest
+
+__all__ = ["Fields", "Floats", "pieces", "values_of"]
+
+Floats = NDArray[np.float64]
+Table = Mapping[str, Floats]
+Fields = dict[str, tuple[tuple[str, str, str, float], ...]]
+"""Record: (column, field, unit, factor); ``#`` is the number of the instance where it is not the first."""
+
+
+def values_of(fields: Fields, record: str, number: int, table: Table) -> Iterator[tuple[str, str, Floats]]:
+    """Yield column, unit and values (m,) of each of `fields` that an instance (from 0) of a record holds."""
+    for column, field, unit, factor in fields[record]:
+        if field in table:
+            yield column.replace("#", str(number + 1) if number else ""), unit, table[field] * factor
+
+
+def pieces(
+    path: Path,
+    rows: int,
+    offset: float,
+    mags: Mapping[int, tuple[Floats, Table]],
+    telemetry: Iterable[tuple[Floats, str, str, Floats]],
+    attrs: Mapping[str, Any],
+) -> Iterator[xr.Dataset]:
+    """Yield the log in pieces of at most `rows` rows.
+
+    Its own times, s, are `offset` s behind UTC, 0 where that is not known. `mags` holds each magnetometer's
+    times (m,) and, by axis, its values (m,), nT; `telemetry` yields times (m,), column, unit and values (m,).
+    """
+    (_, (when, first)), *rest = sorted(mags.items())
+    keep = np.diff(when, prepend=-np.inf) > 0
+    time = when[keep]
+    increasing(path, time + offset)
+    columns = {f"mag_{axis}": values[keep] for axis, values in first.items()}
+    units: dict[str, str] = {}
+    others = ((when, f"mag{k + 1}_{a}", "nT", field[a]) for k, (when, field) in rest for a in field)
+    for when, column, unit, values in chain(others, telemetry):
+        if column not in columns:
+            columns[column], units[column] = latest(time, when, values), unit
+    boot = {} if offset else {"time_reference": "boot"}
+    yield from sliced(deployment(path, time + offset, columns, units, {**attrs, **boot}), rows)
