@@ -255,6 +255,8 @@ class Pipeline:
             say("no calibration: raw field", MAV_SEVERITY.WARNING)
         else:
             say(f"calibration {self._calibration_id:08x}, {calibration.method}")
+            if calibration.doubts:
+                say("calibration is not supported by its data", MAV_SEVERITY.WARNING)
 
     def beginning(self, parameters: Mapping[str, float]) -> list[bytes]:
         """Return the frames that record how the run started, with these values of the parameters."""

@@ -23,9 +23,9 @@ __all__ = ["FORMAT", "calibration_id", "decode_calibration", "encode_calibration
 
 FloatArray = NDArray[np.float64]
 
-FORMAT = 2
+FORMAT = 3
 """Version of the layout; a reader takes this one and all before it. In 1, the noise's
-``autocorrelation`` was called ``memory``."""
+``autocorrelation`` was called ``memory``; 3 adds ``doubts``, and is written only where there are any."""
 
 
 class _File(msgspec.Struct, forbid_unknown_fields=True):
@@ -45,6 +45,7 @@ class _File(msgspec.Struct, forbid_unknown_fields=True):
     boresight: Boresight | None
     runs: tuple[Run, ...]
     inputs: dict[str, str]
+    doubts: tuple[str, ...] = ()
 
 
 class _Version(msgspec.Struct):
@@ -54,7 +55,7 @@ class _Version(msgspec.Struct):
 def encode_calibration(calibration: Calibration) -> bytes:
     """Return `calibration` as JSON, one key a line."""
     content = _File(
-        format=FORMAT,
+        format=FORMAT if calibration.doubts else 2,
         software=calibration.software,
         method=calibration.method,
         sensor=calibration.sensor,
@@ -68,9 +69,11 @@ def encode_calibration(calibration: Calibration) -> bytes:
         boresight=calibration.boresight,
         runs=calibration.runs,
         inputs=calibration.inputs,
+        doubts=calibration.doubts,
     )
     encode = msgspec.json.encode
-    lines = [encode(name) + b": " + encode(getattr(content, name)) for name in _File.__struct_fields__]
+    names = [name for name in _File.__struct_fields__ if name != "doubts" or content.doubts]
+    lines = [encode(name) + b": " + encode(getattr(content, name)) for name in names]
     return b"{\n" + b",\n".join(lines) + b"\n}\n"
 
 
@@ -202,6 +205,7 @@ def _checked(content: _File, terms: tuple[Term, ...], effects: tuple[Term, ...])
         method=content.method,
         inputs=content.inputs,
         software=content.software,
+        doubts=content.doubts,
     )
 
 

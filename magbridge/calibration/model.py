@@ -138,6 +138,8 @@ class Calibration:
         File name -> SHA-256 of what it was made from.
     software : str
         Version that made it.
+    doubts : tuple of str
+        Why the data that it was fitted to do not support it; empty where they do.
     """
 
     parameters: tuple[Parameter, ...]
@@ -153,6 +155,7 @@ class Calibration:
     method: str = ""
     inputs: dict[str, str] = field(default_factory=dict)
     software: str = ""
+    doubts: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         names = tuple(parameter.name for parameter in self.parameters)

@@ -19,6 +19,7 @@ from magbridge.cli.common import (
     app,
     check_inputs,
     complain,
+    doubts_of,
     file_to_write,
     note_losses,
     note_missing,
@@ -194,6 +195,8 @@ def correct(*files: Path, calibration: Path, output: Log, json: Json = False) ->
 
     check_inputs(files, output, calibration)
     known = load(calibration)
+    for doubt in doubts_of(known, calibration):
+        complain(doubt)
     correction = Correction(known)
     rows, flagged, left_out, beyond, whole = 0, 0, 0, 0, False
     pieces: list[dict[str, Any]] = []

@@ -34,6 +34,7 @@ __all__ = [
     "check_inputs",
     "complain",
     "digest",
+    "doubts_of",
     "file_to_write",
     "folder_to_write",
     "note_losses",
@@ -126,6 +127,12 @@ def digest(path: Path) -> str:
     """Return the SHA-256 of a file; a calibration keeps those of the files that it was fitted to."""
     with path.open("rb") as file:
         return file_digest(file, "sha256").hexdigest()
+
+
+def doubts_of(calibration: Calibration, file: Path) -> list[str]:
+    """Return a line that says why the data that a calibration was fitted to do not support it, or none."""
+    doubts = "; ".join(calibration.doubts)
+    return [f"{file}: the data it was fitted to do not support it: {doubts}"] if doubts else []
 
 
 def note_losses(*pieces: Mapping[str, Any]) -> None:

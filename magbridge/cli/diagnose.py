@@ -8,7 +8,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from magbridge.cli.common import Folder, Json, app, check_inputs, complain, digest, note_losses, print_result
+from magbridge.cli.common import (
+    Folder,
+    Json,
+    app,
+    check_inputs,
+    complain,
+    digest,
+    doubts_of,
+    note_losses,
+    print_result,
+)
 from magbridge.progress import waiting
 
 if TYPE_CHECKING:
@@ -65,7 +75,8 @@ def diagnose(
     with waiting("reading") as step:
         logs = [read(path) for path in files]
         note_losses(*(log.attrs for log in logs))
-        remarks = [f"{path}: {ITSELF}" for path in files if digest(path) in known.inputs.values()]
+        remarks = doubts_of(known, calibration)
+        remarks += [f"{path}: {ITSELF}" for path in files if digest(path) in known.inputs.values()]
         remarks += [remark for log in logs for remark in _suspect(log)]
         for remark in remarks:
             complain(remark)

@@ -14,6 +14,7 @@ from magbridge.cli.common import (
     app,
     check_inputs,
     complain,
+    doubts_of,
     note_losses,
     note_missing,
     print_result,
@@ -78,7 +79,7 @@ def navigate(
     if bound:
         _bound(files, map, output, options, known, picture, json)
         return
-    if known is None:
+    if known is None or calibration is None:
         raise WrongUse("expected --calibration, which only --bound can do without")
 
     from magbridge.columns import CHANNELS
@@ -92,6 +93,8 @@ def navigate(
 
     deployment = with_true_heading(read(files, required=CHANNELS), heading_reference)
     note_losses(deployment.attrs)
+    for doubt in doubts_of(known, calibration):
+        complain(doubt)
     note_missing(known, deployment)
     refuse_unsuited(known, deployment)
     corrected = correct_rows(Correction(known), deployment)

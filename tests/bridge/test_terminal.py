@@ -12,9 +12,13 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
+
+from magbridge.calibration.file import save
+from magbridge.calibration.model import identity
 
 CONFIG = """
 [sensor]
@@ -34,6 +38,14 @@ def test_a_terminal_is_told_what_the_link_is(tmp_path: Path, number: signal.Sign
     with on_a_terminal(tmp_path) as (process, terminal):
         read_until(terminal, WANTED)
         process.send_signal(number)
+        assert process.wait(30.0) == 0
+
+
+def test_a_calibration_that_its_data_do_not_support_is_told(tmp_path: Path) -> None:
+    save(replace(identity(), method="nominal", doubts=("few headings",)), tmp_path / "cal.json")
+    with on_a_terminal(tmp_path, '[calibration]\nfile = "cal.json"') as (process, terminal):
+        read_until(terminal, ("calibration is not supported by its data", WANTED[2]))
+        process.terminate()
         assert process.wait(30.0) == 0
 
 

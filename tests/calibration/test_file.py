@@ -78,7 +78,7 @@ def test_round_trip_corrects_with_the_same_bits(cal: Calibration, tmp_path: Path
 
 def test_the_contract_s_keys_are_there(cal: Calibration) -> None:
     content = json.loads(encode_calibration(cal))
-    assert content["format"] == FORMAT
+    assert content["format"] == 2
     assert {
         "sensor", "parameters", "terms", "coefficients", "covariance", "noise", "reference", "boresight",
         "runs", "inputs", "software", "effects",
@@ -92,6 +92,14 @@ def test_an_older_format_is_read(cal: Calibration) -> None:
         noise["memory"] = noise.pop("autocorrelation")
 
     assert encode_calibration(decode_calibration(edit(older, cal))) == encode_calibration(cal)
+
+
+def test_doubts_come_back_and_older_readers_refuse_them(cal: Calibration) -> None:
+    doubtful = replace(cal, doubts=("all headings lie within 60 degrees",))
+    data = encode_calibration(doubtful)
+    assert json.loads(data)["format"] == FORMAT
+    assert decode_calibration(data).doubts == doubtful.doubts
+    assert "doubts" not in json.loads(encode_calibration(cal))  # with the id that it always had
 
 
 def test_another_calibration_has_another_id(cal: Calibration) -> None:

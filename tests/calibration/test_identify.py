@@ -52,7 +52,8 @@ def test_a_fit_from_a_corner_of_the_compass_is_not_supported(glider: Gliders) ->
     turned = np.degrees(runs.attitude[:, 2]) % 360.0
     found = fit(runs.part((turned > 200.0) & (turned < 260.0)), "nominal")
     assert not found.supported
-    assert any("all headings lie within 60 degrees" in warning for warning in found.warnings)
+    assert any("all headings lie within 60 degrees" in doubt for doubt in found.calibration.doubts)
+    assert found.calibration.doubts[-1] in found.warnings[0]
     assert fit(runs, "nominal").supported
 
 

@@ -121,6 +121,28 @@ def test_a_field_that_the_earth_does_not_have_is_said(
         assert (said in capsys.readouterr().err) == bool(iron)
 
 
+def test_what_uses_a_calibration_repeats_that_its_data_do_not_support_it(
+    deployment: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As one of runs that all head one way; `calibrate` says so, too, and ends with 0 without --strict."""
+    one_way, cal, out = tmp_path / "one_way.csv", tmp_path / "cal.json", tmp_path / "out"
+    log = read(deployment)
+    write(log.where((log["heading"] > 200.0) & (log["heading"] < 260.0), drop=True), one_way)
+    fit = ["calibrate", str(one_way), "--method", "nominal", "-o", str(cal)]
+    assert main(fit) == 0
+    why = "all headings lie within 59 degrees"
+    assert why in capsys.readouterr().err
+    assert main([*fit, "--strict"]) == 1
+    capsys.readouterr()
+    use = [str(deployment), "--calibration", str(cal), "-o"]
+    for command in (["correct", *use, f"{out}.nc"], ["diagnose", *use, str(out)]):
+        assert main(command) == 0
+        said = capsys.readouterr().err
+        assert said.startswith(f"magbridge: {cal}: the data it was fitted to do not support it: ")
+        assert why in said.partition("\n")[0]
+    assert why in (out / "report.html").read_text()
+
+
 def test_correct_gives_the_same_in_pieces(deployment: Path, calibration: Path, tmp_path: Path) -> None:
     """A month is corrected in pieces: the state goes on from one to the next."""
     rows = read(deployment)

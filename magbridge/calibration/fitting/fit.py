@@ -61,9 +61,6 @@ class Fit:
         each estimable combination from the data alone (nT).
     samples : Samples
         The data as fitted, for :mod:`.identify`.
-    supported : bool
-        The error expected elsewhere is not large against the noise, and the headings have no wide gap
-        (``--strict`` demands it).
     """
 
     calibration: Calibration
@@ -71,7 +68,14 @@ class Fit:
     warnings: tuple[str, ...]
     details: dict[str, Any]
     samples: Samples
-    supported: bool = True
+
+    @property
+    def supported(self) -> bool:
+        """Whether the calibration is without doubts: ``--strict`` demands it.
+
+        The error expected elsewhere is not large against the noise, and the headings have no wide gap.
+        """
+        return not self.calibration.doubts
 
     @property
     def scales(self) -> tuple[float, float]:
@@ -160,7 +164,7 @@ def _judged(found: Fit, data: Observations) -> Fit:
     if calibration.boresight is None:
         calibration = replace(calibration, boresight=find_boresight(calibration, data))
     ratio = expected_ratio(calibration, data)
-    warnings = list(warnings_for(calibration, data))
+    warnings, doubts = list(warnings_for(calibration, data)), []
     outliers = found.details.get("outliers", 0)
     if outliers > 0.02 * len(data):
         warnings.append(f"{outliers} of {len(data)} samples are outliers and were left out of the fit")
@@ -172,18 +176,18 @@ def _judged(found: Fit, data: Observations) -> Fit:
             "map (--grid)"
         )
     gap = heading_gap(data)
-    if gap > UNSEEN:
-        warnings.insert(
-            0,
-            f"the data do not support this fit: all headings lie within {360.0 - gap:.0f} degrees, and on "
-            "other headings the vehicle's field cannot be told from the Earth's",
-        )
     if ratio > UNSUPPORTED:
-        warnings.insert(
-            0,
-            "the data do not support this fit: at these pitches and positions, on any heading and with 10 "
-            f"degrees more roll, expect {ratio * calibration.noise.sensor:.0f} nT of error",
+        doubts.append(
+            "at these pitches and positions, on any heading and with 10 degrees more roll, expect "
+            f"{ratio * calibration.noise.sensor:.0f} nT of error"
         )
+    if gap > UNSEEN:
+        doubts.append(
+            f"all headings lie within {360.0 - gap:.0f} degrees, and on other headings the vehicle's field "
+            "cannot be told from the Earth's"
+        )
+    if doubts:
+        warnings.insert(0, f"the data do not support this fit: {'; '.join(doubts)}")
     seen = combinations(found.samples, calibration.coefficients, max(calibration.noise.sensor, 1e-9))
     details = {
         **found.details,
@@ -193,10 +197,9 @@ def _judged(found: Fit, data: Observations) -> Fit:
     }
     return replace(
         found,
-        calibration=calibration,
+        calibration=replace(calibration, doubts=tuple(doubts)),
         warnings=tuple(warnings),
         details=details,
-        supported=ratio <= UNSUPPORTED and gap <= UNSEEN,
     )
 
 
