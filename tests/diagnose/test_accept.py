@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from posed import candidate, missed, right
 
 from magbridge.diagnose.accept import _within, accept
 from magbridge.diagnose.causes import CAUSES
-from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.evidence import ODDS
 from magbridge.diagnose.inference.search import search
@@ -19,15 +18,12 @@ from magbridge.diagnose.unexplained.varying import varying
 ROWS = 300
 
 
-def test_names_within_20_to_1_of_a_description_stay(right: Callable[[int], Problem]) -> None:
+def test_names_within_20_to_1_of_a_description_stay() -> None:
     """The name that loses least stays longest, and at 20:1 none is left."""
     t, rng = np.arange(ROWS), np.random.default_rng(8)
     acts = np.sign(np.sin(t / 9.0))
     said = {"a": acts, "like a": acts + 0.1 * rng.normal(size=ROWS), "b": rng.normal(size=ROWS)}
-    candidates = [
-        Candidate(cause, None, x[:, None].__getitem__, np.ones(1), ("b",), ("nT",))
-        for cause, x in said.items()
-    ]
+    candidates = [candidate(cause, x) for cause, x in said.items()]
     outcome = search(replace(right(ROWS), residual=0.5 * acts + rng.normal(size=ROWS)), candidates, 3)
     steps = np.linspace(0.0, ODDS, 30)
     sets = [{rival.cause: rival.behind for rival in _within(outcome, behind)} for behind in steps]
@@ -40,12 +36,12 @@ def test_names_within_20_to_1_of_a_description_stay(right: Callable[[int], Probl
         )
 
 
-def test_a_name_is_asserted_possible_or_ruled_out(right: Callable[[int], Problem]) -> None:
+def test_a_name_is_asserted_possible_or_ruled_out() -> None:
     """A name is worth less the more it was chosen from, but possible until a description beats it 20:1."""
     problem = right(ROWS)
     bent = 8.0 * (problem.survey.field / 5e4).prod(axis=1)
     problem = replace(problem, residual=bent + np.random.default_rng(9).normal(size=ROWS))
-    name = Candidate("a", None, lambda rows: bent[rows, None], np.ones(1), ("b",), ("nT",))
+    name = candidate("a", bent)
     outcome = search(problem, [name], 1)
     said = []
     for price in np.arange(7.0, 15.0) * ODDS:
@@ -57,16 +53,14 @@ def test_a_name_is_asserted_possible_or_ruled_out(right: Callable[[int], Problem
 
 
 @pytest.mark.parametrize(("follows", "named"), [(0.0, True), (0.2, True), (1.0, False)])
-def test_a_name_whose_size_follows_something_else_is_not_asserted(
-    right: Callable[[int], Problem], follows: float, named: bool
-) -> None:
+def test_a_name_whose_size_follows_something_else_is_not_asserted(follows: float, named: bool) -> None:
     """A payload's current at S/N 14 or more, its leads drawn apart by a moving mass."""
     problem, rng = right(ROWS), np.random.default_rng(10)
     drawn = np.where(np.sin(np.arange(ROWS) / 3.0) > 0.3, 1.0, 0.0)
     place = problem.survey.channels["p"].values
     away = drawn * (1.0 + follows * place / np.std(place[drawn > 0.0]))
     problem = replace(problem, residual=1.5 * away + rng.normal(size=ROWS))
-    name = Candidate("a", "amps", lambda rows: drawn[rows, None], np.ones(1), ("b",), ("nT",))
+    name = candidate("a", drawn, channel="amps")
     outcome = search(problem, [name], 1)
     assert [h.candidate for h in outcome.chosen] == [name]
     assert accept(problem, outcome, None)[0] == named
@@ -82,13 +76,10 @@ def test_the_size_of_a_cause_may_follow_all_but_its_own_channel(problem: Problem
     X = described.columns(rows)
     assert X.shape[1] == described.widths[0][1].size
 
-    def left(y: np.ndarray) -> float:
-        return float(np.sum((y - X @ np.linalg.lstsq(X, y, rcond=None)[0]) ** 2) / (y @ y))
-
     own = squeezed.columns(rows)[:, 0]
-    assert left(own * (2.0 - survey.attitude[:, 1])) < 1e-9
-    assert left(own * np.cos(np.radians(survey.attitude[:, 2]))) < 1e-9
-    assert left(own * survey.channels["depth"].values ** 2) > 1e-3
+    assert missed(own * (2.0 - survey.attitude[:, 1]), X) < 1e-9
+    assert missed(own * np.cos(np.radians(survey.attitude[:, 2])), X) < 1e-9
+    assert missed(own * survey.channels["depth"].values ** 2, X) > 1e-3
     assert described.covers([squeezed])
     slow = replace(squeezed, spectra=np.ones((1, squeezed.size)))
     assert varying(problem, slow, {"pressure_offset": 2.0}) is None

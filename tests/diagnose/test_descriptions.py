@@ -6,6 +6,7 @@ import tracemalloc
 
 import numpy as np
 import pytest
+from posed import missed
 from scipy.stats import multivariate_normal
 
 from magbridge.calibration.fitting.fit import fit
@@ -80,14 +81,12 @@ def test_a_feedback_that_falters_at_zero_is_described(width: float) -> None:
     X = crossing(reading, np.eye(3)[np.zeros(len(x), dtype=int)].__getitem__)(slice(None))
     gain = np.column_stack([np.ones_like(x), x])
     X, y = (a - gain @ np.linalg.lstsq(gain, a, rcond=None)[0] for a in (X, dead[:, 0]))
-    left = y - X @ np.linalg.lstsq(X, y, rcond=None)[0]
-    assert left @ left < 0.1 * y @ y
+    assert missed(y, X) < 0.1
 
 
 def left_of(y: np.ndarray, X: np.ndarray) -> float:
     """Share of the power of y (n,) that the columns X (n, k) and a constant do not hold."""
-    X, y = X - X.mean(axis=0), y - y.mean()
-    return float(np.sum((y - X @ np.linalg.lstsq(X, y, rcond=None)[0]) ** 2) / (y @ y))
+    return missed(y - y.mean(), X - X.mean(axis=0))
 
 
 def followed(time: np.ndarray, x: np.ndarray, lag: float) -> np.ndarray:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from posed import right
 from scipy.sparse import csr_array
 
 from magbridge.diagnose.compare.design_columns import (
@@ -18,7 +17,6 @@ from magbridge.diagnose.compare.design_columns import (
     times,
     together,
 )
-from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference import design
 from magbridge.diagnose.inference.information import information
 from magbridge.diagnose.inference.joint import fit_joint
@@ -61,7 +59,7 @@ def test_coefficients_leave_the_same_without_their_columns(table: FloatArray) ->
     np.testing.assert_allclose(times(whole, ROWS, c), shown[ROWS] @ c)
 
 
-def test_strangers_say_what_they_say_among_others(right: Callable[[int], Problem]) -> None:
+def test_strangers_say_what_they_say_among_others() -> None:
     problem, made = right(400), np.random.default_rng(2).normal(size=(400, 7))
     one, other, model = (made[:, own].__getitem__ for own in (slice(3), slice(3, 5), slice(5, 7)))
     columns: list[Columns] = [

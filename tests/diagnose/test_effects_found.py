@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from posed import FIELD, T0, calibrated, surveyed, walk
 
 from magbridge.calibration.correct import Corrector, correct
 from magbridge.calibration.effects import ChannelEffect
@@ -19,16 +20,13 @@ from magbridge.calibration.mass_effects import (
     PowersEffect,
     SourcesEffect,
 )
-from magbridge.calibration.model import Calibration, Noise, Parameter, Reference
+from magbridge.calibration.model import Calibration
 from magbridge.calibration.residual import residuals
-from magbridge.calibration.terms import Effect, Polynomial
-from magbridge.diagnose.compare.past import FAR
+from magbridge.calibration.terms import Effect
 from magbridge.diagnose.compare.problem import add_effects, effect_columns, history, pose, samples_of
 from magbridge.diagnose.compare.survey import Channel, Survey
 from magbridge.errors import FormatError
 
-FIELD = 50_000.0
-T0 = 1.7e9
 EFFECTS: list[Effect] = [
     ChannelEffect(cause="temperature_offset", channel="heat", origin=3.0, lag=200.0, stages=2),
     ChannelEffect(cause="temperature_scale", channel="heat", origin=3.0, lag=50.0, on="scale"),
@@ -53,18 +51,11 @@ EFFECTS: list[Effect] = [
 def survey() -> Survey:
     rng = np.random.default_rng(5)
     n = 300
-    t = T0 + 4.0 * np.arange(float(n))
-    d = rng.normal(size=(n, 3)).cumsum(axis=0) * 0.1 + [0.3, 0.1, 0.9]
-    field = FIELD * d / np.linalg.norm(d, axis=1)[:, None] + [300.0, -200.0, 500.0]
-    p = np.sin(np.arange(n) / 20.0)
-    heat = 3.0 + rng.normal(size=n).cumsum() * 0.1
-    steps = np.where(np.arange(n) > 0, 1, FAR)
-    return Survey(
-        time=t, field=field, reference=np.full(n, FIELD), still=(), steps=steps, dive=np.arange(n) // 50,
-        place=None,
-        channels={"p": Channel(p, "in", ("position",)), "heat": Channel(heat, "degC", ("temperature",))},
-        attitude=None, learned=np.zeros(n, bool), cycles=np.empty(0), source="made",
-    )  # fmt: skip
+    plain = surveyed(walk(n, rng), np.sin(np.arange(n) / 20.0))
+    heat = Channel(3.0 + rng.normal(size=n).cumsum() * 0.1, "degC", ("temperature",))
+    return replace(
+        plain, field=plain.field + np.array([300.0, -200.0, 500.0]), channels=plain.channels | {"heat": heat}
+    )
 
 
 @pytest.fixture(scope="module")
@@ -72,15 +63,7 @@ def calibration() -> Calibration:
     rng = np.random.default_rng(6)
     coefficients = rng.normal(0, 100.0, 27)
     coefficients[6:9] = [300.0, -200.0, 500.0]
-    return Calibration(
-        parameters=(Parameter("p", "in", -1.0, 1.0, 0.0, 1.0),),
-        terms=(Polynomial(exponents=((0,), (1,), (2,))),),
-        coefficients=coefficients,
-        covariance=np.diag(np.full(27, 4.0)),
-        noise=Noise(1.0),
-        reference=Reference(FIELD),
-        method="made",
-    )
+    return calibrated(coefficients)
 
 
 def with_values(calibration: Calibration, effect: Effect, values: np.ndarray) -> Calibration:

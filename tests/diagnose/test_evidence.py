@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from posed import candidate
 from scipy.stats import chi2
 
 from magbridge.diagnose.causes.candidates import Candidate, slices
@@ -11,13 +12,9 @@ from magbridge.diagnose.inference.evidence import LEVEL, evidence_of, log_bayes,
 from magbridge.diagnose.inference.information import Information
 
 
-def candidate(
-    cause: str, size: int = 1, *, positive: bool = False, spectra: np.ndarray | None = None
-) -> Candidate:
-    return Candidate(
-        cause, None, lambda rows: np.zeros((rows.stop - rows.start, size)), np.ones(size), ("b",) * size,
-        ("nT",) * size, positive=positive, spectra=spectra,
-    )  # fmt: skip
+def sized(cause: str, size: int = 1, **more: object) -> Candidate:
+    """A candidate of so many coefficients."""
+    return candidate(cause, np.zeros((1, size)), **more)
 
 
 def test_what_cannot_be_negative_has_twice_the_prior_where_it_is() -> None:
@@ -27,7 +24,7 @@ def test_what_cannot_be_negative_has_twice_the_prior_where_it_is() -> None:
     b = np.linspace(0.0, 12.0, 20_001)
     prior = np.sqrt(2.0 / np.pi) / size * np.exp(-0.5 * (b / size) ** 2)
     exact = np.log(np.trapezoid(prior * np.exp(b * estimate - 0.5 * b**2), b))
-    one_sided = evidence_of(candidate("filter_lag", positive=True), estimate**2, 1)
+    one_sided = evidence_of(sized("filter_lag", positive=True), estimate**2, 1)
     assert one_sided == pytest.approx(exact, abs=0.06)
     assert one_sided - log_bayes(estimate**2, 1) == pytest.approx(np.log(2.0), abs=0.05)
 
@@ -35,8 +32,8 @@ def test_what_cannot_be_negative_has_twice_the_prior_where_it_is() -> None:
 @pytest.mark.parametrize(
     ("one", "least"),
     [
-        (candidate("filter_lag", positive=True), 0.08),
-        (candidate("map_error", 6, spectra=np.array([np.ones(6), 2.0 ** -np.arange(6)])), 0.0),
+        (sized("filter_lag", positive=True), 0.08),
+        (sized("map_error", 6, spectra=np.array([np.ones(6), 2.0 ** -np.arange(6)])), 0.0),
     ],
 )
 def test_a_size_that_cannot_be_negative_has_one_tail(one: Candidate, least: float) -> None:
@@ -48,13 +45,13 @@ def test_a_size_that_cannot_be_negative_has_one_tail(one: Candidate, least: floa
 
 
 def test_numbers_of_one_size_are_not_weighed_twice() -> None:
-    one = candidate("map_error", 40, spectra=np.ones((4, 40)))
+    one = sized("map_error", 40, spectra=np.ones((4, 40)))
     assert evidence_of(one, 30.0, 1) == pytest.approx(15.0 - np.log(4.0))
     assert log_odds(30.0, [one], {"map_error": 1.0}, 0.0) == pytest.approx(evidence_of(one, 30.0, 1))
 
 
 def test_a_second_regressor_pays_for_its_choice_and_for_the_odds() -> None:
-    model = [candidate("clock_offset"), candidate("reference_bias")]
+    model = [sized("clock_offset"), sized("reference_bias")]
     trials = {"clock_offset": 1.0, "reference_bias": 3.0}
     price = log_bayes(200.0, 2) - log_odds(200.0, model, trials, 200.0)
     assert price == pytest.approx(np.log(20.0 * 2.0 * 3.0))
@@ -62,7 +59,7 @@ def test_a_second_regressor_pays_for_its_choice_and_for_the_odds() -> None:
 
 def test_a_map_that_is_wrong_makes_no_size_of_the_vehicles_likelier() -> None:
     """What takes any shape has a prior of its own: beside it a cause is worth what it is alone."""
-    step, chart = candidate("offset_step", 3), candidate("map_error", 6, spectra=np.ones((1, 6)))
+    step, chart = sized("offset_step", 3), sized("map_error", 6, spectra=np.ones((1, 6)))
     trials = {"offset_step": 1.0, "map_error": 1.0}
     worth = log_odds(225.0, [step, chart], trials, 25.0) - log_odds(200.0, [chart], trials, 0.0)
     assert worth == pytest.approx(log_bayes(25.0, 3) - np.log(20.0 * 2.0))
@@ -70,7 +67,7 @@ def test_a_map_that_is_wrong_makes_no_size_of_the_vehicles_likelier() -> None:
 
 def counted(S: np.ndarray, sizes: list[int]) -> float:
     """Independent hypotheses behind one cause."""
-    grid = [candidate("hysteresis", size) for size in sizes]
+    grid = [sized("hysteresis", size) for size in sizes]
     info = Information(S, np.zeros(len(S)), np.zeros((0, len(S))))
     return trials(info, grid, slices(grid))["hysteresis"]
 

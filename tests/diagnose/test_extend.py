@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+from posed import candidate, right
 from scipy.linalg import inv
 
 from magbridge.calibration.correct import correct
@@ -24,15 +24,9 @@ from magbridge.diagnose.inference.joint import Joint, fit_joint
 from magbridge.diagnose.report.doubts import unsettled
 
 
-def candidate(size: int) -> Candidate:
-    return Candidate(
-        "current_field",
-        "amps",
-        lambda rows: np.zeros((len(range(*rows.indices(9))), size)),
-        np.ones(size),
-        ("x", "y", "z")[:size],
-        ("nT",) * size,
-    )
+def current(size: int) -> Candidate:
+    """A cause of so many numbers."""
+    return candidate("current_field", np.zeros((9, size)), channel="amps")
 
 
 def fit(coefficients: np.ndarray, calibration: int = 4) -> Joint:
@@ -45,7 +39,7 @@ def fit(coefficients: np.ndarray, calibration: int = 4) -> Joint:
 
 def test_a_misfit_grows_with_the_effect_and_points_anywhere() -> None:
     before = fit(np.array([3.0, 0.0, 0.0]))
-    after = with_misfit([candidate(3)], before)
+    after = with_misfit([current(3)], before)
     own = slice(4, 7)
     wald = before.coefficients @ np.linalg.solve(before.covariance[own, own], before.coefficients)
     np.testing.assert_allclose(
@@ -61,19 +55,19 @@ def test_a_misfit_grows_with_the_effect_and_points_anywhere() -> None:
 
 def test_what_is_hardly_seen_is_hardly_widened() -> None:
     before = fit(np.array([1e-3, 0.0]))
-    np.testing.assert_allclose(with_misfit([candidate(2)], before).covariance, before.covariance, rtol=1e-4)
+    np.testing.assert_allclose(with_misfit([current(2)], before).covariance, before.covariance, rtol=1e-4)
 
 
 def test_two_causes_are_widened_each_by_its_own() -> None:
     before = fit(np.array([2.0, 0.0, 0.0, 0.0]))
-    after = with_misfit([candidate(1), candidate(3)], before)
+    after = with_misfit([current(1), current(3)], before)
     np.testing.assert_allclose(
         after.covariance[5:, 5:] @ np.ones(3),
-        with_misfit([candidate(1)], before).covariance[5:, 5:] @ np.ones(3),
+        with_misfit([current(1)], before).covariance[5:, 5:] @ np.ones(3),
     )
 
 
-def test_a_calibration_from_turns_is_freed_of_a_filters_attenuation(right: Callable[[int], Problem]) -> None:
+def test_a_calibration_from_turns_is_freed_of_a_filters_attenuation() -> None:
     """Runs turn in five minutes, the survey in an hour; what the runs lost has gone into the gain."""
     rng, tau = np.random.default_rng(5), 1.5
     leg, row = np.divmod(np.arange(1600), 100)
@@ -133,12 +127,12 @@ def skewed(whole: Problem, period: float) -> tuple[Survey, Calibration]:
     return survey, calibration
 
 
-def test_a_rate_is_flown_with_where_a_difference_backwards_tells_it(right: Callable[[int], Problem]) -> None:
+def test_a_rate_is_flown_with_where_a_difference_backwards_tells_it() -> None:
     survey, calibration = skewed(right(300), 200.0)
     assert flyable(survey, calibration) is calibration
 
 
-def test_a_rate_that_is_noise_live_is_left_out(right: Callable[[int], Problem]) -> None:
+def test_a_rate_that_is_noise_live_is_left_out() -> None:
     """A sway of two and a half samples."""
     survey, calibration = skewed(right(300), 10.0)
     calm = flyable(survey, calibration)
@@ -154,7 +148,7 @@ def test_what_was_let_go_is_made_again(problem: Problem) -> None:
     np.testing.assert_array_equal(problem.free, before)
 
 
-def test_what_has_come_since_is_not_in_the_calibrations_logs(right: Callable[[int], Problem]) -> None:
+def test_what_has_come_since_is_not_in_the_calibrations_logs() -> None:
     """A field that bends the magnitude, in the second half alone: linearised anew, it is what it is."""
     whole = right(300)
     learned, there = np.arange(300) < 150, np.array([900.0, -600.0, 300.0])
@@ -171,13 +165,11 @@ def test_what_has_come_since_is_not_in_the_calibrations_logs(right: Callable[[in
     np.testing.assert_allclose(settled.left, 0.0, atol=0.5)
 
 
-def test_a_maps_error_is_in_the_level_of_what_was_fitted_to_the_same_map(
-    right: Callable[[int], Problem],
-) -> None:
+def test_a_maps_error_is_in_the_level_of_what_was_fitted_to_the_same_map() -> None:
     """A map that is 30 nT off along the track: half of it may be its mean."""
     whole = right(300)
     wave = 30.0 * np.sqrt(2.0) * np.sin(0.1 * np.arange(300))
-    chart = Candidate("map_error", None, lambda rows: wave[rows, None], np.ones(1), ("function 1",), ("nT",))
+    chart = candidate("map_error", wave)
     found = fit_joint(replace(whole, residual=whole.residual + wave), [chart.columns], 1)
     new, seen = (
         replace(whole, survey=replace(whole.survey, learned=np.full(300, learned)))
@@ -193,7 +185,7 @@ def test_a_maps_error_is_in_the_level_of_what_was_fitted_to_the_same_map(
     np.testing.assert_allclose(np.sqrt(after**2 - before**2), 15.0, rtol=0.02)
 
 
-def test_a_rate_that_is_there_twice_is_left_out_twice(right: Callable[[int], Problem]) -> None:
+def test_a_rate_that_is_there_twice_is_left_out_twice() -> None:
     """A cause may need more than one term, and two rates are equal: each takes its own coefficients along."""
     survey, calibration = skewed(right(300), 10.0)
     skew, step = calibration.effects

@@ -6,13 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from posed import calibrated, surveyed, walk
 from scipy.stats import multivariate_normal
 
-from magbridge.calibration.model import Calibration, Noise, Parameter, Reference
-from magbridge.calibration.terms import Polynomial
 from magbridge.diagnose.compare.past import FAR
 from magbridge.diagnose.compare.problem import Problem, pose
-from magbridge.diagnose.compare.survey import Channel, Survey
 from magbridge.diagnose.gain import held_out
 from magbridge.diagnose.inference.joint import Joint, fit_joint
 
@@ -24,25 +22,10 @@ def problem() -> Problem:
     """Five dives of turning, as calibrated but for 1 nT of noise."""
     rng = np.random.default_rng(4)
     n = 40 * DIVES
-    d = rng.normal(size=(n, 3)).cumsum(axis=0) * 0.1 + [0.3, 0.1, 0.9]
-    field = 5e4 * d / np.linalg.norm(d, axis=1)[:, None]
-    p = np.sin(np.arange(n) / 9.0)
-    survey = Survey(
-        time=1.7e9 + 4.0 * np.arange(float(n)), field=field + rng.normal(size=(n, 3)),
-        reference=np.full(n, 5e4), still=(), steps=np.where(np.arange(n) % 40 > 0, 1, FAR),
-        dive=np.arange(n) // 40, place=None, attitude=None, learned=np.zeros(n, bool),
-        cycles=np.empty(0), source="made",
-        channels={"p": Channel(p, "in", ("position",))},
-    )  # fmt: skip
-    calibration = Calibration(
-        parameters=(Parameter("p", "in", -1.0, 1.0, 0.0, 1.0),),
-        terms=(Polynomial(exponents=((0,), (1,))),),
-        coefficients=np.zeros(18),
-        covariance=np.diag(np.full(18, 4.0)),
-        noise=Noise(1.0),
-        reference=Reference(5e4),
-    )
-    return pose(survey, calibration)
+    steps, dive = np.where(np.arange(n) % 40 > 0, 1, FAR), np.arange(n) // 40
+    survey = surveyed(walk(n, rng), np.sin(np.arange(n) / 9.0), steps=steps, dive=dive)
+    noisy = replace(survey, field=survey.field + rng.normal(size=(n, 3)))
+    return pose(noisy, calibrated(np.zeros(18)))
 
 
 def gaussian(fit: Joint) -> Joint:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+from posed import right
 
 from magbridge.diagnose.causes.time_dependent import offset_drift
 from magbridge.diagnose.causes.timing import channel_skew
@@ -44,7 +44,7 @@ def made(whole: Problem, field: np.ndarray, seed: int) -> Survey:
     return replace(whole.survey, field=field + noise, reference=np.full(len(field), 5e4))
 
 
-def test_a_line_leaves_its_delay_times_what_it_is_bent_by(right: Callable[[int], Problem]) -> None:
+def test_a_line_leaves_its_delay_times_what_it_is_bent_by() -> None:
     survey = right(400).survey
     error = interpolated(survey.time) - swaying(survey.time)
     expected = TAKEN * interpolation_error(survey, swaying(survey.time).T).T
@@ -53,7 +53,7 @@ def test_a_line_leaves_its_delay_times_what_it_is_bent_by(right: Callable[[int],
         assert np.sum((error - expected)[inside, k] ** 2) < 0.02 * np.sum(error[inside, k] ** 2)
 
 
-def test_the_delays_are_found(right: Callable[[int], Problem]) -> None:
+def test_the_delays_are_found() -> None:
     """All but what they share: a field of one size does not see a vector that is late."""
     whole = right(3000)
     time = whole.survey.time
@@ -65,7 +65,7 @@ def test_the_delays_are_found(right: Callable[[int], Problem]) -> None:
     np.testing.assert_allclose(stated, found[1:], atol=1e-3)
 
 
-def test_the_delays_stay_where_the_comparison_is_linearised_anew(right: Callable[[int], Problem]) -> None:
+def test_the_delays_stay_where_the_comparison_is_linearised_anew() -> None:
     """A calibration that is extended by another cause has no delays."""
     whole = right(3000)
     time = whole.survey.time
@@ -75,7 +75,7 @@ def test_the_delays_stay_where_the_comparison_is_linearised_anew(right: Callable
     np.testing.assert_allclose(DELAY * (fit.z[DELAYS] - fit.z[DELAYS][0]), TAKEN, atol=0.03)
 
 
-def test_channels_taken_at_once_have_none(right: Callable[[int], Problem]) -> None:
+def test_channels_taken_at_once_have_none() -> None:
     whole = right(3000)
     problem = pose(made(whole, swaying(whole.survey.time), 2), whole.calibration)
     fit = fit_joint(problem, [], 1)
@@ -85,7 +85,7 @@ def test_channels_taken_at_once_have_none(right: Callable[[int], Problem]) -> No
     assert not late(problem, fit)
 
 
-def test_delays_that_are_not_there_leave_a_skew_its_power(right: Callable[[int], Problem]) -> None:
+def test_delays_that_are_not_there_leave_a_skew_its_power() -> None:
     """But where noise looks like them."""
     whole = right(3000)
 

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+from posed import right
 
-from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.joint import fit_joint
 
 ROWS = 300
 
 
-def test_numbers_of_one_size_that_say_the_same_share_what_they_say(right: Callable[[int], Problem]) -> None:
+def test_numbers_of_one_size_that_say_the_same_share_what_they_say() -> None:
     """Two causes with a common size each, a column double or empty: only their sizes keep them apart."""
     rng = np.random.default_rng(4)
     a, b = np.sin(np.arange(ROWS) / 7.0), np.sign(np.sin(np.arange(ROWS) / 40.0))

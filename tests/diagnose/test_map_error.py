@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from posed import right
 
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.causes.map_error import map_error
@@ -42,7 +42,7 @@ def flown(altitude: float) -> NDArray[np.float64]:
     return found
 
 
-def test_what_a_map_as_flown_lacks_grows_with_depth(right: Callable[[int], Problem]) -> None:
+def test_what_a_map_as_flown_lacks_grows_with_depth() -> None:
     """Without the depths, one place has two errors."""
     missing, left = flown(90.0), []
     for down in (DOWN, np.zeros(N)):
@@ -52,7 +52,7 @@ def test_what_a_map_as_flown_lacks_grows_with_depth(right: Callable[[int], Probl
 
 
 @pytest.mark.parametrize("altitude", [60.0, 100.0, 150.0])
-def test_the_mean_of_what_a_map_lacks_is_known(right: Callable[[int], Problem], altitude: float) -> None:
+def test_the_mean_of_what_a_map_lacks_is_known(altitude: float) -> None:
     """The growth with depth tells it from a constant."""
     missing = flown(altitude)
     problem = drawn(right(N), missing + 40.0, DOWN)
@@ -63,7 +63,7 @@ def test_the_mean_of_what_a_map_lacks_is_known(right: Callable[[int], Problem], 
     assert abs(error.mean() - missing.mean()) < 0.2 * np.sqrt(np.mean(missing**2))
 
 
-def test_what_is_drawn_wrong_is_the_same_at_every_depth(right: Callable[[int], Problem]) -> None:
+def test_what_is_drawn_wrong_is_the_same_at_every_depth() -> None:
     wrong = 30.0 * np.exp(-0.5 * ((NORTH - 900.0) / 400.0) ** 2)
     problem = drawn(right(N), wrong, DOWN)
     _, chart = map_error(problem)

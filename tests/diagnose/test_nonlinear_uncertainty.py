@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from posed import candidate, right
 
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.compare.problem import Problem
@@ -21,20 +21,17 @@ ROWS, LAG, CELL = 300, 60.0, 40.0
 def decay(lag: float) -> Candidate:
     """What decays, of a size and a lag that nobody knows."""
     x = np.exp(-np.arange(ROWS) / lag)
-    return Candidate(
-        "made", None, lambda rows: x[rows, None], np.ones(1), ("size",), ("nT",),
-        shape={"lag": (lag, "s")}, again=decay, cells=(CELL,),
-    )  # fmt: skip
+    return candidate("made", x, shape={"lag": (lag, "s")}, again=decay, cells=(CELL,))
 
 
 @pytest.fixture(scope="module")
-def problem(right: Callable[[int], Problem]) -> Problem:
+def problem() -> Problem:
     noise = np.random.default_rng(6).normal(size=ROWS)
     return replace(right(ROWS), residual=9.0 * np.exp(-np.arange(ROWS) / LAG) + noise)
 
 
 def fitted(problem: Problem, *model: Candidate) -> Joint:
-    return fit_joint(problem, [candidate.columns for candidate in model], 1)
+    return fit_joint(problem, [one.columns for one in model], 1)
 
 
 def test_the_covariance_is_that_of_a_fit_in_which_the_lag_is_free(problem: Problem) -> None:
@@ -71,13 +68,10 @@ def test_parts_of_one_cause_have_each_their_own(problem: Problem) -> None:
 def step(onset: float) -> Candidate:
     """What begins, nobody knows when."""
     x = (np.arange(ROWS) >= onset).astype(float)
-    return Candidate(
-        "made", None, lambda rows: x[rows, None], np.ones(1), ("size",), ("nT",),
-        shape={"onset": (onset, "s")}, again=step, cells=(4.0,),
-    )  # fmt: skip
+    return candidate("made", x, shape={"onset": (onset, "s")}, again=step, cells=(4.0,))
 
 
-def test_other_peaks_of_the_likelihood_count_by_their_evidence(right: Callable[[int], Problem]) -> None:
+def test_other_peaks_of_the_likelihood_count_by_their_evidence() -> None:
     """Against the mixture of fits at every onset: a small one early or a large one late explain the same.
 
     Beside them is another cause, which gives way to each by as much as it must.
@@ -101,7 +95,7 @@ def test_other_peaks_of_the_likelihood_count_by_their_evidence(right: Callable[[
         for w, d, one in zip(weight, apart, fits, strict=True)
     )
     model = [beside, grid[best]]
-    found = loosened(problem, model, [candidate.columns for candidate in model], fit, grid).covariance
+    found = loosened(problem, model, [one.columns for one in model], fit, grid).covariance
     # each of those fits has noise of its own, so that weights differ a little
     units = np.sqrt(np.outer(np.diag(found), np.diag(found)))
     np.testing.assert_allclose(found / units, (fit.covariance + more) / units, atol=0.15)

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from copy import copy
 from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
+from posed import candidate, right
 
 from magbridge.diagnose.causes.candidates import Candidate
-from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.evidence import LEVEL, score
 from magbridge.diagnose.inference.exchange import _separate, exchanged
 from magbridge.diagnose.inference.pairs import pairs_of
@@ -21,16 +19,10 @@ from magbridge.diagnose.inference.rounds import State
 from magbridge.diagnose.inference.search import _backward_elimination
 
 ROWS = 600
-Array = NDArray[np.float64]
-
-
-def of(cause: str, *columns: Array, **more: object) -> Candidate:
-    X, k = np.column_stack(columns), len(columns)
-    return Candidate(cause, None, lambda rows: X[rows], np.ones(k), ("b",) * k, ("nT",) * k, **more)  # type: ignore[arg-type]
 
 
 @pytest.fixture(scope="module")
-def state(right: Callable[[int], Problem]) -> State:
+def state() -> State:
     """Two causes that act, one that looks like both, one like the first, and a stranger."""
     rng, t = np.random.default_rng(5), np.arange(ROWS)
     a, b = np.sin(t / 7.0), np.sign(np.sin(t / 40.0))
@@ -41,8 +33,9 @@ def state(right: Callable[[int], Problem]) -> State:
         rng.normal(size=(2, ROWS)),
     )
     candidates = [
-        of("a", a), of("b", b, positive=True), of("both", both), of("alike", alike),
-        of("other", *other), of("series", *rng.normal(size=(4, ROWS)), spectra=np.ones((1, 4))),
+        candidate("a", a), candidate("b", b, positive=True), candidate("both", both),
+        candidate("alike", alike), candidate("other", other.T),
+        candidate("series", rng.normal(size=(4, ROWS)).T, spectra=np.ones((1, 4))),
     ]  # fmt: skip
     found = State(problem, candidates, 1, 6)
     found.null = found.fit([])
@@ -77,7 +70,7 @@ def test_all_pairs_at_once_are_one_after_the_other(state: State) -> None:
 def test_two_take_the_place_of_one_that_had_swallowed_both(state: State) -> None:
     alone = [state.candidates[2]]
     model, base = exchanged(state, alone, state.fit(alone))
-    assert {candidate.cause for candidate in model} == {"a", "b"}
+    assert {one.cause for one in model} == {"a", "b"}
     assert state.value(model, base) > state.value(alone, state.fit(alone))
 
 

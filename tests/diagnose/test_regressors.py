@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from posed import calibrated, missed, right, surveyed, thinned, walk
 
 from magbridge.calibration.effects import ChannelEffect
 from magbridge.calibration.mass_effects import MonomialEffect, PlayEffect, PowersEffect, SourcesEffect
-from magbridge.calibration.model import Calibration, Noise, Parameter, Reference
+from magbridge.calibration.model import Parameter
 from magbridge.calibration.terms import Polynomial
 from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.causes.masses import actuator_order
@@ -20,7 +20,7 @@ from magbridge.diagnose.causes.timing import field_rates, mass_rates
 from magbridge.diagnose.compare.interpolation import rates
 from magbridge.diagnose.compare.past import FAR
 from magbridge.diagnose.compare.problem import Problem, effect_columns, history, pose
-from magbridge.diagnose.compare.survey import Channel, Survey
+from magbridge.diagnose.compare.survey import Channel
 
 
 @pytest.fixture(scope="module")
@@ -30,30 +30,19 @@ def problem() -> Problem:
     n = 450
     t = 1.7e9 + 4.0 * np.arange(float(n)) + np.where(np.arange(n) > 300, 500.0, 0.0)
     t[200:204] += rng.uniform(-0.5, 0.5, 4)
-    d = rng.normal(size=(n, 3)).cumsum(axis=0) * 0.1 + [0.3, 0.1, 0.9]
+    directions = walk(n, rng)
     p = np.interp(
         np.arange(n), [0, 60, 70, 150, 160, 300, 310, 449], [-0.5, -0.5, 0.8, 0.8, -1.0, -1.0, 0.6, 0.6]
     )
     warm = 3.0 + rng.normal(size=n).cumsum() * 0.1
     amps = np.where(rng.uniform(size=n) > 0.7, 1.3, 0.0)
-    survey = Survey(
-        time=t, field=5e4 * d / np.linalg.norm(d, axis=1)[:, None], reference=np.full(n, 5e4), still=(),
-        steps=np.append(FAR, np.rint(np.diff(t) / 4.0).astype(int)), dive=np.arange(n) // 50, place=None,
-        attitude=None, learned=np.zeros(n, bool), cycles=np.empty(0), source="made",
-        channels={
-            "p": Channel(p, "in", ("position",)), "fin": Channel(p[::-1].copy(), "deg", ("position",)),
-            "warm": Channel(warm, "degC", ("temperature",)), "amps": Channel(amps, "A", ("current",)),
-        },
-    )  # fmt: skip
-    calibration = Calibration(
-        parameters=(Parameter("p", "in", -1.0, 1.0, 0.1, 0.9),),
-        terms=(Polynomial(exponents=((0,), (1,), (2,))),),
-        coefficients=rng.normal(0, 50.0, 27),
-        covariance=np.diag(np.full(27, 4.0)),
-        noise=Noise(1.0),
-        reference=Reference(5e4),
-    )
-    return pose(survey, calibration)
+    channels = {
+        "p": Channel(p, "in", ("position",)), "fin": Channel(p[::-1].copy(), "deg", ("position",)),
+        "warm": Channel(warm, "degC", ("temperature",)), "amps": Channel(amps, "A", ("current",)),
+    }  # fmt: skip
+    steps = np.append(FAR, np.rint(np.diff(t) / 4.0).astype(int))
+    survey = surveyed(directions, p, time=t, steps=steps, channels=channels)
+    return pose(survey, calibrated(rng.normal(0, 50.0, 27), centre=0.1, scale=0.9))
 
 
 FOLLOWERS = (ChannelEffect, PowersEffect, MonomialEffect, PlayEffect, SourcesEffect)
@@ -89,9 +78,7 @@ def test_columns_in_pieces_are_the_columns(problem: Problem) -> None:
 
 
 @pytest.mark.parametrize("share", [0.05, 0.125])
-def test_a_rate_of_change_is_the_whole_logs_where_samples_are_lost(
-    right: Callable[[int], Problem], thinned: Callable[..., Survey], share: float
-) -> None:
+def test_a_rate_of_change_is_the_whole_logs_where_samples_are_lost(share: float) -> None:
     """And holds no more of its own noise than by chance, as a one-sided difference would."""
     whole, rng = right(3000), np.random.default_rng(2)
     survey = whole.survey
@@ -111,7 +98,7 @@ def test_a_rate_of_change_is_the_whole_logs_where_samples_are_lost(
     assert abs(own) < 0.05 * len(found) / whole.survey.interval
 
 
-def test_a_rate_of_change_holds_a_turn_of_a_few_samples(right: Callable[[int], Problem]) -> None:
+def test_a_rate_of_change_holds_a_turn_of_a_few_samples() -> None:
     """Six of them: a difference both ways lacks a sixth."""
     whole = right(300)
     phase = 2.0 * np.pi * np.arange(len(whole))[:, None] / 6.0 + np.arange(3.0)
@@ -122,7 +109,7 @@ def test_a_rate_of_change_holds_a_turn_of_a_few_samples(right: Callable[[int], P
     assert not found[[0, -1]].any()
 
 
-def test_a_second_derivative_is_that_of_a_turn(right: Callable[[int], Problem]) -> None:
+def test_a_second_derivative_is_that_of_a_turn() -> None:
     """Of 30 samples; in a leg of its own, whose ends have none."""
     survey = right(300).survey
     phase = 2.0 * np.pi * np.arange(len(survey)) / 30.0 + np.arange(3.0)[:, None]
@@ -132,7 +119,7 @@ def test_a_second_derivative_is_that_of_a_turn(right: Callable[[int], Problem]) 
     assert not found[:, [0, -1]].any()
 
 
-def test_a_filter_shortens_a_field_that_turns(right: Callable[[int], Problem]) -> None:
+def test_a_filter_shortens_a_field_that_turns() -> None:
     """By an RC filter's steady answer. Without the calibration's own runs no such cause is put forward."""
     whole, tau, period = right(300), 1.5, 240.0
     phase, steepness = 2.0 * np.pi * whole.survey.time / period, np.arctan(2.0 * np.pi * tau / period)
@@ -236,12 +223,11 @@ def test_lags_in_series_follow_conduction_more_closely_than_one() -> None:
         centre.append(slab[-1])
     heard = np.array(centre) - np.mean(centre)
 
-    def missed(stages: int) -> float:
+    def least(stages: int) -> float:
         followed = (lagged(t, water, lag, stages) for lag in np.geomspace(500.0, 10_000.0, 40))
-        shapes = [y - y.mean() for y in followed]
-        return min(float(np.sum((heard - y * (y @ heard) / (y @ y)) ** 2)) for y in shapes)
+        return min(missed(heard, (y - y.mean())[:, None]) for y in followed)
 
-    assert missed(2) < 0.25 * missed(1)
+    assert least(2) < 0.25 * least(1)
 
 
 def test_sources_along_its_way_hold_the_field_of_iron_that_a_mass_passes(problem: Problem) -> None:
@@ -253,11 +239,8 @@ def test_sources_along_its_way_hold_the_field_of_iron_that_a_mass_passes(problem
     powers = (p[:, None, None] ** np.arange(4)[:, None] * slopes[:, None, :]).reshape(len(p), -1)
     listed = [c.columns(slice(0, len(p))) for c in actuator_order(problem) if c.spectra is not None]
 
-    def missed(columns: np.ndarray, field: np.ndarray) -> float:
-        def beyond(X: np.ndarray, y: np.ndarray) -> float:
-            return float(np.sum((y - X @ np.linalg.lstsq(X, y, rcond=1e-9)[0]) ** 2))
-
-        return beyond(np.hstack([powers, columns]), field) / beyond(powers, field)
+    def beyond(columns: np.ndarray, field: np.ndarray) -> float:
+        return missed(field, np.hstack([powers, columns])) / missed(field, powers)
 
     for _ in range(5):
         r = np.column_stack(
@@ -265,16 +248,12 @@ def test_sources_along_its_way_hold_the_field_of_iron_that_a_mass_passes(problem
         )
         far, m = np.linalg.norm(r, axis=1)[:, None], rng.normal(size=3)
         field = np.sum(slopes * (3.0 * r * (r @ m)[:, None] / far**2 - m) / far**3, axis=1)
-        next_power = missed(p[:, None] ** 4 * slopes, field)
-        assert min(missed(columns, field) for columns in listed) < min(0.2, 0.4 * next_power)
+        next_power = beyond(p[:, None] ** 4 * slopes, field)
+        assert min(beyond(columns, field) for columns in listed) < min(0.2, 0.4 * next_power)
 
 
 def test_a_core_that_shows_through_changes_the_sensitivity_too(problem: Problem) -> None:
     """A feedback of finite gain leaves the core the field that its output takes: not flat at zero."""
     shown = np.einsum("ni,ni->n", problem.slopes[:, 6:], np.arctanh(0.8 * problem.reading / 5e4))
     every = CAUSES["nonlinearity"].candidates(problem)[-1].columns(slice(0, len(problem)))
-
-    def left(X: np.ndarray) -> float:
-        return float(np.linalg.norm(shown - X @ np.linalg.lstsq(X, shown, rcond=1e-12)[0]))
-
-    assert left(every) < 0.2 * left(every[:, 3:])
+    assert missed(shown, every) < 0.04 * missed(shown, every[:, 3:])

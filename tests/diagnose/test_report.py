@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from posed import candidate, right
 
 from magbridge.cli.diagnose import causes_of
 from magbridge.diagnose.causes import CAUSES
-from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.compare.prior import isotropic
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.compare.survey import Channel, _channels
@@ -101,7 +100,7 @@ def test_sizes_of_one_unit_name_it_once() -> None:
 
 def test_a_cause_that_is_larger_than_such_causes_are_is_doubted() -> None:
     """A constant of 360 nT where main-field models are 30 nT off."""
-    bias = Candidate("reference_bias", None, lambda _: np.ones((1, 1)), np.array([30.0]), ("bias",), ("nT",))
+    bias = candidate("reference_bias", np.ones(1), width=np.array([30.0]))
     assert "12 times" in implausible(bias, np.array([-12.0]))
     assert not implausible(bias, np.array([0.99 * IMPLAUSIBLE]))
 
@@ -117,7 +116,7 @@ def test_a_gain_that_does_not_show_is_said_to_be_none() -> None:
     assert (none.shown, much.shown) == (False, True)
 
 
-def test_names_that_gain_nothing_explain_only_in_part(right: Callable[[int], Problem]) -> None:
+def test_names_that_gain_nothing_explain_only_in_part() -> None:
     """As where a survey is diagnosed with the calibration that was fitted to it."""
     candidate = CAUSES["reference_bias"].candidates(right(100))[0]
     named = [Hypothesis(candidate, ratio=25.0, evidence=9.0, p_value=1e-3, fit=None)]
@@ -142,7 +141,7 @@ def test_the_times_of_wrong_samples_are_all_or_the_first() -> None:
 
 
 @pytest.mark.parametrize("unit", ["", "1"])
-def test_a_channel_without_a_unit_shows_none(right: Callable[[int], Problem], unit: str) -> None:
+def test_a_channel_without_a_unit_shows_none(unit: str) -> None:
     """Not "nT/1" nor "nT per 0.3 1"."""
     problem = right(100)
     lights = np.linspace(0.0, 0.6, len(problem.survey))
@@ -157,7 +156,7 @@ def test_a_channel_without_a_unit_shows_none(right: Callable[[int], Problem], un
     assert not any(unit.endswith((" 1)", "/1", ".3 1")) for unit in units)
 
 
-def test_a_shift_of_the_whole_field_beside_a_wrong_reference_is_told(right: Callable[[int], Problem]) -> None:
+def test_a_shift_of_the_whole_field_beside_a_wrong_reference_is_told() -> None:
     """A constant may belong to either; beside a true reference it is the vehicle's."""
     problem = right(100)
     grown = problem.calibration.coefficients + np.repeat([20.0, 0.0], [3, 6])
@@ -175,7 +174,7 @@ def test_a_shift_of_the_whole_field_beside_a_wrong_reference_is_told(right: Call
 def test_names_that_something_unexplained_keeps_are_told() -> None:
     """With what would tell the likeliest of them; what fits no cause has no names."""
     drift, current = (
-        Rival(Candidate(cause, channel, lambda _: np.ones((1, 1)), np.ones(1), ("x",), ("nT",)), behind)
+        Rival(candidate(cause, np.ones(1), channel=channel), behind)
         for cause, channel, behind in (("offset_drift", None, 0.0), ("current_field", "motor<1>", 1.0))
     )
     rest = Leftover("drift", 9.0, 1e-9, 12.0, None, None, within=(drift, current))
@@ -188,7 +187,7 @@ def test_names_that_something_unexplained_keeps_are_told() -> None:
 def test_a_rival_on_another_channel_is_no_other_cause() -> None:
     """Theory's chance is of no other cause: that a second thermometer does as well is no failure of it."""
     own, twin, other = (
-        Candidate(cause, channel, lambda _: np.ones((1, 1)), np.ones(1), ("x",), ("nT",))
+        candidate(cause, np.ones(1), channel=channel)
         for cause, channel in (
             ("temperature_offset", "hull"), ("temperature_offset", "water"), ("offset_drift", None)
         )

@@ -2,33 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from posed import candidate, right
 from scipy.signal import lfilter
 
 from magbridge.calibration.instrument_effects import TimeEffect
 from magbridge.diagnose.causes.candidates import Candidate
-from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.exchange import exchanged
 from magbridge.diagnose.inference.rounds import State
 from magbridge.diagnose.inference.search import search
 
 
-def candidate(cause: str, x: NDArray[np.float64], width: float) -> Candidate:
+def fault(cause: str, x: NDArray[np.float64], width: float) -> Candidate:
     """A vehicle's fault of one free number that adds x (n,) times `width`, nT."""
-    return Candidate(
-        cause, None, lambda rows: width * x[rows, None], np.array([width]), ("size",), ("nT",),
-        (TimeEffect(cause=cause, shape="step", start=0.0),),
-    )  # fmt: skip
+    effects = (TimeEffect(cause=cause, shape="step", start=0.0),)
+    return candidate(cause, width * x, width=np.array([width]), effects=effects)
 
 
 @pytest.mark.parametrize(("functions", "rough", "warm"), [(60, 20.0, 60.0), (150, 6.0, 15.0)])
 def test_noise_does_not_swallow_what_two_causes_do_together(
-    right: Callable[[int], Problem], functions: int, rough: float, warm: float
+    functions: int, rough: float, warm: float
 ) -> None:
     """A warming over rough rock: beside either alone, slow noise describes the other as well."""
     rng = np.random.default_rng(2)
@@ -39,22 +36,18 @@ def test_noise_does_not_swallow_what_two_causes_do_together(
     rock = np.exp(-0.5 * ((t[:, None] - places) / (0.6 / functions)) ** 2)
     noise = lfilter([0.6], [1.0, -0.8], rng.normal(size=n))
     problem = replace(right(n), residual=noise + warm * warming + rough * rock @ rng.normal(size=functions))
-    names = tuple(f"function {k}" for k in range(functions))
-    chart = Candidate(
-        "map_error", None, rock.__getitem__, np.ones(functions), names, ("nT",) * functions,
-        spectra=np.ones((1, functions)),
-    )  # fmt: skip
-    step = candidate("offset_step", (t > 0.1).astype(float), 10.0)
-    outcome = search(problem, [candidate("temperature_offset", warming, 10.0), step, chart], 3)
+    chart = candidate("map_error", rock, spectra=np.ones((1, functions)))
+    step = fault("offset_step", (t > 0.1).astype(float), 10.0)
+    outcome = search(problem, [fault("temperature_offset", warming, 10.0), step, chart], 3)
     assert {h.candidate.cause for h in outcome.chosen} == {"temperature_offset", "map_error"}
     assert outcome.fit.noise.slowest < 20.0 < 80.0 < outcome.null.noise.slowest
 
 
-def test_a_regressor_that_later_ones_made_needless_is_dropped(right: Callable[[int], Problem]) -> None:
+def test_a_regressor_that_later_ones_made_needless_is_dropped() -> None:
     """A step at one time is found for one at another, which is found beside it."""
     rng = np.random.default_rng(1)
     n = 600
-    early, late = (candidate("offset_step", (np.arange(n) >= at).astype(float), 10.0) for at in (60, 500))
+    early, late = (fault("offset_step", (np.arange(n) >= at).astype(float), 10.0) for at in (60, 500))
     problem = replace(right(n), residual=5.0 * (np.arange(n) >= 60) + rng.normal(size=n))
     state = State(problem, [early, late], 1, 1)
     state.null = state.fit([])
@@ -63,15 +56,15 @@ def test_a_regressor_that_later_ones_made_needless_is_dropped(right: Callable[[i
     assert exchanged(state, [both], state.fit([both]))[0] == [early]
 
 
-def test_what_nature_cannot_do_is_the_vehicles(right: Callable[[int], Problem]) -> None:
+def test_what_nature_cannot_do_is_the_vehicles() -> None:
     """Of two causes of one shape the reference takes no more than a usual error of it."""
     rng = np.random.default_rng(1)
     n = 600
     x = np.linspace(-1.0, 1.0, n)
-    fault = candidate("offset_drift", x, 50.0)
-    natural = replace(candidate("diurnal_variation", x, 20.0), effects=())
+    drifting = fault("offset_drift", x, 50.0)
+    natural = replace(fault("diurnal_variation", x, 20.0), effects=())
     problem = replace(right(n), residual=150.0 * x + rng.normal(size=n))
-    fit = State(problem, [fault, natural], 1, 2).fit([fault, natural])
+    fit = State(problem, [drifting, natural], 1, 2).fit([drifting, natural])
     drift, daily = fit.coefficients * [50.0, 20.0]
     assert drift + daily == pytest.approx(150.0, abs=1.0)
     assert daily == pytest.approx(150.0 * 20.0**2 / (20.0**2 + 50.0**2 / 0.1), rel=0.05)

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from posed import right
 
 from magbridge.diagnose.causes.time_dependent import interference_tone
-from magbridge.diagnose.compare.problem import Problem
 
 
 @pytest.mark.parametrize("place", [700.0, 700.5, 2048.0])
-def test_a_tone_between_two_frequencies_is_found_there(place: float, right: Callable[[int], Problem]) -> None:
+def test_a_tone_between_two_frequencies_is_found_there(place: float) -> None:
     """Half a bin off it would have lost a tenth of its power; the last bin has one neighbour only."""
     quiet = right(1800)
     t = quiet.survey.time

@@ -1,0 +1,86 @@
+"""Problems of a diagnosis and candidates for them, made without a simulation."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magbridge.calibration.model import Calibration, Noise, Parameter, Reference
+from magbridge.calibration.terms import Polynomial
+from magbridge.diagnose.causes.candidates import Candidate
+from magbridge.diagnose.compare.past import FAR
+from magbridge.diagnose.compare.problem import Problem, pose
+from magbridge.diagnose.compare.survey import Channel, Survey
+
+__all__ = ["FIELD", "T0", "calibrated", "candidate", "missed", "right", "surveyed", "thinned", "walk"]
+
+FloatArray = NDArray[np.float64]
+
+FIELD, T0 = 5e4, 1.7e9
+"""nT, and s since 1970: the reference, and when a survey begins."""
+
+
+def surveyed(directions: FloatArray, p: FloatArray, **more: Any) -> Survey:
+    """A survey at 4 s without gaps, of a field along `directions` (n, 3) beside a mass at p (n,).
+
+    `more` stands in the place of what it names; dives are of fifty samples.
+    """
+    n = len(p)
+    plain = {
+        "time": T0 + 4.0 * np.arange(float(n)), "reference": np.full(n, FIELD), "still": (),
+        "field": FIELD * directions / np.linalg.norm(directions, axis=1)[:, None],
+        "steps": np.where(np.arange(n) > 0, 1, FAR), "dive": np.arange(n) // 50, "place": None,
+        "attitude": None, "learned": np.zeros(n, bool), "cycles": np.empty(0), "source": "made",
+        "channels": {"p": Channel(p, "in", ("position",))},
+    }  # fmt: skip
+    return Survey(**plain | more)
+
+
+def walk(n: int, rng: np.random.Generator) -> FloatArray:
+    """(n, 3) directions of a field that turns at random."""
+    return np.asarray(rng.normal(size=(n, 3)).cumsum(axis=0) * 0.1 + [0.3, 0.1, 0.9])
+
+
+def calibrated(coefficients: FloatArray, variance: float = 4.0, **parameter: float) -> Calibration:
+    """A calibration with a polynomial in p: nine coefficients for each power, of one `variance`, nT²."""
+    powers = len(coefficients) // 9
+    limits = {"low": -1.0, "high": 1.0, "centre": 0.0, "scale": 1.0} | parameter
+    return Calibration(
+        parameters=(Parameter("p", "in", **limits),),
+        terms=(Polynomial(exponents=tuple((power,) for power in range(powers))),),
+        coefficients=coefficients, covariance=np.diag(np.full(9 * powers, variance)), noise=Noise(1.0),
+        reference=Reference(FIELD), method="made",
+    )  # fmt: skip
+
+
+def right(rows: int) -> Problem:
+    """A vehicle that is right but for noise, and turns to anywhere."""
+    directions = np.random.default_rng(4).normal(size=(rows, 3))
+    return pose(surveyed(directions, np.linspace(-1.0, 1.0, rows)), calibrated(np.zeros(9), 1e-6))
+
+
+def thinned(survey: Survey, here: NDArray[np.bool_]) -> Survey:
+    """Return what is left of a survey of even steps where samples are lost."""
+    rows = {name: getattr(survey, name)[here] for name in ("time", "field", "reference", "dive", "learned")}
+    channels = {name: c._replace(values=c.values[here]) for name, c in survey.channels.items()}
+    steps = np.append(FAR, np.minimum(np.diff(np.flatnonzero(here)), FAR))
+    return replace(survey, **rows, channels=channels, steps=steps)
+
+
+def candidate(cause: str, columns: FloatArray, **more: Any) -> Candidate:
+    """A candidate of the columns (n,) or (n, k), of width 1 unless `more` says otherwise."""
+    X = columns.reshape(len(columns), -1)
+    k = X.shape[1]
+    plain = {
+        "channel": None, "columns": lambda rows: X[rows], "width": np.ones(k), "names": ("b",) * k,
+        "units": ("nT",) * k,
+    }  # fmt: skip
+    return Candidate(cause, **plain | more)
+
+
+def missed(y: FloatArray, X: FloatArray) -> float:
+    """Share of the power of y (n,) that the columns X (n, k) do not hold."""
+    return float(np.sum((y - X @ np.linalg.lstsq(X, y, rcond=None)[0]) ** 2) / (y @ y))
