@@ -58,9 +58,8 @@ def extend(problem: Problem, model: Sequence[Candidate], fit: Joint) -> Calibrat
             reference = msgspec.structs.replace(
                 reference, bias=reference.bias + float(b[at]), bias_sigma=sigma
             )
-    noise = msgspec.structs.replace(
-        calibration.noise, sensor=min(calibration.noise.sensor, level(fit)) or level(fit)
-    )
+    left = robust_scale(fit.left - np.median(fit.left))  # of the bulk, not of outliers
+    noise = msgspec.structs.replace(calibration.noise, sensor=min(calibration.noise.sensor, left) or left)
     return replace(
         calibration,
         effects=(*calibration.effects, *(effect for c in model for effect in c.effects)),
@@ -129,11 +128,6 @@ def with_map_error(
             power += 0.25 * float(b @ normal(candidate.columns, problem.residual)[0] @ b) / len(problem)
     s = isotropic(extended)
     return replace(extended, covariance=extended.covariance + power * np.outer(s, s))
-
-
-def level(fit: Joint) -> float:
-    """Return the 1-sigma of what is left, nT: that of the bulk, not of outliers."""
-    return robust_scale(fit.left - np.median(fit.left))
 
 
 def relinearised(

@@ -214,7 +214,9 @@ def _findings(
         zip(slices([h.candidate for h in named]), zip(named, rivals, strict=True), strict=True)
     ):
         columns = [h.candidate.columns for i, h in enumerate(named) if i != k]
-        without = held_out(problem, columns, _without(fit, own)).left
+        kept = np.delete(fit.prior, slice(q + own.start, q + own.stop))
+        alone = replace(fit, coefficients=np.delete(fit.coefficients, own), prior=kept)
+        without = held_out(problem, columns, alone).left
         gain = paired(without, after, problem.survey.dive, counts)
         covariance = fit.covariance[q:, q:][own, own]
         found.append(Finding(hypothesis, others, gain, fit.coefficients[own], covariance))
@@ -228,13 +230,6 @@ def _loud(problem: Problem, after: FloatArray, counts: NDArray[np.bool_]) -> Lef
     if problem.calibration.noise.sensor <= 0.0 or power < LOUD**2 * n:
         return None
     return Leftover("broadband", float(np.sqrt(power - n)), float(chi2.sf(power, n)), 0.0, None, None)
-
-
-def _without(fit: Joint, own: slice) -> Joint:
-    """Return the fit without the coefficients at `own`."""
-    q = len(fit.z)
-    prior = np.delete(fit.prior, slice(q + own.start, q + own.stop))
-    return replace(fit, coefficients=np.delete(fit.coefficients, own), prior=prior)
 
 
 def _verdict(named: Sequence[Hypothesis], wrong: Outliers | None, rest: Leftover | None, total: Gain) -> str:

@@ -32,7 +32,7 @@ def fitted(given: Problem) -> tuple[Packets, Ridge]:
     found = packets(given, base)
     assert found is not None
     info = information(given, base.noise, base, [found.columns])
-    return found, Statistic(info.matrix, np.ones((1, 2 * found.number))).best(info.score)
+    return found, Statistic(info.matrix, np.ones((1, len(info.score)))).best(info.score)
 
 
 @pytest.mark.parametrize("rho", [0.0, 0.8])

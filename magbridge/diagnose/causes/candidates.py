@@ -183,18 +183,10 @@ def of_reference(
     basis: Callable[[slice], FloatArray],
     width: FloatArray,
     names: tuple[str, ...],
-    **more: Any,
 ) -> Candidate:
     """Make a candidate of an error in the reference: the field is ``H_e + sum_k b_k basis_k(t)``, nT.
 
     `basis` gives (m, k) of m rows; `width` (k,) is the usual size of each coefficient, nT.
     """
-    return Candidate(
-        cause,
-        None,
-        lambda rows: problem.gain[rows, None] * basis(rows) * width,
-        width,
-        names,
-        ("nT",) * len(width),
-        **more,
-    )
+    columns = lambda rows: problem.gain[rows, None] * basis(rows) * width  # noqa: E731 - a regressor is one line
+    return Candidate(cause, None, columns, width, names, ("nT",) * len(width))

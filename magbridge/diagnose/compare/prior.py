@@ -15,7 +15,7 @@ from magbridge.calibration.terms import Polynomial
 from magbridge.diagnose.compare.derivatives import derivatives
 from magbridge.diagnose.compare.survey import Survey
 
-__all__ = ["floor", "isotropic", "level", "loosened", "prior"]
+__all__ = ["floor", "isotropic", "level", "prior"]
 
 FloatArray = NDArray[np.float64]
 
@@ -64,13 +64,6 @@ def _constants(calibration: Calibration) -> list[slice]:
     return found
 
 
-def loosened(calibration: Calibration, L: FloatArray, centre: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return L (K, r) and m (r,), covariance ``L L^T`` and mean ``L m``, with :func:`floor` added."""
-    mean = L @ centre
-    broad = _factor(L @ L.T + floor(calibration))
-    return broad, np.asarray(np.linalg.lstsq(broad, mean, rcond=None)[0], float)
-
-
 def _factor(covariance: FloatArray) -> FloatArray:
     """L with ``L L^T`` the covariance, of as many columns as it has rank."""
     scale = np.sqrt(np.maximum(np.diag(covariance), 0.0)) + 1e-12
@@ -82,7 +75,16 @@ def _factor(covariance: FloatArray) -> FloatArray:
 def prior(
     survey: Survey, calibration: Calibration, samples: Samples, e: FloatArray, g: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return L (K, q) and m (q,) of the prior ``c = c_0 + L z``, ``z ~ N(m, 1)``.
+    """Return L (K, q) and m (q,) of the prior ``c = c_0 + L z``, ``z ~ N(m, 1)``, :func:`floor` included."""
+    L, centre = _without_repeats(survey, calibration, samples, e, g)
+    broad = _factor(L @ L.T + floor(calibration))
+    return broad, np.asarray(np.linalg.lstsq(broad, L @ centre, rcond=None)[0], float)
+
+
+def _without_repeats(
+    survey: Survey, calibration: Calibration, samples: Samples, e: FloatArray, g: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return L and m of the posterior without what it learned from samples that are compared here again.
 
     The information of the calibration's samples that are in the survey again (`survey.learned`) is taken out
     of its posterior: it would count twice. In the posterior's own units the precision left is

@@ -39,7 +39,7 @@ from magbridge.calibration.terms import Effect
 from magbridge.diagnose.compare.derivatives import CHUNK, derivatives
 from magbridge.diagnose.compare.design_columns import Mixture
 from magbridge.diagnose.compare.interpolation import interpolation_error
-from magbridge.diagnose.compare.prior import level, loosened, prior
+from magbridge.diagnose.compare.prior import level, prior
 from magbridge.diagnose.compare.survey import Survey
 
 __all__ = ["DELAY", "DELAYS", "Problem", "add_effects", "effect_columns", "history", "pose", "samples_of"]
@@ -220,7 +220,7 @@ def pose(survey: Survey, calibration: Calibration) -> Problem:
         _, g[rows] = residuals(replace(part, field=reading[rows]), coefficients)
         above, _ = residuals(replace(part, reference=part.reference + 1.0), coefficients)
         gain[rows] = e[rows] - above
-    L, centre = loosened(calibration, *prior(survey, calibration, samples, e, g))
+    L, centre = prior(survey, calibration, samples, e, g)
     seen = np.zeros((L.shape[1],) * 2)
     for start in range(0, n, CHUNK):
         rows = slice(start, start + CHUNK)

@@ -50,15 +50,13 @@ def rivals_of(
     own = slices(model, state.at[-1].stop)[k]
     alone = info.instead(base, np.r_[own])
     standing = score(alone, own, model[k])
-    scores = state.scores(alone)
-    rivals = []
-    best = state.best(scores)
-    paid = best.get(key(model[k]), (0, 0.0))[1]
-    for group, (member, average) in best.items():
-        candidate, s = state.candidates[member], scores[member]
+    rivals, best = [], state.best(alone)
+    paid = best[key(model[k])].price if key(model[k]) in best else 0.0
+    for group, (member, price, s, _) in best.items():
+        candidate = state.candidates[member]
         if group == key(model[k]) or group[0] in {other.cause for other in model if other is not model[k]}:
             continue
-        cheaper = average - paid - float(np.log(candidate.trials / model[k].trials))
+        cheaper = price - paid - float(np.log(candidate.trials / model[k].trials))
         behind = standing.evidence - s.evidence - cheaper
         if behind < margin(standing.ratio) and state.p_value(candidate, s.ratio, s.freedom) < LEVEL:
             rivals.append(Rival(candidate, behind))

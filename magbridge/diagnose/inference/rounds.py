@@ -164,20 +164,15 @@ class State:
         narrow, shaped = sum(candidate.narrow for candidate in model), shaped_ratio(ratio, model, fit)
         return log_odds(ratio, model, self.trials, shaped) - narrow - len(causes) * regressor_error(shaped)
 
-    def scores(self, info: Information) -> list[Score]:
-        """Score every candidate."""
-        return [score(info, at, candidate) for at, candidate in zip(self.at, self.candidates, strict=True)]
-
-    def best(self, scores: Sequence[Score]) -> dict[tuple[str, str | None], tuple[int, float]]:
-        """Best member of each group, and the log of its grid's average evidence, relative to the best.
-
-        The latter is the price of the nonlinear parameters.
-        """
+    def best(self, info: Information) -> dict[tuple[str, str | None], Best]:
+        """Best member of each group."""
         found = {}
         for group, members in self.groups.items():
-            evidences = np.array([scores[k].evidence for k in members])
+            scores = [score(info, self.at[k], self.candidates[k]) for k in members]
+            evidences = np.array([s.evidence for s in scores])
             top = int(np.argmax(evidences))
-            found[group] = members[top], float(np.log(np.mean(np.exp(evidences - evidences[top]))))
+            price = float(np.log(np.mean(np.exp(evidences - evidences[top]))))
+            found[group] = Best(members[top], price, scores[top], info)
         return found
 
     def round(self, model: list[Candidate], base: Joint) -> list[Hypothesis]:
@@ -187,9 +182,8 @@ class State:
             self.trials = trials(as_fitted, self.candidates, self.at)
         under: dict[tuple[str, str | None], list[Best]] = {}
         for info in (as_fitted, self._cleared(model, base, as_fitted)):
-            scores = self.scores(info)
-            for group, (k, price) in self.best(scores).items():
-                under.setdefault(group, []).append(Best(k, price, scores[k], info))
+            for group, best in self.best(info).items():
+                under.setdefault(group, []).append(best)
         listed = sorted(under.values(), key=lambda won: -max(best.score.evidence for best in won))
         # the largest, which take longest, first: then the threads end together
         tried = sorted(listed[:SHORT_LIST], key=lambda won: -self.candidates[won[0].place].size)
@@ -207,12 +201,10 @@ class State:
 
     def _cleared(self, model: list[Candidate], base: Joint, info: Information) -> Information:
         """Information under the noise that remains when the best candidate of every cause is fitted."""
-        top: dict[str, tuple[float, int]] = {}
-        scores = self.scores(info)
-        for k, s in enumerate(scores):
-            if s.evidence > top.get(self.candidates[k].cause, (-np.inf, 0))[0]:
-                top[self.candidates[k].cause] = (s.evidence, k)
-        pool = [k for _, k in top.values()]
+        top: dict[str, Best] = {}
+        for (cause, _), best in self.best(info).items():
+            top[cause] = max(top.get(cause, best), best, key=lambda one: one.score.evidence)
+        pool = [best.place for best in top.values()]
         index = np.r_[*(self.at[k] for k in pool)]
         taken = np.linalg.solve(info.matrix[np.ix_(index, index)] + np.eye(len(index)), info.score[index])
         every = [*model, *(self.candidates[k] for k in pool)]

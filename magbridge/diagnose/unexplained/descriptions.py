@@ -12,29 +12,14 @@ from magbridge.calibration.mass_effects import ClockEffect
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.causes.regressors import powers
 from magbridge.diagnose.causes.timing import field_rates, mass_rates
-from magbridge.diagnose.compare.design_columns import Columns
+from magbridge.diagnose.compare.design_columns import Columns, number
 from magbridge.diagnose.compare.interpolation import rates
 from magbridge.diagnose.compare.problem import Problem, effect_columns
 from magbridge.diagnose.compare.survey import Channel
 from magbridge.diagnose.inference.joint import Joint
+from magbridge.diagnose.unexplained import shapes
 from magbridge.diagnose.unexplained.packets import packets
 from magbridge.diagnose.unexplained.passage import passage
-from magbridge.diagnose.unexplained.shapes import (
-    REPEATED,
-    SLOPES,
-    bends,
-    crossing,
-    curve,
-    delayed,
-    direction,
-    hysteresis,
-    lower_end,
-    near_surface,
-    repeated,
-    response,
-    spectra,
-    swings,
-)
 
 __all__ = ["Description", "descriptions"]
 
@@ -133,13 +118,13 @@ def _in_time(problem: Problem, fit: Joint) -> list[Description]:
 
     passing, times = passage(problem, fit)
     return [
-        Description(_along_axes(problem, waves(BODY)), spectra(BODY, 3), turned=True),
+        Description(_along_axes(problem, waves(BODY)), shapes.spectra(BODY, 3), turned=True),
         Description(
             lambda rows: problem.gain[rows, None] * waves(EARTH)(rows),
-            (*spectra(EARTH, 1), ("transient", np.full(EARTH, 10.0))),
+            (*shapes.spectra(EARTH, 1), ("transient", np.full(EARTH, 10.0))),
         ),
-        _of("drift", lambda rows: (problem.gain * fresh)[rows, None], 1, 1.0, holds=("reference_bias",)),
-        _of("transient", passing, 3, trials=times),
+        _of("drift", lambda rows: (problem.gain * fresh)[rows, None], 1.0, holds=("reference_bias",)),
+        _of("transient", passing, trials=times),
     ]
 
 
@@ -147,17 +132,19 @@ def _of_reading(problem: Problem) -> list[Description]:
     """Functions of the field's direction, its rates of change, each channel's reading; one common delay."""
     body, rates = _body(problem), field_rates(problem)
     listed = [
-        _of("broadband", direction(body), 34, holds=("nonlinearity",), wider=True),
+        _of("broadband", shapes.direction(body), holds=("nonlinearity",), wider=True),
         _of(
-            "broadband", _along_axes(problem, lambda rows: rates[:, rows].T), 9, 1.0,
+            "broadband", _along_axes(problem, lambda rows: rates[:, rows].T), 1.0,
             holds=("eddy_current", "channel_skew"), turned=True,
         ),
-        Description(response(problem.reading, body), bends(), holds=("nonlinearity",), wider=True),
-        _of("broadband", crossing(problem.reading, body), 9),
+        Description(
+            shapes.response(problem.reading, body), shapes.bends(), holds=("nonlinearity",), wider=True
+        ),
+        _of("broadband", shapes.crossing(problem.reading, body)),
     ]  # fmt: skip
     if problem.calibration.parameters:
         late = effect_columns(problem, ClockEffect(), mass_rates(problem))
-        listed.append(_of("broadband", late, 1, 1.0, holds=("clock_offset", "filter_lag")))
+        listed.append(_of("broadband", late, 1.0, holds=("clock_offset", "filter_lag")))
     return listed
 
 
@@ -168,10 +155,10 @@ def _of_channels(problem: Problem) -> list[Description]:
     for name, channel in problem.survey.channels.items():
         if name not in problem.survey.still:
             held = ("actuator_order",) if name in own else ()
-            now, before = curve(channel.values), hysteresis(channel.values)
+            now, before = shapes.curve(channel.values), shapes.hysteresis(channel.values)
             listed += [
-                _of("broadband", _along_axes(problem, now), 12, channel=name, turned=True, holds=held),
-                _of("broadband", _along_axes(problem, before), 24, channel=name, turned=True, remembers=True),
+                _of("broadband", _along_axes(problem, now), channel=name, turned=True, holds=held),
+                _of("broadband", _along_axes(problem, before), channel=name, turned=True, remembers=True),
                 *_late(problem, name, channel),
             ]
     return listed
@@ -179,11 +166,11 @@ def _of_channels(problem: Problem) -> list[Description]:
 
 def _late(problem: Problem, name: str, channel: Channel) -> list[Description]:
     """Return what follows a channel late, as heat soaks into a hull: an offset, or a sensitivity."""
-    late, listed = delayed(problem.survey.time, channel.values), []
+    late, listed = shapes.delayed(problem.survey.time, channel.values), []
     for cause, scales in SCALES.items():
         columns = _along_axes(problem, late, scales=scales)
         held = (cause,) if "temperature" in channel.kinds else ()
-        listed.append(_of("broadband", columns, 15, channel=name, turned=True, scales=scales, holds=held))
+        listed.append(_of("broadband", columns, channel=name, turned=True, scales=scales, holds=held))
     return listed
 
 
@@ -196,12 +183,12 @@ def _of_attitude(problem: Problem) -> list[Description]:
     roll, pitch = angles[:2]
     for down in (-np.sin(pitch), np.sin(roll) * np.cos(pitch)):
         listed += [
-            _of("broadband", _along_axes(problem, curve(down)), 12, turned=True),
-            _of("switching", _along_axes(problem, lower_end(down)), 3 * len(SLOPES), turned=True),
+            _of("broadband", _along_axes(problem, shapes.curve(down)), turned=True),
+            _of("switching", _along_axes(problem, shapes.lower_end(down)), turned=True),
         ]
     for angle in angles:
-        swung = swings(time, rates(problem.survey, angle[None])[0])
-        listed.append(_of("broadband", _along_axes(problem, swung), 18, turned=True))
+        swung = shapes.swings(time, rates(problem.survey, angle[None])[0])
+        listed.append(_of("broadband", _along_axes(problem, swung), turned=True))
     return listed
 
 
@@ -209,17 +196,15 @@ def _repeating(problem: Problem, fit: Joint, tone: Candidate | None) -> list[Des
     """List what the surface does, what each dive repeats, oscillations of limited duration, and a tone."""
     survey, listed = problem.survey, []
     if "depth" in survey.channels and "depth" not in survey.still:
-        above = near_surface(survey.time, survey.channels["depth"].values)
-        listed.append(_of("broadband", _along_axes(problem, above), 24, turned=True))
+        above = shapes.near_surface(survey.time, survey.channels["depth"].values)
+        listed.append(_of("broadband", _along_axes(problem, above), turned=True))
     if np.ptp(survey.dive):
-        listed.append(_of("broadband", _along_axes(problem, repeated(problem)), 3 * REPEATED, turned=True))
+        listed.append(_of("broadband", _along_axes(problem, shapes.repeated(problem)), turned=True))
     rings = packets(problem, fit)
     if rings is not None:
-        width = (("tone", np.full(2 * rings.number, 30.0)),)
-        listed.append(Description(rings.columns, width, None, rings.trials, rings.period))
+        listed.append(_of("tone", rings.columns, trials=rings.trials, period=rings.period))
     if tone is not None:
-        width = (("tone", np.ones(tone.size)),)
-        listed.append(Description(tone.columns, width, None, tone.trials, tone.shape["period"][0]))
+        listed.append(_of("tone", tone.columns, 1.0, trials=tone.trials, period=tone.shape["period"][0]))
     return listed
 
 
@@ -241,5 +226,5 @@ def _along_axes(problem: Problem, basis: Columns, *, scales: bool = False) -> Co
     return columns
 
 
-def _of(kind: str, columns: Columns, size: int, width: float = 30.0, **more: Any) -> Description:
-    return Description(columns, ((kind, np.full(size, width)),), **more)
+def _of(kind: str, columns: Columns, width: float = 30.0, **more: Any) -> Description:
+    return Description(columns, ((kind, np.full(number(columns), width)),), **more)

@@ -71,12 +71,11 @@ class Places(NamedTuple):
 class Packets(NamedTuple):
     """The accepted packets.
 
-    Their columns, two for each; their number; how many sets of as many packets they were chosen from; and the
-    period of the loudest, s.
+    Their columns, two for each; how many sets of as many packets they were chosen from; and the period of the
+    loudest, s.
     """
 
     columns: Columns
-    number: int
     trials: float
     period: float
 
@@ -110,7 +109,7 @@ def packets(problem: Problem, fit: Joint) -> Packets | None:
     if not found:
         return None
     period = found[0][1].period * problem.survey.interval
-    return Packets(_columns(problem, found), len(found), float(np.exp(price)), period)
+    return Packets(_columns(problem, found), float(np.exp(price)), period)
 
 
 def _columns(problem: Problem, found: list[tuple[float, Places]]) -> Columns:

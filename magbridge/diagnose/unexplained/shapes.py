@@ -18,8 +18,6 @@ from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.design import pieces
 
 __all__ = [
-    "REPEATED",
-    "SLOPES",
     "bends",
     "crossing",
     "curve",
