@@ -23,6 +23,7 @@ from magbridge.cli.common import (
     file_to_write,
     note_losses,
     note_missing,
+    note_settings,
     print_result,
     refuse_unsuited,
 )
@@ -164,15 +165,15 @@ def map(  # noqa: A001 - the command's name
 def correct(*files: Path, calibration: Path, output: Log, json: Json = False) -> None:
     """Correct a log with a calibration, as the bridge would have done live.
 
-    The arithmetic and the state (lags, backlash) are the bridge's own, but the input is the log's rows. In
-    a bridge's own log (also converted to .nc or .parquet) these are MAG_RAW with the latest telemetry before
-    each and its age; [align] and every max_age are known as they were when the log began. The bridge itself
-    uses every message about a moving mass, and the channels of a sensor that has no counts are float32 here
-    (to 0.002 nT of 50,000 nT). Of another log, telemetry counts as new in every row that has it, and rows
-    that have nothing else are not samples: they are left out of the output. For what the
-    bridge would have published bit for bit, put the calibration into a bridge.toml and run: magbridge
-    replay LOG --config bridge.toml --log DIR. The replay also reports that this differs from what was
-    published at the time.
+    The arithmetic and the state (lags, backlash) are the bridge's own, but the input is the log's rows. In a
+    bridge's own log (also converted to .nc or .parquet) these are MAG_RAW with the latest telemetry before
+    each and its age; [align] and every max_age are known as they were when the log began, not as they were
+    set later. The bridge itself uses every message about a moving mass, and the channels of a sensor that has
+    no counts are float32 here (to 0.002 nT of 50,000 nT). Of another log, telemetry counts as new in every
+    row that has it, and rows that have nothing else are not samples: they are left out of the output. For
+    what the bridge would have published bit for bit, put the calibration into a bridge.toml and run:
+    magbridge replay LOG --config bridge.toml --log DIR. The replay also reports that this differs from what
+    was published at the time.
 
     Parameters
     ----------
@@ -225,6 +226,7 @@ def correct(*files: Path, calibration: Path, output: Log, json: Json = False) ->
                 f"{', '.join(str(file) for file in files)}: no row has all of {' '.join(CHANNELS)}"
             )
     note_losses(*pieces)
+    note_settings(*pieces)
     if beyond > rows / 2:
         low, high = (f"{limit:,.0f}" for limit in EARTHS)
         complain(

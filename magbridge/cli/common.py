@@ -39,6 +39,7 @@ __all__ = [
     "folder_to_write",
     "note_losses",
     "note_missing",
+    "note_settings",
     "print_result",
     "refuse_unsuited",
 ]
@@ -150,6 +151,20 @@ def note_missing(calibration: Calibration, deployment: xr.Dataset) -> None:
         if name not in deployment:
             lacking = f"{deployment.attrs['source']}: no column {name!r}, which the calibration needs"
             complain(f"{lacking}: every sample is flagged, with a sigma to match")
+
+
+def note_settings(*pieces: Mapping[str, Any]) -> None:
+    """Warn on stderr where a bridge was tuned in the course of its log, from the attributes of its pieces."""
+    from magbridge.logs.deployment import CHANGES
+
+    for attrs in pieces:
+        if times := int(attrs.get(CHANGES, 0)):
+            often = "once" if times == 1 else f"{times} times"
+            complain(
+                f"{attrs['source']}: MB_* parameters were set {often} in the course of the log; it is "
+                "corrected with those of its start (magbridge replay follows them)"
+            )
+            return
 
 
 def refuse_unsuited(calibration: Calibration, deployment: xr.Dataset) -> None:

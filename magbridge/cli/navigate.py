@@ -17,6 +17,7 @@ from magbridge.cli.common import (
     doubts_of,
     note_losses,
     note_missing,
+    note_settings,
     print_result,
     refuse_unsuited,
 )
@@ -96,6 +97,7 @@ def navigate(
     for doubt in doubts_of(known, calibration):
         complain(doubt)
     note_missing(known, deployment)
+    note_settings(deployment.attrs)
     refuse_unsuited(known, deployment)
     corrected = correct_rows(Correction(known), deployment)
     if options is None:

@@ -15,6 +15,7 @@ from magbridge.errors import FormatError
 from magbridge.records import Quality
 
 __all__ = [
+    "CHANGES",
     "COUNTERS",
     "MEANING",
     "SETTINGS",
@@ -33,6 +34,8 @@ MEANING = {"heading_reference": "true", "time_reference": "utc"}
 """Attributes that change what values mean, and their defaults."""
 SETTINGS = "align.", "telemetry."
 """What the names of the numbers begin with by which a bridge corrected, as its log declares them."""
+CHANGES = "align.changes"
+"""One of them: how often a setting was changed in the course of the log; the others are of its start."""
 COUNTERS = {
     "bytes_skipped": ("byte skipped", "bytes skipped"),
     "damages": ("damaged place", "damaged places"),

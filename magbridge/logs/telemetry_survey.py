@@ -11,8 +11,9 @@ from typing import Any
 
 from magbridge.columns import AGE
 from magbridge.errors import FormatError
+from magbridge.logs.deployment import CHANGES
 from magbridge.logs.telemetry_fields import SOURCES, TELEMETRY, Declared, Value, correction, sample
-from magbridge.mavlink import LogReader, Message, spec
+from magbridge.mavlink import LogReader, Message, Record, spec
 from magbridge.records import Channel
 
 __all__ = ["Survey", "survey"]
@@ -20,6 +21,7 @@ __all__ = ["Survey", "survey"]
 V2 = 0xFD
 RAW, FIELD, COLUMN, STEP = (spec(f"MAG_{name}").id for name in ("RAW", "FIELD", "COLUMN", "CLOCK_STEP"))
 START, BYTES = spec("MAG_BRIDGE_START").id, spec("MAG_SENSOR_BYTES").id
+SET, VALUE = spec("PARAM_SET").id, spec("PARAM_VALUE").id
 NAMED = spec("NAMED_VALUE_FLOAT")
 UNITS = {"sensor_supply": "V"}
 
@@ -56,6 +58,7 @@ class Survey:
         self._named: dict[int, dict[bytes, str]] = {}
         self._declared: dict[str, Declared] = {}
         self._open: dict[tuple[int, int], list[Value]] = {}
+        self._asked: dict[str, float] = {}
         self._read(path)
         for self.source in SOURCES:
             senders = self._senders.get(spec(self.source).id)
@@ -95,6 +98,8 @@ class Survey:
                 head = 10 if frame[0] == V2 else 6
                 kind = frame[5 if head == 10 else 3 : head]  # system, component, message id
                 number = int.from_bytes(kind[2:], "little")
+                if number in (SET, VALUE) and self.ours:
+                    self._tuned(record)
                 if self.ours and record.channel == Channel.SENT and number not in (RAW, FIELD):
                     continue  # the bridge's own messages are no telemetry
                 if number == NAMED.id:
@@ -105,6 +110,16 @@ class Survey:
         for kind, n in times.items():
             number = int.from_bytes(kind[2:5], "little")
             self._senders.setdefault(number, Counter())[kind[0], kind[1]] += n
+
+    def _tuned(self, record: Record) -> None:
+        """Count how often a station has set what the alignment computes with; the bridge confirms it."""
+        message = record.message
+        name, value = message["param_id"], message["param_value"]
+        if message.id == SET:
+            self._asked[name] = value
+        elif record.channel == Channel.SENT and self._asked.pop(name, None) == value:
+            aligns = name.startswith("MB_") and not name.startswith("MB_R_")  # which are rates of messages
+            self.attrs[CHANGES] = self.attrs.get(CHANGES, 0) + aligns
 
     def _look(self, message: Message) -> bool:
         """Note what is new in a message; return whether further ones of its kind can add nothing."""

@@ -13,16 +13,42 @@ from magbridge.bridge.events import Event, Start
 from magbridge.bridge.run import declared
 from magbridge.calibration.file import load as load_calibration
 from magbridge.calibration.model import Parameter
+from magbridge.cli import main
 from magbridge.columns import CORRECTED
 from magbridge.config import load
 from magbridge.correction import Correction, correct_rows
 from magbridge.logs.tlog import TlogWriter
 from magbridge.mavlink import Codec
+from magbridge.mavlink.dialect import MAV_PARAM_TYPE
 from magbridge.records import Channel, Quality
 
 KEPT = {"MB_AGE_BATTPOS": 3.0, "MB_SETTLE_TIME": 4.0, "MB_STALE_GROW": 20.0}
 """Set over the link in an earlier run."""
 BATTERY = Parameter("battpos", "", -1.0, 1.0, 0.0, 1.0)
+
+
+@pytest.mark.parametrize("suffix", ["nc", "csv", "tlog"])
+def test_what_was_set_in_the_course_of_the_log_is_told(
+    tmp_path: Path, suffix: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Neither what was refused, nor the rate of a message."""
+    pipeline = small_bridge(tmp_path, Start(START), BATTERY, ["MAG_FIELD"])
+    station = Codec(1, 1)
+    log, out = tmp_path / f"converted.{suffix}", tmp_path / "out.nc"
+    asked = {10: ("MB_SETTLE_TIME", 4.0), 20: ("MB_SETTLE_TIME", -1.0), 30: ("MB_R_HIGHRES_IMU", 1.0)}
+    with TlogWriter(tmp_path / "logs", head=declared(load(tmp_path / "bridge.toml"), pipeline)) as writer:
+        for k in range(40):
+            if k in asked:
+                name, value = asked[k]
+                to = {"target_system": 1, "target_component": 191, "param_type": MAV_PARAM_TYPE.REAL32}
+                frame = station.pack("PARAM_SET", param_id=name, param_value=value, **to)
+                pipeline.feed(Event(START + k * 1_000_000 - 400_000, Channel.LINK, frame))
+            line = b"12340.5 43210.9 -234.5 4.0 %d 7\r\n" % k
+            pipeline.feed(Event(START + k * 1_000_000, Channel.SENSOR, line))
+            writer.extend(pipeline.journal.drain())
+    logs.write(logs.read(sorted((tmp_path / "logs").iterdir())), log)
+    assert main(["correct", str(log), "--calibration", str(tmp_path / "cal.json"), "-o", str(out)]) == 0
+    assert "MB_* parameters were set once in the course of the log" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("suffix", "precision"), [("nc", 1e-7), ("csv", 1e-7), ("tlog", 1e-6)])
