@@ -14,6 +14,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import pytest
 from benchmarks.peer import classes
+from commands import Command
 from hypothesis import settings
 
 # the same examples every time, and none fails because the machine is busy
@@ -47,3 +48,8 @@ def real_data() -> Path:
 def peer() -> ModuleType:
     """Our dialect as a ground station has it: classes that pymavlink's mavgen makes from our XML."""
     return classes()
+
+
+@pytest.fixture
+def command(capsys: pytest.CaptureFixture[str]) -> Command:
+    return Command(capsys)

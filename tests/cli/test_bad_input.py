@@ -7,31 +7,19 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from commands import Command
 
 from magbridge.calibration.file import save as save_calibration
 from magbridge.calibration.fitting.fit import METHODS
 from magbridge.calibration.model import Parameter, Sensor, identity
-from magbridge.cli import main
 from magbridge.columns import CHANNELS
 from magbridge.logs import read, write
 
 METHOD_NAMES = ", ".join(f'"{name}"' for name in METHODS)
 
 
-def complaint(capsys: pytest.CaptureFixture[str], *arguments: object, code: int) -> str:
-    """Run a command that must fail; return its one line."""
-    assert main([str(argument) for argument in arguments]) == code
-    captured = capsys.readouterr()
-    assert captured.err.count("\n") == 1, captured.err
-    assert captured.err.startswith("magbridge: ")
-    assert "Traceback" not in captured.err
-    return captured.err.removeprefix("magbridge: ").rstrip()
-
-
-def test_what_is_read_is_not_written_over(
-    deployment: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    log, link, folder = tmp_path / "log.csv", tmp_path / "link.csv", tmp_path / "calibration.json"
+def test_what_is_read_is_not_written_over(deployment: Path, command: Command) -> None:
+    log, link, folder = Path("log.csv"), Path("link.csv"), Path("calibration.json")
     log.write_bytes(deployment.read_bytes())
     link.symlink_to(log)
     for written, arguments in (
@@ -43,183 +31,145 @@ def test_what_is_read_is_not_written_over(
         (log, ["simulate", "demo", "--like", log, "-o", log]),
         (log, ["simulate", log, "-o", log]),
         (log, ["navigate", deployment, "--map", log, "--bound", "-o", log]),
-        (folder, ["diagnose", deployment, "--calibration", folder, "-o", tmp_path]),
+        (folder, ["diagnose", deployment, "--calibration", folder, "-o", "."]),
     ):
-        line = complaint(capsys, *arguments, code=2)
+        line = command.refuses(*arguments, code=2)
         assert line.endswith(": is among the files to read; choose another file to write")
         assert Path(line.partition(": is among")[0]).resolve() == written.resolve()
     assert log.read_bytes() == deployment.read_bytes()
-    loop = tmp_path / "loop.csv"
+    loop = Path("loop.csv")
     loop.symlink_to(loop)
-    assert "expected a file, there is none" in complaint(
-        capsys, "convert", loop, "-o", tmp_path / "x.csv", code=1
-    )
+    assert "expected a file, there is none" in command.refuses("convert", loop, "-o", "x.csv")
 
 
-def test_a_log_without_a_whole_reading_is_not_corrected(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    log, calibration, output = (tmp_path / name for name in ("log.csv", "cal.json", "x.csv"))
-    log.write_text("time,mag_x,mag_y,mag_z\n1,,2,3\n2,1,,\n")
-    save_calibration(identity(), calibration)
-    line = complaint(capsys, "correct", log, "--calibration", calibration, "-o", output, code=1)
-    assert line == f"{log}: no row has all of mag_x mag_y mag_z"
-    assert not output.exists()
+def test_a_log_without_a_whole_reading_is_not_corrected(command: Command) -> None:
+    Path("log.csv").write_text("time,mag_x,mag_y,mag_z\n1,,2,3\n2,1,,\n")
+    save_calibration(identity(), "cal.json")
+    line = command.refuses("correct", "log.csv", "--calibration", "cal.json", "-o", "x.csv")
+    assert line == "log.csv: no row has all of mag_x mag_y mag_z"
+    assert not Path("x.csv").exists()
 
 
-@pytest.mark.parametrize("command", ["correct", "navigate"])
+@pytest.mark.parametrize("name", ["correct", "navigate"])
 @pytest.mark.parametrize("unit", [1e-9, 1e-3, 1e9])
 def test_a_log_in_another_unit_is_not_corrected(
-    unit: float,
-    command: str,
-    deployment: Path,
-    calibration: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
+    unit: float, name: str, deployment: Path, calibration: Path, here: Path, command: Command
 ) -> None:
     """Tesla, µT or worse under the name of nT would otherwise be corrected to a field, unflagged."""
-    rows, log = read(deployment).isel(time=slice(0, 60)), tmp_path / "log.nc"
-    write(rows.assign({name: unit * rows[name] for name in CHANNELS}), log)
-    options = ["--calibration", calibration, "-o", tmp_path / "x.nc"]
-    more = ["--map", tmp_path / "none.nc"] if command == "navigate" else []
-    line = complaint(capsys, command, log, *options, *more, code=1)
+    rows = read(deployment).isel(time=slice(0, 60))
+    write(rows.assign({channel: unit * rows[channel] for channel in CHANNELS}), "log.nc")
+    more = ["--map", "none.nc"] if name == "navigate" else []
+    line = command.refuses(name, "log.nc", "--calibration", calibration, "-o", "x.nc", *more)
     assert line.startswith("log.nc (deployment.csv): mag_x mag_y mag_z: the length of the vector is ")
     assert line.endswith(" nT: expected nT")
-    assert list(tmp_path.iterdir()) == [log]
+    assert [path.name for path in here.iterdir()] == ["log.nc"]
 
 
-def test_a_log_of_another_sensor_is_not_corrected(
-    deployment: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    log, calibration, output = (tmp_path / name for name in ("log.nc", "cal.json", "x.nc"))
-    write(read(deployment).isel(time=slice(0, 60)).assign_attrs(sensor="hmr2300"), log)
-    save_calibration(replace(identity(), sensor=Sensor("digitizer")), calibration)
-    line = complaint(capsys, "correct", log, "--calibration", calibration, "-o", output, code=1)
+def test_a_log_of_another_sensor_is_not_corrected(deployment: Path, command: Command) -> None:
+    write(read(deployment).isel(time=slice(0, 60)).assign_attrs(sensor="hmr2300"), "log.nc")
+    save_calibration(replace(identity(), sensor=Sensor("digitizer")), "cal.json")
+    line = command.refuses("correct", "log.nc", "--calibration", "cal.json", "-o", "x.nc")
     assert line.endswith(": sensor 'hmr2300', but the calibration is of 'digitizer'")
-    assert not output.exists()
+    assert not Path("x.nc").exists()
 
 
 @pytest.mark.parametrize(
     "arguments",
     [
-        ["correct", "log.nc", "-o", "x.nc"],
-        ["navigate", "log.nc", "-o", "x.nc", "--map", "none.nc"],
-        ["diagnose", "log.nc", "-o", "doubt"],
-        ["plan", "--mission", "log.nc"],
+        "correct log.nc -o x.nc",
+        "navigate log.nc -o x.nc --map none.nc",
+        "diagnose log.nc -o doubt",
+        "plan --mission log.nc",
     ],
-    ids=lambda arguments: arguments[0],
+    ids=lambda arguments: arguments.split()[0],
 )
 def test_a_position_in_another_unit_is_refused(
-    arguments: list[str],
-    deployment: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    arguments: str, deployment: Path, here: Path, command: Command
 ) -> None:
     """Metres taken for inches were corrected to a field that was off by hundreds of nT, unflagged."""
-    monkeypatch.chdir(tmp_path)
     rows = read(deployment).isel(time=slice(0, 60))
     rows["battpos"] = (0.0254 * rows["battpos"]).assign_attrs(units="m")
     write(rows, "log.nc")
     save_calibration(identity((Parameter("battpos", "in", -0.5, 0.5, 0.0, 0.5),)), Path("cal.json"))
-    line = complaint(capsys, *arguments, "--calibration", "cal.json", code=1)
+    line = command.refuses(*arguments.split(), "--calibration", "cal.json")
     assert line.endswith(": column 'battpos': expected 'in', the calibration's unit, not 'm'")
-    assert {path.name for path in tmp_path.iterdir()} == {"log.nc", "cal.json"}
+    assert {path.name for path in here.iterdir()} == {"log.nc", "cal.json"}
 
 
 @pytest.mark.parametrize(
     ("arguments", "code", "words"),
     [
-        (["convert", "-o", "x.csv"], 2, "expected at least one FILE"),
-        (["convert", "none.csv", "-o", "x.csv"], 1, "none.csv: expected a file"),
-        (["convert", "{d}", "-o", "x.foo"], 2, "must end in .csv or .nc or .parquet or .tlog"),
-        (["simulate", "demo", "-o", "x.bin"], 2, "must end in .csv"),
-        (["convert", "{d}"], 2, "parameter --output is required"),
-        (["convert", "{d}", "-o"], 2, "parameter -o requires an argument"),
-        (["fly"], 2, "fly"),
-        (["replay", "{d}", "--speed", "fast"], 2, "--speed fast: expected a positive number"),
-        (["replay", "{d}", "--speed", "-1"], 2, "expected a positive number"),
-        (["replay", "{d}", "--speed", "1e-300"], 2, "0.001 or more, or max"),
-        (["plan", "--calibration", "{d}", "--mission", "{d}", "--runs", "101"], 2, "--runs. Must be <= 100"),
+        ("convert -o x.csv", 2, "expected at least one FILE"),
+        ("convert none.csv -o x.csv", 1, "none.csv: expected a file"),
+        ("convert {d} -o x.foo", 2, "must end in .csv or .nc or .parquet or .tlog"),
+        ("simulate demo -o x.bin", 2, "must end in .csv"),
+        ("convert {d}", 2, "parameter --output is required"),
+        ("convert {d} -o", 2, "parameter -o requires an argument"),
+        ("fly", 2, "fly"),
+        ("replay {d} --speed fast", 2, "--speed fast: expected a positive number"),
+        ("replay {d} --speed -1", 2, "expected a positive number"),
+        ("replay {d} --speed 1e-300", 2, "0.001 or more, or max"),
+        ("plan --calibration {d} --mission {d} --runs 101", 2, "--runs. Must be <= 100"),
         (
-            ["calibrate", "{d}", "--parameter", "heading", "-o", "x.json"],
+            "calibrate {d} --parameter heading -o x.json",
             1,
-            "parameter 'heading' is heading, clockwise from north: it moves no mass",
+            "is heading, clockwise from north: it moves no mass",
         ),
-        (["run", "--config", "none.toml"], 2, "none.toml: No such file"),
-        (
-            ["simulate", "none", "-o", "x.csv"],
-            2,
-            "none: expected a scenario file (.toml), or one of bonne_bay, ",
-        ),
-        (["simulate", "none.toml", "-o", "x.csv"], 2, "none.toml: No such file"),
-        (["correct", "{d}", "--calibration", "none.json", "-o", "x.csv"], 1, "none.json: cannot be read"),
-        (["correct", "{d}", "--calibration", "{d}", "-o", "x.csv"], 1, "not a calibration as magbridge "),
-        (["simulate", "seaglider", "-o", "x.nc"], 2, "has no mission: drive it with a log (--like)"),
-        (["calibrate", "{d}", "--parameter", "nose", "-o", "x.json"], 1, "column 'nose'"),
-        (
-            ["calibrate", "{d}", "--parameter", "mag_x", "-o", "x.json"],
-            1,
-            "'mag_x' is raw magnetic field, sensor x (forward): it moves no mass",
-        ),
-        (["calibrate", "{d}", "--filter-corner", "1e-9", "-o", "x.json"], 1, "filter corner = 1e-09 Hz"),
-        (["calibrate", "{d}", "--method", "magic", "-o", "x.json"], 2, f"Choose from: {METHOD_NAMES}"),
-        (["calibrate", "{d}", "--method", "cubic", "--vehicle", "v.toml", "-o", "x.json"], 2, "--vehicle: "),
-        (["calibrate", "{d}", "--order", "0", "-o", "x.json"], 2, "order"),
-        (
-            ["calibrate", "{d}", "--parameter", "run", "--parameter", "run", "-o", "x.json"],
-            1,
-            "'run' is named twice",
-        ),
-        (["calibrate", "{d}", "--site-bias", "1e300", "-o", "x.json"], 2, "--site-bias. Must be <= 100000"),
-        (["map", "none.nc", "-o", "x.nc"], 1, "none.nc"),
-        (["map", "none.nc", "-o", "x.foo"], 2, "must end in .nc"),
-        (["map", "none.nc", "-o", "x.nc", "--altitude", "1e308"], 2, "Must be <= 1000000"),
-        (["map", "none.nc", "-o", "x.nc", "--picture", "x.foo"], 2, "must end in .png or .pdf or .svg"),
-        (["convert", "{d}", "-o", "nowhere/x.csv"], 2, "There is no folder nowhere"),
-        (["convert", "{d}", "-o", "."], 2, "It is a folder"),
-        (["simulate", "demo", "--like", "{d}", "b.nc", "-o", "x.nc"], 2, "b.nc: unexpected argument"),
-        (["simulate", "demo", "--like", "{d}", "b", "c", "d", "-o", "x.nc"], 2, "b and 2 more: unexpected"),
-        (["convert", "{d}", "-o", "/proc/self/x.csv"], 2, "The folder /proc/self cannot be written to"),
-        (["diagnose", "{d}", "--calibration", "{d}", "-o", "{d}"], 2, "It is a file"),
-        (["demo", "--out", "{d}"], 2, "It is a file"),
-        (["replay", "{d}", "--log", "/proc/self/new"], 2, "The folder /proc/self cannot be written to"),
-        (["demo", "--out", "/proc/self/new/demo"], 2, "The folder /proc/self cannot be written to"),
-        (["simulate", "demo", "-o", "x.nc", "--seed", "-1"], 2, "--seed"),
-        (["simulate", "demo", "-o", "x.nc", "--seed", "1.5"], 2, "--seed: expected a whole number, not 1.5"),
-        (["replay", "{d}", "--config", "none.toml"], 2, "none.toml: No such file"),
-        (["demo", "--out", "/dev/null/demo"], 1, "/dev/null/demo: Not a directory"),
+        ("run --config none.toml", 2, "none.toml: No such file"),
+        ("simulate none -o x.csv", 2, "none: expected a scenario file (.toml), or one of bonne_bay, "),
+        ("simulate none.toml -o x.csv", 2, "none.toml: No such file"),
+        ("correct {d} --calibration none.json -o x.csv", 1, "none.json: cannot be read"),
+        ("correct {d} --calibration {d} -o x.csv", 1, "not a calibration as magbridge "),
+        ("simulate seaglider -o x.nc", 2, "has no mission: drive it with a log (--like)"),
+        ("calibrate {d} --parameter nose -o x.json", 1, "column 'nose'"),
+        ("calibrate {d} --parameter mag_x -o x.json", 1, "'mag_x' is raw magnetic field, sensor x (forward)"),
+        ("calibrate {d} --filter-corner 1e-9 -o x.json", 1, "filter corner = 1e-09 Hz"),
+        ("calibrate {d} --method magic -o x.json", 2, f"Choose from: {METHOD_NAMES}"),
+        ("calibrate {d} --method cubic --vehicle v.toml -o x.json", 2, "--vehicle: "),
+        ("calibrate {d} --order 0 -o x.json", 2, "order"),
+        ("calibrate {d} --parameter run --parameter run -o x.json", 1, "'run' is named twice"),
+        ("calibrate {d} --site-bias 1e300 -o x.json", 2, "--site-bias. Must be <= 100000"),
+        ("map none.nc -o x.nc", 1, "none.nc"),
+        ("map none.nc -o x.foo", 2, "must end in .nc"),
+        ("map none.nc -o x.nc --altitude 1e308", 2, "Must be <= 1000000"),
+        ("map none.nc -o x.nc --picture x.foo", 2, "must end in .png or .pdf or .svg"),
+        ("convert {d} -o nowhere/x.csv", 2, "There is no folder nowhere"),
+        ("convert {d} -o .", 2, "It is a folder"),
+        ("simulate demo --like {d} b.nc -o x.nc", 2, "b.nc: unexpected argument"),
+        ("simulate demo --like {d} b c d -o x.nc", 2, "b and 2 more: unexpected"),
+        ("convert {d} -o /proc/self/x.csv", 2, "The folder /proc/self cannot be written to"),
+        ("diagnose {d} --calibration {d} -o {d}", 2, "It is a file"),
+        ("demo --out {d}", 2, "It is a file"),
+        ("replay {d} --log /proc/self/new", 2, "The folder /proc/self cannot be written to"),
+        ("demo --out /proc/self/new/demo", 2, "The folder /proc/self cannot be written to"),
+        ("simulate demo -o x.nc --seed -1", 2, "--seed"),
+        ("simulate demo -o x.nc --seed 1.5", 2, "--seed: expected a whole number, not 1.5"),
+        ("replay {d} --config none.toml", 2, "none.toml: No such file"),
+        ("demo --out /dev/null/demo", 1, "/dev/null/demo: Not a directory"),
     ],
 )
 def test_bad_input_gets_one_line_and_leaves_nothing(
-    deployment: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    arguments: list[str],
-    code: int,
-    words: str,
+    deployment: Path, here: Path, command: Command, arguments: str, code: int, words: str
 ) -> None:
-    monkeypatch.chdir(tmp_path)
-    line = complaint(capsys, *(argument.format(d=deployment) for argument in arguments), code=code)
+    line = command.refuses(*arguments.format(d=deployment).split(), code=code)
     assert words in line
-    assert list(tmp_path.iterdir()) == []
+    assert list(here.iterdir()) == []
 
 
 @pytest.mark.parametrize("room", [0, 20_000])
 @pytest.mark.parametrize("suffix", [".csv", ".nc", ".parquet", ".tlog"])
 def test_a_full_disk_gets_one_line_and_leaves_nothing(
-    suffix: str, room: int, deployment: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    suffix: str, room: int, deployment: Path, here: Path, command: Command
 ) -> None:
     """The limit of a file's size stands for the disk's end: the reason told is the system's own."""
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (room, limits[1]))
     try:
-        line = complaint(capsys, "convert", deployment, "-o", tmp_path / f"x{suffix}", code=1)
+        line = command.refuses("convert", deployment, "-o", f"x{suffix}")
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-    assert line == f"{tmp_path / f'x{suffix}'}: cannot be written: File too large"
-    assert list(tmp_path.iterdir()) == []
+    assert line == f"x{suffix}: cannot be written: File too large"
+    assert list(here.iterdir()) == []
 
 
 @pytest.mark.parametrize(
@@ -236,38 +186,19 @@ def test_a_full_disk_gets_one_line_and_leaves_nothing(
     ],
 )
 def test_what_would_be_another_place_or_moment(
-    deployment: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    column: str,
-    value: float,
-    words: str,
+    deployment: Path, command: Command, column: str, value: float, words: str
 ) -> None:
     lines = deployment.read_text().splitlines()
     cells = lines[11].split(",")
     cells[lines[0].split(",").index(column)] = repr(value)
-    bad = tmp_path / "bad.csv"
-    bad.write_text("\n".join([*lines[:11], ",".join(cells), *lines[12:]]))
-    assert words in complaint(capsys, "convert", bad, "-o", tmp_path / "x.nc", code=1)
+    Path("bad.csv").write_text("\n".join([*lines[:11], ",".join(cells), *lines[12:]]))
+    assert words in command.refuses("convert", "bad.csv", "-o", "x.nc")
 
 
-def test_one_position_that_is_none(
-    deployment: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_one_position_that_is_none(deployment: Path, command: Command) -> None:
     rows = read(deployment)
     rows["battpos"][7] = -9999.0
-    bad = tmp_path / "bad.nc"
-    write(rows, bad)
-    line = complaint(
-        capsys,
-        "calibrate",
-        bad,
-        "--parameter",
-        "battpos",
-        "--parameter",
-        "ballast",
-        "-o",
-        tmp_path / "c.json",
-        code=1,
-    )
+    write(rows, "bad.nc")
+    masses = "--parameter", "battpos", "--parameter", "ballast"
+    line = command.refuses("calibrate", "bad.nc", *masses, "-o", "c.json")
     assert "'battpos' is -9999 in 1 of 3600 samples" in line

@@ -5,19 +5,20 @@ from __future__ import annotations
 import json
 import os
 import pty
+import re
 import select
 import time
 from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import Command
 
 from magbridge.calibration.file import load as load_calibration
 from magbridge.calibration.file import save as save_calibration
 from magbridge.calibration.fitting.observe import observations
 from magbridge.calibration.model import Parameter, identity
 from magbridge.calibration.planning.plan import expected_calibration
-from magbridge.cli import main
 from magbridge.correction import Correction, correct_rows
 from magbridge.field.igrf import total_field
 from magbridge.field.read import read_grid
@@ -29,76 +30,66 @@ FEW = 40  # rows, which a diagnosis refuses: what it says before is said all the
 
 
 @pytest.mark.parametrize("like", [False, True], ids=["mission", "like a log"])
-def test_the_simulated_world_has_a_map(deployment: Path, tmp_path: Path, like: bool) -> None:
-    out, anomaly = tmp_path / "twin.nc", tmp_path / "grid.nc"
-    driven = ["--like", str(deployment)] if like else []
-    assert main(["simulate", "demo", "-o", str(out), "--map", str(anomaly), "--seed", "5", *driven]) == 0
-    twin = read(out)
+def test_the_simulated_world_has_a_map(deployment: Path, like: bool, command: Command) -> None:
+    driven = ["--like", deployment] if like else []
+    command("simulate", "demo", "-o", "twin.nc", "--map", "grid.nc", "--seed", "5", *driven)
+    twin = read("twin.nc")
     longitude, latitude = (twin[name].to_numpy() for name in ("truth_longitude", "truth_latitude"))
     met = twin["truth_total_field"].to_numpy() - total_field(longitude, latitude, twin["depth"], twin["time"])
-    mapped = read_grid(anomaly).evaluate(longitude, latitude).anomaly
+    mapped = read_grid("grid.nc").evaluate(longitude, latitude).anomaly
     assert np.corrcoef(met, mapped)[0, 1] > 0.9  # from 90 m up it is smoother than what the vehicle meets
     assert np.std(met - mapped) < 0.5 * np.std(met)
 
 
-def test_convert_there_and_back_keeps_every_number(deployment: Path, tmp_path: Path) -> None:
-    assert main(["convert", str(deployment), "-o", str(tmp_path / "a.nc")]) == 0
-    assert main(["convert", str(tmp_path / "a.nc"), "-o", str(tmp_path / "b.csv")]) == 0
-    before, after = read(deployment), read(tmp_path / "b.csv")
+def test_convert_there_and_back_keeps_every_number(deployment: Path, command: Command) -> None:
+    command("convert", deployment, "-o", "a.nc")
+    command("convert", "a.nc", "-o", "b.csv")
+    before, after = read(deployment), read("b.csv")
     assert set(before) == set(after)
     for name in before:
         np.testing.assert_array_equal(before[name], after[name], err_msg=str(name))
 
 
-def test_what_was_passed_over_is_told(
-    deployment: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_was_passed_over_is_told(deployment: Path, command: Command) -> None:
     """Of a damaged log, and of two that tell of the same times; not again of what was made from them."""
     rows = read(deployment).isel(time=slice(0, 200))
-    log, other, both = tmp_path / "log.tlog", tmp_path / "other.nc", tmp_path / "both.nc"
+    log = Path("log.tlog")
     write(rows, log)
     data = log.read_bytes()
     log.write_bytes(data[: len(data) // 2] + bytes(500) + data[len(data) // 2 :])
-    write(rows.isel(time=slice(150, 200)), other)
-    assert main(["convert", str(other), str(log), "-o", str(both)]) == 0
-    lines = capsys.readouterr().err
+    write(rows.isel(time=slice(150, 200)), "other.nc")
+    lines = command("convert", "other.nc", log, "-o", "both.nc").err
     assert lines.startswith("magbridge: in the logs: 5")
     assert " bytes skipped, 1 damaged place, 50 duplicate rows" in lines
-    assert main(["convert", str(both), "-o", str(tmp_path / "again.csv")]) == 0
-    assert not capsys.readouterr().err
+    assert not command("convert", "both.nc", "-o", "again.csv").err
 
 
-def test_what_headings_are_counted_from_may_be_told(deployment: Path, tmp_path: Path) -> None:
-    out = tmp_path / "magnetic.csv"
-    assert main(["convert", str(deployment), "-o", str(out), "--heading-reference", "magnetic"]) == 0
-    assert read(out).attrs["heading_reference"] == "magnetic"
+def test_what_headings_are_counted_from_may_be_told(deployment: Path, command: Command) -> None:
+    command("convert", deployment, "-o", "magnetic.csv", "--heading-reference", "magnetic")
+    assert read("magnetic.csv").attrs["heading_reference"] == "magnetic"
     offsets = []
     for reference in ("true", "magnetic"):
-        options = ["--method", "nominal", "--heading-reference", reference, "-o", str(tmp_path / "cal.json")]
-        assert main(["calibrate", str(deployment), *options]) == 0
-        boresight = load_calibration(tmp_path / "cal.json").boresight
+        options = "--method", "nominal", "--heading-reference", reference
+        command("calibrate", deployment, *options, "-o", "cal.json")
+        boresight = load_calibration("cal.json").boresight
         assert boresight
         offsets.append(boresight.rotation[2])
     assert abs(np.degrees(offsets[0] - offsets[1])) > 5.0  # the declination off Newfoundland is 17 degrees
 
 
-def test_a_fit_can_be_looked_at(deployment: Path, tmp_path: Path) -> None:
+def test_a_fit_can_be_looked_at(deployment: Path, command: Command) -> None:
     """Also where the log tells of no attitude, and a parameter has no part in the fit."""
-    bare, picture = tmp_path / "bare.csv", tmp_path / "fit.png"
-    write(read(deployment).drop_vars(["roll", "pitch", "heading"]), bare)
-    fitted = ["calibrate", str(bare), "--method", "nominal", "--parameter", "battpos"]
-    assert main([*fitted, "-o", str(tmp_path / "cal.json"), "--picture", str(picture)]) == 0
-    assert picture.stat().st_size > 40_000
+    write(read(deployment).drop_vars(["roll", "pitch", "heading"]), "bare.csv")
+    fitted = "calibrate", "bare.csv", "--method", "nominal", "--parameter", "battpos"
+    command(*fitted, "-o", "cal.json", "--picture", "fit.png")
+    assert Path("fit.png").stat().st_size > 40_000
 
 
 def test_correct_writes_what_the_contract_names(
-    deployment: Path, calibration: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    deployment: Path, calibration: Path, command: Command
 ) -> None:
-    out = tmp_path / "corrected.nc"
-    arguments = ["correct", str(deployment), "--calibration", str(calibration), "-o", str(out), "--json"]
-    assert main(arguments) == 0
-    result = json.loads(capsys.readouterr().out)
-    corrected = read(out)
+    said = command("correct", deployment, "--calibration", calibration, "-o", "corrected.nc", "--json")
+    result, corrected = json.loads(said.out), read("corrected.nc")
     assert result["rows"] == corrected.sizes["time"] == 3600
     names = ["total_field", "total_field_sigma", "field_x", "field_y", "field_z", "anomaly", "quality"]
     assert list(corrected) == names
@@ -109,41 +100,35 @@ def test_correct_writes_what_the_contract_names(
 
 
 def test_a_field_that_the_earth_does_not_have_is_said(
-    deployment: Path, calibration: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    deployment: Path, calibration: Path, command: Command
 ) -> None:
     """As with another vehicle's calibration: the magnets that it knows of are not those of this one."""
     own = read(deployment).isel(time=slice(0, 100))
     for name, iron in (("own.nc", 0.0), ("other.nc", 50_000.0)):
-        write(own.assign(mag_z=own["mag_z"] + iron), tmp_path / name)
-        command = ["correct", str(tmp_path / name), "--calibration", str(calibration)]
-        assert main([*command, "-o", str(tmp_path / "out.nc")]) == 0
-        said = "another vehicle's? 100 of 100 corrected total fields are none of the Earth's"
-        assert (said in capsys.readouterr().err) == bool(iron)
+        write(own.assign(mag_z=own["mag_z"] + iron), name)
+        said = command("correct", name, "--calibration", calibration, "-o", "out.nc")
+        doubt = "another vehicle's? 100 of 100 corrected total fields are none of the Earth's"
+        assert (doubt in said.err) == bool(iron)
 
 
 def test_what_uses_a_calibration_repeats_that_its_data_do_not_support_it(
-    deployment: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    deployment: Path, command: Command
 ) -> None:
     """As one of runs that all head one way; `calibrate` says so, too, and ends with 0 without --strict."""
-    one_way, cal, out = tmp_path / "one_way.csv", tmp_path / "cal.json", tmp_path / "out"
     log = read(deployment)
-    write(log.where((log["heading"] > 200.0) & (log["heading"] < 260.0), drop=True), one_way)
-    fit = ["calibrate", str(one_way), "--method", "nominal", "-o", str(cal)]
-    assert main(fit) == 0
+    write(log.where((log["heading"] > 200.0) & (log["heading"] < 260.0), drop=True), "one_way.csv")
+    fit = "calibrate", "one_way.csv", "--method", "nominal", "-o", "cal.json"
     why = "all headings lie within 59 degrees"
-    assert why in capsys.readouterr().err
-    assert main([*fit, "--strict"]) == 1
-    capsys.readouterr()
-    use = [str(deployment), "--calibration", str(cal), "-o"]
-    for command in (["correct", *use, f"{out}.nc"], ["diagnose", *use, str(out)]):
-        assert main(command) == 0
-        said = capsys.readouterr().err
-        assert said.startswith(f"magbridge: {cal}: the data it was fitted to do not support it: ")
+    assert why in command(*fit).err
+    command(*fit, "--strict", code=1)
+    for name, out in (("correct", "out.nc"), ("diagnose", "out")):
+        said = command(name, deployment, "--calibration", "cal.json", "-o", out).err
+        assert said.startswith("magbridge: cal.json: the data it was fitted to do not support it: ")
         assert why in said.partition("\n")[0]
-    assert why in (out / "report.html").read_text()
+    assert why in Path("out/report.html").read_text()
 
 
-def test_correct_gives_the_same_in_pieces(deployment: Path, calibration: Path, tmp_path: Path) -> None:
+def test_correct_gives_the_same_in_pieces(deployment: Path, calibration: Path) -> None:
     """A month is corrected in pieces: the state goes on from one to the next."""
     rows = read(deployment)
     whole = correct_rows(Correction(load_calibration(calibration)), rows)
@@ -155,85 +140,62 @@ def test_correct_gives_the_same_in_pieces(deployment: Path, calibration: Path, t
         np.testing.assert_array_equal(whole[name], np.concatenate([part[name] for part in parts]))
 
 
-def test_a_column_that_the_calibration_needs_is_missed_aloud(
-    deployment: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    known, bare, out = tmp_path / "cal.json", tmp_path / "bare.csv", tmp_path / "x.csv"
-    save_calibration(identity((Parameter("battpos", "in", low=0.0, high=0.1, centre=0.0, scale=1.0),)), known)
+def test_a_column_that_the_calibration_needs_is_missed_aloud(deployment: Path, command: Command) -> None:
+    needing = identity((Parameter("battpos", "in", low=0.0, high=0.1, centre=0.0, scale=1.0),))
+    save_calibration(needing, "cal.json")
     log = read(deployment).isel(time=slice(0, 50))
-    write(log.drop_vars("battpos"), bare)
-    assert main(["correct", str(bare), "--calibration", str(known), "-o", str(out), "--json"]) == 0
-    said = capsys.readouterr()
+    write(log.drop_vars("battpos"), "bare.csv")
+    said = command("correct", "bare.csv", "--calibration", "cal.json", "-o", "x.csv", "--json")
     assert "no column 'battpos', which the calibration needs: every sample is flagged" in said.err
     assert json.loads(said.out)["flags"]["stale_telemetry"] == json.loads(said.out)["flagged"] == 50
-    assert main(["correct", str(deployment), "--calibration", str(known), "-o", str(out)]) == 0
-    said = capsys.readouterr()
+    said = command("correct", deployment, "--calibration", "cal.json", "-o", "x.csv")
     assert not said.err
     assert "stale" not in said.out
     assert "extrapolated " in said.out
 
 
 def test_numbers_that_may_say_not_known_are_told(
-    deployment: Path, calibration: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    deployment: Path, calibration: Path, command: Command
 ) -> None:
     rows = read(deployment).isel(time=slice(0, FEW))
     rows["pump_current"] = rows["depth"] * 0.0 + 0.5
     rows["pump_current"].attrs["units"] = "A"
     rows["pump_current"][[7, 30]] = -9999.0
-    diagnosed = ["--calibration", str(calibration), "-o", str(tmp_path / "doubt")]
-    write(rows, tmp_path / "log.csv")
-    assert main(["diagnose", str(tmp_path / "log.csv"), *diagnosed]) == 1
-    warning, refused = capsys.readouterr().err.splitlines()
+    diagnosed = "--calibration", calibration, "-o", "doubt"
+    write(rows, "log.csv")
+    warning, refused = command("diagnose", "log.csv", *diagnosed, code=1).err.splitlines()
     assert f"log.csv, column 'pump_current': -9999 in 2 of {FEW} rows is read as a number" in warning
     assert refused.endswith(f"{FEW} samples, at least 60 needed")
-    declared = tmp_path / "declared.csv"
-    declared.write_text("# fill_value = -9999\n" + (tmp_path / "log.csv").read_text())
-    assert main(["diagnose", str(declared), *diagnosed]) == 1
-    assert capsys.readouterr().err.count("\n") == 1
+    declared = Path("declared.csv")
+    declared.write_text("# fill_value = -9999\n" + Path("log.csv").read_text())
+    command.refuses("diagnose", declared, *diagnosed)
     assert np.isnan(read(declared)["pump_current"]).sum() == 2
 
 
-def test_a_log_that_the_calibration_was_made_from_is_told(
-    deployment: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    log, cal = tmp_path / "log.csv", tmp_path / "cal.json"
-    write(read(deployment).isel(time=slice(0, FEW)), log)
-    assert main(["calibrate", str(log), "--method", "nominal", "-o", str(cal)]) == 0
-    capsys.readouterr()
-    assert main(["diagnose", str(log), "--calibration", str(cal), "-o", str(tmp_path / "doubt")]) == 1
-    assert f"{log}: the calibration was fitted to this log" in capsys.readouterr().err
+def test_a_log_that_the_calibration_was_made_from_is_told(deployment: Path, command: Command) -> None:
+    write(read(deployment).isel(time=slice(0, FEW)), "log.csv")
+    command("calibrate", "log.csv", "--method", "nominal", "-o", "cal.json")
+    said = command("diagnose", "log.csv", "--calibration", "cal.json", "-o", "doubt", code=1)
+    assert "log.csv: the calibration was fitted to this log" in said.err
 
 
 @pytest.mark.parametrize("names", [(), ("battpos", "ballast")], ids=["nominal", "two masses"])
-def test_plan(
-    names: tuple[str, ...], deployment: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_plan(names: tuple[str, ...], deployment: Path, command: Command) -> None:
     known = expected_calibration(observations(read(deployment), names).ranges(), 52_000.0, order=2)
-    save_calibration(known, tmp_path / "cal.json")
-    arguments = [
-        "plan",
-        "--calibration",
-        str(tmp_path / "cal.json"),
-        "--mission",
-        str(deployment),
-        "--runs",
-        "2",
-    ]
-    assert main([*arguments, "--json"]) == 0
-    result = json.loads(capsys.readouterr().out)
+    save_calibration(known, "cal.json")
+    asked = "plan", "--calibration", "cal.json", "--mission", deployment, "--runs", "2"
+    result = json.loads(command(*asked, "--json").out)
     before, first, second = result["expected_worst_nT"]
     assert before > first > second
     assert [set(run) for run in result["runs"]] == [{"pitch", "roll", *names}] * 2
-    assert main(arguments) == 0
-    lines = capsys.readouterr().out.splitlines()
+    lines = command(*asked).out.splitlines()
     assert [line.split()[0] for line in lines] == ["run", "none", "1", "2", "each"]
 
 
-def test_help_names_every_command(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["--help"]) == 0
-    text = capsys.readouterr().out
-    for command in ("demo", "run", "replay", "simulate", "convert", "calibrate", "correct", "map"):
-        assert command in text
+def test_help_names_every_command(command: Command) -> None:
+    text = command("--help").out
+    commands = "calibrate convert correct demo diagnose map monitor navigate plan replay run simulate"
+    assert re.findall(r"^│ ([a-z]+) ", text, re.MULTILINE) == commands.split()
 
 
 def test_what_takes_long_says_that_it_is_at_work(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -260,17 +222,17 @@ def test_what_takes_long_says_that_it_is_at_work(monkeypatch: pytest.MonkeyPatch
 
 
 def test_only_what_the_sensor_measured_is_corrected(
-    deployment: Path, calibration: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    deployment: Path, calibration: Path, command: Command
 ) -> None:
     """The vehicle's telemetry in a file of its own, at times of its own, makes no samples and no gaps."""
     rows = read(deployment).isel(time=slice(0, 300))
     whole = correct_rows(Correction(load_calibration(calibration)), rows)
     masses = rows[["battpos", "ballast"]]
-    write(masses.assign_coords(time=rows["time"] - 0.5), tmp_path / "vehicle.csv")
-    write(rows.drop_vars(masses), tmp_path / "instrument.csv")
-    command = ["correct", str(tmp_path / "vehicle.csv"), str(tmp_path / "instrument.csv"), "--json"]
-    assert main([*command, "--calibration", str(calibration), "-o", str(tmp_path / "out.nc")]) == 0
-    result, out = json.loads(capsys.readouterr().out), read(tmp_path / "out.nc")
+    write(masses.assign_coords(time=rows["time"] - 0.5), "vehicle.csv")
+    write(rows.drop_vars(masses), "instrument.csv")
+    asked = "correct", "vehicle.csv", "instrument.csv", "--calibration", calibration
+    said = command(*asked, "-o", "out.nc", "--json")
+    result, out = json.loads(said.out), read("out.nc")
     assert (result["rows"], result["left_out"]) == (300, 300)
     np.testing.assert_allclose(out["time"], rows["time"], atol=1e-5)
     before, after = (one["quality"].to_numpy().astype(int) for one in (whole, out))

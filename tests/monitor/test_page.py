@@ -15,8 +15,8 @@ from urllib.error import URLError
 from urllib.request import urlopen
 
 import pytest
+from commands import Command
 
-from magbridge.cli import main
 from magbridge.mavlink import Codec, Signing
 from magbridge.monitor.chart import reach
 from magbridge.monitor.state import Point
@@ -143,32 +143,24 @@ def test_a_bridge_that_signs_is_asked_in_signed_messages(clock: Path, tmp_path: 
         assert "PARAM_REQUEST_LIST" in names
 
 
-def test_bad_input_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+def test_bad_input_is_one_line(command: Command) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = str(taken.getsockname()[1])
         for arguments, code, expected in (
             (["udpin:nowhere"], 2, "magbridge monitor: LINK: expected HOST:PORT or [IPV6]:PORT"),
             (["/dev/nowhere"], 1, "/dev/nowhere: "),
-            (["nonsense"], 2, "LINK: expected udpin, udpout, tcp, tcpin or a serial device"),
             (["udpin:127.0.0.1:0", "--port", port], 1, f"127.0.0.1:{port}: Address already in use"),
             (["--port", "99999"], 2, "99999"),
             (["--signing-key", "/nowhere"], 2, "/nowhere: No such file or directory"),
         ):
-            assert main(["monitor", *arguments]) == code
-            line = capsys.readouterr().err
-            assert line.count("\n") == 1
-            assert expected in line
+            assert expected in command.refuses("monitor", *arguments, code=code)
 
 
-def test_a_missing_extra_is_named(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_missing_extra_is_named(monkeypatch: pytest.MonkeyPatch, command: Command) -> None:
     monkeypatch.setitem(sys.modules, "nicegui", None)
     monkeypatch.delitem(sys.modules, "magbridge.monitor.page", raising=False)
-    assert main(["monitor"]) == 2
-    assert (
-        capsys.readouterr().err == "magbridge: nicegui is not installed: pip install 'magbridge[monitor]'\n"
-    )
+    line = command.refuses("monitor", code=2)
+    assert line == "nicegui is not installed: pip install 'magbridge[monitor]'"
 
 
 def test_the_axis_shows_the_curve_whatever_its_band() -> None:

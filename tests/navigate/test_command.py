@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
+from commands import Command
 from voyages.simulated import voyage
 
 from magbridge.calibration.file import save
 from magbridge.calibration.model import Noise, identity
-from magbridge.cli import main
 from magbridge.field.grid import AnomalyGrid
 from magbridge.logs import read, write
 from magbridge.navigate.options import Options
@@ -23,6 +23,9 @@ PLAN = """time,latitude,longitude
 1386208800,49.50,-57.90
 1386216000,49.50,-57.85
 """
+TRACK = ("navigate", "log.nc", "--map", "grid.nc", "-o", "out.nc")
+BOUND = ("navigate", "--bound", "--map", "grid.nc", "-o", "out.nc")
+CALIBRATED = ("--calibration", "cal.json")
 
 
 @pytest.fixture(scope="module")
@@ -52,76 +55,54 @@ def folder(tmp_path_factory: pytest.TempPathFactory, grid: AnomalyGrid, options:
     return path
 
 
-def run(folder: Path, *arguments: str, calibration: bool = True) -> int:
-    given = ["--calibration", str(folder / "cal.json")] if calibration else []
-    return main(["navigate", *arguments, *given, "-o", str(folder / "out.nc")])
+@pytest.fixture(autouse=True)
+def here(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(folder)
 
 
-def test_a_log_against_its_map(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    picture = folder / "track.png"
-    code = run(
-        folder,
-        *(str(folder / "log.nc"), "--map", str(folder / "grid.nc"), "--config", str(folder / "bridge.toml")),
-        *("--picture", str(picture), "--json"),
-    )
-    assert code == 0
-    said = capsys.readouterr()
+def test_a_log_against_its_map(command: Command) -> None:
+    said = command(*TRACK, *CALIBRATED, "--config", "bridge.toml", "--picture", "track.png", "--json")
     result = json.loads(said.out)
     assert result["findings"] == said.err == ""
-    track = read(folder / "out.nc")
-    error = np.hypot(track["error_north"], track["error_east"])
+    found = read("out.nc")
+    error = np.hypot(found["error_north"], found["error_east"])
     assert result["error_m"] == pytest.approx(float((error**2).mean()) ** 0.5)
-    alone = np.hypot(track["error_north"] - track["north"], track["error_east"] - track["east"])
+    alone = np.hypot(found["error_north"] - found["north"], found["error_east"] - found["east"])
     assert result["dead_reckoning_error_m"] == pytest.approx(float((alone**2).mean()) ** 0.5)
     assert 0.0 < result["valid"] <= 1.0
     assert float(error[-100:].mean()) < 150.0
-    assert picture.stat().st_size > 40_000
+    assert Path("track.png").stat().st_size > 40_000
 
 
-def test_a_map_that_cannot_be_meant_is_one_line(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with xr.open_dataset(folder / "grid.nc") as whole:
-        whole.assign(anomaly=whole["anomaly"] + 52_000.0).to_netcdf(folder / "bad.nc")
-    assert run(folder, str(folder / "log.nc"), "--map", str(folder / "bad.nc")) == 1
-    line = capsys.readouterr().err
-    assert "subtract the IGRF first" in line
-    assert line.count("\n") == 1
+def test_a_map_that_cannot_be_meant_is_one_line(command: Command) -> None:
+    with xr.open_dataset("grid.nc") as whole:
+        whole.assign(anomaly=whole["anomaly"] + 52_000.0).to_netcdf("bad.nc")
+    asked = "navigate", "log.nc", "--map", "bad.nc", "-o", "out.nc"
+    assert "subtract the IGRF first" in command.refuses(*asked, *CALIBRATED)
 
 
-def test_a_plan_is_told_what_the_map_is_worth(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    picture = folder / "bound.png"
-    plan = (str(folder / "plan.csv"), "--map", str(folder / "grid.nc"), "--bound")
-    assert run(folder, *plan, "--picture", str(picture), calibration=False) == 0
-    assert "dead reckoning alone" in capsys.readouterr().out
-    bound = read(folder / "out.nc")
+def test_a_plan_is_told_what_the_map_is_worth(command: Command) -> None:
+    assert "dead reckoning alone" in command(*BOUND, "plan.csv", "--picture", "bound.png").out
+    bound = read("out.nc")
     assert (bound["sigma"] <= bound["unaided"]).all()
-    assert picture.stat().st_size > 20_000
+    assert Path("bound.png").stat().st_size > 20_000
 
 
 @pytest.mark.parametrize(
     ("text", "answer"),
     [(PLAN.replace("1386216000", "1386201000"), "time"), (PLAN.replace("longitude", "x"), "longitude")],
 )
-def test_a_plan_that_cannot_be_flown_is_one_line(
-    folder: Path, capsys: pytest.CaptureFixture[str], text: str, answer: str
-) -> None:
-    (folder / "bad.csv").write_text(text)
-    plan = (str(folder / "bad.csv"), "--map", str(folder / "grid.nc"), "--bound")
-    assert run(folder, *plan, calibration=False) in {1, 2}
-    line = capsys.readouterr().err
-    assert answer in line
-    assert line.count("\n") == 1
+def test_a_plan_that_cannot_be_flown_is_one_line(command: Command, text: str, answer: str) -> None:
+    Path("bad.csv").write_text(text)
+    assert answer in command.refuses(*BOUND, "bad.csv")
 
 
-def test_wrong_use_is_one_line(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(folder, str(folder / "log.nc"), "--map", str(folder / "grid.nc"), calibration=False) == 2
-    assert "expected --calibration" in capsys.readouterr().err
-    (folder / "other.toml").write_text("[navigation.options]\nstart_sgma = 1.0\n")
-    others = (
-        *(str(folder / "log.nc"), "--map", str(folder / "grid.nc")),
-        *("--config", str(folder / "other.toml")),
-    )
-    assert run(folder, *others) == 2
-    assert "navigation.options.start_sgma: unknown key" in capsys.readouterr().err
-    (folder / "other.toml").write_text("[navigation.options]\nstart_sigma = -1.0\n")
-    assert run(folder, *others) == 2
-    assert "navigation.options.start_sigma: expected `float` > 0.0" in capsys.readouterr().err
+def test_wrong_use_is_one_line(command: Command) -> None:
+    assert "expected --calibration" in command.refuses(*TRACK, code=2)
+    for text, line in (
+        ("start_sgma = 1.0", "start_sgma: unknown key"),
+        ("start_sigma = -1.0", "start_sigma: expected `float` > 0.0"),
+    ):
+        Path("other.toml").write_text(f"[navigation.options]\n{text}\n")
+        said = command.refuses(*TRACK, *CALIBRATED, "--config", "other.toml", code=2)
+        assert f"navigation.options.{line}" in said
