@@ -12,6 +12,7 @@ from scipy.signal import lfilter
 
 from magbridge.calibration.instrument_effects import TimeEffect
 from magbridge.diagnose.causes.candidates import Candidate
+from magbridge.diagnose.causes.reference import reference_bias
 from magbridge.diagnose.inference.exchange import exchanged
 from magbridge.diagnose.inference.rounds import State
 from magbridge.diagnose.inference.search import search
@@ -68,3 +69,16 @@ def test_what_nature_cannot_do_is_the_vehicles() -> None:
     drift, daily = fit.coefficients * [50.0, 20.0]
     assert drift + daily == pytest.approx(150.0, abs=1.0)
     assert daily == pytest.approx(150.0 * 20.0**2 / (20.0**2 + 50.0**2 / 0.1), rel=0.05)
+
+
+def test_a_main_field_model_may_be_off_by_140_nanotesla() -> None:
+    """At many sites it is, by the rock: a fault of the vehicle that imitates it must not win by that."""
+    rng = np.random.default_rng(1)
+    problem = right(600)
+    noise = rng.normal(size=600)
+    [bias] = reference_bias(problem)
+    small, large = (
+        State(replace(problem, residual=noise + size * problem.gain), [bias], 1, 1).fit([bias]).log_likelihood
+        for size in (10.0, 140.0)
+    )
+    assert small - 2.0 < large < small
