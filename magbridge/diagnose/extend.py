@@ -54,7 +54,7 @@ def extend(problem: Problem, model: Sequence[Candidate], fit: Joint) -> Calibrat
     for candidate, own in zip(model, slices(model), strict=True):
         if candidate.cause == "reference_bias":
             at = own.start
-            sigma = float(np.sqrt(fit.covariance[q + at, q + at]) * widths[at])
+            sigma = float(np.sqrt(fit.effects_covariance[at, at]) * widths[at])
             reference = msgspec.structs.replace(
                 reference, bias=reference.bias + float(b[at]), bias_sigma=sigma
             )
@@ -166,10 +166,9 @@ def with_misfit(model: Sequence[Candidate], fit: Joint) -> Joint:
     """
     C, q = fit.covariance.copy(), len(fit.z)
     for place in slices(model):
-        own, b = slice(q + place.start, q + place.stop), fit.coefficients[place]
-        given = np.linalg.solve(fit.covariance[own, own], np.column_stack([b, fit.covariance[own]]))
-        power = IDEAL**2 * float(b @ given[:, 0]) / MODES
-        C += power * fit.covariance[:, own] @ given[:, 1:]
+        own = slice(q + place.start, q + place.stop)
+        given = np.linalg.solve(fit.covariance[own, own], fit.covariance[own])
+        C += IDEAL**2 * fit.wald(place) / MODES * fit.covariance[:, own] @ given
     return replace(fit, covariance=0.5 * (C + C.T))
 
 

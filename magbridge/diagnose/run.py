@@ -218,7 +218,7 @@ def _findings(
         alone = replace(fit, coefficients=np.delete(fit.coefficients, own), prior=kept)
         without = held_out(problem, columns, alone).left
         gain = paired(without, after, problem.survey.dive, counts)
-        covariance = fit.covariance[q:, q:][own, own]
+        covariance = fit.effects_covariance[own, own]
         found.append(Finding(hypothesis, others, gain, fit.coefficients[own], covariance))
     return tuple(found)
 

@@ -24,7 +24,6 @@ from magbridge.diagnose.gain import Gain
 from magbridge.diagnose.report.doubts import useful
 from magbridge.diagnose.report.findings import parameters
 from magbridge.diagnose.run import diagnose
-from magbridge.errors import DataError
 from sitl.dataset import corrected
 from sitl.inject import Hidden, disturb
 
@@ -211,18 +210,3 @@ def test_a_channels_name_does_not_decide(
     assert useful(replace(found, findings=both)).endswith(
         "It leaves diurnal variation in the field, which the RMS above has removed.</p>"
     )
-
-
-def test_bad_input_is_one_line(warm: tuple[xr.Dataset, Calibration]) -> None:
-    ds, calibration = warm
-    bare = ds.drop_vars(["reference_field", "latitude", "longitude"])
-    for wrong, message in (
-        (ds.drop_vars("battpos"), "battpos"),
-        (ds.isel(time=slice(0, 3)), "3 of 3|only 3|3 samples"),
-        (ds.assign(mag_x=ds["mag_x"] * np.nan), "mag_x"),
-    ):
-        with pytest.raises(DataError, match=message) as caught:
-            diagnose([wrong], calibration)
-        assert "\n" not in str(caught.value)
-    with pytest.raises(DataError, match="latitude"):
-        diagnose([bare], calibration)

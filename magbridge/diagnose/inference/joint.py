@@ -61,6 +61,16 @@ class Joint:
     left: FloatArray
     prior: FloatArray
 
+    @property
+    def effects_covariance(self) -> FloatArray:
+        """(k, k) of the effects' coefficients."""
+        return self.covariance[len(self.z) :, len(self.z) :]
+
+    def wald(self, at: slice | NDArray[np.intp]) -> float:
+        """Wald's statistic ``b^T C_bb^-1 b`` of the effects' coefficients `at` these places."""
+        b = self.coefficients[at]
+        return float(b @ np.linalg.solve(self.effects_covariance[at][:, at], b))
+
 
 def fit_joint(
     problem: Problem,

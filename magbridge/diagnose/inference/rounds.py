@@ -56,9 +56,9 @@ class Hypothesis:
     @property
     def signal_to_noise(self) -> float:
         """Whitened norm of the effect, calibration and model projected out, less what noise alone gives."""
-        size = self.candidate.size
-        known = self.fit.prior[-size:] * np.diag(self.fit.covariance)[-size:]
-        power = wald(self.fit, size) - float(np.sum(1.0 - known))
+        own = slice(-self.candidate.size, None)
+        known = self.fit.prior[own] * np.diag(self.fit.covariance)[own]
+        power = self.fit.wald(own) - float(np.sum(1.0 - known))
         return float(np.sqrt(power)) if power > 0.0 else 0.0
 
 
@@ -75,30 +75,20 @@ class Best(NamedTuple):
     info: Information
 
 
-def wald(fit: Joint, size: int) -> float:
-    """Wald's statistic of the last coefficients."""
-    b, own = fit.coefficients[-size:], fit.covariance[-size:, -size:]
-    return float(b @ np.linalg.solve(own, b))
-
-
 def shaped_ratio(ratio: float, model: Sequence[Candidate], fit: Joint) -> float:
     """Likelihood ratio of the causes of a model that have a shape, beside those that take any.
 
     `ratio` is that of the whole model.
     """
     free = np.repeat([candidate.shapeless for candidate in model], [candidate.size for candidate in model])
-    if not free.any():
-        return ratio
-    own = np.flatnonzero(~free)
-    b, at = fit.coefficients[own], len(fit.z) + own
-    return min(ratio, float(b @ np.linalg.solve(fit.covariance[np.ix_(at, at)], b)))
+    return min(ratio, fit.wald(np.flatnonzero(~free))) if free.any() else ratio
 
 
 def wald_ratio(fit: Joint, candidate: Candidate) -> float:
     """Likelihood ratio of the last candidate's coefficients under the noise that is left."""
     own = slice(-candidate.size, None)
     spread = 0.0 if candidate.spectra is None else volume_of(fit.covariance[own, own], fit.prior[own])
-    return wald(fit, candidate.size) - 2.0 * spread
+    return fit.wald(own) - 2.0 * spread
 
 
 class State:

@@ -4,28 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from html import escape
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from magbridge.calibration.model import Calibration
 from magbridge.calibration.residual import residuals, residuals_of
+from magbridge.diagnose.causes import Cause
+from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.compare.derivatives import CHUNK, derivatives
 from magbridge.diagnose.compare.problem import DELAY, DELAYS, Problem, samples_of
+from magbridge.diagnose.diagnosis import Diagnosis, Finding
+from magbridge.diagnose.gain import Gain
 from magbridge.diagnose.inference.evidence import LEVEL
 from magbridge.diagnose.inference.joint import Joint
+from magbridge.diagnose.inference.rivals import Rival
 from magbridge.diagnose.report.findings import chance_alone
 from magbridge.diagnose.report.words import label, listed, measured, number
-
-if TYPE_CHECKING:
-    from magbridge.calibration.model import Calibration
-    from magbridge.diagnose.causes import Cause
-    from magbridge.diagnose.causes.candidates import Candidate
-    from magbridge.diagnose.diagnosis import Diagnosis, Finding
-    from magbridge.diagnose.gain import Gain
-    from magbridge.diagnose.inference.rivals import Rival
-    from magbridge.diagnose.unexplained.leftover import Leftover
+from magbridge.diagnose.unexplained.leftover import Leftover
 
 __all__ = ["doubts", "gained", "late", "nameless", "unsettled", "useful"]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from base64 import b64encode
 from io import BytesIO
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -13,10 +13,8 @@ from matplotlib.ticker import LogFormatter, MaxNLocator
 from numpy.typing import NDArray
 from scipy.signal import periodogram
 
+from magbridge.diagnose.diagnosis import Diagnosis
 from magbridge.diagnose.report.words import chance, label
-
-if TYPE_CHECKING:
-    from magbridge.diagnose.diagnosis import Diagnosis
 
 __all__ = ["channels", "evidence", "likeness", "measured", "spectrum", "terms", "track"]
 

@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import msgspec
 import numpy as np
 
+from magbridge.diagnose.causes import Cause
+from magbridge.diagnose.causes.candidates import Candidate
+from magbridge.diagnose.diagnosis import Diagnosis, Finding
+from magbridge.diagnose.gain import Gain
 from magbridge.diagnose.inference.design import normal
 from magbridge.diagnose.inference.rivals import Rival
 from magbridge.diagnose.inference.search import Hypothesis
-
-if TYPE_CHECKING:
-    from magbridge.diagnose.causes import Cause
-    from magbridge.diagnose.causes.candidates import Candidate
-    from magbridge.diagnose.diagnosis import Diagnosis, Finding
-    from magbridge.diagnose.gain import Gain
 
 __all__ = ["chance_alone", "findings", "findings_json", "parameters"]
 

@@ -4,20 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from magbridge.calibration.residual import rms
+from magbridge.diagnose.causes import Cause
+from magbridge.diagnose.diagnosis import Diagnosis, Finding
 from magbridge.diagnose.report import figures
 from magbridge.diagnose.report.doubts import doubts
 from magbridge.diagnose.report.findings import parameters
-from magbridge.diagnose.report.words import MANY, bold, chance, figure, listed, number, physics, row
-
-if TYPE_CHECKING:
-    from magbridge.diagnose.causes import Cause
-    from magbridge.diagnose.diagnosis import Diagnosis, Finding
+from magbridge.diagnose.report.words import MANY, bold, chance, figure, listed, number, physics, row, table
 
 __all__ = ["found", "overview"]
 
@@ -61,15 +59,13 @@ def overview(diagnosis: Diagnosis) -> str:
             f'<td class="n">{number(rms(field))} nT</td><td class="n">{one.signal_to_noise:.1f}</td>'
             f'<td class="n">× {1 / max(one.gain.ratio, 1e-9):.2f}</td><td>{listed(one.rivals)}</td></tr>'
         )
-    heads = ("cause", "its field, RMS", "S/N", "held-out RMS without it", "or possibly")
-    head = "".join(f"<th>{one}</th>" for one in heads)
-    return f"<table><tr>{head}</tr>{''.join(rows)}</table>" if rows else ""
+    return table(("cause", "its field, RMS", "S/N", "held-out RMS without it", "or possibly"), rows)
 
 
 def _cause(diagnosis: Diagnosis, finding: Finding, cause: Cause) -> list[str]:
     """Tell of one cause: its physics, the evidence, its numbers, and what speaks against it."""
     gain, numbers = finding.gain, parameters(finding, len(diagnosis.problem))
-    rows = "".join(row(name, **value) for name, value in numbers.items())
+    terms = table(("term", "value", "1 sigma", "unit"), (row(name, **one) for name, one in numbers.items()))
     return [
         f'<p class="faint">{physics(cause)}</p>',
         (
@@ -79,10 +75,7 @@ def _cause(diagnosis: Diagnosis, finding: Finding, cause: Cause) -> list[str]:
             f"RMS is {1 / max(gain.ratio, 1e-9):.2f} times as large (95 %: "
             f"{1 / max(gain.interval[1], 1e-9):.2f} to {1 / max(gain.interval[0], 1e-9):.2f}).</p>"
         ),
-        _folded(
-            f"<table><tr><th>term</th><th>value</th><th>1 sigma</th><th>unit</th></tr>{rows}</table>",
-            numbers,
-        ),
+        _folded(terms, numbers),
         *doubts(diagnosis, finding, cause),
     ]
 
@@ -98,11 +91,11 @@ def _outliers(time: NDArray[np.float64]) -> str:
     )
 
 
-def _folded(table: str, numbers: Mapping[str, Mapping[str, Any]]) -> str:
+def _folded(terms: str, numbers: Mapping[str, Mapping[str, Any]]) -> str:
     """Fold a table that is too long to be read line by line: its terms count together, few by themselves."""
     if len(numbers) <= MANY:
-        return table
+        return terms
     clear = sum(abs(one["value"]) > 2.0 * one["sigma"] for one in numbers.values() if one["sigma"])
     return (
-        f"<details><summary>{len(numbers)} terms, {clear} of them beyond 2 sigma</summary>{table}</details>"
+        f"<details><summary>{len(numbers)} terms, {clear} of them beyond 2 sigma</summary>{terms}</details>"
     )

@@ -6,18 +6,15 @@ from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from magbridge.diagnose.causes import Cause
+from magbridge.diagnose.diagnosis import Diagnosis, Finding
 from magbridge.diagnose.report import figures
 from magbridge.diagnose.report.doubts import gained, late, nameless, unsettled, useful
 from magbridge.diagnose.report.found import found, overview
-from magbridge.diagnose.report.words import bold, figure, label, listed, number, sizes
-
-if TYPE_CHECKING:
-    from magbridge.diagnose.causes import Cause
-    from magbridge.diagnose.diagnosis import Diagnosis, Finding
+from magbridge.diagnose.report.words import bold, figure, label, listed, number, sizes, table
 
 __all__ = ["report_html"]
 
@@ -197,13 +194,14 @@ def _left(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> str:
 
 def _isolability(diagnosis: Diagnosis) -> list[str]:
     report = diagnosis.isolability
-    rows = "".join(
+    heads = ("cause", "S/N found in 50 %", "in 95 %", "smallest size found in 95 %")
+    rows = (
         f"<tr><td>{escape(label(v.cause, v.channel))}</td>"
         f'<td class="n">{v.half:.1f}</td><td class="n">{v.sure:.1f}</td>'
         f"<td>{sizes(v.sizes)}</td></tr>"
         for v in report.visible
     )
-    pairs = "".join(
+    pairs = (
         f"<tr><td>{escape(label(a.cause, a.channel))}</td><td>{escape(label(b.cause, b.channel))}</td>"
         f'<td class="n">{100 * rho:.0f} %</td></tr>'
         for a, b, rho in report.pairs[:20]
@@ -220,14 +218,9 @@ def _isolability(diagnosis: Diagnosis) -> list[str]:
             "while no mass moves, does not reach it at any plausible size (at most 50 times the usual "
             "one).</p>"
         ),
-        (
-            "<table><tr><th>cause</th><th>S/N found in 50 %</th><th>in 95 %</th>"
-            f"<th>smallest size found in 95 %</th></tr>{rows}</table>"
-        ),
-        "<h3>Causes that look alike</h3>"
-        f"<table><tr><th>one</th><th>another</th><th>correlation</th></tr>{pairs}</table>"
-        if pairs
-        else "",
+        table(heads, rows),
+        "<h3>Causes that look alike</h3>" * bool(report.pairs),
+        table(("one", "another", "correlation"), pairs),
         f"<p>Not testable in this log, with what it would take: {missing}.</p>" if missing else "",
         figure(
             figures.likeness(diagnosis),

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from html import escape
 from inspect import getdoc
 from itertools import groupby
 from math import floor, isfinite, log10
 from operator import itemgetter
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from magbridge.diagnose.causes import Cause
-    from magbridge.diagnose.causes.candidates import Candidate
-    from magbridge.diagnose.inference.rivals import Rival
+from magbridge.diagnose.causes import Cause
+from magbridge.diagnose.causes.candidates import Candidate
+from magbridge.diagnose.inference.rivals import Rival
 
 __all__ = [
     "MANY",
@@ -28,6 +26,7 @@ __all__ = [
     "physics",
     "row",
     "sizes",
+    "table",
 ]
 
 RAISED = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
@@ -86,6 +85,12 @@ def row(name: str, value: float, sigma: float | None, unit: str) -> str:
         f'<tr><td>{escape(name)}</td><td class="n">{shown}</td><td class="n">{within}</td>'
         f"<td>{escape(unit)}</td></tr>"
     )
+
+
+def table(heads: Sequence[str], rows: Iterable[str]) -> str:
+    """Return a table of rows under their heads; nothing where there are no rows."""
+    head, body = "".join(f"<th>{one}</th>" for one in heads), "".join(rows)
+    return f"<table><tr>{head}</tr>{body}</table>" * bool(body)
 
 
 def chance(p_value: float) -> str:
