@@ -30,7 +30,7 @@ def accept(problem: Problem, outcome: Outcome, tone: Candidate | None) -> tuple[
     """
     model = [h.candidate for h in outcome.chosen]
     uneven = [one for candidate in model if (one := varying(problem, candidate, outcome.trials)) is not None]
-    rest = leftover(problem, model, outcome.fit, outcome.order, tone, also=uneven)
+    rest = leftover(problem, model, outcome.fit, tone, also=uneven)
     if not model:
         return False, rest
     ratio = 2.0 * (outcome.fit.log_likelihood - outcome.null.log_likelihood)
@@ -43,7 +43,7 @@ def accept(problem: Problem, outcome: Outcome, tone: Candidate | None) -> tuple[
     # a description that contains the names' own regressors, with nothing else beside them, is no alternative
     alone = rest is None or _same(outcome.chosen, rest)
     but = model if alone else ()
-    free = leftover(problem, [], outcome.null, outcome.order, tone, but=but, also=uneven)
+    free = leftover(problem, [], outcome.null, tone, but=but, also=uneven)
     if not alone:
         names -= ODDS
     if free is None or names >= free.among:

@@ -131,7 +131,7 @@ def with_map_error(
 
 
 def relinearised(
-    problem: Problem, model: Sequence[Candidate], fit: Joint, order: int
+    problem: Problem, model: Sequence[Candidate], fit: Joint
 ) -> tuple[Problem, list[Columns], Joint]:
     """Linearise anew about the extended calibration, and fit again.
 
@@ -145,7 +145,7 @@ def relinearised(
     for _ in range(STEPS):
         before, columns = fit.log_likelihood, []
         settled.let_go()  # one problem's columns at a time
-        settled, columns, fit = _again(problem, model, fit, order)
+        settled, columns, fit = _again(problem, model, fit)
         if abs(fit.log_likelihood - before) < 0.5:
             break
     return settled, columns, fit
@@ -172,14 +172,11 @@ def with_misfit(model: Sequence[Candidate], fit: Joint) -> Joint:
     return replace(fit, covariance=0.5 * (C + C.T))
 
 
-def _again(
-    problem: Problem, model: Sequence[Candidate], fit: Joint, order: int
-) -> tuple[Problem, list[Columns], Joint]:
+def _again(problem: Problem, model: Sequence[Candidate], fit: Joint) -> tuple[Problem, list[Columns], Joint]:
     """Do one Gauss-Newton step on the whole model."""
     again, columns = _about(problem, model, fit)
-    c, ridge = np.append(fit.z, fit.coefficients), fit.prior[len(fit.z) :]
-    uneven = bool(np.ptp(fit.noise.scale))  # likelihoods are comparable only under one kind of noise
-    return again, columns, fit_joint(again, columns, order, c, blocks=uneven, ridge=ridge)
+    c, ridge, noise = np.append(fit.z, fit.coefficients), fit.prior[len(fit.z) :], fit.noise
+    return again, columns, fit_joint(again, columns, noise.past.order, c, blocks=noise.uneven, ridge=ridge)
 
 
 def _about(problem: Problem, model: Sequence[Candidate], fit: Joint) -> tuple[Problem, list[Columns]]:

@@ -117,7 +117,7 @@ def _examine(
     model = [h.candidate for h in named]
     wrong = _wrong(outcome.fit, named, len(causes))
     progress("extending the calibration")
-    settled, columns, fit = relinearised(problem, model, fit, outcome.order)
+    settled, columns, fit = relinearised(problem, model, fit)
     fit = with_misfit(model, loosened(settled, model, columns, fit, candidates))
     extended = calibration
     if model:
@@ -131,7 +131,7 @@ def _examine(
         if score < held_out(problem, [], outcome.null).score - ODDS:
             # the dives left out speak 20:1 against these names
             named, rivals, model, fit, after, extended = (), (), [], outcome.null, before, calibration
-            rest = leftover(problem, [], outcome.null, outcome.order, tone)
+            rest = leftover(problem, [], outcome.null, tone)
     rest = rest or _loud(problem, after, counts)
     total = paired(before, after, problem.survey.dive, counts)
     return Diagnosis(

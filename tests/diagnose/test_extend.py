@@ -160,7 +160,7 @@ def test_what_has_come_since_is_not_in_the_calibrations_logs() -> None:
     assert not late.columns(slice(0, 150)).any()
     np.testing.assert_array_equal(late.columns(slice(150, 300)), lasting.columns(slice(150, 300)))
     fit = fit_joint(problem, [late.columns], 1)
-    _, _, settled = relinearised(problem, [late], fit, 1)
+    _, _, settled = relinearised(problem, [late], fit)
     np.testing.assert_allclose(settled.coefficients * late.width, there, atol=0.5)
     np.testing.assert_allclose(settled.left, 0.0, atol=0.5)
 

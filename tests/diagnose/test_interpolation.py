@@ -71,7 +71,7 @@ def test_the_delays_stay_where_the_comparison_is_linearised_anew() -> None:
     time = whole.survey.time
     problem = pose(made(whole, interpolated(time), 1), whole.calibration)
     drift = offset_drift(problem)[0]
-    _, _, fit = relinearised(problem, [drift], fit_joint(problem, [drift.columns], 1), 1)
+    _, _, fit = relinearised(problem, [drift], fit_joint(problem, [drift.columns], 1))
     np.testing.assert_allclose(DELAY * (fit.z[DELAYS] - fit.z[DELAYS][0]), TAKEN, atol=0.03)
 
 

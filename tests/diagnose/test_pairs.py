@@ -38,7 +38,6 @@ def state() -> State:
         candidate("series", rng.normal(size=(4, ROWS)).T, spectra=np.ones((1, 4))),
     ]  # fmt: skip
     found = State(problem, candidates, 1, 6)
-    found.null = found.fit([])
     found.round([], found.null)
     return found
 
@@ -84,7 +83,7 @@ def test_a_cause_that_is_not_worth_a_further_one_is_dropped(state: State) -> Non
     base = weak.fit([a, b, other])
     ratio = weak.ratio(base) - weak.ratio(weak.fit([a, b]))
     assert weak.p_value(other, ratio, other.size) < LEVEL
-    chosen, _ = _backward_elimination(weak, [a, b, other], base, weak.null)
+    chosen, _ = _backward_elimination(weak, [a, b, other], base)
     assert [h.candidate for h in chosen] == [a, b]
 
 

@@ -51,7 +51,6 @@ def test_a_regressor_that_later_ones_made_needless_is_dropped() -> None:
     early, late = (fault("offset_step", (np.arange(n) >= at).astype(float), 10.0) for at in (60, 500))
     problem = replace(right(n), residual=5.0 * (np.arange(n) >= 60) + rng.normal(size=n))
     state = State(problem, [early, late], 1, 1)
-    state.null = state.fit([])
     state.round([], state.null)
     both = early.with_(late)
     assert exchanged(state, [both], state.fit([both]))[0] == [early]

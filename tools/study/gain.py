@@ -75,7 +75,7 @@ def _oracle(name: str, result: Diagnosis) -> Calibration:
     known = "clock_offset" if name in DELAYS else name
     outcome = search(problem, CAUSES[known].candidates(problem), 1)
     model = [hypothesis.candidate for hypothesis in outcome.chosen]
-    settled, _, fit = relinearised(problem, model, outcome.fit, outcome.order)
+    settled, _, fit = relinearised(problem, model, outcome.fit)
     return extend(settled, model, with_misfit(model, fit))
 
 

@@ -76,6 +76,11 @@ class Noise:
         return (self.nu + 1.0) / (self.nu + 3.0)
 
     @property
+    def uneven(self) -> bool:
+        """Whether its level changes: likelihoods are comparable only under one kind of noise."""
+        return bool(np.ptp(self.scale))
+
+    @property
     def independent(self) -> float:
         """Number of independent samples that determine a constant as well: ``n (1 - sum a)^2 C(0)``."""
         return float(len(self.scale) * (1.0 - self.ar.sum()) ** 2 * autocovariance(self.ar, 0)[0])

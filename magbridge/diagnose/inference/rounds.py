@@ -114,13 +114,14 @@ class State:
         self.at = slices(self.candidates)
         self.columns = _made_once(len(problem), [candidate.columns for candidate in self.candidates])
         self.trials: dict[str, float] = {}
-        self.blocks: bool | None = None
         self.certain: dict[tuple[str, str | None], float] = {}
         self.last: tuple[Joint | None, Information | None] = None, None
-        self.null: Joint
         self.groups: dict[tuple[str, str | None], list[int]] = {}
         for k, candidate in enumerate(self.candidates):
             self.groups.setdefault(key(candidate), []).append(k)
+        self.blocks: bool | None = None
+        self.null = self.fit([])
+        self.blocks = self.null.noise.uneven
 
     def beside_brief_noise(self) -> State:
         """Return the same search, with noise whose correlation is too short to pass for a slow cause."""

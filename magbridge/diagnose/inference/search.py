@@ -53,8 +53,6 @@ class Outcome:
         For each chosen one, all others that it does not beat by :func:`~.evidence.margin`, the best first.
     null, fit : Joint
         Fits without any cause, and with the chosen ones.
-    order : int
-        Order of the noise's autoregression.
     tested : dict
         Cause -> (smallest p-value, ratio) of the first round.
     info : Information
@@ -67,7 +65,6 @@ class Outcome:
     rivals: tuple[tuple[Rival, ...], ...]
     null: Joint
     fit: Joint
-    order: int
     tested: dict[str, tuple[float, float]]
     info: Information
     trials: dict[str, float]
@@ -88,24 +85,22 @@ def search(problem: Problem, candidates: Sequence[Candidate], causes: int) -> Ou
     rough = fit_joint(problem, [], 1, rounds=2)
     order = autoregressive_order(rough.left, problem.survey.slots)
     state = State(problem, candidates, order, causes)
-    null = state.null = state.fit([])
-    state.blocks = bool(np.ptp(null.noise.scale))  # likelihoods are comparable only under one kind of noise
-    first = state.round([], null) if candidates else []
+    first = state.round([], state.null) if candidates else []
     tested: dict[str, tuple[float, float]] = {}
     for h in first:
         if h.p_value <= tested.get(h.candidate.cause, (np.inf, 0.0))[0]:
             tested[h.candidate.cause] = (h.p_value, h.ratio)
-    model, base = _likeliest(state, null, first) if first else ([], null)
-    chosen, base = _backward_elimination(state, model, base, null)
+    model, base = _likeliest(state, first) if first else ([], state.null)
+    chosen, base = _backward_elimination(state, model, base)
     model = [h.candidate for h in chosen]
     info = state.beside(model, base)
     rivals = sets_of(state, info, model, base) if model else ()
-    return Outcome(tuple(chosen), rivals, null, base, order, tested, info, state.trials)
+    return Outcome(tuple(chosen), rivals, state.null, base, tested, info, state.trials)
 
 
-def _likeliest(state: State, null: Joint, first: list[Hypothesis]) -> tuple[list[Candidate], Joint]:
+def _likeliest(state: State, first: list[Hypothesis]) -> tuple[list[Candidate], Joint]:
     """Return the likelier of the models found beside any noise, and beside a short-lived one if need be."""
-    model, base = _forward_selection(state, null, first)
+    model, base = _forward_selection(state, first)
     if model:
         model, base = exchanged(state, model, base)
     if base.noise.slowest > BRIEFEST and (slow := _beside_brief_noise(state)):  # it may have absorbed causes
@@ -117,13 +112,13 @@ def _likeliest(state: State, null: Joint, first: list[Hypothesis]) -> tuple[list
 def _beside_brief_noise(state: State) -> list[Candidate]:
     """Return the causes found one by one beside noise correlated too briefly to pass for a slow cause."""
     brief = state.beside_brief_noise()
-    return _forward_selection(brief, brief.null, brief.round([], brief.null))[0]
+    return _forward_selection(brief, brief.round([], brief.null))[0]
 
 
-def _forward_selection(state: State, null: Joint, first: list[Hypothesis]) -> tuple[list[Candidate], Joint]:
+def _forward_selection(state: State, first: list[Hypothesis]) -> tuple[list[Candidate], Joint]:
     """Add cause after cause while one passes the test, beginning with the best of `first`."""
     model: list[Candidate] = []
-    base, found = null, first
+    base, found = state.null, first
     strengths: dict[str, float] = {}
     for _ in range(MOST):
         # a candidate of one common size is a whole: neither extended nor added to its cause's others
@@ -173,14 +168,14 @@ def _added(state: State, model: list[Candidate], best: Hypothesis) -> tuple[list
 
 
 def _backward_elimination(
-    state: State, model: list[Candidate], base: Joint, null: Joint
+    state: State, model: list[Candidate], base: Joint
 ) -> tuple[list[Hypothesis], Joint]:
     """Drop causes without which the model is likelier, or which fail their test beside the others."""
     chosen: list[Hypothesis] = []
     k = 0
     while k < len(model):
         own, others = model[k], model[:k] + model[k + 1 :]
-        without = state.fit(others) if others else null
+        without = state.fit(others) if others else state.null
         ratio = max(0.0, 2.0 * (base.log_likelihood - without.log_likelihood))
         p_value = state.p_value(own, ratio, own.freedom)
         if p_value >= LEVEL or (others and state.value(others, without) > state.value(model, base)):

@@ -120,7 +120,6 @@ def leftover(
     problem: Problem,
     model: Sequence[Candidate],
     fit: Joint,
-    order: int,
     tone: Candidate | None = None,
     *,
     but: Sequence[Candidate] = (),
@@ -130,7 +129,7 @@ def leftover(
 
     Parameters
     ----------
-    problem, model, fit, order
+    problem, model, fit
         The model that was found.
     tone : Candidate, optional
         The strongest tone, where tones are not among the causes.
@@ -144,10 +143,10 @@ def leftover(
     listed = [one._replace(columns=columns) for one, columns in zip(listed, made, strict=True)]
     columns = [candidate.columns for candidate in model]
     found: list[tuple[float, Scored]] = []
-    for noise in (fit.noise, _calm(problem, columns, fit, order, listed[:2])):
+    for noise in (fit.noise, _calm(problem, columns, fit, listed[:2])):
         scored = _scored(problem, noise, fit, columns, listed)
         tried = sorted(scored, key=lambda one: -one.evidence)[:SHORT_LIST]
-        weighed = in_threads(len(problem), lambda one: _weighed(problem, columns, fit, order, one), tried)
+        weighed = in_threads(len(problem), lambda one: _weighed(problem, columns, fit, one), tried)
         # no more than the description itself can gain: the rest is of a noise that found another optimum
         found += [(min(one.evidence, gained), one) for one, gained in zip(tried, weighed, strict=True)]
     evidence, (_, kind, one, best, _) = max(found, key=lambda entry: entry[0])
@@ -177,30 +176,27 @@ def _scored(
             yield Scored(0.5 * best.ratio - float(np.log(one.trials)), kind, one, best, info.shift[:, at])
 
 
-def _calm(
-    problem: Problem, model: Sequence[Columns], fit: Joint, order: int, slow: Sequence[Description]
-) -> Noise:
+def _calm(problem: Problem, model: Sequence[Columns], fit: Joint, slow: Sequence[Description]) -> Noise:
     """Return the noise that is left when slow curves are fitted, beginning with white noise."""
-    level = robust_scale(np.diff(fit.left)) / np.sqrt(2.0) + 1e-12
-    white = np.full(len(problem), level)
-    noise = replace(fit.noise, ar=np.zeros(order), scale=white, nu=1e6, innovations=fit.left / level)
+    level = np.full(len(problem), robust_scale(np.diff(fit.left)) / np.sqrt(2.0) + 1e-12)
+    ar, innovations = np.zeros_like(fit.noise.ar), fit.left / level
+    noise = replace(fit.noise, ar=ar, scale=level, nu=1e6, innovations=innovations)
     width = np.concatenate([one.widths[1][1] for one in slow])
-    past, blocks = problem.survey.past(order), bool(np.ptp(fit.noise.scale))
     for _ in range(CALM):
         info = information(problem, noise, fit, [*(one.columns for one in slow), *model]).fitted(fit)
         c = Statistic(info.matrix, width[None] ** 2).best(info.score).estimate
         X = Design(problem, [*model, *(one.columns for one in slow)])
         left = fit.left - X.times(np.append(-info.shift @ c, c))
-        noise = fit_noise(left, past, blocks=blocks)
+        noise = fit_noise(left, fit.noise.past, blocks=fit.noise.uneven)
     return noise
 
 
-def _weighed(problem: Problem, model: Sequence[Columns], fit: Joint, order: int, scored: Scored) -> float:
+def _weighed(problem: Problem, model: Sequence[Columns], fit: Joint, scored: Scored) -> float:
     """Log evidence of a description against the model, its noise fitted anew (Laplace's approximation)."""
     one, c = scored.description, scored.best.estimate
     moved = -scored.shift @ c
     left = fit.left - Design(problem, [*model, one.columns]).times(np.append(moved, c))
-    noise = fit_noise(left, problem.survey.past(order), blocks=bool(np.ptp(fit.noise.scale)), like=fit.noise)
+    noise = fit_noise(left, fit.noise.past, blocks=fit.noise.uneven, like=fit.noise)
     before = fit.z - problem.centre
     after = before + moved[: len(fit.z)]
     pull = float(fit.prior[: len(fit.z)] @ (after**2 - before**2))
