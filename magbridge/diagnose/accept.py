@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from magbridge.diagnose.causes.candidates import Candidate
+from magbridge.diagnose.causes.candidates import Candidate, Group
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.evidence import ODDS, REMNANT, log_odds
 from magbridge.diagnose.inference.rivals import Rival
@@ -64,10 +64,10 @@ def _within(outcome: Outcome, behind: float) -> tuple[Rival, ...]:
 
     A description beats the names by `behind`; rivals are those that it does not beat 20:1.
     """
-    found: dict[tuple[str, str | None], Rival] = {}
+    found: dict[Group, Rival] = {}
     for hypothesis, rivals in zip(outcome.chosen, outcome.rivals, strict=True):
         for one in (Rival(hypothesis.candidate, 0.0), *rivals):
-            known = found.get((one.cause, one.channel))
+            known = found.get(one.candidate.group)
             if one.behind + behind < ODDS and (known is None or one.behind + behind < known.behind):
-                found[one.cause, one.channel] = replace(one, behind=one.behind + behind)
+                found[one.candidate.group] = replace(one, behind=one.behind + behind)
     return tuple(sorted(found.values(), key=lambda one: one.behind))

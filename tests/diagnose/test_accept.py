@@ -26,7 +26,7 @@ def test_names_within_20_to_1_of_a_description_stay() -> None:
     candidates = [candidate(cause, x) for cause, x in said.items()]
     outcome = search(replace(right(ROWS), residual=0.5 * acts + rng.normal(size=ROWS)), candidates, 3)
     steps = np.linspace(0.0, ODDS, 30)
-    sets = [{rival.cause: rival.behind for rival in _within(outcome, behind)} for behind in steps]
+    sets = [{rival.candidate.cause: rival.behind for rival in _within(outcome, behind)} for behind in steps]
     assert sets[0].keys() == {"a", "like a"}
     assert not sets[-1]
     for behind, within, less in zip(steps, sets, [*sets[1:], {}], strict=True):

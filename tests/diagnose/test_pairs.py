@@ -91,8 +91,8 @@ def test_the_sets_hold_whatever_a_whole_within_20_to_1_is_made_of(state: State) 
     model = [state.candidates[3], state.candidates[1]]
     base = state.fit(model)
     sets = sets_of(state, state.beside(model, base), model, base)
-    assert "a" in {rival.cause for rival in sets[0]}
-    assert "other" not in {rival.cause for some in sets for rival in some}
+    assert "a" in {rival.candidate.cause for rival in sets[0]}
+    assert "other" not in {rival.candidate.cause for some in sets for rival in some}
 
 
 def test_numbers_of_one_common_size_stay_a_whole(state: State) -> None:

@@ -13,10 +13,12 @@ from magbridge.calibration.terms import Effect
 from magbridge.diagnose.compare.design_columns import Columns, Mixture, Since, parts, places, together
 from magbridge.diagnose.compare.problem import Problem, effect_columns, history
 
-__all__ = ["AXES", "Candidate", "of_effect", "of_reference", "per", "since", "slices"]
+__all__ = ["AXES", "Candidate", "Group", "of_effect", "of_reference", "per", "since", "slices"]
 
 FloatArray = NDArray[np.float64]
 AXES = ("x", "y", "z")
+Group = tuple[str, str | None]
+"""A cause and its channel: candidates that share both are one grid."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,6 +79,11 @@ class Candidate:
     parts: tuple[Candidate, ...] = ()
     spectra: FloatArray | None = None
     since: bool = False
+
+    @property
+    def group(self) -> Group:
+        """The grid that it is a point of."""
+        return self.cause, self.channel
 
     @property
     def size(self) -> int:

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri, chndtrinc
 
-from magbridge.diagnose.causes.candidates import Candidate, slices
+from magbridge.diagnose.causes.candidates import Candidate, Group, slices
 from magbridge.diagnose.inference.evidence import LEVEL, score
 from magbridge.diagnose.inference.information import Information
 from magbridge.diagnose.inference.naming import NamingTheory
@@ -121,11 +121,11 @@ def isolability(
 
 def _most_visible(candidates: Sequence[Candidate], info: Information, at: Sequence[slice]) -> list[int]:
     """Return the place of the candidate of each cause and channel that the log shows best."""
-    best: dict[tuple[str, str | None], tuple[float, int]] = {}
+    best: dict[Group, tuple[float, int]] = {}
     for k, candidate in enumerate(candidates):
         total = float(np.trace(info.matrix[at[k], at[k]])) / candidate.size
-        if total > best.get((candidate.cause, candidate.channel), (-1.0, 0))[0]:
-            best[candidate.cause, candidate.channel] = (total, k)
+        if total > best.get(candidate.group, (-1.0, 0))[0]:
+            best[candidate.group] = (total, k)
     return [k for _, k in best.values()]
 
 

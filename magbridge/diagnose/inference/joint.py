@@ -67,7 +67,7 @@ class Joint:
         return self.covariance[len(self.z) :, len(self.z) :]
 
     def wald(self, at: slice | NDArray[np.intp]) -> float:
-        """Wald's statistic ``b^T C_bb^-1 b`` of the effects' coefficients `at` these places."""
+        """Wald's statistic ``b^T C_bb^-1 b`` of the effects' coefficients b (k,) `at` these places."""
         b = self.coefficients[at]
         return float(b @ np.linalg.solve(self.effects_covariance[at][:, at], b))
 

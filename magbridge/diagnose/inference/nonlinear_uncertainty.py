@@ -33,7 +33,6 @@ from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.evidence import score
 from magbridge.diagnose.inference.information import Information, information
 from magbridge.diagnose.inference.joint import Joint
-from magbridge.diagnose.inference.rounds import key
 
 __all__ = ["loosened"]
 
@@ -128,7 +127,7 @@ def _beyond(
 
 def _same_grid(one: Candidate, other: Candidate) -> bool:
     """Tell whether two candidates are points of one grid, with the same numbers."""
-    return key(one) == key(other) and one.names == other.names
+    return one.group == other.group and one.names == other.names
 
 
 def _elsewhere(info: Information, fit: Joint, placed_piece: Placed, points: Sequence[Placed]) -> FloatArray:

@@ -21,17 +21,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import logsumexp
 
-from magbridge.diagnose.causes.candidates import Candidate, slices
+from magbridge.diagnose.causes.candidates import Candidate, Group, slices
 from magbridge.diagnose.inference.evidence import LEVEL, REMNANT, log_bayes, margin, one_sided, score
 from magbridge.diagnose.inference.information import Information
 from magbridge.diagnose.inference.joint import Joint
-from magbridge.diagnose.inference.rounds import State, key
+from magbridge.diagnose.inference.rounds import State
 from magbridge.diagnose.inference.statistic import Statistic
 
 __all__ = ["Pair", "pairs_of"]
 
 FloatArray = NDArray[np.float64]
-Group = tuple[str, str | None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,7 +124,7 @@ class _Table:
         self.at = [*state.at, *here]
         self.members = {group: list(members) for group, members in state.groups.items()}
         for n, candidate in enumerate(self.standing):
-            self.members[key(candidate)].append(len(state.candidates) + n)
+            self.members[candidate.group].append(len(state.candidates) + n)
         self._fill()
         self.best, self.margin = self._current()
         self.paid = float(np.sum(np.log([candidate.trials for candidate in self.standing])))
@@ -154,7 +153,7 @@ class _Table:
 
     def _current(self) -> tuple[float, float]:
         """Log evidence of the standing causes, averaged over their grids, and the margin that they need."""
-        m, groups = len(self.state.candidates), [key(candidate) for candidate in self.standing]
+        m, groups = len(self.state.candidates), [candidate.group for candidate in self.standing]
         # under the noise that is left, which is less, ratios exceed what the model as a whole has gained
         whole = self.state.ratio(self.base)
         if len(groups) == 1:
@@ -177,7 +176,7 @@ class _Table:
 
     def pair(self, A: Group, B: Group) -> Pair | None:
         """Return the best of two grids, unless what stands beats it by :func:`~.evidence.margin`."""
-        current = [key(candidate) for candidate in self.standing]
+        current = [candidate.group for candidate in self.standing]
         block = self.evidence[np.ix_(self.members[A], self.members[B])]
         top = float(block.max())
         if (

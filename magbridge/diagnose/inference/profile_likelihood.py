@@ -11,7 +11,7 @@ from magbridge.diagnose.causes.candidates import Candidate, slices
 from magbridge.diagnose.inference.evidence import score
 from magbridge.diagnose.inference.information import information
 from magbridge.diagnose.inference.joint import Joint
-from magbridge.diagnose.inference.rounds import Hypothesis, State, key
+from magbridge.diagnose.inference.rounds import Hypothesis, State
 
 __all__ = ["refined", "sharpen"]
 
@@ -82,7 +82,7 @@ def _bracket(state: State, candidate: Candidate, name: str) -> tuple[float, floa
     if name == "period":  # a resolved line is a thousandth wide, the grid is one of peaks
         share = 0.6 * here / float(np.ptp(state.problem.survey.time))
         return here / (1.0 + share), here * (1.0 + share)
-    grid = sorted({state.candidates[k].shape[name][0] for k in state.groups[key(candidate)]})
+    grid = sorted({state.candidates[k].shape[name][0] for k in state.groups[candidate.group]})
     width = 0.5 * (grid[-1] - grid[0])
     # a positive parameter stays positive
     low = max(

@@ -8,12 +8,12 @@ from itertools import combinations
 
 import numpy as np
 
-from magbridge.diagnose.causes.candidates import Candidate, slices
+from magbridge.diagnose.causes.candidates import Candidate, Group, slices
 from magbridge.diagnose.inference.evidence import LEVEL, margin, score
 from magbridge.diagnose.inference.information import Information
 from magbridge.diagnose.inference.joint import Joint
 from magbridge.diagnose.inference.pairs import pairs_of
-from magbridge.diagnose.inference.rounds import State, key
+from magbridge.diagnose.inference.rounds import State
 
 __all__ = ["Rival", "rivals_of", "sets_of"]
 
@@ -32,16 +32,6 @@ class Rival:
     candidate: Candidate
     behind: float
 
-    @property
-    def cause(self) -> str:
-        """The cause's name."""
-        return self.candidate.cause
-
-    @property
-    def channel(self) -> str | None:
-        """Telemetry that it follows."""
-        return self.candidate.channel
-
 
 def rivals_of(
     state: State, info: Information, model: list[Candidate], base: Joint, k: int
@@ -51,10 +41,10 @@ def rivals_of(
     alone = info.instead(base, np.r_[own])
     standing = score(alone, own, model[k])
     rivals, best = [], state.best(alone)
-    paid = best[key(model[k])].price if key(model[k]) in best else 0.0
+    paid = best[model[k].group].price if model[k].group in best else 0.0
     for group, (member, price, s, _) in best.items():
         candidate = state.candidates[member]
-        if group == key(model[k]) or group[0] in {other.cause for other in model if other is not model[k]}:
+        if group == model[k].group or group[0] in {other.cause for other in model if other is not model[k]}:
             continue
         cheaper = price - paid - float(np.log(candidate.trials / model[k].trials))
         behind = standing.evidence - s.evidence - cheaper
@@ -68,8 +58,8 @@ def sets_of(
 ) -> tuple[tuple[Rival, ...], ...]:
     """Return the rivals of each cause of `model`, also those that need another cause replaced as well."""
     pieces = [(piece, place) for place, candidate in enumerate(model) for piece in candidate.pieces]
-    own = [{key(piece) for piece in candidate.pieces} for candidate in model]
-    found: list[dict[tuple[str, str | None], Rival]] = [{} for _ in model]
+    own = [{piece.group for piece in candidate.pieces} for candidate in model]
+    found: list[dict[Group, Rival]] = [{} for _ in model]
 
     def rivals() -> Iterator[tuple[int, Rival]]:
         for place in range(len(model)):
@@ -81,7 +71,7 @@ def sets_of(
                     yield pieces[n][1], Rival(candidate, pair.behind)
 
     for place, rival in rivals():
-        group = key(rival.candidate)
+        group = rival.candidate.group
         if group not in own[place] and (
             group not in found[place] or rival.behind < found[place][group].behind
         ):

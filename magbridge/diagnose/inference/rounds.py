@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import fdtrc
 
-from magbridge.diagnose.causes.candidates import Candidate, slices
+from magbridge.diagnose.causes.candidates import Candidate, Group, slices
 from magbridge.diagnose.compare.design_columns import Columns, Mixture, parts, together
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.design import in_threads, precomputed
@@ -22,7 +22,7 @@ from magbridge.diagnose.inference.information import Information, information
 from magbridge.diagnose.inference.joint import RIDGE, Joint, fit_joint, volume_of
 from magbridge.diagnose.inference.noise import Noise
 
-__all__ = ["Hypothesis", "State", "key", "shaped_ratio"]
+__all__ = ["Hypothesis", "State", "shaped_ratio"]
 
 FloatArray = NDArray[np.float64]
 
@@ -114,11 +114,11 @@ class State:
         self.at = slices(self.candidates)
         self.columns = _made_once(len(problem), [candidate.columns for candidate in self.candidates])
         self.trials: dict[str, float] = {}
-        self.certain: dict[tuple[str, str | None], float] = {}
+        self.certain: dict[Group, float] = {}
         self.last: tuple[Joint | None, Information | None] = None, None
-        self.groups: dict[tuple[str, str | None], list[int]] = {}
+        self.groups: dict[Group, list[int]] = {}
         for k, candidate in enumerate(self.candidates):
-            self.groups.setdefault(key(candidate), []).append(k)
+            self.groups.setdefault(candidate.group, []).append(k)
         self.blocks: bool | None = None
         self.null = self.fit([])
         self.blocks = self.null.noise.uneven
@@ -155,7 +155,7 @@ class State:
         narrow, shaped = sum(candidate.narrow for candidate in model), shaped_ratio(ratio, model, fit)
         return log_odds(ratio, model, self.trials, shaped) - narrow - len(causes) * regressor_error(shaped)
 
-    def best(self, info: Information) -> dict[tuple[str, str | None], Best]:
+    def best(self, info: Information) -> dict[Group, Best]:
         """Best member of each group."""
         found = {}
         for group, members in self.groups.items():
@@ -171,7 +171,7 @@ class State:
         as_fitted = self.beside(model, base).fitted(base)
         if not self.trials:
             self.trials = trials(as_fitted, self.candidates, self.at)
-        under: dict[tuple[str, str | None], list[Best]] = {}
+        under: dict[Group, list[Best]] = {}
         for info in (as_fitted, self._cleared(model, base, as_fitted)):
             for group, best in self.best(info).items():
                 under.setdefault(group, []).append(best)
@@ -248,7 +248,7 @@ class State:
         """
         hypotheses = self.trials.get(candidate.cause, 1.0) * float(np.exp(-candidate.likelier))
         tests = candidate.tail * hypotheses * self.causes
-        freedom, certain = max(freedom, 1), self.certain.get(key(candidate), np.inf)
+        freedom, certain = max(freedom, 1), self.certain.get(candidate.group, np.inf)
         return min(1.0, tests * float(fdtrc(freedom, certain, ratio / freedom)))
 
 
@@ -263,8 +263,3 @@ def _ridge(model: Sequence[Candidate]) -> FloatArray:
     """(k,) prior precision that a fit begins from: nature's sizes are known, a fault's hardly."""
     natural = [not c.effects or c.spectra is not None for c in model]
     return np.repeat(np.where(natural, 1.0, RIDGE), [c.size for c in model])
-
-
-def key(candidate: Candidate) -> tuple[str, str | None]:
-    """Cause and channel: candidates that share both are one grid."""
-    return candidate.cause, candidate.channel

@@ -145,7 +145,7 @@ def useful(diagnosis: Diagnosis) -> str:
     if all(c.cause in REFERENCE or (c.effects and set(added).isdisjoint(c.effects)) for c in diagnosis.named):
         return ""
     stays = [c for c in diagnosis.named if not c.effects or any(effect not in added for effect in c.effects)]
-    others = ", ".join(escape(label(candidate.cause, candidate.channel)) for candidate in stays)
+    others = ", ".join(escape(label(*candidate.group)) for candidate in stays)
     but = f" It leaves {others} in the field, which the RMS above has removed." if stays else ""
     verdict = (
         "corrects for what belongs to the vehicle and its sensor"
@@ -163,8 +163,8 @@ def rivalled(candidate: Candidate, cause: Cause, rivals: Sequence[Rival], chance
     )
     if not rivals:
         return f"<p>No other known cause comes within odds of 20:1.</p>{theory}.</p>"
-    if all(rival.cause == candidate.cause for rival in rivals):
-        channels = ", ".join(escape(str(rival.channel)) for rival in rivals)
+    if all(rival.candidate.cause == candidate.cause for rival in rivals):
+        channels = ", ".join(escape(str(rival.candidate.channel)) for rival in rivals)
         return (
             "<p>No other known cause comes within odds of 20:1. Which channel it follows is less sure: "
             f"{channels} would do nearly as well (odds below 20:1). A log in which these channels differ "
@@ -209,5 +209,5 @@ def nameless(rest: Leftover, causes: Mapping[str, Cause]) -> str:
     return (
         "No name is asserted: a description without a cause is likelier than any known cause, but by less "
         f"than 20:1. Not ruled out: {listed(rest.within)}. To tell: "
-        f"{escape(causes[rest.within[0].cause].separated_by)}."
+        f"{escape(causes[rest.within[0].candidate.cause].separated_by)}."
     )

@@ -247,7 +247,7 @@ def terms(diagnosis: Diagnosis) -> str | None:
         share = candidate.columns(slice(0, len(diagnosis.problem))) @ finding.coefficients
         axis.plot(*_curves(diagnosis, share), color=AFTER, linewidth=0.8)
         axis.set_ylabel("nT", fontsize=8)
-        axis.set_title(label(candidate.cause, candidate.channel), fontsize=9, loc="left")
+        axis.set_title(label(*candidate.group), fontsize=9, loc="left")
     axes[-1, 0].set_xlabel(f"{_clock(diagnosis)[1]} since the start", fontsize=9)
     return _png(figure)
 

@@ -67,7 +67,7 @@ def _finding(diagnosis: Diagnosis, finding: Finding, causes: Mapping[str, Cause]
 
 def alternatives(rivals: tuple[Rival, ...]) -> list[dict[str, Any]]:
     """List the others within 20:1, the likeliest first."""
-    return [{"cause": rival.cause, "channel": rival.channel} for rival in rivals]
+    return [{"cause": one.candidate.cause, "channel": one.candidate.channel} for one in rivals]
 
 
 def parameters(finding: Finding, samples: int) -> dict[str, dict[str, Any]]:

@@ -47,7 +47,7 @@ def bold(candidate: Candidate) -> str:
 
 def listed(rivals: Sequence[Rival], joint: str = ", ") -> str:
     """Return causes as a list in words, the likeliest first."""
-    return joint.join(escape(label(rival.cause, rival.channel)) for rival in rivals)
+    return joint.join(escape(label(*rival.candidate.group)) for rival in rivals)
 
 
 def physics(cause: Cause) -> str:
