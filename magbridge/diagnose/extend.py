@@ -143,9 +143,11 @@ def relinearised(
         return problem, columns, fit
     settled = problem
     for _ in range(STEPS):
-        before, columns = fit.log_likelihood, []
+        before, noise, c = fit.log_likelihood, fit.noise, np.append(fit.z, fit.coefficients)
+        ridge, columns = fit.prior[len(fit.z) :], []
         settled.let_go()  # one problem's columns at a time
-        settled, columns, fit = _again(problem, model, fit)
+        settled, columns = _about(problem, model, fit)
+        fit = fit_joint(settled, columns, noise.past.order, c, blocks=noise.uneven, ridge=ridge)
         if abs(fit.log_likelihood - before) < 0.5:
             break
     return settled, columns, fit
@@ -170,13 +172,6 @@ def with_misfit(model: Sequence[Candidate], fit: Joint) -> Joint:
         given = np.linalg.solve(fit.covariance[own, own], fit.covariance[own])
         C += IDEAL**2 * fit.wald(place) / MODES * fit.covariance[:, own] @ given
     return replace(fit, covariance=0.5 * (C + C.T))
-
-
-def _again(problem: Problem, model: Sequence[Candidate], fit: Joint) -> tuple[Problem, list[Columns], Joint]:
-    """Do one Gauss-Newton step on the whole model."""
-    again, columns = _about(problem, model, fit)
-    c, ridge, noise = np.append(fit.z, fit.coefficients), fit.prior[len(fit.z) :], fit.noise
-    return again, columns, fit_joint(again, columns, noise.past.order, c, blocks=noise.uneven, ridge=ridge)
 
 
 def _about(problem: Problem, model: Sequence[Candidate], fit: Joint) -> tuple[Problem, list[Columns]]:

@@ -186,15 +186,10 @@ def _counts(n: int) -> NDArray[np.int64]:
     return count
 
 
-def _longest(n: int) -> float:
-    """Return the longest time constant that noise of n samples may have, in samples."""
-    return float(np.clip(n / TIMES, BRIEFEST, SLOWEST))
-
-
 def _stable(ar: FloatArray, n: int) -> FloatArray:
     """Move roots that lie outside the unit circle, or too close to it for n samples, back inside."""
-    roots = np.roots(np.append(1.0, -ar))
-    size, largest = np.abs(roots), 1.0 - 1.0 / _longest(n)
+    roots, longest = np.roots(np.append(1.0, -ar)), np.clip(n / TIMES, BRIEFEST, SLOWEST)
+    size, largest = np.abs(roots), 1.0 - 1.0 / longest
     if size.max(initial=0.0) < largest:
         return ar
     return np.asarray(-np.real(np.poly(roots * np.where(size > largest, largest / size, 1.0)))[1:])

@@ -113,7 +113,10 @@ def _beyond(
 ) -> FloatArray:
     """(q + k, q + k) covariance added by all other cells."""
     more = np.zeros_like(fit.covariance)
-    points = [[c for c in grid if piece.again and _same_grid(c, piece)] for piece in pieces]
+    points = [
+        [c for c in grid if piece.again and (c.group, c.names) == (piece.group, piece.names)]
+        for piece in pieces
+    ]
     every = [candidate for some in points for candidate in some]
     if not every:
         return more
@@ -123,11 +126,6 @@ def _beyond(
         if some:
             more += _elsewhere(info, fit, placed_piece, [next(places) for _ in some])
     return more
-
-
-def _same_grid(one: Candidate, other: Candidate) -> bool:
-    """Tell whether two candidates are points of one grid, with the same numbers."""
-    return one.group == other.group and one.names == other.names
 
 
 def _elsewhere(info: Information, fit: Joint, placed_piece: Placed, points: Sequence[Placed]) -> FloatArray:

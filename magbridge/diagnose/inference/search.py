@@ -103,16 +103,13 @@ def _likeliest(state: State, first: list[Hypothesis]) -> tuple[list[Candidate], 
     model, base = _forward_selection(state, first)
     if model:
         model, base = exchanged(state, model, base)
-    if base.noise.slowest > BRIEFEST and (slow := _beside_brief_noise(state)):  # it may have absorbed causes
-        start = refined(state, slow, state.fit(slow, rounds=6))
-        model, base = max((model, base), exchanged(state, *start), key=lambda entry: state.value(*entry))
+    if base.noise.slowest > BRIEFEST:  # it may have absorbed causes
+        brief = state.beside_brief_noise()
+        slow, _ = _forward_selection(brief, brief.round([], brief.null))
+        if slow:
+            start = refined(state, slow, state.fit(slow, rounds=6))
+            model, base = max((model, base), exchanged(state, *start), key=lambda entry: state.value(*entry))
     return model, base
-
-
-def _beside_brief_noise(state: State) -> list[Candidate]:
-    """Return the causes found one by one beside noise correlated too briefly to pass for a slow cause."""
-    brief = state.beside_brief_noise()
-    return _forward_selection(brief, brief.round([], brief.null))[0]
 
 
 def _forward_selection(state: State, first: list[Hypothesis]) -> tuple[list[Candidate], Joint]:
