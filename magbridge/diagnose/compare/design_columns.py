@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 __all__ = [
-    "Columns", "Interpolated", "Mixture", "Since", "beside", "number", "parts", "places", "times", "together",
+    "Columns", "Interpolated", "Mixture", "Since", "beside", "parts", "places", "size_of", "times",
+    "together",
 ]  # fmt: skip
 
 FloatArray = NDArray[np.float64]
@@ -80,10 +81,10 @@ def parts(columns: Columns) -> tuple[tuple[Columns, FloatArray], ...]:
     """Return the pairs (X_i, M_i (p_i, k)) of a mixture; other columns are their own only part, M = I."""
     if isinstance(columns, Mixture):
         return columns.parts
-    return ((columns, np.eye(number(columns))),)
+    return ((columns, np.eye(size_of(columns))),)
 
 
-def number(columns: Columns) -> int:
+def size_of(columns: Columns) -> int:
     """Return how many columns there are."""
     return len(columns(slice(0, 1)).T)
 

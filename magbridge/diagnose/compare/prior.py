@@ -15,7 +15,7 @@ from magbridge.calibration.terms import Polynomial
 from magbridge.diagnose.compare.derivatives import derivatives
 from magbridge.diagnose.compare.survey import Survey
 
-__all__ = ["floor", "isotropic", "level", "prior"]
+__all__ = ["floor", "isotropic", "noise_sigma", "prior"]
 
 FloatArray = NDArray[np.float64]
 
@@ -28,7 +28,7 @@ STABLE = 2e-5
 than 20 ppm."""
 
 
-def level(calibration: Calibration, e: FloatArray) -> float:
+def noise_sigma(calibration: Calibration, e: FloatArray) -> float:
     """Return the noise's 1-sigma, nT: the calibration's, or that of the residual e (n,)."""
     return calibration.noise.sensor or robust_scale(e) or 1.0
 
@@ -100,7 +100,7 @@ def _without_repeats(
     noise = calibration.noise
     steps = np.asarray(survey.steps[learned] * (survey.interval / noise.interval if noise.interval else 1.0))
     white = np.column_stack([J, e[learned]])
-    white = whiten(white, steps, noise.autocorrelation) / level(calibration, e)
+    white = whiten(white, steps, noise.autocorrelation) / noise_sigma(calibration, e)
     A, y = white[:, :-1], white[:, -1]
     values, vectors = np.linalg.eigh(np.eye(len(centre)) - A.T @ A)
     held = values > 0.1  # other directions were learned from the repeated samples alone, which count anyway

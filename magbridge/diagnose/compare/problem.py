@@ -39,7 +39,7 @@ from magbridge.calibration.terms import Effect
 from magbridge.diagnose.compare.derivatives import CHUNK, derivatives
 from magbridge.diagnose.compare.design_columns import Mixture
 from magbridge.diagnose.compare.interpolation import interpolation_error
-from magbridge.diagnose.compare.prior import level, prior
+from magbridge.diagnose.compare.prior import noise_sigma, prior
 from magbridge.diagnose.compare.survey import Survey
 
 __all__ = ["DELAY", "DELAYS", "Problem", "add_effects", "effect_columns", "history", "pose", "samples_of"]
@@ -226,7 +226,7 @@ def pose(survey: Survey, calibration: Calibration) -> Problem:
         rows = slice(start, start + CHUNK)
         J = derivatives(calibration, samples.part(rows), g[rows], L)
         seen += J.T @ J
-    values, vectors = np.linalg.eigh(seen / level(calibration, e) ** 2)
+    values, vectors = np.linalg.eigh(seen / noise_sigma(calibration, e) ** 2)
     keep = values > SEEN
     V, rest = vectors[:, keep], L @ vectors[:, ~keep]
     late = -DELAY * g[:, 6:] * interpolation_error(survey, reading.T).T

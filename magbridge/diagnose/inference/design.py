@@ -11,7 +11,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from magbridge.diagnose.compare.design_columns import Columns, beside, number, places, times
+from magbridge.diagnose.compare.design_columns import Columns, beside, places, size_of, times
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.noise import Noise
 
@@ -33,7 +33,7 @@ THREADS, LONG, POOL = 2, 32768, "diagnose"
 
 def precomputed(n: int, columns: Sequence[Columns]) -> list[Columns]:
     """Return the columns of n rows precomputed, or unchanged where that would fill the memory."""
-    if n * sum(map(number, columns)) > KEPT:
+    if n * sum(map(size_of, columns)) > KEPT:
         return list(columns)
 
     def whole(column: Columns) -> FloatArray:
@@ -60,7 +60,7 @@ class Design:
     def __init__(self, problem: Problem, columns: Sequence[Columns]) -> None:
         self.free, self.columns = problem.free, columns
         self.pieces = pieces(len(problem))
-        sizes = [number(column) for column in columns]
+        sizes = [size_of(column) for column in columns]
         self.at, self.effects = places(sizes, self.free.shape[1]), sum(sizes)
 
     def rows(self, rows: slice) -> FloatArray:
@@ -89,7 +89,7 @@ def normal(
     always in the same way, so any machine returns the same numbers. Of ``X^T X`` only the blocks that are
     `asked` for are computed, and their transposes; the others are zero.
     """
-    k = number(X)
+    k = size_of(X)
 
     def share(some: Sequence[slice]) -> tuple[FloatArray, FloatArray]:
         P, b = np.zeros((k, k)), np.zeros(k)

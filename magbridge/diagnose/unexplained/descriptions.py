@@ -12,7 +12,7 @@ from magbridge.calibration.mass_effects import ClockEffect
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.causes.regressors import powers
 from magbridge.diagnose.causes.timing import field_rates, mass_rates
-from magbridge.diagnose.compare.design_columns import Columns, number
+from magbridge.diagnose.compare.design_columns import Columns, size_of
 from magbridge.diagnose.compare.interpolation import rates
 from magbridge.diagnose.compare.problem import Problem, effect_columns
 from magbridge.diagnose.compare.survey import Channel
@@ -227,4 +227,4 @@ def _along_axes(problem: Problem, basis: Columns, *, scales: bool = False) -> Co
 
 
 def _of(kind: str, columns: Columns, width: float = 30.0, **more: Any) -> Description:
-    return Description(columns, ((kind, np.full(number(columns), width)),), **more)
+    return Description(columns, ((kind, np.full(size_of(columns), width)),), **more)
