@@ -50,7 +50,7 @@ import numpy as np
 from msgspec.structs import replace as with_options
 from scipy.stats import chi2
 from terminal import command_line
-from voyages.calibrated import flown
+from voyages.calibrated import Flown, flown
 from voyages.dived import dived
 from voyages.lost import LEVEL, carried, half, level, misled
 from voyages.others import magnav, stone_soup
@@ -115,7 +115,7 @@ def one(kind: Map, slow: float, start: float, seed: int) -> Score:
 
 def row(label: str, runs: Sequence[Score]) -> list[str]:
     """Return one line of the accuracy table."""
-    drms, bound, nees = (np.array([getattr(run, name) for run in runs]) for name in ("drms", "bound", "nees"))
+    drms, bound, nees = np.array([(run.drms, run.bound, run.nees) for run in runs]).T
     at_hours = np.mean([run.at_hours for run in runs], axis=0)
     low, high = chi2.ppf([0.005, 0.995], 2 * len(runs)) / len(runs)
     return [
@@ -159,12 +159,12 @@ def calibrations(runs: Runs, _asked: argparse.Namespace) -> None:
         f"## What calibration buys: {runs.number} gliders, their own calibration runs and survey of 6 h; "
         "start within a length\n"
     )
-    found = runs(partial(flown, kinds))
+    found: list[dict[tuple[int, str], Flown]] = runs(partial(flown, kinds))
     table: Table = [("calibration", "error nT", "claimed nT", *HEAD)]
     for k, kind in enumerate(kinds):
         for method in METHODS:
             made = [glider[k, method] for glider in found]
-            errors = [f"{np.median([getattr(m, name) for m in made]):.1f}" for name in ("error", "claimed")]
+            errors = [f"{e:.1f}" for e in np.median([(m.error, m.claimed) for m in made], axis=0)]
             table.append((method, *errors, *row(str(kind), [m.score for m in made])))
             show(table)
 
