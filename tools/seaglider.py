@@ -4,7 +4,7 @@ A Seaglider's compass counts in steps of about 1 mG (100 nT), and is not correct
 buoyancy engine. Printed for each choice of masses: the RMS error of the dives left out, in the sensor's own
 nT, beside that of its steps alone, dive by dive.
 
-    python tools/seaglider.py ../shared/data/seaglider_sg167/*.nc
+    python tools/seaglider.py p167*.nc
 """
 
 from __future__ import annotations
