@@ -56,6 +56,21 @@ def test_a_regressor_that_later_ones_made_needless_is_dropped() -> None:
     assert exchanged(state, [both], state.fit([both]))[0] == [early]
 
 
+def test_one_cause_gives_way_to_two_beside_a_third() -> None:
+    """It was found first since it resembles their sum; neither of the two alone is better."""
+    rng = np.random.default_rng(1)
+    n = 600
+    one, two, third = rng.normal(size=(3, n))
+    alike = fault("nonlinearity", one + two + 0.3 * rng.normal(size=n), 10.0)
+    both = [fault("offset_drift", one, 10.0), fault("offset_step", two, 10.0)]
+    beside = fault("current_field", third, 10.0)
+    problem = replace(right(n), residual=5.0 * (one + two + third) + rng.normal(size=n))
+    state = State(problem, [alike, *both, beside], 1, 4)
+    state.round([], state.null)
+    start = [alike, beside]
+    assert {c.cause for c in exchanged(state, start, state.fit(start))[0]} == {c.cause for c in (*both, beside)}
+
+
 def test_what_nature_cannot_do_is_the_vehicles() -> None:
     """Of two causes of one shape the reference takes no more than a usual error of it."""
     rng = np.random.default_rng(1)

@@ -44,7 +44,8 @@ def _changes(state: State, pieces: list[Candidate], base: Joint) -> list[tuple[l
     found = []
     if len(pieces) == 1:
         found = [(r.behind, [r.candidate], [0]) for r in rivals_of(state, info, pieces, base, 0)]
-    for places in combinations(range(len(pieces)), min(2, len(pieces))):
+    everywhere = range(len(pieces))
+    for places in [*combinations(everywhere, 1), *combinations(everywhere, 2)]:
         for pair in pairs_of(state, info, pieces, base, *places):
             kept = [n for n in places if pieces[n] is pair.first or pieces[n] is pair.second]
             new = [c for c in (pair.first, pair.second) if not any(c is pieces[n] for n in kept)]
