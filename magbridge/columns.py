@@ -30,9 +30,9 @@ __all__ = [
 
 
 class Column(NamedTuple):
-    """Unit and meaning of a column."""
+    """Unit and meaning of a column, by the names of the variable's attributes."""
 
-    unit: str
+    units: str
     long_name: str
 
 
@@ -142,7 +142,7 @@ def factor(unit: str, column: str) -> float | None:
     """
     if column not in COLUMNS or unit in ("", "1"):
         return 1.0
-    wanted, unit = COLUMNS[column].unit, usual(unit)
+    wanted, unit = COLUMNS[column].units, usual(unit)
     return 1.0 if unit == wanted else _FACTORS.get((unit, wanted))
 
 

@@ -143,10 +143,7 @@ def correct_rows(correction: Correction, deployment: xr.Dataset) -> xr.Dataset:
     columns = dict(zip(CORRECTED, results.T, strict=True))
     columns["anomaly"] = columns["total_field"] - magnitude(main_field(deployment))
     return xr.Dataset(
-        {
-            name: ("time", column, {"units": COLUMNS[name].unit, "long_name": COLUMNS[name].long_name})
-            for name, column in columns.items()
-        },
+        {name: ("time", column, COLUMNS[name]._asdict()) for name, column in columns.items()},
         coords={"time": deployment["time"]},
         attrs={"source": deployment.attrs.get("source", "")},
     )

@@ -40,19 +40,10 @@ def dataset(track: Track, when: Array, columns: Mapping[str, Array], source: str
         known |= {name: Column(unit, f"position of {name}")}
     parts = [(part, track.start + first, track.start + last) for part, first, last in track.segments]
     return xr.Dataset(
-        {
-            column: ("time", columns[column], attributes(known[column]))
-            for column in known
-            if column in columns
-        },
-        coords={"time": ("time", track.start + when, attributes(COLUMNS["time"]))},
+        {name: ("time", columns[name], known[name]._asdict()) for name in known if name in columns},
+        coords={"time": ("time", track.start + when, COLUMNS["time"]._asdict())},
         attrs={"source": f"simulated: {source}", "segments": json.dumps(parts)},
     )
-
-
-def attributes(column: Column) -> dict[str, str]:
-    """Return a column's unit and meaning as a variable's attributes."""
-    return {"units": column.unit, "long_name": column.long_name}
 
 
 def segments(deployment: xr.Dataset) -> dict[str, xr.Dataset]:

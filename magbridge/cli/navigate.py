@@ -167,7 +167,7 @@ def _continued(grid: AnomalyGrid, options: Options, deployment: xr.Dataset) -> t
     """Return the map continued to the deployment's depth, and options with the error of that; report it."""
     from magbridge.navigate.depth import at_depth
 
-    there, known = at_depth(grid, options, deployment["depth"].to_numpy() if "depth" in deployment else 0.0)
+    there, known = at_depth(grid, options, deployment.get("depth", 0.0))
     if known != options:
         complain(
             f"{grid.name}: at {grid.altitude:.0f} m; continued to {-there.altitude:.0f} m below the "

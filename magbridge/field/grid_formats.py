@@ -12,22 +12,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magbridge.errors import FormatError, MissingExtra
-from magbridge.field.grid_netcdf import ANOMALY, LATITUDE, LONGITUDE, Parts
+from magbridge.field.grid_netcdf import ANOMALY, LATITUDE, LONGITUDE, Parts, netcdf
 
-__all__ = ["ascii_grid", "begins", "folder", "geotiff", "grd", "table"]
+__all__ = ["ascii_grid", "folder", "geotiff", "grd", "table"]
 
 Array = NDArray[np.floating[Any]]
-
-
-def begins(path: Path) -> bytes:
-    """Return the first four bytes, by which kinds of GRD are told apart."""
-    with path.open("rb") as file:
-        return file.read(4)
+NETCDF = (b"CDF\x01", b"CDF\x02", b"\x89HDF")
 
 
 def grd(path: Path) -> Parts:
-    """Read Surfer 6 text or binary, Surfer 7, else Geosoft; FormatError: none of them, or damaged."""
-    start = begins(path)
+    """Read GMT's netCDF, Surfer 6 text or binary, Surfer 7, else Geosoft; FormatError: none, or damaged."""
+    with path.open("rb") as file:
+        start = file.read(4)
+    if start in NETCDF:
+        return netcdf(path)
     if start not in _SURFER:
         return _geosoft(path)
     try:

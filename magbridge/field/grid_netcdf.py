@@ -69,15 +69,11 @@ def write(grid: AnomalyGrid, path: str | Path) -> None:
     """
     import xarray as xr  # noqa: PLC0415  the live path runs without xarray
 
-    axes = {
-        "latitude": ("latitude", grid.latitude, {"units": "degrees_north", "standard_name": "latitude"}),
-        "longitude": (
-            "longitude",
-            grid.longitude,
-            {"units": "degrees_east", "standard_name": "longitude"},
-        ),
-    }
     over = ("latitude", "longitude")
+    axes = {
+        name: (name, getattr(grid, name), {"units": f"degrees_{way}", "standard_name": name})
+        for name, way in zip(over, ("north", "east"), strict=True)
+    }
     fields = {
         "anomaly": (over, grid.anomaly, {"units": "nT", "long_name": "magnetic anomaly"}),
         "sigma": (over, grid.sigma, {"units": "nT", "long_name": "1-sigma of the magnetic anomaly"}),
@@ -94,11 +90,8 @@ def _coordinate(path: Path, grid: Any, names: tuple[str, ...], kind: str) -> str
     """Return the dimension that runs `kind` ("east", "north"), by units, standard name or name."""
     for dimension in map(str, grid.dims):
         attrs = grid[dimension].attrs if dimension in grid.coords else {}
-        called = {
-            dimension.lower(),
-            str(attrs.get("standard_name", "")),
-            str(attrs.get("long_name", "")).lower(),
-        }
+        names_it = (dimension, attrs.get("standard_name", ""), attrs.get("long_name", ""))
+        called = {str(name).lower() for name in names_it}
         metres = str(attrs.get("units", "")).lower() in ("m", "metre", "meter", "km")
         if called & set(PROJECTED) or (metres and called & set(names)):
             raise FormatError(

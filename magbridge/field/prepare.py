@@ -74,7 +74,7 @@ def prepare(
             steps.append(Step(f"continued {up:+.0f} m: {Path(grid.name).name}", lifted[-1]))
         else:
             lifted.append(grid)
-    result, apart = _merged(lifted, spacing)
+    result, apart = merge(lifted, spacing)
     if len(grids) > 1:
         nowhere = "no two of them overlap"
         differ = f"{apart:.1f} nT RMS apart where they overlap" if isfinite(apart) else nowhere
@@ -99,17 +99,13 @@ def continue_upward(grid: AnomalyGrid, height: float) -> AnomalyGrid:
     return continued(grid, -(grid.altitude + height)).grid
 
 
-def merge(grids: Sequence[AnomalyGrid], spacing: float | None = None) -> AnomalyGrid:
+def merge(grids: Sequence[AnomalyGrid], spacing: float | None = None) -> tuple[AnomalyGrid, float]:
     """Return the mean of the grids wherever at least one has a value; on the finest of their spacings.
 
-    Where they overlap, their differences show their errors: the mean of their variances is taken as at
-    least half of the mean squared difference. OutOfRange: more than :data:`MOST` nodes.
+    And by how many nT RMS two of them differ where they overlap; NaN where none do. The differences show
+    their errors: the mean of their variances is taken as at least half of the mean squared difference.
+    OutOfRange: more than :data:`MOST` nodes.
     """
-    return _merged(grids, spacing)[0]
-
-
-def _merged(grids: Sequence[AnomalyGrid], spacing: float | None) -> tuple[AnomalyGrid, float]:
-    """:func:`merge`, and by how many nT RMS two of the grids differ where they overlap; NaN where none do."""
     first = grids[0]
     if len(grids) == 1 and spacing is None:
         return first, nan

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from magbridge.columns import NT_PER_UNIT, usual
 from magbridge.errors import FormatError
 from magbridge.field.grid import AnomalyGrid
-from magbridge.field.grid_formats import ascii_grid, begins, folder, geotiff, grd, table
+from magbridge.field.grid_formats import ascii_grid, folder, geotiff, grd, table
 from magbridge.field.grid_netcdf import Parts, netcdf
 
 __all__ = ["READERS", "read_grid", "read_polygon"]
@@ -64,8 +64,6 @@ def read_grid(path: str | Path) -> AnomalyGrid:
     reader = folder if path.is_dir() else READERS.get(path.suffix.lower())
     if reader is None:
         raise FormatError(path, f"expected a grid: one of {' '.join(READERS)} or a folder")
-    if reader is grd and begins(path) in (b"CDF\x01", b"CDF\x02", b"\x89HDF"):
-        reader = netcdf
     longitude, latitude, values, options = reader(path)
     scale = _scale(path, options.pop("unit", None))
     if "sigma" in options:

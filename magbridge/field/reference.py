@@ -56,11 +56,7 @@ def reference_field(deployment: xr.Dataset, grid: AnomalyGrid | None = None, sit
     shallow rock.
     """
     size = deployment.sizes["time"]
-    given = (
-        deployment["reference_field"].to_numpy().astype(float)
-        if "reference_field" in deployment
-        else np.full(size, np.nan)
-    )
+    given = np.array(np.broadcast_to(deployment.get("reference_field", np.nan), size), float)
     unknown = np.isnan(given)
     if not unknown.any():
         return given

@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from magbridge.columns import NT_PER_UNIT
 from magbridge.errors import FormatError, MissingExtra
 from magbridge.logs.autopilot import Fields, Floats, pieces, values_of
 
@@ -31,7 +32,6 @@ __all__ = ["chunks"]
 Table = dict[str, Floats]
 Tables = dict[str, Table]
 
-NT_PER_MG = 100.0
 FIELDS: Fields = {
     "ATT": (("roll", "Roll", "deg", 1.0), ("pitch", "Pitch", "deg", 1.0), ("heading", "Yaw", "deg", 1.0)),
     "POS": (
@@ -96,7 +96,8 @@ def _telemetry(tables: Tables) -> Iterator[tuple[Floats, str, str, Floats]]:
 def _field(mag: Table) -> Table:
     """Return the raw channels in nT: the logged field less the offsets and the motor compensation."""
     return {
-        axis.lower(): NT_PER_MG * (mag[f"Mag{axis}"] - mag.get(f"Ofs{axis}", 0) - mag.get(f"MO{axis}", 0))
+        axis.lower(): NT_PER_UNIT["mG"]
+        * (mag[f"Mag{axis}"] - mag.get(f"Ofs{axis}", 0) - mag.get(f"MO{axis}", 0))
         for axis in "XYZ"
     }
 

@@ -85,7 +85,7 @@ def deployment(
         unit = units.get(name, "")
         scale = factor(unit, name)
         if scale is None:
-            raise FormatError(file, f"expected {COLUMNS[name].unit}, not {unit}", column=name)
+            raise FormatError(file, f"expected {COLUMNS[name].units}, not {unit}", column=name)
         array = np.asarray(values, dtype=np.float64)
         variables[name] = (
             "time",
@@ -101,7 +101,7 @@ def _describe(name: str, unit: str, long_name: str | None) -> dict[str, Any]:
     known = COLUMNS.get(name)
     if known is None:
         return {"units": unit or "1", "long_name": long_name or name.replace("_", " ")}
-    described: dict[str, Any] = {"units": known.unit, "long_name": known.long_name}
+    described: dict[str, Any] = known._asdict()
     if name == "quality":
         described |= {
             "flag_masks": [int(flag) for flag in Quality],

@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
+from magbridge.columns import NT_PER_UNIT
 from magbridge.errors import FormatError, MissingExtra
 from magbridge.logs.autopilot import Fields, Floats, pieces, values_of
 
@@ -32,7 +33,6 @@ __all__ = ["chunks"]
 Table = dict[str, Floats]
 Topics = dict[str, dict[int, Table]]
 
-NT_PER_GAUSS = 1e5
 FIELDS: Fields = {
     "vehicle_global_position": (("latitude", "lat", "deg", 1.0), ("longitude", "lon", "deg", 1.0)),
     "vehicle_local_position": (("depth", "z", "m", 1.0),),
@@ -73,7 +73,7 @@ def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
         if NEEDED.get(one.name, {"timestamp"}) <= fields.keys():
             topics.setdefault(one.name, {})[one.multi_id] = fields
     mags = {
-        number: (_time(mag), {axis: NT_PER_GAUSS * mag[axis] for axis in "xyz"})
+        number: (_time(mag), {axis: NT_PER_UNIT["G"] * mag[axis] for axis in "xyz"})
         for number, mag in topics.get("sensor_mag", {}).items()
     }
     if not mags:

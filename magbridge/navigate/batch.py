@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 from magbridge.errors import FormatError
 from magbridge.field.earth import offset
 from magbridge.field.grid import AnomalyGrid
+from magbridge.logs.checks import increasing
+from magbridge.logs.deployment import deployment as made
 from magbridge.navigate.deadreckoning import GLIDE
 from magbridge.navigate.findings import findings_of
 from magbridge.navigate.navigator import UNUSABLE, Navigator
@@ -106,8 +108,8 @@ def navigate(
     keep(navigator.finish())
     if not records:
         raise FormatError(source, "expected samples of the total field at known times: none was usable")
-    result = _dataset(records, _smooth(states))
-    result.attrs = {"source": source, "map": grid.name, "motion": motion}
+    attrs = {"source": source, "map": grid.name, "motion": motion}
+    result = _dataset(records, _smooth(states)).assign_attrs(attrs)
     known = reference_track(deployment, frozenset(MOTIONS[motion]))
     result = with_errors(result, known)
     findings = findings_of(result, grid, options, navigator.estimate.jumps, known)
@@ -119,17 +121,10 @@ def _samples(deployment: xr.Dataset, source: str) -> tuple[Floats, Floats, Float
     if "total_field" not in deployment:
         raise FormatError(source, "expected total_field: correct the log with a calibration first")
     time = deployment["time"].to_numpy().astype(float)
-    if (backward := np.flatnonzero(~(np.diff(time) > 0.0))).size:
-        raise FormatError(source, "expected increasing time", row=int(backward[0]) + 2, column="time")
-    field = deployment["total_field"].to_numpy().astype(float)
-    sigma = (
-        deployment["total_field_sigma"].to_numpy().astype(float)
-        if "total_field_sigma" in deployment
-        else np.ones(time.size)
-    )
-    if "quality" in deployment:
-        quality = np.nan_to_num(deployment["quality"].to_numpy().astype(float)).astype(int)
-        field = np.where(quality & UNUSABLE, np.nan, field)
+    increasing(source, time)
+    quality = np.nan_to_num(np.asarray(deployment.get("quality", 0.0), float)).astype(int)
+    field = np.where(quality & UNUSABLE, np.nan, deployment["total_field"].to_numpy())
+    sigma = np.broadcast_to(np.asarray(deployment.get("total_field_sigma", 1.0), float), time.shape)
     return time, field, sigma
 
 
@@ -199,11 +194,4 @@ def _dataset(records: list[Record], smoothed: tuple[Array, Array]) -> xr.Dataset
     columns["smoothed_latitude"], columns["smoothed_longitude"] = np.array(places).T
     columns["smoothed_sigma_north"], columns["smoothed_sigma_east"] = np.sqrt([P[:, 0, 0], P[:, 1, 1]])
     time = np.array([record.time_us for record in records]) * 1e-6
-    return xr.Dataset(
-        {name: ("time", values, _attrs(name)) for name, values in columns.items()},
-        {"time": ("time", time, {"units": "s", "long_name": "seconds since 1970-01-01 UTC"})},
-    )
-
-
-def _attrs(name: str) -> dict[str, str]:
-    return {"units": UNITS.get(name, "1"), "long_name": name.replace("_", " ")}
+    return made("track", time, columns, UNITS)

@@ -177,11 +177,7 @@ def best_shift(grid: AnomalyGrid, latitude: Array, longitude: Array, depth: Arra
 def _positions(grid: AnomalyGrid, reference_track: xr.Dataset, options: Options) -> list[str]:
     """Compare the map with the field at known positions: its place, and whether it is this field's map."""
     latitude, longitude = reference_track["latitude"].to_numpy(), reference_track["longitude"].to_numpy()
-    depth = (
-        reference_track["depth"].fillna(0.0).to_numpy()
-        if "depth" in reference_track
-        else np.zeros(latitude.size)
-    )
+    depth = np.broadcast_to(np.nan_to_num(reference_track.get("depth", 0.0)), latitude.shape)
     time = reference_track["time"].to_numpy()
     measured = reference_track["total_field"].to_numpy() - total_field(longitude, latitude, depth, time)
     known = np.isfinite(measured + grid.evaluate(longitude, latitude, depth).anomaly)

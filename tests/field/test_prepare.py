@@ -82,7 +82,7 @@ def test_nothing_is_prepared_downward() -> None:
 def test_merge_is_the_mean_in_the_overlap() -> None:
     west = AnomalyGrid(LON[:50], LAT, np.full((61, 50), 10.0), sigma=3.0)
     east = AnomalyGrid(LON[30:], LAT[10:], np.full((51, 51), 12.0), sigma=4.0)
-    both = merge([west, east])
+    both, _ = merge([west, east])
     assert both.look_up(-58.09, 49.5).anomaly == pytest.approx(10.0)
     assert both.look_up(-57.91, 49.5).anomaly == pytest.approx(12.0)
     overlap = both.look_up(-58.0, 49.5)
@@ -95,7 +95,7 @@ def test_surveys_that_disagree_are_not_exact() -> None:
     """Each of two that differ by 10 nT is off by 7 nT, alone; their mean is off by 5."""
     west = AnomalyGrid(LON[:50], LAT, np.full((61, 50), 10.0))
     east = AnomalyGrid(LON[30:], LAT, np.full((61, 51), 20.0), sigma=8.0)
-    both = merge([west, east])
+    both, _ = merge([west, east])
     sigma = [float(np.sqrt(both.look_up(place, 49.5).variance)) for place in (-58.09, -58.0, -57.91)]
     assert sigma == pytest.approx([10.0 / np.sqrt(2.0), 5.0, 8.0])
 
@@ -121,14 +121,14 @@ def test_a_map_that_would_fill_the_memory_is_refused() -> None:
     east = AnomalyGrid(LON + 40.0, LAT + 10.0, monopole(60.0))
     with pytest.raises(OutOfRange, match=r"146\d{6} nodes: at most 10000000: set a spacing of 0\.0067 deg"):
         merge([west, east])
-    assert 1e6 < merge([west, east], spacing=0.01).anomaly.size < 1e7
+    assert 1e6 < merge([west, east], spacing=0.01)[0].anomaly.size < 1e7
 
 
 def test_merge_across_the_antimeridian() -> None:
     values = np.full((61, 50), 5.0)
     west = AnomalyGrid(LON[:50] + 238.0, LAT, values)
     east = AnomalyGrid(LON[:50] + 238.1 - 360.0, LAT, values)
-    both = merge([west, east])
+    both, _ = merge([west, east])
     np.testing.assert_allclose(both.at([179.95, -179.9], 49.5), 5.0, atol=1e-9)
 
 

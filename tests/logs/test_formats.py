@@ -47,7 +47,7 @@ def deployments(draw: st.DrawFn, width: Literal[32, 64]) -> xr.Dataset:
     columns = {}
     for name in [*draw(known), *units]:
         most = MOST.get(name, APART / 2 if name in CHANNEL_TIMES else None)
-        least = LEAST.get(COLUMNS[name].unit if name in COLUMNS else units[name])
+        least = LEAST.get(COLUMNS[name].units if name in COLUMNS else units[name])
         bounds = (
             {"min_value": least and int(least)} if most is None else {"min_value": -most, "max_value": most}
         )
