@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from magbridge.columns import CHANNEL_TIMES, usual
 from magbridge.errors import FormatError
 
-__all__ = ["increasing", "plausible"]
+__all__ = ["checked", "increasing"]
 
 Floats = NDArray[np.float64]
 
@@ -62,14 +62,24 @@ def increasing(
     )
 
 
-def plausible(file: str | Path, dataset: xr.Dataset, rows: Sequence[int]) -> None:
-    """Check for impossible temperatures, pressures, angles, positions, depths, references and channel times.
+def checked(file: str | Path, pieces: Iterable[tuple[xr.Dataset, Sequence[int]]]) -> Iterator[xr.Dataset]:
+    """Yield the pieces of a deployment, each given with the numbers of its rows in the file.
 
     Raises
     ------
     FormatError
-        Names the first row that does not fit, by its number in `rows`.
+        Names the first row at which time does not increase, or whose temperature, pressure, angle, position,
+        depth, reference or channel time is impossible.
     """
+    last = -np.inf
+    for dataset, rows in pieces:
+        increasing(file, dataset["time"].values, rows, after=last)
+        _plausible(file, dataset, rows)
+        last = float(dataset["time"][-1])
+        yield dataset
+
+
+def _plausible(file: str | Path, dataset: xr.Dataset, rows: Sequence[int]) -> None:
     time = dataset["time"].values
     for name, column in dataset.data_vars.items():
         values, unit = column.values, usual(column.attrs.get("units", ""))

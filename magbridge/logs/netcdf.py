@@ -13,7 +13,7 @@ OceanGliders format 1.0, https://oceangliderscommunity.github.io/OG-format-user-
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,7 @@ from magbridge.errors import FormatError, MissingExtra
 from magbridge.files import systems_reason
 from magbridge.logs import seaglider
 from magbridge.logs.cf import floats
-from magbridge.logs.checks import increasing, plausible
+from magbridge.logs.checks import checked
 from magbridge.logs.deployment import deployment, sliced
 
 try:
@@ -67,7 +67,7 @@ def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
             if seaglider.DIMENSION in file.dimensions:
                 yield from sliced(seaglider.dive(path, file), rows)
             elif DIMENSION in file.dimensions:
-                yield from _chunks(path, file, rows)
+                yield from checked(path, _chunks(path, file, rows))
             else:
                 there = ", ".join(file.dimensions) or "none"
                 raise FormatError(
@@ -80,7 +80,8 @@ def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
         raise FormatError(path, f"expected a whole netCDF file: {reason}") from None
 
 
-def _chunks(path: Path, file: Any, rows: int) -> Iterator[xr.Dataset]:
+def _chunks(path: Path, file: Any, rows: int) -> Iterator[tuple[xr.Dataset, Sequence[int]]]:
+    """Yield the rows, each piece with their numbers."""
     ours = {capitals: name for name, capitals in NAMES.items()}
     variables = {
         getattr(variable, "column", ours.get(name, name.lower())): variable
@@ -96,16 +97,11 @@ def _chunks(path: Path, file: Any, rows: int) -> Iterator[xr.Dataset]:
     units = {name: getattr(variable, "units", "1") for name, variable in variables.items() if name != "time"}
     meanings = {name: str(getattr(variable, "long_name", "")) for name, variable in variables.items()}
     attrs = {key: _plain(value) for key, value in file.__dict__.items() if key not in GENERATED}
-    last = -np.inf
     for row in range(0, total, rows):
         columns = {name: floats(variable, slice(row, row + rows)) for name, variable in variables.items()}
         time = columns.pop("time") * scale + start
         numbers = range(row + 1, row + 1 + len(time))
-        increasing(path, time, numbers, after=last)
-        last = float(time[-1])
-        dataset = deployment(path, time, columns, units, attrs, meanings)
-        plausible(path, dataset, numbers)
-        yield dataset
+        yield deployment(path, time, columns, units, attrs, meanings), numbers
 
 
 def _epoch(path: Path, variable: Any) -> tuple[float, float]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from magbridge.errors import FormatError, MissingExtra
-from magbridge.logs.checks import increasing, plausible
+from magbridge.logs.checks import checked
 from magbridge.logs.deployment import deployment
 
 try:
@@ -35,12 +35,13 @@ def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
     """
     try:
         with pq.ParquetFile(path) as file:
-            yield from _chunks(path, file, rows)
+            yield from checked(path, _chunks(path, file, rows))
     except (pa.ArrowException, OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
         raise FormatError(path, f"expected a whole Parquet file: {str(error).splitlines()[0]}") from None
 
 
-def _chunks(path: Path, file: Any, rows: int) -> Iterator[xr.Dataset]:
+def _chunks(path: Path, file: Any, rows: int) -> Iterator[tuple[xr.Dataset, Sequence[int]]]:
+    """Yield the rows, each piece with their numbers."""
     schema = file.schema_arrow
     units = {field.name: _text(field.metadata, b"units") for field in schema}
     meanings = {field.name: _text(field.metadata, b"long_name") for field in schema}
@@ -49,15 +50,12 @@ def _chunks(path: Path, file: Any, rows: int) -> Iterator[xr.Dataset]:
         raise FormatError(path, f"expected this column; there are: {' '.join(schema.names)}", column="time")
     if not file.metadata.num_rows:
         raise FormatError(path, "expected rows, there are none")
-    row, last = 1, -np.inf
+    row = 1
     for batch in file.iter_batches(batch_size=min(rows, 1 << 20)):
         columns = {field.name: _floats(path, field, batch.column(k)) for k, field in enumerate(schema)}
-        dataset = deployment(path, columns.pop("time"), columns, units, attrs, meanings)
         numbers = range(row, row + batch.num_rows)
-        increasing(path, dataset["time"].values, numbers, after=last)
-        plausible(path, dataset, numbers)
-        row, last = row + batch.num_rows, float(dataset["time"][-1])
-        yield dataset
+        yield deployment(path, columns.pop("time"), columns, units, attrs, meanings), numbers
+        row = numbers.stop
 
 
 def _text(metadata: dict[bytes, bytes] | None, key: bytes) -> str:

@@ -23,7 +23,7 @@ import xarray as xr
 
 from magbridge.columns import COLUMNS
 from magbridge.errors import FormatError
-from magbridge.logs.checks import increasing, plausible
+from magbridge.logs.checks import checked
 from magbridge.logs.deployment import SETTINGS, deployment, lasting
 from magbridge.records import Quality
 
@@ -45,7 +45,7 @@ def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
     """
     with path.open(encoding="utf-8-sig", newline="") as file:
         try:
-            yield from _chunks(path, file, rows)
+            yield from checked(path, _chunks(path, file, rows))
         except UnicodeDecodeError:
             raise FormatError(path, "expected text in UTF-8") from None
         except csv.Error as error:
@@ -92,10 +92,11 @@ def _header(path: Path, lines: Iterator[str]) -> _Header:
     return _Header(attrs, fill, names, units, row)
 
 
-def _chunks(path: Path, file: TextIO, rows: int) -> Iterator[xr.Dataset]:
+def _chunks(path: Path, file: TextIO, rows: int) -> Iterator[tuple[xr.Dataset, Sequence[int]]]:
+    """Yield the rows, each piece with the numbers of its lines."""
     text = _lines(file)
     attrs, fill, names, units, row = _header(path, text)
-    reader, last, nothing = csv.reader(text), -np.inf, True
+    reader, nothing = csv.reader(text), True
     lines = ((row + reader.line_num, fields) for fields in reader if fields)
     while block := list(islice(lines, rows)):
         numbers, texts = zip(*block, strict=True)
@@ -108,11 +109,8 @@ def _chunks(path: Path, file: TextIO, rows: int) -> Iterator[xr.Dataset]:
         }
         for column in columns.values():
             column[column == fill] = nan
-        dataset = deployment(path, columns.pop("time"), columns, units, attrs)
-        increasing(path, dataset["time"].values, numbers, after=last)
-        plausible(path, dataset, numbers)
-        last, nothing = float(dataset["time"][-1]), False
-        yield dataset
+        nothing = False
+        yield deployment(path, columns.pop("time"), columns, units, attrs), numbers
     if nothing:
         raise FormatError(path, "expected rows after the header", row=row + 1)
 
