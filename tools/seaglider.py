@@ -66,7 +66,7 @@ class HeldOut:
     @property
     def rms(self) -> float:
         """RMS error, nT."""
-        return float(np.sqrt(np.nanmean(self.error**2)))
+        return rms(self.error[np.isfinite(self.error)])
 
     def by_run(self) -> dict[str, float]:
         """RMS error of each run, nT."""

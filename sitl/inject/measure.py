@@ -7,19 +7,17 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from sitl.inject.catalogue import EFFECTS
 from sitl.inject.foreign import FOREIGN
-from sitl.inject.scene import Hidden, Scene, furnish
+from sitl.inject.scene import Array, Hidden, Scene, furnish
 from sitl.instrument import Samples, rotation
 from sitl.trajectory import Track
 from sitl.twin import Twin
 
 __all__ = ["disturb"]
 
-Array = NDArray[np.float64]
 FINER = 5
 """Factor by which the simulation's grid is refined if the instrument has a filter or channel delays."""
 

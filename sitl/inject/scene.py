@@ -14,7 +14,7 @@ from sitl.instrument import Instrument
 from sitl.signals import autoregressive, first_order
 from sitl.trajectory import Track
 
-__all__ = ["Effect", "Generator", "Hidden", "Scene", "direction", "furnish", "relays", "soaked"]
+__all__ = ["Array", "Effect", "Generator", "Hidden", "Scene", "direction", "furnish", "relays", "soaked"]
 
 Array = NDArray[np.float64]
 Generator = np.random.Generator

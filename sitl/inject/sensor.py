@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
-from sitl.inject.scene import Generator, Scene, direction, soaked
-
-Array = NDArray[np.float64]
+from sitl.inject.scene import Array, Generator, Scene, direction, soaked
 
 CALIBRATED_AT = 4.5
 """degC, the instrument's temperature during the calibration, to about half a degree."""

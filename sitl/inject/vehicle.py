@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from sitl.inject.scene import Generator, Scene, direction, relays
+from sitl.inject.scene import Array, Generator, Scene, direction, relays
 from sitl.instrument import rotation
 from sitl.signals import first_order
 from sitl.world import MU_0_OVER_4_PI, dipole_field
-
-Array = NDArray[np.float64]
 
 SWING = {"battpos": 0.6, "ballast": 200.0}
 """How far a survey moves the masses either way, in their units."""

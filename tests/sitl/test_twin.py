@@ -42,17 +42,8 @@ def test_every_scenario_that_comes_along_reads() -> None:
 def test_a_deployment_has_the_contracts_columns(demo: xr.Dataset) -> None:
     for name in (
         *("mag_x", "mag_y", "mag_z", "mag_time_x", "mag_time_y", "mag_time_z", "sensor_temperature"),
-        *(
-            "roll",
-            "pitch",
-            "heading",
-            "latitude",
-            "longitude",
-            "depth",
-            "reference_field",
-            "battpos",
-            "ballast",
-        ),
+        *("roll", "pitch", "heading", "latitude", "longitude", "depth"),
+        *("reference_field", "battpos", "ballast"),
     ):
         assert demo[name].dims == ("time",)
         assert demo[name].dtype == np.float64

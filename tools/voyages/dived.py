@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import xarray as xr
 
+from magbridge.calibration.residual import rms
 from magbridge.navigate.batch import navigate
 from magbridge.navigate.depth import at_depth
 from magbridge.navigate.options import Options
@@ -39,8 +40,4 @@ def _score(track: xr.Dataset) -> Dived:
     nn, ne, ee = (track[f"covariance_{axes}"].to_numpy() for axes in ("nn", "ne", "ee"))
     P = np.stack([nn, ne, ne, ee], axis=-1).reshape(-1, 2, 2)
     squared = np.einsum("ni,nij,nj->n", error, np.linalg.inv(P), error)
-    return Dived(
-        float(np.sqrt(np.mean(np.sum(error**2, axis=1)))),
-        float(squared.mean()) / 2,
-        float(track["valid"].mean()),
-    )
+    return Dived(rms(np.hypot(*error.T)), float(squared.mean()) / 2, float(track["valid"].mean()))

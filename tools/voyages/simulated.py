@@ -14,6 +14,7 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from magbridge.calibration.residual import rms
 from magbridge.field.earth import metres_per_degree, offset
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.igrf import total_field
@@ -193,7 +194,7 @@ class Run:
         half = self.second_half
         away = longest(self.nees > OUTSIDE, self.hours)
         return Score(
-            drms=float(np.sqrt(np.mean(self.error[half] ** 2))),
+            drms=rms(self.error[half]),
             bound=self.bound,
             unaided=self.unaided,
             lost=longest(self.nees[half] > OUTSIDE, self.hours[half]) > 0.5,
@@ -266,8 +267,8 @@ def sail(ds: xr.Dataset, grid: AnomalyGrid, options: Options) -> Run:
         nees,
         table[:, 7].astype(int),
         table[:, 8] > 0,
-        float(np.sqrt(np.mean(best.sigma[half] ** 2))),
-        float(np.sqrt(np.mean(best.unaided[half] ** 2))),
+        rms(best.sigma[half]),
+        rms(best.unaided[half]),
         grid.correlation_length,
         seconds / ds.sizes["time"],
     )

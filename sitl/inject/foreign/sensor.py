@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from sitl.inject.scene import Generator, Scene, direction, relays, soaked
+from sitl.inject.scene import Array, Generator, Scene, direction, relays, soaked
 from sitl.signals import first_order
-
-Array = NDArray[np.float64]
 
 
 def perming(scene: Scene, size: float, rng: Generator) -> None:

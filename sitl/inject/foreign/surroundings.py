@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from sitl.inject.scene import Generator, Scene, direction
+from sitl.inject.scene import Array, Generator, Scene, direction
 from sitl.signals import autoregressive, first_order
 from sitl.world import dipole_field
-
-Array = NDArray[np.float64]
 
 
 def ship(scene: Scene, size: float, rng: Generator) -> None:
