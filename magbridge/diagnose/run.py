@@ -29,7 +29,8 @@ from magbridge.diagnose.inference.joint import Joint
 from magbridge.diagnose.inference.nonlinear_uncertainty import loosened
 from magbridge.diagnose.inference.outliers import Outliers, outliers
 from magbridge.diagnose.inference.rivals import Rival
-from magbridge.diagnose.inference.search import Hypothesis, search
+from magbridge.diagnose.inference.rounds import Hypothesis
+from magbridge.diagnose.inference.search import search
 from magbridge.diagnose.unexplained.leftover import Leftover, leftover
 from magbridge.errors import DataError
 from magbridge.field.grid import AnomalyGrid

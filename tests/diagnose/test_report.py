@@ -17,7 +17,7 @@ from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.compare.survey import Channel, _channels
 from magbridge.diagnose.gain import Gain
 from magbridge.diagnose.inference.rivals import Rival
-from magbridge.diagnose.inference.search import Hypothesis
+from magbridge.diagnose.inference.rounds import Hypothesis
 from magbridge.diagnose.report import figures
 from magbridge.diagnose.report.doubts import IMPLAUSIBLE, gained, implausible, nameless, rivalled, unsettled
 from magbridge.diagnose.report.found import _folded, _outliers

@@ -43,7 +43,6 @@ __all__ = [
     "REMNANT",
     "Score",
     "evidence_of",
-    "evidence_of_all",
     "log_bayes",
     "log_odds",
     "margin",
@@ -181,19 +180,10 @@ def log_odds(ratio: float, model: Sequence[Candidate], trials: Mapping[str, floa
     determine nonlinear parameters is not counted here, but only between names: free descriptions are
     profiled, too, and do not pay for it.
     """
-    further = max(sum(len(candidate.pieces) for candidate in model) - 1, 0) * (
-        ODDS + float(np.log(len(trials)))
-    )
-    grids = sum(len(candidate.pieces) * float(np.log(trials[candidate.cause])) for candidate in model)
-    return 0.5 * (ratio - shaped) + evidence_of_all(shaped, model) - further - grids
-
-
-def evidence_of_all(ratio: float, model: Sequence[Candidate]) -> float:
-    """Log evidence of a whole model, its nonlinear parameters given."""
-    free = sum(candidate.size for candidate in model if candidate.spectra is None)
-    sided = float(np.log(2.0)) * sum(candidate.positive for candidate in model)
-    likelier = sum(candidate.likelier for candidate in model)
-    spectra = sum(
-        float(np.log(len(candidate.spectra))) for candidate in model if candidate.spectra is not None
-    )
-    return (float(log_bayes(ratio, free)) if free else 0.5 * ratio) + sided + likelier - spectra
+    regressors, free = sum(len(c.pieces) for c in model), sum(c.size for c in model if c.spectra is None)
+    further = max(regressors - 1, 0) * (ODDS + float(np.log(len(trials))))
+    prices = sum(len(c.pieces) * float(np.log(trials[c.cause])) for c in model)
+    prices += sum(float(np.log(len(c.spectra))) for c in model if c.spectra is not None)
+    known = sum(c.likelier + float(np.log(2.0)) * c.positive for c in model)
+    worth = float(log_bayes(shaped, free)) if free else 0.5 * shaped
+    return 0.5 * (ratio - shaped) + worth + known - further - prices

@@ -69,13 +69,13 @@ class Information:
             np.vstack([self.shift[:, :m] - self.shift[:, m:] @ K, K]),
         )
 
-    def instead(self, base: Joint, own: NDArray[np.intp]) -> Information:
-        """Take the coefficients at `own` out of the model of `base`, and project out its others.
+    def instead(self, base: Joint, *places: slice) -> Information:
+        """Take the coefficients at these places out of the model of `base`, and project out its others.
 
         The model's columns are the last. The scores are those of what `base` leaves and of what the
-        coefficients at `own` (i,) explain in it.
+        coefficients at these places explain in it.
         """
-        first = len(self.score) - base.coefficients.size
+        first, own = len(self.score) - base.coefficients.size, np.r_[*places]
         others = np.setdiff1d(np.arange(first, len(self.score)), own)
         alone = self.without(others, base.prior[len(base.z) + others - first])
         return replace(alone, score=alone.score + alone.matrix[:, own] @ base.coefficients[own - first])

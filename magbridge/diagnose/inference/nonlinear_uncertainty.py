@@ -136,7 +136,7 @@ def _elsewhere(info: Information, fit: Joint, placed_piece: Placed, points: Sequ
     rest = np.setdiff1d(np.arange(first, len(info.score)), np.r_[own])
     prior = np.diag(fit.prior[q + rest - first])
     K = np.linalg.solve(info.matrix[np.ix_(rest, rest)] + prior, info.matrix[rest])
-    alone = info.instead(fit, np.r_[own])
+    alone = info.instead(fit, own)
 
     def moments(candidate: Candidate, place: slice) -> tuple[float, FloatArray, FloatArray]:
         """Return evidence, all coefficients and their covariance, each up to what is common to all points."""

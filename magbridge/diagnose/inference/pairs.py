@@ -117,7 +117,7 @@ class _Table:
     ) -> None:
         first = state.at[-1].stop
         here = [slices(model, first)[n] for n in places]
-        self.info = info.instead(base, np.r_[*here])
+        self.info = info.instead(base, *here)
         self.signals = [self.info.matrix[:, at] @ base.coefficients[np.r_[at] - first] for at in here]
         self.state, self.base, self.standing = state, base, [model[n] for n in places]
         self.candidates = [*state.candidates, *self.standing]

@@ -38,7 +38,7 @@ def rivals_of(
 ) -> tuple[Rival, ...]:
     """Return the rivals of the k-th cause of `model`, whose columns are the last of `info`."""
     own = slices(model, state.at[-1].stop)[k]
-    alone = info.instead(base, np.r_[own])
+    alone = info.instead(base, own)
     standing = score(alone, own, model[k])
     rivals, best = [], state.best(alone)
     paid = best[model[k].group].price if model[k].group in best else 0.0

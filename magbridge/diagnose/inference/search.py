@@ -35,7 +35,7 @@ from magbridge.diagnose.inference.profile_likelihood import refined, sharpen
 from magbridge.diagnose.inference.rivals import Rival, sets_of
 from magbridge.diagnose.inference.rounds import Hypothesis, State, shaped_ratio
 
-__all__ = ["Hypothesis", "Outcome", "search"]
+__all__ = ["Outcome", "search"]
 
 MOST = 6
 """Regressors found one by one in a log, at most."""

@@ -14,7 +14,7 @@ from magbridge.diagnose.diagnosis import Diagnosis, Finding
 from magbridge.diagnose.gain import Gain
 from magbridge.diagnose.inference.design import normal
 from magbridge.diagnose.inference.rivals import Rival
-from magbridge.diagnose.inference.search import Hypothesis
+from magbridge.diagnose.inference.rounds import Hypothesis
 
 __all__ = ["chance_alone", "findings", "findings_json", "parameters"]
 
