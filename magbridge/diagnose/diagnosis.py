@@ -39,6 +39,8 @@ class Finding:
     coefficients : (k,) array
         In units of their prior width.
     covariance : (k, k) array
+    chance_alone : float
+        That such a cause is named alone in such a log, by theory (:mod:`~.inference.naming`).
     """
 
     hypothesis: Hypothesis
@@ -46,6 +48,7 @@ class Finding:
     gain: Gain
     coefficients: FloatArray
     covariance: FloatArray
+    chance_alone: float
 
     @property
     def candidate(self) -> Candidate:

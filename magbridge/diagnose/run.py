@@ -26,6 +26,7 @@ from magbridge.diagnose.gain import Gain, held_out, paired
 from magbridge.diagnose.inference.evidence import ODDS, REMNANT
 from magbridge.diagnose.inference.isolability import isolability
 from magbridge.diagnose.inference.joint import Joint
+from magbridge.diagnose.inference.naming import chances_alone
 from magbridge.diagnose.inference.nonlinear_uncertainty import loosened
 from magbridge.diagnose.inference.outliers import Outliers, outliers
 from magbridge.diagnose.inference.rivals import Rival
@@ -134,9 +135,11 @@ def _examine(
             named, rivals, model, fit, after, extended = (), (), [], outcome.null, before, calibration
             rest = leftover(problem, [], outcome.null, tone)
     rest = rest or _loud(problem, after, counts)
+    chances = chances_alone(candidates, outcome.info, named, outcome.trials, len(causes))
     total = paired(before, after, problem.survey.dive, counts)
     return Diagnosis(
-        problem=problem, outcome=outcome, findings=_findings(problem, named, rivals, fit, after, counts),
+        problem=problem, outcome=outcome,
+        findings=_findings(problem, named, rivals, fit, after, counts, chances),
         wrong=wrong, unexplained=rest, calibration=extended, fit=fit, before=before, after=after,
         total=total,
         isolability=isolability(candidates, outcome.info, outcome.trials, len(causes), untestable),
@@ -208,19 +211,19 @@ def _findings(
     fit: Joint,
     after: FloatArray,
     counts: NDArray[np.bool_],
+    chances: Sequence[float],
 ) -> tuple[Finding, ...]:
     """Collect each cause's results; its gain is that over a fit of the others without it."""
     found, q = [], len(fit.z)
-    for k, (own, (hypothesis, others)) in enumerate(
-        zip(slices([h.candidate for h in named]), zip(named, rivals, strict=True), strict=True)
-    ):
+    places = slices([h.candidate for h in named])
+    for k, (own, hypothesis, others, chance) in enumerate(zip(places, named, rivals, chances, strict=True)):
         columns = [h.candidate.columns for i, h in enumerate(named) if i != k]
         kept = np.delete(fit.prior, slice(q + own.start, q + own.stop))
         alone = replace(fit, coefficients=np.delete(fit.coefficients, own), prior=kept)
         without = held_out(problem, columns, alone).left
         gain = paired(without, after, problem.survey.dive, counts)
         covariance = fit.effects_covariance[own, own]
-        found.append(Finding(hypothesis, others, gain, fit.coefficients[own], covariance))
+        found.append(Finding(hypothesis, others, gain, fit.coefficients[own], covariance, chance))
     return tuple(found)
 
 

@@ -21,7 +21,6 @@ from scipy.special import chdtri, chndtrinc
 from magbridge.diagnose.causes.candidates import Candidate, Group, slices
 from magbridge.diagnose.inference.evidence import LEVEL, score
 from magbridge.diagnose.inference.information import Information
-from magbridge.diagnose.inference.naming import NamingTheory
 
 __all__ = ["Isolability", "Visible", "isolability"]
 
@@ -68,15 +67,12 @@ class Isolability:
         Cause that this log cannot test -> what a log would need for it.
     correlation : (m, m) array
         Between the causes of `visible`.
-    naming : NamingTheory
-        The chance of each cause to be named alone.
     """
 
     visible: tuple[Visible, ...]
     pairs: tuple[tuple[Visible, Visible, float], ...]
     untestable: dict[str, str]
     correlation: FloatArray
-    naming: NamingTheory
 
 
 def _threshold(freedom: int, hypotheses: float, chance: float) -> float:
@@ -110,13 +106,7 @@ def isolability(
         for i, j in zip(*np.tril_indices(len(R), -1), strict=True)
         if R[i, j] > CONFOUNDED and visible[i].cause != visible[j].cause
     ]
-    return Isolability(
-        tuple(visible),
-        tuple(sorted(pairs, key=lambda p: -p[2])),
-        dict(untestable),
-        R,
-        NamingTheory(candidates, info, trials, causes),
-    )
+    return Isolability(tuple(visible), tuple(sorted(pairs, key=lambda p: -p[2])), dict(untestable), R)
 
 
 def _most_visible(candidates: Sequence[Candidate], info: Information, at: Sequence[slice]) -> list[int]:

@@ -17,78 +17,60 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import chi2, ncx2, norm
 
 from magbridge.diagnose.causes.candidates import Candidate, slices
 from magbridge.diagnose.inference.evidence import LEVEL, log_bayes, margin
 from magbridge.diagnose.inference.information import Information
+from magbridge.diagnose.inference.rounds import Hypothesis
 from magbridge.diagnose.inference.statistic import Statistic
 
-__all__ = ["NamingTheory"]
-
-FloatArray = NDArray[np.float64]
+__all__ = ["chances_alone"]
 
 
-class NamingTheory:
-    """The theory of one log: the chance of each cause to be named alone.
+def chances_alone(
+    candidates: Sequence[Candidate],
+    info: Information,
+    named: Sequence[Hypothesis],
+    trials: Mapping[str, float],
+    causes: int,
+) -> list[float]:
+    """Return the chance of each cause, of this size and direction, to be named alone in such a log.
 
     Parameters
     ----------
     candidates : sequence of Candidate
+        All that were searched.
     info : Information
-        Of the candidates' columns first; others may follow.
+        Of their columns and, last, of those that are named.
+    named : sequence of Hypothesis
+        The causes in question.
     trials : mapping
         Cause -> number of independent hypotheses behind it.
     causes : int
         Number of causes in the table.
     """
-
-    def __init__(
-        self, candidates: Sequence[Candidate], info: Information, trials: Mapping[str, float], causes: int
-    ) -> None:
-        self.candidates, self.S, self.causes = candidates, info.matrix, causes
-        self.at = slices(candidates)
-        self.limit: dict[int, float] = {}
-        self.freedoms = {c.cause: c.freedom for c in candidates if c.spectra is not None}
-        self.statistics = []
-        for k, at in enumerate(self.at):
-            statistic = Statistic(self.S[at, at], candidates[k].spectra)
-            self.statistics.append(statistic)
-            tests = candidates[k].tail * trials.get(candidates[k].cause, 1.0) * causes
-            self.limit[k] = float(chi2.isf(LEVEL / tests, max(statistic.freedom, 1)))
-
-    def chance(self, cause: str, own: NDArray[np.intp], b: FloatArray, signal_to_noise: float) -> float:
-        """Chance that `cause`, with the direction b of the coefficients at `own`, is named alone.
-
-        Parameters
-        ----------
-        cause : str
-            By its public name.
-        own : (k,) int array
-            Places of the coefficients in the information.
-        b : (k,) array
-            Only its direction counts.
-        signal_to_noise : float
-            Of the effect, after projection.
-        """
-        power = float(b @ self.S[np.ix_(own, own)] @ b)
-        if power <= 0.0 or signal_to_noise <= 0.0:
-            return 0.0
-        s = self.S[:, own] @ b * (signal_to_noise / np.sqrt(power))
-        freedom, a2 = self.freedoms.get(cause, len(own)), signal_to_noise**2
+    S, places = info.matrix, slices([*candidates, *(h.candidate for h in named)])
+    others = [
+        (candidate, at, Statistic(S[at, at], candidate.spectra))
+        for candidate, at in zip(candidates if named else (), places, strict=False)
+    ]
+    found = []
+    for hypothesis, own in zip(named, places[len(candidates) :], strict=True):
+        b, a2 = hypothesis.fit.coefficients[-hypothesis.candidate.size :], hypothesis.signal_to_noise**2
+        s = S[:, own] @ b * np.sqrt(a2 / max(float(b @ S[own, own] @ b), 1e-300))
+        freedom = hypothesis.candidate.freedom
         truth = log_bayes(a2 + freedom, freedom)
         chances: dict[str, float] = {}
-        for k, candidate in enumerate(self.candidates):
-            k_free = self.statistics[k].freedom
-            if candidate.cause == cause or not k_free:
+        for other, at, statistic in others:
+            free, part = int(statistic.freedom), s[at]
+            if other.cause == hypothesis.candidate.cause or not free or (other.positive and part.min() < 0.0):
                 continue
-            part = s[self.at[k]]
-            if candidate.positive and part.min() < 0.0:
-                continue
-            ratio = float(self.statistics[k].ratio(part[:, None])[0])
+            ratio = float(statistic.ratio(part[:, None])[0])
             delta = max(np.sqrt(max(a2 - ratio, 0.0)), 1e-3)
-            wins = float(norm.cdf((truth - log_bayes(ratio + k_free, k_free) - margin(a2)) / delta))
-            detected = float(ncx2.sf(self.limit[k], k_free, max(ratio, 1e-9)))
-            chances[candidate.cause] = min(chances.get(candidate.cause, 1.0), 1.0 - (1.0 - wins) * detected)
-        return float(np.prod(list(chances.values())))
+            wins = float(norm.cdf((truth - log_bayes(ratio + free, free) - margin(a2)) / delta))
+            limit = chi2.isf(LEVEL / (other.tail * trials.get(other.cause, 1.0) * causes), free)
+            detected = float(ncx2.sf(limit, free, max(ratio, 1e-9)))
+            chances[other.cause] = min(chances.get(other.cause, 1.0), 1.0 - (1.0 - wins) * detected)
+        found.append(float(np.prod(list(chances.values()))) if a2 > 0.0 else 0.0)
+    return found

@@ -20,7 +20,6 @@ from magbridge.diagnose.gain import Gain
 from magbridge.diagnose.inference.evidence import LEVEL
 from magbridge.diagnose.inference.joint import Joint
 from magbridge.diagnose.inference.rivals import Rival
-from magbridge.diagnose.report.findings import chance_alone
 from magbridge.diagnose.report.words import label, listed, measured, number
 from magbridge.diagnose.unexplained.leftover import Leftover
 
@@ -60,7 +59,7 @@ def doubts(diagnosis: Diagnosis, finding: Finding, cause: Cause) -> list[str]:
         implausible(candidate, finding.coefficients),
         in_motion(diagnosis, finding),
         shortened(finding),
-        rivalled(candidate, cause, finding.rivals, chance_alone(diagnosis, finding.hypothesis)),
+        rivalled(candidate, cause, finding.rivals, finding.chance_alone),
         *(f"<p>{text}</p>" for text, so in said.items() if so),
     ]
 

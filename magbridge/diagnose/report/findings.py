@@ -14,9 +14,8 @@ from magbridge.diagnose.diagnosis import Diagnosis, Finding
 from magbridge.diagnose.gain import Gain
 from magbridge.diagnose.inference.design import normal
 from magbridge.diagnose.inference.rivals import Rival
-from magbridge.diagnose.inference.rounds import Hypothesis
 
-__all__ = ["chance_alone", "findings", "findings_json", "parameters"]
+__all__ = ["findings", "findings_json", "parameters"]
 
 LEVEL = 0.95
 
@@ -58,7 +57,7 @@ def _finding(diagnosis: Diagnosis, finding: Finding, causes: Mapping[str, Cause]
         "signal_to_noise": _round(finding.signal_to_noise),
         "p_value": _round(finding.hypothesis.p_value),
         "alternatives": alternatives(rivals),
-        "isolability": _round(chance_alone(diagnosis, finding.hypothesis)),
+        "isolability": _round(finding.chance_alone),
         "separated_by": causes[candidate.cause].separated_by if rivals else None,
         "parameters": parameters(finding, len(diagnosis.problem)),
         "gain": _gain(finding.gain, diagnosis),
@@ -118,18 +117,6 @@ def _adds_up(candidate: Candidate) -> bool:
     """Tell whether coefficients of one name add up: those of one channel at several lags or onsets."""
     channels = {getattr(effect, "channel", None) for effect in candidate.effects}
     return len(channels) == 1 and not candidate.shape.keys().isdisjoint(("lag", "onset"))
-
-
-def chance_alone(diagnosis: Diagnosis, hypothesis: Hypothesis) -> float:
-    """Theory's chance that this cause, of this size and direction, is named alone in this log."""
-    info, chosen = diagnosis.outcome.info, diagnosis.outcome.chosen
-    k = next(i for i, one in enumerate(chosen) if one.candidate is hypothesis.candidate)
-    first = len(info.score) - sum(one.candidate.size for one in chosen[k:])
-    index = np.arange(first, first + hypothesis.candidate.size)
-    b = hypothesis.fit.coefficients[-hypothesis.candidate.size :]
-    return diagnosis.isolability.naming.chance(
-        hypothesis.candidate.cause, index, b, hypothesis.signal_to_noise
-    )
 
 
 def _wrong(diagnosis: Diagnosis) -> dict[str, Any]:
