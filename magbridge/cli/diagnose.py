@@ -27,8 +27,9 @@ if TYPE_CHECKING:
 NOTHING = (-9999.0, -99999.0)
 """Numbers that logs commonly use for "not known", in any unit."""
 ITSELF = (
-    "the calibration was fitted to this log and has absorbed part of its errors; calibrate on separate "
-    "calibration runs, with --filter-corner if the sensor has an anti-alias filter"
+    "the calibration was fitted to this log and has absorbed part of its errors, so that what is left of "
+    "them easily gets a wrong name, and nothing is held out; calibrate on separate calibration runs, with "
+    "--filter-corner if the sensor has an anti-alias filter"
 )
 
 
@@ -76,7 +77,8 @@ def diagnose(
         logs = [read(path) for path in files]
         note_losses(*(log.attrs for log in logs))
         remarks = doubts_of(known, calibration)
-        remarks += [f"{path}: {ITSELF}" for path in files if digest(path) in known.inputs.values()]
+        own = [f"{path}: {ITSELF}" for path in files if digest(path) in known.inputs.values()]
+        remarks += own
         remarks += [remark for log in logs for remark in _suspect(log)]
         for remark in remarks:
             complain(remark)
@@ -91,8 +93,9 @@ def diagnose(
         )
     if doubt := unsettled(found.problem, found.named, found.calibration):
         complain(doubt)
-    facts = findings(found, CAUSES)
-    rms = f"{facts['rms_before_nT']:.2f} -> {facts['rms_after_nT']:.2f} nT RMS held out"
+    facts = findings(found, CAUSES, remarks)
+    rms = f"{facts['rms_before_nT']:.2f} -> {facts['rms_after_nT']:.2f} nT RMS"
+    rms += ", not held out" if own else " held out"
     if found.findings and not found.total.shown:
         rms += ", no gain shown (95 %: {:.2f} to {:.2f} times)".format(*found.total.interval)
     print_result(facts, f"{facts['verdict']}: {causes_of(facts)}; {rms}; {output / 'report.html'}", json)

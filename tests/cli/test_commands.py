@@ -122,10 +122,13 @@ def test_what_uses_a_calibration_repeats_that_its_data_do_not_support_it(
     assert why in command(*fit).err
     command(*fit, "--strict", code=1)
     for name, out in (("correct", "out.nc"), ("diagnose", "out")):
-        said = command(name, deployment, "--calibration", "cal.json", "-o", out).err
-        assert said.startswith("magbridge: cal.json: the data it was fitted to do not support it: ")
-        assert why in said.partition("\n")[0]
+        printed = command(name, "one_way.csv", "--calibration", "cal.json", "-o", out)
+        assert printed.err.startswith("magbridge: cal.json: the data it was fitted to do not support it: ")
+        assert why in printed.err.partition("\n")[0]
+    assert "nT RMS, not held out" in printed.out
     assert why in Path("out/report.html").read_text()
+    remarks = json.loads(Path("out/findings.json").read_text())["remarks"]
+    assert [why in remarks[0], "was fitted to this log" in remarks[1]] == [True, True]
 
 
 def test_correct_gives_the_same_in_pieces(deployment: Path, calibration: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import resource
 from collections.abc import Callable
 from dataclasses import replace
@@ -48,8 +49,10 @@ def found(
 
 
 def test_the_demonstrations_survey_is_plain(found: tuple[Diagnosis, Path]) -> None:
-    """And the report says what its reader must know of the log."""
+    """And report and findings say what their reader must know of the log."""
     assert found[0].verdict == "nothing_found"
+    remarks = json.loads((found[1] / "findings.json").read_text())["remarks"]
+    assert remarks == ["a<b>.csv: fitted to this log"]
     assert "a&lt;b&gt;.csv: fitted to this log.</p>" in (found[1] / "report.html").read_text()
 
 

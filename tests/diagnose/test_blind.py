@@ -167,7 +167,8 @@ def test_what_is_written(warm: tuple[xr.Dataset, Calibration], written: tuple[Pa
     ds, tmp_path = warm[0], written[0]
     found = json.loads((tmp_path / "out" / "findings.json").read_text())
     assert found["verdict"] == "explained"
-    assert set(found) == {"verdict", "rms_before_nT", "rms_after_nT", "gain", "findings", "unexplained"}
+    keys = {"verdict", "rms_before_nT", "rms_after_nT", "gain", "findings", "unexplained", "remarks"}
+    assert set(found) == keys
     assert found["findings"][0]["cause"] == "current_field"
     assert found["gain"]["interval"][0] <= found["gain"]["rms_ratio"] <= found["gain"]["interval"][1] < 1.0
     assert set(found["findings"][0]["parameters"]["x"]) == {"value", "sigma", "unit"}

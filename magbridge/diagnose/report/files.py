@@ -31,7 +31,7 @@ def write(
     """
     contents = {
         "calibration.json": encode_calibration(diagnosis.calibration),
-        "findings.json": findings_json(diagnosis, causes),
+        "findings.json": findings_json(diagnosis, causes, remarks),
         "report.html": report_html(diagnosis, causes, remarks).encode(),
     }
     with new_folder(out_dir) as folder, ExitStack() as written:

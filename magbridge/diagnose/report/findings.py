@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import msgspec
@@ -20,8 +20,10 @@ __all__ = ["findings", "findings_json", "parameters"]
 LEVEL = 0.95
 
 
-def findings(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> dict[str, Any]:
-    """Return what ``findings.json`` holds, as plain Python."""
+def findings(
+    diagnosis: Diagnosis, causes: Mapping[str, Cause], remarks: Sequence[str] = ()
+) -> dict[str, Any]:
+    """Return what ``findings.json`` holds, as plain Python; a reader must know `remarks` of the logs."""
     listed = [_finding(diagnosis, finding, causes) for finding in diagnosis.findings]
     if diagnosis.wrong is not None:
         listed.append(_wrong(diagnosis))
@@ -41,12 +43,13 @@ def findings(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> dict[str, Any
             "best_channel": rest.best_channel,
             "alternatives": alternatives(rest.within),
         },
+        "remarks": list(remarks),
     }
 
 
-def findings_json(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> bytes:
+def findings_json(diagnosis: Diagnosis, causes: Mapping[str, Cause], remarks: Sequence[str] = ()) -> bytes:
     """Return ``findings.json``."""
-    return msgspec.json.format(msgspec.json.encode(findings(diagnosis, causes)), indent=2) + b"\n"
+    return msgspec.json.format(msgspec.json.encode(findings(diagnosis, causes, remarks)), indent=2) + b"\n"
 
 
 def _finding(diagnosis: Diagnosis, finding: Finding, causes: Mapping[str, Cause]) -> dict[str, Any]:
