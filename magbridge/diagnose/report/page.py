@@ -20,7 +20,7 @@ __all__ = ["report_html"]
 
 STYLE = Path(__file__).with_name("style.css")
 KINDS = {
-    "switching": "An offset that switches",
+    "switching": "Something that switches or comes and goes",
     "drift": "A slow drift",
     "tone": "A tone",
     "transient": "A transient",
