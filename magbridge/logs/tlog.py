@@ -24,7 +24,7 @@ from threading import Thread
 from types import TracebackType
 from typing import Self
 
-from magbridge.mavlink import pack_record
+from magbridge.mavlink import pack_records
 from magbridge.records import Channel
 
 __all__ = ["TlogWriter"]
@@ -156,12 +156,12 @@ class TlogWriter:
 
     def _put_all(self, records: list[Record]) -> None:
         """Write records, where they do not fit the file one by one and into the next."""
-        data = _packed(records)
+        data = pack_records(records)
         if self._fits(len(data), records[-1][0]):
             self._put_down(data, records)
             return
         for record in records:
-            data = _packed([record])
+            data = pack_records([record])
             if not self._fits(len(data), record[0]):
                 self._end_file()
             if self._file >= 0 or self._begin_file(record[0]):
@@ -202,7 +202,7 @@ class TlogWriter:
             first = 0 if self._torn else 1
             frames = (*self.beginning, *self._head) if self._torn else self._head
             declared = [(records[0][0], Channel.STATE, frame) for frame in frames]
-            data = _packed([*records[:first], *declared, *records[first:]])
+            data = pack_records([*records[:first], *declared, *records[first:]])
         rest, time_us = memoryview(data), records[-1][0]
         try:
             while rest:
@@ -237,7 +237,3 @@ class TlogWriter:
                 os.close(file)
             except OSError as error:  # a network disk may report only here that it could not write
                 self.failure = error.strerror or str(error)
-
-
-def _packed(records: Sequence[Record]) -> bytes:
-    return b"".join([pack_record(*record) for record in records])

@@ -6,7 +6,7 @@ from magbridge.mavlink.codec import Codec
 from magbridge.mavlink.messages import BAD_DATA, REFUSED, Message, Spec, spec
 from magbridge.mavlink.signing import Signing, load_key
 from magbridge.mavlink.tape import TapeReader, TapeWriter
-from magbridge.mavlink.tlog import LogReader, Record, pack_record
+from magbridge.mavlink.tlog import LogReader, Record, pack_record, pack_records
 
 __all__ = [
     "BAD_DATA",
@@ -21,5 +21,6 @@ __all__ = [
     "TapeWriter",
     "load_key",
     "pack_record",
+    "pack_records",
     "spec",
 ]

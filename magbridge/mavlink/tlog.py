@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from struct import Struct
-from typing import BinaryIO
+from typing import BinaryIO, Final
 
 import msgspec
 
 from magbridge.mavlink.framing import MAGIC, MORE, NOT_A_FRAME, find_magic, frame_end, message
 from magbridge.mavlink.messages import Message
 
-__all__ = ["LogReader", "Record", "pack_record"]
+__all__ = ["LogReader", "Record", "pack_record", "pack_records"]
 
-STAMP = Struct(">Q")
-LATEST = 1 << 52
+STAMP: Final = Struct(">Q")
+LATEST: Final = 1 << 52
 """µs; a stamp beyond the year 2112 is damage."""
-CHUNK = 1 << 20
-STEP = 4096
+CHUNK: Final = 1 << 20
+STEP: Final = 4096
 """Bytes of damage to search at once for the next record."""
 
 
@@ -47,6 +47,11 @@ class Record(msgspec.Struct, frozen=True, gc=False):
 def pack_record(time_us: int, channel: int, frame: bytes) -> bytes:
     """Return the bytes of a record; `time_us` loses its low two bits to the channel."""
     return STAMP.pack(time_us & ~3 | channel) + frame
+
+
+def pack_records(records: Iterable[tuple[int, int, bytes]]) -> bytes:
+    """Return the bytes of records: time, channel and frame of each."""
+    return b"".join([pack_record(time_us, channel, frame) for time_us, channel, frame in records])
 
 
 class LogReader:
