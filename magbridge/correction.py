@@ -8,7 +8,7 @@ the sigma: the correction is evaluated at both ends of the interval in which the
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from math import hypot, inf, isfinite, nan
+from math import inf, isfinite, nan, sqrt
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -91,16 +91,17 @@ class Correction:
 
     def _widen(self, sample: Sample, corrected: Corrected) -> Corrected:
         """Widen each sigma: ``sigma^2 + s^2 + sum ((F(hi) - F(lo)) / 2)^2``, s and spans the sample's."""
-        changes = self._corrector.changes(sample.field, sample.values, sample.spans)
-        more = hypot(sample.sigma, *[0.5 * change for change in changes])
-        if not more < BEYOND:  # also NaN, as where a parameter has neither value nor range
+        more = sample.sigma * sample.sigma
+        for change in self._corrector.changes(sample.field, sample.values, sample.spans):
+            more += 0.25 * change * change
+        if not more < BEYOND * BEYOND:  # also NaN, as where a parameter has neither value nor range
             more = inf
-        x, y, z = corrected.field_sigma
+        total, (x, y, z) = corrected.total_field_sigma, corrected.field_sigma
         return Corrected(
             corrected.total_field,
-            hypot(corrected.total_field_sigma, more),
+            sqrt(total * total + more),
             corrected.field,
-            (hypot(x, more), hypot(y, more), hypot(z, more)),
+            (sqrt(x * x + more), sqrt(y * y + more), sqrt(z * z + more)),
             corrected.quality,
         )
 

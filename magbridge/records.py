@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from enum import IntEnum, IntFlag
 from math import nan
+from typing import Final
 
 import msgspec
 
@@ -14,7 +15,7 @@ __all__ = ["BEYOND", "Channel", "Corrected", "Quality", "Reading", "Vector"]
 
 Vector = tuple[float, float, float]
 
-BEYOND = 1e9
+BEYOND: Final = 1e9
 """nT (1 T): a field or a sigma above it is no measurement, but garbage that happens to be a number."""
 
 

@@ -19,10 +19,13 @@ arrays go through :func:`for_arrays`, which loads this same source uncompiled.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from importlib.util import module_from_spec, spec_from_file_location
+from math import sqrt
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
+
+import numpy as np
 
 __all__ = [
     "BITS",
@@ -38,8 +41,9 @@ __all__ = [
     "split",
 ]
 
-BITS = 21
-COARSE, FINE = 1.5 * 2.0 ** (52 - BITS), 1.5 * 2.0 ** (52 - 2 * BITS)
+BITS: Final = 21
+COARSE: Final = 1.5 * 2.0 ** (52 - BITS)
+FINE: Final = 1.5 * 2.0 ** (52 - 2 * BITS)
 """Adding and then subtracting COARSE rounds a number to a multiple of 2^-21; FINE, to a multiple of 2^-42."""
 
 Prepared = tuple[list[float], list[list[float]]]
@@ -51,12 +55,13 @@ PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 
 def for_arrays() -> Any:
-    """Load this module's source uncompiled, so that the functions below accept arrays in place of floats."""
+    """Load this module's source uncompiled and with numpy's root: the functions below then accept arrays."""
     spec = spec_from_file_location(f"{__name__}_for_arrays", Path(__file__).with_name("arithmetic.py"))
     assert spec is not None
     assert spec.loader is not None
     module = module_from_spec(spec)
     spec.loader.exec_module(module)
+    vars(module)["sqrt"] = np.sqrt
     return module
 
 
@@ -113,19 +118,13 @@ def prepare(t: list[float]) -> Prepared:
     V = []
     for e, (i, j) in enumerate(PAIRS):
         L = [-(G[3 * i + k][j] + G[3 * j + k][i]) for k in range(3)]
-        (x, y, z), (p, q, r) = A[i], AS[j]
+        x, y, z = A[i]  # one by one: mypyc unpacks a pair of lists slowly
+        p, q, r = AS[j]
         V.append([*t[12 + 6 * e : 18 + 6 * e], *L, x * p + y * q + z * r])
     return t[:12], V
 
 
-def apply(
-    hx: float,
-    hy: float,
-    hz: float,
-    prepared: Prepared,
-    omega: tuple[float, ...] | None,
-    root: Callable[[float], float],
-) -> Numbers:
+def apply(hx: float, hy: float, hz: float, prepared: Prepared, omega: tuple[float, ...] | None) -> Numbers:
     """Correct one sample (or arrays of them); return total, its sigma, the vector, and the vector's sigmas.
 
     `omega` holds xx, yy, zz, xy, xz, yz of the boresight's covariance; None where there is no boresight.
@@ -135,7 +134,7 @@ def apply(
     bx = xx * dx + xy * dy + xz * dz
     by = yx * dx + yy * dy + yz * dz
     bz = zx * dx + zy * dy + zz * dz
-    F = root(bx * bx + by * by + bz * bz)
+    F = sqrt(bx * bx + by * by + bz * bz)
     over = 1.0 / (F + 1e-300)  # a vector of length zero has no direction, but must not raise
     ux, uy, uz = bx * over, by * over, bz * over
     exx, eyy, ezz, exy, exz, eyz = dx * dx, dy * dy, dz * dz, dx * dy, dx * dz, dy * dz
@@ -153,4 +152,4 @@ def apply(
         vyy = vyy + (bz * bz * oxx + bx * bx * ozz - 2.0 * bx * bz * oxz)
         vzz = vzz + (by * by * oxx + bx * bx * oyy - 2.0 * bx * by * oxy)
     # abs: rounding may leave a variance of zero at -1e-12
-    return F, root(abs(variance)), bx, by, bz, root(abs(vxx)), root(abs(vyy)), root(abs(vzz))
+    return F, sqrt(abs(variance)), bx, by, bz, sqrt(abs(vxx)), sqrt(abs(vyy)), sqrt(abs(vzz))

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from math import inf, isnan, nan, sqrt
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,8 +31,9 @@ FloatArray = NDArray[np.float64]
 Span = tuple[int, float, float]
 CHUNK = 4096
 """Samples at a time: enough to outweigh the overhead of a call, few enough for a core's cache."""
-GAP, STALE_TELEMETRY = int(Quality.GAP), int(Quality.STALE_TELEMETRY)
-EXTRAPOLATED = int(Quality.EXTRAPOLATED)
+GAP: Final = int(Quality.GAP)
+STALE_TELEMETRY: Final = int(Quality.STALE_TELEMETRY)
+EXTRAPOLATED: Final = int(Quality.EXTRAPOLATED)
 MARGIN = 0.02
 """Share of the half range: telemetry that jitters at the end of its range is not extrapolated."""
 MANY = for_arrays()
@@ -91,7 +92,8 @@ class Corrector:
         self._weights: list[list[float]] = self._kernel.weights.T.tolist()
         self._positions = len(calibration.parameters)
         self._asked: tuple[tuple[float, ...], list[Span]] = (), []
-        self._ends: list[tuple[list[float], list[float]]] = []
+        self._ends: list[tuple[int, int]] = []
+        self._there: list[list[float]] = []
 
     def step(
         self, time_us: int, field: tuple[float, float, float], values: Sequence[float], quality: int = 0
@@ -129,7 +131,7 @@ class Corrector:
             if regressors != self._last:
                 self._last = regressors
                 self._prepared = prepare(self._kernel.sums_of_one(regressors))
-        F, sigma, x, y, z, sx, sy, sz = apply(hx, hy, hz, self._prepared, self._omega, sqrt)
+        F, sigma, x, y, z, sx, sy, sz = apply(hx, hy, hz, self._prepared, self._omega)
         quality |= self._flags
         if not F < BEYOND:  # also NaN
             quality |= STALE_TELEMETRY if abs(hx) + abs(hy) + abs(hz) < BEYOND else GAP
@@ -162,15 +164,19 @@ class Corrector:
         asked = values[: self._positions], [span for span in spans if span[0] < self._positions]
         if asked != self._asked:
             self._asked = positions, moved = asked
-            self._ends = [
-                (self._linear(positions, index, low), self._linear(positions, index, high))
-                for index, low, high in moved
-            ]
-        return [_total(field, high) - _total(field, low) for low, high in self._ends]
+            places: dict[tuple[float, ...], int] = {}  # the present ones end most spans
 
-    def _linear(self, positions: tuple[float, ...], index: int, value: float) -> list[float]:
-        """Return A's six entries and T with position `index` at `value`; NaN if that is too far off."""
-        phi = self._kernel.monomials((*positions[:index], value, *positions[index + 1 :]), 1.0)
+            def place(index: int, value: float) -> int:
+                return places.setdefault((*positions[:index], value, *positions[index + 1 :]), len(places))
+
+            self._ends = [(place(index, low), place(index, high)) for index, low, high in moved]
+            self._there = [self._linear_at(positions) for positions in places]
+        totals = [_total(field, linear) for linear in self._there]
+        return [totals[high] - totals[low] for low, high in self._ends]
+
+    def _linear_at(self, positions: tuple[float, ...]) -> list[float]:
+        """Return A's six entries and T; NaN if the positions are too far off."""
+        phi = self._kernel.monomials(positions, 1.0)
         if not max(map(abs, phi)) < FARTHEST:
             return [nan] * len(self._weights)
         return [combined(phi, column) for column in self._weights]
@@ -229,7 +235,7 @@ def correct(
             phi = _regressors(kernel, steps, field[part], channels[part], time[part])
             prepared = _stage_many(kernel, phi)
             hx, hy, hz = field[part].T
-            out[:, part] = MANY.apply(hx, hy, hz, prepared, omega, np.sqrt)
+            out[:, part] = MANY.apply(hx, hy, hz, prepared, omega)
         quality = np.full(n, _base_flags(calibration))
         for value, (low, high) in zip(channels.T, _ranges(calibration), strict=False):
             quality |= np.where((value < low) | (value > high), EXTRAPOLATED, 0)

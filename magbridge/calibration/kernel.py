@@ -106,7 +106,8 @@ class Kernel:
         parts = np.array(split(phi, self.pairs, scale))
         found = self.crossed.dot(parts)
         found += self.coarse.dot(parts[len(self.pairs) :])
-        found /= scale
+        if scale != 1.0:
+            found /= scale
         sums: list[float] = found.tolist()
         return sums
 
