@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from magbridge.errors import FormatError, OutOfRange
 from magbridge.field.earth import metres_per_degree, usual, wrap
+from magbridge.field.grid_netcdf import write
 from magbridge.field.local import OFF_THE_MAP, Local
 from magbridge.field.spline import WEIGHTS, coefficients, filled, weights
 
@@ -242,8 +243,6 @@ class AnomalyGrid:
         WriteError
             The file cannot be written; it is as it was before.
         """
-        from magbridge.field.grid_netcdf import write  # noqa: PLC0415  the live path runs without xarray
-
         write(self, path)
 
     def __repr__(self) -> str:
