@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Mapping
 from math import inf, isfinite
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import msgspec
 
@@ -20,13 +20,13 @@ from magbridge.records import Quality, Reading, Vector
 
 __all__ = ["Aligner", "Input", "Sample", "Track"]
 
-STALE = int(Quality.STALE_TELEMETRY)
-MOVING = int(Quality.MOVING)
-SATURATED = int(Quality.SATURATED)
-OFFSET_SUSPECT = int(Quality.OFFSET_SUSPECT)
-GAP = int(Quality.GAP)
-NEVER = -(1 << 62)
-HISTORY = 64
+STALE: Final = int(Quality.STALE_TELEMETRY)
+MOVING: Final = int(Quality.MOVING)
+SATURATED: Final = int(Quality.SATURATED)
+OFFSET_SUSPECT: Final = int(Quality.OFFSET_SUSPECT)
+GAP: Final = int(Quality.GAP)
+NEVER: Final = -(1 << 62)
+HISTORY: Final = 64
 """Telemetry values kept for each parameter: enough for 3 s at 20 Hz."""
 
 

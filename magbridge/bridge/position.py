@@ -4,17 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from math import nan
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar, Final
 
 from magbridge.errors import MagbridgeError
 from magbridge.mavlink import Message, spec
 
+if TYPE_CHECKING:
+    from magbridge.field.nearby import NearbyField
+
 __all__ = ["Position"]
 
 POSITION = spec("GLOBAL_POSITION_INT")
-MAX_AGE_US = 60_000_000
+MAX_AGE_US: Final = 60_000_000
 """µs: a glider makes 20 m in a minute, over which the main field changes by less than 0.1 nT."""
-AGAIN_US = 1_000_000
+AGAIN_US: Final = 1_000_000
 """µs after which the main field is computed anew."""
 
 
@@ -34,7 +37,7 @@ class Position:
         self._where: tuple[float, float, float] | None = None
         self._when_us = self._evaluated_us = 0
         self._field = nan
-        self._model: object = None
+        self._model: NearbyField | None = None
 
     def update(self, message: Message, time_us: int) -> None:
         """Take a GLOBAL_POSITION_INT."""
@@ -61,11 +64,10 @@ class Position:
     def _evaluate(self, utc_us: int) -> float:
         assert self._where is not None
         try:
-            from magbridge.field.nearby import NearbyField  # noqa: PLC0415 - the field model is optional live
-
             if self._model is None:
+                from magbridge.field.nearby import NearbyField  # noqa: PLC0415 - the field model is optional live
+
                 self._model = NearbyField()
-            assert isinstance(self._model, NearbyField)
             return self._model.at(*self._where, utc_us * 1e-6)[0]
         except (ImportError, MagbridgeError) as error:
             self._tell(str(error))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from typing import Final
 
 from magbridge.link.announcer import Announcer
 from magbridge.link.timers import Timers
@@ -12,6 +13,7 @@ from magbridge.records import Vector
 
 __all__ = ["SensorLine"]
 
+OK: Final = MAG_PORT_STATE.OK
 COMMAND_GAP_US = 100_000
 """µs between two commands to a sensor."""
 LISTEN_US = 1_200_000
@@ -22,7 +24,8 @@ SENTENCE = 128
 """Bytes, the longest sentence and a margin."""
 TEXT = re.compile(rb"[\t\r\n -~]+")
 NOT_A_NUMBER = re.compile(rb"\bnan\b", re.IGNORECASE)
-SAME_US, SAME = 60_000_000, 10
+SAME_US: Final = 60_000_000
+SAME: Final = 10
 """µs, and number of readings, after which one that repeats is announced: the sensor may hang. It has no flag,
 because one that counts in steps of 100 nT may as well be at rest."""
 LOOK_US = 1_000_000
@@ -88,8 +91,8 @@ class SensorLine:
     def spoke(self, time_us: int) -> None:
         """Take note of a reading."""
         self._heard_us, self._known = time_us, True
-        if self.state != MAG_PORT_STATE.OK:
-            self.state = MAG_PORT_STATE.OK
+        if self.state != OK:
+            self.state = OK
             self._announcer.state("sensor", f"{self._name} speaks")
 
     def read(self, field: Vector, time_us: int) -> None:

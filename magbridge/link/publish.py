@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from math import isfinite, nan
+from typing import Final
 
 import msgspec
 
@@ -15,16 +16,21 @@ from magbridge.records import Corrected, Reading
 
 __all__ = ["PUBLISHED", "Publisher", "Sample"]
 
-RAW, FIELD, IMU = spec("MAG_RAW"), spec("MAG_FIELD"), spec("HIGHRES_IMU")
-NAMED, VECTOR = spec("NAMED_VALUE_FLOAT"), spec("DEBUG_VECT")
-MAGNETOMETER = 0x1C0
+RAW: Final = spec("MAG_RAW")
+FIELD: Final = spec("MAG_FIELD")
+IMU: Final = spec("HIGHRES_IMU")
+NAMED: Final = spec("NAMED_VALUE_FLOAT")
+VECTOR: Final = spec("DEBUG_VECT")
+MAGNETOMETER: Final = 0x1C0
 """HIGHRES_IMU.fields_updated: xmag, ymag, zmag."""
-GAUSS = 1e-5
+GAUSS: Final = 1e-5
 """Gauss in 1 nT."""
-MASK = 0xFFFFFFFF
-SATURATED, COUNTS = int(MAG_RAW_FLAGS.SATURATED), int(MAG_RAW_FLAGS.COUNTS)
-SEQUENCE, POWER_CYCLE = int(MAG_RAW_FLAGS.SEQUENCE), int(MAG_RAW_FLAGS.POWER_CYCLE)
-NO_COUNTS = (0, 0, 0)
+MASK: Final = 0xFFFFFFFF
+SATURATED: Final = int(MAG_RAW_FLAGS.SATURATED)
+COUNTS: Final = int(MAG_RAW_FLAGS.COUNTS)
+SEQUENCE: Final = int(MAG_RAW_FLAGS.SEQUENCE)
+POWER_CYCLE: Final = int(MAG_RAW_FLAGS.POWER_CYCLE)
+NO_COUNTS: Final = (0, 0, 0)
 
 
 class Sample(msgspec.Struct, frozen=True, gc=False):
@@ -81,9 +87,8 @@ class Publisher:
         self.samples += 1
         now_us = self._codec.now_us
         for rate, build in self._messages:
-            if rate.hertz == 0 or (rate.hertz > 0 and rate.due(sample.time_us)):
-                for frame in build(sample):
-                    self._outbox.frames.append((now_us, frame))
+            if rate.due(sample.time_us):
+                self._outbox.frames += [(now_us, frame) for frame in build(sample)]
 
     def repeat(self, name: str) -> bool:
         """Send message `name` of the latest sample again; False where there is none yet."""
@@ -132,9 +137,9 @@ class Publisher:
         x, y, z = sample.corrected.field
         payload = IMU.struct.pack(
             sample.time_us + self._codec.utc_offset_us,
-            0, 0, 0, 0, 0, 0,  # accelerations and rotations
+            0.0, 0.0, 0.0, 0.0, 0.0, 0.0,  # accelerations and rotations
             x * GAUSS, y * GAUSS, z * GAUSS,
-            0, 0, 0, 0,  # pressures, altitude, temperature
+            0.0, 0.0, 0.0, 0.0,  # pressures, altitude, temperature
             MAGNETOMETER, 0,
         )  # fmt: skip
         return (self._codec.frame(IMU, payload),)

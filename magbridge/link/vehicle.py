@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 from magbridge.link.announcer import Announcer
 from magbridge.link.clock import VehicleClock
 from magbridge.link.timers import Timers
@@ -10,22 +12,22 @@ from magbridge.mavlink.dialect import MAG_PORT_STATE, MAV_AUTOPILOT, MAV_SEVERIT
 
 __all__ = ["Vehicle"]
 
-HEARTBEAT = spec("HEARTBEAT").id
+HEARTBEAT: Final = spec("HEARTBEAT").id
 ABSENT_US = 5_000_000
 """µs without a heartbeat after which the autopilot counts as gone."""
-BACK_MS = 1_000
+BACK_MS: Final = 1_000
 """ms by which ``time_boot_ms`` must go back to mean more than packets out of order."""
 BELIEVED = 3
 """Messages in a row from a new boot clock before it is believed: a single one may just be late."""
-WINDOW = 64
+WINDOW: Final = 64
 """Frames by which one may come late and no longer count as lost."""
-ALL = (1 << WINDOW) - 1
-LEAP_MS = 10_000
+ALL: Final = (1 << WINDOW) - 1
+LEAP_MS: Final = 10_000
 """ms by which ``time_boot_ms`` may run ahead of our clock, or lag behind other messages', before it counts as
 another autopilot's."""
 TWICE, CHANGES_US = 5, 10_000_000
 """This many changes between two boot clocks within this many µs mean that there are two autopilots."""
-BOOT_TIMES = {
+BOOT_TIMES: Final = {
     number: spec(number).fields["time_boot_ms"]
     for number, row in MESSAGES.items()
     if ":time_boot_ms:ms" in row[2]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Final
 
 from magbridge.mavlink.framing import MORE, find_magic, frame_end, join, message
 from magbridge.mavlink.messages import BAD_DATA, REFUSED, Message, Spec, spec
@@ -10,7 +10,7 @@ from magbridge.mavlink.signing import Signing
 
 __all__ = ["WINDOW", "Codec"]
 
-WINDOW = 4096
+WINDOW: Final = 4096
 """Most bytes that are kept without a whole frame; then they are skipped, even if a frame may have begun in
 them, so that memory stays bounded."""
 

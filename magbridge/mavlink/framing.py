@@ -7,6 +7,7 @@ all but the magic byte, closed with a byte that depends on the message's layout,
 from __future__ import annotations
 
 from struct import Struct
+from typing import Final
 
 from fastcrc.crc16 import mcrf4xx
 
@@ -15,19 +16,21 @@ from magbridge.mavlink.messages import Message, Spec, spec
 
 __all__ = ["MAGIC", "MORE", "NOT_A_FRAME", "find_magic", "frame_end", "join", "message"]
 
-V1, V2 = 0xFE, 0xFD
+V1: Final = 0xFE
+V2: Final = 0xFD
 MAGIC = bytes((V1, V2))
-SIGNED = 1
-SIGNATURE = 13
+SIGNED: Final = 1
+SIGNATURE: Final = 13
 """bytes: link id, 6 of time stamp, 6 of hash."""
-NOT_A_FRAME, MORE = 0, -1
-LAST = 0xFFFF
+NOT_A_FRAME: Final = 0
+MORE: Final = -1
+LAST: Final = 0xFFFF
 """The last message id that a message outside the dialect may have."""
-HEADER_V2 = Struct("<BBBBBBBHB")
-HEADER_V1 = Struct("<BBBBBB")
-HEADER_OUT = Struct("<BBBBBB3s")
+HEADER_V2: Final = Struct("<BBBBBBBHB")
+HEADER_V1: Final = Struct("<BBBBBB")
+HEADER_OUT: Final = Struct("<BBBBBB3s")
 """Version 2 without its magic byte, which the checksum leaves out."""
-EXTRA = {number: bytes((extra,)) for number, (_, extra, _) in MESSAGES.items()}
+EXTRA: Final = {number: bytes((extra,)) for number, (_, extra, _) in MESSAGES.items()}
 
 
 def find_magic(data: bytes, start: int, stop: int) -> int:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from functools import cache
 from struct import Struct
-from typing import Any
+from typing import Any, Final
 
 import msgspec
 
@@ -13,9 +13,9 @@ from magbridge.mavlink.dialect import MESSAGES
 
 __all__ = ["BAD_DATA", "REFUSED", "Field", "Message", "Spec", "east_e7", "spec", "split_index"]
 
-BAD_DATA = -1
+BAD_DATA: Final = -1
 """`Message.id` of bytes that belonged to no frame."""
-REFUSED = -2
+REFUSED: Final = -2
 """`Message.id` of a frame whose signature is missing, wrong or old."""
 
 TURN_E7 = 3_600_000_000

@@ -14,7 +14,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from math import isnan
-from typing import NamedTuple
+from typing import Final
+
+import msgspec
 
 from magbridge.records import Reading
 from magbridge.sensors import Driver
@@ -22,18 +24,19 @@ from magbridge.sensors.floor import TOLERANCE, Floor
 
 __all__ = ["DeviceClock", "Stamp"]
 
-SIGMA_CLOCK, SIGMA_PERIOD = 1e3, 1e4
+SIGMA_CLOCK: Final = 1e3
+SIGMA_PERIOD: Final = 1e4
 """µs/s (ppm): how wrong a clock's rate, or a nominal period, is before anything is known."""
-RESTART = 1e6
+RESTART: Final = 1e6
 """µs: an instrument's time that went back has wrapped if, unwrapped, it fits the host's to within this; else
 the instrument was restarted."""
-HALF = 0.6
+HALF: Final = 0.6
 """Fraction of a period: a reading later than this shows that one before it is missing."""
-KEEP_PHASE = 3
+KEEP_PHASE: Final = 3
 """If more readings than this are missing at once, the line is begun anew: the instrument may have stopped."""
 
 
-class Stamp(NamedTuple):
+class Stamp(msgspec.Struct, frozen=True, gc=False):
     """When a reading was taken.
 
     Attributes

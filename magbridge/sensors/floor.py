@@ -6,25 +6,26 @@ Each block of points gives its lowest one, and a line is fitted to the lowest po
 from __future__ import annotations
 
 from math import inf
+from typing import Final
 
 __all__ = ["TOLERANCE", "Floor"]
 
-BLOCK = 8
+BLOCK: Final = 8
 """Readings in the first blocks."""
-POINTS = 16
+POINTS: Final = 16
 """Lowest points that the line is fitted to."""
-SPAN = 4.0
+SPAN: Final = 4.0
 """s: blocks grow to this duration, and every point must be late for this long before the line is given up,
 since a busy computer may delay all points for a second."""
-TOLERANCE = 20_000.0
+TOLERANCE: Final = 20_000.0
 """µs by which an arrival may contradict the line."""
-DELAY = 5_000.0
+DELAY: Final = 5_000.0
 """µs, the mean delay before anything is known."""
-STALL = 100_000.0
+STALL: Final = 100_000.0
 """µs; longer delays enter the mean delay as this, because they say nothing about the usual ones."""
-WANDER = 0.05
+WANDER: Final = 0.05
 """Fraction of the prior sigma below which the slope's sigma never falls: rates change with temperature."""
-BOUND = 5.0
+BOUND: Final = 5.0
 """Largest slope, in prior sigmas."""
 
 
