@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from struct import Struct
-from typing import Any
+from typing import Final
 
-from magbridge.config import Telemetry
 from magbridge.mavlink import Codec, spec
 from magbridge.records import Channel
 
-__all__ = ["Journal", "declarations"]
+__all__ = ["Journal"]
 
-BYTES, RAW = spec("MAG_SENSOR_BYTES"), spec("MAG_RAW")
-HEAD = Struct("<BB")
+BYTES: Final = spec("MAG_SENSOR_BYTES")
+RAW: Final = spec("MAG_RAW")
+HEAD: Final = Struct("<BB")
 """The fields of MAG_SENSOR_BYTES before its data: sensor_id, length."""
-SIZE = BYTES.fields["data"].count
+SIZE: Final = BYTES.fields["data"].count
 SENT, LINK, SENSOR, STATE = Channel
 
 
@@ -70,54 +70,3 @@ class Journal:
         if self.active:
             self._records += records
             self.count += len(records)
-
-
-def declarations(
-    system: int,
-    component: int,
-    telemetry: Mapping[str, Telemetry],
-    nt_per_count: float = 0.0,
-    settings: Mapping[str, float] | None = None,
-) -> list[bytes]:
-    """Return the frames that tell a reader of the log what each column comes from, and how it was corrected.
-
-    Parameters
-    ----------
-    system, component : int
-        The bridge's own.
-    telemetry : mapping of str to Telemetry
-        By parameter.
-    nt_per_count : float
-        nT per count of the sensor, 0 for one without counts. A reader then takes the channels from the
-        counts, because MAG_RAW's float32 fields are less precise than the values that were corrected.
-    settings : mapping of str to float, optional
-        What decides about flags and sigmas, by its key in the configuration: attributes of the log.
-    """
-    codec = Codec(system, component)
-    columns: list[dict[str, Any]] = [
-        {"column": key, "scale": value} for key, value in (settings or {}).items()
-    ]
-    columns += [
-        {
-            "column": name,
-            "unit": one.unit,
-            "message": one.message,
-            "field": one.field,
-            "match": ",".join(f"{field}={value}" for field, value in one.match.items()),
-            "scale": one.scale,
-            "offset": one.offset,
-        }
-        for name, one in telemetry.items()
-    ]
-    if nt_per_count:
-        columns += [
-            {
-                "column": f"mag_{axis}",
-                "unit": "nT",
-                "message": "MAG_RAW",
-                "field": f"count_{axis}",
-                "scale": nt_per_count,
-            }
-            for axis in "xyz"
-        ]
-    return [codec.pack("MAG_COLUMN", **column) for column in columns]

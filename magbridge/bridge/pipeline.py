@@ -6,9 +6,11 @@ from collections import deque
 from collections.abc import Mapping
 from glob import has_magic
 from math import nan
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
+from magbridge.bridge.changes import Changes
 from magbridge.bridge.events import Event, Start
+from magbridge.bridge.head import beginning, declarations
 from magbridge.bridge.journal import Journal
 from magbridge.bridge.position import Position
 from magbridge.bridge.sensor_line import SensorLine
@@ -23,14 +25,8 @@ from magbridge.link.parameters import alignment, telemetry_ages
 from magbridge.link.publish import Sample
 from magbridge.link.reports import Condition
 from magbridge.link.telemetry import TelemetryMap
-from magbridge.mavlink import Codec, Signing, spec
-from magbridge.mavlink.dialect import (
-    MAG_LOG_STATE,
-    MAG_PORT_NAME,
-    MAG_PORT_STATE,
-    MAV_PARAM_TYPE,
-    MAV_SEVERITY,
-)
+from magbridge.mavlink import Signing
+from magbridge.mavlink.dialect import MAG_PORT_STATE, MAV_SEVERITY
 from magbridge.records import Channel, Quality, Reading
 from magbridge.sensors import open_driver
 from magbridge.sensors.clock import DeviceClock, Stamp
@@ -41,11 +37,12 @@ if TYPE_CHECKING:
 
 __all__ = ["Pipeline"]
 
+LINK: Final = Channel.LINK
+SENSOR: Final = Channel.SENSOR
 LATELY = 64
 """Samples over which the sample rate is computed."""
 DOUBTS = int(Quality.STALE_TELEMETRY | Quality.SATURATED | Quality.UNCALIBRATED | Quality.OFFSET_SUSPECT)
 """Flags whose changes are announced; the others change with every manoeuvre."""
-CLOCK_STEP, NOTICE, PORT = (spec(name).id for name in ("MAG_CLOCK_STEP", "STATUSTEXT", "MAG_PORT"))
 
 
 class Pipeline:
@@ -113,27 +110,24 @@ class Pipeline:
             start.time_us,
             searching=has_magic(config.sensor.port),
         )
+        self._changes = Changes(self.component.codec, self.component.announcer, self.sensor)
         self.journal = Journal(config.link.system, config.link.component, active=config.log is not None)
         self.navigation: Navigation | None = None
         self._raw_rate = self.component.rates["MAG_RAW"]
         self._position = Position(self._tell_no_anomaly)
-        self._samples = self._lost = self._quality = self._log_lost = 0
+        self._samples = self._lost = self._quality = 0
         self._times: deque[int] = deque(maxlen=LATELY)
-        self._log_state = MAG_LOG_STATE.OFF
         self._tune()
         self._begin(start, used, foreign=foreign)
 
     @property
-    def nt_per_count(self) -> float:
-        """The sensor's nT per count; 0 where it sends no counts."""
-        return self._driver.nt_per_count
-
-    @property
-    def settings(self) -> dict[str, float]:
-        """The values that the alignment computes with, by their keys in the configuration."""
-        parameters = self.component.parameters
-        keys = (row.key for row in parameters.table.values())
-        return {key: parameters.of(key) for key in keys if key.startswith(("align.", "telemetry."))}
+    def declarations(self) -> list[bytes]:
+        """The frames that every file of the log begins with."""
+        own, parameters = self._config.link, self.component.parameters
+        keys = [row.key for row in parameters.table.values()]
+        settings = {key: parameters.of(key) for key in keys if key.startswith(("align.", "telemetry."))}
+        telemetry, nt_per_count = self._config.telemetry, self._driver.nt_per_count
+        return declarations(own.system, own.component, telemetry, nt_per_count, settings)
 
     @property
     def deadline(self) -> int:
@@ -146,14 +140,14 @@ class Pipeline:
         component.advance(event.time_us)
         due = component.outbox.drain()
         self.journal.sent(due)
-        if event.channel is Channel.SENSOR:
+        if event.channel is SENSOR:
             self.journal.sensor(event.time_us, event.data)
             self._hear_sensor(event)
-        elif event.channel is Channel.LINK:
+        elif event.channel is LINK:
             self._hear_link(event)
         elif event.data:
             self.journal.state(event.time_us, event.data)
-            self._hear_state(event)
+            self._changes.hear(event.data, event.time_us)
         answers = component.outbox.drain()
         self.journal.sent(answers)
         return due + answers
@@ -202,31 +196,6 @@ class Pipeline:
         if component.parameters.revision != self._revision:
             self._tune()
 
-    def _hear_state(self, event: Event) -> None:
-        """Take note of a change at the edge: a port, or the host's clock."""
-        for message in Codec(0, 0).parse(event.data):
-            if message.id == CLOCK_STEP:
-                self.component.codec.utc_offset_us += message["step"]
-                step = f"clock was set by {message['step'] * 1e-6:+.3f} s"
-                self.component.announcer.say(step, MAV_SEVERITY.NOTICE)
-            elif message.id == NOTICE:
-                self.component.announcer.say(message["text"], MAV_SEVERITY(message["severity"]))
-            elif message.id == PORT:
-                well = message["state"] == MAG_PORT_STATE.OK
-                self._hear_port(message["port"], well, message["reason"], message["dropped"], event.time_us)
-
-    def _hear_port(self, port: int, well: bool, reason: str, dropped: int, time_us: int) -> None:
-        severity = MAV_SEVERITY.INFO if well else MAV_SEVERITY.ERROR
-        if port == MAG_PORT_NAME.SENSOR:
-            self.sensor.opened(time_us) if well else self.sensor.lost(reason)
-        elif port == MAG_PORT_NAME.LOG:
-            self._log_state = MAG_LOG_STATE.OK if well else MAG_LOG_STATE.FAILED
-            self._log_lost = dropped
-            self.component.announcer.state("log", f"log: {reason or 'being written'}", severity)
-        else:
-            severity = MAV_SEVERITY.WARNING if well and reason else severity
-            self.component.announcer.state("link", f"link: {reason or 'open'}", severity)
-
     def _tune(self) -> None:
         """Apply the present values of the parameters to the alignment."""
         parameters = self.component.parameters
@@ -260,24 +229,7 @@ class Pipeline:
 
     def beginning(self, parameters: Mapping[str, float]) -> list[bytes]:
         """Return the frames that record how the run started, with these values of the parameters."""
-        codec = Codec(self._config.link.system, self._config.link.component)
-        start = codec.pack(
-            "MAG_BRIDGE_START",
-            time_usec=self._start.time_us,
-            signing_timestamp=self._start.signing_timestamp,
-            calibration_id=self._calibration_id,
-            config_digest=bytes.fromhex(self._config.digest),
-            version=__version__,
-            driver=self._config.sensor.driver,
-        )
-        real = MAV_PARAM_TYPE.REAL32
-        return [
-            start,
-            *(
-                codec.pack("PARAM_VALUE", param_id=name, param_value=value, param_type=real)
-                for name, value in parameters.items()
-            ),
-        ]
+        return beginning(self._config, self._start, self._calibration_id, parameters)
 
     def _status(self) -> Condition:
         """Return what MAG_STATUS says of the sensor, the samples and the log."""
@@ -300,8 +252,8 @@ class Pipeline:
             stale,
             # with the frames yet to be sent: in a replay several timers may fire before the outbox is drained
             self.journal.count + len(self.component.outbox.frames) if self.journal.active else 0,
-            self._log_lost,
-            self._log_state,
+            self._changes.log_lost,
+            self._changes.log_state,
         )
 
 

@@ -1,4 +1,4 @@
-"""Run a bridge: set up the pipeline, feed it with events, send and log its output."""
+"""Run a bridge on its ports until it is stopped; keep what must outlive it."""
 
 from __future__ import annotations
 
@@ -8,29 +8,26 @@ import signal
 import sys
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from threading import Thread
-from typing import Protocol
 
 from magbridge.bridge import states
-from magbridge.bridge.events import Clock, Event, Start
-from magbridge.bridge.journal import declarations
+from magbridge.bridge.drive import drive, set_up
+from magbridge.bridge.events import Clock, Start
 from magbridge.bridge.links import open_link
 from magbridge.bridge.live import LiveEdge
 from magbridge.bridge.pipeline import Pipeline
 from magbridge.bridge.serial_port import serial_line
-from magbridge.calibration import file as calibration_file
 from magbridge.config import Config, load
 from magbridge.errors import FormatError
 from magbridge.link import store
 from magbridge.logs.tlog import TlogWriter
-from magbridge.mavlink import load_key
 from magbridge.mavlink.dialect import MAV_SEVERITY
 from magbridge.records import Channel
 
-__all__ = ["Edge", "declared", "drive", "run", "set_up"]
+__all__ = ["run"]
 
 KEEP_US = 60_000_000
 """µs between two savings of the signing time stamp; the next run adds as much to the saved one."""
@@ -42,59 +39,6 @@ TELL = 0.2
 """s between two checks for texts to print."""
 LOG_LOOK_US = 1_000_000
 """µs between two checks of the log."""
-
-
-class Edge(Protocol):
-    """Where events come from, and where bytes go."""
-
-    def events(self, deadline: Callable[[], int]) -> Iterator[Event]:
-        """Yield events in order; one, if only an empty one, by `deadline` (µs)."""
-        ...
-
-    def send(self, channel: Channel, data: bytes) -> None:
-        """Send to the link or to the sensor."""
-        ...
-
-
-def set_up(config: Config, start: Start) -> Pipeline:
-    """Return the pipeline that a configuration describes.
-
-    Raises
-    ------
-    ConfigError, FormatError, CalibrationError
-        The content of the configuration, or of a file that it names, is wrong.
-    """
-    calibration = None
-    if config.calibration is not None:
-        calibration = calibration_file.load(config.resolve(config.calibration.file))
-    key = load_key(config.resolve(config.link.signing_key)) if config.link.signing_key else None
-    pipeline = Pipeline(config, calibration, start, key)
-    if config.navigation is not None:
-        from magbridge.bridge.navigation import open_navigation  # noqa: PLC0415 - it brings filterpy
-
-        pipeline.navigation = open_navigation(config, pipeline.component, calibration)
-    return pipeline
-
-
-def declared(config: Config, pipeline: Pipeline) -> list[bytes]:
-    """Return the frames that every file of the log begins with."""
-    us, own = config.link, pipeline.settings
-    return declarations(us.system, us.component, config.telemetry, pipeline.nt_per_count, own)
-
-
-def drive(pipeline: Pipeline, edge: Edge, log: TlogWriter | None, after: Callable[[int], None]) -> None:
-    """Feed the pipeline until the edge ends; call ``after(time_us)`` when each event is dealt with."""
-    for event in edge.events(lambda: pipeline.deadline):
-        sent = pipeline.feed(event)
-        if sent:
-            edge.send(Channel.LINK, b"".join([frame for _, frame in sent]))
-        if pipeline.sensor.to_send:
-            edge.send(Channel.SENSOR, b"".join(pipeline.sensor.to_send))
-            pipeline.sensor.to_send.clear()
-        records = pipeline.journal.drain()
-        if log is not None and records:
-            log.extend(records)
-        after(event.time_us)
 
 
 def run(path: Path) -> None:
@@ -169,9 +113,9 @@ def _open_log(config: Config, edge: LiveEdge, pipeline: Pipeline) -> TlogWriter 
     if config.log is None:
         return None
     directory = config.resolve(config.log.directory)
-    head = declared(config, pipeline)
     edge.tell(states.log_state("", 0))
-    return TlogWriter(directory, max_size=config.log.max_size, max_age=config.log.max_age, head=head)
+    limits = config.log
+    return TlogWriter(directory, max_size=limits.max_size, max_age=limits.max_age, head=pipeline.declarations)
 
 
 class LogWatch:

@@ -14,10 +14,10 @@ from pathlib import Path
 
 import msgspec
 
+from magbridge.bridge.drive import drive, set_up
 from magbridge.bridge.events import Event, Start
 from magbridge.bridge.links import open_link
 from magbridge.bridge.port import Port
-from magbridge.bridge.run import declared, drive, set_up
 from magbridge.bridge.serial_port import SerialPort
 from magbridge.config import Log, load
 from magbridge.errors import MagbridgeError, WriteError
@@ -99,7 +99,7 @@ def main() -> int:
         link.open()
         edge = ScriptedEdge({Channel.SENSOR: sensor, Channel.LINK: link}, chosen.timetable)
         pipeline = set_up(config, edge.start())
-        log = TlogWriter(chosen.log, head=declared(config, pipeline)) if chosen.log else None
+        log = TlogWriter(chosen.log, head=pipeline.declarations) if chosen.log else None
         drive(pipeline, edge, log, lambda _: None)
         if log is not None:
             log.close(timeout=60.0)

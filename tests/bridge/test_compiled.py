@@ -18,8 +18,8 @@ from pathlib import Path
 from benchmarks.processor import Edge
 from benchmarks.workload import BEGIN_US, Feed, write_config
 from magbridge import align
+from magbridge.bridge.drive import set_up
 from magbridge.bridge.events import Start
-from magbridge.bridge.run import drive, set_up
 from magbridge.config import load
 
 pipeline = set_up(load(write_config(Path(sys.argv[1]))), Start(BEGIN_US))

@@ -10,12 +10,10 @@ from small import START, small_bridge
 
 from magbridge import logs
 from magbridge.bridge.events import Event, Start
-from magbridge.bridge.run import declared
 from magbridge.calibration.file import load as load_calibration
 from magbridge.calibration.model import Parameter
 from magbridge.cli import main
 from magbridge.columns import CORRECTED
-from magbridge.config import load
 from magbridge.correction import Correction, correct_rows
 from magbridge.logs.tlog import TlogWriter
 from magbridge.mavlink import Codec
@@ -36,7 +34,7 @@ def test_what_was_set_in_the_course_of_the_log_is_told(
     station = Codec(1, 1)
     log, out = tmp_path / f"converted.{suffix}", tmp_path / "out.nc"
     asked = {10: ("MB_SETTLE_TIME", 4.0), 20: ("MB_SETTLE_TIME", -1.0), 30: ("MB_R_HIGHRES_IMU", 1.0)}
-    with TlogWriter(tmp_path / "logs", head=declared(load(tmp_path / "bridge.toml"), pipeline)) as writer:
+    with TlogWriter(tmp_path / "logs", head=pipeline.declarations) as writer:
         for k in range(40):
             if k in asked:
                 name, value = asked[k]
@@ -57,7 +55,7 @@ def test_flags_and_sigmas_are_those_of_the_bridge(tmp_path: Path, suffix: str, p
     rng = np.random.default_rng(1)
     pipeline = small_bridge(tmp_path, Start(START, KEPT), BATTERY, ["MAG_FIELD"])
     autopilot = Codec(1, 1)
-    with TlogWriter(tmp_path / "logs", head=declared(load(tmp_path / "bridge.toml"), pipeline)) as log:
+    with TlogWriter(tmp_path / "logs", head=pipeline.declarations) as log:
         for k in range(400):
             position = np.nan if 300 <= k < 310 else 0.1 * (k // 50)
             if rng.random() < 0.4 and not 200 <= k < 260:

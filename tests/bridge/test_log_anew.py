@@ -10,7 +10,7 @@ from pathlib import Path
 from small import START, small_bridge
 
 from magbridge.bridge.events import Event, Start
-from magbridge.bridge.journal import declarations
+from magbridge.bridge.head import declarations
 from magbridge.bridge.pipeline import Pipeline
 from magbridge.calibration.model import Parameter
 from magbridge.logs.tlog import TlogWriter

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from magbridge.bridge.drive import set_up
 from magbridge.bridge.events import Event, Start
-from magbridge.bridge.run import set_up
 from magbridge.calibration.file import save
 from magbridge.calibration.model import Noise, identity
 from magbridge.config import load

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
+from magbridge.bridge.drive import set_up
 from magbridge.bridge.events import Start
 from magbridge.bridge.pipeline import Pipeline
-from magbridge.bridge.run import set_up
 from magbridge.calibration.file import save
 from magbridge.calibration.model import Calibration, Noise, Parameter, Reference
 from magbridge.calibration.terms import Polynomial, full_order

@@ -18,8 +18,8 @@ from benchmarks.peer import Peer
 from benchmarks.row import Row
 from benchmarks.workload import BEGIN_US, Feed, write_config
 
+from magbridge.bridge.drive import drive, set_up
 from magbridge.bridge.events import Event, Start
-from magbridge.bridge.run import drive, set_up
 from magbridge.config import load
 from magbridge.logs.tlog import TlogWriter
 from magbridge.records import Channel

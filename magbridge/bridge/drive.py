@@ -1,0 +1,63 @@
+"""The pipeline of a configuration, driven by what its lines carry: live, or in a replay."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Protocol
+
+from magbridge.bridge.events import Event, Start
+from magbridge.bridge.pipeline import Pipeline
+from magbridge.calibration import file as calibration_file
+from magbridge.config import Config
+from magbridge.logs.tlog import TlogWriter
+from magbridge.mavlink import load_key
+from magbridge.records import Channel
+
+__all__ = ["Edge", "drive", "set_up"]
+
+
+class Edge(Protocol):
+    """Where events come from, and where bytes go."""
+
+    def events(self, deadline: Callable[[], int]) -> Iterator[Event]:
+        """Yield events in order; one, if only an empty one, by `deadline` (µs)."""
+        ...
+
+    def send(self, channel: Channel, data: bytes) -> None:
+        """Send to the link or to the sensor."""
+        ...
+
+
+def set_up(config: Config, start: Start) -> Pipeline:
+    """Return the pipeline that a configuration describes.
+
+    Raises
+    ------
+    ConfigError, FormatError, CalibrationError
+        The content of the configuration, or of a file that it names, is wrong.
+    """
+    calibration = None
+    if config.calibration is not None:
+        calibration = calibration_file.load(config.resolve(config.calibration.file))
+    key = load_key(config.resolve(config.link.signing_key)) if config.link.signing_key else None
+    pipeline = Pipeline(config, calibration, start, key)
+    if config.navigation is not None:
+        from magbridge.bridge.navigation import open_navigation  # noqa: PLC0415 - it brings filterpy
+
+        pipeline.navigation = open_navigation(config, pipeline.component, calibration)
+    return pipeline
+
+
+def drive(pipeline: Pipeline, edge: Edge, log: TlogWriter | None, after: Callable[[int], None]) -> None:
+    """Feed the pipeline until the edge ends; call ``after(time_us)`` when each event is dealt with."""
+    for event in edge.events(lambda: pipeline.deadline):
+        sent = pipeline.feed(event)
+        if sent:
+            edge.send(Channel.LINK, b"".join([frame for _, frame in sent]))
+        if pipeline.sensor.to_send:
+            edge.send(Channel.SENSOR, b"".join(pipeline.sensor.to_send))
+            pipeline.sensor.to_send.clear()
+        records = pipeline.journal.drain()
+        if log is not None and records:
+            log.extend(records)
+        after(event.time_us)

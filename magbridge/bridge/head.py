@@ -1,0 +1,87 @@
+"""What a log begins with: how the run started, and what each column of the log comes from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from magbridge.bridge.events import Start
+from magbridge.config import Config, Telemetry
+from magbridge.mavlink import Codec
+from magbridge.mavlink.dialect import MAV_PARAM_TYPE
+from magbridge.version import __version__
+
+__all__ = ["beginning", "declarations"]
+
+
+def beginning(
+    config: Config, start: Start, calibration_id: int, parameters: Mapping[str, float]
+) -> list[bytes]:
+    """Return the frames that record how a run started, with these values of the parameters by name."""
+    codec = Codec(config.link.system, config.link.component)
+    frames = [
+        codec.pack(
+            "MAG_BRIDGE_START",
+            time_usec=start.time_us,
+            signing_timestamp=start.signing_timestamp,
+            calibration_id=calibration_id,
+            config_digest=bytes.fromhex(config.digest),
+            version=__version__,
+            driver=config.sensor.driver,
+        )
+    ]
+    for name, value in parameters.items():
+        real = MAV_PARAM_TYPE.REAL32
+        frames.append(codec.pack("PARAM_VALUE", param_id=name, param_value=value, param_type=real))
+    return frames
+
+
+def declarations(
+    system: int,
+    component: int,
+    telemetry: Mapping[str, Telemetry],
+    nt_per_count: float = 0.0,
+    settings: Mapping[str, float] | None = None,
+) -> list[bytes]:
+    """Return the frames that tell a reader of the log what each column comes from, and how it was corrected.
+
+    Parameters
+    ----------
+    system, component : int
+        The bridge's own.
+    telemetry : mapping of str to Telemetry
+        By parameter.
+    nt_per_count : float
+        nT per count of the sensor, 0 for one without counts. A reader then takes the channels from the
+        counts, because MAG_RAW's float32 fields are less precise than the values that were corrected.
+    settings : mapping of str to float, optional
+        What decides about flags and sigmas, by its key in the configuration: attributes of the log.
+    """
+    codec = Codec(system, component)
+    columns: list[dict[str, Any]] = [
+        {"column": key, "scale": value} for key, value in (settings or {}).items()
+    ]
+    columns += [
+        {
+            "column": name,
+            "unit": one.unit,
+            "message": one.message,
+            "field": one.field,
+            "match": ",".join(f"{field}={value}" for field, value in one.match.items()),
+            "scale": one.scale,
+            "offset": one.offset,
+        }
+        for name, one in telemetry.items()
+    ]
+    if nt_per_count:
+        columns += [
+            {
+                "column": f"mag_{axis}",
+                "unit": "nT",
+                "message": "MAG_RAW",
+                "field": f"count_{axis}",
+                "scale": nt_per_count,
+            }
+            for axis in "xyz"
+        ]
+    return [codec.pack("MAG_COLUMN", **column) for column in columns]
