@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
 from magbridge.calibration.model import Calibration
 from magbridge.diagnose.causes.candidates import Candidate
+from magbridge.diagnose.compare.arrays import FloatArray
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.gain import Gain
 from magbridge.diagnose.inference.isolability import Isolability
@@ -20,8 +18,6 @@ from magbridge.diagnose.inference.search import Outcome
 from magbridge.diagnose.unexplained.leftover import Leftover
 
 __all__ = ["Diagnosis", "Finding"]
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

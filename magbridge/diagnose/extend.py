@@ -7,13 +7,13 @@ from dataclasses import replace
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from magbridge.calibration.instrument_effects import RateEffect
 from magbridge.calibration.mass_effects import ClockEffect
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.residual import residuals, residuals_of, robust_scale
 from magbridge.diagnose.causes.candidates import Candidate, slices
+from magbridge.diagnose.compare.arrays import IndexArray
 from magbridge.diagnose.compare.derivatives import derivatives
 from magbridge.diagnose.compare.design_columns import Columns
 from magbridge.diagnose.compare.prior import isotropic
@@ -197,7 +197,7 @@ def _about(problem: Problem, model: Sequence[Candidate], fit: Joint) -> tuple[Pr
     return again, columns
 
 
-def _since(extended: Calibration, model: Sequence[Candidate]) -> NDArray[np.intp]:
+def _since(extended: Calibration, model: Sequence[Candidate]) -> IndexArray:
     """Return the places of the regressors of causes that have appeared since the calibration."""
     late = {id(e) for c in model for piece in c.pieces if piece.since for e in piece.effects}
     counts = [effect.columns(extended.reference.field).shape[1] for effect in extended.effects]

@@ -22,8 +22,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from magbridge.diagnose.compare.arrays import BoolArray, FloatArray, IntArray
 from magbridge.diagnose.compare.design_columns import Columns
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.design import Design, precomputed
@@ -31,7 +31,6 @@ from magbridge.diagnose.inference.joint import Joint
 
 __all__ = ["Gain", "HeldOut", "held_out", "paired"]
 
-FloatArray = NDArray[np.float64]
 FOLDS = 8
 DRAWS = 2000
 
@@ -91,7 +90,7 @@ def held_out(problem: Problem, columns: Sequence[Columns], fit: Joint) -> HeldOu
     return HeldOut(left, noise.log_likelihood - 0.5 * float(learned))
 
 
-def paired(before: FloatArray, after: FloatArray, dive: NDArray[np.int64], counts: NDArray[np.bool_]) -> Gain:
+def paired(before: FloatArray, after: FloatArray, dive: IntArray, counts: BoolArray) -> Gain:
     """Compare two residuals on the same samples.
 
     The interval comes from a bootstrap of whole dives, so correlation within a dive does no harm.

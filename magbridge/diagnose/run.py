@@ -8,7 +8,6 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import chi2
 from threadpoolctl import threadpool_limits
 
@@ -17,6 +16,7 @@ from magbridge.calibration.model import Calibration
 from magbridge.diagnose.accept import accept
 from magbridge.diagnose.causes import CAUSES, Cause
 from magbridge.diagnose.causes.candidates import Candidate, since, slices
+from magbridge.diagnose.compare.arrays import BoolArray, FloatArray
 from magbridge.diagnose.compare.problem import Problem, pose
 from magbridge.diagnose.compare.survey import Survey
 from magbridge.diagnose.compare.take import take
@@ -40,8 +40,6 @@ if TYPE_CHECKING:
     import xarray as xr
 
 __all__ = ["diagnose"]
-
-FloatArray = NDArray[np.float64]
 
 LOUD = 2.0
 """Multiple of the calibration's stated noise: 1.5 times is still noise, at twice something is wrong."""
@@ -170,7 +168,7 @@ def _put_forward(problem: Problem, causes: Mapping[str, Cause]) -> tuple[list[Ca
     return _whenever(every, problem.survey.learned), untestable
 
 
-def _whenever(candidates: Sequence[Candidate], learned: NDArray[np.bool_]) -> list[Candidate]:
+def _whenever(candidates: Sequence[Candidate], learned: BoolArray) -> list[Candidate]:
     """Return the candidates and, given the calibration's own logs, of each a variant absent from those logs.
 
     Steps, drifts and tones have no variant, since they have a time of their own; nor have errors of the
@@ -196,7 +194,7 @@ def _wrong(fit: Joint, named: Sequence[Hypothesis], causes: int) -> Outliers | N
     return wrong if wrong is not None and wrong.ratio >= (REMNANT * strongest) ** 2 else None
 
 
-def _counted(problem: Problem, wrong: Outliers | None) -> NDArray[np.bool_]:
+def _counted(problem: Problem, wrong: Outliers | None) -> BoolArray:
     """(n,) samples by which a gain is measured: new to the calibration, and not wrong."""
     counts = ~problem.survey.learned
     if wrong is not None:
@@ -210,7 +208,7 @@ def _findings(
     rivals: Sequence[tuple[Rival, ...]],
     fit: Joint,
     after: FloatArray,
-    counts: NDArray[np.bool_],
+    counts: BoolArray,
     chances: Sequence[float],
 ) -> tuple[Finding, ...]:
     """Collect each cause's results; its gain is that over a fit of the others without it."""
@@ -227,7 +225,7 @@ def _findings(
     return tuple(found)
 
 
-def _loud(problem: Problem, after: FloatArray, counts: NDArray[np.bool_]) -> Leftover | None:
+def _loud(problem: Problem, after: FloatArray, counts: BoolArray) -> Leftover | None:
     """Describe a structureless residual beyond the calibration's stated noise and coefficient errors."""
     power = float(np.sum(after[counts] ** 2 / np.maximum(problem.stated[counts], 1e-12)))
     n = int(counts.sum())

@@ -19,14 +19,13 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from magbridge.diagnose.inference.evidence import ODDS
 from study.deployment import Background, Injected
 from study.draws import SHOWN, Draws, Span, evidence
+from study.noise import Array
 from study.theory import Setting, best_of, information, own_span, true_span
 
-Array = NDArray[np.float64]
 Wholes = dict[frozenset[str], Array]
 
 

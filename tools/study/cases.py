@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.diagnosis import Diagnosis
@@ -21,11 +20,10 @@ from sitl.inject import EFFECTS, FOREIGN, Hidden
 from study.both import both
 from study.deployment import CHARTS, SEEDS, Background, Injected, deployment_of
 from study.gain import DELAYS, gain, harm
-from study.noise import GLIDER, LOSSES, NOISES
+from study.noise import GLIDER, LOSSES, NOISES, Array
 from study.theory import Setting, ideal
 
 Row = dict[str, Any]
-Array = NDArray[np.float64]
 NAMES = tuple(EFFECTS)
 KNOWN = tuple(CAUSES)
 """Causes with a function of their own in the table; outliers are found by the noise model."""

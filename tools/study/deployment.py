@@ -11,7 +11,6 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from magbridge.calibration.correct import regressors
 from magbridge.calibration.fitting.fit import fit
@@ -27,9 +26,8 @@ from sitl.mission import CrissCross, Spirals
 from sitl.signals import first_order
 from sitl.trajectory import Track
 from sitl.world import Water, World
-from study.noise import GLIDER, Rows, add_noise, left, statistics, whiten
+from study.noise import GLIDER, Array, Rows, add_noise, left, statistics, whiten
 
-Array = NDArray[np.float64]
 HOURS = 6.0
 """Length of a deployment; the tests' are shorter."""
 VEHICLES = 23

@@ -10,12 +10,11 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from magbridge.diagnose.inference.evidence import log_bayes, one_sided
 from magbridge.diagnose.inference.statistic import Statistic
+from study.noise import Array
 
-Array = NDArray[np.float64]
 DRAWS = 400
 SHOWN = "as shown"
 """Instead of a channel's name: the span is a cause's true signature, not columns of the table."""

@@ -8,16 +8,16 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 from scipy.stats import binomtest
 
 from study.cases import KNOWN
+from study.noise import Array
 from study.rates import Row, beside_ideal, curve, found, predicted
 
 NEITHER = "no name"
 
 
-def confusion(rows: Sequence[Row]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def confusion(rows: Sequence[Row]) -> tuple[Array, Array]:
     """Predicted and measured shares, hidden by row, named first by column; the last column is no name."""
     columns = [*KNOWN, NEITHER]
     predicted, measured = np.full((2, len(KNOWN), len(columns)), np.nan)

@@ -14,9 +14,8 @@ from magbridge.diagnose.inference.search import search
 from sitl.dataset import corrected
 from sitl.inject import Hidden
 from study.deployment import DAY, Background, again
-from study.noise import add_noise
+from study.noise import Array, add_noise
 
-Array = NDArray[np.float64]
 DELAYS = ("filter_lag", "clock_offset")
 """In a uniform field these two look the same: a late field shows only where masses have moved meanwhile."""
 

@@ -26,13 +26,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from magbridge.diagnose.inference.evidence import ODDS, log_bayes
 from magbridge.diagnose.unexplained.descriptions import Description
 from study.draws import Draws, Span
-
-Array = NDArray[np.float64]
+from study.noise import Array
 
 
 def against(

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 from scipy.stats import binomtest, norm
 
+from study.noise import Array
 from study.theory import SIZES
 
 Row = dict[str, Any]
@@ -86,7 +87,7 @@ def gained(rows: Sequence[Row]) -> float:
     return float(np.median(shares)) if shares else float("nan")
 
 
-def scores(rows: Sequence[Row]) -> NDArray[np.float64]:
+def scores(rows: Sequence[Row]) -> Array:
     """(value - truth) / sigma of all parameters of known truth."""
     return np.array([z for r in rows for z in r["scores"]])
 
@@ -101,7 +102,7 @@ def chance(rows: Sequence[Row], key: str) -> float:
     return float(np.mean([t[key] for t in predicted(rows)])) if predicted(rows) else np.nan
 
 
-def curve(rows: Sequence[Row], size: NDArray[np.float64] | float) -> NDArray[np.float64]:
+def curve(rows: Sequence[Row], size: Array | float) -> Array:
     """Theory's mean chance that the rows' hidden effects are found, if they had this signal-to-noise."""
     if not predicted(rows):
         return np.full(np.shape(size), np.nan)

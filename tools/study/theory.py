@@ -22,7 +22,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 from scipy.special import chdtrc
 
 from magbridge.diagnose.causes import Cause
@@ -34,9 +33,8 @@ from magbridge.diagnose.unexplained.descriptions import Description
 from study.deployment import Background, Injected, compare, project
 from study.draws import SHOWN, Draws, Span, by_cause, evidence, explained, numbers, with_another
 from study.nameless import against, nameless
-from study.noise import whiten
+from study.noise import Array, whiten
 
-Array = NDArray[np.float64]
 SIZES = np.linspace(1.0, 12.0, 45)
 """Signal-to-noise at which the chance to be found is evaluated."""
 

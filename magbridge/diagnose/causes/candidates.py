@@ -7,15 +7,14 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from magbridge.calibration.terms import Effect
+from magbridge.diagnose.compare.arrays import BoolArray, FloatArray
 from magbridge.diagnose.compare.design_columns import Columns, Mixture, Since, parts, places, together
 from magbridge.diagnose.compare.problem import Problem, effect_columns, history
 
 __all__ = ["AXES", "Candidate", "Group", "of_effect", "of_reference", "per", "since", "slices"]
 
-FloatArray = NDArray[np.float64]
 AXES = ("x", "y", "z")
 Group = tuple[str, str | None]
 """A cause and its channel: candidates that share both are one grid."""
@@ -136,7 +135,7 @@ def slices(candidates: Sequence[Candidate], first: int = 0) -> list[slice]:
     return places((candidate.size for candidate in candidates), first)
 
 
-def since(candidate: Candidate, learned: NDArray[np.bool_]) -> Candidate:
+def since(candidate: Candidate, learned: BoolArray) -> Candidate:
     """Return the same cause, absent from the samples (n,) that the calibration has `learned` from."""
     again, fresh = candidate.again, ~learned
     return replace(

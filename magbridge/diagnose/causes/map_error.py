@@ -6,17 +6,15 @@ from collections.abc import Callable, Sequence
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csr_array, diags_array
 from scipy.spatial.distance import cdist
 
 from magbridge.diagnose.causes.candidates import Candidate
+from magbridge.diagnose.compare.arrays import FloatArray, IndexArray
 from magbridge.diagnose.compare.design_columns import Interpolated
 from magbridge.diagnose.compare.problem import Problem
 
 __all__ = ["map_error"]
-
-FloatArray = NDArray[np.float64]
 
 CELLS = 300
 """Most cells at which a map's error is described."""
@@ -104,7 +102,7 @@ def _cells(place: FloatArray) -> tuple[FloatArray, float]:
     return np.stack([np.bincount(of, x) for x in place.T], axis=1) / np.bincount(of)[:, None], side
 
 
-def _each(corners: FloatArray) -> tuple[FloatArray, NDArray[np.intp]]:
+def _each(corners: FloatArray) -> tuple[FloatArray, IndexArray]:
     """Return the distinct rows (c, d) of whole numbers (n, d), and the place of each row among them (n,)."""
     low = corners.min(axis=0)
     box = np.ptp(corners, axis=0).astype(int) + 1

@@ -8,18 +8,16 @@ from functools import partial, reduce
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
 from magbridge.calibration.mass_effects import MonomialEffect, PlayEffect, PowersEffect, SourcesEffect
 from magbridge.calibration.terms import Polynomial, full_order
 from magbridge.diagnose.causes.candidates import AXES, Candidate, of_effect, per
 from magbridge.diagnose.causes.channels import channels_of, extent
 from magbridge.diagnose.causes.regressors import play, powers
+from magbridge.diagnose.compare.arrays import FloatArray
 from magbridge.diagnose.compare.problem import Problem
 
 __all__ = ["actuator_order", "hysteresis", "unmodelled_actuator"]
-
-FloatArray = NDArray[np.float64]
 
 MANY = 12
 """Most missing monomials that are tried together."""

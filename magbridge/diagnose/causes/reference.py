@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from magbridge.diagnose.causes.candidates import Candidate, of_reference
+from magbridge.diagnose.compare.arrays import FloatArray
 from magbridge.diagnose.compare.problem import Problem
 
 __all__ = ["diurnal_variation", "reference_bias"]
-
-FloatArray = NDArray[np.float64]
 
 
 def diurnal_variation(problem: Problem) -> list[Candidate]:

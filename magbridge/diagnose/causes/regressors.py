@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
+from magbridge.diagnose.compare.arrays import FloatArray
 from magbridge.diagnose.compare.problem import Problem
 
 __all__ = ["lagged", "once", "play", "powers"]
 
-FloatArray = NDArray[np.float64]
 T = TypeVar("T")
 Number = TypeVar("Number", np.float64, np.complex128)
 

@@ -8,16 +8,14 @@ from functools import reduce
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
 from magbridge.calibration.instrument_effects import ResponseEffect
 from magbridge.diagnose.causes.candidates import AXES, Candidate, of_effect, per
 from magbridge.diagnose.causes.regressors import powers
+from magbridge.diagnose.compare.arrays import FloatArray
 from magbridge.diagnose.compare.problem import Problem
 
 __all__ = ["nonlinearity", "saturation"]
-
-FloatArray = NDArray[np.float64]
 
 
 def nonlinearity(problem: Problem) -> list[Candidate]:

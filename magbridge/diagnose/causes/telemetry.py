@@ -7,17 +7,15 @@ from functools import lru_cache
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from magbridge.calibration.effects import ChannelEffect
 from magbridge.diagnose.causes.candidates import Candidate, of_effect
 from magbridge.diagnose.causes.channels import channels_of, extent
 from magbridge.diagnose.causes.regressors import lagged, once
+from magbridge.diagnose.compare.arrays import FloatArray
 from magbridge.diagnose.compare.problem import Problem
 
 __all__ = ["current_field", "pressure_offset", "temperature_offset", "temperature_scale"]
-
-FloatArray = NDArray[np.float64]
 
 LAGS = (0.0, 700.0, 1700.0, 4000.0, 10000.0)
 """s, spaced so closely that any lag between two of them is matched to within a fifth (RMS)."""

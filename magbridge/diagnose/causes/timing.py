@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from magbridge.calibration.instrument_effects import RateEffect
 from magbridge.calibration.mass_effects import ClockEffect
 from magbridge.diagnose.causes.candidates import AXES, Candidate, of_effect
 from magbridge.diagnose.causes.regressors import once
+from magbridge.diagnose.compare.arrays import FloatArray
 from magbridge.diagnose.compare.interpolation import LOST, rates
 from magbridge.diagnose.compare.problem import Problem
 
 __all__ = ["channel_skew", "clock_offset", "eddy_current", "field_rates", "filter_lag", "mass_rates"]
-
-FloatArray = NDArray[np.float64]
 
 MOMENT = 0.01
 """s by which masses are moved forward and back, for a central difference of the nine coefficients."""

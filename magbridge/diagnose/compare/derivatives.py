@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from magbridge.calibration.compilation import coefficient_tensor
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.residual import Samples, jacobian
+from magbridge.diagnose.compare.arrays import FloatArray
 
 __all__ = ["CHUNK", "derivatives"]
-
-FloatArray = NDArray[np.float64]
 
 CHUNK = 8192
 """Rows at a time: the memory is bounded, whatever the log."""

@@ -7,15 +7,15 @@ from dataclasses import dataclass, field
 from itertools import accumulate, pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csr_array
+
+from magbridge.diagnose.compare.arrays import BoolArray, FloatArray
 
 __all__ = [
     "Columns", "Interpolated", "Mixture", "Since", "beside", "parts", "places", "size_of", "times",
     "together",
 ]  # fmt: skip
 
-FloatArray = NDArray[np.float64]
 Columns = Callable[[slice], FloatArray]
 """A function from a slice of m rows to (m, k): what one unit of each of k coefficients, if the calibration
 lacks it, adds to the residual. Best stored column by column."""
@@ -70,7 +70,7 @@ class Since:
     """Columns set to zero in the rows where `fresh` (n,) is false."""
 
     columns: Columns
-    fresh: NDArray[np.bool_] = field(compare=False)
+    fresh: BoolArray = field(compare=False)
 
     def __call__(self, rows: slice) -> FloatArray:
         """(m, k) these rows."""

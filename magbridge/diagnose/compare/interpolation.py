@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
+from magbridge.diagnose.compare.arrays import FloatArray
 from magbridge.diagnose.compare.survey import Survey
 
 __all__ = ["LOST", "interpolation_error", "rates"]
-
-FloatArray = NDArray[np.float64]
 
 LOST = 3
 """Most samples missing in a row within a leg: the rate beside such a gap still has 98 % of the true

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+
+from magbridge.diagnose.compare.arrays import IntArray
 
 __all__ = ["FAR", "Past"]
-
-IntArray = NDArray[np.int64]
 
 FAR = 1000
 """Lag, in sampling intervals, from which on a sample says nothing about the noise; longer ones are cut

@@ -7,17 +7,15 @@ a drift between days that no instrument is free of.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.residual import Samples, robust_scale, whiten
 from magbridge.calibration.terms import Polynomial
+from magbridge.diagnose.compare.arrays import FloatArray
 from magbridge.diagnose.compare.derivatives import derivatives
 from magbridge.diagnose.compare.survey import Survey
 
 __all__ = ["floor", "isotropic", "noise_sigma", "prior"]
-
-FloatArray = NDArray[np.float64]
 
 BROADEST = 1e-3
 """Least precision, in units of the posterior's, of a direction that only the repeated logs determined."""

@@ -30,12 +30,12 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from magbridge.calibration.correct import regressors
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.residual import Samples, residuals
 from magbridge.calibration.terms import Effect
+from magbridge.diagnose.compare.arrays import FloatArray
 from magbridge.diagnose.compare.derivatives import CHUNK, derivatives
 from magbridge.diagnose.compare.design_columns import Mixture
 from magbridge.diagnose.compare.interpolation import interpolation_error
@@ -43,8 +43,6 @@ from magbridge.diagnose.compare.prior import noise_sigma, prior
 from magbridge.diagnose.compare.survey import Survey
 
 __all__ = ["DELAY", "DELAYS", "Problem", "add_effects", "effect_columns", "history", "pose", "samples_of"]
-
-FloatArray = NDArray[np.float64]
 
 DELAY = 0.3
 """s, a plausible size of a channel's delay after its row."""

@@ -8,16 +8,14 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from magbridge.columns import AGE
+from magbridge.diagnose.compare.arrays import BoolArray, FloatArray, IntArray
 from magbridge.diagnose.compare.past import FAR, Past
 from magbridge.errors import DataError
 from magbridge.field.earth import separation, wrap
 
 __all__ = ["FEWEST", "Channel", "Survey", "assemble"]
-
-FloatArray = NDArray[np.float64]
 
 FEWEST = 60
 """Samples below which noise and effect cannot both be estimated."""
@@ -86,11 +84,11 @@ class Survey:
     reference: FloatArray
     channels: dict[str, Channel]
     still: tuple[str, ...]
-    steps: NDArray[np.int64]
-    dive: NDArray[np.int64]
+    steps: IntArray
+    dive: IntArray
     place: FloatArray | None
     attitude: FloatArray | None
-    learned: NDArray[np.bool_]
+    learned: BoolArray
     cycles: FloatArray
     source: str
 
@@ -104,11 +102,11 @@ class Survey:
         return float(np.median(np.diff(self.time)[known] / self.steps[1:][known])) if known.any() else 1.0
 
     @cached_property
-    def slots(self) -> NDArray[np.int64]:
+    def slots(self) -> IntArray:
         """(n,) intervals since the first sample; a gap counts at most :data:`~.past.FAR`."""
         return np.asarray(np.cumsum(self.steps) - self.steps[0])
 
-    def follows(self, lost: int = 0) -> NDArray[np.bool_]:
+    def follows(self, lost: int = 0) -> BoolArray:
         """(n,) the sample follows the previous one at the median interval, with at most `lost` missing."""
         apart = np.diff(self.time, prepend=np.inf)
         return np.asarray((apart > 0.0) & (apart < (lost + 1.5) * np.median(apart)) & (self.steps < FAR))
@@ -237,7 +235,7 @@ def _held(values: FloatArray) -> FloatArray:
     return np.asarray(values[np.maximum(last, known[0])])
 
 
-def _dives(table: dict[str, FloatArray]) -> NDArray[np.int64]:
+def _dives(table: dict[str, FloatArray]) -> IntArray:
     """Count the dives: as the log does, else from surface to surface, else eighths of the log."""
     for name in ("dive", "run"):
         if name in table and np.unique(table[name]).size > 3:
@@ -251,5 +249,5 @@ def _dives(table: dict[str, FloatArray]) -> NDArray[np.int64]:
     return _eighths(len(table["time"]))
 
 
-def _eighths(n: int) -> NDArray[np.int64]:
+def _eighths(n: int) -> IntArray:
     return np.arange(n) * 8 // n

@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from magbridge.calibration.model import Calibration
 from magbridge.columns import CHANNELS, require, require_units
 from magbridge.config import Align
+from magbridge.diagnose.compare.arrays import BoolArray, FloatArray
 from magbridge.diagnose.compare.survey import FEWEST, Survey, assemble
 from magbridge.errors import DataError
 from magbridge.field.grid import AnomalyGrid
@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     import xarray as xr
 
 __all__ = ["take"]
-
-FloatArray = NDArray[np.float64]
 
 TRUSTED = 0.5
 """Largest cubic term in the interpolation of a channel to the time of its row, as a multiple of the noise;
@@ -172,7 +170,7 @@ def _at(time: FloatArray, sampled: FloatArray, values: FloatArray, trusted: floa
     return out
 
 
-def _moving(table: dict[str, FloatArray], calibration: Calibration) -> NDArray[np.bool_]:
+def _moving(table: dict[str, FloatArray], calibration: Calibration) -> BoolArray:
     """(n,) samples next to which a mass moves, by the bridge's own criterion.
 
     There the channels, sampled in turn, saw the mass at different places and form no vector. With

@@ -9,15 +9,14 @@ from threading import current_thread
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from magbridge.diagnose.compare.arrays import FloatArray
 from magbridge.diagnose.compare.design_columns import Columns, beside, places, size_of, times
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.noise import Noise
 
 __all__ = ["ALL", "Design", "in_threads", "normal", "pieces", "precomputed"]
 
-FloatArray = NDArray[np.float64]
 S = TypeVar("S")
 T = TypeVar("T")
 

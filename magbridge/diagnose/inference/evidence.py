@@ -27,11 +27,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import log_ndtr
 from scipy.stats import chi2
 
 from magbridge.diagnose.causes.candidates import Candidate, slices
+from magbridge.diagnose.compare.arrays import FloatArray
 from magbridge.diagnose.inference.information import Information
 from magbridge.diagnose.inference.joint import FLAT
 from magbridge.diagnose.inference.statistic import Statistic
@@ -51,8 +51,6 @@ __all__ = [
     "score",
     "trials",
 ]
-
-FloatArray = NDArray[np.float64]
 
 LEVEL = 0.01
 """Family-wise false-alarm rate."""

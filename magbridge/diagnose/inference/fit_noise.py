@@ -6,18 +6,16 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
-from numpy.typing import NDArray
 from scipy.special import gammaln
 
 from magbridge.calibration.residual import robust_scale
+from magbridge.diagnose.compare.arrays import FloatArray, IntArray
 from magbridge.diagnose.compare.derivatives import CHUNK
 from magbridge.diagnose.compare.design_columns import Columns
 from magbridge.diagnose.compare.past import Past
 from magbridge.diagnose.inference.noise import Noise, Predictors
 
 __all__ = ["BRIEFEST", "LONGEST", "TAILS", "autoregressive_order", "certainty", "fit_noise"]
-
-FloatArray = NDArray[np.float64]
 
 TAILS = (2.5, 3.0, 4.0, 5.0, 7.0, 12.0, 1e6)
 BLOCK = 150
@@ -46,7 +44,7 @@ PIECE, PIECES = 600, 64
 """Pieces of a column from which its power spectrum is estimated: their length in samples, and most pieces."""
 
 
-def autoregressive_order(residual: FloatArray, slots: NDArray[np.int64]) -> int:
+def autoregressive_order(residual: FloatArray, slots: IntArray) -> int:
     r"""Choose p by Akaike's criterion on a residual clipped against outliers; `slots` (n,) count intervals.
 
     Whitening with too high an order costs little; with too low a one, noise passes for structure.
@@ -71,7 +69,7 @@ def autoregressive_order(residual: FloatArray, slots: NDArray[np.int64]) -> int:
     return min(determined, key=lambda p: costs[p], default=1)
 
 
-def _product(r: FloatArray, slots: NDArray[np.int64], lag: int) -> float:
+def _product(r: FloatArray, slots: IntArray, lag: int) -> float:
     """Mean product of samples that are so many intervals apart."""
     before = np.searchsorted(slots, slots - lag)
     pair = slots[before] == slots - lag
@@ -179,7 +177,7 @@ def _regressed(lags: FloatArray, r: FloatArray, weight: FloatArray) -> FloatArra
     return np.asarray(np.linalg.lstsq(P, b, rcond=None)[0], float)
 
 
-def _counts(n: int) -> NDArray[np.int64]:
+def _counts(n: int) -> IntArray:
     """(blocks,) samples in each block."""
     count = np.full(max(n // BLOCK, 1), BLOCK)
     count[-1] += n - count.sum()
@@ -195,7 +193,7 @@ def _stable(ar: FloatArray, n: int) -> FloatArray:
     return np.asarray(-np.real(np.poly(roots * np.where(size > largest, largest / size, 1.0)))[1:])
 
 
-def _uneven(v: FloatArray, count: NDArray[np.int64]) -> bool:
+def _uneven(v: FloatArray, count: IntArray) -> bool:
     """Tell whether the blocks' mean absolute values differ by more than chance."""
     if count.size < 4:
         return False
@@ -207,12 +205,12 @@ def _uneven(v: FloatArray, count: NDArray[np.int64]) -> bool:
     return bool(chi2 > count.size + 4.0 * np.sqrt(2.0 * count.size))
 
 
-def _sums(values: FloatArray, count: NDArray[np.int64]) -> FloatArray:
+def _sums(values: FloatArray, count: IntArray) -> FloatArray:
     """(blocks,) sum of each block."""
     return np.asarray(np.add.reduceat(values, np.cumsum(count) - count))
 
 
-def _tails(v: FloatArray, count: NDArray[np.int64], nu: float) -> tuple[float, FloatArray, float]:
+def _tails(v: FloatArray, count: IntArray, nu: float) -> tuple[float, FloatArray, float]:
     """Find the best tails, uphill from `nu`, the level of each sample under them, and the log likelihood."""
     at = TAILS.index(nu)
     square = v * v
@@ -228,9 +226,7 @@ def _tails(v: FloatArray, count: NDArray[np.int64], nu: float) -> tuple[float, F
         at = best
 
 
-def _levels(
-    square: FloatArray, count: NDArray[np.int64], nu: float, level: FloatArray
-) -> tuple[float, FloatArray]:
+def _levels(square: FloatArray, count: IntArray, nu: float, level: FloatArray) -> tuple[float, FloatArray]:
     """Log likelihood and level of each block, from a first guess.
 
     Each level is shrunk towards that of all blocks, which counts like ten more samples.
@@ -255,13 +251,13 @@ def _levels(
     return float(value - 0.5 * count @ np.log(power)), np.sqrt(power)
 
 
-def _spread(levels: FloatArray, count: NDArray[np.int64]) -> FloatArray:
+def _spread(levels: FloatArray, count: IntArray) -> FloatArray:
     """(n,) level of each sample; of a single block it takes no memory."""
     if count.size == 1:
         return np.broadcast_to(levels, int(count.sum()))
     return np.repeat(levels, count)
 
 
-def _each(values: FloatArray, count: NDArray[np.int64]) -> FloatArray | float:
+def _each(values: FloatArray, count: IntArray) -> FloatArray | float:
     """(n,) a block's value for each of its samples; a number where there is one block."""
     return np.repeat(values, count) if count.size > 1 else float(values[0])

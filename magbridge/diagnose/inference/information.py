@@ -13,9 +13,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
+from magbridge.diagnose.compare.arrays import FloatArray, IndexArray
 from magbridge.diagnose.compare.design_columns import Columns, beside, parts, places, together
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.design import ALL, normal
@@ -23,8 +23,6 @@ from magbridge.diagnose.inference.joint import Joint
 from magbridge.diagnose.inference.noise import Noise
 
 __all__ = ["Information", "information"]
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,11 +42,11 @@ class Information:
     score: FloatArray
     shift: FloatArray
 
-    def moved(self, base: Joint, at: slice | NDArray[np.intp], taken: FloatArray) -> FloatArray:
+    def moved(self, base: Joint, at: slice | IndexArray, taken: FloatArray) -> FloatArray:
         """Return the likeliest calibration and model (q + k,) if the coefficients `at` these are `taken`."""
         return np.append(base.z, base.coefficients) - self.shift[:, at] @ taken
 
-    def without(self, index: NDArray[np.intp], prior: FloatArray) -> Information:
+    def without(self, index: IndexArray, prior: FloatArray) -> Information:
         """Project out the coefficients at `index` as well, with their prior precision (i,)."""
         S = self.matrix[np.ix_(index, index)] + np.diag(prior)
         K = np.linalg.solve(S, self.matrix[index])

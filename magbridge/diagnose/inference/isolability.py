@@ -15,16 +15,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtri, chndtrinc
 
 from magbridge.diagnose.causes.candidates import Candidate, Group, slices
+from magbridge.diagnose.compare.arrays import FloatArray
 from magbridge.diagnose.inference.evidence import LEVEL, score
 from magbridge.diagnose.inference.information import Information
 
 __all__ = ["Isolability", "Visible", "isolability"]
 
-FloatArray = NDArray[np.float64]
 CONFOUNDED = 0.85
 """Correlation beyond which two causes are listed as a pair: at this one they are told apart in 95 of 100
 cases at signal-to-noise 6."""

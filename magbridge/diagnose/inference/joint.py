@@ -12,9 +12,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from magbridge.calibration.residual import robust_scale
+from magbridge.diagnose.compare.arrays import FloatArray, IndexArray
 from magbridge.diagnose.compare.design_columns import Columns
 from magbridge.diagnose.compare.problem import DELAYS, Problem
 from magbridge.diagnose.inference.design import Design, in_threads, normal, precomputed
@@ -24,7 +24,6 @@ from magbridge.diagnose.inference.statistic import Statistic
 
 __all__ = ["FLAT", "RIDGE", "Joint", "fit_joint", "volume_of"]
 
-FloatArray = NDArray[np.float64]
 RIDGE = 0.1
 """Prior precision of an effect, in units of a plausible size's: ten times that size is hardly believed, a
 hundred times not at all. Without it a nonlinearity and the calibration's scales can cancel each other and
@@ -66,7 +65,7 @@ class Joint:
         """(k, k) of the effects' coefficients."""
         return self.covariance[len(self.z) :, len(self.z) :]
 
-    def wald(self, at: slice | NDArray[np.intp]) -> float:
+    def wald(self, at: slice | IndexArray) -> float:
         """Wald's statistic ``b^T C_bb^-1 b`` of the effects' coefficients b (k,) `at` these places."""
         b = self.coefficients[at]
         return float(b @ np.linalg.solve(self.effects_covariance[at][:, at], b))

@@ -28,15 +28,13 @@ from functools import cached_property
 
 import numpy as np
 from numpy.lib.stride_tricks import as_strided, sliding_window_view
-from numpy.typing import NDArray
 from scipy.signal import lfilter, lfiltic
 
+from magbridge.diagnose.compare.arrays import FloatArray
 from magbridge.diagnose.compare.design_columns import Columns
 from magbridge.diagnose.compare.past import FAR, Past
 
 __all__ = ["Noise", "Predictors", "autocovariance"]
-
-FloatArray = NDArray[np.float64]
 
 BAND = 32
 """Rows that are filtered by one product of matrices."""

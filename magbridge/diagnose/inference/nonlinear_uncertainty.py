@@ -25,9 +25,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from magbridge.diagnose.causes.candidates import Candidate, slices
+from magbridge.diagnose.compare.arrays import FloatArray
 from magbridge.diagnose.compare.design_columns import Columns
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.evidence import score
@@ -36,7 +36,6 @@ from magbridge.diagnose.inference.joint import Joint
 
 __all__ = ["loosened"]
 
-FloatArray = NDArray[np.float64]
 Placed = tuple[Candidate, slice]
 """A candidate, and where its columns are."""
 

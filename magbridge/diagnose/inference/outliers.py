@@ -5,24 +5,22 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import gammaln
 from scipy.stats import chi2
 
 from magbridge.calibration.residual import robust_scale
+from magbridge.diagnose.compare.arrays import FloatArray, IndexArray
 from magbridge.diagnose.inference.evidence import LEVEL
 from magbridge.diagnose.inference.fit_noise import TAILS
 from magbridge.diagnose.inference.joint import Joint
 
 __all__ = ["Outliers", "outliers"]
 
-FloatArray = NDArray[np.float64]
-
 
 class Outliers(NamedTuple):
     """Isolated wrong samples: which, twice the gain in log likelihood, and its p-value."""
 
-    rows: NDArray[np.intp]
+    rows: IndexArray
     ratio: float
     p_value: float
 

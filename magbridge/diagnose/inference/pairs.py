@@ -18,10 +18,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import logsumexp
 
 from magbridge.diagnose.causes.candidates import Candidate, Group, slices
+from magbridge.diagnose.compare.arrays import FloatArray
 from magbridge.diagnose.inference.evidence import LEVEL, REMNANT, log_bayes, margin, one_sided, score
 from magbridge.diagnose.inference.information import Information
 from magbridge.diagnose.inference.joint import Joint
@@ -29,8 +29,6 @@ from magbridge.diagnose.inference.rounds import State
 from magbridge.diagnose.inference.statistic import Statistic
 
 __all__ = ["Pair", "pairs_of"]
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

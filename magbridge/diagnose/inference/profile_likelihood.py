@@ -5,17 +5,15 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from magbridge.diagnose.causes.candidates import Candidate, slices
+from magbridge.diagnose.compare.arrays import FloatArray
 from magbridge.diagnose.inference.evidence import score
 from magbridge.diagnose.inference.information import information
 from magbridge.diagnose.inference.joint import Joint
 from magbridge.diagnose.inference.rounds import Hypothesis, State
 
 __all__ = ["refined", "sharpen"]
-
-FloatArray = NDArray[np.float64]
 
 COLUMNS, STAGES = 144, 2
 """Number of columns that all values tried within a nonlinear parameter's bracket may have, and number of

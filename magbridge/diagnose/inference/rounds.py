@@ -9,10 +9,10 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import fdtrc
 
 from magbridge.diagnose.causes.candidates import Candidate, Group, slices
+from magbridge.diagnose.compare.arrays import FloatArray
 from magbridge.diagnose.compare.design_columns import Columns, Mixture, parts, together
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.design import in_threads, precomputed
@@ -23,8 +23,6 @@ from magbridge.diagnose.inference.joint import RIDGE, Joint, fit_joint, volume_o
 from magbridge.diagnose.inference.noise import Noise
 
 __all__ = ["Hypothesis", "State", "shaped_ratio"]
-
-FloatArray = NDArray[np.float64]
 
 SHORT_LIST = 9
 """Causes that are fitted jointly in a round."""

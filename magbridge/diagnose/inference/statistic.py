@@ -21,11 +21,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+
+from magbridge.diagnose.compare.arrays import FloatArray
 
 __all__ = ["Ridge", "Statistic"]
-
-FloatArray = NDArray[np.float64]
 
 SIZES = np.logspace(-7, 2, 64)
 """Values of g that are tried, in units of the widths squared."""

@@ -6,13 +6,13 @@ from collections.abc import Mapping, Sequence
 from html import escape
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.residual import residuals, residuals_of
 from magbridge.diagnose.causes import Cause
 from magbridge.diagnose.causes.candidates import Candidate
+from magbridge.diagnose.compare.arrays import FloatArray
 from magbridge.diagnose.compare.derivatives import CHUNK, derivatives
 from magbridge.diagnose.compare.problem import DELAY, DELAYS, Problem, samples_of
 from magbridge.diagnose.diagnosis import Diagnosis, Finding
@@ -86,7 +86,7 @@ def late(problem: Problem, fit: Joint) -> str:
     )
 
 
-def implausible(candidate: Candidate, b: NDArray[np.float64]) -> str:
+def implausible(candidate: Candidate, b: FloatArray) -> str:
     """Say so when a cause's b (k,), in units of its widths, is implausibly large, as if two cancelled."""
     times = float(np.abs(b).max())
     if candidate.spectra is not None or times < IMPLAUSIBLE:

@@ -10,15 +10,13 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogFormatter, MaxNLocator
-from numpy.typing import NDArray
 from scipy.signal import periodogram
 
+from magbridge.diagnose.compare.arrays import FloatArray
 from magbridge.diagnose.diagnosis import Diagnosis
 from magbridge.diagnose.report.words import chance, label
 
 __all__ = ["channels", "evidence", "likeness", "measured", "spectrum", "terms", "track"]
-
-FloatArray = NDArray[np.float64]
 
 BEFORE, AFTER, INK, FAINT = "#c8553d", "#1f6f8b", "#22303c", "#9aa5b1"
 POINTS = 4000

@@ -6,11 +6,9 @@ from collections.abc import Mapping
 from datetime import UTC, datetime
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from magbridge.calibration.residual import rms
 from magbridge.diagnose.causes import Cause
+from magbridge.diagnose.compare.arrays import FloatArray
 from magbridge.diagnose.diagnosis import Diagnosis, Finding
 from magbridge.diagnose.report import figures
 from magbridge.diagnose.report.doubts import doubts
@@ -80,7 +78,7 @@ def _cause(diagnosis: Diagnosis, finding: Finding, cause: Cause) -> list[str]:
     ]
 
 
-def _outliers(time: NDArray[np.float64]) -> str:
+def _outliers(time: FloatArray) -> str:
     """Say how many samples are wrong, and when: `time` (k,) in s since 1970."""
     when = ", ".join(datetime.fromtimestamp(float(t), UTC).strftime("%H:%M:%S") for t in time[:MANY])
     wrong = "1 isolated sample is wrong" if time.size == 1 else f"{time.size} isolated samples are wrong"

@@ -6,12 +6,12 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from magbridge.calibration.mass_effects import ClockEffect
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.causes.regressors import powers
 from magbridge.diagnose.causes.timing import field_rates, mass_rates
+from magbridge.diagnose.compare.arrays import FloatArray
 from magbridge.diagnose.compare.design_columns import Columns, size_of
 from magbridge.diagnose.compare.interpolation import rates
 from magbridge.diagnose.compare.problem import Problem, effect_columns
@@ -22,8 +22,6 @@ from magbridge.diagnose.unexplained.packets import packets
 from magbridge.diagnose.unexplained.passage import passage
 
 __all__ = ["Description", "descriptions"]
-
-FloatArray = NDArray[np.float64]
 
 BODY, EARTH = 24, 48
 """Half waves per log of slow curves along the axes of the body, and along the field."""

@@ -15,11 +15,11 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from magbridge.calibration.residual import robust_scale
 from magbridge.diagnose.causes.candidates import Candidate
+from magbridge.diagnose.compare.arrays import FloatArray
 from magbridge.diagnose.compare.design_columns import Columns, places
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.design import Design, in_threads, precomputed
@@ -33,8 +33,6 @@ from magbridge.diagnose.inference.statistic import Ridge, Statistic
 from magbridge.diagnose.unexplained.descriptions import Description, descriptions
 
 __all__ = ["Leftover", "leftover"]
-
-FloatArray = NDArray[np.float64]
 
 SHORT_LIST = 3
 """Number of the best descriptions under each noise that are then weighed by the full likelihood."""

@@ -25,9 +25,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.fft import ifft, irfft, next_fast_len, rfft
 
+from magbridge.diagnose.compare.arrays import FloatArray
 from magbridge.diagnose.compare.design_columns import Columns
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.design import in_threads
@@ -36,8 +36,6 @@ from magbridge.diagnose.inference.joint import Joint
 from magbridge.diagnose.inference.noise import Noise
 
 __all__ = ["Packets", "packets"]
-
-FloatArray = NDArray[np.float64]
 
 CYCLES = (0.75, 2.25, 6.75)
 """Values of Q that are tried."""

@@ -8,13 +8,12 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
+from magbridge.diagnose.compare.arrays import FloatArray
 from magbridge.diagnose.compare.design_columns import Columns
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.joint import Joint
 
 __all__ = ["passage"]
-
-FloatArray = NDArray[np.float64]
 
 DURATIONS, SHORTEST, LONGEST = 12, 8.0, 0.125
 """Durations: how many are tried, the shortest in samples, the longest as a share of the log."""

@@ -10,9 +10,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from magbridge.diagnose.causes.regressors import lagged, play, powers
+from magbridge.diagnose.compare.arrays import FloatArray
 from magbridge.diagnose.compare.design_columns import Columns
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.design import pieces
@@ -31,8 +31,6 @@ __all__ = [
     "spectra",
     "swings",
 ]
-
-FloatArray = NDArray[np.float64]
 
 BEND = 32
 """Order of the polynomials of a channel's response: fine enough for a converter's coarsest steps."""

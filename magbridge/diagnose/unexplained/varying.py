@@ -5,16 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
 from magbridge.diagnose.causes.candidates import Candidate
+from magbridge.diagnose.compare.arrays import FloatArray
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.design import pieces
 from magbridge.diagnose.unexplained.descriptions import Description
 
 __all__ = ["varying"]
-
-FloatArray = NDArray[np.float64]
 
 MOST = 6
 """Coefficients of a cause of which this is asked: with more, it takes almost any shape."""
