@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from datetime import UTC, datetime
 
-import msgspec
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
@@ -67,12 +66,9 @@ def simulate_like(log: xr.Dataset, scenario: Scenario, seed: int = 0) -> xr.Data
 
 def placed_at(log: xr.Dataset, scenario: Scenario) -> Scenario:
     """Return the scenario at the log's median position, starting at the log's first time."""
-    latitude, longitude = (_column(log, name) for name in ("latitude", "longitude"))
-    place = msgspec.structs.replace(
-        scenario.world, latitude=float(np.nanmedian(latitude)), longitude=wrap(float(np.nanmedian(longitude)))
-    )
+    latitude, longitude = (float(np.nanmedian(_column(log, name))) for name in ("latitude", "longitude"))
     start = datetime.fromtimestamp(float(log["time"][0]), UTC)
-    return msgspec.structs.replace(scenario, world=place, start=start)
+    return scenario.replace(world={"latitude": latitude, "longitude": wrap(longitude)}, start=start)
 
 
 def read_track(log: xr.Dataset, scenario: Scenario, channels: Sequence[str]) -> tuple[Track, Array]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 from msgspec import Meta
@@ -101,6 +101,14 @@ class Scenario(Table, frozen=True):
         names = dict.fromkeys(("battpos", "ballast", *self.masses))
         return {name: LIMITS[name] for name in names} | self.limits
 
+    def replace(self, **changes: Any) -> Scenario:
+        """Return the scenario with other values; of a table, a dict of those that change."""
+        for name, change in changes.items():
+            table = getattr(self, name)
+            if isinstance(table, Table) and isinstance(change, dict):
+                changes[name] = msgspec.structs.replace(table, **change)
+        return msgspec.structs.replace(self, **changes)
+
 
 def load(path: str | Path) -> Scenario:
     """Read and check a scenario file; a bare name is one that comes with the package.
@@ -129,4 +137,4 @@ def load(path: str | Path) -> Scenario:
     calibration = path.parent / scenario.calibration
     if not calibration.is_file():
         raise ConfigError(path, "calibration", f"no such file: {calibration}")
-    return msgspec.structs.replace(scenario, calibration=str(calibration))
+    return scenario.replace(calibration=str(calibration))

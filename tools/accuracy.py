@@ -28,7 +28,6 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import NamedTuple
 
-import msgspec
 import numpy as np
 import xarray as xr
 from rich.console import Console
@@ -81,14 +80,10 @@ class Row(NamedTuple):
 
 def run(case: Case) -> list[Row]:
     """Simulate, calibrate by every method, and score on the survey."""
-    scenario = load("random_glider")
     noise, memory = NOISES[case.noise]
     names = MASSES[case.masses]
-    scenario = msgspec.structs.replace(
-        scenario,
-        masses=names,
-        instrument=msgspec.structs.replace(scenario.instrument, noise_sigma=noise, noise_memory=memory),
-    )
+    instrument = {"noise_sigma": noise, "noise_memory": memory}
+    scenario = load("random_glider").replace(masses=names, instrument=instrument)
     vehicle = Twin.draw(scenario, case.seed).vehicle
     assert isinstance(vehicle, Vehicle)
     parts = {name: at_rest(part, names) for name, part in segments(simulate(scenario, case.seed)).items()}

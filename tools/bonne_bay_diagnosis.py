@@ -12,7 +12,6 @@ import os
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "2")
 
-import msgspec
 import xarray as xr
 from study.deployment import CHARTS
 from terminal import command_line
@@ -32,9 +31,8 @@ REFERENCES = ("true", *CHARTS)
 
 def fly(seed: int, reference: str) -> dict[str, xr.Dataset]:
     """Return the twin's three parts, on one time base, masses at rest, with one of :data:`REFERENCES`."""
-    scenario = load("bonne_bay")
-    telemetry = msgspec.structs.replace(scenario.telemetry, reference="map" if reference == "map" else "true")
-    twin = Twin.draw(msgspec.structs.replace(scenario, telemetry=telemetry), seed)
+    telemetry = {"reference": "map" if reference == "map" else "true"}
+    twin = Twin.draw(load("bonne_bay").replace(telemetry=telemetry), seed)
     return measure(twin, at_depth=reference == "map at its depth")
 
 

@@ -10,12 +10,12 @@ error that was expected over the mission, and the survey's actual RMS over the n
 
 from __future__ import annotations
 
-from dataclasses import replace
+import dataclasses
 
-import msgspec
 import numpy as np
 import xarray as xr
 from accuracy import total
+from msgspec.structs import replace
 from rich.console import Console
 from rich.progress import track
 from terminal import command_line, table
@@ -57,7 +57,7 @@ def chosen(scenario: Scenario, noise: float) -> tuple[Plan, Plan]:
 def observed(part: xr.Dataset) -> Observations:
     """Return a part of a deployment with its true field's vector."""
     found = observations(at_rest(part, MASSES), MASSES)
-    return replace(found, reference_ned=np.tile(main_field(part)[0], (len(found), 1)))
+    return dataclasses.replace(found, reference_ned=np.tile(main_field(part)[0], (len(found), 1)))
 
 
 def flown(scenario: Scenario, seed: int) -> float:
@@ -76,23 +76,15 @@ def main() -> None:
     parser.add_argument("--noise", type=float, default=1.0, help="nT, white")
     given = parser.parse_args()
     console = Console(width=130)
-    scenario = load("random_glider")
-    scenario = msgspec.structs.replace(
-        scenario, instrument=msgspec.structs.replace(scenario.instrument, noise_sigma=given.noise)
-    )
+    scenario = load("random_glider").replace(instrument={"noise_sigma": given.noise})
     paper, ours = chosen(scenario, given.noise)
     show_runs(ours, console)
     spirals = tuple(
         Run(pitch=run.pitch, roll=run.roll, parameters=dict(zip(MASSES, run.parameters, strict=True)))
         for run in ours.runs
     )
-    planned = msgspec.structs.replace(
-        scenario,
-        mission=tuple(
-            msgspec.structs.replace(part, runs=spirals) if isinstance(part, Spirals) else part
-            for part in scenario.mission
-        ),
-    )
+    mission = (replace(one, runs=spirals) if isinstance(one, Spirals) else one for one in scenario.mission)
+    planned = scenario.replace(mission=tuple(mission))
     seeds = range(given.seeds)
     ratios = {
         name: np.array([flown(how, seed) for seed in track(seeds, name, console=Console(stderr=True))])

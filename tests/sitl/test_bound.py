@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import msgspec
 import numpy as np
 import pytest
 import xarray as xr
@@ -13,9 +12,8 @@ from sitl.bound import BestFit, oracle
 from sitl.mission import CrissCross, Spirals
 from sitl.platform import Vehicle
 
-SCENARIO = msgspec.structs.replace(
-    load("random_glider"), mission=(Spirals(duration=200.0), CrissCross(hours=1.0, duration=450.0))
-)
+MISSION = (Spirals(duration=200.0), CrissCross(hours=1.0, duration=450.0))
+SCENARIO = load("random_glider").replace(mission=MISSION)
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +54,7 @@ def test_with_only_the_hard_iron_unknown_the_bound_is_three_sines(monkeypatch: p
     """A bare vehicle: the hard iron's information is the sum of the field's directions, over the variance."""
     monkeypatch.setattr("sitl.bound.SOFT_IRON", 1e-12)
     monkeypatch.setattr("sitl.bound.HARD_IRON", 1e6)
-    scenario = msgspec.structs.replace(SCENARIO, vehicle=Vehicle())
+    scenario = SCENARIO.replace(vehicle=Vehicle())
     parts = segments(simulate(scenario, 1))
     u, v = (
         np.column_stack([parts[name][f"truth_field_{axis}"] for axis in "xyz"])

@@ -7,7 +7,6 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
-import msgspec
 import numpy as np
 import pytest
 import xarray as xr
@@ -58,12 +57,9 @@ Flight = tuple[Twin, Track, np.ndarray]
 
 @pytest.fixture(scope="module")
 def flight() -> Flight:
-    swap = msgspec.structs.replace
-    base = load("demo")
-    exact = swap(
-        base.instrument, corner=0.0, channel_delay=(0.0,) * 3, noise_sigma=0.0, bits=32, full_scale=2e5
-    )
-    twin = Twin.draw(swap(base, instrument=exact, mission=(CrissCross(hours=1.5, duration=600.0),)), 4)
+    exact = {"corner": 0.0, "channel_delay": (0.0,) * 3, "noise_sigma": 0.0, "bits": 32, "full_scale": 2e5}
+    mission = (CrissCross(hours=1.5, duration=600.0),)
+    twin = Twin.draw(load("demo").replace(instrument=exact, mission=mission), 4)
     track = twin.fly()
     return twin, track, np.arange(0.0, track.elapsed[-1] - 30.0, 4.0)
 

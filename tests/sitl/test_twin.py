@@ -62,14 +62,14 @@ def test_the_seed_says_it_all(demo: xr.Dataset) -> None:
 
 
 def test_another_instrument_does_not_change_the_world_or_the_flight(demo: xr.Dataset) -> None:
-    scenario = msgspec.structs.replace(load("demo"), instrument=PERFECT)
+    scenario = load("demo").replace(instrument=PERFECT)
     other = simulate(scenario, 3)
     for name in ("truth_total_field", "battpos", "pitch", "truth_latitude"):
         np.testing.assert_array_equal(demo[name][: other.sizes["time"]], other[name][: demo.sizes["time"]])
 
 
 def test_a_perfect_instrument_on_a_vehicle_without_iron_reads_the_truth() -> None:
-    scenario = msgspec.structs.replace(load("demo"), instrument=PERFECT, vehicle=Vehicle(), mission=SHORT)
+    scenario = load("demo").replace(instrument=PERFECT, vehicle=Vehicle(), mission=SHORT)
     deployment = simulate(scenario, 1)
     truth = np.column_stack([deployment[f"truth_field_{axis}"] for axis in "xyz"])
     np.testing.assert_allclose(channels(deployment), truth, atol=0.5)  # attitude between points is linear
@@ -79,7 +79,7 @@ def test_a_perfect_instrument_on_a_vehicle_without_iron_reads_the_truth() -> Non
 
 def test_the_same_masses_at_rest_leave_an_ellipsoid_and_moving_do_not() -> None:
     def residual(runs: tuple[Leg, ...]) -> float:
-        scenario = msgspec.structs.replace(load("demo"), instrument=PERFECT, mission=(Legs(runs=runs),))
+        scenario = load("demo").replace(instrument=PERFECT, mission=(Legs(runs=runs),))
         deployment = simulate(scenario, 2)
         x, y, z = channels(deployment).T / 5e4
         quadric = np.column_stack([x * x, y * y, z * z, x * y, x * z, y * z, x, y, z])
@@ -102,8 +102,7 @@ def test_the_same_masses_at_rest_leave_an_ellipsoid_and_moving_do_not() -> None:
 
 
 def test_the_map_reference_is_the_igrf_and_a_map_without_fine_structure() -> None:
-    scenario = load("bonne_bay")
-    scenario = msgspec.structs.replace(scenario, mission=(Spirals(duration=200.0),))
+    scenario = load("bonne_bay").replace(mission=(Spirals(duration=200.0),))
     deployment = simulate(scenario, 5)
     main = np.linalg.norm(
         igrf(*(deployment[name] for name in ("longitude", "latitude", "depth", "time"))), axis=1
@@ -120,12 +119,8 @@ def test_a_calibration_stands_in_for_vehicle_and_instrument(tmp_path: Path) -> N
     hard_iron[6:] = 100.0, -200.0, 300.0
     save_calibration(replace(plain, coefficients=hard_iron), tmp_path / "cal.json")
     (tmp_path / "scene.toml").write_text("name = 'calibrated'\ncalibration = 'cal.json'\n")
-    scenario = msgspec.structs.replace(
-        load(tmp_path / "scene.toml"),
-        instrument=PERFECT,
-        mission=SHORT,
-        motion=Motion(wander=(0.0, 0.0, 0.0)),
-    )
+    calm = Motion(wander=(0.0, 0.0, 0.0))
+    scenario = load(tmp_path / "scene.toml").replace(instrument=PERFECT, mission=SHORT, motion=calm)
     deployment = simulate(scenario, 1)
     truth = np.column_stack([deployment[f"truth_field_{axis}"] for axis in "xyz"])
     np.testing.assert_allclose(
@@ -134,8 +129,7 @@ def test_a_calibration_stands_in_for_vehicle_and_instrument(tmp_path: Path) -> N
 
 
 def test_an_unknown_current_moves_the_truth_from_where_the_vehicle_believes_to_be() -> None:
-    telemetry = msgspec.structs.replace(load("demo").telemetry, drift=0.1)
-    deployment = simulate(msgspec.structs.replace(load("demo"), telemetry=telemetry, mission=SHORT), 1)
+    deployment = simulate(load("demo").replace(telemetry={"drift": 0.1}, mission=SHORT), 1)
     off = deployment["truth_latitude"] - deployment["latitude"]
     assert abs(float(off[0])) < 1e-9
     np.testing.assert_allclose(off / off[-1], np.linspace(0, 1, len(off)), atol=1e-6)
@@ -182,17 +176,9 @@ def test_a_missing_scenario_is_named(tmp_path: Path) -> None:
 
 def test_a_log_drives_the_model_to_what_made_the_log() -> None:
     """A simulated deployment's own telemetry, without its noise, gives the deployment again."""
-    quiet = msgspec.structs.replace(load("demo").telemetry, roll_pitch_sigma=0.0, heading_sigma=0.0)
-    scenario = msgspec.structs.replace(
-        load("demo"),
-        telemetry=quiet,
-        instrument=PERFECT,
-        mission=SHORT,
-        vehicle=Twin.draw(load("demo"), 9).vehicle,
-    )
-    scenario = msgspec.structs.replace(
-        scenario, world=msgspec.structs.replace(scenario.world, geology=Geology(sources=0))
-    )
+    quiet, bare = {"roll_pitch_sigma": 0.0, "heading_sigma": 0.0}, {"geology": Geology(sources=0)}
+    scenario = load("demo").replace(telemetry=quiet, world=bare, instrument=PERFECT, mission=SHORT)
+    scenario = scenario.replace(vehicle=Twin.draw(load("demo"), 9).vehicle)
     deployment = simulate(scenario, 9)
     again = simulate_like(deployment, scenario, 9)
     np.testing.assert_allclose(channels(again), channels(deployment), atol=0.1)

@@ -7,7 +7,6 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-import msgspec
 import numpy as np
 from benchmarks.measure import in_own_process, processor_time
 from benchmarks.row import Row
@@ -161,10 +160,8 @@ def _jobs(
 
 def table_1(noise: float = 1.0) -> Observations:
     """Return a random glider's runs of the paper's Table 1; `noise` in nT."""
-    scenario = load("random_glider")
-    instrument = msgspec.structs.replace(scenario.instrument, noise_sigma=noise)
-    deployment = simulate(msgspec.structs.replace(scenario, instrument=instrument), 1)
-    return observations(segments(deployment)["calibration"], NAMES)
+    scenario = load("random_glider").replace(instrument={"noise_sigma": noise})
+    return observations(segments(simulate(scenario, 1))["calibration"], NAMES)
 
 
 def many(count: int) -> Observations:

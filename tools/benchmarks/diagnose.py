@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 import xarray as xr
 from benchmarks.measure import in_own_process
@@ -95,7 +94,7 @@ def long_survey(hours: float, size: float = 0.0) -> tuple[xr.Dataset, Calibratio
     """
     scenario = load("random_glider")
     survey = CrissCross(hours=hours, roll=(1.0, 2.0), pitch=(25.0, 2.5), battery_spread=0.1)
-    scenario = msgspec.structs.replace(scenario, mission=(scenario.mission[0], survey))
+    scenario = scenario.replace(mission=(scenario.mission[0], survey))
     flown, rng = segments(simulate(scenario, 3)), np.random.default_rng(4)
     calibration = fit(observations(flown["calibration"], ["battpos", "ballast"]), "auto").calibration
     log = flown["survey"].drop_vars([name for name in flown["survey"] if str(name).startswith("truth_")])
