@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import xarray as xr
+from commands import Command
 
 from magbridge.cli import main
 from magbridge.field.grid import AnomalyGrid
@@ -36,15 +37,6 @@ def good(runs: xr.Dataset, tmp_path_factory: pytest.TempPathFactory) -> tuple[Pa
     write(runs, folder / "runs.csv")
     assert main(["calibrate", str(folder / "runs.csv"), *PARAMETERS, "-o", str(folder / "cal.json")]) == 0
     return folder / "runs.csv", folder / "cal.json"
-
-
-def one_line(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
-    capsys.readouterr()
-    assert main([str(argument) for argument in arguments]) == 1
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1, said
-    assert said.startswith("magbridge: ")
-    return said
 
 
 def changed(runs: xr.Dataset, **columns: Any) -> xr.Dataset:
@@ -83,58 +75,43 @@ BAD: dict[str, tuple[Callable[[xr.Dataset], xr.Dataset], str]] = {
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_bad_data(case: str, runs: xr.Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_bad_data(case: str, runs: xr.Dataset, command: Command) -> None:
     spoil, words = BAD[case]
-    write(spoil(runs), tmp_path / "bad.csv")
-    assert words in one_line(
-        capsys, "calibrate", tmp_path / "bad.csv", *PARAMETERS, "-o", tmp_path / "cal.json"
-    )
-    assert not (tmp_path / "cal.json").exists()
+    write(spoil(runs), "bad.csv")
+    assert words in command.refuses("calibrate", "bad.csv", *PARAMETERS, "-o", "cal.json")
+    assert not Path("cal.json").exists()
 
 
-def test_a_log_is_known_by_its_file(
-    runs: xr.Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_log_is_known_by_its_file(runs: xr.Dataset, command: Command) -> None:
     """Beside what it says of its own source."""
-    write(runs.drop_vars("mag_x"), tmp_path / "bad.nc")
-    said = one_line(capsys, "calibrate", tmp_path / "bad.nc", *PARAMETERS, "-o", tmp_path / "cal.json")
-    assert said.startswith("magbridge: bad.nc (simulated: demo): column 'mag_x': expected this column")
+    write(runs.drop_vars("mag_x"), "bad.nc")
+    said = command.refuses("calibrate", "bad.nc", *PARAMETERS, "-o", "cal.json")
+    assert said.startswith("bad.nc (simulated: demo): column 'mag_x': expected this column")
 
 
-def test_a_column_of_strings(
-    good: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_column_of_strings(good: tuple[Path, Path], command: Command) -> None:
     head, *rows = good[0].read_text().splitlines()
     place = [name.partition(" ")[0] for name in head.split(",")].index("ballast")
     cells = [row.split(",") for row in rows]
     spoilt = [",".join([*row[:place], "in", *row[place + 1 :]]) for row in cells]
-    (tmp_path / "bad.csv").write_text("\n".join([head, *spoilt, ""]))
-    said = one_line(capsys, "calibrate", tmp_path / "bad.csv", *PARAMETERS, "-o", tmp_path / "cal.json")
-    assert "bad.csv: row 2, column 'ballast': expected a number, not 'in'" in said
+    Path("bad.csv").write_text("\n".join([head, *spoilt, ""]))
+    said = command.refuses("calibrate", "bad.csv", *PARAMETERS, "-o", "cal.json")
+    assert said == "bad.csv: row 2, column 'ballast': expected a number, not 'in'"
 
 
-def test_positions_outside_the_grid(
-    good: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_positions_outside_the_grid(good: tuple[Path, Path], command: Command) -> None:
     axis = np.arange(10.0, 11.0, 0.1)
-    AnomalyGrid(axis, axis, np.zeros((len(axis), len(axis)))).save(tmp_path / "far.nc")
-    said = one_line(
-        capsys, "calibrate", good[0], *PARAMETERS, "--grid", tmp_path / "far.nc", "-o", tmp_path / "cal.json"
-    )
+    AnomalyGrid(axis, axis, np.zeros((len(axis), len(axis)))).save("far.nc")
+    said = command.refuses("calibrate", good[0], *PARAMETERS, "--grid", "far.nc", "-o", "cal.json")
     assert "far.nc" in said
 
 
-def test_a_run_given_twice_counts_once(
-    good: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    again = tmp_path / "again.csv"
-    again.write_bytes(good[0].read_bytes())
-    capsys.readouterr()
-    assert main(["calibrate", str(good[0]), str(again), *PARAMETERS, "-o", str(tmp_path / "cal.json")]) == 0
-    said = capsys.readouterr().err
-    assert f"{again}: identical to {good[0]}; its samples are counted once" in said
+def test_a_run_given_twice_counts_once(good: tuple[Path, Path], command: Command) -> None:
+    Path("again.csv").write_bytes(good[0].read_bytes())
+    said = command("calibrate", good[0], "again.csv", *PARAMETERS, "-o", "cal.json").err
+    assert f"again.csv: identical to {good[0]}; its samples are counted once" in said
     assert "in the logs: 563 duplicate rows" in said
-    once, twice = (json.loads(path.read_text()) for path in (good[1], tmp_path / "cal.json"))
+    once, twice = (json.loads(path.read_text()) for path in (good[1], Path("cal.json")))
     assert once["coefficients"] == twice["coefficients"]
 
 
@@ -149,15 +126,11 @@ def test_a_run_given_twice_counts_once(
     ids=["truncated", "newer", "by hand"],
 )  # fmt: skip
 def test_a_bad_calibration(
-    edit: Callable[[str], str],
-    words: str,
-    good: tuple[Path, Path],
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
+    edit: Callable[[str], str], words: str, good: tuple[Path, Path], command: Command
 ) -> None:
     log, cal = good
-    (tmp_path / "bad.json").write_text(edit(cal.read_text()))
-    said = one_line(capsys, "correct", log, "--calibration", tmp_path / "bad.json", "-o", tmp_path / "x.csv")
+    Path("bad.json").write_text(edit(cal.read_text()))
+    said = command.refuses("correct", log, "--calibration", "bad.json", "-o", "x.csv")
     assert words in said
     assert "bad.json" in said
-    assert not (tmp_path / "x.csv").exists()
+    assert not Path("x.csv").exists()

@@ -1,4 +1,4 @@
-"""A deployment and a calibration for every command, in a folder of its own."""
+"""A deployment and a calibration for every command."""
 
 from __future__ import annotations
 
@@ -9,13 +9,6 @@ import pytest
 from magbridge.cli import main
 from magbridge.logs import write
 from sitl import load, simulate
-
-
-@pytest.fixture(autouse=True)
-def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The folder in which a command runs: empty."""
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
 
 
 @pytest.fixture(scope="session")

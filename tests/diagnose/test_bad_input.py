@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
+from commands import Command
 
 from magbridge.calibration.file import save
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.observe import observations
 from magbridge.calibration.model import Calibration, Sensor
-from magbridge.cli import main
 from magbridge.diagnose.compare.take import take
 from magbridge.diagnose.diagnosis import Diagnosis
 from magbridge.diagnose.report import files
@@ -193,12 +193,10 @@ def test_another_magnetometer_is_no_telemetry(plain: tuple[xr.Dataset, Calibrati
 
 
 def test_the_command_line_says_it_in_one_line(
-    plain: tuple[xr.Dataset, Calibration], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    plain: tuple[xr.Dataset, Calibration], command: Command
 ) -> None:
-    save(plain[1], tmp_path / "cal.json")
-    write(plain[0].isel(time=slice(0, 3)), tmp_path / "three.nc")
-    arguments = ["diagnose", str(tmp_path / "three.nc"), "--calibration", str(tmp_path / "cal.json")]
-    assert main([*arguments, "-o", str(tmp_path / "out")]) == 1
-    said = capsys.readouterr().err
-    assert said == "magbridge: three.nc (simulated: demo): 3 samples, at least 60 needed\n"
-    assert not (tmp_path / "out").exists()
+    save(plain[1], "cal.json")
+    write(plain[0].isel(time=slice(0, 3)), "three.nc")
+    said = command.refuses("diagnose", "three.nc", "--calibration", "cal.json", "-o", "out")
+    assert said == "three.nc (simulated: demo): 3 samples, at least 60 needed"
+    assert not Path("out").exists()

@@ -55,9 +55,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory, grid: AnomalyGrid, options:
     return path
 
 
-@pytest.fixture(autouse=True)
-def here(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture
+def here(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(folder)
+    return folder
 
 
 def test_a_log_against_its_map(command: Command) -> None:
