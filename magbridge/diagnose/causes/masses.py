@@ -12,7 +12,6 @@ import numpy as np
 from magbridge.calibration.mass_effects import MonomialEffect, PlayEffect, PowersEffect, SourcesEffect
 from magbridge.calibration.terms import Polynomial, full_order
 from magbridge.diagnose.causes.candidates import AXES, Candidate, of_effect, per
-from magbridge.diagnose.causes.channels import channels_of, extent
 from magbridge.diagnose.causes.regressors import play, powers
 from magbridge.diagnose.compare.arrays import FloatArray
 from magbridge.diagnose.compare.problem import Problem
@@ -35,8 +34,8 @@ def unmodelled_actuator(problem: Problem) -> list[Candidate]:
     See :mod:`~magbridge.calibration.dipole`.
     """
     made = []
-    for name in channels_of(problem, "position"):
-        low, high = extent(problem, name)
+    for name in problem.channels_of("position"):
+        low, high = problem.survey.channels[name].extent
         scale = 0.5 * (high - low)
         step = f"{scale:.3g} {problem.survey.channels[name].unit}".rstrip()
         centres = [0.5 * (low + high)] if problem.survey.learned.any() else [0.5 * (low + high), low, high]
@@ -77,13 +76,13 @@ def actuator_order(problem: Problem) -> list[Candidate]:
     missing = [e for e in full_order(len(calibration.parameters), highest + 1) if e not in present]
     made = [_monomial(problem, e) for e in missing]
     whole = [replace(reduce(Candidate.with_, made), parts=())] if 1 < len(missing) <= MANY else []
-    moved = [p.name for p in calibration.parameters if np.ptp(extent(problem, p.name)) > 0.0]
+    moved = [p.name for p in calibration.parameters if np.ptp(problem.survey.channels[p.name].extent) > 0.0]
     return [*made, *whole, *(_sources(problem, name, near) for name in moved for near in NEAR)]
 
 
 def _sources(problem: Problem, name: str, near: float) -> Candidate:
     """Return sources all along one mass' path, and a little beyond its ends."""
-    low, high = extent(problem, name)
+    low, high = problem.survey.channels[name].extent
     channel, scale = problem.survey.channels[name], 0.5 * near * (high - low)
     gaps = int(np.ceil(2.0 / (APART * near)))
     centre = 0.5 * (low + high - gaps * APART * scale)
@@ -134,7 +133,7 @@ def hysteresis(problem: Problem) -> list[Candidate]:
     return [
         made
         for name in names
-        if np.ptp(extent(problem, name)) > 0.0
+        if np.ptp(problem.survey.channels[name].extent) > 0.0
         for made in _plays(problem, name, shapes)
     ]
 
@@ -144,7 +143,7 @@ def _plays(problem: Problem, name: str, shapes: Sequence[tuple[float, float, flo
 
     In `shapes`, widths are in units of its whole travel, centres (from the middle) and scales of half of it.
     """
-    low, high = extent(problem, name)
+    low, high = problem.survey.channels[name].extent
     middle, half = 0.5 * (low + high), 0.5 * (high - low)
     channel = problem.survey.channels[name]
     p, unit = channel.values, channel.unit

@@ -10,7 +10,6 @@ import numpy as np
 
 from magbridge.calibration.effects import ChannelEffect
 from magbridge.diagnose.causes.candidates import Candidate, of_effect
-from magbridge.diagnose.causes.channels import channels_of, extent
 from magbridge.diagnose.causes.regressors import lagged, once
 from magbridge.diagnose.compare.arrays import FloatArray
 from magbridge.diagnose.compare.problem import Problem
@@ -26,7 +25,7 @@ temperature in the centre of a slab one lag misses 10 to 30 %, two in series mis
 
 def _origins(problem: Problem, name: str) -> list[float]:
     """Return values that the channel may have had when the vehicle was calibrated."""
-    low, high = extent(problem, name)
+    low, high = problem.survey.channels[name].extent
     middle = float(np.mean(problem.survey.channels[name].values))
     if problem.survey.learned.any():  # the values during the calibration are in the data
         return [middle]
@@ -38,7 +37,7 @@ def _levels(problem: Problem) -> Callable[[str, float], Callable[[slice], FloatA
     """Return the lagged temperatures, cached: origins and causes share them, each of 5 MB for a month."""
     survey = problem.survey  # a cache that referred to the problem would keep it alive
 
-    @lru_cache(len(LAGS) * len(channels_of(problem, "temperature")))
+    @lru_cache(len(LAGS) * len(problem.channels_of("temperature")))
     def level(name: str, lag: float) -> Callable[[slice], FloatArray]:
         values = lagged(survey.time, survey.channels[name].values, lag, STAGES)
         return lambda rows: values[None, rows]
@@ -49,7 +48,7 @@ def _levels(problem: Problem) -> Callable[[str, float], Callable[[slice], FloatA
 def _thermal(problem: Problem, on: Literal["offset", "scale"]) -> list[Candidate]:
     longest = 2.0 * float(np.ptp(problem.survey.time))
     lags = [lag for lag in LAGS if lag <= longest]
-    return [c for name in channels_of(problem, "temperature") for c in _warmed(problem, on, name, lags)]
+    return [c for name in problem.channels_of("temperature") for c in _warmed(problem, on, name, lags)]
 
 
 def _warmed(
@@ -106,8 +105,8 @@ def pressure_offset(problem: Problem) -> list[Candidate]:
 def _proportional(problem: Problem, cause: str, kind: str, largest: float) -> list[Candidate]:
     """``T += b c(t)`` for every channel c of a kind; plausible are `largest` nT at the channel's extreme."""
     made = []
-    for name in channels_of(problem, kind):
-        low, high = extent(problem, name)
+    for name in problem.channels_of(kind):
+        low, high = problem.survey.channels[name].extent
         effect = ChannelEffect(cause=cause, channel=name)
         of = problem.survey.channels[name].unit
         unit = f"nT/{of}" if of else "nT per 1"

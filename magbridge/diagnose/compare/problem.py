@@ -92,6 +92,11 @@ class Problem:
     def __len__(self) -> int:
         return len(self.residual)
 
+    def channels_of(self, kind: str) -> list[str]:
+        """Name the channels that may be of this kind, but for the calibration's own parameters."""
+        own = {parameter.name for parameter in self.calibration.parameters}
+        return [name for name, c in self.survey.channels.items() if kind in c.kinds and name not in own]
+
     @cached_property
     def free(self) -> FloatArray:
         """(n, q) ``-de/dz``; the delays' are :attr:`late`."""

@@ -46,6 +46,11 @@ class Channel(NamedTuple):
     unit: str
     kinds: tuple[str, ...]
 
+    @property
+    def extent(self) -> tuple[float, float]:
+        """Its smallest and its largest value."""
+        return float(self.values.min()), float(self.values.max())
+
 
 @dataclass(frozen=True, eq=False)
 class Survey:
