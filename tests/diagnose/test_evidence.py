@@ -17,6 +17,15 @@ def sized(cause: str, size: int = 1, **more: object) -> Candidate:
     return candidate(cause, np.zeros((1, size)), **more)
 
 
+def test_evidence_asks_its_price() -> None:
+    """Of many ratios at once, or of one; where nothing is free there is none."""
+    np.testing.assert_allclose(
+        log_bayes(np.array([2.0, 3.0, 60.0]), 3), [0.0, 0.0, 28.5 - 1.5 * np.log(20.0)]
+    )
+    assert log_bayes(60.0, 3) < log_bayes(60.0, 1)
+    assert log_bayes(60.0, 0) == 0.0
+
+
 def test_what_cannot_be_negative_has_twice_the_prior_where_it_is() -> None:
     """Against the integral over half a Gaussian of the size that the data like best."""
     estimate = 1.8

@@ -227,11 +227,6 @@ def test_a_detector_that_needs_more_is_told_by_its_p_values() -> None:
     assert low <= factor <= high < low + 0.02
 
 
-def test_evidence_asks_its_price() -> None:
-    assert log_bayes(np.array([3.0]), 3) == pytest.approx(0.0)
-    assert log_bayes(np.array([60.0]), 3) < log_bayes(np.array([60.0]), 1)
-
-
 def test_a_share_tells_its_interval() -> None:
     rows = [{"k": k} for k in range(100)]
     assert share(rows, lambda r: r["k"] < 1) == "1.0 % (0.0-5.4) | 1/100"
