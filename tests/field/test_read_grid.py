@@ -23,57 +23,35 @@ LON, LAT = np.linspace(10.0, 10.5, 11), np.linspace(54.0, 54.4, 9)
 MAP = 30 * np.sin(np.meshgrid(LON, LAT)[0] * 9) + 100 * (np.meshgrid(LON, LAT)[1] - 54)
 
 
+def lines(values: np.ndarray, delimiter: str = " ") -> str:
+    return "\n".join(delimiter.join(f"{v:.9g}" for v in row) for row in values)
+
+
 def surfer_text(path: Path) -> None:
     head = f"DSAA\n{LON.size} {LAT.size}\n{LON[0]} {LON[-1]}\n{LAT[0]} {LAT[-1]}\n{MAP.min()} {MAP.max()}\n"
-    path.write_text(head + "\n".join(" ".join(f"{v:.9g}" for v in row) for row in MAP))
+    path.write_text(head + lines(MAP))
 
 
 def surfer_6(path: Path) -> None:
-    head = struct.pack(
-        "<4s2h6d", b"DSBB", LON.size, LAT.size, LON[0], LON[-1], LAT[0], LAT[-1], MAP.min(), MAP.max()
-    )
-    path.write_bytes(head + MAP.astype("<f4").tobytes())
+    limits = LON[0], LON[-1], LAT[0], LAT[-1], MAP.min(), MAP.max()
+    path.write_bytes(struct.pack("<4s2h6d", b"DSBB", *MAP.shape[::-1], *limits) + MAP.astype("<f4").tobytes())
 
 
 def surfer_7(path: Path) -> None:
-    step = LON[1] - LON[0], LAT[1] - LAT[0]
-    grid = struct.pack(
-        "<2i8d", LAT.size, LON.size, LON[0], LAT[0], *step, MAP.min(), MAP.max(), 0.0, 1.70141e38
-    )
-    data = MAP.astype("<f8").tobytes()
-    path.write_bytes(
-        b"DSRB"
-        + struct.pack("<2i", 4, 2)
-        + b"GRID"
-        + struct.pack("<i", len(grid))
-        + grid
-        + b"DATA"
-        + struct.pack("<i", len(data))
-        + data
-    )
+    numbers = LON[0], LAT[0], LON[1] - LON[0], LAT[1] - LAT[0], MAP.min(), MAP.max(), 0.0, 1.70141e38
+    grid, data = struct.pack("<2i8d", *MAP.shape, *numbers), MAP.astype("<f8").tobytes()
+    sections = (b"DSRB", struct.pack("<i", 2)), (b"GRID", grid), (b"DATA", data)
+    path.write_bytes(b"".join(tag + struct.pack("<i", len(body)) + body for tag, body in sections))
 
 
 def esri(path: Path) -> None:
-    head = (
-        f"ncols {LON.size}\n"
-        f"nrows {LAT.size}\n"
-        f"xllcenter {LON[0]}\n"
-        f"yllcenter {LAT[0]}\n"
-        "cellsize 0.05\n"
-        "NODATA_value -9999\n"
-    )
-    path.write_text(head + "\n".join(" ".join(f"{v:.9g}" for v in row) for row in MAP[::-1]))
+    head = f"ncols {LON.size}\nnrows {LAT.size}\nxllcenter {LON[0]}\nyllcenter {LAT[0]}\ncellsize 0.05\n"
+    path.write_text(head + "NODATA_value -9999\n" + lines(MAP[::-1]))
 
 
 def esri_corner(path: Path) -> None:
-    head = (
-        f"NCOLS {LON.size}\n"
-        f"NROWS {LAT.size}\n"
-        f"XLLCORNER {LON[0] - 0.025}\n"
-        f"YLLCORNER {LAT[0] - 0.025}\n"
-        "CELLSIZE 0.05\n"
-    )
-    path.write_text(head + "\n".join(" ".join(f"{v:.9g}" for v in row) for row in MAP[::-1]))
+    corner = f"XLLCORNER {LON[0] - 0.025}\nYLLCORNER {LAT[0] - 0.025}"
+    path.write_text(f"NCOLS {LON.size}\nNROWS {LAT.size}\n{corner}\nCELLSIZE 0.05\n{lines(MAP[::-1])}")
 
 
 def table(
@@ -82,7 +60,7 @@ def table(
     x, y = np.meshgrid(LON, LAT)
     rows = np.column_stack([x.ravel(), y.ravel(), MAP.ravel() * scale])
     np.random.default_rng(0).shuffle(rows)
-    path.write_text(header + "\n".join(delimiter.join(f"{v:.9g}" for v in row) for row in rows))
+    path.write_text(header + lines(rows, delimiter))
 
 
 def geotiff(path: Path) -> None:
@@ -239,20 +217,16 @@ def test_a_polygon_may_have_a_header(tmp_path: Path) -> None:
     corners = "10.1,54.1\n10.4,54.1\n10.2,54.3\n"
     for text in (corners, "\ufefflongitude,latitude\n" + corners):
         (tmp_path / "mask.csv").write_text(text, encoding="utf-8")
-        np.testing.assert_array_equal(
-            read_polygon(tmp_path / "mask.csv"), [[10.1, 54.1], [10.4, 54.1], [10.2, 54.3]]
-        )
-    (tmp_path / "mask.csv").write_text("place,longitude,latitude\n")
-    with pytest.raises(
-        FormatError, match=r"mask.csv: row 1: expected longitude,latitude \(deg\), not .place"
+        polygon = read_polygon(tmp_path / "mask.csv")
+        np.testing.assert_array_equal(polygon, [[10.1, 54.1], [10.4, 54.1], [10.2, 54.3]])
+    for text, words in (
+        ("place,longitude,latitude\n", r"mask.csv: row 1: expected longitude,latitude \(deg\), not .place"),
+        (corners + "10.2,nan\n", r"mask.csv: row 4: expected .* not '10.2,nan'"),
+        (corners[:10], "at least three rows"),
     ):
-        read_polygon(tmp_path / "mask.csv")
-    (tmp_path / "mask.csv").write_text(corners + "10.2,nan\n")
-    with pytest.raises(FormatError, match=r"mask.csv: row 4: expected .* not '10.2,nan'"):
-        read_polygon(tmp_path / "mask.csv")
-    (tmp_path / "mask.csv").write_text(corners[:10])
-    with pytest.raises(FormatError, match="at least three rows"):
-        read_polygon(tmp_path / "mask.csv")
+        (tmp_path / "mask.csv").write_text(text)
+        with pytest.raises(FormatError, match=words):
+            read_polygon(tmp_path / "mask.csv")
 
 
 @given(
