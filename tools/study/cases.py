@@ -40,7 +40,7 @@ NAMELESS = ("unknown", "seen", "foreign")
 """Parts in which the hidden effect is not among the causes of the table."""
 PREDICTED = ("named", "ladder", "pair", *NAMELESS)
 """Parts for which theory predicts the outcome."""
-STRANGE = ("accumulator", "modem", "rezero", "pipeline")
+STRANGE = ("backdriven", "microphonic", "soliton", "escort")
 """Foreign effects made after the detector was frozen; its descriptions were not designed for them either."""
 SEEN = (
     "pan", "loose", "corrosion", "pulsation", "needle", "thermostat", "perming", "staircase", "swell",
@@ -52,6 +52,7 @@ SEEN = (
     "gradient", "squeezed", "flare", "swarf",
     "ageing", "crossfield", "railway", "rudder",
     "latch", "recovery", "clamp", "seiche",
+    "accumulator", "modem", "rezero", "pipeline",
 )  # fmt: skip
 """Foreign effects that were once made for this purpose, but before the detector was last improved."""
 GOLDEN = 0.6180339887498949

@@ -75,5 +75,9 @@ FOREIGN: dict[str, Effect] = {
     "modem": vehicle.modem,
     "rezero": sensor.rezero,
     "pipeline": surroundings.pipeline,
+    "backdriven": vehicle.backdriven,
+    "microphonic": sensor.microphonic,
+    "soliton": surroundings.soliton,
+    "escort": surroundings.escort,
 }
 """Effect, by its name."""

@@ -183,3 +183,12 @@ def rezero(scene: Scene, size: float, rng: Generator) -> None:
     every = round(rng.uniform(1800.0, 7200.0) / scene.track.step)
     zeroed = np.arange(len(warm)) // every * every
     scene.add(warm - warm[zeroed], size * direction(rng))
+
+
+def microphonic(scene: Scene, size: float, rng: Generator) -> None:
+    """Stressed cores rectify the pump's vibration, which is louder against pressure; size in nT at most."""
+    step, depth = scene.track.step, scene.track.depth / scene.track.depth.max()
+    pumps = (np.abs(np.gradient(scene.track.parameters["ballast"], step)) > 1.0).astype(float)
+    loud = pumps * (rng.uniform(0.05, 0.3) + depth) ** 2
+    rung = first_order(loud, step, float(rng.uniform(1.0, 10.0)))
+    scene.add(rung / max(rung.max(), 1e-9), size * direction(rng))

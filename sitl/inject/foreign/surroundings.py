@@ -154,6 +154,38 @@ def pipeline(scene: Scene, size: float, rng: Generator) -> None:
     scene.earth = scene.earth + size * flows[:, None] * _around(aside, above, across)
 
 
+def soliton(scene: Scene, size: float, rng: Generator) -> None:
+    """Trains of internal waves run along the thermocline and carry the Earth's field; size in nT.
+
+    In a train the first wave is the highest (Apel 2003); each moves the water above the thermocline one way
+    and that below the other.
+    """
+    depth = scene.track.depth
+    middle, thick = rng.uniform(0.2, 0.5) * depth.max(), rng.uniform(5.0, 20.0)
+    moved = np.zeros_like(scene.t)
+    for _ in range(int(rng.integers(2, 5))):
+        t0, apart, width = (
+            rng.uniform(0.0, 1.0) * scene.t[-1],
+            rng.uniform(400.0, 1200.0),
+            rng.uniform(60.0, 200.0),
+        )
+        for n in range(int(rng.integers(3, 7))):
+            moved += 0.75**n / np.cosh(np.clip((scene.t - t0 - n * apart) / width, -30.0, 30.0)) ** 2
+    shear = np.tanh((middle - depth) / thick)
+    scene.earth = scene.earth + size * np.outer(moved * shear, direction(rng))
+
+
+def escort(scene: Scene, size: float, rng: Generator) -> None:
+    """A boat of steel stands by where the vehicle surfaces, never in the same place; size in nT."""
+    depth = scene.track.depth
+    down = depth > 0.5 * depth.max()
+    dive = np.cumsum(np.diff(down, prepend=False) & down)
+    north, east = 15.0 * rng.normal(size=(2, dive[-1] + 1))[:, dive]
+    away = np.column_stack([north, east, depth + rng.uniform(5.0, 15.0)])
+    own = dipole_field(away, np.broadcast_to(direction(rng), away.shape))
+    scene.earth = scene.earth + size * own / np.linalg.norm(own, axis=1).max()
+
+
 def _cable(scene: Scene, rng: Generator) -> tuple[Array, Array, Array]:
     """Lay a straight cable below the track: m aside and above (n,), and north-east-down across it."""
     track = scene.track

@@ -309,3 +309,18 @@ def modem(scene: Scene, size: float, rng: Generator) -> None:
     heard = away < np.quantile(away, rng.uniform(0.3, 0.6))
     talks = (scene.t / rng.uniform(60.0, 240.0)) % 1.0 < rng.uniform(0.2, 0.6)
     scene.add((heard & talks).astype(float), size * direction(rng))
+
+
+def backdriven(scene: Scene, size: float, rng: Generator) -> None:
+    """The battery's weight creeps its screw back while no move holds it; size in inches an hour at 1 g.
+
+    The encoder, on the motor's side of the clutch, does not see that. Each move takes up what has crept.
+    """
+    place, step = scene.track.parameters["battpos"], scene.track.step
+    moves = np.abs(np.gradient(place, step)) > 1e-6
+    downhill = np.sin(np.radians(scene.track.pitch)) * rng.uniform(0.7, 1.3)
+    crept, off = np.empty(len(place)), 0.0
+    for k, pull in enumerate(downhill):
+        off = 0.0 if moves[k] else off + pull * step / 3600.0
+        crept[k] = off
+    scene.logged["battpos"] = (place - size * crept, "in")
