@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import numpy as np
 from msgspec import Meta
+from numpy.polynomial.legendre import leg2poly
 from numpy.typing import NDArray
 
 from magbridge.calibration.effects import MAX_INTERVAL, SingleChannelEffect, offsets, powers
@@ -123,18 +124,24 @@ class SourcesEffect(PathEffect, frozen=True, kw_only=True):
 
 
 class MonomialEffect(Effect, frozen=True, kw_only=True):
-    """A monomial of the calibration's own positions that its terms lack: ``T += c prod_k x_k^e_k``.
+    """What the calibration's own positions do beyond its terms: ``T += c prod_k P_e_k(x_k)``.
+
+    P_e is Legendre's polynomial of degree e: of x^e it is what a fit of all lower powers leaves, over the
+    travel that the calibration saw.
 
     Attributes
     ----------
     cause : str
     exponents : tuple of int
         One for each parameter, of positions scaled as the calibration scales them.
+    legendre : bool
+        False, as in older files: ``x_k^e_k`` in place of P.
     """
 
     kind: ClassVar[str] = "monomial"
     cause: str
     exponents: Exponents
+    legendre: bool = False
 
     @property
     def size(self) -> int:
@@ -154,16 +161,22 @@ class MonomialEffect(Effect, frozen=True, kw_only=True):
 
     def begin(self, calibration: Calibration) -> Step:
         """Return a stepper; it has no state."""
+        polynomials = [[0.0] * e + [1.0] for e in self.exponents]
+        if self.legendre:
+            polynomials = [leg2poly(p).tolist() for p in polynomials]
         factors = [
-            (k, parameter.centre, parameter.scale)
-            for k, parameter in enumerate(calibration.parameters)
-            for _ in range(self.exponents[k])
+            (k, parameter.centre, parameter.scale, p[::-1])
+            for k, (parameter, p) in enumerate(zip(calibration.parameters, polynomials, strict=True))
+            if self.exponents[k]
         ]
 
         def step(time_us: int, hx: float, hy: float, hz: float, values: Sequence[float]) -> tuple[float]:
             product = 1.0
-            for k, centre, scale in factors:
-                product *= (values[k] - centre) / scale
+            for k, centre, scale, polynomial in factors:
+                x, value = (values[k] - centre) / scale, 0.0
+                for c in polynomial:  # the highest power first
+                    value = value * x + c
+                product *= value
             return (product,)
 
         return step

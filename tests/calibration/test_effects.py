@@ -88,6 +88,8 @@ def test_a_product_of_positions() -> None:
     p = np.array([-0.5, 0.0, 2.0])
     got = stepped(MonomialEffect(cause="", exponents=(3,)), np.arange(3.0), p)
     np.testing.assert_allclose(got[:, 0], p**3)
+    got = stepped(MonomialEffect(cause="", exponents=(3,), legendre=True), np.arange(3.0), p)
+    np.testing.assert_allclose(got[:, 0], (5.0 * p**3 - 3.0 * p) / 2.0)
     for exponents in ((-1,), (HIGHEST + 1,), (1, 1), ()):
         with pytest.raises(CalibrationError, match="monomial: expected"):
             with_effect(MonomialEffect(cause="", exponents=exponents))

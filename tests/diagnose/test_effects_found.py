@@ -33,6 +33,7 @@ EFFECTS: list[Effect] = [
     PowersEffect(cause="unmodelled_actuator", channel="heat", centre=3.0, scale=2.0, order=3),
     SourcesEffect(cause="actuator_order", channel="p", centre=-1.1, scale=0.2, apart=1.25, count=12),
     MonomialEffect(cause="actuator_order", exponents=(4,)),
+    MonomialEffect(cause="actuator_order", exponents=(4,), legendre=True),
     PlayEffect(cause="hysteresis", channel="p", width=0.3, centre=0.1, scale=0.5),
     PlayEffect(cause="hysteresis", channel="p", width=0.3, centre=0.1, scale=0.5, order=3),
     ClockEffect(),

@@ -252,6 +252,24 @@ def test_sources_along_its_way_hold_the_field_of_iron_that_a_mass_passes(problem
         assert min(beyond(columns, field) for columns in listed) < min(0.2, 0.4 * next_power)
 
 
+def test_the_next_order_is_what_a_fit_of_the_lower_ones_has_left(problem: Problem) -> None:
+    """Of a mass whose own field has changed since, all orders together hold what that one misses."""
+    own, x = problem.calibration.parameters[0], np.linspace(-1.0, 1.0, len(problem))
+    values = own.centre + own.scale * x
+    channels = problem.survey.channels | {"p": problem.survey.channels["p"]._replace(values=values)}
+    problem = replace(problem, survey=replace(problem.survey, channels=channels))
+    term, changed, *_ = (c.columns(slice(0, len(x))) for c in actuator_order(problem))
+    slopes = problem.slopes[:, 6:]
+    left = x**3 - np.polyval(np.polyfit(x, x**3, 2), x)
+    np.testing.assert_allclose(term, term[-1] / slopes[-1] * slopes * (left / left[-1])[:, None], atol=1.0)
+    field = slopes @ [3.0, -2.0, 1.0] / (4.0 + x) ** 3
+
+    def missed(columns: np.ndarray) -> float:
+        return float(np.linalg.norm(field - columns @ np.linalg.lstsq(columns, field, rcond=1e-9)[0]))
+
+    assert missed(np.hstack([slopes, changed])) < 0.02 * missed(np.hstack([slopes, term]))
+
+
 def test_a_core_that_shows_through_changes_the_sensitivity_too(problem: Problem) -> None:
     """A feedback of finite gain leaves the core the field that its output takes: not flat at zero."""
     shown = np.einsum("ni,ni->n", problem.slopes[:, 6:], np.arctanh(0.8 * problem.reading / 5e4))

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
-from functools import partial, reduce
+from functools import reduce
 from itertools import product
 
 import numpy as np
+from scipy.special import eval_legendre
 
 from magbridge.calibration.mass_effects import MonomialEffect, PlayEffect, PowersEffect, SourcesEffect
 from magbridge.calibration.terms import Polynomial, full_order
@@ -18,8 +18,6 @@ from magbridge.diagnose.compare.problem import Problem
 
 __all__ = ["actuator_order", "hysteresis", "unmodelled_actuator"]
 
-MANY = 12
-"""Most missing monomials that are tried together."""
 NEAR = (0.25, 0.5)
 """Distances of sources from a mass' path that are tried, in half travels; nearer iron would be struck."""
 APART = 1.25
@@ -37,47 +35,54 @@ def unmodelled_actuator(problem: Problem) -> list[Candidate]:
     for name in problem.channels_of("position"):
         low, high = problem.survey.channels[name].extent
         scale = 0.5 * (high - low)
-        step = f"{scale:.3g} {problem.survey.channels[name].unit}".rstrip()
         centres = [0.5 * (low + high)] if problem.survey.learned.any() else [0.5 * (low + high), low, high]
         for order, centre in product((1, 2, 3), centres):
             effect = PowersEffect(
                 cause="unmodelled_actuator", channel=name, centre=centre, scale=scale, order=order
             )
-            width = np.repeat(100.0 * 0.3 ** np.arange(order), 3)
-            made.append(
-                of_effect(
-                    problem,
-                    effect,
-                    width,
-                    [per(step, power) for power in range(1, order + 1)],
-                    channel=name,
-                    phi=partial(_powers, problem.survey.channels[name].values, centre, scale, order),
-                )
-            )
+            made.append(_series(problem, effect, channel=name))
     return made
 
 
-def _powers(values: FloatArray, centre: float, scale: float, order: int, rows: slice) -> FloatArray:
-    return powers((values[rows] - centre) / scale, order)
+def _series(problem: Problem, effect: PowersEffect, channel: str | None = None) -> Candidate:
+    """Return the powers of a mass' position."""
+    order, centre, scale = effect.order, effect.centre, effect.scale
+    moved = problem.survey.channels[effect.channel]
+    step = f"{scale:.3g} {moved.unit}".rstrip()
+    return of_effect(
+        problem,
+        effect,
+        np.repeat(100.0 * 0.3 ** np.arange(order), 3),
+        [per(step, power) for power in range(1, order + 1)],
+        channel=channel,
+        phi=lambda rows: powers((moved.values[rows] - centre) / scale, order),
+    )
 
 
 def actuator_order(problem: Problem) -> list[Candidate]:
-    """A mass needs what its polynomial lacks: a term ``T += b prod x_k^e_k``, or sources near its way.
+    """A mass needs what its polynomial lacks: a term ``T += b prod P_e_k(x_k)``, or sources near its way.
 
-    Candidates are each missing term up to the next order (paper, eq. 8), all of them together, and a row of
-    sources (:class:`~magbridge.calibration.mass_effects.SourcesEffect`): of a mass that passes close to iron
-    no polynomial of a low order follows the field. The sources have one common size.
+    Candidates are each missing term up to the next order (paper, eq. 8), as a Legendre polynomial, since the
+    calibration has absorbed the lower orders; all orders of one mass together, if its field has changed
+    since; and a row of sources (:class:`~magbridge.calibration.mass_effects.SourcesEffect`): of a mass that
+    passes close to iron no polynomial of a low order follows the field. The sources have one common size.
     """
     calibration = problem.calibration
     if not calibration.parameters:
         return []
     present = {e for term in calibration.terms if isinstance(term, Polynomial) for e in term.exponents}
-    highest = max(sum(e) for e in present)
-    missing = [e for e in full_order(len(calibration.parameters), highest + 1) if e not in present]
-    made = [_monomial(problem, e) for e in missing]
-    whole = [replace(reduce(Candidate.with_, made), parts=())] if 1 < len(missing) <= MANY else []
-    moved = [p.name for p in calibration.parameters if np.ptp(problem.survey.channels[p.name].extent) > 0.0]
-    return [*made, *whole, *(_sources(problem, name, near) for name in moved for near in NEAR)]
+    order = max(sum(e) for e in present) + 1
+    missing = [e for e in full_order(len(calibration.parameters), order) if e not in present]
+    moved = [p for p in calibration.parameters if np.ptp(problem.survey.channels[p.name].extent) > 0.0]
+    changed = [
+        PowersEffect(cause="actuator_order", channel=p.name, centre=p.centre, scale=p.scale, order=order)
+        for p in moved
+    ]
+    return [
+        *(_term(problem, e) for e in missing),
+        *(_series(problem, effect) for effect in changed),
+        *(_sources(problem, p.name, near) for p in moved for near in NEAR),
+    ]
 
 
 def _sources(problem: Problem, name: str, near: float) -> Candidate:
@@ -99,21 +104,14 @@ def _sources(problem: Problem, name: str, near: float) -> Candidate:
     return of_effect(problem, effect, 50.0, "nT", names=names, phi=phi, spectra=np.ones((1, effect.size)))
 
 
-def _monomial(problem: Problem, exponents: tuple[int, ...]) -> Candidate:
-    label = " ".join(
-        f"{p.name}^{e}" if e > 1 else p.name
-        for p, e in zip(problem.calibration.parameters, exponents, strict=True)
-        if e
-    )
-    effect = MonomialEffect(cause="actuator_order", exponents=exponents)
-    factors = [
-        (problem.survey.channels[p.name].values, p.centre, p.scale, e)
-        for p, e in zip(problem.calibration.parameters, exponents, strict=True)
-        if e
-    ]
+def _term(problem: Problem, exponents: tuple[int, ...]) -> Candidate:
+    own = [(p, e) for p, e in zip(problem.calibration.parameters, exponents, strict=True) if e]
+    label = " ".join(f"P{e}({p.name})" for p, e in own)
+    effect = MonomialEffect(cause="actuator_order", exponents=exponents, legendre=True)
+    factors = [(problem.survey.channels[p.name].values, p.centre, p.scale, e) for p, e in own]
 
     def phi(rows: slice) -> FloatArray:
-        product = [powers((values[rows] - centre) / scale, e)[-1] for values, centre, scale, e in factors]
+        product = [eval_legendre(e, (values[rows] - centre) / scale) for values, centre, scale, e in factors]
         return np.asarray(reduce(np.multiply, product)[None])
 
     return of_effect(problem, effect, 50.0, "nT", names=tuple(f"{axis} {label}" for axis in AXES), phi=phi)
