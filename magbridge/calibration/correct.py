@@ -91,7 +91,7 @@ class Corrector:
         self._prepared: Prepared = [], []
         self._weights: list[list[float]] = self._kernel.weights.T.tolist()
         self._positions = len(calibration.parameters)
-        self._asked: tuple[tuple[float, ...], list[Span]] = (), []
+        self._asked: tuple[tuple[float, ...], Sequence[Span]] = (), ()
         self._ends: list[tuple[int, int]] = []
         self._there: list[list[float]] = []
 
@@ -161,16 +161,21 @@ class Corrector:
             Index of a channel, and the two values between which it lies. Spans of channels that are no
             positions are left out of the result.
         """
-        asked = values[: self._positions], [span for span in spans if span[0] < self._positions]
+        positions = values[: self._positions]
+        asked = positions, spans
         if asked != self._asked:
-            self._asked = positions, moved = asked
-            places: dict[tuple[float, ...], int] = {}  # the present ones end most spans
+            self._asked = asked
+            places: dict[tuple[float, ...], int] = {}  # each once: most spans share an end
 
             def place(index: int, value: float) -> int:
                 return places.setdefault((*positions[:index], value, *positions[index + 1 :]), len(places))
 
-            self._ends = [(place(index, low), place(index, high)) for index, low, high in moved]
-            self._there = [self._linear_at(positions) for positions in places]
+            self._ends = [
+                (place(index, low), place(index, high))
+                for index, low, high in spans
+                if index < self._positions
+            ]
+            self._there = [self._linear_at(there) for there in places]
         totals = [_total(field, linear) for linear in self._there]
         return [totals[high] - totals[low] for low, high in self._ends]
 
