@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "ClockEffect",
-    "MonomialEffect",
+    "LegendreEffect",
     "PlayEffect",
     "PowersEffect",
     "SourcesEffect",
@@ -123,7 +123,7 @@ class SourcesEffect(PathEffect, frozen=True, kw_only=True):
         return tuple((1.0 + (x - self.apart * k) ** 2) ** -1.5 for k in range(self.count))
 
 
-class MonomialEffect(Effect, frozen=True, kw_only=True):
+class LegendreEffect(Effect, frozen=True, kw_only=True):
     """What the calibration's own positions do beyond its terms: ``T += c prod_k P_e_k(x_k)``.
 
     P_e is Legendre's polynomial of degree e: of x^e it is what a fit of all lower powers leaves, over the
@@ -133,15 +133,12 @@ class MonomialEffect(Effect, frozen=True, kw_only=True):
     ----------
     cause : str
     exponents : tuple of int
-        One for each parameter, of positions scaled as the calibration scales them.
-    legendre : bool
-        False, as in older files: ``x_k^e_k`` in place of P.
+        Degrees, one for each parameter, of positions scaled as the calibration scales them.
     """
 
-    kind: ClassVar[str] = "monomial"
+    kind: ClassVar[str] = "legendre"
     cause: str
     exponents: Exponents
-    legendre: bool = False
 
     @property
     def size(self) -> int:
@@ -151,9 +148,9 @@ class MonomialEffect(Effect, frozen=True, kw_only=True):
     def check(self, parameters: tuple[str, ...]) -> None:
         """Require one exponent for each parameter."""
         if len(self.exponents) != len(parameters):
-            raise CalibrationError(f"monomial: expected {len(parameters)} exponents, one for each parameter")
+            raise CalibrationError(f"legendre: expected {len(parameters)} exponents, one for each parameter")
         if min(self.exponents, default=0) < 0 or sum(self.exponents) > HIGHEST:
-            raise CalibrationError(f"monomial: expected exponents >= 0, together at most {HIGHEST}")
+            raise CalibrationError(f"legendre: expected exponents >= 0, together at most {HIGHEST}")
 
     def columns(self, field: float) -> FloatArray:
         """Offsets."""
@@ -161,13 +158,10 @@ class MonomialEffect(Effect, frozen=True, kw_only=True):
 
     def begin(self, calibration: Calibration) -> Step:
         """Return a stepper; it has no state."""
-        polynomials = [[0.0] * e + [1.0] for e in self.exponents]
-        if self.legendre:
-            polynomials = [leg2poly(p).tolist() for p in polynomials]
         factors = [
-            (k, parameter.centre, parameter.scale, p[::-1])
-            for k, (parameter, p) in enumerate(zip(calibration.parameters, polynomials, strict=True))
-            if self.exponents[k]
+            (k, p.centre, p.scale, leg2poly([0.0] * e + [1.0])[::-1].tolist())
+            for k, (p, e) in enumerate(zip(calibration.parameters, self.exponents, strict=True))
+            if e
         ]
 
         def step(time_us: int, hx: float, hy: float, hz: float, values: Sequence[float]) -> tuple[float]:

@@ -63,7 +63,7 @@ TERMS: dict[str, str] = {
     "channel": "magbridge.calibration.effects:ChannelEffect",
     "powers": "magbridge.calibration.mass_effects:PowersEffect",
     "sources": "magbridge.calibration.mass_effects:SourcesEffect",
-    "monomial": "magbridge.calibration.mass_effects:MonomialEffect",
+    "legendre": "magbridge.calibration.mass_effects:LegendreEffect",
     "play": "magbridge.calibration.mass_effects:PlayEffect",
     "clock": "magbridge.calibration.mass_effects:ClockEffect",
     "time": "magbridge.calibration.instrument_effects:TimeEffect",

@@ -12,7 +12,7 @@ from magbridge.calibration.effects import ChannelEffect
 from magbridge.calibration.instrument_effects import RateEffect, ResponseEffect, TimeEffect
 from magbridge.calibration.mass_effects import (
     ClockEffect,
-    MonomialEffect,
+    LegendreEffect,
     PlayEffect,
     PowersEffect,
     SourcesEffect,
@@ -84,15 +84,13 @@ def test_powers_and_sources_of_a_mass() -> None:
     np.testing.assert_allclose(got, (1.5 / distance) ** 3)
 
 
-def test_a_product_of_positions() -> None:
+def test_legendre_polynomials_of_positions() -> None:
     p = np.array([-0.5, 0.0, 2.0])
-    got = stepped(MonomialEffect(cause="", exponents=(3,)), np.arange(3.0), p)
-    np.testing.assert_allclose(got[:, 0], p**3)
-    got = stepped(MonomialEffect(cause="", exponents=(3,), legendre=True), np.arange(3.0), p)
+    got = stepped(LegendreEffect(cause="", exponents=(3,)), np.arange(3.0), p)
     np.testing.assert_allclose(got[:, 0], (5.0 * p**3 - 3.0 * p) / 2.0)
     for exponents in ((-1,), (HIGHEST + 1,), (1, 1), ()):
-        with pytest.raises(CalibrationError, match="monomial: expected"):
-            with_effect(MonomialEffect(cause="", exponents=exponents))
+        with pytest.raises(CalibrationError, match="legendre: expected"):
+            with_effect(LegendreEffect(cause="", exponents=exponents))
 
 
 SWEEP = np.concatenate(

@@ -15,7 +15,7 @@ from magbridge.calibration.file import decode_calibration, encode_calibration
 from magbridge.calibration.instrument_effects import RateEffect, ResponseEffect, TimeEffect
 from magbridge.calibration.mass_effects import (
     ClockEffect,
-    MonomialEffect,
+    LegendreEffect,
     PlayEffect,
     PowersEffect,
     SourcesEffect,
@@ -32,8 +32,7 @@ EFFECTS: list[Effect] = [
     ChannelEffect(cause="temperature_scale", channel="heat", origin=3.0, lag=50.0, on="scale"),
     PowersEffect(cause="unmodelled_actuator", channel="heat", centre=3.0, scale=2.0, order=3),
     SourcesEffect(cause="actuator_order", channel="p", centre=-1.1, scale=0.2, apart=1.25, count=12),
-    MonomialEffect(cause="actuator_order", exponents=(4,)),
-    MonomialEffect(cause="actuator_order", exponents=(4,), legendre=True),
+    LegendreEffect(cause="actuator_order", exponents=(4,)),
     PlayEffect(cause="hysteresis", channel="p", width=0.3, centre=0.1, scale=0.5),
     PlayEffect(cause="hysteresis", channel="p", width=0.3, centre=0.1, scale=0.5, order=3),
     ClockEffect(),

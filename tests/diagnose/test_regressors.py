@@ -9,7 +9,7 @@ import pytest
 from posed import calibrated, missed, right, surveyed, thinned, walk
 
 from magbridge.calibration.effects import ChannelEffect
-from magbridge.calibration.mass_effects import MonomialEffect, PlayEffect, PowersEffect, SourcesEffect
+from magbridge.calibration.mass_effects import LegendreEffect, PlayEffect, PowersEffect, SourcesEffect
 from magbridge.calibration.model import Parameter
 from magbridge.calibration.terms import Polynomial
 from magbridge.diagnose.causes import CAUSES
@@ -45,7 +45,7 @@ def problem() -> Problem:
     return pose(survey, calibrated(rng.normal(0, 50.0, 27), centre=0.1, scale=0.9))
 
 
-FOLLOWERS = (ChannelEffect, PowersEffect, MonomialEffect, PlayEffect, SourcesEffect)
+FOLLOWERS = (ChannelEffect, PowersEffect, LegendreEffect, PlayEffect, SourcesEffect)
 
 
 def test_columns_are_those_of_the_stepped_effect(problem: Problem) -> None:

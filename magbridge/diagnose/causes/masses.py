@@ -9,7 +9,7 @@ from itertools import product
 import numpy as np
 from scipy.special import eval_legendre
 
-from magbridge.calibration.mass_effects import MonomialEffect, PlayEffect, PowersEffect, SourcesEffect
+from magbridge.calibration.mass_effects import LegendreEffect, PlayEffect, PowersEffect, SourcesEffect
 from magbridge.calibration.terms import Polynomial, full_order
 from magbridge.diagnose.causes.candidates import AXES, Candidate, of_effect, per
 from magbridge.diagnose.causes.regressors import play, powers
@@ -107,7 +107,7 @@ def _sources(problem: Problem, name: str, near: float) -> Candidate:
 def _term(problem: Problem, exponents: tuple[int, ...]) -> Candidate:
     own = [(p, e) for p, e in zip(problem.calibration.parameters, exponents, strict=True) if e]
     label = " ".join(f"P{e}({p.name})" for p, e in own)
-    effect = MonomialEffect(cause="actuator_order", exponents=exponents, legendre=True)
+    effect = LegendreEffect(cause="actuator_order", exponents=exponents)
     factors = [(problem.survey.channels[p.name].values, p.centre, p.scale, e) for p, e in own]
 
     def phi(rows: slice) -> FloatArray:
