@@ -62,7 +62,6 @@ def run(path: Path) -> None:
     pipeline = set_up(config, keeper.start(clock.now_us()))
     sensor = serial_line(config.sensor.port, config.sensor.baudrate, str(config.path), "sensor.port")
     link = open_link(config.link.url, config.link.baudrate, str(config.path))
-    Thread(target=_say, args=(pipeline.component.announcer.said,), name="voice", daemon=True).start()
     # the link first, so that a sensor's port that does not open can be reported over it
     edge = LiveEdge({Channel.LINK: link, Channel.SENSOR: sensor}, clock)
     keeper.attach(edge)
@@ -70,6 +69,8 @@ def run(path: Path) -> None:
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         if number == signal.SIGINT or signal.getsignal(number) != signal.SIG_IGN:  # as SIGHUP is under nohup
             signal.signal(number, lambda *_: edge.stop())
+    # not before a signal would end the bridge in good order: who hears it may send one
+    Thread(target=_say, args=(pipeline.component.announcer.said,), name="voice", daemon=True).start()
     sys.setswitchinterval(SWITCH)
     gc.collect()
     gc.freeze()  # these objects live as long as the process: the collector need not scan them
