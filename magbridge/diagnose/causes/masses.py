@@ -60,7 +60,7 @@ def _series(problem: Problem, effect: PowersEffect, channel: str | None = None) 
 
 
 def actuator_order(problem: Problem) -> list[Candidate]:
-    """A mass needs what its polynomial lacks: a term ``T += b prod P_e_k(x_k)``, or sources near its way.
+    """A mass needs what its polynomial lacks: ``T += b prod P_e_k(x_k)``, P Legendre's, or sources near it.
 
     Candidates are each missing term up to the next order (paper, eq. 8), as a Legendre polynomial, since the
     calibration has absorbed the lower orders; all orders of one mass together, if its field has changed

@@ -30,10 +30,9 @@ def diurnal_variation(problem: Problem) -> list[Candidate]:
 
 
 def reference_bias(problem: Problem) -> list[Candidate]:
-    """The reference is off by a constant.
+    """The reference is off by a constant, as a main-field model is by the rock that it lacks.
 
-    A main-field model lacks the rock: at 68 % of sites each component is within 73 to 114 nT (Beggan 2022,
-    Earth Planets Space 74:17).
+    At 68 % of sites each component is within 73 to 114 nT (Beggan 2022, Earth Planets Space 74:17).
     """
     ones = (~problem.survey.learned[:, None]).astype(np.float64)
     return [of_reference(problem, "reference_bias", lambda rows: ones[rows], np.array([100.0]), ("bias",))]
