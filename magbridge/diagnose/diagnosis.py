@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from magbridge.calibration.model import Calibration
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.compare.arrays import FloatArray
@@ -55,6 +57,11 @@ class Finding:
     def signal_to_noise(self) -> float:
         """With the calibration refitted."""
         return self.hypothesis.signal_to_noise
+
+    def field(self, problem: Problem) -> FloatArray:
+        """(n,) nT, what it adds to the total field; its columns are in the sensor's nanotesla."""
+        columns = self.candidate.columns(slice(0, len(problem)))
+        return np.asarray(columns @ self.coefficients / problem.gain)
 
 
 @dataclass(frozen=True, eq=False)

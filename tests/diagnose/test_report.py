@@ -15,6 +15,7 @@ from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.compare.prior import isotropic
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.compare.survey import Channel, _channels
+from magbridge.diagnose.diagnosis import Finding
 from magbridge.diagnose.gain import Gain
 from magbridge.diagnose.inference.rivals import Rival
 from magbridge.diagnose.inference.rounds import Hypothesis
@@ -99,10 +100,19 @@ def test_sizes_of_one_unit_name_it_once() -> None:
 
 
 def test_a_cause_that_is_larger_than_such_causes_are_is_doubted() -> None:
-    """A constant of 360 nT where main-field models are 30 nT off."""
-    bias = candidate("reference_bias", np.ones(1), width=np.array([30.0]))
+    """A constant of 1,200 nT where main-field models are 100 nT off."""
+    bias = candidate("reference_bias", np.ones(1), width=np.array([100.0]))
     assert "12 times" in implausible(bias, np.array([-12.0]))
     assert not implausible(bias, np.array([0.99 * IMPLAUSIBLE]))
+
+
+def test_a_constant_of_the_reference_is_one_at_any_attitude() -> None:
+    """Whatever the sensor's scales, which differ from channel to channel."""
+    problem = replace(right(100), gain=np.linspace(0.9, 1.1, 100))
+    bias = CAUSES["reference_bias"].candidates(problem)[0]
+    named = Hypothesis(bias, ratio=25.0, evidence=9.0, p_value=1e-3, fit=None)
+    finding = Finding(named, (), Gain(2.0, 1.0, 0.5, (0.4, 0.6)), np.array([0.5]), np.eye(1), 1.0)
+    np.testing.assert_allclose(finding.field(problem), 0.5 * bias.width[0])
 
 
 def test_a_gain_that_does_not_show_is_said_to_be_none() -> None:

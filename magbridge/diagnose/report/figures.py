@@ -241,11 +241,9 @@ def terms(diagnosis: Diagnosis) -> str | None:
     count = len(diagnosis.findings)
     figure, axes = _figure(10, 1.9 * count, count, 1, sharex=True)
     for axis, finding in zip(axes[:, 0], diagnosis.findings, strict=True):
-        candidate = finding.candidate
-        share = candidate.columns(slice(0, len(diagnosis.problem))) @ finding.coefficients
-        axis.plot(*_curves(diagnosis, share), color=AFTER, linewidth=0.8)
+        axis.plot(*_curves(diagnosis, finding.field(diagnosis.problem)), color=AFTER, linewidth=0.8)
         axis.set_ylabel("nT", fontsize=8)
-        axis.set_title(label(*candidate.group), fontsize=9, loc="left")
+        axis.set_title(label(*finding.candidate.group), fontsize=9, loc="left")
     axes[-1, 0].set_xlabel(f"{_clock(diagnosis)[1]} since the start", fontsize=9)
     return _png(figure)
 

@@ -51,10 +51,10 @@ def overview(diagnosis: Diagnosis) -> str:
     """Return a table with a row for each named cause; empty if there is none."""
     rows = []
     for k, one in enumerate(diagnosis.findings):
-        field = one.candidate.columns(slice(0, len(diagnosis.problem))) @ one.coefficients
+        size = rms(one.field(diagnosis.problem))
         rows.append(
             f'<tr><td><a href="#cause{k}">{bold(one.candidate)}</a></td>'
-            f'<td class="n">{number(rms(field))} nT</td><td class="n">{one.signal_to_noise:.1f}</td>'
+            f'<td class="n">{number(size)} nT</td><td class="n">{one.signal_to_noise:.1f}</td>'
             f'<td class="n">× {1 / max(one.gain.ratio, 1e-9):.2f}</td><td>{listed(one.rivals)}</td></tr>'
         )
     return table(("cause", "its field, RMS", "S/N", "held-out RMS without it", "or possibly"), rows)
