@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from array import array
 from math import inf
 
 import numpy as np
@@ -40,8 +41,8 @@ class Collector:
         self._white = inf if options.noise is None else options.noise**2
         self._bias = options.bias_sigma**2
         self._main_field = NearbyField()
-        self._samples: list[Block] = []  # a block of one sample each
-        self._begun = 0.0  # m travelled until the first of them
+        self._rows = array("d")  # of numbers, a block of one sample each: 20,000 of them are averaged in 1 ms
+        self._start_us, self._begun = 0, 0.0  # the first of them: when, and m travelled until then
 
     def add(
         self, time_us: int, where: DeadReckoning, total_field: float, sigma: float, utc_offset_us: int = 0
@@ -60,24 +61,24 @@ class Collector:
         main, slope_north, slope_east = self._main_field.at(
             where.latitude, where.longitude, where.depth, (time_us + utc_offset_us) * 1e-6
         )
-        if not self._samples:
-            self._begun = where.travelled
+        if not self._rows:
+            self._start_us, self._begun = time_us, where.travelled
         anomaly, variance = total_field - main, max(sigma, LEAST) ** 2
         place = where.latitude, where.longitude
-        self._samples.append(Block(time_us, *place, anomaly, variance, slope_north, slope_east, where.depth))
-        lasts_us = time_us - self._samples[0].time_us
+        self._rows.extend((time_us, *place, anomaly, variance, slope_north, slope_east, where.depth))
+        lasts_us = time_us - self._start_us
         full = lasts_us >= self._interval_us or where.travelled - self._begun >= self._step
         return self.flush() if full else None
 
     def flush(self) -> Block | None:
         """Return the block of the samples collected so far; None if there are none."""
-        samples, self._samples = self._samples, []
-        if not samples:
+        if not self._rows:
             return None
-        variance = np.array([sample.variance for sample in samples])
+        rows, self._rows = np.frombuffer(self._rows).reshape(-1, len(Block._fields)), array("d")
+        variance = rows[:, Block._fields.index("variance")]
         w, white = 1.0 / variance, np.minimum(self._white, variance)
-        seconds = (samples[-1].time_us - samples[0].time_us) * 1e-6
+        seconds = (rows[-1, 0] - rows[0, 0]) * 1e-6
         lasting = self._lasts / (seconds + self._lasts) if self._lasts else 0.0
         noise = max(w * w @ white, lasting * (w @ np.sqrt(white)) ** 2)
         slow = w @ np.sqrt(np.maximum(variance - white - self._bias, 0.0))
-        return average(samples)._replace(variance=float((noise + slow**2) / w.sum() ** 2))
+        return average(rows)._replace(variance=float((noise + slow**2) / w.sum() ** 2))

@@ -73,14 +73,18 @@ class Block(NamedTuple):
     depth: float = nan
 
 
-def average(blocks: Sequence[Block]) -> Block:
-    """Return several blocks as one: their mean, by weight of their precision, as if they were independent."""
-    first, rows = blocks[0], np.array(blocks)
+def average(blocks: Sequence[Block] | Array) -> Block:
+    """Return several blocks, or rows (n, 8) of their fields, as one: their mean, weighted by precision.
+
+    Its variance is that of independent ones.
+    """
+    rows = np.array(blocks)
+    start, _, longitude, *_ = rows[0].tolist()
     precision = 1.0 / rows[:, 4]
-    rows[:, 0] -= first.time_us
-    rows[:, 2] = wrap(rows[:, 2] - first.longitude)
+    rows[:, 0] -= start
+    rows[:, 2] = wrap(rows[:, 2] - longitude)
     time, latitude, east, anomaly, _, *rest = (precision @ rows / precision.sum()).tolist()
-    where = first.time_us + round(time), latitude, wrap(first.longitude + east)
+    where = int(start) + round(time), latitude, wrap(longitude + east)
     return Block(*where, anomaly, 1.0 / float(precision.sum()), *rest)
 
 
