@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from magbridge.calibration.correct import correct
 from magbridge.calibration.fitting.boresight import field_body, find_boresight
+from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.model import identity
 
@@ -30,3 +31,18 @@ def test_boresight_is_found_and_makes_the_vector_right() -> None:
     vector = correct(replace(identity(), boresight=found), data.field, data.parameters, data.time).vector
     np.testing.assert_allclose(vector, body, atol=12.0)
     assert find_boresight(identity(), replace(data, attitude=None)) is None
+
+
+def test_a_reversed_channel_gets_no_boresight_and_is_said() -> None:
+    rng = np.random.default_rng(1)
+    n = 400
+    attitude = np.column_stack([rng.normal(0, 0.1, n), rng.normal(0, 0.4, n), rng.uniform(0, 2 * np.pi, n)])
+    ned = np.tile([16e3, -5e3, 49e3], (n, 1))
+    field = field_body(attitude, ned) * [1.0, 1.0, -1.0] + rng.normal(0, 1, (n, 3))
+    data = Observations(
+        field, np.linalg.norm(ned, axis=1), np.empty((n, 0)), attitude=attitude, reference_ned=ned
+    )
+    found = fit(data, "nominal")
+    assert found.calibration.boresight is None
+    assert [text for text in found.warnings if "a channel or an angle has the other sign" in text]
+    assert found.supported  # the total field does not depend on it

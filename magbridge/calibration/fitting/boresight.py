@@ -21,12 +21,15 @@ from scipy.spatial.transform import Rotation
 from magbridge.calibration.correct import correct
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.model import Boresight, Calibration
+from magbridge.errors import CalibrationError
 
 __all__ = ["field_body", "find_boresight"]
 
 FloatArray = NDArray[np.float64]
 FEWEST = 30
 """Samples with attitude and direction that a boresight takes."""
+MISMATCH = 10.0
+"""deg, median angle that no rotation removes: masses leave less, a reversed channel or angle more."""
 COMPASS_SIGMA = np.radians(0.5)
 """rad, compass error common to all runs, which their scatter does not show."""
 
@@ -52,6 +55,11 @@ def find_boresight(calibration: Calibration, data: Observations) -> Boresight | 
     -------
     Boresight or None
         None if too few samples have both attitude and reference direction, or the calibration has effects.
+
+    Raises
+    ------
+    CalibrationError
+        No rotation takes the corrected vectors to where attitude and main field say they point.
     """
     if data.attitude is None or data.reference_ned is None or calibration.effects:
         return None
@@ -65,7 +73,15 @@ def find_boresight(calibration: Calibration, data: Observations) -> Boresight | 
     b = correct(replace(calibration, boresight=None), part.field, part.parameters[:, :k], part.time).vector
     v = field_body(part.attitude, part.reference_ned)
     rotation, _ = Rotation.align_vectors(v, b)
-    score = np.cross(v, rotation.apply(b) - v)
+    turned = rotation.apply(b)
+    score = np.cross(v, turned - v)
+    angle = np.degrees(np.median(np.arctan2(np.linalg.norm(score, axis=1), np.sum(v * turned, axis=1))))
+    if angle > MISMATCH:
+        raise CalibrationError(
+            f"however the sensor is turned, the field lies {angle:.0f} degrees (median) from where roll, "
+            "pitch, heading and IGRF say: a channel or an angle has the other sign, two are swapped, angles "
+            "are not in degrees, or the place is another; no boresight, so the vector stays in sensor axes"
+        )
     information = np.sum(v * v) * np.eye(3) - v.T @ v
     _, which = np.unique(part.runs, return_inverse=True)
     between = np.stack([np.bincount(which, column) for column in score.T], axis=1)

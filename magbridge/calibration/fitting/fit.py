@@ -161,10 +161,17 @@ def _refuse_one_attitude(data: Observations) -> None:
 def _judged(found: Fit, data: Observations) -> Fit:
     """Add the boresight, and warnings of what the data could not determine."""
     calibration = found.calibration
+    mismatch = None
     if calibration.boresight is None:
-        calibration = replace(calibration, boresight=find_boresight(calibration, data))
+        try:
+            calibration = replace(calibration, boresight=find_boresight(calibration, data))
+        except CalibrationError as error:
+            mismatch = str(error)
+            data = replace(data, attitude=None)
     ratio = expected_ratio(calibration, data)
     warnings, doubts = list(warnings_for(calibration, data)), []
+    if mismatch:
+        warnings.append(mismatch)
     outliers = found.details.get("outliers", 0)
     if outliers > 0.02 * len(data):
         warnings.append(f"{outliers} of {len(data)} samples are outliers and were left out of the fit")
