@@ -169,8 +169,9 @@ def _continued(grid: AnomalyGrid, options: Options, deployment: xr.Dataset) -> t
 
     there, known = at_depth(grid, options, deployment.get("depth", 0.0))
     if known != options:
+        side = "above" if there.altitude > 0.0 else "below"
         complain(
-            f"{grid.name}: at {grid.altitude:.0f} m; continued to {-there.altitude:.0f} m below the "
+            f"{grid.name}: at {grid.altitude:.0f} m; continued to {abs(there.altitude):.0f} m {side} the "
             f"surface, and what that leaves out counts as the map's error: {known.map_sigma:.1f} nT over "
             f"{known.map_length:.0f} m"
         )

@@ -6,9 +6,11 @@ from math import hypot
 
 import numpy as np
 import pytest
+import xarray as xr
 from voyages.dived import dived
 from voyages.simulated import Map, synthetic
 
+from magbridge.cli.navigate import _continued
 from magbridge.field.continuation import continued
 from magbridge.field.grid import AnomalyGrid
 from magbridge.navigate.depth import at_depth
@@ -25,6 +27,18 @@ def test_errors_of_the_map_add_up() -> None:
     assert known.map_sigma == pytest.approx(hypot(1.5, left.sigma))
     assert min(left.length, 800.0) < known.map_length < max(left.length, 800.0)
     assert at_depth(drawn, options, depth) == (drawn, options), "an altitude that nobody knows"
+
+
+@pytest.mark.parametrize(
+    ("depth", "said"), [(60.0, "60 m below the surface"), (-60.0, "60 m above the surface")]
+)
+def test_a_level_is_said_on_its_side_of_the_surface(
+    depth: float, said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    drawn = synthetic(Map(30, 1500), 3)
+    flown = AnomalyGrid(drawn.longitude, drawn.latitude, drawn.anomaly, altitude=90.0)
+    _continued(flown, Options(), xr.Dataset({"depth": ("time", [depth] * 9)}))
+    assert f"continued to {said}" in capsys.readouterr().err
 
 
 def test_a_glider_that_dives_under_it_is_found() -> None:
