@@ -105,7 +105,7 @@ def causes_of(facts: dict[str, Any]) -> str:
     """Return one line: the causes found, the alternatives to each, and the effect left unexplained."""
     causes = [" or ".join(map(_plain, [one, *one["alternatives"]])) for one in facts["findings"]]
     if facts["verdict"] == "unexplained" and (within := facts["unexplained"]["alternatives"]):
-        causes = [f"no name asserted; within 20:1: {', '.join(map(_plain, within))}"]
+        causes = [f"no name asserted; not ruled out: {', '.join(map(_plain, within))}"]
     said = ", ".join(causes) or "no cause"
     if rest := facts["unexplained"]:
         said += f"; left without a name: {rest['kind']}, S/N {rest['signal_to_noise']:.3g}"

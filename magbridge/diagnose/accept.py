@@ -9,7 +9,7 @@ import numpy as np
 
 from magbridge.diagnose.causes.candidates import Candidate, Group
 from magbridge.diagnose.compare.problem import Problem
-from magbridge.diagnose.inference.evidence import ODDS, REMNANT, log_odds
+from magbridge.diagnose.inference.evidence import ODDS, REMNANT, log_odds, margin
 from magbridge.diagnose.inference.rivals import Rival
 from magbridge.diagnose.inference.rounds import Hypothesis, shaped_ratio
 from magbridge.diagnose.inference.search import Outcome
@@ -26,7 +26,7 @@ def accept(problem: Problem, outcome: Outcome, tone: Candidate | None) -> tuple[
     a description of what the names leave is added to theirs; unless it is a remnant of one of the named
     causes, they pay for it as for a further cause. A cause that the table lacks is a rival like any other:
     names are asserted if they are likelier than every description of the whole signal, and remain possible
-    unless one beats them 20:1.
+    unless one beats them 20:1, the error of their regressors allowed for.
     """
     model = [h.candidate for h in outcome.chosen]
     uneven = [one for candidate in model if (one := varying(problem, candidate, outcome.trials)) is not None]
@@ -62,12 +62,14 @@ def _same(chosen: Sequence[Hypothesis], rest: Leftover) -> bool:
 def _within(outcome: Outcome, behind: float) -> tuple[Rival, ...]:
     """Return the names, and their rivals, the likeliest first.
 
-    A description beats the names by `behind`; rivals are those that it does not beat 20:1.
+    A description beats the names by `behind`; rivals are those that it does not beat by their margin. Its
+    shape follows the data, whereas a regressor is idealised, a named cause's as well as its rivals'.
     """
     found: dict[Group, Rival] = {}
     for hypothesis, rivals in zip(outcome.chosen, outcome.rivals, strict=True):
+        limit = margin(hypothesis.ratio)
         for one in (Rival(hypothesis.candidate, 0.0), *rivals):
             known = found.get(one.candidate.group)
-            if one.behind + behind < ODDS and (known is None or one.behind + behind < known.behind):
+            if one.behind + behind < limit and (known is None or one.behind + behind < known.behind):
                 found[one.candidate.group] = replace(one, behind=one.behind + behind)
     return tuple(sorted(found.values(), key=lambda one: one.behind))

@@ -82,7 +82,7 @@ def test_the_command_s_line_names_every_cause_that_may_be_it() -> None:
     found = {"verdict": "explained", "findings": [clock | {"alternatives": [current]}], "unexplained": None}
     assert causes_of(found) == "clock_offset or current_field (pitch_current)"
     nameless = {"verdict": "unexplained", "findings": [], "unexplained": rest}
-    words = "no name asserted; within 20:1: clock_offset, current_field (pitch_current)"
+    words = "no name asserted; not ruled out: clock_offset, current_field (pitch_current)"
     assert causes_of(nameless) == f"{words}; left without a name: drift, S/N 7.04"
     assert causes_of(nameless | {"unexplained": None, "verdict": "nothing_found"}) == "no cause"
 

@@ -206,7 +206,8 @@ def nameless(rest: Leftover, causes: Mapping[str, Cause]) -> str:
     if not rest.within:
         return "It fits no known cause, so it has no name."
     return (
-        "No name is asserted: a description without a cause is likelier than any known cause, but by less "
-        f"than 20:1. Not ruled out: {listed(rest.within)}. To tell: "
+        "No name is asserted: a description without a cause is likelier than any known cause, but by "
+        f"less than 20:1 and what a cause's idealised shape may miss. Not ruled out: {listed(rest.within)}. "
+        "To tell: "
         f"{escape(causes[rest.within[0].candidate.cause].separated_by)}."
     )

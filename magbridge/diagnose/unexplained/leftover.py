@@ -74,7 +74,8 @@ class Leftover(NamedTuple):
     choice : int
         Number of descriptions that it was chosen from.
     within : tuple of Rival
-        The causes that remain possible: it is likelier than they are, but by less than 20:1.
+        The causes that remain possible: it is likelier than they are, but by less
+        than their margin.
     """
 
     kind: str
