@@ -46,6 +46,7 @@ DRAWN = {
     "latch": 122.4, "recovery": 100.9, "clamp": 25.67, "seiche": 42.82,
     "accumulator": 131, "modem": 82.22, "rezero": 105, "pipeline": 187.1,
     "backdriven": 5.032, "microphonic": 23.07, "soliton": 52.93, "escort": 28.71,
+    "airlock": 103.1, "wiper": 172.4, "seep": 62.78, "ferry": 23.7,
 }  # fmt: skip
 """Norm (nT) of what each does to the log of :func:`flight`, as first drawn.
 

@@ -40,7 +40,7 @@ NAMELESS = ("unknown", "seen", "foreign")
 """Parts in which the hidden effect is not among the causes of the table."""
 PREDICTED = ("named", "ladder", "pair", *NAMELESS)
 """Parts for which theory predicts the outcome."""
-STRANGE = ("backdriven", "microphonic", "soliton", "escort")
+STRANGE = ("airlock", "wiper", "seep", "ferry")
 """Foreign effects made after the detector was frozen; its descriptions were not designed for them either."""
 SEEN = (
     "pan", "loose", "corrosion", "pulsation", "needle", "thermostat", "perming", "staircase", "swell",
@@ -53,6 +53,7 @@ SEEN = (
     "ageing", "crossfield", "railway", "rudder",
     "latch", "recovery", "clamp", "seiche",
     "accumulator", "modem", "rezero", "pipeline",
+    "backdriven", "microphonic", "soliton", "escort",
 )  # fmt: skip
 """Foreign effects that were once made for this purpose, but before the detector was last improved."""
 GOLDEN = 0.6180339887498949

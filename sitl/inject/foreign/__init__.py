@@ -6,26 +6,26 @@ function of the scene, a size and a random generator.
 
 from __future__ import annotations
 
-from sitl.inject.foreign import sensor, surroundings, vehicle
+from sitl.inject.foreign import payload, sensor, surroundings, vehicle
 from sitl.inject.scene import Effect
 
 __all__ = ["FOREIGN"]
 
 FOREIGN: dict[str, Effect] = {
-    "relay": vehicle.relay,
+    "relay": payload.relay,
     "ship": surroundings.ship,
-    "pan": vehicle.pan,
+    "pan": payload.pan,
     "loose": vehicle.loose,
     "corrosion": vehicle.corrosion,
     "pulsation": surroundings.pulsation,
-    "needle": vehicle.needle,
-    "thermostat": vehicle.thermostat,
+    "needle": payload.needle,
+    "thermostat": payload.thermostat,
     "perming": sensor.perming,
     "staircase": sensor.staircase,
     "swell": surroundings.swell,
     "cargo": vehicle.cargo,
     "contact": vehicle.contact,
-    "strobe": vehicle.strobe,
+    "strobe": payload.strobe,
     "storm": surroundings.storm,
     "rotor": vehicle.rotor,
     "viscous": vehicle.viscous,
@@ -39,7 +39,7 @@ FOREIGN: dict[str, Effect] = {
     "crossover": sensor.crossover,
     "popcorn": sensor.popcorn,
     "discharge": vehicle.discharge,
-    "towed": vehicle.towed,
+    "towed": payload.towed,
     "sunlit": vehicle.sunlit,
     "eccentric": vehicle.eccentric,
     "astray": surroundings.astray,
@@ -54,11 +54,11 @@ FOREIGN: dict[str, Effect] = {
     "dynamo": surroundings.dynamo,
     "hvdc": surroundings.hvdc,
     "dew": sensor.dew,
-    "sampler": vehicle.sampler,
+    "sampler": payload.sampler,
     "substorm": surroundings.substorm,
     "litter": surroundings.litter,
     "stuck": sensor.stuck,
-    "sounder": vehicle.sounder,
+    "sounder": payload.sounder,
     "gradient": sensor.gradient,
     "squeezed": sensor.squeezed,
     "flare": surroundings.flare,
@@ -72,12 +72,16 @@ FOREIGN: dict[str, Effect] = {
     "clamp": sensor.clamp,
     "seiche": surroundings.seiche,
     "accumulator": vehicle.accumulator,
-    "modem": vehicle.modem,
+    "modem": payload.modem,
     "rezero": sensor.rezero,
     "pipeline": surroundings.pipeline,
     "backdriven": vehicle.backdriven,
     "microphonic": sensor.microphonic,
     "soliton": surroundings.soliton,
     "escort": surroundings.escort,
+    "airlock": vehicle.airlock,
+    "wiper": payload.wiper,
+    "seep": sensor.seep,
+    "ferry": surroundings.ferry,
 }
 """Effect, by its name."""

@@ -192,3 +192,21 @@ def microphonic(scene: Scene, size: float, rng: Generator) -> None:
     loud = pumps * (rng.uniform(0.05, 0.3) + depth) ** 2
     rung = first_order(loud, step, float(rng.uniform(1.0, 10.0)))
     scene.add(rung / max(rung.max(), 1e-9), size * direction(rng))
+
+
+def seep(scene: Scene, size: float, rng: Generator) -> None:
+    """Salt water in a connector leads one channel's signal into another; size in 1e-5 of it when soaked.
+
+    It is pressed in below a depth, within minutes, and dries over hours.
+    """
+    depth = scene.track.depth / scene.track.depth.max()
+    wets, dries = (scene.track.step / lag for lag in (rng.uniform(100.0, 400.0), rng.uniform(1500.0, 9000.0)))
+    opens, wet, film = rng.uniform(0.4, 0.8), 0.0, np.empty(len(scene.t))
+    for k, pressed in enumerate(depth > opens):
+        wet += wets * (1.0 - wet) if pressed else -dries * wet
+        film[k] = wet
+    heard, hears = rng.permutation(3)[:2]
+    leads = film / max(float(film.max()), 1e-9)
+    crossed = np.zeros_like(scene.field)
+    crossed[:, hears] = leads * scene.field[:, heard]
+    scene.field = scene.field + 1e-5 * size * crossed

@@ -186,6 +186,25 @@ def escort(scene: Scene, size: float, rng: Generator) -> None:
     scene.earth = scene.earth + size * own / np.linalg.norm(own, axis=1).max()
 
 
+def ferry(scene: Scene, size: float, rng: Generator) -> None:
+    """A ferry lies at a berth near the track between its crossings; size in nT where it is strongest."""
+    track, at = scene.track, rng.uniform(0.1, 0.9)
+    k = int(at * (len(scene.t) - 1))
+    north, east = track.local(track.latitude, track.longitude)
+    aside, bearing = rng.uniform(150.0, 400.0), rng.uniform(0.0, 2.0 * np.pi)
+    berth = np.array([north[k] + aside * np.cos(bearing), east[k] + aside * np.sin(bearing)])
+    away = np.column_stack([north - berth[0], east - berth[1], track.depth + 3.0])
+    # the same crossing all day, but for delays in port
+    hour = rng.uniform(0.06, 0.15) * scene.t[-1]
+    late = 0.15 * hour * rng.normal(size=int(scene.t[-1] / hour) + 2)
+    turn = (scene.t / hour).astype(int)
+    since = scene.t - hour * turn - np.abs(late[turn])
+    lies = (since > 0.0) & (since < rng.uniform(0.3, 0.7) * hour)
+    come = first_order(lies.astype(float), track.step, 30.0)
+    own = dipole_field(away, np.broadcast_to(direction(rng), away.shape)) * come[:, None]
+    scene.earth = scene.earth + size * own / max(float(np.linalg.norm(own, axis=1).max()), 1e-30)
+
+
 def _cable(scene: Scene, rng: Generator) -> tuple[Array, Array, Array]:
     """Lay a straight cable below the track: m aside and above (n,), and north-east-down across it."""
     track = scene.track

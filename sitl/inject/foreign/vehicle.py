@@ -1,4 +1,4 @@
-"""What goes wrong with the vehicle and is in no table: payloads, loose iron, bad contacts, bent encoders."""
+"""What goes wrong with the vehicle and is in no table: loose iron, bad contacts, bent encoders."""
 
 from __future__ import annotations
 
@@ -8,21 +8,6 @@ from sitl.inject.scene import Generator, Scene, direction
 from sitl.instrument import rotation
 from sitl.signals import autoregressive, first_order
 from sitl.world import MU_0_OVER_4_PI, dipole_field
-
-
-def relay(scene: Scene, size: float, rng: Generator) -> None:
-    """An unlogged payload switches on and off, a dozen times or so; size in nT."""
-    flips = np.cumsum(rng.exponential(0.08 * scene.t[-1], 60))
-    on = (np.searchsorted(flips, scene.t) % 2).astype(float)
-    scene.add(on, size * direction(rng))
-
-
-def pan(scene: Scene, size: float, rng: Generator) -> None:
-    """An unlogged scanning head: its magnet sweeps a sector, no two sweeps of one length; size in nT."""
-    turns = np.cumsum(rng.uniform(0.02, 0.06, 80)) * scene.t[-1]
-    angle = np.radians(150.0) * np.interp(scene.t, turns, (-1.0) ** np.arange(80))
-    a, b = direction(rng), direction(rng)
-    scene.field = scene.field + size * (np.outer(np.cos(angle), a) + np.outer(np.sin(angle), b))
 
 
 def loose(scene: Scene, size: float, rng: Generator) -> None:
@@ -39,30 +24,6 @@ def corrosion(scene: Scene, size: float, rng: Generator) -> None:
     wander = autoregressive(rng, (len(scene.t),), 1.0, 2500.0 / scene.track.step)
     fed = np.sqrt(1.0 + np.abs(np.gradient(scene.track.depth, scene.track.step)))
     scene.add(fed * wander, size * direction(rng))
-
-
-def needle(scene: Scene, size: float, rng: Generator) -> None:
-    """A payload's compass: a card that points north, floats level, and is dragged in turns; size in nT."""
-    track = scene.track
-    turned = np.radians(track.heading)
-    dragged = rng.uniform(0.1, 0.4) * (
-        turned - first_order(turned, track.step, float(rng.uniform(10.0, 40.0)))
-    )
-    level = np.column_stack([np.cos(dragged), np.sin(dragged), np.zeros_like(dragged)])
-    card = rotation(track.roll, track.pitch, track.heading).apply(level, inverse=True)
-    own = dipole_field(np.broadcast_to(direction(rng), card.shape), card)
-    scene.field = scene.field + size * own / np.linalg.norm(own, axis=1).max()
-
-
-def thermostat(scene: Scene, size: float, rng: Generator) -> None:
-    """An unlogged payload heats itself, the longer the colder the water, then cools; size in nT."""
-    lag, band = rng.uniform(400.0, 1200.0), rng.uniform(1.0, 3.0)
-    warm, heats, on = 15.0, False, np.empty(len(scene.t))
-    for k, water in enumerate(scene.water):
-        heats = warm < 15.0 + (0.5 if heats else -0.5) * band
-        warm += scene.track.step / lag * (water - warm + 30.0 * heats)
-        on[k] = heats
-    scene.add(on, size * direction(rng))
 
 
 def cargo(scene: Scene, size: float, rng: Generator) -> None:
@@ -91,18 +52,6 @@ def contact(scene: Scene, size: float, rng: Generator) -> None:
             shut, part = not shut, float(rng.lognormal(0.0, 0.4))
         leads[k] = part * shut
     scene.add(leads * scene.logged[name][0], size * direction(rng))
-
-
-def strobe(scene: Scene, size: float, rng: Generator) -> None:
-    """An unlogged payload is on for a part of each cycle; its clock slows with its cells; size in nT."""
-    along = scene.t / scene.t[-1]
-    slower = rng.uniform(0.15, 0.4) * along**2 + 0.01 * autoregressive(
-        rng, (len(along),), 1.0, 900.0 / scene.track.step
-    )
-    turns = np.cumsum(1.0 - slower) * scene.track.step / rng.uniform(60.0, 240.0)
-    on = (turns % 1.0 < rng.uniform(0.1, 0.4)).astype(float)
-    drawn = first_order(on, scene.track.step, 2.0) * (1.0 - 0.15 * along)
-    scene.add(drawn, size * direction(rng))
 
 
 def rotor(scene: Scene, size: float, rng: Generator) -> None:
@@ -182,16 +131,6 @@ def discharge(scene: Scene, size: float, rng: Generator) -> None:
     scene.add(drawn * nearer**3, size * direction(rng))
 
 
-def towed(scene: Scene, size: float, rng: Generator) -> None:
-    """A magnet on a line astern swings out in turns, and back when they end; size in nT at 1 deg/s."""
-    rate = np.gradient(scene.track.heading, scene.track.step)
-    swung = first_order(
-        first_order(rate, scene.track.step, 8.0), scene.track.step, float(rng.uniform(5.0, 30.0))
-    )
-    aside, astern = direction(rng), direction(rng)
-    scene.field = scene.field + size * (swung[:, None] * aside - 0.5 * (swung**2)[:, None] * astern)
-
-
 def sunlit(scene: Scene, size: float, rng: Generator) -> None:
     """The sun warms a dark housing of unlogged temperature near the surface; size in nT at most."""
     shines = np.exp(-scene.track.depth / rng.uniform(3.0, 10.0))
@@ -234,24 +173,6 @@ def afterglow(scene: Scene, size: float, rng: Generator) -> None:
     warm = first_order(moved.astype(float), scene.track.step, float(rng.uniform(40.0, 200.0)))
     held = (warm > rng.uniform(0.05, 0.2) * max(warm.max(), 1e-9)).astype(float)
     scene.add(held, size * direction(rng))
-
-
-def sampler(scene: Scene, size: float, rng: Generator) -> None:
-    """A water sampler's unlogged pump runs on every climb, and draws more as its filter clogs; size in nT."""
-    sinking = np.gradient(first_order(scene.track.depth, scene.track.step, 20.0), scene.track.step)
-    runs = (sinking < -rng.uniform(0.02, 0.1)).astype(float)
-    hours = np.cumsum(runs) * scene.track.step / 3600.0
-    draws = runs * (1.0 + rng.uniform(0.05, 0.2) * hours)
-    scene.add(first_order(draws, scene.track.step, 5.0), size * direction(rng))
-
-
-def sounder(scene: Scene, size: float, rng: Generator) -> None:
-    """An unlogged echo sounder hears the bottom below a depth and pings faster the nearer; size in nT."""
-    depth = scene.track.depth
-    heard = (depth > rng.uniform(0.3, 0.7) * depth.max()).astype(float)
-    near = rng.uniform(5.0, 20.0)
-    pings = heard * np.minimum(2.0 * near / (depth.max() + near - depth), 1.0)
-    scene.add(first_order(pings, scene.track.step, 5.0), size * direction(rng))
 
 
 def swarf(scene: Scene, size: float, rng: Generator) -> None:
@@ -300,17 +221,6 @@ def accumulator(scene: Scene, size: float, rng: Generator) -> None:
     scene.add(places, size * direction(rng))
 
 
-def modem(scene: Scene, size: float, rng: Generator) -> None:
-    """An unlogged acoustic modem talks to a mooring, while that is within range; size in nT."""
-    track = scene.track
-    north, east = track.local(track.latitude, track.longitude)
-    k = rng.integers(len(north))
-    away = np.hypot(north - north[k], east - east[k])
-    heard = away < np.quantile(away, rng.uniform(0.3, 0.6))
-    talks = (scene.t / rng.uniform(60.0, 240.0)) % 1.0 < rng.uniform(0.2, 0.6)
-    scene.add((heard & talks).astype(float), size * direction(rng))
-
-
 def backdriven(scene: Scene, size: float, rng: Generator) -> None:
     """The battery's weight creeps its screw back while no move holds it; size in inches an hour at 1 g.
 
@@ -324,3 +234,15 @@ def backdriven(scene: Scene, size: float, rng: Generator) -> None:
         off = 0.0 if moves[k] else off + pull * step / 3600.0
         crept[k] = off
     scene.logged["battpos"] = (place - size * crept, "in")
+
+
+def airlock(scene: Scene, size: float, rng: Generator) -> None:
+    """Air in the ballast's oil is squeezed by depth (Boyle) and dissolves; size in cm^3 at the surface.
+
+    The pump's gauge counts it as oil. While the bladder is wide the air has more room, too.
+    """
+    depth, oil = scene.track.depth, scene.track.parameters["ballast"]
+    left = np.exp(-scene.t / scene.t[-1] * rng.uniform(0.5, 3.0))  # Henry's law: a share of it an hour
+    squeezed = 1.0 - 10.0 / (10.0 + depth)
+    room = 1.0 + rng.uniform(0.1, 0.4) * (oil - oil.mean()) / max(float(np.ptp(oil)), 1e-9)
+    scene.logged["ballast"] = (oil + size * left * squeezed * room, "cm3")
