@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from magbridge.arrays import FloatArray
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.observe import observations
 from magbridge.calibration.residual import rms
@@ -23,8 +23,6 @@ from sitl.scenario import load
 from sitl.twin import Twin
 
 __all__ = ["METHODS", "PAPER", "TRIALS", "Trials", "fly", "measure"]
-
-Array = NDArray[np.float64]
 
 MASSES = ("battpos", "ballast")
 METHODS: dict[str, dict[str, Any]] = {
@@ -63,15 +61,15 @@ class Trials:
     """
 
     parts: dict[str, xr.Dataset]
-    corrected: dict[tuple[str, str, str], Array]
+    corrected: dict[tuple[str, str, str], FloatArray]
     failed: dict[tuple[str, str], str]
     scales: dict[tuple[str, str], tuple[float, float]]
     anomaly: AnomalyGrid
 
-    def error(self, part: str, trial: str, method: str, against: str = "reference_field") -> Array:
+    def error(self, part: str, trial: str, method: str, against: str = "reference_field") -> FloatArray:
         """Return the error of `method` with the coefficients of `trial`, (n,) nT; NaN where it failed."""
         known = self.parts[part][against].to_numpy()
-        found: Array = self.corrected.get((part, trial, method), np.full(known.shape, np.nan))
+        found: FloatArray = self.corrected.get((part, trial, method), np.full(known.shape, np.nan))
         return np.asarray(found - known)
 
     def rms(self, part: str, trial: str, method: str) -> float:

@@ -8,17 +8,15 @@ from typing import Any
 import msgspec
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from magbridge.arrays import FloatArray
 from sitl.dataset import channels
 from sitl.platform import HARD_IRON, MOMENT, SOFT_IRON, VOLUME_SPREAD, Vehicle
 
 __all__ = ["BestFit", "oracle"]
 
-Array = NDArray[np.float64]
 
-
-def oracle(vehicle: Vehicle, deployment: xr.Dataset) -> Array:
+def oracle(vehicle: Vehicle, deployment: xr.Dataset) -> FloatArray:
     """Return the total field (n,), nT, corrected by a calibration that knows the vehicle exactly.
 
     Its error is the noise floor: the channels' noise in the magnitude. The instrument must have no errors
@@ -80,7 +78,7 @@ class BestFit:
         self._h = h * scale
         self.bound = np.sqrt(np.einsum("ni,ij,nj->n", self._h, self._covariance, self._h) + self.floor**2)
 
-    def error(self, rng: np.random.Generator) -> Array:
+    def error(self, rng: np.random.Generator) -> FloatArray:
         r"""Return the survey's error (n,), nT, on these very data; the bound is its size on average.
 
         Notes
@@ -97,7 +95,7 @@ class BestFit:
         off = self._covariance @ (self._g.T @ e + rng.normal(size=len(self._covariance)))
         return np.asarray(after - self._h @ off)
 
-    def _whitened(self, values: Array) -> Array:
+    def _whitened(self, values: FloatArray) -> FloatArray:
         """Whiten columns (m, j), nT, on the calibration's samples; each run begins anew."""
         values = values / self._learned_floor[:, None]
         follows = (np.diff(self._calibration["run"].to_numpy(), prepend=np.nan) == 0)[:, None]
@@ -105,7 +103,7 @@ class BestFit:
         return np.where(follows, innovations, values)
 
 
-def _widths(vehicle: Vehicle, at_sigma: float) -> Array:
+def _widths(vehicle: Vehicle, at_sigma: float) -> FloatArray:
     """Return the prior's width of each parameter, (k,), in the order of :func:`_neighbours`."""
     widths = [*[SOFT_IRON] * 9, *[HARD_IRON] * 3]
     for mass in vehicle.mass.values():
@@ -113,7 +111,7 @@ def _widths(vehicle: Vehicle, at_sigma: float) -> Array:
     return np.array(widths)
 
 
-def _sensitivity(vehicle: Vehicle, deployment: xr.Dataset, sigma: float) -> tuple[Array, Array]:
+def _sensitivity(vehicle: Vehicle, deployment: xr.Dataset, sigma: float) -> tuple[FloatArray, FloatArray]:
     """Return the derivative of the corrected magnitude by each parameter (n, k), and its noise (n,), nT."""
     ambient = np.column_stack([deployment[f"truth_field_{axis}"] for axis in "xyz"])
     channels = {name: deployment[name].to_numpy() for name in vehicle.channels}
@@ -127,7 +125,7 @@ def _sensitivity(vehicle: Vehicle, deployment: xr.Dataset, sigma: float) -> tupl
     return np.column_stack(columns), sigma * np.linalg.norm(w, axis=1)
 
 
-def _response(vehicle: Vehicle, deployment: xr.Dataset) -> tuple[Array, Array]:
+def _response(vehicle: Vehicle, deployment: xr.Dataset) -> tuple[FloatArray, FloatArray]:
     """Return D (n, 3, 3) and T (n, 3): the reading is affine in the ambient field."""
     channels = {name: deployment[name].to_numpy() for name in vehicle.channels}
     n, unit = deployment.sizes["time"], 1e4

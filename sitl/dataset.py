@@ -7,8 +7,8 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from magbridge.arrays import FloatArray
 from magbridge.calibration.correct import CorrectedArrays, correct
 from magbridge.calibration.model import Calibration
 from magbridge.columns import CHANNELS, COLUMNS, Column
@@ -16,8 +16,6 @@ from sitl.platform import MOUNTINGS
 from sitl.trajectory import Track
 
 __all__ = ["at_rest", "channels", "corrected", "dataset", "segments", "side_by_side"]
-
-Array = NDArray[np.float64]
 
 OWN = {
     "power_cycle": Column("1", "times the instrument was powered on again"),
@@ -32,7 +30,7 @@ OWN = {
 """Columns that a simulation adds to those of any deployment."""
 
 
-def dataset(track: Track, when: Array, columns: Mapping[str, Array], source: str) -> xr.Dataset:
+def dataset(track: Track, when: FloatArray, columns: Mapping[str, FloatArray], source: str) -> xr.Dataset:
     """Return `columns`, sampled at `when` (n,), s after the track's start, as a deployment."""
     known = dict(COLUMNS | OWN)
     for name in track.parameters:
@@ -64,7 +62,7 @@ def at_rest(deployment: xr.Dataset, masses: Iterable[str]) -> xr.Dataset:
     return deployment.isel(time=still)
 
 
-def side_by_side(deployment: xr.Dataset, names: Sequence[str]) -> Array:
+def side_by_side(deployment: xr.Dataset, names: Sequence[str]) -> FloatArray:
     """Return columns side by side, (n, k)."""
     out = np.empty((deployment.sizes["time"], len(names)))
     for k, name in enumerate(names):
@@ -72,7 +70,7 @@ def side_by_side(deployment: xr.Dataset, names: Sequence[str]) -> Array:
     return out
 
 
-def channels(deployment: xr.Dataset) -> Array:
+def channels(deployment: xr.Dataset) -> FloatArray:
     """Return the three channels as read, (n, 3), nT."""
     return side_by_side(deployment, CHANNELS)
 

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from magbridge.arrays import FloatArray
 from magbridge.bridge.events import Start
 from magbridge.calibration.file import save
 from magbridge.calibration.fitting.fit import Fit, fit
@@ -32,7 +32,6 @@ from sitl.twin import simulate
 __all__ = ["demo", "summary"]
 
 PARAMETERS = ("battpos", "ballast")
-Floats = NDArray[np.float64]
 
 
 def demo(folder: Path, seed: int = 1, say: Callable[[str], None] = print) -> dict[str, Any]:
@@ -81,7 +80,7 @@ def demo(folder: Path, seed: int = 1, say: Callable[[str], None] = print) -> dic
     return {**result, "calibration_rms_nT": found.rms, "said": listener.said, "files": files}
 
 
-def _align(field: dict[str, Floats], survey: xr.Dataset) -> xr.Dataset:
+def _align(field: dict[str, FloatArray], survey: xr.Dataset) -> xr.Dataset:
     """Return what was heard, on the times at which it was measured, with the truth at those times.
 
     ``flagged`` is true where a flag speaks against the total field, which needs no boresight.

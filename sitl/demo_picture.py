@@ -8,8 +8,8 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from magbridge.arrays import FloatArray
 from magbridge.calibration.residual import rms
 from magbridge.files import atomic_path
 from sitl.dataset import channels
@@ -20,11 +20,10 @@ from matplotlib.axes import Axes
 
 __all__ = ["draw"]
 
-Floats = NDArray[np.float64]
 RAW, NOMINAL, CORRECTED, TRUE, FLAGGED = "#b0b0b0", "#d1793b", "#1f6fb4", "#111111", "#c0392b"
 
 
-def draw(survey: xr.Dataset, nominal: Floats, heard: xr.Dataset, path: Path) -> None:
+def draw(survey: xr.Dataset, nominal: FloatArray, heard: xr.Dataset, path: Path) -> None:
     """Draw the survey: masses, raw and true field, corrected and true field, errors."""
     hours = _hours(survey["time"], survey)
     received = _hours(heard["time"], survey)
@@ -67,11 +66,11 @@ def draw(survey: xr.Dataset, nominal: Floats, heard: xr.Dataset, path: Path) -> 
         plt.close(figure)
 
 
-def _hours(time: xr.DataArray, survey: xr.Dataset) -> Floats:
+def _hours(time: xr.DataArray, survey: xr.Dataset) -> FloatArray:
     return (time.to_numpy() - float(survey["time"][0])) / 3600.0
 
 
-def _masses(axes: Axes, hours: Floats, survey: xr.Dataset) -> None:
+def _masses(axes: Axes, hours: FloatArray, survey: xr.Dataset) -> None:
     axes.set_title("What moves: battery and ballast")
     axes.spines["right"].set_visible(True)
     axes.step(hours, survey["battpos"].to_numpy(), color="#5b8a3c", lw=1)
@@ -81,7 +80,7 @@ def _masses(axes: Axes, hours: Floats, survey: xr.Dataset) -> None:
     other.set_ylabel("ballast, cm³", color="#8a3c6e")
 
 
-def _levels(axes: Axes, title: str, *lines: tuple[Floats, Floats, str, str]) -> None:
+def _levels(axes: Axes, title: str, *lines: tuple[FloatArray, FloatArray, str, str]) -> None:
     axes.set_title(title)
     for x, y, colour, label in lines:
         axes.plot(x, y, color=colour, lw=1.0 if colour == TRUE else 1.4, label=label)
@@ -91,7 +90,9 @@ def _levels(axes: Axes, title: str, *lines: tuple[Floats, Floats, str, str]) -> 
     axes.margins(y=0.15)
 
 
-def _errors(axes: Axes, hours: Floats, nominal: Floats, received: Floats, heard: xr.Dataset) -> None:
+def _errors(
+    axes: Axes, hours: FloatArray, nominal: FloatArray, received: FloatArray, heard: xr.Dataset
+) -> None:
     error = (heard["total_field"] - heard["truth"]).to_numpy()
     flagged = heard["flagged"].to_numpy()
     good = rms(error[~flagged])

@@ -7,16 +7,15 @@ from typing import Annotated
 
 import numpy as np
 from msgspec import Meta
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from magbridge.arrays import FloatArray
 from magbridge.config import NotNegative, Positive
 from magbridge.toml import Table
 from sitl.signals import autoregressive, first_order, first_order_at
 
 __all__ = ["Instrument", "Samples", "rotation"]
 
-Array = NDArray[np.float64]
 Vector = tuple[float, float, float]
 
 
@@ -74,7 +73,7 @@ class Instrument(Table, frozen=True):
     noise_sigma: NotNegative = 1.0
     noise_memory: NotNegative = 0.0
 
-    def matrix(self) -> Array:
+    def matrix(self) -> FloatArray:
         """Return the matrix (3, 3) from the field in body axes to the channels, without noise and offset.
 
         Rows are the sensing axes in sensor axes: x is the reference, y lies in the x-y plane. The rotation
@@ -91,7 +90,7 @@ class Instrument(Table, frozen=True):
         return np.asarray(np.diag(self.scale) @ axes @ rotation(*self.mounting).as_matrix().T)
 
     def measure(
-        self, field: Array, water: Array, step: float, when: Array, rng: np.random.Generator
+        self, field: FloatArray, water: FloatArray, step: float, when: FloatArray, rng: np.random.Generator
     ) -> Samples:
         """Measure a field given on a uniform grid.
 
@@ -131,7 +130,7 @@ class Instrument(Table, frozen=True):
             power_cycle=np.searchsorted(np.asarray(self.power_on), when, side="right").astype(np.float64),
         )
 
-    def digitise(self, field: Array) -> Array:
+    def digitise(self, field: FloatArray) -> FloatArray:
         """Return `field` (n, 3), nT, as the converter gives it: rounded to its step, clipped at its ends."""
         half = 2 ** (self.bits - 1)
         step = self.full_scale / half
@@ -154,13 +153,13 @@ class Samples:
         How many times it was powered on again.
     """
 
-    channels: Array
-    times: Array
-    temperature: Array
-    power_cycle: Array
+    channels: FloatArray
+    times: FloatArray
+    temperature: FloatArray
+    power_cycle: FloatArray
 
 
-def rotation(roll: float | Array, pitch: float | Array, heading: float | Array) -> Rotation:
+def rotation(roll: float | FloatArray, pitch: float | FloatArray, heading: float | FloatArray) -> Rotation:
     """Return the rotations that take body vectors to the world's axes, angles (n,) in deg, order 3-2-1.
 
     ``rotation(...).apply(field_ned, inverse=True)`` is the field in body axes.

@@ -7,8 +7,8 @@ from datetime import UTC, datetime
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from magbridge.arrays import FloatArray
 from magbridge.errors import FormatError
 from magbridge.field.declination import with_true_heading
 from magbridge.field.earth import wrap
@@ -17,8 +17,6 @@ from sitl.trajectory import Track
 from sitl.twin import FINE_STEP, Twin
 
 __all__ = ["placed_at", "simulate_like"]
-
-Array = NDArray[np.float64]
 
 POINTS = 8
 """Points of the simulation between two rows of a slow log."""
@@ -71,7 +69,7 @@ def placed_at(log: xr.Dataset, scenario: Scenario) -> Scenario:
     return scenario.replace(world={"latitude": latitude, "longitude": wrap(longitude)}, start=start)
 
 
-def read_track(log: xr.Dataset, scenario: Scenario, channels: Sequence[str]) -> tuple[Track, Array]:
+def read_track(log: xr.Dataset, scenario: Scenario, channels: Sequence[str]) -> tuple[Track, FloatArray]:
     """Return a log's track with these `channels` on a uniform grid, and the times in s from its start."""
     log = with_true_heading(log)
     time = log["time"].to_numpy().astype(np.float64)
@@ -82,7 +80,7 @@ def read_track(log: xr.Dataset, scenario: Scenario, channels: Sequence[str]) -> 
     last = when[-1] + max(scenario.instrument.channel_delay)
     grid = np.arange(0.0, last + 2 * step, step)
 
-    def column(name: str) -> Array:
+    def column(name: str) -> FloatArray:
         value = _column(log, name)
         known = np.isfinite(value)
         return np.interp(grid, when[known], value[known])
@@ -102,7 +100,7 @@ def read_track(log: xr.Dataset, scenario: Scenario, channels: Sequence[str]) -> 
     return track, when
 
 
-def _column(log: xr.Dataset, name: str) -> Array:
+def _column(log: xr.Dataset, name: str) -> FloatArray:
     """Return a column (n,), NaN where it lacks a value; angles without their jumps by 360 deg."""
     if name not in log:
         there = ", ".join(map(str, log))

@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
+from magbridge.arrays import FloatArray
 from magbridge.calibration.forward import forward
 from magbridge.calibration.model import Calibration
 from magbridge.toml import Table
@@ -28,7 +28,6 @@ __all__ = [
     "draw_vehicle",
 ]
 
-Array = NDArray[np.float64]
 Vector = tuple[float, float, float]
 Matrix = tuple[Vector, Vector, Vector]
 
@@ -90,7 +89,7 @@ class Mass(Table, frozen=True):
     moment: Vector
     volume: Vector = (0.0, 0.0, 0.0)
 
-    def field(self, ambient: Array, position: Array) -> Array:
+    def field(self, ambient: FloatArray, position: FloatArray) -> FloatArray:
         r"""Return the mass's field at the sensor.
 
         Parameters
@@ -137,7 +136,12 @@ class Vehicle(Table, frozen=True):
         """Names of the channels that :meth:`field` needs."""
         return tuple(self.mass)
 
-    def field(self, ambient: Array, channels: Mapping[str, Array], time: Array | None = None) -> Array:  # noqa: ARG002
+    def field(
+        self,
+        ambient: FloatArray,
+        channels: Mapping[str, FloatArray],
+        time: FloatArray | None = None,  # noqa: ARG002
+    ) -> FloatArray:
         """Return the field at the sensor, (n, 3) nT in body axes.
 
         Parameters
@@ -165,7 +169,7 @@ class Calibrated:
         """Names of the channels that :meth:`field` needs: masses, and the channels of the effects."""
         return self.calibration.channels
 
-    def field(self, ambient: Array, channels: Mapping[str, Array], time: Array) -> Array:
+    def field(self, ambient: FloatArray, channels: Mapping[str, FloatArray], time: FloatArray) -> FloatArray:
         """Return the field at the sensor (n, 3) as :meth:`Vehicle.field`; `time` (n,) is s since 1970."""
         sampled = np.reshape([channels[name] for name in self.channels], (-1, len(time))).T
         return forward(self.calibration, ambient, sampled, time)
@@ -198,6 +202,6 @@ def _draw_mass(rng: np.random.Generator, mounting: Mounting) -> Mass:
     )
 
 
-def _vector(values: Array) -> Vector:
+def _vector(values: FloatArray) -> Vector:
     x, y, z = (float(value) for value in values)
     return x, y, z

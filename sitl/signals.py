@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import lfilter
+
+from magbridge.arrays import FloatArray
 
 __all__ = ["autoregressive", "correlated", "first_order", "first_order_at"]
 
-Array = NDArray[np.float64]
 
-
-def first_order(u: Array, step: float, time_constant: float, start: Array | float | None = None) -> Array:
+def first_order(
+    u: FloatArray, step: float, time_constant: float, start: FloatArray | float | None = None
+) -> FloatArray:
     r"""Return the output of a first-order lag on a uniform grid.
 
     Parameters
@@ -47,7 +48,9 @@ def first_order(u: Array, step: float, time_constant: float, start: Array | floa
     return np.asarray(y, dtype=np.float64)
 
 
-def first_order_at(u: Array, y: Array, step: float, time_constant: float, when: Array) -> Array:
+def first_order_at(
+    u: FloatArray, y: FloatArray, step: float, time_constant: float, when: FloatArray
+) -> FloatArray:
     r"""Return a first-order lag's output between the points of its grid.
 
     Parameters
@@ -77,7 +80,9 @@ def first_order_at(u: Array, y: Array, step: float, time_constant: float, when: 
     return np.asarray(a * y[k] + (1 - a) * (u[k] - slope * time_constant) + slope * s)
 
 
-def autoregressive(rng: np.random.Generator, shape: tuple[int, ...], sigma: float, memory: float) -> Array:
+def autoregressive(
+    rng: np.random.Generator, shape: tuple[int, ...], sigma: float, memory: float
+) -> FloatArray:
     """Return stationary noise of a shape; its correlation falls by e in `memory` points of the first axis.
 
     `sigma` is the standard deviation of the noise itself, not of its innovations; a memory of 0
@@ -87,7 +92,7 @@ def autoregressive(rng: np.random.Generator, shape: tuple[int, ...], sigma: floa
     return correlated(white, np.exp(-1.0 / memory)) if memory else white
 
 
-def correlated(white: Array, phi: float) -> Array:
+def correlated(white: FloatArray, phi: float) -> FloatArray:
     """Make stationary white noise (n, ...) autoregressive: neighbours correlate by `phi`, the size stays."""
     driven = np.concatenate([white[:1], np.sqrt(1 - phi**2) * white[1:]])
     return np.asarray(lfilter([1.0], [1.0, -phi], driven, axis=0), dtype=np.float64)

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from itertools import accumulate
 
 import numpy as np
-from numpy.typing import NDArray
 
+from magbridge.arrays import FloatArray, IndexArray
 from magbridge.config import NotNegative, Positive
 from magbridge.errors import OutOfRange
 from magbridge.field.earth import offset, separation
@@ -17,8 +17,6 @@ from sitl.mission import LIMITS, Leg, Limit
 from sitl.signals import autoregressive, first_order
 
 __all__ = ["Motion", "Track", "fly"]
-
-Array = NDArray[np.float64]
 
 
 class Motion(Table, frozen=True):
@@ -79,30 +77,30 @@ class Track:
 
     start: float
     step: float
-    latitude: Array
-    longitude: Array
-    depth: Array
-    roll: Array
-    pitch: Array
-    heading: Array
-    parameters: dict[str, Array]
-    run: Array | None = None
+    latitude: FloatArray
+    longitude: FloatArray
+    depth: FloatArray
+    roll: FloatArray
+    pitch: FloatArray
+    heading: FloatArray
+    parameters: dict[str, FloatArray]
+    run: FloatArray | None = None
     segments: tuple[tuple[str, float, float], ...] = ()
-    water: Array | None = None
+    water: FloatArray | None = None
 
     @property
-    def elapsed(self) -> Array:
+    def elapsed(self) -> FloatArray:
         """Time since the start, s, (n,)."""
         return np.asarray(self.step * np.arange(len(self.depth)))
 
-    def at(self, when: Array) -> dict[str, Array]:
+    def at(self, when: FloatArray) -> dict[str, FloatArray]:
         """Return every quantity by name at `when` (m,), s after the start, linear between the points."""
         names = ("latitude", "longitude", "depth", "roll", "pitch", "heading")
         columns = {name: getattr(self, name) for name in names} | self.parameters
         elapsed = self.elapsed
         return {name: np.interp(when, elapsed, column) for name, column in columns.items()}
 
-    def local(self, latitude: Array, longitude: Array) -> tuple[Array, Array]:
+    def local(self, latitude: FloatArray, longitude: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return places (m,), deg, as metres north and east of where the track begins."""
         return separation(float(self.latitude[0]), float(self.longitude[0]), latitude, longitude)
 
@@ -145,7 +143,7 @@ def fly(
     wander = first_order(autoregressive(rng, (len(t), 3), 1.0, memory), step, motion.wander_memory / 3)
     wander *= np.sqrt(4 / 3) * np.asarray(motion.wander)
 
-    def settled(command: Array) -> Array:
+    def settled(command: FloatArray) -> FloatArray:
         return first_order(command, step, motion.settle)
 
     roll = settled(np.array([leg.roll for leg in legs])[leg_of]) + wander[:, 0]
@@ -174,14 +172,14 @@ def fly(
     )
 
 
-def _depth(sink: Array, deepest: float) -> Array:
+def _depth(sink: FloatArray, deepest: float) -> FloatArray:
     """(n,) m: it floats at the surface until it sinks, and stays at its greatest depth until it climbs."""
     return np.array(
         [*accumulate(sink.tolist(), lambda depth, by: min(max(depth + by, 0.0), deepest), initial=0.0)][1:]
     )
 
 
-def _headings(legs: Sequence[Leg], ends: Array, t: Array, leg_of: NDArray[np.intp]) -> Array:
+def _headings(legs: Sequence[Leg], ends: FloatArray, t: FloatArray, leg_of: IndexArray) -> FloatArray:
     """Return the commanded heading, unwrapped: each leg turns the shorter way to its own start."""
     first, last = [], legs[0].heading or 0.0
     for leg in legs:
@@ -196,11 +194,11 @@ def _headings(legs: Sequence[Leg], ends: Array, t: Array, leg_of: NDArray[np.int
 def _mass_motion(
     name: str,
     legs: Sequence[Leg],
-    ends: Array,
-    t: Array,
-    leg_of: NDArray[np.intp],
+    ends: FloatArray,
+    t: FloatArray,
+    leg_of: IndexArray,
     limits: Mapping[str, Limit],
-) -> Array:
+) -> FloatArray:
     """Return a mass's position (n,): at each leg's start it sets out for its target, as fast as it can."""
     if name not in limits:
         raise OutOfRange("moving mass", name, f"the vehicle has {', '.join(limits)}")
@@ -226,7 +224,7 @@ def _mass_motion(
     return np.asarray(np.array(origin)[leg_of] + np.clip(way[leg_of], -gone, gone))
 
 
-def _segments(legs: Sequence[Leg], ends: Array) -> tuple[tuple[str, float, float], ...]:
+def _segments(legs: Sequence[Leg], ends: FloatArray) -> tuple[tuple[str, float, float], ...]:
     segments: list[tuple[str, float, float]] = []
     for leg, end in zip(legs, ends, strict=True):
         if segments and segments[-1][0] == leg.segment:

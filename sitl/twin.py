@@ -13,8 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from magbridge.arrays import FloatArray
 from magbridge.calibration.file import load as load_calibration
 from magbridge.errors import WrongUse
 from magbridge.field.earth import offset, separation
@@ -28,8 +28,6 @@ from sitl.trajectory import Track, fly
 from sitl.world import World
 
 __all__ = ["FINE_STEP", "Ambient", "Twin", "simulate"]
-
-Array = NDArray[np.float64]
 
 FINE_STEP = 0.5
 """s between the simulation's points: a spiral's arc departs from its chords by 0.1 nT."""
@@ -50,9 +48,9 @@ class Ambient(NamedTuple):
         degC.
     """
 
-    earth: Array
-    field: Array
-    water: Array
+    earth: FloatArray
+    field: FloatArray
+    water: FloatArray
 
 
 @dataclass(frozen=True)
@@ -111,7 +109,7 @@ class Twin:
         step = min(FINE_STEP, 1 / self.scenario.instrument.rate)
         return fly(legs, start, step, rng, self.scenario.motion, limits)
 
-    def measure(self, track: Track, when: Array) -> xr.Dataset:
+    def measure(self, track: Track, when: FloatArray) -> xr.Dataset:
         """Measure along a track.
 
         Parameters
@@ -146,7 +144,7 @@ class Twin:
         """Return the generator of the instrument's offsets at power-on and of its noise."""
         return _stream(self.seed, 3)
 
-    def log(self, track: Track, when: Array, earth: Array, samples: Samples) -> xr.Dataset:
+    def log(self, track: Track, when: FloatArray, earth: FloatArray, samples: Samples) -> xr.Dataset:
         """Return the deployment of an instrument's samples, as :meth:`measure` does.
 
         Parameters
@@ -192,7 +190,7 @@ class Twin:
             spacing=(geology.top + altitude) / 3,  # an anomaly is about as wide as its source is deep
         )
 
-    def _earth_field(self, track: Track) -> Array:
+    def _earth_field(self, track: Track) -> FloatArray:
         """Return the Earth's field (n, 3), nT NED, on the track's grid, linear between sparser points."""
         stride = max(1, int(FIELD_STEP / track.step))
         points = np.unique(np.append(np.arange(0, len(track.depth), stride), len(track.depth) - 1))
@@ -201,7 +199,7 @@ class Twin:
         grid = np.arange(len(track.depth))
         return np.column_stack([np.interp(grid, points, component) for component in field.T])
 
-    def _channels(self, track: Track) -> dict[str, Array]:
+    def _channels(self, track: Track) -> dict[str, FloatArray]:
         """Return the channels on which the vehicle's magnetism depends."""
         known = track.at(track.elapsed)
         for name in self.vehicle.channels:
@@ -211,7 +209,7 @@ class Twin:
                 )
         return {name: known[name] for name in self.vehicle.channels}
 
-    def _telemetry(self, true: dict[str, Array], when: Array) -> dict[str, Array]:
+    def _telemetry(self, true: dict[str, FloatArray], when: FloatArray) -> dict[str, FloatArray]:
         """Return the telemetry: attitude and position with their errors, all else as it is."""
         settings, rng = self.scenario.telemetry, _stream(self.seed, 4)
         seen = dict(true)
@@ -225,7 +223,7 @@ class Twin:
         )
         return seen
 
-    def _map_reference(self, columns: dict[str, Array], time: Array) -> Array:
+    def _map_reference(self, columns: dict[str, FloatArray], time: FloatArray) -> FloatArray:
         """Return the IGRF plus the map's anomaly, nT, at the vehicle's logged position (paper, eq. 4)."""
         latitude, longitude = columns["latitude"], columns["longitude"]
         main = total_field(longitude, latitude, columns["depth"], time)

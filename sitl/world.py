@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from magbridge.arrays import FloatArray
 from magbridge.field.earth import offset, separation
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.igrf import igrf, total_field
@@ -14,13 +14,11 @@ from magbridge.toml import Table
 
 __all__ = ["MU_0_OVER_4_PI", "Geology", "Rock", "Water", "World", "dipole_field"]
 
-Array = NDArray[np.float64]
-
 MU_0_OVER_4_PI = 100.0
 """nT m / A: µ0/4π = 1e-7 T m/A."""
 
 
-def dipole_field(r: Array, m: Array) -> Array:
+def dipole_field(r: FloatArray, m: FloatArray) -> FloatArray:
     r"""Return the field of point dipoles.
 
     Parameters
@@ -77,7 +75,7 @@ class Water(Table, frozen=True):
     thermocline: float = 40.0
     thickness: float = 15.0
 
-    def temperature(self, depth: Array) -> Array:
+    def temperature(self, depth: FloatArray) -> FloatArray:
         """Return degC (n,) at `depth` (n,), m."""
         share = 0.5 * (1 + np.tanh((depth - self.thermocline) / self.thickness))
         return np.asarray(self.surface + (self.deep - self.surface) * share)
@@ -95,11 +93,11 @@ class Rock:
         A m², the same axes.
     """
 
-    position: Array
-    moment: Array
+    position: FloatArray
+    moment: FloatArray
 
     @classmethod
-    def draw(cls, geology: Geology, main_field: Array, rng: np.random.Generator) -> Rock:
+    def draw(cls, geology: Geology, main_field: FloatArray, rng: np.random.Generator) -> Rock:
         """Draw bodies that give the anomaly `geology` asks for in a `main_field` (3,) nT.
 
         A body's moment grows as the cube of its depth, so that each depth contributes alike; half of it is
@@ -119,7 +117,7 @@ class Rock:
         anomaly = rock.field(grid) @ main_field / np.linalg.norm(main_field)
         return cls(position, rock.moment * geology.rms / np.std(anomaly))
 
-    def field(self, ned: Array, block: int = 4096) -> Array:
+    def field(self, ned: FloatArray, block: int = 4096) -> FloatArray:
         """Return the bodies' field (n, 3), nT, at local points (n, 3), m.
 
         :func:`dipole_field` summed over the bodies, with the sums as matrix products.
@@ -165,7 +163,9 @@ class World:
         latitude, longitude, depth, when = np.array([[origin[0]], [origin[1]], [0.0], [time]])
         return cls(origin, Rock.draw(geology, igrf(longitude, latitude, depth, when)[0], rng), water)
 
-    def field(self, time: Array, latitude: Array, longitude: Array, depth: Array) -> Array:
+    def field(
+        self, time: FloatArray, latitude: FloatArray, longitude: FloatArray, depth: FloatArray
+    ) -> FloatArray:
         """Return the field (n, 3) in nT, north-east-down, at times (s since 1970), places (deg, deg, m)."""
         north, east = separation(*self.origin, latitude, longitude)
         return igrf(longitude, latitude, depth, time) + self.rock.field(np.column_stack([north, east, depth]))

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from terminal import command_line, table
 
+from magbridge.arrays import FloatArray
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.observe import observations
@@ -24,8 +25,6 @@ from magbridge.calibration.fitting.validate import in_sensor_units
 from magbridge.calibration.residual import rms
 from magbridge.errors import CalibrationError
 from magbridge.logs import read
-
-FloatArray = NDArray[np.float64]
 
 FEWEST = 30
 """Samples of a run that is worth leaving out."""

@@ -17,8 +17,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from magbridge.arrays import FloatArray, IndexArray
 from magbridge.calibration.arithmetic import COARSE, FINE, PAIRS
 from magbridge.calibration.kernel import COLUMNS, Kernel
 from magbridge.calibration.terms import Exponents
@@ -27,8 +27,6 @@ if TYPE_CHECKING:
     from magbridge.calibration.model import Calibration
 
 __all__ = ["coefficient_tensor", "compile_kernel"]
-
-FloatArray = NDArray[np.float64]
 
 ORDINARY = 1024.0
 """nT, the difference that an effect's regressor of 1 may make at most, in the unit chosen for it."""
@@ -135,7 +133,7 @@ def _body_axes(calibration: Calibration) -> FloatArray:
 
 def _table(
     P: FloatArray, W: FloatArray, calibration: Calibration, exponents: list[Exponents]
-) -> tuple[NDArray[np.intp], NDArray[np.intp], FloatArray]:
+) -> tuple[IndexArray, IndexArray, FloatArray]:
     """Return the two regressors of each product, (q,) and (q,), and each product's share of the 81 sums."""
     m, B = len(W), _body_axes(calibration)
     flat = (P @ B).reshape(len(P), -1)

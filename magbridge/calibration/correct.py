@@ -16,8 +16,8 @@ from math import inf, isnan, nan, sqrt
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from magbridge.arrays import FloatArray, IntArray
 from magbridge.calibration.arithmetic import Prepared, apply, combined, for_arrays, prepare
 from magbridge.calibration.kernel import FARTHEST, Kernel
 from magbridge.calibration.model import Calibration
@@ -27,7 +27,6 @@ from magbridge.records import BEYOND, Corrected, Quality
 
 __all__ = ["CorrectedArrays", "Corrector", "correct", "regressors"]
 
-FloatArray = NDArray[np.float64]
 Span = tuple[int, float, float]
 CHUNK = 4096
 """Samples at a time: enough to outweigh the overhead of a call, few enough for a core's cache."""
@@ -54,7 +53,7 @@ class CorrectedArrays(NamedTuple):
     sigma: FloatArray
     vector: FloatArray
     vector_sigma: FloatArray
-    quality: NDArray[np.int64]
+    quality: IntArray
 
 
 def _omega(calibration: Calibration) -> tuple[float, ...] | None:

@@ -22,8 +22,8 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from numpy.polynomial import chebyshev
-from numpy.typing import NDArray
 
+from magbridge.arrays import FloatArray
 from magbridge.calibration.arithmetic import PAIRS
 from magbridge.calibration.terms import Expansion, PositionTerm
 from magbridge.errors import CalibrationError
@@ -33,7 +33,6 @@ if TYPE_CHECKING:
 
 __all__ = ["ORDER", "Dipole", "dipole_columns", "dipole_tensor", "expand_dipole"]
 
-FloatArray = NDArray[np.float64]
 Vector = tuple[float, float, float]
 
 ORDER = 8

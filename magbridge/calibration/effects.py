@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import numpy as np
 from msgspec import Meta
-from numpy.typing import NDArray
 
+from magbridge.arrays import FloatArray
 from magbridge.calibration.terms import Effect, Power, Step
 
 if TYPE_CHECKING:
@@ -27,7 +27,6 @@ if TYPE_CHECKING:
 
 __all__ = ["MAX_INTERVAL", "ChannelEffect", "SingleChannelEffect", "offsets", "powers"]
 
-FloatArray = NDArray[np.float64]
 MAX_INTERVAL = 60_000_000
 """µs; over a longer gap no rate of change is computed."""
 

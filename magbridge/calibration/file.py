@@ -12,16 +12,14 @@ from zlib import crc32
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
+from magbridge.arrays import FloatArray
 from magbridge.calibration.model import Boresight, Calibration, Noise, Parameter, Reference, Run, Sensor
 from magbridge.calibration.terms import Effect, PositionTerm, Term, term_class
 from magbridge.errors import CalibrationError, FormatError
 from magbridge.files import atomic_path
 
 __all__ = ["FORMAT", "calibration_id", "decode_calibration", "encode_calibration", "load", "save"]
-
-FloatArray = NDArray[np.float64]
 
 FORMAT = 3
 """Version of the layout; a reader takes this one and all before it. In 1, the noise's

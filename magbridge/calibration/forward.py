@@ -9,15 +9,13 @@ solved for by iteration; all others are exact in the first pass.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from magbridge.arrays import FloatArray
 from magbridge.calibration.correct import regressors
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.terms import symmetric
 
 __all__ = ["coefficients_at", "forward"]
-
-FloatArray = NDArray[np.float64]
 
 
 def coefficients_at(

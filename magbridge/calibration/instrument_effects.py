@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import numpy as np
 from msgspec import Meta
-from numpy.typing import NDArray
 
+from magbridge.arrays import FloatArray
 from magbridge.calibration.effects import MAX_INTERVAL, offsets, powers
 from magbridge.calibration.terms import HIGHEST, Effect, Power, Step, Width
 
@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     from magbridge.calibration.model import Calibration
 
 __all__ = ["RateEffect", "ResponseEffect", "TimeEffect"]
-
-FloatArray = NDArray[np.float64]
 
 
 class TimeEffect(Effect, frozen=True, kw_only=True):

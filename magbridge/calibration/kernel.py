@@ -27,13 +27,11 @@ from math import frexp, ldexp, nan
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from magbridge.arrays import FloatArray, IndexArray
 from magbridge.calibration.arithmetic import BITS, COARSE, FINE, monomials, split
 
 __all__ = ["COLUMNS", "FARTHEST", "Kernel"]
-
-FloatArray = NDArray[np.float64]
 
 EXPONENT = 3
 """psi is kept below 2^3, scaled by a power of two where positions lie far outside the range seen. Then sums
@@ -71,8 +69,8 @@ class Kernel:
     parents: tuple[tuple[int, int], ...]
     weights: FloatArray
     units: tuple[float, ...] | None
-    first: NDArray[np.intp]
-    second: NDArray[np.intp]
+    first: IndexArray
+    second: IndexArray
     coarse: FloatArray
     fine: FloatArray
 

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated, ClassVar
 import numpy as np
 from msgspec import Meta
 from numpy.polynomial.legendre import leg2poly
-from numpy.typing import NDArray
 
+from magbridge.arrays import FloatArray
 from magbridge.calibration.effects import MAX_INTERVAL, SingleChannelEffect, offsets, powers
 from magbridge.calibration.terms import HIGHEST, Effect, Exponents, Power, Step, Width
 from magbridge.errors import CalibrationError
@@ -27,8 +27,6 @@ __all__ = [
     "PowersEffect",
     "SourcesEffect",
 ]
-
-FloatArray = NDArray[np.float64]
 
 
 class MassEffect(SingleChannelEffect, frozen=True, kw_only=True):

@@ -21,16 +21,14 @@ from functools import cached_property
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
+from magbridge.arrays import FloatArray
 from magbridge.calibration.compilation import compile_kernel
 from magbridge.calibration.kernel import Kernel
 from magbridge.calibration.terms import Effect, Polynomial, PositionTerm, symmetric
 from magbridge.errors import CalibrationError
 
 __all__ = ["Boresight", "Calibration", "Noise", "Parameter", "Reference", "Run", "Sensor", "identity"]
-
-FloatArray = NDArray[np.float64]
 
 
 class Parameter(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

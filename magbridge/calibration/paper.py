@@ -14,13 +14,11 @@ from itertools import permutations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from magbridge.arrays import FloatArray
 from magbridge.calibration.model import Calibration
 
 __all__ = ["facts", "to_paper"]
-
-FloatArray = NDArray[np.float64]
 
 
 def to_paper(A: FloatArray, field: float) -> tuple[FloatArray, FloatArray]:

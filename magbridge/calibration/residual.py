@@ -22,8 +22,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from magbridge.arrays import BoolArray, FloatArray, IndexArray
 from magbridge.calibration.arithmetic import PAIRS
 from magbridge.calibration.terms import symmetric
 
@@ -40,7 +40,6 @@ __all__ = [
     "whiten",
 ]
 
-FloatArray = NDArray[np.float64]
 CHUNK = 8192
 """Rows of the Jacobian at a time: bounded memory at any number of samples."""
 
@@ -72,7 +71,7 @@ class Samples:
     F_0: float
     kappa: float = 0.0
 
-    def part(self, rows: slice | NDArray[np.bool_] | NDArray[np.intp]) -> Samples:
+    def part(self, rows: slice | BoolArray | IndexArray) -> Samples:
         """Pick samples: an (n,) mask, places or a slice."""
         return Samples(
             self.field[rows], self.reference[rows], self.phi[rows], self.steps[rows], self.F_0, self.kappa

@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, cast
 import msgspec
 import numpy as np
 from msgspec import Meta
-from numpy.typing import NDArray
 
+from magbridge.arrays import FloatArray
 from magbridge.errors import CalibrationError
 
 if TYPE_CHECKING:
@@ -43,7 +43,6 @@ __all__ = [
     "term_class",
 ]
 
-FloatArray = NDArray[np.float64]
 Exponents = tuple[int, ...]
 Step = Callable[[int, float, float, float, Sequence[float]], tuple[float, ...]]
 """One sample into an effect: time (µs), the raw channels (nT), the values -> its regressors."""

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from magbridge.arrays import FloatArray
 from magbridge.calibration.model import Calibration
 from magbridge.diagnose.causes.candidates import Candidate
-from magbridge.diagnose.compare.arrays import FloatArray
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.gain import Gain
 from magbridge.diagnose.inference.isolability import Isolability

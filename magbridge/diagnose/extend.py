@@ -8,12 +8,12 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 
+from magbridge.arrays import IndexArray
 from magbridge.calibration.instrument_effects import RateEffect
 from magbridge.calibration.mass_effects import ClockEffect
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.residual import residuals, residuals_of, robust_scale
 from magbridge.diagnose.causes.candidates import Candidate, slices
-from magbridge.diagnose.compare.arrays import IndexArray
 from magbridge.diagnose.compare.derivatives import derivatives
 from magbridge.diagnose.compare.design_columns import Columns
 from magbridge.diagnose.compare.prior import isotropic

@@ -23,7 +23,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from magbridge.diagnose.compare.arrays import BoolArray, FloatArray, IntArray
+from magbridge.arrays import BoolArray, FloatArray, IntArray
 from magbridge.diagnose.compare.design_columns import Columns
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.design import Design, precomputed

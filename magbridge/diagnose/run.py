@@ -11,12 +11,12 @@ import numpy as np
 from scipy.stats import chi2
 from threadpoolctl import threadpool_limits
 
+from magbridge.arrays import BoolArray, FloatArray
 from magbridge.calibration.instrument_effects import TimeEffect
 from magbridge.calibration.model import Calibration
 from magbridge.diagnose.accept import accept
 from magbridge.diagnose.causes import CAUSES, Cause
 from magbridge.diagnose.causes.candidates import Candidate, since, slices
-from magbridge.diagnose.compare.arrays import BoolArray, FloatArray
 from magbridge.diagnose.compare.problem import Problem, pose
 from magbridge.diagnose.compare.survey import Survey
 from magbridge.diagnose.compare.take import take

@@ -17,15 +17,15 @@ from math import isfinite, sqrt
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from magbridge.arrays import FloatArray
 from magbridge.field.earth import metres_per_degree
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.spline import filled
 
 __all__ = ["Continued", "continued"]
 
-Array = NDArray[np.float64]
 
 SURE, TERMS = 3, 10
 """Terms of the series that are used, and terms that stand for the true field when the error is estimated:
@@ -89,7 +89,7 @@ def continued(grid: AnomalyGrid, depth: ArrayLike) -> Continued:
     return Continued(there, sqrt(sigma2), sqrt(2 * sigma2 / steepness2) if steepness2 else float("inf"))
 
 
-def _growth(k: Array, height: float, terms: int) -> Array:
+def _growth(k: FloatArray, height: float, terms: int) -> FloatArray:
     """Return exp(k height), downward the first `terms` of its series."""
     if height <= 0:
         return np.asarray(np.exp(k * height))
@@ -97,7 +97,7 @@ def _growth(k: Array, height: float, terms: int) -> Array:
     return np.asarray((1 - p**terms) / (1 - p))
 
 
-def _wavenumber(grid: AnomalyGrid) -> Array:
+def _wavenumber(grid: AnomalyGrid) -> FloatArray:
     """Return |k| (ny, nx), rad/m, of the cosine transform's terms."""
     per_latitude, per_longitude = metres_per_degree(float(np.mean(grid.latitude)))
     ny, nx = grid.anomaly.shape

@@ -6,7 +6,8 @@ from math import cos, pi, sin, sqrt
 from typing import Any, TypeVar, overload
 
 import numpy as np
-from numpy.typing import NDArray
+
+from magbridge.arrays import FloatArray
 
 __all__ = [
     "ECCENTRICITY_SQUARED",
@@ -30,15 +31,14 @@ ACROSS = EQUATORIAL_RADIUS * RADIAN
 ALONG = ACROSS * (1.0 - ECCENTRICITY_SQUARED)
 """m per degree of latitude, divided by w³."""
 
-Array = NDArray[np.float64]
-Number = TypeVar("Number", float, Array)
+Number = TypeVar("Number", float, FloatArray)
 
 
 @overload
 def metres_per_degree(latitude: float) -> tuple[float, float]: ...
 @overload
-def metres_per_degree(latitude: Array) -> tuple[Array, Array]: ...
-def metres_per_degree(latitude: float | Array) -> tuple[float | Array, float | Array]:
+def metres_per_degree(latitude: FloatArray) -> tuple[FloatArray, FloatArray]: ...
+def metres_per_degree(latitude: float | FloatArray) -> tuple[float | FloatArray, float | FloatArray]:
     """Return the metres that a degree of latitude and one of longitude span at `latitude` (deg, or (n,)).
 
     Notes
@@ -70,8 +70,11 @@ def separation(
 ) -> tuple[float, float]: ...
 @overload
 def separation(
-    latitude: float | Array, longitude: float | Array, to_latitude: Array, to_longitude: Array
-) -> tuple[Array, Array]: ...
+    latitude: float | FloatArray,
+    longitude: float | FloatArray,
+    to_latitude: FloatArray,
+    to_longitude: FloatArray,
+) -> tuple[FloatArray, FloatArray]: ...
 def separation(latitude: Any, longitude: Any, to_latitude: Any, to_longitude: Any) -> tuple[Any, Any]:
     """Return m (north, east) from one position (deg) to another, from one to many (n,), or pair by pair.
 

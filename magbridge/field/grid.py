@@ -12,8 +12,9 @@ from math import inf, nan, sqrt
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from magbridge.arrays import FloatArray
 from magbridge.errors import FormatError, OutOfRange
 from magbridge.field.earth import metres_per_degree, usual, wrap
 from magbridge.field.grid_netcdf import write
@@ -21,8 +22,6 @@ from magbridge.field.local import OFF_THE_MAP, Local
 from magbridge.field.spline import WEIGHTS, coefficients, filled, weights
 
 __all__ = ["AnomalyGrid"]
-
-Array = NDArray[np.float64]
 
 EVEN = 1e-3
 """Share of a step by which rounded coordinates may deviate from an even spacing."""
@@ -102,11 +101,11 @@ class AnomalyGrid:
         self._even_sigma = bool(np.ptp(self._variance) == 0.0)
 
     @cached_property
-    def _coefficients(self) -> Array:
+    def _coefficients(self) -> FloatArray:
         return coefficients(filled(self.anomaly))
 
     @cached_property
-    def _vertical(self) -> Array | None:
+    def _vertical(self) -> FloatArray | None:
         return None if self.vertical is None else coefficients(self.vertical)
 
     def look_up(self, longitude: float, latitude: float, depth: float = nan) -> Local[float]:
@@ -148,7 +147,9 @@ class AnomalyGrid:
             f, fy * north, fx * east, fyy * north * north, fxy * north * east, fxx * east * east, variance
         )
 
-    def evaluate(self, longitude: ArrayLike, latitude: ArrayLike, depth: ArrayLike = nan) -> Local[Array]:
+    def evaluate(
+        self, longitude: ArrayLike, latitude: ArrayLike, depth: ArrayLike = nan
+    ) -> Local[FloatArray]:
         """Return the map around n places as arrays (n,), NaN off the map and for NaN positions.
 
         Parameters
@@ -196,7 +197,7 @@ class AnomalyGrid:
             parts[:, ~inside] = variance[~inside] = nan
         return Local._make([*parts, variance])
 
-    def at(self, longitude: ArrayLike, latitude: ArrayLike, depth: ArrayLike = nan) -> Array:
+    def at(self, longitude: ArrayLike, latitude: ArrayLike, depth: ArrayLike = nan) -> FloatArray:
         """Return the anomaly at n places, nT, (n,): see :meth:`evaluate`.
 
         Raises
@@ -255,7 +256,7 @@ class AnomalyGrid:
         )
 
 
-def _axis(values: ArrayLike, name: str, what: str) -> tuple[Array, bool]:
+def _axis(values: ArrayLike, name: str, what: str) -> tuple[FloatArray, bool]:
     """Return the axis ascending and exactly even, and whether it was descending."""
     axis = np.array(values, float).ravel()
     if axis.size < 4 or not np.isfinite(axis).all():

@@ -9,14 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from magbridge.arrays import IndexArray, RealArray
 from magbridge.errors import FormatError, MissingExtra
 from magbridge.field.grid_netcdf import ANOMALY, LATITUDE, LONGITUDE, Parts, netcdf
 
 __all__ = ["ascii_grid", "folder", "geotiff", "grd", "table"]
 
-Array = NDArray[np.floating[Any]]
 NETCDF = (b"CDF\x01", b"CDF\x02", b"\x89HDF")
 
 
@@ -38,7 +37,7 @@ def grd(path: Path) -> Parts:
         ) from error
 
 
-Surfer = tuple[int, int, tuple[float, float], tuple[float, float], Array]
+Surfer = tuple[int, int, tuple[float, float], tuple[float, float], RealArray]
 
 
 def _surfer_text(path: Path) -> Surfer:
@@ -162,7 +161,7 @@ def table(path: Path) -> Parts:
     return x, y, values, {"unit": unit}
 
 
-def _levels(values: Array) -> tuple[Array, NDArray[np.intp]]:
+def _levels(values: RealArray) -> tuple[RealArray, IndexArray]:
     """Return the distinct coordinates and where each value falls; 179 and -179 are neighbours."""
     levels, index = np.unique(np.round(values, 9), return_inverse=True)
     gaps = np.diff(levels)

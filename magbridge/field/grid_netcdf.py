@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from magbridge.arrays import RealArray
 from magbridge.errors import FormatError
 from magbridge.files import atomic_path, systems_reason
 
@@ -17,8 +17,7 @@ if TYPE_CHECKING:
 
 __all__ = ["ANOMALY", "LATITUDE", "LONGITUDE", "Parts", "netcdf", "write"]
 
-Array = NDArray[np.floating[Any]]
-Parts = tuple[Array, Array, Array, dict[str, Any]]
+Parts = tuple[RealArray, RealArray, RealArray, dict[str, Any]]
 """Longitudes and latitudes (deg) of the nodes, values, options of AnomalyGrid; among them ``unit``, where the
 file states one."""
 LONGITUDE, LATITUDE = ("longitude", "lon", "long", "x"), ("latitude", "lat", "y")

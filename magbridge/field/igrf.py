@@ -15,14 +15,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from magbridge.arrays import FloatArray
 from magbridge.errors import FormatError, MissingExtra, OutOfRange
 from magbridge.field.earth import ECCENTRICITY_SQUARED, EQUATORIAL_RADIUS
 
 __all__ = ["coverage", "igrf", "magnitude", "total_field"]
-
-Array = NDArray[np.float64]
 
 REFERENCE_RADIUS = 6_371_200.0
 """m, of the model's sphere."""
@@ -33,12 +32,12 @@ BLOCK = 2048
 class Model(NamedTuple):
     """Gauss coefficients: ``g[n - 1]`` (epochs, n + 1), ``h[n - 1]`` (epochs, n) nT, at `epochs` s."""
 
-    epochs: Array
-    g: list[Array]
-    h: list[Array]
+    epochs: FloatArray
+    g: list[FloatArray]
+    h: list[FloatArray]
 
 
-def igrf(longitude: ArrayLike, latitude: ArrayLike, depth: ArrayLike, time: ArrayLike) -> Array:
+def igrf(longitude: ArrayLike, latitude: ArrayLike, depth: ArrayLike, time: ArrayLike) -> FloatArray:
     """Return the main field, north-east-down.
 
     Parameters
@@ -83,12 +82,12 @@ def igrf(longitude: ArrayLike, latitude: ArrayLike, depth: ArrayLike, time: Arra
     return field
 
 
-def total_field(longitude: ArrayLike, latitude: ArrayLike, depth: ArrayLike, time: ArrayLike) -> Array:
+def total_field(longitude: ArrayLike, latitude: ArrayLike, depth: ArrayLike, time: ArrayLike) -> FloatArray:
     """Return the magnitude of :func:`igrf`, nT, (n,); same arguments and errors."""
     return magnitude(igrf(longitude, latitude, depth, time))
 
 
-def magnitude(field: Array) -> Array:
+def magnitude(field: FloatArray) -> FloatArray:
     """Return the length (n,) of vectors (n, 3)."""
     return np.asarray(np.sqrt(np.einsum("ij,ij->i", field, field)))
 
@@ -123,7 +122,7 @@ def _model(path: Path) -> Model:
     return Model(epochs, g, h)
 
 
-def _block(model: Model, lon: Array, lat: Array, depth: Array, time: Array) -> Array:
+def _block(model: Model, lon: FloatArray, lat: FloatArray, depth: FloatArray, time: FloatArray) -> FloatArray:
     """Sum the series for one block of samples."""
     first, weights = _weights(model.epochs, time)
     nodes = slice(first, first + len(weights))
@@ -137,7 +136,7 @@ def _block(model: Model, lon: Array, lat: Array, depth: Array, time: Array) -> A
     up = np.zeros((len(weights), lat.size))
     south, east = up.copy(), up.copy()
     legendre = [np.ones_like(sin), cos]  # P_n0
-    before: Array = np.empty((0, lat.size))  # S_n-1, orders 1..n-1
+    before: FloatArray = np.empty((0, lat.size))  # S_n-1, orders 1..n-1
     two_before = before
     ratio = REFERENCE_RADIUS / r
     radial = ratio**3
@@ -170,7 +169,7 @@ def _block(model: Model, lon: Array, lat: Array, depth: Array, time: Array) -> A
     return np.stack([-south * cos_tilt - up * sin_tilt, east, -up * cos_tilt + south * sin_tilt], axis=1)
 
 
-def _weights(epochs: Array, time: Array) -> tuple[int, Array]:
+def _weights(epochs: FloatArray, time: FloatArray) -> tuple[int, FloatArray]:
     """Return the first epoch that the block needs and each sample's weights on it and its successors."""
     index = np.clip(np.searchsorted(epochs, time, side="right") - 1, 0, epochs.size - 2)
     first = int(index.min())
@@ -182,7 +181,7 @@ def _weights(epochs: Array, time: Array) -> tuple[int, Array]:
     return first, weights
 
 
-def _geocentric(latitude: Array, height: Array) -> tuple[Array, Array]:
+def _geocentric(latitude: FloatArray, height: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return radius (m) and geocentric latitude (rad) of a point over the ellipsoid."""
     sin, cos = np.sin(latitude), np.cos(latitude)
     normal = EQUATORIAL_RADIUS / np.sqrt(1.0 - ECCENTRICITY_SQUARED * sin * sin)
@@ -191,11 +190,11 @@ def _geocentric(latitude: Array, height: Array) -> tuple[Array, Array]:
     return np.hypot(axis, polar), np.arctan2(polar, axis)
 
 
-def _outside(values: Array, low: float, high: float) -> list[float]:
+def _outside(values: FloatArray, low: float, high: float) -> list[float]:
     return [float(value) for value in values[(values < low) | (values > high)][:1]]
 
 
-def _refuse(what: str, values: Array, low: float, high: float, covered: str) -> None:
+def _refuse(what: str, values: FloatArray, low: float, high: float, covered: str) -> None:
     if bad := _outside(values, low, high):
         raise OutOfRange(what, bad[0], covered)
 

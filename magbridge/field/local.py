@@ -5,12 +5,11 @@ from __future__ import annotations
 from math import nan
 from typing import Generic, NamedTuple, TypeVar
 
-import numpy as np
-from numpy.typing import NDArray
+from magbridge.arrays import FloatArray
 
 __all__ = ["OFF_THE_MAP", "Local", "curvature"]
 
-T = TypeVar("T", float, NDArray[np.float64])
+T = TypeVar("T", float, FloatArray)
 
 
 class Local(NamedTuple, Generic[T]):

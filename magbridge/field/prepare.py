@@ -11,8 +11,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from magbridge.arrays import FloatArray
 from magbridge.errors import OutOfRange
 from magbridge.field.continuation import continued
 from magbridge.field.earth import usual
@@ -20,8 +21,6 @@ from magbridge.field.grid import AnomalyGrid
 from magbridge.files import atomic_path
 
 __all__ = ["Step", "continue_upward", "draw_steps", "hanning", "merge", "prepare"]
-
-Array = NDArray[np.float64]
 
 HANNING = np.outer([1.0, 2.0, 1.0], [1.0, 2.0, 1.0]) / 16.0
 MOST = 10_000_000
@@ -192,7 +191,7 @@ def draw_steps(steps: Sequence[Step], path: str | Path) -> None:
         figure.savefig(beside, dpi=110)
 
 
-def _masked(grid: AnomalyGrid, polygon: Array) -> AnomalyGrid:
+def _masked(grid: AnomalyGrid, polygon: FloatArray) -> AnomalyGrid:
     from matplotlib.path import Path as Polygon  # noqa: PLC0415  only a mask needs it
 
     x, y = np.meshgrid(grid.longitude, grid.latitude)
@@ -202,17 +201,17 @@ def _masked(grid: AnomalyGrid, polygon: Array) -> AnomalyGrid:
     return _like(grid, np.where(inside, grid.anomaly, np.nan))
 
 
-def _like(grid: AnomalyGrid, values: Array) -> AnomalyGrid:
+def _like(grid: AnomalyGrid, values: FloatArray) -> AnomalyGrid:
     return AnomalyGrid(grid.longitude, grid.latitude, values, grid.sigma, grid.altitude, grid.name)
 
 
-def _cover(axes: Sequence[Array], step: float) -> Array:
+def _cover(axes: Sequence[FloatArray], step: float) -> FloatArray:
     low, high = min(float(a[0]) for a in axes), max(float(a[-1]) for a in axes)
-    axis: Array = low + step * np.arange(int((high - low) / step + 1e-6) + 1, dtype=float)
+    axis: FloatArray = low + step * np.arange(int((high - low) / step + 1e-6) + 1, dtype=float)
     return axis
 
 
-def _reach(axis: Array, own: Array) -> slice:
+def _reach(axis: FloatArray, own: FloatArray) -> slice:
     """Return where on an axis a grid with its `own` axis has values, and a node more on either side."""
     first, last = np.searchsorted(axis, own[[0, -1]])
     return slice(max(int(first) - 1, 0), int(last) + 1)

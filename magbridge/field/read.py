@@ -10,11 +10,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from math import isfinite, nan
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from magbridge.arrays import RealArray
 from magbridge.columns import NT_PER_UNIT, usual
 from magbridge.errors import FormatError
 from magbridge.field.grid import AnomalyGrid
@@ -22,8 +21,6 @@ from magbridge.field.grid_formats import ascii_grid, folder, geotiff, grd, table
 from magbridge.field.grid_netcdf import Parts, netcdf
 
 __all__ = ["READERS", "read_grid", "read_polygon"]
-
-Array = NDArray[np.floating[Any]]
 
 NANOTESLA = {unit.lower(): factor for unit, factor in NT_PER_UNIT.items()}
 """nT in one unit, by the unit's name in lower case."""
@@ -71,7 +68,7 @@ def read_grid(path: str | Path) -> AnomalyGrid:
     return AnomalyGrid(longitude, latitude, values * scale, name=str(path), **options)
 
 
-def read_polygon(path: str | Path) -> Array:
+def read_polygon(path: str | Path) -> RealArray:
     """Read a polygon: a text file with longitude and latitude (deg) in each row, (k, 2), k at least 3.
 
     A header that begins with ``longitude`` is skipped.

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from magbridge.arrays import FloatArray
 from magbridge.errors import FormatError
 from magbridge.field.continuation import continued
 from magbridge.field.earth import wrap
@@ -18,13 +18,13 @@ if TYPE_CHECKING:
 
 __all__ = ["EARTHS", "earth_field", "main_field", "other_units", "positions", "reference_field"]
 
-Array = NDArray[np.float64]
-
 EARTHS = 20_000.0, 70_000.0
 """nT: the main field at the surface is 22,000 to 67,000 (IGRF), and the crust adds thousands at most."""
 
 
-def reference_field(deployment: xr.Dataset, grid: AnomalyGrid | None = None, site_bias: float = 0.0) -> Array:
+def reference_field(
+    deployment: xr.Dataset, grid: AnomalyGrid | None = None, site_bias: float = 0.0
+) -> FloatArray:
     """Return the true total field at every sample.
 
     Parameters
@@ -79,7 +79,9 @@ def reference_field(deployment: xr.Dataset, grid: AnomalyGrid | None = None, sit
     return reference
 
 
-def earth_field(deployment: xr.Dataset, grid: AnomalyGrid | None = None) -> tuple[Array, Array | None, str]:
+def earth_field(
+    deployment: xr.Dataset, grid: AnomalyGrid | None = None
+) -> tuple[FloatArray, FloatArray | None, str]:
     """Return the reference that a calibration is fitted to: total field, vector, and a name for them.
 
     Returns
@@ -100,7 +102,7 @@ def earth_field(deployment: xr.Dataset, grid: AnomalyGrid | None = None) -> tupl
     return total, vector, name
 
 
-def other_units(channels: Array, reference: float) -> str:
+def other_units(channels: FloatArray, reference: float) -> str:
     """Say so when raw channels (n, 3) cannot be nT in a field of `reference`, nT, as gauss or µT; else "".
 
     No iron changes the field tenfold.
@@ -116,7 +118,7 @@ def other_units(channels: Array, reference: float) -> str:
     )
 
 
-def main_field(deployment: xr.Dataset) -> Array:
+def main_field(deployment: xr.Dataset) -> FloatArray:
     """Return the IGRF at every sample, (n, 3) nT, north-east-down; NaN where there is no position."""
     field = np.full((deployment.sizes["time"], 3), np.nan)
     if {"latitude", "longitude"} <= set(deployment.variables):
@@ -128,7 +130,7 @@ def main_field(deployment: xr.Dataset) -> Array:
     return field
 
 
-def positions(deployment: xr.Dataset) -> tuple[Array, Array, Array]:
+def positions(deployment: xr.Dataset) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return longitude, latitude (deg) and depth (m, 0 if unknown) at every sample, (n,) each.
 
     Rows that lack a position get it from their neighbours in time, along a straight line; before the first
@@ -140,13 +142,13 @@ def positions(deployment: xr.Dataset) -> tuple[Array, Array, Array]:
     return wrap(longitude), _between(time, deployment, "latitude"), np.nan_to_num(depth)
 
 
-def _between(time: Array, deployment: xr.Dataset, column: str, turn: float | None = None) -> Array:
+def _between(time: FloatArray, deployment: xr.Dataset, column: str, turn: float | None = None) -> FloatArray:
     values = deployment[column].to_numpy().astype(float)
     known = np.isfinite(values)
     if not known.any():
         return np.full(time.size, np.nan)
-    path: Array = values[known] if turn is None else np.unwrap(values[known], period=turn)
+    path: FloatArray = values[known] if turn is None else np.unwrap(values[known], period=turn)
     if known.all():
         return path
-    filled: Array = np.interp(time, time[known], path)
+    filled: FloatArray = np.interp(time, time[known], path)
     return filled

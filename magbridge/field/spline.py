@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+
+from magbridge.arrays import FloatArray
 
 __all__ = ["WEIGHTS", "coefficients", "filled", "weights"]
-
-Array = NDArray[np.float64]
 
 PAD = 16
 """Nodes: that far inside, the influence of a cubic spline's end has fallen to 1e-9."""
@@ -20,7 +19,7 @@ WEIGHTS = np.concatenate([VALUE, SLOPE, CURVATURE])
 """Weights of four nodes for value, slope and curvature, (12, 4), times powers of t."""
 
 
-def filled(values: Array) -> Array:
+def filled(values: FloatArray) -> FloatArray:
     """Return values (ny, nx), each hole (NaN) filled from the nearest node: a transform takes no holes."""
     hole = np.isnan(values)
     if not hole.any():
@@ -28,22 +27,22 @@ def filled(values: Array) -> Array:
     from scipy.ndimage import distance_transform_edt  # noqa: PLC0415  the live path runs without scipy
 
     nearest = distance_transform_edt(hole, return_distances=False, return_indices=True)
-    patched: Array = values[tuple(nearest)]
+    patched: FloatArray = values[tuple(nearest)]
     return patched
 
 
-def coefficients(values: Array) -> Array:
+def coefficients(values: FloatArray) -> FloatArray:
     """Return B-spline coefficients (ny + 2, nx + 2) of values (ny, nx), without curvature at the edges."""
     from scipy.ndimage import spline_filter  # noqa: PLC0415  the live path runs without scipy
 
     pad = [(min(PAD, n - 1),) * 2 for n in values.shape]
     padded = np.pad(values, pad, mode="reflect", reflect_type="odd")
-    found: Array = spline_filter(padded, order=3, mode="mirror")
+    found: FloatArray = spline_filter(padded, order=3, mode="mirror")
     (a, _), (b, _) = pad
     return np.ascontiguousarray(found[a - 1 : -a + 1 or None, b - 1 : -b + 1 or None])
 
 
-def weights(t: Array) -> Array:
+def weights(t: FloatArray) -> FloatArray:
     """Return value, slope and curvature weights of four nodes, (3, 4, n): n last, along which memory runs."""
-    found: Array = (WEIGHTS @ np.stack([np.ones_like(t), t, t * t, t * t * t])).reshape(3, 4, -1)
+    found: FloatArray = (WEIGHTS @ np.stack([np.ones_like(t), t, t * t, t * t * t])).reshape(3, 4, -1)
     return found

@@ -23,13 +23,14 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from magbridge.arrays import FloatArray
 from magbridge.columns import NT_PER_UNIT
 from magbridge.errors import FormatError, MissingExtra
-from magbridge.logs.autopilot import Fields, Floats, pieces, values_of
+from magbridge.logs.autopilot import Fields, pieces, values_of
 
 __all__ = ["chunks"]
 
-Table = dict[str, Floats]
+Table = dict[str, FloatArray]
 Tables = dict[str, Table]
 
 FIELDS: Fields = {
@@ -84,7 +85,7 @@ def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
     yield from pieces(path, rows, _utc_offset(tables), mags, _telemetry(tables), {"bytes_skipped": skipped})
 
 
-def _telemetry(tables: Tables) -> Iterator[tuple[Floats, str, str, Floats]]:
+def _telemetry(tables: Tables) -> Iterator[tuple[FloatArray, str, str, FloatArray]]:
     """Yield times, column, unit and values of everything but the magnetometers."""
     for record in FIELDS:
         for number, (time, table) in _instances(tables, record).items():
@@ -102,7 +103,7 @@ def _field(mag: Table) -> Table:
     }
 
 
-def _instances(tables: Tables, record: str) -> dict[int, tuple[Floats, Table]]:
+def _instances(tables: Tables, record: str) -> dict[int, tuple[FloatArray, Table]]:
     """Return time and fields of each instance of a record, also if its number is in the name (``MAG2``)."""
     found = {}
     for number, name in enumerate((record, f"{record}2", f"{record}3")):

@@ -13,21 +13,22 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from magbridge.arrays import FloatArray
 from magbridge.logs.checks import increasing
 from magbridge.logs.deployment import deployment, sliced
 from magbridge.logs.resample import latest
 
-__all__ = ["Fields", "Floats", "pieces", "values_of"]
+__all__ = ["Fields", "FloatArray", "pieces", "values_of"]
 
-Floats = NDArray[np.float64]
-Table = Mapping[str, Floats]
+Table = Mapping[str, FloatArray]
 Fields = dict[str, tuple[tuple[str, str, str, float], ...]]
 """Record: (column, field, unit, factor); ``#`` is the number of the instance where it is not the first."""
 
 
-def values_of(fields: Fields, record: str, number: int, table: Table) -> Iterator[tuple[str, str, Floats]]:
+def values_of(
+    fields: Fields, record: str, number: int, table: Table
+) -> Iterator[tuple[str, str, FloatArray]]:
     """Yield column, unit and values (m,) of each of `fields` that an instance (from 0) of a record holds."""
     for column, field, unit, factor in fields[record]:
         if field in table:
@@ -38,8 +39,8 @@ def pieces(
     path: Path,
     rows: int,
     offset: float,
-    mags: Mapping[int, tuple[Floats, Table]],
-    telemetry: Iterable[tuple[Floats, str, str, Floats]],
+    mags: Mapping[int, tuple[FloatArray, Table]],
+    telemetry: Iterable[tuple[FloatArray, str, str, FloatArray]],
     attrs: Mapping[str, Any],
 ) -> Iterator[xr.Dataset]:
     """Yield the log in pieces of at most `rows` rows.

@@ -10,14 +10,15 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+
+from magbridge.arrays import FloatArray
 
 __all__ = ["floats"]
 
 ALL = slice(None)
 
 
-def floats(variable: Any, rows: slice = ALL) -> NDArray[np.float64]:
+def floats(variable: Any, rows: slice = ALL) -> FloatArray:
     """Return rows of a variable, in its shape, NaN where a value is missing.
 
     Missing are the values that the variable declares as missing, compared as stored, before unpacking; and

@@ -7,14 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from magbridge.arrays import FloatArray
 from magbridge.columns import CHANNEL_TIMES, usual
 from magbridge.errors import FormatError
 
 __all__ = ["checked", "increasing"]
-
-Floats = NDArray[np.float64]
 
 YEAR_10000 = 253_402_300_800.0
 """s since 1970: a later time is in another unit, and no calendar goes beyond it."""
@@ -39,7 +37,7 @@ APART = 60.0
 
 
 def increasing(
-    file: str | Path, time: Floats, rows: Sequence[int] | None = None, *, after: float = -np.inf
+    file: str | Path, time: FloatArray, rows: Sequence[int] | None = None, *, after: float = -np.inf
 ) -> None:
     """Check that `time` is finite and increases, also from `after`, the last time before it.
 

@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from magbridge.arrays import FloatArray, IndexArray
 from magbridge.columns import COLUMNS, factor
 from magbridge.errors import FormatError
 from magbridge.records import Quality
@@ -27,8 +28,6 @@ __all__ = [
     "sliced",
     "uncounted",
 ]
-
-Floats = NDArray[np.float64]
 
 MEANING = {"heading_reference": "true", "time_reference": "utc"}
 """Attributes that change what values mean, and their defaults."""
@@ -197,7 +196,7 @@ def passed_over(*pieces: Mapping[str, Any]) -> dict[str, int]:
     return {name: count for name, count in counts.items() if count}
 
 
-def _first_known(values: Floats, starts: NDArray[np.intp]) -> Floats:
+def _first_known(values: FloatArray, starts: IndexArray) -> FloatArray:
     """Return the first value that is not NaN in each group of rows that begins at `starts`."""
     result = values[starts]
     sizes = np.diff(starts, append=len(values))

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from magbridge.arrays import FloatArray
 from magbridge.errors import FormatError, MissingExtra
 from magbridge.logs.checks import checked
 from magbridge.logs.deployment import deployment
@@ -62,7 +62,7 @@ def _text(metadata: dict[bytes, bytes] | None, key: bytes) -> str:
     return (metadata or {}).get(key, b"").decode()
 
 
-def _floats(path: Path, field: Any, array: Any) -> NDArray[np.float64]:
+def _floats(path: Path, field: Any, array: Any) -> FloatArray:
     scale = 1.0
     if pa.types.is_timestamp(field.type):
         scale = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}[field.type.unit]
@@ -71,7 +71,7 @@ def _floats(path: Path, field: Any, array: Any) -> NDArray[np.float64]:
         pa.types.is_integer(field.type) or pa.types.is_floating(field.type) or pa.types.is_boolean(field.type)
     ):
         raise FormatError(path, f"expected numbers, not {field.type}", column=field.name)
-    values: NDArray[np.float64] = array.cast(pa.float64()).to_numpy(zero_copy_only=False)
+    values: FloatArray = array.cast(pa.float64()).to_numpy(zero_copy_only=False)
     return values * scale
 
 

@@ -18,9 +18,10 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
+from magbridge.arrays import FloatArray
 from magbridge.columns import NT_PER_UNIT
 from magbridge.errors import FormatError, MissingExtra
-from magbridge.logs.autopilot import Fields, Floats, pieces, values_of
+from magbridge.logs.autopilot import Fields, pieces, values_of
 
 try:
     from pyulog import ULog
@@ -30,7 +31,7 @@ except ImportError:
 
 __all__ = ["chunks"]
 
-Table = dict[str, Floats]
+Table = dict[str, FloatArray]
 Topics = dict[str, dict[int, Table]]
 
 FIELDS: Fields = {
@@ -82,7 +83,7 @@ def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
     yield from pieces(path, rows, _utc_offset(topics), mags, _telemetry(topics), dropouts)
 
 
-def _telemetry(topics: Topics) -> Iterator[tuple[Floats, str, str, Floats]]:
+def _telemetry(topics: Topics) -> Iterator[tuple[FloatArray, str, str, FloatArray]]:
     """Yield times, column, unit and values of everything but the magnetometers."""
     for attitude in topics.get("vehicle_attitude", {}).values():
         for column, values in zip(("roll", "pitch", "heading"), _angles(attitude), strict=True):
@@ -101,7 +102,7 @@ def _telemetry(topics: Topics) -> Iterator[tuple[Floats, str, str, Floats]]:
             yield _time(table)[names == name], name, "1", table["value"][names == name]
 
 
-def _angles(attitude: Table) -> tuple[Floats, Floats, Floats]:
+def _angles(attitude: Table) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return roll, pitch and heading (deg) of the quaternion (w, x, y, z) from body to north-east-down."""
     w, x, y, z = (attitude[f"q[{k}]"] for k in range(4))
     roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
@@ -110,7 +111,7 @@ def _angles(attitude: Table) -> tuple[Floats, Floats, Floats]:
     return np.degrees(roll), np.degrees(pitch), np.degrees(heading) % 360.0
 
 
-def _time(table: Table) -> Floats:
+def _time(table: Table) -> FloatArray:
     return table.get("timestamp_sample", table["timestamp"]) * 1e-6
 
 

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+
+from magbridge.arrays import FloatArray
 
 __all__ = ["CIRCLES", "MAX_AGE", "latest", "linear"]
-
-Floats = NDArray[np.float64]
 
 MAX_AGE = 30.0
 """s; a value that was received longer ago is not carried to a row."""
@@ -15,7 +14,7 @@ CIRCLES = {"heading": (360.0, 0.0), "longitude": (360.0, -180.0)}
 """Columns on a circle: its circumference and its lowest value, in deg."""
 
 
-def latest(at: Floats, time: Floats, values: Floats) -> Floats:
+def latest(at: FloatArray, time: FloatArray, values: FloatArray) -> FloatArray:
     """Return the last value at or before each time, as a live listener would know it.
 
     Parameters
@@ -40,8 +39,13 @@ def latest(at: Floats, time: Floats, values: Floats) -> Floats:
 
 
 def linear(
-    at: Floats, time: Floats, values: Floats, max_gap: float, period: float | None = None, start: float = 0.0
-) -> Floats:
+    at: FloatArray,
+    time: FloatArray,
+    values: FloatArray,
+    max_gap: float,
+    period: float | None = None,
+    start: float = 0.0,
+) -> FloatArray:
     """Return values interpolated linearly in time, for quantities that change smoothly.
 
     Parameters

@@ -24,8 +24,8 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from magbridge.arrays import FloatArray
 from magbridge.errors import FormatError
 from magbridge.logs.cf import floats
 from magbridge.logs.checks import increasing
@@ -33,8 +33,6 @@ from magbridge.logs.deployment import deployment
 from magbridge.logs.resample import CIRCLES, linear
 
 __all__ = ["DIMENSION", "NT_PER_COUNT", "dive"]
-
-Floats = NDArray[np.float64]
 
 DIMENSION = "sg_data_point"
 NT_PER_COUNT = 100.0
@@ -103,7 +101,7 @@ def dive(path: Path, file: Any) -> xr.Dataset:
     return deployment(path, time, columns, units, attrs)
 
 
-def _current(file: Any, motor: str, time: Floats) -> Floats:
+def _current(file: Any, motor: str, time: FloatArray) -> FloatArray:
     """Return the mean current (A) of one motor in the manoeuvre at each time; 0 outside manoeuvres."""
     current = np.zeros(len(time))
     starts, ends, amperes = (floats(file[name]) for name in ("gc_st_secs", "gc_end_secs", f"gc_{motor}_i"))

@@ -20,8 +20,8 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from magbridge.arrays import FloatArray
 from magbridge.errors import FormatError, MissingExtra
 from magbridge.logs import FLIGHT
 from magbridge.logs.checks import increasing
@@ -29,8 +29,6 @@ from magbridge.logs.deployment import deployment, sliced
 from magbridge.logs.resample import CIRCLES, linear
 
 __all__ = ["chunks"]
-
-Floats = NDArray[np.float64]
 
 MAX_GAP = 300.0
 """s between two updates of a sensor across which nothing is interpolated."""
@@ -112,7 +110,7 @@ def _pair(path: Path) -> tuple[Path | None, Path | None]:
     return both if suffix.lower() in SCIENCE else both[::-1]
 
 
-def _read(path: Path | None) -> dict[str, tuple[Floats, Floats]]:
+def _read(path: Path | None) -> dict[str, tuple[FloatArray, FloatArray]]:
     """Return time and values of each of :data:`SENSORS` in the file, at its updates."""
     if path is None:
         return {}

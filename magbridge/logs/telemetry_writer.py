@@ -18,8 +18,8 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from magbridge.arrays import FloatArray
 from magbridge.columns import CHANNEL_TIMES, CHANNELS, CORRECTED
 from magbridge.logs.deployment import lasting
 from magbridge.logs.telemetry_fields import POWER_CYCLE, UNKNOWN_INT
@@ -146,7 +146,7 @@ def short_name(name: str, taken: Collection[str]) -> str:
     return next(s for s in (short, *(f"{short[:6]}{k:04d}" for k in range(10_000))) if s not in taken)
 
 
-def _single(name: str, values: NDArray[np.float64]) -> NDArray[np.float64]:
+def _single(name: str, values: FloatArray) -> FloatArray:
     """Round to float32, so that packing cannot overflow; columns that are not sent as float32 stay."""
     if name in (*POSITION, *CHANNEL_TIMES, "total_field"):
         return values

@@ -12,16 +12,14 @@ from __future__ import annotations
 from math import log, pi
 
 import numpy as np
-from numpy.typing import NDArray
 
+from magbridge.arrays import BoolArray, FloatArray
 from magbridge.field.earth import metres_per_degree, worse_axis
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.local import Local, curvature
 from magbridge.navigate.model import N_STATES, Block
 
 __all__ = ["Bank", "widest"]
-
-Array = NDArray[np.float64]
 
 MOST = 6_000
 """Hypotheses, at most."""
@@ -67,7 +65,13 @@ class Bank:
     """
 
     def __init__(
-        self, grid: AnomalyGrid, x: Array, P: Array, resolution: float, gate: float, level: float = 0.0
+        self,
+        grid: AnomalyGrid,
+        x: FloatArray,
+        P: FloatArray,
+        resolution: float,
+        gate: float,
+        level: float = 0.0,
     ) -> None:
         self._grid, self._gate = grid, gate
         self._elsewhere = float(np.nanmean(grid.anomaly)), float(np.nanvar(grid.anomaly))
@@ -86,7 +90,7 @@ class Bank:
     def __len__(self) -> int:
         return self.w.size
 
-    def _cut(self, x: Array, P: Array) -> tuple[Array, Array, Array]:
+    def _cut(self, x: FloatArray, P: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Cut one Gaussian into a lattice of Gaussians of the bank's resolution along its position's axes.
 
         Notes
@@ -114,7 +118,7 @@ class Bank:
         w, shifts = w[keep], shifts[:, keep]
         return w / w.sum(), x[:, None] + shifts, np.repeat(part[:, :, None], w.size, axis=2)
 
-    def predict(self, F: Array, Q: Array) -> None:
+    def predict(self, F: FloatArray, Q: FloatArray) -> None:
         """Propagate every hypothesis by one transition: F and the noise's covariance Q, (6, 6)."""
         self.x = F @ self.x
         half = (F @ self.P.reshape(N_STATES, -1)).reshape(self.P.shape)
@@ -150,7 +154,9 @@ class Bank:
                 value - self.x[axis], gain, gain[axis] + sigma * sigma, np.zeros(len(self), dtype=bool)
             )
 
-    def _observe(self, y: Array, gain: Array, s: Array, off: NDArray[np.bool_]) -> tuple[float, float, float]:
+    def _observe(
+        self, y: FloatArray, gain: FloatArray, s: FloatArray, off: BoolArray
+    ) -> tuple[float, float, float]:
         """Take in innovations (n,) of variances (n,), with ``P H'`` (6, n); return as :meth:`update`."""
         z2 = y * y / s
         likelihood = -0.5 * (np.minimum(z2, self._gate) + np.log(s) + log(2.0 * pi))
@@ -168,11 +174,11 @@ class Bank:
         self._tidy()
         return mean, spread, top + log(total)
 
-    def moments(self) -> tuple[Array, Array]:
+    def moments(self) -> tuple[FloatArray, FloatArray]:
         """Return mean (6,) and covariance (6, 6) of the whole mixture."""
-        mean: Array = self.x @ self.w / self.w.sum()
+        mean: FloatArray = self.x @ self.w / self.w.sum()
         d = self.x - mean[:, None]
-        covariance: Array = (self.P @ self.w + (self.w * d) @ d.T) / self.w.sum()
+        covariance: FloatArray = (self.P @ self.w + (self.w * d) @ d.T) / self.w.sum()
         return mean, covariance
 
     def _tidy(self) -> None:
@@ -192,11 +198,11 @@ class Bank:
         if wide.any() and len(self) + 2 * int(wide.sum()) <= 2 * MOST:
             self._split(wide)
 
-    def _take(self, keep: NDArray[np.bool_]) -> None:
+    def _take(self, keep: BoolArray) -> None:
         w = self.w[keep]
         self.w, self.x, self.P = w / w.sum(), self.x[:, keep], self.P[:, :, keep]
 
-    def _split(self, wide: NDArray[np.bool_]) -> None:
+    def _split(self, wide: BoolArray) -> None:
         """Split each along its position's longest axis, keeping mean and covariance."""
         w, x, P = self.w[wide], self.x[:, wide], self.P[:, :, wide]
         values, axes = np.linalg.eigh(np.moveaxis(P[:2, :2], 2, 0))
@@ -224,7 +230,7 @@ class Bank:
         self.w, self.x, self.P = w, x, P
 
 
-def widest(P: Array) -> float:
+def widest(P: FloatArray) -> float:
     """Return the largest 1-sigma of the position, m, of a covariance (6, 6)."""
     (nn, ne), (_, ee) = P[:2, :2].tolist()
     return float(worse_axis(nn, ne, ee))

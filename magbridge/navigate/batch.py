@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import xarray as xr
 from filterpy.kalman import rts_smoother
-from numpy.typing import NDArray
 
+from magbridge.arrays import FloatArray, RealArray
 from magbridge.errors import FormatError
 from magbridge.field.earth import offset
 from magbridge.field.grid import AnomalyGrid
@@ -24,9 +24,6 @@ from magbridge.navigate.reference_track import REFERENCES, reference_track, with
 from magbridge.progress import track
 
 __all__ = ["MOTIONS", "first_position", "motion_of", "navigate"]
-
-Array = NDArray[np.float64]
-Floats = NDArray[np.floating[Any]]
 
 MOTIONS: dict[str, dict[str, str]] = {
     "velocity": {"velocity_north": "velocity_north", "velocity_east": "velocity_east"},
@@ -90,7 +87,7 @@ def navigate(
     latitude, longitude = start if start is not None else first_position(deployment, source)
     moves = _columns(deployment, MOTIONS[motion] | {"depth": "depth"})
     records: list[Record] = []
-    states: list[tuple[Array, Array, Array, Array, int]] = []
+    states: list[tuple[FloatArray, FloatArray, FloatArray, FloatArray, int]] = []
 
     def keep(record: Record | None) -> None:
         if record is not None:
@@ -116,7 +113,7 @@ def navigate(
     return result.assign_attrs(findings="\n".join(findings))
 
 
-def _samples(deployment: xr.Dataset, source: str) -> tuple[Floats, Floats, Floats]:
+def _samples(deployment: xr.Dataset, source: str) -> tuple[RealArray, RealArray, RealArray]:
     """Return time, total field and its sigma; NaN where a sample must not be used."""
     if "total_field" not in deployment:
         raise FormatError(source, "expected total_field: correct the log with a calibration first")
@@ -148,7 +145,7 @@ def _glides(deployment: xr.Dataset) -> bool:
     return bool(steep.mean() > 0.5 and agree.mean() > 0.8) if steep.size else False
 
 
-def _columns(deployment: xr.Dataset, names: Mapping[str, str]) -> dict[str, Floats]:
+def _columns(deployment: xr.Dataset, names: Mapping[str, str]) -> dict[str, RealArray]:
     """Return the columns that the log has, under their other names."""
     return {
         name: deployment[column].to_numpy().astype(float)
@@ -167,7 +164,9 @@ def first_position(deployment: xr.Dataset, source: str) -> tuple[float, float]:
     raise FormatError(source, "expected a position to start from: latitude and longitude")
 
 
-def _smooth(states: list[tuple[Array, Array, Array, Array, int]]) -> tuple[Array, Array]:
+def _smooth(
+    states: list[tuple[FloatArray, FloatArray, FloatArray, FloatArray, int]],
+) -> tuple[FloatArray, FloatArray]:
     """Return smoothed means (n, 6) and covariances (n, 6, 6), each stretch between jumps by itself."""
     x, P, F, Q = (np.stack([state[k] for state in states]) for k in range(4))
     jumps = np.array([state[4] for state in states])
@@ -177,7 +176,7 @@ def _smooth(states: list[tuple[Array, Array, Array, Array, int]]) -> tuple[Array
     return x, P
 
 
-def _dataset(records: list[Record], smoothed: tuple[Array, Array]) -> xr.Dataset:
+def _dataset(records: list[Record], smoothed: tuple[FloatArray, FloatArray]) -> xr.Dataset:
     columns: dict[str, Any] = {
         name: np.array([getattr(record, name) for record in records], float)
         for name in Record.__struct_fields__

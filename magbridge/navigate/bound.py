@@ -6,8 +6,9 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from magbridge.arrays import FloatArray
 from magbridge.errors import OutOfRange
 from magbridge.field.earth import metres_per_degree, separation, wrap
 from magbridge.field.grid import AnomalyGrid
@@ -20,8 +21,6 @@ if TYPE_CHECKING:
 
 __all__ = ["Bound", "as_dataset", "position_bound"]
 
-Array = NDArray[np.float64]
-
 STEP = 0.005
 """deg, over which the main field's slope is taken."""
 
@@ -33,12 +32,12 @@ class Bound(NamedTuple):
     reckoning alone.
     """
 
-    time: Array
-    latitude: Array
-    longitude: Array
-    covariance: Array
-    sigma: Array
-    unaided: Array
+    time: FloatArray
+    latitude: FloatArray
+    longitude: FloatArray
+    covariance: FloatArray
+    sigma: FloatArray
+    unaided: FloatArray
 
 
 def position_bound(
@@ -123,7 +122,7 @@ def position_bound(
     return Bound(at, lat, lon, covariance, reached, unaided)
 
 
-def _along(time: Array, latitude: Array, longitude: Array) -> Array:
+def _along(time: FloatArray, latitude: FloatArray, longitude: FloatArray) -> FloatArray:
     """Return the distance along a track, (n,) m, from its first corner to each."""
     if time.size < 2:
         raise OutOfRange("track", f"{time.size} positions", "at least two are needed")

@@ -11,8 +11,8 @@ from matplotlib.collections import LineCollection
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, MaxNLocator
-from numpy.typing import NDArray
 
+from magbridge.arrays import RealArray
 from magbridge.field.earth import metres_per_degree, usual
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.igrf import total_field
@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 __all__ = ["draw_bound", "draw_navigation", "measured_on_track"]
-
-Array = NDArray[np.floating[Any]]
 
 SHADES = {State.SEARCHING: "#f5d76e", State.DEAD_RECKONING: "#d5d8dc", State.LOST: "#e59a93"}
 
@@ -154,7 +152,7 @@ def _map(axis: Axes, grid: AnomalyGrid, longitude: Any, latitude: Any) -> None:
     scale.tick_params(labelsize=8)
 
 
-def measured_on_track(result: xr.Dataset) -> Array:
+def measured_on_track(result: xr.Dataset) -> RealArray:
     """Return the anomaly (n,), nT: the measured field minus the main field at the filter's position."""
     longitude, latitude = result["longitude"].to_numpy(), result["latitude"].to_numpy()
     per_latitude, per_longitude = metres_per_degree(latitude)
@@ -162,17 +160,17 @@ def measured_on_track(result: xr.Dataset) -> Array:
     depth, time = np.nan_to_num(result["depth"].to_numpy()), result["time"].to_numpy()
     main = total_field(longitude, latitude, depth, time)
     reckoned = total_field(longitude - east, latitude - north, depth, time)
-    measured: Array = result["anomaly"].to_numpy() + reckoned - main
+    measured: RealArray = result["anomaly"].to_numpy() + reckoned - main
     return measured
 
 
-def _tracks(axis: Axes, result: xr.Dataset) -> list[Array]:
+def _tracks(axis: Axes, result: xr.Dataset) -> list[RealArray]:
     """Draw the dead-reckoned, filtered, smoothed and known tracks; return those to fit in, (2, n) each."""
     latitude = result["latitude"].to_numpy()
     longitude = np.unwrap(result["longitude"].to_numpy(), period=360.0)
     per_latitude, per_longitude = metres_per_degree(latitude)
 
-    def back(north: str, east: str) -> Array:
+    def back(north: str, east: str) -> RealArray:
         return np.stack([longitude - result[east] / per_longitude, latitude - result[north] / per_latitude])
 
     here = np.stack([longitude, latitude])

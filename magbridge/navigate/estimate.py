@@ -5,8 +5,8 @@ from __future__ import annotations
 from math import inf, isfinite, log
 
 import numpy as np
-from numpy.typing import NDArray
 
+from magbridge.arrays import FloatArray
 from magbridge.field.earth import offset
 from magbridge.field.grid import AnomalyGrid
 from magbridge.navigate.bank import Bank, widest
@@ -17,8 +17,6 @@ from magbridge.navigate.record import Jump, State
 from magbridge.navigate.tracker import Innovation, Tracker
 
 __all__ = ["Estimate"]
-
-Array = NDArray[np.float64]
 
 CONTRADICTION = 25.0
 """Squared distance of a fix in sigmas, two degrees of freedom: by chance in 4e-6."""
@@ -105,7 +103,7 @@ class Estimate:
         self._confirmed = sigma >= self._reach()
         self.state = State.SEARCHING
 
-    def correct(self, there: Array, sigma: float) -> None:
+    def correct(self, there: FloatArray, sigma: float) -> None:
         """Take in a fix (2,), m north and east of the dead-reckoned position; `sigma` m on each axis.
 
         It holds at the time of the last prediction.
@@ -175,18 +173,18 @@ class Estimate:
 
     # ---- one hypothesis or many, and whether to believe them -----------------------------------------
 
-    def _estimator(self, x: Array, P: Array) -> Tracker | Bank:
+    def _estimator(self, x: FloatArray, P: FloatArray) -> Tracker | Bank:
         """Return one tracker if the position is narrow enough for it, else a bank."""
         if widest(P) < SPLIT * self._resolution:
             return Tracker(self.grid, x, P, self.options.gate)
         return Bank(self.grid, x, P, self._resolution, self.options.gate)
 
-    def _begin(self, x: Array, P: Array, cause: str) -> None:
+    def _begin(self, x: FloatArray, P: FloatArray, cause: str) -> None:
         """Start again from a Gaussian."""
         self._jump(x, cause)
         self._filter, self.x, self.P = self._estimator(x, P), x, P
 
-    def _jump(self, x: Array, cause: str) -> None:
+    def _jump(self, x: FloatArray, cause: str) -> None:
         north, east = (x[:2] - self.x[:2]).tolist()
         self.jumps.append(Jump(self.time_us, north, east, widest(self._alone), cause))
         self._monitor, self._confirmed = None, False

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from math import hypot, sqrt
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from magbridge.arrays import BoolArray, RealArray
 from magbridge.field.earth import metres_per_degree
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.igrf import total_field
@@ -17,8 +17,6 @@ from magbridge.navigate.options import Options
 from magbridge.navigate.record import Jump, State
 
 __all__ = ["Shift", "best_shift", "findings_of"]
-
-Array = NDArray[np.floating[Any]]
 
 SPARSE = 40
 """Positions, below which a map's place cannot be judged."""
@@ -96,7 +94,7 @@ def findings_of(
     return findings
 
 
-def _sigma(result: xr.Dataset, rows: NDArray[np.bool_]) -> float:
+def _sigma(result: xr.Dataset, rows: BoolArray) -> float:
     return float(np.sqrt(np.median((result["covariance_nn"] + result["covariance_ee"]).to_numpy()[rows])))
 
 
@@ -144,7 +142,9 @@ class Shift(NamedTuple):
     here: float
 
 
-def best_shift(grid: AnomalyGrid, latitude: Array, longitude: Array, depth: Array, anomaly: Array) -> Shift:
+def best_shift(
+    grid: AnomalyGrid, latitude: RealArray, longitude: RealArray, depth: RealArray, anomaly: RealArray
+) -> Shift:
     """Return by how much the map must be moved to describe an anomaly measured at known positions.
 
     Parameters

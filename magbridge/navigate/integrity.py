@@ -16,16 +16,14 @@ from enum import Enum
 from math import exp, expm1, log, pi, sqrt
 
 import numpy as np
-from numpy.typing import NDArray
 
+from magbridge.arrays import FloatArray
 from magbridge.field.grid import AnomalyGrid
 from magbridge.navigate.bank import Bank, widest
 from magbridge.navigate.model import Block, average, block_length, transition
 from magbridge.navigate.options import Options
 
 __all__ = ["IntegrityMonitor", "Unmapped", "Verdict", "squared_mahalanobis"]
-
-Array = NDArray[np.float64]
 
 AGREES = 9.0
 """Squared distance in sigmas within which two estimates are the same place."""
@@ -123,8 +121,8 @@ class IntegrityMonitor:
         self,
         grid: AnomalyGrid,
         options: Options,
-        x: Array,
-        P: Array,
+        x: FloatArray,
+        P: FloatArray,
         time_us: int,
         reach: float,
         resolution: float,
@@ -143,7 +141,7 @@ class IntegrityMonitor:
         self.odds = 0.0
         """Natural logarithm of the odds of *elsewhere* against *here*."""
 
-    def step(self, block: Block, metres: float, x: Array, P: Array) -> Verdict:
+    def step(self, block: Block, metres: float, x: FloatArray, P: FloatArray) -> Verdict:
         """Take in a block `metres` after the previous one.
 
         It is compared with the filter's estimate after that block: `x` (6,) and its covariance `P` (6, 6).
@@ -167,7 +165,7 @@ class IntegrityMonitor:
         self.elsewhere.predict(*transition(self._options, (time_us - self._time_us) * 1e-6, 0.0))
         return self.elsewhere
 
-    def _compare(self, x: Array, P: Array) -> Verdict:
+    def _compare(self, x: FloatArray, P: FloatArray) -> Verdict:
         there, spread = self.elsewhere.moments()
         if self.odds > self._threshold and squared_mahalanobis(there - x, P) > ELSEWHERE:
             return Verdict.ELSEWHERE
@@ -181,7 +179,7 @@ class IntegrityMonitor:
         )
 
 
-def squared_mahalanobis(apart: Array, P: Array) -> float:
+def squared_mahalanobis(apart: FloatArray, P: FloatArray) -> float:
     """Return the squared Mahalanobis distance of two positions.
 
     Parameters

@@ -20,8 +20,8 @@ from math import exp, nan
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from magbridge.arrays import FloatArray
 from magbridge.field.earth import wrap
 from magbridge.field.grid import AnomalyGrid
 from magbridge.navigate.options import Options
@@ -36,8 +36,6 @@ __all__ = [
     "resolution",
     "transition",
 ]
-
-Array = NDArray[np.float64]
 
 N_STATES = 6
 FINE = 0.35
@@ -73,7 +71,7 @@ class Block(NamedTuple):
     depth: float = nan
 
 
-def average(blocks: Sequence[Block] | Array) -> Block:
+def average(blocks: Sequence[Block] | FloatArray) -> Block:
     """Return several blocks, or rows (n, 8) of their fields, as one: their mean, weighted by precision.
 
     Its variance is that of independent ones.
@@ -88,7 +86,7 @@ def average(blocks: Sequence[Block] | Array) -> Block:
     return Block(*where, anomaly, 1.0 / float(precision.sum()), *rest)
 
 
-def prior(options: Options, position_sigma: float | None = None) -> tuple[Array, Array]:
+def prior(options: Options, position_sigma: float | None = None) -> tuple[FloatArray, FloatArray]:
     """Return mean (6,) and covariance (6, 6) before anything was measured."""
     o = options
     sigma = o.start_sigma if position_sigma is None else position_sigma
@@ -96,7 +94,7 @@ def prior(options: Options, position_sigma: float | None = None) -> tuple[Array,
     return np.zeros(N_STATES), np.diag(np.square(sigmas))
 
 
-def transition(options: Options, seconds: float, metres: float) -> tuple[Array, Array]:
+def transition(options: Options, seconds: float, metres: float) -> tuple[FloatArray, FloatArray]:
     """Return F and Q (6, 6) over a time and a distance through the water.
 
     Notes
@@ -120,7 +118,7 @@ def transition(options: Options, seconds: float, metres: float) -> tuple[Array, 
     return f, q
 
 
-def measurement_row(north: float, east: float) -> Array:
+def measurement_row(north: float, east: float) -> FloatArray:
     """Return H (1, 6): the field's slopes at the position, and 1 for calibration bias and map error."""
     return np.array([[north, east, 0.0, 0.0, 1.0, 1.0]])
 

@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from magbridge.field.earth import separation
 
 __all__ = ["REFERENCES", "errors", "reference_track", "with_errors"]
-
-Floats = NDArray[np.floating[Any]]
 
 REFERENCES = (
     ("truth_latitude", "truth_longitude"),

@@ -7,16 +7,14 @@ from typing import NamedTuple
 
 import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
-from numpy.typing import NDArray
 
+from magbridge.arrays import FloatArray
 from magbridge.field.earth import metres_per_degree
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.local import curvature
 from magbridge.navigate.model import N_STATES, Block, measurement_row
 
 __all__ = ["Innovation", "Tracker"]
-
-Array = NDArray[np.float64]
 
 
 class Innovation(NamedTuple):
@@ -39,7 +37,7 @@ class Tracker:
     filterpy's update is Joseph's form: the covariance stays symmetric and positive.
     """
 
-    def __init__(self, grid: AnomalyGrid, x: Array, P: Array, gate: float) -> None:
+    def __init__(self, grid: AnomalyGrid, x: FloatArray, P: FloatArray, gate: float) -> None:
         self._grid, self._gate = grid, gate
         self._filter = ExtendedKalmanFilter(dim_x=N_STATES, dim_z=1)
         self._filter.x, self._filter.P = x.copy(), P.copy()
@@ -47,18 +45,18 @@ class Tracker:
         """nT², variance that the map's curvature within the spread added to the last measurement's."""
 
     @property
-    def x(self) -> Array:
+    def x(self) -> FloatArray:
         """State, (6,)."""
-        x: Array = self._filter.x
+        x: FloatArray = self._filter.x
         return x
 
     @property
-    def P(self) -> Array:  # noqa: N802  the name every filter gives it
+    def P(self) -> FloatArray:  # noqa: N802  the name every filter gives it
         """Covariance, (6, 6)."""
-        covariance: Array = self._filter.P
+        covariance: FloatArray = self._filter.P
         return covariance
 
-    def predict(self, F: Array, Q: Array) -> None:
+    def predict(self, F: FloatArray, Q: FloatArray) -> None:
         """Propagate by one transition: F and the noise's covariance Q, (6, 6)."""
         self._filter.F, self._filter.Q = F, Q
         self._filter.predict()
@@ -94,7 +92,7 @@ class Tracker:
             self._observe(value, float(self.x[axis]), row, sigma * sigma, gated=False)
 
     def _observe(
-        self, value: float, expected: float, row: Array, variance: float, *, gated: bool = True
+        self, value: float, expected: float, row: FloatArray, variance: float, *, gated: bool = True
     ) -> Innovation:
         y = value - expected
         s = float((row @ self.P @ row.T)[0, 0]) + variance

@@ -6,8 +6,8 @@ from array import array
 from collections import Counter
 
 import numpy as np
-from numpy.typing import NDArray
 
+from magbridge.arrays import FloatArray
 from magbridge.mavlink import Codec, spec
 from magbridge.mavlink.dialect import MAG_NAVIGATION_STATE
 from magbridge.records import Quality
@@ -64,7 +64,7 @@ class Listener:
             elif message.id == NAVIGATION.id:
                 self.navigation[MAG_NAVIGATION_STATE(message["state"]).name.lower()] += 1
 
-    def field(self) -> dict[str, NDArray[np.float64]]:
+    def field(self) -> dict[str, FloatArray]:
         """Return the corrected field, (n,) each: ``time`` (s since 1970 UTC), the rest in nT, ``quality``."""
         table = np.array(self._values).reshape(-1, len(COLUMNS))
         columns = dict(zip(COLUMNS, table.T, strict=True))

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from magbridge.arrays import FloatArray, IndexArray
 from magbridge.bridge.events import Start
 from magbridge.columns import CHANNELS
 from magbridge.config import load
@@ -30,7 +30,6 @@ from sitl.replay.stage import Stage
 __all__ = ["agreement", "replay"]
 
 Result = dict[str, Any]
-Floats = NDArray[np.float64]
 
 
 def replay(
@@ -117,7 +116,7 @@ def agreement(published: bytearray, recorded: Recorded) -> Result:
     }
 
 
-def _heard(stream: bytearray) -> dict[str, Floats]:
+def _heard(stream: bytearray) -> dict[str, FloatArray]:
     listener = Listener()
     listener.hear(bytes(stream))
     return listener.field()
@@ -167,7 +166,9 @@ def _play(
     }
 
 
-def _compared(part: Part, times: Floats, raw: Floats, corrected: Floats, sigma: Floats) -> Result:
+def _compared(
+    part: Part, times: FloatArray, raw: FloatArray, corrected: FloatArray, sigma: FloatArray
+) -> Result:
     """Return the errors (n,) nT against the reference, raw and corrected, over one part of a replay."""
     rows = rows_of(part, times)
     error = corrected[rows]
@@ -183,13 +184,13 @@ def _compared(part: Part, times: Floats, raw: Floats, corrected: Floats, sigma: 
     }
 
 
-def _nearest(times: Floats, wanted: Floats) -> NDArray[np.intp]:
+def _nearest(times: FloatArray, wanted: FloatArray) -> IndexArray:
     """Return the index of the row (in order of time) nearest to each wanted time."""
     after = np.clip(np.searchsorted(times, wanted), 1, max(len(times) - 1, 1))
     return after - (wanted - times[after - 1] < times[after % len(times)] - wanted)
 
 
-def _reference(deployment: xr.Dataset) -> Floats:
+def _reference(deployment: xr.Dataset) -> FloatArray:
     """Return the true total field in nT; NaN where it is not known."""
     try:
         return reference_field(deployment)
@@ -197,7 +198,7 @@ def _reference(deployment: xr.Dataset) -> Floats:
         return np.full(deployment.sizes["time"], np.nan)
 
 
-def _rms(values: Floats) -> float | None:
+def _rms(values: FloatArray) -> float | None:
     """Return the root mean square of the finite values; None where there are none."""
     values = values[np.isfinite(values)]
     with np.errstate(over="ignore"):  # an absurd value is infinitely wrong

@@ -13,8 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from magbridge.arrays import BoolArray, FloatArray
 from magbridge.calibration.file import save
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.observe import observations
@@ -116,7 +116,7 @@ def _parts(files: Sequence[Path], deployment: xr.Dataset) -> list[Part]:
     return sorted(spans, key=lambda part: part.begin)
 
 
-def rows_of(part: Part, time: NDArray[np.float64]) -> NDArray[np.bool_]:
+def rows_of(part: Part, time: FloatArray) -> BoolArray:
     """Return which times (n,), s since 1970, belong to a part."""
     return (time >= part.begin) & (time <= part.end)
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from posed import right
 from scipy.sparse import csr_array
 
+from magbridge.arrays import FloatArray
 from magbridge.diagnose.compare.design_columns import (
     Columns,
     Interpolated,
@@ -21,7 +21,6 @@ from magbridge.diagnose.inference import design
 from magbridge.diagnose.inference.information import information
 from magbridge.diagnose.inference.joint import fit_joint
 
-FloatArray = NDArray[np.float64]
 ROWS = slice(3, 20)
 
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from magbridge.arrays import FloatArray
 from magbridge.calibration.model import Calibration, Noise, Parameter, Reference
 from magbridge.calibration.terms import Polynomial
 from magbridge.diagnose.causes.candidates import Candidate
@@ -17,7 +18,6 @@ from magbridge.diagnose.compare.survey import Channel, Survey
 
 __all__ = ["FIELD", "T0", "calibrated", "candidate", "missed", "right", "surveyed", "thinned", "walk"]
 
-FloatArray = NDArray[np.float64]
 
 FIELD, T0 = 5e4, 1.7e9
 """nT, and s since 1970: the reference, and when a survey begins."""

@@ -11,33 +11,32 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
+from magbridge.arrays import FloatArray
 from magbridge.records import Reading
 from magbridge.sensors import open_driver
 from magbridge.sensors.clock import DeviceClock, Stamp
 
 EPOCH = 1_700_000_000_000_000
-Array = NDArray[np.float64]
 
 
-def arrivals(true: Array, jitter: float, seed: int = 1) -> Array:
+def arrivals(true: FloatArray, jitter: float, seed: int = 1) -> FloatArray:
     """s; the delay is exponential with mean `jitter`, and bytes do not overtake each other."""
     random = np.random.default_rng(seed)
-    arrived: Array = np.maximum.accumulate(true + random.exponential(jitter, true.size))
+    arrived: FloatArray = np.maximum.accumulate(true + random.exponential(jitter, true.size))
     return arrived
 
 
 def stamps(
-    clock: DeviceClock, device: Array, arrived: Array, sequence: list[int] | None = None
+    clock: DeviceClock, device: FloatArray, arrived: FloatArray, sequence: list[int] | None = None
 ) -> list[Stamp]:
     times = (arrived * 1e6).astype(int) + EPOCH
     numbers: Sequence[int | None] = sequence or [None] * device.size
     return [clock.update(d, a, s) for d, a, s in zip(device.tolist(), times.tolist(), numbers, strict=True)]
 
 
-def error_us(made: list[Stamp], true: Array) -> Array:
-    error: Array = np.array([stamp.time_us - EPOCH for stamp in made]) - true * 1e6
+def error_us(made: list[Stamp], true: FloatArray) -> FloatArray:
+    error: FloatArray = np.array([stamp.time_us - EPOCH for stamp in made]) - true * 1e6
     return error
 
 

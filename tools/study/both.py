@@ -20,13 +20,13 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import xarray as xr
 
+from magbridge.arrays import FloatArray
 from magbridge.diagnose.inference.evidence import ODDS
 from study.deployment import Background, Injected
 from study.draws import SHOWN, Draws, Span, evidence
-from study.noise import Array
 from study.theory import Setting, best_of, information, own_span, true_span
 
-Wholes = dict[frozenset[str], Array]
+Wholes = dict[frozenset[str], FloatArray]
 
 
 def both(
@@ -53,13 +53,13 @@ def both(
 
 def weighed(
     draws: Draws, spans: Sequence[Span], firsts: Sequence[Span], trials: Mapping[str, float]
-) -> dict[tuple[Span, ...], Array]:
+) -> dict[tuple[Span, ...], FloatArray]:
     """Log evidence of every span, and of each two of different causes whose first is in `firsts`."""
 
-    def own(draws: Draws, span: Span) -> Array:
+    def own(draws: Draws, span: Span) -> FloatArray:
         return np.asarray(evidence(span, *draws.ratio(span)) - np.log(trials.get(span.cause, 1.0)))
 
-    values: dict[tuple[Span, ...], Array] = {(span,): own(draws, span) for span in spans}
+    values: dict[tuple[Span, ...], FloatArray] = {(span,): own(draws, span) for span in spans}
     price = ODDS + np.log(max(len(trials), 1))
     for first in firsts:
         beside = draws.beside(first)
@@ -69,7 +69,7 @@ def weighed(
     return values
 
 
-def by_causes(values: Mapping[tuple[Span, ...], Array]) -> Wholes:
+def by_causes(values: Mapping[tuple[Span, ...], FloatArray]) -> Wholes:
     """Return the best log evidence of every set of causes."""
     wholes: Wholes = {}
     for spans, value in values.items():

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import xarray as xr
 
+from magbridge.arrays import FloatArray
 from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.diagnosis import Diagnosis
 from magbridge.diagnose.report.findings import findings
@@ -20,7 +21,7 @@ from sitl.inject import EFFECTS, FOREIGN, Hidden
 from study.both import both
 from study.deployment import CHARTS, SEEDS, Background, Injected, deployment_of
 from study.gain import DELAYS, gain, harm
-from study.noise import GLIDER, LOSSES, NOISES, Array
+from study.noise import GLIDER, LOSSES, NOISES
 from study.theory import Setting, ideal
 
 Row = dict[str, Any]
@@ -223,7 +224,7 @@ def _theory(
     return [ideal(hidden[0], background, ds, setting)]
 
 
-def alike(other: str, late: Injected, background: Background) -> Array:
+def alike(other: str, late: Injected, background: Background) -> FloatArray:
     """Signature of the other delay cause, at this delay, in the log that hides `late`, of a possible sign.
 
     A field that is late looks like a clock that is early, except where a mass starts or stops within the

@@ -12,6 +12,7 @@ import msgspec
 import numpy as np
 import xarray as xr
 
+from magbridge.arrays import FloatArray
 from magbridge.calibration.correct import regressors
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.observe import observations
@@ -26,7 +27,7 @@ from sitl.mission import CrissCross, Spirals
 from sitl.signals import first_order
 from sitl.trajectory import Track
 from sitl.world import Water, World
-from study.noise import GLIDER, Array, Rows, add_noise, left, statistics, whiten
+from study.noise import GLIDER, Rows, add_noise, left, statistics, whiten
 
 HOURS = 6.0
 """Length of a deployment; the tests' are shorter."""
@@ -48,9 +49,11 @@ CHARTS = ("map at its depth", "map")
 class Remembered(World):
     """A world that caches the field along a track: all cases of a vehicle fly the same one."""
 
-    known: dict[bytes, Array] = attribute(default_factory=dict)
+    known: dict[bytes, FloatArray] = attribute(default_factory=dict)
 
-    def field(self, time: Array, latitude: Array, longitude: Array, depth: Array) -> Array:
+    def field(
+        self, time: FloatArray, latitude: FloatArray, longitude: FloatArray, depth: FloatArray
+    ) -> FloatArray:
         """See :meth:`~sitl.world.World.field`."""
         way = np.stack([time, latitude, longitude, depth]).tobytes()
         if way not in self.known:
@@ -68,9 +71,9 @@ class Deployment(NamedTuple):
 
     twin: Twin
     track: Track
-    when: Array
+    when: FloatArray
     calibration: Calibration
-    prior: Array
+    prior: FloatArray
     learned: tuple[xr.Dataset, ...] = ()
     chart: AnomalyGrid | None = None
 
@@ -158,7 +161,7 @@ def deployment_of(number: int, noise: str, reference: str = "true") -> Deploymen
     return vehicle(VEHICLES * seed + place % VEHICLES, rms, reference)
 
 
-def compare(ds: xr.Dataset, calibration: Calibration) -> tuple[Array, Array]:
+def compare(ds: xr.Dataset, calibration: Calibration) -> tuple[FloatArray, FloatArray]:
     """Return the residual (n,), and its derivatives by the calibration's coefficients (n, K)."""
     H = np.column_stack([ds[f"mag_{axis}"] for axis in "xyz"])
     p = np.column_stack([ds[name] for name in calibration.channels])
@@ -171,7 +174,7 @@ def compare(ds: xr.Dataset, calibration: Calibration) -> tuple[Array, Array]:
     return e, jacobian(phi, g)
 
 
-def project(X: Array, A: Array, covariance: Array) -> Array:
+def project(X: FloatArray, A: FloatArray, covariance: FloatArray) -> FloatArray:
     """Project the calibration (columns A, prior `covariance`) out of columns X.
 
     The inner product of the result with X is the Fisher information with the calibration free. By Woodbury's
@@ -181,7 +184,7 @@ def project(X: Array, A: Array, covariance: Array) -> Array:
     return np.asarray(X - A @ (covariance @ np.linalg.solve(inner, A.T @ X)))
 
 
-def size_of(name: str, d: Array, A: Array, covariance: Array) -> float:
+def size_of(name: str, d: FloatArray, A: FloatArray, covariance: FloatArray) -> float:
     """Signal-to-noise of a signature d: its norm with the calibration projected out.
 
     For outliers, each at an unknown moment of its own, it is that of the largest.
@@ -196,7 +199,7 @@ class Injected(NamedTuple):
     """A hidden effect of the wanted size, its whitened signature in the residual, and the log with it."""
 
     hidden: Hidden
-    signature: Array
+    signature: FloatArray
     ds: xr.Dataset
 
 
@@ -210,8 +213,8 @@ class Background(NamedTuple):
     number: int
     noise: str
     rows: Rows
-    residual: Array
-    columns: Array
+    residual: FloatArray
+    columns: FloatArray
 
     @classmethod
     def of(cls, deployment: Deployment, number: int, noise: str, losses: str = "") -> Background:

@@ -11,9 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from magbridge.arrays import FloatArray
 from magbridge.diagnose.inference.evidence import log_bayes, one_sided
 from magbridge.diagnose.inference.statistic import Statistic
-from study.noise import Array
 
 DRAWS = 400
 SHOWN = "as shown"
@@ -46,7 +46,7 @@ class Span:
     own: slice
     price: float = 0.0
     positive: bool = False
-    spectra: Array | None = None
+    spectra: FloatArray | None = None
     more: float = 0.0
 
     @property
@@ -58,11 +58,11 @@ class Span:
 class Draws(NamedTuple):
     """Fisher information S of all columns, the truth's last, and draws of their scores' noise (m, DRAWS)."""
 
-    S: Array
-    noise: Array
+    S: FloatArray
+    noise: FloatArray
 
     @classmethod
-    def of(cls, S: Array) -> Draws:
+    def of(cls, S: FloatArray) -> Draws:
         """Draw the noise of scores whose covariance is S."""
         values, vectors = np.linalg.eigh(0.5 * (S + S.T))
         drawn = np.random.default_rng(20131212).standard_normal((len(S), DRAWS))
@@ -73,7 +73,7 @@ class Draws(NamedTuple):
         """Signal-to-noise of the truth."""
         return float(np.sqrt(self.S[-1, -1]))
 
-    def ratio(self, span: Span, scale: float | Array = 1.0) -> tuple[Array, float]:
+    def ratio(self, span: Span, scale: float | FloatArray = 1.0) -> tuple[FloatArray, float]:
         """Likelihood ratios of a hypothesis, with the truth scaled by `scale`, and its degrees of freedom."""
         statistic = Statistic(self.S[span.own, span.own], span.spectra)
         given, scale = self.S[span.own, -1], np.asarray(scale)[..., None]
@@ -92,14 +92,14 @@ class Draws(NamedTuple):
         return Draws(self.S - taken @ taken.T, self.noise - taken @ own)
 
 
-def explained(S: Array, span: Span) -> float:
+def explained(S: FloatArray, span: Span) -> float:
     """Power of the truth's signature that a hypothesis explains; one of the wrong sign explains nothing."""
     if span.positive and S[span.own, -1].min() < 0.0:
         return 0.0
     return float(np.sum((root_of(S, span).T @ S[span.own, -1]) ** 2))
 
 
-def evidence(span: Span, ratio: Array, freedom: float) -> Array:
+def evidence(span: Span, ratio: FloatArray, freedom: float) -> FloatArray:
     """Log evidence of likelihood ratios; coefficients of one common size are already integrated out."""
     if span.spectra is not None:
         return np.asarray(0.5 * ratio - np.log(len(span.spectra)))
@@ -119,7 +119,7 @@ def with_another(draws: Draws, first: Span, spans: Sequence[Span]) -> dict[str, 
     return left
 
 
-def root_of(S: Array, span: Span) -> Array:
+def root_of(S: FloatArray, span: Span) -> FloatArray:
     """Return R (k, f): ``R R^T`` is the covariance of a hypothesis' coefficients, where the data see them."""
     own = S[span.own, span.own]
     if span.spectra is not None:  # with their prior, at the likeliest size given the truth
@@ -128,18 +128,20 @@ def root_of(S: Array, span: Span) -> Array:
     return np.asarray(statistic.vectors / np.sqrt(statistic.values))
 
 
-def numbers(S: Array, span: Span) -> float:
+def numbers(S: FloatArray, span: Span) -> float:
     """Number of coefficients that the data determine: of one common size, those not held by the prior."""
     root = root_of(S, span)
     return float(np.trace(root.T @ S[span.own, span.own] @ root))
 
 
-def by_cause(evidences: Mapping[Span, Array], name: str = "", truth: Array | None = None) -> dict[str, Array]:
+def by_cause(
+    evidences: Mapping[Span, FloatArray], name: str = "", truth: FloatArray | None = None
+) -> dict[str, FloatArray]:
     """Each cause's log evidence, averaged over its grid, for its best channel; the truth pays as much."""
-    groups: dict[tuple[str, str | None], list[tuple[Array, float]]] = {}
+    groups: dict[tuple[str, str | None], list[tuple[FloatArray, float]]] = {}
     for span, evidence in evidences.items():
         groups.setdefault((span.cause, span.channel), []).append((evidence, span.price))
-    found: dict[str, Array] = {}
+    found: dict[str, FloatArray] = {}
     for (cause, _), members in groups.items():
         table = np.array([evidence for evidence, _ in members])
         top = table.max(axis=0)

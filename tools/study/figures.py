@@ -10,14 +10,14 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy.stats import binomtest
 
+from magbridge.arrays import FloatArray
 from study.cases import KNOWN
-from study.noise import Array
 from study.rates import Row, beside_ideal, curve, found, predicted
 
 NEITHER = "no name"
 
 
-def confusion(rows: Sequence[Row]) -> tuple[Array, Array]:
+def confusion(rows: Sequence[Row]) -> tuple[FloatArray, FloatArray]:
     """Predicted and measured shares, hidden by row, named first by column; the last column is no name."""
     columns = [*KNOWN, NEITHER]
     predicted, measured = np.full((2, len(KNOWN), len(columns)), np.nan)

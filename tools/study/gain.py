@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from magbridge.arrays import BoolArray, FloatArray
 from magbridge.calibration.model import Calibration
 from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.diagnosis import Diagnosis
@@ -14,7 +14,7 @@ from magbridge.diagnose.inference.search import search
 from sitl.dataset import corrected
 from sitl.inject import Hidden
 from study.deployment import DAY, Background, again
-from study.noise import Array, add_noise
+from study.noise import add_noise
 
 DELAYS = ("filter_lag", "clock_offset")
 """In a uniform field these two look the same: a late field shows only where masses have moved meanwhile."""
@@ -55,7 +55,7 @@ def harm(
     return found
 
 
-def _inside(other: xr.Dataset, ds: xr.Dataset, calibration: Calibration) -> NDArray[np.bool_]:
+def _inside(other: xr.Dataset, ds: xr.Dataset, calibration: Calibration) -> BoolArray:
     """Samples of a log whose masses stand within the range that those of `ds` covered."""
     inside = np.ones(other.sizes["time"], bool)
     for parameter in calibration.parameters:
@@ -78,7 +78,7 @@ def _oracle(name: str, result: Diagnosis) -> Calibration:
     return extend(settled, model, with_misfit(model, fit))
 
 
-def error(ds: xr.Dataset, calibration: Calibration) -> Array:
+def error(ds: xr.Dataset, calibration: Calibration) -> FloatArray:
     """Error of the corrected total field against the reference, (n,) nT."""
     reference = ds["reference_field"].to_numpy() + calibration.reference.bias
     return np.asarray(corrected(ds, calibration).total - reference)

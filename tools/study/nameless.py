@@ -27,15 +27,18 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from magbridge.arrays import FloatArray
 from magbridge.diagnose.inference.evidence import ODDS, log_bayes
 from magbridge.diagnose.unexplained.descriptions import Description
 from study.draws import Draws, Span
-from study.noise import Array
 
 
 def against(
-    draws: Draws, names: Mapping[str, Array], pairs: Sequence[tuple[Span, Span]], trials: Mapping[str, float]
-) -> Array:
+    draws: Draws,
+    names: Mapping[str, FloatArray],
+    pairs: Sequence[tuple[Span, Span]],
+    trials: Mapping[str, float],
+) -> FloatArray:
     """Log evidence T that a description must exceed; the price of grids is included in `names` only."""
     found = [*names.values()]
     for first, second in pairs:
@@ -46,7 +49,9 @@ def against(
     return np.asarray(np.max(found, axis=0) - np.log(max(len(trials), 1)))
 
 
-def nameless(draws: Draws, truth: Array, needed: Array, free: Sequence[Description]) -> dict[str, float]:
+def nameless(
+    draws: Draws, truth: FloatArray, needed: FloatArray, free: Sequence[Description]
+) -> dict[str, float]:
     """Chances of the module's notes; the columns of `free` are the first of `draws`."""
     count = sum(len(one.widths) for one in free)
     best, start = np.full(len(needed), -np.inf), 0

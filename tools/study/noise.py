@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from magbridge.arrays import FloatArray, IndexArray
 from sitl.signals import correlated
 
-Array = NDArray[np.float64]
-Rows = NDArray[np.intp]
+Rows = IndexArray
 MEMORY = 0.8
 """Correlation of neighbouring samples in autoregressive noise."""
 SLOWER = 0.95
@@ -66,7 +65,7 @@ def left(losses: str, n: int, seed: int) -> Rows:
     return np.flatnonzero(there)
 
 
-def whiten(x: Array, noise: str, rows: Rows) -> Array:
+def whiten(x: FloatArray, noise: str, rows: Rows) -> FloatArray:
     """Innovations, in units of their 1-sigma under the true noise, of a signal x sampled at `rows` alone.
 
     Over a step of k rows an AR(1) is one of ``rho^k``. The first row has no past and is left out.

@@ -6,11 +6,10 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 from scipy.stats import binomtest, norm
 
-from study.noise import Array
+from magbridge.arrays import BoolArray, FloatArray
 from study.theory import SIZES
 
 Row = dict[str, Any]
@@ -87,7 +86,7 @@ def gained(rows: Sequence[Row]) -> float:
     return float(np.median(shares)) if shares else float("nan")
 
 
-def scores(rows: Sequence[Row]) -> Array:
+def scores(rows: Sequence[Row]) -> FloatArray:
     """(value - truth) / sigma of all parameters of known truth."""
     return np.array([z for r in rows for z in r["scores"]])
 
@@ -102,7 +101,7 @@ def chance(rows: Sequence[Row], key: str) -> float:
     return float(np.mean([t[key] for t in predicted(rows)])) if predicted(rows) else np.nan
 
 
-def curve(rows: Sequence[Row], size: Array | float) -> Array:
+def curve(rows: Sequence[Row], size: FloatArray | float) -> FloatArray:
     """Theory's mean chance that the rows' hidden effects are found, if they had this signal-to-noise."""
     if not predicted(rows):
         return np.full(np.shape(size), np.nan)
@@ -159,7 +158,7 @@ def share(rows: Sequence[Row], good: Callable[[Row], bool]) -> str:
     return fraction([good(row) for row in rows])
 
 
-def fraction(good: Sequence[bool] | NDArray[np.bool_]) -> str:
+def fraction(good: Sequence[bool] | BoolArray) -> str:
     """See :func:`share`."""
     n, k = len(good), int(np.sum(good))
     if not n:

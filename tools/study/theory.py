@@ -24,6 +24,7 @@ import numpy as np
 import xarray as xr
 from scipy.special import chdtrc
 
+from magbridge.arrays import FloatArray
 from magbridge.diagnose.causes import Cause
 from magbridge.diagnose.causes.candidates import slices
 from magbridge.diagnose.compare.problem import pose
@@ -33,7 +34,7 @@ from magbridge.diagnose.unexplained.descriptions import Description
 from study.deployment import Background, Injected, compare, project
 from study.draws import SHOWN, Draws, Span, by_cause, evidence, explained, numbers, with_another
 from study.nameless import against, nameless
-from study.noise import Array, whiten
+from study.noise import whiten
 
 SIZES = np.linspace(1.0, 12.0, 45)
 """Signal-to-noise at which the chance to be found is evaluated."""
@@ -57,7 +58,7 @@ class Setting(NamedTuple):
     causes: Mapping[str, Cause]
     trials: Mapping[str, float]
     free: Sequence[Description]
-    others: Mapping[str, Array]
+    others: Mapping[str, FloatArray]
 
 
 def ideal(one: Injected, background: Background, ds: xr.Dataset, setting: Setting) -> dict[str, Any]:
@@ -120,7 +121,7 @@ def ideal(one: Injected, background: Background, ds: xr.Dataset, setting: Settin
 
 def information(
     hidden: Sequence[Injected], background: Background, ds: xr.Dataset, setting: Setting
-) -> tuple[list[Span], Array, Array]:
+) -> tuple[list[Span], FloatArray, FloatArray]:
     """Return spans, Fisher information (m, m) of all columns, and scores (m, 1) of the log's own noise.
 
     The hidden signatures are the last columns: each one and, if there are several, their sum.
@@ -147,12 +148,12 @@ def information(
     return spans, X.T @ projected, projected.T @ (measured - sum(truth))[:, None]
 
 
-def own_span(S: Array, spans: Sequence[Span], name: str) -> Span | None:
+def own_span(S: FloatArray, spans: Sequence[Span], name: str) -> Span | None:
     """Most evident hypothesis of the true cause; None if the log cannot test it."""
     return max((span for span in spans if span.cause == name), key=lambda span: _worth(S, span), default=None)
 
 
-def true_span(S: Array, own: Span | None, name: str, at: int) -> Span:
+def true_span(S: FloatArray, own: Span | None, name: str, at: int) -> Span:
     """Return the true shape, which stands at `at`, with as many numbers as its cause's `own` hypothesis."""
     shape = slice(at, at + 1)
     if own is None:
@@ -160,7 +161,7 @@ def true_span(S: Array, own: Span | None, name: str, at: int) -> Span:
     return Span(name, SHOWN, shape, positive=own.positive, more=max(numbers(S, own), 1.0) - 1.0)
 
 
-def best_of(S: Array, spans: Sequence[Span]) -> dict[str, Span]:
+def best_of(S: FloatArray, spans: Sequence[Span]) -> dict[str, Span]:
     """Hypothesis of each cause that explains most of the truth."""
     found: dict[str, tuple[float, Span]] = {}
     for span in spans:
@@ -170,13 +171,13 @@ def best_of(S: Array, spans: Sequence[Span]) -> dict[str, Span]:
     return {cause: span for cause, (_, span) in found.items()}
 
 
-def _worth(S: Array, span: Span) -> float:
+def _worth(S: FloatArray, span: Span) -> float:
     """Log evidence of a hypothesis at its mean likelihood ratio."""
     freedom = numbers(S, span)
     return float(log_bayes(explained(S, span) + freedom, freedom))
 
 
-def p_values(draws: Draws, spans: Sequence[Span], setting: Setting) -> Array:
+def p_values(draws: Draws, spans: Sequence[Span], setting: Setting) -> FloatArray:
     """Smallest p-value of all tests, for each of :data:`SIZES` and each draw, look-elsewhere included."""
     scale, least = SIZES / draws.wanted, np.ones((len(SIZES), 1))
     for span in spans:
@@ -187,7 +188,7 @@ def p_values(draws: Draws, spans: Sequence[Span], setting: Setting) -> Array:
     return least
 
 
-def _found(p: Array) -> dict[str, float]:
+def _found(p: FloatArray) -> dict[str, float]:
     """Signal-to-noise at which 50 % and 95 % are found."""
     chance = np.maximum.accumulate(np.mean(p < LEVEL, axis=1))
     return {"half": float(np.interp(0.5, chance, SIZES)), "sure": float(np.interp(0.95, chance, SIZES))}

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 from msgspec.structs import replace as with_options
-from numpy.typing import NDArray
 
+from magbridge.arrays import BoolArray
 from magbridge.field.grid import AnomalyGrid
 from voyages.simulated import GLIDER, OUTSIDE, SPEEDS, Map, Run, longest, sail, synthetic, voyage
 
@@ -46,7 +46,7 @@ def half(kind: Map, seed: int) -> tuple[float, float]:
     return standing(sail(voyage(field, options, 9000 + seed, speed=SPEEDS[seed % 3]), grid, options))
 
 
-def outside(run: Run) -> NDArray[np.bool_]:
+def outside(run: Run) -> BoolArray:
     """Return when the vehicle is outside the filter's ellipse and over a quarter correlation length away."""
     return (run.nees > OUTSIDE) & (run.error > 0.25 * run.length)
 

@@ -11,9 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from magbridge.arrays import BoolArray, FloatArray, IntArray
 from magbridge.calibration.residual import rms
 from magbridge.field.earth import metres_per_degree, offset
 from magbridge.field.grid import AnomalyGrid
@@ -26,8 +26,6 @@ from magbridge.navigate.navigator import Navigator
 from magbridge.navigate.options import Options
 from magbridge.navigate.record import State
 from sitl.signals import autoregressive
-
-Array = NDArray[np.float64]
 
 START = 1_386_201_600.0
 """s, 2013-12-05."""
@@ -120,9 +118,9 @@ def adrift(
     grid: AnomalyGrid,
     options: Options,
     rng: np.random.Generator,
-    velocity: Array,
-    errors: Array,
-    sigma: Array,
+    velocity: FloatArray,
+    errors: FloatArray,
+    sigma: FloatArray,
     *,
     every: float = 4.0,
     jump: tuple[float, float, float] = (0.0, 0.0, 0.0),
@@ -135,9 +133,9 @@ def adrift(
         As for :func:`voyage`.
     rng : Generator
         Of current, drift, start and the map's error.
-    velocity : Array, (n, 2)
+    velocity : FloatArray, (n, 2)
         m/s north and east through the water, each `every` s up to its sample.
-    errors, sigma : Array, (n,)
+    errors, sigma : FloatArray, (n,)
         nT: errors of the corrected total field, and the 1-sigma that the calibration claims.
     every, jump
         As for :func:`voyage`.
@@ -174,18 +172,18 @@ def adrift(
 class Run:
     """The result of one voyage; arrays over the records."""
 
-    hours: Array
-    error: Array  # m
-    nees: Array  # squared distance of the truth, two degrees of freedom
-    state: NDArray[np.int64]
-    valid: NDArray[np.bool_]
+    hours: FloatArray
+    error: FloatArray  # m
+    nees: FloatArray  # squared distance of the truth, two degrees of freedom
+    state: IntArray
+    valid: BoolArray
     bound: float  # m, RMS of the second half
     unaided: float  # m, the same of dead reckoning alone
     length: float  # m, correlation length of the map
     seconds: float  # of a processor, a sample
 
     @property
-    def second_half(self) -> NDArray[np.bool_]:
+    def second_half(self) -> BoolArray:
         """Records of the second half."""
         return np.asarray(self.hours > 0.5 * self.hours[-1])
 
@@ -222,7 +220,7 @@ class Score(NamedTuple):
     seconds: float  # of a processor, a sample
 
 
-def longest(flags: NDArray[np.bool_], hours: Array) -> float:
+def longest(flags: BoolArray, hours: FloatArray) -> float:
     """Return the longest time, in hours, that the flags were set without a break."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(int), [0]])))
     spans = [hours[min(b, hours.size) - 1] - hours[a] for a, b in zip(edges[::2], edges[1::2], strict=True)]

@@ -19,8 +19,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from magbridge.arrays import FloatArray
 from magbridge.calibration.fitting.evidence import Quadratic, Widths, is_maximum, maximise
 from magbridge.calibration.fitting.fit import Fit, assemble
 from magbridge.calibration.fitting.mounted_masses import Mounting, mounted_prior
@@ -35,7 +35,6 @@ from magbridge.errors import CalibrationError
 
 __all__ = ["fit_auto"]
 
-FloatArray = NDArray[np.float64]
 
 ENOUGH, BLOCK = 6000, 50
 """Samples that choose the start, and the size of the blocks of neighbours in which they are taken."""

@@ -15,9 +15,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from magbridge.arrays import FloatArray
 from magbridge.calibration.correct import correct
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.model import Boresight, Calibration
@@ -25,7 +25,6 @@ from magbridge.errors import CalibrationError
 
 __all__ = ["field_body", "find_boresight"]
 
-FloatArray = NDArray[np.float64]
 FEWEST = 30
 """Samples with attitude and direction that a boresight takes."""
 MISMATCH = 10.0

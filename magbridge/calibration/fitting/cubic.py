@@ -8,8 +8,8 @@ the width :data:`ANYTHING`.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from magbridge.arrays import FloatArray
 from magbridge.calibration.fitting.fit import Fit, assemble
 from magbridge.calibration.fitting.noise import NoiseModel, estimate_noise
 from magbridge.calibration.fitting.nominal import check_scales, nominal
@@ -57,7 +57,7 @@ def fit_cubic(data: Observations, order: int = 3) -> Fit:
     return assemble(data, plain, ranges, exponents, start, covariance, as_magnitude, "cubic")
 
 
-def _start(data: Observations) -> NDArray[np.float64]:
+def _start(data: Observations) -> FloatArray:
     """Return the nominal fit with the paper's constraints, or zeros if that fails."""
     try:
         return nominal(data, axes_fixed=True, equal_xz=True)[0]

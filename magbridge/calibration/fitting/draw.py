@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
+from magbridge.arrays import FloatArray
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.validate import in_sensor_units
 from magbridge.calibration.model import Calibration
@@ -16,7 +16,6 @@ from magbridge.files import atomic_path
 
 __all__ = ["draw_fit"]
 
-FloatArray = NDArray[np.float64]
 POINTS = 5_000
 """Points drawn in a panel; more only make a blot."""
 WIDE = 6.0

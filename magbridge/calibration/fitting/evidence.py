@@ -17,16 +17,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
 from scipy.optimize import minimize
 
+from magbridge.arrays import FloatArray
 from magbridge.calibration.fitting.prior import PriorFamily
 from magbridge.calibration.residual import NormalEquations
 
 __all__ = ["Quadratic", "Widths", "evidence", "is_maximum", "maximise"]
 
-FloatArray = NDArray[np.float64]
 FARTHEST = 10.0
 """Sigmas of the prior of eta: nothing physical lies beyond, and exp must not overflow."""
 STILL = 0.01

@@ -8,9 +8,9 @@ from importlib import import_module
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from magbridge.arrays import FloatArray
 from magbridge.calibration.fitting.boresight import find_boresight
 from magbridge.calibration.fitting.identify import combinations, expected_ratio, heading_gap, warnings_for
 from magbridge.calibration.fitting.noise import NoiseModel
@@ -23,8 +23,6 @@ from magbridge.field.reference import other_units
 from magbridge.version import __version__
 
 __all__ = ["METHODS", "Fit", "assemble", "fit"]
-
-FloatArray = NDArray[np.float64]
 
 METHODS: dict[str, str] = {
     "auto": "magbridge.calibration.fitting.auto:fit_auto",

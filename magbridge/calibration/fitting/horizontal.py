@@ -15,11 +15,11 @@ half a degree puts 0.9 % of Z into H_h, 400 nT of 46,000 nT.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import polar
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
+from magbridge.arrays import FloatArray
 from magbridge.calibration.fitting.fit import Fit, assemble
 from magbridge.calibration.fitting.noise import estimate_noise
 from magbridge.calibration.fitting.nominal import HARD_IRON_SIGMA, SCALE_SIGMA, check_scales, nominal_samples
@@ -29,7 +29,6 @@ from magbridge.errors import CalibrationError
 
 __all__ = ["fit_horizontal"]
 
-FloatArray = NDArray[np.float64]
 FIRST_NOISE = 1e-3
 """Share of the field: the noise that attitude errors make, before it is estimated."""
 

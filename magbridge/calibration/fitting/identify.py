@@ -6,8 +6,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from magbridge.arrays import FloatArray
 from magbridge.calibration.fitting.mission import expected_error, nearby_mission
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.model import Calibration
@@ -16,7 +16,6 @@ from magbridge.calibration.terms import Polynomial
 
 __all__ = ["Combinations", "combinations", "expected_ratio", "heading_gap", "warnings_for"]
 
-FloatArray = NDArray[np.float64]
 ROWS = 5_000
 """Rows of the Jacobian: more do not change its rank."""
 RANK_TOLERANCE = 1e-9

@@ -16,8 +16,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from magbridge.arrays import FloatArray
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.errors import CalibrationError
 
@@ -59,6 +59,6 @@ def unfiltered(data: Observations, corner: float) -> Observations:
     ahead = np.where(stretch[ahead] == stretch, ahead, rows)
     behind = np.where(stretch[behind] == stretch, behind, rows)
     apart = data.time[ahead] - data.time[behind]
-    rise: NDArray[np.float64] = data.field[ahead] - data.field[behind]
+    rise: FloatArray = data.field[ahead] - data.field[behind]
     slope = np.divide(rise, apart[:, None], out=np.zeros_like(rise), where=apart[:, None] > 0.0)
     return replace(data, field=data.field + tau * slope)

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from magbridge.arrays import FloatArray
 from magbridge.calibration.correct import correct
 from magbridge.calibration.fitting.boresight import field_body
 from magbridge.calibration.fitting.observations import Observations
@@ -17,7 +17,6 @@ from magbridge.errors import CalibrationError
 
 __all__ = ["Mission", "expected_error", "nearby_mission"]
 
-FloatArray = NDArray[np.float64]
 POINTS = 600
 """Samples that represent a mission."""
 ROLL = 10.0

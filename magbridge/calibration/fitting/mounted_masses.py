@@ -20,8 +20,8 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 from numpy.polynomial import chebyshev
-from numpy.typing import NDArray
 
+from magbridge.arrays import FloatArray, IndexArray
 from magbridge.calibration.dipole import dipole_columns, expand_dipole
 from magbridge.calibration.fitting.prior import FACTOR_MASS, PriorFamily, gain_rotation
 from magbridge.calibration.model import Parameter
@@ -31,7 +31,6 @@ from magbridge.toml import check_entries, convert, load_toml
 
 __all__ = ["Mounting", "mounted_prior", "read_vehicle"]
 
-FloatArray = NDArray[np.float64]
 Vector = tuple[float, float, float]
 
 MOMENT, INDUCED = 2000.0, 30.0
@@ -85,7 +84,7 @@ def read_vehicle(path: str | Path) -> dict[str, Mounting]:
 class _Mass:
     """A mounted mass in the fit: which monomials it contributes to, and the line along which it travels."""
 
-    rows: NDArray[np.intp]  # of its monomials x, x^2 ...
+    rows: IndexArray  # of its monomials x, x^2 ...
     at: FloatArray
     travel: FloatArray
     sigma: float

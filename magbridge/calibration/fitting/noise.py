@@ -5,13 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from magbridge.arrays import BoolArray, FloatArray
 from magbridge.calibration.residual import robust_scale, whiten
 
 __all__ = ["OUTLIER", "NoiseModel", "estimate_noise"]
-
-FloatArray = NDArray[np.float64]
 
 OUTLIER = 5.0
 """A residual beyond this many (robust) sigmas is left out; Gaussian noise practically never gets there."""
@@ -73,7 +71,7 @@ def _robust(e: FloatArray) -> float:
     return robust_scale(e) or float(np.abs(e).mean()) or 1e-9
 
 
-def _autocorrelation(e: FloatArray, follows: NDArray[np.bool_], doubt: tuple[float, float]) -> float:
+def _autocorrelation(e: FloatArray, follows: BoolArray, doubt: tuple[float, float]) -> float:
     """Return that of successive residuals; 0 if it is below three of its standard errors."""
     late, early = e[1:][follows[1:]], e[:-1][follows[1:]]
     if len(late) < 30:

@@ -13,8 +13,8 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from magbridge.arrays import FloatArray
 from magbridge.calibration.fitting.fit import Fit, assemble
 from magbridge.calibration.fitting.noise import NoiseModel, estimate_noise
 from magbridge.calibration.fitting.observations import Observations
@@ -32,8 +32,6 @@ __all__ = [
     "nominal_samples",
     "starts",
 ]
-
-FloatArray = NDArray[np.float64]
 
 SCALE_SIGMA = 0.015
 """Prior 1-sigma by which scales differ from each other, and of soft iron, on a vehicle."""

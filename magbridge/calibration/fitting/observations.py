@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from magbridge.arrays import BoolArray, FloatArray
 from magbridge.calibration.model import Parameter
 from magbridge.calibration.residual import Samples
 from magbridge.calibration.terms import Exponents
@@ -18,7 +19,6 @@ from magbridge.records import BEYOND
 
 __all__ = ["Observations", "monomials", "polynomial_samples"]
 
-FloatArray = NDArray[np.float64]
 COMMON, FAR = 0.005, 10.0
 """A position is implausible if it is farther from the median than FAR times the span between the quantiles
 COMMON and 1 - COMMON."""
@@ -107,7 +107,7 @@ class Observations:
     def __len__(self) -> int:
         return len(self.field)
 
-    def part(self, rows: NDArray[np.bool_]) -> Observations:
+    def part(self, rows: BoolArray) -> Observations:
         """Pick rows: an (n,) mask."""
         columns = ((name, getattr(self, name)) for name in _PER_SAMPLE)
         picked: dict[str, Any] = {name: None if v is None else v[rows] for name, v in columns}
@@ -148,7 +148,7 @@ class Observations:
 
 def _enough(
     n: int,
-    whole: NDArray[np.bool_],
+    whole: BoolArray,
     field: FloatArray,
     parameters: FloatArray,
     names: Sequence[str],

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from magbridge.arrays import FloatArray
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.columns import CHANNELS, COLUMNS, require
 from magbridge.errors import CalibrationError
@@ -21,7 +22,6 @@ if TYPE_CHECKING:
 
 __all__ = ["observations"]
 
-FloatArray = NDArray[np.float64]
 FOLLOWED = ("sensor_temperature", "depth")
 """Columns that move no mass but may be fitted as if they did."""
 

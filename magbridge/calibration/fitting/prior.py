@@ -20,14 +20,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from magbridge.arrays import FloatArray
 from magbridge.calibration.residual import NormalEquations
 from magbridge.calibration.terms import Exponents
 
 __all__ = ["FACTOR_MASS", "Prior", "PriorFamily", "gain_rotation", "polynomial_prior"]
 
-FloatArray = NDArray[np.float64]
 
 GAIN, SOFT_IRON = 0.02, 0.015
 """Share of the field: 1-sigma of the common gain and of soft iron."""

@@ -15,18 +15,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 from scipy.linalg.lapack import dpotrf
 
+from magbridge.arrays import FloatArray
 from magbridge.calibration.fitting.noise import NoiseModel
 from magbridge.calibration.fitting.prior import Prior
 from magbridge.calibration.residual import NormalEquations, Samples, normal_equations
 from magbridge.errors import CalibrationError
 
 __all__ = ["Solution", "covariance_of", "gauss_newton"]
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

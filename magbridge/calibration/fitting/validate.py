@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from magbridge.arrays import FloatArray
 from magbridge.calibration.correct import correct
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.model import Calibration
 
 __all__ = ["in_sensor_units"]
-
-FloatArray = NDArray[np.float64]
 
 
 def in_sensor_units(calibration: Calibration, data: Observations) -> tuple[FloatArray, FloatArray]:

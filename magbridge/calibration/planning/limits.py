@@ -7,14 +7,13 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
+from magbridge.arrays import FloatArray
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.model import Parameter
 
 __all__ = ["Limits", "PlannedRun", "candidate_runs", "settled", "trim_of"]
 
-FloatArray = NDArray[np.float64]
 SLACK = 3.0
 """deg, by which another trim of the vehicle changes the pitch at the same positions."""
 STILL = 0.01

@@ -18,9 +18,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from magbridge.arrays import FloatArray
 from magbridge.calibration.fitting.boresight import field_body
 from magbridge.calibration.fitting.mission import Mission
 from magbridge.calibration.fitting.observations import monomials
@@ -34,7 +34,6 @@ from magbridge.errors import CalibrationError
 
 __all__ = ["Plan", "evaluate_runs", "expected_calibration", "plan"]
 
-FloatArray = NDArray[np.float64]
 HEADINGS = 24
 SAMPLES = 225
 """Samples of a run: a quarter of an hour at the paper's 0.25 Hz."""

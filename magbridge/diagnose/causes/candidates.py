@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from magbridge.arrays import BoolArray, FloatArray
 from magbridge.calibration.terms import Effect
-from magbridge.diagnose.compare.arrays import BoolArray, FloatArray
 from magbridge.diagnose.compare.design_columns import Columns, Mixture, Since, parts, places, together
 from magbridge.diagnose.compare.problem import Problem, effect_columns, history
 

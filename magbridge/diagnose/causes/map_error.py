@@ -9,8 +9,8 @@ import numpy as np
 from scipy.sparse import csr_array, diags_array
 from scipy.spatial.distance import cdist
 
+from magbridge.arrays import FloatArray, IndexArray
 from magbridge.diagnose.causes.candidates import Candidate
-from magbridge.diagnose.compare.arrays import FloatArray, IndexArray
 from magbridge.diagnose.compare.design_columns import Interpolated
 from magbridge.diagnose.compare.problem import Problem
 

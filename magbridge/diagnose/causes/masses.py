@@ -9,11 +9,11 @@ from itertools import product
 import numpy as np
 from scipy.special import eval_legendre
 
+from magbridge.arrays import FloatArray
 from magbridge.calibration.mass_effects import LegendreEffect, PlayEffect, PowersEffect, SourcesEffect
 from magbridge.calibration.terms import Polynomial, full_order
 from magbridge.diagnose.causes.candidates import AXES, Candidate, of_effect, per
 from magbridge.diagnose.causes.regressors import play, powers
-from magbridge.diagnose.compare.arrays import FloatArray
 from magbridge.diagnose.compare.problem import Problem
 
 __all__ = ["actuator_order", "hysteresis", "unmodelled_actuator"]

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from magbridge.arrays import FloatArray
 from magbridge.diagnose.causes.candidates import Candidate, of_reference
-from magbridge.diagnose.compare.arrays import FloatArray
 from magbridge.diagnose.compare.problem import Problem
 
 __all__ = ["diurnal_variation", "reference_bias"]

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from magbridge.diagnose.compare.arrays import FloatArray
+from magbridge.arrays import FloatArray
 from magbridge.diagnose.compare.problem import Problem
 
 __all__ = ["lagged", "once", "play", "powers"]

@@ -9,10 +9,10 @@ from itertools import product
 
 import numpy as np
 
+from magbridge.arrays import FloatArray
 from magbridge.calibration.instrument_effects import ResponseEffect
 from magbridge.diagnose.causes.candidates import AXES, Candidate, of_effect, per
 from magbridge.diagnose.causes.regressors import powers
-from magbridge.diagnose.compare.arrays import FloatArray
 from magbridge.diagnose.compare.problem import Problem
 
 __all__ = ["nonlinearity", "saturation"]

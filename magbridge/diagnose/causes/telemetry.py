@@ -8,10 +8,10 @@ from typing import Literal
 
 import numpy as np
 
+from magbridge.arrays import FloatArray
 from magbridge.calibration.effects import ChannelEffect
 from magbridge.diagnose.causes.candidates import Candidate, of_effect
 from magbridge.diagnose.causes.regressors import lagged, once
-from magbridge.diagnose.compare.arrays import FloatArray
 from magbridge.diagnose.compare.problem import Problem
 
 __all__ = ["current_field", "pressure_offset", "temperature_offset", "temperature_scale"]

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from magbridge.arrays import FloatArray
 from magbridge.calibration.instrument_effects import TimeEffect
 from magbridge.diagnose.causes.candidates import AXES, Candidate, of_effect, per
 from magbridge.diagnose.causes.regressors import powers
-from magbridge.diagnose.compare.arrays import FloatArray
 from magbridge.diagnose.compare.problem import Problem
 
 __all__ = ["interference_tone", "offset_drift", "offset_step"]

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from magbridge.arrays import FloatArray
 from magbridge.calibration.instrument_effects import RateEffect
 from magbridge.calibration.mass_effects import ClockEffect
 from magbridge.diagnose.causes.candidates import AXES, Candidate, of_effect
 from magbridge.diagnose.causes.regressors import once
-from magbridge.diagnose.compare.arrays import FloatArray
 from magbridge.diagnose.compare.interpolation import LOST, rates
 from magbridge.diagnose.compare.problem import Problem
 

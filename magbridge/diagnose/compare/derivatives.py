@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from magbridge.arrays import FloatArray
 from magbridge.calibration.compilation import coefficient_tensor
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.residual import Samples, jacobian
-from magbridge.diagnose.compare.arrays import FloatArray
 
 __all__ = ["CHUNK", "derivatives"]
 

@@ -9,7 +9,7 @@ from itertools import accumulate, pairwise
 import numpy as np
 from scipy.sparse import csr_array
 
-from magbridge.diagnose.compare.arrays import BoolArray, FloatArray
+from magbridge.arrays import BoolArray, FloatArray
 
 __all__ = [
     "Columns", "Interpolated", "Mixture", "Since", "beside", "parts", "places", "size_of", "times",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from magbridge.diagnose.compare.arrays import FloatArray
+from magbridge.arrays import FloatArray
 from magbridge.diagnose.compare.survey import Survey
 
 __all__ = ["LOST", "interpolation_error", "rates"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from magbridge.diagnose.compare.arrays import IntArray
+from magbridge.arrays import IntArray
 
 __all__ = ["FAR", "Past"]
 

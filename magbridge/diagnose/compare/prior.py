@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from magbridge.arrays import FloatArray
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.residual import Samples, robust_scale, whiten
 from magbridge.calibration.terms import Polynomial
-from magbridge.diagnose.compare.arrays import FloatArray
 from magbridge.diagnose.compare.derivatives import derivatives
 from magbridge.diagnose.compare.survey import Survey
 

@@ -31,11 +31,11 @@ from functools import cached_property
 
 import numpy as np
 
+from magbridge.arrays import FloatArray
 from magbridge.calibration.correct import regressors
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.residual import Samples, residuals
 from magbridge.calibration.terms import Effect
-from magbridge.diagnose.compare.arrays import FloatArray
 from magbridge.diagnose.compare.derivatives import CHUNK, derivatives
 from magbridge.diagnose.compare.design_columns import Mixture
 from magbridge.diagnose.compare.interpolation import interpolation_error

@@ -9,8 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from magbridge.arrays import BoolArray, FloatArray, IntArray
 from magbridge.columns import AGE
-from magbridge.diagnose.compare.arrays import BoolArray, FloatArray, IntArray
 from magbridge.diagnose.compare.past import FAR, Past
 from magbridge.errors import DataError
 from magbridge.field.earth import separation, wrap

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from magbridge.arrays import BoolArray, FloatArray
 from magbridge.calibration.model import Calibration
 from magbridge.columns import CHANNELS, require, require_units
 from magbridge.config import Align
-from magbridge.diagnose.compare.arrays import BoolArray, FloatArray
 from magbridge.diagnose.compare.survey import FEWEST, Survey, assemble
 from magbridge.errors import DataError
 from magbridge.field.grid import AnomalyGrid

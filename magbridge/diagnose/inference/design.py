@@ -10,7 +10,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from magbridge.diagnose.compare.arrays import FloatArray
+from magbridge.arrays import FloatArray
 from magbridge.diagnose.compare.design_columns import Columns, beside, places, size_of, times
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.noise import Noise

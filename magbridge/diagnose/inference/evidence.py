@@ -30,8 +30,8 @@ import numpy as np
 from scipy.special import log_ndtr
 from scipy.stats import chi2
 
+from magbridge.arrays import FloatArray
 from magbridge.diagnose.causes.candidates import Candidate, slices
-from magbridge.diagnose.compare.arrays import FloatArray
 from magbridge.diagnose.inference.information import Information
 from magbridge.diagnose.inference.joint import FLAT
 from magbridge.diagnose.inference.statistic import Statistic

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from scipy.special import gammaln
 
+from magbridge.arrays import FloatArray, IntArray
 from magbridge.calibration.residual import robust_scale
-from magbridge.diagnose.compare.arrays import FloatArray, IntArray
 from magbridge.diagnose.compare.derivatives import CHUNK
 from magbridge.diagnose.compare.design_columns import Columns
 from magbridge.diagnose.compare.past import Past

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.sparse import csr_array
 
-from magbridge.diagnose.compare.arrays import FloatArray, IndexArray
+from magbridge.arrays import FloatArray, IndexArray
 from magbridge.diagnose.compare.design_columns import Columns, beside, parts, places, together
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.design import ALL, normal

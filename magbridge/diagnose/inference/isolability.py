@@ -17,8 +17,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import chdtri, chndtrinc
 
+from magbridge.arrays import FloatArray
 from magbridge.diagnose.causes.candidates import Candidate, Group, slices
-from magbridge.diagnose.compare.arrays import FloatArray
 from magbridge.diagnose.inference.evidence import LEVEL, score
 from magbridge.diagnose.inference.information import Information
 

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from magbridge.arrays import FloatArray, IndexArray
 from magbridge.calibration.residual import robust_scale
-from magbridge.diagnose.compare.arrays import FloatArray, IndexArray
 from magbridge.diagnose.compare.design_columns import Columns
 from magbridge.diagnose.compare.problem import DELAYS, Problem
 from magbridge.diagnose.inference.design import Design, in_threads, normal, precomputed

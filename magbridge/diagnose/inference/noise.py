@@ -30,7 +30,7 @@ import numpy as np
 from numpy.lib.stride_tricks import as_strided, sliding_window_view
 from scipy.signal import lfilter, lfiltic
 
-from magbridge.diagnose.compare.arrays import FloatArray
+from magbridge.arrays import FloatArray
 from magbridge.diagnose.compare.design_columns import Columns
 from magbridge.diagnose.compare.past import FAR, Past
 

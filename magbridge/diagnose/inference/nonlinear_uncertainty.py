@@ -26,8 +26,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from magbridge.arrays import FloatArray
 from magbridge.diagnose.causes.candidates import Candidate, slices
-from magbridge.diagnose.compare.arrays import FloatArray
 from magbridge.diagnose.compare.design_columns import Columns
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.evidence import score

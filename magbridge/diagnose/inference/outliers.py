@@ -8,8 +8,8 @@ import numpy as np
 from scipy.special import gammaln
 from scipy.stats import chi2
 
+from magbridge.arrays import FloatArray, IndexArray
 from magbridge.calibration.residual import robust_scale
-from magbridge.diagnose.compare.arrays import FloatArray, IndexArray
 from magbridge.diagnose.inference.evidence import LEVEL
 from magbridge.diagnose.inference.fit_noise import TAILS
 from magbridge.diagnose.inference.joint import Joint

@@ -20,8 +20,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import logsumexp
 
+from magbridge.arrays import FloatArray
 from magbridge.diagnose.causes.candidates import Candidate, Group, slices
-from magbridge.diagnose.compare.arrays import FloatArray
 from magbridge.diagnose.inference.evidence import LEVEL, REMNANT, log_bayes, margin, one_sided, score
 from magbridge.diagnose.inference.information import Information
 from magbridge.diagnose.inference.joint import Joint

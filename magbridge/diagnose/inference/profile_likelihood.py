@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from magbridge.arrays import FloatArray
 from magbridge.diagnose.causes.candidates import Candidate, slices
-from magbridge.diagnose.compare.arrays import FloatArray
 from magbridge.diagnose.inference.evidence import score
 from magbridge.diagnose.inference.information import information
 from magbridge.diagnose.inference.joint import Joint

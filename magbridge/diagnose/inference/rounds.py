@@ -11,8 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import fdtrc
 
+from magbridge.arrays import FloatArray
 from magbridge.diagnose.causes.candidates import Candidate, Group, slices
-from magbridge.diagnose.compare.arrays import FloatArray
 from magbridge.diagnose.compare.design_columns import Columns, Mixture, parts, together
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.design import in_threads, precomputed

@@ -22,7 +22,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from magbridge.diagnose.compare.arrays import FloatArray
+from magbridge.arrays import FloatArray
 
 __all__ = ["Ridge", "Statistic"]
 

@@ -8,11 +8,11 @@ from html import escape
 import numpy as np
 from scipy.stats import chi2
 
+from magbridge.arrays import FloatArray
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.residual import residuals, residuals_of
 from magbridge.diagnose.causes import Cause
 from magbridge.diagnose.causes.candidates import Candidate
-from magbridge.diagnose.compare.arrays import FloatArray
 from magbridge.diagnose.compare.derivatives import CHUNK, derivatives
 from magbridge.diagnose.compare.problem import DELAY, DELAYS, Problem, samples_of
 from magbridge.diagnose.diagnosis import Diagnosis, Finding

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogFormatter, MaxNLocator
 from scipy.signal import periodogram
 
-from magbridge.diagnose.compare.arrays import FloatArray
+from magbridge.arrays import FloatArray
 from magbridge.diagnose.diagnosis import Diagnosis
 from magbridge.diagnose.report.words import chance, label
 

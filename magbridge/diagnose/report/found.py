@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from datetime import UTC, datetime
 from typing import Any
 
+from magbridge.arrays import FloatArray
 from magbridge.calibration.residual import rms
 from magbridge.diagnose.causes import Cause
-from magbridge.diagnose.compare.arrays import FloatArray
 from magbridge.diagnose.diagnosis import Diagnosis, Finding
 from magbridge.diagnose.report import figures
 from magbridge.diagnose.report.doubts import doubts

@@ -7,11 +7,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from magbridge.arrays import FloatArray
 from magbridge.calibration.mass_effects import ClockEffect
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.causes.regressors import powers
 from magbridge.diagnose.causes.timing import field_rates, mass_rates
-from magbridge.diagnose.compare.arrays import FloatArray
 from magbridge.diagnose.compare.design_columns import Columns, size_of
 from magbridge.diagnose.compare.interpolation import rates
 from magbridge.diagnose.compare.problem import Problem, effect_columns

@@ -17,9 +17,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy.stats import chi2
 
+from magbridge.arrays import FloatArray
 from magbridge.calibration.residual import robust_scale
 from magbridge.diagnose.causes.candidates import Candidate
-from magbridge.diagnose.compare.arrays import FloatArray
 from magbridge.diagnose.compare.design_columns import Columns, places
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.design import Design, in_threads, precomputed

@@ -27,7 +27,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.fft import ifft, irfft, next_fast_len, rfft
 
-from magbridge.diagnose.compare.arrays import FloatArray
+from magbridge.arrays import FloatArray
 from magbridge.diagnose.compare.design_columns import Columns
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.design import in_threads

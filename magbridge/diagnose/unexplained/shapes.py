@@ -11,8 +11,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from magbridge.arrays import FloatArray
 from magbridge.diagnose.causes.regressors import lagged, play, powers
-from magbridge.diagnose.compare.arrays import FloatArray
 from magbridge.diagnose.compare.design_columns import Columns
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.design import pieces

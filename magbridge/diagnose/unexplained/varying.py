@@ -6,8 +6,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from magbridge.arrays import FloatArray
 from magbridge.diagnose.causes.candidates import Candidate
-from magbridge.diagnose.compare.arrays import FloatArray
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.design import pieces
 from magbridge.diagnose.unexplained.descriptions import Description

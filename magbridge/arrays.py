@@ -1,0 +1,17 @@
+"""The arrays that docstrings speak of; shapes and units are said there."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["BoolArray", "FloatArray", "IndexArray", "IntArray", "RealArray"]
+
+BoolArray = NDArray[np.bool_]
+FloatArray = NDArray[np.float64]
+RealArray = NDArray[np.floating[Any]]
+"""Of either precision, as files hold them."""
+IndexArray = NDArray[np.intp]
+IntArray = NDArray[np.int64]
