@@ -11,7 +11,7 @@ import xarray as xr
 from magbridge.arrays import FloatArray
 from magbridge.errors import FormatError
 from magbridge.field.declination import with_true_heading
-from magbridge.field.earth import wrap
+from magbridge.field.geodesy import wrap
 from sitl.scenario import Scenario
 from sitl.trajectory import Track
 from sitl.twin import FINE_STEP, Twin

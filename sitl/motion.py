@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import xarray as xr
 
-from magbridge.field.earth import separation
+from magbridge.field.geodesy import separation
 from magbridge.navigate.batch import MOTIONS, first_position, motion_of
 
 __all__ = ["with_motion"]

@@ -11,7 +11,7 @@ import numpy as np
 from magbridge.arrays import FloatArray, IndexArray
 from magbridge.config import NotNegative, Positive
 from magbridge.errors import OutOfRange
-from magbridge.field.earth import offset, separation
+from magbridge.field.geodesy import offset, separation
 from magbridge.toml import Table
 from sitl.mission import LIMITS, Leg, Limit
 from sitl.signals import autoregressive, first_order

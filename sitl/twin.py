@@ -17,7 +17,7 @@ import xarray as xr
 from magbridge.arrays import FloatArray
 from magbridge.calibration.file import load as load_calibration
 from magbridge.errors import WrongUse
-from magbridge.field.earth import offset, separation
+from magbridge.field.geodesy import offset, separation
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.igrf import total_field
 from sitl.dataset import dataset

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from magbridge.arrays import FloatArray
-from magbridge.field.earth import offset, separation
+from magbridge.field.geodesy import offset, separation
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.igrf import igrf, total_field
 from magbridge.toml import Table

@@ -10,7 +10,7 @@ import numpy as np
 from magbridge.calibration.model import Calibration
 from magbridge.config import Config
 from magbridge.errors import ConfigError
-from magbridge.field.earth import separation
+from magbridge.field.geodesy import separation
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.read import read_grid
 from magbridge.link.component import Component

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from magbridge.arrays import FloatArray
-from magbridge.field.earth import metres_per_degree
+from magbridge.field.geodesy import metres_per_degree
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.spline import filled
 

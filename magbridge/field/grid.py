@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from magbridge.arrays import FloatArray
 from magbridge.errors import FormatError, OutOfRange
-from magbridge.field.earth import metres_per_degree, usual, wrap
+from magbridge.field.geodesy import metres_per_degree, usual, wrap
 from magbridge.field.grid_netcdf import write
 from magbridge.field.local import OFF_THE_MAP, Local
 from magbridge.field.spline import WEIGHTS, coefficients, filled, weights

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 
 from magbridge.arrays import FloatArray
 from magbridge.errors import FormatError, MissingExtra, OutOfRange
-from magbridge.field.earth import ECCENTRICITY_SQUARED, EQUATORIAL_RADIUS
+from magbridge.field.geodesy import ECCENTRICITY_SQUARED, EQUATORIAL_RADIUS
 
 __all__ = ["coverage", "igrf", "magnitude", "total_field"]
 

@@ -10,7 +10,7 @@ from itertools import product
 
 import numpy as np
 
-from magbridge.field.earth import offset, separation
+from magbridge.field.geodesy import offset, separation
 from magbridge.field.igrf import coverage, total_field
 
 __all__ = ["NearbyField"]

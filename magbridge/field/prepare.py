@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from magbridge.arrays import FloatArray
 from magbridge.errors import OutOfRange
 from magbridge.field.continuation import continued
-from magbridge.field.earth import usual
+from magbridge.field.geodesy import usual
 from magbridge.field.grid import AnomalyGrid
 from magbridge.files import atomic_path
 

@@ -9,7 +9,7 @@ import numpy as np
 from magbridge.arrays import FloatArray
 from magbridge.errors import FormatError
 from magbridge.field.continuation import continued
-from magbridge.field.earth import wrap
+from magbridge.field.geodesy import wrap
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.igrf import igrf, magnitude, total_field
 

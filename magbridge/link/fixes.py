@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from magbridge.field.earth import worse_axis
+from magbridge.field.geodesy import worse_axis
 from magbridge.link.outbox import Outbox
 from magbridge.mavlink.dialect import MAV_CMD, MAV_ESTIMATOR_TYPE, MAV_FRAME
 

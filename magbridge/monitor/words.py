@@ -5,7 +5,7 @@ from __future__ import annotations
 from enum import IntEnum
 from math import hypot, isfinite, nan, sqrt
 
-from magbridge.field.earth import worse_axis
+from magbridge.field.geodesy import worse_axis
 from magbridge.mavlink.dialect import MAG_LOG_STATE, MAG_NAVIGATION_STATE, MAG_PORT_STATE
 from magbridge.monitor.state import State
 

@@ -14,7 +14,7 @@ from math import log, pi
 import numpy as np
 
 from magbridge.arrays import BoolArray, FloatArray
-from magbridge.field.earth import metres_per_degree, worse_axis
+from magbridge.field.geodesy import metres_per_degree, worse_axis
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.local import Local, curvature
 from magbridge.navigate.model import N_STATES, Block

@@ -11,7 +11,7 @@ from filterpy.kalman import rts_smoother
 
 from magbridge.arrays import FloatArray, RealArray
 from magbridge.errors import FormatError
-from magbridge.field.earth import offset
+from magbridge.field.geodesy import offset
 from magbridge.field.grid import AnomalyGrid
 from magbridge.logs.checks import increasing
 from magbridge.logs.deployment import deployment as made

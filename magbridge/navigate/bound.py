@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from magbridge.arrays import FloatArray
 from magbridge.errors import OutOfRange
-from magbridge.field.earth import metres_per_degree, separation, wrap
+from magbridge.field.geodesy import metres_per_degree, separation, wrap
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.igrf import total_field
 from magbridge.navigate.model import block_length, measurement_row, prior, transition

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from math import cos, hypot, isfinite, nan, radians, sin, tan
 
-from magbridge.field.earth import offset, separation
+from magbridge.field.geodesy import offset, separation
 
 __all__ = ["GLIDE", "DeadReckoning"]
 

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from magbridge.arrays import RealArray
-from magbridge.field.earth import metres_per_degree, usual
+from magbridge.field.geodesy import metres_per_degree, usual
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.igrf import total_field
 from magbridge.files import atomic_path

@@ -7,7 +7,7 @@ from math import inf, isfinite, log
 import numpy as np
 
 from magbridge.arrays import FloatArray
-from magbridge.field.earth import offset
+from magbridge.field.geodesy import offset
 from magbridge.field.grid import AnomalyGrid
 from magbridge.navigate.bank import Bank, widest
 from magbridge.navigate.integrity import IntegrityMonitor, Unmapped, Verdict, squared_mahalanobis

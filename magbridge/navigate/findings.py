@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 
 from magbridge.arrays import BoolArray, RealArray
-from magbridge.field.earth import metres_per_degree
+from magbridge.field.geodesy import metres_per_degree
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.igrf import total_field
 from magbridge.navigate.options import Options

@@ -22,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 
 from magbridge.arrays import FloatArray
-from magbridge.field.earth import wrap
+from magbridge.field.geodesy import wrap
 from magbridge.field.grid import AnomalyGrid
 from magbridge.navigate.options import Options
 

@@ -15,7 +15,7 @@ from math import isfinite, sqrt
 
 import numpy as np
 
-from magbridge.field.earth import offset, separation
+from magbridge.field.geodesy import offset, separation
 from magbridge.field.grid import AnomalyGrid
 from magbridge.navigate.bank import widest
 from magbridge.navigate.collect import Collector

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import xarray as xr
 
-from magbridge.field.earth import separation
+from magbridge.field.geodesy import separation
 
 __all__ = ["REFERENCES", "errors", "reference_track", "with_errors"]
 

@@ -9,7 +9,7 @@ import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
 
 from magbridge.arrays import FloatArray
-from magbridge.field.earth import metres_per_degree
+from magbridge.field.geodesy import metres_per_degree
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.local import curvature
 from magbridge.navigate.model import N_STATES, Block, measurement_row

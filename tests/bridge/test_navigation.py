@@ -17,7 +17,7 @@ from magbridge.calibration.file import save
 from magbridge.calibration.model import Noise, identity
 from magbridge.config import load
 from magbridge.errors import ConfigError
-from magbridge.field.earth import offset, separation
+from magbridge.field.geodesy import offset, separation
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.igrf import total_field
 from magbridge.field.read import read_grid

@@ -22,7 +22,7 @@ from magbridge.diagnose.diagnosis import Diagnosis
 from magbridge.diagnose.report import files
 from magbridge.diagnose.run import diagnose
 from magbridge.errors import DataError, WriteError
-from magbridge.field.earth import offset, wrap
+from magbridge.field.geodesy import offset, wrap
 from magbridge.logs import write
 from sitl import load, segments, simulate
 

@@ -7,7 +7,7 @@ import pytest
 from scipy.interpolate import RectBivariateSpline
 
 from magbridge.errors import FormatError, OutOfRange
-from magbridge.field.earth import metres_per_degree, offset, separation, worse_axis
+from magbridge.field.geodesy import metres_per_degree, offset, separation, worse_axis
 from magbridge.field.grid import AnomalyGrid
 
 LON, LAT = np.linspace(10.0, 10.5, 51), np.linspace(54.0, 54.4, 41)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from magbridge.errors import OutOfRange
-from magbridge.field.earth import offset
+from magbridge.field.geodesy import offset
 from magbridge.field.igrf import total_field
 from magbridge.field.nearby import NearbyField
 

@@ -9,7 +9,7 @@ import pytest
 
 from magbridge.errors import OutOfRange
 from magbridge.field.continuation import continued
-from magbridge.field.earth import metres_per_degree
+from magbridge.field.geodesy import metres_per_degree
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.prepare import continue_upward, draw_steps, hanning, merge, prepare
 

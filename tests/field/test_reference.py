@@ -7,7 +7,7 @@ import pytest
 import xarray as xr
 
 from magbridge.errors import FormatError, OutOfRange
-from magbridge.field.earth import offset
+from magbridge.field.geodesy import offset
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.igrf import total_field
 from magbridge.field.reference import positions, reference_field

@@ -14,7 +14,7 @@ from voyages.others import flight
 from voyages.simulated import PLACE, Map, synthetic, voyage
 
 from magbridge.errors import FormatError
-from magbridge.field.earth import metres_per_degree
+from magbridge.field.geodesy import metres_per_degree
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.igrf import total_field
 from magbridge.navigate import Navigator, Options

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from magbridge.field.earth import separation
+from magbridge.field.geodesy import separation
 from magbridge.navigate.deadreckoning import DeadReckoning
 
 START = (54.0, 15.0)

@@ -8,7 +8,7 @@ from msgspec.structs import replace
 from voyages.lost import misled
 from voyages.simulated import OUTSIDE, PLACE, Map, sail, voyage
 
-from magbridge.field.earth import metres_per_degree
+from magbridge.field.geodesy import metres_per_degree
 from magbridge.field.grid import AnomalyGrid
 from magbridge.navigate.model import transition
 from magbridge.navigate.options import Options, any_level

@@ -9,7 +9,7 @@ from msgspec.structs import replace
 from voyages.lost import carried
 from voyages.simulated import PLACE, Map, sail, voyage
 
-from magbridge.field.earth import offset
+from magbridge.field.geodesy import offset
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.igrf import total_field
 from magbridge.navigate import Navigator, Options, Record, State

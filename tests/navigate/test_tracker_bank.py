@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.stats import multivariate_normal
 from voyages.simulated import PLACE
 
-from magbridge.field.earth import metres_per_degree, offset
+from magbridge.field.geodesy import metres_per_degree, offset
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.local import Local
 from magbridge.navigate.bank import Bank, widest

@@ -14,7 +14,7 @@ from magbridge.calibration.file import save
 from magbridge.calibration.model import Noise, identity
 from magbridge.config import load as load_config
 from magbridge.errors import DataError, FormatError, WrongUse
-from magbridge.field.earth import offset
+from magbridge.field.geodesy import offset
 from magbridge.logs import read, write
 from magbridge.mavlink import Codec, LogReader
 from magbridge.records import Channel

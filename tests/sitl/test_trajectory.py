@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from magbridge.errors import OutOfRange
-from magbridge.field.earth import separation
+from magbridge.field.geodesy import separation
 from sitl.mission import LIMITS, TABLE_1, CrissCross, Leg, Legs, Run, Spirals
 from sitl.trajectory import Motion, Track, fly
 

@@ -12,7 +12,7 @@ from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.observe import observations
 from magbridge.calibration.residual import rms
 from magbridge.correction import Correction, correct_rows
-from magbridge.field.earth import separation
+from magbridge.field.geodesy import separation
 from magbridge.navigate.options import informed
 from sitl import load, segments, simulate
 from sitl.bonne_bay import MASSES, METHODS

@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 from msgspec.structs import replace as with_options
 
-from magbridge.field.earth import metres_per_degree, separation
+from magbridge.field.geodesy import metres_per_degree, separation
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.igrf import total_field
 from magbridge.field.read import read_grid

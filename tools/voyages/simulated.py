@@ -15,7 +15,7 @@ from scipy.stats import chi2
 
 from magbridge.arrays import BoolArray, FloatArray, IntArray
 from magbridge.calibration.residual import rms
-from magbridge.field.earth import metres_per_degree, offset
+from magbridge.field.geodesy import metres_per_degree, offset
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.igrf import total_field
 from magbridge.navigate.bound import position_bound

@@ -13,7 +13,7 @@ from magbridge.arrays import BoolArray, FloatArray, IntArray
 from magbridge.columns import AGE
 from magbridge.diagnose.compare.past import FAR, Past
 from magbridge.errors import DataError
-from magbridge.field.earth import separation, wrap
+from magbridge.field.geodesy import separation, wrap
 
 __all__ = ["FEWEST", "Channel", "Survey", "assemble"]
 
