@@ -77,8 +77,9 @@ def diagnose(
         logs = [read(path) for path in files]
         note_losses(*(log.attrs for log in logs))
         remarks = doubts_of(known, calibration)
-        own = [f"{path}: {ITSELF}" for path in files if digest(path) in known.inputs.values()]
-        remarks += own
+        own = [path for path in files if digest(path) in known.inputs.values()]
+        again = [log for path, log in zip(files, logs, strict=True) if path in own]
+        remarks += [f"{path}: {ITSELF}" for path in own]
         remarks += [remark for log in logs for remark in _suspect(log)]
         for remark in remarks:
             complain(remark)
@@ -86,7 +87,7 @@ def diagnose(
             logs,
             known,
             output,
-            learned_from=[read(path) for path in learned_from],
+            learned_from=[*again, *(read(path) for path in learned_from if path not in files)],
             grid=read_grid(grid) if grid else None,
             progress=step,
             remarks=remarks,

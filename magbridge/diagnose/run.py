@@ -69,7 +69,8 @@ def diagnose(
     out_dir : path, optional
         Where ``findings.json``, ``calibration.json`` and ``report.html`` go; nothing is written if not given.
     learned_from : sequence of Dataset, optional
-        The logs that the calibration was made from: what changed since then is seen against them.
+        The logs that the calibration was made from: what changed since then is seen against them. One that
+        is diagnosed itself may be among them, lest what the calibration knows from it counts twice.
     grid : AnomalyGrid, optional
         Added to the main field where a log has no ``reference_field``.
     causes : mapping, optional

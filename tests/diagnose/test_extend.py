@@ -78,8 +78,8 @@ def test_a_calibration_from_turns_is_freed_of_a_filters_attenuation() -> None:
     field = 5e4 * turning / np.sqrt(1.0 + (omega * tau) ** 2)[:, None] + rng.normal(size=(1600, 3))
     whole = right(1600)
     survey = replace(
-        whole.survey, field=field, time=whole.survey.time + 1e4 * leg, learned=learned, dive=leg,
-        steps=np.where(row > 0, 1, FAR),
+        whole.survey, field=field, time=whole.survey.time + 1e4 * leg, dive=leg,
+        fitted=learned, learned=learned, steps=np.where(row > 0, 1, FAR),
     )  # fmt: skip
     lost = 5e4 * 0.5 * (tau * 2.0 * np.pi / 300.0) ** 2
     calibration = replace(

@@ -12,9 +12,8 @@ from magbridge.diagnose.compare.survey import Survey, assemble
 def survey(time: np.ndarray, learned: np.ndarray | None = None) -> Survey:
     n = len(time)
     table = {name: np.full(n, 3e4) for name in ("mag_x", "mag_y", "mag_z", "reference_field")}
-    return assemble(
-        {**table, "time": time, "learned": np.zeros(n) if learned is None else learned}, {}, "log", ()
-    )
+    learned = np.zeros(n) if learned is None else learned
+    return assemble({**table, "time": time, "fitted": learned, "learned": learned}, {}, "log", ())
 
 
 def test_a_step_is_what_a_quarter_of_the_samples_take_and_gaps_are_counted_in_it() -> None:

@@ -127,7 +127,8 @@ def test_a_filter_shortens_a_field_that_turns() -> None:
     def seen(shorter: float, later: float) -> Problem:
         turning = 4e4 * shorter * np.stack([np.cos(phase - later), np.sin(phase - later)], axis=1)
         field = np.column_stack([turning, np.full(len(phase), 3e4)])
-        return pose(replace(whole.survey, field=field, learned=phase > 0.0), whole.calibration)
+        learned = phase > 0.0
+        return pose(replace(whole.survey, field=field, fitted=learned, learned=learned), whole.calibration)
 
     full, short = seen(1.0, 0.0), seen(float(np.cos(steepness)), float(steepness))
     *_, attenuated = CAUSES["filter_lag"].candidates(short)
@@ -135,7 +136,7 @@ def test_a_filter_shortens_a_field_that_turns() -> None:
     expected = (short.residual - full.residual)[20:-20]
     assert expected.mean() < -20.0 or expected.mean() > 20.0
     np.testing.assert_allclose(tau**2 * attenuated.columns(slice(20, -20))[:, 0], expected, rtol=0.01)
-    new = replace(short, survey=replace(short.survey, learned=phase < 0.0))
+    new = replace(short, survey=replace(short.survey, fitted=phase < 0.0, learned=phase < 0.0))
     assert [c.names for c in CAUSES["filter_lag"].candidates(new)] == [("delay",)]
 
 

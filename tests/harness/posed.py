@@ -33,7 +33,8 @@ def surveyed(directions: FloatArray, p: FloatArray, **more: Any) -> Survey:
         "time": T0 + 4.0 * np.arange(float(n)), "reference": np.full(n, FIELD), "still": (),
         "field": FIELD * directions / np.linalg.norm(directions, axis=1)[:, None],
         "steps": np.where(np.arange(n) > 0, 1, FAR), "dive": np.arange(n) // 50, "place": None,
-        "attitude": None, "learned": np.zeros(n, bool), "cycles": np.empty(0), "source": "made",
+        "attitude": None, "fitted": np.zeros(n, bool), "learned": np.zeros(n, bool), "cycles": np.empty(0),
+        "source": "made",
         "channels": {"p": Channel(p, "in", ("position",))},
     }  # fmt: skip
     return Survey(**plain | more)
@@ -64,7 +65,8 @@ def right(rows: int) -> Problem:
 
 def thinned(survey: Survey, here: NDArray[np.bool_]) -> Survey:
     """Return what is left of a survey of even steps where samples are lost."""
-    rows = {name: getattr(survey, name)[here] for name in ("time", "field", "reference", "dive", "learned")}
+    each = ("time", "field", "reference", "dive", "fitted", "learned")
+    rows = {name: getattr(survey, name)[here] for name in each}
     channels = {name: c._replace(values=c.values[here]) for name, c in survey.channels.items()}
     steps = np.append(FAR, np.minimum(np.diff(np.flatnonzero(here)), FAR))
     return replace(survey, **rows, channels=channels, steps=steps)

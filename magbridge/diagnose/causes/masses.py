@@ -35,7 +35,7 @@ def unmodelled_actuator(problem: Problem) -> list[Candidate]:
     for name in problem.channels_of("position"):
         low, high = problem.survey.channels[name].extent
         scale = 0.5 * (high - low)
-        centres = [0.5 * (low + high)] if problem.survey.learned.any() else [0.5 * (low + high), low, high]
+        centres = [0.5 * (low + high)] if problem.survey.fitted.any() else [0.5 * (low + high), low, high]
         for order, centre in product((1, 2, 3), centres):
             effect = PowersEffect(
                 cause="unmodelled_actuator", channel=name, centre=centre, scale=scale, order=order

@@ -27,7 +27,7 @@ def _origins(problem: Problem, name: str) -> list[float]:
     """Return values that the channel may have had when the vehicle was calibrated."""
     low, high = problem.survey.channels[name].extent
     middle = float(np.mean(problem.survey.channels[name].values))
-    if problem.survey.learned.any():  # the values during the calibration are in the data
+    if problem.survey.fitted.any():  # the values during the calibration are in the data
         return [middle]
     return [middle, 2 * low - high, 2 * high - low]
 

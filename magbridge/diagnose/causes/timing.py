@@ -71,7 +71,7 @@ def filter_lag(problem: Problem) -> list[Candidate]:
     it shows where these are compared with a survey that turns less.
     """
     delayed = _delay(problem, ClockEffect(cause="filter_lag", sign=-1.0), 2.0, positive=True)
-    return [*delayed, _shortened(problem)] if problem.survey.learned.any() else delayed
+    return [*delayed, _shortened(problem)] if problem.survey.fitted.any() else delayed
 
 
 def _shortened(problem: Problem) -> Candidate:

@@ -84,20 +84,20 @@ def _without_repeats(
 ) -> tuple[FloatArray, FloatArray]:
     """Return L and m of the posterior without what it learned from samples that are compared here again.
 
-    The information of the calibration's samples that are in the survey again (`survey.learned`) is taken out
+    The information of the calibration's samples that are in the survey again (`survey.fitted`) is taken out
     of its posterior: it would count twice. In the posterior's own units the precision left is
     ``P_0 = 1 - H`` with H the information of those samples, and since the gradient of the whole fit vanished
     at c_0, ``P_0 m = L^T J^T W e``, the sum over those samples.
     """
     L = _factor(calibration.covariance)
     centre = np.zeros(L.shape[1])
-    learned = np.flatnonzero(survey.learned)
-    if not learned.size:
+    again = np.flatnonzero(survey.fitted)
+    if not again.size:
         return L, centre
-    J = derivatives(calibration, samples.part(learned), g[learned], L)
+    J = derivatives(calibration, samples.part(again), g[again], L)
     noise = calibration.noise
-    steps = np.asarray(survey.steps[learned] * (survey.interval / noise.interval if noise.interval else 1.0))
-    white = np.column_stack([J, e[learned]])
+    steps = np.asarray(survey.steps[again] * (survey.interval / noise.interval if noise.interval else 1.0))
+    white = np.column_stack([J, e[again]])
     white = whiten(white, steps, noise.autocorrelation) / noise_sigma(calibration, e)
     A, y = white[:, :-1], white[:, -1]
     values, vectors = np.linalg.eigh(np.eye(len(centre)) - A.T @ A)

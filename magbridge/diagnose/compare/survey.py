@@ -34,8 +34,9 @@ OURS = ("mag_", "truth_", AGE)
 FIELDS = {"nT", "uT", "\N{MICRO SIGN}T", "mG", "G", "T"}
 """Units of another magnetometer, which follows everything that this one does and so explains nothing."""
 NOT_TELEMETRY = {
-    "time", "learned", "reference_field", "roll", "pitch", "heading", "latitude", "longitude", "run", "dive",
-    "quality", "total_field", "total_field_sigma", "field_x", "field_y", "field_z", "anomaly", "power_cycle",
+    "time", "fitted", "learned", "reference_field", "roll", "pitch", "heading", "latitude", "longitude",
+    "run", "dive", "quality", "total_field", "total_field_sigma", "field_x", "field_y", "field_z", "anomaly",
+    "power_cycle",
 }  # fmt: skip
 
 
@@ -77,8 +78,10 @@ class Survey:
         m north and east of the middle, and below the surface: 0 in a log without a depth.
     attitude : (n, 3) array or None
         deg, roll, pitch, heading.
-    learned : (n,) bool array
+    fitted : (n,) bool array
         The calibration was fitted to this sample.
+    learned : (n,) bool array
+        It was, and the sample is given only to be compared with: its log is not diagnosed.
     cycles : (c,) array
         s, when the instrument was power-cycled, as the log says.
     source : str
@@ -93,6 +96,7 @@ class Survey:
     dive: IntArray
     place: FloatArray | None
     attitude: FloatArray | None
+    fitted: BoolArray
     learned: BoolArray
     cycles: FloatArray
     source: str
@@ -153,7 +157,7 @@ def assemble(
     Parameters
     ----------
     table : dict of (n,) arrays
-        In order of time; ``learned`` is 1 where the calibration was fitted to the sample.
+        In order of time; ``fitted`` and ``learned`` are 1 where the survey's are true.
     units : dict
         Column -> unit.
     source : str
@@ -184,6 +188,7 @@ def assemble(
         dive=_dives(table),
         place=_place(table),
         attitude=attitude,
+        fitted=table["fitted"] > 0.5,
         learned=table["learned"] > 0.5,
         cycles=cycles,
         source=source,

@@ -45,7 +45,8 @@ def take(
     calibration : Calibration
         Decides which channels a deployment must have.
     learned_from : sequence of Dataset
-        The logs that the calibration was fitted to, if available.
+        The logs that the calibration was fitted to, if available; those of them that are among `datasets`,
+        too, are diagnosed.
     grid : AnomalyGrid, optional
         Added to the main field where a log has no reference of its own.
 
@@ -55,13 +56,14 @@ def take(
         A column is missing, too few samples are complete, or a parameter is out of all range: one line
         that says which.
     """
-    logs = (*datasets, *learned_from)
+    own = [any(ds is one for one in learned_from) for ds in datasets]
+    apart = [ds for ds in learned_from if not any(ds is one for one in datasets)]
+    logs = (*datasets, *apart)
     source = ", ".join(dict.fromkeys(str(ds.attrs.get("source", "deployment")) for ds in logs))
     table = _joined(
         [
-            _columns(ds, calibration, grid, learned)
-            for learned, group in ((False, datasets), (True, learned_from))
-            for ds in group
+            *(_columns(ds, calibration, grid, fitted) for ds, fitted in zip(datasets, own, strict=True)),
+            *(_columns(ds, calibration, grid, fitted=True, learned=True) for ds in apart),
         ]
     )
     twice = int(np.sum(np.diff(table["time"]) == 0.0))
@@ -116,7 +118,7 @@ def _comparable(table: dict[str, FloatArray], calibration: Calibration, source: 
 
 
 def _columns(
-    ds: xr.Dataset, calibration: Calibration, grid: AnomalyGrid | None, learned: bool
+    ds: xr.Dataset, calibration: Calibration, grid: AnomalyGrid | None, fitted: bool, learned: bool = False
 ) -> dict[str, FloatArray]:
     """Return every numeric column, the channels interpolated to the rows' times, and the reference field."""
     source = str(ds.attrs.get("source", "deployment"))
@@ -140,7 +142,8 @@ def _columns(
         if sampled is not None and np.isfinite(sampled).all() and not np.array_equal(sampled, time):
             table[f"mag_{axis}"] = _at(time, sampled, table[f"mag_{axis}"], trusted)
             in_turn = True
-    table |= {"time": time, "learned": np.full(time.size, float(learned))}
+    marks = {"fitted": fitted, "learned": learned}
+    table |= {"time": time} | {name: np.full(time.size, float(mark)) for name, mark in marks.items()}
     if in_turn:
         for axis in "xyz":
             table[f"mag_{axis}"][_moving(table, calibration)] = np.nan
