@@ -1,11 +1,10 @@
-"""Commands ashore: convert, simulate, map, correct."""
+"""Commands ashore that need no calibration: convert, simulate, map."""
 
 from __future__ import annotations
 
-from collections import Counter
 from math import inf
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 from cyclopts import Parameter, validators
 
@@ -18,14 +17,9 @@ from magbridge.cli.common import (
     Whole,
     app,
     check_inputs,
-    complain,
-    doubts_of,
     file_to_write,
     note_losses,
-    note_missing,
-    note_settings,
     print_result,
-    refuse_unsuited,
 )
 from magbridge.progress import track, waiting
 
@@ -159,82 +153,3 @@ def map(  # noqa: A001 - the command's name
     titles = [step.title for step in steps]
     facts = {"file": str(output), "steps": titles, "rms_nT": result.rms}
     print_result(facts, f"{output}: {', '.join(titles)}", json)
-
-
-@app.command(usage="Usage: magbridge correct FILE... --calibration cal.json -o FILE [OPTIONS]")
-def correct(*files: Path, calibration: Path, output: Log, json: Json = False) -> None:
-    """Correct a log with a calibration, as the bridge would have done live.
-
-    The arithmetic and the state (lags, backlash) are the bridge's own, but the input is the log's rows. In a
-    bridge's own log (also converted to .nc or .parquet) these are MAG_RAW with the latest telemetry before
-    each and its age; [align] and every max_age are known as they were when the log began, not as they were
-    set later. The bridge itself uses every message about a moving mass, and the channels of a sensor that has
-    no counts are float32 here (to 0.002 nT of 50,000 nT). Of another log, telemetry counts as new in every
-    row that has it, and rows that have nothing else are not samples: they are left out of the output. For
-    what the bridge would have published bit for bit, put the calibration into a bridge.toml and run:
-    magbridge replay LOG --config bridge.toml --log DIR. The replay also reports that this differs from what
-    was published at the time.
-
-    Parameters
-    ----------
-    files
-        The logs of one deployment.
-    calibration
-        The calibration (cal.json).
-    output
-        The file to write: total field with its sigma, vector, anomaly and quality flags.
-    json
-        Print the result as JSON.
-    """
-    from magbridge.calibration.file import load
-    from magbridge.columns import CHANNELS
-    from magbridge.correction import Correction, correct_rows
-    from magbridge.errors import DataError
-    from magbridge.field.reference import EARTHS
-    from magbridge.logs import Writer, read_chunks
-    from magbridge.records import Quality
-
-    check_inputs(files, output, calibration)
-    known = load(calibration)
-    for doubt in doubts_of(known, calibration):
-        complain(doubt)
-    correction = Correction(known)
-    rows, flagged, left_out, beyond, whole = 0, 0, 0, 0, False
-    pieces: list[dict[str, Any]] = []
-    flags: Counter[str] = Counter()
-    doubtful = ~Quality.NO_BORESIGHT  # without a boresight, the total field is just as good
-    with Writer(output) as writer:
-        for part in track(read_chunks(files, required=CHANNELS), "correcting"):
-            if not pieces:
-                note_missing(known, part)
-            pieces.append(part.attrs)
-            sampled = part[list(CHANNELS)].to_array().notnull()
-            corrected = correct_rows(correction, part).isel(time=sampled.any("variable").to_numpy())
-            writer.append(corrected)
-            rows += corrected.sizes["time"]
-            left_out += part.sizes["time"] - corrected.sizes["time"]
-            total = corrected["total_field"]
-            beyond += int(((total < EARTHS[0]) | (total > EARTHS[1])).sum())
-            if not whole:
-                refuse_unsuited(known, part)
-                whole = bool(sampled.all("variable").any())
-            quality = corrected["quality"].to_numpy().astype(int)
-            flagged += int((quality & doubtful != 0).sum())
-            flags.update({flag.names(): int((quality & flag != 0).sum()) for flag in doubtful})
-        if not whole:
-            raise DataError(
-                f"{', '.join(str(file) for file in files)}: no row has all of {' '.join(CHANNELS)}"
-            )
-    note_losses(*pieces)
-    note_settings(*pieces)
-    if beyond > rows / 2:
-        low, high = (f"{limit:,.0f}" for limit in EARTHS)
-        complain(
-            f"{calibration}: another vehicle's? {beyond} of {rows} corrected total fields are none of the "
-            f"Earth's, {low} to {high} nT"
-        )
-    facts = {"file": str(output), "rows": rows, "flagged": flagged, "flags": +flags, "left_out": left_out}
-    named = ", ".join(f"{name} {count}" for name, count in (+flags).items())
-    summary = f"{output}: {rows} samples, {flagged} of them flagged" + (f" ({named})" if named else "")
-    summary += f"; {left_out} rows without any of {' '.join(CHANNELS)} left out" if left_out else ""
-    print_result(facts, summary, json)

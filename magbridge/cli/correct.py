@@ -1,0 +1,152 @@
+"""Correct a log, and tell what has come of it."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from magbridge.cli.common import (
+    Json,
+    Log,
+    app,
+    check_inputs,
+    complain,
+    doubts_of,
+    note_losses,
+    note_missing,
+    note_settings,
+    print_result,
+    refuse_unsuited,
+)
+from magbridge.columns import CHANNELS
+from magbridge.errors import DataError
+from magbridge.progress import track
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+
+@app.command(usage="Usage: magbridge correct FILE... --calibration cal.json -o FILE [OPTIONS]")
+def correct(*files: Path, calibration: Path, output: Log, json: Json = False) -> None:
+    """Correct a log with a calibration, as the bridge would have done live.
+
+    The arithmetic and the state (lags, backlash) are the bridge's own, but the input is the log's rows. In a
+    bridge's own log (also converted to .nc or .parquet) these are MAG_RAW with the latest telemetry before
+    each and its age; [align] and every max_age are known as they were when the log began, not as they were
+    set later. The bridge itself uses every message about a moving mass, and the channels of a sensor that has
+    no counts are float32 here (to 0.002 nT of 50,000 nT). Of another log, telemetry counts as new in every
+    row that has it, and rows that have nothing else are not samples: they are left out of the output. For
+    what the bridge would have published bit for bit, put the calibration into a bridge.toml and run:
+    magbridge replay LOG --config bridge.toml --log DIR. The replay also reports that this differs from what
+    was published at the time.
+
+    Parameters
+    ----------
+    files
+        The logs of one deployment.
+    calibration
+        The calibration (cal.json).
+    output
+        The file to write: total field with its sigma, vector, anomaly and quality flags.
+    json
+        Print the result as JSON.
+    """
+    from magbridge.calibration.file import load
+    from magbridge.correction import Correction, correct_rows
+    from magbridge.logs import Writer, read_chunks
+
+    check_inputs(files, output, calibration)
+    known = load(calibration)
+    for doubt in doubts_of(known, calibration):
+        complain(doubt)
+    correction, tally, whole = Correction(known), _Tally(), False
+    pieces: list[dict[str, Any]] = []
+    with Writer(output) as writer:
+        for part in track(read_chunks(files, required=CHANNELS), "correcting"):
+            if not pieces:
+                note_missing(known, part)
+            pieces.append(part.attrs)
+            sampled = part[list(CHANNELS)].to_array().notnull()
+            corrected = correct_rows(correction, part).isel(time=sampled.any("variable").to_numpy())
+            writer.append(corrected)
+            tally.add(corrected, part.sizes["time"])
+            if not whole:
+                refuse_unsuited(known, part)
+                whole = bool(sampled.all("variable").any())
+        if not whole:
+            raise DataError(
+                f"{', '.join(str(file) for file in files)}: no row has all of {' '.join(CHANNELS)}"
+            )
+    note_losses(*pieces)
+    note_settings(*pieces)
+    if doubt := tally.doubt():
+        complain(f"{calibration}: {doubt}")
+    print_result({"file": str(output), **tally.facts()}, f"{output}: {tally.summary()}", json)
+
+
+@dataclass
+class _Tally:
+    """What has come of a log so far.
+
+    Attributes
+    ----------
+    samples, left_out : int
+        Rows corrected, and those that are no samples.
+    flagged : int
+        Samples whose total field is in doubt.
+    flags : Counter
+        Name of a flag -> samples that carry it.
+    unearthly : int
+        Samples whose total field is none of the Earth's.
+    """
+
+    samples: int = 0
+    left_out: int = 0
+    flagged: int = 0
+    flags: Counter[str] = field(default_factory=Counter)
+    unearthly: int = 0
+
+    def add(self, corrected: xr.Dataset, rows: int) -> None:
+        """Count a piece of the log that had so many rows, with its samples corrected."""
+        from magbridge.field.reference import EARTHS
+        from magbridge.records import Quality
+
+        self.samples += corrected.sizes["time"]
+        self.left_out += rows - corrected.sizes["time"]
+        doubtful = ~Quality.NO_BORESIGHT  # without a boresight, the total field is just as good
+        quality = corrected["quality"].to_numpy().astype(int)
+        self.flagged += int((quality & doubtful != 0).sum())
+        self.flags.update({flag.names(): int((quality & flag != 0).sum()) for flag in doubtful})
+        total = corrected["total_field"]
+        self.unearthly += int(((total < EARTHS[0]) | (total > EARTHS[1])).sum())
+
+    def doubt(self) -> str:
+        """Return why the calibration may be another vehicle's; empty where nothing says so."""
+        from magbridge.field.reference import EARTHS
+
+        if self.unearthly <= self.samples / 2:
+            return ""
+        low, high = (f"{limit:,.0f}" for limit in EARTHS)
+        return (
+            f"another vehicle's? {self.unearthly} of {self.samples} corrected total fields are none of the "
+            f"Earth's, {low} to {high} nT"
+        )
+
+    def facts(self) -> dict[str, Any]:
+        """Return the numbers to print as JSON."""
+        return {
+            "rows": self.samples,
+            "flagged": self.flagged,
+            "flags": +self.flags,
+            "left_out": self.left_out,
+        }
+
+    def summary(self) -> str:
+        """Return the numbers in a sentence."""
+        named = ", ".join(f"{name} {count}" for name, count in (+self.flags).items())
+        text = f"{self.samples} samples, {self.flagged} of them flagged" + (f" ({named})" if named else "")
+        return text + (
+            f"; {self.left_out} rows without any of {' '.join(CHANNELS)} left out" if self.left_out else ""
+        )
