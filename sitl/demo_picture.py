@@ -24,7 +24,11 @@ RAW, NOMINAL, CORRECTED, TRUE, FLAGGED = "#b0b0b0", "#d1793b", "#1f6fb4", "#1111
 
 
 def draw(survey: xr.Dataset, nominal: FloatArray, heard: xr.Dataset, path: Path) -> None:
-    """Draw the survey: masses, raw and true field, corrected and true field, errors."""
+    """Draw the survey: masses, raw and true field, corrected and true field, errors.
+
+    `nominal` (n,) is the total field (nT) of the survey's samples as one ellipsoid corrects it; `heard` is
+    what came over the link.
+    """
     hours = _hours(survey["time"], survey)
     received = _hours(heard["time"], survey)
     truth = survey["truth_total_field"].to_numpy()

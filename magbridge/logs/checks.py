@@ -39,7 +39,7 @@ APART = 60.0
 def increasing(
     file: str | Path, time: FloatArray, rows: Sequence[int] | None = None, *, after: float = -np.inf
 ) -> None:
-    """Check that `time` is finite and increases, also from `after`, the last time before it.
+    """Check that `time` (n,), s, is finite and increases, also from `after`, the last time before it.
 
     Raises
     ------
