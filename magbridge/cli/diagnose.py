@@ -92,7 +92,7 @@ def diagnose(
             progress=step,
             remarks=remarks,
         )
-    if doubt := unsettled(found.problem, found.named, found.calibration):
+    if doubt := unsettled(found.problem, found.possible, found.calibration):
         complain(doubt)
     facts = findings(found, CAUSES, remarks)
     rms = f"{facts['rms_before_nT']:.2f} -> {facts['rms_after_nT']:.2f} nT RMS"

@@ -54,6 +54,11 @@ class Finding:
         return self.hypothesis.candidate
 
     @property
+    def possible(self) -> list[Candidate]:
+        """The cause, and its rivals."""
+        return [self.candidate, *(rival.candidate for rival in self.rivals)]
+
+    @property
     def signal_to_noise(self) -> float:
         """With the calibration refitted."""
         return self.hypothesis.signal_to_noise
@@ -107,3 +112,8 @@ class Diagnosis:
     def named(self) -> list[Candidate]:
         """The causes of the findings."""
         return [one.candidate for one in self.findings]
+
+    @property
+    def possible(self) -> list[Candidate]:
+        """The causes of the findings, and their rivals."""
+        return [candidate for one in self.findings for candidate in one.possible]

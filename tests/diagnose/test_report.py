@@ -167,7 +167,7 @@ def test_a_channel_without_a_unit_shows_none(unit: str) -> None:
 
 
 def test_a_shift_of_the_whole_field_beside_a_wrong_reference_is_told() -> None:
-    """A constant may belong to either; beside a true reference it is the vehicle's."""
+    """A constant may belong to either; beside a reference that is surely true it is the vehicle's."""
     problem = right(100)
     grown = problem.calibration.coefficients + np.repeat([20.0, 0.0], [3, 6])
     louder = replace(problem.calibration, coefficients=grown)
@@ -177,7 +177,11 @@ def test_a_shift_of_the_whole_field_beside_a_wrong_reference_is_told() -> None:
     s = isotropic(louder)
     charted = replace(problem.calibration, covariance=louder.covariance + 30.0**2 * np.outer(s, s))
     assert "by +0.0 nT, to within 30.0 nT" in unsettled(problem, [order, bias], charted)
-    assert not unsettled(problem, [order], louder)
+    named = Hypothesis(order, ratio=25.0, evidence=9.0, p_value=1e-3, fit=None)
+    alone = Finding(named, (), Gain(2.0, 1.0, 0.5, (0.4, 0.6)), np.array([0.5]), np.eye(1), 1.0)
+    contested = replace(alone, rivals=(Rival(bias, behind=3.0),))
+    assert unsettled(problem, contested.possible, louder) == text
+    assert not unsettled(problem, alone.possible, louder)
     assert not unsettled(problem, [bias], problem.calibration)
 
 

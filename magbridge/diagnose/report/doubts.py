@@ -175,12 +175,13 @@ def rivalled(candidate: Candidate, cause: Cause, rivals: Sequence[Rival], chance
     )
 
 
-def unsettled(problem: Problem, named: Sequence[Candidate], extended: Calibration) -> str:
-    """Say how far the corrected field is shifted as a whole beside an error of the reference, and how surely.
+def unsettled(problem: Problem, possible: Sequence[Candidate], extended: Calibration) -> str:
+    """Say how far the corrected field is shifted as a whole, and how surely, if the reference may be wrong.
 
-    A constant may belong to either. Nothing is said where shift and sigma are below the noise.
+    That is, if an error of it is among the causes named or the rivals of one. A constant may belong to either
+    then. Nothing is said where shift and sigma are below the noise.
     """
-    if not any(candidate.cause in REFERENCE for candidate in named):
+    if not any(candidate.cause in REFERENCE for candidate in possible):
         return ""
     survey = problem.survey
     before = residuals_of(*samples_of(survey, problem.calibration))
@@ -196,8 +197,8 @@ def unsettled(problem: Problem, named: Sequence[Candidate], extended: Calibratio
         return ""
     return (
         f"the extended calibration shifts the whole corrected field by {shift:+.1f} nT, to within "
-        f"{sigma:.1f} nT (1 sigma): the reference is in error, too, and a log cannot tell for sure which of "
-        "them a constant belongs to; check the extended field against another reference before using it"
+        f"{sigma:.1f} nT (1 sigma), and a log cannot tell for sure whether a constant belongs to the vehicle "
+        "or to the reference; check the extended field against another reference before using it"
     )
 
 
@@ -208,6 +209,5 @@ def nameless(rest: Leftover, causes: Mapping[str, Cause]) -> str:
     return (
         "No name is asserted: a description without a cause is likelier than any known cause, but by "
         f"less than 20:1 and what a cause's idealised shape may miss. Not ruled out: {listed(rest.within)}. "
-        "To tell: "
-        f"{escape(causes[rest.within[0].candidate.cause].separated_by)}."
+        f"To tell: {escape(causes[rest.within[0].candidate.cause].separated_by)}."
     )

@@ -67,7 +67,7 @@ def _verdict(diagnosis: Diagnosis, remarks: Sequence[str]) -> list[str]:
     first, last = (
         datetime.fromtimestamp(float(t), UTC).strftime("%Y-%m-%d %H:%M") for t in survey.time[[0, -1]]
     )
-    doubt = unsettled(diagnosis.problem, diagnosis.named, diagnosis.calibration)
+    doubt = unsettled(diagnosis.problem, diagnosis.possible, diagnosis.calibration)
     dives = f" in {np.unique(survey.dive).size} dives" if survey.parts == "dives" else ""
     return [
         (
