@@ -98,7 +98,7 @@ def fit(
     Parameters
     ----------
     data : Observations
-        The calibration runs; :func:`~.columns.observations` takes them from a deployment.
+        The calibration runs; :func:`~.observe.observations` takes them from a deployment.
     method : str
         One of :data:`METHODS`.
     order : int
