@@ -15,12 +15,14 @@ from magbridge.calibration.terms import Polynomial
 from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.causes.masses import actuator_order
 from magbridge.diagnose.causes.regressors import lagged
+from magbridge.diagnose.causes.response import BENT
 from magbridge.diagnose.causes.time_dependent import offset_step
 from magbridge.diagnose.causes.timing import field_rates, mass_rates
 from magbridge.diagnose.compare.interpolation import rates
 from magbridge.diagnose.compare.past import FAR
 from magbridge.diagnose.compare.problem import Problem, effect_columns, history, pose
 from magbridge.diagnose.compare.survey import Channel
+from magbridge.diagnose.inference.statistic import Statistic
 
 
 @pytest.fixture(scope="module")
@@ -269,6 +271,15 @@ def test_the_next_order_is_what_a_fit_of_the_lower_ones_has_left(problem: Proble
         return float(np.linalg.norm(field - columns @ np.linalg.lstsq(columns, field, rcond=1e-9)[0]))
 
     assert missed(np.hstack([slopes, changed])) < 0.02 * missed(np.hstack([slopes, term]))
+
+
+def test_a_response_bends_by_no_more_than_is_plausible(problem: Problem) -> None:
+    """However likely a larger common size would be: that a reference is 140 nT off is no bend."""
+    bend = CAUSES["nonlinearity"].candidates(problem)[-1]
+    for size, sigma in ((20.0, 20.0), (140.0, BENT)):
+        coefficients = size / bend.width
+        best = Statistic(1e6 * np.eye(9), bend.spectra).best(1e6 * coefficients)
+        np.testing.assert_allclose(np.sqrt(best.variance) * bend.width, sigma, rtol=0.2)
 
 
 def test_a_core_that_shows_through_changes_the_sensitivity_too(problem: Problem) -> None:

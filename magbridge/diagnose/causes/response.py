@@ -15,7 +15,11 @@ from magbridge.diagnose.causes.candidates import AXES, Candidate, of_effect, per
 from magbridge.diagnose.causes.regressors import powers
 from magbridge.diagnose.compare.problem import Problem
 
-__all__ = ["nonlinearity", "saturation"]
+__all__ = ["BENT", "nonlinearity", "saturation"]
+
+BENT = 50.0
+"""nT, the most that a response may plausibly bend (RMS of its coefficients): a thousandth of the field, as
+magnetoresistive sensors do. Fluxgates are ten times better."""
 
 
 def nonlinearity(problem: Problem) -> list[Candidate]:
@@ -24,19 +28,21 @@ def nonlinearity(problem: Problem) -> list[Candidate]:
     The leak is that of an even harmonic. A feedback of finite gain leaves the core the field that its output
     takes, and that is the inverse of its magnetisation curve: steeper the farther out, but not flat at zero
     either. So a core that shows through also changes the sensitivity, and p = 1 belongs to the bend. All nine
-    coefficients have one common size, because the three channels are built alike.
+    coefficients have one common size, because the three channels are built alike, up to :data:`BENT`: nine
+    free numbers could otherwise take a wrong reference and a mass' error for one bend.
     """
-    powered = [_power(problem, power) for power in (1, 2, 3)]
-    every = replace(reduce(Candidate.with_, powered), parts=(), spectra=np.ones((1, 9)))
-    return [*powered[1:], every]
+    # a common size is at most ten widths (:data:`~magbridge.diagnose.inference.statistic.SIZES`)
+    common = [_power(problem, power, 0.1 * BENT) for power in (1, 2, 3)]
+    every = replace(reduce(Candidate.with_, common), parts=(), spectra=np.ones((1, 9)))
+    return [*(_power(problem, power, BENT) for power in (2, 3)), every]
 
 
-def _power(problem: Problem, power: int) -> Candidate:
+def _power(problem: Problem, power: int, width: float) -> Candidate:
     unit, H = problem.calibration.reference.field, problem.reading
     effect = ResponseEffect(cause="nonlinearity", unit=unit, power=power)
     phi = lambda rows: powers(H[rows].T / unit, power)[-1]  # noqa: E731  (a regressor is one line)
     names = tuple(f"{axis}{power}" for axis in AXES)
-    return of_effect(problem, effect, 50.0, per(f"{unit:.0f} nT", power), names=names, phi=phi)
+    return of_effect(problem, effect, width, per(f"{unit:.0f} nT", power), names=names, phi=phi)
 
 
 def saturation(problem: Problem) -> list[Candidate]:
