@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from struct import Struct
 from typing import Final
 
@@ -36,13 +35,15 @@ class Journal:
         self._records: list[tuple[int, Channel, bytes]] = []
         self._scribe = Codec(system, component)
 
-    def sent(self, frames: Iterable[tuple[int, bytes]]) -> None:
+    def sent(self, frames: list[tuple[int, bytes]]) -> None:
         """Record the frames sent over the link, each with its event time (µs)."""
-        self._add([(time_us, SENT, frame) for time_us, frame in frames])
+        for time_us, frame in frames:
+            self._add(time_us, SENT, frame)
 
-    def link(self, time_us: int, frames: Iterable[bytes]) -> None:
+    def link(self, time_us: int, frames: list[bytes]) -> None:
         """Record the frames that came over the link."""
-        self._add([(time_us, LINK, frame) for frame in frames])
+        for frame in frames:
+            self._add(time_us, LINK, frame)
 
     def sensor(self, time_us: int, data: bytes) -> None:
         """Record bytes as they came from the sensor."""
@@ -51,22 +52,22 @@ class Journal:
         for begin in range(0, len(data), SIZE):
             piece = data[begin : begin + SIZE]
             frame = self._scribe.frame(BYTES, HEAD.pack(0, len(piece)) + piece)
-            self._add([(time_us, SENSOR, frame)])
+            self._add(time_us, SENSOR, frame)
 
     def state(self, time_us: int, frame: bytes) -> None:
         """Record a frame of :mod:`magbridge.bridge.states`, or of the run's start."""
-        self._add([(time_us, STATE, frame)])
+        self._add(time_us, STATE, frame)
 
     def raw(self, time_us: int, payload: bytes) -> None:
         """Record a MAG_RAW in the log only: a calibration from the log needs that of every sample."""
-        self._add([(time_us, STATE, self._scribe.frame(RAW, payload))])
+        self._add(time_us, STATE, self._scribe.frame(RAW, payload))
 
     def drain(self) -> list[tuple[int, Channel, bytes]]:
         """Return and clear the records collected so far, in order: event time in µs, channel, frame."""
         records, self._records = self._records, []
         return records
 
-    def _add(self, records: list[tuple[int, Channel, bytes]]) -> None:
+    def _add(self, time_us: int, channel: Channel, frame: bytes) -> None:
         if self.active:
-            self._records += records
-            self.count += len(records)
+            self._records.append((time_us, channel, frame))
+            self.count += 1

@@ -44,67 +44,37 @@ from __future__ import annotations
 
 from math import nan
 from struct import Struct
-from typing import Annotated, ClassVar
+from typing import ClassVar, Final
 from zlib import crc32
 
-import msgspec
-from msgspec import Meta
-
 from magbridge.records import Reading
+from magbridge.sensors.digitizer_options import FULL_SCALE, DigitizerOptions
 from magbridge.sensors.framing import CRC32_RESIDUE, Framer, cobs_decode
 
 __all__ = ["EXAMPLE", "Digitizer", "DigitizerOptions"]
 
-EXAMPLE = bytes.fromhex(
+EXAMPLE: Final = bytes.fromhex(
     "04 01 24 07 02 03 04 40 42 0F 04 E0 C8 10 04 80 4F 12 05"
     "A9 01 80 0E 04 AB AA 2A 01 09 F0 55 55 55 CC 3B C2 3C 00"
 )
 """The worked example as it stands on the line, delimiter included."""
 
-READING = 1
-LENGTH = 36
-FULL_SCALE = 1 << 23
-WRAP_US = 1 << 32
-NO_TEMPERATURE = -32768
-NO_SUPPLY = 65535
-BODY = Struct("<BBHHIIIhHBHbHbHb")
+READING: Final = 1
+LENGTH: Final = 36
+WRAP_US: Final = 1 << 32
+NO_TEMPERATURE: Final = -32768
+NO_SUPPLY: Final = 65535
+BODY: Final = Struct("<BBHHIIIhHBHbHbHb")
 """A reading's body; a channel's 24 bits are the lower 16, and the upper 8 with the sign."""
-Positive = Annotated[float, Meta(gt=0)]
-
-
-class DigitizerOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """``[sensor.options]`` of the digitizer.
-
-    Attributes
-    ----------
-    sensitivity : float
-        V/nT of the fluxgate's outputs, from its certificate (50 mV/µT is 5e-5).
-    reference_voltage : float
-        V at which the converter is at full scale.
-    gain : float
-        Of the amplifier between fluxgate and converter; below 1 for a divider.
-    full_scale : float or None
-        nT at which the fluxgate itself saturates, where that is before the converter.
-    """
-
-    sensitivity: Positive
-    reference_voltage: Positive = 2.5
-    gain: Positive = 1.0
-    full_scale: Positive | None = None
-
-    @property
-    def nt_per_count(self) -> float:
-        """Field of one count, in nT."""
-        return self.reference_voltage / self.gain / FULL_SCALE / self.sensitivity
 
 
 class Digitizer:
     """Parser of the digitizer's frames."""
 
     Options: ClassVar = DigitizerOptions
-    sequence_modulo = 1 << 16
-    time_modulo = WRAP_US * 1e-6
-    period = 0.0
+    sequence_modulo: ClassVar = 1 << 16
+    time_modulo: ClassVar = WRAP_US * 1e-6
+    period: ClassVar = 0.0
 
     def __init__(self, options: DigitizerOptions) -> None:
         self.nt_per_count = options.nt_per_count

@@ -7,6 +7,7 @@ from zlib import crc32
 
 from magbridge.records import Reading
 from magbridge.sensors import digitizer as wire
+from magbridge.sensors.digitizer_options import FULL_SCALE, DigitizerOptions
 from magbridge.sensors.framing import cobs_encode
 from sitl.fluxgate.encoder import Encoder, clip
 
@@ -18,11 +19,11 @@ WRAP = 1 << 16
 class DigitizerEncoder(Encoder):
     """Three channels, one converter."""
 
-    Options = wire.DigitizerOptions
+    Options = DigitizerOptions
 
     def encode(self, reading: Reading) -> bytes:
         """Return one frame."""
-        top, limit = wire.FULL_SCALE - 1, self.options.full_scale or inf
+        top, limit = FULL_SCALE - 1, self.options.full_scale or inf
         flags, counts = 0, []
         for channel, value in enumerate(reading.field):
             ideal = round(clip(value, limit) / self.options.nt_per_count)
