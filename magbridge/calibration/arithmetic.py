@@ -36,6 +36,7 @@ __all__ = [
     "apply",
     "combined",
     "for_arrays",
+    "largest",
     "monomials",
     "prepare",
     "split",
@@ -83,6 +84,14 @@ def monomials(
     return phi
 
 
+def largest(phi: list[float]) -> float:
+    """Return the largest size among regressors."""
+    found = 0.0
+    for value in phi:
+        found = max(found, abs(value))
+    return found
+
+
 def split(phi: list[float], pairs: list[tuple[int, int]], scale: float) -> list[float]:
     """Return the products of regressors, times `scale`: all fine parts (:mod:`.kernel`), then all coarse."""
     fine: list[float] = []
@@ -108,19 +117,21 @@ def prepare(t: list[float]) -> Prepared:
 
     ``L_ij,k = -(G_ik,j + G_jk,i)`` with ``G = S_a'T A'^T``, and ``O = A' S_TT A'^T``.
     """
-    A = [t[0:3], t[3:6], t[6:9]]
-    G = [[t[k] * ax + t[k + 1] * ay + t[k + 2] * az for ax, ay, az in A] for k in range(48, 75, 3)]
+    xx, xy, xz, yx, yy, yz, zx, zy, zz = t[0:9]
+    G = []
+    for k in range(48, 75, 3):
+        x, y, z = t[k], t[k + 1], t[k + 2]
+        G += [x * xx + y * xy + z * xz, x * yx + y * yy + z * yz, x * zx + y * zy + z * zz]
     sxx, syy, szz, sxy, sxz, syz = t[75:81]
-    AS = [
-        [sxx * x + sxy * y + sxz * z, sxy * x + syy * y + syz * z, sxz * x + syz * y + szz * z]
-        for x, y, z in A
-    ]
+    AS = []
+    for k in range(0, 9, 3):
+        x, y, z = t[k], t[k + 1], t[k + 2]
+        AS += [sxx * x + sxy * y + sxz * z, sxy * x + syy * y + syz * z, sxz * x + syz * y + szz * z]
     V = []
     for e, (i, j) in enumerate(PAIRS):
-        L = [-(G[3 * i + k][j] + G[3 * j + k][i]) for k in range(3)]
-        x, y, z = A[i]  # one by one: mypyc unpacks a pair of lists slowly
-        p, q, r = AS[j]
-        V.append([*t[12 + 6 * e : 18 + 6 * e], *L, x * p + y * q + z * r])
+        O = t[3 * i] * AS[3 * j] + t[3 * i + 1] * AS[3 * j + 1] + t[3 * i + 2] * AS[3 * j + 2]  # noqa: E741
+        L = [-(G[9 * i + 3 * k + j] + G[9 * j + 3 * k + i]) for k in range(3)]
+        V.append([*t[12 + 6 * e : 18 + 6 * e], *L, O])
     return t[:12], V
 
 

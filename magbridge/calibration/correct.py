@@ -18,7 +18,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from magbridge.arrays import FloatArray, IntArray
-from magbridge.calibration.arithmetic import Prepared, apply, combined, for_arrays, prepare
+from magbridge.calibration.arithmetic import Prepared, apply, combined, for_arrays, largest, prepare
 from magbridge.calibration.kernel import FARTHEST, Kernel
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.terms import Step
@@ -181,7 +181,7 @@ class Corrector:
     def _linear_at(self, positions: tuple[float, ...]) -> list[float]:
         """Return A's six entries and T; NaN if the positions are too far off."""
         phi = self._kernel.monomials(positions, 1.0)
-        if not max(map(abs, phi)) < FARTHEST:
+        if not largest(phi) < FARTHEST:
             return [nan] * len(self._weights)
         return [combined(phi, column) for column in self._weights]
 

@@ -29,7 +29,7 @@ from typing import Any
 import numpy as np
 
 from magbridge.arrays import FloatArray, IndexArray
-from magbridge.calibration.arithmetic import BITS, COARSE, FINE, monomials, split
+from magbridge.calibration.arithmetic import BITS, COARSE, FINE, largest, monomials, split
 
 __all__ = ["COLUMNS", "FARTHEST", "Kernel"]
 
@@ -81,8 +81,8 @@ class Kernel:
         psi = np.empty((len(self.pairs), phi.shape[1]))
         for row, (i, j) in zip(psi, self.pairs, strict=True):
             np.multiply(phi[i], phi[j], out=row)
-        largest = max(float(phi.max()), -float(phi.min()))
-        scale = None if largest * largest < 2.0**EXPONENT else _scales(phi)
+        size = max(float(phi.max()), -float(phi.min()))
+        scale = None if size * size < 2.0**EXPONENT else _scales(phi)
         if scale is not None:
             psi *= scale
         coarse = psi + COARSE
@@ -99,8 +99,8 @@ class Kernel:
         """Return the same 81 sums for one sample's regressors, with few numpy calls for speed."""
         if self.units is not None:
             phi = [value * unit for value, unit in zip(phi, self.units, strict=True)]
-        largest = max(*phi, -min(phi))
-        scale = ldexp(1.0, min(EXPONENT - frexp(largest * largest)[1], 0)) if largest < FARTHEST else nan
+        size = largest(phi)
+        scale = ldexp(1.0, min(EXPONENT - frexp(size * size)[1], 0)) if size < FARTHEST else nan
         parts = np.array(split(phi, self.pairs, scale))
         found = self.crossed.dot(parts)
         found += self.coarse.dot(parts[len(self.pairs) :])
