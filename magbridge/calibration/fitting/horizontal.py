@@ -29,6 +29,8 @@ from magbridge.errors import CalibrationError
 
 __all__ = ["fit_horizontal"]
 
+FEWEST = 30
+"""Samples that an ellipsoid's twelve unknowns need."""
 FIRST_NOISE = 1e-3
 """Share of the field: the noise that attitude errors make, before it is estimated."""
 
@@ -44,7 +46,7 @@ def fit_horizontal(data: Observations, order: int = 0) -> Fit:  # noqa: ARG001  
     if data.attitude is None or data.reference_ned is None:
         raise CalibrationError("horizontal: needs roll, pitch and a position (for the field's inclination)")
     known = np.isfinite(data.attitude[:, :2]).all(axis=1) & np.isfinite(data.reference_ned).all(axis=1)
-    if known.sum() < 30:
+    if known.sum() < FEWEST:
         raise CalibrationError(f"horizontal: only {int(known.sum())} samples have roll, pitch and position")
     data = data.part(np.asarray(known))
     assert data.attitude is not None

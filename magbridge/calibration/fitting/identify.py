@@ -122,17 +122,18 @@ def _attitudes(calibration: Calibration, data: Observations) -> Iterator[str]:
     theta = calibration.covariance[8, 8]
     if high - low < 10.0 and theta > (5.0 * calibration.noise.sensor) ** 2:
         yield (
-            f"roll stayed within {low:.0f} to {high:.0f} degrees: the vertical offset is known only to "
+            f"roll stayed within {low:z.0f} to {high:z.0f} degrees: the vertical offset is known only to "
             f"{np.sqrt(theta):.0f} nT; fly a run banked the other way"
         )
     if pitch.min() > -5.0 and pitch.max() < 5.0:
         yield (
-            f"pitch stayed within {pitch.min():.0f} to {pitch.max():.0f} degrees: nothing steeper was "
+            f"pitch stayed within {pitch.min():z.0f} to {pitch.max():z.0f} degrees: nothing steeper was "
             "measured; fly dives and climbs"
         )
     elif pitch.min() > -5.0 or pitch.max() < 5.0:
         seen, lacking = ("climbs", "dives") if pitch.min() > -5.0 else ("dives", "climbs")
-        yield f"only {seen} (pitch {pitch.min():.0f} to {pitch.max():.0f}): nothing was measured in {lacking}"
+        angles = f"pitch {pitch.min():z.0f} to {pitch.max():z.0f}"
+        yield f"only {seen} ({angles}): nothing was measured in {lacking}"
     left, gap = _widest_gap(heading)
     if gap > 60.0:
         yield f"no run headed between {left:03.0f} and {(left + gap) % 360.0:03.0f}: fly full turns"
