@@ -41,7 +41,7 @@ NAMELESS = ("unknown", "seen", "foreign")
 """Parts in which the hidden effect is not among the causes of the table."""
 PREDICTED = ("named", "ladder", "pair", *NAMELESS)
 """Parts for which theory predicts the outcome."""
-STRANGE = ("airlock", "wiper", "seep", "ferry")
+STRANGE = ("solar", "gimbal", "lookup", "consort")
 """Foreign effects made after the detector was frozen; its descriptions were not designed for them either."""
 SEEN = (
     "pan", "loose", "corrosion", "pulsation", "needle", "thermostat", "perming", "staircase", "swell",
@@ -55,6 +55,7 @@ SEEN = (
     "latch", "recovery", "clamp", "seiche",
     "accumulator", "modem", "rezero", "pipeline",
     "backdriven", "microphonic", "soliton", "escort",
+    "airlock", "wiper", "seep", "ferry",
 )  # fmt: skip
 """Foreign effects that were once made for this purpose, but before the detector was last improved."""
 GOLDEN = 0.6180339887498949

@@ -83,5 +83,9 @@ FOREIGN: dict[str, Effect] = {
     "wiper": payload.wiper,
     "seep": sensor.seep,
     "ferry": surroundings.ferry,
+    "solar": vehicle.solar,
+    "gimbal": payload.gimbal,
+    "lookup": sensor.lookup,
+    "consort": surroundings.consort,
 }
 """Effect, by its name."""

@@ -112,3 +112,15 @@ def wiper(scene: Scene, size: float, rng: Generator) -> None:
     angle = np.radians(120.0) * first_order(stops[sweep], scene.track.step, 3.0)
     a, b = direction(rng), direction(rng)
     scene.field = scene.field + size * (np.outer(np.cos(angle), a) + np.outer(np.sin(angle), b))
+
+
+def gimbal(scene: Scene, size: float, rng: Generator) -> None:
+    """A camera's gimbal keeps level between its stops, its motors' magnets with it; size in nT."""
+    track, lag = scene.track, float(rng.uniform(0.5, 3.0))
+    stop = rng.uniform(8.0, 25.0)
+    roll, pitch = (first_order(np.clip(-a, -stop, stop), track.step, lag) for a in (track.roll, track.pitch))
+    held = rotation(roll, pitch, np.zeros_like(roll))
+    magnet, place = direction(rng), direction(rng)
+    turned = held.apply(magnet)
+    own = dipole_field(np.broadcast_to(place, turned.shape), turned - magnet)
+    scene.field = scene.field + size * own / max(float(np.linalg.norm(own, axis=1).max()), 1e-30)

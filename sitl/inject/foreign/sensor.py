@@ -210,3 +210,20 @@ def seep(scene: Scene, size: float, rng: Generator) -> None:
     crossed = np.zeros_like(scene.field)
     crossed[:, hears] = leads * scene.field[:, heard]
     scene.field = scene.field + 1e-5 * size * crossed
+
+
+def lookup(scene: Scene, size: float, rng: Generator) -> None:
+    """Firmware takes the offset of a temperature from a table of coarse steps; size in nT at 1 degC.
+
+    It reads its own thermometer, which is late, and keeps an entry until it is well past the next.
+    """
+    warm = soaked(scene.water, scene.track.step, float(rng.uniform(200.0, 900.0)))
+    read = first_order(warm, scene.track.step, float(rng.uniform(20.0, 120.0)))
+    apart, keeps = rng.uniform(0.1, 0.35) * np.ptp(warm), rng.uniform(0.55, 0.8)
+    start, entry = rng.uniform(0.0, 1.0), 0
+    used = np.empty(len(warm))
+    for k, at in enumerate((read - read[0]) / max(float(apart), 1e-9) + start):
+        if abs(at - entry) > keeps:
+            entry = round(at)
+        used[k] = entry
+    scene.add(warm - warm[0] - apart * (used - used[0]), size * direction(rng))

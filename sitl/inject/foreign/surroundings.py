@@ -205,6 +205,23 @@ def ferry(scene: Scene, size: float, rng: Generator) -> None:
     scene.earth = scene.earth + size * own / max(float(np.linalg.norm(own, axis=1).max()), 1e-30)
 
 
+def consort(scene: Scene, size: float, rng: Generator) -> None:
+    """Another vehicle of the fleet dives beside the track, out of step with this one; size in nT at most."""
+    track = scene.track
+    depth, aside = track.depth, rng.uniform(15.0, 50.0)
+    period = rng.uniform(0.7, 1.4) * scene.t[-1] / max(_dives(depth), 1)
+    other = depth.max() * np.abs(2.0 * ((scene.t / period + rng.uniform()) % 1.0) - 1.0)
+    drifts = aside * autoregressive(rng, (len(scene.t), 2), 0.7, 3600.0 / track.step)
+    away = np.column_stack([drifts[:, 0] + aside, drifts[:, 1], depth - other])
+    own = dipole_field(away, np.broadcast_to(direction(rng), away.shape))
+    scene.earth = scene.earth + size * own / np.linalg.norm(own, axis=1).max()
+
+
+def _dives(depth: Array) -> int:
+    down = depth > 0.5 * depth.max()
+    return int(np.sum(np.diff(down, prepend=False) & down))
+
+
 def _cable(scene: Scene, rng: Generator) -> tuple[Array, Array, Array]:
     """Lay a straight cable below the track: m aside and above (n,), and north-east-down across it."""
     track = scene.track

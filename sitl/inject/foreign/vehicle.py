@@ -246,3 +246,14 @@ def airlock(scene: Scene, size: float, rng: Generator) -> None:
     squeezed = 1.0 - 10.0 / (10.0 + depth)
     room = 1.0 + rng.uniform(0.1, 0.4) * (oil - oil.mean()) / max(float(np.ptp(oil)), 1e-9)
     scene.logged["ballast"] = (oil + size * left * squeezed * room, "cm3")
+
+
+def solar(scene: Scene, size: float, rng: Generator) -> None:
+    """Panels on the hull charge the battery, by heading, through clouds and clear water; size in nT."""
+    track, reach = scene.track, rng.uniform(8.0, 25.0)
+    azimuth, height = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(0.3, 1.0)
+    sun = np.array([np.cos(azimuth) * np.cos(height), np.sin(azimuth) * np.cos(height), -np.sin(height)])
+    normal = np.array([0.0, 0.5 * rng.choice([-1.0, 1.0]), -0.9])
+    faces = np.maximum(rotation(track.roll, track.pitch, track.heading).apply(normal) @ sun, 0.0)
+    clouds = 1.0 / (1.0 + np.exp(2.0 * autoregressive(rng, (len(scene.t),), 1.0, 600.0 / track.step)))
+    scene.add(faces * clouds * np.exp(-(track.depth - track.depth.min()) / reach), size * direction(rng))
