@@ -11,8 +11,8 @@ from magbridge.diagnose.causes.candidates import Candidate, Group
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.evidence import ODDS, REMNANT, log_odds, margin
 from magbridge.diagnose.inference.rivals import Rival
-from magbridge.diagnose.inference.rounds import Hypothesis, shaped_ratio
 from magbridge.diagnose.inference.search import Outcome
+from magbridge.diagnose.inference.state import Hypothesis, shaped_ratio
 from magbridge.diagnose.unexplained.leftover import Leftover, leftover
 from magbridge.diagnose.unexplained.varying import varying
 

@@ -15,8 +15,8 @@ from magbridge.diagnose.inference.isolability import Isolability
 from magbridge.diagnose.inference.joint import Joint
 from magbridge.diagnose.inference.outliers import Outliers
 from magbridge.diagnose.inference.rivals import Rival
-from magbridge.diagnose.inference.rounds import Hypothesis
 from magbridge.diagnose.inference.search import Outcome
+from magbridge.diagnose.inference.state import Hypothesis
 from magbridge.diagnose.unexplained.leftover import Leftover
 
 __all__ = ["Diagnosis", "Finding"]

@@ -30,8 +30,8 @@ from magbridge.diagnose.inference.naming import chances_alone
 from magbridge.diagnose.inference.nonlinear_uncertainty import loosened
 from magbridge.diagnose.inference.outliers import Outliers, outliers
 from magbridge.diagnose.inference.rivals import Rival
-from magbridge.diagnose.inference.rounds import Hypothesis
 from magbridge.diagnose.inference.search import search
+from magbridge.diagnose.inference.state import Hypothesis
 from magbridge.diagnose.unexplained.leftover import Leftover, leftover
 from magbridge.errors import DataError
 from magbridge.field.grid import AnomalyGrid

@@ -15,8 +15,8 @@ from magbridge.diagnose.inference.evidence import LEVEL, score
 from magbridge.diagnose.inference.exchange import _separate, exchanged
 from magbridge.diagnose.inference.pairs import pairs_of
 from magbridge.diagnose.inference.rivals import sets_of
-from magbridge.diagnose.inference.rounds import State
 from magbridge.diagnose.inference.search import _backward_elimination
+from magbridge.diagnose.inference.state import State
 
 ROWS = 600
 

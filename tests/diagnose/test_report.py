@@ -18,7 +18,7 @@ from magbridge.diagnose.compare.survey import Channel, _channels
 from magbridge.diagnose.diagnosis import Finding
 from magbridge.diagnose.gain import Gain
 from magbridge.diagnose.inference.rivals import Rival
-from magbridge.diagnose.inference.rounds import Hypothesis
+from magbridge.diagnose.inference.state import Hypothesis
 from magbridge.diagnose.report import figures
 from magbridge.diagnose.report.doubts import IMPLAUSIBLE, gained, implausible, nameless, rivalled, unsettled
 from magbridge.diagnose.report.found import _folded, _outliers

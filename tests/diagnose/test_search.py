@@ -14,8 +14,8 @@ from magbridge.calibration.instrument_effects import TimeEffect
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.causes.reference import reference_bias
 from magbridge.diagnose.inference.exchange import exchanged
-from magbridge.diagnose.inference.rounds import State
 from magbridge.diagnose.inference.search import search
+from magbridge.diagnose.inference.state import State
 
 
 def fault(cause: str, x: NDArray[np.float64], width: float) -> Candidate:

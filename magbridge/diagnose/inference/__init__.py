@@ -6,7 +6,7 @@ columns of a hypothesis, and :mod:`.joint` fits them together with calibration a
 *One candidate.* :mod:`.information` has scores and Fisher information of all candidates at once;
 :mod:`.statistic` is their likelihood ratio, :mod:`.evidence` what it is worth as evidence and as a test.
 
-*The search.* :mod:`.search` adds cause after cause, each in one of the :mod:`.rounds`.
+*The search.* :mod:`.search` adds cause after cause, each in a round of the :mod:`.state`.
 :mod:`.profile_likelihood` refines nonlinear parameters, :mod:`.exchange` replaces causes by their
 :mod:`.rivals`, also in :mod:`.pairs`.
 

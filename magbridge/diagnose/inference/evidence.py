@@ -170,7 +170,7 @@ def _independent(S: FloatArray, places: Sequence[slice], level: float) -> float:
 def log_odds(ratio: float, model: Sequence[Candidate], trials: Mapping[str, float], shaped: float) -> float:
     """Log posterior odds of a whole model of this likelihood ratio against no effect.
 
-    `shaped` is the part of it that is left beside causes that take any shape (:func:`~.rounds.shaped_ratio`).
+    `shaped` is the part of it that is left beside causes that take any shape (:func:`~.state.shaped_ratio`).
     The others' size is judged by that part, as beside the calibration.
 
     Every regressor pays for the number of hypotheses of its cause. Each after the first also pays for the

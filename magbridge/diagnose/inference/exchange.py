@@ -12,7 +12,7 @@ from magbridge.diagnose.inference.joint import Joint
 from magbridge.diagnose.inference.pairs import pairs_of
 from magbridge.diagnose.inference.profile_likelihood import refined
 from magbridge.diagnose.inference.rivals import rivals_of
-from magbridge.diagnose.inference.rounds import State
+from magbridge.diagnose.inference.state import State
 
 __all__ = ["exchanged"]
 

@@ -25,7 +25,7 @@ from magbridge.diagnose.causes.candidates import Candidate, Group, slices
 from magbridge.diagnose.inference.evidence import LEVEL, REMNANT, log_bayes, margin, one_sided, score
 from magbridge.diagnose.inference.information import Information
 from magbridge.diagnose.inference.joint import Joint
-from magbridge.diagnose.inference.rounds import State
+from magbridge.diagnose.inference.state import State
 from magbridge.diagnose.inference.statistic import Statistic
 
 __all__ = ["Pair", "pairs_of"]
@@ -93,7 +93,7 @@ def pairs_of(
     state : State
         Of the search.
     info : Information
-        Of all candidates and of `model`, whose columns are the last: :meth:`~.rounds.State.beside`.
+        Of all candidates and of `model`, whose columns are the last: :meth:`~.state.State.beside`.
     model : sequence of Candidate
         The causes found so far.
     base : Joint

@@ -11,7 +11,7 @@ from magbridge.diagnose.causes.candidates import Candidate, slices
 from magbridge.diagnose.inference.evidence import score
 from magbridge.diagnose.inference.information import information
 from magbridge.diagnose.inference.joint import Joint
-from magbridge.diagnose.inference.rounds import Hypothesis, State
+from magbridge.diagnose.inference.state import Hypothesis, State
 
 __all__ = ["refined", "sharpen"]
 

@@ -13,7 +13,7 @@ from magbridge.diagnose.inference.evidence import LEVEL, margin, score
 from magbridge.diagnose.inference.information import Information
 from magbridge.diagnose.inference.joint import Joint
 from magbridge.diagnose.inference.pairs import pairs_of
-from magbridge.diagnose.inference.rounds import State
+from magbridge.diagnose.inference.state import State
 
 __all__ = ["Rival", "rivals_of", "sets_of"]
 

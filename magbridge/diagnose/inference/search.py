@@ -33,7 +33,7 @@ from magbridge.diagnose.inference.information import Information
 from magbridge.diagnose.inference.joint import Joint, fit_joint
 from magbridge.diagnose.inference.profile_likelihood import refined, sharpen
 from magbridge.diagnose.inference.rivals import Rival, sets_of
-from magbridge.diagnose.inference.rounds import Hypothesis, State, shaped_ratio
+from magbridge.diagnose.inference.state import Hypothesis, State, shaped_ratio
 
 __all__ = ["Outcome", "search"]
 

@@ -1,4 +1,4 @@
-"""One round of the search: score every cause beside the model so far, and fit the likeliest."""
+"""The state of a search, and a round of it: score every cause beside the model so far, fit the likeliest."""
 
 from __future__ import annotations
 
