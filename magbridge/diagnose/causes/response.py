@@ -59,7 +59,7 @@ def saturation(problem: Problem) -> list[Candidate]:
 def _clipped(problem: Problem, axis: int, knees: Sequence[float]) -> list[Candidate]:
     """Return the candidates for one axis, at one end of its range."""
     unit, H = problem.calibration.reference.field, problem.reading
-    names = (f"{AXES[axis]} beyond", f"{AXES[axis]} slope")
+    names = (f"{AXES[axis]} jump", f"{AXES[axis]} slope")
 
     def again(knee: float) -> Candidate:
         effect = ResponseEffect(cause="saturation", unit=unit, axis=axis, knee=knee)
