@@ -1,0 +1,49 @@
+"""What the simulation gets wrong of real vehicles: measured logs, diagnosed as `magbridge diagnose` does."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from magbridge.calibration.fitting.fit import fit
+from magbridge.calibration.fitting.observe import observations
+from magbridge.diagnose.causes import CAUSES
+from magbridge.diagnose.report.findings import findings
+from magbridge.diagnose.run import diagnose
+from magbridge.logs import read
+
+pytestmark = pytest.mark.real
+
+
+def test_thrusters_leave_the_field_of_an_rov_elsewhere(real_data: Path) -> None:
+    """An ArduSub's eight thrusters rest, turn for a quarter of a minute, and stop: their magnets lie anew.
+
+    The log's only other event is the turning itself, which no telemetry follows closely enough to name.
+    """
+    ds = read(real_data / "ardusub" / "small.tlog")
+    motors = np.stack([ds[f"servo{k}"].values for k in range(1, 9)])
+    turning = np.flatnonzero(np.any(motors != 1500.0, axis=0))
+    half = len(motors[0]) // 2
+    before, after = ds.isel(time=slice(0, half)), ds.isel(time=slice(half, None))
+    result = diagnose([after], fit(observations(before, []), "auto").calibration)
+    found = findings(result, CAUSES)
+    step = next(one for one in found["findings"] if one["cause"] == "offset_step")["parameters"]
+    assert 0.0 <= step["onset"]["value"] - ds.time.values[turning[-1]] < 5.0
+    # the vertical channel, half a minute before the thrusters turn and after; a swaying hull adds 0.6 uT
+    z = ds.mag_z.values
+    seen = z[turning[-1] + 10 :][:60].mean() - z[: turning[0]][-60:].mean()
+    assert seen > 1000.0
+    assert step["z"]["value"] == pytest.approx(seen, abs=600.0)
+    assert found["verdict"] == "partly_explained"
+    assert found["unexplained"]["kind"] == "broadband"
+
+
+def test_a_seaglider_is_better_where_it_was_not_seen(real_data: Path) -> None:
+    """A coarse compass with rock below it: a map's error is among the names, and dives left out improve."""
+    dives = sorted((real_data / "seaglider_sg167").glob("*.nc"))
+    known = fit(observations(read(dives[:3]), ["pitchCtl", "vbdCC"])).calibration
+    result = diagnose([read(dives[3:])], known)
+    assert "map_error" in {one.hypothesis.candidate.cause for one in result.findings}
+    assert result.total.shown
