@@ -177,7 +177,7 @@ def test_what_is_written(warm: tuple[xr.Dataset, Calibration], written: tuple[Pa
     assert np.sqrt(np.mean(error**2)) == pytest.approx(1.0, abs=0.05)
     page = (tmp_path / "out" / "report.html").read_text()
     assert page.count("data:image/png;base64,") >= 6
-    assert page.index('<a href="#cause0"><b>current field</b>') < page.index("<h2>")
+    assert page.index('<a href="#cause0"><b>current field</b>') < page.index("<h2")
     assert '<h3 id="cause0"><b>current field</b>' in page
     assert "<code>calibration.json</code> beside this page, corrects" in page
     assert "http" not in page.replace("http-equiv", "")
@@ -209,5 +209,5 @@ def test_a_channels_name_does_not_decide(
     sun = replace(first.candidate, cause="diurnal_variation", channel=None, effects=())
     both = (first, replace(first, hypothesis=replace(first.hypothesis, candidate=sun)))
     assert useful(replace(found, findings=both)).endswith(
-        "It leaves diurnal variation in the field, which the RMS above has removed.</p>"
+        "It leaves diurnal variation in the field, which the RMS above has removed."
     )

@@ -61,7 +61,15 @@ def test_when_something_began_is_a_date() -> None:
 
 @pytest.mark.parametrize(
     ("value", "text"),
-    [(1073.2, "1070"), (0.0768, "0.0768"), (900.0, "900"), (2, "2.00"), (0.5, "0.500"), (0.0, "0")],
+    [
+        (1073.2, "1070"),
+        (0.0768, "0.0768"),
+        (900.0, "900"),
+        (2, "2.00"),
+        (0.5, "0.500"),
+        (0.0, "0"),
+        (-161.2, "\N{MINUS SIGN}161"),
+    ],
 )
 def test_a_size_is_written_to_its_digits_without_an_exponent(value: float, text: str) -> None:
     assert number(value) == text
@@ -143,9 +151,9 @@ def test_a_long_table_of_terms_is_folded_to_a_line() -> None:
 
 def test_the_times_of_wrong_samples_are_all_or_the_first() -> None:
     few, many = (_outliers(np.linspace(1780300800.0, 1780300799.0 + n, n)) for n in (2, 13))
-    assert "2 isolated samples are wrong, at 08:00:00, 08:00:01 UTC;" in few
+    assert "2 isolated samples are wrong, at 08:00:00, 08:00:01 UTC." in few
     assert "13 isolated samples are wrong, the first 12 at 08:00:00, " in many
-    assert "1 isolated sample is wrong, at 08:00:00 UTC; the figures above leave it out." in _outliers(
+    assert "1 isolated sample is wrong, at 08:00:00 UTC. No RMS before or after counts it." in _outliers(
         np.array([1780300800.0])
     )
 
@@ -173,7 +181,7 @@ def test_a_shift_of_the_whole_field_beside_a_wrong_reference_is_told() -> None:
     louder = replace(problem.calibration, coefficients=grown)
     bias, order = (CAUSES[cause].candidates(problem)[0] for cause in ("reference_bias", "actuator_order"))
     text = unsettled(problem, [order, bias], louder)
-    assert "the whole corrected field by +20.0 nT, to within 0.0 nT" in text
+    assert "the whole corrected field by +20.0 nT, to within 0.1 nT" in text
     s = isotropic(louder)
     charted = replace(problem.calibration, covariance=louder.covariance + 30.0**2 * np.outer(s, s))
     assert "by +0.0 nT, to within 30.0 nT" in unsettled(problem, [order, bias], charted)
@@ -213,11 +221,13 @@ def test_a_rival_on_another_channel_is_no_other_cause() -> None:
     )
     assert "water would do nearly as well" in channels
     for said in (alone, channels):
-        assert "No other known cause comes within" in said
-        assert said.endswith("a 97 % chance of being named beside no other cause.</p>")
+        assert "none comes within odds of 20:1" in said
+        assert said.endswith("told from all other known causes in 97 of 100 cases.</p>")
     assert "cannot tell it from temperature offset (water) or offset drift (" in causes
     assert cause.separated_by in causes
-    assert causes.endswith("here it was not.</p>")
+    assert "in 97 of 100 cases; here it was not." in causes
+    certain = rivalled(own, cause, [Rival(other, 1.0)], 0.999)
+    assert "in more than 99 of 100 cases" in certain
 
 
 def test_of_many_channels_the_difference_s_own_are_drawn(
@@ -231,7 +241,7 @@ def test_of_many_channels_the_difference_s_own_are_drawn(
         attitude=rng.normal(size=(2000, 3)),
     )  # fmt: skip
     before = values["c29"] + rng.normal(size=2000)
-    monkeypatch.setattr(figures, "_png", lambda figure: figure)
+    monkeypatch.setattr(figures, "png", lambda figure: figure)
     diagnosis: Any = SimpleNamespace(
         problem=SimpleNamespace(survey=survey), findings=(1,), before=before, after=before
     )

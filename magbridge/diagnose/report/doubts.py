@@ -23,7 +23,7 @@ from magbridge.diagnose.inference.rivals import Rival
 from magbridge.diagnose.report.words import label, listed, measured, number
 from magbridge.diagnose.unexplained.leftover import Leftover
 
-__all__ = ["doubts", "gained", "late", "nameless", "unsettled", "useful"]
+__all__ = ["doubts", "gained", "late", "nameless", "stays", "times_usual", "unsettled", "useful"]
 
 REFERENCE = ("map_error", "reference_bias", "diurnal_variation")
 """Causes that are errors of the reference."""
@@ -88,14 +88,19 @@ def late(problem: Problem, fit: Joint) -> str:
 
 def implausible(candidate: Candidate, b: FloatArray) -> str:
     """Say so when a cause's b (k,), in units of its widths, is implausibly large, as if two cancelled."""
-    times = float(np.abs(b).max())
-    if candidate.spectra is not None or times < IMPLAUSIBLE:
+    times = times_usual(candidate, b)
+    if times < IMPLAUSIBLE:
         return ""
     return (
         f"<p>This is {number(times, 2)} times the usual size of such a cause. Two causes that cancel each "
         "other can grow this large: check the extended calibration against another reference before it is "
         "flown.</p>"
     )
+
+
+def times_usual(candidate: Candidate, b: FloatArray) -> float:
+    """Return how many times its plausible size a cause of b (k,) is; 0 where its terms share one size."""
+    return float(np.abs(b).max()) if candidate.spectra is None else 0.0
 
 
 def shortened(finding: Finding) -> str:
@@ -138,40 +143,46 @@ def gained(gain: Gain, parts: str) -> str:
     )
 
 
+def stays(diagnosis: Diagnosis) -> list[Candidate]:
+    """Return the named causes that the extended calibration does not correct for."""
+    added = diagnosis.calibration.effects
+    return [c for c in diagnosis.named if not c.effects or any(effect not in added for effect in c.effects)]
+
+
 def useful(diagnosis: Diagnosis) -> str:
     """Say what the extended calibration corrects for and what not; nothing where nothing was added to it."""
     added = diagnosis.calibration.effects
     if all(c.cause in REFERENCE or (c.effects and set(added).isdisjoint(c.effects)) for c in diagnosis.named):
         return ""
-    stays = [c for c in diagnosis.named if not c.effects or any(effect not in added for effect in c.effects)]
-    others = ", ".join(escape(label(*candidate.group)) for candidate in stays)
-    but = f" It leaves {others} in the field, which the RMS above has removed." if stays else ""
+    others = ", ".join(escape(label(*candidate.group)) for candidate in stays(diagnosis))
+    but = f" It leaves {others} in the field, which the RMS above has removed." if others else ""
     verdict = (
         "corrects for what belongs to the vehicle and its sensor"
         if diagnosis.total.shown
         else "shows no gain on what it was not fitted to: do not fly it before another log does"
     )
-    return f"<p>The extended calibration, <code>calibration.json</code> beside this page, {verdict}.{but}</p>"
+    return f"The extended calibration, <code>calibration.json</code> beside this page, {verdict}.{but}"
 
 
 def rivalled(candidate: Candidate, cause: Cause, rivals: Sequence[Rival], chance: float) -> str:
     """Say which causes could take its place, what would tell them apart, and what theory expects."""
     theory = (
-        f"<p>In a log like this one, theory gives it a {100 * chance:.0f} % chance of being named beside no "
-        "other cause"
+        "By theory, an effect of this size in such a log would be told from all other known causes in "
+        f"{'more than 99' if chance > 0.995 else f'{100 * chance:.0f}'} of 100 cases"
     )
+    alone = "No other known cause explains the data nearly as well (none comes within odds of 20:1)."
     if not rivals:
-        return f"<p>No other known cause comes within odds of 20:1.</p>{theory}.</p>"
+        return f"<p><b>Alternatives:</b> none. {alone} {theory}.</p>"
     if all(rival.candidate.cause == candidate.cause for rival in rivals):
         channels = ", ".join(escape(str(rival.candidate.channel)) for rival in rivals)
         return (
-            "<p>No other known cause comes within odds of 20:1. Which channel it follows is less sure: "
+            f"<p><b>Alternatives:</b> only in the channel. {alone} Which channel it follows is less sure: "
             f"{channels} would do nearly as well (odds below 20:1). A log in which these channels differ "
-            f"more would tell.</p>{theory}.</p>"
+            f"more would tell. {theory}.</p>"
         )
     return (
-        f"<p>The data cannot tell it from {listed(rivals, ' or ')} (odds below 20:1). To tell them apart: "
-        f"{escape(cause.separated_by)}.</p>{theory}; here it was not.</p>"
+        f"<p><b>Alternatives:</b> the data cannot tell it from {listed(rivals, ' or ')} (odds below 20:1). "
+        f"{theory}; here it was not.</p><p><b>To tell them apart:</b> {escape(cause.separated_by)}.</p>"
     )
 
 
@@ -197,8 +208,9 @@ def unsettled(problem: Problem, possible: Sequence[Candidate], extended: Calibra
         return ""
     return (
         f"the extended calibration shifts the whole corrected field by {shift:+.1f} nT, to within "
-        f"{sigma:.1f} nT (1 sigma), and a log cannot tell for sure whether a constant belongs to the vehicle "
-        "or to the reference; check the extended field against another reference before using it"
+        f"{max(sigma, 0.1):.1f} nT (1 sigma, if the names are right), and a log cannot tell for sure whether "
+        "a constant belongs to the vehicle or to the reference; check the extended field against another "
+        "reference before using it"
     )
 
 

@@ -11,22 +11,19 @@ import numpy as np
 
 from magbridge.diagnose.causes import Cause
 from magbridge.diagnose.diagnosis import Diagnosis, Finding
-from magbridge.diagnose.report import figures
-from magbridge.diagnose.report.doubts import gained, late, nameless, unsettled, useful
+from magbridge.diagnose.report import figures, figures_of_causes
+from magbridge.diagnose.report.decision import decision
+from magbridge.diagnose.report.doubts import gained, late
 from magbridge.diagnose.report.found import found, overview
-from magbridge.diagnose.report.words import bold, figure, label, listed, number, sizes, table
+from magbridge.diagnose.report.limits import unknown, visible
+from magbridge.diagnose.report.remaining import remaining
+from magbridge.diagnose.report.words import bold, figure, listed, number
 
 __all__ = ["report_html"]
 
 STYLE = Path(__file__).with_name("style.css")
-KINDS = {
-    "switching": "Something that switches or comes and goes",
-    "drift": "A slow drift",
-    "tone": "A tone",
-    "transient": "A transient",
-    "broadband": "Something broadband",
-}
-"""What is left, as the subject of a sentence."""
+LONG = 7200.0
+"""s, from which on a length is told in hours."""
 
 
 def report_html(diagnosis: Diagnosis, causes: Mapping[str, Cause], remarks: Sequence[str] = ()) -> str:
@@ -42,88 +39,107 @@ def report_html(diagnosis: Diagnosis, causes: Mapping[str, Cause], remarks: Sequ
         What a reader must know of the logs, each without its full stop.
     """
     title = f"Diagnosis of {escape(diagnosis.problem.survey.source)}"
-    body = [
-        f"<h1>{title}</h1>",
-        *_verdict(diagnosis, remarks),
-        "<h2>Measured against simulated</h2>",
-        *_compared(diagnosis),
-        "<h2>What was found, and why it is believed</h2>",
-        *found(diagnosis, causes),
-        "<h2>What is left</h2>",
-        _left(diagnosis, causes),
-        "<h2>What this log could have shown at all</h2>",
-        *_isolability(diagnosis),
-    ]
+    sections = {
+        "Measured against simulated": _compared(diagnosis),
+        "What was found, and why it is believed": found(diagnosis, causes),
+        "What is left": remaining(diagnosis, causes),
+        "What is not known": unknown(diagnosis, causes),
+        "What this log could have shown at all": visible(diagnosis),
+    }
+    body = [f"<h1>{title}</h1>", *_verdict(diagnosis, causes, remarks), _contents(list(sections))]
+    for place, (head, parts) in enumerate(sections.items()):
+        body += [f'<h2 id="part{place}">{head}</h2>', *parts]
     content = "\n".join(part for part in body if part)
+    for unit in (" %", " nT", " UTC"):  # no line ends between a number and its unit
+        content = content.replace(unit, f"\N{NO-BREAK SPACE}{unit[1:]}")
     return (
-        f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{title}</title>'
+        '<!doctype html><html lang="en"><head><meta charset="utf-8">'
+        f'<meta name="viewport" content="width=device-width, initial-scale=1"><title>{title}</title>'
         f"<style>\n{STYLE.read_text('utf-8')}</style></head><body>{content}</body></html>\n"
     )
 
 
-def _verdict(diagnosis: Diagnosis, remarks: Sequence[str]) -> list[str]:
-    """Say what was compared, the verdict, and what a reader must know of both."""
+def _contents(heads: Sequence[str]) -> str:
+    """Return the page's contents in one line."""
+    links = (f'<a href="#part{place}">{head}</a>' for place, head in enumerate(heads))
+    return f'<p class="faint">Below: {" · ".join(links)}</p>'
+
+
+def _verdict(diagnosis: Diagnosis, causes: Mapping[str, Cause], remarks: Sequence[str]) -> list[str]:
+    """Say what was compared, the verdict, whether the result may fly, and what a reader must know of it."""
     survey = diagnosis.problem.survey
-    first, last = (
-        datetime.fromtimestamp(float(t), UTC).strftime("%Y-%m-%d %H:%M") for t in survey.time[[0, -1]]
-    )
-    doubt = unsettled(diagnosis.problem, diagnosis.possible, diagnosis.calibration)
-    dives = f" in {np.unique(survey.dive).size} dives" if survey.parts == "dives" else ""
+    new = survey.time[~survey.learned]
+    first, last = (datetime.fromtimestamp(float(t), UTC).strftime("%Y-%m-%d %H:%M") for t in new[[0, -1]])
+    span = float(new[-1] - new[0])
+    length = f"{span / 3600.0:.1f} h" if span > LONG else f"{span / 60.0:.0f} min"
+    dives = f" in {np.unique(survey.dive[~survey.learned]).size} dives" if survey.parts == "dives" else ""
+    beside = f", beside {int(survey.learned.sum())} that the calibration has learned from"
     return [
         (
-            f'<p class="faint">{first} to {last} UTC · {len(survey)} samples{dives} · '
-            f"calibration by method {escape(diagnosis.problem.calibration.method or 'unnamed')}, "
+            f'<p class="faint">{first} to {last} UTC ({length}) · {new.size} samples{dives}'
+            f"{beside if survey.learned.any() else ''} · calibration by method "
+            f"{escape(diagnosis.problem.calibration.method or 'unnamed')}, "
             f"{diagnosis.problem.calibration.coefficients.size} coefficients</p>"
         ),
         f'<p class="verdict">{_sentence(diagnosis)}</p>',
-        overview(diagnosis),
+        decision(diagnosis, causes),
         *(f"<p><b>Note:</b> {escape(remark)}.</p>" for remark in remarks),
-        f"<p><b>Note:</b> {doubt}.</p>" if doubt else "",
-        useful(diagnosis),
+        overview(diagnosis),
     ]
 
 
 def _compared(diagnosis: Diagnosis) -> list[str]:
     """Show the difference between measured and simulated field in five figures."""
     parts = diagnosis.problem.survey.parts
-    sides = (
-        f"before, and with the extended calibration on {parts} that its fit had not seen"
-        if diagnosis.findings
-        else "as calibrated, and with the calibration refitted within its own uncertainty"
+    mended = bool(diagnosis.findings)
+    after = (
+        f"“After, held out” is the extended calibration on {parts} that its fit had not seen."
+        if mended
+        else "“Calibration refitted” lets the calibration's own numbers move within their uncertainty."
     )
-    lacks = "A line that is not flat is an effect that the model lacks" + (
-        "." if diagnosis.findings else ", unless it is flat once the calibration is refitted."
+    drawn = " The logs that the calibration has learned from are drawn, too."
+    learned = drawn if diagnosis.problem.survey.learned.any() else ""
+    flat = "A line that is not flat is an effect that the model lacks" + (
+        "." if mended else ", unless it is flat once the calibration is refitted."
     )
     return [
         (
             "<p>The calibration describes what the vehicle's own magnetism and the sensor's errors do to "
-            "every reading. The corrected field should therefore differ from the reference by noise alone. "
-            "Any other structure in the difference is an effect that the calibration does not describe.</p>"
+            "every reading. Corrected by it, the measured total field should differ from the reference, "
+            "the field that a model or a map gives for the place, by noise alone. Any other structure in the "
+            "difference is something that the calibration does not describe.</p>"
         ),
-        late(diagnosis.problem, diagnosis.fit),
         figure(
             figures.measured(diagnosis),
-            f"The total field, measured and corrected, and the reference; below, their difference {sides}.",
+            "In time: does the difference stay about zero, within the grey band?",
+            f"{after} Grey: what the calibration as given allows (noise, and its own uncertainty).{learned}",
         ),
+        late(diagnosis.problem, diagnosis.fit),
         '<div class="pair">',
         figure(
             figures.spectrum(diagnosis),
-            "Spectral density of the difference; dashed: the noise model.",
+            "As a spectrum: at which periods is there more than noise?",
+            "Where a line lies above the dashed one, the difference holds more than noise at that period.",
         ),
         figure(
-            figures.evidence(diagnosis),
-            "The likeliest causes, each tried alone with calibration and noise refitted. A cause is "
-            "detected below p = 0.01" + ("; blue: named in the end." if diagnosis.findings else "."),
+            figures_of_causes.evidence(diagnosis),
+            "By cause: what would explain it best, alone?",
+            "Each cause tried by itself, with calibration and noise fitted anew. At the bar: the chance that "
+            "noise alone looks so; below 0.01 it counts as detected."
+            + " Blue: named in the end. A grey one explains the same, less well or less plausibly."
+            * mended,
         ),
         "</div>",
         figure(
             figures.channels(diagnosis),
-            "The difference against the channels that it follows most: mean and scatter in twenty bins. "
-            + lacks,
+            "Against each channel: does the difference follow something?",
+            "Mean (line) and scatter (bars) in twenty bins, for the channels that it follows most; the first "
+            f"follow it most. {flat}",
         ),
         figure(
             figures.track(diagnosis),
-            "The difference along the track. An error of the map looks the same on every pass at one depth.",
+            "Along the track: does the difference belong to a place?",
+            "An error of the map looks the same on every pass at one depth.",
         ),
     ]
 
@@ -163,67 +179,3 @@ def _others(finding: Finding) -> str:
     return (
         listed(finding.rivals, " or ") if len(finding.rivals) < 3 else f"one of {len(finding.rivals)} others"
     )
-
-
-def _left(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> str:
-    rest, noise = diagnosis.unexplained, diagnosis.fit.noise
-    tails = "Gaussian" if noise.nu > 1e5 else f"tails like Student's t with {noise.nu:g} degrees of freedom"
-    samples = len(noise.scale)
-    correlation = (
-        f"correlated in time, so that {samples} samples determine a constant as well as "
-        f"{noise.independent:.0f} independent ones would"
-        if noise.independent < 0.95 * samples
-        else "practically uncorrelated in time"
-    )
-    model = (
-        f"The remaining noise: {number(float(np.median(noise.scale)))} nT per sample, {tails}; {correlation}."
-        f" The calibration states {number(diagnosis.problem.calibration.noise.sensor)} nT."
-    )
-    if rest is None:
-        return (
-            "<p>No further structure was found: no slow curve, no steps, no function of attitude. "
-            f"{model}</p>"
-        )
-    goes = f"; it follows <code>{escape(rest.best_channel)}</code> best" if rest.best_channel else ""
-    period = f" of period {rest.period_s:.4g} s" if rest.period_s else ""
-    return (
-        f"<p><b>{KINDS[rest.kind]}</b>{period} is left, of signal-to-noise "
-        f"{rest.signal_to_noise:.1f}{goes}. {nameless(rest, causes)} {model}</p>"
-    )
-
-
-def _isolability(diagnosis: Diagnosis) -> list[str]:
-    report = diagnosis.isolability
-    heads = ("cause", "S/N found in 50 %", "in 95 %", "smallest size found in 95 %")
-    rows = (
-        f"<tr><td>{escape(label(v.cause, v.channel))}</td>"
-        f'<td class="n">{v.half:.1f}</td><td class="n">{v.sure:.1f}</td>'
-        f"<td>{sizes(v.sizes)}</td></tr>"
-        for v in report.visible
-    )
-    pairs = (
-        f"<tr><td>{escape(label(a.cause, a.channel))}</td><td>{escape(label(b.cause, b.channel))}</td>"
-        f'<td class="n">{100 * rho:.0f} %</td></tr>'
-        for a, b, rho in report.pairs[:20]
-    )
-    missing = "; ".join(
-        f"{name.replace('_', ' ')}: {escape(needs)}" for name, needs in report.untestable.items()
-    )
-    return [
-        (
-            '<p class="faint">Computed from telemetry, attitude and noise alone: how large each effect must '
-            "be to be found in 95 of 100 deployments like this one, and which causes look alike in it. "
-            "Signal-to-noise (S/N) is the size of an effect over the whole log, in units of the noise, less "
-            "the part that the calibration can imitate. A cause that the log hardly excites, as a delay "
-            "while no mass moves, does not reach it at any plausible size (at most 50 times the usual "
-            "one).</p>"
-        ),
-        table(heads, rows),
-        "<h3>Causes that look alike</h3>" * bool(report.pairs),
-        table(("one", "another", "correlation"), pairs),
-        f"<p>Not testable in this log, with what it would take: {missing}.</p>" if missing else "",
-        figure(
-            figures.likeness(diagnosis),
-            "Correlation of the signatures of two causes in this log, with the calibration free.",
-        ),
-    ]

@@ -62,7 +62,8 @@ def number(value: float, digits: int = 3) -> str:
     rounded = float(f"{value:.{digits}g}")
     if not rounded or not isfinite(rounded):
         return f"{rounded:g}"
-    return f"{rounded:.{max(digits - 1 - floor(log10(abs(rounded))), 0)}f}"
+    places = max(digits - 1 - floor(log10(abs(rounded))), 0)
+    return f"{rounded:.{places}f}".replace("-", "\N{MINUS SIGN}")
 
 
 def measured(value: float, sigma: float | None) -> str:
@@ -114,11 +115,11 @@ def sizes(smallest: Mapping[str, tuple[float, str]]) -> str:
     return ", ".join(texts) or "no plausible size reaches it"
 
 
-def figure(png: str | None, caption: str) -> str:
-    """Return a picture (base64 of a PNG) above its caption; nothing if there is none."""
+def figure(png: str | None, title: str, caption: str = "") -> str:
+    """Return a picture (base64 of a PNG) below its title and caption, as HTML; nothing if there is none."""
     if png is None:
         return ""
     return (
-        f'<figure><img alt="{escape(caption)}" src="data:image/png;base64,{png}">'
-        f"<figcaption>{caption}</figcaption></figure>"
+        f"<figure><figcaption><b>{title}</b> {caption}</figcaption>"
+        f'<div><img alt="{escape(title)}" src="data:image/png;base64,{png}"></div></figure>'
     )

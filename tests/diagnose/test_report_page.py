@@ -1,0 +1,182 @@
+"""The page as a whole: what its first screen decides, what it says is not known, and its figures."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from posed import candidate
+from study import deployment
+
+from magbridge.diagnose.causes import CAUSES
+from magbridge.diagnose.diagnosis import Diagnosis, Finding
+from magbridge.diagnose.gain import Gain
+from magbridge.diagnose.inference.rivals import Rival
+from magbridge.diagnose.report.canvas import ends, rolling
+from magbridge.diagnose.report.decision import OWN, Decision, decide
+from magbridge.diagnose.report.glossary import MEANINGS, TRIALS, legend
+from magbridge.diagnose.report.limits import unknown, visible
+from magbridge.diagnose.report.page import report_html
+from magbridge.diagnose.report.remaining import remaining
+from magbridge.diagnose.run import diagnose
+from magbridge.diagnose.unexplained.leftover import Leftover
+
+
+@pytest.fixture(scope="module")
+def clear() -> Iterator[Diagnosis]:
+    """A current's field that is named alone, in two hours where the study has six."""
+    hours, deployment.HOURS = deployment.HOURS, 2.0
+    deployment.vehicle.cache_clear()
+    here = deployment.Background.of(deployment.vehicle(0), 24, "white")
+    yield diagnose([here.log(here.hide("current_field", 60.0, 24).ds)], here.deployment.calibration)
+    deployment.HOURS = hours
+    deployment.vehicle.cache_clear()
+
+
+def answer(diagnosis: Diagnosis) -> Decision:
+    return decide(diagnosis, CAUSES)
+
+
+def with_(diagnosis: Diagnosis, **more: object) -> Diagnosis:
+    """The same diagnosis, with its one finding changed."""
+    return replace(diagnosis, findings=(replace(diagnosis.findings[0], **more),))  # type: ignore[arg-type]
+
+
+def test_nothing_speaks_against_a_clear_case(clear: Diagnosis) -> None:
+    """But that what was left out is of the same log is said even then."""
+    found = answer(clear)
+    assert (found.answer, found.mark) == ("Nothing in this log speaks against it.", "good")
+    assert "corrects for what belongs to the vehicle" in found.reasons[0]
+    assert "parts of the same log" in found.reasons[-1]
+    assert len(found.reasons) == 2
+
+
+def test_without_a_gain_it_does_not_fly(clear: Diagnosis) -> None:
+    found = answer(replace(clear, total=Gain(1.0, 1.0, 1.0, (0.9, 1.1))))
+    assert (found.answer, found.mark) == ("Not on the evidence of this log.", "bad")
+    assert "do not fly it" in found.reasons[0]
+
+
+def test_another_possible_cause_is_a_doubt_that_a_manoeuvre_settles(clear: Diagnosis) -> None:
+    """Another channel of the same cause is none: the name holds."""
+    other = Rival(candidate("offset_drift", np.ones(1)), 1.0)
+    twin = Rival(candidate("current_field", np.ones(1), channel="amps_c"), 1.0)
+    found = answer(with_(clear, rivals=(other,)))
+    assert (found.answer, found.mark) == ("Only once these doubts are settled.", "doubt")
+    assert CAUSES["current_field"].separated_by in found.reasons[1]
+    assert answer(with_(clear, rivals=(twin,))).mark == "good"
+
+
+def test_causes_that_cancel_are_a_doubt(clear: Diagnosis) -> None:
+    first = clear.findings[0]
+    against = replace(first, coefficients=-0.9 * first.coefficients)
+    found = answer(replace(clear, findings=(first, against)))
+    assert found.mark == "doubt"
+    assert sum("largely cancel each other" in reason for reason in found.reasons) == 1
+    assert answer(replace(clear, findings=(first, first))).mark == "good"
+
+
+def test_each_other_doubt_is_told(clear: Diagnosis) -> None:
+    idle, large = Gain(1.0, 1.0, 1.0, (0.9, 1.1)), 10.0 * np.ones(3)
+    survey = clear.problem.survey
+    own = replace(clear.problem, survey=replace(survey, fitted=np.ones(len(survey), bool)))
+    rest = Leftover("tone", 9.0, 1e-9, 12.0, 33.0, None)
+    doubtful = {
+        "No gain of its own": with_(clear, gain=idle),
+        "10 times the usual size": with_(clear, coefficients=large),
+        OWN: replace(clear, problem=own),
+        "S/N 9.0 is left that has no name": replace(clear, unexplained=rest),
+    }
+    for text, diagnosis in doubtful.items():
+        found = answer(diagnosis)
+        assert found.mark == "doubt"
+        assert any(text in reason for reason in found.reasons), text
+
+
+def test_where_nothing_was_added_there_is_nothing_to_fly(clear: Diagnosis) -> None:
+    plain = replace(clear, findings=(), verdict="nothing_found")
+    assert answer(plain).reasons == ()
+    assert "it holds" in answer(plain).answer
+    rest = Leftover("tone", 9.0, 1e-9, 12.0, 33.0, None)
+    assert "expect errors like the" in answer(replace(plain, unexplained=rest)).answer
+
+
+def test_what_stays_in_the_field_is_reckoned_with(clear: Diagnosis) -> None:
+    """The RMS of the verdict has removed an error of the reference, which the calibration cannot."""
+    sun = replace(clear.findings[0].candidate, cause="diurnal_variation", channel=None, effects=())
+    named = replace(clear.findings[0].hypothesis, candidate=sun)
+    both: tuple[Finding, ...] = (clear.findings[0], replace(clear.findings[0], hypothesis=named))
+    found = answer(replace(clear, findings=both))
+    (said,) = [reason for reason in found.reasons if reason.startswith("By itself it takes")]
+    before, after = (float(x) for x in re.findall(r"from ([\d.]+) to ([\d.]+) nT RMS", said)[0])
+    assert before == pytest.approx(clear.total.before, rel=0.01)
+    assert after < before
+
+
+def test_every_cause_has_a_meaning() -> None:
+    assert set(MEANINGS) == {*CAUSES, "outliers"}
+
+
+def test_a_legend_explains_the_terms_that_are_there() -> None:
+    assert legend(["x", "lag"]) == (
+        "x, y, z: along the sensor's axes, forward, starboard and down; "
+        "lag: time constant with which the effect follows"
+    )
+    assert legend(["xy"]).startswith("xy: what the field along y")
+    assert "a digit after them" in legend(["x1", "x2"])
+    assert not legend(["bias"])
+
+
+def test_what_is_not_known_is_said_plainly(clear: Diagnosis) -> None:
+    said = "".join(unknown(clear, CAUSES))
+    assert TRIALS in said
+    assert f"the likeliest of {len(CAUSES)} known causes" in said
+    assert "battpos was between \N{MINUS SIGN}" in said
+    assert f"{clear.named[0].channel} was between" in said
+
+
+def test_a_cause_that_cannot_be_seen_has_no_row(clear: Diagnosis) -> None:
+    """Its sizes would all read as infinite."""
+    report = clear.isolability
+    gone = replace(report.visible[0], sizes={"x": (np.inf, "nT")})
+    blind = replace(clear, isolability=replace(report, visible=(gone, *report.visible[1:])))
+    count = [sum("<tr><td>" in part for part in part.split("</tr>")) for part in visible(blind)]
+    assert max(count) == len(report.visible) - 1
+    assert any("Not to be found at any plausible size" in part for part in visible(blind))
+    assert not any("Not to be found at any plausible size" in part for part in visible(clear))
+
+
+def test_predicted_and_remaining_residual_stand_beside_each_other(clear: Diagnosis) -> None:
+    said = "".join(remaining(clear, CAUSES))
+    assert said.count("<tr><td>") == 4
+    assert "times worse than what was fitted" not in said
+    worse = replace(clear, total=clear.total.__class__(5.0, 3.0, 0.6, (0.5, 0.7)))
+    assert "times worse than what was fitted" in "".join(remaining(worse, CAUSES))
+
+
+def test_the_page_is_whole(clear: Diagnosis) -> None:
+    """Every figure has a title, every link a place, and no line ends between a number and its unit."""
+    page = report_html(clear, CAUSES)
+    assert page.count("<figure>") == page.count("<figcaption><b>") == page.count('alt="')
+    assert set(re.findall(r'href="#(\w+)"', page)) <= set(re.findall(r'id="(\w+)"', page))
+    assert page.index('class="box good"') < page.index("<h2")
+    assert not re.search(r"\d (nT|%)", re.sub(r"base64,[^\"]*|<style>.*?</style>", "", page, flags=re.DOTALL))
+
+
+def test_a_running_mean_follows_the_mean_and_stops_at_gaps(clear: Diagnosis) -> None:
+    t = clear.problem.survey.time
+    late = np.where(t > t.mean(), t + 7200.0, t)
+    survey = replace(clear.problem.survey, time=late)
+    gapped = replace(clear, problem=replace(clear.problem, survey=survey))
+    _, mean = rolling(gapped, np.full(len(t), 3.0))
+    assert np.isnan(mean).any()
+    np.testing.assert_allclose(mean[np.isfinite(mean)], 3.0)
+
+
+def test_wild_samples_do_not_set_the_scale() -> None:
+    low, high = ends(np.append(np.linspace(-1.0, 1.0, 1000), 1e6), low=0.0, high=0.0)
+    assert -1.01 < low < -0.98
+    assert 0.98 < high < 1.01
