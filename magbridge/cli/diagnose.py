@@ -44,8 +44,9 @@ def diagnose(
 ) -> None:
     """Find what the calibration model gets wrong, why, and what extending it gains.
 
-    Writes report.html, findings.json and calibration.json. The latter is the extended model, for use by
-    correct, run and replay.
+    Writes report.html, for people: what was found, how sure it is, and whether the extended calibration may
+    fly; findings.json, the same for programs; and calibration.json, the extended calibration, for correct,
+    run and replay.
 
     Parameters
     ----------
@@ -57,9 +58,9 @@ def diagnose(
     output
         The folder to write to.
     learned_from
-        A log that the calibration was fitted to; may be repeated.
+        A log that the calibration was fitted to, to tell what has appeared since; may be repeated.
     grid
-        An anomaly grid to add to the IGRF.
+        An anomaly grid to add to the IGRF, where a log has no reference_field.
     json
         Print the findings as JSON.
     """
@@ -95,22 +96,44 @@ def diagnose(
     if doubt := unsettled(found.problem, found.possible, found.calibration):
         complain(doubt)
     facts = findings(found, CAUSES, remarks)
-    rms = f"{facts['rms_before_nT']:.2f} -> {facts['rms_after_nT']:.2f} nT RMS"
-    rms += ", not held out" if own else " held out"
-    if found.findings and not found.total.shown:
-        rms += ", no gain shown (95 %: {:.2f} to {:.2f} times)".format(*found.total.interval)
-    print_result(facts, f"{facts['verdict']}: {causes_of(facts)}; {rms}; {output / 'report.html'}", json)
+    said = summary(facts, "" if own else found.problem.survey.parts)
+    print_result(facts, f"{said}\nreport: {output / 'report.html'}", json)
 
 
-def causes_of(facts: dict[str, Any]) -> str:
-    """Return one line: the causes found, the alternatives to each, and the effect left unexplained."""
-    causes = [" or ".join(map(_plain, [one, *one["alternatives"]])) for one in facts["findings"]]
-    if facts["verdict"] == "unexplained" and (within := facts["unexplained"]["alternatives"]):
-        causes = [f"no name asserted; not ruled out: {', '.join(map(_plain, within))}"]
-    said = ", ".join(causes) or "no cause"
+def summary(facts: dict[str, Any], parts: str) -> str:
+    """Return the findings in lines: the verdict with its RMS, then each cause with its alternatives.
+
+    Parameters
+    ----------
+    facts : dict
+        What ``findings.json`` holds.
+    parts : str
+        What was left out of the fit in turn, to measure the RMS after; empty where nothing was.
+    """
+    from magbridge.diagnose.report.words import number
+
+    before, after = (number(facts[f"rms_{when}_nT"]) for when in ("before", "after"))
+    low, high = facts["gain"]["interval"]
+    if any(one["cause"] != "outliers" for one in facts["findings"]):
+        rms = f"{before} -> {after} nT RMS, "
+        rms += f"on {parts} left out of the fit" if parts else "not held out"
+        rms += f" ({low:.2f} to {high:.2f} times, 95 %)" + ": no gain is shown" * (high >= 1.0)
+    else:
+        rms = f"{before} nT RMS" + ", not held out" * (not parts) + "; nothing is added to the calibration"
+    return "\n  ".join([f"{facts['verdict']}: {rms}", *causes_of(facts)])
+
+
+def causes_of(facts: dict[str, Any]) -> list[str]:
+    """Return a line for each cause found, with the alternatives to it, and for what is left unexplained."""
+    causes = []
+    for one in facts["findings"]:
+        others = " or ".join(map(_plain, one["alternatives"]))
+        causes.append(f"{_plain(one)}, S/N {one['signal_to_noise']:.1f}" + f"; or {others}" * bool(others))
     if rest := facts["unexplained"]:
-        said += f"; left without a name: {rest['kind']}, S/N {rest['signal_to_noise']:.3g}"
-    return said
+        said = f"left without a name: {rest['kind']}, S/N {rest['signal_to_noise']:.1f}"
+        within = ", ".join(map(_plain, rest["alternatives"]))
+        causes.append(said + f"; not ruled out: {within}" * bool(within))
+    return causes or ["no cause"]
 
 
 def _plain(one: dict[str, Any]) -> str:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from posed import candidate, right
 
-from magbridge.cli.diagnose import causes_of
+from magbridge.cli.diagnose import causes_of, summary
 from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.compare.prior import isotropic
 from magbridge.diagnose.compare.problem import Problem
@@ -83,16 +83,33 @@ def test_a_chance_is_written_to_one_digit(p_value: float, text: str) -> None:
     assert chance(p_value) == text
 
 
-def test_the_command_s_line_names_every_cause_that_may_be_it() -> None:
-    clock = {"cause": "clock_offset", "channel": None}
+def test_the_command_names_every_cause_that_may_be_it_on_a_line_of_its_own() -> None:
+    clock = {"cause": "clock_offset", "channel": None, "signal_to_noise": 9.04}
     current = {"cause": "current_field", "channel": "pitch_current"}
     rest = {"kind": "drift", "signal_to_noise": 7.04, "alternatives": [clock, current]}
     found = {"verdict": "explained", "findings": [clock | {"alternatives": [current]}], "unexplained": None}
-    assert causes_of(found) == "clock_offset or current_field (pitch_current)"
+    assert causes_of(found) == ["clock_offset, S/N 9.0; or current_field (pitch_current)"]
     nameless = {"verdict": "unexplained", "findings": [], "unexplained": rest}
-    words = "no name asserted; not ruled out: clock_offset, current_field (pitch_current)"
-    assert causes_of(nameless) == f"{words}; left without a name: drift, S/N 7.04"
-    assert causes_of(nameless | {"unexplained": None, "verdict": "nothing_found"}) == "no cause"
+    words = "not ruled out: clock_offset, current_field (pitch_current)"
+    assert causes_of(nameless) == [f"left without a name: drift, S/N 7.0; {words}"]
+    assert causes_of(nameless | {"unexplained": None, "verdict": "nothing_found"}) == ["no cause"]
+
+
+def test_the_command_says_what_the_gain_was_measured_on() -> None:
+    """And tells no gain where nothing was added: 1.14 -> 1.14 nT would read as one that failed."""
+    one = {"cause": "clock_offset", "channel": None, "signal_to_noise": 9.04, "alternatives": []}
+    facts = {"verdict": "explained", "findings": [one], "unexplained": None, "rms_before_nT": 117.42}
+    facts |= {"rms_after_nT": 74.42, "gain": {"interval": [0.486, 0.84]}}
+    first, second = summary(facts, "dives").splitlines()
+    assert first == "explained: 117 -> 74.4 nT RMS, on dives left out of the fit (0.49 to 0.84 times, 95 %)"
+    assert second == "  clock_offset, S/N 9.0"
+    assert "nT RMS, not held out (0.49" in summary(facts, "")
+    assert "95 %): no gain is shown" in summary(facts | {"gain": {"interval": [0.9, 1.02]}}, "dives")
+    plain = facts | {"verdict": "nothing_found", "findings": []}
+    assert summary(plain, "dives").startswith(
+        "nothing_found: 117 nT RMS; nothing is added to the calibration"
+    )
+    assert "117 nT RMS, not held out;" in summary(plain, "")
 
 
 def test_sizes_of_one_unit_name_it_once() -> None:
