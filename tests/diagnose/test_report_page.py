@@ -157,6 +157,15 @@ def test_predicted_and_remaining_residual_stand_beside_each_other(clear: Diagnos
     assert "times worse than what was fitted" in "".join(remaining(worse, CAUSES))
 
 
+def test_what_has_no_name_is_described_on_the_first_screen(clear: Diagnosis) -> None:
+    rest = Leftover("tone", 9.0, 1e-9, 12.0, 33.0, "amps<b>")
+    page = report_html(replace(clear, findings=(), unexplained=rest, verdict="unexplained"), CAUSES)
+    first, below = page.split("<h2", 1)
+    assert "<b>A tone</b> of period 33 s is left (signal-to-noise ratio 9.0; it follows" in first
+    assert "amps&lt;b&gt;" in first
+    assert "None is named: a description without a name explains it better." in below
+
+
 def test_the_page_is_whole(clear: Diagnosis) -> None:
     """Every figure has a title, every link a place, and no line ends between a number and its unit."""
     page = report_html(clear, CAUSES)

@@ -72,7 +72,7 @@ def measured(diagnosis: Diagnosis) -> str:
     )
     for axis in axes[:, 0]:  # above the axes, where it covers nothing
         axis.legend(
-            fontsize=SMALL, frameon=False, loc="lower right", bbox_to_anchor=(1.0, 0.98), markerscale=5,
+            fontsize=SMALL, frameon=False, loc="lower left", bbox_to_anchor=(0.0, 0.98), markerscale=5,
             ncols=3, borderaxespad=0.0,
         )  # fmt: skip
     return png(figure)
@@ -99,7 +99,7 @@ def spectrum(diagnosis: Diagnosis) -> str:
     axis.set_xlabel("frequency (Hz)")
     axis.set_ylabel("amplitude density (nT/√Hz)")
     _periods(axis)
-    figure.legend(fontsize=SMALL, frameon=False, loc="outside upper right", ncols=3)
+    figure.legend(fontsize=SMALL, frameon=False, loc="outside upper left", ncols=3)
     return png(figure)
 
 
@@ -157,7 +157,7 @@ def channels(diagnosis: Diagnosis) -> str:
         low, high = np.nanquantile(seen, [0.02, 0.98])
         axes[0, 0].set_ylim(low - 0.1 * (high - low), high + 0.1 * (high - low))
         handles = axes[0, 0].get_legend_handles_labels()
-        figure.legend(*handles, fontsize=SMALL, frameon=False, loc="outside upper right", ncols=2)
+        figure.legend(*handles, fontsize=SMALL, frameon=False, loc="outside upper left", ncols=2)
     return png(figure)
 
 

@@ -44,7 +44,7 @@ def terms(diagnosis: Diagnosis) -> str | None:
         axis.set_title(label(*finding.candidate.group), fontsize=SMALL + 1.0, loc="left")
     axes[-1, 0].set_xlabel(f"{clock(diagnosis)[1]} since the start")
     handles = axes[0, 0].get_legend_handles_labels()
-    figure.legend(*handles, fontsize=SMALL, frameon=False, loc="outside upper right", ncols=3, markerscale=5)
+    figure.legend(*handles, fontsize=SMALL, frameon=False, loc="outside upper left", ncols=3, markerscale=5)
     return png(figure)
 
 

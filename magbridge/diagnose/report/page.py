@@ -16,7 +16,7 @@ from magbridge.diagnose.report.decision import decision
 from magbridge.diagnose.report.doubts import gained, late
 from magbridge.diagnose.report.found import found, overview
 from magbridge.diagnose.report.limits import unknown, visible
-from magbridge.diagnose.report.remaining import remaining
+from magbridge.diagnose.report.remaining import described, remaining
 from magbridge.diagnose.report.words import bold, figure, listed, number
 
 __all__ = ["report_html"]
@@ -91,7 +91,7 @@ def _verdict(diagnosis: Diagnosis, causes: Mapping[str, Cause], remarks: Sequenc
 def _compared(diagnosis: Diagnosis) -> list[str]:
     """Show the difference between measured and simulated field in five figures."""
     parts = diagnosis.problem.survey.parts
-    mended = bool(diagnosis.findings)
+    mended, nameless = bool(diagnosis.findings), diagnosis.verdict == "unexplained"
     after = (
         f"“After, held out” is the extended calibration on {parts} that its fit had not seen."
         if mended
@@ -126,8 +126,8 @@ def _compared(diagnosis: Diagnosis) -> list[str]:
             "By cause: what would explain it best, alone?",
             "Each cause tried by itself, with calibration and noise fitted anew. At the bar: the chance that "
             "noise alone looks so; below 0.01 it counts as detected."
-            + " Blue: named in the end. A grey one explains the same, less well or less plausibly."
-            * mended,
+            + " Blue: named in the end. A grey one explains the same, less well or less plausibly." * mended
+            + " None is named: a description without a name explains it better." * nameless,
         ),
         "</div>",
         figure(
@@ -162,6 +162,7 @@ def _sentence(diagnosis: Diagnosis) -> str:
         if withheld
         else "none of the known causes explains it"
     )
+    seen = f" {described(rest)}." if rest else ""
     return {
         "nothing_found": f"Nothing was found: {number(total.before)} nT RMS is consistent with noise "
         f"({number(float(np.std(diagnosis.fit.left)))} nT) and the calibration's stated uncertainty.",
@@ -170,7 +171,7 @@ def _sentence(diagnosis: Diagnosis) -> str:
         "known cause explains."
         if rest
         else f"{names} {nothing_else}",
-        "unexplained": f"The difference of {number(total.before)} nT RMS is more than noise, but {name}.",
+        "unexplained": f"The difference of {number(total.before)} nT RMS is more than noise, but {name}.{seen}",
     }[diagnosis.verdict]
 
 

@@ -12,8 +12,9 @@ from magbridge.diagnose.causes import Cause
 from magbridge.diagnose.diagnosis import Diagnosis
 from magbridge.diagnose.report.doubts import nameless
 from magbridge.diagnose.report.words import number, table
+from magbridge.diagnose.unexplained.leftover import Leftover
 
-__all__ = ["remaining"]
+__all__ = ["described", "remaining"]
 
 KINDS = {
     "switching": "Something that switches or comes and goes",
@@ -36,12 +37,15 @@ def _left(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> str:
     rest = diagnosis.unexplained
     if rest is None:
         return "<p>No further structure was found: no slow curve, no steps, no function of attitude.</p>"
+    return f"<p>{described(rest)}. {nameless(rest, causes)}</p>"
+
+
+def described(rest: Leftover) -> str:
+    """Return what is left as a sentence without its full stop, as HTML."""
     goes = f"; it follows <code>{escape(rest.best_channel)}</code> best" if rest.best_channel else ""
     period = f" of period {rest.period_s:.4g} s" if rest.period_s else ""
-    return (
-        f"<p><b>{KINDS[rest.kind]}</b>{period} is left, of signal-to-noise {rest.signal_to_noise:.1f}{goes}. "
-        f"{nameless(rest, causes)}</p>"
-    )
+    size = f"signal-to-noise ratio {rest.signal_to_noise:.1f}"
+    return f"<b>{KINDS[rest.kind]}</b>{period} is left ({size}{goes})"
 
 
 def _budget(diagnosis: Diagnosis) -> list[str]:
