@@ -171,7 +171,8 @@ def _sentence(diagnosis: Diagnosis) -> str:
         "known cause explains."
         if rest
         else f"{names} {nothing_else}",
-        "unexplained": f"The difference of {number(total.before)} nT RMS is more than noise, but {name}.{seen}",
+        "unexplained": f"The difference of {number(total.before)} nT RMS is more than noise, but {name}."
+        f"{seen}",
     }[diagnosis.verdict]
 
 
