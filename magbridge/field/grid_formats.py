@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import warnings
 from collections.abc import Callable
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,8 @@ from magbridge.field.grid_netcdf import ANOMALY, LATITUDE, LONGITUDE, Parts, net
 
 __all__ = ["ascii_grid", "folder", "geotiff", "grd", "table"]
 
+BAD_TIFF = (OSError, KeyError, AttributeError, TypeError, ValueError)
+"""What Pillow, or a tag that is not as it should be, raises."""
 NETCDF = (b"CDF\x01", b"CDF\x02", b"\x89HDF")
 
 
@@ -121,13 +124,13 @@ def table(path: Path) -> Parts:
     FormatError
         No such columns, or nodes that form no grid.
     """
-    with path.open(errors="replace") as file:
+    with path.open(encoding="utf-8-sig", errors="replace") as file:
         first = file.readline()
     delimiter = next((mark for mark in ",;" if mark in first), None)
     words = [word.strip() for word in first.strip().lstrip("#").lower().split(delimiter)]
     header = not all(re.fullmatch(r"[-+.\deinfa]+", word) for word in words)
     columns: tuple[int, ...] = (0, 1, 2)
-    unit = None
+    unit = ""
     if header:
         bare = [re.sub(r"[\[(_].*", "", word).strip() for word in words]
         found = [
@@ -138,7 +141,7 @@ def table(path: Path) -> Parts:
             raise FormatError(path, "expected the columns longitude, latitude, anomaly", row=1)
         columns = tuple(i for i in found if i is not None)
         stated = re.search(r"[\[(]([^\])]+)", words[columns[2]])
-        unit = stated.group(1) if stated else None
+        unit = stated.group(1) if stated else ""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # of a file without rows, which is seen below
@@ -181,34 +184,40 @@ def folder(path: Path) -> Parts:
         One of the files is missing or is no table of numbers.
     """
     try:
-        x, y, altitude, values = (
-            np.loadtxt(path / f"{name}.csv", delimiter=",", ndmin=2) for name in ("xx", "yy", "alt", "map")
-        )
-    except (OSError, ValueError) as error:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", UserWarning)  # of a file without numbers
+            x, y, altitude, values = (
+                np.loadtxt(path / f"{name}.csv", delimiter=",", ndmin=2)
+                for name in ("xx", "yy", "alt", "map")
+            )
+    except (OSError, ValueError, UserWarning) as error:
         raise FormatError(path, f"expected xx.csv yy.csv alt.csv map.csv: {error}") from error
     return x.ravel(), y.ravel(), values, {"altitude": float(altitude.flat[0])}
 
 
 def geotiff(path: Path) -> Parts:
     """Read one band with a pixel scale and a tie point in geographic coordinates; FormatError: any other."""
-    from PIL import Image, UnidentifiedImageError  # noqa: PLC0415  comes with matplotlib
+    from PIL import Image  # noqa: PLC0415  comes with matplotlib
 
+    raw = BytesIO(path.read_bytes())  # what the system refuses is its own error, not the format's
     try:
-        with Image.open(path, formats=["TIFF"]) as image:
-            values = np.array(image, float)
-            tags: dict[int, Any] = dict(image.tag_v2)  # type: ignore[attr-defined]  # only TIFF images have it
-            dx, dy = tags[33550][:2]
-            column, row, _, x0, y0 = tags[33922][:5]
-    except (UnidentifiedImageError, KeyError, AttributeError, ValueError) as error:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of damaged tags, and of a large image
+            with Image.open(raw, formats=["TIFF"]) as image:
+                values = np.array(image, float)
+                tags: dict[int, Any] = dict(image.tag_v2)  # type: ignore[attr-defined]  # only TIFF images have it
+        dx, dy = tags[33550][:2]
+        column, row, _, x0, y0 = tags[33922][:5]
+        keys = np.array(tags.get(34735, ()), int).reshape(-1, 4)
+        hole = float(str(tags.get(42113, "nan")).strip("\x00 "))
+    except (*BAD_TIFF, Image.DecompressionBombError) as error:  # its size is damaged: no survey is so large
         raise FormatError(path, "expected a GeoTIFF with a pixel scale and a tie point") from error
-    keys = np.array(tags.get(34735, ()), int).reshape(-1, 4)
     settings = {int(key): int(value) for key, _, _, value in keys}
     if settings.get(1024) == 1:
         raise FormatError(path, "projected coordinates: reproject the grid to longitude and latitude")
     if values.ndim != 2:
         raise FormatError(path, f"expected one band, found an image of shape {values.shape}")
-    if 42113 in tags:
-        values[values == float(str(tags[42113]).strip("\x00 "))] = np.nan
+    values[values == hole] = np.nan
     half = 0.0 if settings.get(1025) == 2 else 0.5  # the tie point is a node, or a pixel's corner
     x = x0 + (np.arange(values.shape[1]) + half - column) * dx
     y = y0 - (np.arange(values.shape[0]) + half - row) * dy

@@ -49,12 +49,15 @@ def netcdf(path: Path) -> Parts:
     x, y = (
         _coordinate(path, grid, names, kind) for names, kind in ((LONGITUDE, "east"), (LATITUDE, "north"))
     )
-    options: dict[str, Any] = {"unit": grid.attrs.get("units")}
+    options: dict[str, Any] = {"unit": str(grid.attrs.get("units", ""))}
     if sigmas:
         options["sigma"] = flat[sigmas[0]].transpose(y, x).to_numpy()
-    for where in (grid.attrs, data.attrs):
-        if "altitude" in where:
-            options.setdefault("altitude", float(where["altitude"]))
+    altitude = grid.attrs.get("altitude", data.attrs.get("altitude"))
+    if altitude is not None:
+        try:
+            options["altitude"] = float(altitude)
+        except (TypeError, ValueError):
+            raise FormatError(path, f"expected the altitude as a number of m, found {altitude!r}") from None
     return grid[x].to_numpy(), grid[y].to_numpy(), grid.transpose(y, x).to_numpy().astype(float), options
 
 
@@ -111,4 +114,4 @@ def _old_gmt(data: Any) -> Parts:
         step = (high - low) / (n - 1 + 2 * half)
         axes.append(low + (np.arange(n) + half) * step)
     values = data["z"].to_numpy().reshape(ny, nx)[::-1].astype(float)
-    return axes[0], axes[1], values, {"unit": data["z"].attrs.get("units")}
+    return axes[0], axes[1], values, {"unit": str(data["z"].attrs.get("units", ""))}

@@ -62,7 +62,7 @@ def read_grid(path: str | Path) -> AnomalyGrid:
     if reader is None:
         raise FormatError(path, f"expected a grid: one of {' '.join(READERS)} or a folder")
     longitude, latitude, values, options = reader(path)
-    scale = _scale(path, options.pop("unit", None))
+    scale = _scale(path, options.pop("unit", ""))
     if "sigma" in options:
         options["sigma"] = options["sigma"] * scale
     return AnomalyGrid(longitude, latitude, values * scale, name=str(path), **options)
@@ -101,8 +101,8 @@ def read_polygon(path: str | Path) -> RealArray:
     return np.array(corners)
 
 
-def _scale(path: Path, unit: str | None) -> float:
-    if unit is None or not unit.strip():
+def _scale(path: Path, unit: str) -> float:
+    if not unit.strip():
         return 1.0
     try:
         return NANOTESLA[usual(unit.strip().lower()).lower()]

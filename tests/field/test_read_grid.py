@@ -20,6 +20,8 @@ from magbridge.field.grid import AnomalyGrid
 from magbridge.field.read import read_grid, read_polygon
 
 LON, LAT = np.linspace(10.0, 10.5, 11), np.linspace(54.0, 54.4, 9)
+GEOTIFF_TAGS = (33550, 12), (33922, 12), (34735, 3), (42113, 2)
+"""Of pixel scale, tie point, keys and the number of a hole, each with its TIFF type."""
 MAP = 30 * np.sin(np.meshgrid(LON, LAT)[0] * 9) + 100 * (np.meshgrid(LON, LAT)[1] - 54)
 
 
@@ -63,22 +65,42 @@ def table(
     path.write_text(header + lines(rows, delimiter))
 
 
-def geotiff(path: Path) -> None:
+def geotiff(path: Path, **others: object) -> None:
     tags = ImageFileDirectory_v2()
-    tags[33550] = (0.05, 0.05, 0.0)
-    tags[33922] = (0.0, 0.0, 0.0, LON[0] - 0.025, LAT[-1] + 0.025, 0.0)
-    tags[34735] = (1, 1, 0, 2, 1024, 0, 1, 2, 1025, 0, 1, 1)
-    for tag, kind in ((33550, 12), (33922, 12), (34735, 3)):
-        tags.tagtype[tag] = kind
+    wanted = {
+        "scale": (0.05, 0.05, 0.0),
+        "tie_point": (0.0, 0.0, 0.0, LON[0] - 0.025, LAT[-1] + 0.025, 0.0),
+        "keys": (1, 1, 0, 2, 1024, 0, 1, 2, 1025, 0, 1, 1),
+        "hole": "-9999",
+    } | others
+    for (tag, kind), value in zip(GEOTIFF_TAGS, wanted.values(), strict=True):
+        tags[tag], tags.tagtype[tag] = value, kind
     Image.fromarray(MAP[::-1].astype(np.float32)).save(path, tiffinfo=tags)
 
 
+def vast(path: Path) -> None:
+    """Write a GeoTIFF in which one byte of the width is damaged."""
+    geotiff(path)
+    width = struct.pack("<HHII", 256, 4, 1, LON.size)
+    path.write_bytes(path.read_bytes().replace(width, width[:-1] + b"\x70"))
+
+
+def cut(path: Path, write: Callable[[Path], None], size: int) -> None:
+    write(path)
+    os.truncate(path, size)
+
+
 def cf(
-    path: Path, unit: str = "nT", scale: float = 1.0, names: tuple[str, str] = ("lat", "lon"), **attrs: str
+    path: Path,
+    unit: str = "nT",
+    scale: float = 1.0,
+    names: tuple[str, str] = ("lat", "lon"),
+    altitude: str | float = 305.0,
+    **of_longitude: str,
 ) -> None:
     grid = xr.DataArray(MAP * scale, {names[0]: LAT, names[1]: LON}, names, attrs={"units": unit})
-    grid[names[1]].attrs = attrs
-    xr.Dataset({"tfa": grid, "survey_flag": ((), 1)}).to_netcdf(path)
+    grid[names[1]].attrs = of_longitude
+    xr.Dataset({"tfa": grid, "survey_flag": ((), 1)}, attrs={"altitude": altitude}).to_netcdf(path)
 
 
 def gmt(path: Path) -> None:
@@ -97,9 +119,9 @@ def old_gmt(path: Path) -> None:
     ).to_netcdf(path, format="NETCDF3_CLASSIC")
 
 
-def folder(path: Path) -> None:
+def folder(path: Path, altitude: tuple[float, ...] = (305.0,)) -> None:
     path.mkdir()
-    for name, values in (("xx", LON[None]), ("yy", LAT[None]), ("alt", [[305.0]]), ("map", MAP)):
+    for name, values in (("xx", LON[None]), ("yy", LAT[None]), ("alt", altitude), ("map", MAP)):
         np.savetxt(path / f"{name}.csv", values, delimiter=",")
 
 
@@ -118,6 +140,7 @@ def folder(path: Path) -> None:
         ("a.xyz", lambda path: table(path, "", " ")),
         ("b.csv", lambda path: table(path, "lon;lat;mag [nT]\n", ";")),
         ("c.csv", lambda path: table(path, "lon,lat,mag (uT)\n", scale=1e-3)),
+        ("d.csv", lambda path: table(path, "\ufefflongitude,latitude,anomaly\n")),  # as Excel writes it
         ("b.nc", lambda path: cf(path, "T", 1e-9)),
         ("a.tif", geotiff),
         ("magnav", folder),
@@ -172,6 +195,7 @@ def scattered(path: Path) -> None:
         ("a.nc", lambda p: cf(p, "mGal"), "expected a magnetic field in nT, found the unit 'mGal'"),
         ("a.nc", lambda p: cf(p, names=("northing", "easting")), "column 'northing': projected coordinates"),
         ("a.nc", lambda p: cf(p, names=("y", "x"), units="m"), "column 'x': projected coordinates"),
+        ("a.nc", lambda p: cf(p, altitude="300 m"), "expected the altitude as a number of m, found '300 m'"),
         ("a.grd", lambda p: p.write_bytes(b"DSBB" + bytes(20)), "expected a Surfer grid"),
         ("a.grd", lambda p: p.write_text("DSAA 4 4 0 1 0 1 0 1 7 7 7"), "expected a Surfer grid"),
         ("a.grd", lambda p: p.write_bytes(bytes(600)), "Geosoft"),
@@ -180,10 +204,17 @@ def scattered(path: Path) -> None:
         ("a.asc", lambda p: p.write_text("ncols inf\nnrows 2\n1 2 3"), "expected an ESRI ASCII grid"),
         ("a.tif", lambda p: p.write_bytes(b"II*\0"), "expected a GeoTIFF"),
         ("a.tif", lambda p: p.write_bytes(b"BM" + bytes(60)), "expected a GeoTIFF"),
+        ("a.tif", lambda p: cut(p, geotiff, 100), "expected a GeoTIFF"),
+        ("a.tif", lambda p: cut(p, geotiff, 300), "expected a GeoTIFF"),
+        ("a.tif", vast, "expected a GeoTIFF"),
+        ("a.tif", lambda p: geotiff(p, scale=0.05), "expected a GeoTIFF"),
+        ("a.tif", lambda p: geotiff(p, keys=(1, 1, 0, 1, 1024)), "expected a GeoTIFF"),
+        ("a.tif", lambda p: geotiff(p, hole="none"), "expected a GeoTIFF"),
         ("a.csv", lambda p: p.write_text("lon,lat,depth\n1,2,3\n"), "row 1: expected the columns"),
         ("a.csv", lambda p: p.write_text("lon,lat,mag\n1,2,x\n"), "row 2, column '3': expected numbers"),
         ("a.xyz", scattered, "50 scattered points"),
         ("dir", lambda p: p.mkdir(), "expected xx.csv"),
+        ("dir", lambda p: folder(p, altitude=()), "expected xx.csv"),
     ],
 )
 def test_one_clear_line(
