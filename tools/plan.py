@@ -50,7 +50,7 @@ def chosen(scenario: Scenario, noise: float) -> tuple[Plan, Plan]:
         PlannedRun(pitch, BANK, (battery, float(np.copysign(200.0, pitch))))
         for _, pitch, battery, _ in TABLE_1
     ]
-    limits = Limits(roll=(-BANK, BANK), pitch_at=trim_of(runs), flown=settled(runs))
+    limits = Limits(roll=(-BANK, BANK), pitch_at=trim_of(runs), flown=settled(runs, runs.ranges()))
     return evaluate_runs(before, mission, ned, table), plan(before, mission, ned, limits, runs=len(table))
 
 

@@ -37,7 +37,7 @@ def test_planned_runs_beat_table_1(glider: Gliders) -> None:
         [PlannedRun(pitch, 6.0, (battery, float(np.copysign(200.0, pitch))))
          for _, pitch, battery, _ in TABLE_1],
     )  # fmt: skip
-    limits = Limits(roll=(-6.0, 6.0), pitch_at=trim_of(one.runs), flown=settled(one.runs))
+    limits = Limits(roll=(-6.0, 6.0), pitch_at=trim_of(one.runs), flown=settled(one.runs, parameters))
     ours = plan(before, mission, ned, limits, runs=6)
     assert len(ours.runs) == 6
     assert ours.worst[-1] < 0.5 * paper.worst[-1]

@@ -195,6 +195,19 @@ def test_plan(names: tuple[str, ...], deployment: Path, command: Command) -> Non
     assert [line.split()[0] for line in lines] == ["run", "none", "1", "2", "each"]
 
 
+def test_plan_for_a_mission_that_moves_one_of_two_masses(deployment: Path, command: Command) -> None:
+    log = read(deployment)
+    known = expected_calibration(observations(log, ("battpos", "ballast")).ranges(), 52_000.0, order=1)
+    save_calibration(known, "cal.json")
+    asked = "plan", "--calibration", "cal.json", "--runs", "2", "--mission"
+    write(log.assign(ballast=log["ballast"] * 0.0 + 200.0), "mission.nc")
+    runs = json.loads(command(*asked, "mission.nc", "--json").out)["runs"]
+    # no further from where it is than a run may be
+    assert all(run["ballast"] >= 200.0 - 0.35 * known.parameters[1].scale for run in runs)
+    write(log.assign(pitch=log["pitch"] * np.nan), "flat.nc")
+    assert command.refuses(*asked, "flat.nc") == "the mission has no sample with both attitude and position"
+
+
 def test_help_names_every_command(command: Command) -> None:
     text = command("--help").out
     commands = "calibrate convert correct demo diagnose map monitor navigate plan replay run simulate"

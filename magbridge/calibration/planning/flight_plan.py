@@ -47,7 +47,7 @@ def flight_plan(calibration: Calibration, mission: xr.Dataset, *, runs: int = 10
     data = observations(mission.assign({f"mag_{axis}": some for axis in "xyz"}), names)
     if data.reference_ned is None:
         raise CalibrationError("the mission needs latitude and longitude, to know the Earth's field there")
-    flown = settled(data) if names else None
+    flown = settled(data, calibration.parameters) if names else None
     limits = Limits(roll=(-roll, roll), pitch_at=trim_of(data), flown=flown)
     return plan(calibration, Mission.of(data), np.nanmean(data.reference_ned, axis=0), limits, runs=runs)
 

@@ -65,16 +65,18 @@ def trim_of(data: Observations) -> Callable[[FloatArray], float] | None:
     known = np.isfinite(data.attitude[:, 1])
     pitch = np.degrees(data.attitude[known, 1])
     design = np.column_stack([np.ones(len(pitch)), data.parameters[known]])
+    if len(pitch) <= design.shape[1]:
+        return None
     trim, *_ = np.linalg.lstsq(design, pitch, rcond=None)
     if np.var(pitch - design @ trim) > 0.1 * np.var(pitch):
         return None
     return lambda positions: float(trim[0] + positions @ trim[1:])
 
 
-def settled(data: Observations) -> FloatArray:
-    """Return the (m, k) positions at which the masses of `data` are at rest."""
-    scale = [parameter.scale for parameter in data.ranges()]
-    moving = np.abs(np.diff(data.parameters, axis=0) / scale).max(axis=1) > STILL
+def settled(data: Observations, parameters: tuple[Parameter, ...]) -> FloatArray:
+    """Return the (m, k) positions at which the masses of `data` are at rest; `parameters` give the scales."""
+    scale = [parameter.scale for parameter in parameters]
+    moving = (np.abs(np.diff(data.parameters, axis=0) / scale) > STILL).any(axis=1)
     at_rest = np.ones(len(data), bool)
     at_rest[1:] &= ~moving
     at_rest[:-1] &= ~moving
