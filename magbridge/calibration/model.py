@@ -133,7 +133,7 @@ class Calibration:
     method : str
         Which fit made it; ``"none"`` marks every sample as uncalibrated.
     inputs : dict
-        File name -> SHA-256 of what it was made from.
+        File -> SHA-256 of what it was made from.
     software : str
         Version that made it.
     doubts : tuple of str

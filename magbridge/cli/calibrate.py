@@ -141,13 +141,14 @@ def _summary(found: Fit, samples: int) -> str:
 
 
 def _digests(files: tuple[Path, ...]) -> dict[str, str]:
-    """Return each file's name and digest; warn of identical files."""
+    """Return each file's name (its path where another has that name) and digest; warn of identical files."""
     seen: dict[str, Path] = {}
     for file in files:
         first = seen.setdefault(digest(file), file)
         if first is not file:
             complain(f"{file}: identical to {first}; its samples are counted once")
-    return {file.name: key for key, file in seen.items()}
+    names = [file.name for file in seen.values()]
+    return {str(file) if names.count(file.name) > 1 else file.name: key for key, file in seen.items()}
 
 
 @app.command(usage="Usage: magbridge plan --calibration cal.json --mission FILE [OPTIONS]")

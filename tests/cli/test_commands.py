@@ -182,6 +182,19 @@ def test_a_log_that_the_calibration_was_made_from_is_told(deployment: Path, comm
     assert "log.csv: the calibration was fitted to this log" in said.err
 
 
+def test_logs_of_one_name_are_all_remembered(deployment: Path, command: Command) -> None:
+    """As of two days, each in a folder of its own."""
+    rows = read(deployment)
+    for day, begin in (("one", 0), ("two", FEW)):
+        Path(day).mkdir()
+        write(rows.isel(time=slice(begin, begin + FEW)), f"{day}/log.csv")
+    command("calibrate", "one/log.csv", "two/log.csv", "--method", "nominal", "-o", "cal.json")
+    assert list(load_calibration("cal.json").inputs) == ["one/log.csv", "two/log.csv"]
+    for log in ("one/log.csv", "two/log.csv"):
+        said = command("diagnose", log, "--calibration", "cal.json", "-o", "doubt", code=1)
+        assert f"{log}: the calibration was fitted to this log" in said.err
+
+
 @pytest.mark.parametrize("names", [(), ("battpos", "ballast")], ids=["nominal", "two masses"])
 def test_plan(names: tuple[str, ...], deployment: Path, command: Command) -> None:
     known = expected_calibration(observations(read(deployment), names).ranges(), 52_000.0, order=2)

@@ -53,7 +53,7 @@ class Observations:
         nT, the true field vector, north-east-down.
     sensor : str
     inputs : dict
-        File name -> SHA-256.
+        File -> SHA-256.
     model : str
         Name of the reference.
     """
