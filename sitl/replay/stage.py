@@ -15,6 +15,7 @@ import threading
 import time
 import tty
 from collections.abc import Callable, Iterable
+from contextlib import ExitStack
 from pathlib import Path
 
 import msgspec
@@ -49,31 +50,38 @@ class Stage:
 
     def __init__(self, config: Path, listener: Callable[[bytes], None], log: Path | None = None) -> None:
         self._listener = listener
-        self._master, self._slave = pty.openpty()
-        # what is written before the bridge opens it must not be edited as a terminal would
-        tty.setraw(self._slave)
-        server = socket.create_server(("127.0.0.1", 0))
-        server.settimeout(CONNECT_TIMEOUT)
-        times_out, self._times = os.pipe()
-        command = [
-            sys.executable, "-m", "sitl.replay.bridge", str(config),
-            "--sensor", os.ttyname(self._slave),
-            "--link", f"tcp:127.0.0.1:{server.getsockname()[1]}",
-            "--timetable", str(times_out),
-            *(("--log", str(log)) if log else ()),
-        ]  # fmt: skip
-        self._bridge = subprocess.Popen(command, pass_fds=(times_out,), stderr=subprocess.PIPE)  # noqa: S603 - our own
-        os.close(times_out)
-        try:
-            self._link, _ = server.accept()
-        except TimeoutError as error:
-            raise self._failure("the bridge did not connect") from error
-        finally:
-            server.close()
-        self._link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self._ear = threading.Thread(target=self._listen, name="autopilot's ear", daemon=True)
-        self._ear.start()
         self._buffers = {Channel.SENSOR: bytearray(), Channel.LINK: bytearray(), Channel.STATE: bytearray()}
+        with ExitStack() as opened, socket.create_server(("127.0.0.1", 0)) as server:
+            self._master, slave = pty.openpty()
+            opened.callback(os.close, self._master)
+            opened.callback(os.close, slave)
+            # what is written before the bridge opens it must not be edited as a terminal would
+            tty.setraw(slave)
+            server.settimeout(CONNECT_TIMEOUT)
+            times_out, times = os.pipe()
+            command = [
+                sys.executable, "-m", "sitl.replay.bridge", str(config),
+                "--sensor", os.ttyname(slave),
+                "--link", f"tcp:127.0.0.1:{server.getsockname()[1]}",
+                "--timetable", str(times_out),
+                *(("--log", str(log)) if log else ()),
+            ]  # fmt: skip
+            self._bridge = opened.enter_context(
+                subprocess.Popen(command, pass_fds=(times_out,), stderr=subprocess.PIPE)  # noqa: S603 - our own
+            )
+            os.close(times_out)
+            self._times = opened.enter_context(os.fdopen(times, "wb", buffering=0))
+            try:
+                self._link, _ = server.accept()
+            except TimeoutError as error:
+                raise self._failure("the bridge did not connect") from error
+            self._link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            opened.enter_context(self._link)
+            ear = threading.Thread(target=self._listen, name="autopilot's ear", daemon=True)
+            ear.start()
+            opened.callback(ear.join, timeout=10.0)
+            opened.enter_context(self._times)  # closed first: the bridge ends with its timetable
+            self._opened = opened.pop_all()
 
     def _listen(self) -> None:
         try:
@@ -113,32 +121,34 @@ class Stage:
         PortError
             It ended early; the message is its last line of output.
         """
-        times = self._buffers[Channel.STATE]
-        begin = msgspec.json.encode(start)
-        times += Entry.pack(start.time_us | Channel.STATE, len(begin)) + begin
-        pending = 0
         try:
-            for wait, event in pace(events, speed):
-                if wait > 0.0:
-                    self._flush()
-                    pending = 0
-                    time.sleep(wait)
-                size = len(event.data)
-                times += Entry.pack(event.time_us | event.channel, size)
-                self._buffers[event.channel] += event.data
-                pending += size
-                if pending >= BATCH:
-                    self._flush()
-                    pending = 0
-            self._flush()
-            os.close(self._times)
+            self._send(start, events, speed)
+            self._times.close()
             if self._bridge.wait() != 0:
                 raise self._failure(f"the bridge ended with {self._bridge.returncode}")
         except (BrokenPipeError, ConnectionResetError) as error:
             raise self._failure("the bridge ended") from error
         finally:
-            self._ear.join(timeout=10.0)
-            self._close()
+            self._opened.close()
+
+    def _send(self, start: Start, events: Iterable[Event], speed: float) -> None:
+        times = self._buffers[Channel.STATE]
+        begin = msgspec.json.encode(start)
+        times += Entry.pack(start.time_us | Channel.STATE, len(begin)) + begin
+        pending = 0
+        for wait, event in pace(events, speed):
+            if wait > 0.0:
+                self._flush()
+                pending = 0
+                time.sleep(wait)
+            size = len(event.data)
+            times += Entry.pack(event.time_us | event.channel, size)
+            self._buffers[event.channel] += event.data
+            pending += size
+            if pending >= BATCH:
+                self._flush()
+                pending = 0
+        self._flush()
 
     def _flush(self) -> None:
         """Write what is due, bytes before timetable: what an entry announces must already be there."""
@@ -149,11 +159,4 @@ class Stage:
             self._link.sendall(link)
             link.clear()
         while times:
-            del times[: os.write(self._times, times)]
-
-    def _close(self) -> None:
-        self._link.close()
-        os.close(self._master)
-        os.close(self._slave)
-        if self._bridge.stderr is not None:
-            self._bridge.stderr.close()
+            del times[: self._times.write(times)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -232,6 +233,18 @@ def test_a_bridge_that_cannot_start_says_why(survey: Path, tmp_path: Path) -> No
     path.write_text(path.read_text().replace("MAG_RAW = 0", "MAG_RAW = 0\nNO_SUCH = 1"))
     with pytest.raises(WrongUse, match=r"^\S*bridge\.toml: publish\.NO_SUCH"):
         replay([survey], path)
+
+
+def test_a_value_that_its_message_cannot_hold_ends_the_replay(survey: Path, tmp_path: Path) -> None:
+    """The bridge hears that nothing more comes, and ends, too."""
+    path = config(tmp_path)
+    table = '[telemetry.battpos]\nmessage = "SERVO_OUTPUT_RAW"\nfield = "servo1_raw"\nscale = 1e-9\n'
+    path.write_text(path.read_text() + table)
+    children = Path(f"/proc/self/task/{os.getpid()}/children")
+    before = children.read_text()
+    with pytest.raises(DataError, match=r"does not fit SERVO_OUTPUT_RAW\.servo1_raw"):
+        replay([survey], path)
+    assert children.read_text() == before
 
 
 def test_short_names_differ() -> None:
