@@ -84,7 +84,7 @@ def _chunks(path: Path, file: Any, rows: int) -> Iterator[tuple[xr.Dataset, Sequ
     """Yield the rows, each piece with their numbers."""
     ours = {capitals: name for name, capitals in NAMES.items()}
     variables = {
-        getattr(variable, "column", ours.get(name, name.lower())): variable
+        str(getattr(variable, "column", ours.get(name, name.lower()))): variable
         for name, variable in file.variables.items()
         if variable.dimensions == (DIMENSION,) and variable.dtype != str and variable.dtype.kind in "iuf"
     }
@@ -94,8 +94,9 @@ def _chunks(path: Path, file: Any, rows: int) -> Iterator[tuple[xr.Dataset, Sequ
     if not total:
         raise FormatError(path, "expected rows, there are none")
     start, scale = _epoch(path, variables["time"])
-    units = {name: getattr(variable, "units", "1") for name, variable in variables.items() if name != "time"}
-    meanings = {name: str(getattr(variable, "long_name", "")) for name, variable in variables.items()}
+    others = [(name, variable) for name, variable in variables.items() if name != "time"]
+    units = {name: str(getattr(variable, "units", "1")) for name, variable in others}
+    meanings = {name: str(getattr(variable, "long_name", "")) for name, variable in others}
     attrs = {key: _plain(value) for key, value in file.__dict__.items() if key not in GENERATED}
     for row in range(0, total, rows):
         columns = {name: floats(variable, slice(row, row + rows)) for name, variable in variables.items()}
@@ -106,13 +107,15 @@ def _chunks(path: Path, file: Any, rows: int) -> Iterator[tuple[xr.Dataset, Sequ
 
 def _epoch(path: Path, variable: Any) -> tuple[float, float]:
     """Return the s since 1970 at which the time variable is 0, and the s in one of its units."""
-    units = getattr(variable, "units", "")
+    units, calendar = (str(getattr(variable, name, "")) for name in ("units", "calendar"))
+    days = [datetime(1970, 1, 1), datetime(1970, 1, 2)]
     try:
-        dates: Any = netCDF4.num2date([0.0, 1.0], units, only_use_cftime_datetimes=False)
+        numbers: Any = netCDF4.date2num(days, units, calendar or "standard")
     except ValueError:
         raise FormatError(path, f"expected {EPOCH!r}, not {units!r}", column="TIME") from None
-    zero, one = dates
-    return zero.replace(tzinfo=UTC).timestamp(), (one - zero).total_seconds()
+    zero, day = numbers
+    scale = 86_400.0 / (day - zero)
+    return float(-zero * scale), float(scale)
 
 
 def _plain(value: Any) -> Any:

@@ -75,8 +75,9 @@ def dive(path: Path, file: Any) -> xr.Dataset:
     FormatError
         No magnetometer in the file, or time that does not increase.
     """
+    rows = file.dimensions[DIMENSION].size
     for theirs in ("time", "eng_mag_x", "eng_mag_y", "eng_mag_z"):
-        if theirs not in file.variables:
+        if _numbers(file, theirs, rows) is None:
             raise FormatError(
                 path, "expected this variable, as of a Seaglider with a raw compass", column=theirs
             )
@@ -84,27 +85,39 @@ def dive(path: Path, file: Any) -> xr.Dataset:
     increasing(path, time)
     columns, units = {}, {}
     for ours, (theirs, unit, scale) in COLUMNS.items():
-        if theirs in file.variables and len(file[theirs]) == len(time):
-            columns[ours], units[ours] = floats(file[theirs]) * scale, unit
+        if (values := _numbers(file, theirs, rows)) is not None:
+            columns[ours], units[ours] = values * scale, unit
     if "ctd_time" in file.variables:
         ctd_time = floats(file["ctd_time"])
         for ours, (theirs, unit) in CTD.items():
-            if theirs in file.variables:
-                columns[ours] = linear(time, ctd_time, floats(file[theirs]), MAX_GAP, *CIRCLES.get(ours, ()))
+            if (values := _numbers(file, theirs, ctd_time.size)) is not None:
+                columns[ours] = linear(time, ctd_time, values, MAX_GAP, *CIRCLES.get(ours, ()))
                 units[ours] = unit
     for motor in MOTORS:
-        if f"gc_{motor}_i" in file.variables:
-            columns[f"{motor}_current"], units[f"{motor}_current"] = _current(file, motor, time), "A"
+        if (current := _current(file, motor, time)) is not None:
+            columns[f"{motor}_current"], units[f"{motor}_current"] = current, "A"
     attrs: dict[str, Any] = {"heading_reference": "magnetic", "mag_scale_nT_per_count": NT_PER_COUNT}
-    if "magnetic_variation" in file.variables:
+    if "magnetic_variation" in file.variables and file["magnetic_variation"].size == 1:
         attrs["magnetic_variation_deg"] = float(file["magnetic_variation"][...])
     return deployment(path, time, columns, units, attrs)
 
 
-def _current(file: Any, motor: str, time: FloatArray) -> FloatArray:
+def _numbers(file: Any, name: str, size: int) -> FloatArray | None:
+    """Return a variable (size,); None where the file has none of that size."""
+    if name not in file.variables or file[name].shape != (size,):
+        return None
+    return floats(file[name])
+
+
+def _current(file: Any, motor: str, time: FloatArray) -> FloatArray | None:
     """Return the mean current (A) of one motor in the manoeuvre at each time; 0 outside manoeuvres."""
+    if f"gc_{motor}_i" not in file.variables:
+        return None
+    amperes = floats(file[f"gc_{motor}_i"])
+    starts, ends = (_numbers(file, name, amperes.size) for name in ("gc_st_secs", "gc_end_secs"))
+    if starts is None or ends is None:
+        return None
     current = np.zeros(len(time))
-    starts, ends, amperes = (floats(file[name]) for name in ("gc_st_secs", "gc_end_secs", f"gc_{motor}_i"))
     for start, end, ampere in zip(starts, ends, amperes, strict=True):
         current[(time >= start) & (time <= end)] = ampere
     return current
