@@ -6,7 +6,6 @@ import tempfile
 from pathlib import Path
 from typing import Literal
 
-import netCDF4
 import numpy as np
 import pytest
 import xarray as xr
@@ -16,7 +15,7 @@ from hypothesis import strategies as st
 from magbridge import logs
 from magbridge.columns import CHANNEL_TIMES, COLUMNS
 from magbridge.logs.checks import APART, FIELDS, LEAST, MOST
-from magbridge.logs.deployment import deployment, join
+from magbridge.logs.deployment import deployment
 
 EXACT = [".csv", ".nc", ".parquet"]
 WRITABLE = [*EXACT, ".tlog"]
@@ -177,18 +176,12 @@ def test_a_later_piece_brings_no_new_column(tmp_path: Path) -> None:
 def test_what_fails_leaves_the_old_file(suffix: str, tmp_path: Path) -> None:
     path = tmp_path / f"log{suffix}"
     path.write_text("old")
-    with pytest.raises(ValueError, match="expected a time after"), logs.Writer(path) as writer:  # noqa: PT012
+    backwards = rf"log\{suffix}: row 1, column 'time': expected a time after"
+    with pytest.raises(ValueError, match=backwards), logs.Writer(path) as writer:  # noqa: PT012
         writer.append(example(5))
         writer.append(example(5))
     assert path.read_text() == "old"
     assert [p.name for p in tmp_path.iterdir()] == [path.name]
-
-
-def test_appending_backwards_is_refused(tmp_path: Path) -> None:
-    with logs.Writer(tmp_path / "log.csv") as writer:
-        writer.append(example(5))
-        with pytest.raises(ValueError, match=r"log.csv: row 1, column 'time': expected a time after"):
-            writer.append(example(5))
 
 
 def test_several_files_are_one_deployment(tmp_path: Path) -> None:
@@ -244,7 +237,7 @@ def test_a_unit_that_we_know_is_converted(tmp_path: Path) -> None:
     assert [back[name].item() for name in ("time", "mag_x", "roll", "depth")] == [1.5, 50_000, 180, 7]
 
 
-def test_columns_say_what_they_are(tmp_path: Path) -> None:
+def test_columns_say_what_they_are() -> None:
     back = example(5)
     assert back["mag_x"].attrs["units"] == "nT"
     assert back["battpos"].attrs["units"] == "in"
@@ -260,109 +253,6 @@ def test_meaning_and_attributes_are_kept(suffix: str, tmp_path: Path) -> None:
     back = logs.read(tmp_path / f"log{suffix}")
     assert back["run"].attrs["long_name"] == "the leg"
     assert back.attrs == dataset.attrs | {"source": f"log{suffix} (made)"}
-
-
-def test_an_attribute_whose_name_netcdf_forbids_is_left_out(tmp_path: Path) -> None:
-    logs.write(deployment("made", [1.0], {}, attrs={"telemetry.a/b.max_age": 3.0}), tmp_path / "log.nc")
-    assert logs.read(tmp_path / "log.nc").attrs.keys() == {"source"}
-
-
-def test_csv_is_as_plain_as_can_be(tmp_path: Path) -> None:
-    dataset = deployment(
-        "made", [1.5, 2], {"mag_x": [1, np.nan], "battpos": [0.1, 2], "quality": [0, 3]}, {"battpos": "in"}
-    )
-    logs.write(dataset, tmp_path / "a.csv")
-    assert (tmp_path / "a.csv").read_text().splitlines() == [
-        "time,mag_x,battpos [in],quality",
-        "1.5,1.0,0.1,",
-        "2.0,,2.0,stale_telemetry extrapolated",
-    ]
-
-
-@pytest.mark.parametrize("rows", [1, 1000])
-def test_csv_says_which_number_stands_for_none(rows: int, tmp_path: Path) -> None:
-    path = tmp_path / "log.csv"
-    path.write_text(
-        "# fill_value = -9999\ntime,mag_x,pump [A],latitude\n1,-9999.0,2,50\n2,-9998,-9999,-9999\n"
-    )
-    read = join(list(logs.read_chunks(path, rows)))
-    np.testing.assert_array_equal(read["mag_x"], [np.nan, -9998.0])
-    np.testing.assert_array_equal(read["pump"], [2.0, np.nan])
-    np.testing.assert_array_equal(read["latitude"], [50.0, np.nan])
-    assert "fill_value" not in read.attrs
-
-
-def test_longitudes_to_the_east_fit_a_telemetry_log(tmp_path: Path) -> None:
-    """302 degrees are -58: as 32 bits of 1e-7 deg they would not fit."""
-    east = np.array([-58.0, 0.0, 58.0, 179.5, 180.5, 200.0, 302.0, np.nan])
-    columns = {"mag_x": np.ones(8), "latitude": np.where(np.isnan(east), np.nan, 49.5), "longitude": east}
-    logs.write(deployment("made", np.arange(8.0), columns), tmp_path / "log.tlog")
-    read = logs.read(tmp_path / "log.tlog")["longitude"].to_numpy()
-    np.testing.assert_allclose(read[:7], (east[:7] + 180.0) % 360.0 - 180.0, atol=2e-7)
-
-
-def test_a_count_that_is_none_fits_a_telemetry_log(tmp_path: Path) -> None:
-    columns = {"mag_x": np.ones(4), "power_cycle": np.array([3.0, np.inf, -1e300, np.nan])}
-    logs.write(deployment("made", np.arange(4.0), columns), tmp_path / "log.tlog")
-    counted = logs.read(tmp_path / "log.tlog")["power_cycle"].to_numpy()
-    np.testing.assert_array_equal(counted, [3.0, np.nan, np.nan, np.nan])
-
-
-def test_netcdf_has_the_shape_of_og1(tmp_path: Path) -> None:
-    logs.write(example(5), tmp_path / "a.nc")
-    with netCDF4.Dataset(tmp_path / "a.nc") as file:
-        assert file.dimensions["N_MEASUREMENTS"].isunlimited()
-        assert {"TIME", "LATITUDE", "LONGITUDE", "DEPTH", "MAG_X", "BATTPOS", "TRAJECTORY"} <= set(
-            file.variables
-        )
-        assert file["TIME"].units == "seconds since 1970-01-01T00:00:00Z"
-        assert file["TRAJECTORY"].cf_role == "trajectory_id"
-        assert file.featureType == "trajectory"
-        assert file.time_coverage_start == "20160623T180948"
-        assert file["LATITUDE"].standard_name == "latitude"
-
-
-def test_og1_file_of_someone_else(tmp_path: Path) -> None:
-    with netCDF4.Dataset(tmp_path / "a.nc", "w") as file:
-        file.createDimension("N_MEASUREMENTS", 3)
-        for name, dtype, values, fill, attrs in (
-            ("TIME", "f8", [0, 60, 120], -1.0, {"units": "minutes since 2020-01-01"}),
-            ("LATITUDE", "f8", [50, -9999.9, 51], -9999.9, {"units": "degrees_north"}),
-            ("DEPTH", "f4", [-0.02, 5, 6], None, {"units": "metres", "valid_min": np.float32(0)}),
-            ("TEMP", "f4", [10, 11, 12], -9999.9, {"units": "Celsius"}),
-            ("PHASE", "i1", [1, 2, 2], 0, {}),
-            ("FLAG", "i1", [1, -127, 2], None, {}),
-            ("BALLAST", "f4", [10, -999, 12], None, {"missing_value": np.float32(-999)}),
-            ("PACKED", "i2", [100, -32767, 300], None, {"scale_factor": 0.01, "add_offset": 1.0}),
-        ):
-            file.createVariable(name, dtype, ("N_MEASUREMENTS",), fill_value=fill).setncatts(attrs)
-            file[name].set_auto_maskandscale(False)
-            file[name][:] = np.array(values)
-        file.createVariable("DEPLOYMENT_TIME", "f8", ())[...] = 5
-        file.createVariable("NEVER_WRITTEN", "f4", ("N_MEASUREMENTS",))
-    back = logs.read(tmp_path / "a.nc")
-    np.testing.assert_array_equal(back["time"], 1577836800 + np.array([0, 3600, 7200]))
-    np.testing.assert_array_equal(back["latitude"], [50, np.nan, 51])
-    np.testing.assert_allclose(back["depth"], [-0.02, 5, 6], rtol=1e-6)
-    assert back["water_temperature"].attrs["units"] == "Celsius"
-    np.testing.assert_array_equal(back["phase"], [1, 2, 2])
-    np.testing.assert_array_equal(back["flag"], [1, -127, 2])
-    np.testing.assert_array_equal(back["ballast"], [10, np.nan, 12])
-    np.testing.assert_allclose(back["packed"], [2, np.nan, 4])
-    assert back["never_written"].isnull().all()
-    assert back["latitude"].attrs["units"] == "deg"
-
-
-def test_parquet_of_someone_else(tmp_path: Path) -> None:
-    pa = pytest.importorskip("pyarrow")
-    pq = pytest.importorskip("pyarrow.parquet")
-    stamps = pa.array([1_500_000, 2_500_000], pa.timestamp("us", tz="UTC"))
-    pq.write_table(
-        pa.table({"time": stamps, "mag_x": pa.array([1, None], pa.int32())}), tmp_path / "a.parquet"
-    )
-    back = logs.read(tmp_path / "a.parquet")
-    np.testing.assert_array_equal(back["time"], [1.5, 2.5])
-    np.testing.assert_array_equal(back["mag_x"], [1, np.nan])
 
 
 def test_streams_in_bounded_memory(tmp_path: Path) -> None:
