@@ -8,6 +8,7 @@ the tests.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from datetime import UTC, datetime
 from functools import cache
 from importlib.util import find_spec
@@ -130,43 +131,50 @@ def _block(model: Model, lon: FloatArray, lat: FloatArray, depth: FloatArray, ti
     r, geocentric = _geocentric(geodetic, -depth)
     sin, cos = np.cos(geocentric), np.sin(geocentric)  # of the colatitude θ
 
-    degree = len(model.g)
-    order = np.arange(1, degree + 1)[:, None]
+    order = np.arange(1, len(model.g) + 1)[:, None]
     cos_m, sin_m = np.cos(order * phi), np.sin(order * phi)
     up = np.zeros((len(weights), lat.size))
     south, east = up.copy(), up.copy()
-    legendre = [np.ones_like(sin), cos]  # P_n0
-    before: FloatArray = np.empty((0, lat.size))  # S_n-1, orders 1..n-1
-    two_before = before
     ratio = REFERENCE_RADIUS / r
     radial = ratio**3
-    for n in range(1, degree + 1):
-        m = np.arange(1, n + 1)[:, None]
-        s = np.empty((n, lat.size))
-        s[n - 1] = np.sqrt((2 * n - 1) / (2 * n)) * sin * before[n - 2] if n > 1 else 1.0
-        root = np.sqrt(n * n - m * m)  # 0 for m = n
-        s[: n - 1] = (2 * n - 1) * cos * before / root[: n - 1]
-        if n > 2:
-            s[: n - 2] -= np.sqrt((n - 1) ** 2 - m[: n - 2] ** 2) / root[: n - 2] * two_before
-        if n > 1:
-            legendre.append(((2 * n - 1) * cos * legendre[n - 1] - (n - 1) * legendre[n - 2]) / n)
-        slope = n * cos * s  # dP_nm/dθ, orders 1..n
-        slope[: n - 1] -= root[: n - 1] * before
-        slope_zero = -np.sqrt(n * (n + 1) / 2) * sin * s[0]
-
+    for n, (p_zero, slope_zero, s, slope) in enumerate(_legendre(sin, cos, len(model.g)), 1):
         g, h = model.g[n - 1][nodes], model.h[n - 1][nodes]
         c, d = cos_m[:n], sin_m[:n]
         p = s * sin
-        up += (n + 1) * radial * (g[:, :1] * legendre[n] + g[:, 1:] @ (p * c) + h @ (p * d))
+        up += (n + 1) * radial * (g[:, :1] * p_zero + g[:, 1:] @ (p * c) + h @ (p * d))
         south -= radial * (g[:, :1] * slope_zero + g[:, 1:] @ (slope * c) + h @ (slope * d))
-        s_m = m * s
+        s_m = order[:n] * s
         east += radial * (g[:, 1:] @ (s_m * d) - h @ (s_m * c))
-        two_before, before, radial = before, s, radial * ratio
+        radial = radial * ratio
 
     up, south, east = (np.einsum("kn,kn->n", weights, part) for part in (up, south, east))
     tilt = geodetic - geocentric  # the ellipsoid's normal leans this far north of the radius
     sin_tilt, cos_tilt = np.sin(tilt), np.cos(tilt)
     return np.stack([-south * cos_tilt - up * sin_tilt, east, -up * cos_tilt + south * sin_tilt], axis=1)
+
+
+def _legendre(
+    sin: FloatArray, cos: FloatArray, degree: int
+) -> Iterator[tuple[FloatArray, FloatArray, FloatArray, FloatArray]]:
+    """Yield for n = 1, 2, ... ``P_n0`` and ``dP_n0/dθ`` (k,), ``S_nm`` and ``dP_nm/dθ`` (n, k), m = 1 to n.
+
+    Of the colatitudes' sine and cosine (k,); see the notes of :func:`igrf`.
+    """
+    p_before, p = np.zeros_like(sin), np.ones_like(sin)  # P_n-1, P_n of order 0
+    s_before = s = np.empty((0, sin.size))
+    for n in range(1, degree + 1):
+        p_before, p = p, ((2 * n - 1) * cos * p - (n - 1) * p_before) / n
+        m = np.arange(1, n + 1)[:, None]
+        root = np.sqrt(n * n - m * m)  # 0 for m = n
+        two_before, s_before = s_before, s
+        s = np.empty((n, sin.size))
+        s[n - 1] = np.sqrt((2 * n - 1) / (2 * n)) * sin * s_before[n - 2] if n > 1 else 1.0
+        s[: n - 1] = (2 * n - 1) * cos * s_before / root[: n - 1]
+        if n > 2:
+            s[: n - 2] -= np.sqrt((n - 1) ** 2 - m[: n - 2] ** 2) / root[: n - 2] * two_before
+        slope = n * cos * s
+        slope[: n - 1] -= root[: n - 1] * s_before
+        yield p, -np.sqrt(n * (n + 1) / 2) * sin * s[0], s, slope
 
 
 def _weights(epochs: FloatArray, time: FloatArray) -> tuple[int, FloatArray]:
