@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from importlib import import_module
 from typing import Any
@@ -158,54 +158,56 @@ def _refuse_one_attitude(data: Observations) -> None:
 
 def _judged(found: Fit, data: Observations) -> Fit:
     """Add the boresight, and warnings of what the data could not determine."""
-    calibration = found.calibration
-    mismatch = None
+    calibration, mismatch = found.calibration, []
     if calibration.boresight is None:
         try:
             calibration = replace(calibration, boresight=find_boresight(calibration, data))
         except CalibrationError as error:
-            mismatch = str(error)
+            mismatch.append(str(error))
             data = replace(data, attitude=None)
     ratio = expected_ratio(calibration, data)
-    warnings, doubts = list(warnings_for(calibration, data)), []
-    if mismatch:
-        warnings.append(mismatch)
-    outliers = found.details.get("outliers", 0)
-    if outliers > 0.02 * len(data):
-        warnings.append(f"{outliers} of {len(data)} samples are outliers and were left out of the fit")
+    doubts = tuple(_doubts(ratio, calibration.noise.sensor, heading_gap(data)))
+    unsupported = [f"the data do not support this fit: {'; '.join(doubts)}"] if doubts else []
+    seen = combinations(found.samples, calibration.coefficients, max(calibration.noise.sensor, 1e-9))
+    return replace(
+        found,
+        calibration=replace(calibration, doubts=doubts),
+        warnings=(*unsupported, *warnings_for(calibration, data), *mismatch, *_suspicions(found)),
+        details={
+            **found.details,
+            "expected_over_noise": ratio,
+            "rank": seen.rank,
+            "combinations_nT": seen.sigma.tolist(),
+        },
+    )
+
+
+def _doubts(ratio: float, noise: float, gap: float) -> Iterator[str]:
+    """Say why data do not support a fit: error over `noise` (nT), and widest gap of the headings (deg)."""
+    if ratio > UNSUPPORTED:
+        yield (
+            "at these pitches and positions, on any heading and with 10 degrees more roll, expect "
+            f"{ratio * noise:.0f} nT of error"
+        )
+    if gap > UNSEEN:
+        yield (
+            f"all headings lie within {360.0 - gap:.0f} degrees, and on other headings the vehicle's field "
+            "cannot be told from the Earth's"
+        )
+
+
+def _suspicions(found: Fit) -> Iterator[str]:
+    """Say what the fit itself shows to be wrong with the samples or with their reference."""
+    samples, outliers = len(found.residual), found.details.get("outliers", 0)
+    if outliers > 0.02 * samples:
+        yield f"{outliers} of {samples} samples are outliers and were left out of the fit"
     smallest, largest = found.scales
     if abs(0.5 * (smallest + largest) - 1.0) > GAIN:
-        warnings.append(
+        yield (
             f"the fit multiplies the readings by {smallest:.2f} to {largest:.2f}, and anomalies with them: "
             "unless the sensor is that far off, the reference is; fit to runs at one place, or with a better "
             "map (--grid)"
         )
-    gap = heading_gap(data)
-    if ratio > UNSUPPORTED:
-        doubts.append(
-            "at these pitches and positions, on any heading and with 10 degrees more roll, expect "
-            f"{ratio * calibration.noise.sensor:.0f} nT of error"
-        )
-    if gap > UNSEEN:
-        doubts.append(
-            f"all headings lie within {360.0 - gap:.0f} degrees, and on other headings the vehicle's field "
-            "cannot be told from the Earth's"
-        )
-    if doubts:
-        warnings.insert(0, f"the data do not support this fit: {'; '.join(doubts)}")
-    seen = combinations(found.samples, calibration.coefficients, max(calibration.noise.sensor, 1e-9))
-    details = {
-        **found.details,
-        "expected_over_noise": ratio,
-        "rank": seen.rank,
-        "combinations_nT": seen.sigma.tolist(),
-    }
-    return replace(
-        found,
-        calibration=replace(calibration, doubts=tuple(doubts)),
-        warnings=tuple(warnings),
-        details=details,
-    )
 
 
 def assemble(
