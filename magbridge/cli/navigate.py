@@ -83,27 +83,17 @@ def navigate(
     if known is None or calibration is None:
         raise WrongUse("expected --calibration, which only --bound can do without")
 
-    from magbridge.columns import CHANNELS
-    from magbridge.correction import Correction, correct_rows
-    from magbridge.field.declination import with_true_heading
     from magbridge.field.read import read_grid
-    from magbridge.logs import read, write
+    from magbridge.logs import write
     from magbridge.navigate import Options
     from magbridge.navigate.batch import navigate as find_way
     from magbridge.navigate.options import informed
 
-    deployment = with_true_heading(read(files, required=CHANNELS), heading_reference)
-    note_losses(deployment.attrs)
-    for doubt in doubts_of(known, calibration):
-        complain(doubt)
-    note_missing(known, deployment)
-    note_settings(deployment.attrs)
-    refuse_unsuited(known, deployment)
-    corrected = correct_rows(Correction(known), deployment)
+    deployment = _corrected(files, known, calibration, heading_reference)
     if options is None:
-        options = informed(Options(), known, float(corrected["total_field_sigma"].median()))
+        options = informed(Options(), known, float(deployment["total_field_sigma"].median()))
     grid, options = _continued(read_grid(map), options, deployment)
-    track = find_way(deployment.assign(corrected.data_vars), grid, options)
+    track = find_way(deployment, grid, options)
     write(track, output)
     if picture:
         from magbridge.navigate.draw import draw_navigation
@@ -113,6 +103,25 @@ def navigate(
         complain(finding)
     facts, summary = _judged(track)
     print_result({"file": str(output), **facts}, f"{output}: {summary}", json)
+
+
+def _corrected(
+    files: tuple[Path, ...], known: Calibration, calibration: Path, heading_reference: Heading
+) -> xr.Dataset:
+    """Return the logs with their field corrected by the calibration `known`, which the file holds."""
+    from magbridge.columns import CHANNELS
+    from magbridge.correction import Correction, correct_rows
+    from magbridge.field.declination import with_true_heading
+    from magbridge.logs import read
+
+    deployment = with_true_heading(read(files, required=CHANNELS), heading_reference)
+    note_losses(deployment.attrs)
+    for doubt in doubts_of(known, calibration):
+        complain(doubt)
+    note_missing(known, deployment)
+    note_settings(deployment.attrs)
+    refuse_unsuited(known, deployment)
+    return deployment.assign(correct_rows(Correction(known), deployment).data_vars)
 
 
 def _judged(track: xr.Dataset) -> tuple[dict[str, Any], str]:
