@@ -24,10 +24,28 @@ def merge(sources: Sequence[Open], rows: int) -> Iterator[xr.Dataset]:
     firsts = [next(source(1)) for source in sources]
     whole = join(firsts)  # also checks that they agree on units and on what heading means
     columns = {str(name): dict(whole[name].attrs) for name in whole.data_vars}
-    waiting = deque(sorted((float(first["time"].values[0]), k) for k, first in enumerate(firsts)))
-    active: dict[int, tuple[xr.Dataset, Iterator[xr.Dataset]]] = {}
+
+    def joined(parts: Sequence[xr.Dataset]) -> xr.Dataset:
+        # a file's attributes are those of the first piece, and must name all sources
+        return same_columns(join(parts), columns).assign_attrs(source=whole.attrs["source"])
+
     parts: list[xr.Dataset] = []
-    held = 0
+    for together in _in_order(sources, [float(first["time"].values[0]) for first in firsts], rows):
+        parts += together
+        if sum(part.sizes["time"] for part in parts) >= rows:
+            yield joined(parts)
+            parts = []
+    if parts:
+        yield joined(parts)
+
+
+def _in_order(sources: Sequence[Open], starts: Sequence[float], rows: int) -> Iterator[list[xr.Dataset]]:
+    """Yield the logs' rows up to one time after another, up to which none can add another row.
+
+    `starts` are the times (s) of their first rows: none is opened before.
+    """
+    waiting = deque(sorted((start, k) for k, start in enumerate(starts)))
+    active: dict[int, tuple[xr.Dataset, Iterator[xr.Dataset]]] = {}
 
     def advance(k: int, pieces: Iterator[xr.Dataset]) -> None:
         piece = next(pieces, None)
@@ -36,28 +54,19 @@ def merge(sources: Sequence[Open], rows: int) -> Iterator[xr.Dataset]:
         else:
             active[k] = piece, pieces
 
-    def joined() -> xr.Dataset:
-        # a file's attributes are those of the first piece, and must name all sources
-        return same_columns(join(parts), columns).assign_attrs(source=whole.attrs["source"])
-
     while waiting or active:
-        # no log can add another row up to the horizon
         horizon = min((float(piece["time"].values[-1]) for piece, _ in active.values()), default=np.inf)
         if waiting and waiting[0][0] <= horizon:
             _, k = waiting.popleft()
             advance(k, sources[k](rows))
             continue
+        parts = []
         for k, (piece, pieces) in sorted(active.items()):
             n = int(np.searchsorted(piece["time"].values, horizon, side="right"))
-            held += n
             if n == piece.sizes["time"]:
                 parts.append(piece)
                 advance(k, pieces)
             elif n:
                 parts.append(piece.isel(time=slice(0, n)))
                 active[k] = uncounted(piece.isel(time=slice(n, None))), pieces
-        if held >= rows:
-            yield joined()
-            parts, held = [], 0
-    if parts:
-        yield joined()
+        yield parts
