@@ -173,16 +173,7 @@ def _checked(content: _File, terms: tuple[Term, ...], effects: tuple[Term, ...])
     _check_covariance(covariance)
     if content.boresight:
         _check_covariance(np.array(content.boresight.covariance), "boresight: ")
-    names = [parameter.name for parameter in content.parameters]
-    if twice := [name for name in names if names.count(name) > 1]:
-        raise CalibrationError(f"parameter {twice[0]!r} is named twice")
-    for parameter in content.parameters:
-        if not (parameter.scale > 0.0 and parameter.low <= parameter.high):
-            raise CalibrationError(f"parameter {parameter.name!r}: expected scale > 0 and low <= high")
-    if not content.reference.field > 0.0:
-        raise CalibrationError("reference: field: expected nT, > 0")
-    if not content.noise.sensor >= 0.0:
-        raise CalibrationError("noise: sensor: expected nT, >= 0")
+    _check_settings(content)
     positions = tuple(term for term in terms if isinstance(term, PositionTerm))
     others = tuple(effect for effect in effects if isinstance(effect, Effect))
     if len(positions) < len(terms) or len(others) < len(effects):
@@ -205,6 +196,20 @@ def _checked(content: _File, terms: tuple[Term, ...], effects: tuple[Term, ...])
         software=content.software,
         doubts=content.doubts,
     )
+
+
+def _check_settings(content: _File) -> None:
+    """Refuse parameters, a reference or a noise that no fit can have had."""
+    names = [parameter.name for parameter in content.parameters]
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise CalibrationError(f"parameter {twice[0]!r} is named twice")
+    for parameter in content.parameters:
+        if not (parameter.scale > 0.0 and parameter.low <= parameter.high):
+            raise CalibrationError(f"parameter {parameter.name!r}: expected scale > 0 and low <= high")
+    if not content.reference.field > 0.0:
+        raise CalibrationError("reference: field: expected nT, > 0")
+    if not content.noise.sensor >= 0.0:
+        raise CalibrationError("noise: sensor: expected nT, >= 0")
 
 
 def _check_covariance(covariance: FloatArray, whose: str = "") -> None:
