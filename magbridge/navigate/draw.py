@@ -38,15 +38,20 @@ def draw_navigation(result: xr.Dataset, grid: AnomalyGrid, path: str | Path) -> 
     tracks = _tracks(panels["map"], result)
     _map(panels["map"], grid, *np.concatenate(tracks, axis=1))
     hours = (result["time"].to_numpy() - float(result["time"][0])) / 3600.0
+    for name, draw in (("field", _field), ("innovation", _innovation), ("sigma", _sigma)):
+        draw(panels[name], hours, result)
+        _legend_above(panels[name])
+    _save(figure, path)
 
-    axis = panels["field"]
-    axis.plot(
-        hours, measured_on_track(result), ".", ms=2, color="0.3", label="measured, on the filter's track"
-    )
+
+def _field(axis: Axes, hours: RealArray, result: xr.Dataset) -> None:
+    measured = measured_on_track(result)
+    axis.plot(hours, measured, ".", ms=2, color="0.3", label="measured, on the filter's track")
     axis.plot(hours, result["map_anomaly"], color="C3", lw=1, label="map, on the filter's track")
     axis.set_ylabel("anomaly, nT")
 
-    axis = panels["innovation"]
+
+def _innovation(axis: Axes, hours: RealArray, result: xr.Dataset) -> None:
     spread = 2.0 * np.sqrt(result["innovation_variance"])
     axis.fill_between(hours, -spread, spread, color="C0", alpha=0.2, lw=0, label="2 sigma")
     taken = result["accepted"].to_numpy() > 0
@@ -59,7 +64,8 @@ def draw_navigation(result: xr.Dataset, grid: AnomalyGrid, path: str | Path) -> 
         axis.set_ylim(-limit, limit)
     axis.set_ylabel("innovation, nT")
 
-    axis = panels["sigma"]
+
+def _sigma(axis: Axes, hours: RealArray, result: xr.Dataset) -> None:
     sigma = np.sqrt(result["covariance_nn"] + result["covariance_ee"])
     axis.semilogy(hours, sigma, color="C0", label="sigma, filter")
     smoothed = np.hypot(result["smoothed_sigma_north"], result["smoothed_sigma_east"])
@@ -73,9 +79,6 @@ def draw_navigation(result: xr.Dataset, grid: AnomalyGrid, path: str | Path) -> 
     _plain(axis)
     axis.set_xlabel("hours")
     _shade(axis, hours, result["state"].to_numpy())
-    for name in ("field", "innovation", "sigma"):
-        _legend_above(panels[name])
-    _save(figure, path)
 
 
 def draw_bound(bound: Bound, grid: AnomalyGrid, path: str | Path) -> None:
