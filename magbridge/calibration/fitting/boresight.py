@@ -60,17 +60,13 @@ def find_boresight(calibration: Calibration, data: Observations) -> Boresight | 
     CalibrationError
         No rotation takes the corrected vectors to where attitude and main field say they point.
     """
-    if data.attitude is None or data.reference_ned is None or calibration.effects:
+    known, attitude, reference_ned = data.directed()
+    if known.sum() < FEWEST or calibration.effects:
         return None
-    known = np.isfinite(data.attitude).all(axis=1) & np.isfinite(data.reference_ned).all(axis=1)
-    if known.sum() < FEWEST:
-        return None
-    part = data.part(np.asarray(known))
-    assert part.attitude is not None
-    assert part.reference_ned is not None
+    part = data.part(known)
     k = len(calibration.parameters)
     b = correct(replace(calibration, boresight=None), part.field, part.parameters[:, :k], part.time).vector
-    v = field_body(part.attitude, part.reference_ned)
+    v = field_body(attitude, reference_ned)
     rotation, _ = Rotation.align_vectors(v, b)
     turned = rotation.apply(b)
     score = np.cross(v, turned - v)

@@ -47,13 +47,13 @@ class Mission:
         CalibrationError
             Attitude or place is lacking.
         """
-        if data.attitude is None or data.reference_ned is None:
-            raise CalibrationError("the mission needs roll, pitch, heading, latitude and longitude")
-        known = np.isfinite(data.attitude).all(axis=1) & np.isfinite(data.reference_ned).all(axis=1)
+        known, attitude, reference_ned = data.directed()
         if not known.any():
-            raise CalibrationError("the mission has no sample with both attitude and position")
-        rows = np.flatnonzero(known)[:: max(int(known.sum()) // POINTS, 1)]
-        return cls(field_body(data.attitude[rows], data.reference_ned[rows]), data.parameters[rows])
+            raise CalibrationError(
+                "the mission has no sample with all of roll, pitch, heading, latitude and longitude"
+            )
+        part = slice(None, None, max(len(attitude) // POINTS, 1))
+        return cls(field_body(attitude[part], reference_ned[part]), data.parameters[known][part])
 
 
 def nearby_mission(calibration: Calibration, data: Observations) -> Mission:

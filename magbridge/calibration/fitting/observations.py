@@ -113,6 +113,16 @@ class Observations:
         picked: dict[str, Any] = {name: None if v is None else v[rows] for name, v in columns}
         return replace(self, **picked)
 
+    def directed(self) -> tuple[BoolArray, FloatArray, FloatArray]:
+        """Return which samples (n,) have both attitude and the reference's direction, and those m of them.
+
+        The attitude (m, 3) is in rad, the reference (m, 3) in nT, as the attributes are.
+        """
+        if self.attitude is None or self.reference_ned is None:
+            return np.zeros(len(self), bool), np.empty((0, 3)), np.empty((0, 3))
+        known = np.asarray(np.isfinite(np.hstack([self.attitude, self.reference_ned])).all(axis=1))
+        return known, self.attitude[known], self.reference_ned[known]
+
     @property
     def steps(self) -> FloatArray:
         """(n,) whole sampling intervals since the run's previous sample; infinite at the first of a run.
