@@ -107,7 +107,7 @@ class Instrument(Table, frozen=True):
         rng : Generator
             Of the offsets at power-on and of the noise.
         """
-        temperature = first_order(water, step, self.thermal_lag, self.start_temperature)
+        temperature = self.temperature(water, step)
         warm = (temperature - self.reference_temperature)[:, None]
         cycle = np.searchsorted(np.asarray(self.power_on), step * np.arange(len(field)), side="right")
         turn_on = rng.normal(0, self.turn_on_sigma, (len(self.power_on) + 1, 3))
@@ -129,6 +129,10 @@ class Instrument(Table, frozen=True):
             temperature=np.interp(when, grid, temperature),
             power_cycle=np.searchsorted(np.asarray(self.power_on), when, side="right").astype(np.float64),
         )
+
+    def temperature(self, water: FloatArray, step: float) -> FloatArray:
+        """Return the fluxgate's temperature (n,), degC, in `water` (n,), degC, sampled every `step` s."""
+        return first_order(water, step, self.thermal_lag, self.start_temperature)
 
     def digitise(self, field: FloatArray) -> FloatArray:
         """Return `field` (n, 3), nT, as the converter gives it: rounded to its step, clipped at its ends."""

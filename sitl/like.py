@@ -14,7 +14,7 @@ from magbridge.field.declination import with_true_heading
 from magbridge.field.geodesy import wrap
 from sitl.scenario import Scenario
 from sitl.trajectory import Track
-from sitl.twin import FINE_STEP, Twin
+from sitl.twin import FINE_STEP, TEMPERATURE, Twin
 
 __all__ = ["placed_at", "simulate_like"]
 
@@ -94,7 +94,7 @@ def read_track(log: xr.Dataset, scenario: Scenario, channels: Sequence[str]) -> 
         roll=column("roll"),
         pitch=column("pitch"),
         heading=column("heading"),
-        parameters={name: column(name) for name in channels},
+        parameters={name: column(name) for name in channels if name != TEMPERATURE},
         water=column("water_temperature") if "water_temperature" in log else None,
     )
     return track, when

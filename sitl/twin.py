@@ -27,10 +27,12 @@ from sitl.scenario import Scenario
 from sitl.trajectory import Track, fly
 from sitl.world import World
 
-__all__ = ["FINE_STEP", "Ambient", "Twin", "simulate"]
+__all__ = ["FINE_STEP", "TEMPERATURE", "Ambient", "Twin", "simulate"]
 
 FINE_STEP = 0.5
 """s between the simulation's points: a spiral's arc departs from its chords by 0.1 nT."""
+TEMPERATURE = "sensor_temperature"
+"""Column of the fluxgate's temperature, which is simulated, whatever the log that drives a twin says."""
 FIELD_STEP = 4.0
 """s between evaluations of the Earth's field, which varies by less than 0.01 nT about a line meanwhile."""
 
@@ -134,10 +136,10 @@ class Twin:
         """Return what the instrument is exposed to along a track."""
         earth = self._earth_field(track)
         attitude = rotation(track.roll, track.pitch, track.heading)
-        field = self.vehicle.field(
-            attitude.apply(earth, inverse=True), self._channels(track), track.start + track.elapsed
-        )
         water = self.world.water.temperature(track.depth) if track.water is None else track.water
+        field = self.vehicle.field(
+            attitude.apply(earth, inverse=True), self._channels(track, water), track.start + track.elapsed
+        )
         return Ambient(earth, field, water)
 
     def instrument_rng(self) -> np.random.Generator:
@@ -160,7 +162,7 @@ class Twin:
         field_ned = np.column_stack([np.interp(when, track.elapsed, b) for b in earth.T])
         field_body = rotation(true["roll"], true["pitch"], true["heading"]).apply(field_ned, inverse=True)
         columns = self._telemetry(true, when) | {
-            "sensor_temperature": samples.temperature,
+            TEMPERATURE: samples.temperature,
             "power_cycle": samples.power_cycle,
             "truth_total_field": np.linalg.norm(field_ned, axis=1),
             "truth_latitude": true["latitude"],
@@ -199,9 +201,10 @@ class Twin:
         grid = np.arange(len(track.depth))
         return np.column_stack([np.interp(grid, points, component) for component in field.T])
 
-    def _channels(self, track: Track) -> dict[str, FloatArray]:
-        """Return the channels on which the vehicle's magnetism depends."""
+    def _channels(self, track: Track, water: FloatArray) -> dict[str, FloatArray]:
+        """Return the channels on which the vehicle depends, the fluxgate's temperature among them."""
         known = track.at(track.elapsed)
+        known[TEMPERATURE] = self.scenario.instrument.temperature(water, track.step)
         for name in self.vehicle.channels:
             if name not in known:
                 raise WrongUse(

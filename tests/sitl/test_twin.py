@@ -11,6 +11,7 @@ import pytest
 import xarray as xr
 
 from magbridge import logs
+from magbridge.calibration.effects import ChannelEffect
 from magbridge.calibration.file import save as save_calibration
 from magbridge.calibration.model import Parameter, identity
 from magbridge.errors import ConfigError, FormatError, WrongUse
@@ -126,6 +127,33 @@ def test_a_calibration_stands_in_for_vehicle_and_instrument(tmp_path: Path) -> N
     np.testing.assert_allclose(
         channels(deployment) - truth, np.tile(hard_iron[6:], (len(truth), 1)), atol=0.02
     )
+
+
+@pytest.mark.parametrize("driven", [False, True], ids=["mission", "log"])
+def test_an_effect_of_temperature_follows_the_fluxgates_own(driven: bool, tmp_path: Path) -> None:
+    """Driven by a log, the effect followed the log's temperature, and the simulated log held another."""
+    warm = ChannelEffect(cause="temperature_offset", channel="sensor_temperature")
+    plain = identity((), 53_000.0)
+    coefficients, covariance = np.append(np.zeros(9), (20.0, 0.0, -10.0)), np.eye(12)
+    extended = replace(plain, effects=(warm,), coefficients=coefficients, covariance=covariance)
+    save_calibration(extended, tmp_path / "cal.json")
+    (tmp_path / "scene.toml").write_text("name = 'extended'\ncalibration = 'cal.json'\n")
+    cooling = msgspec.structs.replace(PERFECT, start_temperature=-10.0, thermal_lag=300.0)
+    scenario = load(tmp_path / "scene.toml").replace(
+        instrument=cooling, mission=SHORT, motion=Motion(wander=(0.0, 0.0, 0.0))
+    )
+    if driven:
+        log = simulate(load("demo").replace(mission=SHORT), 1)
+        deployment = simulate_like(
+            log.assign(sensor_temperature=log["sensor_temperature"] + 7.0), scenario, 1
+        )
+    else:
+        deployment = simulate(scenario, 1)
+    temperature = deployment["sensor_temperature"].to_numpy()
+    assert np.ptp(temperature) > 5.0
+    truth = np.column_stack([deployment[f"truth_field_{axis}"] for axis in "xyz"])
+    expected = temperature[:, None] * (20.0, 0.0, -10.0)
+    np.testing.assert_allclose(channels(deployment) - truth, expected, atol=0.1)
 
 
 def test_an_unknown_current_moves_the_truth_from_where_the_vehicle_believes_to_be() -> None:
