@@ -9,8 +9,10 @@ import pytest
 from gliders import Gliders
 
 from magbridge.calibration.correct import correct
+from magbridge.calibration.effects import ChannelEffect
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.mission import Mission, expected_error
+from magbridge.calibration.model import identity
 from magbridge.calibration.planning.limits import Limits, PlannedRun, settled, trim_of
 from magbridge.calibration.planning.plan import evaluate_runs, expected_calibration, plan
 from magbridge.errors import CalibrationError
@@ -48,3 +50,11 @@ def test_planned_runs_beat_table_1(glider: Gliders) -> None:
     assert all(-6.0 <= run.roll <= 6.0 and 14.0 <= abs(run.pitch) <= 30.0 for run in ours.runs)
     with pytest.raises(CalibrationError, match="within the vehicle's limits"):
         plan(before, mission, ned, replace(limits, pitch=(80.0, 85.0)), runs=1)
+
+
+def test_an_extended_calibration_is_not_planned_with() -> None:
+    warm = ChannelEffect(cause="temperature_offset", channel="sensor_temperature")
+    extended = replace(identity(), effects=(warm,), coefficients=np.zeros(12), covariance=np.eye(12))
+    met = np.tile((20_000.0, 0.0, 45_000.0), (10, 1))
+    with pytest.raises(CalibrationError, match="not one that diagnose extended"):
+        plan(extended, Mission(met, np.empty((10, 0))), met[0], Limits(), runs=1)

@@ -13,6 +13,7 @@ import pytest
 import xarray as xr
 from commands import Command
 
+from magbridge.calibration.effects import ChannelEffect
 from magbridge.calibration.file import save
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.observe import observations
@@ -125,6 +126,21 @@ def test_one_line(
     with pytest.raises(DataError, match=message) as caught:
         diagnose([change(plain[0])], calibration)
     assert "\n" not in str(caught.value)
+
+
+def test_an_effects_channel_that_holds_nothing_is_said_to_be_empty(
+    plain: tuple[xr.Dataset, Calibration],
+) -> None:
+    ds, calibration = plain
+    warm = ChannelEffect(cause="temperature_offset", channel="warmth")
+    extended = replace(
+        calibration,
+        effects=(warm,),
+        coefficients=np.append(calibration.coefficients, np.zeros(3)),
+        covariance=np.pad(calibration.covariance, (0, 3)),
+    )
+    with pytest.raises(DataError, match="column 'warmth', which is missing or empty"):
+        diagnose([ds.assign(warmth=np.nan * ds["battpos"])], extended)
 
 
 def test_a_log_given_twice_is_refused(plain: tuple[xr.Dataset, Calibration]) -> None:

@@ -96,7 +96,10 @@ class _Design:
             or not isinstance(calibration.terms[0], Polynomial)
             or calibration.effects
         ):
-            raise CalibrationError("plan: needs a calibration of polynomials only")
+            raise CalibrationError(
+                "plan: needs a calibration of polynomials only, as magbridge calibrate makes it, not one "
+                "that diagnose extended"
+            )
         self.calibration, self.field_ned = calibration, field_ned
         self.exponents = calibration.terms[0].exponents
         phi, g = self.derivative(mission.field_body, mission.parameters)

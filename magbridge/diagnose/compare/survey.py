@@ -140,7 +140,7 @@ class Survey:
         missing = [name for name in names if name not in self.channels]
         if missing:
             raise DataError(
-                f"{self.source}: the calibration needs the column {missing[0]!r}, which is missing"
+                f"{self.source}: the calibration needs the column {missing[0]!r}, which is missing or empty"
             )
         return (
             np.stack([self.channels[name].values for name in names], axis=1)
