@@ -20,6 +20,7 @@ from magbridge.cli.common import (
     complain,
     digest,
     note_losses,
+    note_unused_grid,
     print_result,
 )
 from magbridge.errors import DataError, WrongUse
@@ -96,6 +97,7 @@ def calibrate(
     anomalies = read_grid(grid) if grid else None
     deployment = with_true_heading(read(files, required=(*CHANNELS, *parameter)), heading_reference)
     note_losses(deployment.attrs)
+    note_unused_grid(grid, deployment)
     data = replace(observations(deployment, parameter, grid=anomalies), inputs=_digests(files))
     if filter_corner:
         data = unfiltered(data, filter_corner)

@@ -40,6 +40,7 @@ __all__ = [
     "note_losses",
     "note_missing",
     "note_settings",
+    "note_unused_grid",
     "print_result",
     "refuse_unsuited",
 ]
@@ -90,6 +91,8 @@ def folder_to_write(_: Any, path: Any) -> None:
     if path.exists() and not path.is_dir():
         raise ValueError("It is a file.")
     there = next(folder for folder in (path, *path.absolute().parents) if folder.exists())
+    if not there.is_dir():
+        raise ValueError(f"{there} is a file.")
     if not os.access(there, os.W_OK):
         raise ValueError(f"The folder {there} cannot be written to.")
 
@@ -151,6 +154,13 @@ def note_missing(calibration: Calibration, deployment: xr.Dataset) -> None:
         if name not in deployment:
             lacking = f"{deployment.attrs['source']}: no column {name!r}, which the calibration needs"
             complain(f"{lacking}: every sample is flagged, with a sigma to match")
+
+
+def note_unused_grid(grid: Path | None, *logs: xr.Dataset) -> None:
+    """Warn on stderr of logs that hold a reference in every row: a grid is only added to the IGRF."""
+    for log in logs if grid else ():
+        if "reference_field" in log and log["reference_field"].notnull().all():
+            complain(f"{log.attrs['source']}: has reference_field in every row: --grid {grid} is not used")
 
 
 def note_settings(*pieces: Mapping[str, Any]) -> None:

@@ -17,6 +17,7 @@ from magbridge.cli.common import (
     digest,
     doubts_of,
     note_losses,
+    note_unused_grid,
     print_result,
 )
 from magbridge.progress import waiting
@@ -77,6 +78,7 @@ def diagnose(
     with waiting("reading") as step:
         logs = [read(path) for path in files]
         note_losses(*(log.attrs for log in logs))
+        note_unused_grid(grid, *logs)
         remarks = doubts_of(known, calibration)
         own = [path for path in files if digest(path) in known.inputs.values()]
         again = [log for path, log in zip(files, logs, strict=True) if path in own]

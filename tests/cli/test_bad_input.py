@@ -145,7 +145,8 @@ def test_a_position_in_another_unit_is_refused(
         ("simulate demo -o x.nc --seed -1", 2, "--seed"),
         ("simulate demo -o x.nc --seed 1.5", 2, "--seed: expected a whole number, not 1.5"),
         ("replay {d} --config none.toml", 2, "none.toml: No such file"),
-        ("demo --out /dev/null/demo", 1, "/dev/null/demo: Not a directory"),
+        ("demo --out /dev/null/demo", 2, "/dev/null is a file"),
+        ("diagnose {d} --calibration {d} -o {d}/doubt", 2, "deployment.csv is a file"),
     ],
 )
 def test_bad_input_gets_one_line_and_leaves_nothing(

@@ -157,6 +157,19 @@ def test_a_column_that_the_calibration_needs_is_missed_aloud(deployment: Path, c
     assert "extrapolated " in said.out
 
 
+def test_a_grid_that_is_not_used_is_told(deployment: Path, calibration: Path, command: Command) -> None:
+    """It is added to the IGRF, and a log with a reference of its own does without either."""
+    command("simulate", "demo", "-o", "twin.nc", "--map", "grid.nc", "--seed", "5", "--like", deployment)
+    rows = read(deployment).isel(time=slice(0, FEW))
+    write(rows, "log.nc")
+    write(rows.drop_vars("reference_field"), "bare.nc")
+    asked = ("--calibration", calibration, "--grid", "grid.nc", "-o", "doubt")
+    words = "has reference_field in every row: --grid grid.nc is not used"
+    assert words in command("diagnose", "log.nc", *asked, code=1).err
+    assert words not in command("diagnose", "bare.nc", *asked, code=1).err
+    assert words in command("calibrate", deployment, "--grid", "grid.nc", "-o", "x.json").err
+
+
 def test_numbers_that_may_say_not_known_are_told(
     deployment: Path, calibration: Path, command: Command
 ) -> None:
