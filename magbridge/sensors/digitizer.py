@@ -65,7 +65,7 @@ WRAP_US: Final = 1 << 32
 NO_TEMPERATURE: Final = -32768
 NO_SUPPLY: Final = 65535
 BODY: Final = Struct("<BBHHIIIhHBHbHbHb")
-"""A reading's body; a channel's 24 bits are the lower 16, and the upper 8 with the sign."""
+"""A reading's body; a channel's 24 bits are in two parts (:func:`_count`)."""
 
 
 class Digitizer:
@@ -106,12 +106,12 @@ class Digitizer:
                 readings.append(self._reading(message))
         return readings
 
-    def _reading(self, message: bytearray) -> Reading:
+    def _reading(self, message: bytes) -> Reading:
         (
             _, _, sequence, cycle, time_x, time_y, time_z, temperature, supply, flags,
             x_low, x_high, y_low, y_high, z_low, z_high,
         ) = BODY.unpack_from(message)  # fmt: skip
-        x, y, z = x_low | x_high << 16, y_low | y_high << 16, z_low | z_high << 16
+        x, y, z = _count(x_low, x_high), _count(y_low, y_high), _count(z_low, z_high)
         scale, limit = self.nt_per_count, self._limit
         inside = -limit < x < limit and -limit < y < limit and -limit < z < limit
         return Reading(
@@ -125,6 +125,11 @@ class Digitizer:
             cycle,
             not inside or flags & 7 != 0,
         )
+
+
+def _count(low: int, high: int) -> int:
+    """Return a channel's count from its lower 16 bits, and the upper 8 with the sign."""
+    return low | high << 16
 
 
 def _after(time: int, start: int) -> float:

@@ -83,14 +83,14 @@ def cobs_encode(data: bytes) -> bytes:
     return bytes(stuffed[:-1])
 
 
-def cobs_decode(frame: bytes) -> bytearray:
+def cobs_decode(frame: bytes) -> bytes:
     """Return the data of a frame of :func:`cobs_encode`; empty where it is not one."""
-    data = bytearray(frame)
-    at, end = 0, len(data)
+    pieces: list[bytes] = []  # between the zeros
+    at, end = 0, len(frame)
     while at < end:
-        step = data[at]
+        step = frame[at]
         if not step:
-            return bytearray()
-        data[at] = 0
+            return b""
+        pieces.append(frame[at + 1 : at + step])
         at += step
-    return data[1:] if at == end else bytearray()
+    return b"\0".join(pieces) if at == end else b""
