@@ -26,8 +26,6 @@ NOT_A_FRAME: Final = 0
 MORE: Final = -1
 LAST: Final = 0xFFFF
 """The last message id that a message outside the dialect may have."""
-HEADER_V2: Final = Struct("<BBBBBBBHB")
-HEADER_V1: Final = Struct("<BBBBBB")
 HEADER_OUT: Final = Struct("<BBBBBB3s")
 """Version 2 without its magic byte, which the checksum leaves out."""
 EXTRA: Final = {number: bytes((extra,)) for number, (_, extra, _) in MESSAGES.items()}
@@ -38,6 +36,8 @@ def find_magic(data: bytes, start: int, stop: int) -> int:
 
     A regular expression would take a hundred times as long for a long run of other bytes.
     """
+    if start < stop and (data[start] == V2 or data[start] == V1):  # as almost always: right after a frame
+        return start
     v2 = data.find(V2, start, stop)
     end = v2 if v2 >= 0 else stop
     v1 = data.find(V1, start, end)
@@ -73,7 +73,7 @@ def frame_end(data: bytes, start: int, stop: int, gap: int = 0, *, last: bool = 
     # an incompatibility flag that we do not know: by the standard, not to be read
     if flags > SIGNED or available < head:
         return NOT_A_FRAME if flags > SIGNED else MORE
-    number = data[start + 5] if head == 6 else int.from_bytes(data[start + 7 : start + 10], "little")
+    number = data[start + 5] if head == 6 else _number(data, start)
     extra = EXTRA.get(number)
     if extra is None and (head == 6 or data[start + 3] or number > LAST):
         return NOT_A_FRAME
@@ -91,17 +91,20 @@ def frame_end(data: bytes, start: int, stop: int, gap: int = 0, *, last: bool = 
 
 def message(frame: bytes) -> Message:
     """Take apart a frame that :func:`frame_end` has accepted."""
-    if frame[0] == V2:
-        _, length, _, _, sequence, system, component, low, high = HEADER_V2.unpack_from(frame)
-        number, head = low | high << 16, 10
-    else:
-        _, length, sequence, system, component, number = HEADER_V1.unpack_from(frame)
-        head = 6
-    payload = frame[head : head + length]
+    head = 10 if frame[0] == V2 else 6
+    number = frame[5] if head == 6 else _number(frame, 0)
+    payload = frame[head : head + frame[1]]
     known = number in EXTRA
     if known:
         payload = payload.ljust(spec(number).size, b"\0")
-    return Message(number, system, component, sequence, payload, frame, known)
+    # the sequence, the sender's system and its component stand before the message's id
+    sender = 4 if head == 10 else 2
+    return Message(number, frame[sender + 1], frame[sender + 2], frame[sender], payload, frame, known)
+
+
+def _number(data: bytes, start: int) -> int:
+    """Return the id of the message whose version 2 frame begins at ``data[start]``."""
+    return data[start + 7] | data[start + 8] << 8 | data[start + 9] << 16
 
 
 def join(
