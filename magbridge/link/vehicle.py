@@ -54,7 +54,7 @@ class Vehicle:
         self.state = MAG_PORT_STATE.ABSENT
         self._announcer, self._timers = announcer, timers
         self._sequence: int | None = None
-        self._seen = ALL  # bit k: the frame k before the latest has come
+        self._missing = 0  # bit k: the frame k before the latest has not come
         self._boot_ms = self._boot_us = 0
         self._stamps: dict[int, int] = {}  # the last boot time (ms) of each kind of message
         self._behind = 0
@@ -95,12 +95,13 @@ class Vehicle:
             self._sequence = sequence
         ahead = (sequence - self._sequence + 128) % 256 - 128
         if -WINDOW < ahead <= 0:
-            self.frames_lost -= not self._seen >> -ahead & 1
-            self._seen |= 1 << -ahead
+            late = self._missing & 1 << -ahead
+            self.frames_lost -= late != 0
+            self._missing ^= late
             return
         # far behind: the sender restarted
         self.frames_lost += max(ahead - 1, 0)
-        self._seen = (self._seen << ahead | 1) & (1 << WINDOW) - 1 if ahead > 0 else ALL
+        self._missing = (self._missing << ahead | (1 << ahead) - 2) & ALL if ahead > 0 else 0
         self._sequence = sequence
 
     def _present(self, t_us: int) -> None:
