@@ -85,21 +85,20 @@ class Publisher:
         """Send what is due of a sample; ``outbox.codec.now_us`` is the time of sending."""
         self.latest = sample
         self.samples += 1
-        now_us = self._codec.now_us
-        for rate, build in self._messages:
+        for rate, send in self._messages:
             if rate.due(sample.time_us):
-                self._outbox.frames += [(now_us, frame) for frame in build(sample)]
+                send(sample)
 
     def repeat(self, name: str) -> bool:
         """Send message `name` of the latest sample again; False where there is none yet."""
         if self.latest is None:
             return False
-        build: Callable[[Sample], tuple[bytes, ...]] = getattr(self, PUBLISHED[name])
-        self._outbox.frames += [(self._codec.now_us, frame) for frame in build(self.latest)]
+        send: Callable[[Sample], None] = getattr(self, PUBLISHED[name])
+        send(self.latest)
         return True
 
-    def _raw(self, sample: Sample) -> tuple[bytes]:
-        return (self._codec.frame(RAW, self.raw_payload(sample)),)
+    def _raw(self, sample: Sample) -> None:
+        self._outbox.put(RAW, self.raw_payload(sample))
 
     def raw_payload(self, sample: Sample) -> bytes:
         """Return the payload of a sample's MAG_RAW."""
@@ -121,7 +120,7 @@ class Publisher:
             reading.temperature, reading.supply, (reading.power_cycle or 0) & 0xFFFF, 0, flags,
         )  # fmt: skip
 
-    def _field(self, sample: Sample) -> tuple[bytes]:
+    def _field(self, sample: Sample) -> None:
         corrected = sample.corrected
         x, y, z = corrected.field
         x_sigma, y_sigma, z_sigma = corrected.field_sigma
@@ -131,9 +130,9 @@ class Publisher:
             x, y, z, x_sigma, y_sigma, z_sigma, sample.anomaly, sample.telemetry_age,
             (self._codec.now_us - sample.time_us) * 1e-6, corrected.quality, 0,
         )  # fmt: skip
-        return (self._codec.frame(FIELD, payload),)
+        self._outbox.put(FIELD, payload)
 
-    def _imu(self, sample: Sample) -> tuple[bytes]:
+    def _imu(self, sample: Sample) -> None:
         x, y, z = sample.corrected.field
         payload = IMU.struct.pack(
             sample.time_us + self._codec.utc_offset_us,
@@ -142,22 +141,22 @@ class Publisher:
             0.0, 0.0, 0.0, 0.0,  # pressures, altitude, temperature
             MAGNETOMETER, 0,
         )  # fmt: skip
-        return (self._codec.frame(IMU, payload),)
+        self._outbox.put(IMU, payload)
 
-    def _named(self, sample: Sample) -> tuple[bytes, ...]:
+    def _named(self, sample: Sample) -> None:
         corrected = sample.corrected
         boot_ms = (sample.time_us - self._start_us) // 1000 & MASK
         values = [(b"mag_total", corrected.total_field), (b"mag_sigma", corrected.total_field_sigma)]
         if isfinite(sample.anomaly):
             values.append((b"mag_anom", sample.anomaly))
-        pack = NAMED.struct.pack
-        return tuple(self._codec.frame(NAMED, pack(boot_ms, value, name)) for name, value in values)
+        for name, value in values:
+            self._outbox.put(NAMED, NAMED.struct.pack(boot_ms, value, name))
 
-    def _vector(self, sample: Sample) -> tuple[bytes]:
+    def _vector(self, sample: Sample) -> None:
         payload = VECTOR.struct.pack(
             sample.time_us + self._codec.utc_offset_us, *sample.corrected.field, b"mag_field"
         )
-        return (self._codec.frame(VECTOR, payload),)
+        self._outbox.put(VECTOR, payload)
 
 
 PUBLISHED: dict[str, str] = {
@@ -167,4 +166,4 @@ PUBLISHED: dict[str, str] = {
     "NAMED_VALUE_FLOAT": "_named",
     "DEBUG_VECT": "_vector",
 }
-"""The messages that follow the samples, and which method of `Publisher` builds each."""
+"""The messages that follow the samples, and which method of `Publisher` sends each."""
