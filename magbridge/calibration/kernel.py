@@ -101,9 +101,10 @@ class Kernel:
             phi = [value * unit for value, unit in zip(phi, self.units, strict=True)]
         size = largest(phi)
         scale = ldexp(1.0, min(EXPONENT - frexp(size * size)[1], 0)) if size < FARTHEST else nan
-        parts = np.array(split(phi, self.pairs, scale))
+        count = len(self.pairs)
+        parts = np.fromiter(split(phi, self.pairs, scale), float, 2 * count)  # much faster than np.array
         found = self.crossed.dot(parts)
-        found += self.coarse.dot(parts[len(self.pairs) :])
+        found += self.coarse.dot(parts[count:])
         if scale != 1.0:
             found /= scale
         sums: list[float] = found.tolist()
