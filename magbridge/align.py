@@ -191,7 +191,8 @@ class Aligner:
         field, first_us = self._common_time(reading, time_us)
         if self._is_gap(time_us) or missing:
             quality |= GAP
-        if isfinite(sum(reading.field)):
+        x, y, z = reading.field
+        if isfinite(x + y + z):
             self._before = time_us, reading
         if self.offset_suspect:
             quality |= OFFSET_SUSPECT

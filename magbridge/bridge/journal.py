@@ -49,8 +49,8 @@ class Journal:
         """Record bytes as they came from the sensor."""
         if not self.active:
             return
-        for begin in range(0, len(data), SIZE):
-            piece = data[begin : begin + SIZE]
+        while data:
+            piece, data = data[:SIZE], data[SIZE:]
             frame = self._scribe.frame(BYTES, HEAD.pack(0, len(piece)) + piece)
             self._add(time_us, SENSOR, frame)
 
