@@ -78,7 +78,7 @@ def simulate(
         Determines everything that the scenario leaves open; the same seed gives the same deployment.
     like
         A log whose attitude, position and masses drive the simulation instead of the scenario's mission;
-        may be repeated.
+        may be repeated. Each call makes a world around its logs: for one world, give all logs in one call.
     map_output
         Also write the anomaly grid that an aeromagnetic survey of the simulated world would have produced.
     json
