@@ -167,6 +167,16 @@ def test_the_paper_s_signature(glider: Gliders) -> None:
     assert rms_on_survey(by["nominal"].calibration, one) > 20.0
 
 
+def test_an_order_that_is_too_low_is_told(glider: Gliders) -> None:
+    """Its sigmas are too small, since they do not know what is missing; with the usual order they are not."""
+    two = glider(0, 2)
+    low, usual = fit(two.runs, "auto", 1), fit(two.runs, "auto", 3)
+    assert survey_error(low.calibration, two)[1] > 1.5
+    assert survey_error(usual.calibration, two)[1] < 1.25
+    assert any("--order is too low" in warning for warning in low.warnings)
+    assert not any("--order" in warning for warning in usual.warnings)
+
+
 def test_fits_are_deterministic(glider: Gliders) -> None:
     first, second = (fit(glider(1).runs).calibration for _ in range(2))
     np.testing.assert_array_equal(first.coefficients, second.coefficients)

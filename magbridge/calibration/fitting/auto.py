@@ -36,10 +36,13 @@ from magbridge.errors import CalibrationError
 __all__ = ["fit_auto"]
 
 
+Vehicle = Mapping[str, Mounting | Mapping[str, Any]]
 ENOUGH, BLOCK = 6000, 50
 """Samples that choose the start, and the size of the blocks of neighbours in which they are taken."""
 ROUNDS = 16
 """Rounds of coefficients, widths, noise, at most; five or six are usually enough."""
+USUAL = 3
+"""The order that is usually enough: below it, the evidence is asked for one more."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,9 +55,7 @@ class _Answer:
     score: float
 
 
-def fit_auto(
-    data: Observations, order: int = 3, *, vehicle: Mapping[str, Mounting | Mapping[str, Any]] | None = None
-) -> Fit:
+def fit_auto(data: Observations, order: int = 3, *, vehicle: Vehicle | None = None) -> Fit:
     """Fit polynomials of all orders up to `order` with physical priors; see the module's notes.
 
     Parameters
@@ -72,11 +73,7 @@ def fit_auto(
         No start reached a maximum, or the best one collapsed.
     """
     ranges = data.ranges()
-    exponents = full_order(len(ranges), order)
-    samples = polynomial_samples(data, exponents)
-    family = polynomial_prior(exponents, data.names, samples.F_0)
-    if vehicle:
-        family = mounted_prior(family, exponents, ranges, vehicle)
+    exponents, samples, family = _posed(data, order, vehicle)
     best = _best(samples, family)
     prior = best.family.at(best.widths.eta)
     precision = best.solution.normal.hessian / best.noise.sigma**2 + prior.precision
@@ -86,11 +83,35 @@ def fit_auto(
         data, samples, ranges, exponents, coefficients, prior.E @ covariance_of(precision) @ prior.E.T,
         best.noise, "auto", details={
             "log_evidence": best.score,
+            "next_order": _gained(data, order, vehicle) if ranges and order < USUAL else 0.0,
             "determined": best.widths.determined,
             "outliers": best.noise.rejected,
             "widths_nT": dict(zip(family.names, np.exp(best.widths.eta).tolist(), strict=True)),
         },
     )  # fmt: skip
+
+
+def _posed(
+    data: Observations, order: int, vehicle: Vehicle | None
+) -> tuple[tuple[tuple[int, ...], ...], Samples, PriorFamily]:
+    """Return the exponents of an order, the samples with its monomials, and the prior of its coefficients."""
+    ranges = data.ranges()
+    exponents = full_order(len(ranges), order)
+    samples = polynomial_samples(data, exponents)
+    family = polynomial_prior(exponents, data.names, samples.F_0)
+    return exponents, samples, mounted_prior(family, exponents, ranges, vehicle) if vehicle else family
+
+
+def _gained(data: Observations, order: int, vehicle: Vehicle | None) -> float:
+    """Log evidence that one more order gains, on as many samples as choose a start; none if it has no fit."""
+    scores = []
+    for n in (order, order + 1):
+        _, samples, family = _posed(data, n, vehicle)
+        try:
+            scores.append(_best(_thinned(samples), family).score)
+        except CalibrationError:
+            return 0.0
+    return scores[1] - scores[0]
 
 
 def _best(samples: Samples, family: PriorFamily) -> _Answer:

@@ -37,6 +37,8 @@ ONE_ATTITUDE = 5.0
 """deg: all samples within that of their mean direction are one attitude."""
 UNSUPPORTED = 5.0
 """Expected error over noise, above which the data do not support the fit."""
+LIKELIER = 3.0
+"""Nats by which one more order is likelier (20:1) where the one that was asked for is too low."""
 GAIN = 0.1
 """Departure of the middle scale from 1 that few sensors have: a wrong reference shrinks all scales."""
 UNSEEN = 270.0
@@ -201,6 +203,11 @@ def _suspicions(found: Fit) -> Iterator[str]:
     samples, outliers = len(found.residual), found.details.get("outliers", 0)
     if outliers > 0.02 * samples:
         yield f"{outliers} of {samples} samples are outliers and were left out of the fit"
+    if (gained := found.details.get("next_order", 0.0)) > LIKELIER:
+        yield (
+            f"--order is too low: one more is likelier by {gained:.0f} nats, and the sigmas do not know what "
+            "is missing"
+        )
     smallest, largest = found.scales
     if abs(0.5 * (smallest + largest) - 1.0) > GAIN:
         yield (
