@@ -22,7 +22,7 @@ from magbridge.diagnose.causes.candidates import Candidate, Group, slices
 from magbridge.diagnose.inference.evidence import LEVEL, score
 from magbridge.diagnose.inference.information import Information
 
-__all__ = ["Isolability", "Visible", "isolability"]
+__all__ = ["CONFOUNDED", "Isolability", "Visible", "isolability"]
 
 CONFOUNDED = 0.85
 """Correlation beyond which two causes are listed as a pair: at this one they are told apart in 95 of 100

@@ -72,7 +72,7 @@ def clock(diagnosis: Diagnosis) -> tuple[float, str]:
 
 
 def curves(diagnosis: Diagnosis, *values: FloatArray) -> tuple[FloatArray, ...]:
-    """Return the time since the start and each of `values`, thinned, with no line across a gap."""
+    """Return (m,) of time since the start and each of `values` (n,), thinned, with no line across a gap."""
     t, part = diagnosis.problem.survey.time, thin(len(diagnosis.problem))
     since = (t[part] - t[0]) / clock(diagnosis)[0]
     steps = np.diff(since)
@@ -81,7 +81,7 @@ def curves(diagnosis: Diagnosis, *values: FloatArray) -> tuple[FloatArray, ...]:
 
 
 def rolling(diagnosis: Diagnosis, values: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the time since the start and the mean of `values` in equal stretches; NaN where a gap is."""
+    """Return (m,) of time since the start and the mean of `values` (n,) in equal stretches; NaN in gaps."""
     t = diagnosis.problem.survey.time
     edges = np.linspace(t[0], t[-1], STRETCHES + 1)
     place = np.clip(np.searchsorted(edges, t, side="right") - 1, 0, STRETCHES - 1)
@@ -91,14 +91,14 @@ def rolling(diagnosis: Diagnosis, values: FloatArray) -> tuple[FloatArray, Float
 
 
 def ends(*values: FloatArray, low: float, high: float) -> tuple[float, float]:
-    """Return limits of an axis: few wild samples do not set the scale; `low`, `high`: shares of room left."""
+    """Return an axis' limits for `values` (n,), few wild ones left aside; `low`, `high`: shares of room."""
     first, last = np.nanquantile(np.concatenate(values), [0.002, 0.998])
     span = max(float(last - first), 1e-9)
     return float(first) - low * span, float(last) + high * span
 
 
 def sides(diagnosis: Diagnosis) -> dict[str, tuple[FloatArray, str]]:
-    """Return the two residuals to compare, each with its colour.
+    """Return the two residuals (n,) to compare, each with its colour.
 
     Without findings, the second is that of the refitted calibration.
     """

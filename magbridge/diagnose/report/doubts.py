@@ -23,7 +23,17 @@ from magbridge.diagnose.inference.rivals import Rival
 from magbridge.diagnose.report.words import label, listed, measured, number
 from magbridge.diagnose.unexplained.leftover import Leftover
 
-__all__ = ["doubts", "gained", "late", "nameless", "stays", "times_usual", "unsettled", "useful"]
+__all__ = [
+    "IMPLAUSIBLE",
+    "doubts",
+    "gained",
+    "late",
+    "nameless",
+    "stays",
+    "times_usual",
+    "unsettled",
+    "useful",
+]
 
 REFERENCE = ("map_error", "reference_bias", "diurnal_variation")
 """Causes that are errors of the reference."""
