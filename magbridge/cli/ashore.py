@@ -113,6 +113,7 @@ def map(  # noqa: A001 - the command's name
     *grids: Path,
     output: Grid,
     altitude: Annotated[float | None, Parameter(validator=validators.Number(gte=-1e6, lte=1e6))] = None,
+    surveyed: Annotated[tuple[float, ...], Parameter(validator=validators.Number(gte=-1e6, lte=1e6))] = (),
     passes: Annotated[Whole, Parameter(validator=validators.Number(gte=0, lte=10_000))] = 20,
     mask: Path | None = None,
     spacing: Annotated[float | None, Parameter(validator=validators.Number(gt=0, lt=inf))] = None,
@@ -129,6 +130,8 @@ def map(  # noqa: A001 - the command's name
         The map to write, netCDF.
     altitude
         Altitude in m to which every grid is continued upward; by default that of the highest.
+    surveyed
+        Altitude in m of the surveys whose grids do not say it: one for all grids, or repeated, one for each.
     passes
         Number of passes of the 3x3 Hanning smoothing kernel.
     mask
@@ -140,13 +143,16 @@ def map(  # noqa: A001 - the command's name
     json
         Print the result as JSON.
     """
-    from magbridge.field.prepare import draw_steps, prepare
+    from magbridge.field.prepare import draw_steps, prepare, surveyed_at
     from magbridge.field.read import read_grid, read_polygon
 
     check_inputs(grids, output, mask)
     polygon = read_polygon(mask) if mask else None
     with waiting("preparing"):
-        result, steps = prepare([read_grid(path) for path in grids], altitude, passes, polygon, spacing)
+        flown = [read_grid(path) for path in grids]
+        if surveyed:
+            flown = surveyed_at(flown, surveyed)
+        result, steps = prepare(flown, altitude, passes, polygon, spacing)
     result.save(output)
     if picture:
         draw_steps(steps, picture)

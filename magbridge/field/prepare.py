@@ -14,13 +14,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from magbridge.arrays import FloatArray
-from magbridge.errors import OutOfRange
+from magbridge.errors import OutOfRange, WrongUse
 from magbridge.field.continuation import continued
 from magbridge.field.geodesy import usual
 from magbridge.field.grid import AnomalyGrid
 from magbridge.files import atomic_path
 
-__all__ = ["Step", "continue_upward", "draw_steps", "hanning", "merge", "prepare"]
+__all__ = ["Step", "continue_upward", "draw_steps", "hanning", "merge", "prepare", "surveyed_at"]
 
 HANNING = np.outer([1.0, 2.0, 1.0], [1.0, 2.0, 1.0]) / 16.0
 MOST = 10_000_000
@@ -59,12 +59,18 @@ def prepare(
     Raises
     ------
     OutOfRange
-        An altitude below a grid's: continuing downward amplifies what the survey did not resolve. More
-        than :data:`MOST` nodes.
+        An altitude below a grid's: continuing downward amplifies what the survey did not resolve. A grid of
+        unknown altitude that is to be continued, or merged with one of known altitude. More than
+        :data:`MOST` nodes.
     """
     steps = [Step(f"as surveyed: {Path(grid.name).name}", grid) for grid in grids]
     known = [grid.altitude for grid in grids if isfinite(grid.altitude)]
-    level = altitude if altitude is not None else max(known, default=float("nan"))
+    level = altitude if altitude is not None else max(known, default=nan)
+    if isfinite(level) and len(known) < len(grids):
+        silent = next(grid.name for grid in grids if not isfinite(grid.altitude))
+        raise OutOfRange(
+            "altitude", f"{level:.0f} m", f"{silent} does not say how high it was surveyed (--surveyed)"
+        )
     lifted = []
     for grid in grids:
         up = level - grid.altitude
@@ -85,6 +91,24 @@ def prepare(
         result = hanning(result, passes)
         steps.append(Step(f"smoothed, {passes} passes", result))
     return result, steps
+
+
+def surveyed_at(grids: Sequence[AnomalyGrid], altitudes: Sequence[float]) -> list[AnomalyGrid]:
+    """Return the grids, those of unknown altitude at `altitudes` (m): one for all, or one for each.
+
+    Raises
+    ------
+    WrongUse
+        There are more or fewer of them.
+    """
+    if len(altitudes) not in (1, len(grids)):
+        count = f"{len(altitudes)} altitudes for {len(grids)} grids"
+        raise WrongUse(f"--surveyed: {count}: one for all, or one for each")
+    each = altitudes if len(altitudes) > 1 else [*altitudes] * len(grids)
+    return [
+        grid if isfinite(grid.altitude) else _like(grid, grid.anomaly, altitude)
+        for grid, altitude in zip(grids, each, strict=True)
+    ]
 
 
 def continue_upward(grid: AnomalyGrid, height: float) -> AnomalyGrid:
@@ -201,8 +225,9 @@ def _masked(grid: AnomalyGrid, polygon: FloatArray) -> AnomalyGrid:
     return _like(grid, np.where(inside, grid.anomaly, np.nan))
 
 
-def _like(grid: AnomalyGrid, values: FloatArray) -> AnomalyGrid:
-    return AnomalyGrid(grid.longitude, grid.latitude, values, grid.sigma, grid.altitude, grid.name)
+def _like(grid: AnomalyGrid, values: FloatArray, altitude: float | None = None) -> AnomalyGrid:
+    level = grid.altitude if altitude is None else altitude
+    return AnomalyGrid(grid.longitude, grid.latitude, values, grid.sigma, level, grid.name)
 
 
 def _cover(axes: Sequence[FloatArray], step: float) -> FloatArray:

@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from magbridge.errors import OutOfRange
+from magbridge.errors import OutOfRange, WrongUse
 from magbridge.field.continuation import continued
 from magbridge.field.geodesy import metres_per_degree
 from magbridge.field.grid import AnomalyGrid
-from magbridge.field.prepare import continue_upward, draw_steps, hanning, merge, prepare
+from magbridge.field.prepare import continue_upward, draw_steps, hanning, merge, prepare, surveyed_at
 
 LON, LAT = np.linspace(-58.1, -57.9, 81), np.linspace(49.45, 49.55, 61)
 
@@ -77,6 +77,23 @@ def test_a_map_of_unknown_height_stays_as_it_is() -> None:
 def test_nothing_is_prepared_downward() -> None:
     with pytest.raises(OutOfRange, match="surveyed at 90 m: a field can only be continued upward"):
         prepare([AnomalyGrid(LON, LAT, monopole(90.0), altitude=90.0, name="a.grd")], altitude=60.0)
+
+
+def test_a_survey_of_unknown_height_is_not_continued_until_it_is_told() -> None:
+    """It stayed as it was, without a word, while the map claimed the altitude that was asked for."""
+    silent = AnomalyGrid(LON, LAT, monopole(60.0), name="a.grd")
+    known = AnomalyGrid(LON, LAT, monopole(90.0), altitude=90.0, name="b.nc")
+    for grids, altitude in (([silent], 90.0), ([known, silent], None)):
+        with pytest.raises(OutOfRange, match=r"90 m: a.grd does not say how high it was surveyed"):
+            prepare(grids, altitude)
+    told = surveyed_at([known, silent], [60.0])
+    assert [grid.altitude for grid in told] == [90.0, 60.0]
+    assert surveyed_at([silent, silent], [60.0, 70.0])[1].altitude == 70.0
+    lifted, _ = prepare(told[1:], 90.0, passes=0)
+    off = (lifted.anomaly - monopole(90.0))[10:-10, 10:-10]
+    assert np.abs(off).max() < 0.1 * np.abs(monopole(60.0) - monopole(90.0)).max()
+    with pytest.raises(WrongUse, match="2 altitudes for 1 grids"):
+        surveyed_at([silent], [60.0, 70.0])
 
 
 def test_merge_is_the_mean_in_the_overlap() -> None:
