@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from magbridge.arrays import FloatArray
+from magbridge.errors import FormatError
 
 __all__ = ["floats"]
 
@@ -23,7 +24,7 @@ def floats(variable: Any, rows: slice = ALL) -> FloatArray:
 
     Missing are the values that the variable declares as missing, compared as stored, before unpacking; and
     those never written, which the library fills with a number of its own. ``valid_range`` is ignored: one
-    that begins at 0 would discard a depth of -2 cm.
+    that begins at 0 would discard a depth of -2 cm. FormatError: packed by what is no number.
     """
     variable.set_auto_maskandscale(False)
     stored = variable[rows]
@@ -33,7 +34,11 @@ def floats(variable: Any, rows: slice = ALL) -> FloatArray:
     # any byte may be meant: of bytes, only a fill value that is declared counts
     if "_FillValue" in attributes or (fill is not None and stored.dtype.itemsize > 1):
         nothing.append(fill)
-    scale, offset = getattr(variable, "scale_factor", 1.0), getattr(variable, "add_offset", 0.0)
+    try:
+        scale, offset = float(getattr(variable, "scale_factor", 1)), float(getattr(variable, "add_offset", 0))
+    except (TypeError, ValueError):
+        expected = "expected numbers as scale_factor and add_offset"
+        raise FormatError(variable.group().filepath(), expected, column=variable.name) from None
     values = stored.astype(np.float64) * scale + offset
     values[np.isin(stored, nothing)] = np.nan
     return np.asarray(values, np.float64)

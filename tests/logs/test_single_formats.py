@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from magbridge import logs
+from magbridge.errors import FormatError
 from magbridge.logs.deployment import deployment, join
 
 
@@ -101,6 +102,16 @@ def test_og1_file_of_someone_else(tmp_path: Path) -> None:
     np.testing.assert_allclose(back["packed"], [2, np.nan, 4])
     assert back["never_written"].isnull().all()
     assert back["latitude"].attrs["units"] == "deg"
+
+
+def test_netcdf_packed_by_words_is_one_line(tmp_path: Path) -> None:
+    with netCDF4.Dataset(tmp_path / "a.nc", "w") as file:
+        file.createDimension("N_MEASUREMENTS", 1)
+        file.createVariable("TIME", "f8", ("N_MEASUREMENTS",)).units = "seconds since 1970-01-01"
+        file["TIME"][:] = 1.0
+        file.createVariable("PUMP", "i2", ("N_MEASUREMENTS",)).scale_factor = "one"
+    with pytest.raises(FormatError, match=r"a.nc: column 'PUMP': expected numbers as scale_factor"):
+        logs.read(tmp_path / "a.nc")
 
 
 def test_an_attribute_whose_name_netcdf_forbids_is_left_out(tmp_path: Path) -> None:
