@@ -30,11 +30,13 @@ def merge(sources: Sequence[Open], rows: int) -> Iterator[xr.Dataset]:
         return same_columns(join(parts), columns).assign_attrs(source=whole.attrs["source"])
 
     parts: list[xr.Dataset] = []
+    held = 0  # rows in them, counted as they come: of thousands of short logs a sum would be quadratic
     for together in _in_order(sources, [float(first["time"].values[0]) for first in firsts], rows):
         parts += together
-        if sum(part.sizes["time"] for part in parts) >= rows:
+        held += sum(part.sizes["time"] for part in together)
+        if held >= rows:
             yield joined(parts)
-            parts = []
+            parts, held = [], 0
     if parts:
         yield joined(parts)
 
