@@ -14,6 +14,7 @@ from study import deployment
 from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.diagnosis import Diagnosis, Finding
 from magbridge.diagnose.gain import Gain
+from magbridge.diagnose.inference.outliers import Outliers
 from magbridge.diagnose.inference.rivals import Rival
 from magbridge.diagnose.report.canvas import ends, rolling
 from magbridge.diagnose.report.decision import OWN, Decision, decide
@@ -164,6 +165,14 @@ def test_what_has_no_name_is_described_on_the_first_screen(clear: Diagnosis) -> 
     assert "<b>A tone</b> of period 33 s is left (signal-to-noise ratio 9.0; it follows" in first
     assert "amps&lt;b&gt;" in first
     assert "None is named: a description without a name explains it better." in below
+
+
+def test_wrong_samples_alone_promise_no_gain(clear: Diagnosis) -> None:
+    """They are left out of every RMS, and nothing is added that could gain."""
+    alone = replace(clear, findings=(), wrong=Outliers(np.array([3, 90]), 40.0, 1e-6), verdict="explained")
+    page = report_html(alone, CAUSES)
+    assert "(2 wrong samples). Without them, " in page
+    assert "became" not in page
 
 
 def test_the_page_is_whole(clear: Diagnosis) -> None:

@@ -152,7 +152,12 @@ def _sentence(diagnosis: Diagnosis) -> str:
     ]
     if diagnosis.wrong is not None:
         causes.append(f"<b>outliers</b> ({diagnosis.wrong.rows.size} wrong samples)")
-    names = f"Found: {'; '.join(causes)}. {gained(total, diagnosis.problem.survey.parts)}"
+    worth = (
+        gained(total, diagnosis.problem.survey.parts)
+        if diagnosis.findings
+        else f"Without them, {number(total.before)} nT RMS; nothing is added to the calibration."
+    )
+    names = f"Found: {'; '.join(causes)}. {worth}"
     rest = diagnosis.unexplained
     withheld = rest.within if rest else ()
     nothing_else = "Nothing else stands out of the noise."
