@@ -116,7 +116,8 @@ def _examine(
     stand, rest = accept(problem, outcome, tone)
     named, rivals, fit = (outcome.chosen, outcome.rivals, outcome.fit) if stand else ((), (), outcome.null)
     model = [h.candidate for h in named]
-    wrong = _wrong(outcome.fit, named, len(causes))
+    off = _off(outcome.fit, named, len(causes))
+    wrong = off if off is not None and off.isolated else None
     progress("extending the calibration")
     settled, columns, fit = relinearised(problem, model, fit)
     fit = with_misfit(model, loosened(settled, model, columns, fit, candidates))
@@ -133,7 +134,7 @@ def _examine(
             # the dives left out speak 20:1 against these names
             named, rivals, model, fit, after, extended = (), (), [], outcome.null, before, calibration
             rest = leftover(problem, [], outcome.null, tone)
-    rest = rest or _loud(problem, after, counts)
+    rest = rest or _passing(off) or _loud(problem, after, counts)
     chances = chances_alone(candidates, outcome.info, named, outcome.trials, len(causes))
     total = paired(before, after, problem.survey.dive, counts)
     return Diagnosis(
@@ -188,11 +189,11 @@ def _strongest_tone(problem: Problem, causes: Mapping[str, Cause]) -> Candidate 
     return tones[0] if tones else None
 
 
-def _wrong(fit: Joint, named: Sequence[Hypothesis], causes: int) -> Outliers | None:
-    """Return the isolated wrong samples, unless they may be a remnant of the strongest cause."""
-    wrong = outliers(fit, causes)
+def _off(fit: Joint, named: Sequence[Hypothesis], causes: int) -> Outliers | None:
+    """Return the wrong samples, unless they may be a remnant of the strongest cause."""
+    off = outliers(fit, causes)
     strongest = max((h.signal_to_noise for h in named), default=0.0)
-    return wrong if wrong is not None and wrong.ratio >= (REMNANT * strongest) ** 2 else None
+    return off if off is not None and off.ratio >= (REMNANT * strongest) ** 2 else None
 
 
 def _counted(problem: Problem, wrong: Outliers | None) -> BoolArray:
@@ -224,6 +225,13 @@ def _findings(
         covariance = fit.effects_covariance[own, own]
         found.append(Finding(hypothesis, others, gain, fit.coefficients[own], covariance, chance))
     return tuple(found)
+
+
+def _passing(off: Outliers | None) -> Leftover | None:
+    """Describe wrong samples that are not isolated: something passed by, or rang, for a few samples."""
+    if off is None or off.isolated:
+        return None
+    return Leftover("transient", float(np.sqrt(off.ratio)), off.p_value, 0.5 * off.ratio, None, None)
 
 
 def _loud(problem: Problem, after: FloatArray, counts: BoolArray) -> Leftover | None:

@@ -1,12 +1,14 @@
-"""Isolated wrong samples."""
+"""Wrong samples, and whether they are isolated."""
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from scipy.linalg import solve_toeplitz
 from scipy.special import gammaln
-from scipy.stats import chi2
+from scipy.stats import chi2, rankdata
 
 from magbridge.arrays import FloatArray, IndexArray
 from magbridge.calibration.residual import robust_scale
@@ -18,15 +20,31 @@ __all__ = ["Outliers", "outliers"]
 
 
 class Outliers(NamedTuple):
-    """Isolated wrong samples: which, twice the gain in log likelihood, and its p-value."""
+    """Wrong samples, and how surely they are isolated.
+
+    Attributes
+    ----------
+    rows : (k,) int array
+    ratio : float
+        Twice the gain in log likelihood.
+    p_value : float
+    neighbours : float
+        Chance that good samples beside them would be off as far as theirs are.
+    """
 
     rows: IndexArray
     ratio: float
     p_value: float
+    neighbours: float
+
+    @property
+    def isolated(self) -> bool:
+        """Whether the samples beside them are good: beside what passes by, or rings, they are not."""
+        return self.neighbours >= LEVEL
 
 
 def outliers(fit: Joint, causes: int) -> Outliers | None:
-    """Test for isolated wrong samples: a few innovations from a wide distribution of their own.
+    """Test for wrong samples: a few innovations from a wide distribution of their own.
 
     Heavy tails alone are no outliers: the mixture ``(1 - eps) t_nu + eps N(0, S^2)`` must beat the
     best ``t_nu``.
@@ -44,7 +62,41 @@ def outliers(fit: Joint, causes: int) -> Outliers | None:
         return None
     # through the noise's autoregression a wrong sample also spoils the innovations after it
     first = rows[np.insert(np.diff(rows) > 1, 0, True)]
-    return Outliers(first, ratio, p_value)
+    return Outliers(first, ratio, p_value, _neighbours(fit, first))
+
+
+def _neighbours(fit: Joint, rows: IndexArray) -> float:
+    r"""Chance that the samples before and after `rows` (k,) are good: 1 where gaps leave none to ask.
+
+    Notes
+    -----
+    A wrong sample i is an additive outlier, or one of the innovations, which the noise's correlation carries
+    on (Fox 1972, JRSS B 34:350). In the first case three impulses c are fitted, at i - 1, i and i + 1. With h
+    the whitening filter ``(1, -a)`` and v the innovations in units of the noise's scale,
+
+    .. math:: G c = b, \qquad G_{jk} = \sum_l h_l h_{l+|j-k|}, \qquad b_j = \sum_l h_l v_{j+l}
+
+    Then the outer c are noise if the neighbours are good; in the second case the innovations beside i are. Of
+    either kind each neighbour has as its p-value its rank among those of all samples, whatever the noise's
+    tails; Fisher's method combines them, each sample being of the kind that is kinder to its neighbours.
+    """
+    noise, p = fit.noise, len(fit.noise.ar)
+    h = np.concatenate([[1.0], -noise.ar, np.zeros(2)])
+    b, v = (
+        sliding_window_view(x, 3).T
+        for x in (noise.back(noise.whiten(fit.left)) * noise.scale, noise.innovations)
+    )
+    c = solve_toeplitz([float(h[: len(h) - k] @ h[k:]) for k in range(3)], b)
+    before = np.arange(b.shape[1])
+    after = np.minimum(before + 2 + p, b.shape[1] + 1)  # the last sample that one of the impulses reaches
+    whole = noise.past.whole[before] & noise.past.whole[after]
+    asked = np.isin(before + 1, rows)[whole]
+    if not asked.any():
+        return 1.0
+    # (kind, side, sample)
+    beside = -np.abs(np.stack([c[::2, whole], v[::2, whole]]))
+    p_values = rankdata(beside, "max", axis=2)[:, :, asked] / asked.size
+    return float(chi2.sf(-2.0 * np.log(p_values).sum(axis=1).max(axis=0).sum(), 4 * asked.sum()))
 
 
 def _mixture(v: FloatArray, nu: float, eps: float) -> tuple[float, FloatArray]:

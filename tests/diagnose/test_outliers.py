@@ -1,0 +1,86 @@
+"""Wrong samples are told from what passes by: beside an isolated one the samples are good."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from magbridge.calibration.fitting.fit import fit
+from magbridge.calibration.fitting.lowpass import unfiltered
+from magbridge.calibration.fitting.observe import observations
+from magbridge.diagnose.compare.past import FAR, Past
+from magbridge.diagnose.inference.fit_noise import fit_noise
+from magbridge.diagnose.inference.joint import Joint
+from magbridge.diagnose.inference.outliers import Outliers, outliers
+from magbridge.diagnose.run import diagnose
+from sitl import load, simulate
+from sitl.dataset import segments
+
+N = 5000
+SPIKE = np.array([0.0, 12.0, 0.0])
+PULSE = np.array([6.0, 12.0, 6.0])
+"""Of a source that passes within a few samples, in units of the innovations."""
+
+
+def found(shape: np.ndarray, rows: np.ndarray, rho: float, seed: int, nu: float = 50.0) -> Outliers | None:
+    rng = np.random.default_rng(seed)
+    left = lfilter([1.0], [1.0, -rho], rng.standard_t(nu, N))
+    for row in rows:
+        left[row - 1 : row + 2] += shape * rng.choice([-1.0, 1.0])
+    steps = np.ones(N, int)
+    steps[[0, N // 3]] = FAR
+    noise = fit_noise(left, Past(steps, 2))
+    none = np.zeros(0)
+    return outliers(Joint(noise.log_likelihood, none, none, np.zeros((0, 0)), noise, left, none), 18)
+
+
+@pytest.mark.parametrize("rho", [0.0, 0.6])
+def test_isolated_samples_are_told_from_a_passage(rho: float) -> None:
+    """Also where the noise's correlation spreads a wrong sample over the innovations after it."""
+    rows = np.arange(400, N, 700)
+    for seed in range(5):
+        isolated, passing = (found(shape, rows, rho, seed) for shape in (SPIKE, PULSE))
+        assert isolated is not None
+        assert passing is not None
+        assert isolated.isolated
+        assert set(rows) <= set(isolated.rows)
+        assert not passing.isolated
+
+
+@pytest.mark.parametrize("nu", [3.0, 50.0])
+@pytest.mark.parametrize("rho", [0.0, 0.6])
+def test_good_neighbours_are_rarely_doubted(nu: float, rho: float) -> None:
+    """Nor those of the noise's own large innovations, which its correlation carries on."""
+    rows = np.arange(300, N, 500)
+    told = [one.neighbours for seed in range(25) if (one := found(3.0 * SPIKE, rows, rho, seed, nu))]
+    assert len(told) == 25
+    assert 0.3 < np.mean(told) < 0.75
+    assert np.mean(np.array(told) < 0.1) < 0.25
+
+
+def test_beside_a_gap_there_is_none_to_ask() -> None:
+    alone = found(3.0 * SPIKE, np.array([N // 3 + 1]), 0.0, 3)
+    assert alone is not None
+    assert alone.neighbours == 1.0
+
+
+@pytest.mark.parametrize(("shape", "isolated"), [(SPIKE, True), (PULSE, False)])
+def test_a_diagnosis_names_isolated_samples_only(shape: np.ndarray, isolated: bool) -> None:
+    """Beside others that are off it says that something was there for a moment."""
+    scenario = load("demo")
+    parts = segments(simulate(scenario, 2))
+    learned = unfiltered(
+        observations(parts["calibration"], ("battpos", "ballast")), scenario.instrument.corner
+    )
+    calibration, survey = fit(learned, "auto").calibration, parts["survey"]
+    off = np.zeros(survey.sizes["time"])
+    for row in (200, 900):
+        off[row - 1 : row + 2] = 3.0 * shape
+    for name in ("mag_x", "mag_y", "mag_z"):
+        survey[name] = survey[name] * (1.0 + off / survey["reference_field"].to_numpy())
+    told = diagnose([survey], calibration)
+    assert not told.findings
+    assert (told.wrong is not None) is isolated
+    assert (told.unexplained is None) is isolated
+    assert isolated or told.unexplained.kind == "transient"
