@@ -48,6 +48,7 @@ DRAWN = {
     "backdriven": 5.032, "microphonic": 23.07, "soliton": 52.93, "escort": 28.71,
     "airlock": 103.1, "wiper": 172.4, "seep": 62.78, "ferry": 23.7,
     "solar": 5.377, "gimbal": 161.7, "lookup": 19.23, "consort": 33.59,
+    "jettison": 214.7, "duet": 149.1, "winch": 61.43, "mooring": 71.04,
 }  # fmt: skip
 """Norm (nT) of what each does to the log of :func:`flight`, as first drawn.
 

@@ -41,7 +41,7 @@ NAMELESS = ("unknown", "seen", "foreign")
 """Parts in which the hidden effect is not among the causes of the table."""
 PREDICTED = ("named", "ladder", "pair", *NAMELESS)
 """Parts for which theory predicts the outcome."""
-STRANGE = ("solar", "gimbal", "lookup", "consort")
+STRANGE = ("jettison", "duet", "winch", "mooring")
 """Foreign effects made after the detector was frozen; its descriptions were not designed for them either."""
 SEEN = (
     "pan", "loose", "corrosion", "pulsation", "needle", "thermostat", "perming", "staircase", "swell",
@@ -56,6 +56,7 @@ SEEN = (
     "accumulator", "modem", "rezero", "pipeline",
     "backdriven", "microphonic", "soliton", "escort",
     "airlock", "wiper", "seep", "ferry",
+    "solar", "gimbal", "lookup", "consort",
 )  # fmt: skip
 """Foreign effects that were once made for this purpose, but before the detector was last improved."""
 GOLDEN = 0.6180339887498949

@@ -87,5 +87,9 @@ FOREIGN: dict[str, Effect] = {
     "gimbal": payload.gimbal,
     "lookup": sensor.lookup,
     "consort": surroundings.consort,
+    "jettison": vehicle.jettison,
+    "duet": sensor.duet,
+    "winch": payload.winch,
+    "mooring": surroundings.mooring,
 }
 """Effect, by its name."""

@@ -124,3 +124,19 @@ def gimbal(scene: Scene, size: float, rng: Generator) -> None:
     turned = held.apply(magnet)
     own = dipole_field(np.broadcast_to(place, turned.shape), turned - magnet)
     scene.field = scene.field + size * own / max(float(np.linalg.norm(own, axis=1).max()), 1e-30)
+
+
+def winch(scene: Scene, size: float, rng: Generator) -> None:
+    """A winch of steel wire lowers an instrument while the vehicle is deep; size in nT, all wire out.
+
+    How much wire it pays out it chooses on each dive; it winds it in again before the next.
+    """
+    track = scene.track
+    deep = track.depth > rng.uniform(0.5, 0.8) * track.depth.max()
+    dive = np.cumsum(np.diff(deep, prepend=deep[0]) & deep)
+    wanted = deep * rng.uniform(0.2, 1.0, dive[-1] + 1)[dive]
+    speed, out, wire = 1.0 / rng.uniform(60.0, 300.0), 0.0, np.empty(len(deep))
+    for k, goal in enumerate(wanted):
+        out += float(np.clip(goal - out, -speed * track.step, speed * track.step))
+        wire[k] = out
+    scene.add(wire, size * direction(rng))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from sitl.inject.scene import Array, Generator, Scene, direction, relays, soaked
-from sitl.signals import first_order
+from sitl.signals import autoregressive, first_order
 
 
 def perming(scene: Scene, size: float, rng: Generator) -> None:
@@ -227,3 +227,17 @@ def lookup(scene: Scene, size: float, rng: Generator) -> None:
             entry = round(at)
         used[k] = entry
     scene.add(warm - warm[0] - apart * (used - used[0]), size * direction(rng))
+
+
+def duet(scene: Scene, size: float, rng: Generator) -> None:
+    """Two converters of nearly one frequency fold into the band, and beat slowly; size in nT of the louder.
+
+    Each wanders with its own load.
+    """
+    step, total = scene.track.step, np.zeros_like(scene.t)
+    folded = rng.uniform(0.01, 0.1)
+    for share, apart in ((1.0, 0.0), (rng.uniform(0.4, 1.0), rng.uniform(3e-4, 1.5e-3))):
+        wanders = 1e-4 * autoregressive(rng, (len(scene.t),), 1.0, 1200.0 / step)
+        phase = 2.0 * np.pi * np.cumsum(folded + apart + wanders) * step
+        total += share * np.cos(phase + rng.uniform(0.0, 2.0 * np.pi))
+    scene.add(total, size * direction(rng))

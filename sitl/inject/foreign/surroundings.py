@@ -217,6 +217,29 @@ def consort(scene: Scene, size: float, rng: Generator) -> None:
     scene.earth = scene.earth + size * own / np.linalg.norm(own, axis=1).max()
 
 
+def mooring(scene: Scene, size: float, rng: Generator) -> None:
+    """A steel buoy swings about its anchor, while the vehicle works near it; size in nT at most.
+
+    It is found at another place each time that the vehicle comes by.
+    """
+    track = scene.track
+    north, east = track.local(track.latitude, track.longitude)
+    k, circle = rng.integers(len(north)), rng.uniform(40.0, 150.0)
+    turned = (
+        rng.uniform(0.0, 2.0 * np.pi)
+        + np.cumsum(autoregressive(rng, (len(scene.t),), 4e-4, 3600.0 / track.step)) * track.step
+    )
+    away = np.column_stack(
+        [
+            north - north[k] - circle * np.cos(turned),
+            east - east[k] - circle * np.sin(turned),
+            track.depth + rng.uniform(5.0, 15.0),
+        ]
+    )
+    own = dipole_field(away, np.broadcast_to(direction(rng), away.shape))
+    scene.earth = scene.earth + size * own / np.linalg.norm(own, axis=1).max()
+
+
 def _dives(depth: Array) -> int:
     down = depth > 0.5 * depth.max()
     return int(np.sum(np.diff(down, prepend=False) & down))

@@ -257,3 +257,15 @@ def solar(scene: Scene, size: float, rng: Generator) -> None:
     faces = np.maximum(rotation(track.roll, track.pitch, track.heading).apply(normal) @ sun, 0.0)
     clouds = 1.0 / (1.0 + np.exp(2.0 * autoregressive(rng, (len(scene.t),), 1.0, 600.0 / track.step)))
     scene.add(faces * clouds * np.exp(-(track.depth - track.depth.min()) / reach), size * direction(rng))
+
+
+def jettison(scene: Scene, size: float, rng: Generator) -> None:
+    """Iron shot leaks out of its box for a while, and takes its induced moment along; size in nT in all.
+
+    What is left of it is magnetised along the field, so what it does turns with the vehicle.
+    """
+    began, lasts = scene.t[-1] * rng.uniform(0.2, 0.7), scene.t[-1] * rng.uniform(0.02, 0.2)
+    lost = np.clip((scene.t - began) / lasts, 0.0, 1.0)
+    unit = scene.field / np.linalg.norm(scene.field[0])
+    own = dipole_field(np.broadcast_to(direction(rng), unit.shape), unit)
+    scene.field = scene.field - size * lost[:, None] * own / MU_0_OVER_4_PI
