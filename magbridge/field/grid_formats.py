@@ -19,6 +19,8 @@ __all__ = ["ascii_grid", "folder", "geotiff", "grd", "table"]
 
 BAD_TIFF = (OSError, KeyError, AttributeError, TypeError, ValueError)
 """What Pillow, or a tag that is not as it should be, raises."""
+TEXT: Any = {"encoding": "utf-8-sig", "errors": "replace"}
+"""How a text is opened: with a byte order mark or without, and whatever its comments are written in."""
 NETCDF = (b"CDF\x01", b"CDF\x02", b"\x89HDF")
 
 
@@ -44,7 +46,7 @@ Surfer = tuple[int, int, tuple[float, float], tuple[float, float], RealArray]
 
 
 def _surfer_text(path: Path) -> Surfer:
-    words = path.read_text(errors="replace").split()
+    words = path.read_text(**TEXT).split()
     nx, ny = int(words[1]), int(words[2])
     limits = [float(word) for word in words[3:9]]
     return nx, ny, (limits[0], limits[1]), (limits[2], limits[3]), np.array(words[9:], float)
@@ -96,7 +98,7 @@ def ascii_grid(path: Path) -> Parts:
     FormatError
         A header or a number is missing.
     """
-    words = path.read_text(errors="replace").split()
+    words = path.read_text(**TEXT).split()
     head: dict[str, float] = {}
     at = 0
     try:
@@ -124,7 +126,7 @@ def table(path: Path) -> Parts:
     FormatError
         No such columns, or nodes that form no grid.
     """
-    with path.open(encoding="utf-8-sig", errors="replace") as file:
+    with path.open(**TEXT) as file:
         first = file.readline()
     delimiter = next((mark for mark in ",;" if mark in first), None)
     words = [word.strip() for word in first.strip().lstrip("#").lower().split(delimiter)]
@@ -145,9 +147,8 @@ def table(path: Path) -> Parts:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # of a file without rows, which is seen below
-            table = np.loadtxt(
-                path, delimiter=delimiter, skiprows=int(header), usecols=columns, ndmin=2, encoding="latin-1"
-            )
+            with path.open(**TEXT) as file:  # not numpy's: it takes a byte order mark for a number
+                table = np.loadtxt(file, delimiter=delimiter, skiprows=int(header), usecols=columns, ndmin=2)
     except ValueError as error:
         # numpy counts rows from 0 below the header
         place = re.search(r"at row (\d+), column (\d+)", str(error))
@@ -187,7 +188,7 @@ def folder(path: Path) -> Parts:
         with warnings.catch_warnings():
             warnings.simplefilter("error", UserWarning)  # of a file without numbers
             x, y, altitude, values = (
-                np.loadtxt(path / f"{name}.csv", delimiter=",", ndmin=2)
+                np.loadtxt(path / f"{name}.csv", delimiter=",", ndmin=2, encoding="utf-8-sig")
                 for name in ("xx", "yy", "alt", "map")
             )
     except (OSError, ValueError, UserWarning) as error:

@@ -125,6 +125,13 @@ def folder(path: Path, altitude: tuple[float, ...] = (305.0,)) -> None:
         np.savetxt(path / f"{name}.csv", values, delimiter=",")
 
 
+def marked(path: Path, write: Callable[[Path], None]) -> None:
+    """What `write` writes, each file with a byte order mark."""
+    write(path)
+    for file in path.iterdir() if path.is_dir() else [path]:
+        file.write_text("\ufeff" + file.read_text(), encoding="utf-8")
+
+
 @pytest.mark.parametrize(
     ("name", "write"),
     [
@@ -141,9 +148,12 @@ def folder(path: Path, altitude: tuple[float, ...] = (305.0,)) -> None:
         ("b.csv", lambda path: table(path, "lon;lat;mag [nT]\n", ";")),
         ("c.csv", lambda path: table(path, "lon,lat,mag (uT)\n", scale=1e-3)),
         ("d.csv", lambda path: table(path, "\ufefflongitude,latitude,anomaly\n")),  # as Excel writes it
+        ("e.csv", lambda path: table(path, "\ufeff")),
+        ("c.asc", lambda path: marked(path, esri)),
         ("b.nc", lambda path: cf(path, "T", 1e-9)),
         ("a.tif", geotiff),
         ("magnav", folder),
+        ("marked", lambda path: marked(path, folder)),
     ],
 )
 def test_every_format_gives_the_same_map(tmp_path: Path, name: str, write: Callable[[Path], None]) -> None:
