@@ -168,8 +168,10 @@ class Calibration:
             raise CalibrationError(
                 f"covariance: expected {size} x {size}, found {' x '.join(map(str, self.covariance.shape))}"
             )
-        for array in (self.coefficients, self.covariance):
-            array.setflags(write=False)
+        for name in ("coefficients", "covariance"):
+            own = np.array(getattr(self, name), float)  # a copy: the caller's array stays the caller's
+            own.setflags(write=False)
+            object.__setattr__(self, name, own)
 
     @property
     def channels(self) -> tuple[str, ...]:

@@ -76,6 +76,17 @@ def test_round_trip_corrects_with_the_same_bits(cal: Calibration, tmp_path: Path
         np.testing.assert_array_equal(got, want)
 
 
+def test_its_arrays_are_its_own(cal: Calibration) -> None:
+    """Those that it was made from stay the caller's to write to, and do not change it."""
+    coefficients, covariance = np.zeros(39), np.eye(39)
+    made = replace(cal, coefficients=coefficients, covariance=covariance)
+    coefficients[0] = covariance[0, 0] = 7.0
+    assert (made.coefficients[0], made.covariance[0, 0]) == (0.0, 1.0)
+    for array in (made.coefficients, made.covariance):
+        with pytest.raises(ValueError, match="read-only"):
+            array[0] = 7.0
+
+
 def test_the_contract_s_keys_are_there(cal: Calibration) -> None:
     content = json.loads(encode_calibration(cal))
     assert content["format"] == 2
