@@ -23,11 +23,14 @@ from magbridge.cli.common import (
     note_unused_grid,
     print_result,
 )
-from magbridge.errors import DataError, WrongUse
+from magbridge.errors import CalibrationError, DataError, WrongUse
 from magbridge.progress import waiting
 
 if TYPE_CHECKING:
+    import xarray as xr
+
     from magbridge.calibration.fitting.fit import Fit
+    from magbridge.calibration.fitting.observations import Observations
 
 
 @app.command(usage="Usage: magbridge calibrate FILE... --parameter NAME... -o cal.json [OPTIONS]")
@@ -82,42 +85,70 @@ def calibrate(
         Print the result as JSON, with the paper's M, S and T at the middle of each parameter's range.
     """
     from magbridge.calibration.file import save
-    from magbridge.calibration.fitting.fit import fit
     from magbridge.calibration.fitting.lowpass import unfiltered
     from magbridge.calibration.fitting.mounted_masses import read_vehicle
     from magbridge.calibration.fitting.observe import observations
-    from magbridge.columns import CHANNELS
+    from magbridge.calibration.fitting.sources import idle
+    from magbridge.columns import CHANNELS, require
     from magbridge.field.declination import with_true_heading
     from magbridge.field.read import read_grid
-    from magbridge.logs import read
+    from magbridge.logs import read_each
+    from magbridge.logs.deployment import join
 
     check_inputs(files, output, vehicle, grid)
     if vehicle and method != "auto":
         raise WrongUse(f"--vehicle: method {method} does not use the positions of the masses; auto does")
     anomalies = read_grid(grid) if grid else None
-    deployment = with_true_heading(read(files, required=(*CHANNELS, *parameter)), heading_reference)
+    logs = read_each(files)
+    deployment = join(logs)
+    require(deployment, (*CHANNELS, *parameter))
+    deployment = with_true_heading(deployment, heading_reference)
     note_losses(deployment.attrs)
     note_unused_grid(grid, deployment)
     data = replace(observations(deployment, parameter, grid=anomalies), inputs=_digests(files))
+    for line in idle(logs, data):
+        complain(line)
     if filter_corner:
         data = unfiltered(data, filter_corner)
     options: dict[str, Any] = {"vehicle": read_vehicle(vehicle)} if vehicle else {}
     with waiting("fitting"):
-        found = fit(data, method, order, site_bias=site_bias, **options)
+        found, doubt = _fitted(logs, data, method, order, site_bias=site_bias, **options)
     save(found.calibration, output)
     if picture:
         from magbridge.calibration.fitting.draw import draw_fit
 
         draw_fit(found.calibration, data, picture)
-    for warning in found.warnings:
+    for warning in (*found.warnings, *doubt):
         complain(warning)
+    left_out = deployment.sizes["time"] - len(data)
     print_result(
-        {"file": str(output), "method": method, **_facts(found, len(data))},
-        f"{output}: {method}, {_summary(found, len(data))}",
+        {"file": str(output), "method": method, **_facts(found, len(data)), "left_out": left_out},
+        f"{output}: {method}, {_summary(found, len(data))}"
+        + (f"; {left_out} rows that lack a value left out" if left_out else ""),
         json,
     )
     if strict and not found.supported:
         raise DataError("the data do not support this fit (see the warnings), and --strict was given")
+
+
+def _fitted(
+    logs: list[xr.Dataset], data: Observations, method: str, order: int, **options: Any
+) -> tuple[Fit, list[str]]:
+    """Return the fit, and why several logs are not of one vehicle, if they are not."""
+    from magbridge.calibration.fitting.fit import fit
+    from magbridge.calibration.fitting.sources import unlike
+
+    def again(part: Observations) -> Fit:
+        return fit(part, method, order)
+
+    try:
+        found = fit(data, method, order, **options)
+    except CalibrationError as error:
+        if doubt := unlike(logs, data, None, again):
+            raise CalibrationError(doubt) from error
+        raise
+    doubt = unlike(logs, data, found, again)
+    return found, [doubt] if doubt else []
 
 
 def _facts(found: Fit, samples: int) -> dict[str, Any]:

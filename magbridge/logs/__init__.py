@@ -41,7 +41,7 @@ from magbridge.files import atomic_path
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["FLIGHT", "FORMATS", "Writer", "read", "read_chunks", "suffixes", "write"]
+__all__ = ["FLIGHT", "FORMATS", "Writer", "read", "read_chunks", "read_each", "suffixes", "write"]
 
 FLIGHT = {".ebd": ".dbd", ".nbd": ".mbd", ".tbd": ".sbd", ".ecd": ".dcd", ".ncd": ".mcd", ".tcd": ".scd"}
 """Suffix of a Slocum's science file to that of its flight file: where both are there, both are read."""
@@ -152,9 +152,20 @@ def read(paths: Paths, *, required: Iterable[str] = ()) -> xr.Dataset:
     """
     from magbridge.logs.deployment import join  # noqa: PLC0415 - xarray is for ashore
 
-    dataset = join([part for path in _paths(paths) for part in _chunks(path, 1 << 40)])
+    dataset = join(read_each(paths))
     require(dataset, required)
     return dataset
+
+
+def read_each(paths: Paths) -> list[xr.Dataset]:
+    """Return the deployment that each file holds, a Slocum's flight and science file as one.
+
+    Raises
+    ------
+    FormatError, MissingExtra
+        As :func:`read`.
+    """
+    return [part for path in _paths(paths) for part in _chunks(path, 1 << 40)]
 
 
 def read_chunks(paths: Paths, rows: int = 65536, *, required: Iterable[str] = ()) -> Iterator[xr.Dataset]:

@@ -115,6 +115,54 @@ def test_a_run_given_twice_counts_once(good: tuple[Path, Path], command: Command
     assert once["coefficients"] == twice["coefficients"]
 
 
+def later(runs: xr.Dataset, days: int) -> xr.Dataset:
+    shift = 86400.0 * days
+    sampled = {name: runs[name].to_numpy() + shift for name in (f"mag_time_{axis}" for axis in "xyz")}
+    return changed(runs, **sampled).assign_coords(time=runs["time"].to_numpy() + shift)
+
+
+def test_a_log_that_adds_nothing_is_told(runs: xr.Dataset, good: tuple[Path, Path], command: Command) -> None:
+    """Its samples were missing from the fit without a word."""
+    write(changed(later(runs, 1), mag_x=np.nan), "no_x.csv")
+    write(later(runs, 2).drop_vars("battpos"), "no_mass.csv")
+    write(runs.assign(mag_x=runs["mag_x"] + 100.0), "same_times.csv")
+    logs = good[0], "no_x.csv", "no_mass.csv", "same_times.csv"
+    said = command("calibrate", *logs, *PARAMETERS, "-o", "cal.json", "--json")
+    idle = [line for line in said.err.splitlines() if "adds no sample" in line]
+    assert [line.partition(": adds no sample to the fit: ")[::2] for line in idle] == [
+        ("magbridge: no_x.csv", "'mag_x' has no number"),
+        ("magbridge: no_mass.csv", "'battpos' has no number"),
+        ("magbridge: same_times.csv", "runs.csv has samples at the same times, and the first counts"),
+    ]
+    assert json.loads(said.out)["left_out"] == 2 * 563
+    once, all_logs = (json.loads(path.read_text())["coefficients"] for path in (good[1], Path("cal.json")))
+    assert once == all_logs
+
+
+def test_logs_of_two_vehicles_are_told_apart(
+    runs: xr.Dataset, good: tuple[Path, Path], command: Command
+) -> None:
+    """But not those of one, on two days."""
+    iron = {f"mag_{axis}": runs[f"mag_{axis}"].to_numpy() + 5000.0 for axis in "xy"}
+    write(changed(later(runs, 1), **iron), "other.csv")
+    write(later(runs, 1), "own.csv")
+    for name in ("own.csv", "other.csv"):
+        said = command("calibrate", good[0], name, "--method", "nominal", "-o", "cal.json").err
+        assert ("one calibration does not fit all logs" in said) == (name == "other.csv"), said
+    assert "each on its own runs.csv " in said
+
+
+def test_where_two_vehicles_leave_no_fit_at_all(runs: xr.Dataset, command: Command) -> None:
+    """It was put down to too few attitudes."""
+    other = segments(simulate(load("demo"), 3))["calibration"].isel(time=slice(0, None, 4))
+    write(runs, "one.csv")
+    write(later(other.drop_vars("reference_field"), 1), "two.csv")
+    fit = "calibrate", "one.csv", "two.csv", *PARAMETERS, "--method", "cubic", "-o", "cal.json"
+    said = command.refuses(*fit)
+    assert said.startswith("one calibration does not fit all logs: together the fit collapses, each on its ")
+    assert not Path("cal.json").exists()
+
+
 @pytest.mark.parametrize(
     ("edit", "words"),
     [

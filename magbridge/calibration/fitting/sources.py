@@ -1,0 +1,120 @@
+"""Sources: what each of several logs adds to a fit, and whether one calibration fits them all."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from magbridge.arrays import FloatArray, IndexArray
+from magbridge.calibration.fitting.fit import Fit
+from magbridge.calibration.fitting.observations import Observations
+from magbridge.calibration.residual import rms
+from magbridge.columns import CHANNELS
+from magbridge.errors import CalibrationError
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+__all__ = ["idle", "source_of", "unlike"]
+
+APART = 3.0
+"""RMS of a fit to all logs over that of fits to each: sampling and slow errors alone do not reach it."""
+JUDGED = 10
+"""Logs, those with most samples, that are fitted each on its own."""
+
+
+def source_of(logs: Sequence[xr.Dataset], time: FloatArray) -> IndexArray:
+    """Return which of `logs` the sample at each `time` (n,), s, is of: (n,), -1 where of none.
+
+    Of logs that have all channels at the same time it is the first, as when they are joined.
+    """
+    which = np.full(len(time), -1)
+    for k in reversed(range(len(logs))):
+        which[np.isin(time, _sampled(logs[k]))] = k
+    return which
+
+
+def idle(logs: Sequence[xr.Dataset], data: Observations) -> Iterator[str]:
+    """Yield a line for each of `logs` that adds no sample to `data`, which were made from all of them."""
+    which = source_of(logs, data.time)
+    for k, log in enumerate(logs):
+        sampled = _sampled(log)
+        if (which == k).any() or (not len(sampled) and np.isin(log["time"].values, data.time).any()):
+            continue
+        numbers = {
+            name: int(log[name].notnull().sum()) if name in log else 0 for name in (*CHANNELS, *data.names)
+        }
+        reasons = [f"{name!r} has no number" for name, count in numbers.items() if not count]
+        others = [other.attrs["source"] for other in logs[:k] if np.isin(sampled, _sampled(other)).any()]
+        if not reasons and others:
+            reasons = [f"{others[0]} has samples at the same times, and the first counts"]
+        why = ", ".join(reasons) or "no row has every value and a reference"
+        yield f"{log.attrs['source']}: adds no sample to the fit: {why}"
+
+
+def unlike(
+    logs: Sequence[xr.Dataset], data: Observations, found: Fit | None, again: Callable[[Observations], Fit]
+) -> str:
+    """Return why logs are not of one vehicle in one state; empty where nothing says so.
+
+    Parameters
+    ----------
+    logs : sequence of Dataset
+        The logs of which `data` was made.
+    data : Observations
+        What was fitted.
+    found : Fit or None
+        The fit to all; None if it collapsed.
+    again : callable
+        Fits a part of the data in the same way.
+    """
+    if len(logs) < 2 or (found and found.rms < APART * _scatter(found.residual)):
+        return ""  # the residuals are noise from one sample to the next
+    which = source_of(logs, data.time)
+    count = np.bincount(which[which >= 0], minlength=len(logs))
+    alone: list[tuple[int, float]] = []
+    for k in np.argsort(-count, kind="stable")[:JUDGED].tolist():
+        try:
+            alone.append((k, again(_moving(data.part(which == k))).rms))
+        except CalibrationError:  # too little in it for a fit of its own
+            continue
+    judged = [k for k, _ in alone]
+    own = float(np.sqrt(np.average([one**2 for _, one in alone], weights=count[judged]))) if alone else 0.0
+    if len(alone) < 2 or (found and rms(found.residual[np.isin(which, judged)]) < APART * own):
+        return ""
+    fits = ", ".join(f"{logs[k].attrs['source']} {one:.3g}" for k, one in sorted(alone)[:3])
+    more = f" and {len(alone) - 3} more" if len(alone) > 3 else ""
+    together = f"{found.rms:.3g} nT RMS together" if found else "together the fit collapses"
+    return (
+        f"one calibration does not fit all logs: {together}, each on its own {fits}{more} nT RMS; they are "
+        "of two vehicles, or of one that changed in between (its iron, or a mass that no --parameter names)"
+    )
+
+
+def _sampled(log: xr.Dataset) -> FloatArray:
+    """Return the times at which a log has all channels."""
+    if not all(name in log for name in CHANNELS):
+        return np.empty(0)
+    whole = np.logical_and.reduce([log[name].notnull().to_numpy() for name in CHANNELS])
+    return np.asarray(log["time"].to_numpy()[whole], float)
+
+
+def _scatter(residual: FloatArray) -> float:
+    """Return the robust sigma of a residual's steps from sample to sample, as if they were white noise."""
+    return float(np.median(np.abs(np.diff(residual)))) / (0.6745 * 2.0**0.5) if len(residual) > 1 else 0.0
+
+
+def _moving(data: Observations) -> Observations:
+    """Return the data without the parameters that stand still in them."""
+    span = np.ptp(data.parameters, axis=0) if len(data) else np.zeros(len(data.names))
+    moves = span > 1e-9 * np.abs(data.parameters).max(axis=0, initial=0.0)
+    pick = np.flatnonzero(moves).tolist()
+    return replace(
+        data,
+        parameters=data.parameters[:, moves],
+        names=tuple(data.names[i] for i in pick),
+        units=tuple(data.units[i] for i in pick),
+    )
