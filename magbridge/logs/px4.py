@@ -79,8 +79,9 @@ def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
     }
     if not mags:
         raise FormatError(path, "expected a PX4 log with sensor_mag")
-    dropouts = {"dropouts": len(log.dropouts)}
-    yield from pieces(path, rows, _utc_offset(topics), mags, _telemetry(topics), dropouts)
+    # pyulog tells that there is damage, not in how many places
+    lost = {"dropouts": len(log.dropouts), "damages": int(log.file_corruption)}
+    yield from pieces(path, rows, _utc_offset(topics), mags, _telemetry(topics), lost)
 
 
 def _telemetry(topics: Topics) -> Iterator[tuple[FloatArray, str, str, FloatArray]]:

@@ -201,6 +201,18 @@ def test_truncated_ulg_is_read_to_its_end(
     assert capsys.readouterr().out == ""
 
 
+def test_damage_in_a_ulg_is_told(tmp_path: Path) -> None:
+    pytest.importorskip("pyulog")
+    path, data = tmp_path / "log.ulg", bytearray(ulog())
+    middle = len(data) * 7 // 8
+    data[middle : middle + 60] = bytes(60)
+    for content, damaged in ((data, 1), (ulog(), 0)):
+        path.write_bytes(content)
+        back = logs.read(path)
+        assert 10 < back.sizes["time"] <= 20 - damaged
+        assert back.attrs["damages"] == damaged
+
+
 def test_ulg_cut_in_its_definitions(tmp_path: Path) -> None:
     pytest.importorskip("pyulog")
     path = tmp_path / "log.ulg"
