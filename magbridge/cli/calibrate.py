@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from math import inf
 from pathlib import Path
@@ -23,7 +25,7 @@ from magbridge.cli.common import (
     note_unused_grid,
     print_result,
 )
-from magbridge.errors import CalibrationError, DataError, WrongUse
+from magbridge.errors import CalibrationError, DataError, OutOfRange, WrongUse
 from magbridge.progress import waiting
 
 if TYPE_CHECKING:
@@ -105,13 +107,13 @@ def calibrate(
     deployment = with_true_heading(deployment, heading_reference)
     note_losses(deployment.attrs)
     note_unused_grid(grid, deployment)
-    data = replace(observations(deployment, parameter, grid=anomalies), inputs=_digests(files))
-    for line in idle(logs, data):
-        complain(line)
-    if filter_corner:
-        data = unfiltered(data, filter_corner)
     options: dict[str, Any] = {"vehicle": read_vehicle(vehicle)} if vehicle else {}
-    with waiting("fitting"):
+    with _naming(deployment), waiting("fitting"):
+        data = replace(observations(deployment, parameter, grid=anomalies), inputs=_digests(files))
+        for line in idle(logs, data):
+            complain(line)
+        if filter_corner:
+            data = unfiltered(data, filter_corner)
         found, doubt = _fitted(logs, data, method, order, site_bias=site_bias, **options)
     save(found.calibration, output)
     if picture:
@@ -124,11 +126,20 @@ def calibrate(
     print_result(
         {"file": str(output), "method": method, **_facts(found, len(data)), "left_out": left_out},
         f"{output}: {method}, {_summary(found, len(data))}"
-        + (f"; {left_out} rows that lack a value left out" if left_out else ""),
+        + (f"; {left_out} row{'s' * (left_out > 1)} without every value left out" if left_out else ""),
         json,
     )
     if strict and not found.supported:
         raise DataError("the data do not support this fit (see the warnings), and --strict was given")
+
+
+@contextmanager
+def _naming(deployment: xr.Dataset) -> Iterator[None]:
+    """Name the logs in what is wrong with them."""
+    try:
+        yield
+    except (CalibrationError, OutOfRange) as error:
+        raise DataError(f"{deployment.attrs['source']}: {error}") from error
 
 
 def _fitted(

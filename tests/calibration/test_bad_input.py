@@ -78,7 +78,9 @@ BAD: dict[str, tuple[Callable[[xr.Dataset], xr.Dataset], str]] = {
 def test_bad_data(case: str, runs: xr.Dataset, command: Command) -> None:
     spoil, words = BAD[case]
     write(spoil(runs), "bad.csv")
-    assert words in command.refuses("calibrate", "bad.csv", *PARAMETERS, "-o", "cal.json")
+    said = command.refuses("calibrate", "bad.csv", *PARAMETERS, "-o", "cal.json")
+    assert words in said
+    assert said.startswith("bad.csv: ")
     assert not Path("cal.json").exists()
 
 
@@ -159,7 +161,9 @@ def test_where_two_vehicles_leave_no_fit_at_all(runs: xr.Dataset, command: Comma
     write(later(other.drop_vars("reference_field"), 1), "two.csv")
     fit = "calibrate", "one.csv", "two.csv", *PARAMETERS, "--method", "cubic", "-o", "cal.json"
     said = command.refuses(*fit)
-    assert said.startswith("one calibration does not fit all logs: together the fit collapses, each on its ")
+    assert said.startswith(
+        "one.csv, two.csv: one calibration does not fit all logs: together the fit collapses, each on its "
+    )
     assert not Path("cal.json").exists()
 
 
