@@ -9,6 +9,7 @@ import os
 import signal
 import sys
 from contextlib import suppress
+from io import TextIOWrapper
 from pathlib import Path
 
 from cyclopts import CycloptsError, MissingArgumentError, UnusedCliTokensError
@@ -45,10 +46,7 @@ ENDS = (signal.SIGTERM, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else []))
 
 def main(arguments: list[str] | None = None) -> int:
     """Run a command; return its exit code."""
-    # closed by the parent process; opened in this order, each gets its own descriptor
-    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
-        if getattr(sys, name) is None:
-            setattr(sys, name, Path(os.devnull).open(mode))  # noqa: SIM115 - as long as the process
+    _open_streams()
     with suppress(ValueError):  # signal handlers can be set on the main thread only
         _heed_signals()
     try:
@@ -64,6 +62,8 @@ def main(arguments: list[str] | None = None) -> int:
         return complain(str(MissingExtra(str(error.name), extra)), 2)
     except BrokenPipeError:  # the reader of our output has gone, as `| head` does
         sys.stderr.close()
+    except UnicodeEncodeError as error:  # netCDF and JSON take no name that is not of the locale
+        return complain(f"{error.object}: a name that cannot be written in {error.encoding}: rename it", 1)
     except (OSError, MemoryError) as error:  # the system refuses a file, a folder or memory
         return complain(_reason(error), 1)
     except _Terminated as end:
@@ -73,6 +73,16 @@ def main(arguments: list[str] | None = None) -> int:
         if not isinstance(end.__context__, BrokenPipeError):
             raise
     return 0
+
+
+def _open_streams() -> None:
+    """See to it that what is printed goes somewhere, whatever the locale."""
+    # closed by the parent process; opened in this order, each gets its own descriptor
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:
+            setattr(sys, name, Path(os.devnull).open(mode))  # noqa: SIM115 - as long as the process
+    if isinstance(sys.stdout, TextIOWrapper) and sys.stdout.errors == "strict":
+        sys.stdout.reconfigure(errors="backslashreplace")  # as stderr does: a result must not end in an error
 
 
 def _misuse(error: CycloptsError) -> str:

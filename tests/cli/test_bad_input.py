@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import resource
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -203,3 +206,26 @@ def test_one_position_that_is_none(deployment: Path, command: Command) -> None:
     masses = "--parameter", "battpos", "--parameter", "ballast"
     line = command.refuses("calibrate", "bad.nc", *masses, "-o", "c.json")
     assert "'battpos' is -9999 in 1 of 3600 samples" in line
+
+
+def run(*arguments: str, **environment: str) -> subprocess.CompletedProcess[bytes]:
+    command = sys.executable, "-m", "magbridge", *arguments
+    return subprocess.run(command, env={**os.environ, **environment}, capture_output=True, check=False)
+
+
+def test_a_name_that_is_not_of_the_locale(deployment: Path, here: Path) -> None:
+    """As Latin-1 names on a UTF-8 system are: netCDF cannot open them, and JSON cannot hold them."""
+    name = os.fsdecode(b"m\xe4.nc")
+    write(read(deployment).isel(time=slice(0, 60)), "log.nc")
+    Path("log.nc").rename(name)
+    done = run("convert", name, "-o", "x.csv", PYTHONUTF8="1")
+    said = rb"magbridge: m\udce4.nc: a name that cannot be written in utf-8: rename it" + b"\n"
+    assert (done.returncode, done.stderr) == (1, said)
+    assert len(list(here.iterdir())) == 1
+
+
+def test_what_cannot_be_printed_is_no_error(deployment: Path, here: Path) -> None:
+    plain = {"LC_ALL": "C", "PYTHONCOERCECLOCALE": "0", "PYTHONUTF8": "0", "PYTHONIOENCODING": "ascii:strict"}
+    done = run("convert", str(deployment), "-o", "\xb5.csv", **plain)
+    assert (done.returncode, done.stderr) == (0, b"")
+    assert done.stdout.endswith(b".csv: 3600 rows\n")
