@@ -98,6 +98,7 @@ def calibrate(
     from magbridge.logs.deployment import join
 
     check_inputs(files, output, vehicle, grid)
+    check_inputs((*files, output), picture)
     if vehicle and method != "auto":
         raise WrongUse(f"--vehicle: method {method} does not use the positions of the masses; auto does")
     anomalies = read_grid(grid) if grid else None

@@ -132,6 +132,7 @@ def test_a_position_in_another_unit_is_refused(
         ("calibrate {d} --order 0 -o x.json", 2, "order"),
         ("calibrate {d} --parameter run --parameter run -o x.json", 1, "'run' is named twice"),
         ("calibrate {d} --site-bias 1e300 -o x.json", 2, "--site-bias. Must be <= 100000"),
+        ("calibrate {d} -o x.png --picture x.png", 2, "x.png: is among the files"),
         ("map none.nc -o x.nc", 1, "none.nc"),
         ("map none.nc -o x.foo", 2, "must end in .nc"),
         ("map none.nc -o x.nc --altitude 1e308", 2, "Must be <= 1000000"),
