@@ -14,7 +14,7 @@ is always the first of its pair, at the size that it would have alone.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,6 +29,9 @@ from magbridge.diagnose.inference.state import State
 from magbridge.diagnose.inference.statistic import Statistic
 
 __all__ = ["Pair", "pairs_of"]
+
+TOGETHER = 128
+"""Columns of candidates that are scored at once: enough to outweigh a call, few enough for a core's cache."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,21 +67,21 @@ class _Stack:
     def beside(
         self, rows: FloatArray, K: FloatArray, taken: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """(m,) log evidences, likelihood ratios and freedoms (:func:`~.evidence.score`) beside another.
+        """(n, m) log evidences, likelihood ratios and freedoms (:func:`~.evidence.score`) beside n others.
 
         Parameters
         ----------
-        rows, K : (k, M) array
-            Rows of the other one in the information matrix M, and ``A^-1 M`` with A its own block and prior.
-        taken : (k,) array
+        rows, K : (n, k, M) array
+            Rows of each other one in the information matrix M, and ``A^-1 M`` with A its own block and prior.
+        taken : (n, k) array
             ``A^-1 b`` of its own score b.
         """
-        U = rows[:, self.index]
-        S = self.S - np.einsum("amk,aml->mkl", U, K[:, self.index])
-        b = self.b - np.einsum("amk,a->mk", U, taken)
+        U = rows[:, :, self.index]
+        S = self.S - np.einsum("namk,naml->nmkl", U, K[:, :, self.index])
+        b = self.b - np.einsum("namk,na->nmk", U, taken)
         statistic = Statistic(S)
-        ratio = statistic.ratio(b[:, :, None])[:, 0]
-        ratio[self.positive & (b.min(axis=1) < 0.0)] = 0.0
+        ratio = statistic.ratio(b[..., None])[..., 0]
+        ratio[self.positive & (b.min(axis=-1) < 0.0)] = 0.0
         evidence = log_bayes(ratio, statistic.freedom) + np.where(self.positive, one_sided(ratio), 0.0)
         return evidence + self.likelier, ratio, statistic.freedom
 
@@ -130,24 +133,43 @@ class _Table:
     def _fill(self) -> None:
         """Score every candidate alone, and beside each other one."""
         m, info = len(self.candidates), self.info
-        sizes: dict[int, list[int]] = {}
-        for n, candidate in enumerate(self.candidates):
-            if candidate.spectra is None:
-                sizes.setdefault(candidate.size, []).append(n)
-        stacks = [_Stack(places, self.at, self.candidates, info) for places in sizes.values()]
+        free = [n for n, candidate in enumerate(self.candidates) if candidate.spectra is None]
+        stacks = [_Stack(places, self.at, self.candidates, info) for places in self._by_size(free)]
         self.scores = [score(info, own, c) for own, c in zip(self.at, self.candidates, strict=True)]
         beside, self.ratio = np.full((m, m), -np.inf), np.zeros((m, m))
         self.freedom = np.ones((m, m), int)
-        for n, (own, first) in enumerate(zip(self.at, self.scores, strict=True)):
-            rows = info.matrix[own]
-            A, every = rows[:, own] + np.diag(first.prior), np.column_stack([rows, info.score[own]])
-            solved: FloatArray = np.asarray(np.linalg.solve(A, every), float)
+        for places, rows, solved in self._pieces():
+            alone = np.array([self.scores[n].evidence for n in places])
             for stack in stacks:
-                evidence, ratio, freedom = stack.beside(rows, solved[:, :-1], solved[:, -1])
-                beside[n, stack.places] = first.evidence + evidence
-                self.ratio[n, stack.places], self.freedom[n, stack.places] = ratio, freedom
+                evidence, ratio, freedom = stack.beside(rows, solved[:, :, :-1], solved[:, :, -1])
+                at = np.ix_(np.array(places), stack.places)
+                beside[at] = alone[:, None] + evidence
+                self.ratio[at], self.freedom[at] = ratio, freedom
         self.evidence = np.maximum(beside, beside.T)
         np.fill_diagonal(self.evidence, -np.inf)
+
+    def _by_size(self, places: Iterable[int]) -> list[list[int]]:
+        """Sort places by their candidates' number of coefficients."""
+        found: dict[int, list[int]] = {}
+        for n in places:
+            found.setdefault(self.candidates[n].size, []).append(n)
+        return list(found.values())
+
+    def _pieces(self) -> Iterator[tuple[list[int], FloatArray, FloatArray]]:
+        """Yield all candidates, some of the same size at a time: their places, and arrays for a _Stack.
+
+        These are the (n, k, M) rows of the information matrix, and ``A^-1`` times those and the score, which
+        stands last.
+        """
+        info = self.info
+        for places in self._by_size(range(len(self.candidates))):
+            step = max(1, TOGETHER // self.candidates[places[0]].size)
+            for some in (places[n : n + step] for n in range(0, len(places), step)):
+                own = np.array([np.r_[self.at[n]] for n in some])
+                rows, prior = info.matrix[own], np.array([np.diag(self.scores[n].prior) for n in some])
+                A = info.matrix[own[:, :, None], own[:, None, :]] + prior
+                every = np.concatenate([rows, info.score[own][..., None]], axis=2)
+                yield some, rows, np.asarray(np.linalg.solve(A, every), float)
 
     def _current(self) -> tuple[float, float]:
         """Log evidence of the standing causes, averaged over their grids, and the margin that they need."""
@@ -186,7 +208,10 @@ class _Table:
         rows, columns = np.unravel_index(int(np.argmax(block)), block.shape)
         a, b = self.members[A][int(rows)], self.members[B][int(columns)]
         one, two = self.candidates[a], self.candidates[b]
-        behind = self.best - top - self._price(A, B) + float(np.log(one.trials * two.trials)) - self.paid
+        paid = float(np.log(one.trials * two.trials)) - self.paid
+        if self.best - top + paid > self.margin:  # before the price, which can only add to it
+            return None
+        behind = self.best - top - self._price(A, B) + paid
         if behind > self.margin or not self._significant(a, b):
             return None
         return Pair(two, one, behind) if self._swapped(a, b) else Pair(one, two, behind)
