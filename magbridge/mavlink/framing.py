@@ -26,9 +26,12 @@ NOT_A_FRAME: Final = 0
 MORE: Final = -1
 LAST: Final = 0xFFFF
 """The last message id that a message outside the dialect may have."""
-HEADER_OUT: Final = Struct("<BBBBBB3s")
-"""Version 2 without its magic byte, which the checksum leaves out."""
-EXTRA: Final = {number: bytes((extra,)) for number, (_, extra, _) in MESSAGES.items()}
+HEADER: Final = Struct("<BBBBBBB3s")
+EXTRA: Final = {number: extra for number, (_, extra, _) in MESSAGES.items()}
+AFTER: Final = [mcrf4xx(bytes((value,)), 0) for value in range(256)]
+"""The checksum of each byte alone, from which that of any bytes follows, one by one."""
+BEFORE_V2: Final = 0x3085
+"""From here, the checksum of a frame with its magic byte is that without it, as it should be."""
 
 
 def find_magic(data: bytes, start: int, stop: int) -> int:
@@ -82,8 +85,8 @@ def frame_end(data: bytes, start: int, stop: int, gap: int = 0, *, last: bool = 
     if end > stop:
         return MORE
     if extra is not None:
-        right = mcrf4xx(data[start + 1 : checksum] + extra) == data[checksum] | data[checksum + 1] << 8
-        return end if right else NOT_A_FRAME
+        right = closed(mcrf4xx(data[start + 1 : checksum]), extra)
+        return end if right == data[checksum] | data[checksum + 1] << 8 else NOT_A_FRAME
     if end + gap >= stop:
         return end if last else MORE
     return end if data[end + gap] in (V1, V2) else NOT_A_FRAME
@@ -111,6 +114,12 @@ def join(
     layout: Spec, payload: bytes, sequence: int, system: int, component: int, *, signed: bool = False
 ) -> bytes:
     """Make a version 2 frame, without the signature that `signed` announces."""
-    payload = payload.rstrip(b"\0") or b"\0"
-    body = HEADER_OUT.pack(len(payload), signed, 0, sequence, system, component, layout.number) + payload
-    return b"\xfd" + body + mcrf4xx(body + layout.extra).to_bytes(2, "little")
+    if not payload or not payload[-1]:  # a call that most payloads need not
+        payload = payload.rstrip(b"\0") or b"\0"
+    body = HEADER.pack(V2, len(payload), signed, 0, sequence, system, component, layout.number) + payload
+    return body + closed(mcrf4xx(body, BEFORE_V2), layout.extra).to_bytes(2, "little")
+
+
+def closed(checksum: int, extra: int) -> int:
+    """Return the checksum of bytes and a last one, `extra`, from that of the bytes."""
+    return checksum >> 8 ^ AFTER[(checksum ^ extra) & 0xFF]

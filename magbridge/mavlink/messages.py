@@ -71,7 +71,7 @@ class Spec:
     name : str
     number : bytes
         The id as it stands on the wire.
-    extra : bytes
+    extra : int
         CRC_EXTRA, the last byte that the checksum covers: it differs between different layouts, so that a
         receiver with another layout refuses the frame.
     size : int
@@ -84,8 +84,8 @@ class Spec:
 
     def __init__(self, number: int) -> None:
         self.id = number
-        self.name, extra, text = MESSAGES[number]
-        self.number, self.extra = number.to_bytes(3, "little"), bytes((extra,))
+        self.name, self.extra, text = MESSAGES[number]
+        self.number = number.to_bytes(3, "little")
         self.fields: dict[str, Field] = {}
         offset, form = 0, "<"
         for part in text.split(","):

@@ -96,7 +96,7 @@ def layout(name: str) -> dict[str, object]:
         {"name": field.name, "offset": field.offset, "size": field.struct.size, "type": TYPES[field.code]}
         for field in message.fields.values()
     ]
-    return {"id": message.id, "name": name, "size": message.size, "extra": message.extra[0], "fields": fields}
+    return {"id": message.id, "name": name, "size": message.size, "extra": message.extra, "fields": fields}
 
 
 def test_node_mavlink(make_rig: MakeRig, start_peer: Start, modules: Path) -> None:
