@@ -23,7 +23,7 @@ YEAR_2001_US = 10**15
 class Extractor:
     """Takes one parameter out of one kind of message."""
 
-    __slots__ = ("field", "index", "match", "name", "offset", "scale")
+    __slots__ = ("field", "index", "match", "name", "offset", "scale", "texts")
 
     def __init__(self, name: str, what: Telemetry, layout: Spec, path: Path) -> None:
         key = f"telemetry.{name}"
@@ -38,10 +38,10 @@ class Extractor:
                 f"{field_name}[0] to {field_name}[{count - 1}]" if count else f"{field_name} without an index"
             )
             raise ConfigError(path, f"{key}.field", f"{wanted}, not {what.field!r}")
-        self.match = [
-            (find(layout, one, path, f"{key}.match.{one}"), value) for one, value in what.match.items()
-        ]
-        for field, value in self.match:
+        self.match: list[tuple[Field, float]] = []
+        self.texts: list[tuple[int, bytes]] = []  # where they lie, and with the zero that ends them
+        for one, value in what.match.items():
+            field = find(layout, one, path, f"{key}.match.{one}")
             if isinstance(value, str) != (field.code == "s"):
                 kind = "text" if field.code == "s" else "a number"
                 raise ConfigError(path, f"{key}.match.{field.name}", f"{kind}, not {value!r}")
@@ -49,9 +49,16 @@ class Extractor:
                 raise ConfigError(
                     path, f"{key}.match.{field.name}", f"at most {field.struct.size} bytes, not {value!r}"
                 )
+            if isinstance(value, str):
+                self.texts.append((field.offset, (value.encode() + b"\0")[: field.struct.size]))
+            else:
+                self.match.append((field, value))
 
     def value(self, payload: bytes) -> float | None:
         """Return the value, NaN where the sender does not know it, None where the message does not match."""
+        for offset, text in self.texts:
+            if not payload.startswith(text, offset):
+                return None
         for field, wanted in self.match:
             if field.get(payload) != wanted:
                 return None

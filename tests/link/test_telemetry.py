@@ -43,6 +43,15 @@ def test_scale_offset_and_match() -> None:
     assert values(telemetry, "ATTITUDE", roll=1) == []
 
 
+def test_a_text_matches_whole() -> None:
+    named = {
+        name: Telemetry("NAMED_VALUE_FLOAT", "value", match={"name": name}) for name in ("bat", "batteryone")
+    }
+    for sent in ("bat", "batteryone", "batt", "ba", ""):  # ten bytes fill the field, without a zero
+        got = values(named, "NAMED_VALUE_FLOAT", name=sent, value=0.5)
+        assert got == [(name, 0.5, NOW) for name in named if name == sent]
+
+
 def test_arrays_and_numeric_match() -> None:
     telemetry = {
         "ballast": Telemetry("ACTUATOR_OUTPUT_STATUS", "actuator[2]"),
