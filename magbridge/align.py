@@ -10,15 +10,13 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping
-from math import inf, isfinite
+from math import inf, isfinite, nan
 from typing import Final, NamedTuple
-
-import msgspec
 
 from magbridge.config import Align
 from magbridge.records import Quality, Reading, Vector
 
-__all__ = ["Aligner", "Input", "Sample", "Track"]
+__all__ = ["Aligner", "Input", "Sample", "Track", "nearest"]
 
 STALE: Final = int(Quality.STALE_TELEMETRY)
 MOVING: Final = int(Quality.MOVING)
@@ -28,6 +26,8 @@ GAP: Final = int(Quality.GAP)
 NEVER: Final = -(1 << 62)
 HISTORY: Final = 64
 """Telemetry values kept for each parameter: enough for 3 s at 20 Hz."""
+WHOLE: Final = 1.5 * 2.0**52
+"""Adding and then subtracting it rounds a number below 2^51."""
 
 
 class Input(NamedTuple):
@@ -39,7 +39,7 @@ class Input(NamedTuple):
     max_age: float
 
 
-class Sample(msgspec.Struct, frozen=True, gc=False):
+class Sample:
     """Three channels and the telemetry at one time.
 
     Attributes
@@ -59,15 +59,31 @@ class Sample(msgspec.Struct, frozen=True, gc=False):
     spans : tuple of (int, float, float)
         Parameters that are not known exactly: index in `values`, and the two ends of the interval in which
         the value lies.
+
+    Notes
+    -----
+    No msgspec record, because compiled code reads the attributes of a class of its own without a call.
     """
 
-    time_us: int
-    field: Vector
-    values: tuple[float, ...]
-    age: float
-    quality: int
-    sigma: float
-    spans: tuple[tuple[int, float, float], ...]
+    __slots__ = ("age", "field", "quality", "sigma", "spans", "time_us", "values")
+
+    def __init__(
+        self,
+        time_us: int,
+        field: Vector,
+        values: tuple[float, ...],
+        age: float,
+        quality: int,
+        sigma: float,
+        spans: tuple[tuple[int, float, float], ...],
+    ) -> None:
+        self.time_us: Final = time_us
+        self.field: Final = field
+        self.values: Final = values
+        self.age: Final = age
+        self.quality: Final = quality
+        self.sigma: Final = sigma
+        self.spans: Final = spans
 
 
 class Track:
@@ -79,11 +95,12 @@ class Track:
     after the anchor becomes the next anchor.
     """
 
-    __slots__ = ("anchor", "history", "input", "lacking", "moved_us")
+    __slots__ = ("anchor", "before", "history", "input", "lacking", "last", "last_us", "max_age", "moved_us")
 
     def __init__(self, what: Input) -> None:
-        self.input = what
+        self.input, self.max_age = what, what.max_age
         self.history: deque[tuple[int, float]] = deque(maxlen=HISTORY)
+        self.last_us, self.last, self.before = NEVER, nan, nan  # the newest, and the value before it
         self.lacking = True
         self.anchor: tuple[int, float] | None = None
         self.moved_us = NEVER
@@ -93,8 +110,10 @@ class Track:
         self.lacking = not isfinite(value)
         if self.lacking:
             return
-        if self.history and time_us <= self.history[-1][0]:
+        if time_us <= self.last_us:
             return
+        self.before = self.last if self.history else value
+        self.last_us, self.last = time_us, value
         self.history.append((time_us, value))
         if self.anchor is None:
             self.anchor = time_us, value
@@ -107,13 +126,11 @@ class Track:
 
     def stale(self, time_us: int) -> bool:
         """Say whether the value is unknown, or older than ``max_age``, at `time_us`."""
-        if self.lacking or not self.history:
-            return True
-        return time_us - self.history[-1][0] > self.input.max_age * 1e6
+        return self.lacking or time_us - self.last_us > self.max_age * 1e6
 
     def moving(self, time_us: int, settle_time: float) -> bool:
         """Say whether the parameter is moving, or stopped less than `settle_time` s before `time_us`."""
-        return self.moved_us == self.history[-1][0] or time_us - self.moved_us <= settle_time * 1e6
+        return self.moved_us == self.last_us or time_us - self.moved_us <= settle_time * 1e6
 
     def at(self, time_us: int) -> tuple[float, float, float]:
         """Return the value at `time_us`, its age in s, and the value before it.
@@ -121,12 +138,10 @@ class Track:
         Between two values it is interpolated (age 0); after the last it is held; before the first, the first
         is taken, and the age is the time until then.
         """
-        history = self.history
-        after_us, after = history[-1]
+        after_us, after = self.last_us, self.last
         if after_us <= time_us:
-            before = history[-2][1] if len(history) > 1 else after
-            return after, (time_us - after_us) * 1e-6, before
-        for then_us, value in reversed(history):
+            return after, (time_us - after_us) * 1e-6, self.before
+        for then_us, value in reversed(self.history):
             if then_us <= time_us:
                 weight = (time_us - then_us) / (after_us - then_us)
                 return value + weight * (after - value), 0.0, value
@@ -152,14 +167,15 @@ class Aligner:
         self.by_name = {what.name: track for what, track in zip(inputs, self.tracks, strict=True)}
         self.power_cycle = power_cycle
         self.offset_suspect = False
-        self._before: tuple[int, Reading] | None = None
+        self._before_us = NEVER
+        self._before_field, self._before_delay = (nan, nan, nan), (0.0, 0.0, 0.0)
         self._period_us, self._step_us = 0.0, 0
 
     def tune(self, settings: Align, ages: Mapping[str, float]) -> None:
         """Replace the settings, and the ages (s) after which the parameters named in `ages` are stale."""
         self.settings = settings
         for name, track in self.by_name.items():
-            track.input = track.input._replace(max_age=ages.get(name, track.input.max_age))
+            track.max_age = ages.get(name, track.max_age)
 
     def telemetry(self, name: str, time_us: int, value: float) -> None:
         """Take a telemetry value; a name that the calibration does not need is ignored."""
@@ -182,18 +198,20 @@ class Aligner:
             Number of readings lost just before this one.
         """
         settings = self.settings
-        if reading.power_cycle is not None:
+        cycle, delay = reading.power_cycle, reading.channel_delay
+        if cycle is not None:
             if self.power_cycle is None:
-                self.power_cycle = reading.power_cycle
-            restarted = restarted or reading.power_cycle != self.power_cycle
+                self.power_cycle = cycle
+            restarted = restarted or cycle != self.power_cycle
         self.offset_suspect = self.offset_suspect or restarted
         quality, variance = 0, 0.0
-        field, first_us = self._common_time(reading, time_us)
+        measured = reading.field
+        field, first_us = self._common_time(measured, delay, time_us)
         if self._is_gap(time_us) or missing:
             quality |= GAP
-        x, y, z = reading.field
+        x, y, z = measured
         if isfinite(x + y + z):
-            self._before = time_us, reading
+            self._before_us, self._before_field, self._before_delay = time_us, measured, delay
         if self.offset_suspect:
             quality |= OFFSET_SUSPECT
             variance += settings.turn_on_sigma**2
@@ -201,13 +219,13 @@ class Aligner:
             quality |= SATURATED
             variance = inf
 
-        sample_us = first_us - round(settings.filter_delay * 1e6)
+        sample_us, settle_time = first_us - nearest(settings.filter_delay * 1e6), settings.settle_time
         values: list[float] = []
         spans: list[tuple[int, float, float]] = []
         oldest = 0.0
         for index, track in enumerate(self.tracks):
-            what = track.input
-            if not track.history:
+            if track.last_us == NEVER:
+                what = track.input
                 values.append(0.5 * (what.low + what.high))
                 spans.append((index, what.low, what.high))
                 quality |= STALE
@@ -216,30 +234,29 @@ class Aligner:
             value, age, before = track.at(sample_us)
             values.append(value)
             oldest = max(oldest, age)
-            if track.lacking or age > what.max_age:
+            if track.lacking or age > track.max_age:
                 quality |= STALE
                 variance += (settings.stale_growth * age) ** 2
-            if track.moving(sample_us, settings.settle_time):
+            if track.moving(sample_us, settle_time):
                 quality |= MOVING
                 spans.append((index, before, value))
-        sigma = variance**0.5
+        sigma = variance**0.5 if variance else 0.0
         # the two low bits of a time belong to the log
         return Sample(sample_us - sample_us % 4, field, tuple(values), oldest, quality, sigma, tuple(spans))
 
-    def _common_time(self, reading: Reading, time_us: int) -> tuple[Vector, int]:
+    def _common_time(self, field: Vector, delay: Vector, time_us: int) -> tuple[Vector, int]:
         """Interpolate all channels to the time of the earliest; return the field (nT) and that time (µs)."""
-        x_late, y_late, z_late = reading.channel_delay
-        earliest = min(x_late, y_late, z_late)
-        first_us = time_us + round(earliest * 1e6)
-        if self._before is None or x_late == y_late == z_late:
-            return reading.field, first_us
-        before_us, before = self._before
-        step = (time_us - before_us) * 1e-6
+        x_late, y_late, z_late = delay
+        earliest = min(x_late, min(y_late, z_late))  # noqa: PLW3301 - compiled, two numbers need no call
+        first_us = time_us + nearest(earliest * 1e6)
+        if self._before_us == NEVER or x_late == y_late == z_late:
+            return field, first_us
+        step = (time_us - self._before_us) * 1e-6
         if step <= 0.0:
-            return reading.field, first_us
-        x, y, z = reading.field
-        x_then, y_then, z_then = before.field
-        x_was, y_was, z_was = before.channel_delay
+            return field, first_us
+        x, y, z = field
+        x_then, y_then, z_then = self._before_field
+        x_was, y_was, z_was = self._before_delay
         return (
             x - (x - x_then) * (x_late - earliest) / (step + x_late - x_was),
             y - (y - y_then) * (y_late - earliest) / (step + y_late - y_was),
@@ -252,11 +269,16 @@ class Aligner:
         The time since the last reading is a gap when it exceeds ``gap_factor`` times both the mean period and
         the interval before it: an instrument that is set to sample less often is flagged once, not for ever.
         """
-        if self._before is None:
+        if self._before_us == NEVER:
             return False
-        step, before = time_us - self._before[0], self._step_us
+        step, before = time_us - self._before_us, self._step_us
         self._step_us = step
         if self._period_us and step > self.settings.gap_factor * max(self._period_us, before):
             return True
         self._period_us += (step - self._period_us) * (0.1 if self._period_us else 1.0)
         return False
+
+
+def nearest(value: float) -> int:
+    """Return the nearest integer, of two the even one: ``round`` without a call of Python."""
+    return int(value + WHOLE - WHOLE) if abs(value) < 0.25 * WHOLE else round(value)

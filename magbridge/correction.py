@@ -84,26 +84,23 @@ class Correction:
         if self._wants_temperature and isfinite(reading.temperature):  # not every reading need have one
             self.aligner.telemetry(TEMPERATURE, time_us, reading.temperature)
         sample = self.aligner.reading(reading, time_us, restarted=restarted, missing=missing)
-        corrected = self._corrector.step(sample.time_us, sample.field, sample.values, sample.quality)
+        (F, sigma, x, y, z, sx, sy, sz), quality = self._corrector.numbers(
+            sample.time_us, sample.field, sample.values, sample.quality
+        )
         if sample.sigma or sample.spans:
-            corrected = self._widen(sample, corrected)
-        return sample, corrected
+            more = self._more(sample)
+            sigma = sqrt(sigma * sigma + more)
+            sx, sy, sz = sqrt(sx * sx + more), sqrt(sy * sy + more), sqrt(sz * sz + more)
+        return sample, Corrected(F, sigma, (x, y, z), (sx, sy, sz), quality)
 
-    def _widen(self, sample: Sample, corrected: Corrected) -> Corrected:
-        """Widen each sigma: ``sigma^2 + s^2 + sum ((F(hi) - F(lo)) / 2)^2``, s and spans the sample's."""
+    def _more(self, sample: Sample) -> float:
+        """Return the variance to add: ``s^2 + sum ((F(hi) - F(lo)) / 2)^2``, s and spans the sample's."""
         more = sample.sigma * sample.sigma
         for change in self._corrector.changes(sample.field, sample.values, sample.spans):
             more += 0.25 * change * change
         if not more < BEYOND * BEYOND:  # also NaN, as where a parameter has neither value nor range
             more = inf
-        total, (x, y, z) = corrected.total_field_sigma, corrected.field_sigma
-        return Corrected(
-            corrected.total_field,
-            sqrt(total * total + more),
-            corrected.field,
-            (sqrt(x * x + more), sqrt(y * y + more), sqrt(z * z + more)),
-            corrected.quality,
-        )
+        return more
 
 
 def correct_rows(correction: Correction, deployment: xr.Dataset) -> xr.Dataset:

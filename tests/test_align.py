@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from magbridge.align import Aligner, Input, Sample
+from magbridge.align import Aligner, Input, Sample, nearest
 from magbridge.config import Align
 from magbridge.records import Quality, Reading
 
@@ -184,3 +184,12 @@ def test_a_saturated_sample_is_kept_with_infinite_sigma() -> None:
     assert flags(sample) == {"saturated"}
     assert sample.sigma == inf
     assert sample.field == (65000.0,) * 3
+
+
+@given(
+    st.one_of(
+        st.floats(allow_nan=False, allow_infinity=False), st.integers(-(10**6), 10**6).map(lambda n: n / 2)
+    )
+)
+def test_the_nearest_integer_is_what_round_gives(value: float) -> None:
+    assert nearest(value) == round(value)

@@ -136,62 +136,62 @@ class Pipeline:
 
     def feed(self, event: Event) -> list[tuple[int, bytes]]:
         """Process an event; return the frames to send over the link, each with its event time (µs)."""
-        component = self.component
-        component.advance(event.time_us)
+        component, time_us, channel, data = self.component, event.time_us, event.channel, event.data
+        component.advance(time_us)
         due = component.outbox.drain()
         self.journal.sent(due)
-        if event.channel is SENSOR:
-            self.journal.sensor(event.time_us, event.data)
-            self._hear_sensor(event)
-        elif event.channel is LINK:
-            self._hear_link(event)
-        elif event.data:
-            self.journal.state(event.time_us, event.data)
-            self._changes.hear(event.data, event.time_us)
+        if channel is SENSOR:
+            self.journal.sensor(time_us, data)
+            self._hear_sensor(data, time_us)
+        elif channel is LINK:
+            self._hear_link(data, time_us)
+        elif data:
+            self.journal.state(time_us, data)
+            self._changes.hear(data, time_us)
         answers = component.outbox.drain()
         self.journal.sent(answers)
         return due + answers
 
-    def _hear_sensor(self, event: Event) -> None:
-        readings = self._driver.feed(event.data)
+    def _hear_sensor(self, data: bytes, time_us: int) -> None:
+        readings = self._driver.feed(data)
         if not readings:
-            self.sensor.mumbled(event.data, event.time_us)
+            self.sensor.mumbled(data, time_us)
             return
-        self.sensor.spoke(event.time_us)
-        stamps = self._clock.stamp(readings, event.time_us)
+        self.sensor.spoke(time_us)
+        stamps = self._clock.stamp(readings, time_us)
         for reading, stamp in zip(readings, stamps):  # noqa: B905 - one stamp per reading; without strict= it compiles to a plain loop
             self._sample(reading, stamp)
 
     def _sample(self, reading: Reading, stamp: Stamp) -> None:
+        time_us, missing, restarted = stamp.time_us, stamp.missing, stamp.restarted
         self._samples += 1
-        self._lost += stamp.missing
-        self._times.append(stamp.time_us)
-        self.sensor.read(reading.field, stamp.time_us)
-        sample, corrected = self._correction.reading(
-            reading, stamp.time_us, restarted=stamp.restarted, missing=stamp.missing
-        )
-        if (corrected.quality ^ self._quality) & DOUBTS:
-            self._tell_doubts(corrected.quality & DOUBTS)
+        self._lost += missing
+        self._times.append(time_us)
+        self.sensor.read(reading.field, time_us)
+        sample, corrected = self._correction.reading(reading, time_us, restarted=restarted, missing=missing)
+        doubts = corrected.quality & DOUBTS
+        if doubts != self._quality:
+            self._tell_doubts(doubts)
         utc_us = sample.time_us + self.component.codec.utc_offset_us
         anomaly = corrected.total_field - self._position.main_field(sample.time_us, utc_us)
         if self.navigation is not None:
             self.navigation.sample(sample.time_us, corrected)
         publisher = self.component.publisher
-        out = Sample(reading, stamp.time_us, corrected, sample.time_us, sample.age, anomaly)
+        out = Sample(reading, time_us, corrected, sample.time_us, sample.age, anomaly)
         publisher.publish(out)
         if self.journal.active and self._raw_rate.hertz != 0:
             self.journal.raw(self.component.codec.now_us, publisher.raw_payload(out))
 
-    def _hear_link(self, event: Event) -> None:
+    def _hear_link(self, data: bytes, time_us: int) -> None:
         component = self.component
-        for message in component.receive(event.data, event.time_us):
-            for value in self._telemetry.values(message, event.time_us, component.vehicle.clock):
-                self._correction.telemetry(*value)
+        for message in component.receive(data, time_us):
+            for name, value, when_us in self._telemetry.values(message, time_us, component.vehicle.clock):
+                self._correction.telemetry(name, value, when_us)
             if message.id == Position.MESSAGE:
-                self._position.update(message, event.time_us)
+                self._position.update(message, time_us)
             if self.navigation is not None:
-                self.navigation.hear(message, event.time_us)
-        self.journal.link(event.time_us, component.heard)
+                self.navigation.hear(message, time_us)
+        self.journal.link(time_us, component.heard)
         component.heard.clear()
         if component.parameters.revision != self._revision:
             self._tune()

@@ -32,11 +32,13 @@ __all__ = [
     "COARSE",
     "FINE",
     "PAIRS",
+    "Linear",
+    "Numbers",
     "Prepared",
     "apply",
-    "combined",
     "for_arrays",
     "largest",
+    "linear",
     "monomials",
     "prepare",
     "split",
@@ -51,6 +53,8 @@ Prepared = tuple[list[float], list[list[float]]]
 """What :func:`apply` needs at one set of positions: A' row by row, then T (12 numbers); and for each of V's
 six entries Q (6), L (3) and O (1)."""
 Numbers = tuple[float, float, float, float, float, float, float, float]
+Linear = tuple[float, float, float, float, float, float, float, float, float]
+"""A's entries xx, yy, zz, xy, xz, yz; T's x, y, z."""
 PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 """Row and column of each of a symmetric matrix's six entries, in the order in which they are kept."""
 
@@ -104,12 +108,20 @@ def split(phi: list[float], pairs: list[tuple[int, int]], scale: float) -> list[
     return fine + coarse
 
 
-def combined(phi: list[float], weights: list[float]) -> float:
-    """Return the sum of regressors times weights, in this order."""
-    found = 0.0
-    for value, weight in zip(phi, weights):  # noqa: B905 - the weights of effects' regressors are left aside
-        found += value * weight
-    return found
+def linear(phi: list[float], weights: list[Linear]) -> Linear:
+    """Return A's six entries and T: the sums of regressors times weights, in this order."""
+    xx = yy = zz = xy = xz = yz = tx = ty = tz = 0.0
+    for value, (a, b, c, d, e, f, g, h, i) in zip(phi, weights):  # noqa: B905 - the weights of effects are left aside
+        xx += value * a
+        yy += value * b
+        zz += value * c
+        xy += value * d
+        xz += value * e
+        yz += value * f
+        tx += value * g
+        ty += value * h
+        tz += value * i
+    return xx, yy, zz, xy, xz, yz, tx, ty, tz
 
 
 def prepare(t: list[float]) -> Prepared:

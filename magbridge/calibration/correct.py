@@ -18,7 +18,16 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from magbridge.arrays import FloatArray, IntArray
-from magbridge.calibration.arithmetic import Prepared, apply, combined, for_arrays, largest, prepare
+from magbridge.calibration.arithmetic import (
+    Linear,
+    Numbers,
+    Prepared,
+    apply,
+    for_arrays,
+    largest,
+    linear,
+    prepare,
+)
 from magbridge.calibration.kernel import FARTHEST, Kernel
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.terms import Step
@@ -88,16 +97,24 @@ class Corrector:
         self._flags = self._base
         self._last: list[float] = []
         self._prepared: Prepared = [], []
-        self._weights: list[list[float]] = self._kernel.weights.T.tolist()
+        self._weights: list[Linear] = [tuple(row) for row in self._kernel.weights.tolist()]
         self._positions = len(calibration.parameters)
         self._asked: tuple[tuple[float, ...], Sequence[Span]] = (), ()
         self._ends: list[tuple[int, int]] = []
-        self._there: list[list[float]] = []
+        self._places: dict[tuple[float, ...], int] = {}
+        self._there: list[Linear] = []
 
     def step(
         self, time_us: int, field: tuple[float, float, float], values: Sequence[float], quality: int = 0
     ) -> Corrected:
-        """Correct one sample.
+        """Correct one sample; see :meth:`numbers`."""
+        (F, sigma, x, y, z, sx, sy, sz), quality = self.numbers(time_us, field, values, quality)
+        return Corrected(F, sigma, (x, y, z), (sx, sy, sz), quality)
+
+    def numbers(
+        self, time_us: int, field: tuple[float, float, float], values: Sequence[float], quality: int
+    ) -> tuple[Numbers, int]:
+        """Correct one sample; return total field, its sigma, the vector, its sigmas, and the flags.
 
         Parameters
         ----------
@@ -134,9 +151,9 @@ class Corrector:
         quality |= self._flags
         if not F < BEYOND:  # also NaN
             quality |= STALE_TELEMETRY if abs(hx) + abs(hy) + abs(hz) < BEYOND else GAP
-            F = x = y = z = np.nan
+            F = x = y = z = nan
             sigma = sx = sy = sz = inf
-        return Corrected(F, sigma, (x, y, z), (sx, sy, sz), quality)
+        return (F, sigma, x, y, z, sx, sy, sz), quality
 
     def _flags_of(self, values: tuple[float, ...]) -> int:
         flags = self._base
@@ -164,31 +181,30 @@ class Corrector:
         asked = positions, spans
         if asked != self._asked:
             self._asked = asked
+            known = {place: self._there[n] for place, n in self._places.items()}
             places: dict[tuple[float, ...], int] = {}  # each once: most spans share an end
-
-            def place(index: int, value: float) -> int:
-                return places.setdefault((*positions[:index], value, *positions[index + 1 :]), len(places))
-
-            self._ends = [
-                (place(index, low), place(index, high))
-                for index, low, high in spans
-                if index < self._positions
-            ]
-            self._there = [self._linear_at(there) for there in places]
-        totals = [_total(field, linear) for linear in self._there]
+            self._ends = []
+            for index, low, high in spans:
+                if index < self._positions:
+                    before, after = positions[:index], positions[index + 1 :]
+                    start = places.setdefault((*before, low, *after), len(places))
+                    self._ends.append((start, places.setdefault((*before, high, *after), len(places))))
+            self._places = places
+            self._there = [known.get(place) or self._linear_at(place) for place in places]
+        totals = [_total(field, there) for there in self._there]
         return [totals[high] - totals[low] for low, high in self._ends]
 
-    def _linear_at(self, positions: tuple[float, ...]) -> list[float]:
+    def _linear_at(self, positions: tuple[float, ...]) -> Linear:
         """Return A's six entries and T; NaN if the positions are too far off."""
         phi = self._kernel.monomials(positions, 1.0)
         if not largest(phi) < FARTHEST:
-            return [nan] * len(self._weights)
-        return [combined(phi, column) for column in self._weights]
+            return nan, nan, nan, nan, nan, nan, nan, nan, nan
+        return linear(phi, self._weights)
 
 
-def _total(field: tuple[float, float, float], linear: list[float]) -> float:
+def _total(field: tuple[float, float, float], there: Linear) -> float:
     """Return ``|A (H_r - T)|``."""
-    xx, yy, zz, xy, xz, yz, tx, ty, tz = linear
+    xx, yy, zz, xy, xz, yz, tx, ty, tz = there
     hx, hy, hz = field
     dx, dy, dz = hx - tx, hy - ty, hz - tz
     bx = xx * dx + xy * dy + xz * dz

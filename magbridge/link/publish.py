@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from math import isfinite, nan
+from struct import Struct
 from typing import Final
 
-import msgspec
-
+from magbridge.align import nearest
 from magbridge.link.outbox import Outbox
 from magbridge.link.rates import Rate
 from magbridge.mavlink import spec
@@ -19,6 +19,8 @@ __all__ = ["PUBLISHED", "Publisher", "Sample"]
 RAW: Final = spec("MAG_RAW")
 FIELD: Final = spec("MAG_FIELD")
 IMU: Final = spec("HIGHRES_IMU")
+IMU_FIELD: Final = Struct("<Q24x3f16xHB")
+"""HIGHRES_IMU without accelerations, rotations, pressures, altitude and temperature, which are zero."""
 NAMED: Final = spec("NAMED_VALUE_FLOAT")
 VECTOR: Final = spec("DEBUG_VECT")
 MAGNETOMETER: Final = 0x1C0
@@ -33,7 +35,7 @@ POWER_CYCLE: Final = int(MAG_RAW_FLAGS.POWER_CYCLE)
 NO_COUNTS: Final = (0, 0, 0)
 
 
-class Sample(msgspec.Struct, frozen=True, gc=False):
+class Sample:
     """One sample, as the bridge hands it out.
 
     Attributes
@@ -48,14 +50,29 @@ class Sample(msgspec.Struct, frozen=True, gc=False):
         s, of the oldest parameter in the correction; infinite where one never came.
     anomaly : float
         nT above the main field; NaN where the position is not known.
+
+    Notes
+    -----
+    As :class:`magbridge.align.Sample`, a class of its own for speed.
     """
 
-    reading: Reading
-    reading_us: int
-    corrected: Corrected
-    time_us: int
-    telemetry_age: float = nan
-    anomaly: float = nan
+    __slots__ = ("anomaly", "corrected", "reading", "reading_us", "telemetry_age", "time_us")
+
+    def __init__(
+        self,
+        reading: Reading,
+        reading_us: int,
+        corrected: Corrected,
+        time_us: int,
+        telemetry_age: float = nan,
+        anomaly: float = nan,
+    ) -> None:
+        self.reading: Final = reading
+        self.reading_us: Final = reading_us
+        self.corrected: Final = corrected
+        self.time_us: Final = time_us
+        self.telemetry_age: Final = telemetry_age
+        self.anomaly: Final = anomaly
 
 
 class Publisher:
@@ -103,21 +120,22 @@ class Publisher:
     def raw_payload(self, sample: Sample) -> bytes:
         """Return the payload of a sample's MAG_RAW."""
         reading = sample.reading
+        counts, sequence, cycle = reading.counts, reading.sequence, reading.power_cycle
         flags = SATURATED if reading.saturated else 0
-        if reading.counts is not None:
+        if counts is not None:
             flags |= COUNTS
-        if reading.sequence is not None:
+        if sequence is not None:
             flags |= SEQUENCE
-        if reading.power_cycle is not None:
+        if cycle is not None:
             flags |= POWER_CYCLE
         x, y, z = reading.field
-        x_count, y_count, z_count = reading.counts or NO_COUNTS
+        x_count, y_count, z_count = counts or NO_COUNTS
         x_late, y_late, z_late = reading.channel_delay
         return RAW.struct.pack(
-            sample.reading_us + self._codec.utc_offset_us, (reading.sequence or 0) & MASK,
+            sample.reading_us + self._codec.utc_offset_us, (sequence or 0) & MASK,
             x, y, z, x_count, y_count, z_count,
-            round(x_late * 1e6), round(y_late * 1e6), round(z_late * 1e6),
-            reading.temperature, reading.supply, (reading.power_cycle or 0) & 0xFFFF, 0, flags,
+            nearest(x_late * 1e6), nearest(y_late * 1e6), nearest(z_late * 1e6),
+            reading.temperature, reading.supply, (cycle or 0) & 0xFFFF, 0, flags,
         )  # fmt: skip
 
     def _field(self, sample: Sample) -> None:
@@ -134,13 +152,8 @@ class Publisher:
 
     def _imu(self, sample: Sample) -> None:
         x, y, z = sample.corrected.field
-        payload = IMU.struct.pack(
-            sample.time_us + self._codec.utc_offset_us,
-            0.0, 0.0, 0.0, 0.0, 0.0, 0.0,  # accelerations and rotations
-            x * GAUSS, y * GAUSS, z * GAUSS,
-            0.0, 0.0, 0.0, 0.0,  # pressures, altitude, temperature
-            MAGNETOMETER, 0,
-        )  # fmt: skip
+        time_us = sample.time_us + self._codec.utc_offset_us
+        payload = IMU_FIELD.pack(time_us, x * GAUSS, y * GAUSS, z * GAUSS, MAGNETOMETER, 0)
         self._outbox.put(IMU, payload)
 
     def _named(self, sample: Sample) -> None:
