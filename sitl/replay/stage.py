@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import pty
+import select
 import socket
 import subprocess
 import sys
@@ -50,14 +51,14 @@ class Stage:
 
     def __init__(self, config: Path, listener: Callable[[bytes], None], log: Path | None = None) -> None:
         self._listener = listener
-        self._buffers = {Channel.SENSOR: bytearray(), Channel.LINK: bytearray(), Channel.STATE: bytearray()}
+        self._buffers = {Channel.STATE: bytearray(), Channel.LINK: bytearray(), Channel.SENSOR: bytearray()}
         with ExitStack() as opened, socket.create_server(("127.0.0.1", 0)) as server:
             self._master, slave = pty.openpty()
             opened.callback(os.close, self._master)
             opened.callback(os.close, slave)
+            os.set_blocking(self._master, False)
             # what is written before the bridge opens it must not be edited as a terminal would
             tty.setraw(slave)
-            server.settimeout(CONNECT_TIMEOUT)
             times_out, times = os.pipe()
             command = [
                 sys.executable, "-m", "sitl.replay.bridge", str(config),
@@ -71,17 +72,25 @@ class Stage:
             )
             os.close(times_out)
             self._times = opened.enter_context(os.fdopen(times, "wb", buffering=0))
-            try:
-                self._link, _ = server.accept()
-            except TimeoutError as error:
-                raise self._failure("the bridge did not connect") from error
+            if not self._wait(server.fileno(), select.POLLIN, CONNECT_TIMEOUT):
+                raise self._failure(f"the bridge did not connect within {CONNECT_TIMEOUT:g} s")
+            self._link = opened.enter_context(server.accept()[0])
             self._link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            opened.enter_context(self._link)
             ear = threading.Thread(target=self._listen, name="autopilot's ear", daemon=True)
             ear.start()
             opened.callback(ear.join, timeout=10.0)
             opened.enter_context(self._times)  # closed first: the bridge ends with its timetable
             self._opened = opened.pop_all()
+
+    def _wait(self, fd: int, event: int, timeout: float | None = None) -> bool:
+        """Return whether `event` comes within `timeout` s; raises why the bridge has ended, if it has."""
+        waiting = select.poll()
+        waiting.register(fd, event)
+        waiting.register(self._times, 0)  # it breaks when the bridge, its only reader, ends
+        ready = [one for one, _ in waiting.poll(timeout and timeout * 1e3)]
+        if ready and fd not in ready:
+            raise self._failure()
+        return bool(ready)
 
     def _listen(self) -> None:
         try:
@@ -90,7 +99,7 @@ class Stage:
         except ConnectionResetError:
             return  # the bridge ended early; :meth:`play` reports why
 
-    def _failure(self, otherwise: str) -> MagbridgeError:
+    def _failure(self, otherwise: str = "") -> MagbridgeError:
         """End the bridge; return why it failed: the error for its exit code, with its last line on stderr."""
         try:
             _, said = self._bridge.communicate(timeout=PATIENCE)
@@ -100,7 +109,7 @@ class Stage:
         words = said.decode(errors="replace").strip().rpartition("\n")[2]
         if words and self._bridge.returncode == WrongUse.exit_code:
             return WrongUse(words)
-        return PortError("replay", words or otherwise)
+        return PortError("replay", words or otherwise or f"the bridge ended with {self._bridge.returncode}")
 
     def play(self, start: Start, events: Iterable[Event], speed: float = float("inf")) -> None:
         """Play events in order, and wait until the bridge has dealt with all of them.
@@ -125,9 +134,7 @@ class Stage:
             self._send(start, events, speed)
             self._times.close()
             if self._bridge.wait() != 0:
-                raise self._failure(f"the bridge ended with {self._bridge.returncode}")
-        except (BrokenPipeError, ConnectionResetError) as error:
-            raise self._failure("the bridge ended") from error
+                raise self._failure()
         finally:
             self._opened.close()
 
@@ -151,12 +158,18 @@ class Stage:
         self._flush()
 
     def _flush(self) -> None:
-        """Write what is due, bytes before timetable: what an entry announces must already be there."""
-        sensor, link, times = self._buffers.values()
-        while sensor:
-            del sensor[: os.write(self._master, sensor)]
-        if link:
+        """Write what is due: the timetable first, by which the bridge reads what is more than a pty holds.
+
+        The sensor's bytes come last, so that the bridge never waits for the link's while the pty is full.
+        """
+        times, link, sensor = self._buffers.values()
+        try:
+            while times:
+                del times[: self._times.write(times)]
             self._link.sendall(link)
             link.clear()
-        while times:
-            del times[: self._times.write(times)]
+            while sensor:
+                self._wait(self._master, select.POLLOUT)
+                del sensor[: os.write(self._master, sensor)]
+        except (BrokenPipeError, ConnectionResetError) as error:
+            raise self._failure() from error

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+import signal
+import time
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,10 +13,11 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from magbridge.bridge.events import Event, Start
 from magbridge.calibration.file import save
 from magbridge.calibration.model import Noise, identity
 from magbridge.config import load as load_config
-from magbridge.errors import DataError, FormatError, WrongUse
+from magbridge.errors import DataError, FormatError, PortError, WrongUse
 from magbridge.field.geodesy import offset
 from magbridge.logs import read, write
 from magbridge.mavlink import Codec, LogReader
@@ -23,9 +26,11 @@ from sitl import Twin, load, segments, simulate
 from sitl.demo import demo
 from sitl.motion import with_motion
 from sitl.replay.autopilot import Autopilot
+from sitl.replay.listener import Listener
 from sitl.replay.own_log import Recorded, is_own_log
 from sitl.replay.run import replay
 from sitl.replay.setup import bridge_toml, short_names
+from sitl.replay.stage import Stage
 from sitl.replay.summary import summary
 
 
@@ -233,6 +238,39 @@ def test_a_bridge_that_cannot_start_says_why(survey: Path, tmp_path: Path) -> No
     path.write_text(path.read_text().replace("MAG_RAW = 0", "MAG_RAW = 0\nNO_SUCH = 1"))
     with pytest.raises(WrongUse, match=r"^\S*bridge\.toml: publish\.NO_SUCH"):
         replay([survey], path)
+
+
+def test_a_bridge_that_ends_before_it_connects_says_why_at_once(tmp_path: Path) -> None:
+    begun = time.monotonic()
+    with pytest.raises(WrongUse, match=r"none\.toml: No such file"):
+        Stage(tmp_path / "none.toml", bytearray().extend)
+    assert time.monotonic() - begun < 15.0  # it waits for a connection for 30 s
+
+
+def lines(count: int) -> Event:
+    """So many readings of an instrument that sends lines, read at once."""
+    return Event(1_700_000_000_000_000, Channel.SENSOR, b"20000 1000 40000\n" * count)
+
+
+def test_more_than_a_pty_holds_is_read_at_once(tmp_path: Path) -> None:
+    """A bridge that was stopped for a while finds so much in its line, and so does a replay of its log."""
+    heard = Listener()
+    stage = Stage(config(tmp_path, "ascii", 'columns = ["x", "y", "z"]'), heard.hear)
+    stage.play(Start(1_700_000_000_000_000), [lines(4000)])
+    assert heard.counts["MAG_FIELD"] == 4000
+
+
+def test_a_bridge_that_dies_holds_nobody_up(tmp_path: Path) -> None:
+    stage = Stage(config(tmp_path, "ascii", 'columns = ["x", "y", "z"]'), bytearray().extend)
+    (bridge,) = map(int, Path(f"/proc/self/task/{os.getpid()}/children").read_text().split())
+
+    def events() -> Iterator[Event]:
+        yield lines(1)
+        os.kill(bridge, signal.SIGKILL)
+        yield lines(4000)
+
+    with pytest.raises(PortError, match="the bridge ended with -9"):
+        stage.play(Start(1_700_000_000_000_000), events())
 
 
 def test_a_value_that_its_message_cannot_hold_ends_the_replay(survey: Path, tmp_path: Path) -> None:
