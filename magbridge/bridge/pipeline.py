@@ -234,7 +234,8 @@ class Pipeline:
     def _status(self) -> Condition:
         """Return what MAG_STATUS says of the sensor, the samples and the log."""
         times, now_us = self._times, self.component.codec.now_us
-        span_us = times[-1] - times[0] if len(times) > 1 else 0
+        # of a sensor that is silent, no rate is known: that of its last samples is not the present one
+        span_us = times[-1] - times[0] if times and self.sensor.state == MAG_PORT_STATE.OK else 0
         tracks = self._correction.aligner.by_name
         stale = sum(
             1 << bit

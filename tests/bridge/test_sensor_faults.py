@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import socket
 import time
+from math import isnan
 
 import pytest
 from checks import NOISE, Row, replays, seconds
@@ -53,7 +54,9 @@ def test_sensor_silent(rig: Rig, table: Row) -> None:
     rig.until_well()
     before, mark = rig.fresh_status(), rig.mark
     rig.fluxgate.speaks = False
-    rig.until_status(lambda status: status["sensor_state"] == SILENT)
+    silent = rig.until_status(lambda status: status["sensor_state"] == SILENT)
+    assert before["sample_rate"] > 1.0
+    assert isnan(silent["sample_rate"])
     noticed = rig.until_said("digitizer is silent", mark)
     rig.fluxgate.speaks = True
     back = rig.until_well()
