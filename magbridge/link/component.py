@@ -18,7 +18,7 @@ from magbridge.link.rates import Rate, period_us
 from magbridge.link.reports import Condition, Reports
 from magbridge.link.timers import Timers
 from magbridge.link.vehicle import Vehicle
-from magbridge.mavlink import Codec, Message, Signing, TapeWriter, spec
+from magbridge.mavlink import REFUSED, Codec, Message, Signing, TapeWriter, spec
 from magbridge.mavlink.dialect import MAV_SEVERITY
 
 __all__ = ["LIMITS", "TIMESYNC_US", "Component", "check_publish"]
@@ -169,6 +169,8 @@ class Component:
         self.heard += self._tape.frames(messages, self.codec.pending)
         for message in messages:
             if not message.known:
+                if message.id == REFUSED:
+                    self._tell_refusals()
                 continue
             handler = self._handlers.get(message.id)
             if handler:
@@ -176,6 +178,13 @@ class Component:
             if self.vehicle.hear(message, t_us):
                 ours.append(message)
         return ours
+
+    def _tell_refusals(self) -> None:
+        """Say once for each reason why frames are refused: else their sender would only seem to be away."""
+        assert self.codec.signing is not None
+        for why, (system, component) in self.codec.signing.refusals.items():
+            text = f"frames of {system}:{component} refused: {why}"
+            self.announcer.state(f"refused: {why}", text, MAV_SEVERITY.WARNING)
 
     def _begin(self, t_us: int) -> None:
         self.codec.now_us = t_us

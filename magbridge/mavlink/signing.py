@@ -62,12 +62,15 @@ class Signing:
     ----------
     refused : int
         Frames that were unsigned, wrongly signed or old.
+    refusals : dict of str to tuple of 2 int
+        Why frames were refused, and the first system and component whose frame was refused for that.
     """
 
     def __init__(self, key: bytes, last: int = 0) -> None:
         self._key = key
         self.last = last
         self.refused = 0
+        self.refusals: dict[str, tuple[int, int]] = {}
         self._streams: dict[tuple[int, int, int], int] = {}
 
     def sign(self, frame: bytes, t_us: int) -> bytes:
@@ -78,21 +81,24 @@ class Signing:
 
     def accept(self, frame: bytes, stream: tuple[int, int], number: int, t_us: int) -> bool:
         """Say whether a frame of the `stream` (system, component) is genuine and new."""
-        genuine = number in NEED_NO_SIGNATURE
+        why = "" if number in NEED_NO_SIGNATURE else "not signed"
         if frame[0] == 0xFD and frame[2] & 1:
-            genuine = self._verify(frame, stream, t_us)
-        self.refused += not genuine
-        return genuine
+            why = self._doubt(frame, stream, t_us)
+        if why:
+            self.refused += 1
+            self.refusals.setdefault(why, stream)
+        return not why
 
-    def _verify(self, frame: bytes, stream: tuple[int, int], t_us: int) -> bool:
+    def _doubt(self, frame: bytes, stream: tuple[int, int], t_us: int) -> str:
+        """Return what is wrong with a signature; nothing where it is genuine and new."""
         if sha256(self._key + frame[:-6]).digest()[:6] != frame[-6:]:
-            return False
+            return "signed with another key"
         stamp = int.from_bytes(frame[-12:-6], "little")
         key = (frame[-13], *stream)
         # a new stream may be a minute behind; an older one may be a recording that is sent again
         floor = self._streams.get(key, max(self.last, timestamp(t_us)) - MINUTE)
         if stamp <= floor:
-            return False
+            return "an old time stamp"
         self._streams[key] = stamp
         self.last = max(self.last, stamp)
-        return True
+        return ""

@@ -202,11 +202,14 @@ def test_forged_signed_packets(make_rig: MakeRig, table: Row) -> None:
     rig.run(0.8)  # beyond max_age: only later genuine telemetry keeps the field good
     rig.until_answered()
     assert rig.undue_flags(mark) == ""
+    told = sorted(text for text in rig.said(mark) if "refused" in text)
+    reasons = ("an old time stamp", "not signed", "signed with another key")
+    assert told == [f"frames of 1:1 refused: {why}" for why in reasons]
     assert all(message.frame[2] & 1 for _, message in rig.heard)
     table(
         "forged packets: a time stamp far in the future, another key, no signature, a replayed genuine "
         "packet",
-        "no change; the genuine packets that follow are accepted",
+        "STATUSTEXT once for each reason; the genuine packets that follow are accepted",
         "at once",
         f"the forged packets: `link_refused` {len(wrong)}",
     )
