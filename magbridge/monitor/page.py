@@ -76,7 +76,7 @@ class Page:
             self._from = ui.label().classes("text-sm text-slate-300 max-sm:order-last max-sm:w-full")
             ui.space()
             self._stream = ui.label().classes("text-sm px-3 py-1 rounded-full")
-        facts = list(health(self._state))
+        facts = list(health(self._state, now()))
         with ui.column().classes("w-full max-w-screen-2xl mx-auto gap-4") as self._body:
             with ui.element().classes(f"{GRID} md:grid-cols-[18rem_1fr]") as self._field:
                 with _card("Field, nT ± 2σ"):
@@ -95,7 +95,7 @@ class Page:
                 _card("Position by the field; innovation and bias in nT"),
                 ui.element().classes(f"{GRID} md:grid-cols-3 gap-y-1"),
             ):
-                self._whereabouts = [_fact(name) for name in whereabouts(self._state)]
+                self._whereabouts = [_fact(name) for name in whereabouts(self._state, now())]
             with ui.element().classes(f"{GRID} lg:grid-cols-2"):
                 with _card("Messages, UTC"):
                     self._texts = ui.column().classes("w-full h-60 gap-1 overflow-auto flex-nowrap")
@@ -124,19 +124,23 @@ class Page:
         flagged = self._state.flags.keys() - {"no_boresight"}
         self._stream.set_text(trouble or ("live, flagged" if flagged else "live"))
         self._stream.style(f"background: {RED if trouble else AMBER if flagged else GREEN}")
-        field = trouble.startswith("no field")  # then the rest of the page says why
-        self._body.style(f"opacity: {0.45 if trouble and not field else 1}")
+        field, status = "no field" in trouble, "no status" in trouble  # then the rest of the page says why
+        self._body.style(f"opacity: {0.45 if trouble and not (field or status) else 1}")
         self._field.style(f"opacity: {0.45 if field else 1}")
+        for label in self._health:
+            label.style(f"opacity: {0.45 if status else 1}")
 
     def _tell_figures(self) -> None:
         for labels, texts in zip(self._measured, measured(self._state).values(), strict=True):
             for label, text in zip(labels, texts, strict=True):
                 label.set_text(text)
         self._navigation.set_visibility(bool(self._state.navigation))
-        for label, (text, well) in zip(self._whereabouts, whereabouts(self._state).values(), strict=True):
+        for label, (text, well) in zip(
+            self._whereabouts, whereabouts(self._state, now()).values(), strict=True
+        ):
             label.set_text(text)
             label.style(f"color: {INK if well else RED}")
-        for label, (text, well) in zip(self._health, health(self._state).values(), strict=True):
+        for label, (text, well) in zip(self._health, health(self._state, now()).values(), strict=True):
             label.set_text(text if self._state.status else "–")
             label.style(f"color: {INK if well or not self._state.status else RED}")
 

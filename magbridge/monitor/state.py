@@ -65,10 +65,10 @@ class State:
     ----------
     bridge : tuple of 2 int or None
         Its system and component.
-    heard, sampled : float
-        When its last message and its last MAG_FIELD came; -inf before the first.
-    interval : float
-        s between its last two MAG_FIELDs; 0 before the second.
+    heard, sampled, reported, navigated : float
+        When its last message, MAG_FIELD, MAG_STATUS and MAG_NAVIGATION came; -inf before the first.
+    interval, report_interval : float
+        s between its last two MAG_FIELDs, and MAG_STATUSes; 0 before the second.
     received, lost : int
         Its messages received, and those missing by their sequence numbers.
     field, status, navigation : dict
@@ -96,8 +96,8 @@ class State:
     def _begin(self) -> None:
         """Forget everything, as before any bridge was heard."""
         self.bridge: tuple[int, int] | None = None
-        self.heard = self.sampled = -inf
-        self.interval = 0.0
+        self.heard = self.sampled = self.reported = self.navigated = -inf
+        self.interval = self.report_interval = 0.0
         self.received = self.lost = 0
         self.field: dict[str, Any] = {}
         self.status: dict[str, Any] = {}
@@ -178,7 +178,9 @@ class State:
         while time - self.trace[0].time > WINDOW:
             self.trace.popleft()
 
-    def _status(self, message: Message, _: float) -> None:
+    def _status(self, message: Message, now: float) -> None:
+        self.report_interval = now - self.reported if self.status else 0.0
+        self.reported = now
         before, self.status = self.status.get("uptime", 0), message.fields
         if self.status["uptime"] < before:  # the bridge restarted, perhaps with other parameters
             self.parameters.clear()
@@ -186,8 +188,8 @@ class State:
             self.lost = self._lost_before  # its sequence numbers began anew
         self._lost_before = self.lost
 
-    def _navigation(self, message: Message, _: float) -> None:
-        self.navigation = message.fields
+    def _navigation(self, message: Message, now: float) -> None:
+        self.navigation, self.navigated = message.fields, now
 
     def _text(self, message: Message, now: float) -> None:
         number, piece = message["id"], message["chunk_seq"]

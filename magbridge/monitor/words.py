@@ -12,8 +12,8 @@ from magbridge.monitor.state import State
 __all__ = ["FLAGS", "ago", "health", "measured", "silence", "whereabouts"]
 
 SILENT, SLOW = 3.0, 30.0
-"""s of silence that are reported: `SILENT` of the bridge, which sends every second; of the field three sample
-intervals, at least `SILENT` and at most `SLOW`."""
+"""s of silence that are reported: `SILENT` of the bridge, which sends every second; of the field and of the
+status three of their intervals, at least `SILENT` and at most `SLOW`."""
 FLAGS = {
     "stale_telemetry": "A parameter of the calibration is old, missing or NaN",
     "extrapolated": "A parameter is outside the calibrated range",
@@ -42,12 +42,24 @@ def ago(seconds: float) -> str:
 
 
 def silence(state: State, now: float) -> str:
-    """Return what is wrong with the stream; an empty text while messages and field come."""
-    slow = max(SILENT, min(3 * state.interval, SLOW))
-    for what, when, limit in (("nothing", state.heard, SILENT), ("no field", state.sampled, slow)):
-        if now - when > limit:
-            return f"{what} heard for {ago(now - when)}" if isfinite(when) else f"{what} heard yet"
-    return ""
+    """Return what is wrong with the stream; an empty text while messages, field and status come."""
+    if _late(state.heard, 0.0, now):
+        return _unheard("nothing", state.heard, now)
+    missing = []
+    if _late(state.sampled, state.interval, now):
+        missing.append(_unheard("no field", state.sampled, now))
+    if state.status and _late(state.reported, state.report_interval, now):  # a bridge need not send it at all
+        missing.append(_unheard("no status", state.reported, now))
+    return "; ".join(missing)
+
+
+def _late(when: float, interval: float, now: float) -> bool:
+    """Say whether more than a message or two of such an interval (s) have not come."""
+    return now - when > max(SILENT, min(3 * interval, SLOW))
+
+
+def _unheard(what: str, when: float, now: float) -> str:
+    return f"{what} heard for {ago(now - when)}" if isfinite(when) else f"{what} heard yet"
 
 
 def measured(state: State) -> dict[str, tuple[str, str]]:
@@ -60,9 +72,11 @@ def measured(state: State) -> dict[str, tuple[str, str]]:
     return shown
 
 
-def health(state: State) -> dict[str, tuple[str, bool]]:
+def health(state: State, now: float) -> dict[str, tuple[str, bool]]:
     """Return the bridge's condition: name of each item to its text, and whether it is in order."""
-    field, get = state.field.get, state.status.get
+    # of a field that no longer comes, neither latency nor age is the present one
+    field = ({} if _late(state.sampled, state.interval, now) else state.field).get
+    get = state.status.get
     sensor, autopilot, log = (get(f"{line}_state", 0) for line in ("sensor", "autopilot", "log"))
     losses = {name: get(counter, 0) for name, counter in LOSSES.items()}
     return {
@@ -76,7 +90,7 @@ def health(state: State) -> dict[str, tuple[str, bool]]:
             "stale_telemetry" not in state.flags,
         ),
         "Calibration": (
-            f"{field('calibration_id', 0):08x}".replace("0" * 8, "none") if state.field else "–",
+            f"{state.field['calibration_id']:08x}".replace("0" * 8, "none") if state.field else "–",
             True,
         ),
         "Uptime": (ago(get("uptime", 0)), True),
@@ -89,7 +103,7 @@ def health(state: State) -> dict[str, tuple[str, bool]]:
     }
 
 
-def whereabouts(state: State) -> dict[str, tuple[str, bool]]:
+def whereabouts(state: State, now: float) -> dict[str, tuple[str, bool]]:
     """Return the position filter's condition: name of each item to its text, and whether it is in order."""
     get = state.navigation.get
     mode = get("state", 0)
@@ -109,6 +123,7 @@ def whereabouts(state: State) -> dict[str, tuple[str, bool]]:
             _number(hypot(get("current_north", nan), get("current_east", nan)), ".2f", unit="m/s")[0],
             True,
         ),
+        "Last update": (f"{ago(now - state.navigated)} ago" if state.navigation else "–", True),
     }
 
 

@@ -61,6 +61,30 @@ def test_a_slow_sensor_is_not_silent(air: Air) -> None:
     assert silence(air.state, NOW + 49) == "no field heard for 13 s"
 
 
+def test_a_status_that_stops_is_not_the_present_one(air: Air) -> None:
+    """Its rate is a parameter: it may be switched off, or once in ten seconds."""
+    for k in range(10):
+        air.field(NOW + k)
+    assert silence(air.state, NOW + 9) == ""  # it never came: dashes are shown
+    air.say(NOW + 9, "MAG_STATUS", uptime=9)
+    air.field(NOW + 14)
+    assert silence(air.state, NOW + 14) == "no status heard for 5 s"
+    air.say(NOW + 30, "HEARTBEAT")
+    assert silence(air.state, NOW + 31) == "no field heard for 17 s; no status heard for 22 s"
+    air.say(NOW + 31, "MAG_STATUS", uptime=31)
+    air.field(NOW + 50)
+    assert silence(air.state, NOW + 50) == ""
+
+
+def test_figures_of_a_field_that_stopped_are_not_the_present_ones(air: Air) -> None:
+    air.field(NOW, latency=0.0042, telemetry_age=0.3)
+    air.say(NOW, "MAG_STATUS", uptime=1)
+    air.say(NOW, "MAG_NAVIGATION", state=2)
+    assert [health(air.state, NOW)[name][0] for name in ("Latency", "Telemetry age")] == ["4.2 ms", "0.3 s"]
+    assert [health(air.state, NOW + 4)[name][0] for name in ("Latency", "Telemetry age")] == ["–", "–"]
+    assert whereabouts(air.state, NOW + 40)["Last update"][0] == "40 s ago"
+
+
 def test_a_restart_loses_nothing(air: Air) -> None:
     """The sequence numbers begin anew; what was lost before and is lost after counts."""
     for k in range(100):
@@ -86,8 +110,8 @@ def test_figures(air: Air) -> None:
     assert shown["Forward"] == ("-4\u202f203.0", "± 2.2")
     assert shown["Anomaly"][0] == shown["Starboard"][0] == "–"
     air.say(NOW, "MAG_STATUS", sensor_state=3, autopilot_state=1, log_state=2, samples_lost=7, uptime=4)
-    assert health(State())["Calibration"] == ("–", True)
-    items = health(air.state)
+    assert health(State(), NOW)["Calibration"] == ("–", True)
+    items = health(air.state, NOW)
     assert items["Sensor"] == ("lost", False)
     assert items["Autopilot"] == ("ok", True)
     assert items["Log"] == ("failed", False)
@@ -98,10 +122,10 @@ def test_figures(air: Air) -> None:
 
 def test_the_position_by_the_field(air: Air) -> None:
     air.field(NOW)
-    assert whereabouts(air.state)["State"] == ("off", True)
+    assert whereabouts(air.state, NOW)["State"] == ("off", True)
     place = {"lat": 495_000_000, "lon": -579_000_000, "covariance_nn": 400.0, "covariance_ee": 900.0}
     air.say(NOW, "MAG_NAVIGATION", state=4, innovation=2.5, innovation_variance=1.0, bias=1.0, **place)
-    items = whereabouts(air.state)
+    items = whereabouts(air.state, NOW)
     assert items["State"] == ("lost", False)
     assert items["Position"][0] == "49.50000, -57.90000"
     assert items["1σ of the longer axis"][0] == "30 m"
@@ -112,9 +136,9 @@ def test_what_a_newer_bridge_says_is_shown_as_far_as_it_is_known(air: Air) -> No
     air.say(NOW, "MAG_STATUS", sensor_state=200, log_state=201)
     air.say(NOW, "MAG_NAVIGATION", state=202)
     air.say(NOW, "STATUSTEXT", chunk_seq=1, text="the end of what was not heard")
-    assert health(air.state)["Sensor"] == ("state 200", False)
-    assert health(air.state)["Log"] == ("state 201", False)
-    assert whereabouts(air.state)["State"][0] == "state 202"
+    assert health(air.state, NOW)["Sensor"] == ("state 200", False)
+    assert health(air.state, NOW)["Log"] == ("state 201", False)
+    assert whereabouts(air.state, NOW)["State"][0] == "state 202"
     assert [said.text for said in air.state.texts] == ["the end of what was not heard"]
 
 
