@@ -12,7 +12,7 @@ from magbridge.bridge.port import Port
 from magbridge.link.component import LIMITS
 from magbridge.mavlink import spec
 
-__all__ = ["LATE", "MOST", "Stream"]
+__all__ = ["LATE", "MOST", "Stream", "cut"]
 
 LATE = 0.1
 """s after which a message that waits is dropped, if a newer one of its kind waits as well."""
@@ -51,7 +51,7 @@ class Stream(Port):
             self._begun += data[self._put(data) :]
             return
         now = time.monotonic()
-        self._waiting.extend(_Waiting(now, _kind(frame), frame) for frame in _frames(data))
+        self._waiting.extend(_Waiting(now, _kind(frame), frame) for frame in cut(data))
         self.flush()
         if len(self._waiting) > MOST:
             self._thin(now)
@@ -117,7 +117,7 @@ class _Waiting(NamedTuple):
     frame: bytes
 
 
-def _frames(data: bytes) -> Iterator[bytes]:
+def cut(data: bytes) -> Iterator[bytes]:
     """Cut `data` into MAVLink frames; a command to a sensor stays in one piece."""
     while data:
         size = len(data)

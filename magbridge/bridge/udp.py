@@ -6,11 +6,13 @@ import errno
 import os
 import socket
 import time
+from collections.abc import Iterator
 from contextlib import suppress
 from typing import Any
 
 from magbridge.bridge.address import resolve
 from magbridge.bridge.port import CHUNK, Port
+from magbridge.bridge.stream import cut
 from magbridge.errors import PortError
 
 __all__ = ["UdpPort"]
@@ -19,6 +21,8 @@ PEER_TIMEOUT = 30.0
 """s without a packet after which a UDP peer is forgotten, or connected anew."""
 PEERS = 16
 """Stations that ``udpin`` answers; of more, those heard last."""
+DATAGRAM = 1400
+"""Bytes that a packet carries on any usual network: more is split on the way, and 64 kB are refused."""
 AWAY = (errno.ECONNREFUSED, errno.ENETUNREACH, errno.EHOSTUNREACH, errno.ENETDOWN, errno.EPERM)
 """What a UDP socket reports when nobody listens (yet): no fault of the port."""
 
@@ -103,7 +107,7 @@ class UdpPort(Port):
         return data
 
     def write(self, data: bytes) -> None:
-        """Send one datagram to each peer; what cannot be sent is dropped and counted."""
+        """Send to each peer, mostly one datagram; what cannot be sent is dropped and counted."""
         assert self._socket is not None
         if not self._listen:
             self._send(data, None)
@@ -116,6 +120,10 @@ class UdpPort(Port):
                 self._send(data, peer)
 
     def _send(self, data: bytes, peer: Any) -> None:
+        for datagram in _datagrams(data):
+            self._send_one(datagram, peer)
+
+    def _send_one(self, data: bytes, peer: Any) -> None:
         assert self._socket is not None
         try:
             if peer is None:
@@ -134,6 +142,20 @@ class UdpPort(Port):
         if self._socket is not None:
             self._socket.close()
         self._socket = None
+
+
+def _datagrams(data: bytes) -> Iterator[bytes]:
+    """Yield `data` in datagrams of whole messages: after a standstill, thousands are sent at once."""
+    if len(data) <= DATAGRAM:
+        yield data
+        return
+    begun = b""
+    for frame in cut(data):
+        if len(begun) + len(frame) > DATAGRAM:
+            yield begun
+            begun = b""
+        begun += frame
+    yield begun
 
 
 def _ends(connected: socket.socket) -> tuple[Any, Any]:

@@ -13,6 +13,7 @@ import pytest
 
 from magbridge.bridge.links import open_link
 from magbridge.bridge.udp import PEERS
+from magbridge.mavlink import Codec
 
 
 def test_a_udp_peer_that_is_not_there_is_no_fault() -> None:
@@ -73,6 +74,27 @@ def test_a_named_host_that_gets_another_address_is_found_again(monkeypatch: pyte
         assert port.read() == b"there"
         port.close()
         port.tend()  # as the thread that opens it may, just then
+
+
+def test_what_is_sent_at_once_after_a_standstill_goes_in_datagrams_that_a_network_takes() -> None:
+    codec, data = Codec(1, 191), b""
+    while len(data) < 100_000:
+        data += codec.pack("MAG_FIELD", total_field=5e4, latency=1.0)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as peer:
+        peer.bind(("127.0.0.1", 0))
+        peer.settimeout(5)
+        peer.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
+        port = open_link(f"udpout:127.0.0.1:{peer.getsockname()[1]}", 0)
+        port.open()
+        port.write(data)
+        datagrams: list[bytes] = []
+        while sum(map(len, datagrams)) < len(data):
+            datagrams.append(peer.recv(1 << 16))
+        assert (port.up, port.dropped) == (True, 0)
+        port.close()
+    assert b"".join(datagrams) == data
+    assert max(map(len, datagrams)) <= 1400
+    assert all(datagram[0] == 0xFD for datagram in datagrams)
 
 
 def test_datagrams_that_waited_come_at_once() -> None:
