@@ -13,7 +13,7 @@ __all__ = ["Commands"]
 
 OURS = 60100
 """The first message id of our dialect: no other component of the vehicle has these messages."""
-AUTOPILOT_VERSION = spec("AUTOPILOT_VERSION").id
+AUTOPILOT_VERSION, MESSAGE_INTERVAL = spec("AUTOPILOT_VERSION").id, spec("MESSAGE_INTERVAL").id
 
 
 class Commands:
@@ -82,6 +82,8 @@ class Commands:
         return about_message and first >= OURS and first in self._messages
 
     def _request(self, values: list[float]) -> MAV_RESULT:
+        if values[0] == MESSAGE_INTERVAL:  # the successor of GET_MESSAGE_INTERVAL
+            return self._get_interval(values[1:])
         answer = self._messages.get(whole(values[0]))
         if answer is None:
             return MAV_RESULT.DENIED

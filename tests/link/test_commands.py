@@ -80,6 +80,14 @@ def test_an_interval_of_an_age_is_kept(link: Line, message: int) -> None:
     assert link.only(link.command(GET, message), "MESSAGE_INTERVAL")[0].interval_us == 0x7FFFFFFF
 
 
+def test_an_interval_is_a_message_that_can_be_requested(link: Line) -> None:
+    """MAVLink has deprecated GET_MESSAGE_INTERVAL in favour of this."""
+    assert result(link, link.command(SET, HIGHRES_IMU, 100_000)) == ACCEPTED
+    heard = link.command(REQUEST, 244, HIGHRES_IMU)
+    assert result(link, heard) == ACCEPTED
+    assert link.only(heard, "MESSAGE_INTERVAL")[0].interval_us == 100_000
+
+
 def test_interval_of_a_message_we_do_not_send(link: Line) -> None:
     assert link.only(link.command(GET, 24), "MESSAGE_INTERVAL")[0].interval_us == 0
     assert result(link, link.command(GET, 70_000)) == DENIED
