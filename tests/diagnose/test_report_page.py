@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from base64 import b64decode
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -183,6 +184,14 @@ def test_the_page_is_whole(clear: Diagnosis) -> None:
     assert set(re.findall(r'href="#(\w+)"', page)) <= set(re.findall(r'id="(\w+)"', page))
     assert page.index('class="box good"') < page.index("<h2")
     assert not re.search(r"\d (nT|%)", re.sub(r"base64,[^\"]*|<style>.*?</style>", "", page, flags=re.DOTALL))
+
+
+def test_the_page_is_small_enough_to_send(clear: Diagnosis) -> None:
+    """Even with eight causes: each picture has a palette (colour type 3 in a PNG's header)."""
+    page = report_html(replace(clear, findings=clear.findings * 8), CAUSES)
+    pictures = [b64decode(text) for text in re.findall(r'base64,([^"]*)', page)]
+    assert {picture[25] for picture in pictures} == {3}
+    assert len(page) < 800_000
 
 
 def test_a_running_mean_follows_the_mean_and_stops_at_gaps(clear: Diagnosis) -> None:

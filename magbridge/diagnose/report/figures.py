@@ -13,6 +13,7 @@ from magbridge.arrays import FloatArray
 from magbridge.diagnose.diagnosis import Diagnosis
 from magbridge.diagnose.report.canvas import (
     BEFORE,
+    DOTS,
     FAINT,
     INK,
     SMALL,
@@ -59,7 +60,7 @@ def measured(diagnosis: Diagnosis) -> str:
         axis.fill_between(
             since, -stated, stated, color=FAINT, alpha=0.25, linewidth=0, label="±2 sigma as calibrated"
         )
-        axis.plot(since, left[part], ".", color=colour, markersize=2, alpha=0.5, label=name)
+        axis.plot(since, left[part], color=colour, label=name, **DOTS)
         axis.plot(*rolling(diagnosis, left), color=INK, linewidth=1.0, label="its running mean")
         axis.axhline(0.0, color=INK, linewidth=0.5)
         for start in starts if starts.size < MANY else ():

@@ -8,6 +8,7 @@ from magbridge.diagnose.diagnosis import Diagnosis
 from magbridge.diagnose.inference.isolability import CONFOUNDED
 from magbridge.diagnose.report.canvas import (
     AFTER,
+    DOTS,
     FAINT,
     INK,
     SMALL,
@@ -34,7 +35,7 @@ def terms(diagnosis: Diagnosis) -> str | None:
         added = finding.field(diagnosis.problem)
         alone = added + diagnosis.fit.left / diagnosis.problem.gain
         since, line = curves(diagnosis, added)
-        axis.plot(since, alone[part], ".", color=FAINT, markersize=2, alpha=0.5, label="all else removed")
+        axis.plot(since, alone[part], color=FAINT, label="all else removed", **DOTS)
         axis.plot(*rolling(diagnosis, alone), color=INK, linewidth=0.9, label="its running mean")
         axis.plot(since, line, color=AFTER, linewidth=1.4, label="what the cause adds")
         axis.axhline(0.0, color=INK, linewidth=0.5)
