@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.observe import observations
+from magbridge.calibration.model import Noise, identity
+from magbridge.diagnose.compare.take import take
 from magbridge.diagnose.run import diagnose
 from sitl import load, simulate
 from sitl.dataset import segments
@@ -18,3 +22,14 @@ def test_what_a_calibration_learned_from_a_log_does_not_count_twice() -> None:
         for again in ((), (ds,))
     )
     assert "filter_lag" in once - twice
+
+
+def test_a_report_names_and_counts_the_dives_of_what_is_diagnosed_alone() -> None:
+    """Also where only the log that was learned from counts its runs."""
+    parts = segments(simulate(load("survey"), 2))
+    survey = parts["survey"].drop_vars("run").assign_attrs(source="survey.nc")
+    learned = parts["calibration"].assign_attrs(source="runs.nc")
+    calibration = replace(identity(), noise=Noise(1.0))
+    alone, beside = take([survey], calibration), take([survey], calibration, [learned])
+    assert alone.dives == beside.dives == len(set(alone.dive.tolist())) > 1
+    assert alone.source == beside.source == "survey.nc"

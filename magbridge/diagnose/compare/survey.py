@@ -74,6 +74,8 @@ class Survey:
         this one's noise.
     dive : (n,) int array
         Number of the dive, the unit of cross-validation.
+    dives : int
+        Dives of the logs that are diagnosed, by themselves; 0 where they have too few.
     place : (n, 3) array or None
         m north and east of the middle, and below the surface: 0 in a log without a depth.
     attitude : (n, 3) array or None
@@ -85,6 +87,7 @@ class Survey:
     cycles : (c,) array
         s, when the instrument was power-cycled, as the log says.
     source : str
+        The logs that are diagnosed, for people to read.
     """
 
     time: FloatArray
@@ -94,6 +97,7 @@ class Survey:
     still: tuple[str, ...]
     steps: IntArray
     dive: IntArray
+    dives: int
     place: FloatArray | None
     attitude: FloatArray | None
     fitted: BoolArray
@@ -161,7 +165,7 @@ def assemble(
     units : dict
         Column -> unit.
     source : str
-        Where they come from, for people to read.
+        The logs that are diagnosed, for people to read.
     needed : sequence of str
         Channels that are kept even if they never change.
     """
@@ -186,6 +190,7 @@ def assemble(
         still=still,
         steps=steps,
         dive=_dives(table),
+        dives=_count(table),
         place=_place(table),
         attitude=attitude,
         fitted=table["fitted"] > 0.5,
@@ -257,6 +262,13 @@ def _dives(table: dict[str, FloatArray]) -> IntArray:
         if 4 <= start.sum() <= 0.05 * len(depth):
             return np.cumsum(start)
     return _eighths(len(table["time"]))
+
+
+def _count(table: dict[str, FloatArray]) -> int:
+    """Count the dives of the logs that are diagnosed; 0 where they have too few."""
+    new = {name: column[table["learned"] < 0.5] for name, column in table.items()}
+    dive = _dives({name: column for name, column in new.items() if np.isfinite(column).any()})
+    return 0 if np.array_equal(dive, _eighths(len(dive))) else np.unique(dive).size
 
 
 def _eighths(n: int) -> IntArray:

@@ -59,7 +59,7 @@ def take(
     own = [any(ds is one for one in learned_from) for ds in datasets]
     apart = [ds for ds in learned_from if not any(ds is one for one in datasets)]
     logs = (*datasets, *apart)
-    source = ", ".join(dict.fromkeys(str(ds.attrs.get("source", "deployment")) for ds in logs))
+    source = _sources(logs)
     table = _joined(
         [
             *(_columns(ds, calibration, grid, fitted) for ds, fitted in zip(datasets, own, strict=True)),
@@ -83,7 +83,12 @@ def take(
     if not any(np.ptp(table[f"mag_{axis}"]) for axis in "xyz"):
         raise DataError(f"{source}: columns mag_x, mag_y, mag_z never change: nothing was measured")
     units = {str(k): str(v.attrs.get("units", "")) for ds in logs for k, v in ds.data_vars.items()}
-    return assemble(table, units, source, calibration.channels)
+    return assemble(table, units, _sources(datasets), calibration.channels)
+
+
+def _sources(logs: Sequence[xr.Dataset]) -> str:
+    """Name logs, each once."""
+    return ", ".join(dict.fromkeys(str(ds.attrs.get("source", "deployment")) for ds in logs))
 
 
 def _joined(parts: Sequence[dict[str, FloatArray]]) -> dict[str, FloatArray]:

@@ -72,7 +72,7 @@ def _verdict(diagnosis: Diagnosis, causes: Mapping[str, Cause], remarks: Sequenc
     first, last = (datetime.fromtimestamp(float(t), UTC).strftime("%Y-%m-%d %H:%M") for t in new[[0, -1]])
     span = float(new[-1] - new[0])
     length = f"{span / 3600.0:.1f} h" if span > LONG else f"{span / 60.0:.0f} min"
-    dives = f" in {np.unique(survey.dive[~survey.learned]).size} dives" if survey.parts == "dives" else ""
+    dives = f" in {survey.dives} dives" if survey.dives else ""
     beside = f", beside {int(survey.learned.sum())} that the calibration has learned from"
     return [
         (
