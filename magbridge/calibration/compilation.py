@@ -51,6 +51,7 @@ def compile_kernel(calibration: Calibration) -> Kernel:
     return Kernel(
         centre=tuple(parameter.centre for parameter in calibration.parameters),
         scale=tuple(parameter.scale for parameter in calibration.parameters),
+        field=calibration.reference.field,
         parents=tuple((row[_parent(e)[0]], _parent(e)[1]) for e in exponents[1:]),
         weights=W,
         units=tuple(units.tolist()) if calibration.effects else None,
@@ -72,7 +73,7 @@ def coefficient_tensor(calibration: Calibration) -> tuple[FloatArray, list[Expon
     exponents : list of tuple of int
         The monomials in the kernel's order: each follows from one before it.
     """
-    expansions = [term.expand(calibration) for term in calibration.terms]
+    expansions = [term.expand(calibration.parameters) for term in calibration.terms]
     exponents = _closed({e for expansion in expansions for e in expansion.exponents}, calibration)
     row = {exponent: i for i, exponent in enumerate(exponents)}
     effects = [effect.columns(calibration.reference.field) for effect in calibration.effects]

@@ -73,6 +73,11 @@ def _omega(calibration: Calibration) -> tuple[float, ...] | None:
     return O[0][0], O[1][1], O[2][2], O[0][1], O[0][2], O[1][2]
 
 
+def _begun(calibration: Calibration) -> list[Step]:
+    """Return a stepper for each effect, in a fresh state."""
+    return [effect.begin(calibration.channels, calibration.kernel) for effect in calibration.effects]
+
+
 class Corrector:
     """Corrects sample after sample, as the bridge does.
 
@@ -89,7 +94,7 @@ class Corrector:
         self.calibration = calibration
         self._kernel = calibration.kernel
         self._omega = _omega(calibration)
-        self._steps = [effect.begin(calibration) for effect in calibration.effects]
+        self._steps = _begun(calibration)
         self._base = _base_flags(calibration)
         self._ranges = _ranges(calibration)
         self._wanted = len(calibration.channels)
@@ -248,12 +253,12 @@ def correct(
         )
     out = np.empty((8, n))
     kernel, omega = calibration.kernel, _omega(calibration)
-    steps = [effect.begin(calibration) for effect in calibration.effects]
+    steps = _begun(calibration)
     with np.errstate(all="ignore"):  # NaN in, NaN out: flagged below
         for start in range(0, n, CHUNK):
             part = slice(start, start + CHUNK)
             phi = _regressors(kernel, steps, field[part], channels[part], time[part])
-            prepared = _stage_many(kernel, phi)
+            prepared = _prepare_many(kernel, phi)
             hx, hy, hz = field[part].T
             out[:, part] = MANY.apply(hx, hy, hz, prepared, omega)
         quality = np.full(n, _base_flags(calibration))
@@ -285,13 +290,13 @@ def regressors(
     calibration: Calibration, field: FloatArray, channels: FloatArray, time: FloatArray
 ) -> FloatArray:
     """(m, n) regressors of every sample, from a fresh state; arguments as for :func:`correct`."""
-    kernel, steps = calibration.kernel, [effect.begin(calibration) for effect in calibration.effects]
+    kernel, steps = calibration.kernel, _begun(calibration)
     channels = channels.reshape(len(field), -1)
     parts = [slice(start, start + CHUNK) for start in range(0, max(len(field), 1), CHUNK)]
     return np.hstack([_regressors(kernel, steps, field[p], channels[p], time[p]) for p in parts])
 
 
-def _stage_many(kernel: Kernel, phi: FloatArray) -> Any:
+def _prepare_many(kernel: Kernel, phi: FloatArray) -> Any:
     """Prepare (m, n) regressors; if most repeat the sample before, once for each stretch of equal ones."""
     new = np.ones(phi.shape[1], bool)
     new[1:] = (phi[:, 1:] != phi[:, :-1]).any(axis=0)

@@ -18,18 +18,15 @@ expanded into a polynomial (order :data:`ORDER`) and costs no more than one.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import numpy as np
 from numpy.polynomial import chebyshev
 
 from magbridge.arrays import FloatArray
 from magbridge.calibration.arithmetic import PAIRS
-from magbridge.calibration.terms import Expansion, PositionTerm
+from magbridge.calibration.terms import Expansion, Parameter, PositionTerm
 from magbridge.errors import CalibrationError
-
-if TYPE_CHECKING:
-    from magbridge.calibration.model import Calibration
 
 __all__ = ["ORDER", "Dipole", "dipole_columns", "dipole_tensor", "expand_dipole"]
 
@@ -154,11 +151,11 @@ class Dipole(PositionTerm, frozen=True, kw_only=True):
         if not np.linalg.norm(self.at) > 0.0:
             raise CalibrationError("dipole: at: expected a place away from the sensor")
 
-    def expand(self, calibration: Calibration) -> Expansion:
+    def expand(self, parameters: tuple[Parameter, ...]) -> Expansion:
         """Return the dipole as a power series in its scaled parameter; CalibrationError: too near for one."""
-        names = [parameter.name for parameter in calibration.parameters]
+        names = [parameter.name for parameter in parameters]
         k = names.index(self.parameter)
-        parameter = calibration.parameters[k]
+        parameter = parameters[k]
         p = parameter.centre + parameter.scale * chebyshev.chebpts1(4 * ORDER)
         r = np.array(self.at) + p[:, None] * np.array(self.travel)
         if np.linalg.norm(r, axis=1).min() < 3.0 * parameter.scale * np.linalg.norm(self.travel):

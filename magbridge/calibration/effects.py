@@ -14,16 +14,14 @@ from collections.abc import Sequence
 from itertools import accumulate, repeat
 from math import exp, isnan
 from operator import mul
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from msgspec import Meta
 
 from magbridge.arrays import FloatArray
+from magbridge.calibration.kernel import Kernel
 from magbridge.calibration.terms import Effect, Power, Step
-
-if TYPE_CHECKING:
-    from magbridge.calibration.model import Calibration
 
 __all__ = ["MAX_INTERVAL", "ChannelEffect", "SingleChannelEffect", "offsets", "powers"]
 
@@ -98,9 +96,9 @@ class ChannelEffect(SingleChannelEffect, frozen=True, kw_only=True):
         columns[:, 0, 0:3] = np.eye(3) * (self.on == "scale")
         return columns
 
-    def begin(self, calibration: Calibration) -> Step:
+    def begin(self, channels: tuple[str, ...], kernel: Kernel) -> Step:
         """Return a stepper that starts in equilibrium with the first value it sees."""
-        index = calibration.channels.index(self.channel)
+        index = channels.index(self.channel)
         origin, stages, lag = self.origin, self.stages, self.lag / self.stages
         levels, then, first = [origin] * stages, 0, True
 

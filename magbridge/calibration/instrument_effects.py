@@ -4,17 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from math import cos, pi, sin
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from msgspec import Meta
 
 from magbridge.arrays import FloatArray
 from magbridge.calibration.effects import MAX_INTERVAL, offsets, powers
+from magbridge.calibration.kernel import Kernel
 from magbridge.calibration.terms import HIGHEST, Effect, Power, Step, Width
-
-if TYPE_CHECKING:
-    from magbridge.calibration.model import Calibration
 
 __all__ = ["RateEffect", "ResponseEffect", "TimeEffect"]
 
@@ -58,7 +56,7 @@ class TimeEffect(Effect, frozen=True, kw_only=True):
         """Offsets."""
         return offsets(self.regressors)
 
-    def begin(self, calibration: Calibration) -> Step:
+    def begin(self, channels: tuple[str, ...], kernel: Kernel) -> Step:
         """Return a stepper; it has no state."""
         start, period, shape, order = round(self.start * 1e6), self.period * 1e6, self.shape, self.order
 
@@ -110,7 +108,7 @@ class RateEffect(Effect, frozen=True, kw_only=True):
                 columns[k, j, 6 + i] = 1.0
         return columns
 
-    def begin(self, calibration: Calibration) -> Step:
+    def begin(self, channels: tuple[str, ...], kernel: Kernel) -> Step:
         """Return a stepper; rates are zero until three samples have come without a gap."""
         before: tuple[float, float, float] = (0.0, 0.0, 0.0)
         slope: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -169,7 +167,7 @@ class ResponseEffect(Effect, frozen=True, kw_only=True):
             columns[k, k, 6 + (k if self.power else self.axis)] = 1.0 if self.power else -1.0
         return columns
 
-    def begin(self, calibration: Calibration) -> Step:
+    def begin(self, channels: tuple[str, ...], kernel: Kernel) -> Step:
         """Return a stepper; it has no state."""
         power, unit, axis, knee = self.power, self.unit, self.axis, self.knee
         sign = 1.0 if knee >= 0.0 else -1.0

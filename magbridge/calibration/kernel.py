@@ -51,6 +51,8 @@ class Kernel:
     ----------
     centre, scale : tuple of float
         Of each parameter.
+    field : float
+        nT, F_0.
     parents : tuple of (int, int)
         Monomial ``i + 1`` is monomial ``parents[i][0]`` times position ``parents[i][1]``.
     weights : (m, 9) array
@@ -66,6 +68,7 @@ class Kernel:
 
     centre: tuple[float, ...]
     scale: tuple[float, ...]
+    field: float
     parents: tuple[tuple[int, int], ...]
     weights: FloatArray
     units: tuple[float, ...] | None
@@ -124,6 +127,11 @@ class Kernel:
     def position_weights(self) -> FloatArray:
         """(m, 9) rows of W that belong to the m monomials."""
         return self.weights[: len(self.parents) + 1]
+
+    @property
+    def rate_weights(self) -> FloatArray:
+        """(m, 9) those rows in nT at F_0: times the monomials' rates, they give the nine coefficients'."""
+        return np.asarray(self.position_weights * np.array([self.field] * 6 + [1.0] * 3))
 
     def monomials(self, values: Sequence[Any], one: Any) -> list[Any]:
         """Return the monomials, of floats or of arrays: the same multiplications in the same order."""

@@ -6,7 +6,7 @@ from abc import abstractmethod
 from collections.abc import Sequence
 from math import isnan, tanh
 from operator import sub
-from typing import TYPE_CHECKING, Annotated, ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 from msgspec import Meta
@@ -14,11 +14,9 @@ from numpy.polynomial.legendre import leg2poly
 
 from magbridge.arrays import FloatArray
 from magbridge.calibration.effects import MAX_INTERVAL, SingleChannelEffect, offsets, powers
+from magbridge.calibration.kernel import Kernel
 from magbridge.calibration.terms import HIGHEST, Effect, Exponents, Power, Step, Width
 from magbridge.errors import CalibrationError
-
-if TYPE_CHECKING:
-    from magbridge.calibration.model import Calibration
 
 __all__ = [
     "ClockEffect",
@@ -53,9 +51,9 @@ class PathEffect(MassEffect, frozen=True, kw_only=True):
     def regressors(self, x: float) -> tuple[float, ...]:
         """Return the regressors at x."""
 
-    def begin(self, calibration: Calibration) -> Step:
+    def begin(self, channels: tuple[str, ...], kernel: Kernel) -> Step:
         """Return a stepper; while the value is missing, the last one holds."""
-        index, x = calibration.channels.index(self.channel), 0.0
+        index, x = channels.index(self.channel), 0.0
 
         def step(time_us: int, hx: float, hy: float, hz: float, values: Sequence[float]) -> tuple[float, ...]:
             nonlocal x
@@ -154,11 +152,13 @@ class LegendreEffect(Effect, frozen=True, kw_only=True):
         """Offsets."""
         return offsets(1)
 
-    def begin(self, calibration: Calibration) -> Step:
+    def begin(self, channels: tuple[str, ...], kernel: Kernel) -> Step:
         """Return a stepper; it has no state."""
         factors = [
-            (k, p.centre, p.scale, leg2poly([0.0] * e + [1.0])[::-1].tolist())
-            for k, (p, e) in enumerate(zip(calibration.parameters, self.exponents, strict=True))
+            (k, centre, scale, leg2poly([0.0] * e + [1.0])[::-1].tolist())
+            for k, (centre, scale, e) in enumerate(
+                zip(kernel.centre, kernel.scale, self.exponents, strict=True)
+            )
             if e
         ]
 
@@ -204,10 +204,10 @@ class PlayEffect(MassEffect, frozen=True, kw_only=True):
         """Three coefficients (nT), one for each axis; for a polynomial, three for each power."""
         return 3 * max(self.order, 1)
 
-    def begin(self, calibration: Calibration) -> Step:
+    def begin(self, channels: tuple[str, ...], kernel: Kernel) -> Step:
         """Return a stepper that starts in the middle of its play."""
         index, centre, scale, width, order = (
-            calibration.channels.index(self.channel), self.centre, self.scale, self.width, self.order
+            channels.index(self.channel), self.centre, self.scale, self.width, self.order
         )  # fmt: skip
         half, y, p, first = 0.5 * width, 0.0, 0.0, True
 
@@ -250,12 +250,10 @@ class ClockEffect(Effect, frozen=True, kw_only=True):
         """One coefficient for nine regressors: the rates of change of the nine coefficients, nT/s."""
         return self.sign * np.eye(9)[None]
 
-    def begin(self, calibration: Calibration) -> Step:
+    def begin(self, channels: tuple[str, ...], kernel: Kernel) -> Step:
         """Return a stepper; rates are differences from the previous sample over the time between."""
-        kernel, field = calibration.kernel, calibration.reference.field
-        W = kernel.position_weights * np.array([field] * 6 + [1.0] * 3)
         last: list[float] = []
-        still, weights, then = (0.0,) * 9, W.T.tolist(), 0
+        still, weights, then = (0.0,) * 9, kernel.rate_weights.T.tolist(), 0
 
         def step(time_us: int, hx: float, hy: float, hz: float, values: Sequence[float]) -> tuple[float, ...]:
             nonlocal last, then

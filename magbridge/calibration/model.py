@@ -25,31 +25,10 @@ import numpy as np
 from magbridge.arrays import FloatArray
 from magbridge.calibration.compilation import compile_kernel
 from magbridge.calibration.kernel import Kernel
-from magbridge.calibration.terms import Effect, Polynomial, PositionTerm, symmetric
+from magbridge.calibration.terms import Effect, Parameter, Polynomial, PositionTerm, symmetric
 from magbridge.errors import CalibrationError
 
 __all__ = ["Boresight", "Calibration", "Noise", "Parameter", "Reference", "Run", "Sensor", "identity"]
-
-
-class Parameter(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A telemetry channel that moves a mass.
-
-    Attributes
-    ----------
-    name, unit : str
-        As in the deployment's columns.
-    low, high : float
-        The range that the calibration has seen.
-    centre, scale : float
-        ``x = (p - centre) / scale``.
-    """
-
-    name: str
-    unit: str
-    low: float
-    high: float
-    centre: float
-    scale: float
 
 
 class Sensor(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -13,17 +13,15 @@ from collections.abc import Callable, Sequence
 from importlib import import_module
 from importlib.metadata import entry_points
 from itertools import combinations_with_replacement
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, cast
+from typing import Annotated, Any, ClassVar, cast
 
 import msgspec
 import numpy as np
 from msgspec import Meta
 
 from magbridge.arrays import FloatArray
+from magbridge.calibration.kernel import Kernel
 from magbridge.errors import CalibrationError
-
-if TYPE_CHECKING:
-    from magbridge.calibration.model import Calibration
 
 __all__ = [
     "HIGHEST",
@@ -32,6 +30,7 @@ __all__ = [
     "Effect",
     "Expansion",
     "Exponents",
+    "Parameter",
     "Polynomial",
     "PositionTerm",
     "Power",
@@ -72,6 +71,27 @@ TERMS: dict[str, str] = {
 """Name in ``cal.json`` -> ``module:class``; others join by the entry point group ``magbridge.terms``."""
 
 
+class Parameter(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A telemetry channel that moves a mass.
+
+    Attributes
+    ----------
+    name, unit : str
+        As in the deployment's columns.
+    low, high : float
+        The range that the calibration has seen.
+    centre, scale : float
+        ``x = (p - centre) / scale``.
+    """
+
+    name: str
+    unit: str
+    low: float
+    high: float
+    centre: float
+    scale: float
+
+
 class Expansion(msgspec.Struct, frozen=True):
     """A position term as a polynomial: ``theta(x) = sum_k c_k sum_m x^m columns[k, m]``.
 
@@ -109,8 +129,8 @@ class PositionTerm(Term, frozen=True, kw_only=True):
     """A term that depends on the positions alone: a polynomial in them, or expanded into one."""
 
     @abstractmethod
-    def expand(self, calibration: Calibration) -> Expansion:
-        """Return the term as a polynomial in the positions as `calibration` scales them."""
+    def expand(self, parameters: tuple[Parameter, ...]) -> Expansion:
+        """Return the term as a polynomial in the positions as `parameters` scale them."""
 
 
 class Polynomial(PositionTerm, frozen=True, kw_only=True):
@@ -143,7 +163,7 @@ class Polynomial(PositionTerm, frozen=True, kw_only=True):
         if len(set(self.exponents)) != len(self.exponents):
             raise CalibrationError("exponents: a monomial stands there twice")
 
-    def expand(self, calibration: Calibration) -> Expansion:  # noqa: ARG002  (a dipole needs the scale)
+    def expand(self, parameters: tuple[Parameter, ...]) -> Expansion:  # noqa: ARG002  (a dipole needs them)
         """Return the polynomial as itself."""
         m = len(self.exponents)
         return Expansion(self.exponents, np.eye(9 * m).reshape(9 * m, m, 9))
@@ -166,8 +186,16 @@ class Effect(Term, frozen=True, kw_only=True):
         """(K, r, 9): what regressor r adds to each slot per unit of coefficient k; `field` is F_0, nT."""
 
     @abstractmethod
-    def begin(self, calibration: Calibration) -> Step:
-        """Return a stepper with a fresh state, as at power-on."""
+    def begin(self, channels: tuple[str, ...], kernel: Kernel) -> Step:
+        """Return a stepper with a fresh state, as at power-on.
+
+        Parameters
+        ----------
+        channels : tuple of str
+            Names of the values that it will be given with each sample: the parameters come first.
+        kernel : Kernel
+            That of the calibration.
+        """
 
 
 def full_order(parameters: int, order: int) -> tuple[Exponents, ...]:

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from posed import FIELD, T0, calibrated, surveyed, walk
+from posed import FIELD, T0, calibrated, regressors_of, surveyed, walk
 
 from magbridge.calibration.correct import Corrector, correct
 from magbridge.calibration.effects import ChannelEffect
@@ -23,7 +23,7 @@ from magbridge.calibration.mass_effects import (
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.residual import residuals
 from magbridge.calibration.terms import Effect
-from magbridge.diagnose.compare.problem import add_effects, effect_columns, history, pose, samples_of
+from magbridge.diagnose.compare.problem import effect_columns, pose, samples_of
 from magbridge.diagnose.compare.survey import Channel, Survey
 from magbridge.errors import FormatError
 
@@ -67,8 +67,13 @@ def calibration() -> Calibration:
 
 
 def with_values(calibration: Calibration, effect: Effect, values: np.ndarray) -> Calibration:
-    extended = add_effects(calibration, (effect,))
-    return replace(extended, coefficients=np.append(calibration.coefficients, values))
+    """The calibration with the effect, whose coefficients are perfectly known."""
+    return replace(
+        calibration,
+        effects=(effect,),
+        coefficients=np.append(calibration.coefficients, values),
+        covariance=np.pad(calibration.covariance, (0, effect.size)),
+    )
 
 
 def sizes(effect: Effect) -> np.ndarray:
@@ -107,7 +112,9 @@ def test_the_search_uses_the_models_own_derivative(
 ) -> None:
     """What a coefficient leaves in the residual, against a difference of the whole model."""
     problem = pose(agreeing, calibration)
-    columns = effect_columns(problem, effect, history(agreeing, calibration, effect))(slice(0, len(agreeing)))
+    columns = effect_columns(problem, effect, regressors_of(agreeing, calibration, effect))(
+        slice(0, len(agreeing))
+    )
     for k in range(effect.size):
         step = np.zeros(effect.size)
         step[k] = 1e-3
@@ -137,7 +144,7 @@ def test_the_calibrations_own_columns_are_derivatives_too(agreeing: Survey, cali
 
 def test_a_drift_is_held_beyond_what_it_was_learned_from(survey: Survey, calibration: Calibration) -> None:
     effect = TimeEffect(cause="offset_drift", shape="drift", start=T0 + 600.0, period=300.0, order=2)
-    first, second = history(survey, calibration, effect)
+    first, second = regressors_of(survey, calibration, effect)
     x = np.clip((survey.time - T0 - 600.0) / 300.0, -1.0, 1.0)
     np.testing.assert_allclose(first, x)
     np.testing.assert_allclose(second, x**2)
@@ -149,7 +156,7 @@ def test_play_remembers_the_side(
 ) -> None:
     """Half the loop's width on either side: all the way if straight, else only near the steel."""
     effect = PlayEffect(cause="hysteresis", channel="p", width=0.4, centre=centre, scale=scale)
-    phi = history(survey, calibration, effect)[0]
+    phi = regressors_of(survey, calibration, effect)[0]
     p = survey.channels["p"].values
     rising = np.gradient(p) > 0.01
     steady = np.arange(len(p)) > 100
@@ -164,10 +171,10 @@ def test_play_remembers_the_side(
 def test_a_play_of_an_older_file_is_read(survey: Survey, calibration: Calibration) -> None:
     """Its branches are polynomials: the key ``order`` says so."""
     effect = PlayEffect(cause="hysteresis", channel="p", width=0.4, centre=0.1, scale=0.5, order=3)
-    phi = history(survey, calibration, effect)
+    phi = regressors_of(survey, calibration, effect)
     straight = PlayEffect(cause="hysteresis", channel="p", width=0.4, centre=0.0, scale=0.5, order=1)
     p = survey.channels["p"].values
-    y = p + 0.5 * history(survey, calibration, straight)[0]
+    y = p + 0.5 * regressors_of(survey, calibration, straight)[0]
     for k in range(3):
         naive = ((y - 0.1) / 0.5) ** (k + 1) - ((p - 0.1) / 0.5) ** (k + 1)
         np.testing.assert_allclose(phi[k], naive, atol=1e-12)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from posed import candidate, right
+from posed import candidate, regressors_of, right
 from scipy.linalg import inv
 
 from magbridge.calibration.correct import correct
@@ -155,7 +155,8 @@ def test_what_has_come_since_is_not_in_the_calibrations_logs() -> None:
     survey = replace(whole.survey, learned=learned, field=whole.survey.field + there * ~learned[:, None])
     problem = pose(survey, whole.calibration)
     effect = PowersEffect(cause="unmodelled_actuator", channel="p", centre=-1e9, scale=1e9, order=1)
-    lasting = of_effect(problem, effect, 100.0, "nT", channel="p")
+    phi = regressors_of(survey, whole.calibration, effect)
+    lasting = of_effect(problem, effect, 100.0, "nT", channel="p", phi=phi)
     late = since(lasting, learned)
     assert not late.columns(slice(0, 150)).any()
     np.testing.assert_array_equal(late.columns(slice(150, 300)), lasting.columns(slice(150, 300)))

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from posed import calibrated, missed, right, surveyed, thinned, walk
+from posed import calibrated, missed, regressors_of, right, surveyed, thinned, walk
 
 from magbridge.calibration.effects import ChannelEffect
 from magbridge.calibration.mass_effects import LegendreEffect, PlayEffect, PowersEffect, SourcesEffect
@@ -20,7 +20,7 @@ from magbridge.diagnose.causes.time_dependent import offset_step
 from magbridge.diagnose.causes.timing import field_rates, mass_rates
 from magbridge.diagnose.compare.interpolation import rates
 from magbridge.diagnose.compare.past import FAR
-from magbridge.diagnose.compare.problem import Problem, effect_columns, history, pose
+from magbridge.diagnose.compare.problem import Problem, effect_columns, pose
 from magbridge.diagnose.compare.survey import Channel
 from magbridge.diagnose.inference.statistic import Statistic
 
@@ -60,7 +60,7 @@ def test_columns_are_those_of_the_stepped_effect(problem: Problem) -> None:
             ):
                 continue
             stepped = [
-                effect_columns(problem, effect, history(problem.survey, problem.calibration, effect))(
+                effect_columns(problem, effect, regressors_of(problem.survey, problem.calibration, effect))(
                     slice(0, None)
                 )
                 for effect in candidate.effects

@@ -10,13 +10,24 @@ from numpy.typing import NDArray
 
 from magbridge.arrays import FloatArray
 from magbridge.calibration.model import Calibration, Noise, Parameter, Reference
-from magbridge.calibration.terms import Polynomial
+from magbridge.calibration.terms import Effect, Polynomial
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.compare.past import FAR
 from magbridge.diagnose.compare.problem import Problem, pose
 from magbridge.diagnose.compare.survey import Channel, Survey
 
-__all__ = ["FIELD", "T0", "calibrated", "candidate", "missed", "right", "surveyed", "thinned", "walk"]
+__all__ = [
+    "FIELD",
+    "T0",
+    "calibrated",
+    "candidate",
+    "missed",
+    "regressors_of",
+    "right",
+    "surveyed",
+    "thinned",
+    "walk",
+]
 
 
 FIELD, T0 = 5e4, 1.7e9
@@ -55,6 +66,15 @@ def calibrated(coefficients: FloatArray, variance: float = 4.0, **parameter: flo
         coefficients=coefficients, covariance=np.diag(np.full(9 * powers, variance)), noise=Noise(1.0),
         reference=Reference(FIELD), method="made",
     )  # fmt: skip
+
+
+def regressors_of(survey: Survey, calibration: Calibration, effect: Effect) -> FloatArray:
+    """(r, n) regressors of one effect along the survey, computed sample by sample as the bridge does."""
+    channels = tuple(dict.fromkeys((*calibration.units, *effect.channels())))
+    step = effect.begin(channels, calibration.kernel)
+    times = np.rint(survey.time * 1e6).astype(np.int64).tolist()
+    rows = zip(times, *survey.field.T.tolist(), survey.values(channels).tolist(), strict=True)
+    return np.array([step(*row) for row in rows]).T
 
 
 def right(rows: int) -> Problem:

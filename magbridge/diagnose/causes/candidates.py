@@ -11,7 +11,7 @@ import numpy as np
 from magbridge.arrays import BoolArray, FloatArray
 from magbridge.calibration.terms import Effect
 from magbridge.diagnose.compare.design_columns import Columns, Mixture, Since, parts, places, together
-from magbridge.diagnose.compare.problem import Problem, effect_columns, history
+from magbridge.diagnose.compare.problem import Problem, effect_columns
 
 __all__ = ["AXES", "Candidate", "Group", "of_effect", "of_reference", "per", "since", "slices"]
 
@@ -157,19 +157,17 @@ def of_effect(
     width: float | FloatArray,
     unit: str | Sequence[str],
     *,
+    phi: FloatArray | Callable[[slice], FloatArray],
     channel: str | None = None,
     names: tuple[str, ...] = (),
-    phi: FloatArray | Callable[[slice], FloatArray] | None = None,
     origin: float = 0.0,
     **more: Any,
 ) -> Candidate:
     """Make a candidate of an effect.
 
-    Its regressors are `phi` (r, n) less `origin`; without `phi` they are computed sample by sample. `unit` is
-    that of all its coefficients, or has one for each of as many equal parts of them.
+    Its regressors are `phi` (r, n), or a function from rows to those, less `origin`. `unit` is that of all
+    its coefficients, or has one for each of as many equal parts of them.
     """
-    if phi is None:
-        phi = history(problem.survey, problem.calibration, effect)
     widths = np.broadcast_to(np.asarray(width, float), effect.size)
     columns = effect_columns(problem, effect, phi, origin).times(widths)
     cause: str = effect.cause  # type: ignore[attr-defined]

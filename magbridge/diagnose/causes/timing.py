@@ -35,14 +35,13 @@ def mass_rates(problem: Problem) -> FloatArray:
     """
     survey, calibration = problem.survey, problem.calibration
     kernel = calibration.kernel
-    W = kernel.position_weights * np.array([calibration.reference.field] * 6 + [1.0] * 3)
     p, t = survey.values([parameter.name for parameter in calibration.parameters]), survey.time
     after = np.diff(p, axis=0, append=p[-1:]) / np.diff(t, append=t[-1] + 1.0)[:, None]
     after[:-1] *= survey.follows(LOST)[1:, None]
     before = np.roll(after, 1, axis=0)
     larger = np.where(np.abs(before) > np.abs(after), before, after)
     moved = MOMENT * np.where(before * after > 0.0, larger, 0.0)
-    theta = W.T @ (kernel.monomials_of(p + moved) - kernel.monomials_of(p - moved))
+    theta = kernel.rate_weights.T @ (kernel.monomials_of(p + moved) - kernel.monomials_of(p - moved))
     return np.asarray(theta / (2.0 * MOMENT))
 
 

@@ -42,7 +42,7 @@ from magbridge.diagnose.compare.interpolation import interpolation_error
 from magbridge.diagnose.compare.prior import noise_sigma, prior
 from magbridge.diagnose.compare.survey import Survey
 
-__all__ = ["DELAY", "DELAYS", "Problem", "add_effects", "effect_columns", "history", "pose", "samples_of"]
+__all__ = ["DELAY", "DELAYS", "Problem", "effect_columns", "pose", "samples_of"]
 
 DELAY = 0.3
 """s, a plausible size of a channel's delay after its row."""
@@ -118,30 +118,6 @@ class Problem:
     def straight(self, z: FloatArray) -> FloatArray:
         """(n,) residual without what the channels' delays in z (q,) add to it."""
         return np.asarray(self.residual - self.late @ z[DELAYS])
-
-
-def add_effects(calibration: Calibration, effects: tuple[Effect, ...]) -> Calibration:
-    """Return the calibration with `effects` at zero, perfectly known."""
-    extra = sum(effect.size for effect in effects)
-    size = calibration.coefficients.size
-    covariance = np.zeros((size + extra, size + extra))
-    covariance[:size, :size] = calibration.covariance
-    return replace(
-        calibration,
-        effects=(*calibration.effects, *effects),
-        coefficients=np.append(calibration.coefficients, np.zeros(extra)),
-        covariance=covariance,
-    )
-
-
-def history(survey: Survey, calibration: Calibration, effect: Effect) -> FloatArray:
-    """(r, n) regressors of one effect along the survey, computed sample by sample as the bridge does."""
-    probe = add_effects(calibration.without_effects(), (effect,))
-    step = effect.begin(probe)
-    channels = survey.values(probe.channels)
-    times = np.rint(survey.time * 1e6).astype(np.int64).tolist()
-    rows = zip(times, *survey.field.T.tolist(), channels.tolist(), strict=True)
-    return np.array([step(*row) for row in rows]).T
 
 
 @dataclass(frozen=True)
