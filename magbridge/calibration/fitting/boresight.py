@@ -85,5 +85,5 @@ def find_boresight(calibration: Calibration, data: Observations) -> Boresight | 
     spread = between.T @ between * (runs / max(runs - 1, 1))
     covariance = inverse @ spread @ inverse + COMPASS_SIGMA**2 * np.eye(3)
     x, y, z = rotation.as_rotvec().tolist()
-    (a, b_, c), (d, e, f), (g, h, i) = ((covariance + covariance.T) / 2).tolist()
-    return Boresight((x, y, z), ((a, b_, c), (d, e, f), (g, h, i)))
+    first, second, third = ((x, y, z) for x, y, z in (0.5 * (covariance + covariance.T)).tolist())
+    return Boresight((x, y, z), (first, second, third))

@@ -8,8 +8,9 @@ corrected field is horizontal, and both parts have known sizes whatever the head
     l = R_y(pitch) R_x(roll) B (H_r - T),   |l_xy| = H_h,   l_z = Z
 
 with a full matrix B: components, unlike a magnitude, show tilts, so all of the boresight but one angle is
-found too. ``B = R A`` with A symmetric (polar decomposition). It is only as good as the attitude: a tilt of
-half a degree puts 0.9 % of Z into H_h, 400 nT of 46,000 nT.
+found too. ``B = R A`` with A symmetric (polar decomposition); with J its derivative, a covariance C of B and
+T becomes ``J C J^T`` of A and T. It is only as good as the attitude: a tilt of half a degree puts 0.9 % of Z
+into H_h, 400 nT of 46,000 nT.
 """
 
 from __future__ import annotations
@@ -31,6 +32,8 @@ __all__ = ["fit_horizontal"]
 
 FEWEST = 30
 """Samples that an ellipsoid's twelve unknowns need."""
+STEP = 1e-6
+"""Of B, and of T over the field: the symmetric difference over it is good to 1e-9."""
 FIRST_NOISE = 1e-3
 """Share of the field: the noise that attitude errors make, before it is estimated."""
 
@@ -70,14 +73,13 @@ def fit_horizontal(data: Observations, order: int = 0) -> Fit:  # noqa: ARG001  
         x = found.x
         sigma = float(np.sqrt(np.mean((misfit(x, sigma)[:-12] * sigma) ** 2)))
     covariance = np.linalg.inv(found.jac.T @ found.jac)
-    map_ = np.array(
-        [(_coefficients(x + h, F_0) - _coefficients(x - h, F_0)) / 2e-6 for h in 1e-6 * np.eye(12)]
-    ).T
+    steps = STEP * np.eye(12)
+    J = np.array([_coefficients(x + h, F_0) - _coefficients(x - h, F_0) for h in steps]).T / (2.0 * STEP)
     coefficients = _coefficients(x, F_0)
     check_scales(samples, coefficients)
     noise = estimate_noise(residuals_of(samples, coefficients), samples.steps, 9.0)
     return assemble(
-        data, samples, (), ((),), coefficients, map_ @ covariance @ map_.T, noise, "horizontal",
+        data, samples, (), ((),), coefficients, J @ covariance @ J.T, noise, "horizontal",
         details={"attitude_noise_nT": sigma},
     )  # fmt: skip
 
