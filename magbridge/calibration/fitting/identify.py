@@ -18,6 +18,19 @@ __all__ = ["Combinations", "combinations", "expected_ratio", "heading_gap", "war
 
 ROWS = 5_000
 """Rows of the Jacobian: more do not change its rank."""
+APART = 0.02
+"""Share of the half range by which neighbouring positions of a mass differ that are not one; and share of the
+samples that a position must have to count."""
+SWEPT = 0.3
+"""Share of the half range that one position spans where its mass moved all along."""
+TOGETHER = 0.9
+"""Correlation of two positions above which their effects cannot be told apart."""
+BANKED = 10.0
+"""deg, range of roll that shows the vertical offset."""
+STEEP = 5.0
+"""deg, pitch from which on a run is a dive or a climb."""
+OPEN = 60.0
+"""deg, gap in the headings that is remarked on."""
 RANK_TOLERANCE = 1e-9
 """Share of the largest singular value, below which one counts as zero."""
 
@@ -83,9 +96,9 @@ def _positions(calibration: Calibration, data: Observations) -> Iterator[str]:
             default=0,
         )
         column = np.sort(data.parameters[:, k])
-        jumps = np.flatnonzero(np.diff(column) > 0.02 * parameter.scale)
-        groups = [g for g in np.split(column, jumps + 1) if len(g) > 0.02 * len(column)]
-        if any(np.ptp(g) > 0.3 * parameter.scale for g in groups):
+        jumps = np.flatnonzero(np.diff(column) > APART * parameter.scale)
+        groups = [g for g in np.split(column, jumps + 1) if len(g) > APART * len(column)]
+        if any(np.ptp(g) > SWEPT * parameter.scale for g in groups):
             continue  # it moved all along: no positions to count
         if len(groups) <= min(order, 3):
             places = " and ".join(f"{np.median(g):.4g}" for g in groups)
@@ -104,7 +117,7 @@ def _together(calibration: Calibration, data: Observations) -> Iterator[str]:
     together = np.atleast_2d(np.corrcoef(data.parameters[:, : len(names)].T))
     for i, one in enumerate(names):
         for j, other in enumerate(names[:i]):
-            if abs(together[i, j]) > 0.9:
+            if abs(together[i, j]) > TOGETHER:
                 yield (
                     f"{other} and {one} always moved together (correlation {together[i, j]:.2f}): their "
                     "effects cannot be told apart; fly a run that moves only one of them"
@@ -119,23 +132,23 @@ def _attitudes(calibration: Calibration, data: Observations) -> Iterator[str]:
         return
     roll, pitch, heading = np.degrees(known).T
     low, high = np.quantile(roll, [0.02, 0.98])
-    theta = calibration.covariance[8, 8]
-    if high - low < 10.0 and theta > (5.0 * calibration.noise.sensor) ** 2:
+    variance = calibration.covariance[8, 8]  # of T's z
+    if high - low < BANKED and variance > (5.0 * calibration.noise.sensor) ** 2:
         yield (
             f"roll stayed within {low:z.0f} to {high:z.0f} degrees: the vertical offset is known only to "
-            f"{np.sqrt(theta):.0f} nT; fly a run banked the other way"
+            f"{np.sqrt(variance):.0f} nT; fly a run banked the other way"
         )
-    if pitch.min() > -5.0 and pitch.max() < 5.0:
+    if pitch.min() > -STEEP and pitch.max() < STEEP:
         yield (
             f"pitch stayed within {pitch.min():z.0f} to {pitch.max():z.0f} degrees: nothing steeper was "
             "measured; fly dives and climbs"
         )
-    elif pitch.min() > -5.0 or pitch.max() < 5.0:
-        seen, lacking = ("climbs", "dives") if pitch.min() > -5.0 else ("dives", "climbs")
+    elif pitch.min() > -STEEP or pitch.max() < STEEP:
+        seen, lacking = ("climbs", "dives") if pitch.min() > -STEEP else ("dives", "climbs")
         angles = f"pitch {pitch.min():z.0f} to {pitch.max():z.0f}"
         yield f"only {seen} ({angles}): nothing was measured in {lacking}"
     left, gap = _widest_gap(heading)
-    if gap > 60.0:
+    if gap > OPEN:
         yield f"no run headed between {left:03.0f} and {(left + gap) % 360.0:03.0f}: fly full turns"
 
 
