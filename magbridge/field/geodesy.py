@@ -15,7 +15,7 @@ __all__ = [
     "metres_per_degree",
     "offset",
     "separation",
-    "usual",
+    "signed_longitude",
     "worse_axis",
     "wrap",
 ]
@@ -101,6 +101,9 @@ def wrap(degrees: Number) -> Number:
     return (degrees + 180.0) % 360.0 - 180.0
 
 
-def usual(longitude: float) -> float:
-    """Return a longitude, deg, of a map across the antimeridian as people write it: 180.01 is -179.99."""
+def signed_longitude(longitude: float) -> float:
+    """Return a longitude up to 540 deg, of a map across the antimeridian, as -180 to 180: 180.01 is -179.99.
+
+    :func:`wrap` makes -180 of 180, a map's east edge.
+    """
     return longitude - 360.0 if longitude > 180.0 else longitude

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from magbridge.arrays import FloatArray
 from magbridge.errors import FormatError, OutOfRange
-from magbridge.field.geodesy import metres_per_degree, usual, wrap
+from magbridge.field.geodesy import metres_per_degree, signed_longitude, wrap
 from magbridge.field.grid_netcdf import write
 from magbridge.field.local import OFF_THE_MAP, Local
 from magbridge.field.spline import WEIGHTS, coefficients, filled, weights
@@ -249,7 +249,7 @@ class AnomalyGrid:
     def __repr__(self) -> str:
         west, east = float(self.longitude[0]), float(self.longitude[-1])
         if east - west < 359.0:  # one all around begins where its file does
-            west, east = usual(west), usual(east)
+            west, east = signed_longitude(west), signed_longitude(east)
         return (
             f"{self.name} (latitude {self.latitude[0]:.4f} to {self.latitude[-1]:.4f},"
             f" longitude {west:.4f} to {east:.4f})"

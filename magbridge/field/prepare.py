@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from magbridge.arrays import FloatArray
 from magbridge.errors import OutOfRange, WrongUse
 from magbridge.field.continuation import continued
-from magbridge.field.geodesy import usual
+from magbridge.field.geodesy import signed_longitude
 from magbridge.field.grid import AnomalyGrid
 from magbridge.files import atomic_path
 
@@ -205,7 +205,7 @@ def draw_steps(steps: Sequence[Step], path: str | Path) -> None:
         axis.set_aspect(1.0 / np.cos(np.radians(grid.latitude.mean())))
         axis.ticklabel_format(axis="y", useOffset=False)
         axis.locator_params(axis="x", nbins=4)
-        axis.xaxis.set_major_formatter(lambda value, _: f"{usual(value):.7g}")
+        axis.xaxis.set_major_formatter(lambda value, _: f"{signed_longitude(value):.7g}")
     for axis in axes[len(steps) :]:
         axis.set_axis_off()
     figure.colorbar(image, ax=axes, label="anomaly, nT", shrink=0.8)

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from magbridge.arrays import RealArray
-from magbridge.field.geodesy import metres_per_degree, usual
+from magbridge.field.geodesy import metres_per_degree, signed_longitude
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.igrf import total_field
 from magbridge.files import atomic_path
@@ -146,7 +146,7 @@ def _map(axis: Axes, grid: AnomalyGrid, longitude: Any, latitude: Any) -> None:
     axis.set_aspect(1.0 / slender)
     axis.ticklabel_format(axis="y", useOffset=False)
     axis.xaxis.set_major_locator(MaxNLocator(5))
-    axis.xaxis.set_major_formatter(lambda value, _: f"{usual(value):.7g}")
+    axis.xaxis.set_major_formatter(lambda value, _: f"{signed_longitude(value):.7g}")
     axis.set_xlabel("longitude, deg")
     axis.set_ylabel("latitude, deg")
     scale = axis.inset_axes((0.04, 0.05, 0.3, 0.02))
