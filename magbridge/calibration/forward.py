@@ -15,10 +15,10 @@ from magbridge.calibration.correct import regressors
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.terms import symmetric
 
-__all__ = ["coefficients_at", "forward"]
+__all__ = ["forward"]
 
 
-def coefficients_at(
+def _coefficients_at(
     calibration: Calibration, field: FloatArray, channels: FloatArray, time: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return ``A`` (n, 3, 3) and ``T`` (n, 3) of every sample, with effects; arguments as in `correct`."""
@@ -54,6 +54,6 @@ def forward(
     reading = truth
     # the first pass is exact unless effects depend on the reading; each further one then gains two digits
     for _ in range(6 if calibration.effects else 1):
-        A, T = coefficients_at(calibration, reading, channels, time)
+        A, T = _coefficients_at(calibration, reading, channels, time)
         reading = np.linalg.solve(A, truth[:, :, None])[:, :, 0] + T
     return reading

@@ -13,7 +13,7 @@ from magbridge.errors import OutOfRange
 from magbridge.field.geodesy import metres_per_degree, separation, wrap
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.igrf import total_field
-from magbridge.navigate.model import block_length, measurement_row, prior, transition
+from magbridge.navigate.model import N_STATES, block_length, measurement_row, prior, transition
 from magbridge.navigate.options import Options
 
 if TYPE_CHECKING:
@@ -107,7 +107,7 @@ def position_bound(
     variance = sigma**2 * every / interval
     _, P = prior(o)
     alone = P
-    covariance = np.empty((at.size, 6, 6))
+    covariance = np.empty((at.size, N_STATES, N_STATES))
     unaided = np.empty(at.size)
     previous = corners[0]
     for i, now in enumerate(at):

@@ -16,7 +16,7 @@ from magbridge.field.igrf import total_field
 from magbridge.navigate.options import Options
 from magbridge.navigate.record import Jump, State
 
-__all__ = ["Shift", "best_shift", "findings_of"]
+__all__ = ["findings_of"]
 
 SPARSE = 40
 """Positions, below which a map's place cannot be judged."""
@@ -133,7 +133,7 @@ def _level(result: xr.Dataset, options: Options) -> list[str]:
     return [said]
 
 
-class Shift(NamedTuple):
+class _Shift(NamedTuple):
     """Shift of a map (m north, east) with which it fits best; scatter (nT) with it and without it."""
 
     north: float
@@ -142,9 +142,9 @@ class Shift(NamedTuple):
     here: float
 
 
-def best_shift(
+def _best_shift(
     grid: AnomalyGrid, latitude: RealArray, longitude: RealArray, depth: RealArray, anomaly: RealArray
-) -> Shift:
+) -> _Shift:
     """Return by how much the map must be moved to describe an anomaly measured at known positions.
 
     Parameters
@@ -171,7 +171,7 @@ def best_shift(
                 origin = scatter
             if scatter < best[2]:
                 best = (float(north), float(east), scatter)
-    return Shift(*best, origin)
+    return _Shift(*best, origin)
 
 
 def _positions(grid: AnomalyGrid, reference_track: xr.Dataset, options: Options) -> list[str]:
@@ -188,7 +188,7 @@ def _positions(grid: AnomalyGrid, reference_track: xr.Dataset, options: Options)
         return []
     thin = np.flatnonzero(known)[:: max(1, int(known.sum()) // 400)]
     measured, latitude, longitude, depth = measured[thin], latitude[thin], longitude[thin], depth[thin]
-    north, east, there, here = best_shift(grid, latitude, longitude, depth, measured)
+    north, east, there, here = _best_shift(grid, latitude, longitude, depth, measured)
     level = float(np.mean(measured - grid.evaluate(longitude, latitude, depth).anomaly))
     step = 2.0 * SEARCH / (LATTICE - 1)
     findings = []
