@@ -11,13 +11,11 @@ import numpy as np
 from magbridge.diagnose.causes import Cause
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.diagnosis import Diagnosis, Finding
-from magbridge.diagnose.gain import Gain
+from magbridge.diagnose.gain import LEVEL, Gain
 from magbridge.diagnose.inference.design import normal
 from magbridge.diagnose.inference.rivals import Rival
 
 __all__ = ["findings", "findings_json", "parameters"]
-
-LEVEL = 0.95
 
 
 def findings(
