@@ -22,12 +22,14 @@ from magbridge.diagnose.causes.candidates import Candidate, Group, slices
 from magbridge.diagnose.inference.evidence import LEVEL, score
 from magbridge.diagnose.inference.information import Information
 
-__all__ = ["CONFOUNDED", "Isolability", "Visible", "isolability"]
+__all__ = ["CONFOUNDED", "LARGEST", "Isolability", "Visible", "isolability"]
 
 CONFOUNDED = 0.85
 """Correlation beyond which two causes are listed as a pair: at this one they are told apart in 95 of 100
 cases at signal-to-noise 6."""
 
+LARGEST = 50.0
+"""Multiple of its plausible size from which on a cause is not plausible at all."""
 FREE = 1e-3
 """Prior precision, in units of a plausible size's, of coefficients that are each free; it is 1 for those of
 one common size."""
@@ -137,7 +139,7 @@ def _visible(candidate: Candidate, info: Information, own: slice, hypotheses: fl
 
 def _plausible(size: float) -> float:
     """Return a size in units of a plausible one; infinite where nothing plausible would show."""
-    return size if size < 50.0 else float("inf")
+    return size if size < LARGEST else float("inf")
 
 
 def _likeness(info: Information, one: Candidate, a: slice, other: Candidate, b: slice) -> float:

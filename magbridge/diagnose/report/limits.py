@@ -8,7 +8,7 @@ from math import isfinite
 
 from magbridge.diagnose.causes import Cause
 from magbridge.diagnose.diagnosis import Diagnosis
-from magbridge.diagnose.inference.isolability import CONFOUNDED, Visible
+from magbridge.diagnose.inference.isolability import CONFOUNDED, LARGEST, Visible
 from magbridge.diagnose.report import figures_of_causes
 from magbridge.diagnose.report.glossary import TRIALS
 from magbridge.diagnose.report.words import figure, label, number, sizes, table
@@ -50,7 +50,7 @@ def _ranges(diagnosis: Diagnosis) -> str:
     seen = []
     for name in dict.fromkeys(name for name in wanted if name in survey.channels):
         channel = survey.channels[name]
-        low, high = (number(float(end)) for end in (channel.values.min(), channel.values.max()))
+        low, high = map(number, channel.extent)
         seen.append(f"{escape(name)} was between {low} and {high} {escape(channel.unit)}".rstrip())
     return f"In this log {', '.join(seen)}." if seen else "This log is one deployment."
 
@@ -77,7 +77,7 @@ def visible(diagnosis: Diagnosis) -> list[str]:
             f"{' Bold: found here.' if named else ''}</p>"
         ),
         table(heads, rows),
-        f"<p>Not to be found at any plausible size, at most 50 times the usual: {unseen}.</p>"
+        f"<p>Not to be found at any plausible size, at most {LARGEST:.0f} times the usual: {unseen}.</p>"
         if unseen
         else "",
         figure(
