@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from magbridge.arrays import FloatArray
+from magbridge.arrays import BoolArray, FloatArray
 from magbridge.calibration.model import Calibration
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.compare.problem import Problem
@@ -19,7 +19,15 @@ from magbridge.diagnose.inference.search import Outcome
 from magbridge.diagnose.inference.state import Hypothesis
 from magbridge.diagnose.unexplained.leftover import Leftover
 
-__all__ = ["Diagnosis", "Finding"]
+__all__ = ["Diagnosis", "Finding", "counted"]
+
+
+def counted(problem: Problem, wrong: Outliers | None) -> BoolArray:
+    """(n,) samples by which a gain is measured: new to the calibration, and not wrong."""
+    counts = ~problem.survey.learned
+    if wrong is not None:
+        counts[wrong.rows] = False
+    return counts if counts.any() else ~counts
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,7 +20,7 @@ from magbridge.diagnose.causes.candidates import Candidate, since, slices
 from magbridge.diagnose.compare.problem import Problem, pose
 from magbridge.diagnose.compare.survey import Survey
 from magbridge.diagnose.compare.take import take
-from magbridge.diagnose.diagnosis import Diagnosis, Finding
+from magbridge.diagnose.diagnosis import Diagnosis, Finding, counted
 from magbridge.diagnose.extend import extend, flyable, relinearised, with_map_error, with_misfit
 from magbridge.diagnose.gain import Gain, held_out, paired
 from magbridge.diagnose.inference.evidence import ODDS, REMNANT
@@ -125,7 +125,7 @@ def _examine(
     if model:
         extended = with_map_error(settled, model, fit, flyable(problem.survey, extend(settled, model, fit)))
     progress("measuring the gain")
-    counts = _counted(problem, wrong)
+    counts = counted(problem, wrong)
     before = after = problem.straight(outcome.null.z)
     if model:
         after, score = held_out(settled, columns, fit)
@@ -194,14 +194,6 @@ def _off(fit: Joint, named: Sequence[Hypothesis], causes: int) -> Outliers | Non
     off = outliers(fit, causes)
     strongest = max((h.signal_to_noise for h in named), default=0.0)
     return off if off is not None and off.ratio >= (REMNANT * strongest) ** 2 else None
-
-
-def _counted(problem: Problem, wrong: Outliers | None) -> BoolArray:
-    """(n,) samples by which a gain is measured: new to the calibration, and not wrong."""
-    counts = ~problem.survey.learned
-    if wrong is not None:
-        counts[wrong.rows] = False
-    return counts if counts.any() else ~counts
 
 
 def _findings(

@@ -9,7 +9,7 @@ import numpy as np
 
 from magbridge.calibration.residual import rms
 from magbridge.diagnose.causes import Cause
-from magbridge.diagnose.diagnosis import Diagnosis
+from magbridge.diagnose.diagnosis import Diagnosis, counted
 from magbridge.diagnose.report.doubts import nameless
 from magbridge.diagnose.report.words import number, table
 from magbridge.diagnose.unexplained.leftover import Leftover
@@ -51,20 +51,17 @@ def described(rest: Leftover) -> str:
 def _budget(diagnosis: Diagnosis) -> list[str]:
     """Compare the residual that the calibration predicts with those that were found."""
     total, parts = diagnosis.total, diagnosis.problem.survey.parts
-    counts = ~diagnosis.problem.survey.learned
-    if diagnosis.wrong is not None:
-        counts[diagnosis.wrong.rows] = False
+    counts = counted(diagnosis.problem, diagnosis.wrong)
     fitted = rms(diagnosis.fit.left[counts])
+    extended = f"found with the extended calibration, on {parts} left out of its fit"
     rows = {
         "predicted by the calibration as given: noise and its own uncertainty": float(
             np.sqrt(np.mean(diagnosis.problem.stated[counts]))
         ),
         "found with the calibration as given": total.before,
-        f"found with the extended calibration, on {parts} left out of its fit": total.after,
+        **({extended: total.after} if diagnosis.findings else {}),
         "left in the fit to the whole log": fitted,
     }
-    if not diagnosis.findings:
-        rows.pop(f"found with the extended calibration, on {parts} left out of its fit")
     lines = (f'<tr><td>{name}</td><td class="n">{number(size)} nT</td></tr>' for name, size in rows.items())
     worse = (
         f"<p>What was left out is predicted {number(total.after / fitted, 2)} times worse than what was "
