@@ -80,7 +80,17 @@ def measured(diagnosis: Diagnosis) -> str:
 
 
 def spectrum(diagnosis: Diagnosis) -> str:
-    """Draw the spectral density of the difference, before and after, with the noise model's."""
+    r"""Draw the spectral density of the difference, before and after, with the noise model's.
+
+    Notes
+    -----
+    Autoregressive noise of coefficients a and innovations of variance sigma^2 has at the interval D the
+    one-sided power density (Box & Jenkins 1976, ch. 3)
+
+    .. math:: S(f) = 2 D \sigma^2 \, |1 - \sum_k a_k e^{-2 \pi i f k D}|^{-2}
+
+    Student's t with nu degrees of freedom and a scale s has the variance ``s^2 nu / (nu - 2)``.
+    """
     survey = diagnosis.problem.survey
     interval = float(np.median(np.diff(survey.time)))
     figure, axes = canvas(5.8, 4.0)
@@ -91,8 +101,8 @@ def spectrum(diagnosis: Diagnosis) -> str:
     noise = diagnosis.fit.noise
     f = np.geomspace(1.0 / float(np.ptp(survey.time)), 0.5 / interval, 200)
     lags = np.exp(-2j * np.pi * f[:, None] * interval * np.arange(1, len(noise.ar) + 1))
-    spread = float(np.median(noise.scale)) * (np.sqrt(noise.nu / (noise.nu - 2.0)) if noise.nu < 1e5 else 1.0)
-    model = spread * np.sqrt(2.0 * interval) / np.abs(1.0 - lags @ noise.ar)
+    sigma = float(np.median(noise.scale)) * (np.sqrt(noise.nu / (noise.nu - 2.0)) if noise.nu < 1e5 else 1.0)
+    model = sigma * np.sqrt(2.0 * interval) / np.abs(1.0 - lags @ noise.ar)
     axis.loglog(f, model, "--", color=INK, linewidth=1.2, label="noise model")
     axis.yaxis.set_major_formatter(LogFormatter())
     axis.yaxis.set_minor_formatter(LogFormatter(minor_thresholds=(1.5, 0.6)))
