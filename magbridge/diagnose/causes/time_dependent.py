@@ -13,6 +13,7 @@ from magbridge.diagnose.compare.problem import Problem
 __all__ = ["interference_tone", "offset_drift", "offset_step"]
 
 ONSETS = 40
+"""Moments tried for a step, evenly over the samples. Four times as many gain 0.6 nats: each costs a trial."""
 
 
 def offset_step(problem: Problem) -> list[Candidate]:
