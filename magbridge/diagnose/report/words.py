@@ -42,7 +42,7 @@ def label(cause: str, channel: str | None) -> str:
 def bold(candidate: Candidate) -> str:
     """Return a candidate's cause in bold, and its channel."""
     channel = candidate.channel
-    return f"<b>{candidate.cause.replace('_', ' ')}</b>" + (f" ({escape(channel)})" if channel else "")
+    return f"<b>{label(candidate.cause, None)}</b>" + (f" ({escape(channel)})" if channel else "")
 
 
 def listed(rivals: Sequence[Rival], joint: str = ", ") -> str:
