@@ -139,7 +139,8 @@ def fly(
     t = np.arange(0.0, ends[-1], step)
     leg_of = np.searchsorted(ends, t, side="right")
     memory = motion.wander_memory / step
-    # a vehicle has inertia: the wander is smoothed and keeps its standard deviation
+    # a vehicle has inertia: the wander is smoothed. A lag of time constant T leaves 1 / (1 + T / tau) of the
+    # variance of noise with memory tau, 3/4 for T = tau / 3, and what it takes is given back
     wander = first_order(autoregressive(rng, (len(t), 3), 1.0, memory), step, motion.wander_memory / 3)
     wander *= np.sqrt(4 / 3) * np.asarray(motion.wander)
 
@@ -150,6 +151,7 @@ def fly(
     pitch = settled(np.array([leg.pitch for leg in legs])[leg_of]) + wander[:, 1]
     heading = settled(_headings(legs, ends, t, leg_of)) + wander[:, 2]
 
+    # the wings' lift, and the angle of attack with it, changes sides between dive and climb
     path = np.radians(pitch + motion.angle_of_attack * np.tanh(pitch / 5))
     sink = -motion.speed * np.sin(path) * step
     ahead = motion.speed * np.cos(path)
