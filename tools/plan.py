@@ -46,12 +46,12 @@ def chosen(scenario: Scenario, noise: float) -> tuple[Plan, Plan]:
     runs, survey = (observed(parts[name]) for name in ("calibration", "survey"))
     before = expected_calibration(runs.ranges(), float(runs.reference.mean()), noise=noise)
     mission, ned = Mission.of(survey), main_field(parts["calibration"])[0]
-    table = [
+    table_1 = [
         PlannedRun(pitch, BANK, (battery, float(np.copysign(200.0, pitch))))
         for _, pitch, battery, _ in TABLE_1
     ]
     limits = Limits(roll=(-BANK, BANK), pitch_at=trim_of(runs), flown=settled(runs, runs.ranges()))
-    return evaluate_runs(before, mission, ned, table), plan(before, mission, ned, limits, runs=len(table))
+    return evaluate_runs(before, mission, ned, table_1), plan(before, mission, ned, limits, runs=len(table_1))
 
 
 def observed(part: xr.Dataset) -> Observations:
