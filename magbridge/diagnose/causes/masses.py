@@ -14,6 +14,7 @@ from magbridge.calibration.mass_effects import LegendreEffect, PlayEffect, Power
 from magbridge.calibration.terms import Polynomial, full_order
 from magbridge.diagnose.causes.candidates import AXES, Candidate, of_effect, per
 from magbridge.diagnose.causes.regressors import play, powers
+from magbridge.diagnose.compare.prior import FALL
 from magbridge.diagnose.compare.problem import Problem
 
 __all__ = ["actuator_order", "hysteresis", "unmodelled_actuator"]
@@ -52,7 +53,7 @@ def _series(problem: Problem, effect: PowersEffect, channel: str | None = None) 
     return of_effect(
         problem,
         effect,
-        np.repeat(100.0 * 0.3 ** np.arange(order), 3),
+        np.repeat(100.0 * FALL ** np.arange(order), 3),
         [per(step, power) for power in range(1, order + 1)],
         channel=channel,
         phi=lambda rows: powers((moved.values[rows] - centre) / scale, order),

@@ -15,12 +15,16 @@ from magbridge.calibration.terms import Polynomial
 from magbridge.diagnose.compare.derivatives import derivatives
 from magbridge.diagnose.compare.survey import Survey
 
-__all__ = ["floor", "isotropic", "noise_sigma", "prior"]
+__all__ = ["FALL", "floor", "isotropic", "noise_sigma", "prior"]
 
 BROADEST = 1e-3
 """Least precision, in units of the posterior's, of a direction that only the repeated logs determined."""
 SOFT, HARD = 0.02, 2000.0
 """Soft iron, as a fraction of the field, and hard iron, nT: plausible sizes (1-sigma) on any vehicle."""
+FALL = 0.3
+"""Share of a coefficient's plausible size that remains from one power of a mass' position to the next."""
+HELD = 0.1
+"""Least precision, in units of the posterior's, of a direction that other logs determined, too."""
 STABLE = 2e-5
 """Stability between days, as a fraction of the field: no fluxgate's scales, axes and offsets do better
 than 20 ppm."""
@@ -101,7 +105,7 @@ def _without_repeats(
     white = whiten(white, steps, noise.autocorrelation) / noise_sigma(calibration, e)
     A, y = white[:, :-1], white[:, -1]
     values, vectors = np.linalg.eigh(np.eye(len(centre)) - A.T @ A)
-    held = values > 0.1  # other directions were learned from the repeated samples alone, which count anyway
+    held = values > HELD  # other directions were learned from the repeated samples alone, which count anyway
     pull = vectors @ np.where(held, vectors.T @ (A.T @ y), 0.0)
     bound = L / _physical(calibration)[:, None]
     values, vectors = np.linalg.eigh((vectors * np.where(held, values, 0.0)) @ vectors.T + bound.T @ bound)
@@ -120,7 +124,7 @@ def _physical(calibration: Calibration) -> FloatArray:
     for term in calibration.terms:
         if isinstance(term, Polynomial):
             for i, exponents in enumerate(term.exponents):
-                fall = 0.3 ** sum(exponents)
+                fall = FALL ** sum(exponents)
                 width[k + 9 * i : k + 9 * i + 6] = SOFT * calibration.reference.field * fall
                 width[k + 9 * i + 6 : k + 9 * i + 9] = HARD * fall
         k += term.size
