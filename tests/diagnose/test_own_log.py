@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
+
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.observe import observations
 from magbridge.calibration.model import Noise, identity
@@ -33,3 +35,6 @@ def test_a_report_names_and_counts_the_dives_of_what_is_diagnosed_alone() -> Non
     alone, beside = take([survey], calibration), take([survey], calibration, [learned])
     assert alone.dives == beside.dives == len(set(alone.dive.tolist())) > 1
     assert alone.source == beside.source == "survey.nc"
+    new = beside.dive[~beside.learned]
+    np.testing.assert_array_equal(new - new[0], alone.dive - alone.dive[0])
+    assert not set(beside.dive[beside.learned].tolist()) & set(new.tolist())

@@ -11,6 +11,7 @@ import numpy as np
 
 from magbridge.arrays import BoolArray, FloatArray, IntArray
 from magbridge.columns import AGE
+from magbridge.diagnose.compare.dives import dives_of, eighths, held, new_dives
 from magbridge.diagnose.compare.past import FAR, Past
 from magbridge.errors import DataError
 from magbridge.field.geodesy import separation, wrap
@@ -127,7 +128,7 @@ class Survey:
     @property
     def parts(self) -> str:
         """The units of cross-validation, in words."""
-        return "eighths of the log" if np.array_equal(self.dive, _eighths(len(self))) else "dives"
+        return "eighths of the log" if np.array_equal(self.dive, eighths(len(self))) else "dives"
 
     def past(self, order: int) -> Past:
         """Return the samples before each one that autoregressive noise of this order depends on."""
@@ -181,7 +182,7 @@ def assemble(
         cycles = time[1:][np.diff(table["power_cycle"]) > 0]
     attitude = None
     if {"roll", "pitch", "heading"} <= set(table):
-        attitude = np.stack([_held(table[name]) for name in ("roll", "pitch", "heading")], axis=1)
+        attitude = np.stack([held(table[name]) for name in ("roll", "pitch", "heading")], axis=1)
     return Survey(
         time=time,
         field=np.stack([table[f"mag_{axis}"] for axis in "xyz"], axis=1),
@@ -189,8 +190,8 @@ def assemble(
         channels=channels,
         still=still,
         steps=steps,
-        dive=_dives(table),
-        dives=_count(table),
+        dive=dives_of(table),
+        dives=new_dives(table),
         place=_place(table),
         attitude=attitude,
         fitted=table["fitted"] > 0.5,
@@ -216,9 +217,9 @@ def _channels(
         if known.size < FEWEST or np.ptp(known) <= 1e-9 * (np.abs(known).max() + 1e-30):
             still.append(name)
             if name in needed and known.size:  # the correction takes it, but nothing can be learned from it
-                channels[name] = Channel(_held(values), unit, ())
+                channels[name] = Channel(held(values), unit, ())
             continue
-        channels[name] = Channel(_held(values), unit, _kinds(name, unit))
+        channels[name] = Channel(held(values), unit, _kinds(name, unit))
     return channels, tuple(still)
 
 
@@ -230,7 +231,7 @@ def _place(table: dict[str, FloatArray]) -> FloatArray | None:
     along = wrap(longitude - longitude[0])  # also across the date line
     middle = float(np.median(latitude)), float(longitude[0] + np.median(along))
     north, east = separation(*middle, latitude, longitude)
-    down = _held(table["depth"]) if "depth" in table else np.zeros_like(north)
+    down = held(table["depth"]) if "depth" in table else np.zeros_like(north)
     return np.stack([north, east, down], axis=1)
 
 
@@ -241,35 +242,3 @@ def _kinds(name: str, unit: str) -> tuple[str, ...]:
         hinted = tuple(kind for hint, kind in HINTS if hint in name.lower())
         return hinted or ("temperature", "current", "pressure", "position")
     return ("position",)
-
-
-def _held(values: FloatArray) -> FloatArray:
-    """Fill gaps with the last known value, and the beginning with the first."""
-    known = np.flatnonzero(np.isfinite(values))
-    last = np.maximum.accumulate(np.where(np.isfinite(values), np.arange(len(values)), known[0]))
-    return np.asarray(values[np.maximum(last, known[0])])
-
-
-def _dives(table: dict[str, FloatArray]) -> IntArray:
-    """Count the dives: as the log does, else from surface to surface, else eighths of the log."""
-    for name in ("dive", "run"):
-        if name in table and np.unique(table[name]).size > 3:
-            return np.unique(table[name], return_inverse=True)[1].astype(np.int64)
-    if "depth" in table and np.nanmax(table["depth"]) > 5.0:
-        depth = _held(table["depth"])
-        shallow = depth < 0.15 * np.quantile(depth, 0.98)
-        start = shallow & ~np.append(False, shallow[:-1])
-        if 4 <= start.sum() <= 0.05 * len(depth):
-            return np.cumsum(start)
-    return _eighths(len(table["time"]))
-
-
-def _count(table: dict[str, FloatArray]) -> int:
-    """Count the dives of the logs that are diagnosed; 0 where they have too few."""
-    new = {name: column[table["learned"] < 0.5] for name, column in table.items()}
-    dive = _dives({name: column for name, column in new.items() if np.isfinite(column).any()})
-    return 0 if np.array_equal(dive, _eighths(len(dive))) else np.unique(dive).size
-
-
-def _eighths(n: int) -> IntArray:
-    return np.arange(n) * 8 // n
