@@ -110,6 +110,7 @@ class Component:
         self._tape = TapeWriter(link.system, link.component)
         self.outbox, self.timers = Outbox(self.codec), Timers()
         self.heard: list[bytes] = []
+        self._refusals_told = 0
         self.announcer = Announcer(self.outbox, self.timers)
         self.vehicle = Vehicle(link.system, link.component, link.autopilot, self.announcer, self.timers)
         self.parameters = Parameters([*rates({**DEFAULTS, **publish}, LIMITS), *tunables])
@@ -182,9 +183,11 @@ class Component:
     def _tell_refusals(self) -> None:
         """Say once for each reason why frames are refused: else their sender would only seem to be away."""
         assert self.codec.signing is not None
-        for why, (system, component) in self.codec.signing.refusals.items():
+        refusals = list(self.codec.signing.refusals.items())
+        for why, (system, component) in refusals[self._refusals_told :]:
             text = f"frames of {system}:{component} refused: {why}"
             self.announcer.state(f"refused: {why}", text, MAV_SEVERITY.WARNING)
+        self._refusals_told = len(refusals)
 
     def _begin(self, t_us: int) -> None:
         self.codec.now_us = t_us
