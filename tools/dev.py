@@ -33,6 +33,7 @@ CHECKS = (
     ("ruff", "format", "--check", "."),
     ("mypy",),
     ("lint-imports", "--no-cache"),
+    ("mkdocs", "build", "--quiet", "--site-dir", ".site"),
 )
 
 
