@@ -1,13 +1,15 @@
 """Instruments: each driver a parser that never touches a port, all of them in one table.
 
 Other packages add their own by an entry point in the group ``magbridge.sensors`` whose name is the driver's
-and whose object is a class like :class:`Driver`.
+and whose object is a class like :class:`Driver`; one that inherits from it needs no more than ``Options``,
+``feed`` and the two counters.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from importlib import import_module
+from math import inf
 from pathlib import Path
 from typing import Any, ClassVar, Protocol
 
@@ -50,11 +52,11 @@ class Driver(Protocol):
     """
 
     Options: ClassVar[Any]
-    range_nt: float
-    nt_per_count: float
-    sequence_modulo: int
-    time_modulo: float
-    period: float
+    range_nt: float = inf
+    nt_per_count: float = 0.0
+    sequence_modulo: int = 0
+    time_modulo: float = 0.0
+    period: float = 0.0
 
     def __init__(self, options: Any) -> None: ...
 
@@ -73,11 +75,17 @@ class Driver(Protocol):
 
         Return the commands to send to the instrument, at least 0.1 s apart; maybe none.
         """
-        ...
+        return ()
 
     def feed(self, data: bytes) -> list[Reading]:
         """Take bytes as they came; return the readings that they complete."""
         ...
+
+
+MEMBERS = (
+    "range_nt", "nt_per_count", "sequence_modulo", "time_modulo", "period", "bytes_skipped", "frames_bad",
+)  # fmt: skip
+"""What an open driver must have besides its methods."""
 
 
 def open_driver(name: str, options: Mapping[str, Any], source: str | Path = "bridge.toml") -> Driver:
@@ -95,10 +103,20 @@ def open_driver(name: str, options: Mapping[str, Any], source: str | Path = "bri
     Raises
     ------
     ConfigError
-        No such driver; an option that is unknown, missing, of the wrong type or out of range.
+        No such driver, or one that lacks a member; an option that is unknown, missing, of the wrong type or
+        out of range.
     """
     driver: type[Driver] = _find(name, source)
-    return driver(convert(dict(options), driver.Options, source, "sensor.options."))
+    _check(name, driver, ("Options", "feed", "start"), source)
+    opened = driver(convert(dict(options), driver.Options, source, "sensor.options."))
+    _check(name, opened, MEMBERS, source)
+    return opened
+
+
+def _check(name: str, driver: object, members: tuple[str, ...], source: str | Path) -> None:
+    """Raise :class:`ConfigError` where a driver, its class or an instance, lacks some of `members`."""
+    if lacking := [member for member in members if not hasattr(driver, member)]:
+        raise ConfigError(source, "sensor.driver", f"driver {name!r} lacks {', '.join(lacking)}")
 
 
 def _find(name: str, source: str | Path) -> Any:

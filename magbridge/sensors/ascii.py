@@ -38,7 +38,7 @@ from msgspec import Meta
 
 from magbridge.columns import NT_PER_UNIT
 from magbridge.records import BEYOND, Reading
-from magbridge.sensors.framing import Framer
+from magbridge.sensors.framing import Framer, saturated
 
 __all__ = ["CHECKSUMS", "Ascii", "AsciiOptions"]
 
@@ -207,13 +207,12 @@ class Ascii:
         if len(cells) != self._width and not (self._more and len(cells) > self._width):
             raise ValueError
         x, y, z = map(float, self._xyz(cells))
-        scale, limit = self._scale, self.range_nt
+        scale = self._scale
         field = (x * scale, y * scale, z * scale)
         largest = abs(field[0]) + abs(field[1]) + abs(field[2])
         if not largest < BEYOND or (self._counts and not abs(x) + abs(y) + abs(z) < COUNTS):
             raise ValueError
         others: dict[str, Any] = {name: kind(cells[at]) for name, at, kind in self._others}
-        inside = -limit < field[0] < limit and -limit < field[1] < limit and -limit < field[2] < limit
         return Reading(
             field,
             (int(x), int(y), int(z)) if self._counts else None,
@@ -222,7 +221,7 @@ class Ascii:
             temperature=others.get("temperature", nan),
             supply=others.get("supply", nan),
             power_cycle=others.get("power_cycle"),
-            saturated=not inside,
+            saturated=saturated(*field, self.range_nt),
         )
 
 

@@ -32,6 +32,10 @@ RESTART: Final = 1e6
 the instrument was restarted."""
 HALF: Final = 0.6
 """Fraction of a period: a reading later than this shows that one before it is missing."""
+BASELINE: Final = 1 << 16
+"""Readings over which the interval between them is measured anew: for counting those that are missing."""
+ENOUGH: Final = 16
+"""Readings from which on an interval is better than the one before."""
 KEEP_PHASE: Final = 3
 """If more readings than this are missing at once, the line is begun anew: the instrument may have stopped."""
 
@@ -77,6 +81,8 @@ class DeviceClock:
         self._period = period
         self._floor = Floor(SIGMA_PERIOD if period else SIGMA_CLOCK)
         self._sequence: int | None = None
+        self._since_us = self._readings = 0
+        self._interval_us = 0.0
         self._origin_us: int | None = None
         self._zero = self._turned = self._device_time = 0.0
         self._count = 0
@@ -134,14 +140,15 @@ class DeviceClock:
             Whether the relation between the clocks is learned from this reading; False for one that only
             waited for a later one.
         """
-        missing = self._hole(sequence)
-        restarted = stepped = False
         timed = not isnan(device_time)
+        missing = self._missing(sequence, arrival_us)
+        restarted = stepped = False
         if self._origin_us is None or timed == isnan(self._device_time):
             stepped = self._origin_us is not None
             self._begin(device_time, arrival_us)
             time_us = float(arrival_us)
         elif timed:
+            missing = missing or self._unnumbered(sequence, device_time)
             time_us, restarted, stepped = self._by_time(device_time, arrival_us, self._origin_us, tells)
         elif self._period:
             time_us, stepped, unseen = self._by_count(arrival_us, self._origin_us, missing, tells)
@@ -155,17 +162,38 @@ class DeviceClock:
         self._out_us = out_us
         return Stamp(out_us, restarted, stepped, 0 if restarted else missing)
 
-    def _hole(self, sequence: int | None) -> int:
-        """Return how many readings are missing before this one, by its sequence number."""
+    def _missing(self, sequence: int | None, arrival_us: int) -> int:
+        """Return how many readings are missing before this one, by its sequence number.
+
+        The number may have wrapped many times since the last reading, so turns are added until the count fits
+        the time that has passed, at the interval at which the readings came so far. That is right as long as
+        the readings in this time, times the relative error of the interval, are fewer than half a turn.
+        """
         last, self._sequence = self._sequence, sequence
         if sequence is None or last is None:
+            self._since_us, self._readings = arrival_us, 0
             return 0
-        hole = sequence - last - 1
-        if self._sequence_modulo:
-            hole %= self._sequence_modulo
-            if hole > self._sequence_modulo // 2:
-                return 0
+        hole, modulo = sequence - last - 1, self._sequence_modulo
+        if hole == 0 and self._readings < BASELINE:
+            self._readings += 1
+            return 0
+        if self._readings >= ENOUGH or (self._readings and not self._interval_us):
+            self._interval_us = (self._arrival_us - self._since_us) / self._readings
+        if hole and modulo:
+            hole %= modulo
+            if self._interval_us > 0.0:
+                expected = (arrival_us - self._arrival_us) / self._interval_us - 1.0
+                hole += max(round((expected - hole) / modulo), -1) * modulo
+            elif hole > modulo // 2:
+                hole = 0
+        self._since_us, self._readings = arrival_us, 0
         return max(hole, 0)
+
+    def _unnumbered(self, sequence: int | None, device_time: float) -> int:
+        """Return how many readings are missing before one with a time and a nominal rate but no number."""
+        if sequence is not None or not self._period:
+            return 0
+        return max(round((device_time - self._device_time) / self._period) - 1, 0)
 
     def _begin(self, device_time: float, arrival_us: int) -> None:
         """Learn the relation between the clocks anew, from this reading on."""

@@ -49,7 +49,7 @@ from zlib import crc32
 
 from magbridge.records import Reading
 from magbridge.sensors.digitizer_options import FULL_SCALE, DigitizerOptions
-from magbridge.sensors.framing import CRC32_RESIDUE, Framer, cobs_decode
+from magbridge.sensors.framing import CRC32_RESIDUE, Framer, cobs_decode, saturated
 
 __all__ = ["EXAMPLE", "Digitizer", "DigitizerOptions"]
 
@@ -112,8 +112,7 @@ class Digitizer:
             x_low, x_high, y_low, y_high, z_low, z_high,
         ) = BODY.unpack_from(message)  # fmt: skip
         x, y, z = _count(x_low, x_high), _count(y_low, y_high), _count(z_low, z_high)
-        scale, limit = self.nt_per_count, self._limit
-        inside = -limit < x < limit and -limit < y < limit and -limit < z < limit
+        scale = self.nt_per_count
         return Reading(
             (x * scale, y * scale, z * scale),
             (x, y, z),
@@ -123,7 +122,7 @@ class Digitizer:
             nan if temperature == NO_TEMPERATURE else temperature * 0.01,
             nan if supply == NO_SUPPLY else supply * 1e-3,
             cycle,
-            not inside or flags & 7 != 0,
+            flags & 7 != 0 or saturated(x, y, z, self._limit),
         )
 
 

@@ -1,8 +1,8 @@
-"""What several protocols share: frames between delimiters, COBS."""
+"""What several protocols share: frames between delimiters, COBS, the end of a range."""
 
 from __future__ import annotations
 
-__all__ = ["CRC32_RESIDUE", "Framer", "cobs_decode", "cobs_encode"]
+__all__ = ["CRC32_RESIDUE", "Framer", "cobs_decode", "cobs_encode", "saturated"]
 
 CRC32_RESIDUE = 0x2144DF1C
 """CRC-32 (IEEE 802.3) of any message followed by its own CRC-32 in little-endian order."""
@@ -94,3 +94,11 @@ def cobs_decode(frame: bytes) -> bytes:
         pieces.append(frame[at + 1 : at + step])
         at += step
     return b"\0".join(pieces) if at == end else b""
+
+
+def saturated(x: float, y: float, z: float, limit: float) -> bool:
+    """Say whether a channel stands at the end of its range, or beyond: ``|channel| >= limit``, in one unit.
+
+    The channels are numbers: a driver has counted a reading with a NaN as bad before it asks.
+    """
+    return not (-limit < x < limit and -limit < y < limit and -limit < z < limit)

@@ -21,7 +21,7 @@ from msgspec import Meta
 
 from magbridge.columns import NT_PER_UNIT
 from magbridge.records import Reading
-from magbridge.sensors.framing import Framer
+from magbridge.sensors.framing import Framer, saturated
 
 __all__ = ["Hmr2300", "Hmr2300Options"]
 
@@ -139,9 +139,8 @@ class Hmr2300:
 
 
 def _reading(x: int, y: int, z: int) -> Reading:
-    inside = -LIMIT < x < LIMIT and -LIMIT < y < LIMIT and -LIMIT < z < LIMIT
     field = (x * NT_PER_COUNT, y * NT_PER_COUNT, z * NT_PER_COUNT)
-    return Reading(field, (x, y, z), saturated=not inside)
+    return Reading(field, (x, y, z), saturated=saturated(x, y, z, LIMIT))
 
 
 def _alignment(buffer: bytes, at: int) -> tuple[int, bool]:

@@ -15,7 +15,7 @@ from msgspec import Meta
 from magbridge.columns import NT_PER_UNIT
 from magbridge.records import BEYOND, Reading
 from magbridge.sensors import tio
-from magbridge.sensors.framing import CRC32_RESIDUE, Framer
+from magbridge.sensors.framing import CRC32_RESIDUE, Framer, saturated
 
 __all__ = ["Twinleaf", "TwinleafOptions"]
 
@@ -207,14 +207,14 @@ class Twinleaf:
                 raise ValueError
             count = int(len(payload) - 4 >= row.fields.size)
         readings = []
-        limit = self.range_nt
         for n in range(first, first + count):
             values = row.pick(row.fields.unpack_from(payload, 4 + (n - first) * row.size))
             x, y, z = values[0] * row.scale, values[1] * row.scale, values[2] * row.scale
             temperature = values[3] if len(values) == 4 else nan
-            if abs(x) + abs(y) + abs(z) > BEYOND or abs(temperature) > BEYOND:
-                raise ValueError
-            inside = -limit < x < limit and -limit < y < limit and -limit < z < limit
+            if not abs(x) + abs(y) + abs(z) < BEYOND or abs(temperature) > BEYOND:  # also NaN
+                self.frames_bad += 1
+                self._framer.skipped += row.fields.size
+                continue
             readings.append(
                 Reading(
                     (x, y, z),
@@ -222,7 +222,7 @@ class Twinleaf:
                     device_time=begin + n * period,
                     temperature=temperature,
                     power_cycle=self._session,
-                    saturated=not inside,
+                    saturated=saturated(x, y, z, self.range_nt),
                 )
             )
         return readings

@@ -1,12 +1,14 @@
 """Emulated instruments: the inverse of each driver, in the instrument's own bytes.
 
 An encoder quantises and saturates as the instrument does, counts its readings, and answers what the driver
-sends, so that a program behind a pty cannot tell it from the real one.
+sends, so that a program behind a pty cannot tell it from the real one. Other packages add theirs by an entry
+point in the group ``magbridge.encoders``: the driver's name, and a class like :class:`Encoder`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
@@ -46,7 +48,8 @@ def open_encoder(
     ConfigError
         No such instrument, or a wrong option.
     """
-    if name not in ENCODERS:
-        raise ConfigError(source, "sensor.driver", f"can emulate {', '.join(ENCODERS)}")
-    encoder = ENCODERS[name]
+    others = {} if name in ENCODERS else {one.name: one for one in entry_points(group="magbridge.encoders")}
+    if name not in ENCODERS and name not in others:
+        raise ConfigError(source, "sensor.driver", f"can emulate {', '.join(sorted({*ENCODERS, *others}))}")
+    encoder: type[Encoder] = ENCODERS[name] if name in ENCODERS else others[name].load()
     return encoder(convert(dict(options), encoder.Options, source, "sensor.options."), rate)

@@ -133,3 +133,16 @@ def test_a_line_found_by_a_pattern_is_listened_to_before_it_gets_commands(
             line.mumbled(heard[11:], 100_000 * k)
     assert times == pytest.approx(sent, abs=0.11)
     assert line.stranger == (sent == [])
+
+
+def test_commands_are_a_tenth_of_a_second_apart() -> None:
+    """An instrument answers one before it reads the next."""
+    timers, codec = Timers(), Codec(1, 191)
+    announcer = Announcer(Outbox(codec), timers)
+    line = SensorLine("hmr2300", lambda: (b"1", b"2", b"3"), 10_000_000, announcer, timers, 0)
+    sent = {0: [b"1"], 100_000: [b"2"], 200_000: [b"3"]}
+    line.opened(0)
+    for now_us in range(0, 300_000, 10_000):
+        timers.advance(now_us, lambda _: None)
+        assert line.to_send == sent.get(now_us, [])
+        line.to_send.clear()

@@ -270,3 +270,47 @@ def test_anything_gives_a_time_that_increases_unless_stepped(
         made.append(first)
     assert all(stamp.time_us % 4 == 0 and stamp.missing >= 0 for stamp in made)
     assert all(b.stepped or b.time_us > a.time_us for a, b in pairwise(made))
+
+
+@pytest.mark.parametrize("away", [3.0, 32.0, 40.0, 65.5, 70.0, 400.0, 3_600.0])
+def test_losses_are_exact_however_often_the_sequence_has_wrapped(away: float) -> None:
+    """1 kHz and 16 bits: a turn is 65.5 s."""
+    numbers = np.concatenate([np.arange(2_000), 2_000 + round(away * 1e3) + np.arange(50)])
+    true: FloatArray = numbers * 1e-3
+    device = true * (1 - 50e-6)
+    made = stamps(
+        DeviceClock(time_modulo=2**32 * 1e-6, sequence_modulo=65_536),
+        device,
+        arrivals(true, 5e-3),
+        [int(number) % 65_536 for number in numbers],
+    )
+    assert sum(stamp.missing for stamp in made) == round(away * 1e3)
+
+
+def test_the_count_stays_exact_over_many_turns_losses_and_doubles() -> None:
+    rng = np.random.default_rng(3)
+    numbers = np.arange(20_000)
+    numbers = numbers[rng.random(numbers.size) > 0.02]
+    sent = np.repeat(numbers, np.where(rng.random(numbers.size) < 0.005, 2, 1))
+    made = stamps(
+        DeviceClock(sequence_modulo=256),
+        np.full(sent.size, nan),
+        arrivals(np.asarray(0.1 * sent), 5e-3),
+        [int(number) % 256 for number in sent],
+    )
+    assert sum(stamp.missing for stamp in made) == numbers[-1] + 1 - numbers.size - numbers[0]
+
+
+def test_with_a_time_and_a_rate_no_number_is_needed_to_count_losses() -> None:
+    true = np.delete(np.arange(0.0, 60.0, 0.1), slice(200, 250))
+    made = stamps(DeviceClock(period=0.1), true, arrivals(true, 2e-3))
+    assert [k for k, stamp in enumerate(made) if stamp.missing] == [200]
+    assert made[200].missing == 50
+
+
+def test_a_shift_of_the_phase_is_followed() -> None:
+    """By less than a reading, so none is missing; stamps must not stay early by it."""
+    true = np.concatenate([np.arange(0.0, 60.0, 1.0), 60.3 + np.arange(0.0, 400.0, 1.0)])
+    made = stamps(DeviceClock(period=1.0), np.full(true.size, nan), arrivals(true, 2e-3))
+    assert sum(stamp.missing for stamp in made) == 0
+    assert np.abs(error_us(made, true)[-100:]).max() < 20_000

@@ -19,6 +19,7 @@ from hypothesis import strategies as st
 from magbridge.errors import ConfigError
 from magbridge.records import Reading
 from magbridge.sensors import DRIVERS, Driver, open_driver
+from magbridge.sensors.clock import DeviceClock
 from sitl.fluxgate import Encoder, open_encoder
 
 CASES: dict[str, tuple[str, dict[str, Any]]] = {
@@ -170,16 +171,65 @@ def test_wrong_options_name_the_key(name: str, options: dict[str, Any], line: st
 
 
 def test_other_packages_can_add_a_driver(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    info = tmp_path / "other-1.0.dist-info"
-    info.mkdir()
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: other\nVersion: 1.0\n")
-    (info / "entry_points.txt").write_text("[magbridge.sensors]\nother = other_sensor:Other\n")
-    (tmp_path / "other_sensor.py").write_text(
-        "from magbridge.sensors.ascii import Ascii\nclass Other(Ascii):\n    pass\n"
-    )
-    monkeypatch.syspath_prepend(str(tmp_path))
+    text = "from magbridge.sensors.ascii import Ascii\nclass Sensor(Ascii):\n    pass\n"
+    other_driver(tmp_path, monkeypatch, "other", text)
     (reading,) = open_driver("other", {"unit": "uT"}).feed(b"1 2 3\n")
     assert reading.field == (1000.0, 2000.0, 3000.0)
+
+
+def other_driver(folder: Path, monkeypatch: pytest.MonkeyPatch, name: str, text: str) -> None:
+    """Install a driver of another package."""
+    info = folder / f"{name}-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text(f"[magbridge.sensors]\n{name} = {name}_sensor:Sensor\n")
+    (folder / f"{name}_sensor.py").write_text(text)
+    monkeypatch.syspath_prepend(str(folder))
+
+
+def test_a_driver_that_inherits_needs_only_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    text = """
+import msgspec
+from magbridge.records import Reading
+from magbridge.sensors import Driver
+class Sensor(Driver):
+    class Options(msgspec.Struct):
+        pass
+    bytes_skipped = frames_bad = 0
+    def __init__(self, options):
+        pass
+    def feed(self, data):
+        return [Reading((float(byte), 0.0, 0.0)) for byte in data]
+"""
+    other_driver(tmp_path, monkeypatch, "least", text)
+    driver = open_driver("least", {})
+    assert driver.start() == ()
+    assert [stamp.missing for stamp in DeviceClock.of(driver).stamp(driver.feed(b"12"), 10**15)] == [0, 0]
+
+
+@pytest.mark.parametrize(
+    ("text", "lacks"),
+    [
+        ("class Sensor: pass", "Options, feed, start"),
+        (
+            """
+from magbridge.sensors.ascii import AsciiOptions
+class Sensor:
+    Options = AsciiOptions
+    feed = start = frames_bad = lambda self: ()
+    def __init__(self, options): pass
+""",
+            "range_nt, nt_per_count, sequence_modulo, time_modulo, period, bytes_skipped",
+        ),
+    ],
+)
+def test_a_driver_that_lacks_a_member_is_named_with_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str, lacks: str
+) -> None:
+    name = f"lacking{len(text)}"
+    other_driver(tmp_path, monkeypatch, name, text)
+    with pytest.raises(ConfigError, match=f"sensor.driver: driver '{name}' lacks {lacks}$"):
+        open_driver(name, {}, source="my.toml")
 
 
 def test_opening_a_driver_imports_that_one_and_nothing_heavy() -> None:

@@ -9,6 +9,7 @@ from zlib import crc32
 import pytest
 
 from magbridge.sensors import Driver, open_driver
+from magbridge.sensors.clock import DeviceClock
 
 F32, I24, U16 = 0x42, 0x31, 0x20
 
@@ -190,3 +191,15 @@ def test_an_unknown_unit_is_not_guessed() -> None:
     known = driver(unit="pT")
     known.feed(generation_2([(F32, name, "furlong") for _, name, _ in VECTOR]))
     assert known.feed(samples_2(1, 1.0, 2.0, 3.0))[0].field == pytest.approx((1e-3, 2e-3, 3e-3))
+
+
+def test_a_nan_is_a_lost_sample_and_not_a_saturated_one() -> None:
+    twinleaf = driver()
+    twinleaf.feed(generation_2(VECTOR))
+    nan = float("nan")
+    readings = twinleaf.feed(samples_2(7, 1.0, 2.0, 3.0, 1.0, nan, 3.0, 4.0, 5.0, 6.0))
+    assert [reading.field for reading in readings] == [(1.0, 2.0, 3.0), (4.0, 5.0, 6.0)]
+    assert [reading.saturated for reading in readings] == [False, False]
+    assert twinleaf.frames_bad == 1
+    stamps = DeviceClock.of(twinleaf).stamp(readings, 10**15)
+    assert [stamp.missing for stamp in stamps] == [0, 1]
