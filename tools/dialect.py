@@ -10,6 +10,7 @@ import argparse
 import re
 import sys
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import pymavlink
@@ -37,11 +38,18 @@ ENUMS: dict[str, tuple[str, ...]] = {
         "REQUEST_PROTOCOL_VERSION",
         "REQUEST_AUTOPILOT_CAPABILITIES",
         "EXTERNAL_POSITION_ESTIMATE",
+        "PREFLIGHT_CALIBRATION",
+        "FIXED_MAG_CAL",
+        "FIXED_MAG_CAL_FIELD",
+        "FIXED_MAG_CAL_YAW",
+        "DO_START_MAG_CAL",
+        "DO_ACCEPT_MAG_CAL",
+        "DO_CANCEL_MAG_CAL",
     ),
     "MAV_ESTIMATOR_TYPE": ("NAIVE",),
     "MAV_FRAME": ("GLOBAL", "LOCAL_NED", "BODY_FRD"),
     "MAV_PARAM_TYPE": ("REAL32",),
-    "MAV_PROTOCOL_CAPABILITY": ("PARAM_FLOAT", "COMMAND_INT", "MAVLINK2"),
+    "MAV_PROTOCOL_CAPABILITY": ("PARAM_FLOAT", "COMMAND_INT", "FTP", "MAVLINK2", "PARAM_ENCODE_C_CAST"),
     "MAV_RESULT": (),
     "MAV_SEVERITY": (),
     "MAV_STATE": (),
@@ -54,6 +62,30 @@ CODES = {
 }  # fmt: skip
 
 
+UPSTREAM = """<?xml version="1.0"?>
+<mavlink>
+  <messages>
+    <message id="396" name="COMPONENT_INFORMATION_BASIC">
+      <description>Basic component information data; to be requested.</description>
+      <field type="uint32_t" name="time_boot_ms" units="ms">Time since system boot.</field>
+      <field type="uint64_t" name="capabilities">Component capability flags.</field>
+      <field type="uint32_t" name="time_manufacture_s" units="s" invalid="0">Date of manufacture.</field>
+      <field type="char[32]" name="vendor_name">Name of the component vendor.</field>
+      <field type="char[32]" name="model_name">Name of the component model.</field>
+      <field type="char[24]" name="software_version">Software version.</field>
+      <field type="char[24]" name="hardware_version">Hardware version.</field>
+      <field type="char[32]" name="serial_number">Hardware serial number.</field>
+    </message>
+    <message id="397" name="COMPONENT_METADATA">
+      <description>Where the general metadata file is, which names the others.</description>
+      <field type="uint32_t" name="time_boot_ms" units="ms">Time since system boot.</field>
+      <field type="uint32_t" name="file_crc">CRC-32 of the general metadata file.</field>
+      <field type="char[100]" name="uri">MAVLink FTP URI of the general metadata file.</field>
+    </message>
+  </messages>
+</mavlink>
+"""
+"""Messages that upstream has added since the definitions in pymavlink; known by their id and checksum."""
 EXTENSIONS = {"TIMESYNC": ("B:target_system::", "B:target_component::")}
 """Fields that upstream has added since the definitions in pymavlink; extensions leave the
 checksum as it is."""
@@ -89,6 +121,10 @@ def field(one: Any) -> str:
 def render() -> str:
     """Return the text of the module."""
     files = collect(DEFINITIONS / INCLUDED, collect(XML, {}))
+    with TemporaryDirectory() as folder:
+        newer = Path(folder) / "upstream.xml"
+        newer.write_text(UPSTREAM, encoding="utf-8")
+        collect(newer, files)
     messages = {m.id: m for xml in files.values() for m in xml.message}
     if len(messages) != sum(len(xml.message) for xml in files.values()):
         raise ValueError("two messages with one id")

@@ -6,6 +6,7 @@ import time
 
 import msgspec
 
+from magbridge.mavlink import Stream
 from magbridge.records import Channel
 
 __all__ = ["Clock", "Event", "Start"]
@@ -21,12 +22,15 @@ class Start(msgspec.Struct, frozen=True):
     parameters : dict of str to float
         Values that a ground station set in earlier runs.
     signing_timestamp : int
-        The last that was used (units of 10 µs since 2015-01-01).
+        The last that may have been used (units of 10 µs since 2015-01-01).
+    signing_streams : list of Stream
+        The last time stamp accepted of each signed stream.
     """
 
     time_us: int
     parameters: dict[str, float] = {}
     signing_timestamp: int = 0
+    signing_streams: list[Stream] = []
 
 
 class Event(msgspec.Struct, frozen=True, gc=False):

@@ -30,6 +30,9 @@ def beginning(
             driver=config.sensor.driver,
         )
     ]
+    for link, system, sender, ahead, stamp in start.signing_streams:
+        stream = {"link": link, "system": system, "sender": sender, "ahead": ahead, "stamp": stamp}
+        frames.append(codec.pack("MAG_SIGNING_STREAM", **stream))
     for name, value in parameters.items():
         real = MAV_PARAM_TYPE.REAL32
         frames.append(codec.pack("PARAM_VALUE", param_id=name, param_value=value, param_type=real))

@@ -88,7 +88,9 @@ class Pipeline:
         used = None if foreign else calibration
         self._correction = Correction(used, config.align)
         self._calibration_id = calibration_id(used) if used else 0
-        self.signing = Signing(key, start.signing_timestamp) if key else None
+        autopilot = config.link.system, config.link.autopilot
+        stamps = start.signing_timestamp, start.signing_streams
+        self.signing = Signing(key, *stamps, autopilot) if key else None
         self.component = Component(
             config.link,
             config.publish,

@@ -24,13 +24,14 @@ from magbridge.config import Config, load
 from magbridge.errors import FormatError
 from magbridge.link import store
 from magbridge.logs.tlog import TlogWriter
+from magbridge.mavlink import readable_by_all
 from magbridge.mavlink.dialect import MAV_SEVERITY
 from magbridge.records import Channel
 
 __all__ = ["run"]
 
 KEEP_US = 60_000_000
-"""µs between two savings of the signing time stamp; the next run adds as much to the saved one."""
+"""µs between two savings of the signing time stamps."""
 SAVE_US = 1_000_000
 """µs between two savings of parameters: each waits for the disk, and the sensor for it."""
 SWITCH = 0.0005
@@ -86,7 +87,7 @@ def run(path: Path) -> None:
     try:
         drive(pipeline, edge, log, after)
     finally:
-        keeper.save(pipeline)
+        keeper.save(pipeline, last=True)
         edge.close()
         if log is not None:
             log.close()
@@ -144,10 +145,10 @@ class LogWatch:
 
 
 class Keeper:
-    """Saves what must outlive the process: parameters set over the link, and the signing time stamp."""
+    """Saves what must outlive the process: parameters set over the link, and the signing time stamps."""
 
-    MARGIN = KEEP_US // 10
-    """Added to the saved time stamp (units of 10 µs), which may be `KEEP_US` older than the last one used."""
+    AHEAD = 2 * KEEP_US // 10
+    """Units of 10 µs for which stamps are reserved at each saving, lest the next run use them again."""
 
     def __init__(self, config: Config) -> None:
         self._tell: Callable[[bytes], None] = lambda _: None
@@ -158,7 +159,7 @@ class Keeper:
             self._kept = store.load(self._path)
         except (FormatError, OSError):  # no reason to keep a vehicle ashore
             self._kept, self._spoilt = store.Kept(), True
-        self._signs = config.link.signing_key is not None
+        self._key = config.resolve(config.link.signing_key) if config.link.signing_key else None
         self._saved_us = self._retry_us = self._revision = 0
 
     def attach(self, edge: LiveEdge) -> None:
@@ -170,26 +171,33 @@ class Keeper:
                 with suppress(OSError):
                     self._path.replace(self._path.with_name(f"{name}.damaged"))
             self._tell(states.notice(f"cannot be read, not used: {name}", MAV_SEVERITY.ERROR))
+        if self._key is not None and readable_by_all(self._key):
+            self._tell(states.notice(f"{self._key.name[-20:]}: every user can read this key"))
 
     def start(self, time_us: int) -> Start:
         """Return the start of a run at `time_us`."""
-        stamp = self._kept.signing_timestamp
-        return Start(time_us, self._kept.parameters, stamp + self.MARGIN if stamp else 0)
+        kept = self._kept
+        return Start(time_us, kept.parameters, kept.signing_timestamp, kept.signing_streams)
 
     def look(self, pipeline: Pipeline, time_us: int) -> None:
-        """Save changed parameters within `SAVE_US`, the time stamp every `KEEP_US`."""
+        """Save changed parameters within `SAVE_US`, the time stamps every `KEEP_US`."""
         revision = pipeline.component.parameters.revision
-        due = self._signs and time_us - self._saved_us > KEEP_US
+        due = self._key is not None and time_us - self._saved_us > KEEP_US
         if time_us < self._retry_us or (revision == self._revision and not due):
             return
         self._revision, self._saved_us, self._retry_us = revision, time_us, time_us + SAVE_US
         if not self.save(pipeline):
             self._revision, self._retry_us = -1, time_us + KEEP_US
 
-    def save(self, pipeline: Pipeline) -> bool:
-        """Write the file if its content has changed; return False, the old file kept, where that fails."""
-        stamp = pipeline.signing.last if pipeline.signing else 0
-        kept = store.Kept(pipeline.component.parameters.changed(), stamp)
+    def save(self, pipeline: Pipeline, *, last: bool = False) -> bool:
+        """Write the file if its content has changed; return False, the old file kept, where that fails.
+
+        At the `last` saving of a run, no stamp need be reserved for what it will yet send.
+        """
+        kept = store.Kept(pipeline.component.parameters.changed())
+        if signing := pipeline.signing:
+            stamp = signing.last if last else signing.reserved(pipeline.component.codec.utc_us, self.AHEAD)
+            kept = store.Kept(kept.parameters, stamp, signing.streams)
         if kept == self._kept:
             return True
         try:

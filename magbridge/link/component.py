@@ -24,6 +24,7 @@ from magbridge.mavlink.dialect import MAV_SEVERITY
 __all__ = ["LIMITS", "TIMESYNC_US", "Component", "check_publish"]
 
 TIMESYNC = spec("TIMESYNC")
+SETUP_SIGNING = spec("SETUP_SIGNING").number
 LIMITS = {
     "HEARTBEAT": (0.2, 10.0),
     "MAG_STATUS": (-1.0, 10.0),
@@ -171,7 +172,7 @@ class Component:
         for message in messages:
             if not message.known:
                 if message.id == REFUSED:
-                    self._tell_refusals()
+                    self._tell_refusals(message)
                 continue
             handler = self._handlers.get(message.id)
             if handler:
@@ -180,9 +181,13 @@ class Component:
                 ours.append(message)
         return ours
 
-    def _tell_refusals(self) -> None:
+    def _tell_refusals(self, message: Message) -> None:
         """Say once for each reason why frames are refused: else their sender would only seem to be away."""
-        assert self.codec.signing is not None
+        if message.frame[7:10] == SETUP_SIGNING:
+            text = f"key from {message.system}:{message.component} not taken: keys come from a file"
+            self.announcer.state("key", text, MAV_SEVERITY.WARNING)
+        if self.codec.signing is None:
+            return
         refusals = list(self.codec.signing.refusals.items())
         for why, (system, component) in refusals[self._refusals_told :]:
             text = f"frames of {system}:{component} refused: {why}"

@@ -1,4 +1,4 @@
-"""What outlives the process: parameters that a station changed, and the last signing time stamp."""
+"""What outlives the process: parameters that a station changed, and the time stamps of signed streams."""
 
 from __future__ import annotations
 
@@ -15,6 +15,9 @@ from magbridge.files import atomic_path
 __all__ = ["Kept", "load", "save"]
 
 
+Byte = Annotated[int, Meta(ge=0, le=255)]
+
+
 class Kept(msgspec.Struct, frozen=True):
     """The contents of the file.
 
@@ -23,11 +26,14 @@ class Kept(msgspec.Struct, frozen=True):
     parameters : dict of str to float
         Values that differ from the configuration's.
     signing_timestamp : int
-        The last that was used (10 µs since 2015-01-01); 48 bits on the link, and a margin is added to it.
+        The last that may have been used (10 µs since 2015-01-01); 48 bits on the link.
+    signing_streams : list of Stream
+        The last time stamp accepted of each stream.
     """
 
     parameters: dict[str, Annotated[float, Meta(ge=-3e38, le=3e38)]] = {}
     signing_timestamp: Annotated[int, Meta(ge=0, lt=1 << 47)] = 0
+    signing_streams: list[tuple[Byte, Byte, Byte, bool, Annotated[int, Meta(ge=0, lt=1 << 48)]]] = []
 
 
 def load(path: str | Path) -> Kept:

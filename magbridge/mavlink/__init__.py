@@ -4,23 +4,27 @@ from __future__ import annotations
 
 from magbridge.mavlink.codec import Codec
 from magbridge.mavlink.messages import BAD_DATA, REFUSED, Message, Spec, spec
-from magbridge.mavlink.signing import Signing, load_key
+from magbridge.mavlink.secrets import SECRET
+from magbridge.mavlink.signing import Signing, Stream, load_key, readable_by_all
 from magbridge.mavlink.tape import TapeReader, TapeWriter
 from magbridge.mavlink.tlog import LogReader, Record, pack_record, pack_records
 
 __all__ = [
     "BAD_DATA",
     "REFUSED",
+    "SECRET",
     "Codec",
     "LogReader",
     "Message",
     "Record",
     "Signing",
     "Spec",
+    "Stream",
     "TapeReader",
     "TapeWriter",
     "load_key",
     "pack_record",
     "pack_records",
+    "readable_by_all",
     "spec",
 ]

@@ -6,6 +6,7 @@ from typing import Any, Final
 
 from magbridge.mavlink.framing import MORE, find_magic, frame_end, join, message
 from magbridge.mavlink.messages import BAD_DATA, REFUSED, Message, Spec, spec
+from magbridge.mavlink.secrets import SECRET, without_secret
 from magbridge.mavlink.signing import Signing
 
 __all__ = ["WINDOW", "Codec"]
@@ -53,13 +54,20 @@ class Codec:
         """Bytes that came but are not yet in any message."""
         return self._rest
 
-    def parse(self, data: bytes) -> list[Message]:
+    def parse(self, data: bytes, *, whole: bool = False) -> list[Message]:
         """Take bytes as they come; return the messages that are complete with them.
 
         Any bytes, however cut, give the same messages. Bytes that belong to no frame come back as a
         message of id `BAD_DATA` just before the message that ended them (or every `WINDOW` bytes), so
         that a log which keeps every ``frame`` keeps every byte. A frame whose signature is not accepted
-        has the id `REFUSED`.
+        has the id `REFUSED`, as has one that carries a secret, which is not kept.
+
+        Parameters
+        ----------
+        data : bytes
+            As they came.
+        whole : bool
+            No frame goes on in what comes next: what is left over belongs to none.
         """
         data = self._rest + data
         found: list[Message] = []
@@ -67,15 +75,16 @@ class Codec:
         while begin < len(data):
             stop = min(len(data), begin + WINDOW)
             start = find_magic(data, at, stop)
-            end = frame_end(data, start, stop) if start < stop else MORE
+            last = whole and stop == len(data)
+            end = frame_end(data, start, stop, last=last) if start < stop else MORE
             if end > 0:
                 if begin < start:
                     found.append(self._skip(data[begin:start]))
                 found.append(self._accept(message(data[start:end])))
                 begin = at = end
-            elif end != MORE:
+            elif end != MORE or (last and start < stop):
                 at = start + 1
-            elif stop == begin + WINDOW:
+            elif stop == begin + WINDOW or last:
                 found.append(self._skip(data[begin:stop]))
                 begin = at = stop
             else:
@@ -101,7 +110,16 @@ class Codec:
         self.bytes_skipped += len(data)
         return Message(BAD_DATA, 0, 0, 0, b"", data, known=False)
 
+    def skip(self, count: int) -> None:
+        """Go on as if `count` frames had been sent: a replay does not have these frames."""
+        self.sequence = self.sequence + count & 0xFF
+        if self.signing:
+            self.signing.skip(count, self.utc_us)
+
     def _accept(self, one: Message) -> Message:
+        if one.id in SECRET:
+            frame = without_secret(one.frame)
+            return Message(REFUSED, one.system, one.component, one.sequence, b"", frame, known=False)
         if self.signing and not self.signing.accept(
             one.frame, (one.system, one.component), one.id, self.utc_us
         ):

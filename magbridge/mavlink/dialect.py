@@ -256,6 +256,8 @@ MESSAGES: dict[int, tuple[str, int, str]] = {
     387: ("CANFD_FRAME", 4, "I:id::,B:target_system::,B:target_component::,B:bus::,B:len::,64B:data::"),
     388: ("CAN_FILTER_MODIFY", 8, "16H:ids::,B:target_system::,B:target_component::,B:bus::,B:operation::,B:num_ids::"),
     390: ("ONBOARD_COMPUTER_STATUS", 156, "Q:time_usec:us:,I:uptime:ms:,I:ram_usage:MiB:4294967295,I:ram_total:MiB:4294967295,4I:storage_type::4294967295,4I:storage_usage:MiB:4294967295,4I:storage_total:MiB:4294967295,6I:link_type::,6I:link_tx_rate:KiB/s:4294967295,6I:link_rx_rate:KiB/s:4294967295,6I:link_tx_max:KiB/s:4294967295,6I:link_rx_max:KiB/s:4294967295,4h:fan_speed:rpm:32767,B:type::,8B:cpu_cores::255,10B:cpu_combined::255,4B:gpu_cores::255,10B:gpu_combined::255,b:temperature_board:degC:127,8b:temperature_core:degC:127,H:status_flags::"),
+    396: ("COMPONENT_INFORMATION_BASIC", 50, "Q:capabilities::,I:time_boot_ms:ms:,I:time_manufacture_s:s:0,32s:vendor_name::,32s:model_name::,24s:software_version::,24s:hardware_version::,32s:serial_number::"),
+    397: ("COMPONENT_METADATA", 182, "I:time_boot_ms:ms:,I:file_crc::,100s:uri::"),
     420: ("RADIO_RC_CHANNELS", 20, "I:time_last_update_ms:ms:,H:flags::,B:target_system::,B:target_component::,B:count::,32h:channels::"),
     435: ("AVAILABLE_MODES", 134, "I:custom_mode::,I:properties::,B:number_modes::,B:mode_index::,B:standard_mode::,35s:mode_name::"),
     436: ("CURRENT_MODE", 193, "I:custom_mode::,I:intended_custom_mode::0,B:standard_mode::"),
@@ -367,6 +369,8 @@ MESSAGES: dict[int, tuple[str, int, str]] = {
     60107: ("MAG_CLOCK_STEP", 81, "Q:time_usec:us:,q:step:us:"),
     60108: ("MAG_PORT", 171, "Q:time_usec:us:,I:dropped:bytes:,B:port::,B:state::,80s:reason::"),
     60109: ("MAG_COLUMN", 112, "d:scale::,d:offset::,16s:unit::,44s:message::,40s:field::,64s:match::,64s:column::"),
+    60120: ("MAG_SIGNING_STREAM", 216, "Q:stamp::,B:link::,B:system::,B:sender::,B:ahead::"),
+    60121: ("MAG_BESIDE", 49, "H:count::"),
 }
 
 
@@ -431,6 +435,13 @@ class MAV_CMD(IntEnum):
     REQUEST_PROTOCOL_VERSION = 519
     REQUEST_AUTOPILOT_CAPABILITIES = 520
     EXTERNAL_POSITION_ESTIMATE = 43003
+    PREFLIGHT_CALIBRATION = 241
+    FIXED_MAG_CAL = 42004
+    FIXED_MAG_CAL_FIELD = 42005
+    FIXED_MAG_CAL_YAW = 42006
+    DO_START_MAG_CAL = 42424
+    DO_ACCEPT_MAG_CAL = 42425
+    DO_CANCEL_MAG_CAL = 42426
 
 
 class MAV_ESTIMATOR_TYPE(IntEnum):
@@ -450,7 +461,9 @@ class MAV_PARAM_TYPE(IntEnum):
 class MAV_PROTOCOL_CAPABILITY(IntEnum):
     PARAM_FLOAT = 2
     COMMAND_INT = 8
+    FTP = 32
     MAVLINK2 = 8192
+    PARAM_ENCODE_C_CAST = 131072
 
 
 class MAV_RESULT(IntEnum):

@@ -13,6 +13,7 @@ from collections.abc import Iterable
 from magbridge.mavlink.codec import Codec
 from magbridge.mavlink.framing import message
 from magbridge.mavlink.messages import BAD_DATA, Message, spec
+from magbridge.mavlink.secrets import without_secrets
 
 __all__ = ["TapeReader", "TapeWriter"]
 
@@ -39,6 +40,7 @@ class TapeWriter:
         return frames + self._wrap(pending, ahead=1) if in_doubt else frames
 
     def _wrap(self, data: bytes, ahead: int) -> list[bytes]:
+        data = without_secrets(data)
         pieces = [data[i : i + SIZE] for i in range(0, len(data), SIZE)]
         return [
             self._codec.pack(WRAPPER.name, ahead=ahead, length=len(piece), data=piece) for piece in pieces

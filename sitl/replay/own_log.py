@@ -9,13 +9,15 @@ from pathlib import Path
 from magbridge.bridge.events import Event, Start
 from magbridge.errors import FormatError
 from magbridge.link.component import TIMESYNC_US
-from magbridge.mavlink import LogReader, Record, TapeReader, spec
+from magbridge.mavlink import LogReader, Record, Stream, TapeReader, spec
 from magbridge.records import Channel
 
 __all__ = ["Recorded", "is_own_log", "runs"]
 
-BEGIN, PARAMETER, COLUMN = (spec(name).id for name in ("MAG_BRIDGE_START", "PARAM_VALUE", "MAG_COLUMN"))
-NOT_EVENTS = (BEGIN, PARAMETER, COLUMN, spec("MAG_RAW").id)
+BEGIN, PARAMETER, STREAM, COLUMN = (
+    spec(name).id for name in ("MAG_BRIDGE_START", "PARAM_VALUE", "MAG_SIGNING_STREAM", "MAG_COLUMN")
+)
+NOT_EVENTS = (BEGIN, PARAMETER, STREAM, COLUMN, spec("MAG_RAW").id)
 """State records that a bridge writes for readers of the log, and that a replay does not need."""
 
 
@@ -76,17 +78,23 @@ class Recorded:
         if first is None or first.message.id != BEGIN:
             raise FormatError(paths[0], "expected the log of a bridge, from its start")
         parameters: dict[str, float] = {}
+        streams: list[Stream] = []
         for record in records:
-            if record.channel == Channel.STATE and record.message.id == COLUMN:
+            one = record.message
+            if record.channel == Channel.STATE and one.id == COLUMN:
                 continue  # repeated in every file, for readers
-            if record.channel != Channel.STATE or record.message.id != PARAMETER:
+            if record.channel == Channel.STATE and one.id == STREAM:
+                ahead = bool(one["ahead"])
+                streams.append((one["link"], one["system"], one["sender"], ahead, one["stamp"]))
+                continue
+            if record.channel != Channel.STATE or one.id != PARAMETER:
                 break
-            parameters[record.message["param_id"]] = record.message["param_value"]
+            parameters[one["param_id"]] = one["param_value"]
         self.config_digest = first.message["config_digest"].hex()
         late_us = first.time_us - first.message["time_usec"]
         self.late = late_us * 1e-6
         start_us = first.time_us - late_us % TIMESYNC_US
-        self.start = Start(start_us, parameters, first.message["signing_timestamp"])
+        self.start = Start(start_us, parameters, first.message["signing_timestamp"], streams)
 
     def _records(self) -> Iterator[Record]:
         for path in self._paths:

@@ -13,7 +13,7 @@ from magbridge.config import Telemetry
 from magbridge.errors import ConfigError
 from magbridge.link import TelemetryMap
 from magbridge.link.clock import VehicleClock
-from magbridge.mavlink import Codec, LogReader
+from magbridge.mavlink import SECRET, Codec, LogReader
 from magbridge.mavlink.dialect import MESSAGES
 from magbridge.mavlink.messages import spec
 
@@ -126,7 +126,7 @@ def test_mistakes_are_one_clear_line(what: Telemetry, complaint: str) -> None:
 
 
 def test_every_numeric_field_of_every_message_maps() -> None:
-    for number in MESSAGES:
+    for number in MESSAGES.keys() - SECRET:
         layout = spec(number)
         telemetry = {
             name: Telemetry(layout.name, f"{name}[{field.count - 1}]" if field.count else name)

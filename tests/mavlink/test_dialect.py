@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import all as everything
 
-from magbridge.mavlink import Codec, spec
+from magbridge.mavlink import SECRET, Codec, spec
 from magbridge.mavlink.dialect import MAG_QUALITY, MESSAGES
 from magbridge.mavlink.messages import Field
 from magbridge.records import Quality
@@ -80,7 +80,7 @@ def test_every_message_has_the_bytes_that_pymavlink_gives_it(peer: ModuleType, d
 def test_every_message_reads_as_pymavlink_reads_it() -> None:
     rng = random.Random(8)
     codec = Codec(1, 191)
-    for number in everything.mavlink_map:
+    for number in everything.mavlink_map.keys() - SECRET:
         layout = spec(number)
         sent = {name: draw(field, rng)[0] for name, field in layout.fields.items()}
         frame = codec.pack(layout.name, **sent)

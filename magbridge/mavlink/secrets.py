@@ -1,0 +1,43 @@
+"""Messages that carry a secret: what is kept of them, in a log or in memory, is that they came.
+
+The bridge takes no key or password over the link, so nobody needs what is in these messages.
+"""
+
+from __future__ import annotations
+
+import re
+
+from fastcrc.crc16 import mcrf4xx
+
+from magbridge.mavlink.messages import spec
+
+__all__ = ["SECRET", "without_secret", "without_secrets"]
+
+SECRET = frozenset(
+    spec(name).id for name in ("SETUP_SIGNING", "AUTH_KEY", "CHANGE_OPERATOR_CONTROL", "WIFI_CONFIG_AP")
+)
+"""Ids of the messages with a key, a passkey or a password in them."""
+HEADER = re.compile(
+    rb"\xfd.{6}(?:" + b"|".join(re.escape(number.to_bytes(3, "little")) for number in SECRET) + rb")",
+    re.DOTALL,
+)
+V2 = 0xFD
+
+
+def without_secret(frame: bytes) -> bytes:
+    """Return a frame of such a message with zeros for its payload, and the checksum that belongs to it."""
+    head = 10 if frame[0] == V2 else 6
+    number = int.from_bytes(frame[7:10], "little") if head == 10 else frame[5]
+    body = frame[1:head] + bytes(frame[1])
+    checksum = mcrf4xx(body + bytes((spec(number).extra,)))
+    end = head + frame[1]
+    return frame[:1] + body + checksum.to_bytes(2, "little") + frame[end + 2 :]
+
+
+def without_secrets(data: bytes) -> bytes:
+    """Return bytes that are no whole frame, with zeros wherever the payload of such a message may be."""
+    for match in HEADER.finditer(data):
+        begin = match.end()
+        end = min(begin + data[match.start() + 1], len(data))
+        data = data[:begin] + bytes(end - begin) + data[end:]
+    return data
