@@ -38,6 +38,20 @@ class MagbridgeError(Exception):
 
     exit_code = 1
 
+    def __reduce__(self) -> tuple[object, ...]:
+        """Pickle the values, too: the sentence in ``args`` is not what the constructor takes."""
+        return _rebuilt, (type(self), self.args, self.__dict__)
+
+
+def _rebuilt(
+    kind: type[MagbridgeError], args: tuple[object, ...], values: dict[str, object]
+) -> MagbridgeError:
+    """Return a pickled error as it was."""
+    error = kind.__new__(kind, *args)
+    error.args = args
+    error.__dict__.update(values)
+    return error
+
 
 class WrongUse(MagbridgeError):
     """The request itself is wrong, whatever the data."""

@@ -45,6 +45,15 @@ def real_data() -> Path:
 
 
 @pytest.fixture(scope="session")
+def cases() -> Path:
+    """Folder of inputs on which the program once failed, kept beside the measured data."""
+    folder = Path(__file__).parents[2] / "shared" / "cases"
+    if not folder.is_dir():
+        pytest.skip("no failing inputs in ../shared/cases")
+    return folder
+
+
+@pytest.fixture(scope="session")
 def peer() -> ModuleType:
     """Our dialect as a ground station has it: classes that pymavlink's mavgen makes from our XML."""
     return classes()

@@ -37,6 +37,7 @@ from typing import TYPE_CHECKING, Any, Self
 from magbridge.columns import require
 from magbridge.errors import FormatError
 from magbridge.files import atomic_path
+from magbridge.guard import guarded
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -59,6 +60,8 @@ FORMATS = {
     **READ_ONLY,
 }
 """Suffix to module."""
+GUARDED = {".nc", ".parquet", ".ulg", *FLIGHT, *FLIGHT.values()}
+"""Formats that other libraries read, which damage may hang or crash: they are read in a child process."""
 
 Paths = str | os.PathLike[str] | Sequence[str | os.PathLike[str]]
 
@@ -107,12 +110,17 @@ def _with_flight(path: Path, given: Sequence[Path]) -> bool:
 def _chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
     if not path.stat().st_size:
         raise FormatError(path, "expected a log, the file is empty")
+    parts = partial(_module(path).chunks, path, rows)
+    none = True
     try:
-        for part in _module(path).chunks(path, rows):
+        for part in guarded(path, parts) if path.suffix.lower() in GUARDED else parts():
+            none = False
             source = str(part.attrs["source"])
             if source != path.name:
                 source = f"{path.name} ({_origin(source)})"
             yield part.assign_attrs(source=source)
+        if none:
+            raise FormatError(path, "expected rows, there are none")
     except OSError as error:
         raise FormatError(path, f"cannot be read: {error.strerror or error}") from error
 

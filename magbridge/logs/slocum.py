@@ -27,6 +27,7 @@ from magbridge.logs import FLIGHT
 from magbridge.logs.checks import increasing
 from magbridge.logs.deployment import deployment, sliced
 from magbridge.logs.resample import CIRCLES, linear
+from magbridge.logs.slocum_header import check_header
 
 __all__ = ["chunks"]
 
@@ -114,6 +115,7 @@ def _read(path: Path | None) -> dict[str, tuple[FloatArray, FloatArray]]:
     """Return time and values of each of :data:`SENSORS` in the file, at its updates."""
     if path is None:
         return {}
+    check_header(path)
     # dbdreader writes the list of sensors where it looks for it
     with tempfile.TemporaryDirectory() as scratch:
         for cache in [*path.parent.glob("*.cac"), *path.parent.glob("*.CAC")]:

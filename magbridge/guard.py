@@ -1,0 +1,183 @@
+"""A damaged file read where it can be ended: in a child process with limits on time and memory.
+
+A library that was written for whole files may never end on a damaged one, ask for all memory or crash, and
+take the process with it. In a child, each of these is an error that names the file. What was read comes back
+through a pipe, piece by piece; for a whole file that costs the fork and one copy.
+"""
+
+from __future__ import annotations
+
+import faulthandler
+import multiprocessing
+import os
+import signal
+import sys
+import traceback
+import warnings
+from collections.abc import Callable, Iterable, Iterator
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
+
+from magbridge.errors import FormatError, MagbridgeError
+
+if sys.platform != "win32":
+    import resource
+
+__all__ = ["guarded"]
+
+T = TypeVar("T")
+
+SECONDS, PER_MEGABYTE = 8.0, 0.2
+"""s of processor time for a file, and for each MB of it: reading any format takes a tenth of that."""
+MEMORY, PER_BYTE = 500_000_000, 50
+"""Bytes of memory for a file, and for each byte of it: compressed, a log may be thirty times smaller."""
+RESERVED = 8_000_000_000
+"""Bytes of address space beyond that: dbdreader asks for a GB, and uses little of it."""
+POLL = 0.1
+"""s between two looks at a child's memory."""
+TOO_LARGE = "asks for far more memory than its size allows: damaged"
+WAIT = 10.0
+"""Wall-clock over processor time after which a child counts as stuck: disks and other processes are slow."""
+
+
+class Raised(NamedTuple):
+    """An error on its way to the parent: what makes it anew, from what."""
+
+    rebuild: Callable[..., BaseException]
+    arguments: tuple[Any, ...]
+
+
+def guarded(path: Path, read: Callable[[], Iterable[T]]) -> Iterator[T]:
+    """Yield what ``read()`` yields, run in a child process that ends where the file lets it run away.
+
+    Parameters
+    ----------
+    path : Path
+        The file that `read` reads: its size sets the limits.
+    read : callable
+        Returns an iterable of objects that can be pickled.
+
+    Raises
+    ------
+    FormatError
+        The file makes its reader fail in a way that nobody foresaw, crash, need more than 8 s of processor
+        time and 0.2 s a MB, or more than 500 MB of memory and 50 times its size.
+    MagbridgeError, OSError
+        As `read` raises them.
+
+    Notes
+    -----
+    Where there is no fork (Windows), or a process may have no children (a worker of a pool), it is read
+    here: then a crash ends the process, and nothing limits the time.
+    """
+    if sys.platform == "win32" or multiprocessing.current_process().daemon:
+        yield from _foreseen(path, read)
+        return
+    size = path.stat().st_size if path.is_file() else 0
+    seconds = round(SECONDS + PER_MEGABYTE * size / 1e6)
+    memory = MEMORY + PER_BYTE * size
+    used = _memory()[1]
+    context = multiprocessing.get_context("fork")
+    pieces, end = context.Pipe(duplex=False)
+    child = context.Process(target=_send, args=(end, path, read, seconds, memory), daemon=True)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # of a fork beside threads: the child uses none
+        child.start()
+    end.close()
+    try:
+        while True:
+            _await(pieces, path, child.pid, WAIT * seconds, used + memory)
+            try:
+                done, piece = pieces.recv()
+            except EOFError:
+                child.join()
+                raise FormatError(path, _ended_by(child.exitcode or 0, seconds)) from None
+            if isinstance(piece, Raised):
+                raise piece.rebuild(*piece.arguments)
+            if done:
+                return
+            yield piece
+    finally:
+        child.kill()
+        child.join()
+        pieces.close()
+
+
+def _await(pieces: Connection, path: Path, process: int | None, seconds: float, memory: int) -> None:
+    """Wait for a piece from `process`, at most `seconds` and while it uses no more than `memory` bytes."""
+    waited = 0.0
+    while not pieces.poll(POLL):
+        waited += POLL
+        if waited > seconds:
+            raise FormatError(path, f"takes longer than {seconds:.0f} s to read: damaged")
+        if _memory(process)[1] > memory:
+            raise FormatError(path, TOO_LARGE)
+
+
+def _foreseen(path: Path, read: Callable[[], Iterable[T]]) -> Iterator[T]:
+    """Yield what ``read()`` yields; what nobody foresaw that it might raise becomes a FormatError."""
+    try:
+        yield from read()
+    except (MagbridgeError, OSError):
+        raise
+    except MemoryError as error:
+        raise FormatError(path, TOO_LARGE) from error
+    except Exception as error:
+        # whatever a library raises on bytes that it was not made for; the traceback goes with the error
+        first = next(iter(str(error).splitlines()), "")
+        damaged = FormatError(path, f"cannot be read, damaged? {type(error).__name__}: {first}"[:300])
+        damaged.add_note(traceback.format_exc())
+        raise damaged from error
+
+
+def _send(end: Connection, path: Path, read: Callable[[], Iterable[Any]], seconds: int, memory: int) -> None:
+    """Read in the child, and send (False, piece) for each, then (True, None), or (True, Raised)."""
+    faulthandler.disable()
+    silent = os.open(os.devnull, os.O_WRONLY)
+    for stream in (1, 2):  # HDF5 and dbdreader print what they find
+        os.dup2(silent, stream)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends the child
+    for number in (signal.SIGTERM, signal.SIGXCPU):
+        signal.signal(number, signal.SIG_DFL)
+    _limit(seconds, memory)
+    try:
+        for piece in _foreseen(path, read):
+            end.send((False, piece))
+        end.send((True, None))
+    except BrokenPipeError:  # the parent wants no more
+        pass
+    except (MagbridgeError, OSError) as error:
+        how = error.__reduce__()
+        assert isinstance(how, tuple)
+        end.send((True, Raised(*how[:2])))  # not the error itself: other packages pickle its causes with it
+
+
+def _limit(seconds: int, memory: int) -> None:
+    """Limit this process to `seconds` of processor time and `memory` bytes beyond what it has."""
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    _lower(resource.RLIMIT_CPU, seconds)
+    if size := _memory()[0]:
+        _lower(resource.RLIMIT_AS, size + memory + RESERVED)
+
+
+def _memory(process: int | str | None = "self") -> tuple[int, int]:
+    """Return the bytes of address space and of memory of a process; 0 where the system does not tell."""
+    try:
+        size, resident = Path(f"/proc/{process}/statm").read_text().split()[:2]
+    except OSError:
+        return 0, 0
+    return int(size) * resource.getpagesize(), int(resident) * resource.getpagesize()
+
+
+def _lower(kind: int, limit: int) -> None:
+    _, most = resource.getrlimit(kind)
+    resource.setrlimit(kind, (limit if most == resource.RLIM_INFINITY else min(limit, most), most))
+
+
+def _ended_by(code: int, seconds: int) -> str:
+    """Return what was wrong with a file whose child ended with this exit code."""
+    if code == -signal.SIGXCPU:
+        return f"takes longer than {seconds} s of processor time to read: damaged"
+    name = signal.Signals(-code).name if code < 0 else f"exit code {code}"
+    return f"damaged: it crashes the library that reads it ({name})"

@@ -1,0 +1,59 @@
+"""Damage that once hung or crashed a reader: a result, or one line that names the file."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from magbridge.errors import FormatError
+from magbridge.logs import read
+
+pq = pytest.importorskip("pyarrow.parquet")
+pa = pytest.importorskip("pyarrow")
+
+
+def test_a_parquet_file_without_rows(tmp_path: Path) -> None:
+    names = ["time", "mag_x", "mag_y", "mag_z"]
+    schema = pa.schema([(name, pa.float64()) for name in names])
+    pq.ParquetWriter(tmp_path / "a.parquet", schema).close()
+    with pytest.raises(FormatError, match="expected rows, there are none"):
+        read(tmp_path / "a.parquet")
+
+
+def test_a_slocums_header_that_is_cut_off(tmp_path: Path) -> None:
+    path = tmp_path / "a.dbd"
+    path.write_bytes(b"dbd_label:    DBD(dinkum_binary_data)file\n")
+    with pytest.raises(FormatError, match="the header is cut off"):
+        read(path)
+    path.write_bytes(
+        b"dbd_label:    DBD(dinkum_binary_data)file\nencoding_ver:    5\nnum_ascii_tags:    14\n"
+    )
+    with pytest.raises(FormatError, match="the header is cut off"):
+        read(path)
+
+
+def test_a_damaged_list_of_sensors_is_named(real_data: Path, tmp_path: Path) -> None:
+    for name in ("comet-2016-174-05-003.dbd", "11d38bfd.cac"):
+        shutil.copy(real_data / "slocum_comet" / name, tmp_path)
+    cache = tmp_path / "11d38bfd.cac"
+    lines = cache.read_bytes().splitlines(keepends=True)
+    lines[1618] = b"s: T 1618 1618 99999999999999999999999 u\n"
+    cache.chmod(0o644)
+    cache.write_bytes(b"".join(lines))
+    with pytest.raises(FormatError, match=r"11d38bfd\.cac: row 1619: expected a sensor"):
+        read(tmp_path / "comet-2016-174-05-003.dbd")
+
+
+@pytest.mark.parametrize("name", ["no_row_group.parquet", "attribute.nc", "hangs.ulg", "short.dbd"])
+def test_files_that_once_failed(cases: Path, name: str) -> None:
+    """A result, or one line: within 10 s of processor time."""
+    path = cases / "files" / name
+    said = f"{path}: "
+    try:
+        assert read(path).sizes["time"] > 0
+    except FormatError as error:
+        said = str(error)
+    assert said.startswith(f"{path}: ")
+    assert "\n" not in said

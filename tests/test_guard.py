@@ -1,0 +1,121 @@
+"""A reader that hangs, crashes or asks for all memory ends in one line; a whole file is read as ever."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from magbridge import guard
+from magbridge.errors import FormatError, MissingExtra
+from magbridge.guard import guarded
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    path = tmp_path / "log.x"
+    path.write_bytes(bytes(1000))
+    return path
+
+
+def hangs() -> Iterator[int]:
+    yield 1
+    while True:
+        pass
+
+
+def crashes() -> Iterator[int]:
+    yield 1
+    os.kill(os.getpid(), signal.SIGSEGV)
+
+
+def hoards() -> Iterator[int]:
+    yield 1
+    yield len(bytearray(10**11))
+
+
+def swells() -> Iterator[int]:
+    yield 1
+    whole = [b"x" * 10**8 for _ in range(20)]
+    yield len(whole)
+
+
+def stumbles() -> Iterator[int]:
+    yield 1
+    yield int("no number\nat all")
+
+
+def test_what_is_read_comes_back_in_pieces(file: Path) -> None:
+    pieces = list(guarded(file, lambda: (np.full(3, k) for k in range(4))))
+    np.testing.assert_array_equal(pieces, [[k] * 3 for k in range(4)])
+
+
+@pytest.mark.parametrize(
+    ("read", "words"),
+    [
+        (hangs, "takes longer than 1 s of processor time to read: damaged"),
+        (crashes, r"damaged: it crashes the library that reads it \(SIGSEGV\)"),
+        (hoards, "asks for far more memory than its size allows: damaged"),
+        (swells, "asks for far more memory than its size allows: damaged"),
+        (stumbles, r"cannot be read, damaged\? ValueError: invalid literal"),
+    ],
+)
+def test_one_line_whatever_happens(
+    file: Path, monkeypatch: pytest.MonkeyPatch, read: Callable[[], Iterator[int]], words: str
+) -> None:
+    monkeypatch.setattr(guard, "SECONDS", 1.0)
+    pieces = guarded(file, read)
+    assert next(pieces) == 1
+    with pytest.raises(FormatError, match=words) as caught:
+        next(pieces)
+    assert str(caught.value).startswith(f"{file}: ")
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        FormatError("a.nc", "expected a number", row=3, column="x"),
+        MissingExtra("pyulog", "formats"),
+        OSError(5, "Input/output error", "a.nc"),
+    ],
+)
+def test_an_error_comes_back_with_its_values(file: Path, error: Exception) -> None:
+    def fails() -> Iterator[int]:
+        yield 1
+        raise error
+
+    with pytest.raises(type(error)) as caught:
+        list(guarded(file, fails))
+    assert str(caught.value) == str(error)
+    assert vars(caught.value) == vars(error)
+
+
+def test_who_reads_no_further_leaves_no_process(file: Path) -> None:
+    def endless() -> Iterator[int]:
+        while True:
+            yield os.getpid()
+
+    pieces = guarded(file, endless)
+    child = next(pieces)
+    assert child != os.getpid()
+    pieces.close()  # type: ignore[attr-defined]  # it is a generator
+    with pytest.raises(ProcessLookupError):
+        os.kill(child, 0)
+
+
+def test_a_child_that_waits_for_ever_is_ended(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(guard, "SECONDS", 1.0)
+    monkeypatch.setattr(guard, "WAIT", 0.2)
+
+    def sleeps() -> Iterator[int]:
+        time.sleep(60.0)
+        yield 1
+
+    with pytest.raises(FormatError, match="takes longer than"):
+        list(guarded(file, sleeps))
