@@ -165,8 +165,8 @@ class Navigation(Table, frozen=True):
     map : str
         The anomaly grid.
     fix : str
-        In which message a fix goes to the autopilot: ``EXTERNAL_POSITION_ESTIMATE`` or ``ODOMETRY``
-        (ArduPilot), ``GLOBAL_POSITION_SENSOR`` or ``ODOMETRY`` (PX4).
+        In which message a fix goes to the autopilot: ``EXTERNAL_POSITION_ESTIMATE`` (ArduPilot and PX4),
+        ``ODOMETRY`` (ArduPilot) or ``GLOBAL_POSITION_SENSOR`` (PX4).
     rate : float
         Hz of the fixes, dead-reckoned between updates; 0 is with each update. Default 5 for
         ``ODOMETRY``, else 0.

@@ -24,13 +24,14 @@ INCLUDED = "all.xml"
 """More than our own messages: any that an autopilot sends can become a parameter, and is in logs."""
 ENUMS: dict[str, tuple[str, ...]] = {
     "FIRMWARE_VERSION_TYPE": ("OFFICIAL",),
+    "GLOBAL_POSITION_SRC": ("MAGNETIC",),
     "MAG_LOG_STATE": (),
     "MAG_NAVIGATION_STATE": (),
     "MAG_PORT_NAME": (),
     "MAG_PORT_STATE": (),
     "MAG_QUALITY": (),
     "MAG_RAW_FLAGS": (),
-    "MAV_AUTOPILOT": ("GENERIC", "INVALID"),
+    "MAV_AUTOPILOT": ("GENERIC", "ARDUPILOTMEGA", "INVALID", "PX4"),
     "MAV_CMD": (
         "GET_MESSAGE_INTERVAL",
         "SET_MESSAGE_INTERVAL",
@@ -46,8 +47,8 @@ ENUMS: dict[str, tuple[str, ...]] = {
         "DO_ACCEPT_MAG_CAL",
         "DO_CANCEL_MAG_CAL",
     ),
-    "MAV_ESTIMATOR_TYPE": ("NAIVE",),
-    "MAV_FRAME": ("GLOBAL", "LOCAL_NED", "BODY_FRD"),
+    "MAV_ESTIMATOR_TYPE": ("VISION",),
+    "MAV_FRAME": ("GLOBAL", "LOCAL_NED", "BODY_FRD", "LOCAL_FRD"),
     "MAV_PARAM_TYPE": ("REAL32",),
     "MAV_PROTOCOL_CAPABILITY": ("PARAM_FLOAT", "COMMAND_INT", "FTP", "MAVLINK2", "PARAM_ENCODE_C_CAST"),
     "MAV_RESULT": (),

@@ -40,12 +40,12 @@ def set_up(config: Config, start: Start) -> Pipeline:
     if config.calibration is not None:
         calibration = calibration_file.load(config.resolve(config.calibration.file))
     key = load_key(config.resolve(config.link.signing_key)) if config.link.signing_key else None
-    pipeline = Pipeline(config, calibration, start, key)
+    navigate = None
     if config.navigation is not None:
         from magbridge.bridge.navigation import open_navigation  # noqa: PLC0415 - it brings filterpy
 
-        pipeline.navigation = open_navigation(config, pipeline.component, calibration)
-    return pipeline
+        navigate = open_navigation(config, config.navigation, calibration)
+    return Pipeline(config, calibration, start, key, navigate)
 
 
 def drive(pipeline: Pipeline, edge: Edge, log: TlogWriter | None, after: Callable[[int], None]) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from glob import has_magic
 from math import nan
 from typing import TYPE_CHECKING, Final
@@ -55,6 +55,8 @@ class Pipeline:
     start : Start
     key : bytes or None
         The signing key.
+    navigate : callable or None
+        Makes the navigation of ``[navigation]`` for the component that it is to speak through.
 
     Attributes
     ----------
@@ -65,7 +67,6 @@ class Pipeline:
     sensor : SensorLine
         Holds the commands that are to be sent to the sensor.
     navigation : Navigation or None
-        To be set before the first event, where the configuration has ``[navigation]``.
 
     Raises
     ------
@@ -75,7 +76,12 @@ class Pipeline:
     """
 
     def __init__(
-        self, config: Config, calibration: Calibration | None, start: Start, key: bytes | None = None
+        self,
+        config: Config,
+        calibration: Calibration | None,
+        start: Start,
+        key: bytes | None = None,
+        navigate: Callable[[Component], Navigation] | None = None,
     ) -> None:
         self._config, self._start = config, start
         self._driver = open_driver(config.sensor.driver, config.sensor.options, config.path)
@@ -114,7 +120,7 @@ class Pipeline:
         )
         self._changes = Changes(self.component.codec, self.component.announcer, self.sensor)
         self.journal = Journal(config.link.system, config.link.component, active=config.log is not None)
-        self.navigation: Navigation | None = None
+        self.navigation = navigate(self.component) if navigate else None
         self._raw_rate = self.component.rates["MAG_RAW"]
         self._position = Position(self._tell_no_anomaly)
         self._samples = self._lost = self._quality = 0

@@ -1,54 +1,87 @@
-"""A position fix, in the message that the navigation stack takes."""
+"""A position fix, in the messages that autopilots take as one: each as the receiver's own source asks for it.
+
+What a receiver does with a field is said beside the field, with the file that does it: ArduPilot's of
+December 2025, PX4's of August 2026.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from math import isfinite, nan
+from math import inf, nan
 from typing import Any, NamedTuple
 
 import msgspec
 
 from magbridge.field.geodesy import worse_axis
 from magbridge.link.outbox import Outbox
-from magbridge.mavlink.dialect import MAV_CMD, MAV_ESTIMATOR_TYPE, MAV_FRAME
+from magbridge.mavlink.dialect import (
+    GLOBAL_POSITION_SRC,
+    MAV_AUTOPILOT,
+    MAV_CMD,
+    MAV_ESTIMATOR_TYPE,
+    MAV_FRAME,
+)
+from magbridge.mavlink.messages import east_e7
 
-__all__ = ["FIXES", "Fix", "Kind"]
+__all__ = ["FIXES", "SENSOR_ID", "Fix", "Kind", "Pose", "widened"]
 
-UNKNOWN_SOURCE = 0
-"""GLOBAL_POSITION_UNKNOWN"""
+SENSOR_ID = 1
+"""GLOBAL_POSITION_SENSOR.id; PX4 takes the one that ``EKF2_AGPn_ID`` names, and 0 is off."""
 LATITUDE_LONGITUDE_ONLY = 0
 """GLOBAL_POSITION_SENSOR.flags"""
+GOOD = 100
+"""ODOMETRY.quality, in %: only valid positions are sent."""
+OTHERS_VARIANCE = 1.0
+"""m², rad²: of the height and attitude in an ODOMETRY, which are the autopilot's own."""
+WALK = 1e-3
+"""(m/s)²/s: how fast the wind, or the velocity error, of an autopilot's filter is taken to walk."""
+
+
+class Pose(NamedTuple):
+    """What ODOMETRY holds besides the position: from the vehicle's own telemetry.
+
+    Attributes
+    ----------
+    north, east, down : float
+        m, from the origin of the autopilot's local frame.
+    attitude : tuple of float
+        Quaternion w, x, y, z from body to north-east-down.
+    """
+
+    north: float
+    east: float
+    down: float
+    attitude: tuple[float, float, float, float]
 
 
 class Fix(msgspec.Struct, frozen=True, gc=False):
-    """A position with its covariance.
+    """A position at the moment of sending, with its covariance.
 
     Attributes
     ----------
     time_us : int
-        µs since 1970 UTC at which it holds.
-    age : float
-        s, since then.
+        µs since 1970 UTC at which it holds: that of sending.
     latitude, longitude : float
         deg.
     covariance_nn, covariance_ne, covariance_ee : float
-        m^2.
-    north, east : float
-        m, from the first GPS position.
+        m².
+    altitude : float
+        m above the sea; NaN where not known.
+    pose : Pose or None
+        Where the message is in a local frame.
     resets : int
         How often the estimate has jumped.
     """
 
     time_us: int
-    age: float
     latitude: float
     longitude: float
     covariance_nn: float
     covariance_ne: float
     covariance_ee: float
-    north: float
-    east: float
-    resets: int
+    altitude: float = nan
+    pose: Pose | None = None
+    resets: int = 0
 
     @property
     def sigma(self) -> float:
@@ -56,18 +89,52 @@ class Fix(msgspec.Struct, frozen=True, gc=False):
         return worse_axis(self.covariance_nn, self.covariance_ne, self.covariance_ee)
 
 
+def widened(fix: Fix, seconds: float) -> Fix:
+    """Return a fix that a filter may fuse, `seconds` after the previous one, as if its error were new.
+
+    Notes
+    -----
+    The errors of successive fixes are alike, but an autopilot's filter takes them for independent and would
+    soon claim to know the position better than the fixes do. Fixes of variance R, dt apart, are to it white
+    noise of the density N = R dt. A filter whose velocity (or wind) walks with the density q (`WALK`), fed
+    with that, comes to the variance
+
+        P = √2 q^(1/4) N^(3/4)
+
+    (steady state of the Riccati equation of a doubly integrated white noise). R is chosen so that P is the
+    fix's own variance σ²: R = (σ²/√2)^(4/3) q^(-1/3) / dt, and never less than σ². Seen from the filter, that
+    is an inflation by about the root of rate times correlation time, where the filter's own memory,
+    (N/q)^(1/4), a minute or two, is the shorter of the two times. P depends on q only by its fourth root: the
+    wind of ArduPilot walks with 5e-4 (``EK3_WIND_P_NSE``), PX4's with 2.5e-3 (``EKF2_WIND_NSD``), a velocity
+    from accelerometers with 1e-3.
+    """
+    variance = fix.sigma**2
+    density = (variance / 2.0**0.5) ** (4.0 / 3.0) * WALK ** (-1.0 / 3.0)
+    factor = max(1.0, density / (variance * seconds)) if seconds > 0.0 and variance > 0.0 else 1.0
+    return msgspec.structs.replace(
+        fix,
+        covariance_nn=fix.covariance_nn * factor,
+        covariance_ne=fix.covariance_ne * factor,
+        covariance_ee=fix.covariance_ee * factor,
+    )
+
+
 def external_position(outbox: Outbox, fix: Fix, system: int, autopilot: int) -> None:
-    """Send MAV_CMD_EXTERNAL_POSITION_ESTIMATE: ArduPilot resets its position to it while it dead-reckons."""
+    """Send MAV_CMD_EXTERNAL_POSITION_ESTIMATE: the autopilot puts its position there, and answers.
+
+    ArduPilot (``AP_NavEKF3_PosVelFusion.cpp``, setLatLng) moves it on by its own velocity over the age, which
+    is 0 here; PX4 (``EKF2.cpp``) insists that the age is a number.
+    """
     outbox.send(
         "COMMAND_INT",
         command=MAV_CMD.EXTERNAL_POSITION_ESTIMATE,
         frame=MAV_FRAME.GLOBAL,
-        param1=outbox.codec.now_us * 1e-6 % 1e5,
-        param2=fix.age,
+        param1=fix.time_us * 1e-6 % 1e5,  # s, of our clock; a float holds no more
+        param2=0.0,  # s, age
         param3=fix.sigma,
         param4=nan,
         x=round(fix.latitude * 1e7),
-        y=round(fix.longitude * 1e7),
+        y=east_e7(fix.longitude),
         z=nan,
         target_system=system,
         target_component=autopilot,
@@ -75,19 +142,23 @@ def external_position(outbox: Outbox, fix: Fix, system: int, autopilot: int) -> 
 
 
 def global_position(outbox: Outbox, fix: Fix, system: int, autopilot: int) -> None:
-    """Send GLOBAL_POSITION_SENSOR, which PX4 fuses as an auxiliary position."""
+    """Send GLOBAL_POSITION_SENSOR, which PX4 fuses as an auxiliary position.
+
+    PX4 (``mavlink_receiver.cpp``, ``aux_global_position_control.cpp``) takes its arrival as its time, and a
+    sigma that is no number as 1 m.
+    """
     outbox.send(
         "GLOBAL_POSITION_SENSOR",
         target_system=system,
         target_component=autopilot,
-        id=0,
+        id=SENSOR_ID,
         time_usec=fix.time_us,
-        processing_time=round(fix.age * 1e6),
-        source=UNKNOWN_SOURCE,
+        processing_time=0,
+        source=GLOBAL_POSITION_SRC.MAGNETIC,
         flags=LATITUDE_LONGITUDE_ONLY,
         lat=round(fix.latitude * 1e7),
-        lon=round(fix.longitude * 1e7),
-        alt=nan,
+        lon=east_e7(fix.longitude),
+        alt=fix.altitude,
         alt_ellipsoid=nan,
         eph=fix.sigma,
         epv=nan,
@@ -95,18 +166,27 @@ def global_position(outbox: Outbox, fix: Fix, system: int, autopilot: int) -> No
 
 
 def odometry(outbox: Outbox, fix: Fix, system: int, autopilot: int) -> None:  # noqa: ARG001 - it has no target
-    """Send ODOMETRY in the local frame, from the first GPS position; for ArduPilot and PX4."""
-    covariance = [nan] * 21  # the upper triangle of x y z roll pitch yaw, row by row
+    """Send ODOMETRY in the autopilot's local frame, which is north-east-down in spite of its name.
+
+    ArduPilot (``GCS_Common.cpp``, handle_odometry) takes these two frames only, needs the whole pose, and
+    computes ``cbrt(c0² + c6² + c11²)`` and ``cbrt(c15² + c18² + c20²)`` from the covariance: a number that is
+    none there is an internal error. It drops a velocity that is none.
+    """
+    assert fix.pose is not None
+    pose = fix.pose
+    covariance = [0.0] * 21  # the upper triangle of x y z roll pitch yaw, row by row
     covariance[0], covariance[1], covariance[6] = fix.covariance_nn, fix.covariance_ne, fix.covariance_ee
+    for diagonal in (11, 15, 18, 20):
+        covariance[diagonal] = OTHERS_VARIANCE
     outbox.send(
         "ODOMETRY",
         time_usec=fix.time_us,
-        frame_id=MAV_FRAME.LOCAL_NED,
+        frame_id=MAV_FRAME.LOCAL_FRD,
         child_frame_id=MAV_FRAME.BODY_FRD,
-        x=fix.north,
-        y=fix.east,
-        z=nan,
-        q=(nan,) * 4,
+        x=pose.north,
+        y=pose.east,
+        z=pose.down,
+        q=pose.attitude,
         vx=nan,
         vy=nan,
         vz=nan,
@@ -116,21 +196,54 @@ def odometry(outbox: Outbox, fix: Fix, system: int, autopilot: int) -> None:  # 
         pose_covariance=covariance,
         velocity_covariance=[nan] * 21,
         reset_counter=fix.resets & 0xFF,
-        estimator_type=MAV_ESTIMATOR_TYPE.NAIVE,
-        quality=100 if isfinite(fix.sigma) else -1,
+        estimator_type=MAV_ESTIMATOR_TYPE.VISION,
+        quality=GOOD,
     )
 
 
 class Kind(NamedTuple):
-    """How a fix is sent, and its default rate in Hz; 0 is with every update."""
+    """How a fix is sent, and what its receiver makes of it.
+
+    Attributes
+    ----------
+    send : callable
+        Sends a :class:`Fix` to a system and component.
+    rate : float
+        Hz by default; 0 is with every update.
+    refused_by : mapping
+        Autopilots that cannot use it, and what to set instead.
+    fused : bool
+        The receiver weighs it against what it knows; else it puts its position there.
+    local : bool
+        It holds a :class:`Pose`.
+    trusted_to : float
+        m: the receiver takes a larger sigma for this one.
+    """
 
     send: Callable[[Outbox, Fix, int, int], Any]
     rate: float
+    refused_by: dict[int, str]
+    fused: bool
+    local: bool = False
+    trusted_to: float = inf
 
 
 FIXES: dict[str, Kind] = {
-    "EXTERNAL_POSITION_ESTIMATE": Kind(external_position, 0.0),
-    "GLOBAL_POSITION_SENSOR": Kind(global_position, 0.0),
-    "ODOMETRY": Kind(odometry, 5.0),  # ArduPilot takes nothing below 4 Hz
+    "EXTERNAL_POSITION_ESTIMATE": Kind(external_position, 0.0, {}, fused=False),
+    "GLOBAL_POSITION_SENSOR": Kind(
+        global_position,
+        0.0,
+        {MAV_AUTOPILOT.ARDUPILOTMEGA: "ArduPilot ignores this message: use EXTERNAL_POSITION_ESTIMATE"},
+        fused=True,
+    ),
+    "ODOMETRY": Kind(
+        odometry,
+        5.0,  # below 4 Hz ArduPilot calls it unhealthy (AP_VisualOdom_Backend.cpp)
+        # EKF2's EV position learns our offset as a bias, and drops what comes 0.25 s late (ev_control.cpp)
+        {MAV_AUTOPILOT.PX4: "PX4 makes a bias of ODOMETRY: use GLOBAL_POSITION_SENSOR"},
+        fused=True,
+        local=True,
+        trusted_to=10.0,  # AP_NavEKF3_PosVelFusion.cpp: constrain_ftype(posErr, 0.01f, 10.0f)
+    ),
 }
 """What ``[navigation] fix`` may name."""

@@ -378,6 +378,10 @@ class FIRMWARE_VERSION_TYPE(IntEnum):
     OFFICIAL = 255
 
 
+class GLOBAL_POSITION_SRC(IntEnum):
+    MAGNETIC = 5
+
+
 class MAG_LOG_STATE(IntEnum):
     OFF = 0
     OK = 1
@@ -425,7 +429,9 @@ class MAG_RAW_FLAGS(IntEnum):
 
 class MAV_AUTOPILOT(IntEnum):
     GENERIC = 0
+    ARDUPILOTMEGA = 3
     INVALID = 8
+    PX4 = 12
 
 
 class MAV_CMD(IntEnum):
@@ -445,13 +451,14 @@ class MAV_CMD(IntEnum):
 
 
 class MAV_ESTIMATOR_TYPE(IntEnum):
-    NAIVE = 1
+    VISION = 2
 
 
 class MAV_FRAME(IntEnum):
     GLOBAL = 0
     LOCAL_NED = 1
     BODY_FRD = 12
+    LOCAL_FRD = 20
 
 
 class MAV_PARAM_TYPE(IntEnum):

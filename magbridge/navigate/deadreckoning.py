@@ -46,6 +46,11 @@ class DeadReckoning:
         """Start, or start again, at a position."""
         self.latitude, self.longitude = latitude, longitude
 
+    def forget(self) -> None:
+        """Forget what the motion was computed from: other telemetry follows. It goes on until then."""
+        self._heading = self._pitch = self._speed = nan
+        self._local = self._carrier = None
+
     def advance(self, time: float) -> None:
         """Move along the last known velocity up to `time` (s)."""
         elapsed = time - self._time

@@ -94,6 +94,11 @@ class Navigator:
         """Take in telemetry for dead reckoning, named as :meth:`DeadReckoning.telemetry` has it."""
         self._reckoning.telemetry(time_us * 1e-6, values)
 
+    def new_motion(self, time_us: int) -> None:
+        """From now on the motion is known by other telemetry."""
+        self._reckoning.advance(time_us * 1e-6)
+        self._reckoning.forget()
+
     def sample(self, time_us: int, corrected: Corrected) -> Record | None:
         """Take in a corrected sample; return the update that it completes, if it does."""
         if corrected.quality & UNUSABLE:

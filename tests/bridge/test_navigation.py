@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import islice
 from math import radians
 from pathlib import Path
 
@@ -28,7 +29,11 @@ from sitl.fluxgate import open_encoder
 TRACKING = 2
 START = 1_780_000_000_000_000
 PLACE = (49.5, -57.9)
-SPEED, HEADING, OFF = 0.5, 60.0, 150.0
+SPEED, HEADING, OFF, DEPTH = 0.5, 60.0, 150.0, 1.0
+ORIGIN, ORIGIN_ALTITUDE = (49.51, -57.93), 12.0
+"""deg and m: of the autopilot's local frame, on a hill beside the water."""
+QUATERNION = (0.8487626, 0.0993347, -0.1720527, 0.4900333)
+"""Of 60 deg of yaw and -0.4 rad of pitch."""
 CONFIG = """
 [sensor]
 driver = "digitizer"
@@ -72,11 +77,14 @@ def events(grid: AnomalyGrid, config: Path) -> Iterator[Event]:
     autopilot, fluxgate = Codec(1, 1), open_encoder("digitizer", load(config).sensor.options)
     origin = offset(*PLACE, OFF, -OFF)  # where it is; it believes to be at PLACE
     fix = {"lat": round(PLACE[0] * 1e7), "lon": round(PLACE[1] * 1e7), "fix_type": 3, "h_acc": 200_000}
-    yield Event(START + 4, Channel.LINK, autopilot.pack("GPS_RAW_INT", **fix))
+    origin_e7 = {"latitude": round(ORIGIN[0] * 1e7), "longitude": round(ORIGIN[1] * 1e7)}
+    data = autopilot.pack("GPS_GLOBAL_ORIGIN", altitude=round(1e3 * ORIGIN_ALTITUDE), **origin_e7)
+    yield Event(START + 4, Channel.LINK, data + autopilot.pack("GPS_RAW_INT", **fix))
     for k in range(1, 901):
         time_us = START + 4_000_000 * k
         data = autopilot.pack("ATTITUDE", yaw=radians(HEADING), pitch=-0.4)
         data += autopilot.pack("VFR_HUD", airspeed=SPEED)
+        data += autopilot.pack("GLOBAL_POSITION_INT", alt=round(-1e3 * DEPTH))
         yield Event(time_us, Channel.LINK, data)
         along = SPEED * 4.0 * k
         here = offset(*origin, along * np.cos(radians(HEADING)), along * np.sin(radians(HEADING)))
@@ -88,13 +96,12 @@ def events(grid: AnomalyGrid, config: Path) -> Iterator[Event]:
         yield Event(time_us + 2000, Channel.SENSOR, fluxgate.encode(Reading(field, device_time=4.0 * k)))
 
 
-def run(folder: Path, fix: str) -> bytes:
+def run(folder: Path, fix: str, count: int | None = None) -> list[tuple[int, bytes]]:
     path = folder / f"{fix}.toml"
     path.write_text(CONFIG.replace("FIX", fix))
     pipeline = set_up(load(path), Start(START))
-    return b"".join(
-        frame for event in events(read_grid(folder / "grid.nc"), path) for _, frame in pipeline.feed(event)
-    )
+    given = islice(events(read_grid(folder / "grid.nc"), path), count)
+    return [sent for event in given for sent in pipeline.feed(event)]
 
 
 def heard(stream: bytes) -> dict[str, list[Message]]:
@@ -104,77 +111,115 @@ def heard(stream: bytes) -> dict[str, list[Message]]:
     return messages
 
 
-def truth(message: Message) -> tuple[float, float]:
-    """Return where the vehicle is at the time of a message."""
-    along = SPEED * (message["time_usec"] - START) * 1e-6
+def where(time_us: int) -> tuple[float, float]:
+    """Return where the vehicle is at a time."""
+    along = SPEED * (time_us - START) * 1e-6
     start = offset(*PLACE, OFF, -OFF)
     return offset(*start, along * np.cos(radians(HEADING)), along * np.sin(radians(HEADING)))
 
 
-@pytest.mark.parametrize(
-    ("fix", "message"),
-    [
-        ("EXTERNAL_POSITION_ESTIMATE", "COMMAND_INT"),
-        ("GLOBAL_POSITION_SENSOR", "GLOBAL_POSITION_SENSOR"),
-        ("ODOMETRY", "ODOMETRY"),
-    ],
-)
-def test_the_field_finds_what_dead_reckoning_lost(folder: Path, fix: str, message: str) -> None:
-    stream = run(folder, fix)
-    messages = heard(stream)
-    last = messages["MAG_NAVIGATION"][-1]
-    latitude, longitude = truth(last)
-    north, east = (last["lat"] * 1e-7 - latitude) * 111_000.0, (last["lon"] * 1e-7 - longitude) * 72_000.0
-    sigma = np.sqrt(last["covariance_nn"] + last["covariance_ee"])
-    assert np.hypot(north, east) < max(4.0 * sigma, 15.0)
-    assert sigma < 60.0
-    assert messages[message], "a fix is sent once it is valid"
-    valid = sum(one["state"] == TRACKING for one in messages["MAG_NAVIGATION"])
-    assert valid < len(messages["MAG_NAVIGATION"])
-    if fix != "ODOMETRY":
-        assert len(messages[message]) <= valid, "and not before"
-    sent = messages[message][-1]
-    if fix == "EXTERNAL_POSITION_ESTIMATE":
-        assert (sent["command"], sent["target_system"], sent["target_component"]) == (43003, 1, 1)
-        assert (sent["x"], sent["y"]) == (last["lat"], last["lon"])
-        assert 0.0 < sent["param3"] <= sigma
-    elif fix == "GLOBAL_POSITION_SENSOR":
-        assert (sent["lat"], sent["lon"]) == (last["lat"], last["lon"])
-    else:
-        begun = next(one for one in messages["MAG_NAVIGATION"] if one["state"] == TRACKING)["time_usec"]
-        assert messages[message][0]["time_usec"] >= begun, "and not before"
-        assert sent["pose_covariance"][0] >= last["covariance_nn"] * (1 - 1e-6), "it grows between updates"
-    assert any(re.match("navigation: tracking", text["text"]) for text in messages["STATUSTEXT"])
+MESSAGES = {
+    "EXTERNAL_POSITION_ESTIMATE": "COMMAND_INT",
+    "GLOBAL_POSITION_SENSOR": "GLOBAL_POSITION_SENSOR",
+    "ODOMETRY": "ODOMETRY",
+}
+
+
+@pytest.fixture(scope="module", params=MESSAGES)
+def sailed(
+    request: pytest.FixtureRequest, folder: Path
+) -> tuple[str, list[tuple[int, bytes]], list[Message]]:
+    """The fix, the frames with their times, and the fixes among them."""
+    sent = run(folder, request.param)
+    messages = heard(b"".join(frame for _, frame in sent))
+    return request.param, sent, messages[MESSAGES[request.param]]
+
+
+Sailed = tuple[str, list[tuple[int, bytes]], list[Message]]
+
+
+def test_a_fix_says_where_the_vehicle_is_when_it_is_sent(sailed: Sailed) -> None:
+    """Decoded, each is within its sigma of the truth, and in its frame."""
+    kind, sent, fixes = sailed
+    last = heard(b"".join(frame for _, frame in sent))["MAG_NAVIGATION"][-1]
+    honest = np.sqrt(0.5 * (last["covariance_nn"] + last["covariance_ee"]))
+    assert len(fixes) > 50
+    for fix in fixes[-40::8]:
+        when_us = next(time_us for time_us, frame in sent if frame == fix.frame)
+        north, east = separation(*PLACE, *where(when_us))
+        if kind == "ODOMETRY":
+            x, y = separation(*PLACE, *ORIGIN)
+            got = fix["x"] + x, fix["y"] + y
+            assert (fix["frame_id"], fix["child_frame_id"], fix["quality"]) == (20, 12, 100)
+            assert fix["z"] == pytest.approx(ORIGIN_ALTITUDE + DEPTH), "down from the origin"
+            assert fix["q"] == pytest.approx(QUATERNION, abs=1e-6)
+            covariance = fix["pose_covariance"]
+            assert np.isfinite(covariance).all()
+            claimed = np.sqrt([covariance[0], covariance[6]])
+            assert covariance[1] ** 2 < covariance[0] * covariance[6]
+        elif kind == "GLOBAL_POSITION_SENSOR":
+            got = separation(*PLACE, fix["lat"] * 1e-7, fix["lon"] * 1e-7)
+            assert (fix["id"], fix["source"], fix["processing_time"]) == (1, 5, 0)
+            assert fix["alt"] == pytest.approx(-DEPTH)
+            claimed = np.array([fix["eph"]])
+        else:
+            got = separation(*PLACE, fix["x"] * 1e-7, fix["y"] * 1e-7)
+            assert (fix["command"], fix["frame"], fix["param2"]) == (43003, 0, 0.0)
+            assert fix["param1"] == pytest.approx(when_us * 1e-6 % 1e5, abs=0.01)
+            claimed = np.array([fix["param3"]])
+        if kind != "EXTERNAL_POSITION_ESTIMATE":
+            assert fix["time_usec"] == when_us
+        if kind != "ODOMETRY":
+            assert (fix["target_system"], fix["target_component"]) == (1, 1)
+        assert np.hypot(got[0] - north, got[1] - east) < 4.0 * honest + 5.0
+        assert (claimed > 0.5 * honest).all()
+        if kind == "EXTERNAL_POSITION_ESTIMATE":
+            assert (claimed < 2.0 * honest).all(), (
+                "it replaces what the autopilot claims: no wider than it is"
+            )
+
+
+def test_no_fix_before_the_position_is_valid(sailed: Sailed) -> None:
+    _, sent, fixes = sailed
+    messages = heard(b"".join(frame for _, frame in sent))
+    tracking = next(one for one in messages["MAG_NAVIGATION"] if one["state"] == TRACKING)["time_usec"]
+    first_us = next(time_us for time_us, frame in sent if frame == fixes[0].frame)
+    assert first_us > tracking
+    texts = [text["text"] for text in messages["STATUSTEXT"]]
+    assert any(text.startswith("navigation: tracking") for text in texts)
+    assert [text for text in texts if "fixes" in text][:3] == [
+        "no fixes to the autopilot: GPS is good",
+        "no fixes to the autopilot: no valid position",
+        "fixes go to the autopilot: GPS is lost",
+    ]
 
 
 def test_odometry_goes_on_between_updates(folder: Path) -> None:
-    """At 5 Hz, where the vehicle is by then, its doubt growing; and it ends when the field does."""
-    path = folder / "odometry.toml"
+    """At 5 Hz, its doubt growing; and it ends when the field does."""
+    path = folder / "ODOMETRY.toml"
     path.write_text(CONFIG.replace("FIX", "ODOMETRY"))
     pipeline = set_up(load(path), Start(START))
     given = list(events(read_grid(folder / "grid.nc"), path))
     stream = b"".join(frame for event in given for _, frame in pipeline.feed(event))
+    beat = Codec(1, 1).pack("ATTITUDE"), Codec(1, 1).pack("GLOBAL_POSITION_INT", alt=-1000)
     silent = b"".join(
         frame
         for k in range(600)
-        for _, frame in pipeline.feed(Event(given[-1].time_us + 200_000 * k, Channel.LINK, b""))
+        for _, frame in pipeline.feed(Event(given[-1].time_us + 200_000 * k, Channel.LINK, b"".join(beat)))
     )
-    sent = heard(stream)["ODOMETRY"]
-    times = np.array([one["time_usec"] for one in sent])
+    times = np.array([one["time_usec"] for one in heard(stream)["ODOMETRY"]])
     assert np.median(np.diff(times)) == 200_000
-    for one in sent[-200::50]:
-        latitude, longitude = truth(one)
-        start = separation(*PLACE, latitude, longitude)
-        sigma = np.sqrt(one["pose_covariance"][0] + one["pose_covariance"][6])
-        assert np.hypot(one["x"] - start[0], one["y"] - start[1]) < max(4.0 * sigma, 15.0)
     after = heard(silent)["ODOMETRY"]
     grown = [one["pose_covariance"][0] for one in after]
     assert grown == sorted(grown)
     assert 2.0 < (after[-1]["time_usec"] - times[-1]) * 1e-6 < 45.0
 
 
-def test_the_same_events_give_the_same_fixes(folder: Path) -> None:
-    assert run(folder, "ODOMETRY") == run(folder, "ODOMETRY")
+def test_the_same_events_give_the_same_fixes(sailed: Sailed, folder: Path) -> None:
+    if sailed[0] != "GLOBAL_POSITION_SENSOR":
+        pytest.skip("one kind is enough")
+    again = run(folder, sailed[0], 300)
+    assert again == sailed[1][: len(again)]
 
 
 @pytest.mark.parametrize(

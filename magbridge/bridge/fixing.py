@@ -1,0 +1,204 @@
+"""When a fix goes to the autopilot, and what it answers: every start, stop and refusal is told once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from math import inf
+
+from magbridge.bridge.frame import Frame
+from magbridge.link.component import Component
+from magbridge.link.fixes import Fix, Kind, widened
+from magbridge.mavlink import Message, spec
+from magbridge.mavlink.dialect import MAV_AUTOPILOT, MAV_CMD, MAV_RESULT, MAV_SEVERITY
+from magbridge.navigate.record import Reckoned
+
+__all__ = ["FIX_3D", "Fixing", "Gps"]
+
+FIX_3D = 3
+"""Lowest GPS_RAW_INT.fix_type whose position is used."""
+SHORTEST_US, LONGEST_US = 5_000_000, 60_000_000
+"""µs without a GPS position after which GPS is lost: three times its period, within these."""
+HELD_US = 60_000_000
+"""µs of good GPS, after which the autopilot's position is that of the GPS."""
+ASK_US = 5_000_000
+"""µs between two requests for the origin of the local frame."""
+UNANSWERED = 3
+"""Commands in a row without an answer before that is told."""
+HINTS = {
+    MAV_RESULT.FAILED: " (it still uses GPS, has no origin, or nothing measures its speed)",
+    MAV_RESULT.TEMPORARILY_REJECTED: " (it does not dead-reckon)",
+}
+"""What the answers of ArduPilot (setLatLng) and PX4 (EKF2.cpp) mean."""
+
+
+class Gps:
+    """Whether the autopilot's GPS has a position."""
+
+    def __init__(self) -> None:
+        self._last_us = self._since_us = -LONGEST_US
+        self._allowed_us = 0
+
+    def hear(self, message: Message, time_us: int) -> bool:
+        """Take in a GPS_RAW_INT; return whether it holds a position."""
+        good: bool = message["fix_type"] >= FIX_3D
+        if not good:
+            self._allowed_us = 0
+            return False
+        if not self.good(time_us):
+            self._since_us = time_us
+        period_us = time_us - self._last_us
+        self._last_us = time_us
+        self._allowed_us = min(max(3 * period_us, SHORTEST_US), LONGEST_US)
+        return True
+
+    def good(self, time_us: int) -> bool:
+        """Return whether there is a position, one that is not too old."""
+        return time_us - self._last_us < self._allowed_us
+
+    def held(self, time_us: int) -> bool:
+        """Return whether there has been a position long enough for the autopilot to have come to it."""
+        return self.good(time_us) and time_us - self._since_us > HELD_US
+
+
+class Fixing:
+    """Sends fixes while the autopilot has no GPS, and hears its answers.
+
+    Parameters
+    ----------
+    kind : Kind
+        Of :data:`~magbridge.link.fixes.FIXES`.
+    component : Component
+    frame : Frame
+        Has heard each message before.
+
+    Attributes
+    ----------
+    gps : Gps
+    stack : int
+        MAV_AUTOPILOT of the autopilot; GENERIC before it is known.
+    sent, accepted, refused : int
+        Number of fixes, and of answers.
+    """
+
+    def __init__(self, kind: Kind, component: Component, frame: Frame) -> None:
+        self.gps, self.stack = Gps(), int(MAV_AUTOPILOT.GENERIC)
+        self.sent = self.accepted = self.refused = 0
+        self._kind, self._component, self._frame = kind, component, frame
+        self._before_us: int | None = None
+        self._waiting = 0
+        self._reboots = component.vehicle.reboots
+        self._handlers: dict[int, Callable[[Message, int], None]] = {
+            spec("COMMAND_ACK").id: self._answer,
+            spec("GPS_RAW_INT").id: self._gps,
+            spec("HEARTBEAT").id: self._heartbeat,
+        }
+        if kind.local:
+            component.timers.every("origin", ASK_US, self._ask_origin, component.codec.now_us)
+
+    @property
+    def velocity_stays(self) -> bool:
+        """Whether a fix leaves the autopilot's velocity alone: ArduPilot's setLatLng does, PX4 does not."""
+        return not self._kind.fused and self.stack != MAV_AUTOPILOT.PX4
+
+    def hear(self, message: Message, time_us: int) -> None:
+        """Take in a message of the autopilot."""
+        if handler := self._handlers.get(message.id):
+            handler(message, time_us)
+
+    def send(self, at: Reckoned | None, resets: int) -> bool:
+        """Send a position that holds now as a fix, if it is wanted; return whether it was sent."""
+        now_us = self._component.codec.now_us
+        fix = self._fix(at, resets, now_us)
+        if isinstance(fix, str):
+            self._before_us = None
+            self._tell_none(fix)
+            return False
+        if self._kind.fused:
+            since_us = inf if self._before_us is None else now_us - self._before_us
+            fix = widened(fix, since_us * 1e-6)
+        self._before_us = now_us
+        self._kind.send(self._component.outbox, fix, *self._component.peer)
+        self.sent += 1
+        self._state("fixes go to the autopilot: GPS is lost")
+        self._watch(fix.sigma)
+        return True
+
+    def _fix(self, at: Reckoned | None, resets: int, now_us: int) -> Fix | str:
+        """Return the fix, or the reason why there is none."""
+        if self.stack in self._kind.refused_by:
+            return self._kind.refused_by[self.stack]
+        if self.gps.good(now_us):
+            return "GPS is good"
+        if at is None:
+            return "no valid position"
+        pose = self._frame.pose(now_us, at.latitude, at.longitude) if self._kind.local else None
+        if isinstance(pose, str):
+            return pose
+        return Fix(
+            time_us=now_us + self._component.codec.utc_offset_us,
+            latitude=at.latitude,
+            longitude=at.longitude,
+            covariance_nn=at.covariance_nn,
+            covariance_ne=at.covariance_ne,
+            covariance_ee=at.covariance_ee,
+            altitude=self._frame.altitude(now_us),
+            pose=pose,
+            resets=resets,
+        )
+
+    def _watch(self, sigma: float) -> None:
+        """Tell what the receiver will make of a fix, where that is not what it says, or that it is silent."""
+        announcer, limit = self._component.announcer, self._kind.trusted_to
+        if self.stack == MAV_AUTOPILOT.ARDUPILOTMEGA and sigma > limit:
+            text = f"the autopilot takes fixes for {limit:g} m or better: it will claim too much"
+            announcer.state("trust", text, MAV_SEVERITY.WARNING)
+        if self._kind.fused:
+            return
+        self._waiting += 1
+        if self._waiting > UNANSWERED:
+            announcer.state("answer", "the autopilot does not answer fixes", MAV_SEVERITY.WARNING)
+
+    def _answer(self, message: Message, time_us: int) -> None:  # noqa: ARG002 - a handler like the others
+        if message["command"] != MAV_CMD.EXTERNAL_POSITION_ESTIMATE or not self.sent:
+            return
+        self._waiting, result = 0, message["result"]
+        if result == MAV_RESULT.ACCEPTED:
+            self.accepted += 1
+            self._component.announcer.state("answer", "the autopilot takes fixes")
+            return
+        self.refused += 1
+        known = result in set(MAV_RESULT)
+        name = MAV_RESULT(result).name if known else f"result {result}"
+        text = f"the autopilot refuses fixes: {name}{HINTS.get(result, '')}"
+        self._component.announcer.state("answer", text, MAV_SEVERITY.WARNING)
+
+    def _gps(self, message: Message, time_us: int) -> None:
+        if self.gps.hear(message, time_us) and self._before_us is not None:
+            self._before_us = None
+            self._tell_none("GPS is good")
+
+    def _heartbeat(self, message: Message, time_us: int) -> None:  # noqa: ARG002 - a handler like the others
+        self.stack = message["autopilot"]
+
+    def _ask_origin(self, time_us: int) -> None:  # noqa: ARG002 - a timer's action
+        component = self._component
+        if component.vehicle.reboots != self._reboots:
+            self._reboots, self._frame.origin = component.vehicle.reboots, None
+        if self._frame.origin is None:
+            system, autopilot = component.peer
+            component.outbox.send(
+                "COMMAND_LONG",
+                command=MAV_CMD.REQUEST_MESSAGE,
+                param1=float(spec("GPS_GLOBAL_ORIGIN").id),
+                target_system=system,
+                target_component=autopilot,
+            )
+
+    def _tell_none(self, reason: str) -> None:
+        wanted = "GPS" not in reason
+        self._state(
+            f"no fixes to the autopilot: {reason}", MAV_SEVERITY.WARNING if wanted else MAV_SEVERITY.INFO
+        )
+
+    def _state(self, text: str, severity: MAV_SEVERITY = MAV_SEVERITY.INFO) -> None:
+        self._component.announcer.state("fixes", text, severity)

@@ -1,0 +1,99 @@
+"""The autopilot's local frame, and the vehicle's height and attitude in it: what an ODOMETRY has to hold."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from math import cos, isnan, nan, sin
+
+from magbridge.field.geodesy import separation
+from magbridge.link.fixes import Pose
+from magbridge.mavlink import Message, spec
+
+__all__ = ["Frame"]
+
+FRESH_US = 10_000_000
+"""µs, for which a height or an attitude is the present one."""
+UNSET = (0, 0)
+"""GPS_GLOBAL_ORIGIN's latitude and longitude of an autopilot without an origin."""
+
+
+class Frame:
+    """Hears the origin of the autopilot's local frame, and the vehicle's height and attitude.
+
+    Attributes
+    ----------
+    origin : tuple of float or None
+        deg, deg, m above the sea.
+    attitude : tuple of float
+        Quaternion w, x, y, z from body to north-east-down, as last heard.
+    """
+
+    def __init__(self) -> None:
+        self.origin: tuple[float, float, float] | None = None
+        self.attitude = 1.0, 0.0, 0.0, 0.0
+        self._altitude = self._down = nan
+        self._altitude_us = self._down_us = self._attitude_us = -FRESH_US
+        self._handlers: dict[int, Callable[[Message, int], None]] = {
+            spec("ATTITUDE").id: self._turn,
+            spec("GLOBAL_POSITION_INT").id: self._rise,
+            spec("GPS_GLOBAL_ORIGIN").id: self._set_origin,
+            spec("LOCAL_POSITION_NED").id: self._sink,
+            spec("ODOMETRY").id: self._sink,
+        }
+
+    def hear(self, message: Message, time_us: int) -> None:
+        """Take in a message of the autopilot."""
+        if handler := self._handlers.get(message.id):
+            handler(message, time_us)
+
+    def altitude(self, time_us: int) -> float:
+        """Return m above the sea; NaN where it is not known."""
+        if time_us - self._altitude_us < FRESH_US:
+            return self._altitude
+        if self.origin is not None and time_us - self._down_us < FRESH_US:
+            return self.origin[2] - self._down
+        return nan
+
+    def depth(self, time_us: int) -> float:
+        """Return m below the sea; without an origin, a local height alone counts from there."""
+        altitude = self.altitude(time_us)
+        return self._down if isnan(altitude) and time_us - self._down_us < FRESH_US else -altitude
+
+    def pose(self, time_us: int, latitude: float, longitude: float) -> Pose | str:
+        """Return the pose of a vehicle at a position (deg), or the reason why there is none."""
+        if self.origin is None:
+            return "no origin of the autopilot's frame"
+        if time_us - self._attitude_us >= FRESH_US:
+            return "no attitude from the autopilot"
+        down = self._down if time_us - self._down_us < FRESH_US else self.origin[2] - self.altitude(time_us)
+        if isnan(down):
+            return "no height from the autopilot"
+        return Pose(*separation(*self.origin[:2], latitude, longitude), down, self.attitude)
+
+    def _turn(self, message: Message, time_us: int) -> None:
+        self.attitude = quaternion(message["roll"], message["pitch"], message["yaw"])
+        self._attitude_us = time_us
+
+    def _rise(self, message: Message, time_us: int) -> None:
+        self._altitude, self._altitude_us = 1e-3 * message["alt"], time_us
+
+    def _sink(self, message: Message, time_us: int) -> None:
+        self._down, self._down_us = message["z"], time_us
+
+    def _set_origin(self, message: Message, time_us: int) -> None:  # noqa: ARG002 - a handler like the others
+        if (message["latitude"], message["longitude"]) != UNSET:
+            where = message["latitude"] * 1e-7, message["longitude"] * 1e-7
+            self.origin = *where, 1e-3 * message["altitude"]
+
+
+def quaternion(roll: float, pitch: float, yaw: float) -> tuple[float, float, float, float]:
+    """Return w, x, y, z of the rotation from body to north-east-down by three angles, rad (3-2-1)."""
+    sr, cr = sin(0.5 * roll), cos(0.5 * roll)
+    sp, cp = sin(0.5 * pitch), cos(0.5 * pitch)
+    sy, cy = sin(0.5 * yaw), cos(0.5 * yaw)
+    return (
+        cr * cp * cy + sr * sp * sy,
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+    )

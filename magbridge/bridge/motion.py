@@ -1,0 +1,208 @@
+"""Which telemetry dead reckoning follows: none that contains our own fixes.
+
+An autopilot that takes our fixes sends them back in LOCAL_POSITION_NED, GLOBAL_POSITION_INT and ODOMETRY.
+Taken for the vehicle's motion, they move the track that the next fix is computed from, which moves the
+autopilot, and so on: 60 m become a kilometre. So its own position counts as motion only until a fix has been
+sent to it, and again once GPS has put it right.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from enum import IntEnum
+from math import degrees, hypot, isfinite, nan
+from typing import Any
+
+from magbridge.bridge.frame import Frame
+from magbridge.link.component import Component
+from magbridge.mavlink import Message, spec
+from magbridge.mavlink.dialect import MAV_FRAME, MAV_SEVERITY
+from magbridge.navigate import Navigator
+from magbridge.navigate.deadreckoning import GLIDE
+
+__all__ = ["Motion", "Source"]
+
+FRESH_US = 30_000_000
+"""µs without it, after which the next best source is used."""
+GLIDING_US = 600_000_000
+"""µs since the vehicle was last steep, for which it counts as a glider."""
+LEARNING = 0.1
+"""Share of each new speed in the mean that is kept for when nothing else is known."""
+JUMP = 10.0
+"""m: a step in a position that its own velocity does not explain by more than that is a reset."""
+
+
+class Source(IntEnum):
+    """What dead reckoning follows; the earlier is preferred."""
+
+    OTHER = 0
+    """The position that another component of the vehicle measures, as a Doppler log's does."""
+    SPEED = 1
+    """Heading and speed through the water or air."""
+    TRACK = 2
+    """The autopilot's own estimate, as long as none of our fixes is in it."""
+    GLIDE = 3
+    """Heading, and the speed by pitch and depth."""
+    LAST = 4
+    """Heading, and the last speed that was known."""
+    NONE = 5
+
+
+class Motion:
+    """Passes the vehicle's motion on to the navigator, from the best source that there is.
+
+    Parameters
+    ----------
+    navigator : Navigator
+    component : Component
+    frame : Frame
+        Has heard each message before.
+    velocity_stays : callable
+        Whether a fix leaves the autopilot's velocity as it was, so that this remains a measurement.
+
+    Attributes
+    ----------
+    source : Source
+    fed_back : bool
+        Our fixes are in the autopilot's position.
+    """
+
+    def __init__(
+        self, navigator: Navigator, component: Component, frame: Frame, velocity_stays: Callable[[], bool]
+    ) -> None:
+        self.source, self.fed_back = Source.NONE, False
+        self._navigator, self._component, self._frame = navigator, component, frame
+        self._velocity_stays = velocity_stays
+        self._heard_us = 0
+        self._heading = self._pitch = self._last = nan
+        self._steep_us = -GLIDING_US
+        self._stream: tuple[int, int] | None = None  # component and message that the track comes from
+        self._step: tuple[int, float, float, int] | None = None  # µs, m, m, resets of that message
+        self._jumps = 0.0, 0.0
+        self._measured: set[tuple[int, int]] = set()  # streams with a velocity that is not always zero
+        self._handlers: dict[int, Callable[[Message, int], None]] = {
+            spec("ATTITUDE").id: self._attitude,
+            spec("GLOBAL_POSITION_INT").id: self._global,
+            spec("LOCAL_POSITION_NED").id: self._local,
+            spec("ODOMETRY").id: self._odometry,
+            spec("VFR_HUD").id: self._speed,
+        }
+
+    def hear(self, message: Message, time_us: int) -> None:
+        """Take in a message of the vehicle."""
+        if handler := self._handlers.get(message.id):
+            handler(message, time_us)
+
+    def fixes_sent(self) -> None:
+        """From now on the autopilot's position contains our fixes."""
+        if not self.fed_back and self.source is Source.TRACK and not self._velocity_stays():
+            self.source = Source.NONE  # the next best is used at once
+        self.fed_back = True
+
+    def gps_held(self) -> None:
+        """GPS has put the autopilot's position right."""
+        self.fed_back = False
+
+    def _attitude(self, message: Message, time_us: int) -> None:
+        self._heading, self._pitch = degrees(message["yaw"]) % 360.0, degrees(message["pitch"])
+        if abs(self._pitch) >= GLIDE:
+            self._steep_us = time_us
+        if self.source is Source.SPEED and time_us - self._heard_us < FRESH_US:
+            self._pass(time_us, heading=self._heading, pitch=self._pitch)
+        elif time_us - self._steep_us < GLIDING_US and isfinite(self._frame.depth(time_us)):
+            if self._use(Source.GLIDE, time_us, "heading, pitch and depth"):
+                self._pass(time_us, heading=self._heading, pitch=self._pitch)
+        elif isfinite(self._last) and self._use(
+            Source.LAST, time_us, "heading and the last known speed: no other is sent"
+        ):
+            self._pass(time_us, heading=self._heading, speed=self._last)
+
+    def _speed(self, message: Message, time_us: int) -> None:
+        speed = message["airspeed"]  # 0 of a vehicle that does not measure it
+        if speed > 0.0 and isfinite(self._heading):
+            self._last = speed
+            if self._use(Source.SPEED, time_us, "heading and speed through the water or air"):
+                self._pass(time_us, heading=self._heading, pitch=self._pitch, speed=speed)
+
+    def _global(self, message: Message, time_us: int) -> None:
+        self._pass(time_us, depth=self._frame.depth(time_us))
+        self._track(message, time_us, None, (message["vx"] * 1e-2, message["vy"] * 1e-2))
+
+    def _local(self, message: Message, time_us: int) -> None:
+        self._pass(time_us, depth=self._frame.depth(time_us))
+        self._track(message, time_us, (message["x"], message["y"]), (message["vx"], message["vy"]))
+
+    def _odometry(self, message: Message, time_us: int) -> None:
+        self._pass(time_us, depth=self._frame.depth(time_us))
+        velocity = message["vx"], message["vy"], message["vz"]
+        if message["child_frame_id"] == MAV_FRAME.BODY_FRD:
+            velocity = rotate(message["q"], velocity)
+        self._track(message, time_us, (message["x"], message["y"]), velocity[:2], message["reset_counter"])
+
+    def _track(
+        self,
+        message: Message,
+        time_us: int,
+        place: tuple[float, float] | None,
+        velocity: tuple[float, float],
+        resets: int = 0,
+    ) -> None:
+        """Take in an estimate of position (m, north and east) and velocity (m/s)."""
+        stream, own = (message.component, message.id), message.component == self._component.peer[1]
+        if isfinite(hypot(*velocity)) and velocity != (0.0, 0.0):
+            self._measured.add(stream)
+            if own and not self.fed_back:
+                last, speed = self._last, hypot(*velocity)
+                self._last = last + LEARNING * (speed - last) if isfinite(last) else speed
+        measured = stream in self._measured
+        source = Source.TRACK if own else Source.OTHER
+        if own and measured and self._velocity_stays():
+            if self._use(source, time_us, "the autopilot's velocity", stream):
+                self._pass(time_us, velocity_north=velocity[0], velocity_east=velocity[1])
+        elif place is not None and not (own and self.fed_back):
+            words = "the autopilot's position" if own else f"the position from component {stream[0]}"
+            if self._use(source, time_us, words, stream):
+                self._move(time_us, place, velocity if measured else None, resets)
+
+    def _move(
+        self, time_us: int, place: tuple[float, float], velocity: tuple[float, float] | None, resets: int
+    ) -> None:
+        """Follow a position, without the jumps of the estimator that it comes from."""
+        if self._step is not None:
+            then_us, *before, count = self._step
+            seconds = (time_us - then_us) * 1e-6
+            moved = place[0] - before[0], place[1] - before[1]
+            carried = (velocity[0] * seconds, velocity[1] * seconds) if velocity else (0.0, 0.0)
+            odd = moved[0] - carried[0], moved[1] - carried[1]
+            unexplained = velocity is not None and hypot(*odd) > JUMP + 0.5 * hypot(*carried)
+            if resets != count or unexplained:
+                self._jumps = self._jumps[0] + odd[0], self._jumps[1] + odd[1]
+        self._step = time_us, *place, resets
+        self._pass(time_us, north=place[0] - self._jumps[0], east=place[1] - self._jumps[1])
+
+    def _use(self, source: Source, time_us: int, words: str, stream: tuple[int, int] | None = None) -> bool:
+        """Return whether dead reckoning follows a source, as it does if no better one is fresh."""
+        same = (source, stream) == (self.source, self._stream)
+        if not same and source >= self.source and time_us - self._heard_us < FRESH_US:
+            return False
+        if not same:
+            self._navigator.new_motion(time_us)
+            self.source, self._stream, self._step = source, stream, None
+        self._heard_us = time_us
+        severity = MAV_SEVERITY.WARNING if source is Source.LAST else MAV_SEVERITY.INFO
+        self._component.announcer.state("motion", f"dead reckoning by {words}", severity)
+        return True
+
+    def _pass(self, time_us: int, **values: Any) -> None:
+        self._navigator.telemetry(time_us, **values)
+
+
+def rotate(q: tuple[float, float, float, float], v: tuple[float, float, float]) -> tuple[float, float, float]:
+    """Return a vector turned by a quaternion w, x, y, z: v + 2 u × (u × v + w v)."""
+    w, x, y, z = q
+    a, b, c = (y * v[2] - z * v[1] + w * v[0], z * v[0] - x * v[2] + w * v[1], x * v[1] - y * v[0] + w * v[2])
+    return (
+        v[0] + 2.0 * (y * c - z * b),
+        v[1] + 2.0 * (z * a - x * c),
+        v[2] + 2.0 * (x * b - y * a),
+    )
