@@ -4,13 +4,17 @@ A multiplexed converter samples channel k at ``t + delay_k``. All channels are i
 earliest one, between the previous reading and this one, so no future data are needed and the latency is
 ``max(delay) - min(delay)``. The anti-alias filter delays the field by ``filter_delay``; the sample's time is
 corrected for that, and the telemetry is looked up at the corrected time.
+
+While the process was held up, readings and telemetry waited. What has a time of its own (the instrument's
+clock, the autopilot's by TIMESYNC) keeps it; what has none was taken at some time of the standstill. A sample
+for which either is guessed is flagged ``late_join``, its parameters anywhere between their values meanwhile.
 """
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping
-from math import inf, isfinite, nan
+from math import inf, isfinite, isnan, nan
 from typing import Final, NamedTuple
 
 from magbridge.config import Align
@@ -23,9 +27,10 @@ MOVING: Final = int(Quality.MOVING)
 SATURATED: Final = int(Quality.SATURATED)
 OFFSET_SUSPECT: Final = int(Quality.OFFSET_SUSPECT)
 GAP: Final = int(Quality.GAP)
+LATE_JOIN: Final = int(Quality.LATE_JOIN)
 NEVER: Final = -(1 << 62)
-HISTORY: Final = 64
-"""Telemetry values kept for each parameter: enough for 3 s at 20 Hz."""
+HISTORY: Final = 1024
+"""Telemetry values kept for each parameter: enough for 20 s at 50 Hz."""
 WHOLE: Final = 1.5 * 2.0**52
 """Adding and then subtracting it rounds a number below 2^51."""
 
@@ -95,26 +100,43 @@ class Track:
     after the anchor becomes the next anchor.
     """
 
-    __slots__ = ("anchor", "before", "history", "input", "lacking", "last", "last_us", "max_age", "moved_us")
+    __slots__ = (
+        "anchor", "before", "first_us", "guess", "guess_us", "history", "input", "lacking", "last", "last_us",
+        "max_age", "moved_us",
+    )  # fmt: skip
 
     def __init__(self, what: Input) -> None:
         self.input, self.max_age = what, what.max_age
         self.history: deque[tuple[int, float]] = deque(maxlen=HISTORY)
         self.last_us, self.last, self.before = NEVER, nan, nan  # the newest, and the value before it
+        self.first_us = NEVER
+        # between these times its values are guessed, and lie between these
+        self.guess_us, self.guess = (NEVER, NEVER), (nan, nan)
         self.lacking = True
         self.anchor: tuple[int, float] | None = None
         self.moved_us = NEVER
 
-    def update(self, time_us: int, value: float, moving_rate: float) -> None:
-        """Take a telemetry value; NaN means unknown from now on. One older than the last is ignored."""
+    def update(self, time_us: int, value: float, moving_rate: float, since_us: int = 0) -> None:
+        """Take a telemetry value; NaN means unknown from now on. One older than the last is ignored.
+
+        One that was true at an unknown time since `since_us` (µs, if not 0) is taken as of `time_us`.
+        """
         self.lacking = not isfinite(value)
         if self.lacking:
             return
-        if time_us <= self.last_us:
+        if time_us < self.last_us:
             return
-        self.before = self.last if self.history else value
+        if since_us:
+            low, high = self.guess if self.guess_us[0] == since_us else (self.last, self.last)
+            self.guess_us = since_us, time_us
+            self.guess = (min(low, value), max(high, value)) if isfinite(low) else (value, value)
+        if time_us == self.last_us:  # of several that came at once, the newest
+            self.history.pop()
+        else:
+            self.before = self.last if self.history else value
         self.last_us, self.last = time_us, value
         self.history.append((time_us, value))
+        self.first_us = self.history[0][0]
         if self.anchor is None:
             self.anchor = time_us, value
         anchor_us, anchor = self.anchor
@@ -132,21 +154,30 @@ class Track:
         """Say whether the parameter is moving, or stopped less than `settle_time` s before `time_us`."""
         return self.moved_us == self.last_us or time_us - self.moved_us <= settle_time * 1e6
 
-    def at(self, time_us: int) -> tuple[float, float, float]:
-        """Return the value at `time_us`, its age in s, and the value before it.
+    def between(self, begin_us: int) -> tuple[float, float]:
+        """Return the least and the greatest value since `begin_us`, what was held then included."""
+        low = high = self.last
+        for then_us, value in reversed(self.history):
+            low, high = min(low, value), max(high, value)
+            if then_us <= begin_us:
+                break
+        return low, high
+
+    def at(self, time_us: int) -> tuple[float, float, float, float]:
+        """Return the value at `time_us`, its age in s, and two values between which a moving mass is.
 
         Between two values it is interpolated (age 0); after the last it is held; before the first, the first
         is taken, and the age is the time until then.
         """
         after_us, after = self.last_us, self.last
         if after_us <= time_us:
-            return after, (time_us - after_us) * 1e-6, self.before
+            return after, (time_us - after_us) * 1e-6, self.before, after
         for then_us, value in reversed(self.history):
             if then_us <= time_us:
                 weight = (time_us - then_us) / (after_us - then_us)
-                return value + weight * (after - value), 0.0, value
+                return value + weight * (after - value), 0.0, value, after
             after_us, after = then_us, value
-        return after, (after_us - time_us) * 1e-6, after
+        return after, (after_us - time_us) * 1e-6, after, after
 
 
 class Aligner:
@@ -159,6 +190,11 @@ class Aligner:
     settings : Align
     power_cycle : int or None
         The instrument's power-on counter at the time of its calibration; None where unknown.
+
+    Attributes
+    ----------
+    late_since_us : int
+        µs, not 0 while what comes may have waited, at most since then.
     """
 
     def __init__(self, inputs: tuple[Input, ...], settings: Align, power_cycle: int | None = None) -> None:
@@ -167,6 +203,7 @@ class Aligner:
         self.by_name = {what.name: track for what, track in zip(inputs, self.tracks, strict=True)}
         self.power_cycle = power_cycle
         self.offset_suspect = False
+        self.late_since_us = 0
         self._before_us = NEVER
         self._before_field, self._before_delay = (nan, nan, nan), (0.0, 0.0, 0.0)
         self._period_us, self._step_us = 0.0, 0
@@ -177,11 +214,24 @@ class Aligner:
         for name, track in self.by_name.items():
             track.max_age = ages.get(name, track.max_age)
 
-    def telemetry(self, name: str, time_us: int, value: float) -> None:
-        """Take a telemetry value; a name that the calibration does not need is ignored."""
+    def telemetry(self, name: str, time_us: int, value: float, *, guessed: bool = False) -> None:
+        """Take a telemetry value; a name that the calibration does not need is ignored.
+
+        Parameters
+        ----------
+        name : str
+            Of the parameter.
+        time_us : int
+            µs, when it was true.
+        value : float
+            NaN where it is not known.
+        guessed : bool
+            `time_us` is its arrival, but it had waited.
+        """
         track = self.by_name.get(name)
         if track is not None:
-            track.update(time_us, value, self.settings.moving_rate)
+            since_us = self.late_since_us if guessed else 0
+            track.update(time_us, value, self.settings.moving_rate, since_us)
 
     def reading(self, reading: Reading, time_us: int, *, restarted: bool = False, missing: int = 0) -> Sample:
         """Turn a reading into a sample.
@@ -219,10 +269,25 @@ class Aligner:
             quality |= SATURATED
             variance = inf
 
-        sample_us, settle_time = first_us - nearest(settings.filter_delay * 1e6), settings.settle_time
+        sample_us = first_us - nearest(settings.filter_delay * 1e6)
+        undated = self.late_since_us != 0 and isnan(reading.device_time)
+        values, spans, age, more, growth = self._parameters(sample_us, undated)
+        variance += growth
+        sigma = variance**0.5 if variance else 0.0
+        # the two low bits of a time belong to the log
+        return Sample(sample_us - sample_us % 4, field, values, age, quality | more, sigma, spans)
+
+    def _parameters(
+        self, sample_us: int, undated: bool
+    ) -> tuple[tuple[float, ...], tuple[tuple[int, float, float], ...], float, int, float]:
+        """Return values, spans, age, flags and variance (nT²) of the parameters at `sample_us` (µs).
+
+        An `undated` sample waited, and it is not known since when.
+        """
+        late_us, settings = self.late_since_us, self.settings
         values: list[float] = []
         spans: list[tuple[int, float, float]] = []
-        oldest = 0.0
+        quality, variance, oldest = 0, 0.0, 0.0
         for index, track in enumerate(self.tracks):
             if track.last_us == NEVER:
                 what = track.input
@@ -231,18 +296,23 @@ class Aligner:
                 quality |= STALE
                 oldest = inf
                 continue
-            value, age, before = track.at(sample_us)
+            value, age, low, high = track.at(sample_us)
             values.append(value)
             oldest = max(oldest, age)
             if track.lacking or age > track.max_age:
                 quality |= STALE
                 variance += (settings.stale_growth * age) ** 2
-            if track.moving(sample_us, settle_time):
+            if track.moving(sample_us, settings.settle_time):
                 quality |= MOVING
-                spans.append((index, before, value))
-        sigma = variance**0.5 if variance else 0.0
-        # the two low bits of a time belong to the log
-        return Sample(sample_us - sample_us % 4, field, tuple(values), oldest, quality, sigma, tuple(spans))
+                spans.append((index, low, high))
+            if sample_us < track.first_us or (late_us and (undated or sample_us > track.last_us)):
+                quality |= LATE_JOIN
+            if undated:
+                spans.append((index, *track.between(late_us)))
+            elif track.guess_us[0] <= sample_us <= track.guess_us[1]:
+                quality |= LATE_JOIN
+                spans.append((index, *track.guess))
+        return tuple(values), tuple(spans), oldest, quality, variance
 
     def _common_time(self, field: Vector, delay: Vector, time_us: int) -> tuple[Vector, int]:
         """Interpolate all channels to the time of the earliest; return the field (nT) and that time (µs)."""

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from magbridge.align import Aligner, Input, Sample
+from magbridge.arrays import FloatArray
 from magbridge.calibration.correct import Corrector
 from magbridge.calibration.model import Calibration, identity
 from magbridge.columns import AGE, CHANNELS, COLUMNS, CORRECTED, require
@@ -73,9 +74,9 @@ class Correction:
         ages = {name: declared.get(f"telemetry.{name}.max_age") for name in self.names}
         self.aligner.tune(self.aligner.settings, {name: age for name, age in ages.items() if age})
 
-    def telemetry(self, name: str, value: float, time_us: int) -> None:
-        """Take a telemetry value; a name that the calibration does not need is ignored."""
-        self.aligner.telemetry(name, time_us, value)
+    def telemetry(self, name: str, value: float, time_us: int, *, guessed: bool = False) -> None:
+        """Take a telemetry value; arguments as :meth:`magbridge.align.Aligner.telemetry`."""
+        self.aligner.telemetry(name, time_us, value, guessed=guessed)
 
     def reading(
         self, reading: Reading, time_us: int, *, restarted: bool = False, missing: int = 0
@@ -138,6 +139,7 @@ def correct_rows(correction: Correction, deployment: xr.Dataset) -> xr.Dataset:
     for row, reading, stamp in _readings(correction, deployment):
         one = correction.reading(reading, stamp)[1]
         results[row] = one.total_field, one.total_field_sigma, *one.field, nan, one.quality
+    _keep_late_joins(results, deployment)
     columns = dict(zip(CORRECTED, results.T, strict=True))
     columns["anomaly"] = columns["total_field"] - magnitude(main_field(deployment))
     return xr.Dataset(
@@ -145,6 +147,17 @@ def correct_rows(correction: Correction, deployment: xr.Dataset) -> xr.Dataset:
         coords={"time": deployment["time"]},
         attrs={"source": deployment.attrs.get("source", "")},
     )
+
+
+def _keep_late_joins(results: FloatArray, deployment: xr.Dataset) -> None:
+    """Flag again what a bridge flagged as late, with its sigma: rows do not tell how long they waited."""
+    if not {"quality", "total_field_sigma"} <= set(deployment):
+        return
+    recorded = np.nan_to_num(deployment["quality"].to_numpy().astype(float)).astype(int)
+    late = recorded & Quality.LATE_JOIN != 0
+    sigma, quality = CORRECTED.index("total_field_sigma"), CORRECTED.index("quality")
+    results[late, quality] = results[late, quality].astype(int) | Quality.LATE_JOIN
+    results[late, sigma] = np.fmax(results[late, sigma], deployment["total_field_sigma"].to_numpy()[late])
 
 
 def _readings(correction: Correction, deployment: xr.Dataset) -> Iterator[tuple[int, Reading, int]]:

@@ -42,6 +42,12 @@ class Quality(IntFlag):
     """The vector is known only up to one rotation; its magnitude is right."""
     GAP = 128
     """Samples are missing just before this one."""
+    IMPLAUSIBLE = 256
+    """It cannot be the Earth's field here, or the sensor or the telemetry shows a fault."""
+    LATE_JOIN = 512
+    """Sample and telemetry may not be of one time."""
+    UNEXPLAINED = 1024
+    """The model no longer explains the data."""
 
     def names(self) -> str:
         """Return the public names, in order of value, separated by spaces; empty for no flag."""

@@ -147,12 +147,49 @@ def test_noisy_telemetry_of_a_resting_mass_is_not_motion() -> None:
         assert "moving" not in flags(sample)
 
 
-def test_out_of_order_and_duplicate_telemetry_is_ignored() -> None:
+def test_out_of_order_telemetry_is_ignored_and_of_several_at_once_the_newest_counts() -> None:
     aligner = Aligner((BATTERY,), Align(moving_rate=100.0))
     aligner.telemetry("battpos", START + SECOND, 0.2)
     aligner.telemetry("battpos", START, 0.9)
     aligner.telemetry("battpos", START + SECOND, 0.9)
-    assert aligner.reading(reading(), START + 2 * SECOND).values == (0.2,)
+    assert aligner.reading(reading(), START + 2 * SECOND).values == (0.9,)
+
+
+def test_a_sample_from_before_all_telemetry_is_a_late_join() -> None:
+    aligner = Aligner((BATTERY,), Align(filter_delay=5.0))
+    aligner.telemetry("battpos", START, 0.3)
+    assert flags(aligner.reading(reading(), START + 2 * SECOND)) == {"late_join"}
+    assert flags(aligner.reading(reading(), START + 6 * SECOND)) == set()
+
+
+@pytest.mark.parametrize("dated", [True, False])
+@pytest.mark.parametrize("guessed", [True, False])
+def test_what_waited_is_joined_with_the_telemetry_of_its_time(dated: bool, guessed: bool) -> None:
+    """A mass goes from 0 to 1 within the 8 s of a standstill, and all that waited comes at once."""
+    aligner = Aligner((BATTERY,), Align(moving_rate=100.0))
+    aligner.telemetry("battpos", START, 0.0)
+    end = START + 8 * SECOND
+    aligner.late_since_us = START
+    for k in range(1, 9):
+        when = end if guessed else START + k * SECOND
+        aligner.telemetry("battpos", when, float(k >= 3), guessed=guessed)
+    for k in range(1, 9):
+        one = reading(device_time=float(k)) if dated else reading()
+        sample = aligner.reading(one, START + k * SECOND if dated else end + 4 * k)
+        assert flags(sample) == ({"late_join"} if guessed or not dated else set())
+        if dated and not guessed:
+            assert sample.values == (float(k >= 3),)
+        else:
+            assert (0, 0.0, 1.0) in sample.spans
+    aligner.late_since_us = 0
+    assert "late_join" not in flags(aligner.reading(reading(), end + SECOND))
+
+
+def test_of_a_time_within_the_standstill_whose_telemetry_has_not_come_nothing_is_known() -> None:
+    aligner = Aligner((BATTERY,), Align())
+    aligner.telemetry("battpos", START, 0.0)
+    aligner.late_since_us = START
+    assert flags(aligner.reading(reading(device_time=1.0), START + SECOND)) == {"late_join"}
 
 
 def test_gap_and_missing_readings() -> None:

@@ -1,4 +1,4 @@
-"""What happens at the edge: a port opens or is lost, the host's clock is set, the log fails or recovers."""
+"""What happens at the edge: ports open or are lost, the host's clock is set, the log or the bridge stalls."""
 
 from __future__ import annotations
 
@@ -9,7 +9,13 @@ from magbridge.mavlink.dialect import MAG_LOG_STATE, MAG_PORT_NAME, MAG_PORT_STA
 
 __all__ = ["Changes"]
 
-CLOCK_STEP, NOTICE, PORT = (spec(name).id for name in ("MAG_CLOCK_STEP", "STATUSTEXT", "MAG_PORT"))
+CLOCK_STEP, NOTICE, PORT, STANDSTILL = (
+    spec(name).id for name in ("MAG_CLOCK_STEP", "STATUSTEXT", "MAG_PORT", "MAG_STANDSTILL")
+)
+GRACE_US = 500_000
+"""µs after a standstill within which more of what waited comes: what a full buffer had no room for."""
+TELL_US = 1_000_000
+"""µs from which on a standstill is announced."""
 
 
 class Changes:
@@ -27,11 +33,14 @@ class Changes:
     log_state : MAG_LOG_STATE
     log_lost : int
         Records that the log has lost.
+    since_us, until_us : int
+        µs: what comes up to `until_us` may have waited since `since_us`.
     """
 
     def __init__(self, codec: Codec, announcer: Announcer, sensor: SensorLine) -> None:
         self._codec, self._announcer, self._sensor = codec, announcer, sensor
         self.log_state, self.log_lost = MAG_LOG_STATE.OFF, 0
+        self.since_us = self.until_us = 0
 
     def hear(self, data: bytes, time_us: int) -> None:
         """Take frames that came at `time_us`."""
@@ -42,9 +51,19 @@ class Changes:
                 self._announcer.say(step, MAV_SEVERITY.NOTICE)
             elif message.id == NOTICE:
                 self._announcer.say(message["text"], MAV_SEVERITY(message["severity"]))
+            elif message.id == STANDSTILL:
+                self._stood_still(time_us, message["duration"])
             elif message.id == PORT:
                 well = message["state"] == MAG_PORT_STATE.OK
                 self._port(message["port"], well, message["reason"], message["dropped"], time_us)
+
+    def _stood_still(self, time_us: int, duration_us: int) -> None:
+        if time_us > self.until_us:  # else one more of a row of them
+            self.since_us = time_us - duration_us
+        self.until_us = time_us + GRACE_US
+        if duration_us >= TELL_US:
+            text = f"stood still for {duration_us * 1e-6:.1f} s: late samples are flagged"
+            self._announcer.say(text, MAV_SEVERITY.WARNING)
 
     def _port(self, port: int, well: bool, reason: str, dropped: int, time_us: int) -> None:
         severity = MAV_SEVERITY.INFO if well else MAV_SEVERITY.ERROR

@@ -29,6 +29,10 @@ SLOW_US = 10_000_000
 """µs between two reports that the link is too slow; repeated, because one may be lost as well."""
 LOOK_US = 100_000
 """µs between two checks for a step of the host's clock, and for a link that is too slow."""
+BACKLOG = 1 << 20
+"""Bytes of a link's backlog that are read at once after the process was held up."""
+STANDSTILL_US = 250_000
+"""µs that a turn takes only where the process was held up: none waits for longer than `LOOK_US`."""
 
 
 class LiveEdge:
@@ -60,7 +64,8 @@ class LiveEdge:
 
     def events(self, deadline: Callable[[], int]) -> Iterator[Event]:
         """Yield events until :meth:`stop`, and an empty one whenever `deadline` (µs) has passed."""
-        look_us = self._clock.now_us() + LOOK_US
+        turned_us = self._clock.now_us()
+        look_us = turned_us + LOOK_US
         while not self._stopping:
             wait = (min(deadline(), look_us) - self._clock.now_us()) * 1e-6
             lines = {fd: channel for channel, port in self._ports.items() for fd in port.fds()}
@@ -77,19 +82,25 @@ class LiveEdge:
                 os.read(self._woken, 4096)
             while not self._changes.empty():  # the news that a port opened comes before its data
                 yield Event(now_us, Channel.STATE, self._changes.get())
+            if held := now_us - turned_us > STANDSTILL_US:
+                yield Event(now_us, Channel.STATE, states.standstill(now_us, now_us - turned_us))
+            turned_us = now_us
             for fd in ready:
-                if fd != self._woken and (data := self._read(lines[fd], fd)):
+                if fd != self._woken and (data := self._waiting(lines[fd], fd, held)):
                     yield Event(now_us, lines[fd], data)
             if now_us >= look_us:
                 look_us = now_us + LOOK_US
-                if step_us := self._clock.step_us():
-                    yield Event(now_us, Channel.STATE, states.clock_step(now_us, step_us))
-                if self._too_slow(now_us):
-                    yield Event(
-                        now_us, Channel.STATE, states.too_slow(Channel.LINK, self._ports[Channel.LINK])
-                    )
+                for state in self._look(now_us):
+                    yield Event(now_us, Channel.STATE, state)
             if now_us >= deadline():
                 yield Event(now_us, Channel.STATE, b"")
+
+    def _look(self, now_us: int) -> Iterator[bytes]:
+        """Yield the states of the host's clock and of the link, where they are to be reported."""
+        if step_us := self._clock.step_us():
+            yield states.clock_step(now_us, step_us)
+        if self._too_slow(now_us):
+            yield states.too_slow(Channel.LINK, self._ports[Channel.LINK])
 
     def send(self, channel: Channel, data: bytes) -> None:
         """Send to a port; while the port is down, data are dropped and counted."""
@@ -140,6 +151,17 @@ class LiveEdge:
         except PortError as error:
             self._lost(channel, error)
             return b""
+
+    def _waiting(self, channel: Channel, fd: int, held: bool) -> bytes:
+        """Return what waits; after a standstill, all of the link: readings need the telemetry then."""
+        data = self._read(channel, fd)
+        while held and data and channel == Channel.LINK and len(data) < BACKLOG:
+            more = select.select([fd], [], [], 0)[0] if fd in self._ports[channel].fds() else []
+            piece = self._read(channel, fd) if more else b""
+            if not piece:
+                break
+            data += piece
+        return data
 
     def _too_slow(self, now_us: int) -> bool:
         """Say whether to report now that the link has dropped data for lack of room."""

@@ -124,6 +124,7 @@ class Pipeline:
         self._raw_rate = self.component.rates["MAG_RAW"]
         self._position = Position(self._tell_no_anomaly)
         self._samples = self._lost = self._quality = 0
+        self._late = False
         self._times: deque[int] = deque(maxlen=LATELY)
         self._tune()
         self._begin(start, used, foreign=foreign)
@@ -148,6 +149,9 @@ class Pipeline:
         component.advance(time_us)
         due = component.outbox.drain()
         self.journal.sent(due)
+        if self._late and time_us > self._changes.until_us:
+            self._late = False
+            self._correction.aligner.late_since_us = 0
         if channel is SENSOR:
             self.journal.sensor(time_us, data)
             self._hear_sensor(data, time_us)
@@ -156,6 +160,9 @@ class Pipeline:
         elif data:
             self.journal.state(time_us, data)
             self._changes.hear(data, time_us)
+            if self._changes.until_us >= time_us:
+                self._late = True
+                self._correction.aligner.late_since_us = self._changes.since_us
         answers = component.outbox.drain()
         self.journal.sent(answers)
         return due + answers
@@ -194,7 +201,7 @@ class Pipeline:
         component = self.component
         for message in component.receive(data, time_us):
             for name, value, when_us in self._telemetry.values(message, time_us, component.vehicle.clock):
-                self._correction.telemetry(name, value, when_us)
+                self._correction.telemetry(name, value, when_us, guessed=self._late and when_us == time_us)
             if message.id == Position.MESSAGE:
                 self._position.update(message, time_us)
             if self.navigation is not None:

@@ -7,7 +7,7 @@ from magbridge.mavlink.codec import Codec
 from magbridge.mavlink.dialect import MAG_PORT_NAME, MAG_PORT_STATE, MAV_SEVERITY
 from magbridge.records import Channel
 
-__all__ = ["clock_step", "log_state", "notice", "opened", "port", "too_slow"]
+__all__ = ["clock_step", "log_state", "notice", "opened", "port", "standstill", "too_slow"]
 
 
 def _frame(name: str, **fields: object) -> bytes:
@@ -17,6 +17,11 @@ def _frame(name: str, **fields: object) -> bytes:
 def clock_step(time_us: int, step_us: int) -> bytes:
     """Return the frame that says that the host's clock was set by `step_us` µs."""
     return _frame("MAG_CLOCK_STEP", time_usec=time_us + step_us, step=step_us)
+
+
+def standstill(time_us: int, duration_us: int) -> bytes:
+    """Return the frame that says that until now the bridge stood still for `duration_us` µs."""
+    return _frame("MAG_STANDSTILL", time_usec=time_us, duration=min(duration_us, 2**32 - 1))
 
 
 def notice(text: str, severity: MAV_SEVERITY = MAV_SEVERITY.WARNING) -> bytes:

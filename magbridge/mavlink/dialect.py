@@ -369,6 +369,7 @@ MESSAGES: dict[int, tuple[str, int, str]] = {
     60107: ("MAG_CLOCK_STEP", 81, "Q:time_usec:us:,q:step:us:"),
     60108: ("MAG_PORT", 171, "Q:time_usec:us:,I:dropped:bytes:,B:port::,B:state::,80s:reason::"),
     60109: ("MAG_COLUMN", 112, "d:scale::,d:offset::,16s:unit::,44s:message::,40s:field::,64s:match::,64s:column::"),
+    60110: ("MAG_STANDSTILL", 94, "Q:time_usec:us:,I:duration:us:"),
     60120: ("MAG_SIGNING_STREAM", 216, "Q:stamp::,B:link::,B:system::,B:sender::,B:ahead::"),
     60121: ("MAG_BESIDE", 49, "H:count::"),
 }
@@ -418,6 +419,9 @@ class MAG_QUALITY(IntEnum):
     OFFSET_SUSPECT = 32
     NO_BORESIGHT = 64
     GAP = 128
+    IMPLAUSIBLE = 256
+    LATE_JOIN = 512
+    UNEXPLAINED = 1024
 
 
 class MAG_RAW_FLAGS(IntEnum):

@@ -23,6 +23,9 @@ FLAGS = {
     "offset_suspect": "The sensor was power-cycled since its calibration",
     "no_boresight": "The vector is in sensor axes; only its magnitude is calibrated",
     "gap": "Samples are missing",
+    "implausible": "It cannot be the Earth's field here, or something is broken",
+    "late_join": "Sample and telemetry may not be of one time",
+    "unexplained": "The calibration no longer explains the field",
 }
 LOSSES = {
     "Samples lost at the sensor": "samples_lost",

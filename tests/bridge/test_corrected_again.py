@@ -9,6 +9,7 @@ import pytest
 from small import START, small_bridge
 
 from magbridge import logs
+from magbridge.bridge import states
 from magbridge.bridge.events import Event, Start
 from magbridge.calibration.file import load as load_calibration
 from magbridge.calibration.model import Parameter
@@ -72,3 +73,26 @@ def test_flags_and_sigmas_are_those_of_the_bridge(tmp_path: Path, suffix: str, p
     assert {Quality.STALE_TELEMETRY, Quality.MOVING} <= seen
     for name in set(CORRECTED) - {"anomaly"}:
         np.testing.assert_allclose(again[name], rows[name], rtol=precision, err_msg=name)
+
+
+def test_what_a_bridge_has_flagged_as_late_stays_so(tmp_path: Path) -> None:
+    """The rows of a log do not tell that the bridge stood still for 5 s, while the mass moved."""
+    pipeline = small_bridge(tmp_path, Start(START), BATTERY, ["MAG_FIELD"])
+    autopilot = Codec(1, 1)
+    with TlogWriter(tmp_path / "logs", head=pipeline.declarations) as log:
+        for k in range(20):
+            if k == 10:
+                stall = states.standstill(START + k * 1_000_000, 5_000_000)
+                pipeline.feed(Event(START + k * 1_000_000 - 400_000, Channel.STATE, stall))
+            position = 0.9 if k >= 10 else 0.0
+            frame = autopilot.pack("NAMED_VALUE_FLOAT", name="battpos", value=position)
+            pipeline.feed(Event(START + k * 1_000_000 - 400_000, Channel.LINK, frame))
+            line = b"12340.5 43210.9 -234.5 4.0 %d 7\r\n" % k
+            pipeline.feed(Event(START + k * 1_000_000, Channel.SENSOR, line))
+            log.extend(pipeline.journal.drain())
+    rows = logs.read(sorted((tmp_path / "logs").iterdir()))
+    again = correct_rows(Correction(load_calibration(tmp_path / "cal.json")), rows)
+    late = rows["quality"].to_numpy().astype(int) & Quality.LATE_JOIN != 0
+    assert late.any()
+    assert ((again["quality"].to_numpy().astype(int) & Quality.LATE_JOIN != 0) == late).all()
+    assert (again["total_field_sigma"].to_numpy()[late] >= rows["total_field_sigma"].to_numpy()[late]).all()

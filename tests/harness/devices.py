@@ -35,11 +35,21 @@ def open_line(name: Path) -> tuple[int, int]:
 
 
 class Fluxgate:
-    """A digitizer on a pty, found under a name that can change as those of USB adapters do."""
+    """An instrument on a pty, found under a name that can change as those of USB adapters do.
 
-    def __init__(self, folder: Path, options: dict[str, object]) -> None:
+    Attributes
+    ----------
+    field : callable
+        The field in nT at a time (s, monotonic).
+    """
+
+    def __init__(
+        self, folder: Path, options: dict[str, object], driver: str = "digitizer", hz: float = SENSOR_HZ
+    ) -> None:
         self.folder = folder
-        self.encoder = open_encoder("digitizer", options)
+        self.encoder = open_encoder(driver, options)
+        self.field: Callable[[float], tuple[float, float, float]] = lambda _: TRUTH
+        self._hz = hz
         self.speaks = True
         self._master = self._slave = -1
         self._name = folder
@@ -76,7 +86,7 @@ class Fluxgate:
 
     def turn(self) -> None:
         """Send the readings that are due; they are taken whether anybody listens or not."""
-        due = int((time.monotonic() - self._on) * SENSOR_HZ)
+        due = int((time.monotonic() - self._on) * self._hz)
         while self._sent < due:
             frame = self._frame()
             if self.speaks:
@@ -84,7 +94,9 @@ class Fluxgate:
 
     def _frame(self) -> bytes:
         self._sent += 1
-        reading = Reading(TRUTH, device_time=self._sent / SENSOR_HZ, temperature=4.0, supply=3.7)
+        elapsed = self._sent / self._hz
+        field = self.field(self._on + elapsed)
+        reading = Reading(field, device_time=elapsed, temperature=4.0, supply=3.7)
         return self.encoder.encode(reading)
 
 
@@ -115,6 +127,10 @@ class Autopilot:
 
     def __init__(self, url: str, codec: Codec) -> None:
         self.codec = codec
+        self.position: Callable[[float], float] = lambda _: 0.5
+        """Of the battery at a time (s, monotonic)."""
+        self.answers = True
+        """Whether it answers TIMESYNC."""
         self.told: list[float] = []
         """When it sent telemetry (s, monotonic)."""
         self._retell: Callable[[bytes], list[bytes]] = lambda frame: [frame]
@@ -194,8 +210,9 @@ class Autopilot:
         """Send a message."""
         self.send(self.pack(name, **fields))
 
-    def telemetry(self, value: float = 0.5, *, behind_us: int = 0) -> bytes:
+    def telemetry(self, value: float | None = None, *, behind_us: int = 0) -> bytes:
         """Return a frame of telemetry."""
+        value = self.position(time.monotonic()) if value is None else value
         return self.pack(
             "NAMED_VALUE_FLOAT", time_boot_ms=(self.boot_us - behind_us) // 1000, value=value, name="battpos"
         )
@@ -216,7 +233,7 @@ class Autopilot:
             for frame in self._retell(self.telemetry()):
                 self.send(frame)
         for message in self._hear():
-            if message.known and message.name == "TIMESYNC" and message["tc1"] == 0:
+            if self.answers and message.known and message.name == "TIMESYNC" and message["tc1"] == 0:
                 self.say("TIMESYNC", tc1=self.boot_us * 1000, ts1=message["ts1"])
             yield message
 

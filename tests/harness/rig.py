@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from devices import TRUTH, TURN, Autopilot, Fluxgate
+from devices import SENSOR_HZ, TRUTH, TURN, Autopilot, Fluxgate
 from standstill import standstill
 
 from magbridge.calibration.file import save
@@ -31,12 +31,11 @@ from sitl.replay.stage import Stage
 
 CONFIG = """\
 [sensor]
-driver = "digitizer"
+driver = "{driver}"
 port = "{port}"
 timeout = 0.5
 [sensor.options]
-sensitivity = 5e-5
-reference_voltage = 5.0
+{options}
 [link]
 url = "{url}"
 {signing}
@@ -60,6 +59,8 @@ directory = "logs"
 """
 
 
+OPTIONS = "sensitivity = 5e-5\nreference_voltage = 5.0"
+LATE = int(Quality.STALE_TELEMETRY | Quality.LATE_JOIN)
 STALE_BY = 0.2
 """s that the machine may stand still, of the last second, before telemetry can be stale for it: 0.5 s
 is `max_age`."""
@@ -87,6 +88,10 @@ class Rig:
         The bridge sees a clock that :meth:`step` sets.
     more : str
         Further lines of the configuration.
+    sensor : (str, str), optional
+        Another driver, and its options.
+    hz : float
+        Of the sensor.
     """
 
     def __init__(
@@ -97,6 +102,8 @@ class Rig:
         key: bytes | None = None,
         stepped: bool = False,
         more: str = "",
+        sensor: tuple[str, str] = ("digitizer", OPTIONS),
+        hz: float = SENSOR_HZ,
     ) -> None:
         self.folder, self.normal = folder, 0
         self.machine = standstill()
@@ -107,6 +114,7 @@ class Rig:
         self.url = f"serial:{folder / 'autopilot'}" if link == "serial" else f"{link}:{place}"
         (folder / "dev").mkdir()
         self.config = folder / "bridge.toml"
+        self._sensor = sensor
         self.config.write_text(self.settings(self.url, key is not None) + more)
         save(calibration(), folder / "cal.json")
         if key is not None:
@@ -116,14 +124,16 @@ class Rig:
         clock = [sys.executable, str(Path(__file__).with_name("stepped.py")), str(self.offset)]
         self._launch = clock if stepped else [str(Path(sys.executable).with_name("magbridge"))]
         options = load(self.config).sensor.options
-        self.fluxgate = Fluxgate(folder / "dev", options)
+        self.fluxgate = Fluxgate(folder / "dev", options, sensor[0], hz)
         self.autopilot = Autopilot(self.url, Codec(1, 1, Signing(key) if key else None))
         self.process: subprocess.Popen[bytes] | None = None
 
     def settings(self, url: str, signs: bool = False) -> str:
         """Return a configuration."""
         signing = 'signing_key = "key.bin"' if signs else ""
-        return CONFIG.format(port=self.folder / "dev" / "ttyUSB*", url=url, signing=signing)
+        driver, options = self._sensor
+        port = self.folder / "dev" / "ttyUSB*"
+        return CONFIG.format(driver=driver, options=options, port=port, url=url, signing=signing)
 
     def start(self) -> float:
         """Plug everything in and start the bridge; return the s until all is well."""
@@ -250,12 +260,12 @@ class Rig:
         return Quality(seen & ~self.normal).names()
 
     def undue_flags(self, mark: int) -> str:
-        """Return the same without `stale_telemetry` where none came: the machine stood still, or we did."""
+        """Return the same without those of late telemetry where the machine stood still, or we did."""
         seen = 0
         for when, message in self.heard[mark:]:
             if message.name == "MAG_FIELD":
                 late = self.machine.seconds(when - 1.0, when) > STALE_BY or self.untold(when) > STALE_BY
-                seen |= message["flags"] & ~(Quality.STALE_TELEMETRY if late else 0)
+                seen |= message["flags"] & ~(LATE if late else 0)
         return Quality(seen & ~self.normal).names()
 
     def untold(self, when: float) -> float:
@@ -285,12 +295,15 @@ class Rig:
         return recorded, bytes(published)
 
 
-def calibration() -> Calibration:
-    """A calibration with one moving mass, which changes nothing at its centre."""
+def calibration(slope: tuple[float, float, float] = (30.0, -20.0, 10.0)) -> Calibration:
+    """A calibration with one moving mass, which changes nothing at its centre.
+
+    `slope` is the nT by which the offset changes as the mass goes from there to the end of its range.
+    """
     return Calibration(
         parameters=(Parameter("battpos", "in", -1.0, 2.0, 0.5, 1.5),),
         terms=(Polynomial(exponents=((0,), (1,))),),
-        coefficients=np.array([0.0] * 15 + [30.0, -20.0, 10.0]),
+        coefficients=np.array([0.0] * 15 + [*slope]),
         covariance=np.eye(18),
         noise=Noise(1.0),
         reference=Reference(float(np.linalg.norm(TRUTH))),
