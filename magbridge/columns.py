@@ -21,6 +21,7 @@ __all__ = [
     "CORRECTED",
     "NT_PER_UNIT",
     "Column",
+    "counts_from_boot",
     "factor",
     "may_be",
     "require",
@@ -132,6 +133,20 @@ _SAME = {
     "cm^3": "cm3",
     "cm³": "cm3",
 }
+
+
+YEAR_1980 = 315_532_800.0
+"""s since 1970: no log of a magnetometer with a computer is older, but a clock that nobody set is."""
+
+
+def counts_from_boot(deployment: xr.Dataset) -> bool:
+    """Say whether a deployment's times count from a boot, on a day that nobody knows.
+
+    So its log says (``time_reference = boot``), or they are before 1980.
+    """
+    time = deployment["time"].values
+    reference = deployment.attrs.get("time_reference")
+    return reference == "boot" or bool(time.size and reference is None and time[-1] < YEAR_1980)
 
 
 def factor(unit: str, column: str) -> float | None:

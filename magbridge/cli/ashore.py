@@ -9,11 +9,13 @@ from typing import Annotated
 from cyclopts import Parameter, validators
 
 from magbridge.cli.common import (
+    AS_THEY_SAY,
     Grid,
     Heading,
     Json,
     Log,
     Picture,
+    Reading,
     Whole,
     app,
     check_inputs,
@@ -25,7 +27,13 @@ from magbridge.progress import track, waiting
 
 
 @app.command(usage="Usage: magbridge convert FILE... -o FILE [OPTIONS]")
-def convert(*files: Path, output: Log, heading_reference: Heading = None, json: Json = False) -> None:
+def convert(
+    *files: Path,
+    output: Log,
+    heading_reference: Heading = None,
+    reading: Reading = AS_THEY_SAY,
+    json: Json = False,
+) -> None:
     """Convert logs from any readable format to any writable one; several logs are merged in time order.
 
     Parameters
@@ -36,6 +44,8 @@ def convert(*files: Path, output: Log, heading_reference: Heading = None, json: 
         The file to write; its suffix sets the format: .csv .nc .parquet .tlog.
     heading_reference
         What headings refer to. If not given: what the log says, else true north.
+    reading
+        How to read the logs.
     json
         Print the result as JSON.
     """
@@ -43,7 +53,7 @@ def convert(*files: Path, output: Log, heading_reference: Heading = None, json: 
 
     rows, pieces = 0, []
     with Writer(output) as writer:
-        for part in track(read_chunks(check_inputs(files, output)), "reading"):
+        for part in track(read_chunks(check_inputs(files, output), options=reading.options), "reading"):
             pieces.append(part.attrs)
             if heading_reference:
                 part.attrs["heading_reference"] = heading_reference
@@ -62,6 +72,7 @@ def simulate(
     output: Log,
     seed: Annotated[Whole, Parameter(validator=validators.Number(gte=0))] = 0,
     like: tuple[Path, ...] = (),
+    reading: Reading = AS_THEY_SAY,
     map_output: Annotated[Path | None, Parameter(name="--map", validator=file_to_write(".nc"))] = None,
     json: Json = False,
 ) -> None:
@@ -81,6 +92,8 @@ def simulate(
         may be repeated. Each call makes a world around its logs: for one world, give all logs in one call.
     map_output
         Also write the anomaly grid that an aeromagnetic survey of the simulated world would have produced.
+    reading
+        How to read the logs.
     json
         Print the result as JSON.
     """
@@ -95,7 +108,7 @@ def simulate(
     chosen = load(scenario)
     with waiting("simulating"):
         if like:
-            log = read(like)
+            log = read(like, options=reading.options)
             note_losses(log.attrs)
             chosen = placed_at(log, chosen)
             deployment = simulate_like(log, chosen, seed)

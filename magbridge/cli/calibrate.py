@@ -12,10 +12,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from cyclopts import Parameter, validators
 
 from magbridge.cli.common import (
+    AS_THEY_SAY,
     Heading,
     Json,
     Output,
     Picture,
+    Reading,
     Whole,
     app,
     check_inputs,
@@ -48,10 +50,12 @@ def calibrate(
     filter_corner: Annotated[float, Parameter(validator=validators.Number(gte=0, lt=inf))] = 0.0,
     heading_reference: Heading = None,
     picture: Picture = None,
-    strict: bool = False,
+    reading: Reading = AS_THEY_SAY,
     json: Json = False,
 ) -> None:
     """Fit a calibration to logs of calibration runs.
+
+    With --strict, also exit with 1 when the data do not support the fit.
 
     Parameters
     ----------
@@ -81,8 +85,8 @@ def calibrate(
     picture
         A PNG, PDF or SVG to draw: the error of each sample, raw and corrected, against time, heading and
         each parameter.
-    strict
-        Exit with 1 when the data do not support the fit.
+    reading
+        How to read the logs.
     json
         Print the result as JSON, with the paper's M, S and T at the middle of each parameter's range.
     """
@@ -102,7 +106,7 @@ def calibrate(
     if vehicle and method != "auto":
         raise WrongUse(f"--vehicle: method {method} does not use the positions of the masses; auto does")
     anomalies = read_grid(grid) if grid else None
-    logs = read_each(files)
+    logs = read_each(files, options=reading.options)
     deployment = join(logs)
     require(deployment, (*CHANNELS, *parameter))
     deployment = with_true_heading(deployment, heading_reference)
@@ -130,7 +134,7 @@ def calibrate(
         + (f"; {left_out} row{'s' * (left_out > 1)} without every value left out" if left_out else ""),
         json,
     )
-    if strict and not found.supported:
+    if reading.strict and not found.supported:
         raise DataError("the data do not support this fit (see the warnings), and --strict was given")
 
 
@@ -204,6 +208,7 @@ def plan(
     runs: Annotated[Whole, Parameter(validator=validators.Number(gte=1, lte=100))] = 10,
     roll: Annotated[float, Parameter(validator=validators.Number(gte=0, lte=90))] = 10.0,
     heading_reference: Heading = None,
+    reading: Reading = AS_THEY_SAY,
     json: Json = False,
 ) -> None:
     """Choose the calibration runs to fly next: those that make the mission's worst error smallest.
@@ -220,6 +225,8 @@ def plan(
         Largest bank angle in deg that the vehicle can fly in a spiral, either way.
     heading_reference
         What headings refer to. If not given: what the log says, else true north.
+    reading
+        How to read the logs.
     json
         Print the result as JSON.
     """
@@ -228,7 +235,7 @@ def plan(
     from magbridge.field.declination import with_true_heading
     from magbridge.logs import read
 
-    deployment = with_true_heading(read(mission), heading_reference)
+    deployment = with_true_heading(read(mission, options=reading.options), heading_reference)
     note_losses(deployment.attrs)
     known = load(calibration)
     with waiting("planning"):

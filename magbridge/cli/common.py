@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, date, datetime, time
 from hashlib import file_digest
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -14,7 +16,7 @@ from cyclopts import App, Parameter, Token
 
 from magbridge import __version__
 from magbridge.errors import FormatError, WrongUse
-from magbridge.logs import suffixes
+from magbridge.logs import Options, suffixes
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -22,6 +24,7 @@ if TYPE_CHECKING:
     from magbridge.calibration.model import Calibration
 
 __all__ = [
+    "AS_THEY_SAY",
     "Folder",
     "Grid",
     "Heading",
@@ -29,6 +32,7 @@ __all__ = [
     "Log",
     "Output",
     "Picture",
+    "Reading",
     "Whole",
     "app",
     "check_inputs",
@@ -105,6 +109,45 @@ def _whole(_: Any, tokens: Sequence[Token]) -> int:
         raise ValueError(f"expected a whole number, not {tokens[0].value}.") from None
 
 
+def _day(_: Any, tokens: Sequence[Token]) -> date:
+    """Read a date; cyclopts would also take a time of day, which no log counts from."""
+    try:
+        return date.fromisoformat(tokens[0].value)
+    except ValueError:
+        raise ValueError(f"expected YYYY-MM-DD, not {tokens[0].value}.") from None
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class Reading:
+    """How to read logs.
+
+    Parameters
+    ----------
+    date
+        The day (UTC, YYYY-MM-DD) of a log whose times count from the boot: the Earth's field is that day's.
+    compass
+        Which of several compasses to use: its number, from 0, or its device id. If not given: the one that
+        the log says was in use.
+    strict
+        Refuse a log of which anything would be dropped, instead of dropping, counting and naming it.
+    """
+
+    date: Annotated[date | None, Parameter(converter=_day)] = None
+    compass: str | None = None
+    strict: bool = False
+
+    @property
+    def options(self) -> Options:
+        """The same for :mod:`magbridge.logs`."""
+        boot = None if self.date is None else datetime.combine(self.date, time(), UTC).timestamp()
+        return Options(strict=self.strict, date=boot, compass=self.compass)
+
+
+AS_THEY_SAY = Reading()
+"""Logs are read as they say themselves."""
+NAMED = 5
+"""Losses that are named, a line each; the others are counted."""
 Output = Annotated[Path, Parameter(name=["--output", "-o"], validator=file_to_write())]
 Log = Annotated[Path, Parameter(name=["--output", "-o"], validator=_log_to_write)]
 Folder = Annotated[Path, Parameter(validator=folder_to_write)]
@@ -141,11 +184,16 @@ def doubts_of(calibration: Calibration, file: Path) -> list[str]:
 
 def note_losses(*pieces: Mapping[str, Any]) -> None:
     """Report on stderr what reading skipped, from the attributes of a deployment or of its pieces."""
-    from magbridge.logs.deployment import COUNTERS, passed_over
+    from magbridge.logs.deployment import COUNTERS, named_losses, passed_over
 
     if counts := passed_over(*pieces):
         losses = ", ".join(f"{count} {COUNTERS[name][count > 1]}" for name, count in counts.items())
         complain(f"in the logs: {losses}")
+    lines = named_losses(*pieces)
+    for line in lines[:NAMED]:
+        complain(line)
+    if len(lines) > NAMED:
+        complain(f"and in {len(lines) - NAMED} places more")
 
 
 def note_missing(calibration: Calibration, deployment: xr.Dataset) -> None:

@@ -8,8 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from magbridge.cli.common import (
+    AS_THEY_SAY,
     Json,
     Log,
+    Reading,
     app,
     check_inputs,
     complain,
@@ -29,7 +31,9 @@ if TYPE_CHECKING:
 
 
 @app.command(usage="Usage: magbridge correct FILE... --calibration cal.json -o FILE [OPTIONS]")
-def correct(*files: Path, calibration: Path, output: Log, json: Json = False) -> None:
+def correct(
+    *files: Path, calibration: Path, output: Log, reading: Reading = AS_THEY_SAY, json: Json = False
+) -> None:
     """Correct a log with a calibration, as the bridge would have done live.
 
     The arithmetic and the state (lags, backlash) are the bridge's own, but the input is the log's rows. In a
@@ -50,6 +54,8 @@ def correct(*files: Path, calibration: Path, output: Log, json: Json = False) ->
         The calibration (cal.json).
     output
         The file to write: total field with its sigma, vector, anomaly and quality flags.
+    reading
+        How to read the logs.
     json
         Print the result as JSON.
     """
@@ -64,7 +70,7 @@ def correct(*files: Path, calibration: Path, output: Log, json: Json = False) ->
     correction, tally, whole = Correction(known), _Tally(), False
     pieces: list[dict[str, Any]] = []
     with Writer(output) as writer:
-        for part in track(read_chunks(files, required=CHANNELS), "correcting"):
+        for part in track(read_chunks(files, required=CHANNELS, options=reading.options), "correcting"):
             if not pieces:
                 note_missing(known, part)
             pieces.append(part.attrs)

@@ -9,8 +9,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 from cyclopts import Parameter
 
 from magbridge.cli.common import (
+    AS_THEY_SAY,
     Folder,
     Json,
+    Reading,
     app,
     check_inputs,
     complain,
@@ -41,6 +43,7 @@ def diagnose(
     output: Annotated[Folder, Parameter(name=["--output", "-o"])],
     learned_from: tuple[Path, ...] = (),
     grid: Path | None = None,
+    reading: Reading = AS_THEY_SAY,
     json: Json = False,
 ) -> None:
     """Find what the calibration model gets wrong, why, and what extending it gains.
@@ -62,6 +65,8 @@ def diagnose(
         A log that the calibration was fitted to, to tell what has appeared since; may be repeated.
     grid
         An anomaly grid to add to the IGRF, where a log has no reference_field.
+    reading
+        How to read the logs.
     json
         Print the findings as JSON.
     """
@@ -76,7 +81,7 @@ def diagnose(
     check_inputs(files, output / "calibration.json", calibration)
     known = load(calibration)
     with waiting("reading") as step:
-        logs = [read(path) for path in files]
+        logs = [read(path, options=reading.options) for path in files]
         note_losses(*(log.attrs for log in logs))
         note_unused_grid(grid, *logs)
         remarks = doubts_of(known, calibration)
@@ -90,7 +95,10 @@ def diagnose(
             logs,
             known,
             output,
-            learned_from=[*again, *(read(path) for path in learned_from if path not in files)],
+            learned_from=[
+                *again,
+                *(read(path, options=reading.options) for path in learned_from if path not in files),
+            ],
             grid=read_grid(grid) if grid else None,
             progress=step,
             remarks=remarks,

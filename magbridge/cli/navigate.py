@@ -7,10 +7,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from magbridge.cli.common import (
+    AS_THEY_SAY,
     Heading,
     Json,
     Log,
     Picture,
+    Reading,
     app,
     check_inputs,
     complain,
@@ -42,6 +44,7 @@ def navigate(
     bound: bool = False,
     picture: Picture = None,
     heading_reference: Heading = None,
+    reading: Reading = AS_THEY_SAY,
     json: Json = False,
 ) -> None:
     """Find the track by matching the corrected field to an anomaly map.
@@ -69,6 +72,8 @@ def navigate(
         A PNG, PDF or SVG to draw: the tracks on the map, errors and innovations; or the bound on the map.
     heading_reference
         What headings refer to. If not given: what the log says, else true north.
+    reading
+        How to read the logs.
     json
         Print the result as JSON.
     """
@@ -78,7 +83,7 @@ def navigate(
     check_inputs(files, output, map, calibration, config)
     known, options = load(calibration) if calibration else None, _options(config)
     if bound:
-        _bound(files, map, output, options, known, picture, json)
+        _bound(files, map, output, options, known, picture, reading, json)
         return
     if known is None or calibration is None:
         raise WrongUse("expected --calibration, which only --bound can do without")
@@ -89,7 +94,7 @@ def navigate(
     from magbridge.navigate.batch import navigate as find_way
     from magbridge.navigate.options import informed
 
-    deployment = _corrected(files, known, calibration, heading_reference)
+    deployment = _corrected(files, known, calibration, heading_reference, reading)
     if options is None:
         options = informed(Options(), known, float(deployment["total_field_sigma"].median()))
     grid, options = _continued(read_grid(map), options, deployment)
@@ -106,7 +111,11 @@ def navigate(
 
 
 def _corrected(
-    files: tuple[Path, ...], known: Calibration, calibration: Path, heading_reference: Heading
+    files: tuple[Path, ...],
+    known: Calibration,
+    calibration: Path,
+    heading_reference: Heading,
+    reading: Reading,
 ) -> xr.Dataset:
     """Return the logs with their field corrected by the calibration `known`, which the file holds."""
     from magbridge.columns import CHANNELS
@@ -114,7 +123,7 @@ def _corrected(
     from magbridge.field.declination import with_true_heading
     from magbridge.logs import read
 
-    deployment = with_true_heading(read(files, required=CHANNELS), heading_reference)
+    deployment = with_true_heading(read(files, required=CHANNELS, options=reading.options), heading_reference)
     note_losses(deployment.attrs)
     for doubt in doubts_of(known, calibration):
         complain(doubt)
@@ -151,6 +160,7 @@ def _bound(
     options: Options | None,
     calibration: Calibration | None,
     picture: Path | None,
+    reading: Reading,
     json: bool,
 ) -> None:
     from magbridge.field.read import read_grid
@@ -158,7 +168,8 @@ def _bound(
     from magbridge.navigate import Options
     from magbridge.navigate.bound import as_dataset, position_bound
 
-    plan = read(files, required=("latitude", "longitude")).dropna("time", subset=["latitude", "longitude"])
+    place = ["latitude", "longitude"]
+    plan = read(files, required=place, options=reading.options).dropna("time", subset=place)
     grid, options = _continued(read_grid(map), options or Options(), plan)
     track = [plan[name].to_numpy().astype(float) for name in ("time", "latitude", "longitude")]
     sigma = calibration.noise.sensor if calibration else 1.0

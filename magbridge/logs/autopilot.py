@@ -11,11 +11,9 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import xarray as xr
 
 from magbridge.arrays import FloatArray
-from magbridge.logs.checks import increasing
 from magbridge.logs.deployment import deployment, sliced
 from magbridge.logs.resample import latest
 
@@ -48,11 +46,8 @@ def pieces(
     Its own times, s, are `offset` s behind UTC, 0 where that is not known. `mags` holds each magnetometer's
     times (m,) and, by axis, its values (m,), nT; `telemetry` yields times (m,), column, unit and values (m,).
     """
-    (_, (when, first)), *rest = sorted(mags.items())
-    keep = np.diff(when, prepend=-np.inf) > 0
-    time = when[keep]
-    increasing(path, time + offset)
-    columns = {f"mag_{axis}": values[keep] for axis, values in first.items()}
+    (_, (time, first)), *rest = sorted(mags.items())
+    columns = {f"mag_{axis}": values for axis, values in first.items()}
     units: dict[str, str] = {}
     others = ((when, f"mag{k + 1}_{a}", "nT", field[a]) for k, (when, field) in rest for a in field)
     for when, column, unit, values in chain(others, telemetry):

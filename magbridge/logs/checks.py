@@ -1,16 +1,26 @@
-"""What no deployment can hold: a time that does not increase, and values beyond what nature has."""
+"""What no deployment can hold is dropped and counted: times that do not increase, impossible values.
+
+One damaged record costs itself, not what follows. Of the times the longest increasing series is kept: a clock
+that was set back costs the rows that it lived through twice, a single wrong stamp its row. Rows at one time
+become one. A value beyond what nature has is unknown (NaN). A file of which half is wrong is in other units,
+or in another order, and is refused.
+"""
 
 from __future__ import annotations
 
+from bisect import bisect_left
+from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
+from itertools import chain, pairwise
 from pathlib import Path
 
 import numpy as np
 import xarray as xr
 
-from magbridge.arrays import FloatArray
+from magbridge.arrays import BoolArray, FloatArray, IndexArray
 from magbridge.columns import CHANNEL_TIMES, usual
 from magbridge.errors import FormatError
+from magbridge.logs.deployment import merged, with_losses
 
 __all__ = ["checked", "increasing"]
 
@@ -34,67 +44,203 @@ FIELDS = 1e3, 1e6
 """nT, between which every reference field lies: 5e-05 is in tesla, and -9999 a code for "not known"."""
 APART = 60.0
 """s by which a channel's sampling time may differ from its row's time."""
+ALONE, FAR = 3, 30 * 86_400.0
+"""Fewer rows than this, farther than this (s) from all others, are stamped wrong: no log of their own."""
+MANY = 10
+"""Rows from which on some can be called alone."""
+AHEAD = 64
+"""Rows looked at beyond the end of a piece: whether its last was stamped too late, they tell."""
+REFUSED = 0.5
+"""Share of the rows, or of a column's values, that are wrong in a file that is refused."""
 
 
-def increasing(
-    file: str | Path, time: FloatArray, rows: Sequence[int] | None = None, *, after: float = -np.inf
-) -> None:
+def increasing(file: str | Path, time: FloatArray, *, after: float = -np.inf) -> None:
     """Check that `time` (n,), s, is finite and increases, also from `after`, the last time before it.
 
     Raises
     ------
     FormatError
-        Names the first row that does not fit: its number in `rows`, or counted from 1.
+        Names the first row that does not fit, counted from 1.
     """
-    steps = np.diff(time, prepend=after)
-    wrong = np.flatnonzero(~((steps > 0) & (np.abs(time) < YEAR_10000)))
-    if not len(wrong):
-        return
-    k = int(wrong[0])
-    before = float(time[k - 1]) if k else after
-    expected = f"expected a time after {before!r}" if np.isfinite(before) else "expected a finite time"
-    if YEAR_10000 <= abs(time[k]) < np.inf:
-        expected = "expected seconds since 1970"
-    raise FormatError(
-        file, f"{expected}, not {float(time[k])!r}", row=rows[k] if rows else k + 1, column="time"
-    )
+    wrong = _wrong(time, after)
+    if len(wrong):
+        k = int(wrong[0])
+        expected = _expected(float(time[k]), float(time[k - 1]) if k else after)
+        raise FormatError(file, expected, row=k + 1, column="time")
 
 
-def checked(file: str | Path, pieces: Iterable[tuple[xr.Dataset, Sequence[int]]]) -> Iterator[xr.Dataset]:
-    """Yield the pieces of a deployment, each given with the numbers of its rows in the file.
+def checked(
+    file: str | Path, pieces: Iterable[tuple[xr.Dataset, Sequence[int]]], *, strict: bool = False
+) -> Iterator[xr.Dataset]:
+    """Yield the pieces of a deployment, each given with the numbers of its rows, without what cannot be.
+
+    Attributes of a piece count what it lost, ``rows_dropped duplicate_rows values_dropped``; ``losses`` has a
+    line for the first in each column of the file.
 
     Raises
     ------
     FormatError
-        Names the first row at which time does not increase, or whose temperature, pressure, angle, position,
-        depth, reference or channel time is impossible.
+        At least half of the rows, or of a column's values, cannot be, or, if `strict`, any: names the first.
     """
-    last = -np.inf
-    for dataset, rows in pieces:
-        increasing(file, dataset["time"].values, rows, after=last)
-        _plausible(file, dataset, rows)
-        last = float(dataset["time"][-1])
-        yield dataset
+    checks = _Checks(file, strict)
+    last: xr.Dataset | None = None
+    for piece, following in pairwise(chain(pieces, [None])):
+        if piece is None:  # only the last is
+            break
+        part = checks.sound(*piece, following[0]["time"].values if following else np.empty(0))
+        if part.sizes["time"]:
+            if last is not None:
+                yield last
+            last = checks.counted(part)
+    checks.finish()
+    if last is not None:
+        yield checks.counted(last)  # with what was lost behind it
 
 
-def _plausible(file: str | Path, dataset: xr.Dataset, rows: Sequence[int]) -> None:
-    time = dataset["time"].values
-    for name, column in dataset.data_vars.items():
-        values, unit = column.values, usual(column.attrs.get("units", ""))
-        if name in MOST:
-            wrong, expected = np.abs(values) > MOST[str(name)], f"{unit}, at most {MOST[str(name)]:g}"
-        elif name == "reference_field":
-            wrong = (values < FIELDS[0]) | (values > FIELDS[1])
-            expected = f"{FIELDS[0]:g} to {FIELDS[1]:g} nT, or nothing where it is not known"
-        elif name in CHANNEL_TIMES:
-            wrong, expected = np.abs(values - time) > APART, f"a time within {APART:g} s of the row's"
-        elif unit in LEAST:
-            wrong = values < LEAST[unit]
-            expected = f"at least {LEAST[unit]:g} {unit}, or nothing where it is not known"
-        else:
-            continue
-        if wrong.any():
-            k = int(wrong.argmax())
-            raise FormatError(
-                file, f"expected {expected}, not {float(values[k])!r}", row=rows[k], column=str(name)
-            )
+class _Checks:
+    """What was wrong in a file so far."""
+
+    def __init__(self, file: str | Path, strict: bool) -> None:
+        self._file, self._strict = file, strict
+        self._last = -np.inf
+        # by column, of time: rows; of the others: values
+        self._wrong: Counter[str] = Counter()
+        self._total: Counter[str] = Counter()
+        self._first: dict[str, FormatError] = {}
+        # not yet in the attributes of a piece
+        self._counts: Counter[str] = Counter()
+        self._lines: list[str] = []
+
+    def sound(self, dataset: xr.Dataset, rows: Sequence[int], ahead: FloatArray) -> xr.Dataset:
+        """Return the piece without what cannot be. `ahead` are the times of the next."""
+        index, duplicates = self._times(dataset["time"].values, rows, ahead)
+        dropped = dataset.sizes["time"] - len(index)
+        if dropped:
+            dataset, rows = dataset.isel(time=index), [rows[k] for k in index.tolist()]
+        dataset, values = self._plausible(dataset, rows)
+        if duplicates:
+            dataset = merged(dataset)
+        if dataset.sizes["time"]:
+            self._last = float(dataset["time"].values[-1])
+        self._counts.update(rows_dropped=dropped, duplicate_rows=duplicates, values_dropped=values)
+        return dataset
+
+    def counted(self, dataset: xr.Dataset) -> xr.Dataset:
+        """Return a piece with what was lost since the last one was returned."""
+        counts, lines = self._counts, self._lines
+        self._counts, self._lines = Counter(), []
+        return with_losses(dataset, counts, lines)
+
+    def finish(self) -> None:
+        """FormatError: half of the file's rows, or of a column's values, are wrong."""
+        for column, error in self._first.items():
+            if self._wrong[column] >= REFUSED * self._total[column]:
+                raise error
+
+    def _times(self, time: FloatArray, rows: Sequence[int], ahead: FloatArray) -> tuple[IndexArray, int]:
+        """Return the indices of the rows to keep, and how many of these have the time of the one before."""
+        self._total["time"] += len(time)
+        whole = np.concatenate([time, ahead[:AHEAD]])
+        if not len(_wrong(whole, self._last)):
+            return np.arange(len(time)), 0
+        index = _kept(whole, self._last)
+        then = [*whole[index].tolist(), np.inf]
+        index = index[index < len(time)]
+        repeated = index[1:][np.diff(time[index]) == 0]
+        wrong = np.union1d(np.setdiff1d(np.arange(len(time)), index), repeated)
+        if len(wrong):
+            k = int(wrong[0])
+            place = int(np.searchsorted(index, k))
+            before = float(time[index[place - 1]]) if place else self._last
+            self._note("time", len(wrong), rows[k], _expected(float(time[k]), before, then[place]))
+        return index, len(repeated)
+
+    def _plausible(self, dataset: xr.Dataset, rows: Sequence[int]) -> tuple[xr.Dataset, int]:
+        """Return the piece with NaN for impossible values, and how many there were."""
+        count, time = 0, dataset["time"].values
+        for name, column in dataset.data_vars.items():
+            values = column.values
+            wrong, expected = _impossible(str(name), column.attrs.get("units", ""), values, time)
+            self._total[str(name)] += int(np.isfinite(values).sum()) if expected else 0
+            if expected and wrong.any():
+                k = int(wrong.argmax())
+                self._note(str(name), int(wrong.sum()), rows[k], f"{expected}, not {float(values[k])!r}")
+                count += int(wrong.sum())
+                dataset = dataset.assign({name: column.copy(data=np.where(wrong, np.nan, values))})
+        return dataset, count
+
+    def _note(self, column: str, count: int, row: int, expected: str) -> None:
+        """Count what is wrong, and remember the first; FormatError: `strict`."""
+        error = FormatError(self._file, expected, row=row, column=column)
+        if self._strict:
+            raise error
+        self._wrong[column] += count
+        if column not in self._first:
+            self._first[column] = error
+            self._lines.append(str(error))
+
+
+def _impossible(name: str, unit: str, values: FloatArray, time: FloatArray) -> tuple[BoolArray, str]:
+    """Return which `values` (n,) of a column cannot be, and what was expected; "" where anything can be."""
+    unit = usual(unit)
+    if name in MOST:
+        return np.abs(values) > MOST[name], f"expected {unit}, at most {MOST[name]:g}"
+    if name == "reference_field":
+        expected = f"expected {FIELDS[0]:g} to {FIELDS[1]:g} nT, or nothing where it is not known"
+        return (values < FIELDS[0]) | (values > FIELDS[1]), expected
+    if name in CHANNEL_TIMES:
+        return np.abs(values - time) > APART, f"expected a time within {APART:g} s of the row's"
+    if unit in LEAST:
+        expected = f"expected at least {LEAST[unit]:g} {unit}, or nothing where it is not known"
+        return values < LEAST[unit], expected
+    return np.zeros(len(values), bool), ""
+
+
+def _wrong(time: FloatArray, after: float) -> IndexArray:
+    """Return the indices at which `time` (n,) is no time, or does not increase."""
+    return np.flatnonzero(~((np.diff(time, prepend=after) > 0) & (np.abs(time) < YEAR_10000)))
+
+
+def _expected(time: float, before: float, then: float = np.inf) -> str:
+    """Return what was expected between two other times, s, in place of `time`."""
+    if YEAR_10000 <= abs(time) < np.inf:
+        return f"expected seconds since 1970, not {time!r}"
+    if before < time and then <= time:
+        return f"expected a time before {then!r}, not {time!r}"
+    return f"expected a {f'time after {before!r}' if np.isfinite(before) else 'finite time'}, not {time!r}"
+
+
+def _kept(time: FloatArray, after: float) -> IndexArray:
+    """Return the indices of the rows to keep of `time` (n,), s, in which rows at one time may remain.
+
+    They are the longest series that does not decrease, all of it after `after`, without the few rows that
+    are far from all others.
+    """
+    index = np.flatnonzero((time > after) & (np.abs(time) < YEAR_10000))
+    if (np.diff(time[index]) < 0).any():
+        index = index[_longest(time[index])]
+    apart = np.flatnonzero(np.diff(time[index]) > FAR) + 1
+    if len(index) >= MANY and len(apart):
+        groups = [group for group in np.split(index, apart) if len(group) >= ALONE]
+        index = np.concatenate(groups) if groups else index
+    return index
+
+
+def _longest(time: FloatArray) -> IndexArray:
+    """Return the indices of the longest series of `time` (n,) that does not decrease.
+
+    Fredman 1975, "On computing the length of longest increasing subsequences", Discrete Mathematics 11, 29.
+    """
+    rank = np.empty(len(time), int)  # which tells equal times apart by their order
+    rank[np.argsort(time, kind="stable")] = np.arange(len(time))
+    starts: list[int] = []  # by length of a series: minus the largest rank with which one starts,
+    at: list[int] = []  # where that is,
+    after = np.full(len(time), -1)  # and, for each time, where its series goes on
+    for k, one in reversed(list(enumerate(rank.tolist()))):  # from the end: of equals, the first is kept
+        length = bisect_left(starts, -one)
+        after[k] = at[length - 1] if length else -1
+        starts[length : length + 1], at[length : length + 1] = [-one], [k]
+    series = at[-1:]
+    while (k := int(after[series[-1]])) >= 0:
+        series.append(k)
+    return np.array(series)

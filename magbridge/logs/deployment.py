@@ -18,15 +18,19 @@ from magbridge.records import Quality
 __all__ = [
     "CHANGES",
     "COUNTERS",
+    "LOSSES",
     "MEANING",
     "SETTINGS",
     "deployment",
     "join",
     "lasting",
+    "merged",
+    "named_losses",
     "passed_over",
     "same_columns",
     "sliced",
     "uncounted",
+    "with_losses",
 ]
 
 MEANING = {"heading_reference": "true", "time_reference": "utc"}
@@ -40,10 +44,14 @@ COUNTERS = {
     "damages": ("damaged place", "damaged places"),
     "dropouts": ("dropout", "dropouts"),
     "duplicate_rows": ("duplicate row", "duplicate rows"),
+    "files_skipped": ("file skipped", "files skipped"),
     "rows_dropped": ("row dropped", "rows dropped"),
+    "values_dropped": ("impossible value dropped", "impossible values dropped"),
 }
 """Attributes that count what reading skipped, with singular and plural. They are summed over pieces, and are
 not copied to a file that is written."""
+LOSSES = "losses"
+"""Attribute that names what was skipped, a line for each file and column. It goes the way of the counts."""
 
 
 def deployment(
@@ -155,8 +163,6 @@ def join(parts: Sequence[xr.Dataset]) -> xr.Dataset:
                 )
     time = np.concatenate([part["time"].values for part in parts])
     order = np.argsort(time, kind="stable")
-    first = np.diff(time[order], prepend=-np.inf) > 0
-    starts = np.flatnonzero(first)
     variables = {}
     for name, attrs in described.items():
         values = np.concatenate(
@@ -164,14 +170,34 @@ def join(parts: Sequence[xr.Dataset]) -> xr.Dataset:
                 part.variables[name].values if name in part else np.full(part.sizes["time"], np.nan)
                 for part in parts
             ]
-        )[order]
-        variables[name] = ("time", _first_known(values, starts), attrs)
-    attrs = _join_attrs([part.attrs for part in parts])
-    if len(starts) < len(time):
-        attrs["duplicate_rows"] = attrs.get("duplicate_rows", 0) + len(time) - len(starts)
+        )
+        variables[name] = ("time", values[order], attrs)
+    joined = merged(xr.Dataset(variables, coords={"time": ("time", time[order], parts[0]["time"].attrs)}))
+    joined.attrs = _join_attrs([part.attrs for part in parts])
+    return with_losses(joined, {"duplicate_rows": len(time) - joined.sizes["time"]})
+
+
+def merged(dataset: xr.Dataset) -> xr.Dataset:
+    """Return a deployment sorted in time with one row for each time: the first, NaNs filled from later."""
+    time = dataset["time"]
+    starts = np.flatnonzero(np.diff(time.values, prepend=-np.inf) > 0)
+    variables = {
+        name: ("time", _first_known(column.values, starts), column.attrs)
+        for name, column in dataset.data_vars.items()
+    }
     return xr.Dataset(
-        variables, coords={"time": ("time", time[order][starts], parts[0]["time"].attrs)}, attrs=attrs
+        variables, coords={"time": ("time", time.values[starts], time.attrs)}, attrs=dataset.attrs
     )
+
+
+def with_losses(dataset: xr.Dataset, counts: Mapping[str, int], lines: Sequence[str] = ()) -> xr.Dataset:
+    """Return the deployment with its :data:`COUNTERS` raised by `counts`, and `lines` that name them."""
+    raised: dict[str, int | str] = {
+        name: int(dataset.attrs.get(name, 0)) + count for name, count in counts.items() if count
+    }
+    if named := [*named_losses(dataset.attrs), *lines]:
+        raised[LOSSES] = "\n".join(named)
+    return dataset.assign_attrs(raised)
 
 
 def lasting(attrs: Mapping[Any, Any]) -> dict[str, str | float]:
@@ -184,9 +210,10 @@ def lasting(attrs: Mapping[Any, Any]) -> dict[str, str | float]:
 
 
 def uncounted(dataset: xr.Dataset) -> xr.Dataset:
-    """Return the deployment without the attributes of :data:`COUNTERS`."""
+    """Return the deployment without the attributes of :data:`COUNTERS`, and :data:`LOSSES`."""
     bare = dataset.copy(deep=False)
-    bare.attrs = {name: value for name, value in dataset.attrs.items() if name not in COUNTERS}
+    counted = {LOSSES, *COUNTERS}
+    bare.attrs = {name: value for name, value in dataset.attrs.items() if name not in counted}
     return bare
 
 
@@ -194,6 +221,11 @@ def passed_over(*pieces: Mapping[str, Any]) -> dict[str, int]:
     """Return the :data:`COUNTERS` of a deployment, summed over its pieces; those that are 0 are left out."""
     counts = {name: sum(int(attrs.get(name, 0)) for attrs in pieces) for name in COUNTERS}
     return {name: count for name, count in counts.items() if count}
+
+
+def named_losses(*pieces: Mapping[str, Any]) -> list[str]:
+    """Return the lines that name what was skipped in the pieces of a deployment."""
+    return [line for attrs in pieces for line in str(attrs.get(LOSSES, "")).splitlines()]
 
 
 def _first_known(values: FloatArray, starts: IndexArray) -> FloatArray:
@@ -221,4 +253,6 @@ def _join_attrs(all_attrs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
                 joined[key] += value
             else:
                 joined.setdefault(key, value)
+    if lines := named_losses(*all_attrs):
+        joined[LOSSES] = "\n".join(lines)
     return joined | {"source": ", ".join(sources)}

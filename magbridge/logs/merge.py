@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import numpy as np
 import xarray as xr
@@ -13,16 +13,29 @@ from magbridge.logs.deployment import join, same_columns, uncounted
 __all__ = ["merge"]
 
 Open = Callable[[int], Iterator[xr.Dataset]]
+Opened = tuple[xr.Dataset, Iterator[xr.Dataset]]
+"""A piece of a log, and those after it."""
+ROOM = 1 << 28
+"""Bytes of first pieces that are kept while the others are opened: of small logs, all."""
 
 
 def merge(sources: Sequence[Open], rows: int) -> Iterator[xr.Dataset]:
     """Yield the logs that `sources` open as one deployment in pieces, sorted in time, with the same columns.
 
-    Each log is opened twice: once for its first row, which gives its start and its columns, and once when the
-    stream has reached that start. Short pieces, as of many short logs, are joined to pieces of `rows` rows.
+    Each log is opened for its first piece, which gives its start and its columns; where there is no room to
+    keep that, it is opened again when the stream has reached its start. Short pieces, as of many short logs,
+    are joined to pieces of `rows` rows. A log without a piece is left out.
     """
-    firsts = [next(source(1)) for source in sources]
-    whole = join(firsts)  # also checks that they agree on units and on what heading means
+    firsts, opened, room = {}, {}, ROOM
+    for k, source in enumerate(sources):
+        pieces = source(rows)
+        if (first := next(pieces, None)) is None:
+            continue
+        firsts[k] = first.isel(time=slice(0, 1)).copy(deep=True)
+        room -= first.nbytes
+        if room > 0:
+            opened[k] = first, pieces
+    whole = join(list(firsts.values()))  # also checks that they agree on units and on what heading means
     columns = {str(name): dict(whole[name].attrs) for name in whole.data_vars}
 
     def joined(parts: Sequence[xr.Dataset]) -> xr.Dataset:
@@ -31,7 +44,8 @@ def merge(sources: Sequence[Open], rows: int) -> Iterator[xr.Dataset]:
 
     parts: list[xr.Dataset] = []
     held = 0  # rows in them, counted as they come: of thousands of short logs a sum would be quadratic
-    for together in _in_order(sources, [float(first["time"].values[0]) for first in firsts], rows):
+    starts = {k: float(first["time"].values[0]) for k, first in firsts.items()}
+    for together in _in_order(sources, starts, opened, rows):
         parts += together
         held += sum(part.sizes["time"] for part in together)
         if held >= rows:
@@ -41,13 +55,15 @@ def merge(sources: Sequence[Open], rows: int) -> Iterator[xr.Dataset]:
         yield joined(parts)
 
 
-def _in_order(sources: Sequence[Open], starts: Sequence[float], rows: int) -> Iterator[list[xr.Dataset]]:
+def _in_order(
+    sources: Sequence[Open], starts: Mapping[int, float], opened: dict[int, Opened], rows: int
+) -> Iterator[list[xr.Dataset]]:
     """Yield the logs' rows up to one time after another, up to which none can add another row.
 
-    `starts` are the times (s) of their first rows: none is opened before.
+    `starts` are the times (s) of their first rows: none is opened before, but for those `opened` already.
     """
-    waiting = deque(sorted((start, k) for k, start in enumerate(starts)))
-    active: dict[int, tuple[xr.Dataset, Iterator[xr.Dataset]]] = {}
+    waiting = deque(sorted((start, k) for k, start in starts.items()))
+    active: dict[int, Opened] = {}
 
     def advance(k: int, pieces: Iterator[xr.Dataset]) -> None:
         piece = next(pieces, None)
@@ -60,7 +76,10 @@ def _in_order(sources: Sequence[Open], starts: Sequence[float], rows: int) -> It
         horizon = min((float(piece["time"].values[-1]) for piece, _ in active.values()), default=np.inf)
         if waiting and waiting[0][0] <= horizon:
             _, k = waiting.popleft()
-            advance(k, sources[k](rows))
+            if k in opened:
+                active[k] = opened.pop(k)
+            else:
+                advance(k, sources[k](rows))
             continue
         parts = []
         for k, (piece, pieces) in sorted(active.items()):

@@ -25,7 +25,6 @@ from magbridge.errors import FormatError, MissingExtra
 from magbridge.files import systems_reason
 from magbridge.logs import seaglider
 from magbridge.logs.cf import floats
-from magbridge.logs.checks import checked
 from magbridge.logs.deployment import deployment, sliced
 
 try:
@@ -54,20 +53,22 @@ CHUNK = 8192
 """Rows stored together."""
 
 
-def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
-    """Yield the file as deployments of at most `rows` rows.
+def chunks(path: Path, rows: int) -> Iterator[tuple[xr.Dataset, Sequence[int]]]:
+    """Yield the file as deployments of at most `rows` rows, each with their numbers.
 
     Raises
     ------
     FormatError
-        Not netCDF or cut short, neither of the two shapes, no ``TIME``, time that does not increase.
+        Not netCDF or cut short, neither of the two shapes, no ``TIME``.
     """
     try:
         with netCDF4.Dataset(path) as file:
             if seaglider.DIMENSION in file.dimensions:
-                yield from sliced(seaglider.dive(path, file), rows)
+                whole = seaglider.dive(path, file)
+                for k, part in enumerate(sliced(whole, rows)):
+                    yield part, range(k * rows + 1, k * rows + 1 + part.sizes["time"])
             elif DIMENSION in file.dimensions:
-                yield from checked(path, _chunks(path, file, rows))
+                yield from _chunks(path, file, rows)
             else:
                 there = ", ".join(file.dimensions) or "none"
                 raise FormatError(

@@ -12,7 +12,6 @@ import xarray as xr
 
 from magbridge.arrays import FloatArray
 from magbridge.errors import FormatError, MissingExtra
-from magbridge.logs.checks import checked
 from magbridge.logs.deployment import deployment
 
 try:
@@ -24,18 +23,19 @@ except ImportError:
 __all__ = ["FileWriter", "chunks"]
 
 
-def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
-    """Yield the file as deployments of at most `rows` rows; ``time`` may be numbers or timestamps.
+def chunks(path: Path, rows: int) -> Iterator[tuple[xr.Dataset, Sequence[int]]]:
+    """Yield the file as deployments of at most `rows` rows, each with their numbers.
+
+    ``time`` may be numbers or timestamps.
 
     Raises
     ------
     FormatError
-        Not Parquet or cut short, no column ``time``, a column that does not hold numbers, time that does
-        not increase.
+        Not Parquet or cut short, no column ``time``, a column that does not hold numbers.
     """
     try:
         with pq.ParquetFile(path) as file:
-            yield from checked(path, _chunks(path, file, rows))
+            yield from _chunks(path, file, rows)
     except (pa.ArrowException, OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
         raise FormatError(path, f"expected a whole Parquet file: {str(error).splitlines()[0]}") from None
 

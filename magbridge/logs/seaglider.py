@@ -28,7 +28,6 @@ import xarray as xr
 from magbridge.arrays import FloatArray
 from magbridge.errors import FormatError
 from magbridge.logs.cf import floats
-from magbridge.logs.checks import increasing
 from magbridge.logs.deployment import deployment
 from magbridge.logs.resample import CIRCLES, linear
 
@@ -73,7 +72,7 @@ def dive(path: Path, file: Any) -> xr.Dataset:
     Raises
     ------
     FormatError
-        No magnetometer in the file, or time that does not increase.
+        No magnetometer in the file.
     """
     rows = file.dimensions[DIMENSION].size
     for theirs in ("time", "eng_mag_x", "eng_mag_y", "eng_mag_z"):
@@ -82,7 +81,6 @@ def dive(path: Path, file: Any) -> xr.Dataset:
                 path, "expected this variable, as of a Seaglider with a raw compass", column=theirs
             )
     time = floats(file["time"])
-    increasing(path, time)
     columns, units = {}, {}
     for ours, (theirs, unit, scale) in COLUMNS.items():
         if (values := _numbers(file, theirs, rows)) is not None:

@@ -23,9 +23,8 @@ import xarray as xr
 
 from magbridge.arrays import FloatArray
 from magbridge.errors import FormatError, MissingExtra
-from magbridge.logs import FLIGHT
-from magbridge.logs.checks import increasing
 from magbridge.logs.deployment import deployment, sliced
+from magbridge.logs.registry import FLIGHT
 from magbridge.logs.resample import CIRCLES, linear
 from magbridge.logs.slocum_header import check_header
 
@@ -90,8 +89,8 @@ def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
     if base not in tracks or not len(tracks[base][0]):
         raise FormatError(path, "expected rows, there are none")
     time = tracks[base][0]
-    time = time[np.diff(time, prepend=-np.inf) > 0]  # some files hold their first cycle twice
-    increasing(path, time)
+    if len(time) > 1 and time[0] == time[1]:  # some files hold their first cycle twice
+        time = time[1:]
     columns, units = {}, {}
     for theirs, (ours, unit, factor) in SENSORS.items():
         if theirs in tracks and len(tracks[theirs][0]):
@@ -105,7 +104,8 @@ def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
 def _pair(path: Path) -> tuple[Path | None, Path | None]:
     """Return the flight and the science file of the same name; None for one that does not exist."""
     suffix = path.suffix
-    other = (SCIENCE | FLIGHT)[suffix.lower()]
+    if (other := (SCIENCE | FLIGHT).get(suffix.lower())) is None:
+        return path, None
     partner = path.with_suffix(other.upper() if suffix.isupper() else other)
     both = path, (partner if partner.is_file() else None)
     return both if suffix.lower() in SCIENCE else both[::-1]

@@ -23,7 +23,6 @@ import xarray as xr
 
 from magbridge.columns import COLUMNS
 from magbridge.errors import FormatError
-from magbridge.logs.checks import checked
 from magbridge.logs.deployment import SETTINGS, deployment, lasting
 from magbridge.records import Quality
 
@@ -35,17 +34,17 @@ LONGEST = 1 << 20
 ATTRIBUTE = re.compile(r"#\s*([\w.-]+)\s*=\s*(.*?)\s*")
 
 
-def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
-    """Yield the file as deployments of at most `rows` rows.
+def chunks(path: Path, rows: int) -> Iterator[tuple[xr.Dataset, Sequence[int]]]:
+    """Yield the file as deployments of at most `rows` rows, each with their numbers.
 
     Raises
     ------
     FormatError
-        No header, a row of another length, a field that is not a number, time that does not increase.
+        No header, a row of another length, a field that is not a number.
     """
     with path.open(encoding="utf-8-sig", newline="") as file:
         try:
-            yield from checked(path, _chunks(path, file, rows))
+            yield from _chunks(path, file, rows)
         except UnicodeDecodeError:
             raise FormatError(path, "expected text in UTF-8") from None
         except csv.Error as error:

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from magbridge import logs
 from magbridge.columns import CHANNELS
 from magbridge.errors import FormatError
-from magbridge.logs.deployment import deployment
+from magbridge.logs.deployment import deployment, named_losses, passed_over
 
 SUFFIXES = (".csv", ".nc", ".parquet", ".tlog", ".bin", ".ulg", ".dbd", ".tbd")
 BAD_CSV = {
@@ -169,7 +169,13 @@ def test_time_goes_back(suffix: str, tmp_path: Path) -> None:
 
         parquet.write_table(pa.table({"time": [1.0, 2.0, 3.0, 2.5, 5.0]}), path)
     for rows in (1, 3, 1000):
-        assert refused(path, rows) == "row 4, column 'time': expected a time after 3.0, not 2.5"
+        pieces = list(logs.read_chunks(path, rows))
+        assert [time for piece in pieces for time in piece["time"].values] == [1.0, 2.0, 3.0, 5.0]
+        assert passed_over(*(piece.attrs for piece in pieces)) == {"rows_dropped": 1}
+        (line,) = named_losses(*(piece.attrs for piece in pieces))
+        assert line == f"{path}: row 4, column 'time': expected a time after 3.0, not 2.5"
+    with pytest.raises(FormatError, match=r"row 4, column 'time'"):
+        logs.read(path, options=logs.Options(strict=True))
 
 
 def test_netcdf_of_another_shape(tmp_path: Path) -> None:

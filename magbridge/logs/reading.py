@@ -1,0 +1,210 @@
+"""Deployments from files of any format, one or several, whole or in pieces.
+
+What is bad is dropped, counted and named in attributes (:func:`magbridge.logs.deployment.with_losses`), and
+the rest is read: rows and values by :mod:`magbridge.logs.checks`, a whole file of several here.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Iterator, Sequence
+from functools import partial
+from inspect import signature
+from itertools import accumulate, chain, pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from magbridge.columns import CHANNEL_TIMES, counts_from_boot, require
+from magbridge.errors import FormatError
+from magbridge.logs.options import Options
+from magbridge.logs.registry import FLIGHT, module_of
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+__all__ = ["read", "read_chunks", "read_each"]
+
+Paths = str | os.PathLike[str] | Sequence[str | os.PathLike[str]]
+WHOLE = 1 << 40
+"""Rows: more than any file has."""
+DEFAULTS = Options()
+
+
+def read(paths: Paths, *, required: Iterable[str] = (), options: Options = DEFAULTS) -> xr.Dataset:
+    """Return one deployment from one file or several, sorted in time.
+
+    Parameters
+    ----------
+    paths : path or sequence of paths
+        Files of any readable format, also of different ones.
+    required : iterable of str
+        Columns that the result must have, as :data:`magbridge.columns.CHANNELS`.
+    options : Options
+        What the user says about the logs.
+
+    Returns
+    -------
+    xarray.Dataset
+        On ``time``; each variable float64 with ``units`` and ``long_name``. Attributes: ``source`` (the
+        file's name, and what it says of its own source), ``heading_reference`` where it is not true north,
+        ``time_reference`` where time does not count from 1970, counts of what was skipped (``rows_dropped``
+        ...), and ``losses``, which names it.
+
+    Raises
+    ------
+    FormatError
+        Nothing can be read: names file, row, column and what was expected. Of several files, one that cannot
+        be read is skipped and counted, unless `options` are strict.
+    MissingExtra
+        The format needs a package that is not installed.
+    """
+    from magbridge.logs.deployment import join  # noqa: PLC0415 - xarray is for ashore
+
+    dataset = join(read_each(paths, options=options))
+    require(dataset, required)
+    return dataset
+
+
+def read_each(paths: Paths, *, options: Options = DEFAULTS) -> list[xr.Dataset]:
+    """Return the deployment that each file holds, a Slocum's flight and science file as one.
+
+    Files that were skipped are counted in the first.
+
+    Raises
+    ------
+    FormatError, MissingExtra
+        As :func:`read`.
+    """
+    files = _Files(_paths(paths), options)
+    whole = [part for k in range(len(files.paths)) for part in files.pieces(k, WHOLE)]
+    return [files.counted(part) for part in whole]
+
+
+def read_chunks(
+    paths: Paths, rows: int = 65536, *, required: Iterable[str] = (), options: Options = DEFAULTS
+) -> Iterator[xr.Dataset]:
+    """Yield what :func:`read` returns in pieces of about `rows` rows, in bounded memory.
+
+    Every piece has the same columns. CSV, netCDF, Parquet and ``.tlog`` are streamed; files of the other
+    formats are held in memory one at a time. Of files that overlap in time, one piece each is held. A file
+    that cannot be read to its end is read up to there.
+
+    Raises
+    ------
+    FormatError, MissingExtra
+        As :func:`read`.
+    """
+    from magbridge.logs.merge import merge  # noqa: PLC0415 - xarray is for ashore
+
+    files = _Files(_paths(paths), options)
+    sources = [partial(files.pieces, k) for k in range(len(files.paths))]
+    required = tuple(required)
+    stream = sources[0](rows) if len(sources) == 1 else merge(sources, rows)
+    for dataset, _ in pairwise(chain(stream, [None])):  # one ahead, so that the last can tell of all
+        if dataset is not None:
+            require(dataset, required)
+            yield files.counted(dataset)
+
+
+class _Files:
+    """Several files, of which some may not be readable."""
+
+    def __init__(self, paths: Sequence[Path], options: Options) -> None:
+        self.paths, self._options = paths, options
+        self._bad: dict[Path, FormatError] = {}
+        self._told = 0
+
+    def pieces(self, k: int, rows: int) -> Iterator[xr.Dataset]:
+        """Yield the pieces of one file, as far as it can be read; FormatError: none of the files can be."""
+        path = self.paths[k]
+        try:
+            yield from _chunks(path, rows, self._options)
+        except FormatError as error:
+            self._bad[path] = error
+            if self._options.strict or len(self._bad) == len(self.paths):
+                raise
+
+    def counted(self, dataset: xr.Dataset) -> xr.Dataset:
+        """Return a deployment with the files counted and named that were skipped since the last call."""
+        from magbridge.logs.deployment import with_losses  # noqa: PLC0415 - xarray is for ashore
+
+        lines = [str(error) for error in self._bad.values()][self._told :]
+        self._told += len(lines)
+        return with_losses(dataset, {"files_skipped": len(lines)}, lines) if lines else dataset
+
+
+def _paths(paths: Paths) -> list[Path]:
+    several = [paths] if isinstance(paths, (str, os.PathLike)) else paths
+    if not several:
+        raise ValueError("expected at least one file")
+    checked = [Path(path) for path in several]
+    for path in checked:
+        if path.is_dir():
+            raise FormatError(path, "expected a file, not a directory")
+        if not path.is_file():
+            what = "not a pipe or a device" if path.exists() else "there is none"
+            raise FormatError(path, f"expected a file, {what}")
+        module_of(path)
+    return [path for path in checked if not _with_flight(path, checked)]
+
+
+def _with_flight(path: Path, given: Sequence[Path]) -> bool:
+    """Tell whether a science file's flight file is given, too."""
+    flight = FLIGHT.get(path.suffix.lower())
+    return flight is not None and any(path.with_suffix(name) in given for name in (flight, flight.upper()))
+
+
+def _chunks(path: Path, rows: int, options: Options) -> Iterator[xr.Dataset]:
+    """Yield one file in pieces, checked and dated."""
+    from magbridge.logs.checks import checked  # noqa: PLC0415 - xarray is for ashore
+    from magbridge.logs.deployment import passed_over  # noqa: PLC0415
+
+    if not path.stat().st_size:
+        raise FormatError(path, "expected a log, the file is empty")
+    chunks = module_of(path).chunks
+    more = (options,) if "options" in signature(chunks).parameters else ()
+    part = None
+    try:
+        for part in checked(path, _numbered(chunks(path, rows, *more)), strict=options.strict):
+            if options.strict and (lost := passed_over(part.attrs)):
+                raise FormatError(path, f"expected a log without {' '.join(lost)}, as --strict was given")
+            source = str(part.attrs["source"])
+            if source != path.name:
+                source = f"{path.name} ({_origin(source)})"
+            yield _dated(part.assign_attrs(source=source), options.date)
+    except OSError as error:
+        raise FormatError(path, f"cannot be read: {error.strerror or error}") from error
+    if part is None:
+        raise FormatError(path, "expected rows, there are none")
+
+
+def _numbered(pieces: Iterable[Any]) -> Iterator[tuple[xr.Dataset, Sequence[int]]]:
+    """Yield each piece with the numbers of its rows: those that it came with, or counted from 1."""
+    row = 1
+    for piece in pieces:
+        if isinstance(piece, tuple):
+            yield piece
+        else:
+            yield piece, range(row, row + piece.sizes["time"])
+            row += piece.sizes["time"]
+
+
+def _dated(part: xr.Dataset, date: float | None) -> xr.Dataset:
+    """Return a deployment whose times count from the boot with that at `date` (s), where it is given."""
+    if date is None or not counts_from_boot(part):
+        return part
+    moved = part.assign_coords(time=part["time"].copy(data=part["time"].values + date))
+    for name in CHANNEL_TIMES:
+        if name in moved:
+            moved[name] = moved[name] + date
+    moved.attrs.pop("time_reference", None)
+    return moved
+
+
+def _origin(source: str) -> str:
+    """Return what the file named in `source` was made from (of ``b.nc (a.csv)``: ``a.csv``), or `source`."""
+    name, opened, inside = source.partition(" (")
+    depths = accumulate((char == "(") - (char == ")") for char in inside)
+    closed = next((k for k, depth in enumerate(depths) if depth < 0), None)
+    one = opened and "," not in name and closed == len(inside) - 1  # not several files
+    return inside[:-1] if one else source

@@ -1,0 +1,102 @@
+"""The table of formats: which module reads and writes what, and how a file is recognised.
+
+A file is what its first bytes say; its suffix counts only where they say nothing (CSV, or a log that begins
+with damage). A package adds a format with an entry point in the group ``magbridge.formats``: the suffix
+without its dot, and the module.
+
+A format's module has ``chunks(path, rows)``, or ``chunks(path, rows, options)`` where
+:class:`~magbridge.logs.options.Options` make a difference to it. It yields deployments of at most `rows`
+rows in the order of the file, or pairs of a deployment and the numbers of its rows in the file. What is wrong
+with their times and values is :mod:`magbridge.logs.checks`' business. A format that can be written also has
+``FileWriter(path)`` with ``append(dataset, first=...)`` and ``close()``.
+"""
+
+from __future__ import annotations
+
+import re
+from functools import cache
+from importlib import import_module
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from magbridge.errors import FormatError
+
+__all__ = ["FLIGHT", "FORMATS", "Format", "module_of", "suffixes"]
+
+FLIGHT = {".ebd": ".dbd", ".nbd": ".mbd", ".tbd": ".sbd", ".ecd": ".dcd", ".ncd": ".mcd", ".tcd": ".scd"}
+"""Suffix of a Slocum's science file to that of its flight file: where both are there, both are read."""
+HEAD = 4096
+"""Bytes at the beginning of a file by which it is recognised."""
+
+
+class Format(NamedTuple):
+    """A format that files are in."""
+
+    module: str
+    suffixes: tuple[str, ...]
+    signature: bytes | None = None
+    """Regular expression that the first bytes of a file match; None: by its suffix only."""
+    writes: bool = False
+
+
+FORMATS: dict[str, Format] = {
+    "netcdf": Format("magbridge.logs.netcdf", (".nc",), rb"CDF[\x01\x02\x05]|\x89HDF\r\n\x1a\n", writes=True),
+    "parquet": Format("magbridge.logs.parquet", (".parquet",), rb"PAR1", writes=True),
+    "ardupilot": Format("magbridge.logs.ardupilot", (".bin",), rb"\xa3\x95\x80\x80"),
+    "px4": Format("magbridge.logs.px4", (".ulg",), rb"ULog\x01\x12\x35"),
+    "slocum": Format("magbridge.logs.slocum", (*FLIGHT, *FLIGHT.values()), rb".{0,8}dbd_label"),
+    # 8 bytes of time, µs since 1970 (before 2079), then a frame of either MAVLink
+    "telemetry": Format(
+        "magbridge.logs.telemetry", (".tlog",), rb"\x00[\x00-\x0c].{6}[\xfd\xfe]", writes=True
+    ),
+    "text": Format("magbridge.logs.text", (".csv",), writes=True),
+}
+"""Name to format; the first whose signature matches reads the file."""
+
+
+@cache
+def _plugins() -> dict[str, Format]:
+    """Return the formats that packages add; those that name a suffix of ours are left out."""
+    ours = {suffix for one in FORMATS.values() for suffix in one.suffixes}
+    points = [(f".{point.name.lower()}", point.value) for point in entry_points(group="magbridge.formats")]
+    return {
+        suffix: Format(module, (suffix,), writes=hasattr(import_module(module), "FileWriter"))
+        for suffix, module in points
+        if suffix not in ours
+    }
+
+
+def suffixes(*, write: bool = False) -> list[str]:
+    """Return the endings of the file names that can be read, or written."""
+    formats = [*FORMATS.values(), *_plugins().values()]
+    return sorted(suffix for one in formats for suffix in one.suffixes if one.writes or not write)
+
+
+def module_of(path: Path, *, write: bool = False) -> Any:
+    """Return the module that reads a file, or that writes files of this name.
+
+    Raises
+    ------
+    FormatError
+        Neither its first bytes nor its name are those of a known format.
+    """
+    found = None if write else _recognised(path)
+    if found is None:
+        known = suffixes(write=write)
+        suffix = path.suffix.lower()
+        if suffix not in known:
+            raise FormatError(path, f"expected a file name that ends in one of {' '.join(known)}")
+        found = next(one for one in [*FORMATS.values(), *_plugins().values()] if suffix in one.suffixes)
+    return import_module(found.module)
+
+
+def _recognised(path: Path) -> Format | None:
+    """Return the format whose signature the file bears; None where it bears none."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(HEAD)
+    except OSError as error:
+        raise FormatError(path, f"cannot be read: {error.strerror or error}") from error
+    signed = (one for one in FORMATS.values() if one.signature is not None)
+    return next((one for one in signed if re.match(one.signature or b"", head, re.DOTALL)), None)

@@ -1,0 +1,94 @@
+"""Deployments out: one writer for all formats that can be written."""
+
+from __future__ import annotations
+
+import os
+from contextlib import ExitStack
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Self
+
+from magbridge.errors import FormatError
+from magbridge.files import atomic_path
+from magbridge.logs.registry import module_of
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+__all__ = ["Writer", "write"]
+
+
+def write(dataset: xr.Dataset, path: str | os.PathLike[str]) -> None:
+    """Write a deployment; `path` is complete or as it was before.
+
+    Parameters
+    ----------
+    dataset : Dataset (time)
+        With columns as :func:`read` returns them.
+    path : path
+        Its suffix chooses the format.
+
+    Raises
+    ------
+    FormatError
+        The suffix is not that of a format that can be written.
+    WriteError
+        The file cannot be written.
+    """
+    with Writer(path) as writer:
+        writer.append(dataset)
+
+
+class Writer:
+    """A file that grows by deployments, one after the other in time, and appears when it is complete.
+
+    The columns are those of the first deployment; a later one that lacks a column has NaN there. When the
+    block raises, nothing is left behind.
+
+    >>> with Writer("out.nc") as writer:  # doctest: +SKIP
+    ...     for dataset in read_chunks("in.tlog"):
+    ...         writer.append(dataset)
+    """
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self._path = Path(path)
+        self._open = module_of(self._path, write=True).FileWriter
+        self._columns: dict[str, dict[str, Any]] = {}
+
+    def __enter__(self) -> Self:
+        with ExitStack() as stack:
+            self._file = self._open(stack.enter_context(atomic_path(self._path)))
+            stack.callback(self._file.close)
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._stack.__exit__(kind, error, trace)
+
+    def append(self, dataset: xr.Dataset) -> None:
+        """Write the rows of `dataset`, which begin after the last ones.
+
+        Raises
+        ------
+        FormatError
+            Time does not increase, or a column was not in the first deployment.
+        """
+        from magbridge.logs.checks import increasing  # noqa: PLC0415 - xarray is for ashore
+        from magbridge.logs.deployment import same_columns, uncounted  # noqa: PLC0415
+
+        first = not self._columns
+        if first:
+            self._columns = {str(name): dict(dataset[name].attrs) for name in dataset.data_vars}
+            self._last = float("-inf")
+        for name in dataset.data_vars:
+            if name not in self._columns:
+                raise FormatError(
+                    self._path, "expected only columns that the first rows had", column=str(name)
+                )
+        time = dataset["time"].values
+        increasing(self._path, time, after=self._last)
+        if len(time):
+            self._last = float(time[-1])
+        self._file.append(uncounted(dataset) if first else same_columns(dataset, self._columns), first=first)
