@@ -24,6 +24,8 @@ from magbridge.logs.deployment import merged, with_losses
 
 __all__ = ["checked", "increasing"]
 
+Piece = tuple[xr.Dataset, Sequence[int]]
+"""Rows of a deployment, and their numbers in the file."""
 YEAR_10000 = 253_402_300_800.0
 """s since 1970: a later time is in another unit, and no calendar goes beyond it."""
 MOST = {"latitude": 90.0, **dict.fromkeys(("longitude", "roll", "pitch", "heading"), 540.0), "depth": 1e5}
@@ -69,9 +71,7 @@ def increasing(file: str | Path, time: FloatArray, *, after: float = -np.inf) ->
         raise FormatError(file, expected, row=k + 1, column="time")
 
 
-def checked(
-    file: str | Path, pieces: Iterable[tuple[xr.Dataset, Sequence[int]]], *, strict: bool = False
-) -> Iterator[xr.Dataset]:
+def checked(file: str | Path, pieces: Iterable[Piece], *, strict: bool = False) -> Iterator[xr.Dataset]:
     """Yield the pieces of a deployment, each given with the numbers of its rows, without what cannot be.
 
     Attributes of a piece count what it lost, ``rows_dropped duplicate_rows values_dropped``; ``losses`` has a
@@ -81,10 +81,12 @@ def checked(
     ------
     FormatError
         At least half of the rows, or of a column's values, cannot be, or, if `strict`, any: names the first.
+        Or what `pieces` raise, after what came before it.
     """
     checks = _Checks(file, strict)
     last: xr.Dataset | None = None
-    for piece, following in pairwise(chain(pieces, [None])):
+    broken: list[FormatError] = []
+    for piece, following in pairwise(chain(_up_to_error(pieces, broken), [None])):
         if piece is None:  # only the last is
             break
         part = checks.sound(*piece, following[0]["time"].values if following else np.empty(0))
@@ -92,9 +94,20 @@ def checked(
             if last is not None:
                 yield last
             last = checks.counted(part)
-    checks.finish()
+    if not broken:
+        checks.finish()
     if last is not None:
         yield checks.counted(last)  # with what was lost behind it
+    for error in broken:
+        raise error
+
+
+def _up_to_error(pieces: Iterable[Piece], broken: list[FormatError]) -> Iterator[Piece]:
+    """Yield the pieces; append to `broken` the error with which they end, if they do."""
+    try:
+        yield from pieces
+    except FormatError as error:
+        broken.append(error)
 
 
 class _Checks:
@@ -141,7 +154,7 @@ class _Checks:
         """Return the indices of the rows to keep, and how many of these have the time of the one before."""
         self._total["time"] += len(time)
         whole = np.concatenate([time, ahead[:AHEAD]])
-        if not len(_wrong(whole, self._last)):
+        if not len(_wrong(whole, self._last)) and not (np.diff(whole) > FAR).any():
             return np.arange(len(time)), 0
         index = _kept(whole, self._last)
         then = [*whole[index].tolist(), np.inf]

@@ -197,7 +197,14 @@ def test_what_would_be_another_place_or_moment(
     cells = lines[11].split(",")
     cells[lines[0].split(",").index(column)] = repr(value)
     Path("bad.csv").write_text("\n".join([*lines[:11], ",".join(cells), *lines[12:]]))
-    assert words in command.refuses("convert", "bad.csv", "-o", "x.nc")
+    assert words in command.refuses("convert", "bad.csv", "-o", "x.nc", "--strict")
+    assert not Path("x.nc").exists()
+    count, named = command("convert", "bad.csv", "-o", "x.nc").err.splitlines()
+    assert count.startswith("magbridge: in the logs: 1 ")
+    assert words in named
+    assert read("x.nc").to_array().isnull().sum() == read(deployment).to_array().isnull().sum() + (
+        0 if column == "time" else 1
+    )
 
 
 def test_one_position_that_is_none(deployment: Path, command: Command) -> None:

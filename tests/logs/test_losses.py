@@ -1,0 +1,159 @@
+"""What is bad in a log is dropped, counted and named, and the rest is read as if it had not been there."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from commands import Command
+from hypothesis import given
+from hypothesis import strategies as st
+
+from magbridge import logs
+from magbridge.errors import FormatError
+from magbridge.logs.checks import _longest, checked
+from magbridge.logs.deployment import deployment, named_losses, passed_over
+
+T0 = 1.7e9
+
+
+def counted(time: np.ndarray, rows: int = 1000) -> tuple[list[float], dict[str, int], list[str]]:
+    """Check a log with these times; return those that are left, what was counted, and what was named."""
+    whole = deployment("log.csv", time, {"mag_x": np.arange(float(len(time)))})
+    pieces = [
+        (whole.isel(time=slice(k, k + rows)), range(k + 1, k + 1 + rows)) for k in range(0, len(time), rows)
+    ]
+    sound = list(checked("log.csv", pieces))
+    attrs = [piece.attrs for piece in sound]
+    return [t for piece in sound for t in piece["time"].values], passed_over(*attrs), named_losses(*attrs)
+
+
+@pytest.mark.parametrize("rows", [100, 1000])
+@pytest.mark.parametrize("wrong", [np.nan, np.inf, 1e14, -2.6e9, T0 + 400 * 86400.0, T0 - 400 * 86400.0])
+@pytest.mark.parametrize("place", [0, 57, 99, 100, 299])
+def test_one_damaged_time_costs_its_row(wrong: float, place: int, rows: int) -> None:
+    time = T0 + np.arange(300.0)
+    damaged = time.copy()
+    damaged[place] = wrong
+    left, counts, (line,) = counted(damaged, rows)
+    assert left == np.delete(time, place).tolist()
+    assert counts == {"rows_dropped": 1}
+    assert line.startswith(f"log.csv: row {place + 1}, column 'time': expected ")
+
+
+def test_a_clock_set_back_costs_what_it_lives_through_twice() -> None:
+    left, counts, _ = counted(T0 + np.r_[np.arange(100.0), np.arange(92.5, 200.0)])
+    assert counts == {"rows_dropped": 7}
+    assert len(left) == 201
+    assert (np.diff(left) > 0).all()
+
+
+def test_rows_at_one_time_become_one() -> None:
+    time = T0 + np.array([0.0, 1, 1, 1, 2, 3, 4, 5])
+    x, y = np.array([0.0, np.nan, 7, 8, 2, 3, 4, 5]), np.array([0.0, 1, np.nan, 9, 2, 3, 4, 5])
+    whole = deployment("log.csv", time, {"x": x, "y": y})
+    (read,) = checked("log.csv", [(whole, range(1, 9))])
+    assert read["time"].values.tolist() == (T0 + np.arange(6.0)).tolist()
+    assert read["x"].values.tolist() == [0, 7, 2, 3, 4, 5]
+    assert read["y"].values.tolist() == [0, 1, 2, 3, 4, 5]
+    assert passed_over(read.attrs) == {"duplicate_rows": 2}
+
+
+def test_a_log_in_another_order_is_refused() -> None:
+    with pytest.raises(FormatError, match="row 2, column 'time': expected a time after"):
+        counted(T0 - np.arange(300.0))
+
+
+def test_an_impossible_value_is_not_known() -> None:
+    depth = np.where(np.arange(300) % 100 == 7, -1e300, 5.0)
+    whole = deployment("log.csv", T0 + np.arange(300.0), {"depth": depth})
+    (read,) = checked("log.csv", [(whole, range(1, 301))])
+    np.testing.assert_array_equal(read["depth"], np.where(depth < 0, np.nan, 5.0))
+    assert passed_over(read.attrs) == {"values_dropped": 3}
+    assert named_losses(read.attrs) == [
+        "log.csv: row 8, column 'depth': expected m, at most 100000, not -1e+300"
+    ]
+
+
+@given(time=st.lists(st.integers(0, 9), max_size=12))
+def test_no_longer_series_of_times_could_be_kept(time: list[int]) -> None:
+    best = [1] * len(time)
+    for k, now in enumerate(time):
+        best[k] += max((best[j] for j in range(k) if time[j] <= now), default=0)
+    if time:
+        series = _longest(np.array(time, float))
+        assert len(series) == max(best)
+        assert (np.diff(series) > 0).all()
+        assert (np.diff(np.array(time)[series]) >= 0).all()
+
+
+def made(folder: Path, n: int, bad: tuple[int, ...]) -> list[Path]:
+    """Write a deployment of `n` files, some of which are no logs."""
+    paths = [folder / f"{k:03}.csv" for k in range(n)]
+    for k, path in enumerate(paths):
+        rows = deployment("made", T0 + 10.0 * k + np.arange(10.0), {"mag_x": np.full(10, float(k))})
+        logs.write(rows, path)
+        if k in bad:
+            path.write_text("time,mag_x\n")
+    return paths
+
+
+def test_three_bad_files_of_forty(tmp_path: Path) -> None:
+    paths = made(tmp_path, 40, (0, 17, 39))
+    whole = logs.read(paths)
+    pieces = list(logs.read_chunks(paths, 30))
+    for attrs in ([whole.attrs], [piece.attrs for piece in pieces]):
+        assert passed_over(*attrs) == {"files_skipped": 3}
+        assert named_losses(*attrs) == [
+            f"{paths[k]}: row 2: expected rows after the header" for k in (0, 17, 39)
+        ]
+    assert whole.sizes["time"] == sum(piece.sizes["time"] for piece in pieces) == 370
+    with pytest.raises(FormatError, match=r"000\.csv"):
+        logs.read(paths, options=logs.Options(strict=True))
+
+
+def test_no_good_file_is_one_line(tmp_path: Path) -> None:
+    paths = made(tmp_path, 3, (0, 1, 2))
+    for read in (logs.read, lambda paths: list(logs.read_chunks(paths))):
+        with pytest.raises(FormatError, match="expected rows after the header"):
+            read(paths)
+
+
+def test_a_file_that_breaks_off_is_read_up_to_there(tmp_path: Path) -> None:
+    paths = made(tmp_path, 3, ())
+    paths[1].write_text(paths[1].read_text() + "nonsense,1\n")
+    pieces = list(logs.read_chunks(paths, 5))
+    assert sum(piece.sizes["time"] for piece in pieces) == 30
+    assert passed_over(*(piece.attrs for piece in pieces)) == {"files_skipped": 1}
+
+
+def test_what_was_lost_is_told_in_a_few_lines(tmp_path: Path, command: Command) -> None:
+    paths = made(tmp_path, 12, tuple(range(1, 9)))
+    lines = command("convert", *paths, "-o", tmp_path / "x.nc").err.splitlines()
+    assert lines[0] == "magbridge: in the logs: 8 files skipped"
+    assert lines[1] == f"magbridge: {paths[1]}: row 2: expected rows after the header"
+    assert lines[-1] == "magbridge: and in 3 places more"
+    assert len(lines) == 7
+    assert not {"losses", "files_skipped"} & logs.read(tmp_path / "x.nc").attrs.keys()
+
+
+def test_a_file_is_what_its_bytes_say(tmp_path: Path) -> None:
+    rows = deployment("made", T0 + np.arange(5.0), {"mag_x": np.arange(5.0)})
+    for suffix in (".nc", ".parquet", ".tlog"):
+        logs.write(rows, tmp_path / f"log{suffix}")
+        (tmp_path / f"log{suffix}").rename(tmp_path / "log.dat")
+        np.testing.assert_array_equal(logs.read(tmp_path / "log.dat")["mag_x"], rows["mag_x"])
+
+
+def test_a_date_moves_times_that_count_from_the_boot(tmp_path: Path) -> None:
+    rows = deployment(
+        "made", 5.0 + np.arange(5.0), {"mag_x": np.arange(5.0), "mag_time_x": 5.0 + np.arange(5.0)}
+    )
+    logs.write(rows, tmp_path / "log.nc")
+    read = logs.read(tmp_path / "log.nc", options=logs.Options(date=T0))
+    assert read["time"].values.tolist() == (T0 + 5.0 + np.arange(5.0)).tolist()
+    np.testing.assert_array_equal(read["mag_time_x"], read["time"])
+    logs.write(read, tmp_path / "dated.nc")
+    again = logs.read(tmp_path / "dated.nc", options=logs.Options(date=0.0))
+    np.testing.assert_array_equal(again["time"], read["time"])
