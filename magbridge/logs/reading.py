@@ -16,8 +16,9 @@ from typing import TYPE_CHECKING, Any
 
 from magbridge.columns import CHANNEL_TIMES, counts_from_boot, require
 from magbridge.errors import FormatError
+from magbridge.guard import guarded
 from magbridge.logs.options import Options
-from magbridge.logs.registry import FLIGHT, module_of
+from magbridge.logs.registry import FLIGHT, format_of
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -144,7 +145,7 @@ def _paths(paths: Paths) -> list[Path]:
         if not path.is_file():
             what = "not a pipe or a device" if path.exists() else "there is none"
             raise FormatError(path, f"expected a file, {what}")
-        module_of(path)
+        format_of(path)
     return [path for path in checked if not _with_flight(path, checked)]
 
 
@@ -161,11 +162,14 @@ def _chunks(path: Path, rows: int, options: Options) -> Iterator[xr.Dataset]:
 
     if not path.stat().st_size:
         raise FormatError(path, "expected a log, the file is empty")
-    chunks = module_of(path).chunks
+    form = format_of(path)
+    chunks = form.load().chunks
     more = (options,) if "options" in signature(chunks).parameters else ()
+    pieces = partial(chunks, path, rows, *more)
     part = None
     try:
-        for part in checked(path, _numbered(chunks(path, rows, *more)), strict=options.strict):
+        numbered = _numbered(guarded(path, pieces) if form.guarded else pieces())
+        for part in checked(path, numbered, strict=options.strict):
             if options.strict and (lost := passed_over(part.attrs)):
                 raise FormatError(path, f"expected a log without {' '.join(lost)}, as --strict was given")
             source = str(part.attrs["source"])

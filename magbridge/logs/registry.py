@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 
 from magbridge.errors import FormatError
 
-__all__ = ["FLIGHT", "FORMATS", "Format", "module_of", "suffixes"]
+__all__ = ["FLIGHT", "FORMATS", "Format", "format_of", "suffixes"]
 
 FLIGHT = {".ebd": ".dbd", ".nbd": ".mbd", ".tbd": ".sbd", ".ecd": ".dcd", ".ncd": ".mcd", ".tcd": ".scd"}
 """Suffix of a Slocum's science file to that of its flight file: where both are there, both are read."""
@@ -38,14 +38,22 @@ class Format(NamedTuple):
     signature: bytes | None = None
     """Regular expression that the first bytes of a file match; None: by its suffix only."""
     writes: bool = False
+    guarded: bool = False
+    """Whether another library reads it, which damage may hang or crash: it is read in a child process."""
+
+    def load(self) -> Any:
+        """Return the module."""
+        return import_module(self.module)
 
 
 FORMATS: dict[str, Format] = {
-    "netcdf": Format("magbridge.logs.netcdf", (".nc",), rb"CDF[\x01\x02\x05]|\x89HDF\r\n\x1a\n", writes=True),
-    "parquet": Format("magbridge.logs.parquet", (".parquet",), rb"PAR1", writes=True),
+    "netcdf": Format(
+        "magbridge.logs.netcdf", (".nc",), rb"CDF[\x01\x02\x05]|\x89HDF\r\n\x1a\n", writes=True, guarded=True
+    ),
+    "parquet": Format("magbridge.logs.parquet", (".parquet",), rb"PAR1", writes=True, guarded=True),
     "ardupilot": Format("magbridge.logs.ardupilot", (".bin",), rb"\xa3\x95\x80\x80"),
-    "px4": Format("magbridge.logs.px4", (".ulg",), rb"ULog\x01\x12\x35"),
-    "slocum": Format("magbridge.logs.slocum", (*FLIGHT, *FLIGHT.values()), rb".{0,8}dbd_label"),
+    "px4": Format("magbridge.logs.px4", (".ulg",), rb"ULog\x01\x12\x35", guarded=True),
+    "slocum": Format("magbridge.logs.slocum", (*FLIGHT, *FLIGHT.values()), rb".{0,8}dbd_label", guarded=True),
     # 8 bytes of time, µs since 1970 (before 2079), then a frame of either MAVLink
     "telemetry": Format(
         "magbridge.logs.telemetry", (".tlog",), rb"\x00[\x00-\x0c].{6}[\xfd\xfe]", writes=True
@@ -73,8 +81,8 @@ def suffixes(*, write: bool = False) -> list[str]:
     return sorted(suffix for one in formats for suffix in one.suffixes if one.writes or not write)
 
 
-def module_of(path: Path, *, write: bool = False) -> Any:
-    """Return the module that reads a file, or that writes files of this name.
+def format_of(path: Path, *, write: bool = False) -> Format:
+    """Return the format of a file, or in which one of this name is written.
 
     Raises
     ------
@@ -88,7 +96,7 @@ def module_of(path: Path, *, write: bool = False) -> Any:
         if suffix not in known:
             raise FormatError(path, f"expected a file name that ends in one of {' '.join(known)}")
         found = next(one for one in [*FORMATS.values(), *_plugins().values()] if suffix in one.suffixes)
-    return import_module(found.module)
+    return found
 
 
 def _recognised(path: Path) -> Format | None:

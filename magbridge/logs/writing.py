@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 from magbridge.errors import FormatError
 from magbridge.files import atomic_path
-from magbridge.logs.registry import module_of
+from magbridge.logs.registry import format_of
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -52,7 +52,7 @@ class Writer:
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self._path = Path(path)
-        self._open = module_of(self._path, write=True).FileWriter
+        self._open = format_of(self._path, write=True).load().FileWriter
         self._columns: dict[str, dict[str, Any]] = {}
 
     def __enter__(self) -> Self:
