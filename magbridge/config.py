@@ -101,6 +101,11 @@ class Link(Table, frozen=True):
         if self.component == self.autopilot:
             raise ValueError(f"component: another than the autopilot's, {self.autopilot}")
 
+    @property
+    def shared(self) -> bool:
+        """Whether anyone can come to the link: what is read of it are then whole frames of each peer."""
+        return self.url.startswith(("udpin:", "tcpin:"))
+
 
 class Telemetry(Table, frozen=True):
     """``[telemetry.NAME]``: a field of a message that becomes the parameter NAME.

@@ -27,6 +27,10 @@ class Edge(Protocol):
         """Send to the link or to the sensor."""
         ...
 
+    def credit(self, frames: list[bytes]) -> None:
+        """Learn which frames of the last event from the link were signed by someone who has the key."""
+        ...
+
 
 def set_up(config: Config, start: Start) -> Pipeline:
     """Return the pipeline that a configuration describes.
@@ -52,6 +56,8 @@ def drive(pipeline: Pipeline, edge: Edge, log: TlogWriter | None, after: Callabl
     """Feed the pipeline until the edge ends; call ``after(time_us)`` when each event is dealt with."""
     for event in edge.events(lambda: pipeline.deadline):
         sent = pipeline.feed(event)
+        if pipeline.component.genuine:
+            edge.credit(pipeline.component.genuine)
         if sent:
             edge.send(Channel.LINK, b"".join([frame for _, frame in sent]))
         if pipeline.sensor.to_send:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 
 from magbridge.bridge.address import parse
+from magbridge.bridge.peers import Peers
 from magbridge.bridge.port import Port
 from magbridge.bridge.serial_port import may_be_device, serial_line
 from magbridge.bridge.tcp import TcpClient, TcpServer
@@ -14,23 +14,44 @@ from magbridge.errors import ConfigError
 
 __all__ = ["LINKS", "open_link"]
 
-LINKS: dict[str, Callable[[str, tuple[str, int]], Port]] = {
-    "udpin": partial(UdpPort, listen=True),
-    "udpout": partial(UdpPort, listen=False),
-    "tcp": TcpClient,
-    "tcpin": TcpServer,
+OWN: dict[str, Callable[[str, tuple[str, int]], Port]] = {"udpout": UdpPort, "tcp": TcpClient}
+"""Kinds of link that go to one peer, by the first part of the URL, as in the MAVLink world."""
+SHARED: dict[str, Callable[[str, tuple[str, int], Peers, bool], Port]] = {
+    "udpin": lambda name, address, peers, _: UdpPort(name, address, peers),
+    "tcpin": lambda name, address, peers, signed: TcpServer(name, address, peers, signed=signed),
 }
-"""Link kinds by the first part of the URL, as in the MAVLink world; any other URL is a serial device."""
+"""Kinds of link that anyone can come to; any other URL is a serial device."""
+LINKS = ("udpin", "udpout", "tcp", "tcpin")
 
 
-def open_link(url: str, baudrate: int, source: str = "bridge.toml", key: str = "link.url") -> Port:
+def open_link(
+    url: str,
+    baudrate: int,
+    source: str = "bridge.toml",
+    key: str = "link.url",
+    *,
+    autopilot: tuple[int, int] | None = None,
+    signed: bool = False,
+) -> Port:
     """Return the (unopened) port for a MAVLink URL.
+
+    Parameters
+    ----------
+    url : str
+        As in ``[link]``.
+    baudrate : int
+        bit/s of a serial device.
+    source, key : str
+        What an error names.
+    autopilot : (int, int) or None
+        System and component that a link with many peers answers before all others.
+    signed : bool
+        Peers are answered once :meth:`Port.credit` has named a frame of theirs.
 
     Raises
     ------
     ConfigError
-        An unknown kind of link or of serial URL, no device's name, or an address that is not HOST:PORT; it
-        names `source` and `key`.
+        An unknown kind of link or of serial URL, no device's name, or an address that is not HOST:PORT.
     """
     kind, colon, address = url.partition(":")
     if kind not in LINKS:
@@ -45,4 +66,6 @@ def open_link(url: str, baudrate: int, source: str = "bridge.toml", key: str = "
             raise ValueError(url)  # noqa: TRY301 - as `parse` does
     except ValueError as error:
         raise ConfigError(source, key, f"expected HOST:PORT or [IPV6]:PORT, got {url!r}") from error
-    return LINKS[kind](url, (host, port))
+    if kind in OWN:
+        return OWN[kind](url, (host, port))
+    return SHARED[kind](url, (host, port), Peers(autopilot, signed=signed), signed)

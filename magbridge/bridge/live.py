@@ -99,6 +99,8 @@ class LiveEdge:
         """Yield the states of the host's clock and of the link, where they are to be reported."""
         if step_us := self._clock.step_us():
             yield states.clock_step(now_us, step_us)
+        if text := self._ports[Channel.LINK].notice():
+            yield states.notice(text)
         if self._too_slow(now_us):
             yield states.too_slow(Channel.LINK, self._ports[Channel.LINK])
 
@@ -112,6 +114,10 @@ class LiveEdge:
             port.write(data)
         except PortError as error:
             self._lost(channel, error)
+
+    def credit(self, frames: list[bytes]) -> None:
+        """Tell the link which frames that it read last are signed by someone who has the key."""
+        self._ports[Channel.LINK].credit(frames)
 
     def _flush(self, channel: Channel) -> None:
         """Go on sending what waits for a slow line."""

@@ -7,6 +7,7 @@ Writing never blocks: what a slow reader does not take waits while it is new, th
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Iterable
 
 from magbridge.errors import PortError
 
@@ -64,6 +65,13 @@ class Port(ABC):
     def blocked(self) -> list[int]:
         """Return the file descriptors that take more of what is waiting once they are writable."""
         return []
+
+    def credit(self, frames: Iterable[bytes]) -> None:  # noqa: B027 - most ports have one peer
+        """Learn which frames that were read last are signed by someone who has the key."""
+
+    def notice(self) -> str:
+        """Return something to tell about the peers, once; empty where there is nothing."""
+        return ""
 
     def write_all(self, data: bytes) -> None:
         """Send `data` whole, waiting for a slow reader; for a replay, which has no deadline."""

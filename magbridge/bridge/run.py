@@ -62,7 +62,9 @@ def run(path: Path) -> None:
     clock = Clock()
     pipeline = set_up(config, keeper.start(clock.now_us()))
     sensor = serial_line(config.sensor.port, config.sensor.baudrate, str(config.path), "sensor.port")
-    link = open_link(config.link.url, config.link.baudrate, str(config.path))
+    own = config.link
+    who, signed = (own.system, own.autopilot), own.signing_key is not None
+    link = open_link(own.url, own.baudrate, str(config.path), autopilot=who, signed=signed)
     # the link first, so that a sensor's port that does not open can be reported over it
     edge = LiveEdge({Channel.LINK: link, Channel.SENSOR: sensor}, clock)
     keeper.attach(edge)

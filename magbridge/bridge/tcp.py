@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import select
 import socket
+import time
+from collections.abc import Iterable
 from contextlib import suppress
 
 from magbridge.bridge.address import resolve
+from magbridge.bridge.peers import Peers
+from magbridge.bridge.port import Port
 from magbridge.bridge.stream import Stream
 from magbridge.errors import PortError
 
@@ -16,14 +20,19 @@ UNSENT = 4096
 """Bytes that may wait in the system for a slow connection; the rest waits here, where it can be dropped."""
 SHARE = 8192
 """Bytes of a connection that are read before the sensor's turn: a flood of them is parsed in some 10 ms."""
+CONNECTIONS = 16
+"""Most clients of a server; for another one, one that has said nothing valid has to go."""
+GREETING = 0.2
+"""s that a client has to say something valid before it has to go for another."""
+ACCEPTED = 4
+"""Most clients that are accepted before the sensor's turn."""
 
 
 class _Connection(Stream):
     """One TCP connection."""
 
-    def __init__(self, name: str, address: tuple[str, int]) -> None:
+    def __init__(self, name: str) -> None:
         super().__init__(name, UNSENT)
-        self._address = address
         self._connection: socket.socket | None = None
 
     def fds(self) -> list[int]:
@@ -88,6 +97,10 @@ class _Connection(Stream):
 class TcpClient(_Connection):
     """``tcp``: connects to a server."""
 
+    def __init__(self, name: str, address: tuple[str, int]) -> None:
+        super().__init__(name)
+        self._address = address
+
     @property
     def up(self) -> bool:
         """Whether it is connected."""
@@ -105,12 +118,40 @@ class TcpClient(_Connection):
         self.drop()
 
 
-class TcpServer(_Connection):
-    """``tcpin``: waits for a client; a new one takes the place of the old, which may be dead."""
+class _Client(_Connection):
+    """One client of a server: when it goes, the server is well."""
 
-    def __init__(self, name: str, address: tuple[str, int]) -> None:
-        super().__init__(name, address)
+    def __init__(self, name: str, connection: socket.socket) -> None:
+        super().__init__(name)
+        self.since = time.monotonic()
+        self.adopt(connection)
+
+    @property
+    def up(self) -> bool:
+        """Whether it is still there."""
+        return self._connection is not None
+
+    def open(self) -> None:
+        """Raise :class:`PortError`: a client comes by itself."""
+        raise PortError(self.name, "not connected")
+
+    def close(self) -> None:
+        """Close the connection."""
+        self.drop()
+
+
+class TcpServer(Port):
+    """``tcpin``: waits for clients, and answers those that :class:`Peers` lets it answer.
+
+    On a link without signatures a client is answered at once, because it may only want to listen, and its
+    address is no forgery. But who has said something valid is never turned out for another.
+    """
+
+    def __init__(self, name: str, address: tuple[str, int], peers: Peers, *, signed: bool = False) -> None:
+        super().__init__(name)
+        self._address, self._peers, self._signed = address, peers, signed
         self._listener: socket.socket | None = None
+        self._clients: dict[int, _Client] = {}
 
     @property
     def up(self) -> bool:
@@ -122,39 +163,103 @@ class TcpServer(_Connection):
         try:
             family, address = resolve(self._address, socket.SOCK_STREAM, listen=True)
             both = family == socket.AF_INET6 and socket.has_dualstack_ipv6()
-            self._listener = socket.create_server(address, family=family, dualstack_ipv6=both)
+            listener = socket.create_server(address, family=family, dualstack_ipv6=both)
         except OSError as error:
             raise PortError(self.name, error.strerror or str(error)) from error
-        self._listener.setblocking(False)
+        listener.setblocking(False)
+        self._listener = listener
 
     def fds(self) -> list[int]:
-        """Return the listener's descriptor and the client's."""
-        listener = [self._listener.fileno()] if self._listener is not None else []
-        return listener + super().fds()
+        """Return the listener's descriptor and the clients'."""
+        return ([self._listener.fileno()] if self._listener is not None else []) + list(self._clients)
 
     def read(self) -> bytes:
-        """Accept a waiting client, then return what the client has sent; a client that leaves is no error."""
+        """Accept clients that wait, then return what all have sent; a client that leaves is no error."""
         assert self._listener is not None
-        with suppress(BlockingIOError):
-            self.adopt(self._listener.accept()[0])
-        try:
-            return super().read() if self._connection is not None else b""
-        except PortError:
-            return b""
+        with suppress(OSError):  # nobody waits, or who did has gone, or there are too many open files
+            for _ in range(ACCEPTED):
+                self._accept(self._listener.accept()[0])
+        for fd, client in list(self._clients.items()):
+            try:
+                if data := client.read():
+                    self._peers.receive(fd, data)
+            except PortError:
+                self._dismiss(fd)
+        return self._peers.take()
+
+    def write(self, data: bytes) -> None:
+        """Send to those clients that are to be answered; without one, `data` are dropped."""
+        chosen = [fd for fd in self._chosen() if fd in self._clients]
+        for fd in chosen:
+            client = self._clients[fd]
+            try:
+                client.write(data)
+            except PortError:
+                self._dismiss(fd)
+        if not chosen:
+            self.dropped += len(data)
+        elif (first := self._clients.get(chosen[0])) is not None:  # of the others nobody wants to know
+            self.dropped, self.overrun = self.dropped + first.dropped, self.overrun + first.overrun
+            first.dropped = first.overrun = 0
+
+    def _chosen(self) -> list[int]:
+        """Return the descriptors of those to send to, in the order in which to send."""
+        valid = [peer.address for peer in self._peers.answered()]
+        chosen = [address for address in valid if isinstance(address, int)]
+        if not self._signed:
+            chosen += [fd for fd in self._clients if fd not in chosen]
+        return chosen
+
+    @property
+    def waiting(self) -> bool:
+        """Whether something waits that a slow client had no room for."""
+        return any(client.waiting for client in self._clients.values())
 
     def flush(self) -> None:
-        """Send to the client; a client that leaves is no error."""
-        with suppress(PortError):
-            super().flush()
+        """Send to the clients; one that leaves is no error."""
+        for fd, client in list(self._clients.items()):
+            try:
+                client.flush()
+            except PortError:
+                self._dismiss(fd)
 
-    def lost(self, reason: object) -> PortError:
-        """Drop the client: the port itself is well."""
-        self.drop()
-        return PortError(self.name, str(reason))
+    def blocked(self) -> list[int]:
+        """Return the descriptors of clients that take more once they are writable."""
+        return [fd for fd, client in self._clients.items() if client.waiting]
+
+    def credit(self, frames: Iterable[bytes]) -> None:
+        """Answer, from now on, who sent these frames."""
+        self._peers.credit(frames)
+
+    def notice(self) -> str:
+        """Return something to tell about the clients, once."""
+        return self._peers.notices.popleft() if self._peers.notices else ""
+
+    def write_all(self, data: bytes) -> None:
+        """Send `data` whole to every client, waiting for a slow reader."""
+        for client in self._clients.values():
+            client.write_all(data)
 
     def close(self) -> None:
-        """Close the client and the listener."""
-        self.drop()
+        """Close the clients and the listener."""
+        for fd in list(self._clients):
+            self._dismiss(fd)
         if self._listener is not None:
             self._listener.close()
         self._listener = None
+
+    def _accept(self, connection: socket.socket) -> None:
+        """Take a client, if need be for one that has had its time and said nothing valid."""
+        if len(self._clients) >= CONNECTIONS:
+            late = time.monotonic() - GREETING
+            mute = (fd for fd, one in self._clients.items() if not self._peers.is_known(fd))
+            idle = next((fd for fd in mute if self._clients[fd].since < late), None)
+            if idle is None:
+                connection.close()
+                return
+            self._dismiss(idle)
+        self._clients[connection.fileno()] = _Client(self.name, connection)
+
+    def _dismiss(self, fd: int) -> None:
+        self._clients.pop(fd).close()
+        self._peers.forget(fd)

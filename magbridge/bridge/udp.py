@@ -6,11 +6,12 @@ import errno
 import os
 import socket
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from typing import Any
 
 from magbridge.bridge.address import resolve
+from magbridge.bridge.peers import Peers
 from magbridge.bridge.port import CHUNK, Port
 from magbridge.bridge.stream import cut
 from magbridge.errors import PortError
@@ -18,23 +19,22 @@ from magbridge.errors import PortError
 __all__ = ["UdpPort"]
 
 PEER_TIMEOUT = 30.0
-"""s without a packet after which a UDP peer is forgotten, or connected anew."""
-PEERS = 16
-"""Stations that ``udpin`` answers; of more, those heard last."""
+"""s without a packet after which the peer of ``udpout`` is connected anew."""
 DATAGRAM = 1400
 """Bytes that a packet carries on any usual network: more is split on the way, and 64 kB are refused."""
+DATAGRAMS = 512
+"""Most that are read before the sensor's turn: empty ones could keep it waiting for ever."""
 AWAY = (errno.ECONNREFUSED, errno.ENETUNREACH, errno.EHOSTUNREACH, errno.ENETDOWN, errno.EPERM)
 """What a UDP socket reports when nobody listens (yet): no fault of the port."""
 
 
 class UdpPort(Port):
-    """``udpout`` sends to one address; ``udpin`` answers the stations that it has heard from lately."""
+    """``udpout`` sends to one address; ``udpin``, given its `peers`, answers those of them that are valid."""
 
-    def __init__(self, name: str, address: tuple[str, int], *, listen: bool) -> None:
+    def __init__(self, name: str, address: tuple[str, int], peers: Peers | None = None) -> None:
         super().__init__(name)
-        self._address, self._listen = address, listen
+        self._address, self._peers = address, peers
         self._socket: socket.socket | None = None
-        self._peers: dict[Any, float] = {}
         self._heard = 0.0
 
     @property
@@ -53,7 +53,7 @@ class UdpPort(Port):
     def tend(self) -> None:
         """Connect anew if nothing has come for long, and the host, or we, have another address by now."""
         opened, now = self._socket, time.monotonic()
-        if opened is None or self._listen or now - self._heard < PEER_TIMEOUT:
+        if opened is None or self._peers is not None or now - self._heard < PEER_TIMEOUT:
             return
         self._heard = now
         with suppress(OSError), self._new() as new:  # not known at present, or closed meanwhile
@@ -63,12 +63,13 @@ class UdpPort(Port):
 
     def _new(self) -> socket.socket:
         """Return a socket that is bound or connected; raises OSError."""
-        family, address = resolve(self._address, socket.SOCK_DGRAM, listen=self._listen)
+        listen = self._peers is not None
+        family, address = resolve(self._address, socket.SOCK_DGRAM, listen=listen)
         opened = socket.socket(family, socket.SOCK_DGRAM)
         opened.setblocking(False)
         opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
         try:
-            (opened.bind if self._listen else opened.connect)(address)
+            (opened.bind if listen else opened.connect)(address)
         except OSError:
             opened.close()
             raise
@@ -85,39 +86,41 @@ class UdpPort(Port):
         bridge stood still meet the telemetry that queued up with them.
         """
         assert self._socket is not None
-        data = b""
-        while len(data) < CHUNK:
+        datagrams: list[bytes] = []
+        size = 0
+        while size < CHUNK and len(datagrams) < DATAGRAMS:
             try:
                 datagram, peer = self._socket.recvfrom(CHUNK)
             except BlockingIOError:
                 break
             except OSError as error:
-                if data or error.errno in AWAY:
+                if datagrams or error.errno in AWAY:
                     break  # first return what has come
                 raise self.lost(error.strerror) from error
+            size += len(datagram)
+            datagrams.append(datagram)
+            if self._peers is not None:
+                self._peers.receive(peer, datagram)
+        if datagrams:
             self._heard = time.monotonic()
-            if self._listen:
-                self._peers.pop(peer, None)  # so that the dict is in the order in which they were heard last
-                self._peers[peer] = self._heard
-                if len(self._peers) > PEERS:
-                    del self._peers[next(iter(self._peers))]
-            data += datagram
-            if not datagram:
-                break  # empty datagrams could keep this loop running for ever
-        return data
+        return b"".join(datagrams) if self._peers is None else self._peers.take()
+
+    def credit(self, frames: Iterable[bytes]) -> None:
+        """Answer, from now on, who sent these frames."""
+        if self._peers is not None:
+            self._peers.credit(frames)
+
+    def notice(self) -> str:
+        """Return something to tell about the peers, once."""
+        return self._peers.notices.popleft() if self._peers is not None and self._peers.notices else ""
 
     def write(self, data: bytes) -> None:
         """Send to each peer, mostly one datagram; what cannot be sent is dropped and counted."""
-        assert self._socket is not None
-        if not self._listen:
+        if self._peers is None:
             self._send(data, None)
             return
-        now = time.monotonic()
-        for peer, heard in list(self._peers.items()):
-            if now - heard > PEER_TIMEOUT:
-                del self._peers[peer]
-            else:
-                self._send(data, peer)
+        for peer in self._peers.answered():
+            self._send(data, peer.address)
 
     def _send(self, data: bytes, peer: Any) -> None:
         for datagram in _datagrams(data):
@@ -133,9 +136,11 @@ class UdpPort(Port):
         except BlockingIOError:
             self.overran(data)
         except OSError as error:
-            if error.errno not in AWAY:
-                raise self.lost(error.strerror) from error
             self.dropped += len(data)
+            if self._peers is not None:  # an address that cannot be sent to, as one with port 0, is no fault
+                self._peers.forget(peer)
+            elif error.errno not in AWAY:
+                raise self.lost(error.strerror) from error
 
     def close(self) -> None:
         """Close the socket."""

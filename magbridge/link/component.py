@@ -34,6 +34,7 @@ LIMITS = {
 """The messages whose rate (Hz) can be set, and within which limits."""
 DEFAULTS = {"HEARTBEAT": 1.0, "MAG_STATUS": 1.0, "MAG_NAVIGATION": 0.0}
 TIMESYNC_US = 1_000_000
+VERSION_2 = 0xFD
 LONGEST_US = 0x7FFFFFFF
 """µs, 36 min: the longest interval that a MESSAGE_INTERVAL holds."""
 
@@ -87,6 +88,8 @@ class Component:
         What is to be sent.
     heard : list of bytes
         Everything that came, as frames for the log (see `TapeReader`); the bridge empties it.
+    genuine : list of bytes
+        The signed frames of the last :meth:`receive` that were accepted.
     parameters, rates, announcer, vehicle, publisher
         The services, for use by the bridge.
     """
@@ -111,6 +114,8 @@ class Component:
         self._tape = TapeWriter(link.system, link.component)
         self.outbox, self.timers = Outbox(self.codec), Timers()
         self.heard: list[bytes] = []
+        self.genuine: list[bytes] = []
+        self._whole = link.shared
         self._refusals_told = 0
         self.announcer = Announcer(self.outbox, self.timers)
         self.vehicle = Vehicle(link.system, link.component, link.autopilot, self.announcer, self.timers)
@@ -167,7 +172,8 @@ class Component:
         """
         self._begin(t_us)
         ours = []
-        messages = self.codec.parse(data)
+        messages = self.codec.parse(data, whole=self._whole)
+        self.genuine = [one.frame for one in messages if one.known and is_signed(one.frame)]
         self.heard += self._tape.frames(messages, self.codec.pending)
         for message in messages:
             if not message.known:
@@ -261,6 +267,11 @@ class Component:
         self._changed(parameter)
         self._service.send(parameter)
         return True
+
+
+def is_signed(frame: bytes) -> bool:
+    """Say whether a frame carries a signature."""
+    return frame[0] == VERSION_2 and bool(frame[2] & 1)
 
 
 def always(report: Callable[[], None]) -> bool:

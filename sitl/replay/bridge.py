@@ -75,6 +75,9 @@ class ScriptedEdge:
         if len(self._unsent) >= BATCH:
             self.flush()
 
+    def credit(self, frames: list[bytes]) -> None:
+        """Do nothing: there is one peer."""
+
     def flush(self) -> None:
         """Send all bytes that are waiting."""
         self._ports[Channel.LINK].write_all(bytes(self._unsent))

@@ -21,6 +21,7 @@ from standstill import standstill
 from magbridge.bridge.events import Clock
 from magbridge.bridge.links import open_link
 from magbridge.bridge.live import LiveEdge
+from magbridge.bridge.peers import Peers
 from magbridge.bridge.serial_port import SerialPort
 from magbridge.bridge.stream import LATE, MOST
 from magbridge.bridge.tcp import TcpServer
@@ -31,6 +32,7 @@ from magbridge.sensors import open_driver
 from magbridge.sensors.clock import DeviceClock, Stamp
 
 FRAME = bytes(range(200)) * 5
+BEAT = Codec(1, 1).pack("HEARTBEAT", type=12)
 
 
 def waiting(terminal: int) -> int:
@@ -226,7 +228,7 @@ def test_a_server_takes_the_next_client() -> None:
         address = listener.getsockname()
     port.write(b"nobody hears this")
     assert port.dropped == 17
-    for word in (b"first", b"second"):
+    for word in (BEAT, BEAT * 2):
         with socket.create_connection(address) as client:
             client.sendall(word)
             heard = b""
@@ -256,11 +258,11 @@ def test_a_link_by_ipv6_and_by_both(kinds: tuple[str, str], host: str, to: str) 
     there.open()
     heard = b""
     for one, other in ((there, here), (here, there)):
-        one.write(FRAME)
+        one.write(BEAT)
         while not heard:
             assert select.select(other.fds(), [], [], 5)[0]
             heard = other.read()
-        assert heard == FRAME
+        assert heard == BEAT
         heard = b""
     here.close()
     there.close()
@@ -320,7 +322,7 @@ class Unresolved(TcpServer):
 
 def test_a_link_that_takes_its_time_to_open_holds_up_neither_the_sensor_nor_the_end() -> None:
     master, slave = pty.openpty()
-    link, sensor = Unresolved("tcpin:", ("", 0)), SerialPort(os.ttyname(slave), 9600)
+    link, sensor = Unresolved("tcpin:", ("", 0), Peers()), SerialPort(os.ttyname(slave), 9600)
     edge = LiveEdge({Channel.LINK: link, Channel.SENSOR: sensor}, Clock())
     deadline = time.monotonic() + 10.0
     while not sensor.up:

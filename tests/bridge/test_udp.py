@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import os
 import select
 import socket
 import time
-from contextlib import ExitStack
 from typing import Any
 
 import pytest
 
 from magbridge.bridge.links import open_link
-from magbridge.bridge.udp import PEERS
 from magbridge.mavlink import Codec
 
 
@@ -110,28 +107,7 @@ def test_datagrams_that_waited_come_at_once() -> None:
         heard = [port.read() for _ in range(3)]
         for data in (b"first", b"", b"after an empty one"):
             peer.sendto(data, bridge)
-        assert [port.read(), port.read()] == [b"first", b"after an empty one"]
+        assert port.read() == b"firstafter an empty one"
         port.close()
     assert [len(data) for data in heard] == [66_000, 54_000, 0]
     assert b"".join(heard)[::600] == bytes(range(200))
-
-
-def test_a_crowd_of_peers_costs_no_more_than_a_few() -> None:
-    """Whoever sends one datagram from each of its ports, as a scan does, must not have a copy for each."""
-    with ExitStack() as stack:
-        port = open_link("udpin:127.0.0.1:0", 0)
-        port.open()
-        with socket.socket(fileno=os.dup(port.fds()[0])) as own:
-            place = own.getsockname()
-        everyone = [
-            stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) for _ in range(PEERS + 5)
-        ]
-        station = everyone[0]
-        for peer in (*everyone, station):  # the station speaks again; five others did so least lately
-            peer.sendto(b"here", place)
-        assert len(port.read()) == 4 * (len(everyone) + 1)
-        port.write(b"field")
-        answered = select.select(everyone, [], [], 1.0)[0]
-        port.close()
-    assert len(answered) == PEERS
-    assert station in answered

@@ -1,0 +1,167 @@
+"""Who is at the other end of a link that anyone can come to: by ``udpin`` or ``tcpin``.
+
+Each peer has a parser of its own, so that what one sends never swallows what another does: the bridge gets
+whole frames, and after them the bytes that belong to none. A peer is answered once it has sent something
+valid, signed where the link is signed; who speaks as the autopilot is answered first and is never left out
+for the others.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Hashable, Iterable
+from math import inf
+
+from magbridge.mavlink import BAD_DATA, Codec
+
+__all__ = ["ANSWERED", "TIMEOUT", "Peer", "Peers"]
+
+TIMEOUT = 30.0
+"""s after its last valid frame at which a peer is no longer answered."""
+ANSWERED = 8
+"""Most peers that are answered; of more, the autopilot's and then those that came first."""
+KNOWN = 64
+"""Most peers of which there is a parser."""
+SHARE = 8192
+"""Bytes of one peer that are looked at before the sensor's turn; the autopilot's are looked at whole."""
+STRANGERS = 8192
+"""Bytes, likewise, of all peers together that have not yet sent anything valid."""
+LOOK = 1.0
+"""s between two looks at who has fallen silent."""
+V2 = 0xFD
+
+
+class Peer:
+    """One of them.
+
+    Attributes
+    ----------
+    address : hashable
+        As the port knows it.
+    genuine, pilot : float
+        When it last sent something valid, and something of the autopilot's; s, monotonic.
+    """
+
+    __slots__ = ("address", "codec", "genuine", "pilot", "share", "since")
+
+    def __init__(self, address: Hashable) -> None:
+        self.address, self.codec = address, Codec(0, 0)
+        self.genuine = self.pilot = self.since = -inf
+        self.share = 0
+
+
+class Peers:
+    """The peers of one port.
+
+    Parameters
+    ----------
+    autopilot : (int, int) or None
+        System and component whose peer goes before all others.
+    signed : bool
+        A frame is valid once :meth:`credit` has named it; else if it is a known message.
+
+    Attributes
+    ----------
+    ignored : int
+        Bytes that nobody looked at, because their sender had used up its share.
+    notices : deque of str
+        What is to be told about them, each once.
+    """
+
+    def __init__(self, autopilot: tuple[int, int] | None = None, *, signed: bool = False) -> None:
+        self._autopilot, self._signed = autopilot, signed
+        self._peers: dict[Hashable, Peer] = {}
+        self._frames: list[bytes] = []
+        self._stray: list[bytes] = []
+        self._authors: dict[bytes, Peer] = {}
+        self._strangers = 0
+        self._answered: list[Peer] = []
+        self._look = 0.0
+        self._told: set[str] = set()
+        self.ignored = 0
+        self.notices: deque[str] = deque(maxlen=8)
+
+    def receive(self, address: Hashable, data: bytes) -> None:
+        """Take the bytes that came from one of them."""
+        peer, now = self._peers.get(address), time.monotonic()
+        if peer is None:
+            peer = self._meet(address)
+        known = now - peer.genuine < TIMEOUT
+        peer.share += len(data)
+        self._strangers += 0 if known else len(data)
+        if now - peer.pilot > TIMEOUT and (peer.share > SHARE or (not known and self._strangers > STRANGERS)):
+            self.ignored += len(data)
+            return
+        for message in peer.codec.parse(data):
+            if message.id == BAD_DATA:
+                self._stray.append(message.frame)
+                continue
+            self._frames.append(message.frame)
+            if self._signed:
+                self._authors.setdefault(message.frame, peer)
+            elif message.known:
+                self._prove(peer, message.frame, now)
+
+    def take(self) -> bytes:
+        """Return what has come since the last time: first the frames, then what belongs to none."""
+        data = b"".join(self._frames + self._stray)
+        self._frames, self._stray, self._strangers = [], [], 0
+        for peer in self._peers.values():
+            peer.share = 0
+        return data
+
+    def credit(self, frames: Iterable[bytes]) -> None:
+        """Learn which frames of the last :meth:`take` were signed by someone who has the key."""
+        now = time.monotonic()
+        for frame in frames:
+            if peer := self._authors.get(frame):
+                self._prove(peer, frame, now)
+        self._authors.clear()
+
+    def forget(self, address: Hashable) -> None:
+        """Forget a peer that is gone."""
+        self._peers.pop(address, None)
+        self._look = 0.0
+
+    def is_known(self, address: Hashable) -> bool:
+        """Say whether a peer has lately sent something valid."""
+        peer = self._peers.get(address)
+        return peer is not None and time.monotonic() - peer.genuine < TIMEOUT
+
+    def answered(self) -> list[Peer]:
+        """Return those to send to, in the order in which to send."""
+        now = time.monotonic()
+        if now < self._look:
+            return self._answered
+        self._look = now + LOOK
+        valid = [peer for peer in self._peers.values() if now - peer.genuine < TIMEOUT]
+        valid.sort(key=lambda peer: (now - peer.pilot > TIMEOUT, peer.since))
+        self._answered = valid[:ANSWERED]
+        if len(valid) > ANSWERED:
+            self._tell(f"more than {ANSWERED} peers: the others are not answered")
+        if sum(now - peer.pilot < TIMEOUT for peer in valid) > 1:
+            self._tell("the autopilot speaks from several addresses")
+        return self._answered
+
+    def _meet(self, address: Hashable) -> Peer:
+        if len(self._peers) >= KNOWN:
+            least = min(self._peers.values(), key=lambda peer: (peer.pilot, peer.genuine))
+            del self._peers[least.address]
+        peer = self._peers[address] = Peer(address)
+        return peer
+
+    def _prove(self, peer: Peer, frame: bytes, now: float) -> None:
+        if now - peer.genuine > TIMEOUT:
+            peer.since, self._look = now, 0.0
+        peer.genuine = now
+        who = (frame[5], frame[6]) if frame[0] == V2 else (frame[3], frame[4])
+        if who == self._autopilot:
+            if now - peer.pilot > TIMEOUT:
+                self._look = 0.0
+            peer.pilot = now
+
+    def _tell(self, text: str) -> None:
+        if text not in self._told:
+            self._told.add(text)
+            self.notices.append(text)

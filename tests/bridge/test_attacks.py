@@ -1,0 +1,53 @@
+"""A running bridge on a network that is not friendly; tools/attacks.py measures more of the kind."""
+
+from __future__ import annotations
+
+import select
+import socket
+from collections.abc import Callable
+from contextlib import ExitStack
+
+from checks import replays
+from rig import Rig
+
+from magbridge.mavlink import Codec
+
+KEY = bytes(range(1, 33))
+SECRET = bytes(range(101, 133))
+MakeRig = Callable[..., Rig]
+
+
+def test_a_signed_bridge_that_anyone_can_reach(make_rig: MakeRig) -> None:
+    """Restarted in haste, between strangers' headers, asked for too much, and told a key."""
+    rig = make_rig("udpin", key=KEY)
+    rig.start()
+    for _ in range(3):
+        assert rig.stop() == 0
+        for path in rig.logs:
+            path.unlink()
+        rig.heard.clear()
+        rig.again()
+    before, mark = rig.fresh_status(), rig.mark
+    with ExitStack() as stack:
+        strangers = [stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) for _ in range(40)]
+        header = bytes((0xFD, 60, 0, 0, 7, 9, 9, 0xF0, 0xE0, 0))
+        beat = Codec(255, 190).pack("HEARTBEAT", type=6)
+
+        def shout(frame: bytes) -> list[bytes]:
+            for one in strangers:
+                one.sendto(header, rig.autopilot.address)
+                one.sendto(beat, rig.autopilot.address)
+            return [frame]
+
+        with rig.autopilot.retelling(shout):
+            rig.run(1.5)
+        assert not select.select(strangers, [], [], 0)[0]
+    rig.autopilot.say("SETUP_SIGNING", target_system=1, target_component=191, secret_key=SECRET)
+    rig.until_said("key from 1:1 not taken: keys come from a file", mark)
+    after = rig.fresh_status()
+    assert after["link_frames_lost"] - before["link_frames_lost"] <= 1  # that one
+    assert after["link_refused"] - before["link_refused"] >= 40 * 20
+    assert rig.undue_flags(mark) == ""
+    assert not any("old time stamp" in text for text in rig.said())
+    replays(rig)
+    assert not any(SECRET[:6] in path.read_bytes() for path in rig.logs)

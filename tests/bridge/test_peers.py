@@ -1,0 +1,192 @@
+"""A link that anyone can come to: who is answered, and that nobody swallows what another sends."""
+
+from __future__ import annotations
+
+import os
+import select
+import socket
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, closing, contextmanager
+from typing import Any
+
+import pytest
+
+from magbridge.bridge.links import open_link
+from magbridge.bridge.peers import ANSWERED, KNOWN, SHARE, Peers
+from magbridge.bridge.port import Port
+from magbridge.bridge.tcp import CONNECTIONS
+from magbridge.mavlink import Codec
+
+PILOT = (1, 1)
+
+
+def beat(component: int = 1, system: int = 1) -> bytes:
+    return Codec(system, component).pack("HEARTBEAT", type=12)
+
+
+def header(size: int) -> bytes:
+    """The beginning of an unknown message: whoever waits for the rest of it swallows `size` bytes."""
+    return bytes((0xFD, size, 0, 0, 7, 9, 9, 0xF0, 0xE0, 0))
+
+
+@contextmanager
+def opened(kind: str, *, signed: bool = False) -> Iterator[tuple[Port, Any]]:
+    port = open_link(f"{kind}:127.0.0.1:0", 0, autopilot=PILOT, signed=signed)
+    port.open()
+    with socket.socket(fileno=os.dup(port.fds()[0])) as own:
+        place = own.getsockname()
+    with closing(port):
+        yield port, place
+
+
+def hear(port: Port, size: int) -> bytes:
+    data = b""
+    while len(data) < size:
+        assert select.select(port.fds(), [], [], 2.0)[0], data
+        data += port.read()
+    return data
+
+
+def answered(everyone: list[socket.socket], port: Port) -> list[int]:
+    """Return which of them an answer reaches."""
+    port.write(b"field")
+    time.sleep(0.02)
+    return [k for k, one in enumerate(everyone) if select.select([one], [], [], 0)[0] and one.recv(9)]
+
+
+def udp(stack: ExitStack, count: int) -> list[socket.socket]:
+    return [stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) for _ in range(count)]
+
+
+def test_a_header_swallows_nothing_of_another_peer() -> None:
+    with opened("udpin") as (port, place), ExitStack() as stack:
+        autopilot, stranger = udp(stack, 2)
+        heard = b""
+        for k in range(30):
+            stranger.sendto(header(20 + k), place)
+            autopilot.sendto(beat(), place)
+            heard += hear(port, len(beat()))
+    assert [one.name for one in Codec(1, 191).parse(heard, whole=True)].count("HEARTBEAT") == 30
+
+
+def test_frames_come_first_and_a_frame_in_pieces_is_whole() -> None:
+    """So whoever parses what is read needs no more of it to tell a frame from what is none."""
+    both = Peers()
+    noise, frame = b"noise" + header(30) + bytes(9), beat()
+    for who, data in ((1, frame[:7]), (2, noise), (1, frame[7:]), (2, bytes(5000)), (3, frame)):
+        both.receive(who, data)
+    data = both.take()
+    assert data.startswith(frame * 2)
+    assert len(data) == 2 * len(frame) + 4096
+    messages = Codec(1, 191).parse(data, whole=True)
+    assert [one.name for one in messages[:2]] == ["HEARTBEAT"] * 2
+    assert b"".join(one.frame for one in messages) == data
+    assert both.take() == b""
+
+
+@pytest.mark.parametrize("word", [b"", b"x", b"\xfd", beat()[:-1], beat()[:-1] + b"\0", header(1) + bytes(3)])
+def test_who_says_nothing_valid_is_not_answered(word: bytes) -> None:
+    with opened("udpin") as (port, place), ExitStack() as stack:
+        (stranger,) = udp(stack, 1)
+        stranger.sendto(word, place)
+        assert select.select(port.fds(), [], [], 1)[0]
+        port.read()
+        assert answered([stranger], port) == []
+
+
+@pytest.mark.parametrize("kind", ["udpin", "tcpin"])
+def test_where_we_sign_only_a_signature_is_answered(kind: str) -> None:
+    with opened(kind, signed=True) as (port, place), ExitStack() as stack:
+        if kind == "udpin":
+            everyone = udp(stack, 2)
+            for one in everyone:
+                one.connect(place)
+        else:
+            everyone = [stack.enter_context(socket.create_connection(place)) for _ in range(2)]
+        for k, one in enumerate(everyone):
+            one.send(beat(1 + k))
+        hear(port, 2 * len(beat()))
+        assert answered(everyone, port) == []
+        everyone[0].send(beat(1))
+        hear(port, len(beat()))
+        port.credit([beat(1)])
+        assert answered(everyone, port) == [0]
+
+
+@pytest.mark.parametrize("first", [True, False])
+def test_strangers_never_take_the_autopilot_s_place(first: bool) -> None:
+    with opened("udpin") as (port, place), ExitStack() as stack:
+        autopilot, *strangers = udp(stack, 41)
+        everyone = [autopilot, *strangers]
+        for one in everyone if first else reversed(everyone):
+            one.sendto(beat(1 if one is autopilot else 99), place)
+        hear(port, 41 * len(beat()))
+        reached = answered(everyone, port)
+        assert len(reached) == ANSWERED
+        assert 0 in reached
+        assert port.notice() == f"more than {ANSWERED} peers: the others are not answered"
+        assert port.notice() == ""
+
+
+def test_two_who_speak_as_the_autopilot_are_told() -> None:
+    both = Peers(PILOT)
+    for who in "ab":
+        both.receive(who, beat())
+    assert [one.address for one in both.answered()] == ["a", "b"]
+    assert list(both.notices) == ["the autopilot speaks from several addresses"]
+
+
+def test_a_peer_that_falls_silent_is_no_longer_answered(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [1000.0]
+    monkeypatch.setattr("magbridge.bridge.peers.time.monotonic", lambda: now[0])
+    both = Peers(PILOT)
+    both.receive("station", beat(190, 255))
+    assert [one.address for one in both.answered()] == ["station"]
+    now[0] += 31.0
+    assert both.answered() == []
+    assert not both.is_known("station")
+
+
+def test_a_flood_costs_its_sender_not_the_autopilot() -> None:
+    both = Peers(PILOT)
+    both.receive("autopilot", beat())
+    both.take()
+    for k in range(10 * KNOWN):
+        both.receive(k, beat(99)[:-1] + b"?" + bytes(1000))
+    for _ in range(100):
+        both.receive("station", beat(190, 255) * 20)
+    for _ in range(1000):
+        both.receive("autopilot", beat())
+    frames = [one for one in Codec(1, 191).parse(both.take(), whole=True) if one.known]
+    assert sum(one.component == 1 for one in frames) == 1000
+    assert sum(one.component == 190 for one in frames) <= SHARE / len(beat())
+    assert both.ignored > 10 * KNOWN * 900
+
+
+def test_connections_never_turn_the_autopilot_out() -> None:
+    with opened("tcpin") as (port, place), ExitStack() as stack:
+        autopilot = stack.enter_context(socket.create_connection(place))
+        autopilot.sendall(beat())
+        assert hear(port, len(beat())) == beat()
+        for _ in range(200):
+            stack.enter_context(socket.create_connection(place))
+            port.read()
+        assert len(port.fds()) <= CONNECTIONS + 1
+        autopilot.sendall(beat())
+        assert hear(port, len(beat())) == beat()
+        port.write(b"field")
+        assert autopilot.recv(9) == b"field"
+
+
+def test_a_client_that_only_listens_has_to_go_for_one_that_speaks(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("magbridge.bridge.tcp.GREETING", 0.0)
+    with opened("tcpin") as (port, place), ExitStack() as stack:
+        mute = [stack.enter_context(socket.create_connection(place)) for _ in range(CONNECTIONS)]
+        for _ in mute:
+            port.read()
+        assert len(answered(mute, port)) == CONNECTIONS
+        late = stack.enter_context(socket.create_connection(place))
+        late.sendall(beat())
+        assert hear(port, len(beat())) == beat()
+        assert mute[0].recv(9) == b""
