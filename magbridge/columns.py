@@ -102,6 +102,8 @@ _FACTORS = {
 }
 _SAME = {
     "degrees": "deg",
+    "Decimal Degrees": "deg",
+    "decimal degrees": "deg",
     "degree": "deg",
     "degrees_north": "deg",
     "degrees_east": "deg",

@@ -14,11 +14,11 @@ from pathlib import Path
 
 from cyclopts import CycloptsError, MissingArgumentError, UnusedCliTokensError
 
-from magbridge.cli import ashore, bridge, calibrate, correct, diagnose, navigate
+from magbridge.cli import ashore, bridge, calibrate, correct, diagnose, info, navigate
 from magbridge.cli.common import app, complain
 from magbridge.errors import MagbridgeError, MissingExtra
 
-__all__ = ["app", "ashore", "bridge", "calibrate", "correct", "diagnose", "main", "navigate"]
+__all__ = ["app", "ashore", "bridge", "calibrate", "correct", "diagnose", "info", "main", "navigate"]
 
 EXTRAS = {
     **dict.fromkeys(

@@ -131,17 +131,24 @@ class Reading:
         the log says was in use.
     strict
         Refuse a log of which anything would be dropped, instead of dropping, counting and naming it.
+    column
+        A column under our name, NAME="THEIRS [unit]", as mag_x="Bx [uT]"; may be repeated.
+    columns
+        A columns.toml that does so for a whole file: renames, scales, declares units and what headings refer
+        to.
     """
 
     date: Annotated[date | None, Parameter(converter=_day)] = None
     compass: str | None = None
     strict: bool = False
+    column: tuple[str, ...] = ()
+    columns: Path | None = None
 
     @property
     def options(self) -> Options:
         """The same for :mod:`magbridge.logs`."""
         boot = None if self.date is None else datetime.combine(self.date, time(), UTC).timestamp()
-        return Options(strict=self.strict, date=boot, compass=self.compass)
+        return Options(self.strict, boot, self.compass, self.column, self.columns)
 
 
 AS_THEY_SAY = Reading()
@@ -184,8 +191,11 @@ def doubts_of(calibration: Calibration, file: Path) -> list[str]:
 
 def note_losses(*pieces: Mapping[str, Any]) -> None:
     """Report on stderr what reading skipped, from the attributes of a deployment or of its pieces."""
-    from magbridge.logs.deployment import COUNTERS, named_losses, passed_over
+    from magbridge.logs.deployment import COUNTERS, GUESSED, named_losses, passed_over
 
+    for guess in dict.fromkeys(str(attrs.get(GUESSED, "")) for attrs in pieces):
+        if guess:
+            complain(f"guessed: {guess}")
     if counts := passed_over(*pieces):
         losses = ", ".join(f"{count} {COUNTERS[name][count > 1]}" for name, count in counts.items())
         complain(f"in the logs: {losses}")

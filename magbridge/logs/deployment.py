@@ -18,6 +18,8 @@ from magbridge.records import Quality
 __all__ = [
     "CHANGES",
     "COUNTERS",
+    "GUESSED",
+    "HISTORY",
     "LOSSES",
     "MEANING",
     "SETTINGS",
@@ -50,6 +52,10 @@ COUNTERS = {
 }
 """Attributes that count what reading skipped, with singular and plural. They are summed over pieces, and are
 not copied to a file that is written."""
+GUESSED = "guessed"
+"""Attribute that says what a file left open and was taken for granted; it goes the way of the counts, too."""
+HISTORY = "history"
+"""Attribute that keeps such things in what is written, a line for each."""
 LOSSES = "losses"
 """Attribute that names what was skipped, a line for each file and column. It goes the way of the counts."""
 
@@ -212,7 +218,7 @@ def lasting(attrs: Mapping[Any, Any]) -> dict[str, str | float]:
 def uncounted(dataset: xr.Dataset) -> xr.Dataset:
     """Return the deployment without the attributes of :data:`COUNTERS`, and :data:`LOSSES`."""
     bare = dataset.copy(deep=False)
-    counted = {LOSSES, *COUNTERS}
+    counted = {GUESSED, LOSSES, *COUNTERS}
     bare.attrs = {name: value for name, value in dataset.attrs.items() if name not in counted}
     return bare
 
@@ -253,6 +259,8 @@ def _join_attrs(all_attrs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
                 joined[key] += value
             else:
                 joined.setdefault(key, value)
-    if lines := named_losses(*all_attrs):
-        joined[LOSSES] = "\n".join(lines)
+    for key in (GUESSED, HISTORY, LOSSES):
+        told = [line for attrs in all_attrs for line in str(attrs.get(key, "")).splitlines()]
+        if told:
+            joined[key] = "\n".join(dict.fromkeys(told))
     return joined | {"source": ", ".join(sources)}

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+from magbridge.logs.mapping import Declared, declared
 
 __all__ = ["Options"]
 
@@ -19,8 +23,19 @@ class Options:
         s since 1970 UTC of the boot, for logs whose times count from it.
     compass : str or None
         Number (from 0) or device id of the compass to use, of several; None: the one that was in use.
+    column : tuple of str
+        Columns under our names, each ``NAME="THEIRS [unit]"``.
+    columns : path or None
+        A mapping file (:class:`magbridge.logs.mapping.Declared`), which does so for a whole file.
     """
 
     strict: bool = False
     date: float | None = None
     compass: str | None = None
+    column: tuple[str, ...] = ()
+    columns: Path | None = None
+
+    @cached_property
+    def declared(self) -> Declared:
+        """What `columns` and `column` say together; ConfigError, WrongUse: one is wrong."""
+        return declared(self.column, self.columns)

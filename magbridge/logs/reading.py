@@ -169,6 +169,10 @@ def _chunks(path: Path, rows: int, options: Options) -> Iterator[xr.Dataset]:
     part = None
     try:
         numbered = _numbered(guarded(path, pieces) if form.guarded else pieces())
+        if options.declared.columns and not form.maps_columns:
+            from magbridge.logs.mapping import renamed  # noqa: PLC0415 - xarray is for ashore
+
+            numbered = ((renamed(piece, options.declared), rows) for piece, rows in numbered)
         for part in checked(path, numbered, strict=options.strict):
             if options.strict and (lost := passed_over(part.attrs)):
                 raise FormatError(path, f"expected a log without {' '.join(lost)}, as --strict was given")

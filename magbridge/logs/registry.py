@@ -40,6 +40,8 @@ class Format(NamedTuple):
     writes: bool = False
     guarded: bool = False
     """Whether another library reads it, which damage may hang or crash: it is read in a child process."""
+    maps_columns: bool = False
+    """Whether it heeds itself what the options declare of columns; else they are renamed when it is read."""
 
     def load(self) -> Any:
         """Return the module."""
@@ -58,7 +60,8 @@ FORMATS: dict[str, Format] = {
     "telemetry": Format(
         "magbridge.logs.telemetry", (".tlog",), rb"\x00[\x00-\x0c].{6}[\xfd\xfe]", writes=True
     ),
-    "text": Format("magbridge.logs.text", (".csv",), writes=True),
+    "csv": Format("magbridge.logs.text", (".csv",), writes=True, maps_columns=True),
+    "text": Format("magbridge.logs.text", (".txt", ".tsv", ".dat", ".asc"), maps_columns=True),
 }
 """Name to format; the first whose signature matches reads the file."""
 

@@ -1,154 +1,112 @@
-"""CSV: a header row, one row per sample, an empty field for a missing value.
+"""CSV and other text: a header row, one row per sample, an empty field for a missing value.
 
-A heading is ``name`` or ``name [unit]``: ``battpos [in]``. Columns of :data:`magbridge.columns.COLUMNS` need
-no unit; those in another known unit (``mag_x [uT]``, ``roll [rad]``) are converted. Before the header there
-may be lines such as ``# heading_reference = magnetic``, and ``# fill_value = -9999`` where that number stands
-for a missing value; from a bridge's log, also the settings by which it corrected. ``quality`` holds the names
-of the flags, separated by spaces. Numbers are written with as many digits as it takes to read back the same
-float64.
+A heading is ``name``, ``name [unit]`` or ``name (unit)``: ``battpos [in]``. Columns of
+:data:`magbridge.columns.COLUMNS` need no unit; those in another known unit (``mag_x [uT]``, ``roll [rad]``)
+are converted. Before the header there may be lines such as ``# heading_reference = magnetic``, and
+``# fill_value = -9999`` where that number stands for a missing value; from a bridge's log, also the settings
+by which it corrected. ``quality`` holds the names of the flags, separated by spaces. Numbers are written with
+as many digits as it takes to read back the same float64.
+
+Files of others are read by :mod:`.layout` (separator, decimal commas, headings, units) and :mod:`.clocks`
+(times); what other programs capture without headings by :mod:`.captures`. What was guessed is told by the
+attributes ``guessed`` and ``history``; :class:`~magbridge.logs.options.Options` declare instead.
 """
 
 from __future__ import annotations
 
+import codecs
 import csv
-import re
 from collections.abc import Iterator, Sequence
-from itertools import islice
-from math import isnan, nan
+from itertools import chain, islice
+from math import isnan
 from pathlib import Path
-from typing import NamedTuple, TextIO
+from typing import TextIO
 
 import numpy as np
 import xarray as xr
 
 from magbridge.columns import COLUMNS
 from magbridge.errors import FormatError
-from magbridge.logs.deployment import SETTINGS, deployment, lasting
+from magbridge.logs import captures
+from magbridge.logs.deployment import GUESSED, HISTORY, deployment, lasting, with_losses
+from magbridge.logs.layout import HEAD, layout_of
+from magbridge.logs.options import Options
+from magbridge.logs.table import Table
 from magbridge.records import Quality
 
 __all__ = ["FileWriter", "chunks"]
 
-HEADING = re.compile(r"(?P<name>.*?)\s*(?:\[(?P<unit>[^\]]*)\])?")
+DEFAULTS = Options()
 LONGEST = 1 << 20
 """Characters of the longest line that is read."""
-ATTRIBUTE = re.compile(r"#\s*([\w.-]+)\s*=\s*(.*?)\s*")
+LOOKED_AT = 1 << 16
+"""Bytes by which the encoding is found."""
 
 
-def chunks(path: Path, rows: int) -> Iterator[tuple[xr.Dataset, Sequence[int]]]:
+def chunks(path: Path, rows: int, options: Options = DEFAULTS) -> Iterator[tuple[xr.Dataset, Sequence[int]]]:
     """Yield the file as deployments of at most `rows` rows, each with their numbers.
 
     Raises
     ------
     FormatError
-        No header, a row of another length, a field that is not a number.
+        No header, a row of another length, a field that is not a number, or a declared column that is not
+        there.
     """
-    with path.open(encoding="utf-8-sig", newline="") as file:
+    encoding, guess = _encoding(path)
+    with path.open(encoding=encoding) as file:
         try:
-            yield from _chunks(path, file, rows)
+            yield from _chunks(path, file, rows, options, guess)
         except UnicodeDecodeError:
             raise FormatError(path, "expected text in UTF-8") from None
-        except csv.Error as error:
-            raise FormatError(path, f"expected comma-separated values: {error}") from None
 
 
-class _Header(NamedTuple):
-    """What precedes the rows, and the number of the header's line."""
-
-    attrs: dict[str, str | float]
-    fill: float
-    names: list[str]
-    units: dict[str, str]
-    row: int
-
-
-def _header(path: Path, lines: Iterator[str]) -> _Header:
-    """Read the comments and the names of the columns from the first lines."""
-    attrs: dict[str, str | float] = {}
-    fill = nan
-    line, row = next(lines, ""), 1
-    while line.startswith("#"):
-        if match := ATTRIBUTE.fullmatch(line.rstrip("\r\n")):
-            name, text = match.groups()
-            if name == "fill_value":
-                (fill,) = _numbers(path, name, [text], [row])
-            else:
-                attrs[name] = _numbers(path, name, [text], [row])[0] if name.startswith(SETTINGS) else text
-        line, row = next(lines, ""), row + 1
-    if not line.strip():
-        raise FormatError(path, "expected a header row, the file is empty", row=row)
-    headings = next(csv.reader([line]))
-    if len(headings) == 1 and {";", "\t"} & set(line.strip()):
-        raise FormatError(path, "expected columns separated by commas, and points in decimals", row=row)
-    matches = [HEADING.fullmatch(heading.strip()) for heading in headings]
-    names = [match["name"] if match else "" for match in matches]
-    units = {match["name"]: match["unit"] for match in matches if match and match["unit"]}
-    for k, name in enumerate(names):
-        if not name or name in names[:k]:
-            raise FormatError(path, f"expected a name of its own for column {k + 1}, not {name!r}", row=row)
-    if "time" not in names:
-        there = " ".join(names)
-        raise FormatError(path, f"expected this column; there are: {there}", row=row, column="time")
-    return _Header(attrs, fill, names, units, row)
+def _encoding(path: Path) -> tuple[str, list[str]]:
+    """Return the encoding of a text file, and what had to be guessed."""
+    with path.open("rb") as file:
+        start = file.read(LOOKED_AT)
+    if start.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return "utf-16", []
+    try:
+        codecs.getincrementaldecoder("utf-8")().decode(start)
+    except UnicodeDecodeError:
+        if not any(byte < 32 and byte not in b"\t\r\n\f" for byte in start):
+            return "cp1252", ["text in Windows' Western alphabet, cp1252"]
+    return "utf-8-sig", []
 
 
-def _chunks(path: Path, file: TextIO, rows: int) -> Iterator[tuple[xr.Dataset, Sequence[int]]]:
+def _chunks(
+    path: Path, file: TextIO, rows: int, options: Options, guess: list[str]
+) -> Iterator[tuple[xr.Dataset, Sequence[int]]]:
     """Yield the rows, each piece with the numbers of its lines."""
-    text = _lines(file)
-    attrs, fill, names, units, row = _header(path, text)
-    reader, nothing = csv.reader(text), True
-    lines = ((row + reader.line_num, fields) for fields in reader if fields)
-    while block := list(islice(lines, rows)):
-        numbers, texts = zip(*block, strict=True)
-        for number, fields in block:
-            if len(fields) != len(names):
-                raise FormatError(path, f"expected {len(names)} fields, not {len(fields)}", row=number)
-        columns = {
-            name: np.array(_numbers(path, name, column, numbers))
-            for name, column in zip(names, zip(*texts, strict=True), strict=True)
-        }
-        for column in columns.values():
-            column[column == fill] = nan
-        nothing = False
-        yield deployment(path, columns.pop("time"), columns, units, attrs), numbers
-    if nothing:
-        raise FormatError(path, "expected rows after the header", row=row + 1)
+    lines = _lines(path, file)
+    head = list(islice(lines, HEAD))
+    if reader := captures.reader(head):
+        yield from reader(path, chain(head, lines), rows)
+        return
+    layout = layout_of(path, head, options.declared)
+    table = Table(path, layout, head, strict=options.strict)
+    attrs = {**layout.attrs, **table.attrs}
+    if guesses := [*guess, *layout.guesses, *table.guesses]:
+        told = "; ".join(guesses)
+        before = [str(attrs[HISTORY])] if HISTORY in attrs else []
+        attrs |= {GUESSED: told, HISTORY: "\n".join([*before, f"{path.name} was read with: {told}"])}
+    numbered = enumerate(chain(head[layout.first :], lines), layout.first + 1)
+    wanted = ((row, line) for row, line in numbered if line.strip() and not line.startswith("#"))
+    while block := list(islice(wanted, rows)):
+        time, columns, numbers = table.read([line for _, line in block], [row for row, _ in block])
+        piece = deployment(path, time, columns, layout.units, attrs)
+        yield with_losses(piece, *table.faults.since_last()), numbers
+    table.faults.finish()
+    if not table.faults.rows:
+        raise FormatError(path, "expected rows after the header", row=layout.first + 1)
 
 
-def _lines(file: TextIO) -> Iterator[str]:
+def _lines(path: Path, file: TextIO) -> Iterator[str]:
     """Yield the lines; an endless one, as of the zeros that a crash leaves, must not fill the memory."""
     while line := file.readline(LONGEST):
         if len(line) == LONGEST:
-            raise csv.Error(f"a line has more than {LONGEST:,} characters")
-        yield line
-
-
-def _numbers(path: Path, name: str, texts: Sequence[str], rows: Sequence[int]) -> list[float]:
-    number = _flags if name == "quality" else _float
-    try:
-        return [number(text) for text in texts]
-    except ValueError:
-        pass
-    for row, text in zip(rows, texts, strict=True):
-        try:
-            number(text)
-        except ValueError as error:
-            expected = "seconds since 1970" if name == "time" else error
-            raise FormatError(path, f"expected {expected}, not {text!r}", row=row, column=name) from None
-    raise AssertionError
-
-
-def _float(text: str) -> float:
-    try:
-        return float(text) if text else nan
-    except ValueError:
-        raise ValueError("a number") from None
-
-
-def _flags(text: str) -> float:
-    try:
-        return float(Quality.parse(text))
-    except KeyError:
-        raise ValueError("the names of flags") from None
+            raise FormatError(path, f"expected lines of text: a line has more than {LONGEST:,} characters")
+        yield line if line.endswith("\n") else f"{line}\n"
 
 
 class FileWriter:
@@ -163,6 +121,8 @@ class FileWriter:
         if first:
             for key, value in lasting(dataset.attrs).items():
                 self._file.write(f"# {key} = {value}\n")
+            for line in str(dataset.attrs.get(HISTORY, "")).splitlines():
+                self._file.write(f"# {HISTORY} = {line}\n")
             self._csv.writerow(["time", *(_heading(dataset[name]) for name in dataset.data_vars)])
         columns = [_texts("time", dataset["time"].values)]
         columns += [_texts(str(name), dataset[name].values) for name in dataset.data_vars]

@@ -25,10 +25,9 @@ BAD_CSV = {
     "": "expected a log, the file is empty",
     "\n1,2\n": "row 1: expected a header row, the file is empty",
     "time,mag_x\n": "row 2: expected rows after the header",
-    "t,mag_x\n1,2\n": "row 1, column 'time': expected this column; there are: t mag_x",
-    "time;mag_x\n1;2\n": "row 1: expected columns separated by commas, and points in decimals",
+    "s,mag_x\n1,2\n": "row 1, column 'time': expected this column; there are: s mag_x",
+    "1,2\n3,4\n": "row 1: expected a header row with the columns' names, not '1,2'",
     "time,water_speed [kn]\n1,2\n": "column 'water_speed': expected m/s, not kn",
-    "time\tmag_x\n1\t2\n": "row 1: expected columns separated by commas, and points in decimals",
     "time,,mag_x\n1,2,3\n": "row 1: expected a name of its own for column 2, not ''",
     "time,mag_x,mag_x\n1,2,3\n": "row 1: expected a name of its own for column 3, not 'mag_x'",
     "time,mag_x\n1,2\n2\n": "row 3: expected 2 fields, not 1",
@@ -37,7 +36,14 @@ BAD_CSV = {
     "time,mag_x\n1,2\n,3\n": "row 3, column 'time': expected a time after 1.0, not nan",
     "time,mag_x\n2,2\n1,3\n": "row 3, column 'time': expected a time after 2.0, not 1.0",
     "time,mag_x\n2,2\n2,3\n": "row 3, column 'time': expected a time after 2.0, not 2.0",
-    "time,mag_x\n2016-06-23,2\n": "row 2, column 'time': expected seconds since 1970, not '2016-06-23'",
+    "time,mag_x\n2016-06-23,2\nlater,3\n": "row 3, column 'time': expected a time, not 'later'",
+    "time,mag_x\n1.5,2\n2016-06-23,3\n": (
+        "row 3, column 'time': expected seconds since 1970, not '2016-06-23'"
+    ),
+    "time,mag_x\n3/4/2022 12:00,2\n3/4/2022 12:01,2\n": (
+        "column 'time': day or month first? '3/4/2022 12:00' can be both: declare "
+        '--column time="... [%d/%m/%Y %H:%M] or [%m/%d/%Y %H:%M]"'
+    ),
     "time,mag_x [V]\n2,2\n": "column 'mag_x': expected nT, not V",
     "time,heading\n1,-9999\n": "row 2, column 'heading': expected deg, at most 540, not -9999.0",
     "time,depth\n1,4\n2,1e300\n": "row 3, column 'depth': expected m, at most 100000, not 1e+300",

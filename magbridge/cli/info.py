@@ -1,0 +1,102 @@
+"""Say what logs hold, and what could be done with them."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from magbridge.cli.common import AS_THEY_SAY, Json, Reading, app, check_inputs, complain, print_result
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+
+@app.command(usage="Usage: magbridge info FILE... [OPTIONS]")
+def info(*files: Path, reading: Reading = AS_THEY_SAY, json: Json = False) -> None:
+    """Say what logs hold: columns, units, rates, gaps, ranges, and what could be done with them.
+
+    Several logs are described one after the other.
+
+    Parameters
+    ----------
+    files
+        The logs.
+    reading
+        How to read the logs.
+    json
+        Print the result as JSON.
+    """
+    check_inputs(files)
+
+    from magbridge.logs import read
+    from magbridge.logs.info import info as facts_of
+
+    found = {}
+    for file in files:
+        found[str(file)] = facts_of(read(file, options=reading.options))
+        if not json:
+            _show(str(file), found[str(file)])
+    if json:
+        print_result(found, "", as_json=True)
+
+
+def _show(file: str, facts: dict[str, Any]) -> None:
+    from rich.console import Console
+
+    console = Console(highlight=False, soft_wrap=False)
+    console.print(f"[bold]{_plain(file)}[/bold]: {_plain(summary(facts))}")
+    console.print(_columns(facts))
+    console.print(_uses(facts))
+    for hint in [*(f"guessed: {guess}" for guess in facts["guessed"]), *facts["hints"]]:
+        complain(f"{file}: {hint}")
+
+
+def summary(facts: dict[str, Any]) -> str:
+    """Return a log's rows, its time, its rate and its gaps in a sentence."""
+    if not facts["rows"]:
+        return "no rows"
+    boot = facts["references"]["time_reference"] == "boot"
+    first, last = (f"{facts[end]:.1f} s" if boot else _utc(facts[end]) for end in ("start", "end"))
+    rate = f", {facts['rate_hz']:.4g} Hz" if facts["rate_hz"] else ""
+    gaps = f", {facts['gaps']} gaps, the longest of {facts['longest_gap_s']:.4g} s" if facts["gaps"] else ""
+    return f"{facts['rows']} rows, {first} to {last}{rate}{gaps}"
+
+
+def _utc(time: float) -> str:
+    return f"{datetime.fromtimestamp(time, UTC):%Y-%m-%d %H:%M:%S} UTC"
+
+
+def _columns(facts: dict[str, Any]) -> Table:
+    from rich.table import Table
+
+    table = Table("column", "unit", "known", "lowest", "highest", "changes every", "meaning")
+    for name in ("known", "lowest", "highest", "changes every"):
+        table.columns[[str(column.header) for column in table.columns].index(name)].justify = "right"
+    for one in facts["columns"]:
+        every = one["changes_every_s"]
+        table.add_row(
+            _plain(one["name"]),
+            _plain(one["unit"]),
+            f"{one['known']:.0%}",
+            *("" if one[end] is None else f"{one[end]:.6g}" for end in ("lowest", "highest")),
+            "" if every is None else f"{every:.3g} s",
+            _plain(one["meaning"]),
+        )
+    return table
+
+
+def _uses(facts: dict[str, Any]) -> Table:
+    from rich.table import Table
+
+    table = Table("command", "could use it?")
+    for command, lacks in facts["uses"].items():
+        table.add_row(command, f"lacks {'; and '.join(lacks)}" if lacks else "yes")
+    return table
+
+
+def _plain(text: str) -> str:
+    """Return a text whose brackets are not taken for rich's markup."""
+    from rich.markup import escape
+
+    return escape(text)

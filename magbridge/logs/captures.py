@@ -1,0 +1,74 @@
+"""What programs write to a terminal for others to capture: lines without headings.
+
+MotionCal (PJRC) takes nine numbers a line, ``Raw:`` and the counts of accelerometer, gyroscope and
+magnetometer; the last three are in 0.1 uT. Adafruit's sketches add ``Uni:`` with the same in m/s2, rad/s and
+uT; where a capture has both, ``Uni:`` is read, for it has more digits. Neither has a time: the lines are
+taken for a hundred a second, which is what the sketches send.
+
+References
+----------
+https://www.pjrc.com/store/prop_shield.html; Adafruit_AHRS, examples/calibration.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator, Sequence
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+
+from magbridge.columns import CHANNELS, NT_PER_UNIT
+from magbridge.errors import FormatError
+from magbridge.logs.deployment import GUESSED, HISTORY, deployment, with_losses
+
+__all__ = ["reader"]
+
+RATE = 100.0
+"""Lines a second that MotionCal's senders write."""
+LINE = re.compile(r"(Raw|Uni):\s*(" + r",\s*".join([r"-?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?"] * 9) + r")\s*")
+OTHERS = "Uni:", "Ori:", "Cal1:", "Cal2:"
+"""What else these senders write."""
+COUNT = {"Raw": 0.1 * NT_PER_UNIT["uT"], "Uni": NT_PER_UNIT["uT"]}
+"""nT in one unit of the magnetometer's numbers."""
+Pieces = Iterator[tuple[xr.Dataset, Sequence[int]]]
+
+
+def reader(head: Sequence[str]) -> Callable[[Path, Iterator[str], int], Pieces] | None:
+    """Return the reader of a capture that begins with these lines; None: it is none that is known."""
+    kinds = [match[1] for line in head if (match := LINE.fullmatch(line.strip()))]
+    if not kinds or len(kinds) < len(head) / 4:
+        return None
+    kind = "Uni" if "Uni" in kinds else "Raw"
+    return lambda path, lines, rows: _motioncal(path, lines, rows, kind)
+
+
+def _motioncal(path: Path, lines: Iterator[str], rows: int, kind: str) -> Pieces:
+    """Yield the lines of one kind, each piece with their numbers; those that are damaged are counted."""
+    damaged = 0
+
+    def wanted() -> Iterator[tuple[int, str]]:
+        nonlocal damaged
+        for number, line in enumerate(lines, 1):
+            match = LINE.fullmatch(line.strip())
+            if match and match[1] == kind:
+                yield number, match[2]
+            elif not match and line.strip() and not line.startswith(OTHERS):
+                damaged += 1
+
+    told = f"MotionCal's {kind}: lines, {COUNT[kind]:g} nT a count; time: {RATE:g} lines a second"
+    attrs = {"time_reference": "boot", GUESSED: told, HISTORY: f"{path.name} was read with: {told}"}
+    found, done = wanted(), 0
+    block = list(islice(found, rows))
+    if not block:
+        raise FormatError(path, f"expected lines as {kind}:0,0,8192,0,0,0,300,50,450")
+    while block:
+        following = list(islice(found, rows))
+        lost, damaged = damaged, 0
+        values = np.array([[float(text) for text in numbers.split(",")] for _, numbers in block])
+        axes = dict(zip(CHANNELS, COUNT[kind] * values[:, 6:].T, strict=True))
+        piece = deployment(path, (done + np.arange(len(block))) / RATE, axes, attrs=attrs)
+        yield with_losses(piece, {"rows_dropped": lost}), [number for number, _ in block]
+        done, block = done + len(block), following

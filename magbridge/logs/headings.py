@@ -1,0 +1,104 @@
+"""The headings of a text file: name and unit, and the names that other programs give our columns."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+
+from magbridge.columns import COLUMNS, NT_PER_UNIT, usual
+
+__all__ = ["aliases", "is_unit", "split"]
+
+HEADING = re.compile(r"(?P<name>.*?)\s*(?:\[(?P<square>[^\]]*)\]|\((?P<round>[^)]*)\))?")
+UNITS = {
+    *NT_PER_UNIT,
+    *(column.units for column in COLUMNS.values() if column.units != "1"),
+    *("ms", "us", "ns", "min", "h", "UTC", "iso", "deg/s", "rad/s", "rad", "cm", "km", "mm", "in", "cm3"),
+    *("A", "mA", "V", "mV", "Hz", "%", "K", "Pa", "hPa", "kPa", "mbar", "bar", "dbar", "g", "m/s2", "m/s^2"),
+    *("cm/s", "kn"),
+}
+"""Units by which a row of units under the headings is known."""
+AXES = "x", "y", "z"
+VECTORS = (
+    *("mag{}", "magnetometer{}", "magneticfield{}", "magfield{}", "magnetic{}", "fluxgate{}", "b{}", "m{}"),
+    *(
+        "h{}",
+        "{}mag",
+        "b1{}",
+        "mag1{}",
+        "rawmag{}",
+        "magraw{}",
+        "imumagmagneticfield{}",
+        "magmagneticfield{}",
+    ),
+)
+"""What the three axes are called elsewhere, with neither capitals nor punctuation."""
+ALIASES = {
+    "time": (
+        *("timestamp", "datetime", "timeutc", "utctime", "datetimeutc", "dateandtime", "isotime", "unixtime"),
+        *("unixtimestamp", "posixtime", "epoch", "epochtime", "utc", "gpstime", "gpsseconds", "jd", "mjd"),
+        *("juliandate", "julianday", "julian", "exceltime", "exceldate", "zeit", "seconds", "t"),
+    ),
+    "roll": ("rollangle", "rolldeg"),
+    "pitch": ("pitchangle", "pitchdeg"),
+    "heading": ("yaw", "hdg", "compassheading", "trueheading"),
+    "latitude": ("lat", "gpslat", "gpslatitude"),
+    "longitude": ("lon", "long", "lng", "gpslon", "gpslongitude"),
+    "depth": ("depthm",),
+}
+"""Our name -> what others call it, the surest first."""
+
+
+def split(heading: str) -> tuple[str, str]:
+    """Return the name and the unit of a heading: ``Bx [uT]``, ``Bx (uT)``, ``Bx/uT``, ``Bx_uT``.
+
+    Where there is no unit it is empty.
+    """
+    match = HEADING.fullmatch(heading.strip())
+    assert match is not None
+    name, unit = match["name"].strip(), match["square"] or match["round"] or ""
+    if not name:  # nothing but brackets is a name after all
+        return heading.strip(), ""
+    if not unit:
+        for sign in "/_":
+            head, _, tail = name.rpartition(sign)
+            if head and usual(tail) in NT_PER_UNIT and tail not in {"T", "G"}:
+                return head.strip(), tail
+    return name, unit.strip()
+
+
+def is_unit(text: str) -> bool:
+    """Whether a cell under the headings is a unit: of a row of them at least one must be."""
+    return usual(text.strip().strip("[]()")) in UNITS
+
+
+def aliases(names: Sequence[str]) -> Mapping[int, str]:
+    """Return, for columns under another name than ours that are known to mean the same: position -> our name.
+
+    The three axes are recognised together or not at all: one `b_x` alone may be anything.
+    """
+    bare = [re.sub(r"[^a-z0-9]", "", name.lower()) for name in names]
+    found: dict[int, str] = {}
+
+    def only(word: str) -> int | None:
+        return bare.index(word) if bare.count(word) == 1 else None
+
+    if not all(f"mag_{axis}" in names for axis in AXES):
+        for pattern in VECTORS:
+            places = [only(pattern.format(axis)) for axis in AXES]
+            if None not in places:
+                found |= {
+                    place: f"mag_{axis}"
+                    for place, axis in zip(places, AXES, strict=True)
+                    if place is not None
+                }
+                break
+    for name in COLUMNS:
+        if name in names or name == "quality":  # a foreign one is not our set of flags
+            continue
+        for word in (name.replace("_", ""), *ALIASES.get(name, ())):
+            place = only(word)
+            if place is not None and place not in found and name not in found.values():
+                found[place] = name
+                break
+    return found

@@ -1,0 +1,144 @@
+"""What a log holds, and what could be done with it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from magbridge.arrays import FloatArray
+from magbridge.columns import AGE, CHANNELS, COLUMNS, NT_PER_UNIT
+from magbridge.field.igrf import magnitude
+from magbridge.logs.deployment import MEANING, passed_over
+
+__all__ = ["USES", "info", "lacking", "telemetry"]
+
+POSITION = ("latitude", "longitude")
+ATTITUDE = ("roll", "pitch", "heading")
+RECKONING: tuple[tuple[str, ...], ...] = (
+    ("velocity_north", "velocity_east"),
+    ("water_speed", "heading"),
+    ("local_north", "local_east"),
+    ("dr_latitude", "dr_longitude"),
+    ("depth", "pitch", "heading"),
+)
+Needs = tuple[tuple[tuple[str, ...], ...], ...]
+REFERENCE: tuple[tuple[str, ...], ...] = (("reference_field",), POSITION)
+USES: dict[str, Needs] = {
+    "calibrate": ((CHANNELS,), REFERENCE),
+    "correct": ((CHANNELS,),),
+    "diagnose": ((CHANNELS,), REFERENCE),
+    "navigate": ((CHANNELS,), RECKONING),
+    "survey": ((CHANNELS, ("total_field",), ("anomaly",)), (POSITION,)),
+    "plan --mission": ((ATTITUDE,), (POSITION,)),
+    "replay": ((CHANNELS,),),
+    "simulate --like": ((ATTITUDE,), (POSITION,)),
+}
+"""Command -> what it needs: of each group, one of the alternatives, each a set of columns."""
+GAP = 2.5
+"""A pause longer than this many sampling intervals is a gap."""
+EARTHS = 15_000.0, 90_000.0
+"""nT, within which the Earth's field lies, with a vehicle's own."""
+
+
+def info(log: xr.Dataset) -> dict[str, Any]:
+    """Return what a log holds: as a dictionary that JSON can hold.
+
+    Parameters
+    ----------
+    log : Dataset (time)
+        As :func:`magbridge.logs.read` returns it.
+
+    Returns
+    -------
+    dict
+        ``rows``, ``start``, ``end`` (s since 1970), ``interval_s``, ``rate_hz``, ``gaps``, ``longest_gap_s``,
+        ``references`` (what heading and time refer to), ``guessed`` and ``skipped``, ``columns`` (name, unit,
+        meaning, share known, lowest, highest, interval of its changes), ``uses`` (command -> what it lacks)
+        and ``hints``.
+    """
+    time = log["time"].to_numpy().astype(float)
+    steps = np.diff(time)
+    interval = float(np.median(steps)) if len(steps) else None
+    gaps = steps[steps > GAP * interval] if interval else steps
+    columns = [_column(str(name), log[name], time) for name in log.data_vars]
+    return {
+        "source": str(log.attrs.get("source", "")),
+        "rows": len(time),
+        "start": float(time[0]) if len(time) else None,
+        "end": float(time[-1]) if len(time) else None,
+        "interval_s": interval,
+        "rate_hz": 1.0 / interval if interval else None,
+        "gaps": len(gaps),
+        "longest_gap_s": float(gaps.max()) if len(gaps) else None,
+        "references": {name: str(log.attrs.get(name, default)) for name, default in MEANING.items()},
+        "guessed": [part for part in str(log.attrs.get("guessed", "")).split("; ") if part],
+        "skipped": passed_over(log.attrs),
+        "columns": columns,
+        "uses": {command: lacking(log, needs) for command, needs in USES.items()},
+        "hints": _hints(log, columns),
+    }
+
+
+def lacking(log: xr.Dataset, needs: Needs) -> list[str]:
+    """Return what of `needs` a log lacks, as ``a b or c``; a column without any value is not there."""
+    there = {str(name) for name in log.data_vars if bool(log[name].notnull().any())}
+    return [
+        " or ".join(" ".join(name for name in one if name not in there) for one in alternatives)
+        for alternatives in needs
+        if not any(set(one) <= there for one in alternatives)
+    ]
+
+
+def telemetry(log: xr.Dataset) -> list[str]:
+    """Return the columns that may be parameters of a calibration: telemetry that varies."""
+    names = [str(name) for name in log.data_vars]
+    return [
+        name
+        for name in names
+        if name not in COLUMNS
+        and not name.startswith((AGE, "truth_", "mag"))
+        and name not in {"run", "dive", "power_cycle", "line", "line_type"}
+        and float(log[name].max()) > float(log[name].min())
+    ]
+
+
+def _column(name: str, column: xr.DataArray, time: FloatArray) -> dict[str, Any]:
+    values = column.to_numpy()
+    known = np.isfinite(values)
+    changed = np.flatnonzero(np.diff(values[known]) != 0.0) + 1
+    since = np.diff(time[known][changed])
+    return {
+        "name": name,
+        "unit": str(column.attrs.get("units", "")),
+        "meaning": str(column.attrs.get("long_name", "")),
+        "known": float(known.mean()) if len(values) else 0.0,
+        "lowest": float(values[known].min()) if known.any() else None,
+        "highest": float(values[known].max()) if known.any() else None,
+        "changes_every_s": float(np.median(since)) if len(since) else None,
+    }
+
+
+def _hints(log: xr.Dataset, columns: list[dict[str, Any]]) -> list[str]:
+    hints = []
+    if set(CHANNELS) <= set(log.data_vars):
+        length = float(np.nanmedian(magnitude(log[list(CHANNELS)].to_array().to_numpy().T)))
+        if not EARTHS[0] < length < EARTHS[1]:
+            fitting = [
+                unit for unit, factor in NT_PER_UNIT.items() if EARTHS[0] < length * factor < EARTHS[1]
+            ]
+            said = (
+                f'; in {fitting[0]} it would be the Earth\'s: --column mag_x="mag_x [{fitting[0]}]" and so on'
+            )
+            hints.append(f"the vector's length is {length:.4g} nT (median)" + said * bool(fitting))
+    if log.attrs.get("time_reference") == "boot":
+        hints.append("times count from a start that the log does not tell: --date says when it was")
+    if "heading" in log and "heading_reference" not in log.attrs:
+        hints.append("heading is taken as true: say --heading-reference magnetic if it is a compass'")
+    if moving := telemetry(log):
+        hints.append(f"may move the field, for --parameter: {' '.join(moving)}")
+    empty = [one["name"] for one in columns if not one["known"]]
+    if empty:
+        hints.append(f"never known: {' '.join(empty)}")
+    return hints

@@ -1,0 +1,42 @@
+"""Files of instruments whose makers say what their columns mean: what a user would have to declare.
+
+MagArrow's compass has its x to the right, its y aft and its z down (Geometrics, MagArrow user manual, 'Data
+Format'); ``Mag`` is its caesium magnetometer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import msgspec
+
+from magbridge.logs.mapping import Declared, Source
+
+__all__ = ["declared_by_maker"]
+
+MAKERS: dict[str, tuple[set[str], dict[str, Source]]] = {
+    "MagArrow": (
+        {"Counter", "Date", "Time", "Mag", "MagValid"},
+        {
+            "total_field": Source(heading="Mag", unit="nT", valid="MagValid"),
+            "mag_x": Source(heading="CompassY", unit="nT", scale=-1.0),
+            "mag_y": Source(heading="CompassX", unit="nT"),
+            "mag_z": Source(heading="CompassZ", unit="nT"),
+            "sensor_temperature": Source(heading="CompassTemperature", unit="degC"),
+        },
+    )
+}
+"""Instrument -> headings by which its files are known, and what its columns are."""
+
+
+def declared_by_maker(headings: Sequence[str], declared: Declared) -> tuple[str, Declared]:
+    """Return the instrument's name, and what its maker says of these columns; the user's word counts more.
+
+    The name is empty where the headings are of no known instrument.
+    """
+    bare = {heading.replace(" ", "") for heading in headings}
+    for name, (known, columns) in MAKERS.items():
+        if known <= bare:
+            there = {ours: source for ours, source in columns.items() if source.heading in bare}
+            return name, msgspec.structs.replace(declared, columns={**there, **declared.columns})
+    return "", declared

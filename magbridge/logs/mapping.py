@@ -1,0 +1,140 @@
+"""``--column`` and ``columns.toml``: which of their columns is which of ours, in what unit."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import isfinite
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import msgspec
+
+from magbridge.errors import WrongUse
+from magbridge.logs.headings import split
+from magbridge.toml import Table, check_entries, convert, load_toml
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+__all__ = ["Declared", "Source", "declared", "renamed"]
+
+
+class Source(Table, frozen=True, rename={"heading": "from"}):
+    """``[columns.NAME]`` of a mapping file: where the column NAME comes from.
+
+    The value is ``scale * theirs + offset``, in `unit`.
+
+    Attributes
+    ----------
+    heading : str or None
+        Their name of the column (key ``from``), as the file has it; by default our own.
+    unit : str or None
+        Its unit after scaling, where the file does not say it or is wrong. Of ``time`` also: excel, julian,
+        mjd, gps, matlab, iso, or a pattern as ``%d.%m.%Y %H:%M:%S``.
+    scale, offset : float
+        By which their number becomes one in `unit`.
+    valid : str or None
+        Their name of a column that is 0 where there is no value.
+    """
+
+    heading: str | None = None
+    unit: str | None = None
+    scale: float = 1.0
+    offset: float = 0.0
+    valid: str | None = None
+
+    def __post_init__(self) -> None:
+        if not (isfinite(self.scale) and self.scale and isfinite(self.offset)):
+            raise ValueError("expected a scale other than 0, and numbers")
+
+
+class Declared(Table, frozen=True):
+    """A mapping file, ``columns.toml``, whole.
+
+    Attributes
+    ----------
+    columns : dict
+        Our name of a column -> its :class:`Source`.
+    heading_reference : str or None
+        What headings refer to.
+    fill_value : float or None
+        The number that stands for a missing value.
+    separator, decimal : str or None
+        Of a text file; found by looking where they are not given.
+    zone : str or None
+        Time zone (``Europe/Berlin``) of times of day that do not say theirs; UTC if not given.
+    """
+
+    columns: dict[str, Source] = msgspec.field(default_factory=dict)
+    heading_reference: Literal["true", "magnetic"] | None = None
+    fill_value: float | None = None
+    separator: str | None = None
+    decimal: Literal[".", ","] | None = None
+    zone: str | None = None
+
+
+def declared(column: Sequence[str], file: Path | None) -> Declared:
+    """Return what a mapping file and the texts of ``--column`` say together.
+
+    Parameters
+    ----------
+    column : sequence of str
+        ``NAME="THEIRS [unit]"``; each overrules the file.
+    file : path or None
+        A ``columns.toml``.
+
+    Raises
+    ------
+    ConfigError
+        A key of the mapping file that is wrong.
+    WrongUse
+        A text without its name.
+    """
+    told = _load(file) if file else Declared()
+    return msgspec.structs.replace(told, columns={**told.columns, **dict(map(_named, column))})
+
+
+def _load(path: Path) -> Declared:
+    table = load_toml(path)
+    check_entries(table, "columns", Source, path)
+    return convert(table, Declared, path)
+
+
+def _named(text: str) -> tuple[str, Source]:
+    name, equals, heading = (part.strip() for part in text.partition("="))
+    if not (name and equals and heading):
+        raise WrongUse(f'--column {text}: expected NAME="THEIRS [unit]", as mag_x="Bx [uT]"')
+    return name, Source(heading=heading)
+
+
+def renamed(dataset: xr.Dataset, told: Declared) -> xr.Dataset:
+    """Return a deployment of a format that names its columns itself with the columns as declared.
+
+    Raises
+    ------
+    FormatError
+        A column that is not there, or a unit that does not fit ours.
+    """
+    from magbridge.columns import require  # noqa: PLC0415 - xarray is for ashore
+    from magbridge.logs.deployment import deployment  # noqa: PLC0415
+
+    taken: dict[str, Any] = {}
+    for name, source in told.columns.items():
+        theirs, unit = _column(dataset, name, source)
+        require(dataset, [theirs])
+        values = source.scale * dataset[theirs].to_numpy() + source.offset
+        unit = unit or str(dataset[theirs].attrs.get("units", ""))
+        part = deployment(dataset.attrs["source"], dataset["time"].to_numpy(), {name: values}, {name: unit})
+        taken[name] = part[name]
+    used = {_column(dataset, name, source)[0] for name, source in told.columns.items()}
+    named = dataset.drop_vars(used - told.columns.keys()).assign(taken)
+    return named.assign_attrs({"heading_reference": told.heading_reference} if told.heading_reference else {})
+
+
+def _column(dataset: xr.Dataset, name: str, source: Source) -> tuple[str, str]:
+    """Return the name of the column that `source` means, and the unit that is declared for it."""
+    theirs = source.heading or name
+    if theirs in dataset:
+        return theirs, source.unit or ""
+    theirs, unit = split(theirs)
+    return theirs, source.unit or unit

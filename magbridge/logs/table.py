@@ -1,0 +1,224 @@
+"""Lines of a text file into columns of numbers; what is none is dropped, counted and named."""
+
+from __future__ import annotations
+
+import io
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from magbridge.arrays import BoolArray, FloatArray
+from magbridge.errors import FormatError
+from magbridge.logs.clocks import clock_of, seconds
+from magbridge.logs.layout import BLANKS, Layout, cells
+from magbridge.records import Quality
+
+__all__ = ["Faults", "Table"]
+
+NOTHING = "-", "--", "*", "---"
+"""What means 'no value', beside what pandas knows (an empty field, NaN, NA, null ...)."""
+REFUSED = 0.5
+"""Share of the rows, or of a column's values, that are wrong in a file that is refused."""
+
+
+class Faults:
+    """What was wrong in a file so far.
+
+    Attributes
+    ----------
+    rows : int
+        Rows seen, also the wrong ones.
+    """
+
+    def __init__(self, path: Path, *, strict: bool) -> None:
+        self._path, self._strict = path, strict
+        self.rows = 0
+        self._wrong: Counter[str] = Counter()
+        self._known: Counter[str] = Counter()
+        self._first: dict[str, FormatError] = {}
+        self._counts: Counter[str] = Counter()
+        self._lines: list[str] = []
+
+    def note(self, column: str, wrong: BoolArray, numbers: Sequence[int], expected: str) -> None:
+        """Count values of a column ("" and ``time``: rows) that are wrong; `expected` is of the first.
+
+        FormatError: `strict`.
+        """
+        first = numbers[int(wrong.argmax())]
+        error = FormatError(self._path, expected, row=first, column=column or None)
+        if self._strict:
+            raise error
+        count = int(wrong.sum())
+        self._wrong[column] += count
+        self._counts["rows_dropped" if column in {"", "time"} else "values_dropped"] += count
+        if column not in self._first:
+            self._first[column] = error
+            self._lines.append(str(error))
+
+    def count(self, column: str, known: int) -> None:
+        """Count the values that a column has."""
+        self._known[column] += known
+
+    def since_last(self) -> tuple[Counter[str], list[str]]:
+        """Return what was dropped since the last call: how much, and the lines that name it."""
+        last = self._counts, self._lines
+        self._counts, self._lines = Counter(), []
+        return last
+
+    def finish(self) -> None:
+        """FormatError: half of the rows, or of a column's values, are wrong."""
+        for column, error in self._first.items():
+            if self._wrong[column] >= REFUSED * (self._known[column] or self.rows):
+                raise error
+
+
+class Table:
+    """Reads lines of one layout into columns.
+
+    Attributes
+    ----------
+    guesses : list of str
+        What was taken for granted of the times.
+    attrs : dict
+        What that means for the deployment.
+    faults : Faults
+        What was dropped.
+    """
+
+    def __init__(self, path: Path, layout: Layout, head: Sequence[str], *, strict: bool) -> None:
+        self._path, self._layout, self._declared = path, layout, layout.declared
+        self.faults = Faults(path, strict=strict)
+        if "time" not in layout.names:
+            expected = f"expected this column; there are: {' '.join(layout.headings)}"
+            raise FormatError(path, expected, row=layout.row, column="time")
+        self._time = layout.names.index("time")
+        heading, unit = layout.headings[self._time].strip(), layout.units.pop("time", "")
+        first = [cells(line, layout.separator) for line in head[layout.first :] if line.strip()]
+        texts = [self._stamp(row) for row in first if max(self._time, layout.date or 0) < len(row)]
+        try:
+            self._clock = clock_of(heading, unit, texts, self._declared.zone)
+        except ValueError as error:
+            raise FormatError(path, str(error), column="time") from None
+        self.guesses = [f"time: {self._clock.assumed}"] if self._clock.assumed else []
+        if layout.date is not None:
+            self.guesses.append(f"date and time from {layout.headings[layout.date]!r} and {heading!r}")
+        self.attrs: dict[str, Any] = {"time_reference": "boot"} if self._clock.boot else {}
+        if self._declared.heading_reference:
+            self.attrs["heading_reference"] = self._declared.heading_reference
+        self._fill = layout.fill if self._declared.fill_value is None else self._declared.fill_value
+
+    def _stamp(self, row: Sequence[str]) -> str:
+        date = self._layout.date
+        return row[self._time] if date is None else f"{row[date]} {row[self._time]}"
+
+    def read(
+        self, lines: list[str], numbers: Sequence[int]
+    ) -> tuple[FloatArray, dict[str, FloatArray], list[int]]:
+        """Return the times, the values of each column, and the numbers of the lines that are rows."""
+        self.faults.rows += len(lines)
+        lines, kept = self._whole(lines, numbers)
+        frame = self._frame(lines, kept)
+        times, wrong = self._times(frame, kept)
+        if wrong.any():
+            frame, times = frame[~wrong], times[~wrong]
+            kept = [number for number, bad in zip(kept, wrong.tolist(), strict=True) if not bad]
+        columns = {
+            name: self._floats(name, frame[k], kept)
+            for k, name in enumerate(self._layout.names)
+            if name and name != "time"
+        }
+        for name, source in self._declared.columns.items():
+            if name in columns and source.valid in columns:
+                columns[name][columns[source.valid] == 0.0] = np.nan
+        return times, columns, kept
+
+    def _whole(self, lines: list[str], numbers: Sequence[int]) -> tuple[list[str], list[int]]:
+        """Return the lines that have as many fields as there are headings, and their numbers."""
+        separator, width = self._layout.separator, len(self._layout.headings)
+        counts = [
+            len(cells(line, separator)) if separator == BLANKS or '"' in line else line.count(separator) + 1
+            for line in lines
+        ]
+        if self._layout.open_ended:
+            lines = [separator.join(line.split(separator, width)[:width]) + "\n" for line in lines]
+            counts = [min(count, width) for count in counts]
+        wrong = np.array([count != width for count in counts])
+        if not wrong.any():
+            return lines, list(numbers)
+        self.faults.note("", wrong, numbers, f"expected {width} fields, not {counts[int(wrong.argmax())]}")
+        rows = [(line, n) for line, n, bad in zip(lines, numbers, wrong.tolist(), strict=True) if not bad]
+        return [line for line, _ in rows], [number for _, number in rows]
+
+    def _frame(self, lines: list[str], numbers: Sequence[int]) -> pd.DataFrame:
+        layout = self._layout
+        kept = [k for k, name in enumerate(layout.names) if name or k == layout.date]
+        texts = {k for k, name in enumerate(layout.names) if name == "quality" or k == layout.date}
+        texts |= {self._time} if self._clock.is_text else set()
+        if not lines:
+            return pd.DataFrame({k: pd.Series(dtype="str" if k in texts else float) for k in kept})
+        frame = pd.read_csv(
+            io.StringIO("".join(lines)),
+            sep=r"\s+" if layout.separator == BLANKS else layout.separator,
+            decimal=layout.decimal,
+            header=None,
+            names=range(len(layout.headings)),
+            usecols=kept,
+            index_col=False,
+            dtype=dict.fromkeys(texts, "str"),
+            na_values=list(NOTHING),
+            skipinitialspace=True,
+            skip_blank_lines=False,
+            low_memory=False,
+        )
+        if len(frame) != len(lines):
+            raise FormatError(self._path, "expected every quote to be closed in its line", row=numbers[0])
+        return frame
+
+    def _times(self, frame: pd.DataFrame, numbers: Sequence[int]) -> tuple[FloatArray, BoolArray]:
+        """Return the times, and which of the rows have something else there."""
+        column = frame[self._time]
+        if self._layout.date is not None:
+            column = frame[self._layout.date].str.strip() + " " + column.str.strip()
+        times = seconds(self._clock, column, self._declared.zone)
+        wrong = np.isnan(times) & column.notna().to_numpy()
+        times[times == self._fill] = np.nan
+        self.faults.count("time", len(times))
+        if wrong.any():
+            text = str(column.iloc[int(wrong.argmax())]).strip()
+            self.faults.note("time", wrong, numbers, f"expected {self._clock.expected}, not {text!r}")
+        return times, wrong
+
+    def _floats(self, name: str, column: pd.Series, numbers: Sequence[int]) -> FloatArray:
+        if name == "quality":
+            return self._flags(column, numbers)
+        if pd.api.types.is_numeric_dtype(column) or pd.api.types.is_bool_dtype(column):
+            values = column.to_numpy(np.float64, copy=True)
+        else:
+            texts = column.astype("str").str.strip()
+            texts = texts.str.replace(",", ".") if self._layout.decimal == "," else texts
+            values = pd.to_numeric(texts, errors="coerce").to_numpy(np.float64, copy=True)
+            wrong = np.isnan(values) & column.notna().to_numpy() & (texts.str.lower() != "nan").to_numpy()
+            if wrong.any():
+                text = str(column.iloc[int(wrong.argmax())]).strip()
+                self.faults.note(name, wrong, numbers, f"expected a number, not {text!r}")
+        self.faults.count(name, int(column.notna().sum()))
+        values[values == self._fill] = np.nan
+        source = self._declared.columns.get(name)
+        return values if source is None else np.asarray(values * source.scale + source.offset, np.float64)
+
+    def _flags(self, column: pd.Series, numbers: Sequence[int]) -> FloatArray:
+        """Return the bits of named flags; FormatError: a name that is none, for a doubt is never dropped."""
+        known: dict[str, float] = {}
+        texts = column.fillna("").tolist()
+        for row, text in zip(numbers, texts, strict=True):
+            try:
+                if text not in known:
+                    known[text] = float(Quality.parse(text))
+            except KeyError:
+                expected = f"expected the names of flags, not {text!r}"
+                raise FormatError(self._path, expected, row=row, column="quality") from None
+        return np.array([known[text] for text in texts])

@@ -1,0 +1,85 @@
+"""``magbridge info``, and what is declared of a log on the command line."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from commands import Command
+
+from magbridge.logs import read, write
+from magbridge.logs.deployment import deployment as made
+from magbridge.logs.info import USES, info
+
+START = 1.6e9
+
+
+def test_info_of_the_demo(deployment: Path, command: Command) -> None:
+    said = command("info", deployment)
+    assert "battpos" in said.out
+    assert "calibrate" in said.out
+    assert "may move the field, for --parameter: battpos ballast" in " ".join(said.err.split())
+    facts = json.loads(command("info", deployment, "--json").out)[str(deployment)]
+    assert facts["rows"] == 3600
+    assert all(not lacks for lacks in facts["uses"].values())
+    battpos = next(one for one in facts["columns"] if one["name"] == "battpos")
+    assert battpos["unit"] == "in"
+    assert battpos["lowest"] < battpos["highest"]
+
+
+def test_info_says_what_is_missing() -> None:
+    log = made("log", START + np.arange(9.0), {"mag_x": np.ones(9), "depth": np.full(9, np.nan)})
+    facts = info(log)
+    assert facts["uses"].keys() == USES.keys()
+    assert facts["uses"]["calibrate"] == ["mag_y mag_z", "reference_field or latitude longitude"]
+    assert facts["uses"]["correct"] == ["mag_y mag_z"]
+    assert "never known: depth" in facts["hints"]
+
+
+def test_info_counts_gaps_and_rates() -> None:
+    time = START + np.concatenate([np.arange(10.0), 30.0 + np.arange(10.0)])
+    facts = info(made("log", time, {"pump": np.repeat([1.0, 2.0, 1.0, 2.0], 5)}, {"pump": "A"}))
+    assert (facts["rate_hz"], facts["gaps"], facts["longest_gap_s"]) == (1.0, 1, 21.0)
+    (pump,) = facts["columns"]
+    assert (pump["unit"], pump["known"], pump["lowest"], pump["highest"]) == ("A", 1.0, 1.0, 2.0)
+
+
+def test_info_knows_a_field_in_another_unit() -> None:
+    axes = {"mag_x": [30.0, 30.0], "mag_y": [5.0, 5.0], "mag_z": [45.0, 45.0]}
+    (hint,) = [line for line in info(made("log", [START, START + 1], axes))["hints"] if "length" in line]
+    assert "54.31 nT (median); in uT it would be the Earth's" in hint
+
+
+def test_info_of_nothing_is_one_line(command: Command) -> None:
+    assert "expected a file, there is none" in command.refuses("info", "none.csv")
+    assert "expected at least one FILE" in command("info", code=2).err
+
+
+def test_columns_are_declared_on_the_command_line(command: Command) -> None:
+    Path("theirs.csv").write_text("Zeit;Fx [uT];Fy [uT];Fz [uT]\n2022-05-04T12:00:00Z;30,0;5,0;45,0\n")
+    columns = [f"--column=mag_{axis}=F{axis} [uT]" for axis in "xyz"]
+    said = command("convert", "theirs.csv", "-o", "ours.csv", *columns)
+    assert "guessed: decimal commas; fields separated by ';'; time is 'Zeit'" in said.err
+    assert float(read("ours.csv")["mag_z"][0]) == 45_000.0
+    assert "# history = theirs.csv was read with: decimal commas" in Path("ours.csv").read_text()
+    assert "guessed" not in command("convert", "ours.csv", "-o", "again.nc").err
+    Path("columns.toml").write_text('[columns.mag_x]\nfrom = "Fx"\nunit = "mT"\n')
+    command("convert", "theirs.csv", "-o", "ours.csv", "--columns", "columns.toml")
+    assert float(read("ours.csv")["mag_x"][0]) == 30e6
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "words"),
+    [
+        (("--column", "mag_x"), 2, '--column mag_x: expected NAME="THEIRS [unit]"'),
+        (("--columns", "none.toml"), 2, "none.toml: No such file"),
+        (("--column", "mag_x=Q"), 1, "column 'Q': expected this column; there are: mag_x"),
+    ],
+)
+def test_what_is_declared_wrongly_is_one_line(
+    arguments: tuple[str, ...], code: int, words: str, command: Command
+) -> None:
+    write(made("log", [START], {"mag_x": [1.0]}), "log.parquet")
+    assert words in command.refuses("convert", "log.parquet", "-o", "x.csv", *arguments, code=code)
