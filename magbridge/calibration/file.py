@@ -21,9 +21,10 @@ from magbridge.files import atomic_path
 
 __all__ = ["FORMAT", "calibration_id", "decode_calibration", "encode_calibration", "load", "save"]
 
-FORMAT = 3
+FORMAT = 4
 """Version of the layout; a reader takes this one and all before it. In 1, the noise's
-``autocorrelation`` was called ``memory``; 3 adds ``doubts``, and is written only where there are any."""
+``autocorrelation`` was called ``memory``; 3 adds ``doubts``, 4 the noise's
+``white`` share: each is written only where there is any."""
 
 
 class _File(msgspec.Struct, forbid_unknown_fields=True):
@@ -53,7 +54,7 @@ class _Version(msgspec.Struct):
 def encode_calibration(calibration: Calibration) -> bytes:
     """Return `calibration` as JSON, one key a line."""
     content = _File(
-        format=FORMAT if calibration.doubts else 2,
+        format=4 if calibration.noise.white else 3 if calibration.doubts else 2,
         software=calibration.software,
         method=calibration.method,
         sensor=calibration.sensor,
@@ -71,7 +72,10 @@ def encode_calibration(calibration: Calibration) -> bytes:
     )
     encode = msgspec.json.encode
     names = [name for name in _File.__struct_fields__ if name != "doubts" or content.doubts]
-    lines = [encode(name) + b": " + encode(getattr(content, name)) for name in names]
+    values = {name: getattr(content, name) for name in names}
+    if not content.noise.white:
+        values["noise"] = {k: v for k, v in msgspec.structs.asdict(content.noise).items() if k != "white"}
+    lines = [encode(name) + b": " + encode(value) for name, value in values.items()]
     return b"{\n" + b",\n".join(lines) + b"\n}\n"
 
 
@@ -210,6 +214,8 @@ def _check_settings(content: _File) -> None:
         raise CalibrationError("reference: field: expected nT, > 0")
     if not content.noise.sensor >= 0.0:
         raise CalibrationError("noise: sensor: expected nT, >= 0")
+    if not 0.0 <= content.noise.white <= 1.0:
+        raise CalibrationError("noise: white: expected a share, 0 to 1")
 
 
 def _check_covariance(covariance: FloatArray, whose: str = "") -> None:

@@ -48,13 +48,15 @@ UNKNOWN = Sensor()
 class Noise(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Noise of the samples: 1-sigma of each channel (nT), of the reference (nT), autocorrelation.
 
-    `autocorrelation` is that of a sample's noise with the next one's, `interval` s later.
+    A share `white` of the variance is white; the rest has, with the next sample's, `interval` s later, this
+    `autocorrelation`: AR(1), of the memory ``-interval / log(autocorrelation)`` s.
     """
 
     sensor: float
     reference: float = 0.0
     autocorrelation: float = 0.0
     interval: float = 0.0
+    white: float = 0.0
 
 
 class Reference(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -13,7 +13,7 @@ own nanotesla::
     w^T dw = w^T dA u + y^T dA d - y^T A dT,   y = (I - u u^T) A w / F
 
 Each coefficient is a polynomial, so a row of the Jacobian is ``phi (x) g`` with g the derivative by the
-nine. AR(1) noise of autocorrelation rho is whitened within a run: ``(e_i - rho e_(i-1)) / sqrt(1 - rho^2)``.
+nine. Noise with a memory is whitened within a run (:class:`Whitening`).
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from scipy.linalg.lapack import dtbtrs
 
 from magbridge.arrays import BoolArray, FloatArray, IndexArray
 from magbridge.calibration.arithmetic import PAIRS
@@ -30,6 +31,8 @@ from magbridge.calibration.terms import symmetric
 __all__ = [
     "NormalEquations",
     "Samples",
+    "Whitening",
+    "independent",
     "jacobian",
     "normal_equations",
     "residuals",
@@ -42,6 +45,8 @@ __all__ = [
 
 CHUNK = 8192
 """Rows of the Jacobian at a time: bounded memory at any number of samples."""
+SETTLED = 1e-13
+"""Share of the variance by which a filter that has settled still changes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,7 +162,11 @@ def _times(A: FloatArray, x: FloatArray) -> FloatArray:
 
 
 def normal_equations(
-    samples: Samples, coefficients: FloatArray, weight: FloatArray | None = None, rho: float = 0.0
+    samples: Samples,
+    coefficients: FloatArray,
+    weight: FloatArray | None = None,
+    rho: float = 0.0,
+    white: float = 0.0,
 ) -> NormalEquations:
     """Sum up the normal equations of the whitened residual, in bounded memory.
 
@@ -169,19 +178,19 @@ def normal_equations(
         nT, monomial by monomial: where to linearise.
     weight : (n,) array, optional
         Of each whitened residual (robust fits); 1 if not given.
-    rho : float
-        Autocorrelation of the noise at one sampling interval.
+    rho, white : float
+        The noise's memory, as for :func:`whiten`.
     """
     size = coefficients.size
     hessian, gradient, cost = np.zeros((size, size)), np.zeros(size), 0.0
+    whitening = Whitening(samples.steps, rho, white)
     for start in range(0, len(samples.field), CHUNK):
-        first = max(start - 1, 0)  # one row of overlap: whitening looks back
-        part = samples.part(slice(first, start + CHUNK))
+        part = samples.part(slice(start, start + CHUNK))
         e, g = residuals(part, coefficients)
         J = jacobian(part.phi, g)
         if rho:
-            e, J = whiten(e, part.steps, rho), whiten(J, part.steps, rho)
-        e, J = e[start - first :], J[start - first :]
+            both = whitening.take(np.column_stack([e, J]))
+            e, J = both[:, 0], both[:, 1:]
         if weight is not None:
             root = np.sqrt(weight[start : start + CHUNK])
             e, J = e * root, J * root[:, None]
@@ -191,10 +200,80 @@ def normal_equations(
     return NormalEquations(hessian, gradient, cost)
 
 
-def whiten(values: FloatArray, steps: FloatArray, rho: float) -> FloatArray:
-    """Whiten AR(1) noise (n, ...), gaps too: ``(v_i - r v_(i-1)) / sqrt(1 - r^2)``, r = rho^steps (n,)."""
-    white, r, gaps = values.copy(), np.full(len(values) - 1, rho), np.flatnonzero(steps[1:] != 1)
-    r[gaps] = rho ** steps[1:][gaps]
-    r = r.reshape(-1, *(1,) * (values.ndim - 1))
-    white[1:] = (values[1:] - r * values[:-1]) / np.sqrt(1.0 - r**2)
-    return white
+class Whitening:
+    """Whitens noise of unit variance: an AR(1) process, and white noise of the share `white` beside it.
+
+    Parameters
+    ----------
+    steps : (n,) array
+        Sampling intervals since the previous sample; infinite at the first of a run.
+    rho : float
+        Autocorrelation of the slow part at one sampling interval.
+    white : float
+        Share of the variance that is white.
+
+    Notes
+    -----
+    The innovations of a Kalman filter that follows the slow part s, of variance ``1 - f`` beside the white
+    noise's f, and predicts m (Harvey 1989, Forecasting, structural time series models, section 3.2)::
+
+        v_t = y_t - m_t,   S_t = P_t + f,   K_t = P_t / S_t
+        m_t+1 = r (m_t + K_t v_t),   P_t+1 = r^2 (1 - K_t) P_t + (1 - f)(1 - r^2),   r = rho^steps
+
+    and ``v / sqrt(S)`` is white, of unit variance. With f = 0 it is ``(y_t - r y_t-1) / sqrt(1 - r^2)``.
+    """
+
+    def __init__(self, steps: FloatArray, rho: float, white: float = 0.0) -> None:
+        self.decay = np.full(len(steps), rho)  # from the sample before
+        others = np.flatnonzero(steps != 1)
+        self.decay[others] = rho ** steps[others]
+        self.variance, self.gain = _gains(self.decay, white)
+        self._at = 0
+        self._last: FloatArray | None = None  # the slow part at the row before, as far as known
+
+    def take(self, values: FloatArray) -> FloatArray:
+        """Whiten the next rows (k, ...) of all n: a block at a time, in order."""
+        rows = slice(self._at, self._at + len(values))
+        y = values.reshape(len(values), -1)
+        r, K, S = self.decay[rows, None], self.gain[rows, None], self.variance[rows, None]
+        updated = K * y  # of m_t + K_t v_t = (1 - K_t) m_t + K_t y_t
+        before = np.zeros(y.shape[1]) if self._last is None else self._last
+        updated[0] += (1.0 - K[0]) * r[0] * before
+        if (self.gain[rows] != 1.0).any():  # x_t - (1 - K_t) r_t x_t-1 = K_t y_t: two diagonals
+            band = np.ones((2, len(y)))
+            band[1, :-1] = -((1.0 - K) * r)[1:, 0]
+            updated, _ = dtbtrs(band, updated, uplo="L", diag="U")
+        m = r * np.vstack([before[None], updated[:-1]])
+        self._at, self._last = rows.stop, updated[-1]
+        return np.asarray(((y - m) / np.sqrt(S)).reshape(values.shape))
+
+
+def _gains(decay: FloatArray, white: float) -> tuple[FloatArray, FloatArray]:
+    """Return S and K (n,) of the filter above, for the decay (n,) since the sample before."""
+    if white == 0.0:
+        return 1.0 - decay**2, np.ones(len(decay))
+    variance = np.empty(len(decay))
+    slow, after, last = 1.0 - white, 0.0, -1.0
+    ends = np.flatnonzero(np.diff(decay, append=-1.0))  # until these the filter goes to its steady state
+    start = 0
+    for end in ends.tolist():
+        for t in range(start, end + 1):
+            ahead = decay[t] ** 2 * after + slow * (1.0 - decay[t] ** 2)
+            variance[t] = ahead + white
+            after = ahead * white / variance[t]
+            if abs(after - last) < SETTLED * slow:
+                variance[t : end + 1] = variance[t]
+                break
+            last = after
+        start, last = end + 1, -1.0
+    return variance, 1.0 - white / variance
+
+
+def whiten(values: FloatArray, steps: FloatArray, rho: float, white: float = 0.0) -> FloatArray:
+    """Whiten noise (n, ...), gaps too; see :class:`Whitening`."""
+    return Whitening(steps, rho, white).take(values)
+
+
+def independent(rho: float, white: float = 0.0) -> float:
+    """Share of the samples that are independent in a mean: ``1 / (f + (1 - f)(1 + rho) / (1 - rho))``."""
+    return (1.0 - rho) / (white * (1.0 - rho) + (1.0 - white) * (1.0 + rho))

@@ -92,7 +92,8 @@ def informed(options: Options, calibration: Calibration, sigma: float) -> Option
     noise_time = -noise.interval / log(rho) if 0.0 < rho < 1.0 else 0.0
     lasts = LEG
     if noise_time > LASTING * options.interval:
-        white, lasts, noise_time = white * sqrt(1.0 - rho**2), noise_time, 0.0
+        white *= sqrt(noise.white + (1.0 - noise.white) * (1.0 - rho**2))
+        lasts, noise_time = noise_time, 0.0
     slow = sqrt(max(0.0, sigma**2 - white**2))
     return replace(
         options,

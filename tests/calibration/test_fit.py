@@ -10,15 +10,18 @@ import numpy as np
 import pytest
 from gliders import Glider, Gliders
 from scipy.optimize import least_squares
+from scipy.signal import lfilter
 
 from magbridge.calibration.correct import correct
 from magbridge.calibration.fitting.evidence import Quadratic, evidence
 from magbridge.calibration.fitting.fit import METHODS, fit
+from magbridge.calibration.fitting.noise import estimate_noise, memory
 from magbridge.calibration.fitting.nominal import nominal, nominal_samples
 from magbridge.calibration.fitting.observations import Observations, polynomial_samples
 from magbridge.calibration.fitting.prior import polynomial_prior
+from magbridge.calibration.fitting.validate import in_sensor_units
 from magbridge.calibration.model import Calibration
-from magbridge.calibration.residual import Samples, normal_equations, residuals, whiten
+from magbridge.calibration.residual import Samples, Whitening, normal_equations, residuals, whiten
 from magbridge.calibration.terms import full_order
 from magbridge.errors import CalibrationError
 
@@ -110,7 +113,7 @@ def test_errors_in_variables_take_the_bias_away() -> None:
         w = h * np.sin(heading) * np.sin(roll) + level * np.cos(roll)
         field = 5e4 * np.column_stack([x, y, w]) + [300.0, -200.0, 500.0] + rng.normal(0, 5, (n, 3))
         data = Observations(field, np.full(n, 5e4), np.empty((n, 0)))
-        coefficients, covariance, _ = nominal(data, scale_sigma=1e-3, gain_sigma=0.02)
+        coefficients, covariance, *_ = nominal(data, scale_sigma=1e-3, gain_sigma=0.02)
         off.append((coefficients[8] - 500.0) / np.sqrt(covariance[8, 8]))
     assert abs(np.mean(off)) < 3.0 / np.sqrt(len(off)) + 0.3
     assert np.std(off) < 1.6
@@ -171,7 +174,11 @@ def test_an_order_that_is_too_low_is_told(glider: Gliders) -> None:
     """Its sigmas are too small, since they do not know what is missing; with the usual order they are not."""
     two = glider(0, 2)
     low, usual = fit(two.runs, "auto", 1), fit(two.runs, "auto", 3)
-    assert survey_error(low.calibration, two)[1] > 1.5
+    assert survey_error(low.calibration, two)[1] > 1.25
+    assert low.details["left_out_ratio"] > 1.0
+    assert any("sigmas were raised" in warning for warning in low.warnings) == (
+        low.details["left_out_ratio"] > 1.25
+    )
     assert survey_error(usual.calibration, two)[1] < 1.25
     assert any("--order is too low" in warning for warning in low.warnings)
     assert not any("--order" in warning for warning in usual.warnings)
@@ -275,7 +282,7 @@ def test_without_parameters_auto_is_one_ellipsoid(glider: Gliders) -> None:
 
 
 def test_nominal_constraints(glider: Gliders) -> None:
-    coefficients, covariance, _ = nominal(glider(0).runs, axes_fixed=True, equal_xz=True)
+    coefficients, covariance, *_ = nominal(glider(0).runs, axes_fixed=True, equal_xz=True)
     assert coefficients[0] == coefficients[2]
     assert not coefficients[3:6].any()
     assert not covariance[3:6].any()
@@ -301,6 +308,50 @@ def test_least_squares_of_the_whitened_is_generalised_least_squares_beside_gaps_
     C = 0.9 ** np.abs(np.subtract.outer(place, place)) * np.equal.outer(run, run)
     white = whiten(X, steps, 0.9)
     np.testing.assert_allclose(white.T @ white, X.T @ np.linalg.solve(C, X), rtol=1e-9)
+
+
+def test_a_slow_part_beside_white_noise_is_whitened_in_any_blocks() -> None:
+    """Against the naive oracle, as above; and in blocks as at once."""
+    rng = np.random.default_rng(3)
+    place = np.flatnonzero(rng.random(150) > 0.2)
+    run = np.arange(len(place)) // 45
+    steps = np.where(np.diff(run, prepend=-1) > 0, np.inf, np.diff(place, prepend=0))
+    X = rng.normal(size=(len(place), 3)).cumsum(axis=0)
+    C = 0.7 * 0.95 ** np.abs(np.subtract.outer(place, place)) * np.equal.outer(run, run)
+    C += 0.3 * np.eye(len(place))
+    white = whiten(X, steps, 0.95, 0.3)
+    np.testing.assert_allclose(white.T @ white, X.T @ np.linalg.solve(C, X), rtol=1e-9)
+    whitening = Whitening(steps, 0.95, 0.3)
+    np.testing.assert_allclose(np.vstack([whitening.take(part) for part in np.array_split(X, 7)]), white)
+    assert np.log(whitening.variance).sum() == pytest.approx(np.linalg.slogdet(C)[1])
+
+
+@pytest.mark.parametrize("interval", [0.5, 4.0])
+def test_the_memory_of_noise_is_a_time_at_any_rate(interval: float) -> None:
+    """A slow part of 8 nT that lasts for 60 s, beside 4 nT white: a fifth of the variance is white."""
+    rng = np.random.default_rng(4)
+    n, rho = int(40_000 / interval), np.exp(-interval / 60.0)
+    slow = lfilter([np.sqrt(1.0 - rho**2)], [1.0, -rho], rng.normal(0.0, 8.0, n))
+    steps = np.r_[np.inf, np.ones(n - 1)]
+    e = slow + rng.normal(0.0, 4.0, n)
+    found = memory(e, steps, estimate_noise(e, steps, 0.0))
+    assert -interval / np.log(found.autocorrelation) == pytest.approx(60.0, rel=0.25)
+    assert found.white == pytest.approx(0.2, abs=0.04)
+
+
+def test_what_the_model_lacks_is_in_its_sigmas(glider: Gliders) -> None:
+    """Runs between which something that nobody measured was moved, against the same runs without that."""
+    one = glider(0)
+    assert fit(one.runs).details["left_out_ratio"] == 1.0
+    labels, run = np.unique(one.runs.runs, return_inverse=True)
+    moved = np.random.default_rng(1).normal(0.0, 15.0, (len(labels), 3))[run]
+    found = fit(replace(one.runs, field=one.runs.field + moved)).calibration
+    assert found.noise.sensor == pytest.approx(11.0, rel=0.3)  # some of the 15 nT is taken for the masses
+    assert found.noise.autocorrelation > 0.98
+    # elsewhere it lies otherwise once more
+    elsewhere = [replace(one.survey, field=one.survey.field + shift) for shift in np.diag([15.0, 15.0, 15.0])]
+    spread = [np.std(in_sensor_units(found, survey)[1]) for survey in elsewhere]
+    assert max(spread) < 1.5
 
 
 def test_how_long_before_a_sample_the_last_one_came() -> None:

@@ -9,7 +9,9 @@ residuals. The start with the largest evidence wins. It must be a maximum of the
 must not have collapsed.
 
 Choosing the widths by leaving out one run at a time is no better (survey error 1.045 times the noise floor,
-against 1.036; median of 8 gliders) and takes hundreds of fits where the evidence needs a few.
+against 1.036; median of 8 gliders) and takes hundreds of fits where the evidence needs a few. Leaving out is
+used to check: sigmas grow to what the parts left out show (:mod:`.left_out`), and where one ellipsoid
+predicts those better, it is taken.
 """
 
 from __future__ import annotations
@@ -23,13 +25,14 @@ import numpy as np
 from magbridge.arrays import FloatArray
 from magbridge.calibration.fitting.evidence import Quadratic, Widths, is_maximum, maximise
 from magbridge.calibration.fitting.fit import Fit, assemble
+from magbridge.calibration.fitting.left_out import LeftOut, leave_out
 from magbridge.calibration.fitting.mounted_masses import Mounting, mounted_prior
-from magbridge.calibration.fitting.noise import OUTLIER, NoiseModel, estimate_noise
-from magbridge.calibration.fitting.nominal import check_scales, starts
+from magbridge.calibration.fitting.noise import OUTLIER, NoiseModel, estimate_noise, memory
+from magbridge.calibration.fitting.nominal import check_scales, fit_nominal, starts
 from magbridge.calibration.fitting.observations import Observations, polynomial_samples
 from magbridge.calibration.fitting.prior import Prior, PriorFamily, polynomial_prior
 from magbridge.calibration.fitting.solve import Solution, covariance_of, gauss_newton
-from magbridge.calibration.residual import Samples, jacobian, residuals, residuals_of
+from magbridge.calibration.residual import Samples, Whitening, jacobian, residuals, residuals_of
 from magbridge.calibration.terms import full_order
 from magbridge.errors import CalibrationError
 
@@ -79,9 +82,12 @@ def fit_auto(data: Observations, order: int = 3, *, vehicle: Vehicle | None = No
     precision = best.solution.normal.hessian / best.noise.sigma**2 + prior.precision
     coefficients = prior.coefficients(best.solution.z)
     check_scales(samples, coefficients)
+    left = leave_out(samples, prior, best.solution.z, best.noise, data.runs)
+    if left.ratio > 1.0 and (simpler := _simpler(data, left)) is not None:
+        return simpler
+    covariance = prior.E @ covariance_of(precision) @ prior.E.T
     return assemble(
-        data, samples, ranges, exponents, coefficients, prior.E @ covariance_of(precision) @ prior.E.T,
-        best.noise, "auto", details={
+        data, samples, ranges, exponents, coefficients, covariance, best.noise, "auto", left, details={
             "log_evidence": best.score,
             "next_order": _gained(data, order, vehicle) if ranges and order < USUAL else 0.0,
             "determined": best.widths.determined,
@@ -89,6 +95,15 @@ def fit_auto(data: Observations, order: int = 3, *, vehicle: Vehicle | None = No
             "widths_nT": dict(zip(family.names, np.exp(best.widths.eta).tolist(), strict=True)),
         },
     )  # fmt: skip
+
+
+def _simpler(data: Observations, left: LeftOut) -> Fit | None:
+    """Return the fit of one ellipsoid, if it predicts the parts left out better than this one does."""
+    try:
+        one = fit_nominal(data)
+    except CalibrationError:
+        return None
+    return one if one.details["left_out_nT"] < left.rms else None
 
 
 def _posed(
@@ -124,11 +139,23 @@ def _best(samples: Samples, family: PriorFamily) -> _Answer:
     for answer in sorted(answers, key=lambda answer: -answer.score):
         last = answer
         if few is not samples:
-            noise = NoiseModel(answer.noise.sigma, answer.noise.autocorrelation)
+            noise = NoiseModel(answer.noise.sigma, answer.noise.autocorrelation, answer.noise.white)
             last = _climb(samples, answer.family, answer.solution.z, answer.widths.eta, noise)
+        last = _remembering(samples, last)
         if last.solution.settled and is_maximum(last.quadratic, last.family, last.widths):
             return last
     raise CalibrationError("auto: no start reached a maximum of the evidence; the data contradict themselves")
+
+
+def _remembering(samples: Samples, answer: _Answer) -> _Answer:
+    """Return the answer whose noise is a slow part and a white one, where the residuals are of that kind."""
+    for _ in range(2):
+        e = residuals_of(samples, answer.family.at(answer.widths.eta).coefficients(answer.solution.z))
+        noise = memory(e, samples.steps, answer.noise)
+        if noise is answer.noise:
+            break
+        answer = _climb(samples, answer.family, answer.solution.z, answer.widths.eta, noise, shaped=True)
+    return answer
 
 
 def _thinned(samples: Samples) -> Samples:
@@ -145,10 +172,20 @@ def _thinned(samples: Samples) -> Samples:
 
 
 def _climb(
-    samples: Samples, family: PriorFamily, z: FloatArray, eta: FloatArray, noise: NoiseModel | None = None
+    samples: Samples,
+    family: PriorFamily,
+    z: FloatArray,
+    eta: FloatArray,
+    noise: NoiseModel | None = None,
+    *,
+    shaped: bool = False,
 ) -> _Answer:
-    """Alternate coefficients, widths and noise until the evidence settles; give `noise` if z is near that."""
+    """Alternate coefficients, widths and noise until the evidence settles; give `noise` if z is near that.
+
+    `shaped`: the memory of `noise` is kept.
+    """
     score, white = -np.inf, noise is None
+    shape = noise.shape if noise is not None and shaped else None
     if noise is None:
         z, noise = _approach(samples, family.at(eta), z)
     for step in range(ROUNDS):
@@ -171,9 +208,10 @@ def _climb(
         if step < ROUNDS - 4:
             prior = family.at(eta)
             e = residuals_of(samples, prior.coefficients(z))
-            doubt = (0.0, 0.0) if white else _doubt(samples, prior, solution, noise)
-            shape = estimate_noise(e, np.where(white, np.inf, samples.steps), widths.determined, doubt)
-            noise = replace(shape, sigma=widths.sigma)
+            doubt = (0.0, 0.0) if white or shape else _doubt(samples, prior, solution, noise)
+            steps = np.where(white, np.inf, samples.steps)
+            found = estimate_noise(e, steps, widths.determined, doubt, shape)
+            noise = replace(found, sigma=widths.sigma)
     return _Answer(solution, widths, noise, family, quadratic, score)
 
 
@@ -203,5 +241,6 @@ def _approach(samples: Samples, prior: Prior, z: FloatArray) -> tuple[FloatArray
 def _score(widths: Widths, noise: NoiseModel, samples: Samples) -> float:
     """Log evidence of all samples: an outlier counts as one just at the limit, whitening by its Jacobian."""
     outlier = np.log(widths.sigma) + 0.5 * OUTLIER**2
-    whitening = 0.5 * np.log(1.0 - noise.autocorrelation ** (2.0 * samples.steps)).sum()
+    variance = Whitening(samples.steps, noise.autocorrelation, noise.white).variance
+    whitening = 0.5 * np.log(variance).sum()
     return float(widths.log_evidence - noise.rejected * outlier - whitening)

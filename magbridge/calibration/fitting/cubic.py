@@ -60,6 +60,6 @@ def fit_cubic(data: Observations, order: int = 3) -> Fit:
 def _start(data: Observations) -> FloatArray:
     """Return the nominal fit with the paper's constraints, or zeros if that fails."""
     try:
-        return nominal(data, axes_fixed=True, equal_xz=True)[0]
+        return nominal(data, axes_fixed=True, equal_xz=True).coefficients
     except CalibrationError:
         return np.zeros(9)

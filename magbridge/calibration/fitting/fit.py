@@ -13,6 +13,7 @@ from threadpoolctl import threadpool_limits
 from magbridge.arrays import FloatArray
 from magbridge.calibration.fitting.boresight import find_boresight
 from magbridge.calibration.fitting.identify import combinations, expected_ratio, heading_gap, warnings_for
+from magbridge.calibration.fitting.left_out import LeftOut
 from magbridge.calibration.fitting.noise import NoiseModel
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.model import Calibration, Noise, Parameter, Reference, Run, Sensor
@@ -39,6 +40,8 @@ UNSUPPORTED = 5.0
 """Expected error over noise, above which the data do not support the fit."""
 LIKELIER = 3.0
 """Nats by which one more order is likelier (20:1) where the one that was asked for is too low."""
+WORSE = 1.25
+"""Errors of parts left out over what a fit claims for them, from which on a pilot should know."""
 GAIN = 0.1
 """Departure of the middle scale from 1 that few sensors have: a wrong reference shrinks all scales."""
 UNSEEN = 270.0
@@ -203,6 +206,11 @@ def _suspicions(found: Fit) -> Iterator[str]:
     samples, outliers = len(found.residual), found.details.get("outliers", 0)
     if outliers > 0.02 * samples:
         yield f"{outliers} of {samples} samples are outliers and were left out of the fit"
+    if (ratio := found.details.get("left_out_ratio", 1.0)) > WORSE:
+        yield (
+            f"parts left out of the fit are off by {ratio:.1f} times what it claimed, so its sigmas were "
+            "raised by that: the model lacks something (magbridge diagnose), or the reference does"
+        )
     if (gained := found.details.get("next_order", 0.0)) > LIKELIER:
         yield (
             f"--order is too low: one more is likelier by {gained:.0f} nats, and the sigmas do not know what "
@@ -226,6 +234,7 @@ def assemble(
     covariance: FloatArray,
     noise: NoiseModel,
     method: str,
+    left_out: LeftOut | None = None,
     details: dict[str, Any] | None = None,
 ) -> Fit:
     """Return the fit: its numbers as a calibration with a table of runs, and its residuals.
@@ -242,8 +251,13 @@ def assemble(
         nT².
     noise, method, details
         As :class:`Fit` and its calibration have them.
+    left_out : LeftOut, optional
+        What the fit is worth on parts left out: the sigmas grow by its ratio.
     """
     e = residuals_of(samples, coefficients)
+    if left_out is not None:
+        noise, covariance = replace(noise, sigma=noise.sigma * left_out.ratio), covariance * left_out.ratio**2
+        details = {**(details or {}), "left_out_nT": left_out.rms, "left_out_ratio": left_out.ratio}
     steps = np.diff(data.time)
     calibration = Calibration(
         parameters=parameters,
@@ -255,6 +269,7 @@ def assemble(
             samples.kappa * noise.sigma,
             noise.autocorrelation,
             float(np.median(steps)) if steps.size else 0.0,
+            noise.white,
         ),
         reference=Reference(samples.F_0, data.model),
         sensor=Sensor(data.sensor),

@@ -10,17 +10,18 @@ the sensor's own nT, and a fit that collapsed all the same is refused.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from magbridge.arrays import FloatArray
 from magbridge.calibration.fitting.fit import Fit, assemble
-from magbridge.calibration.fitting.noise import NoiseModel, estimate_noise
+from magbridge.calibration.fitting.left_out import leave_out
+from magbridge.calibration.fitting.noise import NoiseModel, estimate_noise, memory
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.prior import Prior
 from magbridge.calibration.fitting.solve import covariance_of, gauss_newton
-from magbridge.calibration.residual import Samples, residuals_of, scales_and_offsets
+from magbridge.calibration.residual import Samples, independent, residuals_of, scales_and_offsets
 from magbridge.errors import CalibrationError
 
 __all__ = [
@@ -41,10 +42,22 @@ HARD_IRON_SIGMA = 0.6
 """Prior 1-sigma of the hard iron, as a fraction of the field."""
 
 
+class Ellipsoid(NamedTuple):
+    """Coefficients (9,) in nT, their covariance (9, 9) in nT², the noise; and z (q,) with its prior."""
+
+    coefficients: FloatArray
+    covariance: FloatArray
+    noise: NoiseModel
+    prior: Prior
+    z: FloatArray
+
+
 def fit_nominal(data: Observations, order: int = 0, **options: Any) -> Fit:  # noqa: ARG001  (one ellipsoid has none)
     """Return the fit of :func:`nominal` as a calibration without parameters."""
-    coefficients, covariance, noise = nominal(data, **options)
-    return assemble(data, nominal_samples(data), (), ((),), coefficients, covariance, noise, "nominal")
+    one = nominal(data, **options)
+    samples = nominal_samples(data)
+    left = leave_out(samples, one.prior, one.z, one.noise, data.runs)
+    return assemble(data, samples, (), ((),), one.coefficients, one.covariance, one.noise, "nominal", left)
 
 
 def nominal_samples(data: Observations) -> Samples:
@@ -61,7 +74,7 @@ def nominal(
     equal_xz: bool = False,
     scale_sigma: float = SCALE_SIGMA,
     gain_sigma: float = GAIN_SIGMA,
-) -> tuple[FloatArray, FloatArray, NoiseModel]:
+) -> Ellipsoid:
     """Fit one ellipsoid.
 
     Parameters
@@ -74,14 +87,6 @@ def nominal(
         ``S_x = S_z``, as the paper does.
     scale_sigma, gain_sigma : float
         Prior 1-sigma of soft iron, and of the gain common to all axes.
-
-    Returns
-    -------
-    coefficients : (9,) array
-        nT.
-    covariance : (9, 9) array
-        nT².
-    noise : NoiseModel
 
     Raises
     ------
@@ -112,13 +117,12 @@ def nominal(
         check_scales(samples, E @ z)  # a fit on its way to collapse never settles: that is the better message
         raise CalibrationError("nominal: no start settled; are the samples those of one sensor?")
     _, found, noise, rho = best
-    noise = replace(noise, autocorrelation=rho)
-    independent = (1.0 - rho) / (1.0 + rho)
-    precision = found.normal.hessian * independent / noise.sigma**2 + prior.precision
+    noise = memory(residuals_of(samples, E @ found.z), samples.steps, replace(noise, autocorrelation=rho))
+    precision = found.normal.hessian * independent(*noise.shape) / noise.sigma**2 + prior.precision
     covariance = E @ covariance_of(precision) @ E.T
     coefficients = E @ found.z
     check_scales(samples, coefficients)
-    return coefficients, covariance, noise
+    return Ellipsoid(coefficients, covariance, noise, prior, found.z)
 
 
 def _precision(E: FloatArray, scale_sigma: float, gain_sigma: float) -> FloatArray:

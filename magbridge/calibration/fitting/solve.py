@@ -63,7 +63,7 @@ def gauss_newton(
 
     def normal_at(z: FloatArray) -> NormalEquations:
         return prior.reduce(
-            normal_equations(samples, prior.coefficients(z), noise.weight, noise.autocorrelation)
+            normal_equations(samples, prior.coefficients(z), noise.weight, noise.autocorrelation, noise.white)
         )
 
     normal = normal_at(z)

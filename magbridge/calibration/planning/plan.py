@@ -28,7 +28,7 @@ from magbridge.calibration.fitting.prior import polynomial_prior
 from magbridge.calibration.forward import forward
 from magbridge.calibration.model import Calibration, Noise, Parameter, Reference
 from magbridge.calibration.planning.limits import Limits, PlannedRun, candidate_runs
-from magbridge.calibration.residual import Samples, jacobian, residuals
+from magbridge.calibration.residual import Samples, independent, jacobian, residuals
 from magbridge.calibration.terms import Polynomial, full_order
 from magbridge.errors import CalibrationError
 
@@ -120,8 +120,9 @@ class _Design:
         attitude = np.column_stack([np.radians([[run.roll, run.pitch]] * HEADINGS), turn])
         truth = field_body(attitude, np.tile(self.field_ned, (HEADINGS, 1)))
         phi, g = self.derivative(truth, np.tile(run.parameters, (HEADINGS, 1)))
-        noise, rho = self.calibration.noise.sensor, self.calibration.noise.autocorrelation
-        weight = SAMPLES / HEADINGS / noise**2 * (1.0 - rho) / (1.0 + rho)
+        noise = self.calibration.noise
+        share = independent(noise.autocorrelation, noise.white)
+        weight = SAMPLES / HEADINGS / noise.sensor**2 * share
         values, vectors = np.linalg.eigh(g.T @ g * weight)
         return np.asarray(np.kron(phi[:1].T, vectors * np.sqrt(np.maximum(values, 0.0))), np.float64)
 

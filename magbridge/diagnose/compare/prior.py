@@ -102,7 +102,7 @@ def _without_repeats(
     noise = calibration.noise
     steps = np.asarray(survey.steps[again] * (survey.interval / noise.interval if noise.interval else 1.0))
     white = np.column_stack([J, e[again]])
-    white = whiten(white, steps, noise.autocorrelation) / noise_sigma(calibration, e)
+    white = whiten(white, steps, noise.autocorrelation, noise.white) / noise_sigma(calibration, e)
     A, y = white[:, :-1], white[:, -1]
     values, vectors = np.linalg.eigh(np.eye(len(centre)) - A.T @ A)
     held = values > HELD  # other directions were learned from the repeated samples alone, which count anyway

@@ -1,0 +1,123 @@
+"""What a fit is worth on parts that it has not seen: from its normal equations, without fitting again.
+
+Notes
+-----
+At the fit, ``g / sigma^2 + L z = 0`` (g: half the gradient of the cost, L: precision of the prior). Without
+part k its Hessian and gradient are missing, so to first order::
+
+    P_k = ((H - H_k) / sigma^2 + L)^-1,   z_k - z = P_k g_k / sigma^2
+    e_i(z_k) = e_i + J_i (z_k - z),   s_i^2 = sigma^2 + J_i P_k J_i^T     for i in part k
+
+If the model is right, ``e_i / s_i`` has the variance 1. Its root mean square is Birge's ratio R (Birge 1932,
+Phys. Rev. 40:207): where it is larger than chance allows, the model lacks something of that size, and all
+sigmas are too small by R.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magbridge.arrays import FloatArray, IndexArray
+from magbridge.calibration.fitting.noise import OUTLIER, NoiseModel
+from magbridge.calibration.fitting.prior import Prior
+from magbridge.calibration.fitting.solve import covariance_of
+from magbridge.calibration.residual import (
+    NormalEquations,
+    Samples,
+    independent,
+    jacobian,
+    normal_equations,
+    residuals,
+)
+
+__all__ = ["LeftOut", "leave_out"]
+
+PARTS, BLOCKS = 10, 4
+"""Parts at most, where the log has runs; and blocks of neighbours where it has fewer runs than three."""
+TESTED = 20_000
+"""Samples that are predicted: enough for any ratio."""
+CHANCE = 2.0
+"""Standard errors by which R^2 must exceed 1 before it counts."""
+
+
+@dataclass(frozen=True, eq=False)
+class LeftOut:
+    """Errors of the parts left out, each predicted from the others.
+
+    Attributes
+    ----------
+    rms : float
+        nT, in the sensor's own units; single samples count as five sigmas at most.
+    ratio : float
+        Root mean square of the errors over their claimed sigmas; 1 where it is less, or not more than chance.
+    """
+
+    rms: float
+    ratio: float
+
+
+def leave_out(
+    samples: Samples, prior: Prior, z: FloatArray, noise: NoiseModel, runs: NDArray[np.generic]
+) -> LeftOut:
+    """Predict each part of the samples from the others.
+
+    Parameters
+    ----------
+    samples : Samples
+        n of them.
+    prior : Prior
+        With which they were fitted.
+    z : (q,) array
+        The fit.
+    noise : NoiseModel
+        Its noise, nT.
+    runs : (n,) array
+        A label for each sample: whole runs are left out, or blocks of neighbours where there are few runs.
+    """
+    parts = _parts(runs)
+    c = prior.coefficients(z)
+    normals = [prior.reduce(_normal(samples, c, noise, rows)) for rows in parts]
+    hessian = np.sum([normal.hessian for normal in normals], axis=0)
+    every = max(len(samples.field) // TESTED, 1)
+    e, s2 = [], []
+    for rows, normal in zip(parts, normals, strict=True):
+        P = covariance_of((hessian - normal.hessian) / noise.sigma**2 + prior.precision)
+        tested = samples.part(rows[::every])
+        off, g = residuals(tested, c)
+        J = jacobian(tested.phi, g) @ prior.E
+        e.append(off + J @ (P @ normal.gradient / noise.sigma**2))
+        s2.append(noise.sigma**2 + ((J @ P) * J).sum(axis=1))
+    return _judged(np.concatenate(e), np.concatenate(s2), len(samples.field) * independent(*noise.shape))
+
+
+def _judged(e: FloatArray, s2: FloatArray, count: float) -> LeftOut:
+    """Return the ratio of errors (n,) over their variances, of which `count` are independent."""
+    ratio2 = 1.0
+    for _ in range(20):  # an outlier counts as one just at the limit, and the limit grows with the ratio
+        last, limit = ratio2, OUTLIER**2 * ratio2
+        ratio2 = max(float(np.minimum(e * e / s2, limit).mean()), 1.0)
+        if ratio2 < 1.01 * last:
+            break
+    rms = float(np.sqrt(np.minimum(e * e, OUTLIER**2 * ratio2 * s2).mean()))
+    chance = 1.0 + CHANCE * np.sqrt(2.0 / max(count, 1.0))
+    return LeftOut(rms, float(np.sqrt(ratio2)) if ratio2 > chance else 1.0)
+
+
+def _parts(runs: NDArray[np.generic]) -> list[IndexArray]:
+    """Return the places of each part: runs, several in one where there are many; else blocks."""
+    _, first, label = np.unique(runs, return_index=True, return_inverse=True)
+    if len(first) < 3:
+        return np.array_split(np.arange(len(runs)), BLOCKS)
+    order = np.argsort(np.argsort(first))  # labels in the order of the log
+    part = order[label] * min(PARTS, len(first)) // len(first)
+    return [np.flatnonzero(part == k) for k in range(part.max() + 1)]
+
+
+def _normal(samples: Samples, c: FloatArray, noise: NoiseModel, rows: IndexArray) -> NormalEquations:
+    part = samples.part(rows)
+    part.steps[0] = np.inf
+    weight = None if noise.weight is None else noise.weight[rows]
+    return normal_equations(part, c, weight, *noise.shape)
