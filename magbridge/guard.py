@@ -74,7 +74,8 @@ def guarded(path: Path, read: Callable[[], Iterable[T]]) -> Iterator[T]:
     if sys.platform == "win32" or multiprocessing.current_process().daemon:
         yield from _foreseen(path, read)
         return
-    size = path.stat().st_size if path.is_file() else 0
+    files = path.iterdir() if path.is_dir() else [path]  # a folder is one log, too
+    size = sum(file.stat().st_size for file in files if file.is_file())
     seconds = round(SECONDS + PER_MEGABYTE * size / 1e6)
     memory = MEMORY + PER_BYTE * size
     used = _memory()[1]

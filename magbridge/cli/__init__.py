@@ -31,7 +31,6 @@ EXTRAS = {
             "filterpy",
             "rich",
             "pandas",
-            "pymavlink",
             "threadpoolctl",
         ],
         "analysis",

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, date, datetime, time
-from hashlib import file_digest
+from hashlib import file_digest, sha256
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -178,7 +178,10 @@ def check_inputs(
 
 
 def digest(path: Path) -> str:
-    """Return the SHA-256 of a file; a calibration keeps those of the files that it was fitted to."""
+    """Return the SHA-256 of a file or folder; a calibration keeps those of what it was fitted to."""
+    if path.is_dir():  # a bag: one log in several files
+        parts = [digest(file) for file in sorted(path.iterdir()) if file.is_file()]
+        return sha256("".join(parts).encode()).hexdigest()
     with path.open("rb") as file:
         return file_digest(file, "sha256").hexdigest()
 
@@ -191,7 +194,7 @@ def doubts_of(calibration: Calibration, file: Path) -> list[str]:
 
 def note_losses(*pieces: Mapping[str, Any]) -> None:
     """Report on stderr what reading skipped, from the attributes of a deployment or of its pieces."""
-    from magbridge.logs.deployment import COUNTERS, GUESSED, named_losses, passed_over
+    from magbridge.logs.deployment import COUNTERS, GUESSED, named_losses, noted, passed_over
 
     for guess in dict.fromkeys(str(attrs.get(GUESSED, "")) for attrs in pieces):
         if guess:
@@ -199,6 +202,8 @@ def note_losses(*pieces: Mapping[str, Any]) -> None:
     if counts := passed_over(*pieces):
         losses = ", ".join(f"{count} {COUNTERS[name][count > 1]}" for name, count in counts.items())
         complain(f"in the logs: {losses}")
+    for note in dict.fromkeys(noted(*pieces)):
+        complain(note)
     lines = named_losses(*pieces)
     for line in lines[:NAMED]:
         complain(line)

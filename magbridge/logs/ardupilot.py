@@ -1,172 +1,212 @@
-"""ArduPilot's own logs (``.BIN``), through pymavlink.
+"""ArduPilot's own logs, binary (``.BIN``) or as text (``.log``).
 
-The log holds the field with the autopilot's offsets and motor compensation applied; these are in the log,
-too, and are subtracted again, so ``mag_x`` is the raw channel (mG, so steps of 100 nT). The scale factors in
-``COMPASS_DIA`` and ``COMPASS_ODI`` are not undone.
+The log holds the field as the autopilot used it. Its offsets, its motor compensation and its soft-iron
+matrix (``COMPASS_DIA``, ``COMPASS_ODI``) are in the log, too, and are undone, so ``mag_x`` is the raw channel
+(mG, so steps of 100 nT):
 
-UTC is that of the first GPS fix. Damaged bytes are skipped and counted in ``bytes_skipped``.
+    MAG = D (s raw + Ofs) + MO        with D of DIA and ODI, and s = ``COMPASS_SCALE``, which is left in
+
+UTC is the median of what the GPS fixes say, so one damaged record does not date the log. Of several compasses
+that is read which the estimator names (``XKFS``), or the first that is enabled (``COMPASS_USE``) and healthy.
 
 References
 ----------
 ArduPilot, "Onboard Message Log Messages", https://ardupilot.org/copter/docs/logmessages.html
+ArduPilot, ``libraries/AP_Compass/AP_Compass_Backend.cpp``, ``correct_field``
 """
 
 from __future__ import annotations
 
-import struct
-from array import array
-from collections.abc import Iterator
-from contextlib import redirect_stderr, redirect_stdout, suppress
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import xarray as xr
 
-from magbridge.arrays import FloatArray
+from magbridge.arrays import FloatArray, IndexArray
 from magbridge.columns import NT_PER_UNIT
-from magbridge.errors import FormatError, MissingExtra
-from magbridge.logs.autopilot import Fields, pieces, values_of
+from magbridge.errors import FormatError
+from magbridge.logs.ardupilot_fields import FIELDS, INSTANCE, WANTED, in_declared_units
+from magbridge.logs.autopilot import Fields, Magnetometer, Run, Series, pieces, values_of
+from magbridge.logs.compasses import Compass, rate
+from magbridge.logs.dataflash import Records, read_binary
+from magbridge.logs.dataflash_text import read_text
+from magbridge.logs.order import boots
+
+if TYPE_CHECKING:
+    from magbridge.logs.options import Options
 
 __all__ = ["chunks"]
 
-Table = dict[str, FloatArray]
-Tables = dict[str, Table]
-
-FIELDS: Fields = {
-    "ATT": (("roll", "Roll", "deg", 1.0), ("pitch", "Pitch", "deg", 1.0), ("heading", "Yaw", "deg", 1.0)),
-    "POS": (
-        ("latitude", "Lat", "deg", 1.0),
-        ("longitude", "Lng", "deg", 1.0),
-        ("depth", "RelHomeAlt", "m", -1.0),
-    ),
-    "GPS": (("latitude", "Lat", "deg", 1.0), ("longitude", "Lng", "deg", 1.0)),
-    "CTUN": (("depth", "Alt", "m", -1.0),),
-    "BAT": (("battery#_current", "Curr", "A", 1.0), ("battery#_voltage", "Volt", "V", 1.0)),
-    "BARO": (("pressure#", "Press", "hPa", 0.01), ("pressure#_temperature", "Temp", "degC", 1.0)),
-    "ESC": (("esc#_current", "Curr", "A", 1.0),),
-    "IMU": (("imu#_temperature", "T", "degC", 1.0),),
-    "RCOU": tuple((f"servo{k}", f"C{k}", "us", 1.0) for k in range(1, 15)),
-}
-INSTANCE = ("I", "Instance")
 EPOCH_GPS = 315_964_800
 WEEK = 604_800
 LEAP = ((1_483_228_800, 18), (1_435_708_800, 17), (1_341_100_800, 16), (0, 15))
 """UTC (s) from which GPS time is ahead of UTC by this many s."""
+FIX = 3
+"""Least ``GPS.Status`` of a fix in three dimensions."""
+TABLES = 8
+"""Highest number in the name of a kind, as ``ESC8``."""
+DIAGONAL, OFF = ("DIA_X", "DIA_Y", "DIA_Z"), ("ODI_X", "ODI_Y", "ODI_Z")
+IDS = ("COMPASS_PRIO{}_ID", "COMPASS_DEV_ID{}")
+"""Parameters that hold a compass' device id, the first that is there; the second has no number 1."""
 
 
-KINDS = {f"{name}{k}" for name in ("MAG", *FIELDS) for k in ("", "2", "3")}
-COLUMNS = {
-    *("TimeUS", "GWk", "GMS", "Status", *INSTANCE),
-    *(f"{what}{axis}" for what in ("Mag", "Ofs", "MO") for axis in "XYZ"),
-    *(field for fields in FIELDS.values() for _, field, _, _ in fields),
-}
-NUMBERS = (int, float)
-DAMAGE = (AttributeError, LookupError, RecursionError, TypeError, ValueError, struct.error)
-"""What pymavlink raises where a record, or its FMT record, is damaged."""
-
-
-def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
-    """Yield the log in pieces of at most `rows` rows; it is held whole.
+def chunks(path: Path, rows: int, options: Options | None = None) -> Iterator[xr.Dataset]:
+    """Yield the log in pieces of at most `rows` rows; what is read of it is held whole.
 
     Raises
     ------
     FormatError
         No magnetometer in it.
     """
-    tables, skipped = _tables(path)
-    mags = {
-        number: (time, _field(mag))
-        for number, (time, mag) in _instances(tables, "MAG").items()
-        if {"MagX", "MagY", "MagZ"} <= mag.keys()
-    }
-    if not mags:
+    with path.open("rb") as file:
+        text = b"FMT," in file.read(4096)
+    flash = (read_text if text else read_binary)(path, WANTED)
+    fields = in_declared_units(flash)
+    runs = [run for part in _boots(flash.records) if (run := _run(fields, part)).magnetometers]
+    if not runs:
         raise FormatError(path, "expected an ArduPilot log with MAG records")
-    yield from pieces(path, rows, _utc_offset(tables), mags, _telemetry(tables), {"bytes_skipped": skipped})
+    lost = {"lines_skipped" if text else "bytes_skipped": flash.skipped}
+    yield from pieces(path, rows, runs, lost, options.compass if options else None)
 
 
-def _telemetry(tables: Tables) -> Iterator[tuple[FloatArray, str, str, FloatArray]]:
-    """Yield times, column, unit and values of everything but the magnetometers."""
+def _run(fields: Fields, records: dict[str, Records]) -> Run:
+    parameters = _parameters(records.get("PARM"))
+    chosen = _estimators(records.get("XKFS"))
+    mags = [
+        _magnetometer(number, records_of, parameters, chosen)
+        for number, records_of in _instances(records, "MAG").items()
+        if {"MagX", "MagY", "MagZ"} <= records_of.fields.keys()
+    ]
+    return Run(mags, _telemetry(fields, records), _utc_offset(records))
+
+
+def _boots(records: dict[str, Records]) -> Iterator[dict[str, Records]]:
+    """Yield the records of each boot."""
+    timed = [one for one in records.values() if "TimeUS" in one.fields]
+    if not timed:
+        return
+    at = np.concatenate([one.at for one in timed])
+    order = np.argsort(at)
+    time = np.concatenate([one.fields["TimeUS"] for one in timed])[order] * 1e-6
+    starts = at[order][boots(time)]
+    starts[0] = 0
+    ends = [*starts[1:].tolist(), np.iinfo(np.intp).max]
+    for first, last in zip(starts.tolist(), ends, strict=True):
+        yield {name: _part(one, np.searchsorted(one.at, [first, last])) for name, one in records.items()}
+
+
+def _part(records: Records, between: IndexArray) -> Records:
+    part = slice(*between.tolist())
+    return Records(
+        records.at[part],
+        {name: values[part] for name, values in records.fields.items()},
+        {name: values[part] for name, values in records.texts.items()},
+    )
+
+
+def _parameters(records: Records | None) -> dict[str, float]:
+    """Return the vehicle's parameters as they were at the boot."""
+    if records is None or "Name" not in records.texts or "Value" not in records.fields:
+        return {}
+    pairs = zip(records.texts["Name"], records.fields["Value"].tolist(), strict=True)
+    return dict(reversed(list(pairs)))
+
+
+def _estimators(records: Records | None) -> int | None:
+    """Return the number of the compass that the estimator used most."""
+    if records is None or "MI" not in records.fields or not len(records.at):
+        return None
+    numbers, counts = np.unique(records.fields["MI"], return_counts=True)
+    return int(numbers[counts.argmax()])
+
+
+def _magnetometer(
+    number: int, records: Records, parameters: Mapping[str, float], chosen: int | None
+) -> Magnetometer:
+    """Return the raw channels in nT, and what the log says of the compass."""
+    fields = records.fields
+    time = fields["TimeUS"] * 1e-6
+    field: FloatArray = np.stack([fields[f"Mag{axis}"] for axis in "XYZ"])
+    none = np.zeros(len(time))
+    # the motors' share is MOX, up to ArduPilot 4.0 MOfsX
+    field -= np.stack([fields.get(f"MO{axis}", fields.get(f"MOfs{axis}", none)) for axis in "XYZ"])
+    if (matrix := _soft_iron(parameters, _numbered(number))) is not None:
+        field = np.asarray(np.linalg.solve(matrix, field), dtype=np.float64)
+    field -= np.stack([fields.get(f"Ofs{axis}", none) for axis in "XYZ"])
+    names = (IDS[0].format(number + 1), IDS[1].format(_numbered(number)))
+    device = next((parameters[name] for name in names if parameters.get(name)), 0.0)
+    use = parameters.get(f"COMPASS_USE{_numbered(number)}")
+    health = fields.get("Health")
+    compass = Compass(
+        number,
+        len(time),
+        rate(time),
+        f"{device:.0f}" if device else "",
+        None if use is None else use != 0,
+        None if health is None else float((health > 0).mean()),
+        number + 1 if names[0] in parameters else None,
+        number == chosen,
+    )
+    nanotesla = NT_PER_UNIT["mG"] * field
+    return Magnetometer(compass, time, dict(zip("xyz", nanotesla, strict=True)))
+
+
+def _numbered(number: int) -> str:
+    """Return how the names of parameters number a compass: the first not at all, the second with 2."""
+    return str(number + 1) if number else ""
+
+
+def _soft_iron(parameters: Mapping[str, float], number: str) -> FloatArray | None:
+    """Return the matrix of ``COMPASS_DIA`` and ``COMPASS_ODI``; None where it is not used."""
+    x, y, z = (parameters.get(f"COMPASS_{name[:3]}{number}{name[3:]}", 0.0) for name in DIAGONAL)
+    xy, xz, yz = (parameters.get(f"COMPASS_{name[:3]}{number}{name[3:]}", 0.0) for name in OFF)
+    matrix = np.array([[x, xy, xz], [xy, y, yz], [xz, yz, z]])
+    return matrix if x * y * z and abs(np.linalg.det(matrix)) > 1e-3 else None
+
+
+def _telemetry(fields: Fields, records: dict[str, Records]) -> Iterator[Series]:
+    """Yield everything but the magnetometers."""
     for record in FIELDS:
-        for number, (time, table) in _instances(tables, record).items():
-            for column, unit, values in values_of(FIELDS, record, number, table):
-                if record != "RCOU" or np.any(values):  # an output that is always 0 is not in use
+        for number, found in _instances(records, record).items():
+            time, table = found.fields["TimeUS"] * 1e-6, dict(found.fields)
+            if record == "GPS" and "Status" in table:
+                fixed = table["Status"] >= FIX
+                table |= {key: np.where(fixed, table[key], np.nan) for key in ("Lat", "Lng") if key in table}
+            for column, unit, values in values_of(fields, record, number, table):
+                if np.any(values) or not column.startswith("servo"):  # an output that is 0 is not in use
                     yield time, column, unit, values
 
 
-def _field(mag: Table) -> Table:
-    """Return the raw channels in nT: the logged field less the offsets and the motor compensation."""
-    return {
-        axis.lower(): NT_PER_UNIT["mG"]
-        * (mag[f"Mag{axis}"] - mag.get(f"Ofs{axis}", 0) - mag.get(f"MO{axis}", 0))
-        for axis in "XYZ"
-    }
-
-
-def _instances(tables: Tables, record: str) -> dict[int, tuple[FloatArray, Table]]:
-    """Return time and fields of each instance of a record, also if its number is in the name (``MAG2``)."""
-    found = {}
-    for number, name in enumerate((record, f"{record}2", f"{record}3")):
-        if (table := tables.get(name)) is None or "TimeUS" not in table:
+def _instances(records: dict[str, Records], kind: str) -> dict[int, Records]:
+    """Return each instance of a kind, also if its number is in the name (``MAG2``)."""
+    found: dict[int, Records] = {}
+    for number, name in enumerate((kind, *(f"{kind}{k}" for k in range(2, TABLES + 1)))):
+        if (one := records.get(name)) is None or "TimeUS" not in one.fields or not len(one.at):
             continue
-        which = next(
-            (table[field] for field in INSTANCE if field in table), np.full(len(table["TimeUS"]), number)
-        )
+        which = next((one.fields[field] for field in INSTANCE if field in one.fields), None)
+        if which is None:
+            found.setdefault(number, one)
+            continue
         for k in np.unique(which[np.isfinite(which)]):
-            fields = {field: values[which == k] for field, values in table.items()}
-            found[int(k)] = fields["TimeUS"] * 1e-6, fields
+            here = np.flatnonzero(which == k)
+            fields = {key: values[here] for key, values in one.fields.items()}
+            found[int(k)] = Records(one.at[here], fields, {})
     return found
 
 
-def _utc_offset(tables: Tables) -> float:
-    """Return UTC minus time since boot in s, from the first GPS fix; 0 without one."""
-    gps = tables.get("GPS")
-    if gps is None or not {"GWk", "GMS", "TimeUS"} <= gps.keys():
-        return 0.0
-    fixes = np.flatnonzero((gps["GWk"] > 0) & (gps.get("Status", np.full(len(gps["GWk"]), 3.0)) >= 3))
-    if not len(fixes):
-        return 0.0
-    k = fixes[0]
-    utc = EPOCH_GPS + gps["GWk"][k] * WEEK + gps["GMS"][k] * 1e-3
-    leap = next((seconds for since, seconds in LEAP if utc - seconds >= since), 0)
-    return float(utc - leap - gps["TimeUS"][k] * 1e-6)
-
-
-def _tables(path: Path) -> tuple[Tables, int]:
-    """Return every kind of record that we use as columns, and the bytes that belonged to no record."""
-    try:
-        from pymavlink.DFReader import DFReader_binary  # noqa: PLC0415 - a slow import
-    except ImportError:
-        raise MissingExtra("pymavlink", "analysis") from None
-
-    class Reader(DFReader_binary):  # type: ignore[misc]  # pymavlink is untyped
-        """Reads record by record: an index would stop at an unknown record, and might never end on damage."""
-
-        def init_arrays(self, progress_callback: object = None) -> None:
-            pass
-
-        init_arrays_fast = init_clock = init_arrays
-
-    tables: dict[str, dict[str, array[float]]] = {}
-    with redirect_stdout(None), redirect_stderr(None), Reader(str(path)) as log:
-        skipped = log.data_len
-        while (at := log.offset) < log.data_len - 2:
-            with suppress(*DAMAGE):
-                if record := log.recv_msg():
-                    skipped -= record.fmt.len
-                    if record.fmt.name in KINDS:
-                        _add(tables.setdefault(record.fmt.name, {}), record)
-            log.offset = max(log.offset, at + 3)  # a damaged FMT may give records the length 0
-    return {
-        name: {field: np.array(table[field]) for field in table} for name, table in tables.items()
-    }, skipped
-
-
-def _add(table: dict[str, array[float]], record: Any) -> None:
-    """Append the numbers of a record; one that lacks a field of those before it counts as damaged."""
-    kinds = zip(record.fmt.columns, record.fmt.msg_types, strict=False)
-    row = {name: float(getattr(record, name)) for name, kind in kinds if name in COLUMNS and kind in NUMBERS}
-    if not table:
-        table.update((name, array("d")) for name in row)
-    for column, value in zip(table.values(), [row[name] for name in table], strict=True):
-        column.append(value)
+def _utc_offset(records: dict[str, Records]) -> float | None:
+    """Return UTC minus time since boot in s, the median of all GPS fixes; None without one."""
+    offsets = []
+    for gps in (one.fields for one in _instances(records, "GPS").values()):
+        if {"GWk", "GMS"} <= gps.keys():
+            fixed = (gps["GWk"] > 0) & (gps.get("Status", np.full(len(gps["GWk"]), FIX)) >= FIX)
+            ahead = EPOCH_GPS + gps["GWk"] * WEEK + gps["GMS"] * 1e-3 - gps["TimeUS"] * 1e-6
+            offsets.append(ahead[fixed])
+    known = np.concatenate(offsets) if offsets else np.empty(0)
+    if not len(known):
+        return None
+    offset = float(np.median(known))
+    leap = next((seconds for since, seconds in LEAP if offset - seconds >= since), 0)
+    return offset - leap

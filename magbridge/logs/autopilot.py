@@ -1,27 +1,70 @@
-"""An autopilot's own log as a deployment: what ArduPilot's and PX4's have in common.
+"""An autopilot's own log as a deployment: what ArduPilot's, PX4's and a robot's have in common.
 
-A row is a sample of the first magnetometer that the log has; every other column is the last value before it.
-A log that does not tell UTC counts from the boot, and says so in the attribute ``time_reference = "boot"``.
+A row is a sample of one of the magnetometers, that in use (:mod:`.compasses`); every other column is the last
+value before it. A log that does not tell UTC counts from the boot, and says so in the attribute
+``time_reference = "boot"``. Each boot is a run with its own UTC.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import chain
+from math import inf
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import xarray as xr
 
 from magbridge.arrays import FloatArray
-from magbridge.logs.deployment import deployment, sliced
+from magbridge.logs.compasses import Compass, choose, listed, said
+from magbridge.logs.deployment import NOTES, deployment, same_columns, sliced, uncounted
+from magbridge.logs.order import in_order
 from magbridge.logs.resample import latest
 
-__all__ = ["Fields", "FloatArray", "pieces", "values_of"]
+__all__ = ["Fields", "Magnetometer", "Run", "Series", "pieces", "values_of"]
 
 Table = Mapping[str, FloatArray]
 Fields = dict[str, tuple[tuple[str, str, str, float], ...]]
 """Record: (column, field, unit, factor); ``#`` is the number of the instance where it is not the first."""
+Series = tuple[FloatArray, str, str, FloatArray]
+"""Times (m,), s; column, unit and values (m,)."""
+BETWEEN = 60.0
+"""s between two boots whose times would overlap: no value is carried from one to the other."""
+
+
+class Magnetometer(NamedTuple):
+    """The samples of a magnetometer.
+
+    Attributes
+    ----------
+    compass : Compass
+    time : (n,) array
+        s of the log.
+    field : dict of str to (n,) array
+        nT, by axis (``x``, ``y``, ``z``).
+    """
+
+    compass: Compass
+    time: FloatArray
+    field: Table
+
+
+class Run(NamedTuple):
+    """What was logged from one boot to the next.
+
+    Attributes
+    ----------
+    magnetometers : list of Magnetometer
+        At least one.
+    telemetry : iterable of Series
+        The first of several with one name is taken.
+    offset : float or None
+        UTC minus the log's time, s; None where it is not known.
+    """
+
+    magnetometers: list[Magnetometer]
+    telemetry: Iterable[Series]
+    offset: float | None
 
 
 def values_of(
@@ -34,24 +77,67 @@ def values_of(
 
 
 def pieces(
-    path: Path,
-    rows: int,
-    offset: float,
-    mags: Mapping[int, tuple[FloatArray, Table]],
-    telemetry: Iterable[tuple[FloatArray, str, str, FloatArray]],
-    attrs: Mapping[str, Any],
+    path: Path, rows: int, runs: Sequence[Run], attrs: Mapping[str, Any], compass: str | None = None
 ) -> Iterator[xr.Dataset]:
-    """Yield the log in pieces of at most `rows` rows.
+    """Yield the log in pieces of at most `rows` rows, run by run.
 
-    Its own times, s, are `offset` s behind UTC, 0 where that is not known. `mags` holds each magnetometer's
-    times (m,) and, by axis, its values (m,), nT; `telemetry` yields times (m,), column, unit and values (m,).
+    `attrs` are of the whole log: its first piece has what they count. Runs without a date are left out, and
+    counted, where others have one.
     """
-    (_, (time, first)), *rest = sorted(mags.items())
-    columns = {f"mag_{axis}": values for axis, values in first.items()}
-    units: dict[str, str] = {}
-    others = ((when, f"mag{k + 1}_{a}", "nT", field[a]) for k, (when, field) in rest for a in field)
-    for when, column, unit, values in chain(others, telemetry):
+    dated = [run for run in runs if run.offset is not None]
+    chosen = choose(path, [one.compass for one in runs[0].magnetometers], compass)
+    notes = said(chosen, compass)
+    if len(runs) > 1:
+        notes.append(f"{len(runs)} boots, each a run of its own")
+    counted = dict(attrs)
+    if dated and len(dated) < len(runs):
+        lost = sum(len(run.magnetometers[0].time) for run in runs if run.offset is None)
+        counted["rows_dropped"] = counted.get("rows_dropped", 0) + lost
+        notes.append(f"{len(runs) - len(dated)} of them without GPS time are left out: they have no date")
+    own = next(one for one in chosen if one.chosen)
+    found = [_assembled(path, run, own) for run in dated or runs]
+    notes += _one_after_the_other(found)
+    kept = {**listed(chosen), **({} if dated else {"time_reference": "boot"})}
+    first: dict[str, Any] = {**counted, **({NOTES: "\n".join(notes)} if notes else {})}
+    columns = {str(name): dict(one.attrs) for data in found for name, one in data.data_vars.items()}
+    for k, data in enumerate(found):
+        whole = same_columns(data, columns).assign_attrs(kept | first)
+        yield from sliced(uncounted(whole) if k else whole, rows)
+
+
+def _assembled(path: Path, run: Run, wanted: Compass) -> xr.Dataset:
+    """Return a run on the times of a compass, or where the run lacks it, of its own choice."""
+    there = [one.compass for one in run.magnetometers]
+    same = [one for one in there if (one.id, one.number) == (wanted.id, wanted.number)]
+    compass = same[0] if same else next(one for one in choose(path, there, None) if one.chosen)
+    mag = next(one for one in run.magnetometers if one.compass.number == compass.number)
+    columns = {f"mag_{axis}": values for axis, values in mag.field.items()}
+    units = dict.fromkeys(columns, "nT")
+    further = (
+        (other.time, f"mag{other.compass.number + 1}_{axis}", "nT", values)
+        for other in run.magnetometers
+        if other is not mag
+        for axis, values in other.field.items()
+    )
+    for when, column, unit, values in chain(further, run.telemetry):
         if column not in columns:
-            columns[column], units[column] = latest(time, when, values), unit
-    boot = {} if offset else {"time_reference": "boot"}
-    yield from sliced(deployment(path, time + offset, columns, units, {**attrs, **boot}), rows)
+            keep = in_order(when, strictly=False)
+            columns[column], units[column] = latest(mag.time, when[keep], values[keep]), unit
+    return deployment(path, mag.time + (run.offset or 0.0), columns, units)
+
+
+def _one_after_the_other(runs: list[xr.Dataset]) -> list[str]:
+    """Move runs that begin before the end of the one before them, in place; return what was moved."""
+    notes, ended = [], -inf
+    for k, run in enumerate(runs):
+        time = run["time"].values
+        kept = time[in_order(time)]
+        if len(kept) and kept[0] <= ended:
+            later = ended + BETWEEN - float(kept[0])
+            runs[k] = run.assign_coords(time=run["time"].copy(data=time + later))
+            notes.append(
+                f"boot {k + 1} begins by its own clock before the end of the last: moved by {later:.0f} s"
+            )
+        if len(kept):
+            ended = float(runs[k]["time"].values[in_order(time)][-1])
+    return notes

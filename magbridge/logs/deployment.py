@@ -22,12 +22,14 @@ __all__ = [
     "HISTORY",
     "LOSSES",
     "MEANING",
+    "NOTES",
     "SETTINGS",
     "deployment",
     "join",
     "lasting",
     "merged",
     "named_losses",
+    "noted",
     "passed_over",
     "same_columns",
     "sliced",
@@ -47,6 +49,7 @@ COUNTERS = {
     "dropouts": ("dropout", "dropouts"),
     "duplicate_rows": ("duplicate row", "duplicate rows"),
     "files_skipped": ("file skipped", "files skipped"),
+    "lines_skipped": ("line skipped", "lines skipped"),
     "rows_dropped": ("row dropped", "rows dropped"),
     "values_dropped": ("impossible value dropped", "impossible values dropped"),
 }
@@ -58,6 +61,8 @@ HISTORY = "history"
 """Attribute that keeps such things in what is written, a line for each."""
 LOSSES = "losses"
 """Attribute that names what was skipped, a line for each file and column. It goes the way of the counts."""
+NOTES = "notes"
+"""Attribute with a line for each choice that reading made: which of several compasses, a name, a unit."""
 
 
 def deployment(
@@ -124,9 +129,10 @@ def _describe(name: str, unit: str, long_name: str | None) -> dict[str, Any]:
 
 
 def sliced(dataset: xr.Dataset, rows: int) -> Iterator[xr.Dataset]:
-    """Yield a deployment that is already in memory in pieces of at most `rows` rows."""
+    """Yield a deployment in memory in pieces of at most `rows` rows; the first has what it counts."""
     for start in range(0, dataset.sizes["time"], rows):
-        yield dataset.isel(time=slice(start, start + rows))
+        part = dataset.isel(time=slice(start, start + rows))
+        yield uncounted(part) if start else part
 
 
 def same_columns(dataset: xr.Dataset, like: Mapping[str, Mapping[str, Any]]) -> xr.Dataset:
@@ -216,9 +222,9 @@ def lasting(attrs: Mapping[Any, Any]) -> dict[str, str | float]:
 
 
 def uncounted(dataset: xr.Dataset) -> xr.Dataset:
-    """Return the deployment without the attributes of :data:`COUNTERS`, and :data:`LOSSES`."""
+    """Return the deployment without the attributes of :data:`COUNTERS`, :data:`LOSSES`, :data:`NOTES`."""
     bare = dataset.copy(deep=False)
-    counted = {GUESSED, LOSSES, *COUNTERS}
+    counted = {GUESSED, LOSSES, NOTES, *COUNTERS}
     bare.attrs = {name: value for name, value in dataset.attrs.items() if name not in counted}
     return bare
 
@@ -232,6 +238,11 @@ def passed_over(*pieces: Mapping[str, Any]) -> dict[str, int]:
 def named_losses(*pieces: Mapping[str, Any]) -> list[str]:
     """Return the lines that name what was skipped in the pieces of a deployment."""
     return [line for attrs in pieces for line in str(attrs.get(LOSSES, "")).splitlines()]
+
+
+def noted(*pieces: Mapping[str, Any]) -> list[str]:
+    """Return what a user should know of how the pieces of a deployment were read."""
+    return [line for attrs in pieces for line in str(attrs.get(NOTES, "")).splitlines()]
 
 
 def _first_known(values: FloatArray, starts: IndexArray) -> FloatArray:
@@ -259,7 +270,7 @@ def _join_attrs(all_attrs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
                 joined[key] += value
             else:
                 joined.setdefault(key, value)
-    for key in (GUESSED, HISTORY, LOSSES):
+    for key in (GUESSED, HISTORY, LOSSES, NOTES):
         told = [line for attrs in all_attrs for line in str(attrs.get(key, "")).splitlines()]
         if told:
             joined[key] = "\n".join(dict.fromkeys(told))

@@ -1,19 +1,25 @@
 """PX4's logs (``.ulg``), through pyulog.
 
-``sensor_mag`` is in gauss, as the driver gives it: before PX4's own calibration. ``heading`` is the
-estimator's yaw. ``depth`` is the local position's z, down from where the vehicle was switched on. UTC is that
-of the first GPS message that has it.
+The field is in gauss, as the driver gives it, before PX4's own calibration: that of ``sensor_mag`` or, where
+the log has it at a higher rate, that of ``vehicle_magnetometer``, from which the offsets and scales of
+``CAL_MAGn`` are taken off again. The oldest logs have it in ``sensor_combined``. Of several compasses that is
+read which flew: the one that ``vehicle_magnetometer`` names, if it is enabled (``CAL_MAGn_PRIO`` is not 0).
+
+``heading`` is the estimator's yaw. ``depth`` is the local position's z, down from where the vehicle was
+switched on. UTC is the median of what the GPS messages say.
 
 References
 ----------
 PX4 user guide, "ULog File Format", https://docs.px4.io/main/en/dev_log/ulog_file_format.html
+PX4, ``src/lib/sensor_calibration/Magnetometer.hpp``, ``Correct``
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import redirect_stdout
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
@@ -21,7 +27,8 @@ import xarray as xr
 from magbridge.arrays import FloatArray
 from magbridge.columns import NT_PER_UNIT
 from magbridge.errors import FormatError, MissingExtra
-from magbridge.logs.autopilot import Fields, pieces, values_of
+from magbridge.logs.autopilot import Fields, Magnetometer, Run, Series, pieces, values_of
+from magbridge.logs.compasses import Compass, rate
 
 try:
     from pyulog import ULog
@@ -29,71 +36,199 @@ try:
 except ImportError:
     raise MissingExtra("pyulog", "formats") from None
 
+if TYPE_CHECKING:
+    from magbridge.logs.options import Options
+
 __all__ = ["chunks"]
 
 Table = dict[str, FloatArray]
 Topics = dict[str, dict[int, Table]]
+Parameters = Mapping[str, float]
 
 FIELDS: Fields = {
     "vehicle_global_position": (("latitude", "lat", "deg", 1.0), ("longitude", "lon", "deg", 1.0)),
     "vehicle_local_position": (("depth", "z", "m", 1.0),),
+    "sensor_gps": (
+        *(("latitude", "latitude_deg", "deg", 1.0), ("longitude", "longitude_deg", "deg", 1.0)),
+        *(("latitude", "lat", "deg", 1e-7), ("longitude", "lon", "deg", 1e-7)),
+    ),
     "battery_status": (
         ("battery#_current", "current_a", "A", 1.0),
         ("battery#_voltage", "voltage_v", "V", 1.0),
     ),
     "vehicle_air_data": (("pressure", "baro_pressure_pa", "hPa", 0.01),),
+    "sensor_baro": (
+        ("pressure", "pressure", "hPa", 0.01),
+        ("pressure_temperature", "temperature", "degC", 1.0),
+    ),
     "actuator_outputs": tuple((f"servo{k + 1}", f"output[{k}]", "us", 1.0) for k in range(16)),
-    "esc_status": tuple((f"esc{k + 1}_current", f"esc[{k}].esc_current", "A", 1.0) for k in range(8)),
+    "actuator_motors": tuple((f"motor{k + 1}", f"control[{k}]", "1", 1.0) for k in range(12)),
+    "esc_status": tuple(
+        (f"esc{k + 1}_{column}", f"esc[{k}].{field}", unit, 1.0)
+        for k in range(8)
+        for column, field, unit in (
+            ("current", "esc_current", "A"),
+            ("voltage", "esc_voltage", "V"),
+            ("rpm", "esc_rpm", "rpm"),
+        )
+    ),
 }
+"""Topic to columns; of topics with one column, the first that the log has is taken."""
+FIELDS["vehicle_gps_position"] = FIELDS["sensor_gps"]
 NEEDED = {
     "sensor_mag": {"timestamp", "x", "y", "z"},
+    "vehicle_magnetometer": {"timestamp", *(f"magnetometer_ga[{k}]" for k in range(3))},
+    "sensor_combined": {"timestamp", *(f"magnetometer_ga[{k}]" for k in range(3))},
     "vehicle_attitude": {"timestamp", "q[0]", "q[1]", "q[2]", "q[3]"},
     "debug_key_value": {"timestamp", "value", "key[0]"},
 }
-UNUSED = ("servo", "esc")
+UNUSED = ("servo", "esc", "motor")
 """Outputs that a log lists in the largest possible number; those that are always 0 are not in use."""
-OTHERS = ("sensor_mag", "vehicle_attitude", "vehicle_gps_position", "sensor_gps", "debug_key_value")
+GPS = ("vehicle_gps_position", "sensor_gps")
+FIX = 3
+"""Least ``fix_type`` of a fix in three dimensions."""
+CALIBRATIONS = 4
+FASTER = 1.5
+"""Times the rate of ``sensor_mag`` from which ``vehicle_magnetometer`` is read instead."""
 
 
-def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
+def chunks(path: Path, rows: int, options: Options | None = None) -> Iterator[xr.Dataset]:
     """Yield the log in pieces of at most `rows` rows; it is held whole.
 
     Raises
     ------
     FormatError
-        Not a ULog, or no ``sensor_mag`` in it.
+        Not a ULog, or no magnetometer in it.
     """
     try:
         with path.open("rb") as file, redirect_stdout(None):  # pyulog prints what it finds damaged
-            log = ULog(file, [*FIELDS, *OTHERS])
+            log = ULog(file, [*FIELDS, *NEEDED])
     except (ULogException, ValueError, KeyError, IndexError, TypeError) as error:
         raise FormatError(path, f"expected a PX4 log: {error}") from None
     topics: Topics = {}
     for one in log.data_list:
         fields = {name: values.astype(np.float64) for name, values in one.data.items()}
-        if NEEDED.get(one.name, {"timestamp"}) <= fields.keys():
+        if NEEDED.get(one.name, {"timestamp"}) <= fields.keys() and len(fields["timestamp"]):
             topics.setdefault(one.name, {})[one.multi_id] = fields
-    mags = {
-        number: (_time(mag), {axis: NT_PER_UNIT["G"] * mag[axis] for axis in "xyz"})
-        for number, mag in topics.get("sensor_mag", {}).items()
-    }
+    mags = _magnetometers(topics, log.initial_parameters)
     if not mags:
-        raise FormatError(path, "expected a PX4 log with sensor_mag")
+        raise FormatError(path, "expected a PX4 log with a magnetometer")
     # pyulog tells that there is damage, not in how many places
     lost = {"dropouts": len(log.dropouts), "damages": int(log.file_corruption)}
-    yield from pieces(path, rows, _utc_offset(topics), mags, _telemetry(topics), lost)
+    run = Run(mags, _telemetry(topics), _utc_offset(topics))
+    yield from pieces(path, rows, [run], lost, options.compass if options else None)
 
 
-def _telemetry(topics: Topics) -> Iterator[tuple[FloatArray, str, str, FloatArray]]:
-    """Yield times, column, unit and values of everything but the magnetometers."""
+def _magnetometers(topics: Topics, parameters: Parameters) -> list[Magnetometer]:
+    """Return the compasses, each from the topic that has it at the highest rate, as the driver gave it."""
+    used = {
+        device: table
+        for table in topics.get("vehicle_magnetometer", {}).values()
+        for device in np.unique(table.get("device_id", np.zeros(1))).tolist()
+    }
+    current = _most(topics.get("vehicle_magnetometer", {}))
+    found: list[Magnetometer] = []
+    for number, table in sorted(topics.get("sensor_mag", {}).items()):
+        device = _most({0: table})
+        mag = _magnetometer(number, device, table, ("x", "y", "z"), parameters, device and device == current)
+        faster = _of_device(used.pop(device, None), device)
+        if faster is not None and rate(_time(faster)) > FASTER * mag.compass.rate:
+            mag = _uncalibrated(number, device, faster, parameters, in_use=device == current)
+        found.append(mag)
+    numbers = {one.compass.number for one in found}
+    for device, table in used.items():  # logged after the vehicle's own calibration only
+        part = _of_device(table, device)
+        if part is not None and (device or not found):
+            number = next(k for k in range(len(numbers) + 1) if k not in numbers)
+            numbers.add(number)
+            found.append(_uncalibrated(number, device, part, parameters, in_use=device == current))
+    if not found:
+        axes = tuple(f"magnetometer_ga[{k}]" for k in range(3))
+        found = [
+            _magnetometer(number, 0.0, table, axes, parameters, True)
+            for number, table in topics.get("sensor_combined", {}).items()
+        ]
+    return found
+
+
+def _of_device(table: Table | None, device: float) -> Table | None:
+    """Return the samples of one device: a topic may change from one compass to another."""
+    if table is None or "device_id" not in table:
+        return table
+    here = table["device_id"] == device
+    return {name: values[here] for name, values in table.items()}
+
+
+def _most(tables: Mapping[int, Table]) -> float:
+    """Return the device id that most samples of the first instance that has one carry; 0 where none has."""
+    for _, table in sorted(tables.items()):
+        if "device_id" in table:
+            devices, counts = np.unique(table["device_id"], return_counts=True)
+            return float(devices[counts.argmax()])
+    return 0.0
+
+
+def _magnetometer(
+    number: int, device: float, table: Table, axes: Sequence[str], parameters: Parameters, in_use: Any
+) -> Magnetometer:
+    time = _time(table)
+    slot = _calibration(device, parameters)
+    priority = parameters.get(f"CAL_MAG{slot}_PRIO") if slot is not None else None
+    known = priority is not None and priority >= 0
+    compass = Compass(
+        number,
+        len(time),
+        rate(time),
+        f"{device:.0f}" if device else "",
+        priority != 0 if known else None,
+        None,
+        int(priority) if known and priority is not None else None,
+        bool(in_use),
+    )
+    field = {axis: NT_PER_UNIT["G"] * table[name] for axis, name in zip("xyz", axes, strict=True)}
+    return Magnetometer(compass, time, field)
+
+
+def _uncalibrated(
+    number: int, device: float, table: Table, parameters: Parameters, *, in_use: bool
+) -> Magnetometer:
+    """Return a compass from ``vehicle_magnetometer``, with PX4's calibration undone.
+
+    PX4 computes ``R S (raw - offset - power compensation)``, where the symmetric S holds scales and
+    off-diagonals. S and the offset are undone; the rotation R, that of the mounting, stays: the axes are the
+    vehicle's. The compensation for power (``CAL_MAG_COMP_TYP``) is not in the log, and stays, too.
+    """
+    axes = tuple(f"magnetometer_ga[{k}]" for k in range(3))
+    slot = _calibration(device, parameters)
+    rotated = slot is not None and parameters.get(f"CAL_MAG{slot}_ROT", 0) > 0
+    if slot is not None and not rotated:
+        head = f"CAL_MAG{slot}_"
+        x, y, z = (parameters.get(f"{head}{axis}SCALE", 1.0) or 1.0 for axis in "XYZ")
+        xy, xz, yz = (parameters.get(f"{head}{axis}ODIAG", 0.0) for axis in "XYZ")
+        matrix = np.array([[x, xy, xz], [xy, y, yz], [xz, yz, z]])
+        offset = np.array([[parameters.get(f"{head}{axis}OFF", 0.0)] for axis in "XYZ"])
+        raw = np.linalg.solve(matrix, np.stack([table[axis] for axis in axes])) + offset
+        table = {**table, **dict(zip(axes, raw, strict=True))}
+    return _magnetometer(number, device, table, axes, parameters, in_use)
+
+
+def _calibration(device: float, parameters: Parameters) -> int | None:
+    """Return the n of the ``CAL_MAGn`` that belong to a device; None where none does."""
+    slots = (k for k in range(CALIBRATIONS) if device and parameters.get(f"CAL_MAG{k}_ID") == device)
+    return next(slots, None)
+
+
+def _telemetry(topics: Topics) -> Iterator[Series]:
+    """Yield everything but the magnetometers."""
     for attitude in topics.get("vehicle_attitude", {}).values():
         for column, values in zip(("roll", "pitch", "heading"), _angles(attitude), strict=True):
             yield _time(attitude), column, "deg", values
     for topic in FIELDS:
         for number, table in topics.get(topic, {}).items():
-            for column, unit, values in values_of(FIELDS, topic, number, table):
-                if np.any(values) or not column.startswith(UNUSED):
-                    yield _time(table), column, unit, values
+            fixed = table.get("fix_type", np.full(len(table["timestamp"]), FIX)) >= FIX
+            for column, unit, values in values_of(FIELDS, topic, number, _known(table)):
+                if np.any(np.nan_to_num(values)) or not column.startswith(UNUSED):
+                    yield _time(table), column, unit, np.where(fixed, values, np.nan)
     for table in topics.get("debug_key_value", {}).values():
         letters = [table[f"key[{k}]"].astype(np.uint8) for k in range(10) if f"key[{k}]" in table]
         names = np.array(
@@ -101,6 +236,13 @@ def _telemetry(topics: Topics) -> Iterator[tuple[FloatArray, str, str, FloatArra
         )
         for name in dict.fromkeys(names.tolist()):
             yield _time(table)[names == name], name, "1", table["value"][names == name]
+
+
+def _known(table: Table) -> Table:
+    """Return a table without the -1 A by which ``battery_status`` says that the current is not measured."""
+    if "current_a" not in table:
+        return table
+    return {**table, "current_a": np.where(table["current_a"] == -1.0, np.nan, table["current_a"])}
 
 
 def _angles(attitude: Table) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -116,11 +258,13 @@ def _time(table: Table) -> FloatArray:
     return table.get("timestamp_sample", table["timestamp"]) * 1e-6
 
 
-def _utc_offset(topics: Topics) -> float:
-    """Return UTC minus time since boot in s, from the first GPS message that has UTC; 0 without one."""
-    for topic in ("vehicle_gps_position", "sensor_gps"):
-        for gps in topics.get(topic, {}).values():
-            known = np.flatnonzero(gps.get("time_utc_usec", np.zeros(0)) > 0)
-            if len(known):
-                return float(gps["time_utc_usec"][known[0]] - gps["timestamp"][known[0]]) * 1e-6
-    return 0.0
+def _utc_offset(topics: Topics) -> float | None:
+    """Return UTC minus time since boot in s, the median of the GPS messages that have it, or None."""
+    ahead = [
+        (gps["time_utc_usec"] - gps["timestamp"])[gps["time_utc_usec"] > 0] * 1e-6
+        for topic in GPS
+        for gps in topics.get(topic, {}).values()
+        if "time_utc_usec" in gps
+    ]
+    known = np.concatenate(ahead) if ahead else np.empty(0)
+    return float(np.median(known)) if len(known) else None

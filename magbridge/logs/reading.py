@@ -18,7 +18,7 @@ from magbridge.columns import CHANNEL_TIMES, counts_from_boot, require
 from magbridge.errors import FormatError
 from magbridge.guard import guarded
 from magbridge.logs.options import Options
-from magbridge.logs.registry import FLIGHT, format_of
+from magbridge.logs.registry import FLIGHT, format_of, is_bag
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -140,9 +140,9 @@ def _paths(paths: Paths) -> list[Path]:
         raise ValueError("expected at least one file")
     checked = [Path(path) for path in several]
     for path in checked:
-        if path.is_dir():
+        if path.is_dir() and not is_bag(path):
             raise FormatError(path, "expected a file, not a directory")
-        if not path.is_file():
+        if not path.is_file() and not is_bag(path):
             what = "not a pipe or a device" if path.exists() else "there is none"
             raise FormatError(path, f"expected a file, {what}")
         format_of(path)

@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 
 from magbridge.errors import FormatError
 
-__all__ = ["FLIGHT", "FORMATS", "Format", "format_of", "suffixes"]
+__all__ = ["FLIGHT", "FORMATS", "Format", "format_of", "is_bag", "suffixes"]
 
 FLIGHT = {".ebd": ".dbd", ".nbd": ".mbd", ".tbd": ".sbd", ".ecd": ".dcd", ".ncd": ".mcd", ".tcd": ".scd"}
 """Suffix of a Slocum's science file to that of its flight file: where both are there, both are read."""
@@ -53,9 +53,15 @@ FORMATS: dict[str, Format] = {
         "magbridge.logs.netcdf", (".nc",), rb"CDF[\x01\x02\x05]|\x89HDF\r\n\x1a\n", writes=True, guarded=True
     ),
     "parquet": Format("magbridge.logs.parquet", (".parquet",), rb"PAR1", writes=True, guarded=True),
-    "ardupilot": Format("magbridge.logs.ardupilot", (".bin",), rb"\xa3\x95\x80\x80"),
+    "ardupilot": Format("magbridge.logs.ardupilot", (".bin", ".log"), rb"\xa3\x95\x80\x80|FMT, ?\d+, ?\d+,"),
     "px4": Format("magbridge.logs.px4", (".ulg",), rb"ULog\x01\x12\x35", guarded=True),
     "slocum": Format("magbridge.logs.slocum", (*FLIGHT, *FLIGHT.values()), rb".{0,8}dbd_label", guarded=True),
+    "ros": Format(
+        "magbridge.logs.rosbag",
+        (".bag", ".db3", ".mcap"),
+        rb"#ROSBAG V2|\x89MCAP0\r\n|SQLite format 3\0",
+        guarded=True,
+    ),
     # 8 bytes of time, µs since 1970 (before 2079), then a frame of either MAVLink
     "telemetry": Format(
         "magbridge.logs.telemetry", (".tlog",), rb"\x00[\x00-\x0c].{6}[\xfd\xfe]", writes=True
@@ -102,8 +108,15 @@ def format_of(path: Path, *, write: bool = False) -> Format:
     return found
 
 
+def is_bag(path: Path) -> bool:
+    """Tell whether a folder is a bag of ROS 2, which is read as one file."""
+    return (path / "metadata.yaml").is_file()
+
+
 def _recognised(path: Path) -> Format | None:
     """Return the format whose signature the file bears; None where it bears none."""
+    if is_bag(path):
+        return FORMATS["ros"]
     try:
         with path.open("rb") as file:
             head = file.read(HEAD)

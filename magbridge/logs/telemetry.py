@@ -17,22 +17,25 @@ Telemetry is what the log itself declares by ``MAG_COLUMN`` (a bridge's own, wit
 from :mod:`magbridge.logs`), what :data:`~magbridge.logs.telemetry_fields.TELEMETRY` lists, and every
 ``NAMED_VALUE_FLOAT`` by its name.
 Where the clock of a bridge was set, its rows are dated by the clock as it was set last in the file.
-Damaged bytes are skipped and counted in the attributes ``bytes_skipped`` and ``damages``; rows whose time
-does not increase are dropped and counted in ``rows_dropped``.
+Attitude and position are the autopilot's, not a gimbal's, and a named value never takes the place of a column
+that the log has a source for. Damaged bytes are skipped and counted in the attributes ``bytes_skipped`` and
+``damages``. A log that no bridge wrote is read at once, by :mod:`.telemetry_columns`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from math import inf, isclose, isnan, nan
+from itertools import chain
+from math import isclose, isnan, nan
 from pathlib import Path
 
 import numpy as np
 import xarray as xr
 
 from magbridge.columns import AGE, CHANNEL_TIMES, CORRECTED
-from magbridge.logs.deployment import deployment
+from magbridge.logs.deployment import deployment, sliced
 from magbridge.logs.resample import MAX_AGE
+from magbridge.logs.telemetry_columns import whole
 from magbridge.logs.telemetry_fields import SOURCES, TELEMETRY, Columns, correction
 from magbridge.logs.telemetry_survey import Survey, survey
 from magbridge.logs.telemetry_writer import FileWriter
@@ -58,7 +61,11 @@ def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
         Nothing in it makes a row.
     """
     status = path.stat()
-    pieces = Rows(path, survey(path, status.st_mtime_ns, status.st_size))
+    found = survey(path, status.st_mtime_ns, status.st_size)
+    if found.plain:
+        yield from sliced(whole(path, found), rows)
+        return
+    pieces = Rows(path, found)
     with path.open("rb") as file:
         pieces.reader = LogReader(file)
         for record in pieces.reader:
@@ -90,7 +97,7 @@ class Rows:
         }
         said = {column for columns in survey.named.values() for column, _, _ in columns}
         said |= {one.column for one in survey.declared}
-        self._tables: dict[int, list[tuple[int, Callable[[bytes], float | None]]]] = {
+        self._tables = {
             number: [
                 (self._slot[value.column], value.get)
                 for value in values
@@ -99,14 +106,14 @@ class Rows:
             for number, values in TELEMETRY.items()
         }
         self._counted = [one for one in survey.declared if one.message == self._source]
+        self._declared: dict[int, list[tuple[int, Callable[[bytes], float | None]]]] = {}
         for one in survey.declared:
             if one.message != self._source:
-                self._tables.setdefault(one.message, []).append((self._slot[one.column], one.find))
+                self._declared.setdefault(one.message, []).append((self._slot[one.column], one.find))
         aged = [one for one in survey.columns if survey.ours and AGE + one in survey.columns]
         self._aged = [(self._slot[AGE + one], self._slot[one]) for one in aged]
-        self._last = -inf
         self._to_step_us = survey.stepped_us
-        self._dropped = self._skipped = self._damages = 0
+        self._skipped = self._damages = 0
 
     def put(self, record: Record) -> None:
         """Take the next record of the log."""
@@ -121,7 +128,9 @@ class Rows:
                 _, value, letters = NAMED.struct.unpack(payload)
                 for slot, scale, offset in self._named.get(letters, ()):
                     self._note(record.time_us, slot, value * scale + offset)
-            for slot, get in self._tables.get(number, ()):
+            mine = self._survey.senders.get(number) == message.component
+            values = self._tables.get(number, ()) if mine else ()
+            for slot, get in chain(values, self._declared.get(number, ())):
                 if (known := get(payload)) is not None:
                     self._note(record.time_us, slot, known)
         if number == self._source and message.component == self._survey.component:
@@ -143,10 +152,6 @@ class Rows:
             later = {name: round(1e6 * columns[name]) + self._to_step_us for name in TIMES if name in columns}
             columns |= {name: at_us / 1e6 for name, at_us in later.items()}
         time = columns["time"]
-        if time <= self._last:
-            self._dropped += 1
-            return
-        self._last = time
         oldest = time_us - MAX_AGE_US
         row = [v if t >= oldest else nan for v, t in zip(self._values, self._stamps, strict=True)]
         for slot, of in self._aged:
@@ -170,9 +175,8 @@ class Rows:
         attrs = {
             "bytes_skipped": lost[0] - self._skipped,
             "damages": lost[1] - self._damages,
-            "rows_dropped": self._dropped,
         }
-        self._dropped, (self._skipped, self._damages) = 0, lost
+        self._skipped, self._damages = lost
         columns = {name: array[:, k] for name, k in self._slot.items() if k}
         if "heading" in columns:
             columns["heading"] %= 360.0

@@ -6,12 +6,17 @@ from collections.abc import Callable
 from math import isnan, nan
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
+from magbridge.arrays import FloatArray
 from magbridge.columns import CHANNEL_TIMES, CORRECTED
 from magbridge.mavlink import Message, spec
 from magbridge.mavlink.dialect import MAG_RAW_FLAGS
 from magbridge.mavlink.messages import split_index
 
 __all__ = [
+    "IMUS",
     "POWER_CYCLE",
     "SOURCES",
     "TELEMETRY",
@@ -53,12 +58,14 @@ UNITS = {
     "mm": ("m", 1e-3),
 }
 UNKNOWN_INT = 0x7FFFFFFF
-UNKNOWN: dict[str, tuple[int, ...]] = {
+UNKNOWN: dict[tuple[str, str], tuple[int, ...]] = {
     # what these fields hold when their sender does not know the value; the dialect does not declare it
-    "lat": (0, UNKNOWN_INT),
-    "lon": (0, UNKNOWN_INT),
-    "relative_alt": (UNKNOWN_INT,),
-    **{f"servo{k}_raw": (0,) for k in range(1, 17)},
+    ("GLOBAL_POSITION_INT", "lat"): (0, UNKNOWN_INT),
+    ("GLOBAL_POSITION_INT", "lon"): (0, UNKNOWN_INT),
+    ("GLOBAL_POSITION_INT", "relative_alt"): (UNKNOWN_INT,),
+    **{("SERVO_OUTPUT_RAW", f"servo{k}_raw"): (0,) for k in range(1, 17)},
+    # "0: IMU does not provide temperature values"; one that is at 0 degC sends 1
+    ("RAW_IMU", "temperature"): (0,),
 }
 
 
@@ -68,7 +75,7 @@ class Value:
     def __init__(self, column: str, message: str, field: str) -> None:
         name, self._index = split_index(field)
         self._field = spec(message).fields[name]
-        self._unknown = UNKNOWN.get(name, ())
+        self._unknown = UNKNOWN.get((message, name), ())
         self.column = column
         self.unit, self.scale = UNITS.get(self._field.unit, (self._field.unit or "1", 1.0))
         if name == "relative_alt":
@@ -82,6 +89,15 @@ class Value:
             value = value[self._index]
         unknown = value == self._field.invalid or value in self._unknown
         return nan if unknown else float(value * self.scale + self.offset)
+
+    def column_of(self, payloads: NDArray[np.uint8]) -> FloatArray:
+        """Return the values (n,) of payloads (n, size), each as :meth:`get`."""
+        layout = np.dtype(f"<{self._field.code}")
+        start = self._field.offset + (self._index or 0) * layout.itemsize
+        raw = payloads[:, start : start + layout.itemsize].copy().view(layout)[:, 0]
+        invalid = () if self._field.invalid is None else (self._field.invalid,)
+        unknown = np.isin(raw, [*self._unknown, *invalid])
+        return np.where(unknown, np.nan, raw.astype(np.float64) * self.scale + self.offset)
 
 
 class Declared(Value):
@@ -148,19 +164,21 @@ def correction(payload: bytes) -> Columns:
     }
 
 
+IMUS = {
+    message: [Value(f"mag_{axis}", message, f"{axis}mag") for axis in "xyz"]
+    for message in ("HIGHRES_IMU", "RAW_IMU", "SCALED_IMU", "SCALED_IMU2", "SCALED_IMU3")
+}
+"""Messages of an autopilot that hold its compass' field, the best first."""
+
+
 def _of(message: str) -> Callable[[bytes], Columns]:
-    values = [Value(f"mag_{axis}", message, f"{axis}mag") for axis in "xyz"]
-    return lambda payload: {value.column: value.get(payload) for value in values}
+    return lambda payload: {value.column: value.get(payload) for value in IMUS[message]}
 
 
 SOURCES: dict[str, Callable[[bytes], Columns]] = {
     "MAG_RAW": sample,
     "MAG_FIELD": correction,
-    "HIGHRES_IMU": _of("HIGHRES_IMU"),
-    "RAW_IMU": _of("RAW_IMU"),
-    "SCALED_IMU": _of("SCALED_IMU"),
-    "SCALED_IMU2": _of("SCALED_IMU2"),
-    "SCALED_IMU3": _of("SCALED_IMU3"),
+    **{message: _of(message) for message in IMUS},
     "ATTITUDE": lambda _: {},
     "GLOBAL_POSITION_INT": lambda _: {},
 }

@@ -5,25 +5,33 @@ from __future__ import annotations
 from collections import Counter
 from contextlib import suppress
 from functools import lru_cache
-from math import isnan
 from pathlib import Path
 from typing import Any
 
-from magbridge.columns import AGE
+import numpy as np
+from numpy.typing import NDArray
+
+from magbridge.arrays import IndexArray
+from magbridge.columns import AGE, CHANNELS
 from magbridge.errors import FormatError
 from magbridge.logs.deployment import CHANGES
 from magbridge.logs.telemetry_fields import SOURCES, TELEMETRY, Declared, Value, correction, sample
-from magbridge.mavlink import LogReader, Message, Record, spec
+from magbridge.mavlink import Message, spec
+from magbridge.mavlink.blocks import Block, blocks
 from magbridge.records import Channel
 
 __all__ = ["Survey", "survey"]
 
-V2 = 0xFD
 RAW, FIELD, COLUMN, STEP = (spec(f"MAG_{name}").id for name in ("RAW", "FIELD", "COLUMN", "CLOCK_STEP"))
 START, BYTES = spec("MAG_BRIDGE_START").id, spec("MAG_SENSOR_BYTES").id
 SET, VALUE = spec("PARAM_SET").id, spec("PARAM_VALUE").id
 NAMED = spec("NAMED_VALUE_FLOAT")
 UNITS = {"sensor_supply": "V"}
+AUTOPILOT = 1
+GIMBALS = {154, 171, 172, 173, 174, 175}
+"""Components whose attitude is their own, and not the vehicle's."""
+RESERVED = {"time", *CHANNELS}
+"""Columns that a named value never is."""
 
 
 class Survey:
@@ -35,6 +43,9 @@ class Survey:
         The message that makes the rows.
     system, component : int
         Its sender.
+    senders : dict of int to int
+        Of the other messages: the component whose values are taken. It is the sender of the rows
+        or the autopilot (1) where they send it, and hardly a gimbal.
     columns : dict of str to str
         Column to unit, of each column that has a value at least once.
     named : dict of bytes to list of (str, float, float)
@@ -42,7 +53,7 @@ class Survey:
     declared : list of Declared
         Columns that the log itself declares to be in other messages.
     attrs : dict
-        Attributes that the log declares.
+        Attributes that the log declares, and ``notes``.
     ours : bool
         A bridge's own log: the time stamps carry the :class:`~magbridge.records.Channel`.
     stepped_us : int
@@ -54,10 +65,10 @@ class Survey:
         self.ours = False
         self.stepped_us = 0
         self._senders: dict[int, Counter[tuple[int, int]]] = {}
-        self._known: dict[int, dict[str, str]] = {}
+        self._known: dict[tuple[int, int, int], dict[str, str]] = {}
         self._named: dict[int, dict[bytes, str]] = {}
         self._declared: dict[str, Declared] = {}
-        self._open: dict[tuple[int, int], list[Value]] = {}
+        self._open: dict[tuple[int, int, int], list[Value]] = {}
         self._asked: dict[str, float] = {}
         self._read(path)
         for self.source in SOURCES:
@@ -65,15 +76,43 @@ class Survey:
             if not senders or (self.ours and "IMU" in self.source):
                 continue  # the autopilot's compass does not replace the instrument
             (self.system, self.component), _ = senders.most_common(1)[0]
-            self.columns = self._known.get(self.system, {})
+            self.senders = self._chosen()
+            self.columns = {
+                column: unit
+                for (system, component, number), columns in self._known.items()
+                if system == self.system and component == self.senders.get(number, component)
+                for column, unit in columns.items()
+            }
             self._name()
             return
         raise FormatError(path, f"expected MAVLink records with one of {' '.join(SOURCES)}")
+
+    @property
+    def plain(self) -> bool:
+        """Whether no bridge wrote the log: one clock, and nothing declared."""
+        return self.source not in ("MAG_RAW", "MAG_FIELD") and not (
+            self.ours or self.declared or self.stepped_us
+        )
+
+    def _chosen(self) -> dict[int, int]:
+        """Return the component that each message of :data:`TELEMETRY` is taken from."""
+        chosen = {}
+        for number in TELEMETRY.keys() & self._senders.keys():
+            senders = self._senders[number]
+            mine = [component for system, component in senders if system == self.system]
+            ranks = {
+                one: (one == self.component, one == AUTOPILOT, one not in GIMBALS, senders[self.system, one])
+                for one in mine
+            }
+            if mine:
+                chosen[number] = max(mine, key=ranks.__getitem__)
+        return chosen
 
     def _name(self) -> None:
         """Map each ``NAMED_VALUE_FLOAT`` to the columns that the log declares, else to its name."""
         self.named: dict[bytes, list[tuple[str, float, float]]] = {}
         self.declared: list[Declared] = []
+        notes: list[str] = []
         for one in self._declared.values():
             self.columns[one.column] = one.unit
             if self.ours and one.message not in (RAW, FIELD):
@@ -85,73 +124,92 @@ class Survey:
                 self.named.setdefault(letters, []).append((one.column, one.scale, one.offset))
         for letters, name in self._named.get(self.system, {}).items():
             if letters not in self.named:
-                self.named[letters] = [(name, 1.0, 0.0)]
-                self.columns.setdefault(name, "1")
+                own = f"named_{name}" if name in self.columns or name in RESERVED else name
+                if own != name:
+                    notes.append(
+                        f"NAMED_VALUE_FLOAT {name!r} is read as {own}: the log has a {name} of its own"
+                    )
+                self.named[letters] = [(own, 1.0, 0.0)]
+                self.columns.setdefault(own, "1")
+        if notes:
+            self.attrs["notes"] = "\n".join(notes)
 
     def _read(self, path: Path) -> None:
         """Read every record, but decode only those that may add to what is known."""
-        times: Counter[bytes] = Counter()
-        settled: set[bytes] = set()
+        settled: set[int] = set()
         with path.open("rb") as file:
-            for record in LogReader(file):
-                frame = record.frame
-                head = 10 if frame[0] == V2 else 6
-                kind = frame[5 if head == 10 else 3 : head]  # system, component, message id
-                number = int.from_bytes(kind[2:], "little")
-                if number in (SET, VALUE) and self.ours:
-                    self._tuned(record)
-                if self.ours and record.channel == Channel.SENT and number not in (RAW, FIELD):
-                    continue  # the bridge's own messages are no telemetry
-                if number == NAMED.id:
-                    kind += frame[head + NAMED.fields["name"].offset : head + frame[1]]
-                times[kind] += 1
-                if kind not in settled and self._look(record.message):
-                    settled.add(kind)
-        for kind, n in times.items():
-            number = int.from_bytes(kind[2:5], "little")
-            self._senders.setdefault(number, Counter())[kind[0], kind[1]] += n
+            for block in blocks(file):
+                if np.isin(block.number, (START, BYTES)).any():
+                    self.ours = True
+                if self.ours:
+                    self._tuned(block)
+                which = np.arange(len(block.number))
+                if self.ours:  # the bridge's own messages are no telemetry
+                    which = which[(block.channel != Channel.SENT) | np.isin(block.number, (RAW, FIELD))]
+                codes = block.number[which] << 16 | block.system[which] << 8 | block.component[which]
+                for code in np.unique(codes).tolist():
+                    number, system, component = code >> 16, code >> 8 & 0xFF, code & 0xFF
+                    of_kind = which[codes == code]
+                    self._senders.setdefault(number, Counter())[system, component] += len(of_kind)
+                    if code not in settled and self._look(block, number, of_kind):
+                        settled.add(code)
 
-    def _tuned(self, record: Record) -> None:
+    def _tuned(self, block: Block) -> None:
         """Count how often a station has set what the alignment computes with; the bridge confirms it."""
-        message = record.message
-        name, value = message["param_id"], message["param_value"]
-        if message.id == SET:
-            self._asked[name] = value
-        elif record.channel == Channel.SENT and self._asked.pop(name, None) == value:
-            aligns = name.startswith("MB_") and not name.startswith("MB_R_")  # which are rates of messages
-            self.attrs[CHANGES] = self.attrs.get(CHANGES, 0) + aligns
+        for k in np.flatnonzero(np.isin(block.number, (SET, VALUE))).tolist():
+            message = block.message(k)
+            name, value = message["param_id"], message["param_value"]
+            if message.id == SET:
+                self._asked[name] = value
+            elif block.channel[k] == Channel.SENT and self._asked.pop(name, None) == value:
+                aligns = name.startswith("MB_") and not name.startswith(
+                    "MB_R_"
+                )  # which are rates of messages
+                self.attrs[CHANGES] = self.attrs.get(CHANGES, 0) + aligns
 
-    def _look(self, message: Message) -> bool:
-        """Note what is new in a message; return whether further ones of its kind can add nothing."""
-        number, system = message.id, message.system
-        known = self._known.setdefault(system, {})
+    def _look(self, block: Block, number: int, which: IndexArray) -> bool:
+        """Note what is new in messages of one kind; return whether further ones can add nothing."""
+        system, component = int(block.system[which[0]]), int(block.component[which[0]])
+        if number in TELEMETRY:
+            return self._values((system, component, number), block.payloads(which))
         if number == NAMED.id:
-            letters = NAMED.struct.unpack(message.payload)[-1]
-            self._named.setdefault(system, {})[letters] = message["name"]
-        elif number == COLUMN:
-            if not message["message"]:
-                self.attrs[message["column"]] = message["unit"] or message["scale"]
-            else:
-                with suppress(KeyError, ValueError):  # of a dialect that we do not know
-                    self._declared[message["column"]] = Declared(message)
+            letters = block.payloads(which)[:, NAMED.fields["name"].offset :]
+            for k in np.unique(letters, axis=0, return_index=True)[1].tolist():
+                message = block.message(int(which[k]))
+                self._named.setdefault(system, {})[bytes(letters[k])] = message["name"]
             return False
-        elif number in (START, BYTES):
-            self.ours = True
-        elif number == STEP:
-            self.stepped_us += message["step"]
+        if number in (RAW, FIELD, COLUMN, STEP):
+            known = self._known.setdefault((system, component, number), {})
+            for k in which.tolist():
+                self._declares(block.message(k), known)
+                if number == FIELD:
+                    return True
             return False
-        elif number in (RAW, FIELD):
+        return True
+
+    def _declares(self, message: Message, known: dict[str, str]) -> None:
+        """Note what one of the messages of a bridge, or of :mod:`magbridge.logs`, declares."""
+        number = message.id
+        if number in (RAW, FIELD):
             for column in (sample if number == RAW else correction)(message.payload):
                 if column != "time":
                     known.setdefault(column, UNITS.get(column, ""))
-            return number == FIELD
-        elif number in TELEMETRY:
-            still = self._open.setdefault((number, system), list(TELEMETRY[number]))
-            for value in [one for one in still if not isnan(one.get(message.payload))]:
-                still.remove(value)
-                known.setdefault(value.column, value.unit)
-            return not still
-        return True
+        elif number == STEP:
+            self.stepped_us += message["step"]
+        elif not message["message"]:
+            self.attrs[message["column"]] = message["unit"] or message["scale"]
+        else:
+            with suppress(KeyError, ValueError):  # of a dialect that we do not know
+                self._declared[message["column"]] = Declared(message)
+
+    def _values(self, sender: tuple[int, int, int], payloads: NDArray[np.uint8]) -> bool:
+        """Note which fields of a message have a value; return whether all have."""
+        known = self._known.setdefault(sender, {})
+        still = self._open.setdefault(sender, list(TELEMETRY[sender[2]]))
+        for value in [one for one in still if not np.isnan(one.column_of(payloads)).all()]:
+            still.remove(value)
+            known.setdefault(value.column, value.unit)
+        return not still
 
 
 @lru_cache(maxsize=64)

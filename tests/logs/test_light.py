@@ -37,7 +37,7 @@ def test_slocum_leaves_the_home_alone(tmp_path: Path) -> None:
         (".ulg", "pyulog", "formats"),
         (".dbd", "dbdreader", "formats"),
         (".nc", "netCDF4", "analysis"),
-        (".bin", "pymavlink", "analysis"),
+        (".mcap", "rosbags", "ros"),
     ],
 )
 def test_a_missing_extra_is_named(suffix: str, package: str, extra: str, tmp_path: Path) -> None:

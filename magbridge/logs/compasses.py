@@ -1,0 +1,135 @@
+"""The compasses of a log: which there are, what the log says of each, and which is read as ``mag_x``.
+
+A log tells which compass was in use by the vehicle's settings and by its state: the one that the estimator
+names, that is enabled and healthy. Unless the user asks for another, this one becomes ``mag_x``, ``mag_y``,
+``mag_z``; the others keep their number, as in ``mag2_x`` of the second.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from magbridge.errors import FormatError
+
+__all__ = ["HEALTHY", "Compass", "choose", "compasses_of", "listed", "said"]
+
+HEALTHY = 0.5
+"""Least share of its samples in which a compass in use is healthy."""
+ATTRIBUTE = "compasses"
+
+
+class Compass(msgspec.Struct, frozen=True, omit_defaults=True):
+    """One compass of a log.
+
+    Attributes
+    ----------
+    number : int
+        From 0, as the log counts; the option ``--compass`` takes it.
+    samples : int
+    rate : float
+        Hz, the median.
+    id : str
+        The device's id or topic; the option takes it, too. Empty where the log does not say.
+    enabled : bool or None
+        Whether the vehicle's settings allow its use; None where the log does not say.
+    healthy : float or None
+        Share of its samples that the vehicle found healthy.
+    priority : int or None
+        The vehicle's own: of ArduPilot 1 is the first, of PX4 100 the highest.
+    in_use : bool
+        The log says that the vehicle used this one.
+    chosen : bool
+        It is ``mag_x`` of the deployment.
+    """
+
+    number: int
+    samples: int
+    rate: float
+    id: str = ""
+    enabled: bool | None = None
+    healthy: float | None = None
+    priority: int | None = None
+    in_use: bool = False
+    chosen: bool = False
+
+    @property
+    def fit(self) -> bool:
+        """Whether nothing in the log speaks against its use."""
+        return self.enabled is not False and (self.healthy is None or self.healthy >= HEALTHY)
+
+    @property
+    def words(self) -> str:
+        """What is known of it, in a few words."""
+        facts = [f"id {self.id}"] if self.id else []
+        facts.append(f"{self.rate:.3g} Hz, {self.samples} samples")
+        facts += ["disabled"] if self.enabled is False else []
+        facts += [f"healthy in {self.healthy:.0%}"] if self.healthy is not None and self.healthy < 1 else []
+        facts += [f"priority {self.priority}"] if self.priority is not None else []
+        facts += ["in use"] if self.in_use else []
+        return f"compass {self.number}: {', '.join(facts)}"
+
+
+def rate(time: Sequence[float] | np.ndarray[Any, Any]) -> float:
+    """Return the median rate, Hz, of times in s; 0 of fewer than two."""
+    steps = np.diff(np.asarray(time, dtype=np.float64))
+    steps = steps[steps > 0]
+    return float(1 / np.median(steps)) if len(steps) else 0.0
+
+
+def choose(path: Path, found: Sequence[Compass], wanted: str | None) -> list[Compass]:
+    """Return the compasses with one marked as chosen.
+
+    Parameters
+    ----------
+    path : path
+        Named in the error.
+    found : sequence of Compass
+        At least one.
+    wanted : str or None
+        A number or an id; None: the one in use, else the first that is enabled and healthy.
+
+    Raises
+    ------
+    FormatError
+        There is no compass of that number or id.
+    """
+    if wanted is None:
+        best = min(found, key=lambda one: (not one.fit, not one.in_use, one.number))
+    else:
+        named = [one for one in found if wanted in (str(one.number), one.id)]
+        if not named:
+            there = "; ".join(one.words for one in found)
+            raise FormatError(path, f"expected a compass {wanted!r}; there are: {there}")
+        best = named[0]
+    return [msgspec.structs.replace(one, chosen=one is best) for one in found]
+
+
+def said(found: Sequence[Compass], wanted: str | None) -> list[str]:
+    """Return what a user should be told of the choice: that there was one, and what speaks against it."""
+    best = next(one for one in found if one.chosen)
+    words = []
+    if wanted is None and len(found) > 1:
+        others = ", ".join(one.words for one in found if one is not best)
+        words.append(f"{best.words} is read, of {len(found)} (--compass chooses another): {others}")
+    if not best.fit:
+        words.append(f"{best.words}: the log says that it was not fit for use")
+    return words
+
+
+def listed(found: Sequence[Compass]) -> dict[str, str]:
+    """Return the attribute of a deployment that holds its compasses; none where there is only one unnamed."""
+    return {ATTRIBUTE: msgspec.json.encode(found).decode()}
+
+
+def compasses_of(attrs: Mapping[Any, Any]) -> list[Compass]:
+    """Return the compasses that the attributes of a deployment list; none where they do not.
+
+    A log of several boots lists those of its first.
+    """
+    text = attrs.get(ATTRIBUTE)
+    return msgspec.json.decode(text, type=list[Compass]) if isinstance(text, str) else []

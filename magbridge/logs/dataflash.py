@@ -1,0 +1,258 @@
+"""ArduPilot's binary log as columns, read by numpy from the log's own format (``FMT``) records.
+
+A record is the bytes A3 95, the number of its kind, and that kind's fields, as an ``FMT`` record of the
+log describes them: there is neither a length nor a checksum. So a record is believed where it joins another:
+where it begins right after one that is believed, or another header follows right after its end. What joins
+nothing is damage, and its bytes are counted. A record whose end lies beyond the beginning of a chain was cut
+short, and is damage too: its last fields are the next record's bytes.
+
+Only the kinds that are asked for are decoded. Which records there are is found in a few passes over all bytes
+at once; Python steps only from one place to the next where the chain does not go on with the next header.
+
+References
+----------
+ArduPilot, "Logs (for developers)", https://ardupilot.org/dev/docs/code-overview-adding-a-new-log-message.html
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections.abc import Collection, Iterator, Mapping
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magbridge.arrays import FloatArray, IndexArray
+
+__all__ = ["OWN_SCALE", "Flash", "Records", "number_of", "read_binary"]
+
+Bytes = NDArray[np.uint8]
+
+FMT = 128
+HEAD = 3
+PASS = 1 << 24
+"""Bytes in which headers are searched at once."""
+LETTERS = {
+    "b": "i1",
+    "B": "u1",
+    "M": "u1",
+    "h": "<i2",
+    "H": "<u2",
+    "i": "<i4",
+    "I": "<u4",
+    "q": "<i8",
+    "Q": "<u8",
+    "g": "<f2",
+    "f": "<f4",
+    "d": "<f8",
+    "n": "S4",
+    "N": "S16",
+    "Z": "S64",
+    "a": "V64",
+    "c": "<i2",
+    "C": "<u2",
+    "e": "<i4",
+    "E": "<u4",
+    "L": "<i4",
+}
+OWN_SCALE = {"c": 100.0, "C": 100.0, "e": 100.0, "E": 100.0, "L": 1e7}
+"""Letters of fields that hold the value times this."""
+LAYOUT = np.dtype([("", "u1", HEAD), *zip(("type", "length", "name", "letters", "columns"),
+                                           ("u1", "u1", "S4", "S16", "S64"), strict=True)])  # fmt: skip
+
+
+class Records(NamedTuple):
+    """The records of one kind.
+
+    Attributes
+    ----------
+    at : (n,) array of int
+        Where each stands in the file, increasing: its byte, or its line.
+    fields : dict of str to (n,) array of float
+        In the unit of the field.
+    texts : dict of str to list of str
+        The fields of letters.
+    """
+
+    at: IndexArray
+    fields: dict[str, FloatArray]
+    texts: dict[str, list[str]]
+
+
+class Flash(NamedTuple):
+    """What was read of a log.
+
+    Attributes
+    ----------
+    records : dict of str to Records
+        By the name of the kind.
+    letters : dict of (str, str) to str
+        Kind and field to the letter of its type.
+    skipped : int
+        Bytes, or lines, that belonged to no record.
+    """
+
+    records: dict[str, Records]
+    letters: dict[tuple[str, str], str]
+    skipped: int
+
+
+class _Kind(NamedTuple):
+    """A kind of record, as an ``FMT`` record at byte `at` describes it."""
+
+    at: int
+    number: int
+    length: int
+    name: str
+    letters: str
+    columns: tuple[str, ...]
+
+
+def read_binary(path: Path, wanted: Mapping[str, Collection[str]]) -> Flash:
+    """Return the records of the `wanted` kinds, and of each the wanted fields."""
+    data = np.memmap(path, dtype=np.uint8, mode="r")
+    headers = _headers(data)
+    kinds = _kinds(data, headers)
+    lengths = _lengths(data, headers, kinds)
+    headers, lengths = headers[lengths > 0], lengths[lengths > 0]
+    believed = _chained(headers, headers + lengths, data.size)
+    at = headers[believed]
+    numbers = data[at + 2]
+    records: dict[str, Records] = {}
+    letters: dict[tuple[str, str], str] = {}
+    for kind, first, last in _spans(kinds):
+        if kind.name not in wanted:
+            continue
+        here = at[numbers == kind.number]
+        here = here[slice(*np.searchsorted(here, (first, last)))]
+        if len(here):
+            fields = zip(kind.columns, kind.letters, strict=False)
+            letters |= {(kind.name, name): letter for name, letter in fields}
+            found = _decoded(data, kind, here, wanted[kind.name])
+            before = records.get(kind.name)
+            records[kind.name] = found if before is None else _joined(before, found)
+    return Flash(records, letters, int(data.size - lengths[believed].sum()))
+
+
+def _headers(data: Bytes) -> IndexArray:
+    """Return where the bytes A3 95 stand, with at least one more after them."""
+    found = [
+        start + np.flatnonzero((data[start:stop] == 0xA3) & (data[start + 1 : stop + 1] == 0x95))
+        for start in range(0, data.size - 2, PASS)
+        for stop in [min(start + PASS, data.size - 2)]
+    ]
+    return np.concatenate(found) if found else np.empty(0, dtype=np.intp)
+
+
+def _kinds(data: Bytes, headers: IndexArray) -> list[_Kind]:
+    """Return what the log describes, in the order of the file; what contradicts itself is left out."""
+    at = headers[(headers <= data.size - LAYOUT.itemsize)]
+    at = at[data[at + 2] == FMT]
+    kinds = []
+    for start, one in zip(at, _gather(data, at, LAYOUT), strict=True):
+        name, letters, columns = (one[field].decode("latin-1") for field in ("name", "letters", "columns"))
+        known = all(letter in LETTERS for letter in letters)
+        size = (
+            HEAD + sum(np.dtype(LETTERS[letter]).itemsize for letter in letters) if known else one["length"]
+        )
+        if size == one["length"] > HEAD and name.isalnum():
+            kinds.append(
+                _Kind(int(start), int(one["type"]), int(size), name, letters, tuple(columns.split(",")))
+            )
+    return kinds
+
+
+def _spans(kinds: list[_Kind]) -> Iterator[tuple[_Kind, int, int]]:
+    """Yield each description with the bytes of the file between which it holds: to that of another layout."""
+    for number in sorted({kind.number for kind in kinds}):
+        mine = [kind for kind in kinds if kind.number == number]
+        new = [mine[0], *(b for a, b in pairwise(mine) if a[2:] != b[2:])]
+        starts = [0, *(kind.at for kind in new[1:]), np.iinfo(np.intp).max]
+        yield from zip(new, starts, starts[1:], strict=False)
+
+
+def _lengths(data: Bytes, headers: IndexArray, kinds: list[_Kind]) -> IndexArray:
+    """Return the length of the record that each header begins; 0 where its kind is not described."""
+    numbers = data[headers + 2]
+    spans = list(_spans(kinds))
+    table = np.zeros(256, dtype=np.intp)
+    for kind, first, _ in spans:
+        if not first:
+            table[kind.number] = kind.length
+    lengths = table[numbers]
+    for kind, first, _ in spans:
+        if first:  # described anew, as after a boot with other firmware
+            lengths[(numbers == kind.number) & (headers >= first)] = kind.length
+    return lengths
+
+
+def _chained(starts: IndexArray, ends: IndexArray, size: int) -> IndexArray:
+    """Return which of the records that may begin at `starts` are believed, as indices."""
+    n = len(starts)
+    if not n:
+        return np.empty(0, dtype=np.intp)
+    joins = np.append(ends[:-1] == starts[1:], False)
+    breaks = np.flatnonzero(~joins)
+    after = np.searchsorted(starts, ends[breaks])  # the first header not inside
+    meets = np.append(starts, -1)[after] == ends[breaks]
+    joins[breaks] = meets | (ends[breaks] == size)
+    joined, at_breaks = np.flatnonzero(joins).tolist(), breaks.tolist()
+    found, k, linked = [], 0, False
+    while k < n:
+        if not linked:
+            later = bisect_left(joined, k)
+            if later == len(joined):
+                break
+            k = joined[later]
+        b = bisect_left(at_breaks, k)
+        last = at_breaks[b]
+        found.append((k, last))
+        linked = bool(meets[b])
+        following = int(after[b])
+        if not joins[last]:  # what follows is no header: damage after this record, or in it
+            inside = bisect_left(joined, last + 1)
+            cut = inside < len(joined) and joined[inside] < following
+            if cut or ends[last] > size:
+                found[-1] = (k, last - 1)
+            following = joined[inside] if cut else following
+        k = following
+    return np.concatenate([np.arange(first, last + 1) for first, last in found])
+
+
+def _gather(data: Bytes, at: IndexArray, layout: np.dtype[Any], offset: int = 0) -> NDArray[Any]:
+    """Return what stands `offset` bytes after each of `at`, read as `layout`."""
+    taken = data[at[:, None] + np.arange(offset, offset + layout.itemsize)]
+    return taken.view(layout)[:, 0] if len(at) else np.empty(0, layout)
+
+
+def _decoded(data: Bytes, kind: _Kind, at: IndexArray, wanted: Collection[str]) -> Records:
+    fields, texts, offset = {}, {}, HEAD
+    for name, letter in zip(kind.columns, kind.letters, strict=False):
+        layout = np.dtype(LETTERS.get(letter, "V1"))
+        if name in wanted and layout.kind in "iuf":
+            fields[name] = _gather(data, at, layout, offset).astype(np.float64) / OWN_SCALE.get(letter, 1.0)
+        elif name in wanted and layout.kind == "S":
+            texts[name] = [text.decode("latin-1") for text in _gather(data, at, layout, offset)]
+        offset += layout.itemsize
+    return Records(at, fields, texts)
+
+
+def _joined(first: Records, second: Records) -> Records:
+    """Return the records of a kind that was described anew, as one: the fields that both have."""
+    return Records(
+        np.concatenate([first.at, second.at]),
+        {name: np.concatenate([first.fields[name], second.fields[name]])
+         for name in first.fields if name in second.fields},
+        {name: first.texts[name] + second.texts[name] for name in first.texts if name in second.texts},
+    )  # fmt: skip
+
+
+def number_of(text: str) -> float:
+    """Return the number that a text is; NaN where it is none."""
+    try:
+        return float(text)
+    except ValueError:
+        return float("nan")

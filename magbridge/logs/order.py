@@ -1,0 +1,78 @@
+"""Times in the order in which they were written: which rows to leave out, and where a clock began anew."""
+
+from __future__ import annotations
+
+from bisect import bisect_left, bisect_right
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magbridge.arrays import FloatArray, IndexArray
+
+__all__ = ["boots", "in_order"]
+
+BACK = 1.0
+"""s by which times are set back where a vehicle was switched on again: records of one moment, which tasks of
+their own write, differ by less."""
+AROUND = 5
+"""Times before and after, whose median is compared: fewer than half of them may be damaged."""
+
+
+def in_order(time: FloatArray, *, strictly: bool = True) -> NDArray[np.bool_]:
+    """Return which rows to keep so that time increases and the fewest are left out.
+
+    A single time that is ahead costs its own row, and not all that follow; so does one set back.
+
+    Parameters
+    ----------
+    time : (n,) array of float
+        s, in the order of the file; NaN is never kept.
+    strictly : bool
+        Of several rows with one time, only one is kept.
+
+    Returns
+    -------
+    (n,) array of bool
+
+    Notes
+    -----
+    The longest increasing subsequence, by patience sorting: C. Schensted (1961), Canad. J. Math. 13, 179.
+    """
+    known = np.isfinite(time)
+    steps = np.diff(time[known])
+    if (steps > 0 if strictly else steps >= 0).all():
+        return known
+    rows, place = np.flatnonzero(known).tolist(), bisect_left if strictly else bisect_right
+    ends: list[float] = []  # ends[k]: the least last time of an increasing sequence of k + 1
+    last: list[int] = []
+    before: list[int] = [-1] * len(time)
+    for row, one in zip(rows, time[known].tolist(), strict=True):
+        k = place(ends, one)
+        if k == len(ends):
+            ends.append(one)
+            last.append(row)
+        else:
+            ends[k], last[k] = one, row
+        before[row] = last[k - 1] if k else -1
+    keep = np.zeros(len(time), dtype=bool)
+    row = last[-1] if last else -1
+    while row >= 0:
+        keep[row] = True
+        row = before[row]
+    return keep
+
+
+def boots(time: FloatArray) -> IndexArray:
+    """Return the rows at which the clock began anew, the first row included.
+
+    Parameters
+    ----------
+    time : (n,) array of float
+        s since the boot, in the order of the file.
+    """
+    found = [0]
+    for k in (1 + np.flatnonzero(np.diff(time) < -BACK)).tolist():
+        before, after = time[max(found[-1], k - AROUND) : k], time[k : k + AROUND]
+        if np.median(after) < np.median(before) - BACK:
+            found.append(k)
+    return np.array(found, dtype=np.intp)

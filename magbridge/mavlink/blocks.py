@@ -1,0 +1,160 @@
+"""The records of a telemetry log as arrays: many at once, for whoever reads logs ashore.
+
+The same records as :class:`~magbridge.mavlink.tlog.LogReader` finds, by the same rules: every place where a
+record may begin is tried at once, and of those with a right checksum the first that begins after the last is
+taken.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections.abc import Iterator
+from typing import BinaryIO, NamedTuple
+
+import numpy as np
+from fastcrc.crc16 import mcrf4xx
+from numpy.typing import NDArray
+
+from magbridge.arrays import IndexArray
+from magbridge.mavlink.framing import AFTER, EXTRA, LAST, SIGNATURE, V1, V2
+from magbridge.mavlink.messages import Message, spec
+from magbridge.mavlink.tlog import LATEST
+
+__all__ = ["Block", "blocks"]
+
+SIZE = 1 << 22
+"""Bytes read at a time."""
+LONGEST = 8 + 10 + 255 + 2 + SIGNATURE + 9
+"""Bytes of the longest record, and of what shows that another follows."""
+CLOSE = np.array(AFTER, dtype=np.int64)
+LAYOUT = np.dtype([("stamp", ">u8"), ("head", "u1", 10)])
+KNOWN = np.full(1 << 16, -1, dtype=np.int64)
+KNOWN[[number for number in EXTRA if number < len(KNOWN)]] = [EXTRA[n] for n in EXTRA if n < len(KNOWN)]
+"""CRC_EXTRA of each message in the dialect, -1 of the others."""
+
+
+class Block(NamedTuple):
+    """Records that follow each other.
+
+    Attributes
+    ----------
+    data : bytes
+    time_us, channel, number, system, component : (n,) array of int
+        The stamp and its low two bits, the message's id, and its sender.
+    frame, payload, end : (n,) array of int
+        Where in `data` the frame and the payload begin, and where the payload ends.
+    bytes_skipped, damages : int
+        Bytes between them that belong to no record, and the places.
+    """
+
+    data: bytes
+    time_us: IndexArray
+    channel: IndexArray
+    number: IndexArray
+    system: IndexArray
+    component: IndexArray
+    frame: IndexArray
+    payload: IndexArray
+    end: IndexArray
+    bytes_skipped: int
+    damages: int
+
+    def payloads(self, which: IndexArray) -> NDArray[np.uint8]:
+        """Return the payloads (n, size) of records of one message, with the zeros that were cut off."""
+        size = spec(int(self.number[which[0]])).size
+        start, length = self.payload[which], self.end[which] - self.payload[which]
+        at = np.arange(size)
+        raw = np.frombuffer(self.data, np.uint8)
+        taken: NDArray[np.uint8] = raw[np.minimum(start[:, None] + at, len(raw) - 1)]
+        taken[at >= length[:, None]] = 0
+        return taken
+
+    def message(self, k: int) -> Message:
+        """Return one record's message."""
+        number, start, end = int(self.number[k]), int(self.payload[k]), int(self.end[k])
+        payload = self.data[start:end].ljust(spec(number).size, b"\0")
+        return Message(number, int(self.system[k]), int(self.component[k]), 0, payload, b"", known=True)
+
+
+def blocks(file: BinaryIO) -> Iterator[Block]:
+    """Yield the records of a log."""
+    data, broken, last = b"", False, False
+    while not last:
+        chunk = file.read(SIZE)
+        last = not chunk
+        data += chunk
+        block, at, broken = _block(data, broken, last=last)
+        yield block
+        data = data[at:]
+
+
+def _block(data: bytes, broken: bool, *, last: bool) -> tuple[Block, int, bool]:
+    """Return the records in `data`, where those that cannot be told yet begin, and whether that is damage."""
+    stop = len(data) if last else max(len(data) - LONGEST, 0)
+    start, found = _candidates(data, stop)
+    ends = found.pop("stop")
+    taken, at, skipped, damages = [], 0, 0, 0
+    # where each record is followed by another, they are taken all at once
+    joins = np.append(start[1:] == ends[:-1], False)
+    breaks, starts = np.flatnonzero(~joins).tolist(), start.tolist()
+    k = 0
+    while k < len(starts):
+        gap = starts[k] - at
+        damages += gap > 0 and not broken
+        skipped, broken = skipped + gap, False
+        b = breaks[bisect_left(breaks, k)]
+        taken.append((k, b + 1))
+        at = int(ends[b])
+        k = bisect_left(starts, at, b + 1)
+    if at < stop:  # nothing begins here
+        damages += not broken
+        skipped, broken, at = skipped + stop - at, True, stop
+    which = np.concatenate([np.arange(*one) for one in taken]) if taken else np.empty(0, dtype=np.int64)
+    fields = {name: values[which] for name, values in found.items()}
+    return Block(data=data, **fields, bytes_skipped=skipped, damages=damages), at, broken
+
+
+def _candidates(data: bytes, stop: int) -> tuple[IndexArray, dict[str, IndexArray]]:
+    """Return where records begin whose frames are right, and what they are; some lie within others."""
+    raw = np.frombuffer(data, np.uint8)
+    # a stamp before 2112 has twelve bits of zeros
+    n = max(min(stop, len(raw) - 16), 0)
+    magic = raw[8 : 8 + n]
+    start = np.flatnonzero(((magic == V2) | (magic == V1)) & (raw[:n] == 0) & (raw[1 : n + 1] < 0x10))
+    window = raw[np.minimum(start[:, None] + np.arange(LAYOUT.itemsize), len(raw) - 1)]
+    records = window.view(LAYOUT)[:, 0] if len(start) else np.empty(0, LAYOUT)
+    stamp, head = records["stamp"].astype(np.int64), records["head"].astype(np.int64)
+    two = head[:, 0] == V2
+    flags = np.where(two, head[:, 2], 0)
+    number = np.where(two, head[:, 7] | head[:, 8] << 8 | head[:, 9] << 16, head[:, 5])
+    system, component = np.where(two, head[:, 5], head[:, 3]), np.where(two, head[:, 6], head[:, 4])
+    frame = start + 8
+    payload = frame + np.where(two, 10, 6)
+    checksum = payload + head[:, 1]
+    end = checksum + 2 + np.where(flags > 0, SIGNATURE, 0)
+    extra = np.where(number < len(KNOWN), KNOWN[np.minimum(number, len(KNOWN) - 1)], -1)
+    fits = (flags <= 1) & (end <= len(raw)) & (stamp < LATEST)
+    known = np.flatnonzero(fits & (extra >= 0))
+    spans = zip((frame[known] + 1).tolist(), checksum[known].tolist(), strict=True)
+    crc = np.array([mcrf4xx(data[first:after]) for first, after in spans], dtype=np.int64)
+    closed = crc >> 8 ^ CLOSE[(crc ^ extra[known]) & 0xFF]
+    good = np.zeros(len(start), dtype=bool)
+    good[known] = closed == (
+        raw[checksum[known]].astype(np.int64) | raw[checksum[known] + 1].astype(np.int64) << 8
+    )
+    # outside the dialect: believed where another follows
+    unknown = np.flatnonzero(fits & (extra < 0) & two & (head[:, 3] == 0) & (number <= LAST))
+    after = end[unknown] + 8
+    follows = np.isin(raw[np.minimum(after, len(raw) - 1)], (V1, V2)) & (after < len(raw))
+    good[unknown] = follows | (after >= len(raw))
+    found = {
+        "time_us": stamp & ~3,
+        "channel": stamp & 3,
+        "number": number,
+        "system": system,
+        "component": component,
+        "frame": frame,
+        "payload": payload,
+        "end": checksum,
+    }
+    return start[good], {name: values[good] for name, values in {**found, "stop": end}.items()}

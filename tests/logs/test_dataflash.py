@@ -1,0 +1,152 @@
+"""ArduPilot's records: every field beside pymavlink's reading, and damage that costs only itself."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from flash import KINDS, Log, described
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from pymavlink.DFReader import DFReader_binary, DFReader_text
+
+from magbridge.logs.dataflash import Flash, read_binary
+from magbridge.logs.dataflash_text import read_text
+
+EVERYTHING = {name: set(fields.split(",")) for name, (_, _, fields) in KINDS.items()}
+
+
+def flight(rows: int = 40, seed: int = 0) -> Log:
+    """Return a log with records of every kind, whose fields hold the bytes of headers now and then."""
+    rng, log = np.random.default_rng(seed), Log()
+    for k in range(rows):
+        us = k * 100_000 + 7
+        log.say("PARM", us, f"COMPASS_X{k}", k / 3)
+        log.fix(us, 1.7e9 + us * 1e-6)
+        log.say("ATT", us, *rng.uniform(-180, 180, 4).round(2), *rng.uniform(0, 360, 4).round(2), 3)
+        log.say("BAT", us, k % 2, 16.5, k / 7)
+        log.mag(us, k % 2, rng.integers(-600, 600, 3).tolist(), 1, [0x95A3 - 65536, 14, -27, 1, 2, 3])
+        log.say("IMU", us, 0, *rng.normal(size=6))
+        log.say("BARO", us, 0, 1.5, 101_325.0)
+        log.say("XKFS", us, 0, k % 3, 0, 0, 0)
+    return log
+
+
+def same_as_pymavlink(path: Path, reader: type, ours: Flash) -> int:
+    """Compare every number and text that both have read; return how many records there were."""
+    theirs: dict[str, list[dict[str, object]]] = {}
+    with reader(str(path)) as log:
+        while record := log.recv_msg():
+            theirs.setdefault(record.get_type(), []).append(record.to_dict())
+    for name, records in ours.records.items():
+        for field, values in records.fields.items():
+            expected = np.array([one[field] for one in theirs[name]], dtype=float)
+            np.testing.assert_array_equal(values, expected, err_msg=f"{name}.{field}")
+        for field, texts in records.texts.items():
+            assert texts == [str(one[field]).rstrip("\0") for one in theirs[name]], (name, field)
+    return sum(len(theirs[name]) for name in ours.records)
+
+
+def test_every_field_is_as_pymavlink_reads_it(tmp_path: Path) -> None:
+    path = tmp_path / "log.bin"
+    path.write_bytes(flight().data)
+    ours = read_binary(path, EVERYTHING)
+    assert ours.skipped == 0
+    assert same_as_pymavlink(path, DFReader_binary, ours) == 40 * 8
+
+
+def test_every_field_of_a_text_log_is_as_pymavlink_reads_it(tmp_path: Path) -> None:
+    path = tmp_path / "log.log"
+    path.write_text("\n".join(flight().lines) + "\n")
+    ours = read_text(path, EVERYTHING)
+    assert ours.skipped == 0
+    assert same_as_pymavlink(path, DFReader_text, ours) == 40 * 8
+
+
+@pytest.mark.real
+def test_a_real_log_is_as_pymavlink_reads_it(real_data: Path) -> None:
+    path = real_data / "ardusub" / "small.BIN"
+    wanted: dict[str, set[str]] = {}
+    with DFReader_binary(str(path)) as log:
+        while record := log.recv_msg():
+            wanted.setdefault(record.get_type(), set(record.fmt.columns))
+    ours = read_binary(path, wanted)
+    assert ours.skipped == 0
+    ours.records.pop("DSF", None)
+    assert same_as_pymavlink(path, DFReader_binary, ours) > 5000
+
+
+def test_text_and_bytes_are_the_same_log(tmp_path: Path) -> None:
+    log, binary, text = flight(), tmp_path / "a.bin", tmp_path / "a.log"
+    binary.write_bytes(log.data)
+    text.write_text("\n".join(log.lines))
+    first, second = read_binary(binary, EVERYTHING), read_text(text, EVERYTHING)
+    assert first.records.keys() == second.records.keys()
+    for name, records in first.records.items():
+        assert records.texts == second.records[name].texts
+        for field, values in records.fields.items():
+            np.testing.assert_allclose(values, second.records[name].fields[field], rtol=1e-6, atol=1e-6)
+
+
+@given(at=st.integers(0, 319), junk=st.binary(min_size=1, max_size=300))
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_junk_between_records_costs_no_record(at: int, junk: bytes, tmp_path: Path) -> None:
+    """Its bytes are counted, unless they are records themselves."""
+    log, path = flight(), tmp_path / "log.bin"
+    starts = [place for place in range(len(log.data)) if log.data[place : place + 2] == b"\xa3\x95"]
+    heads = [a for a, b in pairwise([*starts, len(log.data)]) if b > a and log.data[a + 2] in range(10, 18)]
+    at = heads[at % len(heads)]
+    junk = junk.replace(b"\xa3\x95", b"..").rstrip(b"\xa3")
+    path.write_bytes(log.data[:at] + junk + log.data[at:])
+    clean = tmp_path / "clean.bin"
+    clean.write_bytes(log.data)
+    before, after = read_binary(clean, EVERYTHING), read_binary(path, EVERYTHING)
+    # inside a record (its fields hold header bytes) junk cuts that one
+    lost = sum(len(before.records[name].at) - len(after.records[name].at) for name in before.records)
+    assert 0 <= lost <= 1
+    assert after.skipped >= len(junk)
+
+
+def test_a_record_that_was_cut_short_is_not_read(tmp_path: Path) -> None:
+    """Its last fields would be the bytes of the next record: numbers that nobody measured."""
+    log, path = Log(), tmp_path / "log.bin"
+    for k in range(20):
+        log.mag(k * 100_000, 0, (k, 20, -300))
+        if k == 10:
+            log.data = log.data[:-20]
+    path.write_bytes(log.data)
+    mag = read_binary(path, EVERYTHING).records["MAG"]
+    np.testing.assert_array_equal(mag.fields["MagX"], np.delete(np.arange(20), 10))
+    np.testing.assert_array_equal(mag.fields["MagZ"], -300)
+
+
+def test_random_bytes_hold_no_records(tmp_path: Path) -> None:
+    """3 MB of them have about 45 headers, of which some are of known kinds; none joins another."""
+    log, path = flight(), tmp_path / "log.bin"
+    half = len(log.data) - len(log.record("XKFS", 0, 0, 0, 0, 0, 0))
+    junk = np.random.default_rng(1).bytes(3_000_000)
+    path.write_bytes(log.data[:half] + junk + log.data[half:])
+    ours = read_binary(path, EVERYTHING)
+    assert sum(len(one.at) for one in ours.records.values()) <= 40 * 8
+    assert ours.skipped >= len(junk)
+
+
+def test_a_kind_that_is_described_anew(tmp_path: Path) -> None:
+    """As after a boot with other firmware: each record is read as the description before it says."""
+    first, second = Log(), Log({**KINDS, "BARO": (16, "QBffH", "TimeUS,I,Alt,Press,More")})
+    for log, alt in ((first, 1.0), (second, 2.0)):
+        for k in range(5):
+            log.say("BARO", k, 0, alt, 1e5, *([7] if log is second else []))
+    path = tmp_path / "log.bin"
+    path.write_bytes(first.data + second.data)
+    ours = read_binary(path, EVERYTHING)
+    assert ours.skipped == 0
+    np.testing.assert_array_equal(ours.records["BARO"].fields["Alt"], [1.0] * 5 + [2.0] * 5)
+
+
+def test_a_description_that_contradicts_itself_is_not_believed(tmp_path: Path) -> None:
+    log, path = flight(), tmp_path / "log.bin"
+    path.write_bytes(described(14, 9, "MAG", "Q", "TimeUS") + log.data)
+    assert len(read_binary(path, EVERYTHING).records["MAG"].at) == 40

@@ -1,0 +1,222 @@
+"""Logs of drones that once were read wrong without a word, or refused for a little, and what is right."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from flash import Log
+
+from magbridge import logs
+from magbridge.errors import FormatError
+from magbridge.logs.compasses import compasses_of
+from magbridge.logs.deployment import noted, passed_over
+from magbridge.logs.options import Options
+
+UTC = 1_700_000_000
+
+
+def flight(
+    rows: int = 30,
+    start: int = 5,
+    boot: float = UTC,
+    *,
+    gps: bool = True,
+    compasses: int = 1,
+    log: Log | None = None,
+) -> Log:
+    """Return a log with 30 rows, one each 0.1 s; its boot is at `boot` (s since 1970)."""
+    log = log or Log()
+    for k in range(30):
+        us = start * 1_000_000 + k * 100_000
+        if gps and k % 5 == 0:
+            log.fix(us, boot + us * 1e-6)
+        log.say("ATT", us, 0, 1.0, 0, -5.0, 0, float(k), 0, 0, 3)
+        log.say("BAT", us, 0, 16.0, 0.1 * k)
+        for number in range(compasses):
+            log.mag(us, number, (100 + k, 200 * (1 + number), -300), 1, [7, 0, 0, 0, 0, 50])
+    return log
+
+
+def write(tmp_path: Path, log: Log, name: str = "log.bin") -> Path:
+    path = tmp_path / name
+    path.write_bytes(log.data)
+    return path
+
+
+@pytest.mark.parametrize("compensation", ["MO", "MOfs"])
+def test_the_motors_share_is_taken_off_by_either_name(compensation: str, tmp_path: Path) -> None:
+    """Up to ArduPilot 4.0 it is MOfsX."""
+    fields = ",".join(
+        ["TimeUS", *(f"{what}{axis}" for what in ("Mag", "Ofs", compensation) for axis in "XYZ")]
+    )
+    log = Log({"MAG": (14, "Qhhhhhhhhh", fields)})
+    for k in range(5):
+        log.say("MAG", k * 100_000, 100 + 3 * k, 200, -300, 10, 20, 30, 3 * k, 0, -5)
+    back = logs.read(write(tmp_path, log))
+    np.testing.assert_array_equal(back["mag_x"], 9_000.0)
+    np.testing.assert_array_equal(back["mag_z"], -32_500.0)
+
+
+def test_the_soft_iron_matrix_is_undone(tmp_path: Path) -> None:
+    """MAG = D (raw + Ofs) + MO, with D of COMPASS_DIA and COMPASS_ODI."""
+    log = Log()
+    matrix = np.array([[1.1, 0.05, -0.02], [0.05, 0.9, 0.03], [-0.02, 0.03, 1.05]])
+    for name, value in zip(
+        ("DIA_X", "DIA_Y", "DIA_Z", "ODI_X", "ODI_Y", "ODI_Z"),
+        (1.1, 0.9, 1.05, 0.05, -0.02, 0.03),
+        strict=True,
+    ):
+        log.say("PARM", 0, f"COMPASS_{name}", value)
+    raw = np.random.default_rng(0).uniform(-400, 400, (50, 3))
+    for k, one in enumerate(raw):
+        field = matrix @ (one + np.array([20, -30, 40])) + np.array([5, 0, -5])
+        log.mag(k * 100_000, 0, field.round().astype(int).tolist(), 1, [20, -30, 40, 5, 0, -5])
+    back = logs.read(write(tmp_path, log))
+    found = np.stack([back[f"mag_{axis}"] for axis in "xyz"], axis=1)
+    np.testing.assert_allclose(found, 100 * raw, rtol=0, atol=100)  # mG are whole
+
+
+def test_the_compass_that_flew_is_read(tmp_path: Path) -> None:
+    """The first is disabled and unhealthy; the third is another."""
+    log = Log()
+    for name, value in (("USE", 0.0), ("USE2", 1.0), ("USE3", 1.0), ("DEV_ID2", 97539.0)):
+        log.say("PARM", 0, f"COMPASS_{name}", value)
+    for k in range(20):
+        for number in range(3):
+            log.mag(k * 100_000, number, (number, 0, 0), health=number)
+    path = write(tmp_path, log)
+    back = logs.read(path)
+    assert (back["mag_x"] == 100).all()
+    assert {"mag1_x", "mag3_x"} <= set(back.data_vars)
+    found = compasses_of(back.attrs)
+    assert [one.chosen for one in found] == [False, True, False]
+    assert [one.enabled for one in found] == [False, True, True]
+    assert [one.healthy for one in found] == [0, 1, 1]
+    assert [one.id for one in found] == ["", "97539", ""]
+    assert "compass 1" in noted(back.attrs)[0]
+    assert (logs.read(path, options=Options(compass="2"))["mag_x"] == 200).all()
+    assert (logs.read(path, options=Options(compass="97539"))["mag_x"] == 100).all()
+    with pytest.raises(FormatError, match=r"expected a compass '7'; there are: compass 0: .*disabled"):
+        logs.read(path, options=Options(compass="7"))
+
+
+def test_the_estimators_word_goes_before_the_number(tmp_path: Path) -> None:
+    log = Log()
+    for k in range(9):
+        log.say("XKFS", 4_900_000 + k, 0, int(k > 2), 0, 0, 0)
+    back = logs.read(write(tmp_path, flight(compasses=2, log=log)))
+    assert (back["mag_y"] == 40_000).all()
+
+
+def test_one_damaged_fix_does_not_date_a_log(tmp_path: Path) -> None:
+    log = Log()
+    log.fix(5_000_000, 1_000_000_000)
+    back = logs.read(write(tmp_path, flight(log=log)))
+    np.testing.assert_allclose(back["time"], UTC + 5 + 0.1 * np.arange(30), rtol=0, atol=1e-3)
+
+
+def test_one_damaged_time_costs_its_row(tmp_path: Path) -> None:
+    log = flight()
+    log.mag(1 << 50, 0, (1, 2, 3))
+    log.say("BAT", 1 << 51, 0, 99.0, 99.0)
+    back = logs.read(write(tmp_path, flight(start=8, log=log)))
+    assert back.sizes["time"] == 60
+    assert passed_over(back.attrs) == {"rows_dropped": 1}
+    np.testing.assert_allclose(back["battery_voltage"], 16.0)
+
+
+def test_two_boots_are_two_runs(tmp_path: Path) -> None:
+    log = flight(log=flight(), boot=UTC + 900)
+    path = write(tmp_path, log)
+    back = logs.read(path)
+    expected = np.concatenate([UTC + 5 + 0.1 * np.arange(30), UTC + 905 + 0.1 * np.arange(30)])
+    np.testing.assert_allclose(back["time"], expected, rtol=0, atol=1e-3)
+    assert len(logs.read_each(path)) == 2
+    assert not passed_over(back.attrs)
+    columns = {tuple(piece.data_vars) for piece in logs.read_chunks(path, 7)}
+    assert len(columns) == 1
+
+
+def test_a_boot_without_gps_is_left_out_and_counted(tmp_path: Path) -> None:
+    back = logs.read(write(tmp_path, flight(log=flight(), gps=False)))
+    assert back.sizes["time"] == 30
+    assert passed_over(back.attrs) == {"rows_dropped": 30}
+    assert "no date" in " ".join(noted(back.attrs))
+
+
+def test_boots_without_any_date_follow_each_other(tmp_path: Path) -> None:
+    back = logs.read(write(tmp_path, flight(log=flight(gps=False), gps=False)))
+    assert back.sizes["time"] == 60
+    assert back.attrs["time_reference"] == "boot"
+    assert float(np.diff(back["time"]).max()) == pytest.approx(60)
+
+
+def test_units_that_the_log_declares(tmp_path: Path) -> None:
+    """The pressure is in hPa: declared as Pa, with a multiplier of 100."""
+    log = Log()
+    for letter, label in (("P", "Pa"), ("m", "m"), ("s", "s")):
+        log.say("UNIT", 0, ord(letter), label)
+    for letter, factor in (("-", 0.0), ("2", 100.0), ("0", 1.0)):
+        log.say("MULT", 0, ord(letter), factor)
+    log.say("FMTU", 0, 16, "s-mP", "--02")
+    back = logs.read(write(tmp_path, flight(log=_with_baro(log))))
+    np.testing.assert_allclose(back["pressure"], 1013.0)
+    np.testing.assert_allclose(back["depth"], 3.0)
+
+
+def _with_baro(log: Log) -> Log:
+    log.say("BARO", 4_900_000, 0, -3.0, 1013.0)
+    return log
+
+
+@pytest.mark.parametrize("name", ["log.bin", "log.log", "log.tlog"])
+def test_a_log_is_what_its_bytes_say(name: str, tmp_path: Path) -> None:
+    log = flight()
+    path = tmp_path / name
+    path.write_bytes(log.data)
+    binary = logs.read(path)
+    path.write_text("\n".join(log.lines) + "\nno record\n")
+    text = logs.read(path)
+    assert passed_over(text.attrs) == {"lines_skipped": 1}
+    for column in binary.data_vars:
+        np.testing.assert_allclose(text[column], binary[column], rtol=1e-6, err_msg=str(column))
+
+
+CASES = {
+    # file of the collection: rows, first time, counts
+    "first_compass_unhealthy.BIN": (300, 1646824782.0, {}),
+    "first_gps_time.BIN": (600, 1646824782.0, {}),
+    "motor_compensation_old_names.BIN": (600, 1646824782.0, {}),
+    "no_gps_position_known.BIN": (600, 5.0, {}),
+    "one_mag_time.BIN": (599, 1646824782.0, {"rows_dropped": 1}),
+    "two_boots.BIN": (400, 1646824782.0, {}),
+    "ardupilot_text.log": (60, 1.0, {}),
+    "first_compass_disabled.ulg": (300, 1650000002.0, {}),
+    "magnetic_field_bag": (300, 1700000000.0, {}),
+    "clock_ahead_once.tlog": (199, 1700000000.05, {"rows_dropped": 1}),
+    "gimbal_attitude.tlog": (200, 1700000000.05, {}),
+    "named_value_heading.tlog": (150, 1700000000.05, {}),
+    "raw_imu_temperature_0.tlog": (100, 1700000000.05, {}),
+}
+
+
+@pytest.mark.real
+@pytest.mark.parametrize("name", CASES)
+def test_a_case(name: str, real_data: Path) -> None:
+    """The collection's own files, where they are beside the measured data."""
+    path = real_data.parent / "cases" / "logs" / name
+    if not path.exists():
+        pytest.skip(f"no {name} beside the measured data")
+    rows, start, counts = CASES[name]
+    back = logs.read(path)
+    assert back.sizes["time"] == rows
+    assert passed_over(back.attrs) == counts
+    assert float(back["time"][0]) == pytest.approx(start, abs=0.2)
+    assert ("time_reference" in back.attrs) == (start < 100)
+    assert "imu_temperature" not in back
+    if "pitch" in back:
+        assert float(abs(back["pitch"]).max()) < 40
+    length = np.linalg.norm([back[f"mag_{axis}"] for axis in "xyz"], axis=0)
+    assert 20_000 < np.median(length) < 70_000
