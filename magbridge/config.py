@@ -111,7 +111,8 @@ class Telemetry(Table, frozen=True):
     """``[telemetry.NAME]``: a field of a message that becomes the parameter NAME.
 
     ``value = scale * message.field + offset``. `field` may carry an index, ``actuator[2]``. `match` holds
-    values that other fields of the message must have. `max_age` is in s; an older value is stale.
+    values that other fields of the message must have. `max_age` is in s; an older value is stale. Only what
+    `component` sends counts; without it, the autopilot's, else what the first sends that is heard.
     """
 
     message: str
@@ -121,6 +122,7 @@ class Telemetry(Table, frozen=True):
     offset: float = 0.0
     unit: str = ""
     max_age: Positive = 30.0
+    component: SystemId | None = None
 
     def __post_init__(self) -> None:
         if not 0.0 < abs(self.scale) < inf:

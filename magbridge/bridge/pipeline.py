@@ -20,6 +20,7 @@ from magbridge.columns import may_be
 from magbridge.config import Align, Config
 from magbridge.correction import TEMPERATURE, Correction
 from magbridge.errors import ConfigError
+from magbridge.link.authority import Sources
 from magbridge.link.component import Component, check_publish
 from magbridge.link.parameters import alignment, telemetry_ages
 from magbridge.link.publish import Sample
@@ -109,6 +110,8 @@ class Pipeline:
             status=self._status,
             speaking=lambda: self.sensor.state == MAG_PORT_STATE.OK,
         )
+        own = config.link
+        self._sources = Sources(config.telemetry, own.system, own.autopilot, self.component.announcer)
         self.sensor = SensorLine(
             config.sensor.driver,
             self._driver.start,
@@ -126,6 +129,7 @@ class Pipeline:
         self._samples = self._lost = self._quality = 0
         self._late = False
         self._times: deque[int] = deque(maxlen=LATELY)
+        self.component.parameters.watch(self._tune)
         self._tune()
         self._begin(start, used, foreign=foreign)
 
@@ -201,20 +205,19 @@ class Pipeline:
         component = self.component
         for message in component.receive(data, time_us):
             for name, value, when_us in self._telemetry.values(message, time_us, component.vehicle.clock):
-                self._correction.telemetry(name, value, when_us, guessed=self._late and when_us == time_us)
+                if self._sources.admit(name, message.component, time_us):
+                    guessed = self._late and when_us == time_us
+                    self._correction.telemetry(name, value, when_us, guessed=guessed)
             if message.id == Position.MESSAGE:
                 self._position.update(message, time_us)
             if self.navigation is not None:
                 self.navigation.hear(message, time_us)
         self.journal.link(time_us, component.heard)
         component.heard.clear()
-        if component.parameters.revision != self._revision:
-            self._tune()
 
-    def _tune(self) -> None:
+    def _tune(self, _: str = "") -> None:
         """Apply the present values of the parameters to the alignment."""
         parameters = self.component.parameters
-        self._revision = parameters.revision
         settings = {name: parameters.of(f"align.{name}") for name in Align.__struct_fields__}
         ages = {name: parameters.of(f"telemetry.{name}.max_age") for name in self._config.telemetry}
         self._correction.aligner.tune(Align(**settings), ages)

@@ -5,14 +5,25 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from math import isfinite
 
+from magbridge.link.announcer import Announcer
+from magbridge.link.authority import Authority
 from magbridge.link.outbox import Outbox
 from magbridge.mavlink import Message, spec
-from magbridge.mavlink.dialect import MAV_CMD, MAV_RESULT
+from magbridge.mavlink.dialect import MAV_CMD, MAV_RESULT, MAV_SEVERITY
 
 __all__ = ["Commands"]
 
 OURS = 60100
 """The first message id of our dialect: no other component of the vehicle has these messages."""
+CALIBRATES = (
+    MAV_CMD.PREFLIGHT_CALIBRATION,
+    MAV_CMD.FIXED_MAG_CAL,
+    MAV_CMD.FIXED_MAG_CAL_FIELD,
+    MAV_CMD.FIXED_MAG_CAL_YAW,
+    MAV_CMD.DO_START_MAG_CAL,
+    MAV_CMD.DO_ACCEPT_MAG_CAL,
+    MAV_CMD.DO_CANCEL_MAG_CAL,
+)
 AUTOPILOT_VERSION, MESSAGE_INTERVAL = spec("AUTOPILOT_VERSION").id, spec("MESSAGE_INTERVAL").id
 
 
@@ -22,7 +33,7 @@ class Commands:
     A command to component 0 is for any component that can execute it. The bridge then executes only what
     concerns messages of its own dialect and never refuses, because a ground station would take the refusal
     for the autopilot's. Calibration of the autopilot's own compass (DO_START_MAG_CAL and the like) is the
-    autopilot's business.
+    autopilot's business; who asks the bridge itself for one is told how ours is calibrated.
 
     Parameters
     ----------
@@ -35,6 +46,9 @@ class Commands:
     set_rate : callable
         Takes a message id and a rate in Hz (-1 off, None for the default); returns whether it is allowed.
         KeyError where the message has no rate.
+    authority : Authority
+        Knows who may change a rate.
+    announcer : Announcer
     """
 
     def __init__(
@@ -43,8 +57,10 @@ class Commands:
         messages: Mapping[int, Callable[[], bool]],
         interval_us: Callable[[int], int],
         set_rate: Callable[[int, float | None], bool],
+        authority: Authority,
+        announcer: Announcer,
     ) -> None:
-        self._outbox = outbox
+        self._outbox, self._authority, self._announcer = outbox, authority, announcer
         self._messages, self._interval_us, self._set_rate = messages, interval_us, set_rate
         self._commands = {
             MAV_CMD.REQUEST_MESSAGE: self._request,
@@ -63,7 +79,12 @@ class Commands:
         if target == 0 and not self._only_us(number, values[0]):
             return
         command = self._commands.get(number)
-        result = command(values) if command else MAV_RESULT.UNSUPPORTED
+        if number == MAV_CMD.SET_MESSAGE_INTERVAL and not self._authority.may_change(message):
+            text = f"{message.system}:{message.component} may not set a rate: no station, no autopilot"
+            self._announcer.state("rate", text, MAV_SEVERITY.WARNING, again=True)
+            result = MAV_RESULT.DENIED
+        else:
+            result = command(values) if command else self._unsupported(number)
         self._outbox.send(
             "COMMAND_ACK",
             command=number,
@@ -72,6 +93,12 @@ class Commands:
             target_system=message.system,
             target_component=message.component,
         )
+
+    def _unsupported(self, number: int) -> MAV_RESULT:
+        if number in CALIBRATES:
+            text = "this magnetometer is calibrated from its logs: magbridge calibrate"
+            self._announcer.state("calibrate", text, MAV_SEVERITY.NOTICE, again=True)
+        return MAV_RESULT.UNSUPPORTED
 
     def _only_us(self, number: int, first: float) -> bool:
         about_message = number in (

@@ -9,6 +9,7 @@ from pathlib import Path
 from magbridge.config import Link
 from magbridge.errors import ConfigError
 from magbridge.link.announcer import Announcer
+from magbridge.link.authority import Authority
 from magbridge.link.commands import Commands
 from magbridge.link.outbox import Outbox
 from magbridge.link.parameter_service import ParameterService
@@ -134,10 +135,19 @@ class Component:
             "HEARTBEAT": self._reports.heartbeat,
             "MAG_STATUS": self._reports.status,
         }
+        self._authority = Authority(link.system, link.autopilot)
         self._service = ParameterService(
-            self.parameters, self.outbox, self.timers, self.announcer, self._changed
+            self.parameters, self.outbox, self.timers, self.announcer, self._authority
         )
-        self._commands = Commands(self.outbox, self._requestable(), self._interval_us, self._set_rate)
+        self.parameters.watch(self._changed)
+        self._commands = Commands(
+            self.outbox,
+            self._requestable(),
+            self._interval_us,
+            self._set_rate,
+            self._authority,
+            self.announcer,
+        )
         self._handlers: dict[int, Callable[[Message], None]] = {
             spec("PARAM_REQUEST_LIST").id: self._if_ours(self._service.list),
             spec("PARAM_REQUEST_READ").id: self._if_ours(self._service.read),
@@ -145,6 +155,7 @@ class Component:
             spec("COMMAND_LONG").id: self._command,
             spec("COMMAND_INT").id: self._command,
             TIMESYNC.id: self._timesync,
+            spec("HEARTBEAT").id: self._heartbeat,
         }
         for name in self._by_clock:
             self._start_timer(name, start_us)
@@ -215,6 +226,10 @@ class Component:
     def _command(self, message: Message) -> None:
         self._commands.handle(message, self._link.system, self._link.component)
 
+    def _heartbeat(self, message: Message) -> None:
+        if self._authority.heartbeat(message):
+            self._service.greet((message.system, message.component))
+
     def _timesync(self, message: Message) -> None:
         now_us = self.codec.now_us
         if not self._for_us(message):
@@ -264,7 +279,6 @@ class Component:
         value = self.parameters.table[parameter].default if hertz is None else hertz
         if not self.parameters.set(parameter, value):
             return False
-        self._changed(parameter)
         self._service.send(parameter)
         return True
 

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 from magbridge.link.announcer import Announcer
+from magbridge.link.authority import Authority
 from magbridge.link.outbox import Outbox
 from magbridge.link.parameters import Parameters
 from magbridge.link.timers import Timers
@@ -15,6 +14,12 @@ __all__ = ["ParameterService"]
 
 PACE_US = 20_000
 """µs between the values of a list: 50 a second, which a slow radio can carry."""
+AGAIN_US = 10_000_000
+"""µs between two lists that nobody asked for."""
+FORGOTTEN_US = 60_000_000
+"""µs without a heartbeat after which a station is new again."""
+STATIONS = 16
+"""Stations that are remembered."""
 
 
 class ParameterService:
@@ -24,8 +29,8 @@ class ParameterService:
     ----------
     parameters : Parameters
     outbox, timers, announcer
-    on_change : callable
-        Called with the name of a parameter that a station changed.
+    authority : Authority
+        Knows who may set a parameter.
     """
 
     def __init__(
@@ -34,11 +39,12 @@ class ParameterService:
         outbox: Outbox,
         timers: Timers,
         announcer: Announcer,
-        on_change: Callable[[str], None],
+        authority: Authority,
     ) -> None:
         self._parameters, self._outbox, self._timers = parameters, outbox, timers
-        self._announcer, self._on_change = announcer, on_change
-        self._listed = 0
+        self._announcer, self._authority = announcer, authority
+        self._listed = self._rounds = self._unasked = 0
+        self._stations: dict[tuple[int, int], int] = {}
 
     def send(self, name: str) -> None:
         """Send the value of a parameter."""
@@ -51,15 +57,45 @@ class ParameterService:
             param_index=self._parameters.names.index(name),
         )
 
+    def greet(self, station: tuple[int, int]) -> None:
+        """Send all parameters to a station that is new, and once more `AGAIN_US` later.
+
+        QGroundControl with an autopilot never asks another component for its parameters, and what it is sent
+        before it has those of the autopilot it forgets.
+        """
+        now_us = self._outbox.codec.now_us
+        before_us = self._stations.pop(station, None)
+        self._stations[station] = now_us
+        if len(self._stations) > STATIONS:
+            del self._stations[next(iter(self._stations))]
+        if before_us is None or now_us - before_us > FORGOTTEN_US:
+            under_way, self._unasked = self._unasked, 3
+            if not under_way:
+                self._list_unasked(now_us)
+
+    def _list_unasked(self, time_us: int) -> None:
+        self._unasked -= 1
+        if self._unasked:
+            self._begin()
+            self._timers.at("parameters unasked", time_us + AGAIN_US, self._list_unasked)
+
     def list(self, message: Message) -> None:  # noqa: ARG002 - every handler takes its message
-        """Begin to send all parameters, one every `PACE_US`; a list already under way is begun again."""
-        self._listed = 0
-        self._timers.every("parameters", PACE_US, self._send_next, self._outbox.codec.now_us)
+        """Begin to send all parameters, one every `PACE_US`; of a list under way, the rest comes first."""
+        self._begin()
+
+    def _begin(self) -> None:
+        if not self._rounds:
+            self._listed = 0
+            self._timers.every("parameters", PACE_US, self._send_next, self._outbox.codec.now_us)
+        self._rounds = 2 if self._listed else 1
 
     def _send_next(self, _: int) -> None:
         self.send(self._parameters.names[self._listed])
         self._listed += 1
         if self._listed == len(self._parameters.names):
+            self._listed = 0
+            self._rounds -= 1
+        if not self._rounds:
             self._timers.cancel("parameters")
 
     def read(self, message: Message) -> None:
@@ -80,12 +116,16 @@ class ParameterService:
             return
         if message["param_type"] != MAV_PARAM_TYPE.REAL32:
             self._refuse(name, "only REAL32 is taken")
+        elif not self._authority.may_change(message):
+            who = f"{message.system}:{message.component}"
+            self._refuse(name, f"only a station or the autopilot sets it, not {who}")
         elif not self._parameters.set(name, value):
             self._refuse(
                 name, f"{value:.6g} is not within {row.low:.6g} to {row.high:.6g} {row.unit}".rstrip()
             )
         else:
-            self._on_change(name)
+            text = f"{name} = {value:.6g}, set by {message.system}:{message.component}"
+            self._announcer.state(f"set {name}", text, MAV_SEVERITY.NOTICE)
         self.send(name)
 
     def _refuse(self, name: str, why: str) -> None:

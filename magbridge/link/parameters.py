@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from math import isfinite
 from struct import pack, unpack
 
@@ -110,6 +110,7 @@ class Parameters:
         self.table = {row.name: row for row in table}
         self.names = list(self.table)
         self.revision = 0
+        self._watchers: list[Callable[[str], None]] = []
         self._values = {row.name: float(row.default) for row in self.table.values()}
         self._names_of = {row.key: row.name for row in self.table.values()}
 
@@ -124,6 +125,10 @@ class Parameters:
         """Return the values that are no longer the defaults, by name: what has to be kept."""
         return {name: value for name, value in self._values.items() if value != self.table[name].default}
 
+    def watch(self, watcher: Callable[[str], None]) -> None:
+        """Call ``watcher(name)`` at every change from now on: this is how a value takes effect."""
+        self._watchers.append(watcher)
+
     def set(self, name: str, value: float) -> bool:
         """Set a value; return False, and change nothing, when it is not finite or out of its range."""
         row = self.table[name]
@@ -136,6 +141,8 @@ class Parameters:
             return True
         self._values[name] = row.default if short == real32(row.default) else short
         self.revision += 1
+        for watcher in self._watchers:
+            watcher(name)
         return True
 
     def restore(self, values: Mapping[str, float]) -> list[str]:

@@ -61,7 +61,8 @@ def test_not_ours(link: Line) -> None:
 
 def test_set(link: Line) -> None:
     before = link.component.parameters.revision
-    (value,) = write(link, "MB_GAP_FACTOR", 4.0)
+    text, value = write(link, "MB_GAP_FACTOR", 4.0)
+    assert text.text == "MB_GAP_FACTOR = 4, set by 255:190"
     assert value.param_value == 4.0
     assert link.component.parameters.of("align.gap_factor") == 4.0
     assert link.component.parameters.revision == before + 1
