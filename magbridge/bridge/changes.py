@@ -9,6 +9,7 @@ from magbridge.mavlink.dialect import MAG_LOG_STATE, MAG_PORT_NAME, MAG_PORT_STA
 
 __all__ = ["Changes"]
 
+BESIDE = spec("MAG_BESIDE").id
 CLOCK_STEP, NOTICE, PORT, STANDSTILL = (
     spec(name).id for name in ("MAG_CLOCK_STEP", "STATUSTEXT", "MAG_PORT", "MAG_STANDSTILL")
 )
@@ -49,6 +50,8 @@ class Changes:
                 self._codec.utc_offset_us += message["step"]
                 step = f"clock was set by {message['step'] * 1e-6:+.3f} s"
                 self._announcer.say(step, MAV_SEVERITY.NOTICE)
+            elif message.id == BESIDE:  # in a replay
+                self._codec.skip(message["count"])
             elif message.id == NOTICE:
                 self._announcer.say(message["text"], MAV_SEVERITY(message["severity"]))
             elif message.id == STANDSTILL:

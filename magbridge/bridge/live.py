@@ -115,6 +115,15 @@ class LiveEdge:
         except PortError as error:
             self._lost(channel, error)
 
+    def answer(self, sender: tuple[int, int], data: bytes) -> None:
+        """Send over the link what only one system and component wants."""
+        link = self._ports[Channel.LINK]
+        try:
+            if link.up:
+                link.write_to(sender, data)
+        except PortError as error:
+            self._lost(Channel.LINK, error)
+
     def credit(self, frames: list[bytes]) -> None:
         """Tell the link which frames that it read last are signed by someone who has the key."""
         self._ports[Channel.LINK].credit(frames)

@@ -75,6 +75,7 @@ class Peers:
         self._frames: list[bytes] = []
         self._stray: list[bytes] = []
         self._authors: dict[bytes, Peer] = {}
+        self._routes: dict[tuple[int, int], Peer] = {}  # at most 65,536
         self._strangers = 0
         self._answered: list[Peer] = []
         self._look = 0.0
@@ -144,6 +145,11 @@ class Peers:
             self._tell("the autopilot speaks from several addresses")
         return self._answered
 
+    def route(self, sender: tuple[int, int]) -> Peer | None:
+        """Return the peer from which a system and component was last heard, if it is answered."""
+        peer = self._routes.get(sender)
+        return peer if peer in self.answered() else None
+
     def _meet(self, address: Hashable) -> Peer:
         if len(self._peers) >= KNOWN:
             least = min(self._peers.values(), key=lambda peer: (peer.pilot, peer.genuine))
@@ -156,6 +162,7 @@ class Peers:
             peer.since, self._look = now, 0.0
         peer.genuine = now
         who = (frame[5], frame[6]) if frame[0] == V2 else (frame[3], frame[4])
+        self._routes[who] = peer
         if who == self._autopilot:
             if now - peer.pilot > TIMEOUT:
                 self._look = 0.0

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from glob import has_magic
 from math import nan
 from typing import TYPE_CHECKING, Final
 
+from magbridge.bridge import states
 from magbridge.bridge.changes import Changes
 from magbridge.bridge.events import Event, Start
 from magbridge.bridge.head import beginning, declarations
@@ -22,11 +23,11 @@ from magbridge.correction import TEMPERATURE, Correction
 from magbridge.errors import ConfigError
 from magbridge.link.authority import Sources
 from magbridge.link.component import Component, check_publish
-from magbridge.link.parameters import alignment, telemetry_ages
+from magbridge.link.parameters import alignment, file_rate, telemetry_ages
 from magbridge.link.publish import Sample
 from magbridge.link.reports import Condition
 from magbridge.link.telemetry import TelemetryMap
-from magbridge.mavlink import Signing
+from magbridge.mavlink import Signing, Spec
 from magbridge.mavlink.dialect import MAG_PORT_STATE, MAV_SEVERITY
 from magbridge.records import Channel, Quality, Reading
 from magbridge.sensors import open_driver
@@ -101,7 +102,7 @@ class Pipeline:
         self.component = Component(
             config.link,
             config.publish,
-            [*alignment(config.align), *telemetry_ages(config.telemetry)],
+            [*alignment(config.align), *telemetry_ages(config.telemetry), *file_rate()],
             start_us=start.time_us,
             signing=self.signing,
             calibration_id=self._calibration_id,
@@ -170,6 +171,12 @@ class Pipeline:
         answers = component.outbox.drain()
         self.journal.sent(answers)
         return due + answers
+
+    def beside(self, messages: Sequence[tuple[Spec, bytes]]) -> bytes:
+        """Return the frames of messages that are sent beside those of :meth:`feed` and are not logged."""
+        codec = self.component.codec
+        self.journal.state(codec.now_us, states.beside(len(messages)))
+        return b"".join([codec.frame(layout, payload) for layout, payload in messages])
 
     def _hear_sensor(self, data: bytes, time_us: int) -> None:
         readings = self._driver.feed(data)

@@ -54,6 +54,10 @@ class Port(ABC):
     def write(self, data: bytes) -> None:
         """Send each message in `data` whole or drop it; raises :class:`PortError` when the port is gone."""
 
+    def write_to(self, sender: tuple[int, int], data: bytes) -> None:  # noqa: ARG002 - most ports have one peer
+        """Send as :meth:`write` does, only to the peer from which a system and component was last heard."""
+        self.write(data)
+
     @property
     def waiting(self) -> bool:
         """Whether something waits that a slow line had no room for."""

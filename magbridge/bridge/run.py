@@ -16,6 +16,7 @@ from threading import Thread
 from magbridge.bridge import states
 from magbridge.bridge.drive import drive, set_up
 from magbridge.bridge.events import Clock, Start
+from magbridge.bridge.file_server import FileServer
 from magbridge.bridge.links import open_link
 from magbridge.bridge.live import LiveEdge
 from magbridge.bridge.pipeline import Pipeline
@@ -79,7 +80,17 @@ def run(path: Path) -> None:
     gc.freeze()  # these objects live as long as the process: the collector need not scan them
     watch = LogWatch(log, edge, pipeline)
 
+    logs = config.resolve(config.log.directory) if config.log else None
+    parameters, requests = pipeline.component.parameters, pipeline.component.file_requests
+    files = FileServer(pipeline.component.metadata, logs, lambda: 1e3 * parameters["MB_FILE_RATE"], edge.tell)
+
     def after(time_us: int) -> None:
+        while requests:
+            files.ask(requests.popleft())
+        if not link.waiting:
+            station, messages = files.take()
+            if messages:
+                edge.answer(station, pipeline.beside(messages))
         keeper.look(pipeline, time_us)
         watch.look(time_us)
         if pipeline.sensor.stranger:
@@ -90,6 +101,7 @@ def run(path: Path) -> None:
         drive(pipeline, edge, log, after)
     finally:
         keeper.save(pipeline, last=True)
+        files.close()
         edge.close()
         if log is not None:
             log.close()

@@ -202,6 +202,15 @@ class TcpServer(Port):
             self.dropped, self.overrun = self.dropped + first.dropped, self.overrun + first.overrun
             first.dropped = first.overrun = 0
 
+    def write_to(self, sender: tuple[int, int], data: bytes) -> None:
+        """Send only to the client from which a system and component was last heard."""
+        peer = self._peers.route(sender)
+        if peer is not None and isinstance(fd := peer.address, int) and fd in self._clients:
+            try:
+                self._clients[fd].write(data)
+            except PortError:
+                self._dismiss(fd)
+
     def _chosen(self) -> list[int]:
         """Return the descriptors of those to send to, in the order in which to send."""
         valid = [peer.address for peer in self._peers.answered()]

@@ -122,6 +122,13 @@ class UdpPort(Port):
         for peer in self._peers.answered():
             self._send(data, peer.address)
 
+    def write_to(self, sender: tuple[int, int], data: bytes) -> None:
+        """Send only to the peer from which a system and component was last heard."""
+        if self._peers is None:
+            self._send(data, None)
+        elif (peer := self._peers.route(sender)) is not None:
+            self._send(data, peer.address)
+
     def _send(self, data: bytes, peer: Any) -> None:
         for datagram in _datagrams(data):
             self._send_one(datagram, peer)

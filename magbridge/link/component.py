@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from pathlib import Path
 
 from magbridge.config import Link
 from magbridge.errors import ConfigError
+from magbridge.link import metadata
 from magbridge.link.announcer import Announcer
 from magbridge.link.authority import Authority
 from magbridge.link.commands import Commands
@@ -36,6 +38,9 @@ LIMITS = {
 DEFAULTS = {"HEARTBEAT": 1.0, "MAG_STATUS": 1.0, "MAG_NAVIGATION": 0.0}
 TIMESYNC_US = 1_000_000
 VERSION_2 = 0xFD
+MOST_REQUESTS = 64
+"""Requests for files that are kept while nobody takes them."""
+FILE_REQUESTS = ("FILE_TRANSFER_PROTOCOL", "LOG_REQUEST_LIST", "LOG_REQUEST_DATA", "LOG_REQUEST_END")
 LONGEST_US = 0x7FFFFFFF
 """µs, 36 min: the longest interval that a MESSAGE_INTERVAL holds."""
 
@@ -91,6 +96,10 @@ class Component:
         Everything that came, as frames for the log (see `TapeReader`); the bridge empties it.
     genuine : list of bytes
         The signed frames of the last :meth:`receive` that were accepted.
+    file_requests : deque of Message
+        Requests for files; the bridge takes them out.
+    metadata : mapping of str to bytes
+        The files that describe the parameters, by path.
     parameters, rates, announcer, vehicle, publisher
         The services, for use by the bridge.
     """
@@ -127,8 +136,17 @@ class Component:
             self.announcer.say(f"kept from the link, not as configured: {', '.join(changed)}")
         self.rates = {name: Rate(self.parameters[rate_name(name)]) for name in LIMITS}
         self.publisher = Publisher(self.outbox, self.rates, calibration_id, start_us)
+        self.metadata = metadata.files(self.parameters.table.values(), link.component)
+        self.file_requests: deque[Message] = deque(maxlen=MOST_REQUESTS)
         self._reports = Reports(
-            self.outbox, self.vehicle, start_us, version, calibration_id, status, speaking
+            self.outbox,
+            self.vehicle,
+            start_us,
+            version,
+            calibration_id,
+            status,
+            speaking,
+            self.metadata[metadata.GENERAL],
         )
         # sent at times of the clock, not with the samples; here a rate of 0 is off
         self._by_clock: dict[str, Callable[[], None]] = {
@@ -156,6 +174,8 @@ class Component:
             spec("COMMAND_INT").id: self._command,
             TIMESYNC.id: self._timesync,
             spec("HEARTBEAT").id: self._heartbeat,
+            spec("LOG_ERASE").id: self._erase,
+            **{spec(name).id: self._file_request for name in FILE_REQUESTS},
         }
         for name in self._by_clock:
             self._start_timer(name, start_us)
@@ -230,6 +250,18 @@ class Component:
         if self._authority.heartbeat(message):
             self._service.greet((message.system, message.component))
 
+    def _file_request(self, message: Message) -> None:
+        """Keep a request for a file, if it is to us alone: the autopilot has files, too."""
+        target = message["target_system"], message["target_component"]
+        if target == (self._link.system, self._link.component):
+            self.file_requests.append(message)
+
+    def _erase(self, message: Message) -> None:
+        target = message["target_system"], message["target_component"]
+        if target == (self._link.system, self._link.component):
+            text = "logs are not erased over the link"
+            self.announcer.state("erase", text, MAV_SEVERITY.WARNING, again=True)
+
     def _timesync(self, message: Message) -> None:
         now_us = self.codec.now_us
         if not self._for_us(message):
@@ -262,7 +294,12 @@ class Component:
 
     def _requestable(self) -> dict[int, Callable[[], bool]]:
         """Return what REQUEST_MESSAGE can ask for: id to a function that sends it, False if it cannot."""
-        reports = {**self._by_clock, "AUTOPILOT_VERSION": self._reports.version}
+        reports = {
+            **self._by_clock,
+            "AUTOPILOT_VERSION": self._reports.version,
+            "COMPONENT_INFORMATION_BASIC": self._reports.component,
+            "COMPONENT_METADATA": self._reports.metadata,
+        }
         return {
             **{spec(name).id: partial(always, report) for name, report in reports.items()},
             **{spec(name).id: partial(self.publisher.repeat, name) for name in PUBLISHED},

@@ -10,7 +10,7 @@ import msgspec
 
 from magbridge.config import Align, Telemetry
 
-__all__ = ["Parameters", "Tunable", "alignment", "rate_name", "rates", "telemetry_ages"]
+__all__ = ["Parameters", "Tunable", "alignment", "file_rate", "rate_name", "rates", "telemetry_ages"]
 
 
 class Tunable(msgspec.Struct, frozen=True):
@@ -51,6 +51,12 @@ def alignment(align: Align) -> list[Tunable]:
         Tunable(name, f"align.{key}", float(getattr(align, key)), low, high, unit, doc)
         for name, key, low, high, unit, doc in rows
     ]
+
+
+def file_rate() -> list[Tunable]:
+    """Return the tunable for how fast files are sent."""
+    doc = "at which files are sent to stations; 0 sends none"
+    return [Tunable("MB_FILE_RATE", "files.rate", 250.0, 0, 10_000, "kB/s", doc)]
 
 
 def telemetry_ages(telemetry: Mapping[str, Telemetry]) -> list[Tunable]:

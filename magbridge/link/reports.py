@@ -7,6 +7,7 @@ from collections.abc import Callable
 from math import nan
 from typing import NamedTuple
 
+from magbridge.link.metadata import GENERAL, crc32, uri
 from magbridge.link.outbox import Outbox
 from magbridge.link.vehicle import Vehicle
 from magbridge.mavlink import spec
@@ -35,6 +36,8 @@ CAPABILITIES = (
     MAV_PROTOCOL_CAPABILITY.PARAM_FLOAT
     | MAV_PROTOCOL_CAPABILITY.COMMAND_INT
     | MAV_PROTOCOL_CAPABILITY.MAVLINK2
+    | MAV_PROTOCOL_CAPABILITY.FTP
+    | MAV_PROTOCOL_CAPABILITY.PARAM_ENCODE_C_CAST
 )
 
 
@@ -55,7 +58,7 @@ class Condition(NamedTuple):
 
 
 class Reports:
-    """Sends HEARTBEAT, MAG_STATUS and AUTOPILOT_VERSION.
+    """Sends HEARTBEAT, MAG_STATUS, AUTOPILOT_VERSION and what describes the component.
 
     Parameters
     ----------
@@ -70,6 +73,8 @@ class Reports:
         Returns the Condition.
     speaking : callable
         Says whether readings come from the sensor.
+    general : bytes
+        The general metadata file.
     """
 
     def __init__(
@@ -81,9 +86,10 @@ class Reports:
         calibration_id: int,
         status: Callable[[], Condition],
         speaking: Callable[[], bool],
+        general: bytes,
     ) -> None:
         self._outbox, self._vehicle, self._status = outbox, vehicle, status
-        self._speaking = speaking
+        self._speaking, self._general = speaking, general
         self._start_us, self._version, self._calibration_id = start_us, version, calibration_id
 
     def heartbeat(self) -> None:
@@ -130,6 +136,28 @@ class Reports:
             flight_sw_version=int.from_bytes(
                 bytes([*numbers, 0, 0, 0][:3]) + bytes((FIRMWARE_VERSION_TYPE.OFFICIAL,)), "big"
             ),
+        )
+
+    def component(self) -> None:
+        """Send COMPONENT_INFORMATION_BASIC."""
+        codec = self._outbox.codec
+        self._outbox.send(
+            "COMPONENT_INFORMATION_BASIC",
+            time_boot_ms=(codec.now_us - self._start_us) // 1000 & MASK,
+            capabilities=CAPABILITIES,
+            vendor_name="magbridge",
+            model_name="magnetometer bridge",
+            software_version=self._version,
+        )
+
+    def metadata(self) -> None:
+        """Send COMPONENT_METADATA: where the files are that describe the parameters."""
+        codec = self._outbox.codec
+        self._outbox.send(
+            "COMPONENT_METADATA",
+            time_boot_ms=(codec.now_us - self._start_us) // 1000 & MASK,
+            file_crc=crc32(self._general),
+            uri=uri(codec.component, GENERAL),
         )
 
     def sample_interval_us(self) -> int:

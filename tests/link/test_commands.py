@@ -36,7 +36,7 @@ def test_version(link: Line) -> None:
         assert result(link, heard) == ACCEPTED
         (version,) = link.only(heard, "AUTOPILOT_VERSION")
         assert version.flight_sw_version == 0x010203FF
-        assert version.capabilities == 2 | 8 | 8192
+        assert version.capabilities == 2 | 8 | 32 | 8192 | 131072
 
 
 def test_intervals(link: Line) -> None:

@@ -1,0 +1,168 @@
+"""Files for stations, read by a thread of its own and sent beside what the bridge measures.
+
+The live thread hands on requests and takes replies, a few messages at a time; it never waits for the disk.
+Replies are not in the log, which would grow by what is read of it: it gets their number, so that a replay
+counts on as the bridge did.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from queue import Empty, SimpleQueue
+from threading import Thread
+
+from magbridge.bridge import states
+from magbridge.link.ftp import FtpServer
+from magbridge.link.log_transfer import LogTransfer
+from magbridge.link.tree import Tree
+from magbridge.mavlink import Message, Spec, spec
+
+__all__ = ["FileServer"]
+
+FTP = spec("FILE_TRANSFER_PROTOCOL")
+LIST, DATA, END = (spec(f"LOG_REQUEST_{name}").id for name in ("LIST", "DATA", "END"))
+REQUESTS = 64
+"""Requests that may wait; more are dropped, and stations ask again."""
+UNDER_WAY = 32
+"""Replies of one station that may be under way."""
+BATCH = 4
+"""Messages that are sent at once: some 0.1 ms of the live thread."""
+READY = 8
+"""Messages that may wait to be sent; then nothing more is read."""
+PAUSE = 0.01
+"""s between two looks at whether the link takes more."""
+IDLE = 1.0
+"""s between two looks for requests while nothing is under way."""
+
+Reply = tuple[Spec, bytes]
+Sender = tuple[int, int]
+
+
+class FileServer:
+    """Serves the metadata of the parameters, and the logs.
+
+    Parameters
+    ----------
+    texts : mapping of str to bytes
+        The metadata's files, by path.
+    logs : Path or None
+        The folder of the logs.
+    rate : callable
+        Returns bytes/s at which files are sent; 0 refuses every request by silence.
+    tell : callable
+        Wakes the live thread with a state frame, or with none.
+    """
+
+    def __init__(
+        self,
+        texts: Mapping[str, bytes],
+        logs: Path | None,
+        rate: Callable[[], float],
+        tell: Callable[[bytes], None],
+    ) -> None:
+        tree = Tree(texts, logs)
+        self._ftp, self._logs = FtpServer(tree, time.monotonic), LogTransfer(tree)
+        self._rate, self._tell = rate, tell
+        self._asked: SimpleQueue[Message | None] = SimpleQueue()
+        self._ready: deque[tuple[Sender, Reply]] = deque()
+        self._ending = False
+        self._under_way: dict[Sender, deque[Iterator[Reply]]] = {}
+        self._told: set[str] = set()
+        self._thread = Thread(target=self._serve, name="file server", daemon=True)
+        self._thread.start()
+
+    def ask(self, request: Message) -> None:
+        """Hand on a request; returns at once."""
+        if self._asked.qsize() < REQUESTS:
+            self._asked.put(request)
+
+    def take(self) -> tuple[Sender, list[Reply]]:
+        """Return what is to be sent now, and to whom; returns at once."""
+        sender, replies = (0, 0), list[Reply]()
+        while self._ready and len(replies) < BATCH and (not replies or self._ready[0][0] == sender):
+            sender, reply = self._ready.popleft()
+            replies.append(reply)
+        return sender, replies
+
+    def close(self) -> None:
+        """End the thread, and close its files."""
+        self._ending = True
+        self._asked.put(None)
+        self._thread.join(IDLE)
+
+    def _serve(self) -> None:
+        try:
+            while True:
+                busy = bool(self._under_way)
+                for request in self._waiting(0.0 if busy else IDLE):
+                    if request is None:
+                        return
+                    self._begin(request)
+                if self._under_way:
+                    self._turn()
+        finally:
+            self._ftp.close()
+
+    def _waiting(self, timeout: float) -> Iterator[Message | None]:
+        """Yield the requests that wait, or the first that comes."""
+        try:
+            yield self._asked.get(timeout=timeout) if timeout else self._asked.get_nowait()
+            for _ in range(self._asked.qsize()):
+                yield self._asked.get_nowait()
+        except Empty:
+            return
+
+    def _begin(self, request: Message) -> None:
+        sender = request.system, request.component
+        waiting = self._under_way.setdefault(sender, deque(maxlen=UNDER_WAY))
+        if request.id == FTP.id:
+            replies = self._ftp.handle(sender, request["payload"])
+            head = bytes((0, *sender))
+            waiting.append((FTP, head + payload) for payload in self._told_once(sender, replies))
+        elif request.id == LIST:
+            waiting.append(self._logs.entries(request["start"], request["end"]))
+        elif request.id == DATA:
+            waiting.append(self._logs.data(request["id"], request["ofs"], request["count"]))
+        elif request.id == END:
+            waiting.clear()
+
+    def _told_once(self, sender: Sender, replies: Iterator[bytes]) -> Iterator[bytes]:
+        """Hand on replies; tell of the first refusal to a station that is more than the end of a file."""
+        for payload in replies:
+            yield payload
+            if why := FtpServer.refusal(payload):
+                text = f"file for {sender[0]}:{sender[1]} refused: {why}"
+                if text not in self._told and len(self._told) < REQUESTS:
+                    self._told.add(text)
+                    self._tell(states.notice(text[:50]))
+
+    def _turn(self) -> None:
+        """Make ready a batch, of each station in turn, and pause as long as it may take."""
+        rate, size = self._rate(), 0
+        if rate <= 0:
+            self._under_way.clear()
+            return
+        while (
+            len(self._ready) >= READY and not self._ending
+        ):  # the link is full, or the live thread has other things to do
+            time.sleep(PAUSE)
+            self._tell(b"")
+        for _ in range(BATCH):
+            if not self._under_way:
+                break
+            sender = next(iter(self._under_way))
+            waiting = self._under_way.pop(sender)
+            reply = next(waiting[0], None) if waiting else None
+            if reply is None and waiting:
+                waiting.popleft()
+            if waiting:
+                self._under_way[sender] = waiting  # behind the others
+            if reply is not None:
+                self._ready.append((sender, reply))
+                size += len(reply[1])
+        if self._ready:
+            self._tell(b"")
+        time.sleep(size / rate)

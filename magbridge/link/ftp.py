@@ -1,0 +1,322 @@
+"""MAVLink FTP: a station reads files of the bridge; it never writes any.
+
+Requests in, replies out, without port and clock (MAVLink guide, 'File Transfer Protocol'). A request that
+cannot be granted gets the protocol's own error.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from enum import IntEnum
+from struct import Struct
+from typing import BinaryIO, NamedTuple
+
+from magbridge.link.metadata import crc32
+from magbridge.link.tree import Entry, Tree
+
+__all__ = ["DATA", "Error", "FtpServer", "Opcode", "Request"]
+
+HEADER = Struct("<HBBBBBxI")
+"""Sequence, session, opcode, size, opcode replied to, whether the burst is complete, offset."""
+DATA = 239
+"""Most bytes of data in a message."""
+SESSIONS, EACH = 16, 8
+"""Most files open at once, and most of one station."""
+STALE = 10.0
+"""s after its last request at which a session may be closed, when another is wanted."""
+BURST = 256
+"""Most messages of a burst; the station then asks for the next."""
+BLOCK = 1 << 20
+
+Sender = tuple[int, int]
+"""System and component."""
+
+
+class Opcode(IntEnum):
+    """What is asked for, or that it was granted or not."""
+
+    NONE = 0
+    TERMINATE = 1
+    RESET = 2
+    LIST = 3
+    OPEN_READ = 4
+    READ = 5
+    CREATE = 6
+    WRITE = 7
+    REMOVE = 8
+    CREATE_FOLDER = 9
+    REMOVE_FOLDER = 10
+    OPEN_WRITE = 11
+    TRUNCATE = 12
+    RENAME = 13
+    CRC32 = 14
+    BURST = 15
+    ACK = 128
+    NAK = 129
+
+
+WRITES = frozenset(
+    (Opcode.CREATE, Opcode.WRITE, Opcode.REMOVE, Opcode.CREATE_FOLDER, Opcode.REMOVE_FOLDER)
+) | {Opcode.OPEN_WRITE, Opcode.TRUNCATE, Opcode.RENAME}
+
+
+class Error(IntEnum):
+    """Why it was not granted."""
+
+    FAIL = 1
+    FAIL_ERRNO = 2
+    INVALID_SIZE = 3
+    INVALID_SESSION = 4
+    NO_SESSIONS = 5
+    END_OF_FILE = 6
+    UNKNOWN_COMMAND = 7
+    FILE_PROTECTED = 9
+    FILE_NOT_FOUND = 10
+
+
+class Refused(Exception):
+    """A request that is not granted."""
+
+    def __init__(self, error: Error, number: int = 0) -> None:
+        self.data = bytes((error, number & 0xFF)) if error is Error.FAIL_ERRNO else bytes((error,))
+        super().__init__(error.name)
+
+
+class Request(NamedTuple):
+    """A request, taken apart."""
+
+    sequence: int
+    session: int
+    opcode: int
+    size: int
+    offset: int
+    data: bytes
+
+    @classmethod
+    def of(cls, payload: bytes) -> Request:
+        """Take apart the payload of a FILE_TRANSFER_PROTOCOL."""
+        sequence, session, opcode, size, _, _, offset = HEADER.unpack_from(payload)
+        return cls(sequence, session, opcode, size, offset, payload[HEADER.size : HEADER.size + DATA])
+
+    @property
+    def path(self) -> str:
+        """The path in its data."""
+        return self.data[: self.size].partition(b"\0")[0].decode("utf-8", "replace")
+
+    def reply(
+        self, opcode: Opcode, data: bytes = b"", *, ahead: int = 1, session: int | None = None,
+        offset: int | None = None, complete: bool = False,
+    ) -> bytes:  # fmt: skip
+        """Return the payload of a reply, the `ahead`-th to this request."""
+        head = HEADER.pack(
+            (self.sequence + ahead) & 0xFFFF,
+            self.session if session is None else session,
+            opcode,
+            len(data),
+            self.opcode,
+            complete,
+            self.offset if offset is None else offset,
+        )
+        return (head + data).ljust(HEADER.size + DATA, b"\0")
+
+
+class Session:
+    """A file that a station has open."""
+
+    def __init__(self, file: BinaryIO, size: int, now: float) -> None:
+        self.file, self.size, self.used = file, size, now
+
+    def read(self, offset: int, size: int) -> bytes:
+        """Return bytes of the file; none beyond its end."""
+        self.file.seek(offset)
+        return self.file.read(size)
+
+
+class FtpServer:
+    """Answers the requests of all stations.
+
+    Parameters
+    ----------
+    tree : Tree
+    now : callable
+        A clock in s, for sessions that nobody uses any more.
+    """
+
+    def __init__(self, tree: Tree, now: Callable[[], float]) -> None:
+        self._tree, self._now = tree, now
+        self._sessions: dict[tuple[Sender, int], Session] = {}
+        self._last: dict[Sender, tuple[Request, bytes]] = {}
+        self._simple: dict[int, Callable[[Sender, Request], bytes]] = {
+            Opcode.NONE: lambda _, request: request.reply(Opcode.ACK),
+            Opcode.TERMINATE: self._terminate,
+            Opcode.RESET: self._reset,
+            Opcode.LIST: self._list,
+            Opcode.OPEN_READ: self._open,
+            Opcode.READ: self._read,
+            Opcode.CRC32: self._crc32,
+        }
+
+    @property
+    def sessions(self) -> int:
+        """Number of files that are open."""
+        return len(self._sessions)
+
+    def handle(self, sender: Sender, payload: bytes) -> Iterator[bytes]:
+        """Yield the payloads of the replies to a request: one, or a burst, read as it is taken.
+
+        A request that comes again, because its reply was lost, gets the same reply again and does nothing.
+        """
+        request = Request.of(payload)
+        before, reply = self._last.get(sender, (None, b""))
+        if request == before:
+            yield reply
+            return
+        try:
+            if request.opcode == Opcode.BURST:
+                self._last.pop(sender, None)
+                yield from self._burst(sender, request)
+                return
+            reply = self._answer(sender, request)
+        except Refused as refused:
+            reply = request.reply(Opcode.NAK, refused.data)
+        except OSError as error:
+            reply = request.reply(Opcode.NAK, Refused(Error.FAIL_ERRNO, error.errno or 0).data)
+        self._last[sender] = request, reply
+        if len(self._last) > SESSIONS:
+            del self._last[next(iter(self._last))]
+        yield reply
+
+    @staticmethod
+    def refusal(reply: bytes) -> str:
+        """Return in words why a reply refuses; empty where it grants, or the end of a file was reached."""
+        if reply[3] != Opcode.NAK or reply[HEADER.size] == Error.END_OF_FILE:
+            return ""
+        return Error(reply[HEADER.size]).name.lower().replace("_", " ")
+
+    def close(self) -> None:
+        """Close all files."""
+        for key in list(self._sessions):
+            self._close(key)
+
+    def _answer(self, sender: Sender, request: Request) -> bytes:
+        self._check(request)
+        if request.opcode in WRITES:
+            raise Refused(Error.FILE_PROTECTED)
+        answer = self._simple.get(request.opcode)
+        if answer is None:
+            raise Refused(Error.UNKNOWN_COMMAND)
+        return answer(sender, request)
+
+    def _terminate(self, sender: Sender, request: Request) -> bytes:
+        self._session(sender, request)
+        self._close((sender, request.session))
+        return request.reply(Opcode.ACK)
+
+    def _reset(self, sender: Sender, request: Request) -> bytes:
+        """Close all that this station has open: what others have is not its business."""
+        for key in [key for key in self._sessions if key[0] == sender]:
+            self._close(key)
+        return request.reply(Opcode.ACK)
+
+    def _list(self, _: Sender, request: Request) -> bytes:
+        with _no_such_file():
+            entries = self._tree.entries(request.path)
+        if request.offset >= len(entries):
+            raise Refused(Error.END_OF_FILE)
+        data = b""
+        for one in entries[request.offset :]:
+            text = _described(one)
+            if len(data) + len(text) > DATA:
+                break
+            data += text
+        return request.reply(Opcode.ACK, data)
+
+    def _open(self, sender: Sender, request: Request) -> bytes:
+        number = self._free(sender, request.session)
+        with _no_such_file():
+            file, size = self._tree.open(request.path)
+        self._sessions[sender, number] = Session(file, size, self._now())
+        size_data = min(size, 0xFFFFFFFF).to_bytes(4, "little")
+        return request.reply(Opcode.ACK, size_data, session=number)
+
+    def _read(self, sender: Sender, request: Request) -> bytes:
+        data = self._session(sender, request).read(request.offset, request.size or DATA)
+        if not data:
+            raise Refused(Error.END_OF_FILE)
+        return request.reply(Opcode.ACK, data)
+
+    def _crc32(self, _: Sender, request: Request) -> bytes:
+        with _no_such_file():
+            file, _size = self._tree.open(request.path)
+        total = 0
+        with file:
+            while data := file.read(BLOCK):
+                total = crc32(data, total)
+        return request.reply(Opcode.ACK, total.to_bytes(4, "little"))
+
+    def _burst(self, sender: Sender, request: Request) -> Iterator[bytes]:
+        """Yield the messages of a burst; it ends when its session does."""
+        self._check(request)
+        session, size = self._session(sender, request), request.size or DATA
+        block = session.read(request.offset, BURST * size)
+        for count in range(BURST):
+            if self._sessions.get((sender, request.session)) is not session:
+                return
+            session.used = self._now()
+            data = block[count * size : (count + 1) * size]
+            opcode, complete = (Opcode.ACK, count == BURST - 1) if data else (Opcode.NAK, False)
+            yield request.reply(
+                opcode,
+                data or bytes((Error.END_OF_FILE,)),
+                ahead=count + 1,
+                offset=request.offset + min(count * size, len(block)),
+                complete=complete,
+            )
+            if not data:
+                return
+
+    @staticmethod
+    def _check(request: Request) -> None:
+        if request.size > DATA:
+            raise Refused(Error.INVALID_SIZE)
+
+    def _session(self, sender: Sender, request: Request) -> Session:
+        session = self._sessions.get((sender, request.session))
+        if session is None:
+            raise Refused(Error.INVALID_SESSION)
+        session.used = self._now()
+        return session
+
+    def _free(self, sender: Sender, wanted: int) -> int:
+        """Return the number of a new session, the `wanted` one if it is free; make room if need be."""
+        own = [key for key in self._sessions if key[0] == sender]
+        crowd = own if len(own) >= EACH else list(self._sessions) if len(self._sessions) >= SESSIONS else []
+        if crowd:
+            oldest: tuple[Sender, int] = min(crowd, key=lambda key: self._sessions[key].used)
+            if self._now() - self._sessions[oldest].used < STALE:
+                raise Refused(Error.NO_SESSIONS)
+            self._close(oldest)
+        taken = {number for who, number in self._sessions if who == sender}
+        return wanted if wanted not in taken else min(set(range(256)) - taken)
+
+    def _close(self, key: tuple[Sender, int]) -> None:
+        with suppress(OSError):
+            self._sessions.pop(key).file.close()
+
+
+class _no_such_file:  # noqa: N801 - a context manager, used as a function
+    """Turn 'no such file', or a path that leads elsewhere, into the protocol's error."""
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
+        if isinstance(error, (FileNotFoundError, PermissionError, UnicodeError)):
+            raise Refused(Error.FILE_NOT_FOUND) from error
+
+
+def _described(one: Entry) -> bytes:
+    """Return an entry of a listing."""
+    text = f"D{one.name}" if one.size is None else f"F{one.name}\t{one.size}"
+    return text.encode("utf-8", "replace") + b"\0"

@@ -1,0 +1,88 @@
+"""The files that a station may read, and no others: texts made here, and the logs in one folder."""
+
+from __future__ import annotations
+
+import errno
+import os
+import re
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from io import BytesIO
+from pathlib import Path
+from typing import BinaryIO, NamedTuple
+
+__all__ = ["Entry", "Tree", "began_s"]
+
+LOG = re.compile(r"(\d{8}T\d{6})Z_\d{4,}\.tlog")
+"""Names that the bridge gives its logs: its key or configuration may lie in the same folder."""
+LOGS = ("@MAV_LOG", "logs")
+"""The folder of the logs, as the MAVLink guide calls it and as people do."""
+
+
+class Entry(NamedTuple):
+    """A name in a folder, and its size in bytes; None is a folder."""
+
+    name: str
+    size: int | None
+
+
+class Tree:
+    """A read-only tree.
+
+    Parameters
+    ----------
+    texts : mapping of str to bytes
+        Files of the root, ``/name``.
+    logs : Path or None
+        The folder of the logs.
+    """
+
+    def __init__(self, texts: Mapping[str, bytes], logs: Path | None) -> None:
+        self._texts = {name.strip("/"): text for name, text in texts.items()}
+        self._logs = logs
+
+    def entries(self, path: str) -> list[Entry]:
+        """Return what is in a folder, in order; raises OSError where there is none."""
+        match parts(path):
+            case []:
+                texts = [Entry(name, len(text)) for name, text in self._texts.items()]
+                return [*(Entry(name, None) for name in LOGS if self._logs is not None), *texts]
+            case [name] if name in LOGS and self._logs is not None:
+                return self.logs()
+        raise FileNotFoundError(errno.ENOENT, path)
+
+    def open(self, path: str) -> tuple[BinaryIO, int]:
+        """Return a file and its size in bytes; raises OSError where there is none."""
+        match parts(path):
+            case [name] if name in self._texts:
+                return BytesIO(self._texts[name]), len(self._texts[name])
+            case [folder, name] if folder in LOGS and self._logs is not None and LOG.fullmatch(name):
+                opened = os.open(self._logs / name, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
+                return os.fdopen(opened, "rb", buffering=0), os.fstat(opened).st_size
+        raise FileNotFoundError(errno.ENOENT, path)
+
+    def logs(self) -> list[Entry]:
+        """Return the logs, oldest first."""
+        if self._logs is None or not self._logs.is_dir():
+            return []
+        with os.scandir(self._logs) as found:
+            logs = [
+                Entry(one.name, one.stat().st_size)
+                for one in found
+                if LOG.fullmatch(one.name) and one.is_file(follow_symlinks=False)
+            ]
+        return sorted(logs)
+
+
+def parts(path: str) -> list[str]:
+    """Return the names along a path; raises OSError where it leads upward."""
+    names = [name for name in path.split("/") if name not in ("", ".")]
+    if ".." in names or "\0" in path:
+        raise PermissionError(errno.EACCES, path)
+    return names
+
+
+def began_s(name: str) -> int:
+    """Return when the run of a log began, by the log's name: s of UNIX time."""
+    found = LOG.fullmatch(name)
+    return int(datetime.strptime(found[1], "%Y%m%dT%H%M%S").replace(tzinfo=UTC).timestamp()) if found else 0
