@@ -120,8 +120,9 @@ def correct_rows(correction: Correction, deployment: xr.Dataset) -> xr.Dataset:
     Dataset (time)
         ``total_field total_field_sigma field_x field_y field_z anomaly quality``; ``time`` as in the input.
         The field is in body axes. The anomaly is the total field minus the IGRF, NaN where there is no
-        position. All in nT, but for ``quality``, the bits of :class:`~magbridge.records.Quality`. A row
-        without any channel is not a sample but telemetry: NaN there, with ``gap``.
+        position or no date. All in nT, but for ``quality``, the bits of
+        :class:`~magbridge.records.Quality`. A row without any channel is not a sample but telemetry: NaN
+        there, with ``gap``.
 
     Raises
     ------

@@ -43,6 +43,7 @@ __all__ = [
     "folder_to_write",
     "note_losses",
     "note_missing",
+    "note_no_date",
     "note_settings",
     "note_unused_grid",
     "print_result",
@@ -224,6 +225,15 @@ def note_unused_grid(grid: Path | None, *logs: xr.Dataset) -> None:
     for log in logs if grid else ():
         if "reference_field" in log and log["reference_field"].notnull().all():
             complain(f"{log.attrs['source']}: has reference_field in every row: --grid {grid} is not used")
+
+
+def note_no_date(deployment: xr.Dataset) -> None:
+    """Warn on stderr that a log has no anomaly, since the field of its day is not known."""
+    from magbridge.columns import counts_from_boot
+
+    if counts_from_boot(deployment):
+        source = deployment.attrs["source"]
+        complain(f"{source}: its times count from the boot: no anomaly without --date YYYY-MM-DD")
 
 
 def note_settings(*pieces: Mapping[str, Any]) -> None:

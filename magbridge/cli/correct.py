@@ -18,6 +18,7 @@ from magbridge.cli.common import (
     doubts_of,
     note_losses,
     note_missing,
+    note_no_date,
     note_settings,
     print_result,
     refuse_unsuited,
@@ -73,6 +74,7 @@ def correct(
         for part in track(read_chunks(files, required=CHANNELS, options=reading.options), "correcting"):
             if not pieces:
                 note_missing(known, part)
+                note_no_date(part)
             pieces.append(part.attrs)
             sampled = part[list(CHANNELS)].to_array().notnull()
             corrected = correct_rows(correction, part).isel(time=sampled.any("variable").to_numpy())

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from magbridge.arrays import FloatArray
+from magbridge.columns import counts_from_boot
 from magbridge.errors import FormatError
 from magbridge.field.continuation import continued
 from magbridge.field.geodesy import wrap
@@ -16,7 +17,15 @@ from magbridge.field.igrf import igrf, magnitude, total_field
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["EARTHS", "earth_field", "main_field", "other_units", "positions", "reference_field"]
+__all__ = [
+    "EARTHS",
+    "earth_field",
+    "main_field",
+    "other_units",
+    "positions",
+    "reference_field",
+    "require_date",
+]
 
 EARTHS = 20_000.0, 70_000.0
 """nT: the main field at the surface is 22,000 to 67,000 (IGRF), and the crust adds thousands at most."""
@@ -45,7 +54,7 @@ def reference_field(
     Raises
     ------
     FormatError
-        No reference and no position in the whole deployment.
+        No reference and no position in the whole deployment, or no date.
     OutOfRange
         A date or place that the IGRF or the grid does not cover.
 
@@ -67,6 +76,7 @@ def reference_field(
         raise FormatError(
             source, "expected latitude and longitude, or reference_field: the true field is unknown"
         )
+    require_date(deployment)
     longitude, latitude, depth = positions(deployment)
     time = deployment["time"].to_numpy()
     reference = given.copy()
@@ -89,11 +99,12 @@ def earth_field(
     total : (n,) array
         nT, :func:`reference_field`.
     vector : (n, 3) array or None
-        nT, north-east-down: the IGRF's direction with the length of `total`; None without positions.
+        nT, north-east-down: the IGRF's direction with the length of `total`; None without positions, or
+        without a date.
     name : str
     """
     total = reference_field(deployment, grid)
-    if not {"latitude", "longitude"} <= set(deployment.variables):
+    if not {"latitude", "longitude"} <= set(deployment.variables) or counts_from_boot(deployment):
         return total, None, "reference_field"
     field = main_field(deployment)
     vector = field * (total / magnitude(field))[:, None]
@@ -119,15 +130,28 @@ def other_units(channels: FloatArray, reference: float) -> str:
 
 
 def main_field(deployment: xr.Dataset) -> FloatArray:
-    """Return the IGRF at every sample, (n, 3) nT, north-east-down; NaN where there is no position."""
+    """Return the IGRF at every sample, (n, 3) nT, north-east-down; NaN where no position or date is known."""
     field = np.full((deployment.sizes["time"], 3), np.nan)
-    if {"latitude", "longitude"} <= set(deployment.variables):
+    if {"latitude", "longitude"} <= set(deployment.variables) and not counts_from_boot(deployment):
         longitude, latitude, depth = positions(deployment)
         known = np.isfinite(longitude) & np.isfinite(latitude)
         if known.any():
             time = deployment["time"].to_numpy()
             field[known] = igrf(longitude[known], latitude[known], depth[known], time[known])
     return field
+
+
+def require_date(deployment: xr.Dataset) -> None:
+    """FormatError: the times of a deployment count from the boot, so that its day's field is not known.
+
+    In 1970, from which such times seem to count, the field was up to 10 % another.
+    """
+    if counts_from_boot(deployment):
+        raise FormatError(
+            deployment.attrs.get("source", "deployment"),
+            "its times count from the boot, so the Earth's field is not known: expected the day, by "
+            "--date YYYY-MM-DD, or a column reference_field",
+        )
 
 
 def positions(deployment: xr.Dataset) -> tuple[FloatArray, FloatArray, FloatArray]:

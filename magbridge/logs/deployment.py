@@ -65,6 +65,10 @@ NOTES = "notes"
 """Attribute with a line for each choice that reading made: which of several compasses, a name, a unit."""
 
 
+# xarray imports hundreds of modules with its first data set: here, and not in every child that reads a file
+xr.Dataset({"first": ("time", np.zeros(1))})
+
+
 def deployment(
     file: str | Path,
     time: ArrayLike,

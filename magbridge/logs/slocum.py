@@ -2,7 +2,9 @@
 
 A row is a cycle of the flight computer; values that were not updated in a cycle are interpolated linearly.
 The science file of the same name beside a flight file is joined to it, and the other way round: either name,
-or both, give the same deployment. The list of sensors is read from the file ``<crc>.cac`` beside the file.
+or both, give the same deployment. The list of sensors is read from the file ``<crc>.cac`` beside the file, or
+in a folder ``cac`` or ``cache`` beside it or above. A science file begins with the sensors' start values, 0
+degC at 0 bar, which nobody measured: they are left out.
 
 Angles are converted to degrees; ``heading`` is the compass's, magnetic. A Slocum logs no vector magnetometer
 of its own, so there is no ``mag_x``: the log can drive a simulated one. To correct the log of an instrument
@@ -15,6 +17,7 @@ import logging
 import os
 import tempfile
 from collections.abc import Iterator
+from functools import reduce
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +35,9 @@ __all__ = ["chunks"]
 
 MAX_GAP = 300.0
 """s between two updates of a sensor across which nothing is interpolated."""
+Tracks = dict[str, tuple[FloatArray, FloatArray]]
+"""By sensor: times (m,), s, and values (m,)."""
+CTD = "sci_water_temp", "sci_water_pressure"
 SCIENCE = {flight: science for science, flight in FLIGHT.items()}
 SENSORS = {
     # theirs: (ours, unit, factor)
@@ -84,7 +90,7 @@ def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
         Not a Slocum file, no ``.cac`` for it, or no rows in it.
     """
     flight, science = _pair(path)
-    tracks = {**_read(flight), **_read(science)}
+    tracks = {**_read(flight), **_measured(_read(science))}
     base = "m_present_time" if "m_present_time" in tracks else "sci_m_present_time"
     if base not in tracks or not len(tracks[base][0]):
         raise FormatError(path, "expected rows, there are none")
@@ -111,15 +117,34 @@ def _pair(path: Path) -> tuple[Path | None, Path | None]:
     return both if suffix.lower() in SCIENCE else both[::-1]
 
 
-def _read(path: Path | None) -> dict[str, tuple[FloatArray, FloatArray]]:
+def _measured(tracks: Tracks) -> Tracks:
+    """Return the tracks of a science file without the CTD's samples that are exactly 0 in all that it measures.
+
+    As pyglider does: the sensors' values before their first sample are 0.
+    """
+    ctd = {name: tracks[name] for name in CTD if name in tracks}
+    unset = [when[value == 0.0] for when, value in ctd.values()]
+    if not unset:
+        return tracks
+    start = reduce(np.intersect1d, unset)
+    return tracks | {
+        name: (when[keep], value[keep])
+        for name, (when, value) in ctd.items()
+        for keep in [~np.isin(when, start)]
+    }
+
+
+def _read(path: Path | None) -> Tracks:
     """Return time and values of each of :data:`SENSORS` in the file, at its updates."""
     if path is None:
         return {}
-    check_header(path)
+    lists = check_header(path)
     # dbdreader writes the list of sensors where it looks for it
     with tempfile.TemporaryDirectory() as scratch:
-        for cache in [*path.parent.glob("*.cac"), *path.parent.glob("*.CAC")]:
-            Path(scratch, cache.name.lower()).symlink_to(cache.resolve())
+        for cache in reversed(lists):  # of two, the one nearest to the file stays
+            link = Path(scratch, cache.name.lower())
+            link.unlink(missing_ok=True)
+            link.symlink_to(cache.resolve())
         try:
             file = dbdreader.DBD(str(path), cacheDir=scratch)
             wanted = [name for name in (file.timeVariable, *SENSORS) if name in file.parameterNames]
@@ -128,7 +153,7 @@ def _read(path: Path | None) -> dict[str, tuple[FloatArray, FloatArray]]:
             if error.value == dbdreader.DBD_ERROR_CACHE_NOT_FOUND:
                 cache_id = next(iter(error.data.missing_cache_files))
                 raise FormatError(
-                    path, f"expected {cache_id}.cac, the list of its sensors, beside it"
+                    path, f"expected {cache_id}.cac, the list of its sensors, beside it or in a folder cac"
                 ) from None
             raise FormatError(path, f"expected a Slocum file: {error}") from None
         except (ValueError, KeyError, IndexError, UnicodeDecodeError, RuntimeError) as error:
