@@ -118,7 +118,7 @@ def _pair(path: Path) -> tuple[Path | None, Path | None]:
 
 
 def _measured(tracks: Tracks) -> Tracks:
-    """Return the tracks of a science file without the CTD's samples that are exactly 0 in all that it measures.
+    """Return the tracks of a science file without the CTD's samples that are 0 in all that it measures.
 
     As pyglider does: the sensors' values before their first sample are 0.
     """

@@ -22,8 +22,8 @@ CRC = "ab12cd34"
 def segment(path: Path, cycles: Mapping[str, Sequence[float]], *, factored: bool = False) -> None:
     """Write a file in which every sensor of `cycles` is updated in every cycle.
 
-    Four bytes a value; a cycle is ``d``, two bits a sensor (2: updated), the values. With `factored`, the list
-    of sensors is left out: it is in a ``.cac``.
+    Eight bytes a value; a cycle is ``d``, two bits a sensor (2: updated), the values. With `factored`, the
+    list of sensors is left out: it is in a ``.cac``.
     """
     names = list(cycles)
     sensors = "".join(f"s: T {k} {k} 8 {name} unit\n" for k, name in enumerate(names))
@@ -31,8 +31,9 @@ def segment(path: Path, cycles: Mapping[str, Sequence[float]], *, factored: bool
     tags = {
         "dbd_label": "DBD(dinkum_binary_data)file", "encoding_ver": 5, "num_ascii_tags": 14, "all_sensors": 0,
         "the8x3_filename": "00010000", "full_filename": path.stem, "filename_extension": path.suffix[1:],
-        "mission_name": "MADE.MI", "fileopen_time": "Mon_Jan__1_00:00:00_2024", "total_num_sensors": len(names),
-        "sensors_per_cycle": len(names), "state_bytes_per_cycle": state, "sensor_list_crc": CRC.upper(),
+        "mission_name": "MADE.MI", "fileopen_time": "Mon_Jan__1_00:00:00_2024",
+        "total_num_sensors": len(names), "sensors_per_cycle": len(names), "state_bytes_per_cycle": state,
+        "sensor_list_crc": CRC.upper(),
         "sensor_list_factored": int(factored),
     }  # fmt: skip
     data = "".join(f"{name}:    {value}\n" for name, value in tags.items()).encode()
