@@ -22,12 +22,13 @@ ALL = slice(None)
 def floats(variable: Any, rows: slice = ALL) -> FloatArray:
     """Return rows of a variable, in its shape, NaN where a value is missing.
 
-    Missing are the values that the variable declares as missing, compared as stored, before unpacking; and
-    those never written, which the library fills with a number of its own. ``valid_range`` is ignored: one
-    that begins at 0 would discard a depth of -2 cm. FormatError: packed by what is no number.
+    Missing are the values that the variable declares as missing, compared as stored, before unpacking, and
+    rounded to the variable's type where they are of another; and those never written, which the library fills
+    with a number of its own. ``valid_range`` is ignored: one that begins at 0 would discard a depth of -2 cm.
+    FormatError: packed by what is no number.
     """
     variable.set_auto_maskandscale(False)
-    stored = variable[rows]
+    stored = np.asarray(variable[rows])
     attributes = variable.ncattrs()
     nothing = [variable.getncattr("missing_value")] if "missing_value" in attributes else []
     fill = variable.get_fill_value()
@@ -40,5 +41,17 @@ def floats(variable: Any, rows: slice = ALL) -> FloatArray:
         expected = "expected numbers as scale_factor and add_offset"
         raise FormatError(variable.group().filepath(), expected, column=variable.name) from None
     values = stored.astype(np.float64) * scale + offset
-    values[np.isin(stored, nothing)] = np.nan
-    return np.asarray(values, np.float64)
+    missing = [number for one in nothing for number in _as_stored(one, stored.dtype)]
+    return np.where(np.isin(stored, missing), np.nan, values)
+
+
+def _as_stored(declared: Any, kind: np.dtype[Any]) -> list[Any]:
+    """Return the numbers that an attribute declares, in a variable's type; none that this cannot hold."""
+    try:
+        numbers = np.atleast_1d(np.asarray(declared)).astype(np.float64)  # also from text
+    except ValueError:
+        return []
+    with np.errstate(all="ignore"):
+        stored = numbers.astype(kind)
+    exact = stored.astype(np.float64) == numbers
+    return [one for one, same in zip(stored, exact, strict=True) if same or kind.kind == "f"]

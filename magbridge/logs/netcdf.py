@@ -64,7 +64,7 @@ def chunks(path: Path, rows: int) -> Iterator[tuple[xr.Dataset, Sequence[int]]]:
     try:
         with netCDF4.Dataset(path) as file:
             if seaglider.DIMENSION in file.dimensions:
-                whole = seaglider.dive(path, file)
+                whole = seaglider.dive(path, seaglider.read_netcdf(path, file))
                 for k, part in enumerate(sliced(whole, rows)):
                     yield part, range(k * rows + 1, k * rows + 1 + part.sizes["time"])
             elif DIMENSION in file.dimensions:

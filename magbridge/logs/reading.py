@@ -7,7 +7,7 @@ the rest is read: rows and values by :mod:`magbridge.logs.checks`, a whole file 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from functools import partial
 from inspect import signature
 from itertools import accumulate, chain, pairwise
@@ -18,7 +18,7 @@ from magbridge.columns import CHANNEL_TIMES, counts_from_boot, require
 from magbridge.errors import FormatError
 from magbridge.guard import guarded
 from magbridge.logs.options import Options
-from magbridge.logs.registry import FLIGHT, format_of, is_bag
+from magbridge.logs.registry import LEADS, format_of, is_bag
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -146,13 +146,14 @@ def _paths(paths: Paths) -> list[Path]:
             what = "not a pipe or a device" if path.exists() else "there is none"
             raise FormatError(path, f"expected a file, {what}")
         format_of(path)
-    return [path for path in checked if not _with_flight(path, checked)]
+    given = set(checked)
+    return [path for path in checked if not _with_another(path, given)]
 
 
-def _with_flight(path: Path, given: Sequence[Path]) -> bool:
-    """Tell whether a science file's flight file is given, too."""
-    flight = FLIGHT.get(path.suffix.lower())
-    return flight is not None and any(path.with_suffix(name) in given for name in (flight, flight.upper()))
+def _with_another(path: Path, given: Collection[Path]) -> bool:
+    """Tell whether the file is given that this one is read with, as a flight file with its science file."""
+    leads = LEADS.get(path.suffix.lower())
+    return leads is not None and any(path.with_suffix(name) in given for name in (leads, leads.upper()))
 
 
 def _chunks(path: Path, rows: int, options: Options) -> Iterator[xr.Dataset]:

@@ -22,10 +22,12 @@ from typing import Any, NamedTuple
 
 from magbridge.errors import FormatError
 
-__all__ = ["FLIGHT", "FORMATS", "Format", "format_of", "is_bag", "suffixes"]
+__all__ = ["FLIGHT", "FORMATS", "LEADS", "Format", "format_of", "is_bag", "suffixes"]
 
 FLIGHT = {".ebd": ".dbd", ".nbd": ".mbd", ".tbd": ".sbd", ".ecd": ".dcd", ".ncd": ".mcd", ".tcd": ".scd"}
 """Suffix of a Slocum's science file to that of its flight file: where both are there, both are read."""
+LEADS = {**FLIGHT, ".log": ".eng"}
+"""Suffix of a file that is read with another of its name, to that of the other."""
 HEAD = 4096
 """Bytes at the beginning of a file by which it is recognised."""
 
@@ -67,6 +69,7 @@ FORMATS: dict[str, Format] = {
         "magbridge.logs.telemetry", (".tlog",), rb"\x00[\x00-\x0c].{6}[\xfd\xfe]", writes=True
     ),
     "csv": Format("magbridge.logs.text", (".csv",), writes=True, maps_columns=True),
+    "seaglider": Format("magbridge.logs.seaglider_text", (".eng",), rb"%?version: [\d.]+\s+%?glider:"),
     "text": Format("magbridge.logs.text", (".txt", ".tsv", ".dat", ".asc"), maps_columns=True),
 }
 """Name to format; the first whose signature matches reads the file."""

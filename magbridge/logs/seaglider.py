@@ -1,16 +1,18 @@
-"""A Seaglider's dive as the basestation writes it: raw compass counts, attitude and the moving masses.
+"""A Seaglider's dive: raw compass counts, attitude and the moving masses.
 
-Conventions, and how they were found (SG167, five dives of 2014, 8 N 85 E: regression of the raw counts on
-the IGRF rotated by the logged attitude):
+From the netCDF of a basestation, or from the ``.eng`` and ``.log`` that a glider sends
+(:mod:`magbridge.logs.seaglider_text`). Conventions, and how they were found (regression of the raw counts on
+the IGRF rotated by the logged attitude, dives of SG167, SG171, SG180, SG236, SG249, SG272 and SG686):
 
-- ``eng_mag_x/y/z`` are x forward, y starboard, z down, as ours: the 3x3 matrix of that regression is the
-  identity to 5 % with no element off the diagonal above 0.01;
-- one count is 1 mG = 100 nT: the diagonal of that matrix is 0.97 to 1.05 counts/mG; the deviation from 1 is
-  the sensor's own calibration;
-- ``eng_head`` is magnetic (the file says so, and with that the matrix's elements between x and y vanish);
+- ``mag_x/y/z`` are x forward, y starboard, z down, as ours: the 3x3 matrix of that regression is the identity
+  to 5 % with few elements off the diagonal above 0.05;
+- what a count is worth, the compass's type says (:data:`NT_PER_COUNT`). The matrix's diagonal is 0.95 to 1.04
+  counts/mG for the types 1, 2 and 6, and 1.75 to 1.91 for type 4;
+- ``head`` is magnetic (the file says so, and with that the matrix's elements between x and y vanish);
   ``magnetic_variation`` is kept as an attribute, 0.1 deg coarse;
-- ``eng_pitchCtl`` is in cm; ``eng_rollCtl`` in deg (its counts are scaled by ``ROLL_CNV`` = 0.028 deg);
-  ``eng_vbdCC`` in cc.
+- ``pitchCtl`` is in cm, ``rollCtl`` in deg, ``vbdCC`` in cc: ``(AD - centre) * CNV`` of each mass's
+  potentiometer. Older firmware logs them with every sample (the formula gives SG167's to 2e-4 cm); newer only
+  around each manoeuvre, ``gc_*``, and there the masses go straight from where they were to where they came.
 
 The CTD's temperature, pressure, latitude and longitude are interpolated to the compass samples. Of each
 motor's current, the file holds one mean per manoeuvre; rows within a manoeuvre in which that motor ran carry
@@ -19,6 +21,8 @@ it, all others 0.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -27,28 +31,31 @@ import xarray as xr
 
 from magbridge.arrays import FloatArray
 from magbridge.errors import FormatError
+from magbridge.field.igrf import total_field
 from magbridge.logs.cf import floats
-from magbridge.logs.deployment import deployment
+from magbridge.logs.deployment import deployment, with_losses
 from magbridge.logs.resample import CIRCLES, linear
 
-__all__ = ["DIMENSION", "NT_PER_COUNT", "dive"]
+__all__ = ["DIMENSION", "NT_PER_COUNT", "Dive", "dive", "read_netcdf"]
 
 DIMENSION = "sg_data_point"
-NT_PER_COUNT = 100.0
+NT_PER_COUNT = {1: 100.0, 2: 100.0, 4: 56.0, 6: 100.0}
+"""nT in a count, by the type of the compass: ``COMPASS_DEVICE`` is 16 times the type, and the port."""
+SECOND = 2048
+"""Bit of ``COMPASS_USE``: the second compass is in use."""
 MAX_GAP = 120.0
 """s between CTD samples across which nothing is interpolated."""
-COLUMNS = {
-    # ours: (theirs, unit, factor)
-    "mag_x": ("eng_mag_x", "nT", NT_PER_COUNT),
-    "mag_y": ("eng_mag_y", "nT", NT_PER_COUNT),
-    "mag_z": ("eng_mag_z", "nT", NT_PER_COUNT),
-    "roll": ("eng_rollAng", "deg", 1.0),
-    "pitch": ("eng_pitchAng", "deg", 1.0),
-    "heading": ("eng_head", "deg", 1.0),
-    "depth": ("depth", "m", 1.0),
-    "pitchCtl": ("eng_pitchCtl", "cm", 1.0),
-    "rollCtl": ("eng_rollCtl", "deg", 1.0),
-    "vbdCC": ("eng_vbdCC", "cc", 1.0),
+SAMPLED = {
+    # ours: (theirs, unit); the channels are in counts
+    "mag_x": ("mag_x", "nT"),
+    "mag_y": ("mag_y", "nT"),
+    "mag_z": ("mag_z", "nT"),
+    "roll": ("rollAng", "deg"),
+    "pitch": ("pitchAng", "deg"),
+    "heading": ("head", "deg"),
+    "pitchCtl": ("pitchCtl", "cm"),
+    "rollCtl": ("rollCtl", "deg"),
+    "vbdCC": ("vbdCC", "cc"),
 }
 CTD = {
     "latitude": ("latitude", "deg"),
@@ -56,66 +63,182 @@ CTD = {
     "water_temperature": ("temperature", "degC"),
     "water_pressure": ("ctd_pressure", "dbar"),
 }
-MOTORS = ("pitch", "roll", "vbd")
+PLACE = "longitude", "latitude"
+MASSES = {"pitchCtl": ("pitch", "C_PITCH"), "rollCtl": ("roll", "C_ROLL_DIVE"), "vbdCC": ("vbd", "C_VBD")}
+"""Column to the name of its motor, and of the parameter that holds its centre in AD counts."""
 
 
-def dive(path: Path, file: Any) -> xr.Dataset:
-    """Return one dive.
+@dataclass
+class Dive:
+    """What a glider tells of a dive.
 
-    Parameters
+    Attributes
     ----------
-    path : Path
-        Named in errors.
-    file : netCDF4.Dataset
-        Open.
+    time : (n,) array
+        s since 1970 UTC, of the compass samples.
+    sampled : dict of str to (n,) array
+        Engineering columns by their own names, the depth in m.
+    settings : dict of str to float
+        Parameters of the log, as ``COMPASS_DEVICE``.
+    manoeuvres : dict of str to (m,) array
+        ``st_secs`` and ``end_secs``, s since 1970, and what was logged of each, as ``pitch_ctl``.
+    elsewhere : dict of str to a pair of (k,) arrays
+        Times, s, and values of what has its own times: positions, CTD.
+    max_gap : float
+        s between two of those times across which nothing is interpolated.
+    """
 
-    Raises
-    ------
-    FormatError
-        No magnetometer in the file.
+    time: FloatArray
+    sampled: dict[str, FloatArray]
+    settings: dict[str, float] = field(default_factory=dict)
+    manoeuvres: dict[str, FloatArray] = field(default_factory=dict)
+    elsewhere: dict[str, tuple[FloatArray, FloatArray]] = field(default_factory=dict)
+    max_gap: float = MAX_GAP
+
+
+def dive(path: Path, known: Dive) -> xr.Dataset:
+    """Return one dive as a deployment; FormatError: it has no magnetometer."""
+    for axis in "xyz":
+        if f"mag_{axis}" not in known.sampled:
+            raise FormatError(
+                path,
+                "expected this variable, as of a Seaglider with a raw compass",
+                column=f"eng_mag_{axis}",
+            )
+    columns = {
+        ours: known.sampled[theirs] for ours, (theirs, _) in SAMPLED.items() if theirs in known.sampled
+    }
+    units = {ours: unit for ours, (_, unit) in SAMPLED.items()}
+    if "depth" in known.sampled:
+        columns["depth"], units["depth"] = known.sampled["depth"], "m"
+    for ours, (theirs, unit) in CTD.items():
+        if theirs in known.elsewhere:
+            columns[ours] = linear(
+                known.time, *known.elsewhere[theirs], known.max_gap, *CIRCLES.get(ours, ())
+            )
+            units[ours] = unit
+    for column in MASSES:
+        if column not in columns and (moved := _position(known, column)) is not None:
+            columns[column] = moved
+    for motor, _ in MASSES.values():
+        if (current := _current(known, motor)) is not None:
+            columns[f"{motor}_current"], units[f"{motor}_current"] = current, "A"
+    count, remarks = _count(path, known, columns)
+    for axis in "xyz":
+        columns[f"mag_{axis}"] = columns[f"mag_{axis}"] * count
+    attrs: dict[str, Any] = {"heading_reference": "magnetic", "mag_scale_nT_per_count": count}
+    if (declination := known.settings.get("magnetic_variation")) is not None:
+        attrs["magnetic_variation_deg"] = declination
+    return with_losses(deployment(path, known.time, columns, units, attrs), {}, remarks)
+
+
+def _count(path: Path, known: Dive, columns: Mapping[str, FloatArray]) -> tuple[float, list[str]]:
+    """Return the nT in a count of the compass in use, and a remark where that had to be estimated.
+
+    Of an unknown type: what gives the sphere through the counts the radius of the Earth's field. The
+    calibration's scales are free to differ from it.
+    """
+    use = known.settings.get("COMPASS_USE", 0.0)
+    name = "COMPASS2_DEVICE" if np.isfinite(use) and int(use) & SECOND else "COMPASS_DEVICE"
+    device = known.settings.get(name)
+    if device is None or not np.isfinite(device):
+        return NT_PER_COUNT[2], [f"{path}: no {name}: a count of the compass is taken as 100 nT"]
+    kind = int(device) // 16
+    if kind in NT_PER_COUNT:
+        return NT_PER_COUNT[kind], []
+    estimated = _by_length(known.time, columns)
+    unknown = f"{path}: {name} {int(device)} is not known: counts of unknown size"
+    return estimated, [f"{unknown}, taken as {estimated:.3g} nT, with which they are as long as the field"]
+
+
+def _by_length(time: FloatArray, columns: Mapping[str, FloatArray]) -> float:
+    """Return the IGRF over the radius of the sphere ``|m|² = 2 m·c + d`` through the counts m, nT."""
+    counts = np.column_stack([columns[f"mag_{axis}"] for axis in "xyz"])
+    counts = counts[np.isfinite(counts).all(axis=1)]
+    place = [columns[name][np.isfinite(columns[name])][:1] for name in PLACE if name in columns]
+    if len(counts) < 4 or sum(map(len, place)) < 2:
+        return NT_PER_COUNT[2]
+    squared = np.einsum("ij,ij->i", counts, counts)
+    (*centre, d), *_ = np.linalg.lstsq(np.column_stack([2 * counts, np.ones(len(counts))]), squared)
+    radius = np.sqrt(max(d + np.dot(centre, centre), 1.0))
+    return float(total_field(*place, 0.0, time[0])[0] / radius)
+
+
+def _position(known: Dive, column: str) -> FloatArray | None:
+    """Return where a mass was at each sample, by its manoeuvres: measured, else commanded; None: neither."""
+    motor, centre = MASSES[column]
+    each = known.manoeuvres
+    if not {"st_secs", "end_secs"} <= each.keys():
+        return None
+    zero, scale = known.settings.get(centre, np.nan), known.settings.get(f"{motor.upper()}_CNV", np.nan)
+    if f"{motor}_ad" in each and np.isfinite(zero) and np.isfinite(scale):
+        after = (each[f"{motor}_ad"] - zero) * scale
+        before = (each.get(f"{motor}_ad_start", np.roll(each[f"{motor}_ad"], 1)) - zero) * scale
+    elif f"{motor}_ctl" in each:
+        after = each[f"{motor}_ctl"]
+        before = np.roll(after, 1)
+        before[:1] = np.nan
+    else:
+        return None
+    when = np.column_stack([each["st_secs"], each["end_secs"]]).ravel()
+    where = np.column_stack([before, after]).ravel()
+    order = np.argsort(when, kind="stable")
+    sure = order[np.isfinite(when[order]) & np.isfinite(where[order])]
+    where_it_was = linear(known.time, when[sure], where[sure], np.inf)
+    return np.where(known.time < when[sure][:1].min(initial=np.inf), np.nan, where_it_was)
+
+
+def _current(known: Dive, motor: str) -> FloatArray | None:
+    """Return the mean current (A) of one motor in the manoeuvre at each sample; 0 outside manoeuvres."""
+    each = known.manoeuvres
+    if not {"st_secs", "end_secs", f"{motor}_i"} <= each.keys():
+        return None
+    current = np.zeros(len(known.time))
+    for start, end, ampere in zip(each["st_secs"], each["end_secs"], each[f"{motor}_i"], strict=True):
+        current[(known.time >= start) & (known.time <= end)] = ampere
+    return current
+
+
+def read_netcdf(path: Path, file: Any) -> Dive:
+    """Return the dive in a basestation's file; variables of another length than their times are left out.
+
+    FormatError: it has no time.
     """
     rows = file.dimensions[DIMENSION].size
-    for theirs in ("time", "eng_mag_x", "eng_mag_y", "eng_mag_z"):
-        if _numbers(file, theirs, rows) is None:
-            raise FormatError(
-                path, "expected this variable, as of a Seaglider with a raw compass", column=theirs
-            )
-    time = floats(file["time"])
-    columns, units = {}, {}
-    for ours, (theirs, unit, scale) in COLUMNS.items():
-        if (values := _numbers(file, theirs, rows)) is not None:
-            columns[ours], units[ours] = values * scale, unit
+    if (time := _numbers(file, "time", rows)) is None:
+        raise FormatError(path, "expected this variable, as of a Seaglider", column="time")
+    sampled = {
+        name.removeprefix("eng_"): values
+        for name in file.variables
+        if (name.startswith("eng_") and name != "eng_depth") or name == "depth"
+        if (values := _numbers(file, name, rows)) is not None
+    }
+    names = [name for name in file.variables if name.startswith("gc_")]
+    size = file["gc_end_secs"].size if "gc_end_secs" in names else 0
+    manoeuvres = {
+        name.removeprefix("gc_"): values
+        for name in names
+        if (values := _numbers(file, name, size)) is not None
+    }
+    settings = {
+        name.removeprefix("log_"): float(floats(variable))
+        for name, variable in file.variables.items()
+        if (name.startswith("log_") or name == "magnetic_variation")
+        if variable.shape == () and variable.dtype != str and variable.dtype.kind in "iuf"
+    }
+    elsewhere = {}
     if "ctd_time" in file.variables:
         ctd_time = floats(file["ctd_time"])
-        for ours, (theirs, unit) in CTD.items():
-            if (values := _numbers(file, theirs, ctd_time.size)) is not None:
-                columns[ours] = linear(time, ctd_time, values, MAX_GAP, *CIRCLES.get(ours, ()))
-                units[ours] = unit
-    for motor in MOTORS:
-        if (current := _current(file, motor, time)) is not None:
-            columns[f"{motor}_current"], units[f"{motor}_current"] = current, "A"
-    attrs: dict[str, Any] = {"heading_reference": "magnetic", "mag_scale_nT_per_count": NT_PER_COUNT}
-    if "magnetic_variation" in file.variables and file["magnetic_variation"].size == 1:
-        attrs["magnetic_variation_deg"] = float(file["magnetic_variation"][...])
-    return deployment(path, time, columns, units, attrs)
+        elsewhere = {
+            theirs: (ctd_time, values)
+            for theirs, _ in CTD.values()
+            if (values := _numbers(file, theirs, ctd_time.size)) is not None
+        }
+    return Dive(time, sampled, settings, manoeuvres, elsewhere)
 
 
 def _numbers(file: Any, name: str, size: int) -> FloatArray | None:
-    """Return a variable (size,); None where the file has none of that size."""
-    if name not in file.variables or file[name].shape != (size,):
+    """Return a variable (size,); None where the file has none of that size, or no numbers."""
+    if name not in file.variables or file[name].shape != (size,) or file[name].dtype == str:
         return None
-    return floats(file[name])
-
-
-def _current(file: Any, motor: str, time: FloatArray) -> FloatArray | None:
-    """Return the mean current (A) of one motor in the manoeuvre at each time; 0 outside manoeuvres."""
-    if f"gc_{motor}_i" not in file.variables:
-        return None
-    amperes = floats(file[f"gc_{motor}_i"])
-    starts, ends = (_numbers(file, name, amperes.size) for name in ("gc_st_secs", "gc_end_secs"))
-    if starts is None or ends is None:
-        return None
-    current = np.zeros(len(time))
-    for start, end, ampere in zip(starts, ends, amperes, strict=True):
-        current[(time >= start) & (time <= end)] = ampere
-    return current
+    return floats(file[name]) if file[name].dtype.kind in "iuf" else None

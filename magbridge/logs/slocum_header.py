@@ -41,10 +41,10 @@ def check_header(path: Path) -> list[Path]:
     if tags.get(b"sensor_list_factored") == b"0":
         return []
     crc = tags.get(b"sensor_list_crc", b"").decode("ascii", "replace").lower()
-    found = [cache for cache in _caches(path) if cache.stem.lower() == crc][:1]
-    for cache in found:
+    lists = [cache for cache in _caches(path) if cache.stem.lower() == crc][:1]
+    for cache in lists:
         _check_cache(cache)
-    return found
+    return lists
 
 
 def _caches(path: Path) -> Iterator[Path]:

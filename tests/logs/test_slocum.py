@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +19,7 @@ T0 = 1_704_067_200.0
 CRC = "ab12cd34"
 
 
-def segment(path: Path, cycles: Mapping[str, Sequence[float]], *, factored: bool = False) -> None:
+def segment(path: Path, cycles: Mapping[str, np.ndarray], *, factored: bool = False) -> None:
     """Write a file in which every sensor of `cycles` is updated in every cycle.
 
     Eight bytes a value; a cycle is ``d``, two bits a sensor (2: updated), the values. With `factored`, the
