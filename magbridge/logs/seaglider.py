@@ -161,7 +161,7 @@ def _by_length(time: FloatArray, columns: Mapping[str, FloatArray]) -> float:
     squared = np.einsum("ij,ij->i", counts, counts)
     (*centre, d), *_ = np.linalg.lstsq(np.column_stack([2 * counts, np.ones(len(counts))]), squared)
     radius = np.sqrt(max(d + np.dot(centre, centre), 1.0))
-    return float(total_field(*place, 0.0, time[0])[0] / radius)
+    return float(total_field(place[0], place[1], 0.0, time[0])[0] / radius)
 
 
 def _position(known: Dive, column: str) -> FloatArray | None:
