@@ -36,6 +36,7 @@ EXTRAS = {
         "analysis",
     ),
     "harmonica": "grids",
+    "pymavlink": "dialect",
     "nicegui": "monitor",
 }
 """Package to the extra that installs it."""

@@ -102,6 +102,26 @@ def replay(
         raise DataError("the replay did not publish what the log holds")
 
 
+@app.command(usage="Usage: magbridge dialect -o DIR")
+def dialect(*, output: Annotated[Folder, Parameter(name=["--output", "-o"])], json: Json = False) -> None:
+    """Write the MAVLink dialect for other programs: the XML with all that it includes, modules for pymavlink.
+
+    magbridge.xml holds the common messages and ours; magbridge_ardupilotmega.xml ArduPilot's as well.
+
+    Parameters
+    ----------
+    output
+        The folder to write to; it is made if it does not exist.
+    json
+        Print the result as JSON.
+    """
+    from magbridge.mavlink.definitions import write_definitions
+
+    with new_folder(output):
+        files = [str(path) for path in write_definitions(output)]
+    print_result({"files": files}, "\n".join(files), json)
+
+
 @app.command(usage="Usage: magbridge monitor [LINK] [OPTIONS]")
 def monitor(
     link: str = "udpin:0.0.0.0:14550",
