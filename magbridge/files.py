@@ -9,9 +9,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from magbridge.errors import MagbridgeError, WriteError
+from magbridge.errors import FormatError, MagbridgeError, WriteError
 
-__all__ = ["atomic_path", "new_folder", "systems_reason"]
+__all__ = ["atomic_path", "existing", "new_folder", "systems_reason"]
 
 ROOM = 1 << 20
 """Bytes written to learn why a write failed: more than a library writes at a time."""
@@ -45,6 +45,16 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     finally:
         with suppress(OSError):  # it was renamed, or never made
             beside.unlink()
+
+
+def existing(path: Path) -> Path:
+    """Return a path that is a file to read; FormatError: it is none."""
+    if path.is_dir():
+        raise FormatError(path, "expected a file, not a directory")
+    if not path.is_file():
+        what = "not a pipe or a device" if path.exists() else "there is none"
+        raise FormatError(path, f"expected a file, {what}")
+    return path
 
 
 @contextmanager

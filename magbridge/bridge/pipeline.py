@@ -37,7 +37,7 @@ from magbridge.version import __version__
 if TYPE_CHECKING:
     from magbridge.bridge.navigation import Navigation  # imports filterpy, which few vehicles have
 
-__all__ = ["Pipeline"]
+__all__ = ["Pipeline", "unmet"]
 
 LINK: Final = Channel.LINK
 SENSOR: Final = Channel.SENSOR
@@ -291,18 +291,22 @@ def check(calibration: Calibration, config: Config) -> None:
     ConfigError
         A parameter that ``[telemetry]`` lacks, or that comes in another unit.
     """
-    units = calibration.units
+    for error in unmet(calibration, config):
+        raise error
+
+
+def unmet(calibration: Calibration, config: Config) -> list[ConfigError]:
+    """Return what the calibration needs and the link will not provide: each as :func:`check` raises it."""
+    units, errors = calibration.units, []
     for name in calibration.channels:
         if name == TEMPERATURE:
             continue
         if name not in config.telemetry:
-            raise ConfigError(
-                config.path, f"telemetry.{name}", "missing: the calibration needs this parameter"
-            )
+            missing = "missing: the calibration needs this parameter"
+            errors.append(ConfigError(config.path, f"telemetry.{name}", missing))
+            continue
         unit = config.telemetry[name].unit
         if not may_be(unit, units.get(name, "")):
-            raise ConfigError(
-                config.path,
-                f"telemetry.{name}.unit",
-                f"expected {units[name]!r}, the calibration's unit, not {unit!r}",
-            )
+            expected = f"expected {units[name]!r}, the calibration's unit, not {unit!r}"
+            errors.append(ConfigError(config.path, f"telemetry.{name}.unit", expected))
+    return errors

@@ -14,11 +14,22 @@ from pathlib import Path
 
 from cyclopts import CycloptsError, MissingArgumentError, UnusedCliTokensError
 
-from magbridge.cli import ashore, bridge, calibrate, correct, diagnose, info, navigate
+from magbridge.cli import ashore, attach, bridge, calibrate, correct, diagnose, info, navigate
 from magbridge.cli.common import app, complain
 from magbridge.errors import MagbridgeError, MissingExtra
 
-__all__ = ["app", "ashore", "bridge", "calibrate", "correct", "diagnose", "info", "main", "navigate"]
+__all__ = [
+    "app",
+    "ashore",
+    "attach",
+    "bridge",
+    "calibrate",
+    "correct",
+    "diagnose",
+    "info",
+    "main",
+    "navigate",
+]
 
 EXTRAS = {
     **dict.fromkeys(

@@ -20,6 +20,7 @@ from magbridge.cli.common import (
     app,
     check_inputs,
     file_to_write,
+    logs_to_read,
     note_losses,
     print_result,
 )
@@ -49,11 +50,13 @@ def convert(
     json
         Print the result as JSON.
     """
+    logs_to_read(files, output)
+
     from magbridge.logs import Writer, read_chunks
 
     rows, pieces = 0, []
     with Writer(output) as writer:
-        for part in track(read_chunks(check_inputs(files, output), options=reading.options), "reading"):
+        for part in track(read_chunks(files, options=reading.options), "reading"):
             pieces.append(part.attrs)
             if heading_reference:
                 part.attrs["heading_reference"] = heading_reference

@@ -10,7 +10,16 @@ from typing import Annotated
 
 from cyclopts import Parameter, validators
 
-from magbridge.cli.common import Folder, Json, Whole, app, check_inputs, folder_to_write, print_result
+from magbridge.cli.common import (
+    Folder,
+    Json,
+    Whole,
+    app,
+    check_inputs,
+    complain,
+    folder_to_write,
+    print_result,
+)
 from magbridge.errors import DataError, WrongUse
 from magbridge.files import new_folder
 
@@ -47,20 +56,42 @@ def demo(
     print_result(result, demonstration.summary(result), json)
 
 
-@app.command(usage="Usage: magbridge run --config bridge.toml")
-def run(*, config: Path) -> None:
+@app.command(usage="Usage: magbridge run --config bridge.toml [--check]")
+def run(*, config: Path, check: bool = False) -> None:
     """Attach to the sensor and the autopilot link, and publish the corrected field until stopped.
+
+    magbridge init writes a configuration, magbridge ports shows what speaks on which serial port, and
+    magbridge drivers lists the drivers of sensors with their options.
 
     Parameters
     ----------
     config
         The configuration (bridge.toml).
+    check
+        Say all that would go wrong, and end; no port is opened.
     """
+    if check:
+        _check(config)
+        return
+
     from magbridge.bridge.run import run as attach
 
     if sys.stderr.isatty():
         print(f"{config}: running until Ctrl-C; announcements on the link are repeated here", file=sys.stderr)
     attach(config)
+
+
+def _check(config: Path) -> None:
+    """Print all that would go wrong; WrongUse: the bridge would not start."""
+    from magbridge.bridge.check import findings
+
+    found = findings(config)
+    for one in found:
+        complain(one.text)
+    fatal = sum(one.fatal for one in found)
+    if fatal:
+        raise WrongUse(f"{config}: the bridge would not start: {fatal} thing{'s' * (fatal > 1)} to mend")
+    print(f"{config}: the bridge would start" + (", with what is said above" if found else ""))
 
 
 @app.command(usage="Usage: magbridge replay FILE... [--config bridge.toml] [OPTIONS]")

@@ -23,6 +23,7 @@ from magbridge.cli.common import (
     check_inputs,
     complain,
     digest,
+    logs_to_read,
     note_losses,
     note_unused_grid,
     print_result,
@@ -90,6 +91,9 @@ def calibrate(
     json
         Print the result as JSON, with the paper's M, S and T at the middle of each parameter's range.
     """
+    logs_to_read(files, output, vehicle, grid)
+    check_inputs((*files, output), picture)
+
     from magbridge.calibration.file import save
     from magbridge.calibration.fitting.lowpass import unfiltered
     from magbridge.calibration.fitting.mounted_masses import read_vehicle
@@ -101,8 +105,6 @@ def calibrate(
     from magbridge.logs import read_each
     from magbridge.logs.deployment import join
 
-    check_inputs(files, output, vehicle, grid)
-    check_inputs((*files, output), picture)
     if vehicle and method != "auto":
         raise WrongUse(f"--vehicle: method {method} does not use the positions of the masses; auto does")
     anomalies = read_grid(grid) if grid else None

@@ -16,7 +16,9 @@ from cyclopts import App, Parameter, Token
 
 from magbridge import __version__
 from magbridge.errors import FormatError, WrongUse
+from magbridge.files import existing
 from magbridge.logs import Options, suffixes
+from magbridge.logs.registry import is_bag
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -41,6 +43,7 @@ __all__ = [
     "doubts_of",
     "file_to_write",
     "folder_to_write",
+    "logs_to_read",
     "note_losses",
     "note_missing",
     "note_no_date",
@@ -176,6 +179,21 @@ def check_inputs(
     if output is not None and os.path.realpath(output) in read:
         raise WrongUse(f"{output}: is among the files to read; choose another file to write")
     return files
+
+
+def logs_to_read(files: tuple[Path, ...], output: Path | None = None, *others: Path | None) -> None:
+    """Check, before anything heavy is imported, that logs are there and are not written over.
+
+    Raises
+    ------
+    WrongUse
+        As :func:`check_inputs`.
+    FormatError
+        One is not there.
+    """
+    for path in check_inputs(files, output, *others):
+        if not is_bag(path):
+            existing(path)
 
 
 def digest(path: Path) -> str:

@@ -13,9 +13,9 @@ from magbridge.cli.common import (
     Log,
     Reading,
     app,
-    check_inputs,
     complain,
     doubts_of,
+    logs_to_read,
     note_losses,
     note_missing,
     note_no_date,
@@ -60,11 +60,12 @@ def correct(
     json
         Print the result as JSON.
     """
+    logs_to_read(files, output, calibration)
+
     from magbridge.calibration.file import load
     from magbridge.correction import Correction, correct_rows
     from magbridge.logs import Writer, read_chunks
 
-    check_inputs(files, output, calibration)
     known = load(calibration)
     for doubt in doubts_of(known, calibration):
         complain(doubt)

@@ -14,10 +14,10 @@ from magbridge.cli.common import (
     Json,
     Reading,
     app,
-    check_inputs,
     complain,
     digest,
     doubts_of,
+    logs_to_read,
     note_losses,
     note_unused_grid,
     print_result,
@@ -70,6 +70,8 @@ def diagnose(
     json
         Print the findings as JSON.
     """
+    logs_to_read(files, output / "calibration.json", calibration)
+
     from magbridge.calibration.file import load
     from magbridge.diagnose.causes import CAUSES
     from magbridge.diagnose.report.doubts import unsettled
@@ -78,7 +80,6 @@ def diagnose(
     from magbridge.field.read import read_grid
     from magbridge.logs import read
 
-    check_inputs(files, output / "calibration.json", calibration)
     known = load(calibration)
     with waiting("reading") as step:
         logs = [read(path, options=reading.options) for path in files]

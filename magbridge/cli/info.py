@@ -6,7 +6,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from magbridge.cli.common import AS_THEY_SAY, Json, Reading, app, check_inputs, complain, print_result
+from magbridge.cli.common import AS_THEY_SAY, Json, Reading, app, complain, logs_to_read, print_result
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -27,7 +27,7 @@ def info(*files: Path, reading: Reading = AS_THEY_SAY, json: Json = False) -> No
     json
         Print the result as JSON.
     """
-    check_inputs(files)
+    logs_to_read(files)
 
     from magbridge.logs import read
     from magbridge.logs.info import info as facts_of

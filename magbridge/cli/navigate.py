@@ -14,9 +14,9 @@ from magbridge.cli.common import (
     Picture,
     Reading,
     app,
-    check_inputs,
     complain,
     doubts_of,
+    logs_to_read,
     note_losses,
     note_missing,
     note_settings,
@@ -77,10 +77,11 @@ def navigate(
     json
         Print the result as JSON.
     """
+    logs_to_read(files, output, map, calibration, config)
+
     from magbridge.calibration.file import load
     from magbridge.errors import WrongUse
 
-    check_inputs(files, output, map, calibration, config)
     known, options = load(calibration) if calibration else None, _options(config)
     if bound:
         _bound(files, map, output, options, known, picture, reading, json)

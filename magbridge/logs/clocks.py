@@ -173,13 +173,13 @@ def _fits(times: pd.Series, pattern: str) -> bool:
 
 
 def seconds(clock: Clock, cells: pd.Series, zone: str | None) -> FloatArray:
-    """Return the cells in s since 1970-01-01 UTC; NaN where one is empty or cannot be read.
+    """Return the cells in s since 1970-01-01 UTC, (n,); NaN where one is empty or cannot be read.
 
     Parameters
     ----------
     clock : Clock
         As :func:`clock_of` returns it.
-    cells : Series
+    cells : (n,) Series
         Numbers or texts.
     zone : str or None
         Zone of times that do not say theirs; UTC if None.

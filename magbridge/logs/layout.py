@@ -22,7 +22,7 @@ from magbridge.logs.headings import aliases, is_unit, split
 from magbridge.logs.makers import declared_by_maker
 from magbridge.logs.mapping import Declared
 
-__all__ = ["HEAD", "Layout", "cells", "layout_of"]
+__all__ = ["BLANKS", "HEAD", "Layout", "cells", "layout_of"]
 
 HEAD = 200
 """Lines at the start of a file by which its layout is found."""

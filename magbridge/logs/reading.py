@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from magbridge.columns import CHANNEL_TIMES, counts_from_boot, require
 from magbridge.errors import FormatError
+from magbridge.files import existing
 from magbridge.guard import guarded
 from magbridge.logs.options import Options
 from magbridge.logs.registry import LEADS, format_of, is_bag
@@ -140,12 +141,7 @@ def _paths(paths: Paths) -> list[Path]:
         raise ValueError("expected at least one file")
     checked = [Path(path) for path in several]
     for path in checked:
-        if path.is_dir() and not is_bag(path):
-            raise FormatError(path, "expected a file, not a directory")
-        if not path.is_file() and not is_bag(path):
-            what = "not a pipe or a device" if path.exists() else "there is none"
-            raise FormatError(path, f"expected a file, {what}")
-        format_of(path)
+        format_of(path if is_bag(path) else existing(path))
     given = set(checked)
     return [path for path in checked if not _with_another(path, given)]
 

@@ -44,7 +44,7 @@ class Faults:
         self._lines: list[str] = []
 
     def note(self, column: str, wrong: BoolArray, numbers: Sequence[int], expected: str) -> None:
-        """Count values of a column ("" and ``time``: rows) that are wrong; `expected` is of the first.
+        """Count the `wrong` (n,) values of a column ("" and ``time``: rows); `expected` is of the first.
 
         FormatError: `strict`.
         """
@@ -118,7 +118,7 @@ class Table:
     def read(
         self, lines: list[str], numbers: Sequence[int]
     ) -> tuple[FloatArray, dict[str, FloatArray], list[int]]:
-        """Return the times, the values of each column, and the numbers of the lines that are rows."""
+        """Return the times (n,), the values (n,) of each column, and the numbers of the rows' lines."""
         self.faults.rows += len(lines)
         lines, kept = self._whole(lines, numbers)
         frame = self._frame(lines, kept)

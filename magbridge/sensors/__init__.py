@@ -17,7 +17,7 @@ from magbridge.errors import ConfigError
 from magbridge.records import Reading
 from magbridge.toml import convert
 
-__all__ = ["DRIVERS", "Driver", "open_driver"]
+__all__ = ["DRIVERS", "Driver", "driver_class", "open_driver"]
 
 DRIVERS: dict[str, tuple[str, str]] = {
     "ascii": ("magbridge.sensors.ascii", "Ascii"),
@@ -106,7 +106,7 @@ def open_driver(name: str, options: Mapping[str, Any], source: str | Path = "bri
         No such driver, or one that lacks a member; an option that is unknown, missing, of the wrong type or
         out of range.
     """
-    driver: type[Driver] = _find(name, source)
+    driver: type[Driver] = driver_class(name, source)
     _check(name, driver, ("Options", "feed", "start"), source)
     opened = driver(convert(dict(options), driver.Options, source, "sensor.options."))
     _check(name, opened, MEMBERS, source)
@@ -119,7 +119,8 @@ def _check(name: str, driver: object, members: tuple[str, ...], source: str | Pa
         raise ConfigError(source, "sensor.driver", f"driver {name!r} lacks {', '.join(lacking)}")
 
 
-def _find(name: str, source: str | Path) -> Any:
+def driver_class(name: str, source: str | Path) -> Any:
+    """Return the class of the driver called `name`; ConfigError, naming `source`: there is none."""
     if name in DRIVERS:
         module, attribute = DRIVERS[name]
         return getattr(import_module(module), attribute)

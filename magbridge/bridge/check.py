@@ -1,0 +1,241 @@
+"""What would go wrong with a ``bridge.toml``, all of it, without opening a port."""
+
+from __future__ import annotations
+
+import glob
+import os
+import shutil
+from collections.abc import Callable, Iterator
+from copy import deepcopy
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+
+from magbridge.bridge.links import LINKS, open_link
+from magbridge.bridge.pipeline import unmet
+from magbridge.bridge.serial_port import serial_line
+from magbridge.calibration import file as calibration_file
+from magbridge.calibration.model import Calibration
+from magbridge.config import Config, load
+from magbridge.errors import ConfigError, MagbridgeError
+from magbridge.link.component import check_publish
+from magbridge.link.telemetry import TelemetryMap
+from magbridge.mavlink import load_key
+from magbridge.sensors import open_driver
+from magbridge.toml import convert, load_toml
+
+__all__ = ["Finding", "access", "findings"]
+
+ROOM = 100e6
+"""Bytes that a log's disk should have."""
+
+
+class Finding(NamedTuple):
+    """Something that would go wrong.
+
+    Attributes
+    ----------
+    fatal : bool
+        The bridge would not start; otherwise it would start and wait, or run worse.
+    text : str
+        One line with the file, the key, and what was expected.
+    """
+
+    fatal: bool
+    text: str
+
+
+def findings(path: Path) -> list[Finding]:
+    """Return all that would go wrong with a configuration; nothing is opened but the files that it names.
+
+    Parameters
+    ----------
+    path : Path
+        The ``bridge.toml``.
+    """
+    try:
+        table = load_toml(path)
+    except ConfigError as error:
+        return [Finding(fatal=True, text=str(error))]
+    found = [Finding(fatal=True, text=line) for line in _keys(path, table)]
+    config = _what_is_left(path, table)
+    if config is not None:
+        found += dict.fromkeys(_contents(config))
+    try:
+        load(path)
+    except ConfigError as error:
+        if not any(one.fatal for one in found):
+            found.append(Finding(fatal=True, text=str(error)))
+    return found
+
+
+def _keys(path: Path, table: dict[str, Any]) -> list[str]:
+    """Return what is wrong with keys and types: each is taken out, so that the next is found, too."""
+    left, lines = deepcopy(table), []
+    for _ in range(1000):
+        try:
+            convert(left, Config, path)
+        except ConfigError as error:
+            lines.append(str(error))
+            if not _without(left, error.key):
+                break
+        else:
+            break
+    return lines
+
+
+def _without(table: dict[str, Any], key: str) -> bool:
+    """Take a dotted key out of nested tables; False: it is not there, as where it is missing."""
+    first, _, rest = key.replace("[...]", "").partition(".")
+    if rest and isinstance(table.get(first), dict):
+        return _without(table[first], rest)
+    return table.pop(first, None) is not None
+
+
+def _what_is_left(path: Path, table: dict[str, Any]) -> Config | None:
+    """Return the configuration without what is wrong in it, where sensor and link remain."""
+    left = deepcopy(table)
+    for _ in range(1000):
+        try:
+            return msgspec.structs.replace(convert(left, Config, path), path=path)
+        except ConfigError as error:
+            if not _without(left, error.key):
+                return None
+    return None
+
+
+def _contents(config: Config) -> Iterator[Finding]:
+    """Yield what is wrong with what the keys say, each looked at on its own."""
+    path = config.path
+    yield from _files(config)
+    calibration = None
+    if config.calibration is not None and (file := config.resolve(config.calibration.file)).exists():
+        try:
+            calibration = calibration_file.load(file)
+        except MagbridgeError as error:
+            yield Finding(fatal=True, text=str(error))
+    yield from _driver(config)
+    yield from _tried(
+        lambda: serial_line(config.sensor.port, config.sensor.baudrate, str(path), "sensor.port")
+    )
+    yield from _device(config, "sensor.port", config.sensor.port)
+    yield from _tried(lambda: open_link(config.link.url, config.link.baudrate, str(path)))
+    if config.link.url.partition(":")[0] not in LINKS:
+        yield from _device(config, "link.url", config.link.url.removeprefix("serial:"))
+    if config.link.signing_key and (key := config.resolve(config.link.signing_key)).exists():
+        yield from _tried(lambda: load_key(key))
+    for name, one in config.telemetry.items():
+        yield from _tried(partial(TelemetryMap, {name: one}, config.link.autopilot, path))
+    for name, rate in config.publish.items():
+        yield from _tried(partial(check_publish, {name: rate}, path))
+    if calibration is not None:
+        yield from _parameters(config, calibration)
+    if config.navigation is not None and config.resolve(config.navigation.map).exists():
+        yield from _map(config, calibration)
+    yield from _log(config)
+
+
+def _files(config: Config) -> Iterator[Finding]:
+    """Yield each file that the configuration names and that is not there."""
+    named = {
+        "calibration.file": config.calibration.file if config.calibration else None,
+        "link.signing_key": config.link.signing_key,
+        "navigation.map": config.navigation.map if config.navigation else None,
+    }
+    for key, name in named.items():
+        if name is not None and not (file := config.resolve(name)).exists():
+            yield Finding(fatal=True, text=str(ConfigError(config.path, key, f"no such file: {file}")))
+
+
+def _driver(config: Config) -> Iterator[Finding]:
+    """Yield what is wrong with the driver and its options: one taken out, the next is found, too."""
+    options = deepcopy(config.sensor.options)
+    for _ in range(1000):
+        try:
+            open_driver(config.sensor.driver, options, config.path)
+        except ConfigError as error:
+            yield Finding(fatal=True, text=str(error))
+            if not _without({"sensor": {"options": options}}, error.key):
+                return
+        else:
+            return
+
+
+def _tried(attempt: Callable[[], object]) -> Iterator[Finding]:
+    try:
+        attempt()
+    except MagbridgeError as error:
+        yield Finding(fatal=True, text=str(error))
+
+
+def _device(config: Config, key: str, name: str) -> Iterator[Finding]:
+    """Yield why a serial device could not be opened now."""
+    if "://" in name or not name.startswith("/"):
+        return
+    there = sorted(glob.glob(name))  # noqa: PTH207 - it may be absolute, which pathlib does not glob
+    if not there:
+        yield Finding(fatal=False, text=f"{config.path}: {key}: no {name} now: the bridge would wait for it")
+    for device in there:
+        if reason := access(device):
+            yield Finding(fatal=False, text=f"{config.path}: {key}: {reason}")
+
+
+def access(device: str) -> str:
+    """Return why a device may not be opened by this user, and what to do; empty where it may."""
+    if os.access(device, os.R_OK | os.W_OK):
+        return ""
+    group = _group(device)
+    hint = (
+        f": it belongs to the group {group}: sudo usermod -aG {group} $USER, then log in anew"
+        if group
+        else ""
+    )
+    return f"{device} may not be opened by this user{hint}"
+
+
+def _group(device: str) -> str:
+    try:
+        return Path(device).group()
+    except (OSError, KeyError, NotImplementedError):  # gone, without a name, or not on this system
+        return ""
+
+
+def _parameters(config: Config, calibration: Calibration) -> Iterator[Finding]:
+    """Yield each parameter that the calibration needs and the link would not provide."""
+    if not calibration.sensor.may_be(config.sensor.driver):
+        text = (
+            f"{config.path}: sensor.driver: the calibration is of {calibration.sensor.name!r}: every sample "
+        )
+        yield Finding(fatal=False, text=text + "would be uncalibrated")
+        return
+    for error in unmet(calibration, config):
+        yield Finding(fatal=True, text=str(error))
+    for doubt in calibration.doubts:
+        yield Finding(fatal=False, text=f"{config.path}: calibration.file: {doubt}")
+
+
+def _map(config: Config, calibration: Calibration | None) -> Iterator[Finding]:
+    from magbridge.bridge.navigation import open_navigation  # noqa: PLC0415 - it brings filterpy
+
+    assert config.navigation is not None
+    wanted = config.navigation
+    yield from _tried(lambda: open_navigation(config, wanted, calibration))
+
+
+def _log(config: Config) -> Iterator[Finding]:
+    if config.log is None:
+        yield Finding(
+            fatal=False, text=f"{config.path}: log: none is kept: nothing can be replayed or learned"
+        )
+        return
+    folder = config.resolve(config.log.directory)
+    there = next(one for one in (folder, *folder.absolute().parents) if one.exists())
+    key = f"{config.path}: log.directory"
+    if not there.is_dir():
+        yield Finding(fatal=False, text=f"{key}: {there} is a file")
+    elif not os.access(there, os.W_OK):
+        yield Finding(fatal=False, text=f"{key}: {there} cannot be written to")
+    elif (free := shutil.disk_usage(there).free) < ROOM:
+        yield Finding(fatal=False, text=f"{key}: {free / 1e6:.0f} MB are free")

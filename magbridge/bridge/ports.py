@@ -1,0 +1,179 @@
+"""What speaks on a serial line: a fluxgate, an autopilot, a GPS, or something that nobody here knows."""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+import serial
+from serial.tools import list_ports
+
+from magbridge.bridge.check import access
+from magbridge.mavlink import BAD_DATA, Codec
+from magbridge.sensors import DRIVERS, driver_class
+
+__all__ = ["BAUDRATES", "Heard", "Port", "listen", "ports", "recognise"]
+
+BAUDRATES = (115_200, 57_600, 9_600, 38_400, 230_400, 19_200, 921_600)
+"""Bit/s at which a line is listened to, the most usual first."""
+SENTENCE = re.compile(rb"[$!][A-Z]{5},[ -~]*\*[0-9A-Fa-f]{2}\r?\n")
+LINE = re.compile(rb"[^\r\n]+[\r\n]")
+NUMBER = re.compile(rb"[-+]?\d+(?:\.\d+)?")
+SHOWN = 60
+"""Characters of a line that nobody understands which are shown."""
+ENOUGH = 3
+"""Readings or frames by which a sender is known."""
+
+
+class Heard(NamedTuple):
+    """What a line sends.
+
+    Attributes
+    ----------
+    who : str
+        ``mavlink``, ``nmea``, the name of a driver, ``text``, ``bytes``; empty where nothing came.
+    told : str
+        More of it, for people: rates, systems, the first line that cannot be parsed.
+    """
+
+    who: str
+    told: str
+
+
+class Port(NamedTuple):
+    """A serial port of this computer.
+
+    Attributes
+    ----------
+    device : str
+    description : str
+        What the USB says of it.
+    """
+
+    device: str
+    description: str
+
+
+def ports() -> list[Port]:
+    """Return the serial ports that there are, those without hardware left out."""
+    found = [one for one in list_ports.comports() if one.hwid != "n/a" or one.vid is not None]
+    return [Port(one.device, _described(one)) for one in sorted(found)]
+
+
+def _described(one: Any) -> str:
+    number = f"serial number {one.serial_number}" if one.serial_number else ""
+    return ", ".join(text for text in (one.manufacturer, one.product or one.description, number) if text)
+
+
+def listen(
+    device: str, baudrates: Sequence[int] = BAUDRATES, seconds: float = 1.5
+) -> tuple[Heard, int | None, bytes]:
+    """Return what speaks on a device, at which baud rate, and what came; nothing is sent.
+
+    Parameters
+    ----------
+    device : str
+        A device or a pyserial URL.
+    baudrates : sequence of int
+        Tried in turn, until one is understood.
+    seconds : float
+        For each.
+    """
+    best, at, came = Heard("", "silent"), None, b""
+    for baudrate in baudrates:
+        try:
+            data = _read(device, baudrate, seconds)
+        except (serial.SerialException, OSError, ValueError) as error:
+            return Heard("", access(device) or f"cannot be opened: {error}"), None, b""
+        heard = recognise(data, seconds)
+        if heard.who not in {"", "bytes", "text"}:
+            return heard, baudrate, data
+        if (heard.who == "text") > (best.who == "text") or (heard.who and not best.who):
+            best, at, came = heard, baudrate, data
+        if "://" in device:  # a network's line has no baud rate of ours
+            break
+    return best, at, came
+
+
+def _read(device: str, baudrate: int, seconds: float) -> bytes:
+    line = serial.serial_for_url(device, baudrate, timeout=0.1, do_not_open=True)
+    line.exclusive = None if "://" in device else True
+    # opening must not reset what is at the other end, as it does an Arduino
+    line.dtr = line.rts = False
+    data, end = b"", time.monotonic() + seconds
+    with line:
+        while time.monotonic() < end:
+            data += line.read(4096)
+    return data
+
+
+def recognise(data: bytes, seconds: float) -> Heard:
+    """Return what sent these bytes within `seconds`."""
+    if not data:
+        return Heard("", "silent")
+    for known in (_mavlink(data), _nmea(data), *_drivers(data, seconds)):
+        if known is not None:
+            return known
+    lines = LINE.findall(data)
+    printable = sum(32 <= byte < 127 or byte in b"\r\n\t" for byte in data) / len(data)
+    if printable < 0.9 or not lines:
+        return Heard("bytes", f"not understood: {data[:24].hex(' ')}")
+    line = lines[len(lines) // 2]
+    shown = line.decode("ascii", "replace").strip()[:SHOWN]
+    numbers = len(NUMBER.findall(line))
+    hint = "; if these are x y z, driver ascii reads them: columns" if numbers >= 3 else ""
+    return Heard("text", f"not understood: {shown!r}{hint}")
+
+
+def _mavlink(data: bytes) -> Heard | None:
+    codec = Codec(255, 190)
+    frames = [one for one in codec.parse(data) if one.id != BAD_DATA and one.known]
+    if len(frames) < ENOUGH:
+        return None
+    senders = sorted({(one.system, one.component) for one in frames})
+    return Heard(
+        "mavlink", ", ".join(f"system {system} component {component}" for system, component in senders)
+    )
+
+
+def _nmea(data: bytes) -> Heard | None:
+    valid = [line for line in SENTENCE.findall(data) if _checked(line)]
+    if len(valid) < ENOUGH:
+        return None
+    kinds = sorted({line[1:6].decode() for line in valid})
+    return Heard("nmea", f"NMEA 0183: {' '.join(kinds)}")
+
+
+def _checked(sentence: bytes) -> bool:
+    text, _, digits = sentence[1:].partition(b"*")
+    total = 0
+    for byte in text:
+        total ^= byte
+    return total == int(digits[:2], 16)
+
+
+def _drivers(data: bytes, seconds: float) -> Iterator[Heard | None]:
+    """Yield what our own drivers make of the bytes: those that need no more than that."""
+    for name in DRIVERS:
+        for options in OPTIONS.get(name, ({},)):
+            kind = driver_class(name, "ports")
+            driver = kind(kind.Options(**options))
+            driver.start()
+            readings = driver.feed(data)
+            wasted = driver.bytes_skipped / len(data)
+            if len(readings) >= ENOUGH and wasted < 0.5:
+                said = ", ".join(
+                    f"{key} = {value!r}" for key, value in options.items() if key != "sensitivity"
+                )
+                rate = f"{len(readings) / seconds:.0f} readings/s"
+                yield Heard(name, f"driver {name}, {rate}" + (f", with {said}" if said else ""))
+
+
+OPTIONS: dict[str, tuple[dict[str, Any], ...]] = {
+    "ascii": (),  # any line of numbers would do: it has to be described
+    "digitizer": ({"sensitivity": 1e-5},),
+    "hmr2300": ({"output": "ascii"}, {"output": "binary"}),
+}
+"""Driver -> the options to try; the sensitivity says nothing about the line."""

@@ -1,0 +1,225 @@
+"""Attach a bridge: write its configuration, see what speaks where, and what the drivers take."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from cyclopts import Parameter, validators
+
+from magbridge.cli.common import Json, Whole, app, complain, file_to_write, print_result
+from magbridge.errors import WrongUse
+
+if TYPE_CHECKING:
+    from magbridge.calibration.model import Calibration
+
+
+@app.command(usage="Usage: magbridge init [-o bridge.toml] [OPTIONS]")
+def init(
+    *,
+    output: Annotated[Path, Parameter(name=["--output", "-o"], validator=file_to_write(".toml"))] = Path(
+        "bridge.toml"
+    ),
+    driver: str | None = None,
+    port: str | None = None,
+    baudrate: Annotated[Whole, Parameter(validator=validators.Number(gt=0, lte=20_000_000))] = 9600,
+    link: str | None = None,
+    system: Annotated[Whole | None, Parameter(validator=validators.Number(gte=1, lte=255))] = None,
+    parameter: tuple[str, ...] = (),
+    option: tuple[str, ...] = (),
+    calibration: Path | None = None,
+) -> None:
+    """Write a commented bridge.toml, from five questions or from options.
+
+    On a terminal it asks for what no option says: sensor, port, link, system id, moving masses.
+
+    Parameters
+    ----------
+    output
+        The configuration to write; one that is there is not overwritten.
+    driver
+        The sensor's driver; magbridge drivers lists them.
+    port
+        The sensor's port: a device, a pattern (/dev/ttyUSB*) or a pyserial URL.
+    baudrate
+        The sensor's baud rate.
+    link
+        The MAVLink URL, as udpout:192.0.2.1:14550, or a serial device.
+    system
+        The vehicle's system id.
+    parameter
+        A moving mass, as "battpos [in]"; may be repeated. Those of a calibration need not be named.
+    option
+        An option of the driver, as sensitivity=5e-5; may be repeated.
+    calibration
+        The calibration (cal.json) to correct with.
+    """
+    if output.exists():
+        raise WrongUse(f"{output}: is there already; choose another with -o")
+
+    from magbridge.bridge.check import findings
+    from magbridge.bridge.init import Answers, bridge_toml
+    from magbridge.files import atomic_path
+
+    known = _loaded(calibration)
+    asks = sys.stdin.isatty() and sys.stdout.isatty()
+    driver = driver or _ask("1. Which sensor?", _drivers_told(), "digitizer", asks, "--driver")
+    port = port or _ask("2. On which port?", _ports_told(), "/dev/ttyUSB*", asks, "--port")
+    default = "udpout:127.0.0.1:14550"
+    link = link or _ask("3. Where is the autopilot or the ground station?", "", default, asks, "--link")
+    number = system or int(_ask("4. The vehicle's system id?", "", "1", asks, "--system"))
+    names = parameter
+    if not names and known is None and asks:
+        told = "as: battpos [in], ballast [cm3]; none: press Enter"
+        names = tuple(name.strip() for name in _ask("5. Which masses move?", told, "", asks, "").split(","))
+        names = tuple(name for name in names if name)
+    answers = Answers(
+        driver,
+        port,
+        baudrate,
+        link,
+        number,
+        names,
+        dict(map(_option, option)),
+        _relative(calibration, output),
+    )
+    text = bridge_toml(answers, known)
+    with atomic_path(output) as path:
+        path.write_text(text, encoding="utf-8")
+    for one in findings(output):
+        complain(one.text)
+    print(f"{output}: written; next: magbridge run --check --config {output}")
+
+
+def _loaded(calibration: Path | None) -> Calibration | None:
+    from magbridge.calibration.file import load
+
+    return load(calibration) if calibration else None
+
+
+def _relative(file: Path | None, output: Path) -> str | None:
+    """Return how `output` is to name a file: paths in it are relative to it."""
+    if file is None:
+        return None
+    folder = output.absolute().parent
+    return (
+        str(file.absolute().relative_to(folder))
+        if file.absolute().is_relative_to(folder)
+        else str(file.absolute())
+    )
+
+
+def _ask(question: str, told: str, default: str, asks: bool, flag: str) -> str:
+    if not asks:
+        if not default:
+            raise WrongUse(f"expected {flag}")
+        return default
+    if told:
+        print(told)
+    answer = input(f"{question} [{default}] " if default else f"{question} ").strip()
+    return answer or default
+
+
+def _drivers_told() -> str:
+    from magbridge.sensors.options import driver_names
+
+    return f"drivers: {', '.join(driver_names())} (magbridge drivers NAME: its options)"
+
+
+def _ports_told() -> str:
+    from magbridge.bridge.ports import ports as there
+
+    found = [f"  {one.device}  {one.description}" for one in there()]
+    return "\n".join(["ports of this computer:", *found]) if found else "no serial port is there now"
+
+
+def _option(text: str) -> tuple[str, Any]:
+    import tomllib
+
+    name, equals, value = text.partition("=")
+    if not equals:
+        raise WrongUse(f"--option {text}: expected NAME=VALUE, as sensitivity=5e-5")
+    try:
+        return name.strip(), tomllib.loads(f"value = {value.strip()}")["value"]
+    except tomllib.TOMLDecodeError:
+        return name.strip(), value.strip()  # a word without quotes
+
+
+@app.command(usage="Usage: magbridge ports [PORT...] [OPTIONS]")
+def ports(
+    *names: str,
+    baudrate: tuple[int, ...] = (),
+    seconds: Annotated[float, Parameter(validator=validators.Number(gt=0, lte=600))] = 1.5,
+    json: Json = False,
+) -> None:
+    """Listen on serial ports, and show what speaks on each.
+
+    It is a sensor, an autopilot, a GPS, or a line that cannot be parsed, which is then shown. Nothing is
+    sent: a sensor that waits for a command stays silent here.
+
+    Parameters
+    ----------
+    names
+        The ports to listen on: devices or pyserial URLs; all of this computer's if none is given.
+    baudrate
+        A baud rate to listen at; may be repeated. If not given: the usual ones, until one is understood.
+    seconds
+        How long to listen at each baud rate.
+    json
+        Print the result as JSON.
+    """
+    from magbridge.bridge.ports import BAUDRATES, Port, listen
+    from magbridge.bridge.ports import ports as there
+    from magbridge.progress import track
+
+    asked = [Port(name, "") for name in names] or there()
+    found = []
+    for port in track(asked, "listening", len(asked)):
+        heard, at, _ = listen(port.device, baudrate or BAUDRATES, seconds)
+        found.append(
+            {
+                "port": port.device,
+                "device": port.description,
+                "who": heard.who,
+                "said": heard.told,
+                "baudrate": at,
+            }
+        )
+        if not json:
+            speed = f" at {at} bit/s" if at and heard.who else ""
+            about = f" ({port.description})" if port.description else ""
+            print(f"{port.device}{about}: {heard.told}{speed}")
+    if not asked and not json:
+        print("no serial port is there")
+    if json:
+        print_result({"ports": found}, "", as_json=True)
+
+
+@app.command(usage="Usage: magbridge drivers [NAME] [OPTIONS]")
+def drivers(name: str | None = None, /, *, json: Json = False) -> None:
+    """List the drivers of sensors, or the options of one, as they stand in [sensor.options] of a bridge.toml.
+
+    Parameters
+    ----------
+    name
+        The driver.
+    json
+        Print the result as JSON.
+    """
+    from magbridge.sensors.options import driver_names, options_of
+
+    facts = {}
+    for one in [name] if name else driver_names():
+        facts[one] = [
+            {"name": o.name, "type": o.kind, "required": o.required, "meaning": o.meaning}
+            | ({} if o.required else {"default": o.default})
+            for o in options_of(one)
+        ]
+    lines = []
+    for one, options in facts.items():
+        lines.append(f"{one}:")
+        for option in options:
+            default = "required" if option["required"] else f"default {option['default']!r}"
+            lines.append(f"  {option['name']} ({option['type']}; {default}): {option['meaning']}")
+    print_result(facts, "\n".join(lines), json)

@@ -1,0 +1,144 @@
+"""What speaks on a serial line is recognised by its bytes, through real pseudo-terminals."""
+
+from __future__ import annotations
+
+import json
+import os
+import pty
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import reduce
+from operator import xor
+from pathlib import Path
+
+import pytest
+from commands import Command
+
+from magbridge.bridge.check import findings
+from magbridge.bridge.ports import listen, recognise
+from magbridge.config import load
+from magbridge.mavlink import Codec
+from magbridge.sensors.options import driver_names, options_of
+
+
+def nmea(text: str) -> bytes:
+    return f"${text}*{reduce(xor, text.encode()):02X}\r\n".encode()
+
+
+def hmr(k: int) -> bytes:
+    return f" 12,3{k:02}  - 1,045   23,100\r".encode()
+
+
+SPEAKERS = {
+    "nmea": b"".join(nmea(f"GPGGA,12000{k},4736.0,N,05242.0,W") for k in range(5)),
+    "mavlink": b"".join(
+        Codec(7, 1).pack("HEARTBEAT", type=1, autopilot=3, system_status=4, mavlink_version=3)
+        for _ in range(5)
+    ),
+    "hmr2300": b"".join(hmr(k) for k in range(9)),
+    "text": b"".join(f"B={k}.5 X 1 2 3\r\n".encode() for k in range(9)),
+    "bytes": bytes(range(128, 250)) * 3,
+    "": b"",
+}
+
+
+@contextmanager
+def speaking(data: bytes) -> Iterator[str]:
+    """Give a pseudo-terminal that says `data` again and again."""
+    master, slave = pty.openpty()
+    stop = threading.Event()
+
+    def say() -> None:
+        while not stop.wait(0.02):
+            if data:
+                os.write(master, data)
+
+    talker = threading.Thread(target=say)
+    talker.start()
+    try:
+        yield os.ttyname(slave)
+    finally:
+        stop.set()
+        talker.join()
+        os.close(master)
+        os.close(slave)
+
+
+@pytest.mark.parametrize("who", SPEAKERS)
+def test_recognised(who: str) -> None:
+    with speaking(SPEAKERS[who]) as device:
+        heard, baudrate, _ = listen(device, (9600,), 0.4)
+    assert heard.who == who
+    assert baudrate == (9600 if who else None)
+
+
+def test_the_line_that_cannot_be_parsed_is_shown() -> None:
+    assert recognise(SPEAKERS["text"], 1.0).told.startswith(
+        "not understood: 'B=4.5 X 1 2 3'; if these are x y z"
+    )
+    assert "80 81 82" in recognise(SPEAKERS["bytes"], 1.0).told
+
+
+def test_systems_are_named() -> None:
+    assert recognise(SPEAKERS["mavlink"], 1.0).told == "system 7 component 1"
+
+
+def test_ports_as_a_command(command: Command) -> None:
+    with speaking(SPEAKERS["nmea"]) as device:
+        said = command("ports", device, "/dev/no_such", "--seconds", "0.3", "--baudrate", "9600", "--json")
+    first, second = json.loads(said.out)["ports"]
+    assert (first["who"], first["said"], first["baudrate"]) == ("nmea", "NMEA 0183: GPGGA", 9600)
+    assert "cannot be opened" in second["said"] or "may not be opened" in second["said"]
+
+
+@pytest.mark.parametrize("driver", driver_names())
+def test_every_option_of_a_driver_is_told(driver: str, command: Command) -> None:
+    said = command("drivers", driver).out
+    for one in options_of(driver):
+        assert one.name in said
+        assert one.kind
+        assert one.meaning, one.name
+
+
+@pytest.mark.parametrize(
+    ("driver", "options"),
+    [
+        ("hmr2300", ()),
+        ("twinleaf", ()),
+        ("digitizer", ("--option", "sensitivity=5e-5")),
+        ("ascii", ("--option", 'columns=["x", "y", "z"]', "--option", "unit=uT")),
+    ],
+)
+def test_init_writes_what_run_would_start_with(
+    driver: str, options: tuple[str, ...], here: Path, command: Command
+) -> None:
+    command("init", "--driver", driver, "--port", "loop://", "--parameter", "battpos [in]", *options)
+    config = load("bridge.toml")
+    assert config.telemetry["battpos"].unit == "in"
+    assert not [one for one in findings(Path("bridge.toml")) if one.fatal]
+    assert "would start" in command("run", "--check", "--config", "bridge.toml").out
+    assert "is there already" in command.refuses("init", code=2)
+    assert not (here / "logs").exists()
+
+
+def test_init_says_what_is_left_to_fill_in(command: Command) -> None:
+    said = command("init", "--driver", "digitizer")
+    assert "sensor.options.sensitivity: missing key" in said.err
+    assert "FILL IN" in Path("bridge.toml").read_text()
+    assert "1 thing to mend" in command("run", "--check", "--config", "bridge.toml", code=2).err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ("init --driver none", "expected one of ascii, digitizer, hmr2300, twinleaf"),
+        ("init --option x", "expected NAME=VALUE"),
+        ("init --calibration none.json", "none.json: cannot be read"),
+        ("drivers none", "expected one of ascii"),
+        ("run --check --config none.toml", "none.toml: No such file"),
+    ],
+)
+def test_what_is_wrong_is_one_line(arguments: str, words: str, command: Command) -> None:
+    code = 1 if "calibration" in arguments else 2
+    assert words in command(*arguments.split(), code=code).err

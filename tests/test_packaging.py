@@ -1,0 +1,107 @@
+"""What is shipped beside the package: the service, the adapter's rule, the container and BlueOS extension."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import subprocess
+from configparser import ConfigParser
+from pathlib import Path
+
+import pytest
+
+from magbridge.version import __version__
+
+PACKAGING = Path(__file__).parents[1] / "tools" / "packaging"
+
+
+class _Unit(ConfigParser):
+    """A systemd unit: keys keep their capitals, and may be repeated."""
+
+    def optionxform(self, optionstr: str) -> str:
+        return optionstr
+
+
+def test_the_service_runs_what_the_command_line_has() -> None:
+    unit = _Unit(strict=False, interpolation=None)
+    unit.read(PACKAGING / "magbridge.service")
+    service = unit["Service"]
+    assert re.fullmatch(r"/\S+/magbridge run --config /\S+\.toml", service["ExecStart"])
+    assert service["RestartPreventExitStatus"] == "2"  # wrong use: the configuration
+    assert service["SupplementaryGroups"] == "dialout"
+    assert service["WorkingDirectory"] == f"/var/lib/{service['StateDirectory']}"
+    assert service["ExecStart"].split()[-1].startswith(service["WorkingDirectory"])
+
+
+def test_systemd_finds_nothing_wrong_with_the_service(tmp_path: Path) -> None:
+    verify = shutil.which("systemd-analyze")
+    if verify is None:
+        pytest.skip("systemd-analyze is not installed")
+    unit = tmp_path / "magbridge.service"
+    text = (PACKAGING / "magbridge.service").read_text()
+    unit.write_text(text.replace("/opt/magbridge/bin/magbridge", "/bin/true"))
+    done = subprocess.run([verify, "verify", str(unit)], capture_output=True, text=True, check=False)
+    assert not [line for line in done.stderr.splitlines() if "magbridge.service" in line]
+
+
+def test_the_rule_names_each_adapter_once() -> None:
+    lines = [
+        line for line in (PACKAGING / "99-magbridge.rules").read_text().splitlines() if line[:1] not in "#"
+    ]
+    part = r'[A-Z]+(?:\{\w+\})?(?:==|\+=|=)"[^"]*"'
+    assert all(re.fullmatch(rf"{part}(?:, {part})*", line) for line in lines)
+    assert all('SYMLINK+="fluxgate"' in line and 'GROUP="dialout"' in line for line in lines)
+    adapters = [re.findall(r'ATTRS\{id\w+\}=="(\w{4})"', line) for line in lines]
+    assert all(len(one) == 2 for one in adapters)
+    assert len({tuple(one) for one in adapters}) == len(lines)
+
+
+def labels() -> dict[str, str]:
+    text = (PACKAGING / "Containerfile").read_text()
+    return {name: value.strip("\"'") for name, value in re.findall(r"^LABEL (\w+)=(.*)$", text, re.MULTILINE)}
+
+
+def test_the_extension_has_the_labels_that_blueos_asks_for() -> None:
+    found = labels()
+    assert found["version"] == __version__
+    assert found.keys() >= {"version", "permissions", "authors", "company", "readme", "links", "type", "tags"}
+    assert json.loads(found["permissions"])["HostConfig"]["GroupAdd"] == ["dialout"]
+    assert all(one["name"] for one in json.loads(found["authors"]))
+    assert json.loads(found["company"]).keys() >= {"name", "about"}
+    assert isinstance(json.loads(found["links"]), dict)
+    assert re.fullmatch(r"https://raw\.githubusercontent\.com/\S+/\{tag\}/(\S+\.md)", found["readme"])
+    assert (PACKAGING.parents[1] / found["readme"].split("{tag}/")[1]).is_file()
+
+
+def test_the_extension_s_entry_in_the_store() -> None:
+    entry = json.loads((PACKAGING / "blueos" / "metadata.json").read_text())
+    assert entry.keys() == {"name", "website", "docker", "description"}
+    assert all(entry.values())
+
+
+def test_the_container_starts_the_command() -> None:
+    text = (PACKAGING / "Containerfile").read_text()
+    (command,) = re.findall(r"^ENTRYPOINT (.*)$", text, re.MULTILINE)
+    (arguments,) = re.findall(r"^CMD (.*)$", text, re.MULTILINE)
+    assert [*json.loads(command), *json.loads(arguments)] == [
+        "magbridge",
+        "run",
+        "--config",
+        "/data/bridge.toml",
+    ]
+
+
+def test_the_container_can_be_built() -> None:
+    builders = [shutil.which(name) for name in ("docker", "podman", "buildah")]
+    working = [
+        one
+        for one in builders
+        if one and not subprocess.run([one, "info"], capture_output=True, check=False).returncode
+    ]
+    if not working:
+        pytest.skip("neither docker, podman nor buildah works here")
+    build = working[0]
+    subprocess.run(
+        [build, "build", "-f", PACKAGING / "Containerfile", PACKAGING.parents[1]], check=True, timeout=600
+    )
