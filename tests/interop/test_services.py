@@ -1,0 +1,184 @@
+"""Files and parameters by programs that nobody here wrote, also through one that forwards, and old peers."""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from pymavlink.dialects.v10 import common as version_1
+from rig import Rig
+
+from magbridge.link.ftp import HEADER, Opcode
+from magbridge.mavlink import Codec, Message
+
+LOG = "20250101T000000Z_0001.tlog"
+MakeRig = Callable[[str], Rig]
+Start = Callable[..., Any]
+
+
+def port(rig: Rig) -> int:
+    return int(rig.url.rpartition(":")[2])
+
+
+def with_a_log(rig: Rig, size: int) -> bytes:
+    content = bytes(range(251)) * (size // 251)
+    rig.until((rig.folder / "logs").is_dir)
+    (rig.folder / "logs" / LOG).write_bytes(content)
+    return content
+
+
+def proxy(python: Path, *arguments: str) -> list[object]:
+    return [python, python.with_name("mavproxy.py"), "--state-basedir=.", *arguments]
+
+
+def test_mavproxy_reads_logs_both_ways(make_rig: MakeRig, start_peer: Start, python: Path) -> None:
+    rig = make_rig("udpout")
+    content = with_a_log(rig, 200_000)
+    target = ("--target-system=1", "--target-component=191", "--default-modules=ftp,log,link,param")
+    peer = start_peer(rig, proxy(python, f"--master=udpin:127.0.0.1:{port(rig)}", *target))
+    peer.until("Detected vehicle 1:191")
+    peer.ask("ftp list @MAV_LOG")
+    peer.until(LOG)
+    peer.ask(f"ftp get @MAV_LOG/{LOG} by_ftp.tlog")
+    got = rig.folder / "by_ftp.tlog"
+    rig.until(lambda: got.exists() and got.stat().st_size == len(content), 60)
+    peer.ask("ftp get ../key.bin none.bin")
+    peer.until("ftp open failed")
+    peer.ask("log list")
+    peer.until(f"lastLog {len(rig.logs)}")
+    peer.ask("log download 1 by_log.tlog")
+    peer.until("Finished downloading by_log.tlog", timeout=60)
+    peer.end()
+    assert got.read_bytes() == content
+    assert (rig.folder / "by_log.tlog").read_bytes() == content
+    assert rig.stop() == 0
+
+
+def indices(values: list[Message]) -> set[int]:
+    return {value["param_index"] for value in values}
+
+
+class Ear:
+    """A station on a socket: says frames, and keeps what it hears."""
+
+    def __init__(self, system: int) -> None:
+        self.codec, self.ear = Codec(system, 190), Codec(0, 0)
+        self.line = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.line.bind(("127.0.0.1", 0))
+        self.line.setblocking(False)
+        self.peer: Any = None
+        self.heard: list[Message] = []
+
+    @property
+    def number(self) -> int:
+        return int(self.line.getsockname()[1])
+
+    def turn(self) -> None:
+        try:
+            while True:
+                data, self.peer = self.line.recvfrom(65536)
+                self.heard += self.ear.parse(data)
+        except BlockingIOError:
+            return
+
+    def say(self, name: str, **fields: object) -> None:
+        if self.peer is not None:
+            self.line.sendto(self.codec.pack(name, **fields), self.peer)
+
+    def of(self, name: str) -> list[Message]:
+        self.turn()
+        return [one for one in self.heard if one.name == name]
+
+
+@pytest.fixture
+def ears() -> Iterator[list[Ear]]:
+    made = [Ear(255), Ear(254)]
+    yield made
+    for one in made:
+        one.line.close()
+
+
+def ftp(opcode: int, data: bytes, sequence: int) -> dict[str, object]:
+    head = HEADER.pack(sequence, 0, opcode, len(data), 0, 0, 0)
+    return {"target_system": 1, "target_component": 191, "payload": (head + data).ljust(251, b"\0")}
+
+
+def test_two_stations_and_a_vehicle_behind_a_router(
+    make_rig: MakeRig, start_peer: Start, python: Path, ears: list[Ear]
+) -> None:
+    """MAVProxy forwards between the bridge and two stations; another vehicle is heard through it, too."""
+    rig = make_rig("udpout")
+    with_a_log(rig, 1000)
+    outs = [f"--out=udp:127.0.0.1:{one.number}" for one in ears]
+    target = (
+        "--target-system=1",
+        "--target-component=191",
+        "--default-modules=link,output",
+        "--streamrate=-1",
+    )
+    start_peer(rig, proxy(python, f"--master=udpin:127.0.0.1:{port(rig)}", *outs, *target))
+    rig.until(lambda: all(one.of("MAG_FIELD") or one.of("HEARTBEAT") for one in ears), 60)
+    for one in ears:
+        one.say("HEARTBEAT", type=6, autopilot=8, mavlink_version=3)
+    names = 15
+    rig.until(
+        lambda: all(len({v["param_index"] for v in one.of("PARAM_VALUE")}) >= names for one in ears), 30
+    )
+    for k, one in enumerate(ears):
+        one.say("FILE_TRANSFER_PROTOCOL", **ftp(Opcode.LIST, b"logs", 10 + k))
+    rig.until(lambda: all(one.of("FILE_TRANSFER_PROTOCOL") for one in ears), 30)
+    other = Codec(2, 1)
+    for name, fields in (
+        ("HEARTBEAT", {"type": 12, "autopilot": 3, "mavlink_version": 3}),
+        ("NAMED_VALUE_FLOAT", {"name": "battpos", "value": -9.0}),
+    ):
+        ears[0].line.sendto(other.pack(name, **fields), ears[0].peer)
+    rig.until(lambda: any("vehicle 2 is on the link" in one["text"] for one in ears[1].of("STATUSTEXT")), 30)
+    assert rig.stop() == 0
+
+
+def test_an_autopilot_that_speaks_mavlink_1(tmp_path: Path) -> None:
+    """Its telemetry counts; what we send stays MAVLink 2."""
+    rig = Rig(tmp_path, "udpin")
+    station = version_1.MAVLink(None, 1, 1)
+    try:
+        rig.fluxgate.plug()
+        rig.autopilot.up()
+        rig.autopilot.pack = lambda name, /, **fields: old(station, name, fields)  # type: ignore[method-assign]
+        rig.again()
+        assert rig.status["autopilot_state"] == 1
+        assert rig.stop() == 0
+        assert all(one.message.frame[0] == 0xFD for one in rig.heard)
+    finally:
+        rig.close()
+
+
+def old(station: Any, name: str, fields: dict[str, Any]) -> bytes:
+    """Return a frame of version 1; nothing for a message or a field that it lacks."""
+    if "name" in fields:
+        fields = {**fields, "name": fields["name"].encode()}
+    make = getattr(version_1, f"MAVLink_{name.lower()}_message")
+    wanted = {key: fields.get(key, 0) for key in make.fieldnames}
+    return bytes(make(**wanted).pack(station))
+
+
+def test_a_station_behind_the_autopilot(tmp_path: Path) -> None:
+    """On a serial line all that a station says comes through the autopilot, and all answers go back there."""
+    rig = Rig(tmp_path, "serial")
+    try:
+        rig.start()
+        rig.until(lambda: rig.of("HEARTBEAT"))  # so the autopilot knows where 1:191 is
+        station, mark = Codec(255, 190), rig.mark
+        rig.autopilot.send(station.pack("HEARTBEAT", type=6, autopilot=8, mavlink_version=3))
+        rig.autopilot.send(station.pack("FILE_TRANSFER_PROTOCOL", **ftp(Opcode.LIST, b"/", 1)))
+        rig.until(lambda: rig.of("FILE_TRANSFER_PROTOCOL", mark))
+        rig.until(lambda: len(indices(rig.of("PARAM_VALUE", mark))) >= 15)
+        (reply,) = rig.of("FILE_TRANSFER_PROTOCOL", mark)
+        assert (reply["target_system"], reply["target_component"]) == (255, 190)
+        assert b"D@MAV_LOG\0" in reply["payload"]
+        assert rig.undue_flags(mark) == ""
+    finally:
+        rig.close()
