@@ -69,6 +69,7 @@ COLUMNS: dict[str, Column] = {
     "dr_longitude": Column("deg", "dead-reckoned longitude"),
     "total_field": Column("nT", "corrected total magnetic field"),
     "total_field_sigma": Column("nT", "1-sigma of the corrected total field"),
+    "level_sigma": Column("nT", "the part of total_field_sigma that all samples share"),
     "field_x": Column("nT", "corrected magnetic field, body x (forward)"),
     "field_y": Column("nT", "corrected magnetic field, body y (starboard)"),
     "field_z": Column("nT", "corrected magnetic field, body z (down)"),

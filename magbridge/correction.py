@@ -57,6 +57,7 @@ class Correction:
         self.names = tuple(one.name for one in inputs)
         self._wants_temperature = TEMPERATURE in self.names
         self._corrector = Corrector(calibration)
+        self._raised = Corrector(calibration.at_level()) if calibration.level else None
 
     def as_declared(self, attrs: Mapping[str, Any]) -> None:
         """Align as the bridge did whose log declares its settings among its attributes.
@@ -94,6 +95,13 @@ class Correction:
             sx, sy, sz = sqrt(sx * sx + more), sqrt(sy * sy + more), sqrt(sz * sz + more)
         return sample, Corrected(F, sigma, (x, y, z), (sx, sy, sz), quality)
 
+    def level(self, sample: Sample, corrected: Corrected) -> float:
+        """Return how much of a corrected sample's sigma all samples share, nT; NaN without a level."""
+        if self._raised is None:
+            return nan
+        raised = self._raised.numbers(sample.time_us, sample.field, sample.values, sample.quality)[0][0]
+        return abs(raised - corrected.total_field)
+
     def _more(self, sample: Sample) -> float:
         """Return the variance to add: ``s^2 + sum ((F(hi) - F(lo)) / 2)^2``, s and spans the sample's."""
         more = sample.sigma * sample.sigma
@@ -120,9 +128,9 @@ def correct_rows(correction: Correction, deployment: xr.Dataset) -> xr.Dataset:
     Dataset (time)
         ``total_field total_field_sigma field_x field_y field_z anomaly quality``; ``time`` as in the input.
         The field is in body axes. The anomaly is the total field minus the IGRF, NaN where there is no
-        position or no date. All in nT, but for ``quality``, the bits of
-        :class:`~magbridge.records.Quality`. A row without any channel is not a sample but telemetry: NaN
-        there, with ``gap``.
+        position or no date. ``level_sigma`` is there where the calibration states one. All in nT, but for
+        ``quality``, the bits of :class:`~magbridge.records.Quality`. A row without any channel is not a
+        sample but telemetry: NaN there, with ``gap``.
 
     Raises
     ------
@@ -136,12 +144,16 @@ def correct_rows(correction: Correction, deployment: xr.Dataset) -> xr.Dataset:
     require(deployment, CHANNELS)
     correction.as_declared(deployment.attrs)
     results = np.full((deployment.sizes["time"], len(CORRECTED)), nan)
+    level = np.full(len(results), nan)
     results[:, CORRECTED.index("quality")] = Quality.GAP
     for row, reading, stamp in _readings(correction, deployment):
-        one = correction.reading(reading, stamp)[1]
+        sample, one = correction.reading(reading, stamp)
+        level[row] = correction.level(sample, one)
         results[row] = one.total_field, one.total_field_sigma, *one.field, nan, one.quality
     _keep_late_joins(results, deployment)
     columns = dict(zip(CORRECTED, results.T, strict=True))
+    if np.isfinite(level).any():
+        columns["level_sigma"] = level
     columns["anomaly"] = columns["total_field"] - magnitude(main_field(deployment))
     return xr.Dataset(
         {name: ("time", column, COLUMNS[name]._asdict()) for name, column in columns.items()},

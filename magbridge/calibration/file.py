@@ -24,7 +24,7 @@ __all__ = ["FORMAT", "calibration_id", "decode_calibration", "encode_calibration
 FORMAT = 4
 """Version of the layout; a reader takes this one and all before it. In 1, the noise's
 ``autocorrelation`` was called ``memory``; 3 adds ``doubts``, 4 the noise's
-``white`` share: each is written only where there is any."""
+``white`` share, ``level`` and the reference's ``level_sigma``: each is written only where there is any."""
 
 
 class _File(msgspec.Struct, forbid_unknown_fields=True):
@@ -45,6 +45,7 @@ class _File(msgspec.Struct, forbid_unknown_fields=True):
     runs: tuple[Run, ...]
     inputs: dict[str, str]
     doubts: tuple[str, ...] = ()
+    level: tuple[float, ...] = ()
 
 
 class _Version(msgspec.Struct):
@@ -54,7 +55,7 @@ class _Version(msgspec.Struct):
 def encode_calibration(calibration: Calibration) -> bytes:
     """Return `calibration` as JSON, one key a line."""
     content = _File(
-        format=4 if calibration.noise.white else 3 if calibration.doubts else 2,
+        format=4 if calibration.noise.white or calibration.level else 3 if calibration.doubts else 2,
         software=calibration.software,
         method=calibration.method,
         sensor=calibration.sensor,
@@ -69,12 +70,16 @@ def encode_calibration(calibration: Calibration) -> bytes:
         runs=calibration.runs,
         inputs=calibration.inputs,
         doubts=calibration.doubts,
+        level=calibration.level,
     )
     encode = msgspec.json.encode
-    names = [name for name in _File.__struct_fields__ if name != "doubts" or content.doubts]
+    names = [
+        name for name in _File.__struct_fields__ if name not in ("doubts", "level") or getattr(content, name)
+    ]
     values = {name: getattr(content, name) for name in names}
-    if not content.noise.white:
-        values["noise"] = {k: v for k, v in msgspec.structs.asdict(content.noise).items() if k != "white"}
+    for key, lately in (("noise", "white"), ("reference", "level_sigma")):
+        known = msgspec.structs.asdict(values[key])
+        values[key] = {name: value for name, value in known.items() if name != lately or value}
     lines = [encode(name) + b": " + encode(value) for name, value in values.items()]
     return b"{\n" + b",\n".join(lines) + b"\n}\n"
 
@@ -199,6 +204,7 @@ def _checked(content: _File, terms: tuple[Term, ...], effects: tuple[Term, ...])
         inputs=content.inputs,
         software=content.software,
         doubts=content.doubts,
+        level=content.level,
     )
 
 

@@ -60,12 +60,17 @@ class Noise(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Reference(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What the magnitude was compared with: F_0 (nT), which model, and the site bias found (nT)."""
+    """What the magnitude was compared with: F_0 (nT), which model, and the site bias found (nT).
+
+    `bias_sigma` is how well the reference's level was known, `level_sigma` how well that of the corrected
+    field is: the part of its sigma that is common to all samples.
+    """
 
     field: float
     model: str = ""
     bias: float = 0.0
     bias_sigma: float = 0.0
+    level_sigma: float = 0.0
 
 
 class Boresight(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -119,6 +124,9 @@ class Calibration:
         Version that made it.
     doubts : tuple of str
         Why the data that it was fitted to do not support it; empty where they do.
+    level : tuple of float
+        How the first coefficients move together where the level of the reference is off by 1-sigma (nT);
+        empty where that was known.
     """
 
     parameters: tuple[Parameter, ...]
@@ -135,6 +143,7 @@ class Calibration:
     inputs: dict[str, str] = field(default_factory=dict)
     software: str = ""
     doubts: tuple[str, ...] = ()
+    level: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         names = tuple(parameter.name for parameter in self.parameters)
@@ -178,6 +187,13 @@ class Calibration:
         return replace(
             self, effects=(), coefficients=self.coefficients[own], covariance=self.covariance[own, own]
         )
+
+    def at_level(self) -> Calibration:
+        """Return the calibration with its reference's level, and all that follows from it, 1-sigma up."""
+        moved = self.coefficients.copy()
+        many = min(len(moved), len(self.level))
+        moved[:many] += self.level[:many]
+        return replace(self, coefficients=moved)
 
     def matrices(self, positions: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return ``A`` and ``T`` of the position terms.

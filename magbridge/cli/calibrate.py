@@ -44,10 +44,10 @@ def calibrate(
     output: Output,
     parameter: tuple[str, ...] = (),
     order: Annotated[Whole, Parameter(validator=validators.Number(gte=1, lte=6))] = 3,
-    method: Literal["auto", "nominal", "cubic", "runs", "horizontal"] = "auto",
+    method: Literal["auto", "survey", "nominal", "cubic", "runs", "horizontal"] = "auto",
     vehicle: Path | None = None,
     grid: Path | None = None,
-    site_bias: Annotated[float, Parameter(validator=validators.Number(gte=0, lte=1e5))] = 0.0,
+    site_bias: Annotated[float | None, Parameter(validator=validators.Number(gte=0, lte=1e5))] = None,
     filter_corner: Annotated[float, Parameter(validator=validators.Number(gte=0, lt=inf))] = 0.0,
     heading_reference: Heading = None,
     picture: Picture = None,
@@ -69,15 +69,20 @@ def calibrate(
     order
         Highest total degree of the polynomials in the parameters.
     method
-        auto is the one to use. For comparison: nominal (one ellipsoid for all positions), cubic (the
-        paper's), runs (an ellipsoid for each run, then polynomials through them: the paper's first stage),
-        horizontal (one ellipsoid, levelled by roll and pitch: the alternative that the paper names).
+        auto is the one to use: survey where only the main field or a map is known at the log's positions
+        (the rock below is found with the calibration), else the fit to a known field. For comparison:
+        nominal (one ellipsoid for all positions), cubic (the paper's), runs (an ellipsoid for each run,
+        then polynomials through them: the paper's first stage), horizontal (one ellipsoid, levelled by
+        roll and pitch: the alternative that the paper names).
     vehicle
         A vehicle.toml with the positions of the moving masses relative to the sensor (method auto).
     grid
         An anomaly grid to add to the IGRF.
     site_bias
-        1-sigma in nT of a constant error of the reference field over the whole site.
+        1-sigma in nT of a constant error of the reference field over the whole site. By default 0 where
+        the log has reference_field, the map's own sigma with --grid (20 if it states none), else 145: what
+        main-field models do not reach of the crust (error model of the World Magnetic Model 2020). The
+        corrected field's sigma counts it, and level_sigma says how much is common to all samples.
     filter_corner
         Corner frequency in Hz of the sensor's first-order anti-alias filter, whose attenuation in turns is
         undone; 0: no filter.

@@ -33,7 +33,7 @@ VEHICLE, AUTOPILOT, BRIDGE = 1, 1, 191
 ATTITUDE = ("roll", "pitch", "heading")
 POSITION = ("latitude", "longitude", "depth")
 SAMPLE = (*CHANNELS, "sensor_temperature", "sensor_supply", "power_cycle")
-STANDARD = {*ATTITUDE, *POSITION, *SAMPLE, *CHANNEL_TIMES, *CORRECTED}
+STANDARD = {*ATTITUDE, *POSITION, *SAMPLE, *CHANNEL_TIMES, *CORRECTED, "level_sigma"}
 """Columns that have a field of their own in one of these messages."""
 ATTITUDE_, POSITION_, NAMED_, RAW_, FIELD_ = (
     spec(name) for name in ("ATTITUDE", "GLOBAL_POSITION_INT", "NAMED_VALUE_FLOAT", "MAG_RAW", "MAG_FIELD")

@@ -84,7 +84,7 @@ def informed(options: Options, calibration: Calibration, sigma: float) -> Option
     The white part is the noise of the calibration runs. If that noise was correlated for longer than a few
     updates, it does not average out: it becomes a bias with the same correlation time, and the white part
     is what drives it, ``σ √(1 - ρ²)`` with ρ the correlation from sample to sample. A calibration's other
-    errors depend on attitude and masses, and last for a leg.
+    errors depend on attitude and masses, and last for a leg; its level is that of all samples.
     """
     noise = calibration.noise
     white = noise.sensor
@@ -94,26 +94,34 @@ def informed(options: Options, calibration: Calibration, sigma: float) -> Option
     if noise_time > LASTING * options.interval:
         white *= sqrt(noise.white + (1.0 - noise.white) * (1.0 - rho**2))
         lasts, noise_time = noise_time, 0.0
-    slow = sqrt(max(0.0, sigma**2 - white**2))
-    return replace(
+    level = calibration.reference.level_sigma
+    slow = sqrt(max(0.0, sigma**2 - level**2 - white**2))
+    known = replace(
         options,
         noise=white,
         noise_time=noise_time,
         bias_sigma=hypot(options.bias_sigma, slow),
         bias_time=min(options.bias_time, lasts) if slow > options.bias_sigma else options.bias_time,
     )
+    return _wider_level(known, hypot(known.bias_sigma, level)) if level else known
 
 
 def any_level(options: Options, grid: AnomalyGrid) -> Options:
-    """Return options with which the field's level carries no information, and its changes as much as before.
+    """Return options with which the field's level carries no information, its changes as much as before."""
+    return _wider_level(options, grid.rms)
+
+
+def _wider_level(options: Options, sigma: float) -> Options:
+    """Return options with a level of at least `sigma`, nT, whose changes are as large as before.
 
     Notes
     -----
-    The driving noise of a Gauss-Markov process is ``2σ²/τ`` (nT²/s). σ is raised to the map's RMS, and τ in
-    proportion to σ², so that it stays the same.
+    The driving noise of a Gauss-Markov process is ``2σ²/τ`` (nT²/s). σ is raised, and τ in proportion to σ²,
+    so that it stays the same.
     """
     o = options
-    if o.bias_sigma >= grid.rms:
+    if o.bias_sigma >= sigma:
         return o
-    lasts = o.bias_time * (grid.rms / max(o.bias_sigma, 1e-3 * grid.rms)) ** 2
-    return replace(o, bias_sigma=grid.rms, bias_time=lasts)
+    return replace(
+        o, bias_sigma=sigma, bias_time=o.bias_time * (sigma / max(o.bias_sigma, 1e-3 * sigma)) ** 2
+    )

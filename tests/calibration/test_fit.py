@@ -213,7 +213,7 @@ def test_without_moving_masses_nothing_moves(glider: Gliders) -> None:
     assert np.ptp(total) < 2.0
 
 
-@pytest.mark.parametrize("method", sorted(METHODS))
+@pytest.mark.parametrize("method", sorted(set(METHODS) - {"survey"}))  # see test_in_place
 def test_every_method_fills_the_calibration(glider: Gliders, method: str) -> None:
     found = fit(glider(2).runs, method)
     calibration = found.calibration

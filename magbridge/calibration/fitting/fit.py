@@ -14,6 +14,7 @@ from magbridge.arrays import FloatArray
 from magbridge.calibration.fitting.boresight import find_boresight
 from magbridge.calibration.fitting.identify import combinations, expected_ratio, heading_gap, warnings_for
 from magbridge.calibration.fitting.left_out import LeftOut
+from magbridge.calibration.fitting.level import apart_from_level, with_level
 from magbridge.calibration.fitting.noise import NoiseModel
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.model import Calibration, Noise, Parameter, Reference, Run, Sensor
@@ -27,6 +28,7 @@ __all__ = ["METHODS", "Fit", "assemble", "fit"]
 
 METHODS: dict[str, str] = {
     "auto": "magbridge.calibration.fitting.auto:fit_auto",
+    "survey": "magbridge.calibration.fitting.in_place:fit_in_place",
     "nominal": "magbridge.calibration.fitting.nominal:fit_nominal",
     "cubic": "magbridge.calibration.fitting.cubic:fit_cubic",
     "runs": "magbridge.calibration.fitting.per_run:fit_per_run",
@@ -44,6 +46,9 @@ WORSE = 1.25
 """Errors of parts left out over what a fit claims for them, from which on a pilot should know."""
 GAIN = 0.1
 """Departure of the middle scale from 1 that few sensors have: a wrong reference shrinks all scales."""
+LEVEL = 145.0
+"""nT, 1-sigma by which the total field at a site differs from a main-field model's: what its degrees do not
+reach, the crust above all (error model of the World Magnetic Model 2020, Chulliat et al. 2020)."""
 UNSEEN = 270.0
 """deg, a gap in the headings: less than a quarter of the compass does not determine the rest."""
 
@@ -64,6 +69,8 @@ class Fit:
         each estimable combination from the data alone (nT).
     samples : Samples
         The data as fitted, for :mod:`.identify`.
+    open : tuple of str
+        What the track leaves open, which is a reason for an error that is large.
     """
 
     calibration: Calibration
@@ -71,6 +78,7 @@ class Fit:
     warnings: tuple[str, ...]
     details: dict[str, Any]
     samples: Samples
+    open: tuple[str, ...] = ()
 
     @property
     def supported(self) -> bool:
@@ -96,7 +104,12 @@ class Fit:
 
 
 def fit(
-    data: Observations, method: str = "auto", order: int = 3, *, site_bias: float = 0.0, **options: Any
+    data: Observations,
+    method: str = "auto",
+    order: int = 3,
+    *,
+    site_bias: float | None = None,
+    **options: Any,
 ) -> Fit:
     """Fit a calibration to `data`.
 
@@ -105,12 +118,13 @@ def fit(
     data : Observations
         The calibration runs; :func:`~.observe.observations` takes them from a deployment.
     method : str
-        One of :data:`METHODS`.
+        One of :data:`METHODS`. Where the reference lacks the rock, ``auto`` is ``survey``.
     order : int
         Highest total degree of the polynomials.
     site_bias : float
         nT, 1-sigma of a constant error of the reference over the site. No scalar fit at one site can tell
-        it from the gain, so it goes into the covariance.
+        it from the gain, so it goes into the covariance. By default none of a true field, of a map that of
+        the map, and of a main-field model alone :data:`LEVEL`.
     **options
         Further arguments of the method's own function, as ``vehicle`` of
         :func:`~magbridge.calibration.fitting.auto.fit_auto`.
@@ -122,6 +136,11 @@ def fit(
     """
     if method not in METHODS:
         raise CalibrationError(f"method {method!r} is not known: one of {', '.join(METHODS)}")
+    bias = _default_bias(data) if site_bias is None else site_bias
+    if method == "auto" and data.lacks_rock:
+        method = "survey"
+    if method == "survey":
+        options["level"] = bias
     module, _, name = METHODS[method].partition(":")
     chosen: Callable[..., Fit] = getattr(import_module(module), name)
     # one thread: for matrices this small threads cost more than they gain, and the order of sums is fixed
@@ -129,24 +148,29 @@ def fit(
         if wrong := other_units(data.field, float(np.median(data.reference))):  # no fit would settle
             raise CalibrationError(wrong)
         _refuse_one_attitude(data)
-        return _judged(_biased(chosen(data, order, **options), site_bias), data)
+        found = chosen(data, order, **options)
+        return _judged(found if method == "survey" else _biased(found, bias), data)
+
+
+def _default_bias(data: Observations) -> float:
+    """Return how well the reference's level is known, nT, as far as nobody says so."""
+    if not data.lacks_rock:
+        return 0.0
+    return LEVEL if data.map_sigma is None else data.map_sigma
 
 
 def _biased(found: Fit, sigma: float) -> Fit:
     """Carry an unknown bias of the reference into the covariance: ``dA = A dF / F`` at all positions."""
+    if not sigma:
+        return found
     calibration = found.calibration
     field = calibration.reference.field
     v = calibration.coefficients.reshape(-1, 9) / field
     v[0, :3] += 1.0
     v[:, 6:] = 0.0
-    return replace(
-        found,
-        calibration=replace(
-            calibration,
-            covariance=calibration.covariance + sigma**2 * np.outer(v, v),
-            reference=Reference(field, calibration.reference.model, 0.0, sigma),
-        ),
-    )
+    P = calibration.covariance + sigma**2 * np.outer(v, v)
+    wider = replace(calibration, covariance=P)
+    return replace(found, calibration=with_level(wider, found.samples, 0.0, sigma))
 
 
 def _refuse_one_attitude(data: Observations) -> None:
@@ -170,14 +194,22 @@ def _judged(found: Fit, data: Observations) -> Fit:
         except CalibrationError as error:
             mismatch.append(str(error))
             data = replace(data, attitude=None)
-    ratio = expected_ratio(calibration, data)
+    ratio = expected_ratio(apart_from_level(calibration), data)
     doubts = tuple(_doubts(ratio, calibration.noise.sensor, heading_gap(data)))
+    if ratio > UNSUPPORTED:
+        doubts = (*doubts, *found.open)
     unsupported = [f"the data do not support this fit: {'; '.join(doubts)}"] if doubts else []
     seen = combinations(found.samples, calibration.coefficients, max(calibration.noise.sensor, 1e-9))
     return replace(
         found,
         calibration=replace(calibration, doubts=doubts),
-        warnings=(*unsupported, *warnings_for(calibration, data), *mismatch, *_suspicions(found)),
+        warnings=(
+            *unsupported,
+            *(found.open if ratio <= UNSUPPORTED else ()),
+            *warnings_for(calibration, data),
+            *mismatch,
+            *_suspicions(found),
+        ),
         details={
             **found.details,
             "expected_over_noise": ratio,

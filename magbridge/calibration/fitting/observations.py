@@ -22,7 +22,9 @@ __all__ = ["Observations", "monomials", "polynomial_samples"]
 COMMON, FAR = 0.005, 10.0
 """A position is implausible if it is farther from the median than FAR times the span between the quantiles
 COMMON and 1 - COMMON."""
-_PER_SAMPLE = ("field", "reference", "parameters", "runs", "time", "attitude", "reference_ned")
+_PER_SAMPLE = (
+    "field", "reference", "parameters", "runs", "time", "attitude", "reference_ned", "place", "unmapped"
+)  # fmt: skip
 
 
 def _nothing() -> FloatArray:
@@ -51,6 +53,14 @@ class Observations:
         rad, roll, pitch, heading (true).
     reference_ned : (n, 3) array, optional
         nT, the true field vector, north-east-down.
+    place : (n, 3) array, optional
+        m north, east, down of `origin`.
+    unmapped : (n,) array, optional
+        1 where the reference lacks the rock below or what a map lacks of it, 0 where it is the true field.
+    map_sigma : float or None
+        nT, 1-sigma of the map in the reference; None without a map.
+    origin : tuple of 2 float
+        deg, latitude and longitude of the origin of `place`.
     sensor : str
     inputs : dict
         File -> SHA-256.
@@ -67,6 +77,10 @@ class Observations:
     time: FloatArray = attribute(default_factory=_nothing)
     attitude: FloatArray | None = None
     reference_ned: FloatArray | None = None
+    place: FloatArray | None = None
+    unmapped: FloatArray | None = None
+    map_sigma: float | None = None
+    origin: tuple[float, float] = (0.0, 0.0)
     sensor: str = ""
     inputs: dict[str, str] = attribute(default_factory=dict)
     model: str = ""
@@ -100,7 +114,7 @@ class Observations:
         put(self, "parameters", parameters[whole])
         put(self, "runs", runs[whole])
         put(self, "time", time[whole])
-        for name in ("attitude", "reference_ned"):
+        for name in ("attitude", "reference_ned", "place", "unmapped"):
             if getattr(self, name) is not None:
                 put(self, name, np.asarray(getattr(self, name), float)[whole])
 
@@ -122,6 +136,11 @@ class Observations:
             return np.zeros(len(self), bool), np.empty((0, 3)), np.empty((0, 3))
         known = np.asarray(np.isfinite(np.hstack([self.attitude, self.reference_ned])).all(axis=1))
         return known, self.attitude[known], self.reference_ned[known]
+
+    @property
+    def lacks_rock(self) -> bool:
+        """Whether the reference is, anywhere, less than the true field."""
+        return self.unmapped is not None and bool(self.unmapped.any())
 
     @property
     def steps(self) -> FloatArray:

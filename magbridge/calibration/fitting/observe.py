@@ -13,7 +13,8 @@ from magbridge.calibration.fitting.observations import Observations
 from magbridge.columns import CHANNELS, COLUMNS, require
 from magbridge.errors import CalibrationError
 from magbridge.field.declination import with_true_heading
-from magbridge.field.reference import earth_field
+from magbridge.field.geodesy import separation
+from magbridge.field.reference import earth_field, positions
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -22,6 +23,8 @@ if TYPE_CHECKING:
 
 __all__ = ["observations"]
 
+MAP_ERROR = 20.0
+"""nT, 1-sigma of a map that does not state its own."""
 FOLLOWED = ("sensor_temperature", "depth")
 """Columns that move no mass but may be fitted as if they did."""
 
@@ -59,6 +62,7 @@ def observations(
     if all(name in ds for name in ("roll", "pitch", "heading")):
         attitude = np.radians(np.stack([_column(ds, name) for name in ("roll", "pitch", "heading")], axis=1))
     time = np.asarray(ds["time"].values, float)
+    place, unmapped, origin = _places(ds)
     return Observations(
         field=np.stack([_at_common_time(ds, axis, columns[f"mag_{axis}"]) for axis in "xyz"], axis=1),
         reference=total,
@@ -71,6 +75,10 @@ def observations(
         time=time,
         attitude=attitude,
         reference_ned=vector,
+        place=place,
+        unmapped=unmapped,
+        map_sigma=None if grid is None else grid_sigma(grid),
+        origin=origin,
         sensor=str(ds.attrs.get("sensor", "")),
         model=model,
     )
@@ -90,6 +98,28 @@ def _at_common_time(ds: xr.Dataset, axis: str, values: FloatArray) -> FloatArray
         return values
     common = np.interp(time, sampled[known], values[known])
     return np.where(known, common, np.nan)
+
+
+def _places(ds: xr.Dataset) -> tuple[FloatArray | None, FloatArray | None, tuple[float, float]]:
+    """Return m north, east and down of an origin (n, 3), where the true field is not known (n,), the origin.
+
+    The first two are None where there are no positions, or the true field is known all along.
+    """
+    known = ds["reference_field"].notnull().to_numpy() if "reference_field" in ds else np.array(False)
+    if not {"latitude", "longitude"} <= set(ds.variables) or known.all():
+        return None, None, (0.0, 0.0)
+    longitude, latitude, depth = positions(ds)
+    if not np.isfinite(latitude).any():
+        return None, None, (0.0, 0.0)
+    origin = float(np.nanmedian(latitude)), float(np.nanmedian(longitude))
+    north, east = separation(*origin, latitude, longitude)
+    unmapped = np.broadcast_to(np.where(known, 0.0, 1.0), len(north))
+    return np.stack([north, east, depth], axis=1), unmapped, origin
+
+
+def grid_sigma(grid: AnomalyGrid) -> float:
+    """Return the error of a map, nT: its own sigma (RMS), or a plausible one where it states none."""
+    return float(np.sqrt(np.nanmean(grid.sigma**2))) or MAP_ERROR
 
 
 def _column(ds: xr.Dataset, name: str) -> FloatArray:

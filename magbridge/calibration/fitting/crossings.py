@@ -1,0 +1,80 @@
+"""Whether a track can tell rock from heading: where it came back to a place on another course."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import pairwise
+
+import numpy as np
+
+from magbridge.arrays import BoolArray, FloatArray
+from magbridge.calibration.fitting.observations import Observations
+
+__all__ = ["crossed", "left_open"]
+
+TURNED = 30.0
+"""deg between two courses that cross."""
+BACK = 150.0
+"""deg, from which on the second course is the first one's reverse."""
+FEW = 3
+"""Crossed places below which a survey says nothing about itself."""
+SHARE = 0.25
+"""Of the rock's length: places as near as that are one."""
+STILL = 5.0
+"""m between samples, below which a course is not one."""
+
+
+def left_open(data: Observations, length: float) -> Iterator[str]:
+    """Say, in a pilot's words, what keeps rock of a `length`, m, from being told from the vehicle's field."""
+    if data.place is None or data.unmapped is None or not data.unmapped.all():
+        return
+    place, course = _courses(data.place[:, :2])
+    if np.ptp(place, axis=0).max(initial=0.0) < SHARE * length:
+        return  # all at one place: the rock is a constant
+    cells, reversed_cells = crossed(place, course, SHARE * length)
+    if cells + reversed_cells == 0:
+        yield (
+            "you never crossed your own track: rock and heading cannot be told apart, but for how smooth the "
+            "rock is; fly legs that cross earlier ones at other headings"
+        )
+    elif cells < FEW and reversed_cells < FEW:
+        places = f"{cells + reversed_cells} place{'s' * (cells + reversed_cells > 1)}"
+        yield (
+            f"you crossed your own track at {places} only: rock and heading are told apart by how smooth the "
+            "rock is; fly more legs that cross earlier ones"
+        )
+
+
+def crossed(place: FloatArray, course: FloatArray, cell: float) -> tuple[int, int]:
+    """Return at how many places courses (n,), rad, cross, and at how many others one is the other's reverse.
+
+    `place` (n, 2) and `cell`, the size of one place, are in m.
+    """
+    _, of = np.unique(np.floor(place / cell).astype(np.int64), axis=0, return_inverse=True)
+    of = of.ravel()
+    order = np.argsort(of, kind="stable")
+    edges = np.flatnonzero(np.diff(of[order], prepend=-1, append=-1))
+    across = back = 0
+    for first, last in pairwise(edges):
+        here = np.sort(order[first:last])
+        new = np.flatnonzero(np.diff(here, prepend=-9) > 1)  # another visit
+        passes = np.angle(np.add.reduceat(np.exp(1j * course[here]), new))
+        apart = np.degrees(np.abs(np.angle(np.exp(1j * (passes[:, None] - passes)))))
+        if ((apart > TURNED) & (apart < BACK)).any():
+            across += 1
+        elif (apart >= BACK).any():
+            back += 1
+    return across, back
+
+
+def _courses(place: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the places (m, 2) between which the vehicle moved, and the courses there (m,), rad."""
+    moved = _thinned(place)
+    step = np.diff(place[moved], axis=0)
+    return place[moved][:-1], np.arctan2(step[:, 1], step[:, 0])
+
+
+def _thinned(place: FloatArray) -> BoolArray:
+    """Return which places (n, 2) are at least :data:`STILL` m of way after the last one: (n,)."""
+    way = np.cumsum(np.hypot(*np.diff(place, axis=0, prepend=place[:1]).T))
+    return np.asarray(np.diff(np.floor(way / STILL), prepend=-1) > 0)

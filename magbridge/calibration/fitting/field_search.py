@@ -1,0 +1,189 @@
+"""Size, length and smoothness of a field in place, and the noise's autocorrelation, by the evidence."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.optimize import minimize, minimize_scalar
+
+from magbridge.arrays import FloatArray
+from magbridge.calibration.fitting.evidence import evidence
+from magbridge.calibration.fitting.joint import Reduced, Sums, eliminate
+from magbridge.calibration.fitting.prior import PriorFamily
+from magbridge.field.place.matern import SMOOTHNESS, Matern
+from magbridge.field.place.nodes import nodes_near
+
+__all__ = ["Choice", "Weighed", "choose", "first_guess", "ladder", "refined", "same_noise"]
+
+RUNGS = 7
+"""Lengths that are tried first."""
+FINE, COARSE = 2.5, 2.0
+"""Nodes a length, of the field that is kept and of those that are tried first."""
+PAD = 1.0
+"""Lengths around the track that have nodes."""
+NODES = 30_000
+"""Nodes at most: a shorter length is not tried on so large an area."""
+SMALL = 0.03
+"""Autocorrelation below which noise counts as white."""
+HIGHEST = 0.995
+"""Largest autocorrelation of a sample with the next one."""
+SIZE, SIZE_SPREAD = 50.0, np.log(4.0)
+"""nT of rock, and the 1-sigma of its logarithm: sea floor and land as airborne surveys meet them."""
+LENGTH_SPREAD = np.log(6.0)
+"""1-sigma of the logarithm of the length, about the middle of those that are tried."""
+SHORTEST = 60.0
+"""m, least length."""
+
+
+@dataclass(frozen=True, eq=False)
+class Choice:
+    """A field for a standard deviation of 1, its size over the noise's, and that noise's autocorrelation."""
+
+    field: Matern
+    ratio: float
+    rho: float
+    score: float = -np.inf
+
+
+@dataclass(frozen=True, eq=False)
+class Weighed:
+    """With what an evidence is taken: the dense unknowns' prior, at widths eta (h,), and the noise, nT."""
+
+    family: PriorFamily
+    eta: FloatArray
+    sigma: float
+    middle: float
+    """m, the length that is expected."""
+
+    def score(self, reduced: Reduced, field: Matern, ratio: float) -> float:
+        """Return the log evidence, the noise's size being the likeliest one."""
+        log_sigma, value = float(np.log(self.sigma)), -np.inf
+        for _ in range(4):  # Newton's: in log sigma it is nearly a parabola of curvature -2n
+            value, slope, _ = evidence(reduced.quadratic, self.family, self.eta, log_sigma)
+            step = float(np.clip(slope[-1] / (2.0 * reduced.quadratic.n), -1.0, 1.0))
+            log_sigma += step
+            if abs(step) < 1e-3:
+                break
+        size = (log_sigma + np.log(ratio / SIZE)) / SIZE_SPREAD
+        length = np.log(field.length / self.middle) / LENGTH_SPREAD
+        return value + reduced.log_evidence - 0.5 * float(size * size + length * length)
+
+
+def choose(
+    sums_of: Callable[[Matern], Sums], place: FloatArray, weighed: Weighed, start: float, *, harmonic: bool
+) -> Choice:
+    """Choose the field from nothing: lengths from a ladder, then smoothness and all the rest about the best.
+
+    Parameters
+    ----------
+    sums_of : callable
+        The samples' sums with a field.
+    place : (n, 2) array
+        m, where they are.
+    weighed : Weighed
+        What each is weighed with.
+    start : float
+        The field's size over the noise's, to begin with.
+    harmonic : bool
+        Whether the depth varies, so that a field which falls off upwards differs from one that does not.
+    """
+    best: Choice | None = None
+    ratio, rho = start, 0.3
+    for length in ladder(place):
+        nodes = nodes_near(place, length / COARSE, PAD * length)
+        if nodes.size > NODES:
+            continue
+        field = Matern(nodes, float(length), SMOOTHNESS[1], harmonic)
+        found = climb(sums_of(field), Choice(field, ratio, rho), weighed, move_length=False, steps=24)
+        ratio, rho = found.ratio, found.rho
+        if best is None or found.score > best.score:
+            best = found
+    assert best is not None
+    nodes = nodes_near(place, best.field.length / FINE, PAD * best.field.length)
+    tried = []
+    for alpha in SMOOTHNESS:
+        field = Matern(nodes, best.field.length, alpha, harmonic)
+        tried.append(climb(sums_of(field), replace(best, field=field), weighed, steps=36))
+    best = max(tried, key=lambda one: one.score)
+    if harmonic:
+        flat = replace(best.field, harmonic=False)
+        best = max(
+            best, climb(sums_of(flat), replace(best, field=flat), weighed, steps=20), key=lambda c: c.score
+        )
+    return best
+
+
+def first_guess(place: FloatArray) -> Choice:
+    """Return a field to begin with at places (n, 2), m: of the middle length, and of usual size and noise."""
+    length = float(ladder(place)[RUNGS // 2 + 1])
+    return Choice(Matern(nodes_near(place, length / COARSE, PAD * length), length, SMOOTHNESS[1]), SIZE, 0.0)
+
+
+def ladder(place: FloatArray) -> FloatArray:
+    """Return the lengths to try, (7,) m: from what samples at places (n, 2), m, resolve to the area."""
+    known = place[np.isfinite(place).all(axis=1)]
+    extent = float(np.hypot(*np.ptp(known, axis=0)))
+    step = np.linalg.norm(np.diff(known, axis=0), axis=1)
+    shortest = max(4.0 * float(np.median(step)), extent / 60.0, SHORTEST)
+    return np.asarray(np.geomspace(shortest, max(extent / 2.5, 1.5 * shortest), RUNGS))
+
+
+def climb(
+    sums: Sums, start: Choice, weighed: Weighed, *, move_length: bool = True, steps: int = 40
+) -> Choice:
+    """Climb the evidence from a choice, its nodes kept; without `move_length`, its length too."""
+
+    def at(x: FloatArray) -> Choice:
+        rho = HIGHEST / (1.0 + np.exp(-np.clip(x[1], -30.0, 30.0)))
+        length = (
+            start.field.length * float(np.exp(np.clip(x[2], -0.5, 0.9)))
+            if move_length
+            else start.field.length
+        )
+        field = replace(start.field, length=length)
+        return Choice(field, start.ratio * float(np.exp(np.clip(x[0], -6.0, 6.0))), float(rho))
+
+    def downhill(x: FloatArray) -> float:
+        one = at(x)
+        try:
+            return -weighed.score(eliminate(sums, one.field, one.ratio, one.rho), one.field, one.ratio)
+        except np.linalg.LinAlgError:
+            return 1e300
+
+    share = np.clip(max(start.rho, 0.01) / HIGHEST, 1e-6, 1.0 - 1e-6)
+    first = np.array([0.0, np.log(share / (1.0 - share)), 0.0][: 3 if move_length else 2])
+    simplex = first + np.vstack([np.zeros(len(first)), np.diag([0.7, 0.8, 0.3][: len(first)])])
+    found = minimize(
+        downhill, first, method="Nelder-Mead",
+        options={"initial_simplex": simplex, "maxfev": steps, "xatol": 0.02, "fatol": 0.05},
+    )  # fmt: skip
+    best = at(found.x)
+    return replace(best, rho=best.rho if best.rho > SMALL else 0.0, score=-float(found.fun))
+
+
+def refined(sums_of: Callable[[Matern], Sums], place: FloatArray, choice: Choice, weighed: Weighed) -> Choice:
+    """Climb from a choice; nodes at places (n, 2), m, are made anew where they no longer suit the length."""
+    field = choice.field
+    if not 2.0 <= field.length / field.nodes.spacing <= 4.0:
+        nodes = nodes_near(place, field.length / FINE, PAD * field.length)
+        field = replace(field, nodes=nodes)
+    return climb(sums_of(field), replace(choice, field=field), weighed, steps=30)
+
+
+def same_noise(sums: Sums, choice: Choice, weighed: Weighed) -> Choice:
+    """Choose the noise's autocorrelation alone, with all samples, where the rest was chosen with a few."""
+
+    def downhill(x: float) -> float:
+        try:
+            rho = HIGHEST / (1.0 + np.exp(-x))
+            return -weighed.score(
+                eliminate(sums, choice.field, choice.ratio, float(rho)), choice.field, choice.ratio
+            )
+        except np.linalg.LinAlgError:
+            return 1e300
+
+    found = minimize_scalar(downhill, bounds=(-5.0, 5.0), method="bounded", options={"maxiter": 12})
+    rho = float(HIGHEST / (1.0 + np.exp(-found.x)))
+    return replace(choice, rho=rho if rho > SMALL else 0.0)

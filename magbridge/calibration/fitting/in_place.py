@@ -1,0 +1,317 @@
+r"""The fit to a survey: coefficients and the rock below the track, jointly.
+
+Where nobody knows the true field, the reference is the main field, and what it lacks at a place,
+
+.. math:: H_e(x, t) = |\mathrm{IGRF}| + b + f(x) + s(t),
+
+has a level b, a Gaussian field f in place (:mod:`magbridge.field.place`) and a slow part s in time. A
+criss-cross meets the same rock with another heading, roll and position of the masses, so f and the
+coefficients can be told apart. The errors stand in the readings, as in every fit here
+(:mod:`magbridge.calibration.residual`): without the weight of :math:`|A^T u|` a joint fit would shrink A to
+have less rock to explain.
+
+Notes
+-----
+Rounds of Gauss-Newton about the last answer; in each the sparse field is eliminated (:mod:`.joint`), the
+prior's widths are chosen by the evidence of what remains (:mod:`.evidence`), and the field's size and length
+and the noise's autocorrelation by that of the whole (:mod:`.field_search`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from magbridge.arrays import BoolArray, FloatArray
+from magbridge.calibration.fitting.crossings import left_open
+from magbridge.calibration.fitting.evidence import Widths, maximise
+from magbridge.calibration.fitting.field_search import (
+    Choice,
+    Weighed,
+    choose,
+    first_guess,
+    ladder,
+    refined,
+    same_noise,
+)
+from magbridge.calibration.fitting.fit import Fit, assemble
+from magbridge.calibration.fitting.joint import Reduced, Sums, add_up, eliminate
+from magbridge.calibration.fitting.latent import Group, slow_functions, with_groups
+from magbridge.calibration.fitting.level import with_level
+from magbridge.calibration.fitting.mounted_masses import Mounting, mounted_prior
+from magbridge.calibration.fitting.noise import NoiseModel
+from magbridge.calibration.fitting.nominal import check_scales, starts
+from magbridge.calibration.fitting.observations import Observations, polynomial_samples
+from magbridge.calibration.fitting.prior import PriorFamily, polynomial_prior
+from magbridge.calibration.fitting.solve import covariance_of, gauss_newton
+from magbridge.calibration.fitting.survey_samples import SurveySamples
+from magbridge.calibration.residual import Samples, residuals_of, robust_scale
+from magbridge.calibration.terms import full_order
+from magbridge.errors import CalibrationError
+from magbridge.field.place.matern import Matern
+
+__all__ = ["InPlace", "fit_in_place", "fit_survey"]
+
+SLOW, SLOW_SPREAD = 2.0, np.log(4.0)
+"""nT over a stretch, and the 1-sigma of its logarithm: a quiet day's currents aloft, a sensor's drift."""
+GUESSED = 2
+"""Rounds before the field is searched: while the coefficients are far off, they look like rock and noise."""
+SEARCHES = 2
+"""Rounds after that in which the search goes on."""
+ROUNDS = 12
+"""Rounds at most; six are usual."""
+STILL = 0.05
+"""Of the noise: a round that moves no residual by more (RMS) is the last."""
+OUTLIER = 5.0
+"""Sigmas beyond which a sample is left out."""
+SEARCHED = 12_000
+"""Samples that the field's size and length are searched with, at most."""
+
+Vehicle = Mapping[str, Mounting | Mapping[str, Any]]
+
+
+@dataclass(frozen=True, eq=False)
+class InPlace:
+    """What a survey says of the field in place, beside its calibration.
+
+    Attributes
+    ----------
+    field : Matern
+        The field's prior for a standard deviation of 1.
+    size : float
+        nT, its standard deviation.
+    w : (nodes,) array
+        nT, posterior mean of its coefficients.
+    reduced : Reduced
+        Where `w` comes from, with its precision in units of the noise's.
+    sigma, rho : float
+        nT, the noise of a sample, and its autocorrelation.
+    z, covariance : (q,), (q, q) arrays
+        The dense unknowns and their posterior.
+    level : int
+        Which of them is the level, nT.
+    middle : float
+        m, the depth at which the field is given.
+    slow : (n,) array
+        nT, the slow part in time at every sample.
+    kept : (n,) array
+        Which samples are no outliers.
+    """
+
+    field: Matern
+    size: float
+    w: FloatArray
+    reduced: Reduced
+    sigma: float
+    rho: float
+    z: FloatArray
+    covariance: FloatArray
+    level: int
+    middle: float
+    slow: FloatArray
+    kept: BoolArray
+
+
+def fit_in_place(data: Observations, order: int = 3, **options: Any) -> Fit:
+    """Return the fit of :func:`fit_survey` alone."""
+    return fit_survey(data, order, **options)[0]
+
+
+def fit_survey(
+    data: Observations, order: int = 3, *, level: float, vehicle: Vehicle | None = None
+) -> tuple[Fit, InPlace]:
+    """Fit coefficients, level, slow changes and the field in place.
+
+    Parameters
+    ----------
+    data : Observations
+        With places.
+    order : int
+        Highest total degree of the polynomials in the masses' positions.
+    level : float
+        nT, 1-sigma of the reference's error that is the same everywhere.
+    vehicle : mapping, optional
+        As for :func:`~.auto.fit_auto`.
+
+    Raises
+    ------
+    CalibrationError
+        There are no positions, or the fit collapsed or did not settle.
+    """
+    if data.place is None:
+        raise CalibrationError(
+            "method survey: expected latitude and longitude, and a field that is not known"
+        )
+    ranges = data.ranges()
+    exponents = full_order(len(ranges), order)
+    samples = polynomial_samples(data, exponents)
+    own = polynomial_prior(exponents, data.names, samples.F_0)
+    if vehicle:
+        own = mounted_prior(own, exponents, ranges, vehicle)
+    q = own.E.shape[1]
+    survey = SurveySamples(data, samples, _groups(data, level))
+    found = _Rounds(survey, with_groups(own, survey.groups), q).settle()
+    prior = found.family.at(found.widths.eta)
+    coefficients = prior.coefficients(found.z)
+    check_scales(samples, coefficients)
+    sigma, choice = found.widths.sigma, found.choice
+    covariance = covariance_of(found.reduced.quadratic.H / sigma**2 + prior.precision)
+    P = prior.E @ covariance @ prior.E.T
+    known = replace(samples, reference=samples.reference + found.lacking)
+    fit = assemble(
+        data, known, ranges, exponents, coefficients, P,
+        NoiseModel(sigma, choice.rho), "survey", details=_details(found, survey),
+    )  # fmt: skip
+    stated = with_level(fit.calibration, known, float(found.z[q]), level) if level else fit.calibration
+    fit = replace(
+        fit,
+        calibration=stated,
+        open=tuple(left_open(data, choice.field.length)),
+    )
+    slow = survey.functions[:, 1:] @ found.z[q + 1 :]
+    return fit, InPlace(
+        choice.field, choice.ratio * sigma, found.w, found.reduced, sigma, choice.rho, found.z, covariance,
+        q, survey.middle, slow, survey.kept,
+    )  # fmt: skip
+
+
+def _groups(data: Observations, level: float) -> tuple[Group, ...]:
+    """Return the unknowns beside coefficients and field: the level, and what changes slowly with time."""
+    groups = [Group("level", np.ones((len(data), 1)), np.ones(1), max(level, 1e-3))]
+    waves, shape = slow_functions(data.time)
+    if len(shape):
+        groups.append(Group("slow change with time", waves, shape, SLOW, SLOW_SPREAD))
+    return tuple(groups)
+
+
+def _details(found: _Answer, survey: SurveySamples) -> dict[str, Any]:
+    choice, field, names = found.choice, found.choice.field, found.family.names
+    return {
+        "log_evidence": found.score,
+        "determined": found.widths.determined,
+        "outliers": int((~survey.kept).sum()),
+        "widths_nT": dict(zip(names, np.exp(found.widths.eta).tolist(), strict=True)),
+        "rock": {
+            "size_nT": choice.ratio * found.widths.sigma,
+            "length_m": field.length,
+            "smoothness": field.alpha - 1,
+            "falls_off_upwards": field.harmonic,
+            "nodes": field.nodes.size,
+        },
+    }
+
+
+@dataclass(frozen=True, eq=False)
+class _Answer:
+    """Where the rounds stand; `lacking` (n,) nT is what they add to the reference at every sample."""
+
+    z: FloatArray
+    w: FloatArray
+    reduced: Reduced
+    choice: Choice
+    widths: Widths
+    family: PriorFamily
+    lacking: FloatArray
+    score: float
+
+
+class _Rounds:
+    """Alternate coefficients, widths and the field until no residual moves."""
+
+    def __init__(self, survey: SurveySamples, family: PriorFamily, q: int) -> None:
+        self.survey, self.family, self.q = survey, family, q
+        self.step = max(len(survey.samples.field) // SEARCHED, 1)
+        self.harmonic = bool(np.ptp(survey.deeper) > 5.0)
+        self.middle = float(np.median(ladder(survey.place)))
+        self.choice = first_guess(survey.place)
+        self.z, self.sigma = _start(survey, family)
+        self.eta, self.w = family.centre, np.zeros(self.choice.field.nodes.size)
+        self.nodes = self.choice.field.nodes
+
+    def settle(self) -> _Answer:
+        """Return the answer.
+
+        Raises
+        ------
+        CalibrationError
+            The rounds do not come to rest.
+        """
+        survey, last, moved = self.survey, None, np.inf
+        for turn in range(ROUNDS):
+            if self.family.renew is not None and turn:
+                self.family = self.family.renew(self.z)
+            answer = self._round(turn)
+            e = self._residuals(answer)
+            if last is not None:
+                moved = float(np.sqrt(np.mean((e - last) ** 2)))
+            last = e
+            if turn > GUESSED + SEARCHES and moved < STILL * self.sigma:
+                return answer
+            if GUESSED <= turn <= GUESSED + SEARCHES:
+                survey.kept = np.abs(e) <= OUTLIER * robust_scale(e)
+        if moved > self.sigma:
+            raise CalibrationError("the fit to the survey did not settle: the data contradict themselves")
+        return answer
+
+    def _round(self, turn: int) -> _Answer:
+        """Search the field where it is time to, and solve for all that is linear about the last answer."""
+        place, weighed = self.survey.place, Weighed(self.family, self.eta, self.sigma, self.middle)
+        few = self.step > 1
+        if turn == GUESSED:
+            self.choice = choose(self._few, place, weighed, self.choice.ratio, harmonic=self.harmonic)
+        elif GUESSED < turn <= GUESSED + SEARCHES:
+            start = replace(self.choice, rho=self.choice.rho**self.step)
+            self.choice = refined(self._few, place, start, weighed)
+        else:
+            few = False
+        if few:
+            self.choice = replace(self.choice, rho=self.choice.rho ** (1.0 / self.step))
+        sums = self._sums(self.choice.field, 1)
+        if few:
+            self.choice = same_noise(sums, self.choice, weighed)
+        choice, reduced = self.choice, eliminate(sums, self.choice.field, self.choice.ratio, self.choice.rho)
+        widths = maximise(reduced.quadratic, self.family, self.eta, self.sigma)
+        self.eta, self.sigma = widths.eta, widths.sigma
+        precision = reduced.quadratic.H / self.sigma**2 + self.family.at(self.eta).precision
+        self.z = np.asarray(np.linalg.solve(precision, reduced.quadratic.b / self.sigma**2), float)
+        self.w, self.nodes = reduced.field(self.z), choice.field.nodes
+        lacking = self._slow() + self.survey.basis(choice.field) @ self.w
+        score = widths.log_evidence + reduced.log_evidence
+        return _Answer(self.z, self.w, reduced, choice, widths, self.family, lacking, score)
+
+    def _few(self, field: Matern) -> Sums:
+        return self._sums(field, self.step)
+
+    def _sums(self, field: Matern, step: int) -> Sums:
+        """Return the sums of every `step`-th sample about the last answer; about none where nodes are new."""
+        B = self.survey.basis(field)
+        w = self.w if field.nodes is self.nodes else np.zeros(field.nodes.size)
+        return add_up(self.survey.linear(self.family, self.z, self._slow() + B @ w, w, B, step))
+
+    def _slow(self) -> FloatArray:
+        """Return level and slow changes at every sample, nT."""
+        return np.asarray(self.survey.functions @ self.z[self.q :])
+
+    def _residuals(self, answer: _Answer) -> FloatArray:
+        samples = self.survey.samples
+        known: Samples = replace(samples, reference=samples.reference + answer.lacking)
+        return residuals_of(known, answer.family.E @ answer.z + answer.family.offset)
+
+
+def _start(survey: SurveySamples, family: PriorFamily) -> tuple[FloatArray, float]:
+    """Return z near the answer, the rock taken for noise; and the size of that."""
+    samples, prior = survey.samples, family.at(family.centre)
+    found: list[tuple[float, FloatArray]] = []
+    for start in starts(samples):
+        z = family.E[:9].T @ start
+        sigma = np.inf
+        for _ in range(5):
+            e = residuals_of(samples, prior.coefficients(z))
+            sigma = max(robust_scale(e), 1.0)
+            z = gauss_newton(samples, prior, NoiseModel(sigma), z, steps=8).z
+        found.append((sigma, z))
+    sigma, z = min(found, key=lambda one: one[0])
+    return z, sigma

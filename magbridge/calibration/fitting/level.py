@@ -1,0 +1,74 @@
+"""The level of the corrected field: what an unknown constant of the reference leaves uncertain everywhere.
+
+Of a corrected sample's variance a part is common to all: nobody knows the mean of the field at a site better
+than its reference does. A survey is flown for the rest. With j the mean slope of the corrected field by the
+coefficients and P their covariance, the level's sigma is ``sqrt(j^T P j)``, and the coefficients move with it
+by ``P j / sqrt(j^T P j)``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from magbridge.arrays import FloatArray
+from magbridge.calibration.correct import correct
+from magbridge.calibration.model import Calibration, Reference
+from magbridge.calibration.residual import Samples, jacobian, residuals
+from magbridge.calibration.terms import symmetric
+
+__all__ = ["apart_from_level", "level_of", "sizes", "with_level"]
+
+ROWS = 5_000
+"""Samples that the mean is taken over, at most."""
+
+
+def with_level(calibration: Calibration, samples: Samples, bias: float, bias_sigma: float) -> Calibration:
+    """State how much of a calibration's covariance is level.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        As fitted.
+    samples : Samples
+        Those it was fitted to.
+    bias, bias_sigma : float
+        nT, of the reference's level, as found and as expected.
+    """
+    part = samples.part(slice(None, None, max(len(samples.field) // ROWS, 1)))
+    _, g = residuals(part, calibration.coefficients)
+    j = (jacobian(part.phi, g) * sizes(part, calibration.coefficients)[:, None]).mean(axis=0)
+    Pj = calibration.covariance @ j
+    sigma = float(np.sqrt(max(float(j @ Pj), 0.0)))
+    known = calibration.reference
+    reference = Reference(known.field, known.model, bias, bias_sigma, sigma)
+    return replace(calibration, reference=reference, level=tuple((Pj / max(sigma, 1e-300)).tolist()))
+
+
+def apart_from_level(calibration: Calibration) -> Calibration:
+    """Return the calibration with the covariance that is left where the level is known."""
+    if not calibration.level:
+        return calibration
+    w = np.zeros(len(calibration.coefficients))
+    w[: len(calibration.level)] = calibration.level
+    return replace(calibration, covariance=calibration.covariance - np.outer(w, w))
+
+
+def level_of(
+    calibration: Calibration, field: FloatArray, channels: FloatArray, time: FloatArray
+) -> FloatArray:
+    """Return the part of each sample's sigma (n,), nT, that is level; arguments as for ``correct``."""
+    if not calibration.level:
+        return np.zeros(len(field))
+    up, here = (correct(one, field, channels, time).total for one in (calibration.at_level(), calibration))
+    return np.abs(up - here)
+
+
+def sizes(samples: Samples, coefficients: FloatArray) -> FloatArray:
+    """Return ``sqrt(kappa^2 + |A u|^2)`` (n,): nT of the corrected field in one of the sensor's."""
+    theta = samples.phi @ coefficients.reshape(-1, 9)
+    A = np.eye(3) + symmetric(theta[:, :6] / samples.F_0)
+    b = np.matmul(A, (samples.field - theta[:, 6:])[:, :, None])
+    w = np.matmul(A, b)[:, :, 0] / np.linalg.norm(b[:, :, 0], axis=1)[:, None]
+    return np.asarray(np.sqrt(samples.kappa**2 + (w * w).sum(axis=1)))

@@ -1,0 +1,120 @@
+r"""What a sparse precision is asked for: solutions, its determinant, and its inverse near the diagonal.
+
+Solutions and determinant come from SuperLU, whose fill-in on nodes along a track is small (20,000 nodes:
+0.2 s, where the blocks below take 3 s). Variances need blocks of the inverse. Nodes that are numbered strip
+by strip make matrices whose blocks couple to the next strip only: with :math:`D_i` on the diagonal and
+:math:`E_i` below it,
+
+.. math:: L_i L_i^T = D_i - M_i M_i^T, \quad M_i = E_i L_{i-1}^{-T}, \quad G_i = L_i^{-T} M_{i+1}^T
+
+.. math:: \Sigma_{i,i+1} = -G_i \Sigma_{i+1,i+1}, \quad
+          \Sigma_{ii} = (L_i L_i^T)^{-1} + G_i \Sigma_{i+1,i+1} G_i^T
+
+(Takahashi et al. 1973; Rue & Martino 2007).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import solve_triangular
+from scipy.linalg.lapack import dpotrf
+from scipy.sparse import csc_array, csr_array
+from scipy.sparse.linalg import splu
+
+from magbridge.arrays import FloatArray, IndexArray
+
+__all__ = ["Factor", "NearInverse", "near_inverse"]
+
+
+class Factor:
+    """A symmetric positive definite sparse matrix (n, n), factorised.
+
+    Raises
+    ------
+    LinAlgError
+        It is not positive definite.
+    """
+
+    def __init__(self, matrix: csr_array) -> None:
+        try:
+            self._lu = splu(
+                csc_array(matrix), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0,
+                options={"SymmetricMode": True},
+            )  # fmt: skip
+        except RuntimeError as problem:
+            raise np.linalg.LinAlgError("singular") from problem
+        pivots = self._lu.U.diagonal()
+        if not (pivots > 0.0).all():
+            raise np.linalg.LinAlgError("not positive definite")
+        self.log_determinant = float(np.log(pivots).sum())
+
+    def solve(self, right: FloatArray) -> FloatArray:
+        """Return the inverse times b (n,) or (n, r)."""
+        return np.asarray(self._lu.solve(np.asfortranarray(right)))
+
+
+@dataclass(frozen=True, eq=False)
+class NearInverse:
+    """Blocks of an inverse that begin at `edges`: those on the diagonal, and those right of it."""
+
+    edges: IndexArray
+    own: tuple[FloatArray, ...]
+    beside: tuple[FloatArray, ...]
+
+    def variances(self, rows: csr_array) -> FloatArray:
+        """Return the variance of each combination in `rows` (m, n), which reach two blocks at most: (m,)."""
+        out = np.zeros(rows.shape[0])
+        some = np.diff(rows.indptr) > 0
+        if not some.any():
+            return out
+        first = np.zeros(rows.shape[0], np.intp)
+        first[some] = np.minimum.reduceat(rows.indices, rows.indptr[:-1][some])
+        at = np.searchsorted(self.edges, first, side="right") - 1
+        for i in np.unique(at[some]).tolist():
+            of = np.flatnonzero((at == i) & some)
+            mine = rows[of]
+            here = mine[:, self.edges[i] : self.edges[i + 1]].toarray()
+            out[of] = np.einsum("mi,mi->m", here @ self.own[i], here)
+            if i + 1 < len(self.own):
+                there = mine[:, self.edges[i + 1] : self.edges[i + 2]].toarray()
+                out[of] += np.einsum("mi,mi->m", 2.0 * here @ self.beside[i] + there @ self.own[i + 1], there)
+        return out
+
+
+def near_inverse(matrix: csr_array, edges: IndexArray) -> NearInverse:
+    """Return the inverse's blocks on and beside the diagonal, of a block-tridiagonal matrix (n, n).
+
+    Raises
+    ------
+    LinAlgError
+        It is not positive definite.
+    """
+    diagonal: list[FloatArray] = []
+    below: list[FloatArray] = []
+    for i in range(len(edges) - 1):
+        rows = matrix[edges[i] : edges[i + 1]]
+        D = rows[:, edges[i] : edges[i + 1]].toarray()
+        if i:
+            M = _lower(diagonal[-1], rows[:, edges[i - 1] : edges[i]].toarray().T).T
+            below.append(M)
+            D -= M @ M.T
+        L, info = dpotrf(D, lower=True, clean=True)
+        if info:
+            raise np.linalg.LinAlgError("not positive definite")
+        diagonal.append(L)
+    own: list[FloatArray] = [np.empty(0)] * len(diagonal)
+    beside: list[FloatArray] = [np.empty(0)] * len(below)
+    for i in reversed(range(len(diagonal))):
+        inverse = _lower(diagonal[i], np.eye(len(diagonal[i])))
+        own[i] = inverse.T @ inverse
+        if i < len(below):
+            G = inverse.T @ below[i].T
+            beside[i] = -G @ own[i + 1]
+            own[i] -= beside[i] @ G.T
+    return NearInverse(np.asarray(edges), tuple(own), tuple(beside))
+
+
+def _lower(L: FloatArray, right: FloatArray) -> FloatArray:
+    return np.asarray(solve_triangular(L, right, lower=True, check_finite=False))

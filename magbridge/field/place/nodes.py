@@ -1,0 +1,134 @@
+"""The nodes that a track comes near, and cubic B-splines between them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.ndimage import binary_dilation
+from scipy.sparse import csr_array
+
+from magbridge.arrays import BoolArray, FloatArray, IndexArray
+from magbridge.field.spline import weights
+
+__all__ = ["REACH", "Nodes", "nodes_near"]
+
+REACH = 6
+"""Strips of nodes that a stencil of the prior, or a spline that a slope with depth widens, reaches across."""
+BLOCK = 96
+"""Fewest nodes of a block: smaller ones cost more in calls than in arithmetic."""
+MOST = 4_000_000
+"""Cells of the box that holds a track, at most: beyond, the nodes are too fine for it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Nodes:
+    """Nodes of a square grid, where there are any; numbered strip by strip along the longer side.
+
+    Attributes
+    ----------
+    spacing : float
+        m.
+    low : (2,) array
+        m, north and east, of the box's first node.
+    number : (a, b) array
+        The number of each of the box's nodes, -1 where there is none.
+    turned : bool
+        Whether strips run north (the box is longer to the east).
+    """
+
+    spacing: float
+    low: FloatArray
+    number: IndexArray
+    turned: bool
+
+    @property
+    def size(self) -> int:
+        """How many there are."""
+        return int(self.number.max()) + 1
+
+    @cached_property
+    def places(self) -> FloatArray:
+        """(n, 2) m, north and east, of every node."""
+        strip, along = np.nonzero(self.number >= 0)
+        at = np.stack([strip, along][:: -1 if self.turned else 1], axis=1)
+        return np.asarray(self.low + self.spacing * at)
+
+    @cached_property
+    def edges(self) -> IndexArray:
+        """(b + 1,) where blocks begin that couple to the next one only."""
+        count = (self.number >= 0).sum(axis=1)
+        edges, nodes, strips = [0], 0, 0
+        for here in count[count > 0].tolist():
+            nodes, strips = nodes + here, strips + 1
+            if strips >= REACH and nodes >= BLOCK:
+                edges.append(edges[-1] + nodes)
+                nodes = strips = 0
+        if nodes:  # a last block too narrow would couple beyond its neighbour
+            edges = [*edges[:-1], self.size] if len(edges) > 1 else [0, self.size]
+        return np.array(edges)
+
+    def inside(self, place: FloatArray) -> BoolArray:
+        """Return which places (n, 2), m, have all the nodes that a spline there needs: (n,)."""
+        return np.asarray((self._around(place)[0] >= 0).all(axis=(1, 2)))
+
+    def basis(self, place: FloatArray) -> csr_array:
+        """Return the (n, nodes) splines at places (n, 2), m; rows are zero where nodes are missing."""
+        return self._rows(place, 0, 0)
+
+    def slopes(self, place: FloatArray) -> tuple[csr_array, csr_array]:
+        """Return the splines' derivatives north and east, 1/m, at places (n, 2), m."""
+        along, across = self._rows(place, 1, 0), self._rows(place, 0, 1)
+        return (across, along) if self.turned else (along, across)
+
+    def _around(self, place: FloatArray) -> tuple[IndexArray, FloatArray]:
+        """Return the numbers (n, 4, 4) of the nodes around places (n, 2), -1 outside; the cells' shares."""
+        u = (place - self.low) / self.spacing
+        u = u[:, ::-1] if self.turned else u
+        corner = np.floor(np.nan_to_num(u, nan=-9.0)).astype(np.intp)
+        steps = np.arange(-1, 3)
+        i, j = corner[:, 0, None] + steps, corner[:, 1, None] + steps
+        rows, columns = self.number.shape
+        inside = np.empty((len(u), 4, 4), bool)
+        inside[:] = ((i >= 0) & (i < rows)).reshape(-1, 4, 1)
+        inside &= ((j >= 0) & (j < columns)).reshape(-1, 1, 4)
+        i, j = np.clip(i, 0, rows - 1), np.clip(j, 0, columns - 1)
+        return np.where(inside, self.number[i[:, :, None], j[:, None, :]], -1), u - corner
+
+    def _rows(self, place: FloatArray, first: int, second: int) -> csr_array:
+        number, share = self._around(place)
+        good = np.asarray((number >= 0).all(axis=(1, 2)))
+        n, share = len(place), np.where(good[:, None], share, 0.0)
+        by = weights(share[:, 0])[first][:, None, :] * weights(share[:, 1])[second][None, :, :]
+        by = np.where(good, by, 0.0) / self.spacing ** (first + second)
+        number = np.maximum(number, 0).reshape(16 * n)
+        rows = csr_array(
+            (by.reshape(16, n).T.ravel(), number, np.arange(0, 16 * n + 1, 16)), shape=(n, self.size)
+        )
+        rows.eliminate_zeros()
+        return rows
+
+
+def nodes_near(place: FloatArray, spacing: float, pad: float) -> Nodes:
+    """Return the nodes within about `pad` m of places (n, 2), m north and east."""
+    around = int(np.ceil(pad / spacing)) + 2
+    cells = np.floor(place / spacing).astype(np.intp)
+    low = cells.min(axis=0) - around - 1
+    turned = bool(np.ptp(cells[:, 1]) > np.ptp(cells[:, 0]))
+    at = cells - low
+    shape = at.max(axis=0) + around + 3
+    if int(shape[0]) * int(shape[1]) > MOST:
+        raise ValueError("nodes are too fine for so large an area")
+    near = np.zeros(shape, bool)
+    near[at[:, 0], at[:, 1]] = True
+    near = binary_dilation(near, _disc(around))
+    if turned:
+        near = near.T
+    number = np.where(near, np.cumsum(near.ravel()).reshape(near.shape) - 1, -1)
+    return Nodes(spacing, spacing * low.astype(float), number, turned)
+
+
+def _disc(radius: int) -> BoolArray:
+    at = np.arange(-radius, radius + 1)
+    return np.asarray(np.hypot(at[:, None], at) <= radius + 0.5)

@@ -1,0 +1,137 @@
+"""A survey without calibration runs and without a map: the vehicle's field and the rock, told apart."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from magbridge.arrays import FloatArray
+from magbridge.calibration.correct import correct
+from magbridge.calibration.file import decode_calibration, encode_calibration
+from magbridge.calibration.fitting.boresight import field_body
+from magbridge.calibration.fitting.fit import LEVEL, Fit, fit
+from magbridge.calibration.fitting.level import level_of
+from magbridge.calibration.fitting.observations import Observations
+from magbridge.field.place.blocks import Factor, near_inverse
+from magbridge.field.place.matern import Matern
+from magbridge.field.place.nodes import nodes_near
+
+MAIN = np.array([18_000.0, -5_000.0, 48_000.0])
+IRON = np.eye(3) + np.array([[0.012, 0.003, -0.004], [0.003, -0.008, 0.002], [-0.004, 0.002, 0.005]])
+OFFSET = np.array([900.0, -600.0, 1200.0])
+NOISE = 1.0
+
+Survey = tuple[Observations, FloatArray, Fit]
+
+
+def flown(*, legs: int = 16, straight: bool = False, seed: int = 3) -> tuple[Observations, FloatArray]:
+    """Fly dives and climbs criss-cross over rock of 40 nT; return what was read, and the true total field."""
+    rng = np.random.default_rng(seed)
+    each, dt, speed = 110, 4.0, 0.9
+    n = legs * each
+    leg = np.arange(n) // each
+    course = np.zeros(legs) if straight else np.radians(rng.uniform(0, 360, legs))
+    heading = course[leg] + rng.normal(0, 0.02, n)
+    pitch = np.radians(np.where(leg % 2, 25, -25) + rng.normal(0, 1, n))
+    roll = np.radians(rng.normal(0, 5, legs)[leg] + rng.normal(0, 1, n))
+    place = np.cumsum(speed * dt * np.stack([np.cos(heading), np.sin(heading), 0 * heading], axis=1), axis=0)
+    k, phase = rng.normal(0, 1 / 700.0, (400, 2)), rng.uniform(0, 2 * np.pi, 400)
+    rock = 40.0 * np.sqrt(2 / 400) * np.cos(place[:, :2] @ k.T + phase).sum(axis=1)
+    F_0 = float(np.linalg.norm(MAIN))
+    true = F_0 + rock
+    ned = MAIN * (true / F_0)[:, None]
+    attitude = np.stack([roll, pitch, heading], axis=1)
+    field = field_body(attitude, ned) @ np.linalg.inv(IRON).T + OFFSET + rng.normal(0, NOISE, (n, 3))
+    data = Observations(
+        field=field, reference=np.full(n, F_0), parameters=np.empty((n, 0)),
+        time=1e9 + dt * np.arange(n, dtype=float), runs=leg, attitude=attitude,
+        reference_ned=np.tile(MAIN, (n, 1)), place=place, unmapped=np.ones(n),
+    )  # fmt: skip
+    return data, true
+
+
+@pytest.fixture(scope="module")
+def survey() -> Survey:
+    data, true = flown()
+    return data, true, fit(data)
+
+
+def test_field_about_its_mean(survey: Survey) -> None:
+    """The corrected field reaches the noise, rock or not, and its sigma says so, level apart."""
+    data, true, found = survey
+    assert found.calibration.method == "survey"
+    got = correct(found.calibration, data.field, np.empty((len(data), 0)), data.time)
+    error = got.total - true
+    assert np.std(error) < 1.15 * NOISE
+    level = level_of(found.calibration, data.field, np.empty((len(data), 0)), data.time)
+    apart = np.sqrt(got.sigma**2 - level**2)
+    assert 0.8 < np.std(error) / np.median(apart) < 1.25
+
+
+def test_level_is_known_as_well_as_the_reference(survey: Survey) -> None:
+    """An IGRF alone does not know the level: the sigma counts that, and says how much of it there is."""
+    data, true, found = survey
+    level = found.calibration.reference.level_sigma
+    assert 0.8 * LEVEL < level < 1.5 * LEVEL
+    got = correct(found.calibration, data.field, np.empty((len(data), 0)), data.time)
+    assert got.sigma.min() > 0.9 * level
+    assert abs(np.mean(got.total - true)) < 2.5 * level
+
+
+def test_rock_is_not_taken_for_noise(survey: Survey) -> None:
+    """Its size and length are the rock's, its noise the sensor's."""
+    rock = survey[2].details["rock"]
+    assert 20.0 < rock["size_nT"] < 100.0
+    assert 300.0 < rock["length_m"] < 2000.0
+    assert survey[2].calibration.noise.sensor == pytest.approx(NOISE, rel=0.1)
+
+
+def test_level_stands_in_the_file(survey: Survey) -> None:
+    calibration = survey[2].calibration
+    again = decode_calibration(encode_calibration(calibration))
+    assert again.reference == calibration.reference
+    assert again.level == calibration.level
+    assert again.reference.bias_sigma == LEVEL
+
+
+def test_true_field_is_fitted_as_before() -> None:
+    """Where the true field is known at every sample there is no rock, and no level either."""
+    data, true = flown(legs=6)
+    known = Observations(field=data.field, reference=true, parameters=data.parameters, time=data.time)
+    found = fit(known)
+    assert found.calibration.method == "auto"
+    assert found.calibration.reference.level_sigma == 0.0
+
+
+def test_straight_line_is_not_supported() -> None:
+    """On one straight line rock and heading are one: the pilot is told, and --strict refuses."""
+    found = fit(flown(legs=8, straight=True)[0])
+    assert not found.supported
+    assert any("never crossed your own track" in line for line in found.warnings)
+
+
+@pytest.mark.parametrize("alpha", [2, 3, 4])
+def test_prior_has_unit_variance_and_its_inverse_is_exact(alpha: int) -> None:
+    """Away from edges the splines' variance is 1; blocks of the inverse are those of the dense one."""
+    rng = np.random.default_rng(alpha)
+    place = np.cumsum(rng.normal(0, 60, (1500, 2)), axis=0)
+    field = Matern(nodes_near(place, 400.0, 1000.0), 1000.0, alpha)
+    Q = field.precision.toarray()
+    B = field.basis(place[::9])
+    variance = near_inverse(field.precision, field.nodes.edges).variances(B)
+    np.testing.assert_allclose(variance, np.einsum("ni,ij,nj->n", B.toarray(), np.linalg.inv(Q), B.toarray()))
+    np.testing.assert_allclose(variance, 1.0, atol=0.05)
+    assert field.log_determinant == pytest.approx(np.linalg.slogdet(Q)[1])
+    assert Factor(field.precision).log_determinant == pytest.approx(field.log_determinant)
+
+
+def test_slopes_are_the_splines_derivatives() -> None:
+    nodes = nodes_near(np.array([[0.0, 0.0], [3000.0, 500.0]]), 300.0, 900.0)
+    rng = np.random.default_rng(1)
+    w, x = rng.normal(size=nodes.size), np.array([[100.0, 50.0], [2900.0, 600.0]])
+    north, east = (slope @ w for slope in nodes.slopes(x))
+    step = np.array([[0.5, 0.0]])
+    np.testing.assert_allclose(north, (nodes.basis(x + step) - nodes.basis(x - step)) @ w, rtol=1e-4)
+    np.testing.assert_allclose(
+        east, (nodes.basis(x + step[:, ::-1]) - nodes.basis(x - step[:, ::-1])) @ w, rtol=1e-4
+    )
