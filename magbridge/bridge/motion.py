@@ -156,10 +156,11 @@ class Motion:
                 self._last = last + LEARNING * (speed - last) if isfinite(last) else speed
         measured = stream in self._measured
         source = Source.TRACK if own else Source.OTHER
-        if own and measured and self._velocity_stays():
+        clean = not (own and self.fed_back)
+        if own and measured and (self._velocity_stays() or (clean and place is None)):
             if self._use(source, time_us, "the autopilot's velocity", stream):
                 self._pass(time_us, velocity_north=velocity[0], velocity_east=velocity[1])
-        elif place is not None and not (own and self.fed_back):
+        elif place is not None and clean:
             words = "the autopilot's position" if own else f"the position from component {stream[0]}"
             if self._use(source, time_us, words, stream):
                 self._move(time_us, place, velocity if measured else None, resets)

@@ -7,12 +7,11 @@ December 2025, PX4's of August 2026.
 from __future__ import annotations
 
 from collections.abc import Callable
-from math import inf, nan
+from math import inf, nan, sqrt
 from typing import Any, NamedTuple
 
 import msgspec
 
-from magbridge.field.geodesy import worse_axis
 from magbridge.link.outbox import Outbox
 from magbridge.mavlink.dialect import (
     GLOBAL_POSITION_SRC,
@@ -85,8 +84,11 @@ class Fix(msgspec.Struct, frozen=True, gc=False):
 
     @property
     def sigma(self) -> float:
-        """m, 1-sigma of the worse axis."""
-        return worse_axis(self.covariance_nn, self.covariance_ne, self.covariance_ee)
+        """m, 1-sigma on each axis of a circle that stands for the ellipse: as many squared metres in all.
+
+        Receivers know only circles. That of the worse axis would claim less than is known, by up to a third.
+        """
+        return sqrt(0.5 * (self.covariance_nn + self.covariance_ee))
 
 
 def widened(fix: Fix, seconds: float) -> Fix:

@@ -154,6 +154,18 @@ class Estimate:
             self._filter.predict(F, Q)
         return seconds, metres
 
+    def other_motion(self) -> None:
+        """From now on dead reckoning follows other telemetry: what it misses, the current, is another."""
+        if self._filter is None:
+            return
+        banks = [self._monitor.here, self._monitor.elsewhere] if self._monitor else []
+        Q = np.zeros_like(self.P)
+        Q[2, 2] = Q[3, 3] = self.options.current_sigma**2
+        for one in (self._filter, *banks):
+            one.predict(np.eye(len(Q)), Q)
+        self._alone += Q[:4, :4]
+        self._read()
+
     def _take_in(self, block: Block) -> Innovation:
         if isinstance(self._filter, Tracker):
             return self._filter.update(block)

@@ -98,6 +98,7 @@ class Navigator:
         """From now on the motion is known by other telemetry."""
         self._reckoning.advance(time_us * 1e-6)
         self._reckoning.forget()
+        self.estimate.other_motion()
 
     def sample(self, time_us: int, corrected: Corrected) -> Record | None:
         """Take in a corrected sample; return the update that it completes, if it does."""
@@ -139,9 +140,13 @@ class Navigator:
         x, P = F @ last.x, F @ last.P @ F.T + Q
         if widest(P) > last.options.sigma_limit:
             return None
-        place = offset(*self._reckoning.ahead(time_us * 1e-6), float(x[0]), float(x[1]))
+        place = offset(*self.reckoned(time_us), float(x[0]), float(x[1]))
         (nn, ne), (_, ee) = P[:2, :2].tolist()
         return Reckoned(time_us, *place, nn, ne, ee)
+
+    def reckoned(self, time_us: int) -> tuple[float, float]:
+        """Return latitude and longitude by dead reckoning alone, at a time from the last one on."""
+        return self._reckoning.ahead(time_us * 1e-6)
 
     def _update(self, block: Block) -> Record:
         now = self.estimate

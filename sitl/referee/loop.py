@@ -1,0 +1,153 @@
+"""A bridge's navigation and an autopilot that takes its fixes, each hearing what the other sends."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterator
+from math import hypot
+from typing import NamedTuple
+
+import numpy as np
+
+from magbridge.arrays import FloatArray
+from magbridge.bridge.navigation import Navigation
+from magbridge.config import Link
+from magbridge.field.geodesy import offset, separation
+from magbridge.field.grid import AnomalyGrid
+from magbridge.link.component import Component
+from magbridge.link.fixes import FIXES
+from magbridge.navigate import Options
+from magbridge.records import Corrected
+from sitl.referee.autopilot import GPS_SIGMA, Autopilot, Truth
+
+__all__ = ["Passage", "Run", "sail"]
+
+SECOND_US = 1_000_000
+
+
+class Passage(NamedTuple):
+    """What a vehicle does, and what its corrected magnetometer gives; n samples, evenly spaced.
+
+    Attributes
+    ----------
+    time : ndarray, (n,)
+        s since 1970 UTC.
+    latitude, longitude : ndarray, (n,)
+        deg, true.
+    velocity : ndarray, (n, 2)
+        m/s north and east through the water, until the next sample.
+    total_field, sigma : ndarray, (n,)
+        nT.
+    depth : float
+        m.
+    gps : callable
+        Of s since the start: whether there is reception.
+    """
+
+    time: FloatArray
+    latitude: FloatArray
+    longitude: FloatArray
+    velocity: FloatArray
+    total_field: FloatArray
+    sigma: FloatArray
+    depth: float
+    gps: Callable[[float], bool]
+
+
+class Run(NamedTuple):
+    """Once a second: who believes to be how far off.
+
+    Attributes
+    ----------
+    seconds : ndarray, (n,)
+        s since the start.
+    error : ndarray, (n,)
+        m, of the bridge's position; NaN while it has none.
+    autopilot : ndarray, (n, 2)
+        m, of the autopilot's, north and east.
+    claimed : ndarray, (n,)
+        m, the autopilot's 1-sigma on each axis.
+    sent : ndarray, (n,)
+        Number of fixes until then.
+    texts : list of (float, str)
+        s since the start, and what was announced.
+    """
+
+    seconds: FloatArray
+    error: FloatArray
+    autopilot: FloatArray
+    claimed: FloatArray
+    sent: FloatArray
+    texts: list[tuple[float, str]]
+
+
+def sail(
+    passage: Passage,
+    grid: AnomalyGrid,
+    options: Options,
+    kind: str,
+    make: Callable[[tuple[float, float, float], int], Autopilot],
+    seed: int = 0,
+) -> tuple[Run, Autopilot, Navigation]:
+    """Sail a passage with the autopilot that ``make(origin, start_us)`` returns, by fixes of one `kind`."""
+    start_us = round(passage.time[0] * 1e6) // 4 * 4
+    component = Component(Link("udpout:127.0.0.1:14550"), {"MAG_NAVIGATION": -1.0}, start_us=start_us)
+    navigation = Navigation(grid, options, FIXES[kind], component)
+    origin = float(passage.latitude[0]), float(passage.longitude[0]), 3.0
+    autopilot = make(origin, start_us)
+    rows: list[tuple[float, ...]] = []
+    texts: list[tuple[float, str]] = []
+    answers = b""
+    columns = passage.time.tolist(), passage.total_field.tolist(), passage.sigma.tolist()
+    samples = deque(zip(*columns, strict=True))
+    for seconds, truth in truths(passage, seed):
+        now_us = start_us + round(seconds * SECOND_US)
+        component.advance(now_us)
+        answers += exchange(component, autopilot)
+        for message in component.receive(answers + autopilot.step(now_us, truth), now_us):
+            navigation.hear(message, now_us)
+        component.heard.clear()
+        while samples and samples[0][0] * 1e6 <= now_us:
+            when, field, sigma = samples.popleft()
+            corrected = Corrected(field, sigma, (field, 0.0, 0.0), (sigma, sigma, sigma), 0)
+            navigation.sample(round(when * 1e6), corrected)
+        answers = exchange(component, autopilot)
+        texts += [(seconds, text) for _, text in component.announcer.said]
+        component.announcer.said.clear()
+        off = separation(*truth.place, *autopilot.place)
+        own, claimed = own_error(navigation, now_us, truth), autopilot.filter.sigma
+        rows.append((seconds, own, *off, claimed, navigation.fixing.sent))
+    table = np.array(rows)
+    seconds, error, _, _, claimed, sent = table.T
+    return Run(seconds, error, table[:, 2:4], claimed, sent, texts), autopilot, navigation
+
+
+def exchange(component: Component, autopilot: Autopilot) -> bytes:
+    """Hand what the bridge sends to the autopilot; return its answers."""
+    return b"".join([autopilot.receive(frame, time_us) for time_us, frame in component.outbox.drain()])
+
+
+def own_error(navigation: Navigation, now_us: int, truth: Truth) -> float:
+    """Return m between the bridge's position and the true one."""
+    navigator = navigation.navigator
+    if not navigator.estimate.begun:
+        return float("nan")
+    north, east = navigator.estimate.x[:2].tolist()
+    return hypot(*separation(*truth.place, *offset(*navigator.reckoned(now_us), north, east)))
+
+
+def truths(passage: Passage, seed: int) -> Iterator[tuple[float, Truth]]:
+    """Yield the vehicle's state once a second, and when; between samples it moves evenly."""
+    rng = np.random.default_rng(seed)
+    time, every = passage.time, float(passage.time[1] - passage.time[0])
+    heading = np.degrees(np.arctan2(passage.velocity[:, 1], passage.velocity[:, 0])) % 360.0
+    speed = np.hypot(*passage.velocity.T)
+    seconds = np.arange(0.0, time[-1] - time[0])
+    latitude = np.interp(seconds, time - time[0], passage.latitude)
+    longitude = np.interp(seconds, time - time[0], passage.longitude)
+    noise = rng.normal(size=(seconds.size, 2)) * GPS_SIGMA
+    for k, second in enumerate(seconds.tolist()):
+        place = float(latitude[k]), float(longitude[k])
+        i = int(second / every)
+        gps = offset(*place, *noise[k].tolist()) if passage.gps(second) else None
+        yield second, Truth(place, float(speed[i]), float(heading[i]), 0.0, passage.depth, gps)

@@ -1,0 +1,162 @@
+"""When fixes go to the autopilot, and what is told of it."""
+
+from __future__ import annotations
+
+import pytest
+from vehicle import ACK, ARDUPILOT, PX4, Bench
+
+GOOD = {"fix_type": 3, "lat": 495000000, "lon": -579000000, "h_acc": 2000}
+
+
+def test_none_while_gps_is_good_and_none_from_the_moment_it_is_back() -> None:
+    bench = Bench("EXTERNAL_POSITION_ESTIMATE")
+    bench.hear("GPS_RAW_INT", **GOOD)
+    assert bench.fix() == []
+    bench.to(2)
+    bench.hear("GPS_RAW_INT", fix_type=1)
+    assert [one.name for one in bench.fix()] == ["COMMAND_INT"], "lost as soon as it says so"
+    bench.to(4)
+    bench.hear("GPS_RAW_INT", **GOOD)
+    assert bench.fix() == []
+    bench.to(10)
+    assert bench.said("fixes") == [
+        "no fixes to the autopilot: GPS is good",
+        "fixes go to the autopilot: GPS is lost",
+        "no fixes to the autopilot: GPS is good",
+    ]
+
+
+def test_a_silent_gps_is_lost_but_a_slow_one_is_not() -> None:
+    bench = Bench("EXTERNAL_POSITION_ESTIMATE")
+    for k in range(5):
+        bench.to(k)
+        bench.hear("GPS_RAW_INT", **GOOD)
+    bench.to(8.9)
+    assert bench.fix() == []
+    bench.to(9.1)
+    assert bench.fix()
+    for k in (20, 40, 60):
+        bench.to(k)
+        bench.hear("GPS_RAW_INT", **GOOD)
+    bench.to(90)
+    assert bench.fix() == []
+    bench.to(121)
+    assert bench.fix()
+
+
+def test_odometry_waits_for_origin_attitude_and_height() -> None:
+    bench = Bench("ODOMETRY")
+    asked = [one for k in range(11) for one in bench.to(k)]
+    assert {one.name for one in asked} == {"COMMAND_LONG"}
+    assert [(one["command"], one["param1"]) for one in asked] == [(512, 49.0)] * 3, "every 5 s"
+    assert bench.fix() == []
+    bench.hear("GPS_GLOBAL_ORIGIN", latitude=0, longitude=0)  # not set yet
+    bench.hear("GPS_GLOBAL_ORIGIN", latitude=495_000_000, longitude=-579_000_000, altitude=5000)
+    bench.to(12)
+    assert bench.fix() == []
+    bench.hear("ATTITUDE", yaw=0.5)
+    bench.to(14)
+    assert bench.fix() == []
+    bench.hear("GLOBAL_POSITION_INT", alt=-2000)
+    bench.to(16)
+    (sent,) = bench.fix()
+    assert sent["z"] == pytest.approx(7.0), "2 m under the sea is 7 m under the origin"
+    assert bench.said("fixes to") == [
+        "no fixes to the autopilot: no origin of the autopilot's frame",
+        "no fixes to the autopilot: no attitude from the autopilot",
+        "no fixes to the autopilot: no height from the autopilot",
+    ]
+    bench.to(30)
+    bench.hear("GLOBAL_POSITION_INT", alt=-2000)
+    assert bench.fix() == [], "that attitude is old"
+    assert not any(one.name == "COMMAND_LONG" for one in bench.to(60)), "the origin is known"
+
+
+def test_a_reboot_takes_the_origin_with_it() -> None:
+    bench = Bench("ODOMETRY")
+    bench.hear("GPS_GLOBAL_ORIGIN", latitude=495_000_000, longitude=-579_000_000)
+    bench.to(20)
+    for boot_ms in (100_000, 101_000, 500, 600, 700, 800):
+        bench.hear("ATTITUDE", time_boot_ms=boot_ms)
+    assert any(one["command"] == 512 for one in bench.to(26) if one.name == "COMMAND_LONG")
+
+
+@pytest.mark.parametrize(
+    ("kind", "stack", "reason"),
+    [
+        ("ODOMETRY", PX4, "PX4 makes a bias of ODOMETRY: use GLOBAL_POSITION_SENSOR"),
+        (
+            "GLOBAL_POSITION_SENSOR",
+            ARDUPILOT,
+            "ArduPilot ignores this message: use EXTERNAL_POSITION_ESTIMATE",
+        ),
+    ],
+)
+def test_what_an_autopilot_cannot_use_is_not_sent(kind: str, stack: int, reason: str) -> None:
+    bench = Bench(kind)
+    bench.hear("HEARTBEAT", autopilot=stack)
+    for k in range(5):
+        bench.to(2 * k)
+        assert bench.fix() == []
+    assert bench.said("fixes") == [f"no fixes to the autopilot: {reason}"]
+
+
+def test_a_refusal_is_told_once_and_so_is_its_end() -> None:
+    bench = Bench("EXTERNAL_POSITION_ESTIMATE")
+    bench.hear("COMMAND_ACK", **ACK, result=2)
+    assert bench.said("refuses") == [], "nothing was asked of it yet"
+    for k in range(10):
+        bench.to(10 * k)
+        bench.fix()
+        bench.hear("COMMAND_ACK", **{**ACK, "command": 512}, result=4)
+        bench.hear("COMMAND_ACK", **ACK, result=2)
+    assert bench.said("refuses") == ["the autopilot refuses fixes: DENIED"]
+    for k in range(10, 13):
+        bench.to(10 * k)
+        bench.fix()
+        bench.hear("COMMAND_ACK", **ACK, result=0)
+    assert bench.said("fixes") == ["the autopilot takes fixes"]
+    fixing = bench.navigation.fixing
+    assert (fixing.sent, fixing.refused, fixing.accepted) == (13, 10, 3)
+    bench.to(200)
+    bench.fix()
+    bench.hear("COMMAND_ACK", **ACK, result=4)
+    assert "FAILED (it still uses GPS, has no origin, or nothing" in bench.said("refuses")[0]
+    bench.to(210)
+    bench.hear("COMMAND_ACK", **ACK, result=77)
+    assert bench.said("refuses") == ["the autopilot refuses fixes: result 77"]
+
+
+def test_an_autopilot_that_does_not_answer_is_told() -> None:
+    bench = Bench("EXTERNAL_POSITION_ESTIMATE")
+    for k in range(3):
+        bench.to(10 * k)
+        bench.fix()
+    assert bench.said("answer") == []
+    bench.to(40)
+    bench.fix()
+    assert bench.said("answer") == ["the autopilot does not answer fixes"]
+
+
+def test_that_ardupilot_believes_odometry_too_much_is_told() -> None:
+    bench = Bench("ODOMETRY")
+    bench.hear("HEARTBEAT", autopilot=ARDUPILOT)
+    bench.hear("GPS_GLOBAL_ORIGIN", latitude=495_000_000, longitude=-579_000_000)
+    bench.hear("ATTITUDE")
+    bench.hear("LOCAL_POSITION_NED", z=1.0)
+    bench.fix(sigma=3.0)
+    assert bench.said("claim") == []
+    bench.to(5)
+    bench.fix(sigma=30.0)
+    assert bench.said("claim") == ["the autopilot takes fixes for 10 m or better: it will claim too much"]
+
+
+def test_a_fix_soon_after_another_is_widened_where_it_is_fused() -> None:
+    bench = Bench("GLOBAL_POSITION_SENSOR")
+    assert bench.fix(sigma=20.0)[0]["eph"] == pytest.approx(20.0), "the first is new"
+    bench.to(1)
+    soon = bench.fix(sigma=20.0)[0]["eph"]
+    bench.to(5)
+    later = bench.fix(sigma=20.0)[0]["eph"]
+    assert soon == pytest.approx(2.0 * later)
+    assert later > 20.0

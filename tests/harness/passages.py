@@ -1,0 +1,51 @@
+"""A vehicle over hills of the field: what a bridge and an autopilot are tried on in closed loop."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+
+from magbridge.field.geodesy import metres_per_degree, offset
+from magbridge.field.grid import AnomalyGrid
+from magbridge.field.igrf import total_field
+from magbridge.navigate import Options
+from sitl.referee.loop import Passage
+
+PLACE = (49.5, -57.9)
+START = 1_780_000_000.0
+LOST, BACK, LAST = 60.0, 840.0, 900.0
+"""s: GPS is lost, and comes back; the end."""
+OPTIONS = Options(start_sigma=200.0, current_sigma=0.1, bias_sigma=1.0, map_sigma=0.5, interval=4.0)
+
+
+@cache
+def hills(seed: int = 4) -> AnomalyGrid:
+    """Return waves of 80 to 300 m and 50 nT, over 6 km."""
+    rng = np.random.default_rng(seed)
+    per_latitude, per_longitude = metres_per_degree(PLACE[0])
+    along = np.arange(-3000.0, 3001.0, 20.0)
+    x, y = np.meshgrid(along, along)
+    anomaly = np.zeros_like(x)
+    for direction, length, phase in zip(
+        rng.uniform(0, 3.1, 12), rng.uniform(80, 300, 12), rng.uniform(0, 6.3, 12), strict=True
+    ):
+        anomaly += 15.0 * np.sin((x * np.cos(direction) + y * np.sin(direction)) / length + phase)
+    return AnomalyGrid(PLACE[1] + along / per_longitude, PLACE[0] + along / per_latitude, anomaly)
+
+
+@cache
+def passage(seed: int = 1, current: float = 0.1) -> Passage:
+    """Return two legs at 1.5 m/s through a current that nobody measures (m/s, north)."""
+    rng = np.random.default_rng(seed)
+    time = START + np.arange(0.0, LAST + 1.0)
+    heading = np.where(time - START < 0.5 * LAST, np.radians(50.0), np.radians(-40.0))
+    velocity = 1.5 * np.column_stack([np.cos(heading), np.sin(heading)])
+    away = np.cumsum(velocity + np.array([current, 0.0]), axis=0)
+    away = np.vstack([[0.0, 0.0], away[:-1]])
+    latitude, longitude = np.array([offset(*PLACE, *row) for row in away.tolist()]).T
+    field = total_field(longitude, latitude, 2.0, time) + hills().evaluate(longitude, latitude).anomaly
+    noisy = field + rng.normal(size=time.size)
+    return Passage(
+        time, latitude, longitude, velocity, noisy, np.ones(time.size), 2.0, lambda s: s < LOST or s > BACK
+    )

@@ -1,0 +1,64 @@
+"""An autopilot's messages by hand, and what the bridge's navigation makes of them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from passages import OPTIONS, PLACE, hills
+
+from magbridge.bridge.navigation import Navigation
+from magbridge.config import Link
+from magbridge.link.component import Component
+from magbridge.link.fixes import FIXES
+from magbridge.mavlink import Codec, Message
+from magbridge.navigate.record import Reckoned
+
+START_US = 1_780_000_000_000_000
+ARDUPILOT, PX4 = 3, 12
+ACK = {"command": 43003, "target_system": 1, "target_component": 191}
+
+
+class Bench:
+    """A bridge's navigation without its ports."""
+
+    def __init__(self, kind: str) -> None:
+        self.component = Component(
+            Link("udpout:127.0.0.1:14550"), {"MAG_NAVIGATION": -1.0}, start_us=START_US
+        )
+        self.navigation = Navigation(hills(), OPTIONS, FIXES[kind]._replace(rate=0.0), self.component)
+        self.texts: list[str] = []
+        self._autopilot = {number: Codec(1, number) for number in (1, 197)}
+        self.now_us = START_US
+
+    def to(self, seconds: float) -> list[Message]:
+        """Let time pass; return what was sent, and keep what was said."""
+        self.now_us = START_US + round(seconds * 1e6) // 4 * 4
+        self.component.advance(self.now_us)
+        return self._drain()
+
+    def hear(self, name: str, component: int = 1, **fields: Any) -> list[Message]:
+        """Hear a message now; return what was sent."""
+        frame = self._autopilot[component].pack(name, **fields)
+        for message in self.component.receive(frame, self.now_us):
+            self.navigation.hear(message, self.now_us)
+        return self._drain()
+
+    def fix(self, sigma: float = 5.0) -> list[Message]:
+        """Offer a position; return what was sent."""
+        at = Reckoned(self.now_us, *PLACE, sigma**2, 0.0, sigma**2)
+        if self.navigation.fixing.send(at, 0):
+            self.navigation.motion.fixes_sent()
+        return self._drain()
+
+    def said(self, word: str) -> list[str]:
+        """Return the texts with a word in them, since asked last."""
+        self._drain()
+        found, self.texts = [text for text in self.texts if word in text], []
+        return found
+
+    def _drain(self) -> list[Message]:
+        self.texts += [text for _, text in self.component.announcer.said]
+        self.component.announcer.said.clear()
+        frames = b"".join(frame for _, frame in self.component.outbox.drain())
+        wanted = ("COMMAND_INT", "COMMAND_LONG", "GLOBAL_POSITION_SENSOR", "ODOMETRY")
+        return [message for message in Codec(255, 190).parse(frames) if message.name in wanted]
