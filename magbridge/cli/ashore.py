@@ -130,7 +130,7 @@ def map(  # noqa: A001 - the command's name
     output: Grid,
     altitude: Annotated[float | None, Parameter(validator=validators.Number(gte=-1e6, lte=1e6))] = None,
     surveyed: Annotated[tuple[float, ...], Parameter(validator=validators.Number(gte=-1e6, lte=1e6))] = (),
-    passes: Annotated[Whole, Parameter(validator=validators.Number(gte=0, lte=10_000))] = 20,
+    smooth: Annotated[float, Parameter(validator=validators.Number(gte=0, lte=1e4))] = 0.0,
     mask: Path | None = None,
     spacing: Annotated[float | None, Parameter(validator=validators.Number(gt=0, lt=inf))] = None,
     picture: Picture = None,
@@ -148,8 +148,9 @@ def map(  # noqa: A001 - the command's name
         Altitude in m to which every grid is continued upward; by default that of the highest.
     surveyed
         Altitude in m of the surveys whose grids do not say it: one for all grids, or repeated, one for each.
-    passes
-        Number of passes of the 3x3 Hanning smoothing kernel.
+    smooth
+        Wavelength in km: of shorter waves less than half stays, and what is taken out counts as the map's
+        sigma. By default nothing is smoothed.
     mask
         A CSV of longitude,latitude (deg): the polygon outside which the map is blank.
     spacing
@@ -168,7 +169,7 @@ def map(  # noqa: A001 - the command's name
         flown = [read_grid(path) for path in grids]
         if surveyed:
             flown = surveyed_at(flown, surveyed)
-        result, steps = prepare(flown, altitude, passes, polygon, spacing)
+        result, steps = prepare(flown, altitude, smooth, polygon, spacing)
     result.save(output)
     if picture:
         draw_steps(steps, picture)

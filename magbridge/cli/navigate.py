@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from math import isfinite
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+from cyclopts import Parameter, validators
 
 from magbridge.cli.common import (
     AS_THEY_SAY,
@@ -42,6 +45,7 @@ def navigate(
     calibration: Path | None = None,
     config: Path | None = None,
     bound: bool = False,
+    every: Annotated[float | None, Parameter(validator=validators.Number(gt=0, lte=1e6))] = None,
     picture: Picture = None,
     heading_reference: Heading = None,
     reading: Reading = AS_THEY_SAY,
@@ -68,6 +72,9 @@ def navigate(
         A bridge.toml whose [navigation.options] say how well start, current and map are known.
     bound
         Compute what the map is worth along a planned track.
+    every
+        Seconds between samples, for --bound. By default those of FILE where it is a log with a magnetometer,
+        else those of the calibration, else 4.
     picture
         A PNG, PDF or SVG to draw: the tracks on the map, errors and innovations; or the bound on the map.
     heading_reference
@@ -84,7 +91,7 @@ def navigate(
 
     known, options = load(calibration) if calibration else None, _options(config)
     if bound:
-        _bound(files, map, output, options, known, picture, reading, json)
+        _bound(files, map, output, options, known, every, picture, reading, json)
         return
     if known is None or calibration is None:
         raise WrongUse("expected --calibration, which only --bound can do without")
@@ -160,6 +167,7 @@ def _bound(
     output: Path,
     options: Options | None,
     calibration: Calibration | None,
+    every: float | None,
     picture: Path | None,
     reading: Reading,
     json: bool,
@@ -174,14 +182,27 @@ def _bound(
     grid, options = _continued(read_grid(map), options or Options(), plan)
     track = [plan[name].to_numpy().astype(float) for name in ("time", "latitude", "longitude")]
     sigma = calibration.noise.sensor if calibration else 1.0
-    best = position_bound(grid, track[0], track[1], track[2], options, sigma)
+    every = every or _every(plan, calibration)
+    best = position_bound(grid, track[0], track[1], track[2], options, sigma, every=every)
     result = as_dataset(best, grid)
+    result.attrs["findings"] += f", with samples of {sigma:.3g} nT every {every:.3g} s"
+    result.attrs |= {"sample_sigma_nT": sigma, "sample_interval_s": every}
     write(result, output)
     if picture:
         from magbridge.navigate.draw import draw_bound
 
         draw_bound(best, grid, picture)
     print_result({"file": str(output), **result.attrs}, f"{output}: {result.attrs['findings']}", json)
+
+
+def _every(plan: xr.Dataset, calibration: Calibration | None) -> float:
+    """Return the s between samples: those of a log, else those that a calibration was fitted to."""
+    times = plan["time"].to_numpy()
+    if times.size > 2 and {"mag_x", "total_field"} & set(plan.variables):
+        return float(np.median(np.diff(times)))
+    if calibration is not None and calibration.noise.interval > 0.0:
+        return calibration.noise.interval
+    return 4.0
 
 
 def _continued(grid: AnomalyGrid, options: Options, deployment: xr.Dataset) -> tuple[AnomalyGrid, Options]:

@@ -12,7 +12,7 @@ from math import inf, nan, sqrt
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from magbridge.arrays import FloatArray
 from magbridge.errors import FormatError, OutOfRange
@@ -31,6 +31,9 @@ FLAT = 1e-6
 """nT: what rounding leaves of a plane."""
 NOT_AN_ANOMALY = 15_000.0
 """nT: a median this large is the total field, not an anomaly."""
+
+FEWEST, MIDDLE = 20, 400
+"""Nodes along an axis, with fewer of which the error between them is not asked for; and at most asked for."""
 
 DOWN, ACROSS = [0, 1, 0, 2, 1, 0], [0, 0, 1, 0, 1, 2]
 """Orders of derivative, north and east, in the order of Local."""
@@ -221,6 +224,12 @@ class AnomalyGrid:
         left = values - design @ np.linalg.lstsq(design, values, rcond=None)[0]
         return float(np.sqrt(np.mean(left**2)))
 
+    @property
+    def spacing(self) -> float:
+        """m, the larger of the distances between nodes, in the map's middle."""
+        per_latitude, per_longitude = metres_per_degree(float(np.mean(self.latitude)))
+        return max(self._dy * per_latitude, self._dx * per_longitude)
+
     @cached_property
     def correlation_length(self) -> float:
         """m, distance over which the anomaly changes by its own RMS; infinite for a map without slopes.
@@ -235,6 +244,27 @@ class AnomalyGrid:
         flat = north - np.nanmean(north), east - np.nanmean(east)
         slope = sqrt(float(np.nanmean(flat[0] ** 2 + flat[1] ** 2)))
         return sqrt(2.0) * self.rms / slope if self.rms > FLAT else inf
+
+    @cached_property
+    def interpolation_sigma(self) -> float:
+        """nT, RMS error of the spline between nodes, as far as the nodes tell; 0 on a small map.
+
+        Notes
+        -----
+        Every second node is left out and predicted from the others: the error at twice the spacing, e(2h);
+        likewise e(4h). The field of sources at a depth d falls off as exp(-k d), and what a spacing misses
+        begins at k = π/h, so log e goes as 1/h: ``e(h) = e(2h) (e(2h) / e(4h))²``. Noise of the nodes has
+        e(h) = e(2h). That is at a cell's middle; over the cell, the mean of its square is half that.
+        """
+        rows, columns = (slice((n - MIDDLE) // 2, (n + MIDDLE) // 2) if n > MIDDLE else slice(None)
+                         for n in self.anomaly.shape)  # fmt: skip
+        values = filled(self.anomaly)[rows, columns]
+        known = ~np.isnan(self.anomaly)[rows, columns]
+        if min(values.shape) < FEWEST or known.sum() < known.size / 2:
+            return 0.0
+        finer, coarser = (_left_out(values, known, step) for step in (2, 4))
+        at_middle = finer * min(finer / coarser, 1.0) ** 2 if coarser > FLAT else 0.0
+        return at_middle * sqrt(0.5)
 
     def save(self, path: str | Path) -> None:
         """Write the grid as CF netCDF, which :func:`~magbridge.field.read.read_grid` and GMT read.
@@ -254,6 +284,19 @@ class AnomalyGrid:
             f"{self.name} (latitude {self.latitude[0]:.4f} to {self.latitude[-1]:.4f},"
             f" longitude {west:.4f} to {east:.4f})"
         )
+
+
+def _left_out(values: FloatArray, known: NDArray[np.bool_], step: int) -> float:
+    """Return the RMS error (nT) of a spline through every `step`-th node, halfway between them."""
+    from scipy.interpolate import RectBivariateSpline  # noqa: PLC0415  the live path runs without scipy
+
+    y, x = (np.arange(0, n, step) for n in values.shape)
+    spline = RectBivariateSpline(y, x, values[::step, ::step])
+    half = step // 2
+    rows, columns = np.arange(half, y[-1], step), np.arange(half, x[-1], step)
+    there = np.ix_(rows, columns)
+    error = (spline(rows, columns) - values[there])[known[there]]
+    return float(np.sqrt(np.mean(error**2))) if error.size else 0.0
 
 
 def _axis(values: ArrayLike, name: str, what: str) -> tuple[FloatArray, bool]:

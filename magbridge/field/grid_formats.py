@@ -1,9 +1,10 @@
-"""Anomaly grids that are not netCDF: Surfer, Geosoft, ESRI ASCII, GeoTIFF, tables, MagNav's folder."""
+"""Anomaly grids that are not netCDF: Surfer, Geosoft, ESRI ASCII, GeoTIFF, MagNav's folder."""
 
 from __future__ import annotations
 
 import re
 import warnings
+import zlib
 from collections.abc import Callable
 from io import BytesIO
 from pathlib import Path
@@ -11,12 +12,15 @@ from typing import Any
 
 import numpy as np
 
-from magbridge.arrays import IndexArray, RealArray
+from magbridge.arrays import RealArray
 from magbridge.errors import FormatError, MissingExtra
-from magbridge.field.grid_netcdf import ANOMALY, LATITUDE, LONGITUDE, Parts, netcdf
+from magbridge.field.coordinates import Axes
+from magbridge.field.grid_netcdf import Parts, netcdf
 
-__all__ = ["ascii_grid", "folder", "geotiff", "grd", "table"]
+__all__ = ["TEXT", "ascii_grid", "folder", "geotiff", "grd"]
 
+BAD_GEOSOFT = (ValueError, NotImplementedError, OSError, IndexError, UnboundLocalError, OverflowError)
+"""What harmonica raises on a file that is no such grid, or damaged; beside zlib's error."""
 BAD_TIFF = (OSError, KeyError, AttributeError, TypeError, ValueError)
 """What Pillow, or a tag that is not as it should be, raises."""
 TEXT: Any = {"encoding": "utf-8-sig", "errors": "replace"}
@@ -34,12 +38,15 @@ def grd(path: Path) -> Parts:
         return _geosoft(path)
     try:
         nx, ny, x, y, values = _SURFER[start](path)
-        longitude, latitude = np.linspace(*x, nx), np.linspace(*y, ny)
-        return longitude, latitude, np.asarray(values, float).reshape(ny, nx), {}
     except (ValueError, IndexError) as error:
         raise FormatError(
             path, "expected a Surfer grid: it ends too early or is not what its header says"
         ) from error
+    if min(nx, ny) < 1 or nx * ny != values.size:
+        raise FormatError(
+            path, f"expected a Surfer grid: its header claims {nx} x {ny} values, it holds {values.size}"
+        )
+    return np.linspace(*x, nx), np.linspace(*y, ny), values.astype(float).reshape(ny, nx), {}
 
 
 Surfer = tuple[int, int, tuple[float, float], tuple[float, float], RealArray]
@@ -56,7 +63,7 @@ def _surfer_6(path: Path) -> Surfer:
     raw = path.read_bytes()
     nx, ny = (int(n) for n in np.frombuffer(raw, "<i2", 2, 4))
     limits = np.frombuffer(raw, "<f8", 6, 8).tolist()
-    values = np.frombuffer(raw, "<f4", nx * ny, 56).astype(float)
+    values = np.frombuffer(raw, "<f4", _held(raw, 56, 4, nx * ny), 56)
     return nx, ny, (limits[0], limits[1]), (limits[2], limits[3]), values
 
 
@@ -66,9 +73,15 @@ def _surfer_7(path: Path) -> Surfer:
     at = raw.index(b"GRID") + 8
     ny, nx = (int(n) for n in np.frombuffer(raw, "<i4", 2, at))
     x0, y0, dx, dy, _, _, _, blank = np.frombuffer(raw, "<f8", 8, at + 8).tolist()
-    values = np.frombuffer(raw, "<f8", nx * ny, raw.index(b"DATA", at) + 8).copy()
+    start = raw.index(b"DATA", at) + 8
+    values = np.frombuffer(raw, "<f8", _held(raw, start, 8, nx * ny), start).copy()
     values[values >= blank] = np.nan
     return nx, ny, (x0, x0 + dx * (nx - 1)), (y0, y0 + dy * (ny - 1)), values
+
+
+def _held(raw: bytes, start: int, size: int, claimed: int) -> int:
+    """Return how many of the claimed values, `size` bytes each from `start` on, are there."""
+    return max(min(claimed, (len(raw) - start) // size), 0)
 
 
 _SURFER: dict[bytes, Callable[[Path], Surfer]] = {
@@ -85,8 +98,8 @@ def _geosoft(path: Path) -> Parts:
         raise MissingExtra("harmonica", "grids") from None
     try:
         grid = load_oasis_montaj_grid(str(path))
-    except (ValueError, NotImplementedError, OSError, IndexError) as error:
-        raise FormatError(path, "expected a Surfer, GMT or Geosoft grid") from error
+    except (*BAD_GEOSOFT, zlib.error) as error:
+        raise FormatError(path, "expected a Surfer, GMT or Geosoft grid: it is none, or damaged") from error
     return grid["easting"].to_numpy(), grid["northing"].to_numpy(), grid.to_numpy().astype(float), {}
 
 
@@ -116,64 +129,6 @@ def ascii_grid(path: Path) -> Parts:
         ) from error
     values[values == head.get("nodata_value", -9999.0)] = np.nan
     return x0 + dx * np.arange(nx), y0 + dy * np.arange(ny), values, {}
-
-
-def table(path: Path) -> Parts:
-    """Read longitude, latitude, anomaly in columns, header or not; any order of rows; gaps are holes.
-
-    Raises
-    ------
-    FormatError
-        No such columns, or nodes that form no grid.
-    """
-    with path.open(**TEXT) as file:
-        first = file.readline()
-    delimiter = next((mark for mark in ",;" if mark in first), None)
-    words = [word.strip() for word in first.strip().lstrip("#").lower().split(delimiter)]
-    header = not all(re.fullmatch(r"[-+.\deinfa]+", word) for word in words)
-    columns: tuple[int, ...] = (0, 1, 2)
-    unit = ""
-    if header:
-        bare = [re.sub(r"[\[(_].*", "", word).strip() for word in words]
-        found = [
-            next((i for i, word in enumerate(words) if word in names or bare[i] in names), None)
-            for names in (LONGITUDE, LATITUDE, ANOMALY)
-        ]
-        if None in found:
-            raise FormatError(path, "expected the columns longitude, latitude, anomaly", row=1)
-        columns = tuple(i for i in found if i is not None)
-        stated = re.search(r"[\[(]([^\])]+)", words[columns[2]])
-        unit = stated.group(1) if stated else ""
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # of a file without rows, which is seen below
-            with path.open(**TEXT) as file:  # not numpy's: it takes a byte order mark for a number
-                table = np.loadtxt(file, delimiter=delimiter, skiprows=int(header), usecols=columns, ndmin=2)
-    except ValueError as error:
-        # numpy counts rows from 0 below the header
-        place = re.search(r"at row (\d+), column (\d+)", str(error))
-        line, number = (int(place[1]) + 1 + header, place[2]) if place else (None, None)
-        raise FormatError(path, "expected numbers", row=line, column=number) from error
-    if not np.isfinite(table[:, :2]).all() or not len(table):
-        raise FormatError(path, "expected rows of longitude, latitude, anomaly")
-    x, column = _levels(table[:, 0])
-    y, row = _levels(table[:, 1])
-    if x.size * y.size > 4 * len(table):
-        raise FormatError(path, f"expected a grid, found {len(table)} scattered points: grid them first")
-    values = np.full((y.size, x.size), np.nan)
-    values[row, column] = table[:, 2]
-    return x, y, values, {"unit": unit}
-
-
-def _levels(values: RealArray) -> tuple[RealArray, IndexArray]:
-    """Return the distinct coordinates and where each value falls; 179 and -179 are neighbours."""
-    levels, index = np.unique(np.round(values, 9), return_inverse=True)
-    gaps = np.diff(levels)
-    if gaps.size and gaps.max() > 180.0 > levels[-1] - 180.0:
-        split = int(gaps.argmax()) + 1
-        levels = np.concatenate([levels[split:], levels[:split] + 360.0])
-        index = (index - split) % levels.size
-    return levels, index
 
 
 def folder(path: Path) -> Parts:
@@ -211,15 +166,27 @@ def geotiff(path: Path) -> Parts:
         column, row, _, x0, y0 = tags[33922][:5]
         keys = np.array(tags.get(34735, ()), int).reshape(-1, 4)
         hole = float(str(tags.get(42113, "nan")).strip("\x00 "))
+        scale, offset, unit = _gdal(str(tags.get(42112, "")))
     except (*BAD_TIFF, Image.DecompressionBombError) as error:  # its size is damaged: no survey is so large
         raise FormatError(path, "expected a GeoTIFF with a pixel scale and a tie point") from error
     settings = {int(key): int(value) for key, _, _, value in keys}
-    if settings.get(1024) == 1:
-        raise FormatError(path, "projected coordinates: reproject the grid to longitude and latitude")
     if values.ndim != 2:
         raise FormatError(path, f"expected one band, found an image of shape {values.shape}")
     values[values == hole] = np.nan
     half = 0.0 if settings.get(1025) == 2 else 0.5  # the tie point is a node, or a pixel's corner
     x = x0 + (np.arange(values.shape[1]) + half - column) * dx
     y = y0 - (np.arange(values.shape[0]) + half - row) * dy
-    return x, y, values, {}
+    kind, code = settings.get(1024), settings.get(3072, 0)
+    projected = Axes("", f"EPSG:{code}") if 1024 <= code < 32767 else Axes("m")
+    axes = projected if kind == 1 else Axes("deg" if kind == 2 else "")
+    return x, y, values * scale + offset, {"axes": axes, "unit": unit}
+
+
+def _gdal(text: str) -> tuple[float, float, str]:
+    """Return scale, offset and unit of the first band in GDAL's items, ``<Item role="scale">0.1</Item>``."""
+    said = {}
+    for attributes, value in re.findall(r"<Item([^>]*)>([^<]*)</Item>", text):
+        role = re.search(r'role="(\w+)"', attributes)
+        if role and 'sample="0"' in attributes:
+            said[role[1].lower()] = value.strip()
+    return float(said.get("scale", 1.0)), float(said.get("offset", 0.0)), said.get("unittype", "")

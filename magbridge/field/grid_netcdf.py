@@ -10,24 +10,29 @@ import numpy as np
 
 from magbridge.arrays import RealArray
 from magbridge.errors import FormatError
+from magbridge.field.coordinates import EVEN, LATITUDE, LONGITUDE, METRES, PROJECTED, Axes, stated
 from magbridge.files import atomic_path, systems_reason
 
 if TYPE_CHECKING:
     from magbridge.field.grid import AnomalyGrid
 
-__all__ = ["ANOMALY", "LATITUDE", "LONGITUDE", "Parts", "netcdf", "write"]
+__all__ = ["ANOMALY", "Parts", "netcdf", "write"]
 
 Parts = tuple[RealArray, RealArray, RealArray, dict[str, Any]]
-"""Longitudes and latitudes (deg) of the nodes, values, options of AnomalyGrid; among them ``unit``, where the
-file states one."""
-LONGITUDE, LATITUDE = ("longitude", "lon", "long", "x"), ("latitude", "lat", "y")
-ANOMALY = ("anomaly", "magnetic_anomaly", "mag_anomaly", "tfa", "tmi", "mag", "nt", "value", "z")
+"""Coordinates x and y of the nodes, values, options of AnomalyGrid; among them ``unit``, that of the values,
+and ``axes``, what the file states of x and y (:class:`~magbridge.field.coordinates.Axes`)."""
+ANOMALY = (
+    "anomaly", "magnetic_anomaly", "mag_anomaly", "mag_anom", "total_field_anomaly", "tfa",
+    "tmi_anomaly", "tmi", "mag", "residual", "nt", "value", "z",
+)  # fmt: skip
+"""What the anomaly is called, the surest first: z may be a height."""
 SIGMA = ("sigma", "error", "uncertainty", "std")
-PROJECTED = ("easting", "northing", "projection_x_coordinate", "projection_y_coordinate", "utm_x", "utm_y")
+EASTWARD_NORTHWARD = ("east", (*LONGITUDE, *PROJECTED[0])), ("north", (*LATITUDE, *PROJECTED[1]))
+"""Which way an axis runs, and what it is called."""
 
 
 def netcdf(path: Path) -> Parts:
-    """Read CF or GMT netCDF, one two-dimensional variable on geographic axes; FormatError: any other."""
+    """Read CF or GMT netCDF, one two-dimensional variable on even axes; FormatError: any other."""
     import xarray as xr  # noqa: PLC0415  the live path runs without xarray
 
     try:
@@ -36,9 +41,10 @@ def netcdf(path: Path) -> Parts:
     except (OSError, ValueError, RuntimeError) as error:  # RuntimeError: netCDF's for damaged data
         raise FormatError(path, "expected a netCDF grid") from error
     if {"x_range", "y_range", "dimension", "z"} <= set(data.variables):
-        return _old_gmt(data)
+        return _old_gmt(path, data)
     flat = {str(name): da.squeeze(drop=True) for name, da in data.data_vars.items()}
     flat = {name: da for name, da in flat.items() if da.ndim == 2 and da.dtype.kind in "fiu"}
+    flat = {name: da for name, da in flat.items() if not _names(name, da.attrs) & {*LONGITUDE, *LATITUDE}}
     named = [name for name in ANOMALY if name in {n.lower() for n in flat}]
     sigmas = [name for name in flat if name.lower() in SIGMA]
     choices = [n for n in flat if named and n.lower() == named[0]] or [n for n in flat if n not in sigmas]
@@ -46,19 +52,59 @@ def netcdf(path: Path) -> Parts:
         found = " ".join(flat) or "none"
         raise FormatError(path, f"expected one grid, found {found}: call the one to use anomaly")
     grid = flat[choices[0]]
-    x, y = (
-        _coordinate(path, grid, names, kind) for names, kind in ((LONGITUDE, "east"), (LATITUDE, "north"))
-    )
-    options: dict[str, Any] = {"unit": str(grid.attrs.get("units", ""))}
+    bent = _two_dimensional(path, grid, data)
+    if bent:
+        order, x, y, axes = bent
+    else:
+        order, x, y, axes = _along_its_axes(path, grid, data)
+    options: dict[str, Any] = {"unit": str(grid.attrs.get("units", "")), "axes": axes}
     if sigmas:
-        options["sigma"] = flat[sigmas[0]].transpose(y, x).to_numpy()
+        options["sigma"] = flat[sigmas[0]].transpose(*order).to_numpy()
     altitude = grid.attrs.get("altitude", data.attrs.get("altitude"))
     if altitude is not None:
         try:
             options["altitude"] = float(altitude)
         except (TypeError, ValueError):
             raise FormatError(path, f"expected the altitude as a number of m, found {altitude!r}") from None
-    return grid[x].to_numpy(), grid[y].to_numpy(), grid.transpose(y, x).to_numpy().astype(float), options
+    return x, y, grid.transpose(*order).to_numpy().astype(float), options
+
+
+Coordinates = tuple[tuple[str, str], RealArray, RealArray, Axes]
+"""Dimensions north and east, x and y along them, and what is stated of them."""
+
+
+def _along_its_axes(path: Path, grid: Any, data: Any) -> Coordinates:
+    """Return the coordinates of a grid on one-dimensional axes."""
+    x, y = (_dimension(path, grid, *names) for names in EASTWARD_NORTHWARD)
+    for name in (x, y):
+        if name not in grid.coords or grid[name].dtype.kind not in "fiu":
+            raise FormatError(path, "expected the coordinates of this axis", column=name)
+    units = [stated(str(grid[n].attrs.get("units", "")), *_names(n, grid[n].attrs)) for n in (x, y)]
+    mapping = grid.attrs.get("grid_mapping", grid.encoding.get("grid_mapping"))
+    crs = dict(data[mapping].attrs) if mapping in data.variables else None
+    return (y, x), grid[x].to_numpy().astype(float), grid[y].to_numpy().astype(float), Axes(units[0], crs)
+
+
+def _two_dimensional(path: Path, grid: Any, data: Any) -> Coordinates | None:
+    """Return the coordinates of a grid whose longitudes and latitudes stand node by node, if they do."""
+    found = {}
+    for names in (LONGITUDE[:-1], LATITUDE[:-1]):
+        for name, variable in data.variables.items():
+            if set(variable.dims) == set(grid.dims) and _names(str(name), variable.attrs) & {*names}:
+                found[names] = variable
+    if len(found) < 2:
+        return None
+    longitude, latitude = found.values()
+    for y, x in (grid.dims, grid.dims[::-1]):
+        lon, lat = (v.transpose(y, x).to_numpy().astype(float) for v in (longitude, latitude))
+        steps = np.abs(np.diff(lon[0])).max(), np.abs(np.diff(lat[:, 0])).max()
+        if np.ptp(lon, axis=0).max() <= EVEN * steps[0] and np.ptp(lat, axis=1).max() <= EVEN * steps[1]:
+            return (str(y), str(x)), lon[0], lat[:, 0], Axes("deg")
+    if any(str(grid[d].attrs.get("units", "")).lower() in METRES for d in grid.dims if d in grid.coords):
+        return None  # a projection's
+    raise FormatError(
+        path, "longitudes and latitudes that are no even grid: regrid it to longitude and latitude"
+    )
 
 
 def write(grid: AnomalyGrid, path: str | Path) -> None:
@@ -88,30 +134,32 @@ def write(grid: AnomalyGrid, path: str | Path) -> None:
         xr.Dataset(fields, axes, attrs).to_netcdf(beside, engine="netcdf4", encoding=packed)
 
 
-def _coordinate(path: Path, grid: Any, names: tuple[str, ...], kind: str) -> str:
-    """Return the dimension that runs `kind` ("east", "north"), by units, standard name or name."""
+def _names(name: str, attrs: Any) -> set[str]:
+    """Return what a variable is called, in small letters: its name, its standard name, its long name."""
+    return {str(one).lower() for one in (name, attrs.get("standard_name", ""), attrs.get("long_name", ""))}
+
+
+def _dimension(path: Path, grid: Any, kind: str, names: tuple[str, ...]) -> str:
+    """Return the dimension that runs `kind` ("east", "north"), by its unit or by one of its `names`."""
     for dimension in map(str, grid.dims):
         attrs = grid[dimension].attrs if dimension in grid.coords else {}
-        names_it = (dimension, attrs.get("standard_name", ""), attrs.get("long_name", ""))
-        called = {str(name).lower() for name in names_it}
-        metres = str(attrs.get("units", "")).lower() in ("m", "metre", "meter", "km")
-        if called & set(PROJECTED) or (metres and called & set(names)):
-            raise FormatError(
-                path, "projected coordinates: reproject the grid to longitude and latitude", column=dimension
-            )
-        if str(attrs.get("units", "")).lower().startswith(f"degrees_{kind}") or called & set(names):
+        unit = str(attrs.get("units", "")).lower()
+        if unit.startswith((f"degrees_{kind}", f"degree_{kind}")) or _names(dimension, attrs) & {*names}:
             return dimension
     raise FormatError(path, f"expected the axis {names[0]!r}, found {' '.join(map(str, grid.dims))}")
 
 
-def _old_gmt(data: Any) -> Parts:
+def _old_gmt(path: Path, data: Any) -> Parts:
     """GMT's netCDF of before 2007: ranges and one long row, from the north-west corner."""
     nx, ny = (int(n) for n in data["dimension"].to_numpy())
+    if min(nx, ny) < 1 or nx * ny != data["z"].size:
+        raise FormatError(path, f"expected {nx} x {ny} values, found {data['z'].size}: damaged")
+    values = data["z"].to_numpy().reshape(ny, nx)[::-1].astype(float)
     half = 0.5 * int(data["z"].attrs.get("node_offset", 0))
     axes = []
     for name, n in (("x_range", nx), ("y_range", ny)):
         low, high = (float(v) for v in data[name].to_numpy())
-        step = (high - low) / (n - 1 + 2 * half)
+        step = (high - low) / max(n - 1 + 2 * half, 1)
         axes.append(low + (np.arange(n) + half) * step)
-    values = data["z"].to_numpy().reshape(ny, nx)[::-1].astype(float)
-    return axes[0], axes[1], values, {"unit": str(data["z"].attrs.get("units", ""))}
+    unit = stated(str(data["x_range"].attrs.get("units", "")))
+    return axes[0], axes[1], values, {"unit": str(data["z"].attrs.get("units", "")), "axes": Axes(unit)}

@@ -1,4 +1,4 @@
-"""Several surveys to one map: continued to one altitude, merged, masked, smoothed (section 4 of the paper).
+"""Several surveys to one map: continued to one altitude, merged, masked, smoothed if asked for.
 
 The pictures show every step, because a map should be looked at before it is used.
 """
@@ -15,14 +15,13 @@ from numpy.typing import ArrayLike
 
 from magbridge.arrays import FloatArray
 from magbridge.errors import OutOfRange, WrongUse
-from magbridge.field.continuation import continued
+from magbridge.field.continuation import continued, smoothed
 from magbridge.field.geodesy import signed_longitude
 from magbridge.field.grid import AnomalyGrid
 from magbridge.files import atomic_path
 
-__all__ = ["Step", "continue_upward", "draw_steps", "hanning", "merge", "prepare", "surveyed_at"]
+__all__ = ["Step", "continue_upward", "draw_steps", "merge", "prepare", "surveyed_at"]
 
-HANNING = np.outer([1.0, 2.0, 1.0], [1.0, 2.0, 1.0]) / 16.0
 MOST = 10_000_000
 """Nodes of a merged map. As many, from two surveys that overlap, take 2 GB."""
 
@@ -37,7 +36,7 @@ class Step(NamedTuple):
 def prepare(
     grids: Sequence[AnomalyGrid],
     altitude: float | None = None,
-    passes: int = 20,
+    smooth: float = 0.0,
     mask: ArrayLike | None = None,
     spacing: float | None = None,
 ) -> tuple[AnomalyGrid, list[Step]]:
@@ -49,8 +48,8 @@ def prepare(
         At least one.
     altitude : float, optional
         m, to which every grid is continued upward; default the highest of the grids'.
-    passes : int, optional
-        Number of passes of the 3x3 Hanning kernel.
+    smooth : float, optional
+        km, wavelength of which half the amplitude stays (:func:`~.continuation.smoothed`); 0: none.
     mask : array_like, (k, 2), optional
         Longitude and latitude (deg) of a polygon; nodes outside become holes.
     spacing : float, optional
@@ -87,9 +86,10 @@ def prepare(
     if mask is not None:
         result = _masked(result, np.asarray(mask, float))
         steps.append(Step("masked", result))
-    if passes:
-        result = hanning(result, passes)
-        steps.append(Step(f"smoothed, {passes} passes", result))
+    if smooth:
+        before, result = result, smoothed(result, 1000.0 * smooth)
+        lost = float(np.sqrt(np.nanmean((before.anomaly - result.anomaly) ** 2)))
+        steps.append(Step(f"smoothed over {smooth:g} km: {lost:.1f} nT RMS taken out, now its sigma", result))
     return result, steps
 
 
@@ -165,19 +165,6 @@ def merge(grids: Sequence[AnomalyGrid], spacing: float | None = None) -> tuple[A
             " + ".join(Path(grid.name).name for grid in grids),
         )
     return merged, apart
-
-
-def hanning(grid: AnomalyGrid, passes: int) -> AnomalyGrid:
-    """Return the grid after `passes` of the 3x3 Hanning kernel; missing nodes take no part."""
-    from scipy.ndimage import convolve  # noqa: PLC0415  the live path runs without scipy
-
-    present = np.isfinite(grid.anomaly)
-    share = convolve(present.astype(float), HANNING, mode="constant")
-    values = grid.anomaly
-    for _ in range(passes):
-        smooth = convolve(np.where(present, values, 0.0), HANNING, mode="constant")
-        values = np.where(present, smooth / np.where(present, share, 1.0), np.nan)
-    return _like(grid, values)
 
 
 def draw_steps(steps: Sequence[Step], path: str | Path) -> None:

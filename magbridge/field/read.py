@@ -8,6 +8,7 @@ their first bytes.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from math import isfinite, nan
 from pathlib import Path
 
@@ -16,12 +17,19 @@ import numpy as np
 from magbridge.arrays import RealArray
 from magbridge.columns import NT_PER_UNIT, usual
 from magbridge.errors import FormatError
-from magbridge.field.grid import AnomalyGrid
-from magbridge.field.grid_formats import ascii_grid, folder, geotiff, grd, table
+from magbridge.field.coordinates import Axes, geographic
+from magbridge.field.grid import HOLE, AnomalyGrid
+from magbridge.field.grid_formats import ascii_grid, folder, geotiff, grd
 from magbridge.field.grid_netcdf import Parts, netcdf
+from magbridge.field.grid_table import table
+from magbridge.guard import guarded
 
-__all__ = ["READERS", "read_grid", "read_polygon"]
+__all__ = ["READERS", "read_grid", "read_polygon", "without_fill"]
 
+FILLS = tuple(sign * number for number in (99999.0, 9999.0, 32768.0, 32767.0, 999.0) for sign in (-1.0, 1.0))
+"""Numbers that files without NaN write for "not known"."""
+CERTAIN = 9_000.0
+"""nT: a fill value as large as this is no anomaly; -999 may be one."""
 NANOTESLA = {unit.lower(): factor for unit, factor in NT_PER_UNIT.items()}
 """nT in one unit, by the unit's name in lower case."""
 
@@ -36,6 +44,8 @@ READERS: dict[str, Callable[..., Parts]] = {
     ".tif": geotiff,
     ".tiff": geotiff,
 }
+GUARDED = {".nc", ".grd", ".tif", ".tiff"}
+"""Formats that other libraries read, which damage may hang or crash: they are read in a child process."""
 
 
 def read_grid(path: str | Path) -> AnomalyGrid:
@@ -51,7 +61,14 @@ def read_grid(path: str | Path) -> AnomalyGrid:
     Raises
     ------
     FormatError
-        A file that is no such grid, in a unit that is no magnetic field, or in projected coordinates.
+        A file that is no such grid, damaged, in a unit that is no magnetic field, or on axes that are neither
+        degrees nor lengths of a known projection.
+
+    Notes
+    -----
+    What the axes are is decided by their units, names, reference system and range
+    (:mod:`~magbridge.field.coordinates`); a projection that the file does not state may stand beside it in a
+    ``.prj``. A library reads the file in a process of its own (:mod:`magbridge.guard`).
     """
     path = Path(path)
     if not path.exists():
@@ -61,11 +78,47 @@ def read_grid(path: str | Path) -> AnomalyGrid:
     reader = folder if path.is_dir() else READERS.get(path.suffix.lower())
     if reader is None:
         raise FormatError(path, f"expected a grid: one of {' '.join(READERS)} or a folder")
-    longitude, latitude, values, options = reader(path)
-    scale = _scale(path, options.pop("unit", ""))
+    parts = partial(reader, path)
+    if path.suffix.lower() in GUARDED:
+        (found,) = guarded(path, lambda: [parts()])
+    else:
+        found = parts()
+    x, y, values, options = found
+    scale = _scale(path, options.get("unit", ""))
+    fields = {"anomaly": without_fill(path, values) * scale}
     if "sigma" in options:
-        options["sigma"] = options["sigma"] * scale
-    return AnomalyGrid(longitude, latitude, values * scale, name=str(path), **options)
+        fields["sigma"] = options["sigma"] * scale
+    longitude, latitude, fields = geographic(path, x, y, fields, options.get("axes", Axes()))
+    altitude = options.get("altitude", nan)
+    return AnomalyGrid(
+        longitude, latitude, fields["anomaly"], fields.get("sigma", 0.0), altitude, name=str(path)
+    )
+
+
+def without_fill(path: str | Path, values: RealArray) -> RealArray:
+    """Return the values with those numbers that stand for "not known", without being declared, as NaN.
+
+    One of :data:`FILLS` that lies beyond the others by more than half their range is a hole.
+
+    Raises
+    ------
+    FormatError
+        Values of -9999 or 9999 that lie among the others: holes, or not?
+    """
+    for fill in FILLS:
+        here = values == fill
+        if not here.any():
+            continue
+        others = values[np.isfinite(values) & ~here & (np.abs(values) < HOLE)]
+        if not others.size:
+            continue
+        beyond = max(others.min() - fill, fill - others.max())
+        if beyond > 0.5 * np.ptp(others):
+            values = np.where(here, np.nan, values)
+        elif abs(fill) >= CERTAIN:
+            count = f"{int(here.sum())} nodes are exactly {fill:g}"
+            raise FormatError(path, f"{count}: holes, or values? declare it as the fill value, or write NaN")
+    return values
 
 
 def read_polygon(path: str | Path) -> RealArray:

@@ -90,7 +90,8 @@ def position_bound(
     lat, lon = np.asarray(latitude, float), np.unwrap(np.asarray(longitude, float), period=360.0)
     along = _along(corners, lat, lon)
     speed = along[-1] / (corners[-1] - corners[0])
-    interval = max(every, min(o.interval, block_length(grid) / max(speed, 1e-9)))
+    lasts = min(o.interval, block_length(grid) / max(speed, 1e-9))
+    interval = every * (int(lasts / every + 1e-9) + 1)  # a block of as many samples as the filter's
     at = np.arange(corners[0] + 0.5 * interval, corners[-1], interval)
     if not at.size:
         raise OutOfRange(

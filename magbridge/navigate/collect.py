@@ -1,4 +1,8 @@
-"""Samples to blocks: samples between which the map is linear become one measurement, their mean."""
+"""Samples to blocks: samples between which the map is linear become one measurement, their mean.
+
+A block is full when one more sample, as far on as the last, would lie beyond it: where every step is longer
+than a block, every sample is one, and no two that lie further apart than the map's detail are averaged.
+"""
 
 from __future__ import annotations
 
@@ -43,11 +47,12 @@ class Collector:
         self._main_field = NearbyField()
         self._rows = array("d")  # of numbers, a block of one sample each: 20,000 of them are averaged in 1 ms
         self._start_us, self._begun = 0, 0.0  # the first of them: when, and m travelled until then
+        self._last: tuple[float, float] | None = None  # the sample before: when, and m travelled until then
 
     def add(
         self, time_us: int, where: DeadReckoning, total_field: float, sigma: float, utc_offset_us: int = 0
     ) -> Block | None:
-        """Take in a sample; return the block that it fills.
+        """Take in a sample; return the block that it fills, or that it lies too far from to belong to.
 
         Parameters
         ----------
@@ -61,14 +66,24 @@ class Collector:
         main, slope_north, slope_east = self._main_field.at(
             where.latitude, where.longitude, where.depth, (time_us + utc_offset_us) * 1e-6
         )
+        there = time_us, where.travelled
+        apart = self._rows and (
+            time_us - self._start_us > self._interval_us or where.travelled - self._begun > self._step
+        )
+        block = self.flush() if apart else None
         if not self._rows:
-            self._start_us, self._begun = time_us, where.travelled
+            self._start_us, self._begun = there
+        # the first sample of all is a block by itself: how long a step is, is not known yet
+        wait, step = (there[0] - self._last[0], there[1] - self._last[1]) if self._last else (inf, inf)
+        self._last = there
         anomaly, variance = total_field - main, max(sigma, LEAST) ** 2
         place = where.latitude, where.longitude
         self._rows.extend((time_us, *place, anomaly, variance, slope_north, slope_east, where.depth))
-        lasts_us = time_us - self._start_us
-        full = lasts_us >= self._interval_us or where.travelled - self._begun >= self._step
-        return self.flush() if full else None
+        full = (
+            time_us - self._start_us + wait > self._interval_us
+            or where.travelled - self._begun + step > self._step
+        )
+        return self.flush() if full and block is None else block
 
     def flush(self) -> Block | None:
         """Return the block of the samples collected so far; None if there are none."""

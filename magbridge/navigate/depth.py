@@ -1,4 +1,4 @@
-"""A map continued to the vehicle's depth; the error of the continuation counts as map error."""
+"""A map continued to the vehicle's depth; the errors of that, and between nodes, count as map error."""
 
 from __future__ import annotations
 
@@ -14,9 +14,12 @@ from magbridge.navigate.options import Options
 
 __all__ = ["at_depth"]
 
+NEGLIGIBLE = 0.1
+"""Share of the map error below which another error changes it by less than 1 %."""
+
 
 def at_depth(grid: AnomalyGrid, options: Options, depth: ArrayLike) -> tuple[AnomalyGrid, Options]:
-    """Return the map at the vehicle's depth, and options whose map error includes the continuation's.
+    """Return the map at the vehicle's depth, and options whose map error includes what that and nodes cost.
 
     Parameters
     ----------
@@ -30,13 +33,16 @@ def at_depth(grid: AnomalyGrid, options: Options, depth: ArrayLike) -> tuple[Ano
     Notes
     -----
     Independent errors of the map add their variances σᵢ² and the mean squares of their slopes, σᵢ²/Lᵢ², so
-    that together 1/L² = Σ(σᵢ²/Lᵢ²) / Σσᵢ².
+    that together 1/L² = Σ(σᵢ²/Lᵢ²) / Σσᵢ². The error between nodes is as long as half their spacing.
     """
     known = np.asarray(depth, float)
     known = known[np.isfinite(known)]
     there = continued(grid, known if known.size else 0.0)
-    if there.sigma == 0.0:
+    errors = [(there.sigma, there.length), (grid.interpolation_sigma, 0.5 * grid.spacing)]
+    errors = [(sigma, length) for sigma, length in errors if sigma > NEGLIGIBLE * options.map_sigma]
+    if not errors:
         return there.grid, options
-    sigma = hypot(options.map_sigma, there.sigma)
-    steepness = hypot(options.map_sigma / options.map_length, there.sigma / there.length)
+    errors.append((options.map_sigma, options.map_length))
+    sigma = hypot(*(sigma for sigma, _ in errors))
+    steepness = hypot(*(sigma / length for sigma, length in errors))
     return there.grid, replace(options, map_sigma=sigma, map_length=sigma / steepness)

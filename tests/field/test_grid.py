@@ -175,3 +175,20 @@ def test_the_worse_axis_is_the_larger_eigenvalue() -> None:
     nn, ne, ee = covariances[:, 0, 0], covariances[:, 0, 1], covariances[:, 1, 1]
     np.testing.assert_allclose(worse_axis(nn, ne, ee), expected)
     assert worse_axis(float(nn[0]), float(ne[0]), float(ee[0])) == pytest.approx(expected[0])
+
+
+@pytest.mark.parametrize("depth", [0.5, 1.0, 1.5])
+def test_what_lies_between_the_nodes_is_foretold(depth: float) -> None:
+    """Sources `depth` spacings below, every fourth node given: the spline's error at the others, within 2."""
+    rng, n = np.random.default_rng(7), 241
+    k = 2.0 * np.pi * np.hypot(np.fft.fftfreq(n)[:, None], np.fft.fftfreq(n))
+    waves = np.fft.fft2(rng.normal(size=(n, n))) * np.exp(-4.0 * depth * k)
+    fine = np.fft.ifft2(waves).real
+    fine *= 50.0 / fine.std()
+    axis = np.arange(n) * 1e-3
+    coarse = AnomalyGrid(10.0 + axis[::4], 54.0 + axis[::4], fine[::4, ::4])
+    x, y = np.meshgrid(10.0 + axis, 54.0 + axis)
+    error = coarse.evaluate(x.ravel(), y.ravel()).anomaly - fine.ravel()
+    middle = (np.abs(x - 10.12) < 0.1) & (np.abs(y - 54.12) < 0.1)
+    truth = np.sqrt(np.mean(error.reshape(n, n)[middle] ** 2))
+    assert 0.5 < coarse.interpolation_sigma / truth < 2.0

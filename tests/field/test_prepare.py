@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from magbridge.errors import OutOfRange, WrongUse
-from magbridge.field.continuation import continued
+from magbridge.field.continuation import continued, smoothed
 from magbridge.field.geodesy import metres_per_degree
 from magbridge.field.grid import AnomalyGrid
-from magbridge.field.prepare import continue_upward, draw_steps, hanning, merge, prepare, surveyed_at
+from magbridge.field.prepare import continue_upward, draw_steps, merge, prepare, surveyed_at
 
 LON, LAT = np.linspace(-58.1, -57.9, 81), np.linspace(49.45, 49.55, 61)
 
@@ -89,7 +89,7 @@ def test_a_survey_of_unknown_height_is_not_continued_until_it_is_told() -> None:
     told = surveyed_at([known, silent], [60.0])
     assert [grid.altitude for grid in told] == [90.0, 60.0]
     assert surveyed_at([silent, silent], [60.0, 70.0])[1].altitude == 70.0
-    lifted, _ = prepare(told[1:], 90.0, passes=0)
+    lifted, _ = prepare(told[1:], 90.0)
     off = (lifted.anomaly - monopole(90.0))[10:-10, 10:-10]
     assert np.abs(off).max() < 0.1 * np.abs(monopole(60.0) - monopole(90.0)).max()
     with pytest.raises(WrongUse, match="2 altitudes for 1 grids"):
@@ -121,7 +121,7 @@ def test_it_is_told_how_far_surveys_are_apart() -> None:
     """Two by their difference, three by that of any two; apart in space, they are not apart in nT."""
 
     def merged(*surveys: AnomalyGrid) -> str:
-        return prepare(surveys, passes=0)[1][-1].title
+        return prepare(surveys)[1][-1].title
 
     a, b, c = (AnomalyGrid(LON, LAT, monopole(60.0) + offset) for offset in (0.0, 3.0, 9.0))
     assert merged(a, b) == "merged, 3.0 nT RMS apart where they overlap"
@@ -149,15 +149,31 @@ def test_merge_across_the_antimeridian() -> None:
     np.testing.assert_allclose(both.at([179.95, -179.9], 49.5), 5.0, atol=1e-9)
 
 
-def test_hanning_is_the_plain_kernel_inside_and_keeps_constants_at_edges() -> None:
-    rng = np.random.default_rng(0)
-    rough = rng.normal(size=(61, 81))
-    smooth = hanning(AnomalyGrid(LON, LAT, rough), 1).anomaly
-    kernel = np.outer([1, 2, 1], [1, 2, 1]) / 16
-    naive = sum(kernel[a, b] * rough[a : a + 59, b : b + 79] for a in range(3) for b in range(3))
-    np.testing.assert_allclose(smooth[1:-1, 1:-1], naive, atol=1e-12)
-    flat = np.where(rough > 2.0, np.nan, 3.0)
-    kept = hanning(AnomalyGrid(LON, LAT, flat), 20).anomaly
+def test_nothing_is_smoothed_unless_asked_for() -> None:
+    rough = AnomalyGrid(LON, LAT, np.random.default_rng(0).normal(size=(61, 81)))
+    same, steps = prepare([rough])
+    np.testing.assert_array_equal(same.anomaly, rough.anomaly)
+    assert same.sigma.max() == 0.0
+    assert len(steps) == 1
+
+
+def test_smoothing_is_by_wavelength_and_what_goes_becomes_sigma() -> None:
+    """Of a wave as long as asked for half stays, of one twice as long 84 %; sigma is the RMS of what went."""
+    per_latitude, _ = metres_per_degree(49.5)
+    north = (LAT - LAT[0]) * per_latitude
+    middle = slice(20, -20), slice(20, -20)
+    for length, kept in ((2_000.0, 0.5), (4_000.0, 2**-0.25)):
+        wave = np.repeat(100.0 * np.cos(2.0 * np.pi * north / length)[:, None], LON.size, axis=1)
+        less = smoothed(AnomalyGrid(LON, LAT, wave, sigma=3.0), 2_000.0)
+        share = np.sum(less.anomaly[middle] * wave[middle]) / np.sum(wave[middle] ** 2)
+        assert share == pytest.approx(kept, abs=0.02)
+        gone = (1.0 - kept) * 100.0 / np.sqrt(2.0)
+        assert np.sqrt(np.mean(less.sigma[middle] ** 2)) == pytest.approx(np.hypot(3.0, gone), rel=0.1)
+
+
+def test_smoothing_keeps_a_constant_and_the_holes() -> None:
+    flat = np.where(np.random.default_rng(0).normal(size=(61, 81)) > 2.0, np.nan, 3.0)
+    kept = smoothed(AnomalyGrid(LON, LAT, flat), 3_000.0).anomaly
     np.testing.assert_array_equal(np.isnan(kept), np.isnan(flat))
     np.testing.assert_allclose(kept[~np.isnan(flat)], 3.0)
 
@@ -166,7 +182,7 @@ def test_the_whole_preparation_and_its_pictures(tmp_path: Path) -> None:
     low = AnomalyGrid(LON[:60], LAT, monopole(60.0)[:, :60], altitude=60.0, name="low.grd")
     high = AnomalyGrid(LON[40:], LAT, monopole(90.0)[:, 40:], altitude=90.0, name="high.grd")
     outline = [(-58.08, 49.46), (-57.92, 49.46), (-57.92, 49.54), (-58.08, 49.54)]
-    grid, steps = prepare([low, high], passes=20, mask=outline)
+    grid, steps = prepare([low, high], smooth=1.0, mask=outline)
     assert grid.altitude == 90.0
     assert [step.title.partition(",")[0] for step in steps] == [
         "as surveyed: low.grd",
@@ -174,7 +190,7 @@ def test_the_whole_preparation_and_its_pictures(tmp_path: Path) -> None:
         "continued +30 m: low.grd",
         "merged",
         "masked",
-        "smoothed",
+        "smoothed over 1 km: 1.5 nT RMS taken out",
     ]
     assert np.isnan(grid.look_up(-58.09, 49.5).anomaly)
     inside = grid.look_up(-58.02, 49.51).anomaly

@@ -57,10 +57,16 @@ def esri_corner(path: Path) -> None:
 
 
 def table(
-    path: Path, header: str = "longitude,latitude,anomaly\n", delimiter: str = ",", scale: float = 1.0
+    path: Path,
+    header: str = "longitude,latitude,anomaly\n",
+    delimiter: str = ",",
+    scale: float = 1.0,
+    *,
+    height: bool = False,
 ) -> None:
     x, y = np.meshgrid(LON, LAT)
-    rows = np.column_stack([x.ravel(), y.ravel(), MAP.ravel() * scale])
+    heights = [np.linspace(100.0, 140.0, MAP.size)] if height else []
+    rows = np.column_stack([x.ravel(), y.ravel(), *heights, MAP.ravel() * scale])
     np.random.default_rng(0).shuffle(rows)
     path.write_text(header + lines(rows, delimiter))
 
@@ -144,11 +150,11 @@ def marked(path: Path, write: Callable[[Path], None]) -> None:
         ("a.asc", esri),
         ("b.asc", esri_corner),
         ("a.csv", table),
-        ("a.xyz", lambda path: table(path, "", " ")),
+        ("a.xyz", lambda path: table(path, "# lon lat z\n", " ")),
         ("b.csv", lambda path: table(path, "lon;lat;mag [nT]\n", ";")),
         ("c.csv", lambda path: table(path, "lon,lat,mag (uT)\n", scale=1e-3)),
         ("d.csv", lambda path: table(path, "\ufefflongitude,latitude,anomaly\n")),  # as Excel writes it
-        ("e.csv", lambda path: table(path, "\ufeff")),
+        ("e.csv", lambda path: table(path, "\ufeffx,y,z,mag\n", height=True)),
         ("c.asc", lambda path: marked(path, esri)),
         ("b.nc", lambda path: cf(path, "T", 1e-9)),
         ("a.tif", geotiff),
@@ -187,12 +193,12 @@ def test_a_table_over_the_antimeridian(tmp_path: Path) -> None:
 def test_a_gap_in_a_table_is_a_hole(tmp_path: Path) -> None:
     x, y = np.meshgrid(LON, LAT)
     rows = np.column_stack([x.ravel(), y.ravel(), MAP.ravel()])
-    np.savetxt(tmp_path / "a.xyz", np.delete(rows, 45, axis=0))
+    np.savetxt(tmp_path / "a.xyz", np.delete(rows, 45, axis=0), header="lon lat anomaly")
     assert np.isnan(read_grid(tmp_path / "a.xyz").anomaly).sum() == 1
 
 
 def scattered(path: Path) -> None:
-    np.savetxt(path, np.random.default_rng(0).uniform(10, 11, (50, 3)))
+    np.savetxt(path, np.random.default_rng(0).uniform(10, 11, (50, 3)), header="lon lat anomaly")
 
 
 @pytest.mark.parametrize(
@@ -203,8 +209,12 @@ def scattered(path: Path) -> None:
         ("a.png", lambda p: p.write_bytes(b"x"), "expected a grid: one of .nc"),
         ("a.nc", lambda p: p.write_bytes(b"not netCDF"), "expected a netCDF grid"),
         ("a.nc", lambda p: cf(p, "mGal"), "expected a magnetic field in nT, found the unit 'mGal'"),
-        ("a.nc", lambda p: cf(p, names=("northing", "easting")), "column 'northing': projected coordinates"),
-        ("a.nc", lambda p: cf(p, names=("y", "x"), units="m"), "column 'x': projected coordinates"),
+        (
+            "a.nc",
+            lambda p: cf(p, names=("northing", "easting")),
+            "projected coordinates of an unknown",
+        ),
+        ("a.nc", lambda p: cf(p, names=("y", "x"), units="m"), "projected coordinates of an unknown"),
         ("a.nc", lambda p: cf(p, altitude="300 m"), "expected the altitude as a number of m, found '300 m'"),
         ("a.grd", lambda p: p.write_bytes(b"DSBB" + bytes(20)), "expected a Surfer grid"),
         ("a.grd", lambda p: p.write_text("DSAA 4 4 0 1 0 1 0 1 7 7 7"), "expected a Surfer grid"),

@@ -38,6 +38,9 @@ SCALE_SIGMA = 0.015
 """Prior 1-sigma by which scales differ from each other, and of soft iron, on a vehicle."""
 GAIN_SIGMA = 0.02
 """Prior 1-sigma of the gain that the three axes share: data of all attitudes overrule it."""
+ALL_AROUND = 0.05
+"""Least variance of the field along any axis, over its square: 1/3 where all attitudes are seen, and 1 % on a
+glider that never rolls."""
 HARD_IRON_SIGMA = 0.6
 """Prior 1-sigma of the hard iron, as a fraction of the field."""
 
@@ -154,14 +157,16 @@ def check_scales(samples: Samples, coefficients: FloatArray) -> None:
     Raises
     ------
     CalibrationError
-        Where the samples are, a scale of A outside 0.5 to 2, or a T above twice the field.
+        Where the samples are, a scale of A outside 0.5 to 2; or a T above twice the field, where the
+        attitudes do not tell it from a scale. All around, any T is known as well as the noise allows.
     """
     seen = samples.part(slice(None, None, max(len(samples.phi) // 1000, 1)))
     scales, T = scales_and_offsets(seen, coefficients)
     worst = int(
         np.argmax(np.maximum(np.abs(np.log2(np.maximum(scales, 1e-3))).max(axis=1), T / (2.0 * samples.F_0)))
     )
-    if scales[worst, 0] < 0.5 or scales[worst, 2] > 2.0 or T[worst] / samples.F_0 > 2.0:
+    narrow = float(np.linalg.eigvalsh(np.cov(seen.field.T))[0]) < ALL_AROUND * samples.F_0**2
+    if scales[worst, 0] < 0.5 or scales[worst, 2] > 2.0 or (narrow and T[worst] / samples.F_0 > 2.0):
         listed = ", ".join(f"{value:.3g}" for value in scales[worst])
         raise CalibrationError(
             f"the fit collapsed: scales {listed} (expected near 1), offset {T[worst]:.0f} nT in a field of "

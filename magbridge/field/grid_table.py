@@ -1,0 +1,149 @@
+"""Anomaly grids in text, a node a row: which column is what by its name and its numbers, not by its place."""
+
+from __future__ import annotations
+
+import re
+import warnings
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from magbridge.arrays import IndexArray, RealArray
+from magbridge.errors import FormatError
+from magbridge.field.coordinates import LATITUDE, LONGITUDE, PROJECTED, Axes, stated
+from magbridge.field.grid_formats import TEXT
+from magbridge.field.grid_netcdf import ANOMALY, Parts
+
+__all__ = ["table"]
+
+NUMBERS = re.compile(r"[-+.\deinfa]+")
+UNITS = ("nt", "ut", "µt", "deg", "m", "km")
+"""What a column's name may end in, after an underscore, to tell its unit."""
+OTHERS = (
+    "sigma",
+    "error",
+    "std",
+    "line",
+    "flight",
+    "date",
+    "time",
+    "fid",
+    "alt",
+    "altitude",
+    "height",
+    "depth",
+    "elev",
+)
+"""Columns that are no anomaly, whatever else there is."""
+HEADER = "name the columns in the first row: longitude,latitude,anomaly"
+
+
+class Column(NamedTuple):
+    """A column's place, its name in small letters without unit, and the unit."""
+
+    place: int
+    name: str
+    unit: str
+
+
+def table(path: Path) -> Parts:
+    """Read a grid from columns, named or not; any order of rows; gaps are holes.
+
+    Raises
+    ------
+    FormatError
+        No such columns, columns that may be this or that, or nodes that form no grid.
+    """
+    with path.open(**TEXT) as file:
+        first = file.readline()
+    delimiter = next((mark for mark in ",;\t" if mark in first), None)
+    words = [word.strip() for word in first.strip().lstrip("#").lower().split(delimiter)]
+    header = not all(NUMBERS.fullmatch(word) for word in words)
+    unit, axes = "", Axes()
+    if header:
+        x, y, z = _named(path, words)
+        unit, axes = z.unit, Axes(stated(x.unit, x.name))
+        places = x.place, y.place, z.place
+    elif len(words) == 3:
+        places = 0, 1, 2
+    else:
+        raise FormatError(path, f"{len(words)} columns without names: {HEADER}", row=1)
+    rows = _numbers(path, delimiter, int(header), places)
+    if not header:
+        rows = rows[:, _order(path, rows)]
+    x_levels, column = _levels(rows[:, 0])
+    y_levels, row = _levels(rows[:, 1])
+    if x_levels.size * y_levels.size > 4 * len(rows):
+        raise FormatError(path, f"expected a grid, found {len(rows)} scattered points: grid them first")
+    values = np.full((y_levels.size, x_levels.size), np.nan)
+    if np.unique(row * x_levels.size + column).size < len(rows):
+        raise FormatError(path, "expected one row for each node, some are there twice")
+    values[row, column] = rows[:, 2]
+    return x_levels, y_levels, values, {"unit": unit, "axes": axes}
+
+
+def _named(path: Path, words: list[str]) -> tuple[Column, Column, Column]:
+    """Return the columns of x, y and anomaly by their names."""
+    columns = [_column(place, word) for place, word in enumerate(words)]
+    x, y, z = (
+        next((c for name in names for c in columns if c.name == name), None)
+        for names in ((*LONGITUDE, *PROJECTED[0]), (*LATITUDE, *PROJECTED[1]), ANOMALY)
+    )
+    if x is None or y is None:
+        raise FormatError(path, "expected the columns longitude, latitude, anomaly", row=1)
+    unknown = [c.name for c in columns if c not in (x, y, z) and c.name not in OTHERS]
+    if z is None or (z.name in ("z", "value") and unknown):  # z may be a height
+        listed = " or ".join([*([z.name] if z else []), *unknown])
+        which = f": which of {listed} is it?" if listed else ""
+        raise FormatError(
+            path, f"expected the columns longitude, latitude, anomaly{which} call it anomaly", row=1
+        )
+    return x, y, z
+
+
+def _column(place: int, word: str) -> Column:
+    """Return the column of a word in the header: ``mag``, ``mag [uT]``, ``mag (uT)`` or ``mag_uT``."""
+    name, *inside = re.split(r"\s*[\[(]\s*", word.strip("\"' "), maxsplit=1)
+    unit = inside[0].rstrip("]) ") if inside else ""
+    stem, _, ending = name.rpartition("_")
+    if not unit and stem and ending in UNITS:
+        name, unit = stem, ending
+    return Column(place, name, unit)
+
+
+def _order(path: Path, rows: RealArray) -> list[int]:
+    """Return where longitude, latitude and anomaly are in columns without names: beyond 90 is no latitude."""
+    first, second = np.abs(rows[:, :2]).max(axis=0)
+    if second > 90.0 >= first:
+        return [1, 0, 2]
+    if first > 90.0 >= second:
+        return [0, 1, 2]
+    raise FormatError(path, f"longitude or latitude first? {HEADER}", row=1)
+
+
+def _numbers(path: Path, delimiter: str | None, skip: int, places: tuple[int, int, int]) -> RealArray:
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # of a file without rows, which is seen below
+            with path.open(**TEXT) as file:  # not numpy's: it takes a byte order mark for a number
+                rows = np.loadtxt(file, delimiter=delimiter, skiprows=skip, usecols=places, ndmin=2)
+    except ValueError as error:
+        # numpy counts rows from 0 below the header
+        place = re.search(r"at row (\d+), column (\d+)", str(error))
+        line, number = (int(place[1]) + 1 + skip, place[2]) if place else (None, None)
+        raise FormatError(path, "expected numbers", row=line, column=number) from error
+    if not np.isfinite(rows[:, :2]).all() or not len(rows):
+        raise FormatError(path, "expected rows of longitude, latitude, anomaly")
+    return np.asarray(rows)
+
+
+def _levels(values: RealArray) -> tuple[RealArray, IndexArray]:
+    """Return the distinct coordinates and where each value falls; 179 and -179 are neighbours."""
+    levels, index = np.unique(np.round(values, 9), return_inverse=True)
+    gaps = np.diff(levels)
+    if gaps.size and gaps.max() > 180.0 > levels[-1] - 180.0 and np.abs(levels).max() <= 360.0:
+        split = int(gaps.argmax()) + 1
+        levels = np.concatenate([levels[split:], levels[:split] + 360.0])
+        index = (index - split) % levels.size
+    return levels, index

@@ -1,0 +1,194 @@
+"""What axes and columns are is decided by units, names, reference system and range, not by their place."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+from PIL import Image
+from PIL.TiffImagePlugin import ImageFileDirectory_v2
+
+from magbridge.errors import FormatError
+from magbridge.field.read import read_grid
+
+LON, LAT = np.linspace(10.0, 10.5, 11), np.linspace(54.0, 54.4, 9)
+X, Y = np.meshgrid(LON, LAT)
+MAP = 30.0 * np.sin(9.0 * X) + 100.0 * (Y - 54.0)
+DEGREES = "degrees_east", "degrees_north"
+
+
+def columns(path: Path, header: str, *values: np.ndarray) -> None:
+    rows = np.column_stack([v.ravel() for v in values])
+    np.savetxt(path, rows, delimiter=",", header=header, comments="")
+
+
+def grid(
+    path: Path, x: np.ndarray, y: np.ndarray, values: np.ndarray = MAP, units: tuple[str, str] = ("", "")
+) -> None:
+    array = xr.DataArray(values, {"y": y, "x": x}, ("y", "x"), "z", {"units": "nT"})
+    for name, unit in zip("xy", units, strict=True):
+        array[name].attrs["units"] = unit
+    array.to_netcdf(path)
+
+
+def geotiff(path: Path, values: np.ndarray, tags: dict[int, tuple[int, object]]) -> None:
+    """Write a GeoTIFF with tags of (TIFF type, value)."""
+    directory = ImageFileDirectory_v2()
+    for tag, (kind, value) in tags.items():
+        directory[tag], directory.tagtype[tag] = value, kind
+    Image.fromarray(values[::-1].astype(np.float32)).save(path, tiffinfo=directory)
+
+
+def placed(x0: float, y1: float, step: float, *keys: int) -> dict[int, tuple[int, object]]:
+    """Return the tags of a grid whose north-west node is (x0, y1)."""
+    return {
+        33550: (12, (step, step, 0.0)),
+        33922: (12, (0.0, 0.0, 0.0, x0, y1, 0.0)),
+        34735: (3, (1, 1, 0, len(keys) // 4 + 1, 1025, 0, 1, 2, *keys)),
+    }
+
+
+@pytest.mark.parametrize(
+    ("header", "values"),
+    [
+        ("x,y,z,mag", (X, Y, X * 0 + 120, MAP)),
+        ("lon,lat,z,anomaly", (X, Y, X * 9, MAP)),
+        ("lat,lon,mag_nT", (Y, X, MAP)),
+        ("line,mag [uT],lon,lat", (X * 0 + 3, MAP * 1e-3, X, Y)),
+        ("easting,northing,longitude,latitude,tmi", (X * 1e5, Y * 1e5, X, Y, MAP)),
+    ],
+)
+def test_a_column_is_what_its_name_says(tmp_path: Path, header: str, values: tuple[np.ndarray, ...]) -> None:
+    columns(tmp_path / "a.csv", header, *values)
+    found = read_grid(tmp_path / "a.csv")
+    np.testing.assert_allclose(found.longitude, LON)
+    np.testing.assert_allclose(found.anomaly, MAP, atol=1e-6)
+
+
+def test_without_names_only_the_range_tells(tmp_path: Path) -> None:
+    """A number beyond 90 is no latitude; two that could be make one line."""
+    path = tmp_path / "a.xyz"
+    for values in ((Y, X + 100.0, MAP), (X + 100.0, Y, MAP)):
+        columns(path, "", *values)
+        path.write_text(path.read_text().lstrip())
+        np.testing.assert_allclose(read_grid(path).longitude, LON + 100.0)
+    columns(path, "", Y, X, MAP)
+    path.write_text(path.read_text().lstrip())
+    with pytest.raises(FormatError, match="longitude or latitude first"):
+        read_grid(path)
+
+
+@pytest.mark.parametrize(
+    ("write", "words"),
+    [
+        (lambda p: grid(p, 2.0 * np.arange(11), 2.0 * np.arange(9), units=("meters", "meters")), "projected"),
+        (lambda p: grid(p, LON, LAT, units=("km", "km")), "projected"),
+        (lambda p: grid(p, 0.5 * np.arange(11), 0.5 * np.arange(9)), "degrees, or local coordinates"),
+        (lambda p: grid(p, np.arange(11) - 5.0, np.arange(9) - 4.0), "degrees, or local coordinates"),
+        (lambda p: grid(p, 500.0 + np.arange(11), 54.0 + np.arange(9)), "projected"),
+        (
+            lambda p: xr.Dataset({"z": (("y", "x"), MAP)}).to_netcdf(p),
+            "expected the coordinates of this axis",
+        ),
+        (lambda p: grid(p, np.radians(LON), np.radians(LAT), units=("rad", "rad")), "found radians"),
+    ],
+)
+def test_what_is_no_degree_is_not_taken_for_one(
+    tmp_path: Path, write: Callable[[Path], object], words: str
+) -> None:
+    write(tmp_path / "a.nc")
+    with pytest.raises(FormatError, match=words):
+        read_grid(tmp_path / "a.nc")
+
+
+def test_longitudes_beyond_360_are_the_same_meridians(tmp_path: Path) -> None:
+    grid(tmp_path / "a.nc", LON + 380.0, LAT, units=DEGREES)
+    found = read_grid(tmp_path / "a.nc")
+    assert found.look_up(30.2, 54.2).anomaly == pytest.approx(found.look_up(390.2, 54.2).anomaly)
+
+
+@pytest.mark.parametrize("bend", [0.0, 0.01])
+def test_longitudes_and_latitudes_node_by_node(tmp_path: Path, bend: float) -> None:
+    lat = Y + bend * np.sin(X * 9)
+    array = xr.DataArray(MAP, {"lat": (("j", "i"), lat), "lon": (("j", "i"), X)}, ("j", "i"), "anomaly")
+    array.to_netcdf(tmp_path / "a.nc")
+    if bend:
+        with pytest.raises(FormatError, match="no even grid"):
+            read_grid(tmp_path / "a.nc")
+    else:
+        np.testing.assert_allclose(read_grid(tmp_path / "a.nc").latitude, LAT)
+
+
+@pytest.mark.parametrize("stated", ["grid_mapping", "prj", "tiff"])
+def test_metres_of_a_known_projection_become_degrees(tmp_path: Path, stated: str) -> None:
+    """A smooth field of longitude and latitude, sampled every 500 m in UTM zone 32."""
+    pyproj = pytest.importorskip("pyproj")
+    crs = pyproj.CRS("EPSG:32632")
+    there = pyproj.Transformer.from_crs(crs, "EPSG:4326", always_xy=True)
+    east, north = 560_000.0 + 500.0 * np.arange(60), 5_990_000.0 + 500.0 * np.arange(50)
+    lon, lat = there.transform(*np.meshgrid(east, north))
+
+    def field(lon: np.ndarray, lat: np.ndarray) -> np.ndarray:
+        return np.asarray(100.0 * np.sin(40.0 * (lon - 10.0)) + 80.0 * np.cos(60.0 * (lat - 54.0)))
+
+    path = tmp_path / ("a.tif" if stated == "tiff" else "a.nc")
+    if stated == "tiff":
+        keys = 1024, 0, 1, 1, 3072, 0, 1, 32632
+        geotiff(path, field(lon, lat), placed(east[0], north[-1], 500.0, *keys))
+    else:
+        array = xr.DataArray(field(lon, lat), {"y": north, "x": east}, ("y", "x"), "z", {"units": "nT"})
+        array["x"].attrs["units"] = array["y"].attrs["units"] = "m"
+        data = array.to_dataset()
+        if stated == "prj":
+            path.with_suffix(".prj").write_text(crs.to_wkt("WKT1_ESRI"))
+        else:
+            data["crs"] = ((), 0, crs.to_cf())
+            data["z"].attrs["grid_mapping"] = "crs"
+        data.to_netcdf(path)
+    found = read_grid(path)
+    x, y = np.meshgrid(found.longitude, found.latitude)
+    known = np.isfinite(found.anomaly)
+    assert known.mean() > 0.8
+    np.testing.assert_allclose(found.anomaly[known], field(x, y)[known], atol=0.5)
+
+
+def test_a_geotiffs_scale_offset_and_unit(tmp_path: Path) -> None:
+    items = (
+        '<Item name="SCALE" sample="0" role="scale">0.001</Item>'
+        '<Item name="OFFSET" sample="0" role="offset">0.05</Item>'
+        '<Item name="UNITTYPE" sample="0" role="unittype">uT</Item>'
+    )
+    tags = placed(LON[0], LAT[-1], 0.05, 1024, 0, 1, 2)
+    tags[42112] = 2, f"<GDALMetadata>{items}</GDALMetadata>"
+    geotiff(tmp_path / "a.tif", MAP, tags)
+    np.testing.assert_allclose(read_grid(tmp_path / "a.tif").anomaly, MAP + 50.0, atol=1e-3)
+
+
+@pytest.mark.parametrize("fill", [-9999.0, 99999.0, -999.0, 32767.0])
+def test_a_hole_that_is_not_declared_is_one(tmp_path: Path, fill: float) -> None:
+    values = MAP.copy()
+    values[2:4, 3] = values[7, 9] = fill
+    grid(tmp_path / "a.nc", LON, LAT, values, units=DEGREES)
+    found = read_grid(tmp_path / "a.nc")
+    assert np.isnan(found.anomaly).sum() == 3
+    known = np.isfinite(found.anomaly)
+    np.testing.assert_allclose(found.anomaly[known], MAP[known])
+
+
+def test_a_fill_value_among_values_is_asked_about(tmp_path: Path) -> None:
+    values = MAP * 180.0
+    values[2, 3] = -9999.0
+    grid(tmp_path / "a.nc", LON, LAT, values, units=DEGREES)
+    with pytest.raises(FormatError, match="1 nodes are exactly -9999: holes, or values"):
+        read_grid(tmp_path / "a.nc")
+
+
+def test_a_node_that_is_there_twice(tmp_path: Path) -> None:
+    columns(
+        tmp_path / "a.csv", "lon,lat,mag", np.append(X, X[0, 0]), np.append(Y, Y[0, 0]), np.append(MAP, 1.0)
+    )
+    with pytest.raises(FormatError, match="one row for each node"):
+        read_grid(tmp_path / "a.csv")
