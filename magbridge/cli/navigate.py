@@ -210,7 +210,7 @@ def _continued(grid: AnomalyGrid, options: Options, deployment: xr.Dataset) -> t
     from magbridge.navigate.depth import at_depth
 
     there, known = at_depth(grid, options, deployment.get("depth", 0.0))
-    if known != options:
+    if there is not grid and known != options:
         side = "above" if there.altitude > 0.0 else "below"
         complain(
             f"{grid.name}: at {grid.altitude:.0f} m; continued to {abs(there.altitude):.0f} m {side} the "

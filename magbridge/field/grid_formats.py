@@ -6,6 +6,7 @@ import re
 import warnings
 import zlib
 from collections.abc import Callable
+from importlib.util import find_spec
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ from magbridge.errors import FormatError, MissingExtra
 from magbridge.field.coordinates import Axes
 from magbridge.field.grid_netcdf import Parts, netcdf
 
-__all__ = ["TEXT", "ascii_grid", "folder", "geotiff", "grd"]
+__all__ = ["TEXT", "ascii_grid", "folder", "geotiff", "grd", "libraries"]
 
 BAD_GEOSOFT = (ValueError, NotImplementedError, OSError, IndexError, UnboundLocalError, OverflowError)
 """What harmonica raises on a file that is no such grid, or damaged; beside zlib's error."""
@@ -47,6 +48,18 @@ def grd(path: Path) -> Parts:
             path, f"expected a Surfer grid: its header claims {nx} x {ny} values, it holds {values.size}"
         )
     return np.linspace(*x, nx), np.linspace(*y, ny), values.astype(float).reshape(ny, nx), {}
+
+
+def libraries(path: Path) -> list[str]:
+    """Return the modules that reading a file with this suffix and beginning takes, if they are there."""
+    if path.suffix.lower().startswith(".tif"):
+        names = ["PIL.Image"]
+    else:
+        with path.open("rb") as file:
+            start = file.read(4)
+        netcdf_like = path.suffix.lower() == ".nc" or start in NETCDF
+        names = ["xarray", "netCDF4"] if netcdf_like else [] if start in _SURFER else ["harmonica"]
+    return [name for name in names if find_spec(name.partition(".")[0])]
 
 
 Surfer = tuple[int, int, tuple[float, float], tuple[float, float], RealArray]

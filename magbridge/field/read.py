@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from importlib import import_module
 from math import isfinite, nan
 from pathlib import Path
 
@@ -19,7 +20,7 @@ from magbridge.columns import NT_PER_UNIT, usual
 from magbridge.errors import FormatError
 from magbridge.field.coordinates import Axes, geographic
 from magbridge.field.grid import HOLE, AnomalyGrid
-from magbridge.field.grid_formats import ascii_grid, folder, geotiff, grd
+from magbridge.field.grid_formats import ascii_grid, folder, geotiff, grd, libraries
 from magbridge.field.grid_netcdf import Parts, netcdf
 from magbridge.field.grid_table import table
 from magbridge.guard import guarded
@@ -80,6 +81,8 @@ def read_grid(path: str | Path) -> AnomalyGrid:
         raise FormatError(path, f"expected a grid: one of {' '.join(READERS)} or a folder")
     parts = partial(reader, path)
     if path.suffix.lower() in GUARDED:
+        for library in libraries(path):
+            import_module(library)  # here, once, and not in every child
         (found,) = guarded(path, lambda: [parts()])
     else:
         found = parts()

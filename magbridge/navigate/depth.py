@@ -15,7 +15,7 @@ from magbridge.navigate.options import Options
 __all__ = ["at_depth"]
 
 NEGLIGIBLE = 0.1
-"""Share of the map error below which another error changes it by less than 1 %."""
+"""Share of the map error below which what lies between the nodes changes it by less than 1 %."""
 
 
 def at_depth(grid: AnomalyGrid, options: Options, depth: ArrayLike) -> tuple[AnomalyGrid, Options]:
@@ -38,8 +38,9 @@ def at_depth(grid: AnomalyGrid, options: Options, depth: ArrayLike) -> tuple[Ano
     known = np.asarray(depth, float)
     known = known[np.isfinite(known)]
     there = continued(grid, known if known.size else 0.0)
-    errors = [(there.sigma, there.length), (grid.interpolation_sigma, 0.5 * grid.spacing)]
-    errors = [(sigma, length) for sigma, length in errors if sigma > NEGLIGIBLE * options.map_sigma]
+    errors = [(there.sigma, there.length)] if there.sigma else []
+    if grid.interpolation_sigma > NEGLIGIBLE * options.map_sigma:
+        errors.append((grid.interpolation_sigma, 0.5 * grid.spacing))
     if not errors:
         return there.grid, options
     errors.append((options.map_sigma, options.map_length))

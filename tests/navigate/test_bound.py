@@ -83,3 +83,9 @@ def test_its_sentence_says_when_it_is_best(grid: AnomalyGrid, options: Options) 
 def test_its_picture(grid: AnomalyGrid, options: Options, tmp_path: Path) -> None:
     draw_bound(position_bound(grid, *TRACK, options), grid, tmp_path / "bound.png")
     assert (tmp_path / "bound.png").stat().st_size > 20_000
+
+
+def test_more_samples_allow_a_smaller_error(grid: AnomalyGrid, options: Options) -> None:
+    """Twenty times as many of the same noise: a filter at 5 Hz must not beat the bound that was printed."""
+    slow, fast = (position_bound(grid, *TRACK, options, 50.0, every=every).sigma[-1] for every in (4.0, 0.2))
+    assert fast < 0.8 * slow

@@ -47,3 +47,17 @@ def test_a_glider_that_dives_under_it_is_found() -> None:
     assert below.error < 0.2 * flown.error
     assert below.nees < 2.0
     assert below.valid > 0.5
+
+
+def test_what_lies_between_nodes_counts_as_map_error() -> None:
+    """Sources as deep as the nodes are apart: some nT between them, over half their distance."""
+    rng, n = np.random.default_rng(7), 60
+    k = 2.0 * np.pi * np.hypot(np.fft.fftfreq(n)[:, None], np.fft.fftfreq(n))
+    values = np.fft.ifft2(np.fft.fft2(rng.normal(size=(n, n))) * np.exp(-k)).real
+    axis = 0.01 * np.arange(n)
+    coarse = AnomalyGrid(10.0 + axis, 54.0 + axis, values * 100.0 / values.std())
+    there, known = at_depth(coarse, Options(map_sigma=0.0), 0.0)
+    assert there is coarse
+    assert known.map_sigma == pytest.approx(coarse.interpolation_sigma)
+    assert known.map_sigma > 1.0
+    assert known.map_length == pytest.approx(0.5 * coarse.spacing)
