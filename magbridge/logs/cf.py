@@ -7,19 +7,48 @@ CF Conventions 1.10, sections 2.5.1 (missing data) and 8.1 (packed data), https:
 
 from __future__ import annotations
 
+import re
+from datetime import datetime
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from magbridge.arrays import FloatArray
-from magbridge.errors import FormatError
+from magbridge.errors import FormatError, MissingExtra
 
-__all__ = ["floats"]
+try:
+    import netCDF4
+except ImportError:
+    raise MissingExtra("netCDF4", "analysis") from None
+
+__all__ = ["EPOCH", "epoch", "floats"]
 
 ALL = slice(None)
+EPOCH = "seconds since 1970-01-01T00:00:00Z"
+NANOSECONDS = re.compile(r"(nanosecond|nanosec|nsec|ns)s?(?= since)")
 
 
-def floats(variable: Any, rows: slice = ALL) -> FloatArray:
+def epoch(path: Path, variable: Any) -> tuple[float, float]:
+    """Return the s since 1970 at which a time variable is 0, and the s in one of its units.
+
+    FormatError: its unit is no unit of time since a date.
+    """
+    units, calendar = (str(getattr(variable, name, "")) for name in ("units", "calendar"))
+    unit = 1.0
+    if nano := NANOSECONDS.match(units):  # which the library does not know
+        units, unit = f"seconds{units[nano.end() :]}", 1e-9
+    days = [datetime(1970, 1, 1), datetime(1970, 1, 2)]
+    try:
+        numbers: Any = netCDF4.date2num(days, units, calendar or "standard")
+    except ValueError:
+        raise FormatError(path, f"expected {EPOCH!r}, not {units!r}", column=variable.name) from None
+    zero, day = numbers
+    scale = 86_400.0 / (day - zero)
+    return float(-zero * scale), float(scale) * unit
+
+
+def floats(variable: Any, rows: slice | tuple[slice, ...] = ALL) -> FloatArray:
     """Return rows of a variable, in its shape, NaN where a value is missing.
 
     Missing are the values that the variable declares as missing, compared as stored, before unpacking, and

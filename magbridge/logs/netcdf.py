@@ -1,10 +1,11 @@
-"""netCDF in the shape of OceanGliders OG1.0: one trajectory along ``N_MEASUREMENTS``, names in capitals.
+"""netCDF in and out: trajectories, written in the shape of OceanGliders OG1.0.
 
-``TIME LATITUDE LONGITUDE DEPTH ROLL PITCH HEADING TEMP PRES`` are OG1.0's own names; the others are ours in
-capitals (``MAG_X``), and the attribute ``column`` keeps the exact name. A file by someone else is read by the
-same rules: any numeric variable along ``N_MEASUREMENTS`` becomes a column in small letters. What OG1.0 also
-demands about people, platform and quality control we do not know, so a file does not claim to comply. A
-basestation's Seaglider file is recognised by its dimensions and read by :mod:`magbridge.logs.seaglider`.
+Written is one trajectory along ``N_MEASUREMENTS``, names in capitals. ``TIME LATITUDE LONGITUDE DEPTH ROLL
+PITCH HEADING TEMP PRES`` are OG1.0's own names; the others are ours in capitals (``MAG_X``), and the
+attribute ``column`` keeps the exact name. What OG1.0 also demands about people, platform and quality control
+we do not know, so a file does not claim to comply. Read is any trajectory, by
+:mod:`magbridge.logs.trajectory`; a basestation's Seaglider file is recognised by its dimensions and read by
+:mod:`magbridge.logs.seaglider`.
 
 References
 ----------
@@ -23,9 +24,9 @@ import xarray as xr
 
 from magbridge.errors import FormatError, MissingExtra
 from magbridge.files import systems_reason
-from magbridge.logs import seaglider
-from magbridge.logs.cf import floats
-from magbridge.logs.deployment import deployment, sliced
+from magbridge.logs import seaglider, trajectory
+from magbridge.logs.cf import EPOCH
+from magbridge.logs.deployment import sliced
 
 try:
     import netCDF4
@@ -35,7 +36,6 @@ except ImportError:
 __all__ = ["FileWriter", "chunks"]
 
 DIMENSION = "N_MEASUREMENTS"
-EPOCH = "seconds since 1970-01-01T00:00:00Z"
 NAMES = {"water_temperature": "TEMP", "water_pressure": "PRES"}
 """Columns whose OG1.0 name is not simply our name in capitals."""
 ATTRIBUTES: dict[str, dict[str, Any]] = {
@@ -59,7 +59,7 @@ def chunks(path: Path, rows: int) -> Iterator[tuple[xr.Dataset, Sequence[int]]]:
     Raises
     ------
     FormatError
-        Not netCDF or cut short, neither of the two shapes, no ``TIME``.
+        Not netCDF or cut short, or no time in it.
     """
     try:
         with netCDF4.Dataset(path) as file:
@@ -67,63 +67,11 @@ def chunks(path: Path, rows: int) -> Iterator[tuple[xr.Dataset, Sequence[int]]]:
                 whole = seaglider.dive(path, seaglider.read_netcdf(path, file))
                 for k, part in enumerate(sliced(whole, rows)):
                     yield part, range(k * rows + 1, k * rows + 1 + part.sizes["time"])
-            elif DIMENSION in file.dimensions:
-                yield from _chunks(path, file, rows)
             else:
-                there = ", ".join(file.dimensions) or "none"
-                raise FormatError(
-                    path,
-                    f"expected a log: the dimension {DIMENSION} (OG1.0), or a Seaglider's file; "
-                    f"there are: {there}",
-                )
+                yield from trajectory.chunks(path, file, rows)
     except (OSError, RuntimeError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or error
         raise FormatError(path, f"expected a whole netCDF file: {reason}") from None
-
-
-def _chunks(path: Path, file: Any, rows: int) -> Iterator[tuple[xr.Dataset, Sequence[int]]]:
-    """Yield the rows, each piece with their numbers."""
-    ours = {capitals: name for name, capitals in NAMES.items()}
-    variables = {
-        str(getattr(variable, "column", ours.get(name, name.lower()))): variable
-        for name, variable in file.variables.items()
-        if variable.dimensions == (DIMENSION,) and variable.dtype != str and variable.dtype.kind in "iuf"
-    }
-    if "time" not in variables:
-        raise FormatError(path, f"expected this variable along {DIMENSION}", column="TIME")
-    total = len(file.dimensions[DIMENSION])
-    if not total:
-        raise FormatError(path, "expected rows, there are none")
-    start, scale = _epoch(path, variables["time"])
-    others = [(name, variable) for name, variable in variables.items() if name != "time"]
-    units = {name: str(getattr(variable, "units", "1")) for name, variable in others}
-    meanings = {name: str(getattr(variable, "long_name", "")) for name, variable in others}
-    attrs = {key: _plain(value) for key, value in file.__dict__.items() if key not in GENERATED}
-    for row in range(0, total, rows):
-        columns = {name: floats(variable, slice(row, row + rows)) for name, variable in variables.items()}
-        time = columns.pop("time") * scale + start
-        numbers = range(row + 1, row + 1 + len(time))
-        yield deployment(path, time, columns, units, attrs, meanings), numbers
-
-
-def _epoch(path: Path, variable: Any) -> tuple[float, float]:
-    """Return the s since 1970 at which the time variable is 0, and the s in one of its units."""
-    units, calendar = (str(getattr(variable, name, "")) for name in ("units", "calendar"))
-    days = [datetime(1970, 1, 1), datetime(1970, 1, 2)]
-    try:
-        numbers: Any = netCDF4.date2num(days, units, calendar or "standard")
-    except ValueError:
-        raise FormatError(path, f"expected {EPOCH!r}, not {units!r}", column="TIME") from None
-    zero, day = numbers
-    scale = 86_400.0 / (day - zero)
-    return float(-zero * scale), float(scale)
-
-
-def _plain(value: Any) -> Any:
-    return value.item() if isinstance(value, np.generic) else value
-
-
-GENERATED = ("Conventions", "featureType", "title", "start_date", "time_coverage_start", "time_coverage_end")
 
 
 class FileWriter:
