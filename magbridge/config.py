@@ -154,6 +154,9 @@ class Align(Table, frozen=True):
         nT/s by which the sigma grows with the age of stale telemetry.
     turn_on_sigma : float
         nT, 1-sigma, by which the sensor's offset changes at every power-on.
+    reference_sigma : float
+        nT, 1-sigma of the Earth's total field about the main field: a corrected field beyond five of them is
+        ``implausible``.
     """
 
     filter_delay: NotNegative = 0.0
@@ -162,6 +165,7 @@ class Align(Table, frozen=True):
     settle_time: NotNegative = 0.0
     stale_growth: NotNegative = 1.0
     turn_on_sigma: NotNegative = 20.0
+    reference_sigma: Positive = 145.0
 
 
 class Navigation(Table, frozen=True):

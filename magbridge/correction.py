@@ -21,6 +21,7 @@ from magbridge.columns import AGE, CHANNELS, COLUMNS, CORRECTED, require
 from magbridge.config import Align
 from magbridge.field.igrf import magnitude
 from magbridge.field.reference import main_field
+from magbridge.plausibility import Plausibility
 from magbridge.records import BEYOND, Corrected, Quality, Reading
 from magbridge.toml import convert
 
@@ -58,6 +59,8 @@ class Correction:
         self._wants_temperature = TEMPERATURE in self.names
         self._corrector = Corrector(calibration)
         self._raised = Corrector(calibration.at_level()) if calibration.level else None
+        # what has no calibration is not expected to be the Earth's field
+        self.plausibility = None if calibration.method == "none" else Plausibility(calibration.noise.sensor)
 
     def as_declared(self, attrs: Mapping[str, Any]) -> None:
         """Align as the bridge did whose log declares its settings among its attributes.
@@ -80,17 +83,44 @@ class Correction:
         self.aligner.telemetry(name, time_us, value, guessed=guessed)
 
     def reading(
-        self, reading: Reading, time_us: int, *, restarted: bool = False, missing: int = 0
+        self,
+        reading: Reading,
+        time_us: int,
+        *,
+        restarted: bool = False,
+        missing: int = 0,
+        main_field: float = nan,
     ) -> tuple[Sample, Corrected]:
-        """Align and correct one reading; arguments as :meth:`magbridge.align.Aligner.reading`."""
+        """Align and correct one reading, and judge what comes out.
+
+        Parameters
+        ----------
+        reading, time_us, restarted, missing
+            As for :meth:`magbridge.align.Aligner.reading`.
+        main_field : float
+            nT, the main field's total where the sample was taken; NaN where that is not known.
+        """
         if self._wants_temperature and isfinite(reading.temperature):  # not every reading need have one
             self.aligner.telemetry(TEMPERATURE, time_us, reading.temperature)
         sample = self.aligner.reading(reading, time_us, restarted=restarted, missing=missing)
         (F, sigma, x, y, z, sx, sy, sz), quality = self._corrector.numbers(
             sample.time_us, sample.field, sample.values, sample.quality
         )
-        if sample.sigma or sample.spans:
-            more = self._more(sample)
+        judged = 0.0
+        if self.plausibility is not None:
+            judged = self.plausibility.check(
+                sample.time_us,
+                reading.field,
+                sample.values,
+                F,
+                sigma,
+                quality,
+                main_field,
+                self.aligner.settings.reference_sigma,
+            )
+            quality |= self.plausibility.flags
+        if sample.sigma or sample.spans or judged:
+            more = self._more(sample) + judged
             sigma = sqrt(sigma * sigma + more)
             sx, sy, sz = sqrt(sx * sx + more), sqrt(sy * sy + more), sqrt(sz * sz + more)
         return sample, Corrected(F, sigma, (x, y, z), (sx, sy, sz), quality)
@@ -146,15 +176,17 @@ def correct_rows(correction: Correction, deployment: xr.Dataset) -> xr.Dataset:
     results = np.full((deployment.sizes["time"], len(CORRECTED)), nan)
     level = np.full(len(results), nan)
     results[:, CORRECTED.index("quality")] = Quality.GAP
+    main_fields = magnitude(main_field(deployment))
+    known = main_fields.tolist()
     for row, reading, stamp in _readings(correction, deployment):
-        sample, one = correction.reading(reading, stamp)
+        sample, one = correction.reading(reading, stamp, main_field=known[row])
         level[row] = correction.level(sample, one)
         results[row] = one.total_field, one.total_field_sigma, *one.field, nan, one.quality
     _keep_late_joins(results, deployment)
     columns = dict(zip(CORRECTED, results.T, strict=True))
     if np.isfinite(level).any():
         columns["level_sigma"] = level
-    columns["anomaly"] = columns["total_field"] - magnitude(main_field(deployment))
+    columns["anomaly"] = columns["total_field"] - main_fields
     return xr.Dataset(
         {name: ("time", column, COLUMNS[name]._asdict()) for name, column in columns.items()},
         coords={"time": deployment["time"]},

@@ -31,7 +31,7 @@ LOOK_US = 100_000
 """µs between two checks for a step of the host's clock, and for a link that is too slow."""
 BACKLOG = 1 << 20
 """Bytes of a link's backlog that are read at once after the process was held up."""
-STANDSTILL_US = 250_000
+STANDSTILL_US = 400_000
 """µs that a turn takes only where the process was held up: none waits for longer than `LOOK_US`."""
 
 

@@ -95,6 +95,7 @@ class Pipeline:
             check(calibration, config)
         used = None if foreign else calibration
         self._correction = Correction(used, config.align)
+        self._plausibility = self._correction.plausibility
         self._calibration_id = calibration_id(used) if used else 0
         autopilot = config.link.system, config.link.autopilot
         stamps = start.signing_timestamp, start.signing_streams
@@ -194,12 +195,17 @@ class Pipeline:
         self._lost += missing
         self._times.append(time_us)
         self.sensor.read(reading.field, time_us)
-        sample, corrected = self._correction.reading(reading, time_us, restarted=restarted, missing=missing)
+        utc_offset_us = self.component.codec.utc_offset_us
+        main_field = self._position.main_field(time_us, time_us + utc_offset_us)
+        sample, corrected = self._correction.reading(
+            reading, time_us, restarted=restarted, missing=missing, main_field=main_field
+        )
+        if self._plausibility is not None and self._plausibility.notices:
+            self._tell_implausible()
         doubts = corrected.quality & DOUBTS
         if doubts != self._quality:
             self._tell_doubts(doubts)
-        utc_us = sample.time_us + self.component.codec.utc_offset_us
-        anomaly = corrected.total_field - self._position.main_field(sample.time_us, utc_us)
+        anomaly = corrected.total_field - main_field
         if self.navigation is not None:
             self.navigation.sample(sample.time_us, corrected)
         publisher = self.component.publisher
@@ -234,6 +240,12 @@ class Pipeline:
         severity = MAV_SEVERITY.WARNING if names else MAV_SEVERITY.INFO
         self.component.announcer.state("quality", f"field: {names or 'good'}", severity)
         self._quality = doubts
+
+    def _tell_implausible(self) -> None:
+        assert self._plausibility is not None
+        for text in self._plausibility.notices:
+            self.component.announcer.say(text, MAV_SEVERITY.ERROR)
+        self._plausibility.notices.clear()
 
     def _tell_no_anomaly(self, reason: str) -> None:
         self.component.announcer.state("anomaly", f"no anomaly: {reason}", MAV_SEVERITY.WARNING)

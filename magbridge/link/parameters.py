@@ -45,6 +45,14 @@ def alignment(align: Align) -> list[Tunable]:
         ("MB_MOVING_RATE", "moving_rate", 1e-6, 10, "1/s", "ranges per second from which on a mass moves"),
         ("MB_SETTLE_TIME", "settle_time", 0, 3600, "s", "how long samples stay flagged after a motion"),
         ("MB_STALE_GROW", "stale_growth", 0, 1e4, "nT/s", "growth of sigma with the age of stale telemetry"),
+        (
+            "MB_REF_SIGMA",
+            "reference_sigma",
+            1e-3,
+            1e9,
+            "nT",
+            "1-sigma of the Earth's field about the main field",
+        ),
         ("MB_TURNON_SIGMA", "turn_on_sigma", 0, 1e5, "nT", "1-sigma of the offset's change at power-on"),
     )
     return [

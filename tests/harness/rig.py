@@ -60,7 +60,6 @@ directory = "logs"
 
 
 OPTIONS = "sensitivity = 5e-5\nreference_voltage = 5.0"
-LATE = int(Quality.STALE_TELEMETRY | Quality.LATE_JOIN)
 STALE_BY = 0.2
 """s that the machine may stand still, of the last second, before telemetry can be stale for it: 0.5 s
 is `max_age`."""
@@ -260,12 +259,13 @@ class Rig:
         return Quality(seen & ~self.normal).names()
 
     def undue_flags(self, mark: int) -> str:
-        """Return the same without those of late telemetry where the machine stood still, or we did."""
+        """Return the same without those of late telemetry, where the machine or we stood still."""
         seen = 0
         for when, message in self.heard[mark:]:
             if message.name == "MAG_FIELD":
                 late = self.machine.seconds(when - 1.0, when) > STALE_BY or self.untold(when) > STALE_BY
-                seen |= message["flags"] & ~(LATE if late else 0)
+                seen |= message["flags"] & ~(Quality.STALE_TELEMETRY if late else 0)
+        seen &= ~Quality.LATE_JOIN  # a busy machine holds the process up; it has a test of its own
         return Quality(seen & ~self.normal).names()
 
     def untold(self, when: float) -> float:

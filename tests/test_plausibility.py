@@ -1,0 +1,169 @@
+"""What can be the Earth's field: each fault is seen, told once, and a healthy sensor is left alone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from math import nan
+
+import numpy as np
+import pytest
+
+from magbridge.arrays import FloatArray, IntArray
+from magbridge.plausibility import Plausibility
+from magbridge.records import Quality
+
+IMPLAUSIBLE, MOVING = int(Quality.IMPLAUSIBLE), int(Quality.MOVING)
+SIGMA, FIELD, PERIOD_US = 1.9, 52_000.0, 4_000_000
+
+
+class Flight:
+    """A vehicle in a field of 52,000 nT over rock, whose sensor has 1 nT of noise."""
+
+    def __init__(self, n: int = 1500, seed: int = 1, steps: float = 0.01) -> None:
+        rng = np.random.default_rng(seed)
+        time = 4.0 * np.arange(n)
+        rock = 40.0 * np.sin(time / 900.0) + 15.0 * np.sin(time / 260.0)
+        turn = np.cumsum(rng.normal(0.0, 0.05, (n, 3)), axis=0) + np.array([1.0, 0.5, 2.0])
+        direction = turn / np.linalg.norm(turn, axis=1)[:, None]
+        self.raw: FloatArray = (FIELD + rock)[:, None] * direction + rng.normal(0.0, 1.0, (n, 3))
+        self.raw = np.rint(self.raw / steps) * steps
+        self.values = np.zeros(n)
+        self.quality = np.zeros(n, int)
+
+    def judge(self, reference: float = FIELD) -> tuple[IntArray, FloatArray, list[str]]:
+        """Return the flags (n,), the sigma (n,) and what was told."""
+        judge = Plausibility(1.0)
+        flags: list[int] = []
+        sigma: list[float] = []
+        total = np.linalg.norm(self.raw, axis=1).tolist()
+        for k, raw in enumerate(self.raw.tolist()):
+            quality = int(self.quality[k])
+            values = (float(self.values[k]),)
+            more = judge.check(
+                k * PERIOD_US, tuple(raw), values, total[k], SIGMA, quality, reference, 145.0
+            )  # fmt: skip
+            flags.append(judge.flags)
+            sigma.append((SIGMA**2 + more) ** 0.5)
+        return np.array(flags), np.array(sigma), judge.notices
+
+
+def along(raw: FloatArray, by: float) -> FloatArray:
+    """What makes the total field of `raw` (n, 3) larger by so many nT."""
+    return np.asarray(by * raw / np.linalg.norm(raw, axis=1)[:, None])
+
+
+@pytest.mark.parametrize("steps", [1e-3, 0.5, 6.7, 100.0])
+@pytest.mark.parametrize("reference", [FIELD, nan])
+def test_a_healthy_sensor_is_left_alone(steps: float, reference: float) -> None:
+    """Also one that counts in steps far above its noise, as an HMR2300 or an autopilot's compass does."""
+    flight = Flight(n=3000, steps=steps)
+    if steps > 1.0:
+        flight.raw[:, 2] = flight.raw[:, 2] + 0.0
+    flags, sigma, told = flight.judge(reference)
+    assert np.mean(flags != 0) <= 0.001
+    if steps < 1.0:
+        assert not flags.any()
+        assert told == []
+        assert (sigma[200:] == SIGMA).all()
+
+
+@pytest.mark.parametrize(
+    ("fault", "text"),
+    [
+        (lambda raw: raw / 1000.0, "sensor or calibration"),
+        (lambda raw: raw * 1.02, "sensor or calibration"),
+        (lambda raw: raw * [1.0, 1.0, 0.0] + [0.0, 0.0, 31_234.0], "axis z stuck at 31234 nT"),
+        (lambda raw: raw + along(raw, 100.0), "which no telemetry explains"),
+    ],
+)
+def test_a_fault_on_the_way_is_flagged_from_there_on(
+    fault: Callable[[FloatArray], FloatArray], text: str
+) -> None:
+    flight = Flight()
+    flight.raw[700:] = fault(flight.raw[700:])
+    flags, sigma, told = flight.judge()
+    assert not flags[:700].any()
+    assert (flags[710:] & IMPLAUSIBLE).all() or (sigma[710:][flags[710:] == 0] > 30.0).all()
+    assert np.mean(flags[700:710] == 0) <= 0.9
+    assert len([line for line in told if text in line]) == 1
+
+
+def test_spikes_are_flagged_one_by_one() -> None:
+    flight = Flight()
+    hit = np.random.default_rng(7).random(1500) < 0.03
+    hit[:10] = False
+    flight.raw[hit] += along(flight.raw[hit], 500.0)
+    flags, sigma, told = flight.judge()
+    assert (flags[hit] == IMPLAUSIBLE).all()
+    assert np.mean(flags[~hit] != 0) < 0.005
+    assert np.median(sigma[~hit]) == SIGMA
+    assert told == []
+
+
+def test_a_jump_that_comes_back_soon_is_forgotten_and_one_that_stays_is_not() -> None:
+    flight = Flight()
+    flight.raw[500:515] += along(flight.raw[500:515], 200.0)  # a ship passes: one minute
+    flags, _, told = flight.judge()
+    assert (flags[500:515] == IMPLAUSIBLE).all()
+    assert not flags[540:].any()
+    assert len(told) == 1
+    flight.raw[515:1000] += along(flight.raw[515:1000], 200.0)
+    flags, sigma, _ = flight.judge()
+    assert (flags[500:1000] == IMPLAUSIBLE).all()
+    assert (sigma[1000:] > 100.0).all()  # what is right again may not be
+
+
+def test_a_mass_that_moves_is_no_jump_if_the_field_stays_and_one_if_it_does_not() -> None:
+    flight = Flight()
+    flight.values[700:] = 1.0
+    flight.quality[695:705] = MOVING
+    flight.raw[695:700] += along(flight.raw[695:700], 300.0)  # while it moves, nothing is known
+    flags, _, told = flight.judge()
+    assert not flags.any()
+    flight.raw[700:] += along(flight.raw[700:], 150.0)
+    flags, _, told = flight.judge()
+    assert (flags[705:] == IMPLAUSIBLE).all()
+    assert "as a mass moves: calibration or telemetry wrong" in told[0]
+
+
+def test_clipping_is_remembered() -> None:
+    """The first time it takes some samples to see; from then on it is seen at once."""
+    flight = Flight()
+    limit = float(np.quantile(flight.raw[:, 2], 0.8))
+    clipped = flight.raw[:, 2] > limit
+    flight.raw[:, 2] = np.minimum(flight.raw[:, 2], limit)
+    flags, _, told = flight.judge()
+    missed = clipped & (flags == 0)
+    assert missed.sum() <= 10
+    assert missed[np.flatnonzero(clipped)[30] :].sum() == 0
+    assert any("axis z stuck" in line for line in told)
+
+
+def test_more_noise_than_the_calibration_s_widens_sigma() -> None:
+    flight = Flight(n=3000)
+    flight.raw[700:] += np.random.default_rng(2).normal(0.0, 20.0, (2300, 3))
+    flags, sigma, told = flight.judge()
+    error = np.abs(np.linalg.norm(flight.raw, axis=1) - FIELD)
+    assert np.median(sigma[1000:]) == pytest.approx(20.0 * (4 / 3) ** 0.5, rel=0.2)
+    late = np.arange(3000) > 1000
+    assert np.mean((flags == 0)[late] & (error > 3.0 * sigma + 60.0)[late]) < 0.003
+    assert [line for line in told if "noise" in line]
+    assert len(told) == len(set(told))
+
+
+def test_without_a_position_only_what_is_nowhere_on_earth_is_wrong() -> None:
+    flight = Flight(n=50)
+    assert not flight.judge(reference=nan)[0].any()
+    flight.raw *= 0.2
+    flags, _, told = flight.judge(reference=nan)
+    assert (flags == IMPLAUSIBLE).all()
+    assert "expected 17000 to 72000" in told[0]
+
+
+def test_memory_and_state_do_not_grow() -> None:
+    judge = Plausibility(1.0)
+    rng = np.random.default_rng(3)
+    for k in range(3000):
+        raw = tuple(rng.normal(0.0, 4e4, 3).tolist())
+        judge.check(k * PERIOD_US, raw, (0.0,), float(np.linalg.norm(raw)), SIGMA, 0, FIELD, 145.0)
+    assert len(judge.notices) <= 5

@@ -1,0 +1,297 @@
+"""What the sensor, the telemetry and the computer can do to a value, and what the bridge says of it.
+
+    python3 tools/faults.py                      the table: each fault on a simulated survey
+    python3 tools/faults.py --hours 6 spikes     some of it, longer
+    python3 tools/faults.py --clean 30           days without a fault: how often a flag is a false alarm
+
+A glider like that of ``magbridge demo`` flies calibration spirals and a survey; the survey's bytes, with a
+fault in them, go through the bridge. A sample is wrong if it carries no flag and lies beyond three of its own
+sigmas.
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+from rich.console import Console
+from terminal import command_line, table
+
+from magbridge.arrays import FloatArray
+from magbridge.bridge import states
+from magbridge.bridge.drive import set_up
+from magbridge.bridge.events import Event, Start
+from magbridge.calibration.file import save
+from magbridge.calibration.fitting.fit import fit
+from magbridge.calibration.fitting.lowpass import unfiltered
+from magbridge.calibration.fitting.observe import observations
+from magbridge.config import load as load_config
+from magbridge.records import Channel, Quality
+from sitl.dataset import segments
+from sitl.mission import CrissCross
+from sitl.replay.emulation import emulate, start_us
+from sitl.replay.listener import Listener
+from sitl.replay.setup import bridge_toml
+from sitl.scenario import load
+from sitl.twin import simulate
+
+__all__ = ["FAULTS", "Flight", "Score", "prepare", "score"]
+
+MASSES = ("battpos", "ballast")
+CHANNELS = ("mag_x", "mag_y", "mag_z")
+FAULT_AT = 0.27
+"""Where in the survey a fault begins that comes on the way."""
+Rows = xr.Dataset
+Events = Iterator[Event]
+
+
+@dataclass(frozen=True)
+class Flight:
+    """A calibrated glider's survey: its folder (``bridge.toml``, ``cal.json``) and rows."""
+
+    folder: Path
+    survey: xr.Dataset
+
+
+@dataclass(frozen=True)
+class Score:
+    """What a bridge made of a survey.
+
+    Attributes
+    ----------
+    samples, flagged, wrong : int
+        `wrong`: without a flag, and beyond three sigmas.
+    worst : float
+        nT, the largest error without a flag.
+    sigma : float
+        nT, median of those without a flag.
+    said : tuple of str
+    """
+
+    samples: int
+    flagged: int
+    wrong: int
+    worst: float
+    sigma: float
+    said: tuple[str, ...]
+
+
+def prepare(folder: Path, seed: int, hours: float, *, calibrated_by: int | None = None) -> Flight:
+    """Simulate a glider, fit its calibration (or that of another seed) and write the bridge's files."""
+    scenario = load("demo")
+    survey = CrissCross(hours=hours, roll=(1.0, 2.0))
+    deployment = simulate(scenario.replace(mission=(scenario.mission[0], survey)), seed)
+    parts = segments(deployment)
+    if calibrated_by is None:
+        training = parts["calibration"]
+    else:
+        training = segments(simulate(scenario, calibrated_by))["calibration"]
+    corner = scenario.instrument.corner
+    found = fit(unfiltered(observations(training, MASSES), corner), "auto")
+    folder.mkdir(parents=True, exist_ok=True)
+    save(found.calibration, folder / "cal.json")
+    (folder / "bridge.toml").write_text(bridge_toml(deployment, MASSES, calibrated=True), encoding="utf-8")
+    return Flight(folder, parts["survey"])
+
+
+def score(flight: Flight, rows: xr.Dataset, change: Callable[[Events], Events] = iter) -> Score:
+    """Feed the bridge with `rows` of a flight, their events changed by `change`; compare with the truth."""
+    config = load_config(flight.folder / "bridge.toml")
+    pipeline = set_up(config, Start(start_us(rows)))
+    listener = Listener()
+    for event in change(emulate(rows, config)):
+        sent = pipeline.feed(event)
+        if sent:
+            listener.hear(b"".join(frame for _, frame in sent))
+    field = listener.field()
+    truth = np.interp(field["time"], flight.survey["time"], flight.survey["truth_total_field"])
+    error = np.abs(field["total_field"] - truth)
+    plain = (field["quality"].astype(int) & ~int(Quality.NO_BORESIGHT)) == 0
+    wrong = plain & ~(error <= 3.0 * field["sigma"])
+    return Score(
+        len(plain),
+        int((~plain).sum()),
+        int(wrong.sum()),
+        float(error[plain].max()) if plain.any() else 0.0,
+        float(np.median(field["sigma"][plain])) if plain.any() else 0.0,
+        tuple(listener.said),
+    )
+
+
+# -- faults: rows in, rows out -----------------------------------------------------------------------------
+
+
+def fault_of(
+    *channels: str, by: Callable[[FloatArray, FloatArray], FloatArray] | None, late: bool = False
+) -> Callable[[Rows], Rows]:
+    """Return a fault: ``by(values, seconds)`` in place of each channel's values, or the value when it begins.
+
+    It begins at `FAULT_AT` if it comes `late`.
+    """
+
+    def fault(rows: Rows) -> Rows:
+        seconds = rows["time"].to_numpy() - float(rows["time"][0])
+        from_here = seconds >= (FAULT_AT * seconds[-1] if late else 0.0)
+        changed = {}
+        for name in channels:
+            values = rows[name].to_numpy()
+            held = np.full_like(values, values[np.argmax(from_here)])
+            faulty = by(values, seconds) if by is not None else held
+            changed[name] = ("time", np.where(from_here, faulty, values), rows[name].attrs)
+        return rows.assign(changed)
+
+    return fault
+
+
+def spikes(values: FloatArray, _: FloatArray) -> FloatArray:
+    """3 % of the samples are 500 nT off."""
+    hit = np.random.default_rng(5).random(len(values)) < 0.03
+    return np.asarray(values + np.where(hit, 500.0, 0.0))
+
+
+def silent(rows: Rows) -> Rows:
+    """Telemetry is silent for 25 of every 60 s."""
+    seconds = rows["time"].to_numpy() - float(rows["time"][0])
+    return rows.assign(
+        {n: ("time", np.where(seconds % 60 < 25, np.nan, rows[n]), rows[n].attrs) for n in MASSES}
+    )
+
+
+def late(rows: Rows) -> Rows:
+    """Telemetry is 2 s late."""
+    time = rows["time"].to_numpy()
+    return rows.assign({n: ("time", np.interp(time - 2.0, time, rows[n]), rows[n].attrs) for n in MASSES})
+
+
+def noise(values: FloatArray, _: FloatArray) -> FloatArray:
+    """Twenty times the noise."""
+    seed = int(abs(values[0]))  # each channel's own
+    return np.asarray(values + np.random.default_rng(seed).normal(0.0, 20.0, len(values)))
+
+
+FAULTS: dict[str, Callable[[Rows], Rows]] = {
+    "none": lambda rows: rows,
+    "scaled by a thousandth": fault_of(*CHANNELS, by=lambda v, _: v / 1000),
+    "polarity of x": fault_of("mag_x", by=lambda v, _: -v),
+    "polarity of y": fault_of("mag_y", by=lambda v, _: -v),
+    "polarity of z": fault_of("mag_z", by=lambda v, _: -v),
+    "polarity of all axes": fault_of(*CHANNELS, by=lambda v, _: -v),
+    "x stuck": fault_of("mag_x", by=None, late=True),
+    "y stuck": fault_of("mag_y", by=None, late=True),
+    "z stuck": fault_of("mag_z", by=None, late=True),
+    "telemetry frozen, stamps advance": fault_of(*MASSES, by=None, late=True),
+    "clips below its range": fault_of(
+        *CHANNELS, by=lambda v, _: np.clip(v, -0.97 * np.abs(v).max(), 0.97 * np.abs(v).max())
+    ),
+    "telemetry silent 25 of 60 s": silent,
+    "ballast's sign": fault_of("ballast", by=lambda v, _: -v),
+    "ballast's unit": fault_of("ballast", by=lambda v, _: v / 1000),
+    "gain +2 %": fault_of(*CHANNELS, by=lambda v, _: v * 1.02),
+    "gain of x +2 %": fault_of("mag_x", by=lambda v, _: v * 1.02),
+    "gain +2 % on the way": fault_of(*CHANNELS, by=lambda v, _: v * 1.02, late=True),
+    "spikes of 500 nT": fault_of("mag_x", by=spikes),
+    "telemetry 2 s late": late,
+    "offset of x +100 nT": fault_of("mag_x", by=lambda v, _: v + 100.0, late=True),
+    "offset of z +100 nT": fault_of("mag_z", by=lambda v, _: v + 100.0, late=True),
+    "noise times 20": fault_of(*CHANNELS, by=noise, late=True),
+}
+
+
+def stalls(length_us: int, every_us: int = 600_000_000) -> Callable[[Events], Events]:
+    """Return what a process that stands still for `length_us` of every `every_us` makes of its events."""
+
+    def change(events: Events) -> Events:
+        waiting: list[Event] = []
+        first_us = end_us = 0
+        for event in events:
+            first_us = first_us or event.time_us
+            since = (event.time_us - first_us) % every_us
+            if since < length_us and event.time_us - first_us > every_us:
+                end_us = event.time_us - since + length_us & ~3
+                waiting.append(event)
+                continue
+            if waiting:
+                yield Event(end_us, Channel.STATE, states.standstill(end_us, length_us))
+                for channel in (Channel.LINK, Channel.SENSOR):  # as the live edge reads them
+                    if data := b"".join(one.data for one in waiting if one.channel == channel):
+                        yield Event(end_us, channel, data)
+                waiting = []
+            yield event
+
+    return change
+
+
+def main() -> int:
+    parser = command_line(__doc__)
+    parser.add_argument("names", nargs="*", metavar="FAULT", help="; ".join(FAULTS))
+    parser.add_argument("--hours", type=float, default=6.0)
+    parser.add_argument("--seeds", type=int, default=1)
+    parser.add_argument("--clean", type=float, default=0.0, metavar="DAYS")
+    chosen = parser.parse_args()
+    if chosen.clean:
+        return clean(chosen.clean)
+    totals: dict[str, list[Score]] = {}
+    for seed in range(1, chosen.seeds + 1):
+        with tempfile.TemporaryDirectory() as name:
+            folder = Path(name)
+            flight = prepare(folder, seed, chosen.hours)
+            for fault, change in FAULTS.items():
+                if not chosen.names or fault in chosen.names:
+                    totals.setdefault(fault, []).append(score(flight, change(flight.survey)))
+            for seconds in (1.5, 8.0):
+                fault = f"stands still for {seconds} s every 100 s"
+                if not chosen.names or fault in chosen.names:
+                    found = score(flight, flight.survey, stalls(round(seconds * 1e6), 100_000_000))
+                    totals.setdefault(fault, []).append(found)
+            if not chosen.names:
+                other = prepare(folder / "other", seed, chosen.hours, calibrated_by=seed + 100)
+                totals.setdefault("another glider's calibration", []).append(score(other, other.survey))
+    show(totals)
+    return 0
+
+
+def clean(days: float) -> int:
+    """Fly gliders without a fault, a day each; print the flags that were false alarms."""
+    samples = flagged = wrong = 0
+    said: list[str] = []
+    seed = 1000
+    while samples < days * 21_600:
+        with tempfile.TemporaryDirectory() as name:
+            flight = prepare(Path(name), seed, 24.0)
+            found = score(flight, flight.survey)
+        seed += 1
+        samples, flagged, wrong = samples + found.samples, flagged + found.flagged, wrong + found.wrong
+        said += [text for text in found.said if "calibration " not in text]
+        print(f"{samples} samples, {flagged} flagged, {wrong} beyond 3 sigma; {found.said}", flush=True)
+    return 0
+
+
+def show(totals: dict[str, list[Score]]) -> None:
+    """Print the table."""
+    shown = table("", "fault", "flagged", "wrong", "worst, nT", "sigma, nT", "said", left=("fault", "said"))
+    for fault, scores in totals.items():
+        samples = sum(one.samples for one in scores)
+        said = [
+            text
+            for one in scores
+            for text in one.said
+            if "field" in text or "axis" in text or "noise" in text
+        ]
+        shown.add_row(
+            fault,
+            f"{100 * sum(one.flagged for one in scores) / samples:.1f} %",
+            f"{100 * sum(one.wrong for one in scores) / samples:.2f} %",
+            f"{max(one.worst for one in scores):.0f}",
+            f"{np.median([one.sigma for one in scores]):.1f}",
+            " | ".join(dict.fromkeys(t for t in said if not t.startswith("field: ")))[:120],
+        )
+    Console(width=None if sys.stdout.isatty() else 200).print(shown)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
