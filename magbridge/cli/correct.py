@@ -11,8 +11,10 @@ from magbridge.cli.common import (
     AS_THEY_SAY,
     Json,
     Log,
+    Picture,
     Reading,
     app,
+    check_inputs,
     complain,
     doubts_of,
     logs_to_read,
@@ -23,17 +25,31 @@ from magbridge.cli.common import (
     print_result,
     refuse_unsuited,
 )
-from magbridge.columns import CHANNELS
+from magbridge.columns import CHANNELS, CORRECTED
 from magbridge.errors import DataError
 from magbridge.progress import track
 
 if TYPE_CHECKING:
     import xarray as xr
 
+    from magbridge.calibration.model import Calibration
+
+KEPT = (
+    *("latitude", "longitude", "depth", "roll", "pitch", "heading", "run", "dive", "line", "line_type"),
+    *("sensor_temperature", "reference_field", "velocity_north", "velocity_east", "water_speed"),
+    *("local_north", "local_east", "dr_latitude", "dr_longitude"),
+)
+"""Columns of a log that stay beside the corrected field, with the calibration's parameters."""
+
 
 @app.command(usage="Usage: magbridge correct FILE... --calibration cal.json -o FILE [OPTIONS]")
 def correct(
-    *files: Path, calibration: Path, output: Log, reading: Reading = AS_THEY_SAY, json: Json = False
+    *files: Path,
+    calibration: Path,
+    output: Log,
+    picture: Picture = None,
+    reading: Reading = AS_THEY_SAY,
+    json: Json = False,
 ) -> None:
     """Correct a log with a calibration, as the bridge would have done live.
 
@@ -54,13 +70,17 @@ def correct(
     calibration
         The calibration (cal.json).
     output
-        The file to write: total field with its sigma, vector, anomaly and quality flags.
+        The file to write: total field with its sigma, vector, anomaly and quality flags; beside them the
+        log's position, depth, attitude and the calibration's parameters.
+    picture
+        A PNG, PDF or SVG to draw: the corrected field with its 2-sigma band, and what is flagged.
     reading
         How to read the logs.
     json
         Print the result as JSON.
     """
     logs_to_read(files, output, calibration)
+    check_inputs((*files, output), picture)
 
     from magbridge.calibration.file import load
     from magbridge.correction import Correction, correct_rows
@@ -71,6 +91,7 @@ def correct(
         complain(doubt)
     correction, tally, whole = Correction(known), _Tally(), False
     pieces: list[dict[str, Any]] = []
+    drawn: list[xr.Dataset] = []
     with Writer(output) as writer:
         for part in track(read_chunks(files, required=CHANNELS, options=reading.options), "correcting"):
             if not pieces:
@@ -78,8 +99,11 @@ def correct(
                 note_no_date(part)
             pieces.append(part.attrs)
             sampled = part[list(CHANNELS)].to_array().notnull()
-            corrected = correct_rows(correction, part).isel(time=sampled.any("variable").to_numpy())
+            corrected = _beside(part, correct_rows(correction, part), known, calibration)
+            corrected = corrected.isel(time=sampled.any("variable").to_numpy())
             writer.append(corrected)
+            if picture:
+                drawn.append(corrected[list(CORRECTED)])
             tally.add(corrected, part.sizes["time"])
             if not whole:
                 refuse_unsuited(known, part)
@@ -88,11 +112,29 @@ def correct(
             raise DataError(
                 f"{', '.join(str(file) for file in files)}: no row has all of {' '.join(CHANNELS)}"
             )
+    if picture:
+        from magbridge.logs.deployment import join
+        from magbridge.logs.draw import draw_corrected
+
+        draw_corrected(join(drawn), picture)
     note_losses(*pieces)
     note_settings(*pieces)
     if doubt := tally.doubt():
         complain(f"{calibration}: {doubt}")
     print_result({"file": str(output), **tally.facts()}, f"{output}: {tally.summary()}", json)
+
+
+def _beside(log: xr.Dataset, corrected: xr.Dataset, known: Calibration, file: Path) -> xr.Dataset:
+    """Return the corrected columns with those of the log that say where and in what state they were taken."""
+    from magbridge.calibration.file import calibration_id
+    from magbridge.logs.deployment import HISTORY, MEANING, lasting
+
+    names = [name for name in (*KEPT, *known.channels) if name in log and name not in corrected]
+    made = f"corrected with {file.name}, calibration {calibration_id(known):08x}"
+    history = [*str(log.attrs.get(HISTORY, "")).splitlines(), made]
+    attrs = {"calibration_id": f"{calibration_id(known):08x}", HISTORY: "\n".join(history)}
+    meaning = {name: value for name, value in lasting(log.attrs).items() if name in MEANING}
+    return corrected.assign({name: log[name] for name in names}).assign_attrs(meaning | attrs)
 
 
 @dataclass

@@ -27,6 +27,8 @@ from magbridge.files import systems_reason
 from magbridge.logs import seaglider, trajectory
 from magbridge.logs.cf import EPOCH
 from magbridge.logs.deployment import sliced
+from magbridge.records import Quality
+from magbridge.version import __version__
 
 try:
     import netCDF4
@@ -49,6 +51,9 @@ ATTRIBUTES: dict[str, dict[str, Any]] = {
     "water_temperature": {"standard_name": "sea_water_temperature"},
     "water_pressure": {"standard_name": "sea_water_pressure"},
 }
+COORDINATES = "time", "latitude", "longitude", "depth"
+NO_FLAGS = -1
+"""Stands for flags that are not known."""
 CHUNK = 8192
 """Rows stored together."""
 
@@ -91,7 +96,10 @@ class FileWriter:
                 self._define(dataset)
             n = dataset.sizes["time"]
             for name, variable in self._variables.items():
-                variable[self._rows : self._rows + n] = dataset[name].values
+                values = dataset[name].values
+                if name == "quality":
+                    values = np.where(np.isnan(values), NO_FLAGS, values).astype(np.int32)
+                variable[self._rows : self._rows + n] = values
             self._rows += n
             if n:
                 self._file.time_coverage_end = _iso(float(dataset["time"][-1]))
@@ -110,14 +118,17 @@ class FileWriter:
             | {
                 "title": "magnetometer deployment",
                 "featureType": "trajectory",
-                "Conventions": "CF-1.10, ACDD-1.3",
+                "Conventions": "CF-1.11, ACDD-1.3",
                 "start_date": _iso(first),
                 "time_coverage_start": _iso(first),
+                "history": _history(str(dataset.attrs.get("history", ""))),
             }
         )
         trajectory = file.createVariable("TRAJECTORY", str)
         trajectory.setncatts({"cf_role": "trajectory_id", "long_name": "trajectory name"})
         trajectory[...] = str(dataset.attrs.get("source", ""))
+        there = [name for name in COORDINATES if name == "time" or name in dataset]
+        coordinates = " ".join(name.upper() for name in there)
         taken = {"TRAJECTORY"}
         for name in ("time", *(str(name) for name in dataset.data_vars)):
             capitals = NAMES.get(name, name.upper()).replace("/", "_")
@@ -125,16 +136,32 @@ class FileWriter:
                 capitals += "_"
             taken.add(capitals)
             attrs = dict(dataset[name].attrs) | ATTRIBUTES.get(name, {})
+            flags = name == "quality"  # CF: flags have the type of their masks
+            # a coordinate of CF has no fill value: a time is never missing
+            fill = {"time": None, "quality": NO_FLAGS}.get(name, np.nan)
             variable = file.createVariable(
-                capitals, "f8", (DIMENSION,), fill_value=np.nan, zlib=True, complevel=1, chunksizes=(CHUNK,)
-            )
-            variable.setncatts(attrs | {"column": name})
+                capitals, "i4" if flags else "f8", (DIMENSION,), fill_value=fill, zlib=True, complevel=1,
+                chunksizes=(CHUNK,),
+            )  # fmt: skip
+            if flags:
+                attrs["flag_masks"] = np.array([int(flag) for flag in Quality], np.int32)
+                attrs["flag_meanings"] = " ".join(str(flag.name).lower() for flag in Quality)
+            if name not in COORDINATES and coordinates:
+                attrs["coordinates"] = coordinates
+            variable.setncatts({key: value for key, value in attrs.items() if key != "units" or not flags})
+            variable.setncatts({"column": name})
             self._variables[name] = variable
 
     def close(self) -> None:
         """Write everything to the file and close it."""
         with systems_reason(self._path):
             self._file.close()
+
+
+def _history(before: str) -> str:
+    """Return the history, an entry a line, with this writing after what was there before."""
+    written = f"{datetime.now(UTC):%Y-%m-%dT%H:%M:%SZ} written by magbridge {__version__}"
+    return "\n".join(line for line in (*before.splitlines(), written) if line)
 
 
 def _iso(time: float) -> str:

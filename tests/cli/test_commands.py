@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import xarray as xr
 from commands import Command
 
 from magbridge.calibration.file import load as load_calibration
@@ -19,6 +20,7 @@ from magbridge.calibration.file import save as save_calibration
 from magbridge.calibration.fitting.observe import observations
 from magbridge.calibration.model import Parameter, identity
 from magbridge.calibration.planning.plan import expected_calibration
+from magbridge.cli.common import app
 from magbridge.correction import Correction, correct_rows
 from magbridge.field.igrf import total_field
 from magbridge.field.read import read_grid
@@ -92,11 +94,33 @@ def test_correct_writes_what_the_contract_names(
     result, corrected = json.loads(said.out), read("corrected.nc")
     assert result["rows"] == corrected.sizes["time"] == 3600
     names = ["total_field", "total_field_sigma", "field_x", "field_y", "field_z", "anomaly", "quality"]
-    assert list(corrected) == names
+    assert list(corrected)[: len(names)] == names
+    kept = {"latitude", "longitude", "depth", "roll", "pitch", "heading"}
+    assert kept <= set(corrected)
+    assert not {"mag_x", "truth_total_field"} & set(corrected)
     truth = read(deployment)
     np.testing.assert_array_equal(corrected["time"], truth["time"])
     error = (corrected["total_field"] - truth["truth_total_field"]).to_numpy()
     assert np.sqrt(np.mean(error**2)) < 1000.0
+
+
+def test_what_correct_writes_is_netcdf_that_others_read(
+    deployment: Path, calibration: Path, command: Command
+) -> None:
+    command("calibrate", deployment, "--parameter", "battpos", "-o", "cal.json", "--method", "nominal")
+    command("correct", deployment, "--calibration", "cal.json", "-o", "corrected.nc", "--picture", "c.png")
+    assert Path("c.png").read_bytes().startswith(b"\x89PNG")
+    with xr.open_dataset("corrected.nc") as theirs:
+        assert theirs["TIME"].dtype.kind == "M"
+        assert {"TIME", "LATITUDE", "LONGITUDE", "DEPTH"} == set(theirs.coords)
+        quality = theirs["QUALITY"]
+        assert len(quality.attrs["flag_masks"]) == len(quality.attrs["flag_meanings"].split())
+        assert quality.attrs["flag_masks"].dtype == np.int32
+        assert f"calibration {theirs.attrs['calibration_id']}" in theirs.attrs["history"]
+        assert "written by magbridge" in theirs.attrs["history"]
+        np.testing.assert_array_equal(theirs["LATITUDE"], read(deployment)["latitude"])
+    flags = read("corrected.nc")["quality"]
+    np.testing.assert_array_equal(flags % 1, 0.0)
 
 
 def test_a_field_that_the_earth_does_not_have_is_said(
@@ -236,8 +260,9 @@ def test_plan_for_a_mission_that_moves_one_of_two_masses(deployment: Path, comma
 
 def test_help_names_every_command(command: Command) -> None:
     text = command("--help").out
-    commands = "calibrate convert correct demo diagnose map monitor navigate plan replay run simulate"
-    assert re.findall(r"^│ ([a-z]+) ", text, re.MULTILINE) == commands.split()
+    assert re.findall(r"^│ ([a-z]+) ", text, re.MULTILINE) == sorted(name for name in app if name[0] != "-")
+    commands = "calibrate convert correct demo diagnose info init map monitor navigate plan ports replay run"
+    assert set(commands.split()) <= set(app)
 
 
 def test_what_takes_long_says_that_it_is_at_work(monkeypatch: pytest.MonkeyPatch) -> None:

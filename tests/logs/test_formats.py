@@ -252,6 +252,8 @@ def test_meaning_and_attributes_are_kept(suffix: str, tmp_path: Path) -> None:
     logs.write(dataset, tmp_path / f"log{suffix}")
     back = logs.read(tmp_path / f"log{suffix}")
     assert back["run"].attrs["long_name"] == "the leg"
+    history = back.attrs.pop("history", "written by magbridge")
+    assert history.count("written by magbridge") == 1
     assert back.attrs == dataset.attrs | {"source": f"log{suffix} (made)"}
 
 

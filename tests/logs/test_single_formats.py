@@ -116,7 +116,7 @@ def test_netcdf_packed_by_words_is_one_line(tmp_path: Path) -> None:
 
 def test_an_attribute_whose_name_netcdf_forbids_is_left_out(tmp_path: Path) -> None:
     logs.write(deployment("made", [1.0], {}, attrs={"telemetry.a/b.max_age": 3.0}), tmp_path / "log.nc")
-    assert logs.read(tmp_path / "log.nc").attrs.keys() == {"source"}
+    assert logs.read(tmp_path / "log.nc").attrs.keys() == {"source", "history"}
 
 
 def test_parquet_of_someone_else(tmp_path: Path) -> None:
