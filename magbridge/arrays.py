@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["BoolArray", "FloatArray", "IndexArray", "IntArray", "RealArray"]
+__all__ = ["BoolArray", "FloatArray", "IndexArray", "IntArray", "RealArray", "plain"]
 
 BoolArray = NDArray[np.bool_]
 FloatArray = NDArray[np.float64]
@@ -15,3 +15,16 @@ RealArray = NDArray[np.floating[Any]]
 """Of either precision, as files hold them."""
 IndexArray = NDArray[np.intp]
 IntArray = NDArray[np.int64]
+
+
+def plain(value: object) -> object:
+    """Return a numpy number as Python's, for msgspec, which encodes no other.
+
+    Raises
+    ------
+    NotImplementedError
+        It is no number of numpy's.
+    """
+    if isinstance(value, np.generic):
+        return value.item()
+    raise NotImplementedError(f"{type(value).__name__} cannot be encoded")

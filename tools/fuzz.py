@@ -233,7 +233,9 @@ class Session:
     def save(self) -> None:
         """Write the counts."""
         self.state["seconds"] = round(time.monotonic() - self._began, 1)
-        self._state.write_text(json.dumps(self.state, indent=1))
+        beside = self._state.with_suffix(".partial")
+        beside.write_text(json.dumps(self.state, indent=1))
+        beside.replace(self._state)
 
 
 def blind(session: Session, read: Read, seeds: list[bytes], count: int, seconds: float) -> None:

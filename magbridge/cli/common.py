@@ -284,7 +284,9 @@ def refuse_unsuited(calibration: Calibration, deployment: xr.Dataset) -> None:
 
 def print_result(result: dict[str, Any], sentence: str, as_json: bool) -> None:
     """Print the result, for people or for machines."""
-    print(msgspec.json.encode(result).decode() if as_json else sentence)
+    from magbridge.arrays import plain
+
+    print(msgspec.json.encode(result, enc_hook=plain).decode() if as_json else sentence)
 
 
 def complain(sentence: str, code: int = 0) -> int:

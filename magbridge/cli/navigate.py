@@ -6,7 +6,6 @@ from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import numpy as np
 from cyclopts import Parameter, validators
 
 from magbridge.cli.common import (
@@ -197,9 +196,8 @@ def _bound(
 
 def _every(plan: xr.Dataset, calibration: Calibration | None) -> float:
     """Return the s between samples: those of a log, else those that a calibration was fitted to."""
-    times = plan["time"].to_numpy()
-    if times.size > 2 and {"mag_x", "total_field"} & set(plan.variables):
-        return float(np.median(np.diff(times)))
+    if plan.sizes["time"] > 2 and {"mag_x", "total_field"} & set(plan.variables):
+        return float(plan["time"].diff("time").median())
     if calibration is not None and calibration.noise.interval > 0.0:
         return calibration.noise.interval
     return 4.0

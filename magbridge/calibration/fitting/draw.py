@@ -13,6 +13,7 @@ from magbridge.calibration.fitting.validate import in_sensor_units
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.residual import rms, robust_scale
 from magbridge.files import atomic_path
+from magbridge.pictures import literal
 
 __all__ = ["draw_fit"]
 
@@ -71,6 +72,7 @@ def draw_fit(calibration: Calibration, data: Observations, path: str | Path) -> 
         markerscale=2,
     )  # fmt: skip
     with atomic_path(path) as partial:
+        literal(figure)
         figure.savefig(partial, dpi=110)
 
 

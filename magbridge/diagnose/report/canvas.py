@@ -12,6 +12,7 @@ from PIL import Image
 
 from magbridge.arrays import FloatArray
 from magbridge.diagnose.diagnosis import Diagnosis
+from magbridge.pictures import literal
 
 __all__ = [
     "AFTER",
@@ -68,6 +69,7 @@ def canvas(width: float, height: float, rows: int = 1, columns: int = 1, **more:
 
 def png(figure: Figure) -> str:
     """Return the picture as a PNG in base64, its colours those of a palette."""
+    literal(figure)
     drawn, packed = BytesIO(), BytesIO()
     figure.savefig(drawn, format="png")
     picture = Image.open(drawn).convert("RGB").quantize(COLOURS, dither=Image.Dither.NONE)

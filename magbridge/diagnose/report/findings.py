@@ -8,6 +8,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from magbridge.arrays import plain
 from magbridge.diagnose.causes import Cause
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.diagnosis import Diagnosis, Finding
@@ -47,7 +48,12 @@ def findings(
 
 def findings_json(diagnosis: Diagnosis, causes: Mapping[str, Cause], remarks: Sequence[str] = ()) -> bytes:
     """Return ``findings.json``."""
-    return msgspec.json.format(msgspec.json.encode(findings(diagnosis, causes, remarks)), indent=2) + b"\n"
+    return (
+        msgspec.json.format(
+            msgspec.json.encode(findings(diagnosis, causes, remarks), enc_hook=plain), indent=2
+        )
+        + b"\n"
+    )
 
 
 def _finding(diagnosis: Diagnosis, finding: Finding, causes: Mapping[str, Cause]) -> dict[str, Any]:
