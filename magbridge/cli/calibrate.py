@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from math import inf
@@ -37,6 +37,9 @@ if TYPE_CHECKING:
     from magbridge.calibration.fitting.fit import Fit
     from magbridge.calibration.fitting.observations import Observations
 
+ALL = "all"
+"""``--compass all``: a calibration for each compass."""
+
 
 @app.command(usage="Usage: magbridge calibrate FILE... --parameter NAME... -o cal.json [OPTIONS]")
 def calibrate(
@@ -55,6 +58,8 @@ def calibrate(
     json: Json = False,
 ) -> None:
     """Fit a calibration to logs of calibration runs.
+
+    With --compass all, every compass of the logs gets a calibration of its own: cal_0.json, cal_1.json.
 
     With --strict, also exit with 1 when the data do not support the fit.
 
@@ -98,6 +103,18 @@ def calibrate(
     """
     logs_to_read(files, output, vehicle, grid)
     check_inputs((*files, output), picture)
+    if reading.compass == ALL:
+        _each_compass(
+            files,
+            output,
+            reading,
+            lambda one, name, of: calibrate(
+                *files, output=name, picture=picture and _of(picture, of), reading=one, parameter=parameter,
+                order=order, method=method, vehicle=vehicle, grid=grid, site_bias=site_bias,
+                filter_corner=filter_corner, heading_reference=heading_reference, json=json,
+            ),
+        )  # fmt: skip
+        return
 
     from magbridge.calibration.file import save
     from magbridge.calibration.fitting.lowpass import unfiltered
@@ -113,8 +130,9 @@ def calibrate(
     if vehicle and method != "auto":
         raise WrongUse(f"--vehicle: method {method} does not use the positions of the masses; auto does")
     anomalies = read_grid(grid) if grid else None
-    logs = read_each(files, options=reading.options)
-    deployment = join(logs)
+    with waiting("reading"):
+        logs = read_each(files, options=reading.options)
+        deployment = join(logs)
     require(deployment, (*CHANNELS, *parameter))
     deployment = with_true_heading(deployment, heading_reference)
     note_losses(deployment.attrs)
@@ -143,6 +161,31 @@ def calibrate(
     )
     if reading.strict and not found.supported:
         raise DataError("the data do not support this fit (see the warnings), and --strict was given")
+
+
+def _of(path: Path, compass: int) -> Path:
+    """Return the name of a file for one of several compasses."""
+    return path.with_name(f"{path.stem}_{compass}{path.suffix}")
+
+
+def _each_compass(
+    files: tuple[Path, ...], output: Path, reading: Reading, fit: Callable[[Reading, Path, int], None]
+) -> None:
+    """Calibrate every compass of the logs; DataError: not one could be."""
+    from magbridge.logs import read_each
+    from magbridge.logs.compasses import compasses_of
+
+    first = replace(reading, compass=None)
+    found = {one.number for log in read_each(files, options=first.options) for one in compasses_of(log.attrs)}
+    failed = 0
+    for number in sorted(found) or [0]:
+        try:
+            fit(replace(reading, compass=str(number)), _of(output, number), number)
+        except DataError as error:
+            failed += 1
+            complain(f"compass {number}: {error}")
+    if failed == max(len(found), 1):
+        raise DataError(f"{files[0]}: not one of its compasses could be calibrated")
 
 
 @contextmanager

@@ -42,10 +42,16 @@ def info(*files: Path, reading: Reading = AS_THEY_SAY, json: Json = False) -> No
 
 
 def _show(file: str, facts: dict[str, Any]) -> None:
+    from msgspec import convert
     from rich.console import Console
+
+    from magbridge.logs.compasses import Compass
 
     console = Console(highlight=False, soft_wrap=False)
     console.print(f"[bold]{_plain(file)}[/bold]: {_plain(summary(facts))}")
+    for compass in facts["compasses"]:
+        one = convert(compass, Compass)
+        console.print(_plain(f"  {one.words}{', read as mag_x mag_y mag_z' * one.chosen}"))
     console.print(_columns(facts))
     console.print(_uses(facts))
     for hint in [*(f"guessed: {guess}" for guess in facts["guessed"]), *facts["hints"]]:

@@ -7,16 +7,19 @@ names, that is enabled and healthy. Unless the user asks for another, this one b
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
+import xarray as xr
 
+from magbridge.columns import CHANNELS, COLUMNS
 from magbridge.errors import FormatError
 
-__all__ = ["HEALTHY", "Compass", "choose", "compasses_of", "listed", "said"]
+__all__ = ["HEALTHY", "Compass", "by_columns", "choose", "compasses_of", "listed", "rate", "said"]
 
 HEALTHY = 0.5
 """Least share of its samples in which a compass in use is healthy."""
@@ -124,6 +127,34 @@ def said(found: Sequence[Compass], wanted: str | None) -> list[str]:
 def listed(found: Sequence[Compass]) -> dict[str, str]:
     """Return the attribute of a deployment that holds its compasses; none where there is only one unnamed."""
     return {ATTRIBUTE: msgspec.json.encode(found).decode()}
+
+
+def by_columns(deployment: xr.Dataset, wanted: str | None) -> xr.Dataset:
+    """Return a deployment whose ``mag_x`` is another of its columns, as ``mag2_x`` for the compass 1.
+
+    For formats that know columns, but no compasses: the rows stay those of the first.
+
+    Raises
+    ------
+    FormatError
+        There are no such columns.
+    """
+    there = [str(name) for name in deployment.data_vars]
+    numbers = [0, *(int(name[3:-2]) - 1 for name in there if re.fullmatch(r"mag[1-9]\d*_x", name))]
+    if wanted in (None, "0"):
+        return deployment
+    if not wanted.isdecimal() or int(wanted) not in numbers:
+        known = " ".join(str(number) for number in sorted(numbers))
+        raise FormatError(
+            deployment.attrs.get("source", ""), f"expected a compass {wanted!r}; there are: {known}"
+        )
+    moved = {f"mag_{axis}": f"mag1_{axis}" for axis in "xyz"}
+    moved |= {f"mag{int(wanted) + 1}_{axis}": f"mag_{axis}" for axis in "xyz"}
+    renamed = deployment.rename({old: new for old, new in moved.items() if old in deployment})
+    for name in CHANNELS:
+        if name in renamed:
+            renamed[name].attrs = dict(COLUMNS[name]._asdict())
+    return renamed
 
 
 def compasses_of(attrs: Mapping[Any, Any]) -> list[Compass]:

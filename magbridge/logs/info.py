@@ -6,11 +6,13 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
+from msgspec import to_builtins
 
 from magbridge.arrays import FloatArray
 from magbridge.columns import AGE, CHANNELS, COLUMNS, NT_PER_UNIT
 from magbridge.field.igrf import magnitude
-from magbridge.logs.deployment import MEANING, passed_over
+from magbridge.logs.compasses import compasses_of
+from magbridge.logs.deployment import MEANING, noted, passed_over
 
 __all__ = ["USES", "info", "lacking", "telemetry"]
 
@@ -54,7 +56,8 @@ def info(log: xr.Dataset) -> dict[str, Any]:
     -------
     dict
         ``rows``, ``start``, ``end`` (s since 1970), ``interval_s``, ``rate_hz``, ``gaps``, ``longest_gap_s``,
-        ``references`` (what heading and time refer to), ``guessed`` and ``skipped``, ``columns`` (name, unit,
+        ``references`` (what heading and time refer to), ``guessed``, ``skipped``,
+        ``notes``, ``compasses``, ``columns`` (name, unit,
         meaning, share known, lowest, highest, interval of its changes), ``uses`` (command -> what it lacks)
         and ``hints``.
     """
@@ -75,6 +78,8 @@ def info(log: xr.Dataset) -> dict[str, Any]:
         "references": {name: str(log.attrs.get(name, default)) for name, default in MEANING.items()},
         "guessed": [part for part in str(log.attrs.get("guessed", "")).split("; ") if part],
         "skipped": passed_over(log.attrs),
+        "compasses": [to_builtins(one) for one in compasses_of(log.attrs)],
+        "notes": noted(log.attrs),
         "columns": columns,
         "uses": {command: lacking(log, needs) for command, needs in USES.items()},
         "hints": _hints(log, columns),

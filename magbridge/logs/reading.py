@@ -166,6 +166,10 @@ def _chunks(path: Path, rows: int, options: Options) -> Iterator[xr.Dataset]:
     part = None
     try:
         numbered = _numbered(guarded(path, pieces) if form.guarded else pieces())
+        if options.compass is not None and not form.compasses:
+            from magbridge.logs.compasses import by_columns  # noqa: PLC0415 - xarray is for ashore
+
+            numbered = ((by_columns(piece, options.compass), rows) for piece, rows in numbered)
         if options.declared.columns and not form.maps_columns:
             from magbridge.logs.mapping import renamed  # noqa: PLC0415 - xarray is for ashore
 

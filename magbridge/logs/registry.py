@@ -42,6 +42,8 @@ class Format(NamedTuple):
     writes: bool = False
     guarded: bool = False
     """Whether another library reads it, which damage may hang or crash: it is read in a child process."""
+    compasses: bool = False
+    """Whether it heeds itself which compass the options ask for; else its columns are looked through."""
     maps_columns: bool = False
     """Whether it heeds itself what the options declare of columns; else they are renamed when it is read."""
 
@@ -55,18 +57,21 @@ FORMATS: dict[str, Format] = {
         "magbridge.logs.netcdf", (".nc",), rb"CDF[\x01\x02\x05]|\x89HDF\r\n\x1a\n", writes=True, guarded=True
     ),
     "parquet": Format("magbridge.logs.parquet", (".parquet",), rb"PAR1", writes=True, guarded=True),
-    "ardupilot": Format("magbridge.logs.ardupilot", (".bin", ".log"), rb"\xa3\x95\x80\x80|FMT, ?\d+, ?\d+,"),
-    "px4": Format("magbridge.logs.px4", (".ulg",), rb"ULog\x01\x12\x35", guarded=True),
+    "ardupilot": Format(
+        "magbridge.logs.ardupilot", (".bin", ".log"), rb"\xa3\x95\x80\x80|FMT, ?\d+, ?\d+,", compasses=True
+    ),
+    "px4": Format("magbridge.logs.px4", (".ulg",), rb"ULog\x01\x12\x35", guarded=True, compasses=True),
     "slocum": Format("magbridge.logs.slocum", (*FLIGHT, *FLIGHT.values()), rb".{0,8}dbd_label", guarded=True),
     "ros": Format(
         "magbridge.logs.rosbag",
         (".bag", ".db3", ".mcap"),
         rb"#ROSBAG V2|\x89MCAP0\r\n|SQLite format 3\0",
         guarded=True,
+        compasses=True,
     ),
     # 8 bytes of time, µs since 1970 (before 2079), then a frame of either MAVLink
     "telemetry": Format(
-        "magbridge.logs.telemetry", (".tlog",), rb"\x00[\x00-\x0c].{6}[\xfd\xfe]", writes=True
+        "magbridge.logs.telemetry", (".tlog",), rb"\x00[\x00-\x0c].{6}[\xfd\xfe]", writes=True, compasses=True
     ),
     "csv": Format("magbridge.logs.text", (".csv",), writes=True, maps_columns=True),
     "seaglider": Format("magbridge.logs.seaglider_text", (".eng",), rb"%?version: [\d.]+\s+%?glider:"),

@@ -28,11 +28,13 @@ from collections.abc import Callable, Iterator
 from itertools import chain
 from math import isclose, isnan, nan
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import xarray as xr
 
 from magbridge.columns import AGE, CHANNEL_TIMES, CORRECTED
+from magbridge.logs.compasses import Compass, by_columns, choose
 from magbridge.logs.deployment import deployment, sliced
 from magbridge.logs.resample import MAX_AGE
 from magbridge.logs.telemetry_columns import whole
@@ -41,6 +43,9 @@ from magbridge.logs.telemetry_survey import Survey, survey
 from magbridge.logs.telemetry_writer import FileWriter
 from magbridge.mavlink import LogReader, Record, spec
 from magbridge.records import Channel
+
+if TYPE_CHECKING:
+    from magbridge.logs.options import Options
 
 __all__ = ["FileWriter", "chunks"]
 
@@ -52,7 +57,7 @@ FIELD, STEP, NAMED = spec("MAG_FIELD").id, spec("MAG_CLOCK_STEP").id, spec("NAME
 TIMES = ("time", *CHANNEL_TIMES)
 
 
-def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
+def chunks(path: Path, rows: int, options: Options | None = None) -> Iterator[xr.Dataset]:
     """Yield the log as deployments of at most `rows` rows; it is read twice.
 
     Raises
@@ -62,8 +67,9 @@ def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
     """
     status = path.stat()
     found = survey(path, status.st_mtime_ns, status.st_size)
+    wanted = options.compass if options else None
     if found.plain:
-        yield from sliced(whole(path, found), rows)
+        yield from sliced(whole(path, *_of_compass(path, found, wanted), wanted), rows)
         return
     pieces = Rows(path, found)
     with path.open("rb") as file:
@@ -71,9 +77,18 @@ def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
         for record in pieces.reader:
             pieces.put(record)
             if len(pieces.rows) > rows:  # the last one still waits for its correction
-                yield pieces.take(rows)
+                yield by_columns(pieces.take(rows), wanted)
         if pieces.rows:
-            yield pieces.take(len(pieces.rows))
+            yield by_columns(pieces.take(len(pieces.rows)), wanted)
+
+
+def _of_compass(path: Path, found: Survey, wanted: str | None) -> tuple[Survey, list[Compass]]:
+    """Return the survey with the compass that is wanted as the source of its rows, and all compasses."""
+    if not (there := found.compasses):
+        return found, []
+    compasses = choose(path, there, wanted)
+    chosen = next(one for one in compasses if one.chosen)
+    return found.of_compass(chosen.id), compasses
 
 
 class Rows:

@@ -6,13 +6,16 @@ wrote; here each field of all messages is read at once.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import xarray as xr
+from msgspec.structs import replace
 
 from magbridge.arrays import FloatArray, IndexArray
-from magbridge.logs.deployment import deployment
+from magbridge.logs.compasses import Compass, listed, said
+from magbridge.logs.deployment import NOTES, deployment, noted
 from magbridge.logs.resample import MAX_AGE
 from magbridge.logs.telemetry_fields import IMUS, TELEMETRY
 from magbridge.logs.telemetry_survey import Survey
@@ -26,7 +29,7 @@ Part = tuple[IndexArray, IndexArray, FloatArray]
 """Places in the file (m,), µs (m,) and values (m,)."""
 
 
-def whole(path: Path, survey: Survey) -> xr.Dataset:
+def whole(path: Path, survey: Survey, compasses: Sequence[Compass], wanted: str | None) -> xr.Dataset:
     """Return the log as one deployment; of the file, one block at a time is held."""
     source = spec(survey.source).id
     own = IMUS.get(survey.source, [])
@@ -57,6 +60,11 @@ def whole(path: Path, survey: Survey) -> xr.Dataset:
         columns["heading"] %= 360.0
     units = {name: survey.columns.get(name, "") for name in columns}
     attrs = {**survey.attrs, "bytes_skipped": skipped, "damages": damages}
+    if compasses:
+        seconds = float(time_us[-1] - time_us[0]) / 1e6
+        timed = [replace(one, rate=(one.samples - 1) / seconds if seconds > 0 else 0.0) for one in compasses]
+        attrs |= listed(timed)
+        attrs[NOTES] = "\n".join([*noted(survey.attrs), *said(timed, wanted)])
     return deployment(path, time_us / 1e6, columns, units, attrs)
 
 

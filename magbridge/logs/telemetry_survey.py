@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from contextlib import suppress
+from copy import copy
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 from magbridge.arrays import IndexArray
 from magbridge.columns import AGE, CHANNELS
 from magbridge.errors import FormatError
+from magbridge.logs.compasses import Compass
 from magbridge.logs.deployment import CHANGES
 from magbridge.logs.telemetry_fields import SOURCES, TELEMETRY, Declared, Value, correction, sample
 from magbridge.mavlink import Message, spec
@@ -27,6 +29,8 @@ START, BYTES = spec("MAG_BRIDGE_START").id, spec("MAG_SENSOR_BYTES").id
 SET, VALUE = spec("PARAM_SET").id, spec("PARAM_VALUE").id
 NAMED = spec("NAMED_VALUE_FLOAT")
 UNITS = {"sensor_supply": "V"}
+NUMBERS = {"HIGHRES_IMU": 0, "RAW_IMU": 0, "SCALED_IMU": 0, "SCALED_IMU2": 1, "SCALED_IMU3": 2}
+"""Message to the number of the compass whose field it holds; of several for one, the first is read."""
 AUTOPILOT = 1
 GIMBALS = {154, 171, 172, 173, 174, 175}
 """Components whose attitude is their own, and not the vehicle's."""
@@ -86,6 +90,22 @@ class Survey:
             self._name()
             return
         raise FormatError(path, f"expected MAVLink records with one of {' '.join(SOURCES)}")
+
+    @property
+    def compasses(self) -> list[Compass]:
+        """The compasses whose field messages of the sender hold: ``RAW_IMU`` has the first."""
+        found = {}
+        for message, number in NUMBERS.items():
+            n = self._senders.get(spec(message).id, Counter())[self.system, self.component]
+            if n and number not in found:
+                found[number] = Compass(number, n, 0.0, message)
+        return [found[number] for number in sorted(found)]
+
+    def of_compass(self, message: str) -> Survey:
+        """Return the survey with the rows made by another message."""
+        other = copy(self)
+        other.source = message
+        return other
 
     @property
     def plain(self) -> bool:

@@ -14,7 +14,21 @@ from fastcrc.crc16 import mcrf4xx
 from magbridge.mavlink.dialect import MESSAGES
 from magbridge.mavlink.messages import Message, Spec, spec
 
-__all__ = ["MAGIC", "MORE", "NOT_A_FRAME", "find_magic", "frame_end", "join", "message"]
+__all__ = [
+    "AFTER",
+    "EXTRA",
+    "LAST",
+    "MAGIC",
+    "MORE",
+    "NOT_A_FRAME",
+    "SIGNATURE",
+    "V1",
+    "V2",
+    "find_magic",
+    "frame_end",
+    "join",
+    "message",
+]
 
 V1: Final = 0xFE
 V2: Final = 0xFD

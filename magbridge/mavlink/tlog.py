@@ -11,7 +11,7 @@ import msgspec
 from magbridge.mavlink.framing import MAGIC, MORE, NOT_A_FRAME, find_magic, frame_end, message
 from magbridge.mavlink.messages import Message
 
-__all__ = ["LogReader", "Record", "pack_record", "pack_records"]
+__all__ = ["LATEST", "LogReader", "Record", "pack_record", "pack_records"]
 
 STAMP: Final = Struct(">Q")
 LATEST: Final = 1 << 52

@@ -1,0 +1,178 @@
+"""Bags of robots: written by rosbags, read back in this project's frames, and beside rosbags' own reading."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from magbridge import logs
+from magbridge.errors import FormatError
+from magbridge.logs.compasses import compasses_of
+from magbridge.logs.deployment import noted
+
+pytest.importorskip("rosbags")
+from rosbags.highlevel import AnyReader
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as Writer2
+from rosbags.typesys import Stores, get_typestore
+
+T0 = 1_700_000_000
+ANGLES = np.random.default_rng(0).uniform([-180, -89, 0], [180, 89, 360], (40, 3))
+FIELD = np.random.default_rng(1).normal(0, 3e-5, (40, 3))
+"""T, in ROS' axes."""
+
+
+def bag(
+    path: Path,
+    kind: str = "sqlite3",
+    scale: float = 1.0,
+    frame: str = "map",
+    more: Callable[..., None] | None = None,
+) -> Path:
+    """Write a bag: ``ros1``, ``sqlite3`` or ``mcap``."""
+    one = kind == "ros1"
+    store = get_typestore(Stores.ROS1_NOETIC if one else Stores.ROS2_HUMBLE)
+    types: Any = store.types
+    writer: Any = (
+        Writer1(path)
+        if one
+        else Writer2(path, version=9, storage_plugin=getattr(StoragePlugin, kind.upper()))
+    )
+    serialize = store.serialize_ros1 if one else store.serialize_cdr
+
+    def header(k: int, name: str) -> Any:
+        stamp = types["builtin_interfaces/msg/Time"](sec=T0 + k // 10, nanosec=k % 10 * 100_000_000)
+        extra = {"seq": k} if one else {}
+        return types["std_msgs/msg/Header"](stamp=stamp, frame_id=name, **extra)
+
+    vector, nine = types["geometry_msgs/msg/Vector3"], np.zeros(9)
+    with writer:
+        topics: dict[str, Any] = {}
+
+        def say(topic: str, message: str, k: int, /, **fields: Any) -> None:
+            if topic not in topics:
+                topics[topic] = writer.add_connection(topic, message, typestore=store)
+            writer.write(
+                topics[topic], (T0 * 10 + k) * 100_000_000 + 7, serialize(types[message](**fields), message)
+            )
+
+        for k, (angles, field) in enumerate(zip(ANGLES, FIELD, strict=True)):
+            # from FRD to NED, turned to FLU and ENU
+            turned = Rotation.from_euler("ZYX", angles[::-1], degrees=True).as_matrix()
+            enu = np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1.0]]) @ turned @ np.diag([1, -1, -1.0])
+            q = types["geometry_msgs/msg/Quaternion"](*Rotation.from_matrix(enu).as_quat())
+            say(
+                "/imu/data", "sensor_msgs/msg/Imu", k, header=header(k, "imu"), orientation=q,
+                orientation_covariance=nine, angular_velocity=vector(1, 2, 3),
+                angular_velocity_covariance=nine, linear_acceleration=vector(4, 5, 6),
+                linear_acceleration_covariance=nine,
+            )  # fmt: skip
+            say(
+                "/joints", "sensor_msgs/msg/JointState", k, header=header(k, ""), name=["arm lift", "grip"],
+                position=np.array([0.01 * k, 1.0]), velocity=np.array([]), effort=np.array([]),
+            )  # fmt: skip
+            if more is not None:
+                more(say, types, header, k, frame)
+            say(
+                "/imu/mag", "sensor_msgs/msg/MagneticField", k, header=header(k, "mag" * (1 + k % 2)),
+                magnetic_field=vector(*(scale * field)), magnetic_field_covariance=nine,
+            )  # fmt: skip
+    return path
+
+
+@pytest.mark.parametrize("kind", ["ros1", "sqlite3", "mcap"])
+def test_a_bag_in_our_frames(kind: str, tmp_path: Path) -> None:
+    back = logs.read(bag(tmp_path / ("log.bag" if kind == "ros1" else "log"), kind))
+    np.testing.assert_allclose(back["time"], T0 + 0.1 * np.arange(40), rtol=0, atol=1e-6)
+    for axis, values in zip("xyz", (1e9 * FIELD * [1, -1, -1]).T, strict=True):
+        np.testing.assert_allclose(back[f"mag_{axis}"], values, rtol=1e-12)
+    for name, values in zip(("roll", "pitch", "heading"), ANGLES.T, strict=True):
+        np.testing.assert_allclose(back[name], values, atol=1e-6, err_msg=name)
+    np.testing.assert_allclose(back["arm_lift"], 0.01 * np.arange(40))
+    assert "ENU to NED" in back.attrs["history"]
+    assert [one.id for one in compasses_of(back.attrs)] == ["/imu/mag"]
+    assert not noted(back.attrs)
+
+
+@pytest.mark.parametrize("kind", ["sqlite3", "mcap"])
+def test_one_file_of_a_bag(kind: str, tmp_path: Path) -> None:
+    """Without the folder's metadata, as Foxglove has them."""
+    folder = bag(tmp_path / "log", kind)
+    (file,) = folder.glob("*.db3" if kind == "sqlite3" else "*.mcap")
+    whole = logs.read(folder)
+    xr_equal = logs.read(file)
+    for name in whole.data_vars:
+        np.testing.assert_array_equal(xr_equal[name], whole[name])
+
+
+def test_every_sample_is_as_rosbags_reads_it(tmp_path: Path) -> None:
+    path = bag(tmp_path / "log")
+    with AnyReader([path]) as reader:
+        wanted = [one for one in reader.connections if one.topic == "/imu/mag"]
+        theirs: list[Any] = [
+            reader.deserialize(raw, connection.msgtype) for connection, _, raw in reader.messages(wanted)
+        ]
+    back = logs.read(path)
+    np.testing.assert_array_equal(back["mag_x"], [1e9 * one.magnetic_field.x for one in theirs])
+    np.testing.assert_array_equal(back["mag_z"], [-1e9 * one.magnetic_field.z for one in theirs])
+
+
+@pytest.mark.parametrize(("unit", "per_tesla"), [("G", 1e4), ("uT", 1e6), ("mG", 1e7)])
+def test_a_driver_that_does_not_publish_tesla_is_told_of(unit: str, per_tesla: float, tmp_path: Path) -> None:
+    back = logs.read(bag(tmp_path / "log", scale=per_tesla))
+    np.testing.assert_allclose(back["mag_x"], 1e9 * FIELD[:, 0], rtol=1e-9)
+    (note,) = noted(back.attrs)
+    assert note.endswith(f" {unit}")
+    assert "is no field on Earth" in note
+    assert note in back.attrs["history"]
+
+
+def test_no_unit_fits(tmp_path: Path) -> None:
+    """A field that would be the Earth's in no unit stays what the message says."""
+    back = logs.read(bag(tmp_path / "log", scale=1e12))
+    np.testing.assert_allclose(back["mag_x"], 1e21 * FIELD[:, 0], rtol=1e-9)
+    assert not noted(back.attrs)
+
+
+def _odometry(say: Any, types: Any, header: Any, k: int, frame: str) -> None:
+    """Sail east at 2 m/s, the bow to the east."""
+    pose = types["geometry_msgs/msg/Pose"](
+        position=types["geometry_msgs/msg/Point"](x=0.2 * k, y=5.0, z=-3.0),
+        orientation=types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0),
+    )
+    vector = types["geometry_msgs/msg/Vector3"]
+    twist = types["geometry_msgs/msg/Twist"](linear=vector(2.0, 0.0, 0.0), angular=vector(0.0, 0.0, 0.0))
+    say(
+        "/odom", "nav_msgs/msg/Odometry", k, header=header(k, frame), child_frame_id="base_link",
+        pose=types["geometry_msgs/msg/PoseWithCovariance"](pose=pose, covariance=np.zeros(36)),
+        twist=types["geometry_msgs/msg/TwistWithCovariance"](twist=twist, covariance=np.zeros(36)),
+    )  # fmt: skip
+
+
+def test_an_odometry_of_the_map_is_dead_reckoning(tmp_path: Path) -> None:
+    back = logs.read(bag(tmp_path / "log", more=_odometry))
+    np.testing.assert_allclose(back["local_east"], 0.2 * np.arange(40))
+    np.testing.assert_allclose(back["local_north"], 5.0)
+    np.testing.assert_allclose(back["velocity_east"], 2.0)
+    np.testing.assert_allclose(back["velocity_north"], 0.0, atol=1e-12)
+
+
+def test_an_odometry_of_its_own_frame_is_no_position(tmp_path: Path) -> None:
+    back = logs.read(bag(tmp_path / "log", frame="odom", more=_odometry))
+    assert "local_east" not in back
+    np.testing.assert_allclose(back["odom_x"], 0.2 * np.arange(40))
+
+
+@pytest.mark.parametrize("kept", [0.3, 0.9])
+def test_a_bag_that_breaks_off_is_one_line(kept: float, tmp_path: Path) -> None:
+    path = bag(tmp_path / "log.bag", "ros1")
+    data = path.read_bytes()
+    path.write_bytes(data[: int(kept * len(data))])
+    with pytest.raises(FormatError, match=r"log\.bag: .*ROS bag"):
+        logs.read(path)
