@@ -29,7 +29,7 @@ def left_open(data: Observations, length: float) -> Iterator[str]:
     if data.place is None or data.unmapped is None or not data.unmapped.all():
         return
     place, course = _courses(data.place[:, :2])
-    if np.ptp(place, axis=0).max(initial=0.0) < SHARE * length:
+    if not len(place) or np.ptp(place, axis=0).max() < SHARE * length:
         return  # all at one place: the rock is a constant
     cells, reversed_cells = crossed(place, course, SHARE * length)
     if cells + reversed_cells == 0:
