@@ -74,6 +74,10 @@ FORMATS: dict[str, Format] = {
         "magbridge.logs.telemetry", (".tlog",), rb"\x00[\x00-\x0c].{6}[\xfd\xfe]", writes=True, compasses=True
     ),
     "csv": Format("magbridge.logs.text", (".csv",), writes=True, maps_columns=True),
+    "seaexplorer": Format(
+        "magbridge.logs.seaexplorer", (".gz",), rb"Timestamp;NavState;|PLD_REALTIMECLOCK;|\x1f\x8b"
+    ),
+    "iaga2002": Format("magbridge.logs.iaga", (), rb" ?Format +IAGA-2002"),
     "seaglider": Format("magbridge.logs.seaglider_text", (".eng",), rb"%?version: [\d.]+\s+%?glider:"),
     "text": Format("magbridge.logs.text", (".txt", ".tsv", ".dat", ".asc"), maps_columns=True),
 }

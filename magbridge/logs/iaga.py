@@ -1,0 +1,88 @@
+"""IAGA-2002: an observatory's or a base station's field, minute by minute or second by second.
+
+The elements become ``observatory_x`` (or ``_h``, ``_d`` ...), nT or minutes of arc, and the total field is
+``total_field``: F where it is there, else from the vector. The place is the observatory's.
+
+References
+----------
+IAGA-2002 Data Exchange Format, https://www.ncei.noaa.gov/services/world-data-system/v-dat-working-group/iaga-2002-data-exchange-format
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+
+from magbridge.arrays import FloatArray
+from magbridge.errors import FormatError
+from magbridge.logs.deployment import deployment, sliced, with_losses
+
+__all__ = ["chunks"]
+
+UNKNOWN = 88_888.0
+"""nT; this, and 99,999, stand for what was not recorded, or not observed."""
+TOTALS = (("f",), ("s",), ("x", "y", "z"), ("h", "z"))
+"""Elements whose length is the total field, the surest first."""
+
+
+def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
+    """Yield the file in pieces of at most `rows` rows.
+
+    Raises
+    ------
+    FormatError
+        No header of the format, or no rows.
+    """
+    lines = path.read_text(encoding="ascii", errors="replace").splitlines()
+    first = next((k for k, line in enumerate(lines) if line.startswith("DATE ")), None)
+    if first is None:
+        raise FormatError(path, "expected the line DATE TIME DOY ... of IAGA-2002")
+    head = {line[1:24].strip().lower(): line[24:69].strip() for line in lines[:first]}
+    elements = [name[-1].lower() for name in lines[first].split()[3:7]]
+    fields = [line.split() for line in lines[first + 1 :] if line.strip()]
+    whole = [parsed for one in fields if (parsed := _row(one, len(elements))) is not None]
+    if not whole:
+        raise FormatError(path, "expected rows, there are none", row=first + 2)
+    time, *values = np.array(whole).T
+    by_element = {
+        name: np.where(np.abs(value) >= UNKNOWN, np.nan, value)
+        for name, value in zip(elements, values, strict=True)
+    }
+    columns = {f"observatory_{name}": value for name, value in by_element.items()}
+    units = {name: "arcmin" if name[-1] in "di" else "nT" for name in columns}
+    if (total := _total(by_element)) is not None:
+        columns["total_field"] = total
+    for name in ("latitude", "longitude"):
+        try:
+            place = float(head.get(f"geodetic {name}") or "nan")
+        except ValueError:
+            raise FormatError(path, "expected a number of degrees", column=f"Geodetic {name}") from None
+        columns[name] = np.full(len(time), (place + 180.0) % 360.0 - 180.0 if name == "longitude" else place)
+    attrs = {"observatory": head.get("iaga code", "")}
+    read = deployment(path, time, columns, units, attrs)
+    yield from sliced(with_losses(read, {"rows_dropped": len(fields) - len(whole)}), rows)
+
+
+def _row(fields: list[str], elements: int) -> list[float] | None:
+    """Return time (s since 1970) and values of a row; None for one that is damaged."""
+    try:
+        date, clock, _, *values = fields
+        when = datetime.fromisoformat(f"{date}T{clock}").replace(tzinfo=UTC).timestamp()
+        numbers = [float(value) for value in values[:elements]]
+    except ValueError:
+        return None
+    return [when, *numbers] if len(numbers) == elements else None
+
+
+def _total(elements: dict[str, FloatArray]) -> FloatArray | None:
+    """Return the total field (n,), nT, from the elements, (n,) each; None: they do not give it."""
+    total: FloatArray | None = None
+    for names in TOTALS:
+        if set(names) <= elements.keys():
+            length = np.sqrt(sum(np.square(elements[name]) for name in names))
+            total = length if total is None else np.where(np.isnan(total), length, total)
+    return total
