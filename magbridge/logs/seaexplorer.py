@@ -2,8 +2,9 @@
 
 Text with semicolons; positions are degrees and minutes written together, 9999 is a code for "not known". Of
 the navigation, ``LinPos`` (mm) and ``AngPos`` (deg) are where the battery is, ``BallastPos`` (cc) is the
-ballast: moving masses, as ``battpos``, ``battery_roll`` and ``ballast``. A payload's columns keep their names in small
-letters, but for the CTD's and a vector magnetometer's. Give both files: their rows are joined in time.
+ballast: moving masses, as ``battpos``, ``battery_roll`` and ``ballast``. A payload's columns keep their names
+in small letters, but for the CTD's and a vector magnetometer's. Give both files: their rows are joined in
+time.
 
 Whether ``Heading`` is true or magnetic the file does not say. It is taken as true, and said; against the
 compass of an acoustic profiler on SEA063 it was 14 deg off (quartiles 12 and 16) where the declination was 6.
