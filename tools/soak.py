@@ -1,0 +1,174 @@
+"""Hours at 1 kHz, in accelerated time, with faults drawn at random: counts exact, memory flat, nothing wrong.
+
+    python3 tools/soak.py                    2 minutes of the instrument's time
+    python3 tools/soak.py --minutes 1440     a day: some hours of a core
+
+Bytes of an emulated digitizer and of an autopilot go straight into the bridge's pipeline. In the end,
+readings made = samples + lost, as MAG_STATUS tells; a sample without a flag lies within five of its sigmas.
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+import tracemalloc
+from pathlib import Path
+
+import numpy as np
+from terminal import command_line
+
+from magbridge.bridge import states
+from magbridge.bridge.drive import set_up
+from magbridge.bridge.events import Event, Start
+from magbridge.calibration.file import save
+from magbridge.calibration.model import Calibration, Noise, Parameter, Reference, Sensor
+from magbridge.calibration.terms import Polynomial
+from magbridge.config import load
+from magbridge.mavlink import Codec, Message
+from magbridge.records import Channel, Quality, Reading
+from sitl.fluxgate import open_encoder
+
+CONFIG = """
+[sensor]
+driver = "digitizer"
+port = "/dev/null"
+options = {sensitivity = 5e-5, reference_voltage = 5.0}
+[link]
+url = "udpout:127.0.0.1:14550"
+[telemetry.battpos]
+message = "NAMED_VALUE_FLOAT"
+match = {name = "battpos"}
+field = "value"
+[calibration]
+file = "cal.json"
+"""
+BEGIN_US = 1_780_000_000_000_000
+TRUTH = np.array([20_000.0, 1_000.0, 40_000.0])
+"""nT."""
+SLOPE = np.array([300.0, -200.0, 100.0])
+"""nT that the mass adds from 0 to 1."""
+FAULTS = ("unplugged", "damaged", "twice", "standstill", "spike", "moves")
+EVERY = 5_000
+"""Readings between two faults, on average."""
+
+
+def calibration() -> Calibration:
+    """Return what is right for a mass whose field is `SLOPE` times its position."""
+    return Calibration(
+        parameters=(Parameter("battpos", "", -1.0, 1.0, 0.0, 1.0),),
+        terms=(Polynomial(exponents=((0,), (1,))),),
+        coefficients=np.array([0.0] * 15 + [*SLOPE]),
+        covariance=np.eye(18),
+        noise=Noise(1.0),
+        reference=Reference(float(np.linalg.norm(TRUTH))),
+        sensor=Sensor("digitizer"),
+        method="made for a soak",
+    )
+
+
+class Soak:
+    """A bridge, its instrument and autopilot, and the account of what was made."""
+
+    def __init__(self, folder: Path, seed: int) -> None:
+        save(calibration(), folder / "cal.json")
+        (folder / "bridge.toml").write_text(CONFIG, encoding="utf-8")
+        config = load(folder / "bridge.toml")
+        self.pipeline = set_up(config, Start(BEGIN_US))
+        self.encoder = open_encoder("digitizer", config.sensor.options)
+        self.rng = np.random.default_rng(seed)
+        self.made = self.published = self.wrong = self.flagged = 0
+        self.done = dict.fromkeys(FAULTS, 0)
+        self.position = 0.0
+        self.later_us = 0
+        self.status: Message | None = None
+        self._ear, self._autopilot = Codec(0, 0), Codec(1, 1)
+
+    def reading(self, extra: float = 0.0) -> bytes:
+        """Return the bytes of the next reading, whether anybody hears them or not."""
+        self.made += 1
+        field = TRUTH + SLOPE * self.position + self.rng.normal(0.0, 1.0, 3) + [0.0, 0.0, extra]
+        x, y, z = field.tolist()
+        return self.encoder.encode(Reading((x, y, z), device_time=self.made * 1e-3 % 4294.967296, supply=3.7))
+
+    def feed(self, channel: Channel, data: bytes) -> None:
+        """Let the bridge have bytes now, and look at what it says of them."""
+        event = Event(BEGIN_US + self.made * 1000 + 400 + self.later_us, channel, data)
+        for _, frame in self.pipeline.feed(event):
+            for message in self._ear.parse(frame):
+                if message.name == "MAG_STATUS":
+                    self.status = message
+                if message.name != "MAG_FIELD":
+                    continue
+                self.published += 1
+                flags = message["flags"] & ~Quality.NO_BORESIGHT
+                error = abs(message["total_field"] - float(np.linalg.norm(TRUTH)))
+                self.flagged += flags != 0
+                self.wrong += flags == 0 and not error <= 5.0 * message["total_field_sigma"]
+
+    def telemetry(self) -> None:
+        """Send the mass's position."""
+        frame = self._autopilot.pack("NAMED_VALUE_FLOAT", name="battpos", value=self.position)
+        self.feed(Channel.LINK, frame)
+
+    def fault(self) -> None:
+        """Draw a fault and let it happen."""
+        which = FAULTS[self.rng.integers(len(FAULTS))]
+        self.done[which] += 1
+        if which == "unplugged":  # for up to three turns of the number
+            for _ in range(int(self.rng.integers(1, 200_000))):
+                self.made += 1
+                self.encoder.sequence += 1
+            self.telemetry()
+        elif which == "damaged":
+            self.feed(Channel.SENSOR, self.reading()[:20] + b"\xff\x00")
+        elif which == "twice":
+            self.feed(Channel.SENSOR, self.reading())
+            self.feed(Channel.LINK, b"\xfd\x00noise")
+        elif which == "standstill":
+            count = int(self.rng.integers(500, 3000))
+            waited = b"".join([self.reading() for _ in range(count)])
+            end_us = BEGIN_US + self.made * 1000 + 400
+            self.feed(Channel.STATE, states.standstill(end_us, count * 1000))
+            self.telemetry()
+            self.feed(Channel.SENSOR, waited)
+        elif which == "spike":
+            self.feed(Channel.SENSOR, self.reading(extra=500.0))
+        else:
+            self.telemetry()
+            self.position = float(self.rng.uniform(-1.0, 1.0))
+            self.telemetry()
+
+
+def main() -> int:
+    parser = command_line(__doc__)
+    parser.add_argument("--minutes", type=float, default=2.0)
+    parser.add_argument("--seed", type=int, default=1)
+    chosen = parser.parse_args()
+    with tempfile.TemporaryDirectory() as name:
+        soak = Soak(Path(name), chosen.seed)
+        last = round(chosen.minutes * 60_000)
+        early = 0
+        while soak.made < last:
+            if soak.made % 100 == 0:
+                soak.telemetry()
+            soak.feed(Channel.SENSOR, soak.reading())
+            if soak.rng.random() < 1.0 / EVERY and soak.made > 20_000:
+                soak.fault()
+            if not early and soak.made > last // 3:
+                tracemalloc.start()
+                early = tracemalloc.get_traced_memory()[0] + 1
+        for _ in range(3):
+            soak.feed(Channel.SENSOR, soak.reading())
+        grown = tracemalloc.get_traced_memory()[0] - early if early else 0
+        soak.later_us = 2_000_000
+        soak.feed(Channel.STATE, b"")  # the last status
+        assert soak.status is not None
+        lost, samples = soak.status["samples_lost"], soak.status["samples"]
+    print(f"made {soak.made}, published {samples}, lost {lost}: difference {soak.made - samples - lost}")
+    print(f"flagged {soak.flagged}, wrong without a flag {soak.wrong}, memory grown by {grown / 1e3:.0f} kB")
+    print(", ".join(f"{what} {count}" for what, count in soak.done.items()))
+    return int(soak.made != samples + lost or soak.wrong > 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
