@@ -6,7 +6,7 @@ Gliders of tools/navigation.py's study, on its maps: GPS for ten minutes, then n
 again. Each is sailed twice for every kind of fix and every kind of telemetry that an autopilot may send: with
 one that ignores fixes, and with one that takes them by the rules of ArduPilot or PX4 (``sitl/referee``).
 
-follows       what the bridge's dead reckoning followed at the end
+follows       what the bridge's dead reckoning followed while GPS was lost
 obeying m     root mean square error of the bridge's position without GPS, with the autopilot that takes fixes
 ignoring m    with the one that does not
 ratio         the former over the latter
@@ -31,12 +31,12 @@ from msgspec.structs import replace
 from terminal import command_line
 from voyages.simulated import GLIDER, HOUR, SPEEDS, Map, synthetic, voyage
 
-from magbridge.bridge.motion import Source
 from sitl.referee import ArduPilot, Autopilot, Px4
 from sitl.referee.loop import Passage, Run, sail
 
 LOST, BACK = 600.0, 300.0
 """s: GPS is lost after the first, and back the second before the end."""
+FOLLOWS = "dead reckoning by "
 MAPS = (Map(20, 1000), Map(60, 2000))
 STREAMS = {
     "speed": ("VFR_HUD",),
@@ -96,21 +96,22 @@ def one(case: Case) -> list[str]:
     grid, way = synthetic(case.kind, case.seed % 10), passage(case)
     options = replace(GLIDER, start_sigma=0.2 * grid.correlation_length)
 
-    def run(obeys: bool) -> tuple[Run, Autopilot, Source]:
+    def run(obeys: bool) -> tuple[Run, Autopilot]:
         make = partial(case.stack, streams=STREAMS[case.streams], obeys=obeys)
-        result, autopilot, navigation = sail(way, grid, options, case.fix, make)
-        return result, autopilot, navigation.motion.source
+        return sail(way, grid, options, case.fix, make)[:2]
 
-    with_us, autopilot, source = run(True)
-    without, _, _ = run(False)
+    with_us, autopilot = run(True)
+    without, _ = run(False)
     lost = (with_us.seconds > LOST) & (with_us.seconds < case.hours * HOUR - BACK)
     fed = lost & (with_us.sent > 0)
     fed &= np.cumsum(fed) > LOST  # once it has settled
     obeying, ignoring = rms(with_us.error[lost]), rms(without.error[lost])
+    said = [text for second, text in with_us.texts if FOLLOWS in text and second < case.hours * HOUR - BACK]
     back = with_us.seconds > case.hours * HOUR - BACK
     far = np.flatnonzero(np.hypot(*with_us.autopilot[back].T) > 3.0 * 2.5)
     return [
-        case.fix, case.stack.__name__, case.streams, str(case.kind), source.name.lower(),
+        case.fix, case.stack.__name__, case.streams, str(case.kind),
+        said[-1].removeprefix(FOLLOWS).partition(":")[0],
         f"{obeying:.1f}", f"{ignoring:.1f}", f"{obeying / ignoring:.2f}",
         f"{rms(np.hypot(*with_us.autopilot[fed].T)):.1f}", f"{rms(np.hypot(*without.autopilot[fed].T)):.1f}",
         f"{rms(with_us.claimed[fed]):.1f}", f"{rms(with_us.autopilot[fed] / with_us.claimed[fed, None]):.2f}",
