@@ -139,10 +139,9 @@ class Peers:
         valid = [peer for peer in self._peers.values() if now - peer.genuine < TIMEOUT]
         valid.sort(key=lambda peer: (now - peer.pilot > TIMEOUT, peer.since))
         self._answered = valid[:ANSWERED]
-        if len(valid) > ANSWERED:
-            self._tell(f"more than {ANSWERED} peers: the others are not answered")
-        if sum(now - peer.pilot < TIMEOUT for peer in valid) > 1:
-            self._tell("the autopilot speaks from several addresses")
+        pilots = sum(now - peer.pilot < TIMEOUT for peer in valid)
+        self._tell(f"more than {ANSWERED} peers: the others are not answered", len(valid) > ANSWERED)
+        self._tell("the autopilot speaks from several addresses", pilots > 1)
         return self._answered
 
     def route(self, sender: tuple[int, int]) -> Peer | None:
@@ -168,7 +167,8 @@ class Peers:
                 self._look = 0.0
             peer.pilot = now
 
-    def _tell(self, text: str) -> None:
-        if text not in self._told:
-            self._told.add(text)
+    def _tell(self, text: str, holds: bool) -> None:
+        """Note a text once, when it begins to hold."""
+        if holds and text not in self._told:
             self.notices.append(text)
+        (self._told.add if holds else self._told.discard)(text)

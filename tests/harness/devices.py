@@ -163,6 +163,8 @@ class Autopilot:
         if self._kind == "serial":
             self._line = SerialEnd(Path(self._at))
             return
+        if self._kind == "tcpin":  # the bridge listens; it may not yet
+            return
         if self._kind == "tcp":
             self._listener = socket.create_server(self.address)
             self._listener.setblocking(False)
@@ -196,7 +198,7 @@ class Autopilot:
         if self._line is None:
             return
         with suppress(BlockingIOError, ConnectionRefusedError, BrokenPipeError, ConnectionResetError):
-            if isinstance(self._line, SerialEnd) or self._kind == "tcp":
+            if isinstance(self._line, SerialEnd) or self._kind in ("tcp", "tcpin"):
                 self._line.sendall(data)
             elif self._peer is not None:
                 self._line.sendto(data, self._peer)
@@ -224,6 +226,10 @@ class Autopilot:
             with suppress(BlockingIOError):
                 self._line = self._listener.accept()[0]
                 self._line.setblocking(False)
+        if self._kind == "tcpin" and self._line is None:
+            with suppress(OSError):
+                self._line = socket.create_connection(self.address, timeout=0.5)
+                self._line.setblocking(False)
         if now >= self._beat:
             self._beat = now + 1 / BEAT_HZ
             self.say("HEARTBEAT", type=12, autopilot=3, system_status=4, mavlink_version=3)
@@ -246,7 +252,7 @@ class Autopilot:
             except OSError:
                 data = b""
             if not data:
-                if self._kind == "tcp":
+                if self._kind in ("tcp", "tcpin"):
                     self._line.close()
                     self._line = None
                 return

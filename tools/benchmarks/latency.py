@@ -28,7 +28,7 @@ from benchmarks.workload import OPTIONS, TELEMETRY_HZ, Feed, write_config
 from magbridge.mavlink import Codec, spec
 from magbridge.sensors import open_driver
 
-__all__ = ["latency", "started"]
+__all__ = ["SECONDS", "Sent", "bridge_command", "latency", "play", "sequences_of_messages", "started"]
 
 ECHO = Path(__file__).with_name("echo.py")
 RATES = (100, 1000)
@@ -115,8 +115,8 @@ def latency(folder: Path, repetitions: int) -> list[Row]:
         ):
             feed, other = Feed(), Feed()
             for _ in range(repetitions):
-                bridge.append(_play(live, feed, hertz, _sequences_of_messages()))
-                echo.append(_play(bare, other, hertz, _sequences_of_frames()))
+                bridge.append(play(live, feed, hertz, sequences_of_messages()))
+                echo.append(play(bare, other, hertz, _sequences_of_frames()))
         rows += _rows(hertz, bridge, echo)
     return rows
 
@@ -143,8 +143,17 @@ def _rows(hertz: int, bridge: list[Sent], echo: list[Sent]) -> list[Row]:
     return rows
 
 
-def _play(running: Running, feed: Feed, hertz: int, sequences: Callable[[bytes], list[int]]) -> Sent:
-    """Send readings and telemetry for a while; match what comes back by sequence number."""
+def play(
+    running: Running,
+    feed: Feed,
+    hertz: int,
+    sequences: Callable[[bytes], list[int]],
+    station: Callable[[bytes], bytes] = lambda _: b"",
+) -> Sent:
+    """Send readings and telemetry for a while; match what comes back by sequence number.
+
+    A `station` is shown every datagram, and what it returns is sent.
+    """
     clock, send, recv = time.perf_counter, running.link.sendto, running.link.recv
     heard: list[tuple[float, bytes]] = []
     written: dict[int, float] = {}
@@ -156,6 +165,8 @@ def _play(running: Running, feed: Feed, hertz: int, sequences: Callable[[bytes],
                 heard.append((now, recv(65536)))
             except BlockingIOError:
                 continue
+            if request := station(heard[-1][1]):
+                send(request, running.peer)
 
     cpu = processor_time(running.process.pid)
     begun = clock() + 0.01
@@ -183,7 +194,7 @@ def _play(running: Running, feed: Feed, hertz: int, sequences: Callable[[bytes],
     return Sent(np.array(late[round(WARM_UP * hertz) :]), cpu, resident(running.process.pid)["VmRSS"])
 
 
-def _sequences_of_messages() -> Callable[[bytes], list[int]]:
+def sequences_of_messages() -> Callable[[bytes], list[int]]:
     codec = Codec(255, 190)
 
     def sequences(data: bytes) -> list[int]:

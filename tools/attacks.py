@@ -1,0 +1,233 @@
+"""What an unfriendly network costs the autopilot: a running bridge, attacked, and a table of what was lost.
+
+    .venv/bin/python tools/attacks.py              all: some minutes
+    .venv/bin/python tools/attacks.py header       some, by a part of their names
+
+The bridge runs as a process between an emulated sensor and an emulated autopilot, which sends 200 frames a
+second. *In*: the autopilot's frames that the bridge missed, by their numbers, or refused where an attacker
+speaks as the autopilot and has numbers of its own. *Out*: the samples of MAG_FIELD that the autopilot missed.
+Attackers without a key may send whatever they like from where they like.
+"""
+
+from __future__ import annotations
+
+import socket
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from contextlib import ExitStack, suppress
+from pathlib import Path
+from typing import Any, NamedTuple
+
+sys.path.append(str(Path(__file__).parents[1] / "tests" / "harness"))
+
+
+from rich.console import Console
+from rig import Rig
+from terminal import table
+
+from magbridge.link.ftp import HEADER, Opcode
+from magbridge.mavlink import Codec, Signing
+
+KEY = bytes(range(1, 33))
+SECONDS = 2.0
+"""Of each attack."""
+ALLOWED = 0.01
+YEARS_US = 315_576_000_000_000
+"""Ten years."""
+
+
+class Attacker:
+    """Strangers on sockets of their own."""
+
+    def __init__(self, rig: Rig, stack: ExitStack, count: int) -> None:
+        kind = socket.SOCK_DGRAM
+        self.rig = rig
+        self.lines = [stack.enter_context(socket.socket(socket.AF_INET, kind)) for _ in range(count)]
+        for line in self.lines:
+            line.setblocking(False)
+
+    def say(self, data: bytes, times: int = 1) -> None:
+        """Send from each."""
+        for line in self.lines:
+            for _ in range(times):
+                with suppress(BlockingIOError):
+                    line.sendto(data, self.rig.autopilot.address)
+
+    def answered(self) -> int:
+        """Return the bytes that they got."""
+        total = 0
+        for line in self.lines:
+            with suppress(OSError):
+                while data := line.recv(65536):
+                    total += len(data)
+        return total
+
+
+class Attack(NamedTuple):
+    """One: on which link, by how many, and what is done at every frame of the autopilot."""
+
+    name: str
+    link: str
+    strangers: int
+    act: Callable[[Attacker, int], None]
+    told: str = ""
+    spoofs: bool = False
+
+
+def frame(system: int, component: int, message: str, /, **fields: Any) -> bytes:
+    """Return an unsigned frame."""
+    return Codec(system, component).pack(message, **fields)
+
+
+def to_us(**fields: Any) -> dict[str, Any]:
+    """Return fields with the bridge as the target."""
+    return {"target_system": 1, "target_component": 191, **fields}
+
+
+def ftp(opcode: int, data: bytes, sequence: int, size: int = 0) -> bytes:
+    """Return a request for a file."""
+    head = HEADER.pack(sequence & 0xFFFF, sequence & 0xFF, opcode, size or len(data), 0, 0, 0)
+    payload = (head + data).ljust(251, b"\0")
+    return frame(255, 190, "FILE_TRANSFER_PROTOCOL", **to_us(payload=payload))
+
+
+def signed(component: int, ahead_us: int) -> bytes:
+    """Return a frame of someone who has the key and another time."""
+    codec = Codec(1, component, Signing(KEY))
+    codec.now_us = time.time_ns() // 1000 + ahead_us
+    return codec.pack("NAMED_VALUE_FLOAT", name="x", value=1.0)
+
+
+def again(attacker: Attacker, _: int) -> None:
+    """Send again what the autopilot has just sent."""
+    attacker.say(RECORDED[0])
+
+
+def connect(attacker: Attacker, _: int) -> None:
+    """Open connections and leave them open."""
+    for _ in range(5):
+        line = socket.socket()
+        line.setblocking(False)
+        with suppress(OSError):
+            line.connect(attacker.rig.autopilot.address)
+        attacker.lines.append(line)
+    for line in attacker.lines[:-200]:
+        line.close()
+    del attacker.lines[:-200]
+
+
+RECORDED = [b""]
+HEAD = bytes((0xFD, 60, 0, 0, 7, 9, 9, 0xF0, 0xE0, 0))
+BEAT = frame(255, 190, "HEARTBEAT", type=6, autopilot=8)
+BATTERY = frame(1, 99, "NAMED_VALUE_FLOAT", name="battpos", value=-9.0)
+AGE = frame(1, 99, "PARAM_SET", **to_us(param_id="MB_AGE_BATTPOS", param_value=1e6, param_type=9))
+OFF = frame(1, 99, "COMMAND_LONG", **to_us(command=511, param1=60101, param2=-1.0))
+ATTACKS = (
+    Attack("nothing, signed", "signed", 0, lambda _a, _k: None),
+    Attack("header of an unknown message before each frame", "signed", 1, lambda a, _: a.say(HEAD)),
+    Attack("unsigned heartbeats of 40", "signed", 40, lambda a, _: a.say(BEAT), "not signed"),
+    Attack("an unsigned RADIO_STATUS, which needs no signature", "signed", 1,
+           lambda a, _: a.say(frame(51, 68, "RADIO_STATUS", rssi=80))),
+    Attack("frames signed with another key", "signed", 1,
+           lambda a, _: a.say(Codec(1, 1, Signing(bytes(32))).pack("HEARTBEAT", type=12)), "another key"),
+    Attack("genuine frames, recorded and sent again", "signed", 1, again, "an old time stamp"),
+    Attack("a liar with the key, ten years ahead, as 1:25", "signed", 1,
+           lambda a, _: a.say(signed(25, YEARS_US))),
+    Attack("a liar with the key, ten years ahead, as the autopilot", "signed", 1,
+           lambda a, _: a.say(signed(1, YEARS_US)), "several addresses", spoofs=True),
+    Attack("a liar with the key, an hour behind, as 1:25", "signed", 1,
+           lambda a, _: a.say(signed(25, -3_600_000_000)), "a time stamp behind our clock"),
+    Attack("a new key, unasked (SETUP_SIGNING)", "signed", 1,
+           lambda a, _: a.say(frame(255, 190, "SETUP_SIGNING", **to_us(secret_key=KEY[::-1]))),
+           "keys come from a file"),
+    Attack("nothing, unsigned", "udpin", 0, lambda _a, _k: None),
+    Attack("one byte from each of 40", "udpin", 40, lambda a, _: a.say(b"x")),
+    Attack("8,000 datagrams of garbage a second", "udpin", 1, lambda a, _: a.say(bytes(range(97)), 40)),
+    Attack("empty datagrams and one of 60 kB", "udpin", 2,
+           lambda a, k: a.say(b"" if k % 20 else bytes(60_000))),
+    Attack("battpos of another component (1:99)", "udpin", 1, lambda a, _: a.say(BATTERY), "not used"),
+    Attack("MB_AGE_BATTPOS = 1e6 from 1:99", "udpin", 1, lambda a, _: a.say(AGE), "only a station"),
+    Attack("MAG_FIELD turned off by 1:99", "udpin", 1, lambda a, _: a.say(OFF), "may not set a rate"),
+    Attack("the list of parameters, asked for 1,000 times a second", "udpin", 1,
+           lambda a, _: a.say(frame(255, 190, "PARAM_REQUEST_LIST", **to_us()), 5)),
+    Attack("metadata, asked for 1,000 times a second", "udpin", 1,
+           lambda a, _: a.say(frame(255, 190, "COMMAND_LONG", **to_us(command=512, param1=397)), 5)),
+    Attack("heartbeats of 200 new stations a second", "udpin", 1,
+           lambda a, k: a.say(frame(200 + k % 50, 1 + k % 200, "HEARTBEAT", type=6, autopilot=8))),
+    Attack("files opened without end, and one outside", "udpin", 1,
+           lambda a, k: a.say(ftp(Opcode.OPEN_READ, (b"general.json", b"../key.bin")[k % 2], k)), "refused"),
+    Attack("answers to TIMESYNC that nobody asked for", "udpin", 1,
+           lambda a, k: a.say(frame(1, 1, "TIMESYNC", tc1=1 + k, ts1=k)), "several addresses", spoofs=True),
+    Attack("bursts of a file by 7 at once", "udpin, others", 7,
+           lambda a, k: a.say(ftp(Opcode.OPEN_READ if k < 2 else Opcode.BURST, b"parameter.json", k, 239))),
+    Attack("valid heartbeats of 40 stations", "udpin, others", 40,
+           lambda a, _: a.say(BEAT), "more than 8 peers"),
+    Attack("nothing, by TCP", "tcpin", 0, lambda _a, _k: None),
+    Attack("1,000 connections a second", "tcpin", 0, connect),
+)  # fmt: skip
+
+
+def run(rig: Rig, attack: Attack) -> tuple[float, float, int, str]:
+    """Attack; return the shares lost in and out, bytes that the strangers got, and what was told."""
+    rig.until_well()
+    before, mark, sent, said = rig.fresh_status(), rig.mark, [0], set(rig.said())
+    with ExitStack() as stack:
+        attacker = Attacker(rig, stack, attack.strangers)
+
+        def retell(genuine: bytes) -> list[bytes]:
+            for k in range(10):
+                attack.act(attacker, sent[0])
+                rig.autopilot.send(genuine if not k else rig.autopilot.telemetry())
+                sent[0] += 1
+            RECORDED[0] = genuine
+            return []
+
+        with rig.autopilot.retelling(retell):
+            rig.run(SECONDS)
+        after = rig.fresh_status()
+        got = attacker.answered()
+        for line in attacker.lines:
+            line.close()
+    samples = {one["sequence"] for one in rig.of("MAG_FIELD", mark)}
+    missed = max(samples) - min(samples) + 1 - len(samples)
+    counter = "link_refused" if attack.spoofs else "link_frames_lost"
+    lost = max(after[counter] - before[counter], 0) / sent[0]
+    new = [text for text in rig.said(mark) if text not in said or attack.told in text]
+    told = next((text for text in new if attack.told and attack.told in text), "")
+    return lost, missed / (len(samples) + missed), got, told
+
+
+def main() -> int:
+    """Run the attacks that the arguments name."""
+    wanted = sys.argv[1:]
+    chosen = [one for one in ATTACKS if not wanted or any(part in one.name for part in wanted)]
+    columns = ("attack", "link", "lost in", "lost out", "strangers got", "told")
+    shown = table("Attacks", *columns, left=("attack", "link", "told"))
+    worst = 0
+    for link in dict.fromkeys(one.link for one in chosen):
+        with tempfile.TemporaryDirectory() as folder:
+            key = KEY if link == "signed" else None
+            rig = Rig(Path(folder), "udpin" if link == "signed" else link.partition(",")[0], key=key)
+            try:
+                rig.start()
+                for attack in (one for one in chosen if one.link == link):
+                    lost, out, got, told = run(rig, attack)
+                    fails = max(lost, out) > ALLOWED and not told
+                    worst += fails
+                    row = (f"{lost:.1%}", f"{out:.1%}", f"{got / 1e3:.1f} kB", told + " FAILS" * fails)
+                    shown.add_row(attack.name, link, *row)
+                    print(attack.name, *row, sep=" | ", flush=True)
+                if any(KEY[::-1][:6] in path.read_bytes() for path in rig.logs):
+                    worst += 1
+                    shown.add_row("the key that was sent is in the log: FAILS", link, "", "", "", "")
+            finally:
+                rig.close()
+                rig.fluxgate.unplug()
+    Console(width=170).print(shown)
+    return int(worst > 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
