@@ -219,7 +219,7 @@ def _chained(starts: IndexArray, ends: IndexArray, size: int) -> IndexArray:
                 found[-1] = (k, last - 1)
             following = joined[inside] if cut else following
         k = following
-    return np.concatenate([np.arange(first, last + 1) for first, last in found])
+    return np.concatenate([np.arange(0), *(np.arange(first, last + 1) for first, last in found)])
 
 
 def _gather(data: Bytes, at: IndexArray, layout: np.dtype[Any], offset: int = 0) -> NDArray[Any]:
