@@ -1,0 +1,101 @@
+"""A station's log read at once, beside the reading message by message; and what is whose."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from magbridge import logs
+from magbridge.logs import telemetry
+from magbridge.logs.compasses import compasses_of
+from magbridge.logs.deployment import noted
+from magbridge.logs.options import Options
+from magbridge.logs.telemetry_survey import Survey
+from magbridge.mavlink import Codec, LogReader, pack_record
+
+T0, S = 1_700_000_000_000_000, 1_000_000
+
+
+class Log:
+    """A log in the making; times in s after its start."""
+
+    def __init__(self) -> None:
+        self.data = b""
+        self.codecs: dict[int, Codec] = {}
+
+    def say(self, t: float, message: str, /, component: int = 1, **fields: Any) -> None:
+        frame = self.codecs.setdefault(component, Codec(1, component)).pack(message, **fields)
+        self.data += pack_record(T0 + round(t * S), 0, frame)
+
+    def write(self, tmp_path: Path) -> Path:
+        path = tmp_path / "log.tlog"
+        path.write_bytes(self.data)
+        return path
+
+
+def one_by_one(path: Path) -> Any:
+    """Return the log as it is read message by message."""
+    rows = telemetry.Rows(path, Survey(path))
+    with path.open("rb") as file:
+        rows.reader = LogReader(file)
+        for record in rows.reader:
+            rows.put(record)
+    return rows.take(len(rows.rows))
+
+
+@pytest.mark.real
+@pytest.mark.parametrize("name", ["small.tlog", "damaged.tlog"])
+def test_both_readings_are_the_same(name: str, real_data: Path) -> None:
+    path = real_data / "ardusub" / name
+    at_once, slowly = logs.read(path), one_by_one(path)
+    assert set(at_once.data_vars) == set(slowly.data_vars)
+    np.testing.assert_array_equal(at_once["time"], slowly["time"])
+    for column in slowly.data_vars:
+        np.testing.assert_array_equal(at_once[column], slowly[column], err_msg=str(column))
+
+
+def test_a_named_value_never_takes_a_column_with_a_source(tmp_path: Path) -> None:
+    log = Log()
+    for k in range(5):
+        log.say(k, "ATTITUDE", yaw=1.0)
+        log.say(k, "NAMED_VALUE_FLOAT", name="heading", value=7.0)
+        log.say(k, "NAMED_VALUE_FLOAT", name="mag_x", value=8.0)
+        log.say(k, "RAW_IMU", xmag=100 + k)
+    back = logs.read(log.write(tmp_path))
+    np.testing.assert_allclose(back["heading"], np.degrees(1.0), rtol=1e-6)
+    np.testing.assert_allclose(back["mag_x"], 100.0 * (100 + np.arange(5)))
+    np.testing.assert_allclose(back["named_heading"], 7.0)
+    assert any("named_heading" in note for note in noted(back.attrs))
+
+
+def test_a_gimbals_attitude_is_not_the_vehicles(tmp_path: Path) -> None:
+    log = Log()
+    for k in range(5):
+        log.say(k, "ATTITUDE", pitch=0.1)
+        for _ in range(3):
+            log.say(k, "ATTITUDE", component=154, pitch=-1.2)
+        log.say(k, "RAW_IMU", xmag=k)
+    back = logs.read(log.write(tmp_path))
+    np.testing.assert_allclose(back["pitch"], np.degrees(0.1), rtol=1e-6)
+
+
+def test_a_temperature_of_0_is_none(tmp_path: Path) -> None:
+    log = Log()
+    for k in range(5):
+        log.say(k, "RAW_IMU", xmag=k, temperature=0)
+    assert "imu_temperature" not in logs.read(log.write(tmp_path))
+
+
+def test_another_compass_makes_the_rows(tmp_path: Path) -> None:
+    log = Log()
+    for k in range(5):
+        log.say(k, "RAW_IMU", xmag=k)
+        log.say(k + 0.5, "SCALED_IMU2", xmag=50 + k)
+    path = log.write(tmp_path)
+    assert [one.number for one in compasses_of(logs.read(path).attrs)] == [0, 1]
+    back = logs.read(path, options=Options(compass="1"))
+    np.testing.assert_allclose(back["mag_x"], 100.0 * (50 + np.arange(5)))
+    np.testing.assert_allclose(back["time"] - T0 / S, 0.5 + np.arange(5))
