@@ -5,6 +5,7 @@ from __future__ import annotations
 from contextlib import suppress
 from pathlib import Path
 from struct import pack
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from magbridge import logs
 from magbridge.errors import FormatError
+from magbridge.logs.compasses import compasses_of
 
 KINDS = {
     # name: (type, letters, struct, fields)
@@ -230,3 +232,97 @@ def test_quaternion_of_known_attitudes() -> None:
     np.testing.assert_allclose(
         np.transpose(_angles({"q[0]": w, "q[1]": x, "q[2]": y, "q[3]": z})), angles, atol=1e-9
     )
+
+
+Said = list[tuple[str, int, tuple[Any, ...]]]
+"""Topic, instance and values of each message."""
+
+
+def _ulog(topics: dict[str, tuple[str, str]], parameters: dict[str, float], said: Said) -> bytes:
+    """Return a ULog of topics (definition, struct), each an instance, with parameters and messages."""
+
+    def message(kind: str, body: bytes) -> bytes:
+        return pack("<HB", len(body), ord(kind)) + body
+
+    data = b"ULog\x01\x12\x35\x01" + pack("<Q", 0) + message("B", bytes(40))
+    for name, (definition, _) in topics.items():
+        data += message("F", f"{name}:{definition}".encode())
+    for name, value in parameters.items():
+        whole = isinstance(value, int)
+        key = f"{'int32_t' if whole else 'float'} {name}".encode()
+        data += message("P", bytes([len(key)]) + key + pack("<i" if whole else "<f", value))
+    numbers: dict[tuple[str, int], int] = {}
+    for name, instance, _ in said:
+        if (name, instance) not in numbers:
+            numbers[name, instance] = len(numbers)
+            data += message("A", pack("<BH", instance, numbers[name, instance]) + name.encode())
+    for name, instance, values in said:
+        data += message("D", pack("<H", numbers[name, instance]) + pack(topics[name][1], *values))
+    return data
+
+
+def test_the_compass_that_vehicle_magnetometer_names(tmp_path: Path) -> None:
+    """The first is disabled; that in use is taken at its full rate, with PX4's calibration undone."""
+    pytest.importorskip("pyulog")
+    topics = {
+        "sensor_mag": ("uint64_t timestamp;uint32_t device_id;float x;float y;float z;", "<QI3f"),
+        "vehicle_magnetometer": ("uint64_t timestamp;uint32_t device_id;float[3] magnetometer_ga;", "<QI3f"),
+    }
+    parameters = {
+        "CAL_MAG0_ID": 11,
+        "CAL_MAG0_PRIO": 0,
+        "CAL_MAG1_ID": 22,
+        "CAL_MAG1_PRIO": 75,
+        "CAL_MAG1_XOFF": 0.05,
+        "CAL_MAG1_XSCALE": 1.25,
+    }
+    said: Said = []
+    for k in range(20):
+        us = 1_000_000 + k * 100_000
+        if k % 10 == 0:
+            said += [("sensor_mag", 0, (us, 11, 9, 9, 9)), ("sensor_mag", 1, (us, 22, 0.2, 0.1, -0.4))]
+        said.append(("vehicle_magnetometer", 0, (us, 22, 1.25 * (0.2 - 0.05), 0.1, -0.4)))
+    path = tmp_path / "log.ulg"
+    path.write_bytes(_ulog(topics, parameters, said))
+    back = logs.read(path)
+    assert back.sizes["time"] == 20
+    np.testing.assert_allclose(back["mag_x"], 20_000, rtol=1e-6)
+    assert (back["mag1_x"] == 900_000).all()
+    assert [(one.id, one.enabled, one.in_use) for one in compasses_of(back.attrs)] == [
+        ("11", False, False),
+        ("22", True, True),
+    ]
+
+
+def test_an_old_log_has_its_field_in_sensor_combined(tmp_path: Path) -> None:
+    """With raw GPS as the only position, and outputs, currents that are used or not."""
+    pytest.importorskip("pyulog")
+    topics = {
+        "sensor_combined": ("uint64_t timestamp;float[3] magnetometer_ga;", "<Q3f"),
+        "vehicle_gps_position": (
+            "uint64_t timestamp;uint64_t time_utc_usec;int32_t lat;int32_t lon;uint8_t fix_type;",
+            "<QQiiB",
+        ),
+        "battery_status": ("uint64_t timestamp;float voltage_v;float current_a;", "<Qff"),
+        "actuator_motors": ("uint64_t timestamp;float[2] control;", "<Q2f"),
+    }
+    said: Said = []
+    for k in range(20):
+        us = 1_000_000 + k * 100_000
+        fix = (us, UTC * 1_000_000 + us + (k == 0) * 10**14, 450_000_000, -630_000_000, 3 if k > 5 else 1)
+        said += [
+            ("vehicle_gps_position", 0, fix),
+            ("battery_status", 0, (us, 16, 2.5 if k > 9 else -1)),
+            ("actuator_motors", 0, (us, 0.1 * k, float("nan"))),
+            ("sensor_combined", 0, (us, 0.2, 0.1, -0.4)),
+        ]
+    path = tmp_path / "log.ulg"
+    path.write_bytes(_ulog(topics, {}, said))
+    back = logs.read(path)
+    np.testing.assert_allclose(back["mag_x"], 20_000, rtol=1e-6)
+    np.testing.assert_allclose(back["time"], UTC + 1 + 0.1 * np.arange(20), rtol=0, atol=1e-5)
+    assert np.isnan(back["latitude"][:6]).all()
+    np.testing.assert_allclose(back["latitude"][6:], 45)
+    assert np.isnan(back["battery_current"][:10]).all()  # -1 A: not measured
+    np.testing.assert_allclose(back["motor1"], 0.1 * np.arange(20), rtol=1e-6)
+    assert "motor2" not in back
