@@ -60,6 +60,7 @@ COLUMNS: dict[str, Column] = {
     "longitude": Column("deg", "longitude, east positive (WGS84)"),
     "depth": Column("m", "depth below the surface"),
     "reference_field": Column("nT", "true total magnetic field"),
+    "daily_variation": Column("nT", "variation of the Earth's field with time, by a base station"),
     "velocity_north": Column("m/s", "velocity by dead reckoning, north"),
     "velocity_east": Column("m/s", "velocity by dead reckoning, east"),
     "water_speed": Column("m/s", "speed through the water"),

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from cyclopts import CycloptsError, MissingArgumentError, UnusedCliTokensError
 
-from magbridge.cli import ashore, attach, bridge, calibrate, correct, diagnose, info, navigate
+from magbridge.cli import ashore, attach, bridge, calibrate, correct, diagnose, info, navigate, survey
 from magbridge.cli.common import app, complain
 from magbridge.errors import MagbridgeError, MissingExtra
 
@@ -29,6 +29,7 @@ __all__ = [
     "info",
     "main",
     "navigate",
+    "survey",
 ]
 
 EXTRAS = {

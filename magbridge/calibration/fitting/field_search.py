@@ -13,13 +13,23 @@ from magbridge.calibration.fitting.evidence import evidence
 from magbridge.calibration.fitting.joint import Reduced, Sums, eliminate
 from magbridge.calibration.fitting.prior import PriorFamily
 from magbridge.field.place.matern import SMOOTHNESS, Matern
-from magbridge.field.place.nodes import nodes_near
+from magbridge.field.place.nodes import Nodes, nodes_near
 
-__all__ = ["Choice", "Weighed", "choose", "first_guess", "ladder", "refined", "same_noise"]
+__all__ = [
+    "Choice",
+    "Weighed",
+    "choose",
+    "climb",
+    "first_guess",
+    "ladder",
+    "nodes_for",
+    "refined",
+    "same_noise",
+]
 
 RUNGS = 7
 """Lengths that are tried first."""
-FINE, COARSE = 2.5, 2.0
+FINE, COARSE = 3.0, 2.0
 """Nodes a length, of the field that is kept and of those that are tried first."""
 PAD = 1.0
 """Lengths around the track that have nodes."""
@@ -72,7 +82,14 @@ class Weighed:
 
 
 def choose(
-    sums_of: Callable[[Matern], Sums], place: FloatArray, weighed: Weighed, start: float, *, harmonic: bool
+    sums_of: Callable[[Matern], Sums],
+    place: FloatArray,
+    weighed: Weighed,
+    start: float,
+    *,
+    harmonic: bool,
+    rho: float | None = None,
+    effort: float = 1.0,
 ) -> Choice:
     """Choose the field from nothing: lengths from a ladder, then smoothness and all the rest about the best.
 
@@ -88,30 +105,42 @@ def choose(
         The field's size over the noise's, to begin with.
     harmonic : bool
         Whether the depth varies, so that a field which falls off upwards differs from one that does not.
+    rho : float, optional
+        Autocorrelation of the noise, where it is known.
+    effort : float
+        Share of the usual steps.
     """
     best: Choice | None = None
-    ratio, rho = start, 0.3
+    move_rho = rho is None
+    ratio, rho = start, 0.3 if rho is None else rho
     for length in ladder(place):
         nodes = nodes_near(place, length / COARSE, PAD * length)
         if nodes.size > NODES:
             continue
         field = Matern(nodes, float(length), SMOOTHNESS[1], harmonic)
-        found = climb(sums_of(field), Choice(field, ratio, rho), weighed, move_length=False, steps=24)
+        found = climb(
+            sums_of(field), Choice(field, ratio, rho), weighed, move_length=False, steps=int(24 * effort)
+        )
         ratio, rho = found.ratio, found.rho
         if best is None or found.score > best.score:
             best = found
     assert best is not None
-    nodes = nodes_near(place, best.field.length / FINE, PAD * best.field.length)
+    nodes = nodes_for(place, best.field.length)
     tried = []
     for alpha in SMOOTHNESS:
         field = Matern(nodes, best.field.length, alpha, harmonic)
-        tried.append(climb(sums_of(field), replace(best, field=field), weighed, steps=36))
+        tried.append(
+            climb(
+                sums_of(field), replace(best, field=field), weighed, move_rho=move_rho, steps=int(36 * effort)
+            )
+        )
     best = max(tried, key=lambda one: one.score)
     if harmonic:
         flat = replace(best.field, harmonic=False)
-        best = max(
-            best, climb(sums_of(flat), replace(best, field=flat), weighed, steps=20), key=lambda c: c.score
+        other = climb(
+            sums_of(flat), replace(best, field=flat), weighed, move_rho=move_rho, steps=int(20 * effort)
         )
+        best = max(best, other, key=lambda one: one.score)
     return best
 
 
@@ -119,6 +148,11 @@ def first_guess(place: FloatArray) -> Choice:
     """Return a field to begin with at places (n, 2), m: of the middle length, and of usual size and noise."""
     length = float(ladder(place)[RUNGS // 2 + 1])
     return Choice(Matern(nodes_near(place, length / COARSE, PAD * length), length, SMOOTHNESS[1]), SIZE, 0.0)
+
+
+def nodes_for(place: FloatArray, length: float, fine: float = FINE) -> Nodes:
+    """Return the nodes, so many a `length`, m, on which a field is kept, about places (n, 2), m."""
+    return nodes_near(place, length / fine, PAD * length)
 
 
 def ladder(place: FloatArray) -> FloatArray:
@@ -131,17 +165,24 @@ def ladder(place: FloatArray) -> FloatArray:
 
 
 def climb(
-    sums: Sums, start: Choice, weighed: Weighed, *, move_length: bool = True, steps: int = 40
+    sums: Sums,
+    start: Choice,
+    weighed: Weighed,
+    *,
+    move_length: bool = True,
+    move_rho: bool = True,
+    steps: int = 40,
 ) -> Choice:
-    """Climb the evidence from a choice, its nodes kept; without `move_length`, its length too."""
+    """Climb the evidence from a choice, its nodes kept; its length or its noise's memory, too, if need be."""
+    share = np.clip(max(start.rho, 0.01) / HIGHEST, 1e-6, 1.0 - 1e-6)
+    moves = [0] + [1] * move_rho + [2] * move_length
+    first = np.array([0.0, np.log(share / (1.0 - share)), 0.0])
 
-    def at(x: FloatArray) -> Choice:
-        rho = HIGHEST / (1.0 + np.exp(-np.clip(x[1], -30.0, 30.0)))
-        length = (
-            start.field.length * float(np.exp(np.clip(x[2], -0.5, 0.9)))
-            if move_length
-            else start.field.length
-        )
+    def at(moved: FloatArray) -> Choice:
+        x = first.copy()
+        x[moves] = moved
+        rho = HIGHEST / (1.0 + np.exp(-np.clip(x[1], -30.0, 30.0))) if move_rho else start.rho
+        length = start.field.length * float(np.exp(np.clip(x[2], -0.5, 0.9)))
         field = replace(start.field, length=length)
         return Choice(field, start.ratio * float(np.exp(np.clip(x[0], -6.0, 6.0))), float(rho))
 
@@ -152,22 +193,22 @@ def climb(
         except np.linalg.LinAlgError:
             return 1e300
 
-    share = np.clip(max(start.rho, 0.01) / HIGHEST, 1e-6, 1.0 - 1e-6)
-    first = np.array([0.0, np.log(share / (1.0 - share)), 0.0][: 3 if move_length else 2])
-    simplex = first + np.vstack([np.zeros(len(first)), np.diag([0.7, 0.8, 0.3][: len(first)])])
+    begin = first[moves]
+    simplex = begin + np.vstack([np.zeros(len(moves)), np.diag(np.array([0.7, 0.8, 0.3])[moves])])
     found = minimize(
-        downhill, first, method="Nelder-Mead",
+        downhill, begin, method="Nelder-Mead",
         options={"initial_simplex": simplex, "maxfev": steps, "xatol": 0.02, "fatol": 0.05},
     )  # fmt: skip
     best = at(found.x)
-    return replace(best, rho=best.rho if best.rho > SMALL else 0.0, score=-float(found.fun))
+    rho = best.rho if best.rho > SMALL or not move_rho else 0.0
+    return replace(best, rho=rho, score=-float(found.fun))
 
 
 def refined(sums_of: Callable[[Matern], Sums], place: FloatArray, choice: Choice, weighed: Weighed) -> Choice:
     """Climb from a choice; nodes at places (n, 2), m, are made anew where they no longer suit the length."""
     field = choice.field
-    if not 2.0 <= field.length / field.nodes.spacing <= 4.0:
-        nodes = nodes_near(place, field.length / FINE, PAD * field.length)
+    if not 0.7 * FINE <= field.length / field.nodes.spacing <= 1.5 * FINE:
+        nodes = nodes_for(place, field.length)
         field = replace(field, nodes=nodes)
     return climb(sums_of(field), replace(choice, field=field), weighed, steps=30)
 

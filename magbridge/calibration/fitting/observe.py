@@ -57,6 +57,8 @@ def observations(
     names = (*CHANNELS, *parameters)
     columns = {name: _column(ds, name) for name in names}
     total, vector, model = earth_field(ds, grid)
+    if "daily_variation" in ds:
+        total = total + _column(ds, "daily_variation")
     ds = with_true_heading(ds)
     attitude = None
     if all(name in ds for name in ("roll", "pitch", "heading")):

@@ -1,0 +1,214 @@
+"""From a survey's logs to its anomaly map."""
+
+from __future__ import annotations
+
+from math import inf
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter, validators
+
+from magbridge.cli.common import (
+    Json,
+    Output,
+    Picture,
+    Whole,
+    app,
+    check_inputs,
+    complain,
+    doubts_of,
+    file_to_write,
+    note_losses,
+    print_result,
+)
+from magbridge.errors import DataError, WrongUse
+from magbridge.progress import waiting
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from magbridge.calibration.model import Calibration
+    from magbridge.survey.run import Result
+    from magbridge.survey.samples import Samples
+
+Written = Annotated[Path | None, Parameter(validator=file_to_write())]
+
+
+@app.command(usage="Usage: magbridge survey LOG... -o map.nc [OPTIONS]")
+def survey(
+    *logs: Path,
+    output: Output,
+    parameter: tuple[str, ...] = (),
+    order: Annotated[Whole, Parameter(validator=validators.Number(gte=1, lte=6))] = 3,
+    calibration: tuple[Path, ...] = (),
+    save: Written = None,
+    base: Path | None = None,
+    spacing: Annotated[float | None, Parameter(validator=validators.Number(gt=0, lt=inf))] = None,
+    altitude: Annotated[float | None, Parameter(validator=validators.Number(gte=-1e6, lte=1e6))] = None,
+    predict: Path | None = None,
+    geotiff: Annotated[Path | None, Parameter(validator=file_to_write(".tif", ".tiff"))] = None,
+    tracks: Annotated[Path | None, Parameter(validator=file_to_write(".geojson", ".json", ".kml"))] = None,
+    crossovers: Annotated[Path | None, Parameter(validator=file_to_write(".csv"))] = None,
+    picture: Picture = None,
+    strict: bool = False,
+    json: Json = False,
+) -> None:
+    """Make an anomaly map, with its sigma, from a survey's own logs: no calibration runs, no map.
+
+    Raw logs are calibrated with the rock below, found from the same data, unless a calibration is given.
+    Lines are levelled, what changes slowly with time is taken out, and the field is gridded.
+
+    Parameters
+    ----------
+    logs
+        The survey's logs: raw (mag_x mag_y mag_z), or corrected by others (total_field or anomaly, with line
+        and line_type where there are any), also a plain table without times.
+    output
+        The map, netCDF (.nc): what navigate --map takes. With --predict: the predictions (.csv).
+    parameter
+        A column that gives the position of a moving mass; may be repeated.
+    order
+        Highest total degree of the polynomials in the parameters.
+    calibration
+        A calibration (cal.json) to correct with instead; may be repeated, once for each raw log in order.
+    save
+        The calibration found, to write (cal.json).
+    base
+        A base station's log (total_field): its variation is taken off.
+    spacing
+        m between nodes of the map; by default an eighth of the rock's length.
+    altitude
+        m above the sea to which the map is continued upward; by default that of the survey.
+    predict
+        A table with longitude and latitude (and height or depth): anomaly and anomaly_sigma there are
+        written to the output, instead of a map.
+    geotiff
+        The map as GeoTIFF, too.
+    tracks
+        The tracks, as GeoJSON or KML.
+    crossovers
+        A table of the crossovers with their mis-ties before and after levelling.
+    picture
+        A PNG, PDF or SVG to draw: map, sigma, track, residuals, crossovers.
+    strict
+        Exit with 1 when the data do not support the calibration.
+    json
+        Print the result as JSON.
+    """
+    from magbridge.survey.run import facts, summary
+    from magbridge.survey.run import survey as make
+    from magbridge.survey.write import write_crossovers, write_tracks
+
+    check_inputs(logs, output, base, predict, *calibration)
+    if predict is None and output.suffix.lower() != ".nc":
+        raise WrongUse(f"{output}: a map's name must end in .nc")
+    if calibration and save:
+        raise WrongUse("--save: with --calibration none is found")
+    with waiting("surveying"):
+        samples = _samples(logs, parameter, order, calibration, save, base, strict=strict)
+        done = make(samples)
+    for warning in done.warnings:
+        complain(warning)
+    if predict:
+        _predict(done, predict, output)
+    else:
+        _map(done, output, spacing, altitude, geotiff, picture)
+    if tracks:
+        write_tracks(done.samples, tracks)
+    if crossovers:
+        write_crossovers(done.found, done.samples, done.before, done.after, crossovers)
+    print_result(facts(done, output), f"{output}: {summary(done)}", json)
+
+
+def _samples(
+    files: tuple[Path, ...],
+    parameters: tuple[str, ...],
+    order: int,
+    calibration: tuple[Path, ...],
+    save: Path | None,
+    base: Path | None,
+    *,
+    strict: bool,
+) -> Samples:
+    """Return the corrected samples of all files."""
+    from magbridge.calibration.file import load
+    from magbridge.columns import CHANNELS
+    from magbridge.logs import read, read_each
+    from magbridge.survey.read import is_table, joined, read_table
+    from magbridge.survey.run import samples_of, without_daily_variation
+
+    tables = [path for path in files if is_table(path)]
+    others = [path for path in files if path not in tables]
+    parts = [read_table(path) for path in tables]
+    if not others:
+        return joined(parts)
+    deployments = read_each(others)
+    note_losses(*(one.attrs for one in deployments))
+    if base:
+        deployments = without_daily_variation(deployments, read(base))
+    raw = [one for one in deployments if all(name in one for name in CHANNELS)]
+    known = [load(path) for path in calibration]
+    for path, one in zip(calibration, known, strict=True):
+        for doubt in doubts_of(one, path):
+            complain(doubt)
+    if raw and not known:
+        known = [_calibrated(raw, parameters, order, save, strict=strict)]
+    return joined([*parts, samples_of(deployments, known)])
+
+
+def _calibrated(
+    logs: list[xr.Dataset], parameters: tuple[str, ...], order: int, save: Path | None, *, strict: bool
+) -> Calibration:
+    """Return the calibration that the raw logs give themselves; write it where that is asked for."""
+    from magbridge.calibration.file import save as write
+    from magbridge.calibration.fitting.fit import fit
+    from magbridge.calibration.fitting.observe import observations
+    from magbridge.columns import require
+    from magbridge.logs.deployment import join
+
+    together = join(logs)
+    require(together, parameters)
+    found = fit(observations(together, parameters), order=order)
+    for warning in found.warnings:
+        complain(warning)
+    if strict and not found.supported:
+        raise DataError(
+            "the survey does not support a calibration (see the warnings), and --strict was given"
+        )
+    if save:
+        write(found.calibration, save)
+    return found.calibration
+
+
+def _predict(done: Result, points: Path, output: Path) -> None:
+    """Write the anomaly at points of one's own."""
+    from magbridge.survey.read import read_points
+    from magbridge.survey.write import write_points
+
+    longitude, latitude, depth, place = read_points(points, done.samples.origin)
+    anomaly, sigma = done.gridded.at(place, depth)
+    write_points(longitude, latitude, anomaly, sigma, output)
+
+
+def _map(
+    done: Result,
+    output: Path,
+    spacing: float | None,
+    altitude: float | None,
+    geotiff: Path | None,
+    picture: Path | None,
+) -> None:
+    """Write the map in every form that is asked for."""
+    from magbridge.survey.maps import anomaly_map
+    from magbridge.survey.write import write_geotiff
+
+    grid = anomaly_map(
+        done.gridded, done.samples.origin, spacing=spacing, altitude=altitude, name=output.name
+    )
+    grid.save(output)
+    if geotiff:
+        write_geotiff(grid, geotiff)
+    if picture:
+        from magbridge.survey.draw import draw_survey
+
+        draw_survey(grid, done.samples, done.residual, done.found, (done.before, done.after), picture)

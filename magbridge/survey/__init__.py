@@ -1,0 +1,13 @@
+"""A survey from its logs to its anomaly map.
+
+::
+
+    logs, tables --> read (corrected with a calibration, or with one found from the same logs)
+                       |
+                    samples --> gridding (field in place, levels, slow changes) --> maps, predictions
+                       |                        |
+                  crossovers (before)      crossovers (after)
+
+The field is that of :mod:`magbridge.field.place`, as in a calibration from a survey alone
+(:mod:`magbridge.calibration.fitting.in_place`).
+"""

@@ -1,0 +1,103 @@
+"""Crossovers: where a survey meets its own lines again, and how far apart the two readings are there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from magbridge.arrays import FloatArray, IndexArray
+
+__all__ = ["Crossovers", "crossovers"]
+
+SEGMENTS = 60_000
+"""Segments of all lines, at most: a longer track is taken in longer steps."""
+APART = 20
+"""Segments of one line between two that can be a crossover."""
+
+
+@dataclass(frozen=True, eq=False)
+class Crossovers:
+    """Places where two lines cross.
+
+    Attributes
+    ----------
+    place : (m, 2) array
+        m north and east.
+    first, second : (m,) arrays
+        Samples that begin the two segments.
+    share : (m, 2) array
+        How far along each segment, 0 to 1.
+    step : int
+        Samples of a segment.
+    """
+
+    place: FloatArray
+    first: IndexArray
+    second: IndexArray
+    share: FloatArray
+    step: int
+
+    def misties(self, value: FloatArray) -> FloatArray:
+        """Return the difference (m,) of `value` (n,) between the lines, the first minus the second."""
+
+        def at(start: IndexArray, share: FloatArray) -> FloatArray:
+            end = np.minimum(start + self.step, len(value) - 1)
+            return np.asarray((1.0 - share) * value[start] + share * value[end])
+
+        return at(self.first, self.share[:, 0]) - at(self.second, self.share[:, 1])
+
+
+def crossovers(place: FloatArray, line: IndexArray) -> Crossovers:
+    """Find where the lines cross.
+
+    Parameters
+    ----------
+    place : (n, 2) array
+        m north and east.
+    line : (n,) array
+        Label of each sample's line.
+    """
+    step = max(len(place) // SEGMENTS, 1)
+    start = np.arange(0, len(place) - step, step)
+    start = start[line[start] == line[start + step]]
+    a, way = place[start], place[start + step] - place[start]
+    i, j = _near(a, way, line[start])
+    cross = way[i, 0] * way[j, 1] - way[i, 1] * way[j, 0]
+    off = a[j] - a[i]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        s = (off[:, 0] * way[j, 1] - off[:, 1] * way[j, 0]) / cross
+        t = (off[:, 0] * way[i, 1] - off[:, 1] * way[i, 0]) / cross
+    met = (s >= 0.0) & (s < 1.0) & (t >= 0.0) & (t < 1.0)
+    i, j, s, t = i[met], j[met], s[met], t[met]
+    return Crossovers(a[i] + s[:, None] * way[i], start[i], start[j], np.stack([s, t], axis=1), step)
+
+
+def _near(a: FloatArray, way: FloatArray, line: IndexArray) -> tuple[IndexArray, IndexArray]:
+    """Return pairs of segments, from `a` (m, 2) along `way` (m, 2), in one cell: those of one line apart."""
+    cell = max(float(np.quantile(np.abs(way).max(axis=1, initial=0.0), 0.99)), 1.0) if len(a) else 1.0
+    keys: list[IndexArray] = []
+    of: list[IndexArray] = []
+    for share in (0.0, 0.5, 1.0):  # the cells that a segment touches
+        at = np.floor((a + share * way) / cell).astype(np.int64)
+        for down in (-1, 0, 1) if share == 0.5 else (0,):
+            for across in (-1, 0, 1) if share == 0.5 else (0,):
+                keys.append((at[:, 0] + down) * 2_000_003 + at[:, 1] + across)
+                of.append(np.arange(len(a)))
+    key, segment = np.concatenate(keys), np.concatenate(of)
+    order = np.lexsort((segment, key))
+    key, segment = key[order], segment[order]
+    pairs: list[IndexArray] = []
+    edges = np.flatnonzero(np.diff(key, prepend=key[:1] - 1, append=key[-1:] + 1))
+    for first, last in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
+        here = np.unique(segment[first:last])
+        if len(here) < 2 or (here[-1] - here[0] < APART and line[here[0]] == line[here[-1]]):
+            continue
+        one, other = np.triu_indices(len(here), 1)
+        one, other = here[one], here[other]
+        apart = (line[one] != line[other]) | (other - one >= APART)
+        pairs.append(np.stack([one[apart], other[apart]], axis=1).astype(np.intp))
+    if not pairs:
+        return np.empty(0, np.intp), np.empty(0, np.intp)
+    found = np.unique(np.concatenate(pairs), axis=0)
+    return found[:, 0], found[:, 1]

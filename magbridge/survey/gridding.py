@@ -1,0 +1,283 @@
+r"""The map from corrected samples: a Gaussian field in place, with each line's own level.
+
+.. math:: y_i = f(x_i) + l_{line(i)} + s(t_i) + e_i
+
+f is the field of :mod:`magbridge.field.place` and its size, length and smoothness are chosen by the evidence,
+as those of a survey that calibrates itself are; so are the widths of the levels l and of the slow changes s.
+Map and sigma are the posterior's mean and standard deviation. What the calibration does not know (its
+`modes`) is not fitted again to the same data: it is carried into the sigma as it stands (a *considered*
+uncertainty: Schmidt 1966).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.sparse import csr_array, diags_array
+
+from magbridge.arrays import BoolArray, FloatArray, IndexArray
+from magbridge.calibration.fitting.evidence import Widths, maximise
+from magbridge.calibration.fitting.field_search import (
+    Choice,
+    Weighed,
+    choose,
+    climb,
+    ladder,
+    nodes_for,
+)
+from magbridge.calibration.fitting.joint import Linear, Reduced, Sums, add_up, eliminate
+from magbridge.calibration.fitting.latent import Group, slow_functions, with_groups
+from magbridge.calibration.fitting.prior import PriorFamily
+from magbridge.calibration.fitting.solve import covariance_of
+from magbridge.calibration.residual import robust_scale
+from magbridge.field.place.blocks import NearInverse, near_inverse
+from magbridge.field.place.matern import Matern
+from magbridge.survey.roughness import Roughness
+from magbridge.survey.samples import Samples
+
+__all__ = ["Gridded", "gridded"]
+
+LEVEL, LEVEL_SPREAD = 5.0, np.log(5.0)
+"""nT by which lines are off each other's level, and the 1-sigma of its logarithm."""
+SLOW, SLOW_SPREAD = 2.0, np.log(4.0)
+"""As in a survey that calibrates itself."""
+SEARCHED = 4_000
+"""Samples about the middle with which the field is searched."""
+OUTLIER = 6.0
+"""Sigmas beyond which a sample is left out."""
+FINE = 4.0
+"""Nodes a length: a map shows what coarser ones would leave out."""
+CHUNK = 16_384
+"""Rows at a time."""
+NOTHING = PriorFamily(
+    np.zeros((0, 0)), np.zeros(0), np.zeros(0), np.zeros((0, 0)), np.zeros(0), np.zeros(0), ()
+)
+"""A prior of no coefficients."""
+
+
+@dataclass(frozen=True, eq=False)
+class Gridded:
+    """A gridded survey: ask it for the field at any place.
+
+    Attributes
+    ----------
+    field : Matern
+    roughness : Roughness
+        How the field's size varies from place to place.
+    size, sigma, rho : float
+        nT, the field's standard deviation where the roughness is 1, and the noise's; its autocorrelation.
+    w : (nodes,) array
+        The field's coefficients.
+    follow : (nodes, r) array
+        How they move with 1-sigma of what is uncertain elsewhere: levels, slow changes, the calibration.
+    inverse : NearInverse
+        Of the precision, in units of the noise's.
+    levels : (n,) array
+        nT, what was taken off each sample: its line's level and the slow part.
+    middle : float
+        m, depth at which the map holds.
+    mean : float
+        nT, of all samples.
+    kept : (n,) array
+        Which samples are no outliers.
+    widths : Widths
+        As the evidence chose them.
+    """
+
+    field: Matern
+    roughness: Roughness
+    size: float
+    sigma: float
+    rho: float
+    w: FloatArray
+    follow: FloatArray
+    inverse: NearInverse
+    levels: FloatArray
+    middle: float
+    mean: float
+    kept: BoolArray
+    widths: Widths
+
+    def at(self, place: FloatArray, depth: FloatArray | float | None = None) -> tuple[FloatArray, FloatArray]:
+        """Return the anomaly and its 1-sigma (n,) each, nT, at places (n, 2), m, and depths (n,), m.
+
+        The depth is the map's own if not given.
+        """
+        deeper = 0.0 if depth is None else np.asarray(depth, float) - self.middle
+        scale = self.roughness.at(place)
+        B = csr_array(diags_array(scale) @ self.field.basis(place, deeper))
+        variance = self.sigma**2 * self.inverse.variances(B)
+        variance += ((B @ self.follow) ** 2).sum(axis=1)
+        variance[~self.field.nodes.inside(place)] = (self.size * scale[~self.field.nodes.inside(place)]) ** 2
+        return self.mean + B @ self.w, np.sqrt(np.maximum(variance, 0.0))
+
+    def at_samples(self, samples: Samples) -> FloatArray:
+        """Return the anomaly (n,), nT, at the samples' own places and depths."""
+        B = self.field.basis(samples.place, np.nan_to_num(samples.depth - self.middle))
+        return np.asarray(self.mean + self.roughness.at(samples.place) * (B @ self.w))
+
+
+class _Problem:
+    """The samples of a survey as rows of a linear model."""
+
+    def __init__(self, samples: Samples, groups: tuple[Group, ...], roughness: Roughness) -> None:
+        self.samples, self.roughness = samples, roughness
+        self.mean = float(np.median(samples.value))
+        self.middle = float(np.nanmedian(samples.depth))
+        self.deeper = np.nan_to_num(samples.depth - self.middle)
+        self.D = np.concatenate([group.functions for group in groups], axis=1)
+        self.scale = roughness.at(samples.place)
+        self.kept = np.ones(len(samples.value), bool)
+
+    def basis(self, field: Matern, rows: IndexArray) -> csr_array:
+        known = field.basis(self.samples.place[rows], self.deeper[rows])
+        return csr_array(diags_array(self.scale[rows]) @ known)
+
+    def sums(self, field: Matern, rows: IndexArray, modes: bool = False) -> Sums:
+        return add_up(self._pieces(field, rows, modes))
+
+    def _pieces(self, field: Matern, rows: IndexArray, modes: bool) -> Iterator[Linear]:
+        s = self.samples
+        rows = rows[self.kept[rows]]
+        follows = np.zeros(len(rows), bool)
+        follows[1:] = (np.diff(rows) == 1) & (s.line[rows][1:] == s.line[rows][:-1])
+        for start in range(0, len(rows), CHUNK):
+            first = max(start - 1, 0)
+            mine = rows[first : start + CHUNK]
+            weight = -1.0 / s.weight[mine]
+            V = [(s.value[mine] - self.mean)[:, None], self.D[mine]]
+            if modes:
+                V.append(s.modes[mine])
+            rows_of = np.concatenate(V, axis=1)
+            rows_of[:, 1:] *= weight[:, None]
+            rows_of[:, 0] *= -weight
+            B = csr_array(diags_array(weight) @ self.basis(field, mine))
+            yield Linear(rows_of, B, follows[first : start + CHUNK], overlap=start > 0)
+
+
+def gridded(samples: Samples, *, local: bool = True) -> Gridded:
+    """Grid a survey.
+
+    Parameters
+    ----------
+    samples : Samples
+        Corrected.
+    local : bool
+        Whether the field's size may vary from place to place.
+    """
+    sigma = max(robust_scale(np.diff(samples.value)) / 2.0**0.5, 0.1)
+    choice, roughness = _searched(samples, sigma, local=local)
+    choice = replace(
+        choice, field=replace(choice.field, nodes=nodes_for(samples.place, choice.field.length, FINE))
+    )
+    groups = _groups(samples)
+    problem, family = _Problem(samples, groups, roughness), with_groups(NOTHING, groups)
+    every = np.arange(len(samples.value))
+    weighed = Weighed(family, family.centre, sigma, choice.field.length)
+    for turn in range(2):
+        sums = problem.sums(choice.field, every)
+        reduced = eliminate(sums, choice.field, choice.ratio, choice.rho)
+        widths = maximise(reduced.quadratic, family, weighed.eta, sigma)
+        z, covariance = _solved(reduced, widths, family)
+        w = reduced.field(z)
+        e = samples.value - problem.mean - problem.D @ z - problem.basis(choice.field, every) @ w
+        e = e / problem.scale  # where the rock is rough, so is what no node resolves
+        if turn or not (far := np.abs(e) > OUTLIER * max(robust_scale(e), widths.sigma)).any():
+            break
+        problem.kept = ~far
+        weighed = replace(weighed, eta=widths.eta, sigma=widths.sigma)
+    follow = reduced.follow @ np.linalg.cholesky(covariance)
+    if samples.modes.shape[1]:
+        follow = np.hstack([follow, _considered(problem, choice, reduced, widths, family, every)])
+    return Gridded(
+        field=choice.field,
+        roughness=roughness,
+        size=choice.ratio * widths.sigma,
+        sigma=widths.sigma,
+        rho=choice.rho,
+        w=w,
+        follow=_apart(follow, problem, choice.field, every),
+        inverse=near_inverse(reduced.precision, choice.field.nodes.edges),
+        levels=problem.D @ z,
+        middle=problem.middle,
+        mean=problem.mean,
+        kept=problem.kept,
+        widths=widths,
+    )
+
+
+def _groups(samples: Samples) -> tuple[Group, ...]:
+    """Return the levels, one a line (or log), and what changes slowly within a log."""
+    of = np.unique(samples.line, return_inverse=True)[1].ravel()
+    levels = np.zeros((len(of), int(of.max()) + 1))
+    levels[np.arange(len(of)), of] = 1.0
+    groups = [Group("levels of lines", levels, np.ones(levels.shape[1]), LEVEL, LEVEL_SPREAD)]
+    if np.isfinite(samples.time).all():
+        waves, shape = slow_functions(samples.time)
+        if len(shape):
+            groups.append(Group("slow change with time", waves, shape, SLOW, SLOW_SPREAD))
+    return tuple(groups)
+
+
+def _about_the_middle(samples: Samples) -> BoolArray:
+    """Return the samples nearest to the middle one, whole stretches of lines among them: (n,)."""
+    n = len(samples.value)
+    if n <= SEARCHED:
+        return np.ones(n, bool)
+    from_middle = np.abs(samples.place - np.median(samples.place, axis=0)).max(axis=1)
+    return np.asarray(from_middle <= np.partition(from_middle, SEARCHED)[SEARCHED])
+
+
+def _searched(samples: Samples, sigma: float, *, local: bool) -> tuple[Choice, Roughness]:
+    """Return the field that a part of the samples, with noise of about `sigma` nT, is likeliest with."""
+    few = samples.part(_about_the_middle(samples))
+    groups, rows = _groups(few), np.arange(len(few.value))
+    family = with_groups(NOTHING, groups)
+    weighed = Weighed(family, family.centre, sigma, float(np.median(ladder(few.place))))
+    even = Roughness.even()
+    problem = _Problem(few, groups, even)
+    size = max(robust_scale(few.value - problem.mean), 5.0)
+    best = choose(
+        lambda field: problem.sums(field, rows), few.place, weighed, size / sigma,
+        harmonic=bool(np.ptp(problem.deeper) > 5.0), rho=samples.rho, effort=0.5,
+    )  # fmt: skip
+    if not local:
+        return best, even
+    uneven = Roughness.of(samples, best.field.length)
+    problem = _Problem(few, groups, uneven)
+    other = climb(problem.sums(best.field, rows), best, weighed, move_rho=False, steps=16)
+    return (other, uneven) if other.score > best.score else (best, even)
+
+
+def _solved(reduced: Reduced, widths: Widths, family: PriorFamily) -> tuple[FloatArray, FloatArray]:
+    """Return z (q,) and its covariance (q, q)."""
+    precision = reduced.quadratic.H / widths.sigma**2 + family.at(widths.eta).precision
+    z = np.linalg.solve(precision, reduced.quadratic.b / widths.sigma**2)
+    return np.asarray(z, float), covariance_of(precision)
+
+
+def _considered(
+    problem: _Problem,
+    choice: Choice,
+    reduced: Reduced,
+    widths: Widths,
+    family: PriorFamily,
+    rows: IndexArray,
+) -> FloatArray:
+    """Return how the field's coefficients follow the calibration's modes: (nodes, r), 1-sigma each."""
+    q = problem.D.shape[1]
+    sums = problem.sums(choice.field, rows, modes=True)
+    all_in = eliminate(sums, choice.field, choice.ratio, choice.rho)
+    H = all_in.quadratic.H / widths.sigma**2
+    own = np.linalg.solve(H[:q, :q] + family.at(widths.eta).precision, H[:q, q:])
+    return np.asarray(all_in.follow[:, q:] - reduced.follow @ own)
+
+
+def _apart(follow: FloatArray, problem: _Problem, field: Matern, rows: IndexArray) -> FloatArray:
+    """Take from the uncertain shifts of the field (nodes, r) their mean over the samples: that is level."""
+    mean = np.asarray(problem.basis(field, rows).sum(axis=0)).ravel() / len(rows)
+    shift = mean @ follow
+    even = mean.sum()
+    return np.asarray(follow - shift[None, :] / max(even, 1e-9))

@@ -1,0 +1,67 @@
+"""From a gridded survey to an anomaly map on even longitudes and latitudes."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from magbridge.field.continuation import continued
+from magbridge.field.geodesy import metres_per_degree
+from magbridge.field.grid import AnomalyGrid
+from magbridge.survey.gridding import Gridded
+
+__all__ = ["anomaly_map"]
+
+A_LENGTH = 8.0
+"""Nodes of a map to one length of its field."""
+NODES = 250_000
+"""Nodes of a map at most, unless a spacing is asked for."""
+KNOWN = 0.95
+"""Of the field's own size: where the sigma is as large, nothing is known, and the map has a hole."""
+
+
+def anomaly_map(
+    gridded: Gridded,
+    origin: tuple[float, float],
+    *,
+    spacing: float | None = None,
+    altitude: float | None = None,
+    name: str = "survey",
+) -> AnomalyGrid:
+    """Return the map of a survey, at its own height or continued upward.
+
+    Parameters
+    ----------
+    gridded : Gridded
+        The survey.
+    origin : tuple of 2 float
+        deg, latitude and longitude of its places' origin.
+    spacing : float, optional
+        m between nodes; an eighth of the field's length if not given.
+    altitude : float, optional
+        m above the ellipsoid, not below the survey.
+    name : str
+        Of the map.
+    """
+    places = gridded.field.nodes.places
+    inner = places[gridded.field.nodes.inside(places)]
+    low, high = inner.min(axis=0), inner.max(axis=0)
+    step = spacing or max(
+        gridded.field.length / A_LENGTH, float(np.sqrt(np.prod(np.maximum(high - low, 1.0)) / NODES))
+    )
+    north, east = (np.arange(low[k], max(high[k], low[k] + 3.5 * step) + step, step) for k in range(2))
+    at = np.stack(np.meshgrid(north, east, indexing="ij"), axis=-1).reshape(-1, 2)
+    anomaly, sigma = gridded.at(at)
+    size = gridded.size * gridded.roughness.at(at)
+    hole = ~gridded.field.nodes.inside(at) | (sigma > KNOWN * size)
+    anomaly[hole] = sigma[hole] = np.nan
+    shape = len(north), len(east)
+    per_latitude, per_longitude = metres_per_degree(origin[0])
+    grid = AnomalyGrid(
+        origin[1] + east / per_longitude,
+        origin[0] + north / per_latitude,
+        anomaly.reshape(shape),
+        sigma.reshape(shape),
+        altitude=-gridded.middle,
+        name=name,
+    )
+    return grid if altitude is None else continued(grid, -altitude).grid

@@ -1,0 +1,233 @@
+"""Logs and tables to the samples of a survey: corrected here, or by others."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from magbridge.arrays import FloatArray
+from magbridge.calibration.correct import correct
+from magbridge.calibration.fitting.level import apart_from_level
+from magbridge.calibration.model import Calibration
+from magbridge.columns import CHANNELS
+from magbridge.correction import Correction, correct_rows
+from magbridge.errors import FormatError
+from magbridge.field.geodesy import separation
+from magbridge.field.igrf import magnitude
+from magbridge.field.reference import main_field, positions
+from magbridge.records import Quality
+from magbridge.survey.samples import Samples
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import xarray as xr
+
+__all__ = ["corrected_by_others", "from_vector", "is_table", "joined", "read_points", "read_table"]
+
+ANOMALY = (
+    "anomaly",
+    "total_field_anomaly_nt",
+    "total_field_anomaly",
+    "mag_anomaly",
+    "magnetic_anomaly",
+    "tfa",
+)
+"""Names of the anomaly in tables of others."""
+HEIGHT = ("height", "altitude", "height_m", "height_ell_m", "altitude_m", "elevation")
+TABLES = (".csv", ".csv.gz", ".csv.xz", ".csv.bz2")
+MODES, FAINT = 24, 0.05
+"""Uncertain combinations of a calibration at most, and nT below which one does not matter."""
+THINNED = 2_000
+"""Samples by which they are found."""
+
+
+def is_table(path: Path) -> bool:
+    """Return whether a file is a table of lines: positions and an anomaly, without a vector or a time."""
+    if not path.name.lower().endswith(TABLES):
+        return False
+    names = set(_table(path, rows=0).columns)
+    return not names & set(CHANNELS) and "time" not in names and bool(names & {*ANOMALY, "total_field"})
+
+
+def read_table(path: Path) -> Samples:
+    """Read a table: longitude, latitude, anomaly (nT), and where there are any height, line, line_type.
+
+    Raises
+    ------
+    FormatError
+        A column is missing or holds something else than numbers.
+    """
+    table = _table(path)
+    value = _numbers(path, table, _first(path, table, ANOMALY))
+    longitude, latitude = (_numbers(path, table, name) for name in ("longitude", "latitude"))
+    heights = [name for name in HEIGHT if name in table]
+    if "depth" in table:
+        depth = _numbers(path, table, "depth")
+    else:
+        depth = -_numbers(path, table, heights[0]) if heights else np.zeros(len(value))
+    lines = next((name for name in ("line", "line_number", "line_no") if name in table), None)
+    line = np.unique(table[lines].astype(str), return_inverse=True)[1] if lines else np.zeros(len(value), int)
+    kind = table["line_type"].astype(str).str.upper() if "line_type" in table else None
+    tie = np.zeros(len(value), bool) if kind is None else (kind == "TIE").to_numpy()
+    known = np.isfinite(value) & np.isfinite(longitude) & np.isfinite(latitude)
+    if known.sum() < 10:
+        raise FormatError(path, f"only {int(known.sum())} rows have longitude, latitude and anomaly")
+    origin = float(np.median(latitude[known])), float(np.median(longitude[known]))
+    north, east = separation(*origin, latitude, longitude)
+    return Samples(
+        np.stack([north, east], axis=1), depth, np.full(len(value), np.nan), value, line.ravel(), tie, origin
+    ).part(known)
+
+
+def read_points(
+    path: Path, origin: tuple[float, float]
+) -> tuple[FloatArray, FloatArray, FloatArray | None, FloatArray]:
+    """Read points: longitude and latitude (n,), deg, depth (n,), m, if known, and m north and east (n, 2).
+
+    Raises
+    ------
+    FormatError
+        A column is missing or holds something else than numbers.
+    """
+    table = _table(path)
+    longitude, latitude = (_numbers(path, table, name) for name in ("longitude", "latitude"))
+    heights = [name for name in HEIGHT if name in table]
+    depth = -_numbers(path, table, heights[0]) if heights else None
+    if "depth" in table:
+        depth = _numbers(path, table, "depth")
+    return longitude, latitude, depth, np.stack(separation(*origin, latitude, longitude), axis=1)
+
+
+def corrected_by_others(ds: xr.Dataset, label: int) -> Samples:
+    """Return the samples of a log with ``total_field`` or ``anomaly``, nT, and positions.
+
+    Raises
+    ------
+    FormatError
+        It has neither, or no position.
+    """
+    source = ds.attrs.get("source", "the log")
+    if not {"latitude", "longitude"} <= set(ds.variables):
+        raise FormatError(source, "expected latitude and longitude: a map needs to know where")
+    if "anomaly" in ds:
+        value = ds["anomaly"].to_numpy().astype(float)
+    elif "total_field" in ds:
+        value = ds["total_field"].to_numpy().astype(float) - magnitude(main_field(ds))
+        value = value - _daily(ds)
+    else:
+        raise FormatError(source, "expected mag_x mag_y mag_z, total_field or anomaly")
+    lines = ds["line"].to_numpy() if "line" in ds else np.zeros(len(value))
+    return _placed(ds, value, lines, label)
+
+
+def from_vector(ds: xr.Dataset, calibration: Calibration, label: int) -> Samples:
+    """Correct a log with its calibration; doubtful samples are left out, the calibration's doubt is kept."""
+    corrected = correct_rows(Correction(calibration), ds)
+    flagged = (corrected["quality"].to_numpy().astype(int) & int(~Quality.NO_BORESIGHT)) != 0
+    value = np.where(flagged, np.nan, corrected["anomaly"].to_numpy() - _daily(ds))
+    samples = _placed(ds, value, np.zeros(len(value)), label)
+    known = np.isfinite(value) & np.isfinite(positions(ds)[1])
+    field = np.stack([ds[name].to_numpy() for name in CHANNELS], axis=1)[known]
+    channels = [
+        ds[name].to_numpy() if name in ds else np.full(len(value), np.nan) for name in calibration.channels
+    ]
+    read = np.stack(channels, axis=1)[known] if channels else np.empty((len(field), 0))
+    modes = _modes(apart_from_level(calibration), field, read, ds["time"].to_numpy()[known])
+    return replace(samples, rho=calibration.noise.autocorrelation, modes=modes)
+
+
+def joined(parts: Sequence[Samples]) -> Samples:
+    """Join the samples of several logs about one origin: lines and modes stay each log's own."""
+    origin = parts[0].origin
+    places, lines, first = [], [], 0
+    for one in parts:
+        shift = separation(*origin, *one.origin)
+        places.append(one.place + np.array(shift))
+        lines.append(one.line + first)
+        first += int(one.line.max()) + 1
+    many = sum(one.modes.shape[1] for one in parts)
+    modes = np.zeros((sum(len(one.value) for one in parts), many))
+    row = column = 0
+    for one in parts:
+        n, r = one.modes.shape
+        modes[row : row + n, column : column + r] = one.modes
+        row, column = row + n, column + r
+    depth, time, value, tie, weight = (
+        np.concatenate([getattr(one, name) for one in parts])
+        for name in ("depth", "time", "value", "tie", "weight")
+    )
+    return Samples(
+        np.concatenate(places), depth, time, value, np.concatenate(lines), tie, origin, weight,
+        max(one.rho for one in parts), modes,
+    )  # fmt: skip
+
+
+def _daily(ds: xr.Dataset) -> FloatArray | float:
+    """Return a base station's variation (n,), nT; 0 without one."""
+    return ds["daily_variation"].to_numpy() if "daily_variation" in ds else 0.0
+
+
+def _placed(ds: xr.Dataset, value: FloatArray, lines: FloatArray, label: int) -> Samples:
+    longitude, latitude, depth = positions(ds)
+    known = np.isfinite(value) & np.isfinite(latitude)
+    if known.sum() < 10:
+        source = ds.attrs.get("source", "the log")
+        raise FormatError(source, f"only {int(known.sum())} samples have a field and a position")
+    origin = float(np.median(latitude[known])), float(np.median(longitude[known]))
+    north, east = separation(*origin, latitude, longitude)
+    of = np.unique(lines, return_inverse=True)[1].ravel() + label
+    tie = np.zeros(len(value), bool)
+    time = np.asarray(ds["time"].to_numpy(), float)
+    return Samples(np.stack([north, east], axis=1), depth, time, value, of, tie, origin).part(known)
+
+
+def _modes(calibration: Calibration, field: FloatArray, channels: FloatArray, time: FloatArray) -> FloatArray:
+    """Return what each uncertain combination of coefficients does to the samples (n, r), nT for 1-sigma."""
+
+    def moved(by: FloatArray, rows: slice) -> FloatArray:
+        shifted = replace(calibration, coefficients=calibration.coefficients + by)
+        up = correct(shifted, field[rows], channels[rows], time[rows]).total
+        return np.nan_to_num(up - correct(calibration, field[rows], channels[rows], time[rows]).total)
+
+    values, vectors = np.linalg.eigh(calibration.covariance)
+    roots = vectors * np.sqrt(np.maximum(values, 0.0))
+    few = slice(None, None, max(len(field) // THINNED, 1))
+    seen = np.stack([moved(root, few) for root in roots.T], axis=1)
+    _, sizes, turned = np.linalg.svd(seen, full_matrices=False)
+    kept = [k for k in range(min(MODES, len(sizes))) if sizes[k] / np.sqrt(len(seen)) > FAINT]
+    columns = [moved(roots @ turned[k], slice(None)) for k in kept]
+    return np.stack(columns, axis=1) if columns else np.empty((len(field), 0))
+
+
+def _table(path: Path, rows: int | None = None) -> pd.DataFrame:
+    import pandas as pd  # noqa: PLC0415 - slow to import
+
+    try:
+        table = pd.read_csv(path, nrows=rows, comment="#")
+    except (OSError, ValueError, EOFError) as error:
+        raise FormatError(path, f"expected a table with a header row: {error}") from error
+    return table.rename(columns=lambda name: str(name).partition("[")[0].strip().lower())
+
+
+def _first(path: Path, table: pd.DataFrame, names: Sequence[str]) -> str:
+    for name in names:
+        if name in table:
+            return name
+    raise FormatError(path, f"expected a column {names[0]!r}; there are: {' '.join(map(str, table.columns))}")
+
+
+def _numbers(path: Path, table: pd.DataFrame, name: str) -> FloatArray:
+    import pandas as pd  # noqa: PLC0415 - slow to import
+
+    if name not in table:
+        raise FormatError(
+            path, f"expected this column; there are: {' '.join(map(str, table.columns))}", column=name
+        )
+    try:
+        return np.asarray(pd.to_numeric(table[name]), float)
+    except (ValueError, TypeError) as error:
+        raise FormatError(path, f"expected numbers: {error}", column=name) from error

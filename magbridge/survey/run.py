@@ -1,0 +1,200 @@
+"""A survey from its logs to its map: calibrate if need be, correct, level, grid."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from magbridge.arrays import BoolArray, FloatArray
+from magbridge.calibration.model import Calibration
+from magbridge.columns import CHANNELS
+from magbridge.errors import CalibrationError, DataError, FormatError
+from magbridge.survey.crossovers import Crossovers, crossovers
+from magbridge.survey.gridding import Gridded, gridded
+from magbridge.survey.read import corrected_by_others, from_vector, joined
+from magbridge.survey.samples import Samples
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+__all__ = ["Result", "facts", "samples_of", "summary", "survey", "without_daily_variation"]
+
+FARTHEST = 5.0
+"""Of the distance to the median position that 99 % of the samples keep: beyond, a position is wrong."""
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """A survey that is done.
+
+    Attributes
+    ----------
+    samples : Samples
+        Corrected.
+    gridded : Gridded
+    found : Crossovers
+    before, after : (m,) arrays
+        nT, mis-ties before levelling and after.
+    residual : (n,) array
+        nT, of every sample.
+    warnings : tuple of str
+    """
+
+    samples: Samples
+    gridded: Gridded
+    found: Crossovers
+    before: FloatArray
+    after: FloatArray
+    residual: FloatArray
+    warnings: tuple[str, ...]
+
+
+def samples_of(logs: Sequence[xr.Dataset], calibrations: Sequence[Calibration]) -> Samples:
+    """Return the corrected samples of several logs.
+
+    Parameters
+    ----------
+    logs : sequence of Dataset
+        Those with a vector are corrected, others must hold a corrected field.
+    calibrations : sequence of Calibration
+        One for all logs with a vector, or one for each of them in order.
+    """
+    parts: list[Samples] = []
+    with_vector = [log for log in logs if _has_vector(log)]
+    if with_vector and len(calibrations) not in (1, len(with_vector)):
+        raise DataError(
+            f"{len(with_vector)} logs with mag_x mag_y mag_z, and {len(calibrations)} calibrations: give one "
+            "for all, or one for each log in order"
+        )
+    waiting = (
+        list(calibrations) if len(calibrations) == len(with_vector) else list(calibrations) * len(with_vector)
+    )
+    for log in logs:
+        if _has_vector(log):
+            if not {"latitude", "longitude"} <= set(log.variables):
+                raise FormatError(log.attrs.get("source", "the log"), "expected latitude and longitude")
+            parts.append(from_vector(log, waiting.pop(0), 0))
+        else:
+            parts.append(corrected_by_others(log, 0))
+    return joined(parts)
+
+
+def survey(samples: Samples) -> Result:
+    """Level and grid corrected samples."""
+    warnings = []
+    far = _far(samples.place)
+    if far.any():
+        warnings.append(f"{int(far.sum())} samples lie far from all others (a jump in position): left out")
+        samples = samples.part(~far)
+    with threadpool_limits(1, "blas"):
+        try:
+            found = gridded(samples)
+        except np.linalg.LinAlgError as problem:
+            raise CalibrationError(f"the survey cannot be gridded: {problem}") from problem
+    crossed = crossovers(samples.place, samples.line)
+    B = found.at_samples(samples)
+    residual = samples.value - found.levels - B
+    before = crossed.misties(samples.value)
+    after = crossed.misties(samples.value - found.levels)
+    if not len(before):
+        warnings.append(
+            "no line crosses another: what is level of a line and what is rock rests on its smoothness"
+        )
+    if (out := int((~found.kept).sum())) > 0.02 * len(residual):
+        warnings.append(f"{out} of {len(residual)} samples are outliers and were left out of the map")
+    return Result(samples, found, crossed, before, after, residual, tuple(warnings))
+
+
+def without_daily_variation(logs: Sequence[xr.Dataset], base: xr.Dataset) -> list[xr.Dataset]:
+    """Return the logs with a base station's variation taken into their reference.
+
+    Parameters
+    ----------
+    logs : sequence of Dataset
+        Of the survey.
+    base : Dataset
+        The base station's, with ``total_field`` (nT) or ``reference_field``, or a raw vector.
+
+    Raises
+    ------
+    FormatError
+        It has none of them.
+    DataError
+        It does not cover the logs' time.
+    """
+    total = _base_field(base)
+    known = np.isfinite(total)
+    time = base["time"].to_numpy()[known]
+    varied = total[known] - np.median(total[known])
+    out = []
+    for log in logs:
+        t = log["time"].to_numpy()
+        if not len(time) or t[0] < time[0] - 600.0 or t[-1] > time[-1] + 600.0:
+            source = base.attrs.get("source", "the base station's log")
+            raise DataError(f"{source}: does not cover the time of {log.attrs.get('source', 'the log')}")
+        out.append(log.assign(daily_variation=("time", np.interp(t, time, varied), {"units": "nT"})))
+    return out
+
+
+def _base_field(base: xr.Dataset) -> FloatArray:
+    for name in ("total_field", "reference_field"):
+        if name in base:
+            return np.asarray(base[name].to_numpy(), float)
+    if _has_vector(base):
+        return np.sqrt(sum(base[name].to_numpy() ** 2 for name in CHANNELS))
+    raise FormatError(
+        base.attrs.get("source", "the base station's log"), "expected total_field, or mag_x mag_y mag_z"
+    )
+
+
+def _has_vector(log: xr.Dataset) -> bool:
+    return all(name in log for name in CHANNELS)
+
+
+def _far(place: FloatArray) -> BoolArray:
+    """Return which places (n, 2) lie far from all others."""
+    distance = np.linalg.norm(place - np.median(place, axis=0), axis=1)
+    return np.asarray(distance > FARTHEST * max(float(np.quantile(distance, 0.99)), 100.0))
+
+
+def facts(result: Result, path: Path) -> dict[str, Any]:
+    """Return the numbers to print as JSON."""
+    found = result.gridded
+    return {
+        "file": str(path),
+        "samples": len(result.samples.value),
+        "lines": len(np.unique(result.samples.line)),
+        "crossovers": len(result.before),
+        "misties_before_nT": _rms(result.before),
+        "misties_after_nT": _rms(result.after),
+        "residual_nT": _rms(result.residual[found.kept]),
+        "noise_nT": found.sigma,
+        "rock": {"size_nT": found.size, "length_m": found.field.length, "smoothness": found.field.alpha - 1},
+        "depth_m": found.middle,
+        "warnings": result.warnings,
+    }
+
+
+def summary(result: Result) -> str:
+    """Return the numbers in a sentence."""
+    known = facts(result, Path())
+    ties = (
+        f"{known['crossovers']} crossovers {known['misties_before_nT']:.1f} nT RMS before levelling and "
+        f"{known['misties_after_nT']:.1f} after"
+        if known["crossovers"]
+        else "no crossovers"
+    )
+    rock = known["rock"]
+    return (
+        f"{known['samples']} samples on {known['lines']} line{'s' * (known['lines'] > 1)}, {ties}; rock of "
+        f"{rock['size_nT']:.0f} nT over {rock['length_m']:.0f} m, noise {known['noise_nT']:.2f} nT"
+    )
+
+
+def _rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.mean(values**2))) if len(values) else 0.0

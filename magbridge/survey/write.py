@@ -1,0 +1,123 @@
+"""What a survey writes beside its map: GeoTIFF, tracks as GeoJSON and KML, crossovers as CSV."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from xml.sax.saxutils import escape
+
+import numpy as np
+
+from magbridge.arrays import FloatArray, IndexArray
+from magbridge.field.geodesy import offset
+from magbridge.field.grid import AnomalyGrid
+from magbridge.files import atomic_path
+from magbridge.survey.crossovers import Crossovers
+from magbridge.survey.samples import Samples
+
+__all__ = ["write_crossovers", "write_geotiff", "write_points", "write_tracks"]
+
+VERTICES = 5_000
+"""Of a track, at most."""
+SCALE, TIE, KEYS, NODATA = 33550, 33922, 34735, 42113
+"""TIFF tags: ModelPixelScale, ModelTiepoint, GeoKeyDirectory (GeoTIFF 1.1), and GDAL's NODATA."""
+WGS84 = (1, 1, 0, 3, 1024, 0, 1, 2, 1025, 0, 1, 1, 2048, 0, 1, 4326)
+"""GeoKeys: geographic, a pixel is an area, EPSG:4326."""
+
+
+def write_geotiff(grid: AnomalyGrid, path: Path) -> None:
+    """Write a map's anomaly as a GeoTIFF, float32 on WGS84, holes as NaN.
+
+    Raises
+    ------
+    WriteError
+        The file cannot be written.
+    """
+    from PIL import Image, TiffImagePlugin  # noqa: PLC0415 - only here
+
+    dx, dy = (float(axis[1] - axis[0]) for axis in (grid.longitude, grid.latitude))
+    tags = TiffImagePlugin.ImageFileDirectory_v2()
+    corner = (float(grid.longitude[0]) - 0.5 * dx, float(grid.latitude[-1]) + 0.5 * dy)
+    for tag, kind, value in (
+        (SCALE, 12, (dx, dy, 0.0)),
+        (TIE, 12, (0.0, 0.0, 0.0, *corner, 0.0)),
+        (KEYS, 3, WGS84),
+        (NODATA, 2, "nan"),
+    ):
+        tags.tagtype[tag] = kind
+        tags[tag] = value
+    with atomic_path(path) as beside:
+        image = Image.fromarray(np.ascontiguousarray(grid.anomaly[::-1], np.float32))
+        image.save(beside, format="TIFF", tiffinfo=tags)
+
+
+def write_tracks(samples: Samples, path: Path) -> None:
+    """Write every line's track, as GeoJSON or, where the suffix is .kml, as KML."""
+    tracks = {f"{label}": _track(samples, label) for label in np.unique(samples.line).tolist()}
+    with atomic_path(path) as beside:
+        if path.suffix.lower() == ".kml":
+            beside.write_text(_kml(tracks), encoding="utf-8")
+            return
+        features = [
+            {
+                "type": "Feature",
+                "properties": {"line": label, "tie": bool(samples.tie[samples.line == int(label)].any())},
+                "geometry": {"type": "LineString", "coordinates": track.round(7).tolist()},
+            }
+            for label, track in tracks.items()
+        ]
+        content = {"type": "FeatureCollection", "features": features}
+        beside.write_text(json.dumps(content), encoding="utf-8")
+
+
+def write_crossovers(
+    found: Crossovers, samples: Samples, before: FloatArray, after: FloatArray, path: Path
+) -> None:
+    """Write a row for each crossover: where, of which lines, its mis-ties (m,), nT, `before` and `after`."""
+    latitude, longitude = offset(*samples.origin, found.place[:, 0], found.place[:, 1])
+    lines: list[IndexArray] = [samples.line[found.first], samples.line[found.second]]
+    heads = ["longitude", "latitude", "line", "crossed", "before [nT]", "after [nT]"]
+    columns: list[FloatArray | IndexArray] = [
+        longitude.round(7),
+        latitude.round(7),
+        *lines,
+        before.round(3),
+        after.round(3),
+    ]
+    _write_csv(path, heads, columns)
+
+
+def write_points(
+    longitude: FloatArray, latitude: FloatArray, anomaly: FloatArray, sigma: FloatArray, path: Path
+) -> None:
+    """Write predictions at points, (n,) each: deg, nT, and their 1-sigma."""
+    heads = ["longitude", "latitude", "anomaly [nT]", "anomaly_sigma [nT]"]
+    _write_csv(path, heads, [longitude, latitude, anomaly.round(3), sigma.round(3)])
+
+
+def _write_csv(path: Path, heads: list[str], columns: Sequence[FloatArray | IndexArray]) -> None:
+    with atomic_path(path) as beside, beside.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(heads)
+        writer.writerows(zip(*(column.tolist() for column in columns), strict=True))
+
+
+def _track(samples: Samples, label: int) -> FloatArray:
+    """Return longitude and latitude (v, 2) along a line, deg."""
+    place = samples.place[samples.line == label]
+    place = place[:: max(len(place) // VERTICES, 1)]
+    latitude, longitude = offset(*samples.origin, place[:, 0], place[:, 1])
+    return np.stack([longitude, latitude], axis=1)
+
+
+def _kml(tracks: dict[str, FloatArray]) -> str:
+    marks = "\n".join(
+        f"<Placemark><name>line {escape(label)}</name><LineString><coordinates>"
+        + " ".join(f"{x:.7f},{y:.7f}" for x, y in track.tolist())
+        + "</coordinates></LineString></Placemark>"
+        for label, track in tracks.items()
+    )
+    head = '<?xml version="1.0" encoding="UTF-8"?>\n<kml xmlns="http://www.opengis.net/kml/2.2"><Document>'
+    return f"{head}\n{marks}\n</Document></kml>\n"

@@ -1,0 +1,151 @@
+"""Corrected lines to a levelled map: what goes in comes out, with a sigma that holds."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from commands import Command
+
+from magbridge.arrays import FloatArray
+from magbridge.field.geodesy import offset, separation
+from magbridge.field.read import read_grid
+from magbridge.survey.crossovers import crossovers
+from magbridge.survey.run import Result, survey
+from magbridge.survey.samples import Samples
+
+ORIGIN = 49.5, -57.9
+NOISE = 1.5
+
+
+class Rock:
+    """A Gaussian field of 50 nT over 900 m."""
+
+    def __init__(self, seed: int) -> None:
+        rng = np.random.default_rng(seed)
+        self.k, self.phase = rng.normal(0, 1 / 900.0, (500, 2)), rng.uniform(0, 2 * np.pi, 500)
+
+    def at(self, place: FloatArray) -> FloatArray:
+        return np.asarray(50.0 * np.sqrt(2 / 500) * np.cos(place @ self.k.T + self.phase).sum(axis=1))
+
+
+def lines(rock: Rock, rng: np.random.Generator) -> Samples:
+    """Ten lines north and three ties east, each with a level of its own (20 nT)."""
+    places, label, tie, level = [], [], [], []
+    along = np.arange(-3000.0, 3000.0, 120.0)
+    for k, across in enumerate([*np.linspace(-2700, 2700, 10), -2000.0, 100.0, 2100.0]):
+        wander = across + 40.0 * np.sin(along / 700.0 + k)
+        places.append(np.stack([along, wander] if k < 10 else [wander, along], axis=1))
+        label += [k] * len(along)
+        tie += [k >= 10] * len(along)
+        level += [rng.normal(0, 20.0)] * len(along)
+    place = np.concatenate(places)
+    value = rock.at(place) + np.array(level) + rng.normal(0, NOISE, len(place))
+    n = len(place)
+    return Samples(place, np.zeros(n), np.full(n, np.nan), value, np.array(label), np.array(tie), ORIGIN)
+
+
+@pytest.fixture(scope="module")
+def done() -> tuple[Rock, Result]:
+    rock = Rock(5)
+    return rock, survey(lines(rock, np.random.default_rng(6)))
+
+
+def test_levels_are_found_at_the_crossovers(done: tuple[Rock, Result]) -> None:
+    """Thirty crossings; their mis-ties fall from the levels' size to the noise's."""
+    _, result = done
+    assert len(result.before) == 30
+    assert np.std(result.before) > 15.0
+    assert np.std(result.after) < 2.0 * NOISE
+
+
+def test_map_is_right_within_its_sigma(done: tuple[Rock, Result]) -> None:
+    """Between the lines, apart from the level that all lines share."""
+    rock, result = done
+    at = np.random.default_rng(7).uniform(-2500, 2500, (400, 2))
+    anomaly, sigma = result.gridded.at(at)
+    error = anomaly - rock.at(at)
+    error -= error.mean()
+    assert np.sqrt(np.mean(error**2)) < 6.0
+    assert 0.6 < np.sqrt(np.mean((error / sigma) ** 2)) < 1.4
+    assert result.gridded.sigma == pytest.approx(NOISE, rel=0.25)
+
+
+def test_far_from_the_lines_nothing_is_known(done: tuple[Rock, Result]) -> None:
+    _, result = done
+    _, sigma = result.gridded.at(np.array([[40_000.0, 0.0]]))
+    assert sigma[0] == pytest.approx(
+        result.gridded.size * result.gridded.roughness.at(np.array([[4e4, 0.0]]))
+    )
+
+
+def test_crossing_is_where_the_lines_cross() -> None:
+    """Two straight lines; the value there is interpolated on each."""
+    t = np.linspace(0.0, 100.0, 11)
+    place = np.concatenate([np.stack([t, 0 * t + 33.0], axis=1), np.stack([0 * t + 52.0, t], axis=1)])
+    line = np.repeat([0, 1], 11)
+    found = crossovers(place, line)
+    np.testing.assert_allclose(found.place, [[52.0, 33.0]])
+    np.testing.assert_allclose(found.misties(place.sum(axis=1)), [0.0], atol=1e-9)
+
+
+@pytest.fixture
+def table(tmp_path: Path) -> Path:
+    samples = lines(Rock(5), np.random.default_rng(6))
+    latitude, longitude = offset(*ORIGIN, samples.place[:, 0], samples.place[:, 1])
+    kind = np.where(samples.tie, "TIE", "LINE")
+    rows = zip(longitude, latitude, samples.value, samples.line, kind, strict=True)
+    text = "\n".join(f"{x:.8f},{y:.8f},{v:.3f},{k},{t}" for x, y, v, k, t in rows)
+    (tmp_path / "lines.csv").write_text(f"longitude,latitude,anomaly,line,line_type\n{text}\n")
+    return tmp_path / "lines.csv"
+
+
+def test_command_makes_a_map_that_navigate_reads(command: Command, table: Path) -> None:
+    """And GeoTIFF, tracks and crossovers beside it; the map says what the survey says."""
+    out = table.parent
+    said = command(
+        "survey", table, "-o", out / "map.nc", "--geotiff", out / "map.tif", "--tracks", out / "t.geojson",
+        "--crossovers", out / "x.csv", "--json",
+    )  # fmt: skip
+    facts = json.loads(said.out)
+    assert facts["crossovers"] == 30
+    assert facts["misties_after_nT"] < 0.2 * facts["misties_before_nT"]
+    grid = read_grid(out / "map.nc")
+    rock = Rock(5)
+    y, x = np.meshgrid(grid.latitude[20:-20], grid.longitude[20:-20], indexing="ij")
+    north, east = separation(*ORIGIN, y.ravel(), x.ravel())
+    inner = (np.abs(north) < 2500) & (np.abs(east) < 2500)
+    error = grid.anomaly[20:-20, 20:-20].ravel()[inner] - rock.at(np.stack([north, east], axis=1))[inner]
+    assert np.std(error) < 6.0
+    flat = read_grid(out / "map.tif")
+    assert flat.anomaly.shape == grid.anomaly.shape
+    np.testing.assert_allclose(flat.longitude, grid.longitude, atol=1e-9)
+    assert len(json.loads((out / "t.geojson").read_text())["features"]) == 13
+    assert len((out / "x.csv").read_text().splitlines()) == 31
+
+
+def test_command_predicts_at_points(command: Command, table: Path) -> None:
+    points = table.parent / "points.csv"
+    points.write_text("longitude,latitude\n-57.9,49.5\n-57.89,49.51\n")
+    command("survey", table, "--predict", points, "-o", table.parent / "out.csv")
+    rows = (table.parent / "out.csv").read_text().splitlines()
+    assert rows[0] == "longitude,latitude,anomaly [nT],anomaly_sigma [nT]"
+    assert len(rows) == 3
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("longitude,latitude,anomaly\n1,2,3\n", "only 1 rows have longitude, latitude and anomaly"),
+        ("longitude,anomaly\n1,2\n", "expected this column; there are: longitude anomaly"),
+        ("longitude,latitude,anomaly\n1,2,three\n", "expected numbers"),
+    ],
+)
+def test_a_bad_table_is_one_line(command: Command, tmp_path: Path, text: str, words: str) -> None:
+    (tmp_path / "bad.csv").write_text(text)
+    said = command("survey", tmp_path / "bad.csv", "-o", tmp_path / "map.nc", code=1)
+    assert words in said.err
+    assert said.err.count("\n") == 1
+    assert not (tmp_path / "map.nc").exists()
