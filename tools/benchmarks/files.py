@@ -62,10 +62,11 @@ def files(folder: Path, repetitions: int) -> list[Row]:
             live.link.sendto(station.ask(Opcode.OPEN_READ, f"logs/{NAME}".encode()), live.peer)
             beside.append(play(live, feed, HERTZ, sequences_of_messages(), station.hear))
             live.link.sendto(station.ask(Opcode.RESET), live.peer)
-    rows = [
-        Row(f"latency beside a download, {name}", late(beside, q), "ms", late(alone, q), "without", most=most)
-        for name, q, most in (("p50", 50.0, None), ("p99", 99.0, 2.0))
-    ]
+    rows = []
+    for name, q, most in (("p50", 50.0, None), ("p99", 99.0, 2.0)):
+        with_it, without = late(beside, q), late(alone, q)
+        what = f"latency beside a download, {name}"
+        rows.append(Row(what, with_it, "ms", without, "without", with_it / without, most=most))
     lost = sum(int(np.isnan(run.latency).sum()) for run in beside)
     speed = station.received / (repetitions * SECONDS) / 1e3
     return [
