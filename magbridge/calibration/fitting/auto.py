@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 
 from magbridge.arrays import FloatArray
+from magbridge.calibration.fitting.ends import flown
 from magbridge.calibration.fitting.evidence import Quadratic, Widths, is_maximum, maximise
 from magbridge.calibration.fitting.fit import Fit, assemble
 from magbridge.calibration.fitting.left_out import LeftOut, leave_out
@@ -78,6 +79,14 @@ def fit_auto(data: Observations, order: int = 3, *, vehicle: Vehicle | None = No
     ranges = data.ranges()
     exponents, samples, family = _posed(data, order, vehicle)
     best = _best(samples, family)
+    kept = flown(residuals_of(samples, best.family.at(best.widths.eta).coefficients(best.solution.z)))
+    if not kept.all():
+        found = fit_auto(data.part(kept), order, vehicle=vehicle)
+        inner = found.details.pop("flown", None)
+        if inner is not None:
+            kept[kept] = inner
+        return replace(found, details={**found.details, "flown": kept})
+    best = _remembering(samples, best)
     prior = best.family.at(best.widths.eta)
     precision = best.solution.normal.hessian / best.noise.sigma**2 + prior.precision
     coefficients = prior.coefficients(best.solution.z)
@@ -141,7 +150,6 @@ def _best(samples: Samples, family: PriorFamily) -> _Answer:
         if few is not samples:
             noise = NoiseModel(answer.noise.sigma, answer.noise.autocorrelation, answer.noise.white)
             last = _climb(samples, answer.family, answer.solution.z, answer.widths.eta, noise)
-        last = _remembering(samples, last)
         if last.solution.settled and is_maximum(last.quadratic, last.family, last.widths):
             return last
     raise CalibrationError("auto: no start reached a maximum of the evidence; the data contradict themselves")

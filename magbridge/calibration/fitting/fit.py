@@ -149,6 +149,9 @@ def fit(
             raise CalibrationError(wrong)
         _refuse_one_attitude(data)
         found = chosen(data, order, **options)
+        if (kept := found.details.pop("flown", None)) is not None:
+            data = data.part(kept)
+            found.details["ends"] = int((~kept).sum())
         return _judged(found if method == "survey" else _biased(found, bias), data)
 
 
@@ -238,6 +241,11 @@ def _suspicions(found: Fit) -> Iterator[str]:
     samples, outliers = len(found.residual), found.details.get("outliers", 0)
     if outliers > 0.02 * samples:
         yield f"{outliers} of {samples} samples are outliers and were left out of the fit"
+    if ends := found.details.get("ends", 0):
+        yield (
+            f"{ends} samples at the ends of the log do not fit the others (a crash, handling?), "
+            "and were left out"
+        )
     if (ratio := found.details.get("left_out_ratio", 1.0)) > WORSE:
         yield (
             f"parts left out of the fit are off by {ratio:.1f} times what it claimed, so its sigmas were "
