@@ -21,7 +21,9 @@ def drone(crash: int, n: int = 500) -> Observations:
     body[n - crash :] = body[-1] + other.normal(0.0, 20_000.0, 3) + other.normal(0.0, 2_000.0, (crash, 3))
     field = body @ (np.eye(3) + rng.normal(0.0, 0.03, (3, 3))) + rng.normal(0.0, 3_000.0, 3)
     field += rng.normal(0.0, 200.0, (n, 3))
-    return Observations(field, np.full(n, np.linalg.norm(FIELD)), np.empty((n, 0)), time=0.1 * np.arange(n))
+    return Observations(
+        field, np.full(n, np.linalg.norm(FIELD)), np.empty((n, 0)), time=np.arange(n, dtype=float) * 0.1
+    )
 
 
 def test_a_crash_is_left_out_and_told() -> None:
