@@ -14,7 +14,18 @@ from pathlib import Path
 
 from cyclopts import CycloptsError, MissingArgumentError, UnusedCliTokensError
 
-from magbridge.cli import ashore, attach, bridge, calibrate, correct, diagnose, info, navigate, survey
+from magbridge.cli import (
+    ashore,
+    attach,
+    bridge,
+    calibrate,
+    correct,
+    diagnose,
+    export,
+    info,
+    navigate,
+    survey,
+)
 from magbridge.cli.common import app, complain
 from magbridge.errors import MagbridgeError, MissingExtra
 
@@ -26,6 +37,7 @@ __all__ = [
     "calibrate",
     "correct",
     "diagnose",
+    "export",
     "info",
     "main",
     "navigate",

@@ -1,0 +1,154 @@
+"""A calibration in other hands: compiled C gives the field of Python, autopilots' formulae that of theirs."""
+
+from __future__ import annotations
+
+import ctypes
+import shutil
+import subprocess
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from magbridge.calibration.correct import correct
+from magbridge.calibration.export_autopilot import ardupilot, compass_of, px4
+from magbridge.calibration.export_c import c_header, c_source
+from magbridge.calibration.file import load, save
+from magbridge.calibration.model import Boresight, Calibration, Parameter, identity
+from magbridge.calibration.terms import Polynomial
+
+GCC = shutil.which("gcc") or shutil.which("cc")
+
+
+def made(*parameters: Parameter, order: int = 3, seed: int = 1, turned: bool = True) -> Calibration:
+    """Return a calibration with random coefficients and covariance."""
+    random = np.random.default_rng(seed)
+    n = len(parameters)
+    powers = tuple(p for p in np.ndindex(*(order + 1,) * n) if sum(p) <= order) if n else ((),)
+    term = Polynomial(exponents=powers)
+    size = term.size
+    coefficients = random.normal(0.0, 300.0, size)
+    root = random.normal(0.0, 2.0, (size, size)) / np.sqrt(size)
+    small = ((1e-4, 1e-5, 0.0), (1e-5, 2e-4, 0.0), (0.0, 0.0, 3e-4))
+    return replace(
+        identity(),
+        parameters=parameters,
+        terms=(term,),
+        coefficients=coefficients,
+        covariance=root @ root.T,
+        boresight=Boresight((0.02, -0.03, 0.1), small) if turned else None,
+        method="auto",
+    )
+
+
+def compiled(calibration: Calibration, folder: Path, *flags: str) -> ctypes.CDLL:
+    if GCC is None:
+        pytest.skip("no C compiler is installed")
+    (folder / "magbridge_calibration.h").write_text(c_header(calibration))
+    (folder / "magbridge_calibration.c").write_text(c_source(calibration))
+    library = folder / f"calibration{'_'.join(flags)}.so"
+    strict = ["-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-O2", "-ffp-contract=off"]
+    source = str(folder / "magbridge_calibration.c")
+    subprocess.run([GCC, *strict, *flags, "-shared", "-fPIC", source, "-o", library, "-lm"], check=True)
+    return ctypes.CDLL(str(library))
+
+
+def in_c(library: ctypes.CDLL, kind: Any, field: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return total, its sigma, vector and its sigmas (n, 8)."""
+
+    class Corrected(ctypes.Structure):
+        _fields_ = [
+            *[(name, kind) for name in ("total", "total_sigma")],
+            *[(name, kind * 3) for name in ("field", "field_sigma")],
+            ("extrapolated", ctypes.c_int),
+        ]
+
+    out, rows = Corrected(), []
+    for h, x in zip(field, values, strict=True):
+        library.magbridge_correct((kind * 3)(*h), (kind * max(len(x), 1))(*x), ctypes.byref(out))
+        rows.append([out.total, out.total_sigma, *out.field, *out.field_sigma, out.extrapolated])
+    return np.array(rows)
+
+
+TWO = (
+    Parameter("battpos", "in", -1.0, 1.0, 0.1, 0.8),
+    Parameter("ballast", "cm3", -200.0, 200.0, 5.0, 150.0),
+)
+CASES = {"none": (), "one": TWO[:1], "two": TWO}
+
+
+@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("turned", [True, False])
+def test_c_gives_what_python_gives(name: str, turned: bool, tmp_path: Path) -> None:
+    calibration = made(*CASES[name], turned=turned)
+    random = np.random.default_rng(5)
+    field = random.normal(size=(200, 3))
+    field *= 50_000.0 / np.linalg.norm(field, axis=1)[:, None]
+    low, high = (np.array([getattr(one, end) for one in CASES[name]]) for end in ("low", "high"))
+    values = low + (high - low) * random.uniform(-0.1, 1.1, (200, len(CASES[name])))
+    ours = correct(calibration, field, values, np.zeros(200))
+    expected = np.column_stack([ours.total, ours.sigma, ours.vector, ours.vector_sigma])
+    double = in_c(compiled(calibration, tmp_path), ctypes.c_double, field, values)
+    np.testing.assert_allclose(double[:, [0, 2, 3, 4]], expected[:, [0, 2, 3, 4]], rtol=0, atol=1e-7)
+    np.testing.assert_allclose(double[:, [1, 5, 6, 7]], expected[:, [1, 5, 6, 7]], rtol=1e-6)
+    outside = ((values < low) | (values > high)).any(axis=1)
+    np.testing.assert_array_equal(double[:, 8], outside)
+    single = in_c(compiled(calibration, tmp_path, "-DMAGBRIDGE_FLOAT"), ctypes.c_float, field, values)
+    np.testing.assert_allclose(single[:, [0, 2, 3, 4]], expected[:, [0, 2, 3, 4]], rtol=0, atol=0.05)
+    np.testing.assert_allclose(single[:, [1, 5, 6, 7]], expected[:, [1, 5, 6, 7]], rtol=2e-2)
+
+
+def test_c_passes_nan_on(tmp_path: Path) -> None:
+    library = compiled(made(*TWO), tmp_path)
+    for field, values in (((np.nan, 1.0, 2.0), (0.0, 0.0)), ((3e4, 0.0, 4e4), (np.nan, 0.0))):
+        (row,) = in_c(library, ctypes.c_double, np.array([field]), np.array([values]))
+        assert np.isnan(row[0])
+
+
+def read_parameters(text: str) -> dict[str, float]:
+    rows = [line.replace("\t", ",").split(",") for line in text.splitlines() if not line.startswith("#")]
+    return {row[-2] if len(row) == 2 else row[2]: float(row[-1] if len(row) == 2 else row[3]) for row in rows}
+
+
+CURRENT = Parameter("battery_current", "A", 0.0, 20.0, 0.0, 20.0)
+
+
+@pytest.mark.parametrize("current", [False, True])
+def test_autopilots_correct_as_we_do(current: bool) -> None:
+    """By their formulae, as their source has them, on a calibration that they can hold."""
+    calibration = made(*([CURRENT] if current else []), order=1, turned=False)
+    if current:  # a current has a field of its own, and leaves the scales alone
+        coefficients = calibration.coefficients.copy()
+        coefficients[9:15] = 0.0
+        calibration = replace(calibration, coefficients=coefficients)
+    compass = compass_of(calibration)
+    assert compass.lost == ("uncertainties and flags",)
+    field, ampere = np.array([21_000.0, -5_000.0, 44_000.0]), 12.0 if current else 0.0
+    channels = np.array([[ampere]] if current else [[]])
+    ours = correct(calibration, field[None], channels, np.zeros(1)).vector[0]
+
+    def vector(found: dict[str, float], name: str, axes: str = "XYZ") -> np.ndarray:
+        return np.array([found.get(name.format(axis), 0.0) for axis in axes])
+
+    def matrix(diagonal: np.ndarray, off: np.ndarray) -> np.ndarray:
+        (a, b, c), (d, e, f) = diagonal, off
+        return np.array([[a, d, e], [d, b, f], [e, f, c]])
+
+    found = read_parameters(ardupilot(compass)[0])
+    M = matrix(vector(found, "COMPASS_DIA_{}"), vector(found, "COMPASS_ODI_{}"))
+    theirs = M @ (field / 100.0 + vector(found, "COMPASS_OFS_{}")) + vector(found, "COMPASS_MOT_{}") * ampere
+    np.testing.assert_allclose(theirs * 100.0, ours, atol=0.01)
+    found = read_parameters(px4(compass, 1))
+    M = matrix(vector(found, "CAL_MAG1_{}SCALE"), vector(found, "CAL_MAG1_{}ODIAG"))
+    power = vector(found, "CAL_MAG1_{}COMP") * ampere * 1e-3
+    theirs = M @ (field / 1e5 + power - vector(found, "CAL_MAG1_{}OFF"))
+    np.testing.assert_allclose(theirs * 1e5, ours, atol=0.01)
+
+
+def test_what_an_autopilot_cannot_hold_is_said(tmp_path: Path) -> None:
+    save(made(*TWO), tmp_path / "cal.json")
+    lost = " ".join(compass_of(load(tmp_path / "cal.json")).lost)
+    assert "what moves with battpos, ballast: up to " in lost
+    assert "the boresight, a turn of 6.1 deg" in lost
