@@ -150,7 +150,7 @@ def calibrate(
         from magbridge.calibration.fitting.draw import draw_fit
 
         draw_fit(found.calibration, data, picture)
-    for warning in (*found.warnings, *doubt):
+    for warning in (*found.warnings, *doubt, *_undeclared(deployment, data, found)):
         complain(warning)
     left_out = deployment.sizes["time"] - len(data)
     print_result(
@@ -215,6 +215,18 @@ def _fitted(
         raise
     doubt = unlike(logs, data, found, again)
     return found, [doubt] if doubt else []
+
+
+def _undeclared(deployment: xr.Dataset, data: Observations, found: Fit) -> list[str]:
+    """Return a line for each column of the log that moves the field and is no parameter."""
+    import numpy as np
+
+    from magbridge.calibration.fitting.hints import undeclared
+    from magbridge.logs.info import telemetry
+
+    rows = np.searchsorted(deployment["time"].to_numpy(), data.time)
+    others = [name for name in telemetry(deployment) if name not in data.names]
+    return undeclared(found.calibration, data, {name: deployment[name].to_numpy()[rows] for name in others})
 
 
 def _facts(found: Fit, samples: int) -> dict[str, Any]:

@@ -1,0 +1,28 @@
+"""A column that moves the field and was not declared is named; one that does not is not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from magbridge.calibration.fitting.fit import fit
+from magbridge.calibration.fitting.hints import undeclared
+from magbridge.calibration.fitting.observe import observations
+from sitl import load, simulate
+
+
+@pytest.mark.parametrize("declared", [("battpos",), ("battpos", "ballast")])
+def test_a_mass_that_was_left_out_is_named(declared: tuple[str, ...]) -> None:
+    log = simulate(load("demo"), 5)
+    data = observations(log, declared)
+    rows = np.searchsorted(log["time"].to_numpy(), data.time)
+    noise = np.random.default_rng(2).normal(size=len(data))
+    columns = {"noise": noise, "clock": data.time, "ballast": log["ballast"].to_numpy()[rows]}
+    others = {name: column for name, column in columns.items() if name not in declared}
+    said = undeclared(fit(data, "auto").calibration, data, others)
+    if "ballast" in declared:
+        assert not said
+    else:
+        (line,) = said
+        assert line.startswith("column 'ballast' is not declared and moves the field, by about ")
+        assert line.endswith("--parameter ballast")
