@@ -21,7 +21,7 @@ from magbridge.field.grid_netcdf import write
 from magbridge.field.local import OFF_THE_MAP, Local
 from magbridge.field.spline import WEIGHTS, coefficients, filled, weights
 
-__all__ = ["AnomalyGrid"]
+__all__ = ["HOLE", "AnomalyGrid"]
 
 EVEN = 1e-3
 """Share of a step by which rounded coordinates may deviate from an even spacing."""

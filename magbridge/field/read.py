@@ -103,6 +103,13 @@ def without_fill(path: str | Path, values: RealArray) -> RealArray:
 
     One of :data:`FILLS` that lies beyond the others by more than half their range is a hole.
 
+    Parameters
+    ----------
+    path : path
+        Named in errors.
+    values : (...,) array
+        In the grid's unit.
+
     Raises
     ------
     FormatError
