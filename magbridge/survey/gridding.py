@@ -47,6 +47,8 @@ SEARCHED = 4_000
 """Samples about the middle with which the field is searched."""
 OUTLIER = 6.0
 """Sigmas beyond which a sample is left out."""
+LARGE, LIKELIER = 100.0, 5.0
+"""Areas of a length's square, and nats, from which on the field's size may vary from place to place."""
 FINE = 4.0
 """Nodes a length: a map shows what coarser ones would leave out."""
 CHUNK = 16_384
@@ -243,12 +245,13 @@ def _searched(samples: Samples, sigma: float, *, local: bool) -> tuple[Choice, R
         lambda field: problem.sums(field, rows), few.place, weighed, size / sigma,
         harmonic=bool(np.ptp(problem.deeper) > 5.0), rho=samples.rho, effort=0.5,
     )  # fmt: skip
-    if not local:
+    area = float(np.prod(np.ptp(samples.place, axis=0)))
+    if not local or area < LARGE * best.field.length**2:
         return best, even
     uneven = Roughness.of(samples, best.field.length)
     problem = _Problem(few, groups, uneven)
     other = climb(problem.sums(best.field, rows), best, weighed, move_rho=False, steps=16)
-    return (other, uneven) if other.score > best.score else (best, even)
+    return (other, uneven) if other.score > best.score + LIKELIER else (best, even)
 
 
 def _solved(reduced: Reduced, widths: Widths, family: PriorFamily) -> tuple[FloatArray, FloatArray]:

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from magbridge.arrays import BoolArray, FloatArray
+from magbridge.arrays import FloatArray
+from magbridge.calibration.fitting.crossings import far_off, jumped
 from magbridge.calibration.model import Calibration
 from magbridge.columns import CHANNELS
 from magbridge.errors import CalibrationError, DataError, FormatError
@@ -23,9 +24,6 @@ if TYPE_CHECKING:
     import xarray as xr
 
 __all__ = ["Result", "facts", "samples_of", "summary", "survey", "without_daily_variation"]
-
-FARTHEST = 5.0
-"""Of the distance to the median position that 99 % of the samples keep: beyond, a position is wrong."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,6 +61,13 @@ def samples_of(logs: Sequence[xr.Dataset], calibrations: Sequence[Calibration]) 
         Those with a vector are corrected, others must hold a corrected field.
     calibrations : sequence of Calibration
         One for all logs with a vector, or one for each of them in order.
+
+    Raises
+    ------
+    DataError
+        Another number of calibrations.
+    FormatError
+        A log without positions.
     """
     parts: list[Samples] = []
     with_vector = [log for log in logs if _has_vector(log)]
@@ -85,12 +90,17 @@ def samples_of(logs: Sequence[xr.Dataset], calibrations: Sequence[Calibration]) 
 
 
 def survey(samples: Samples) -> Result:
-    """Level and grid corrected samples."""
-    warnings = []
-    far = _far(samples.place)
-    if far.any():
-        warnings.append(f"{int(far.sum())} samples lie far from all others (a jump in position): left out")
-        samples = samples.part(~far)
+    """Level and grid corrected samples.
+
+    Raises
+    ------
+    CalibrationError
+        They cannot be gridded.
+    """
+    warnings: list[str] = []
+    far = far_off(samples.place)
+    warnings += jumped(int(far.sum()))
+    samples = samples.part(~far)
     with threadpool_limits(1, "blas"):
         try:
             found = gridded(samples)
@@ -154,12 +164,6 @@ def _base_field(base: xr.Dataset) -> FloatArray:
 
 def _has_vector(log: xr.Dataset) -> bool:
     return all(name in log for name in CHANNELS)
-
-
-def _far(place: FloatArray) -> BoolArray:
-    """Return which places (n, 2) lie far from all others."""
-    distance = np.linalg.norm(place - np.median(place, axis=0), axis=1)
-    return np.asarray(distance > FARTHEST * max(float(np.quantile(distance, 0.99)), 100.0))
 
 
 def facts(result: Result, path: Path) -> dict[str, Any]:

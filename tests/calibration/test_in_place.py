@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -108,6 +110,17 @@ def test_straight_line_is_not_supported() -> None:
     found = fit(flown(legs=8, straight=True)[0])
     assert not found.supported
     assert any("never crossed your own track" in line for line in found.warnings)
+
+
+def test_a_jump_in_position_is_left_out_and_told() -> None:
+    """A fix on the other side of the Earth must not spread the nodes there."""
+    data, _ = flown(legs=4)
+    assert data.place is not None
+    place = data.place.copy()
+    place[100:103, 0] += 8e6
+    found = fit(replace(data, place=place))
+    assert any("3 samples far from all others" in line for line in found.warnings)
+    assert sum(run.samples for run in found.calibration.runs) == len(data) - 3
 
 
 @pytest.mark.parametrize("alpha", [2, 3, 4])

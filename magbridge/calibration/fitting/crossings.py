@@ -10,7 +10,7 @@ import numpy as np
 from magbridge.arrays import BoolArray, FloatArray
 from magbridge.calibration.fitting.observations import Observations
 
-__all__ = ["crossed", "left_open"]
+__all__ = ["crossed", "far_off", "jumped", "left_open"]
 
 TURNED = 30.0
 """deg between two courses that cross."""
@@ -20,6 +20,8 @@ FEW = 3
 """Crossed places below which a survey says nothing about itself."""
 SHARE = 0.25
 """Of the rock's length: places as near as that are one."""
+FARTHEST, NEAR = 5.0, 1000.0
+"""Of the distance from the middle within which 99 % of the samples stay, and the least such distance, m."""
 STILL = 5.0
 """m between samples, below which a course is not one."""
 
@@ -43,6 +45,19 @@ def left_open(data: Observations, length: float) -> Iterator[str]:
             f"you crossed your own track at {places} only: rock and heading are told apart by how smooth the "
             "rock is; fly more legs that cross earlier ones"
         )
+
+
+def far_off(place: FloatArray) -> BoolArray:
+    """Return which places (n, 2), m, lie so far from all others that they cannot be right: (n,)."""
+    distance = np.linalg.norm(place - np.nanmedian(place, axis=0), axis=1)
+    usual = max(float(np.nanquantile(distance, 0.99)), NEAR)
+    return np.asarray(~(distance <= FARTHEST * usual))
+
+
+def jumped(count: int) -> Iterator[str]:
+    """Say that so many samples were left out for their position."""
+    if count:
+        yield f"{count} sample{'s' * (count > 1)} far from all others (a jump in position): left out"
 
 
 def crossed(place: FloatArray, course: FloatArray, cell: float) -> tuple[int, int]:

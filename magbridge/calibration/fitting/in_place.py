@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 
 from magbridge.arrays import BoolArray, FloatArray
-from magbridge.calibration.fitting.crossings import left_open
+from magbridge.calibration.fitting.crossings import far_off, jumped, left_open
 from magbridge.calibration.fitting.evidence import Widths, maximise
 from magbridge.calibration.fitting.field_search import (
     Choice,
@@ -145,6 +145,9 @@ def fit_survey(
         raise CalibrationError(
             "method survey: expected latitude and longitude, and a field that is not known"
         )
+    far = far_off(data.place[:, :2])
+    if far.any():
+        data = data.part(~far)
     ranges = data.ranges()
     exponents = full_order(len(ranges), order)
     samples = polynomial_samples(data, exponents)
@@ -169,7 +172,7 @@ def fit_survey(
     fit = replace(
         fit,
         calibration=stated,
-        open=tuple(left_open(data, choice.field.length)),
+        open=(*jumped(int(far.sum())), *left_open(data, choice.field.length)),
     )
     slow = survey.functions[:, 1:] @ found.z[q + 1 :]
     return fit, InPlace(
