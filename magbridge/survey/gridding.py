@@ -49,8 +49,8 @@ OUTLIER = 6.0
 """Sigmas beyond which a sample is left out."""
 LARGE, LIKELIER = 100.0, 5.0
 """Areas of a length's square, and nats, from which on the field's size may vary from place to place."""
-FINE = 4.0
-"""Nodes a length: a map shows what coarser ones would leave out."""
+FINE, ENOUGH = 4.0, 8_000
+"""Nodes a length, as long as there are no more than enough: a map shows what coarser ones leave out."""
 CHUNK = 16_384
 """Rows at a time."""
 NOTHING = PriorFamily(
@@ -171,9 +171,10 @@ def gridded(samples: Samples, *, local: bool = True) -> Gridded:
     """
     sigma = max(robust_scale(np.diff(samples.value)) / 2.0**0.5, 0.1)
     choice, roughness = _searched(samples, sigma, local=local)
-    choice = replace(
-        choice, field=replace(choice.field, nodes=nodes_for(samples.place, choice.field.length, FINE))
-    )
+    nodes = nodes_for(samples.place, choice.field.length, FINE)
+    if nodes.size > ENOUGH:
+        nodes = nodes_for(samples.place, choice.field.length)
+    choice = replace(choice, field=replace(choice.field, nodes=nodes))
     groups = _groups(samples)
     problem, family = _Problem(samples, groups, roughness), with_groups(NOTHING, groups)
     every = np.arange(len(samples.value))
@@ -201,7 +202,7 @@ def gridded(samples: Samples, *, local: bool = True) -> Gridded:
         rho=choice.rho,
         w=w,
         follow=_apart(follow, problem, choice.field, every),
-        inverse=near_inverse(reduced.precision, choice.field.nodes.edges),
+        inverse=near_inverse(reduced.precision, choice.field.edges),
         levels=problem.D @ z,
         middle=problem.middle,
         mean=problem.mean,

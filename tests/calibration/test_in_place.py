@@ -131,7 +131,7 @@ def test_prior_has_unit_variance_and_its_inverse_is_exact(alpha: int) -> None:
     field = Matern(nodes_near(place, 400.0, 1000.0), 1000.0, alpha)
     Q = field.precision.toarray()
     B = field.basis(place[::9])
-    variance = near_inverse(field.precision, field.nodes.edges).variances(B)
+    variance = near_inverse(field.precision, field.edges).variances(B)
     np.testing.assert_allclose(variance, np.einsum("ni,ij,nj->n", B.toarray(), np.linalg.inv(Q), B.toarray()))
     np.testing.assert_allclose(variance, 1.0, atol=0.05)
     assert field.log_determinant == pytest.approx(np.linalg.slogdet(Q)[1])

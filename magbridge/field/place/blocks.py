@@ -109,8 +109,10 @@ def near_inverse(matrix: csr_array, edges: IndexArray) -> NearInverse:
     for i in reversed(range(len(diagonal))):
         inverse = _lower(diagonal[i], np.eye(len(diagonal[i])))
         own[i] = inverse.T @ inverse
+        diagonal[i] = np.empty(0)
         if i < len(below):
             G = inverse.T @ below[i].T
+            below[i] = np.empty(0)  # large, and not needed again
             beside[i] = -G @ own[i + 1]
             own[i] -= beside[i] @ G.T
     return NearInverse(np.asarray(edges), tuple(own), tuple(beside))

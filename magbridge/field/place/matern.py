@@ -20,7 +20,7 @@ from functools import cached_property
 import numpy as np
 from scipy.sparse import csr_array, diags_array, eye_array
 
-from magbridge.arrays import FloatArray
+from magbridge.arrays import FloatArray, IndexArray
 from magbridge.field.place.blocks import Factor
 from magbridge.field.place.nodes import Nodes
 
@@ -28,6 +28,8 @@ __all__ = ["SMOOTHNESS", "Matern"]
 
 SMOOTHNESS = (2, 3, 4)
 """Powers alpha that are tried: rough, smooth, and as good as a Gaussian."""
+FLAT, FALLING = 4, 6
+"""Strips of nodes that the prior's stencil reaches across, and splines that a slope with depth widens."""
 WAVES = 96
 """Wave numbers an axis at which a spectrum is summed."""
 
@@ -91,6 +93,11 @@ class Matern:
         for _ in range(self.alpha - 1):
             power = power @ self._root
         return csr_array(float(self._spectrum[1].mean()) * power)
+
+    @property
+    def edges(self) -> IndexArray:
+        """(b + 1,) where blocks of nodes begin that couple to the next one only."""
+        return self.nodes.edges(FALLING if self.harmonic else FLAT)
 
     @cached_property
     def log_determinant(self) -> float:

@@ -12,10 +12,8 @@ from scipy.sparse import csr_array
 from magbridge.arrays import BoolArray, FloatArray, IndexArray
 from magbridge.field.spline import weights
 
-__all__ = ["REACH", "Nodes", "nodes_near"]
+__all__ = ["Nodes", "nodes_near"]
 
-REACH = 6
-"""Strips of nodes that a stencil of the prior, or a spline that a slope with depth widens, reaches across."""
 BLOCK = 96
 """Fewest nodes of a block: smaller ones cost more in calls than in arithmetic."""
 MOST = 4_000_000
@@ -55,14 +53,16 @@ class Nodes:
         at = np.stack([strip, along][:: -1 if self.turned else 1], axis=1)
         return np.asarray(self.low + self.spacing * at)
 
-    @cached_property
-    def edges(self) -> IndexArray:
-        """(b + 1,) where blocks begin that couple to the next one only."""
+    def edges(self, reach: int) -> IndexArray:
+        """Return where blocks begin (b + 1,) that couple to the next one only, if nothing reaches further.
+
+        `reach` is in strips of nodes.
+        """
         count = (self.number >= 0).sum(axis=1)
         edges, nodes, strips = [0], 0, 0
         for here in count[count > 0].tolist():
             nodes, strips = nodes + here, strips + 1
-            if strips >= REACH and nodes >= BLOCK:
+            if strips >= reach and nodes >= BLOCK:
                 edges.append(edges[-1] + nodes)
                 nodes = strips = 0
         if nodes:  # a last block too narrow would couple beyond its neighbour
