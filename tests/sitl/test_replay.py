@@ -15,6 +15,7 @@ import xarray as xr
 
 from magbridge.bridge.events import Event, Start
 from magbridge.calibration.file import save
+from magbridge.calibration.fitting.fit import LEVEL
 from magbridge.calibration.model import Noise, identity
 from magbridge.config import load as load_config
 from magbridge.errors import DataError, FormatError, PortError, WrongUse
@@ -310,13 +311,16 @@ def test_a_log_of_few_samples_is_no_silent_sensor(flown: xr.Dataset, tmp_path: P
 
 @pytest.mark.real
 def test_measured_counts_and_moving_masses_go_through(real_data: Path) -> None:
-    """Seaglider 167: the dive that was left out of the fit is right to about one count (100 nT)."""
+    """Seaglider 167: the dive that was left out of the fit is right to about one count (100 nT).
+
+    Its sigma knows besides that the IGRF, which it is compared with here, says nothing of the rock's level.
+    """
     result = replay(sorted((real_data / "seaglider_sg167").glob("*.nc")))
     last = result["parts"][-1]
     assert last["held_out"]
     assert result["samples"] == result["rows"] == 6740
     assert 50.0 < last["corrected_rms_nT"] < 110.0 < 1000.0 < last["raw_rms_nT"]
-    assert np.isclose(last["sigma_nT"], last["corrected_rms_nT"], rtol=0.4)
+    assert np.isclose(last["sigma_nT"], np.hypot(last["corrected_rms_nT"], LEVEL), rtol=0.25)
 
 
 @pytest.mark.real
