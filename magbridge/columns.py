@@ -195,7 +195,8 @@ def require(deployment: xr.Dataset, names: Iterable[str]) -> None:
         if name not in deployment:
             there = " ".join(str(column) for column in deployment.data_vars)
             source = deployment.attrs.get("source", "the deployment")
-            raise FormatError(source, f"expected this column; there are: {there}", column=name)
+            guessed = f"; guessed: {deployment.attrs['guessed']}" if "guessed" in deployment.attrs else ""
+            raise FormatError(source, f"expected this column; there are: {there}{guessed}", column=name)
 
 
 def require_units(deployment: xr.Dataset, units: Mapping[str, str]) -> None:

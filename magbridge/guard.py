@@ -124,6 +124,10 @@ def _foreseen(path: Path, read: Callable[[], Iterable[T]]) -> Iterator[T]:
         raise
     except MemoryError as error:
         raise FormatError(path, TOO_LARGE) from error
+    except UnicodeEncodeError as error:
+        if path.name not in error.object:
+            raise FormatError(path, f"cannot be read, damaged? {error}"[:300]) from error
+        raise FormatError(path, f"a name that cannot be written in {error.encoding}: rename it") from error
     except Exception as error:
         # whatever a library raises on bytes that it was not made for; the traceback goes with the error
         first = next(iter(str(error).splitlines()), "")

@@ -11,8 +11,10 @@ from typing import Annotated
 from cyclopts import Parameter, validators
 
 from magbridge.cli.common import (
+    AS_THEY_SAY,
     Folder,
     Json,
+    Reading,
     Whole,
     app,
     check_inputs,
@@ -100,6 +102,7 @@ def replay(
     config: Path | None = None,
     speed: str = "max",
     log: Annotated[Path | None, Parameter(validator=folder_to_write)] = None,
+    reading: Reading = AS_THEY_SAY,
     json: Json = False,
 ) -> None:
     """Replay logs through the unmodified bridge: real bytes through a pty, real MAVLink through a socket.
@@ -120,6 +123,8 @@ def replay(
         A multiple of real time, or max: as fast as possible.
     log
         A folder for the log that the bridge writes during the replay.
+    reading
+        How to read logs that are not a bridge's own.
     json
         Print the result as JSON.
     """
@@ -127,7 +132,7 @@ def replay(
     from sitl.replay.summary import summary
 
     with new_folder(log) if log else nullcontext():
-        result = played(check_inputs(files), config, speed_of(speed), log)
+        result = played(check_inputs(files), config, speed_of(speed), log, reading.options)
     print_result(result, summary(result), json)
     if not all(run["identical"] for run in result.get("runs", ())):
         raise DataError("the replay did not publish what the log holds")

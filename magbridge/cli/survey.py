@@ -9,9 +9,11 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter, validators
 
 from magbridge.cli.common import (
+    AS_THEY_SAY,
     Json,
     Output,
     Picture,
+    Reading,
     Whole,
     app,
     check_inputs,
@@ -50,13 +52,15 @@ def survey(
     tracks: Annotated[Path | None, Parameter(validator=file_to_write(".geojson", ".json", ".kml"))] = None,
     crossovers: Annotated[Path | None, Parameter(validator=file_to_write(".csv"))] = None,
     picture: Picture = None,
-    strict: bool = False,
+    reading: Reading = AS_THEY_SAY,
     json: Json = False,
 ) -> None:
     """Make an anomaly map, with its sigma, from a survey's own logs: no calibration runs, no map.
 
     Raw logs are calibrated with the rock below, found from the same data, unless a calibration is given.
     Lines are levelled, what changes slowly with time is taken out, and the field is gridded.
+
+    With --strict, also exit with 1 when the data do not support the calibration.
 
     Parameters
     ----------
@@ -90,8 +94,8 @@ def survey(
         A table of the crossovers with their mis-ties before and after levelling.
     picture
         A PNG, PDF or SVG to draw: map, sigma, track, residuals, crossovers.
-    strict
-        Exit with 1 when the data do not support the calibration.
+    reading
+        How to read the logs.
     json
         Print the result as JSON.
     """
@@ -105,7 +109,7 @@ def survey(
     if calibration and save:
         raise WrongUse("--save: with --calibration none is found")
     with waiting("surveying"):
-        samples = _samples(logs, parameter, order, calibration, save, base, strict=strict)
+        samples = _samples(logs, parameter, order, calibration, save, base, reading)
         done = make(samples)
     for warning in done.warnings:
         complain(warning)
@@ -127,8 +131,7 @@ def _samples(
     calibration: tuple[Path, ...],
     save: Path | None,
     base: Path | None,
-    *,
-    strict: bool,
+    reading: Reading,
 ) -> Samples:
     """Return the corrected samples of all files."""
     from magbridge.calibration.file import load
@@ -142,7 +145,7 @@ def _samples(
     parts = [read_table(path) for path in tables]
     if not others:
         return joined(parts)
-    deployments = read_each(others)
+    deployments = read_each(others, options=reading.options)
     note_losses(*(one.attrs for one in deployments))
     if base:
         deployments = without_daily_variation(deployments, read(base))
@@ -152,7 +155,7 @@ def _samples(
         for doubt in doubts_of(one, path):
             complain(doubt)
     if raw and not known:
-        known = [_calibrated(raw, parameters, order, save, strict=strict)]
+        known = [_calibrated(raw, parameters, order, save, strict=reading.strict)]
     return joined([*parts, samples_of(deployments, known)])
 
 

@@ -38,7 +38,9 @@ __all__ = ["FileWriter", "chunks"]
 
 DEFAULTS = Options()
 LONGEST = 1 << 20
-"""Characters of the longest line that is read."""
+"""Characters of the longest line that is read whole."""
+KEPT = 1000
+"""Characters that are kept of a longer one: a row that is dropped, and counted."""
 LOOKED_AT = 1 << 16
 """Bytes by which the encoding is found."""
 
@@ -78,7 +80,7 @@ def _chunks(
     path: Path, file: TextIO, rows: int, options: Options, guess: list[str]
 ) -> Iterator[tuple[xr.Dataset, Sequence[int]]]:
     """Yield the rows, each piece with the numbers of its lines."""
-    lines = _lines(path, file)
+    lines = _lines(file)
     head = list(islice(lines, HEAD))
     if reader := captures.reader(head):
         yield from reader(path, chain(head, lines), rows)
@@ -101,11 +103,14 @@ def _chunks(
         raise FormatError(path, "expected rows after the header", row=layout.first + 1)
 
 
-def _lines(path: Path, file: TextIO) -> Iterator[str]:
-    """Yield the lines; an endless one, as of the zeros that a crash leaves, must not fill the memory."""
+def _lines(file: TextIO) -> Iterator[str]:
+    """Yield the lines; of an endless one, as of the zeros that a crash leaves, the beginning."""
     while line := file.readline(LONGEST):
         if len(line) == LONGEST:
-            raise FormatError(path, f"expected lines of text: a line has more than {LONGEST:,} characters")
+            rest = line
+            while rest and not rest.endswith("\n"):
+                rest = file.readline(LONGEST)
+            line = line[:KEPT]
         yield line if line.endswith("\n") else f"{line}\n"
 
 

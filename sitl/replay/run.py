@@ -18,7 +18,7 @@ from magbridge.columns import CHANNELS
 from magbridge.config import load
 from magbridge.errors import DataError, WrongUse
 from magbridge.field.reference import reference_field
-from magbridge.logs import read
+from magbridge.logs import Options, read
 from magbridge.logs.deployment import passed_over
 from magbridge.progress import track
 from sitl.replay.emulation import emulate, start_us
@@ -30,10 +30,15 @@ from sitl.replay.stage import Stage
 __all__ = ["agreement", "replay"]
 
 Result = dict[str, Any]
+DEFAULTS = Options()
 
 
 def replay(
-    files: Sequence[Path], config: Path | None = None, speed: float = inf, log: Path | None = None
+    files: Sequence[Path],
+    config: Path | None = None,
+    speed: float = inf,
+    log: Path | None = None,
+    options: Options = DEFAULTS,
 ) -> Result:
     """Replay `files` through the bridge; return the results, as the command prints them.
 
@@ -48,13 +53,15 @@ def replay(
         Times real time; ``inf`` is as fast as it goes.
     log : path, optional
         Folder for the bridge's log of the replay.
+    options : Options
+        How to read other logs.
 
     Raises
     ------
     DataError
         A log without the three channels, or of one row.
     WrongUse
-        A bridge's own log without its configuration, or a log of a bridge together with other logs.
+        A bridge's own log without its configuration, with `options`, or together with other logs.
     """
     if config is not None:
         load(config)  # a faulty configuration is reported before anything begins
@@ -63,14 +70,16 @@ def replay(
             raise WrongUse(f"{other}: cannot be replayed together with {own}, a bridge's own log")
         if config is None:
             raise WrongUse(f"{own} is a bridge's own log: name its configuration with --config")
+        if options != DEFAULTS:
+            raise WrongUse(f"{own} is a bridge's own log: it is read as it is, without options")
         return {"runs": [_republished(run, config, speed, log) for run in runs(files)]}
     if config is not None:
-        deployment = read(files, required=CHANNELS)
+        deployment = read(files, required=CHANNELS, options=options)
         times = deployment["time"].to_numpy()
         parts = [Part("all", float(times[0]), float(times[-1]))]
         return _play(deployment, config, parts, speed, log)
     with tempfile.TemporaryDirectory() as folder:
-        setup = prepare(files, Path(folder))
+        setup = prepare(files, Path(folder), options)
         result = _play(setup.deployment, setup.config, setup.parts, speed, log)
     result |= {"calibration": setup.calibration, "simulated_field": setup.simulated}
     result["parts"][-1]["held_out"] = setup.calibration.startswith("nominal")

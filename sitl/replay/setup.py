@@ -20,7 +20,7 @@ from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.observe import observations
 from magbridge.columns import CHANNELS, COLUMNS
 from magbridge.errors import CalibrationError, FormatError
-from magbridge.logs import read
+from magbridge.logs import Options, read
 from magbridge.logs.telemetry_writer import short_name
 from sitl.like import simulate_like
 from sitl.scenario import load
@@ -75,7 +75,7 @@ class ReplaySetup(NamedTuple):
     simulated: bool
 
 
-def prepare(files: Sequence[Path], folder: Path) -> ReplaySetup:
+def prepare(files: Sequence[Path], folder: Path, options: Options) -> ReplaySetup:
     """Read logs, fit a nominal calibration on all but the last, and write the bridge's files to `folder`.
 
     Raises
@@ -83,11 +83,11 @@ def prepare(files: Sequence[Path], folder: Path) -> ReplaySetup:
     FormatError
         A file cannot be read, or holds neither a magnetic field nor what is needed to simulate one.
     """
-    deployment = read(files)
+    deployment = read(files, options=options)
     simulated = not set(CHANNELS) <= set(deployment)
     if simulated:
         deployment = simulate_like(deployment, load("comet"))
-    parts = _parts(files, deployment)
+    parts = _parts(files, deployment, options)
     summary = _calibrate(deployment, parts, folder / "cal.json")
     config = folder / "bridge.toml"
     names, steps = telemetry_of(deployment), np.diff(deployment["time"].to_numpy())
@@ -97,7 +97,7 @@ def prepare(files: Sequence[Path], folder: Path) -> ReplaySetup:
     return ReplaySetup(config, deployment, parts, summary, simulated)
 
 
-def _parts(files: Sequence[Path], deployment: xr.Dataset) -> list[Part]:
+def _parts(files: Sequence[Path], deployment: xr.Dataset, options: Options) -> list[Part]:
     """Return the time spans of the files (those of one stem are one part), or the thirds of one file."""
     time = deployment["time"].to_numpy()
     stems = list(dict.fromkeys(file.stem for file in files))
@@ -108,7 +108,7 @@ def _parts(files: Sequence[Path], deployment: xr.Dataset) -> list[Part]:
     spans: list[Part] = []
     few = deployment.sizes["time"] / len(stems) / 10
     for stem in stems:
-        own = read([file for file in files if file.stem == stem])["time"].to_numpy()
+        own = read([file for file in files if file.stem == stem], options=options)["time"].to_numpy()
         if spans and len(own) < few:  # a few rows at the surface are no part of their own
             spans[-1] = spans[-1]._replace(end=float(own[-1]))
         else:

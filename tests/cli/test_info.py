@@ -83,3 +83,25 @@ def test_what_is_declared_wrongly_is_one_line(
 ) -> None:
     write(made("log", [START], {"mag_x": [1.0]}), "log.parquet")
     assert words in command.refuses("convert", "log.parquet", "-o", "x.csv", *arguments, code=code)
+
+
+@pytest.mark.parametrize(
+    "name", "calibrate convert correct diagnose info navigate plan replay simulate survey".split()
+)
+def test_every_command_that_takes_a_log_is_told_how_to_read_it(name: str, command: Command) -> None:
+    said = command(name, "--help").out
+    for option in ("--column ", "--columns", "--compass", "--date", "--strict"):
+        assert option in said, option
+
+
+def test_a_replay_of_columns_under_other_names(deployment: Path, here: Path, command: Command) -> None:
+    rows = read(deployment).isel(time=slice(0, 60))[["mag_x", "mag_y", "mag_z"]]
+    write(rows.rename(mag_x="Bx", mag_y="By", mag_z="Bz"), "log.csv")
+    declared = [word for axis in "xyz" for word in ("--column", f"mag_{axis}=B{axis} [nT]")]
+    result = json.loads(command("replay", "log.csv", "--json", *declared).out)
+    assert (result["rows"], result["samples"], result["simulated_field"]) == (60, 60, False)
+
+
+def test_a_survey_by_the_other_compass(deployment: Path, here: Path, command: Command) -> None:
+    line = command.refuses("survey", deployment, "--compass", "1", "-o", "map.nc")
+    assert line == f"{deployment.name}: expected a compass '1'; there are: 0"

@@ -65,6 +65,14 @@ def test_every_field_of_a_text_log_is_as_pymavlink_reads_it(tmp_path: Path) -> N
     assert same_as_pymavlink(path, DFReader_text, ours) == 40 * 8
 
 
+@pytest.mark.parametrize("records", [1, 2])
+def test_a_log_in_which_no_record_joins_another_holds_none(records: int, tmp_path: Path) -> None:
+    fmt = described(128, 89, "FMT", "BBnNZ", "Type,Length,Name,Format,Columns")
+    (tmp_path / "log.bin").write_bytes((fmt + b"?") * records)
+    ours = read_binary(tmp_path / "log.bin", EVERYTHING)
+    assert (ours.records, ours.skipped) == ({}, 90 * records)
+
+
 @pytest.mark.real
 def test_a_real_log_is_as_pymavlink_reads_it(real_data: Path) -> None:
     path = real_data / "ardusub" / "small.BIN"

@@ -121,11 +121,16 @@ def test_no_good_file_is_one_line(tmp_path: Path) -> None:
 
 
 def test_a_file_that_breaks_off_is_read_up_to_there(tmp_path: Path) -> None:
+    """Its end is no text: rows that were given out before are kept, and the file is counted and named."""
     paths = made(tmp_path, 3, ())
-    paths[1].write_text(paths[1].read_text() + "nonsense,1\n")
-    pieces = list(logs.read_chunks(paths, 5))
-    assert sum(piece.sizes["time"] for piece in pieces) == 30
+    long = deployment("made", T0 + 10.0 + np.arange(0.0, 10.0, 0.001), {"mag_x": np.ones(10_000)})
+    logs.write(long, paths[1])
+    paths[1].write_bytes(paths[1].read_bytes() + b"\xff\x00" * 5_000)
+    pieces = list(logs.read_chunks(paths, 1000))
+    assert 9_000 <= sum(piece.sizes["time"] for piece in pieces) - 20 <= 10_000
     assert passed_over(*(piece.attrs for piece in pieces)) == {"files_skipped": 1}
+    named = [line for piece in pieces for line in named_losses(piece.attrs)]
+    assert named == [f"{paths[1]}: expected text in UTF-8"]
 
 
 def test_what_was_lost_is_told_in_a_few_lines(tmp_path: Path, command: Command) -> None:

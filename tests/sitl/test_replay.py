@@ -20,7 +20,7 @@ from magbridge.calibration.model import Noise, identity
 from magbridge.config import load as load_config
 from magbridge.errors import DataError, FormatError, PortError, WrongUse
 from magbridge.field.geodesy import offset
-from magbridge.logs import read, write
+from magbridge.logs import Options, read, write
 from magbridge.mavlink import Codec, LogReader
 from magbridge.records import Channel
 from sitl import Twin, load, segments, simulate
@@ -96,6 +96,8 @@ def test_a_log_of_a_replay_is_replayed_bit_for_bit(
     path, log = recorded
     assert is_own_log(log)
     assert not is_own_log(survey)
+    with pytest.raises(WrongUse, match="is a bridge's own log: it is read as it is"):
+        replay([log], path, options=Options(strict=True))
     (run,) = replay([log], path, log=tmp_path / "again")["runs"]
     assert run["identical"]
     assert run["same_config"]
