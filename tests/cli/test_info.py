@@ -85,9 +85,10 @@ def test_what_is_declared_wrongly_is_one_line(
     assert words in command.refuses("convert", "log.parquet", "-o", "x.csv", *arguments, code=code)
 
 
-@pytest.mark.parametrize(
-    "name", "calibrate convert correct diagnose info navigate plan replay simulate survey".split()
-)
+TAKE_LOGS = "calibrate convert correct diagnose info navigate plan replay simulate survey"
+
+
+@pytest.mark.parametrize("name", TAKE_LOGS.split())
 def test_every_command_that_takes_a_log_is_told_how_to_read_it(name: str, command: Command) -> None:
     said = command(name, "--help").out
     for option in ("--column ", "--columns", "--compass", "--date", "--strict"):
