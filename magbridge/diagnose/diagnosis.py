@@ -8,6 +8,7 @@ import numpy as np
 
 from magbridge.arrays import BoolArray, FloatArray
 from magbridge.calibration.model import Calibration
+from magbridge.calibration.residual import rms
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.gain import Gain
@@ -17,6 +18,7 @@ from magbridge.diagnose.inference.outliers import Outliers
 from magbridge.diagnose.inference.rivals import Rival
 from magbridge.diagnose.inference.search import Outcome
 from magbridge.diagnose.inference.state import Hypothesis
+from magbridge.diagnose.seen import Seen, seen
 from magbridge.diagnose.unexplained.leftover import Leftover
 
 __all__ = ["Diagnosis", "Finding", "counted"]
@@ -75,6 +77,13 @@ class Finding:
         """(n,) nT, what it adds to the total field; its columns are in the sensor's nanotesla."""
         columns = self.candidate.columns(slice(0, len(problem)))
         return np.asarray(columns @ self.coefficients / problem.gain)
+
+    def follows(self, problem: Problem, fit: Joint) -> Seen:
+        """Say what is seen of it in what all other causes leave, or if noise hides it, in its fit."""
+        field = self.field(problem)
+        found = seen(problem, field + fit.left / problem.gain)
+        known = found if found.channel else seen(problem, field)
+        return known._replace(size=rms(field), share=found.share)
 
 
 @dataclass(frozen=True, eq=False)

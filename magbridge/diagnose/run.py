@@ -32,6 +32,7 @@ from magbridge.diagnose.inference.outliers import Outliers, outliers
 from magbridge.diagnose.inference.rivals import Rival
 from magbridge.diagnose.inference.search import search
 from magbridge.diagnose.inference.state import Hypothesis
+from magbridge.diagnose.seen import memory, seen
 from magbridge.diagnose.unexplained.leftover import Leftover, leftover
 from magbridge.errors import DataError
 from magbridge.field.grid import AnomalyGrid
@@ -43,6 +44,9 @@ __all__ = ["diagnose"]
 
 LOUD = 2.0
 """Multiple of the calibration's stated noise: 1.5 times is still noise, at twice something is wrong."""
+SLOW, NEGLIGIBLE = 0.4, 1e-5
+"""Share of a residual's power that is left in means over 64 samples from which it is far from white, and its
+RMS, as a share of the field, below which that does not matter."""
 ABSURD = 0.5
 """Fraction of the field; when the corrected field is off by more, no diagnosis is attempted."""
 
@@ -134,7 +138,7 @@ def _examine(
             # the dives left out speak 20:1 against these names
             named, rivals, model, fit, after, extended = (), (), [], outcome.null, before, calibration
             rest = leftover(problem, [], outcome.null, tone)
-    rest = rest or _passing(off) or _loud(problem, after, counts)
+    rest = rest or _passing(off) or _slow(problem, fit) or _loud(problem, after, counts)
     chances = chances_alone(candidates, outcome.info, named, outcome.trials, len(causes))
     total = paired(before, after, problem.survey.dive, counts)
     return Diagnosis(
@@ -233,6 +237,21 @@ def _loud(problem: Problem, after: FloatArray, counts: BoolArray) -> Leftover | 
     if problem.calibration.noise.sensor <= 0.0 or power < LOUD**2 * n:
         return None
     return Leftover("broadband", float(np.sqrt(power - n)), float(chi2.sf(power, n)), 0.0, None, None)
+
+
+def _slow(problem: Problem, fit: Joint) -> Leftover | None:
+    """Describe a residual that is far from white, though no description of the list stands out of it.
+
+    Noise of a long memory can describe anything slow: what it describes is still no noise of the sensor.
+    """
+    left = fit.left / problem.gain
+    found = memory(problem, left)
+    if found.slow < SLOW or found.rms < NEGLIGIBLE * float(np.median(problem.survey.reference)):
+        return None
+    power = found.means * found.samples * found.slow
+    ratio = power * (found.rms / max(found.white, 1e-9)) ** 2
+    channel = seen(problem, left).channel
+    return Leftover("drift", float(np.sqrt(ratio)), float(chi2.sf(power, found.means)), 0.0, None, channel)
 
 
 def _verdict(named: Sequence[Hypothesis], wrong: Outliers | None, rest: Leftover | None, total: Gain) -> str:

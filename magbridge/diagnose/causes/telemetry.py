@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import lru_cache
+from dataclasses import replace
+from functools import lru_cache, reduce
 from typing import Literal
 
 import numpy as np
 
 from magbridge.arrays import FloatArray
 from magbridge.calibration.effects import ChannelEffect
-from magbridge.diagnose.causes.candidates import Candidate, of_effect
+from magbridge.diagnose.causes.candidates import AXES, Candidate, of_effect
 from magbridge.diagnose.causes.regressors import lagged, once
 from magbridge.diagnose.compare.problem import Problem
 
@@ -21,6 +22,9 @@ LAGS = (0.0, 700.0, 1700.0, 4000.0, 10000.0)
 STAGES = 2
 """Equal lags in series, because conducted heat passes the hull before it reaches the core. Of the
 temperature in the centre of a slab one lag misses 10 to 30 %, two in series miss 4 to 9 %."""
+
+TOGETHER = 12
+"""Most currents that are also tried together."""
 
 
 def _origins(problem: Problem, name: str) -> list[float]:
@@ -93,8 +97,17 @@ def _level(problem: Problem, name: str) -> Callable[[slice], FloatArray]:
 
 
 def current_field(problem: Problem) -> list[Candidate]:
-    """A current loop is a fixed source: ``T += b I(t)`` (Biot and Savart), zero when the current is."""
-    return _proportional(problem, "current_field", "current", 100.0)
+    """A current loop is a fixed source: ``T += sum_k b_k I_k(t)`` (Biot and Savart), zero when they are.
+
+    Each current by itself, and all together: motors that are driven as one (throttle, speed controllers,
+    battery) leave the field of currents at several places, which have one common size.
+    """
+    alone = _proportional(problem, "current_field", "current", 100.0)
+    if not 2 <= len(alone) <= TOGETHER:
+        return alone
+    names = tuple(f"{axis} {one.channel}" for one in alone for axis in AXES)
+    every = replace(reduce(Candidate.with_, alone), channel=None, names=names, parts=())
+    return [*alone, replace(every, spectra=np.ones((1, every.size)))]
 
 
 def pressure_offset(problem: Problem) -> list[Candidate]:

@@ -12,6 +12,7 @@ import numpy as np
 from magbridge.arrays import BoolArray, FloatArray, IntArray
 from magbridge.columns import AGE
 from magbridge.diagnose.compare.dives import dives_of, eighths, held, new_dives
+from magbridge.diagnose.compare.kinds import kinds_of
 from magbridge.diagnose.compare.past import FAR, Past
 from magbridge.errors import DataError
 from magbridge.field.geodesy import separation, wrap
@@ -23,14 +24,6 @@ FEWEST = 60
 SHORT = 0.25
 """Quantile of the time steps that is taken for the sampling interval: some gliders sample faster near
 the surface."""
-KINDS = {
-    "degC": "temperature", "K": "temperature", "A": "current", "mA": "current",
-    "m": "pressure", "dbar": "pressure", "bar": "pressure",
-    "Pa": "pressure", "hPa": "pressure", "kPa": "pressure", "mbar": "pressure",
-}  # fmt: skip
-"""Kind of a channel by its unit. Any other unit is taken for the position of something that moves."""
-HINTS = (("temp", "temperature"), ("current", "current"), ("press", "pressure"))
-"""Kind by name for a channel without a unit; without a hint it is tried as every kind."""
 OURS = ("mag_", "truth_", AGE)
 FIELDS = {"nT", "uT", "\N{MICRO SIGN}T", "mG", "G", "T"}
 """Units of another magnetometer, which follows everything that this one does and so explains nothing."""
@@ -219,7 +212,7 @@ def _channels(
             if name in needed and known.size:  # the correction takes it, but nothing can be learned from it
                 channels[name] = Channel(held(values), unit, ())
             continue
-        channels[name] = Channel(held(values), unit, _kinds(name, unit))
+        channels[name] = Channel(held(values), unit, kinds_of(name, unit))
     return channels, tuple(still)
 
 
@@ -233,12 +226,3 @@ def _place(table: dict[str, FloatArray]) -> FloatArray | None:
     north, east = separation(*middle, latitude, longitude)
     down = held(table["depth"]) if "depth" in table else np.zeros_like(north)
     return np.stack([north, east, down], axis=1)
-
-
-def _kinds(name: str, unit: str) -> tuple[str, ...]:
-    if unit in KINDS:
-        return (KINDS[unit],)
-    if not unit:
-        hinted = tuple(kind for hint, kind in HINTS if hint in name.lower())
-        return hinted or ("temperature", "current", "pressure", "position")
-    return ("position",)

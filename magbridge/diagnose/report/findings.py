@@ -15,6 +15,7 @@ from magbridge.diagnose.diagnosis import Diagnosis, Finding
 from magbridge.diagnose.gain import LEVEL, Gain
 from magbridge.diagnose.inference.design import normal
 from magbridge.diagnose.inference.rivals import Rival
+from magbridge.diagnose.seen import Seen, seen
 
 __all__ = ["findings", "findings_json", "parameters"]
 
@@ -40,6 +41,7 @@ def findings(
             "signal_to_noise": _round(rest.signal_to_noise),
             "period_s": None if rest.period_s is None else _round(rest.period_s),
             "best_channel": rest.best_channel,
+            "follows": follows(seen(diagnosis.problem, diagnosis.fit.left / diagnosis.problem.gain)),
             "alternatives": alternatives(rest.within),
         },
         "remarks": list(remarks),
@@ -61,6 +63,7 @@ def _finding(diagnosis: Diagnosis, finding: Finding, causes: Mapping[str, Cause]
     return {
         "cause": candidate.cause,
         "channel": candidate.channel,
+        "follows": follows(finding.follows(diagnosis.problem, diagnosis.fit)),
         "signal_to_noise": _round(finding.signal_to_noise),
         "p_value": _round(finding.hypothesis.p_value),
         "alternatives": alternatives(rivals),
@@ -126,6 +129,17 @@ def _adds_up(candidate: Candidate) -> bool:
     return len(channels) == 1 and not candidate.shape.keys().isdisjoint(("lag", "onset"))
 
 
+def follows(what: Seen) -> dict[str, Any]:
+    """Return what is seen, apart from what it may be."""
+    return {
+        "channel": what.channel,
+        "lag_s": what.lag,
+        "axis": what.axis,
+        "size_nT": _round(what.size),
+        "share": _round(what.share),
+    }
+
+
 def _wrong(diagnosis: Diagnosis) -> dict[str, Any]:
     wrong = diagnosis.wrong
     assert wrong is not None
@@ -133,6 +147,7 @@ def _wrong(diagnosis: Diagnosis) -> dict[str, Any]:
     return {
         "cause": "outliers",
         "channel": None,
+        "follows": None,
         "signal_to_noise": _round(float(np.sqrt(wrong.ratio))),
         "p_value": _round(wrong.p_value),
         "alternatives": [],

@@ -1,0 +1,154 @@
+r"""What is seen in a signal, apart from what it may be: which series it follows, how late, along which axis.
+
+Notes
+-----
+A signal y is explained by a series q, late by a lag, along the axes of the body and along the field itself,
+
+.. math:: y = c_0 + \sum_i b_i u_i + q\,\bigl(d_0 + \sum_i d_i u_i\bigr)
+
+u the direction of the field in the body: what an offset of one nanotesla along each axis adds to the total
+field. The share of y's power that the terms in q add is what the series explains. That is a description: a
+cause is a claim about physics, and is tested elsewhere.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from magbridge.arrays import FloatArray
+from magbridge.calibration.residual import rms
+from magbridge.diagnose.causes.regressors import lagged
+from magbridge.diagnose.compare.problem import Problem
+
+__all__ = ["Memory", "Seen", "memory", "seen"]
+
+LAGS = (0.0, 1.0, 2.0, 4.0, 8.0, 16.0, 30.0, 60.0, 120.0, 300.0, 700.0, 1700.0, 4000.0, 10000.0)
+"""s, lags that are tried."""
+LEAST = 0.1
+"""Share of a signal's power that a series must explain to be said to be followed."""
+MOSTLY = 0.8
+"""Share of what all axes together explain that one must explain alone, to be said to be the one."""
+WORTH = 0.02
+"""Share of the signal's power that a lag must add over none."""
+AXES = ("field", "x", "y", "z")
+ROWS = 20_000
+"""Rows that are looked at."""
+
+
+class Seen(NamedTuple):
+    """What a signal follows.
+
+    Attributes
+    ----------
+    channel : str or None
+        The series that explains most of it: telemetry, ``time``, ``roll``, ``pitch`` or ``heading``; None
+        if none explains a tenth.
+    lag : float
+        s, by which it follows.
+    axis : str or None
+        ``x y z`` of the body, ``field`` along the field; None where several take part.
+    size : float
+        RMS of the signal in the total field.
+    share : float
+        Of its power, that the series explains.
+    """
+
+    channel: str | None
+    lag: float
+    axis: str | None
+    size: float
+    share: float
+
+
+class Memory(NamedTuple):
+    """How far from white a residual is.
+
+    Attributes
+    ----------
+    rms, white : float
+        RMS; and what of it changes from one sample to the next.
+    correlation_time : float
+        s, after which its autocorrelation has fallen to 1/e.
+    slow : float
+        Share of its power that is left in means over :attr:`samples` samples.
+    samples, means : int
+        Samples of a mean, and how many means there are.
+    """
+
+    rms: float
+    white: float
+    correlation_time: float
+    slow: float
+    samples: int
+    means: int
+
+
+def seen(problem: Problem, signal: FloatArray) -> Seen:
+    """Say which series a signal (n,), nT of the total field, follows."""
+    part = slice(None, None, -(-len(signal) // ROWS))
+    u = -(problem.slopes[:, 6:] / problem.gain[:, None])[part]
+    axes = np.column_stack([np.ones(len(u)), u])
+    y = signal[part] - signal[part].mean()
+    total = float(y @ y)
+    size = rms(signal)
+    if not total:
+        return Seen(None, 0.0, None, size, 0.0)
+    base = np.linalg.qr(axes)[0]
+    y = y - base @ (base.T @ y)
+
+    def explained(q: FloatArray, some: slice) -> float:
+        X = (q[:, :, None] * axes[:, None, some]).reshape(len(q), -1)
+        X -= base @ (base.T @ X)
+        G, b = X.T @ X, X.T @ y
+        G += 1e-9 * np.trace(G) / len(G) * np.eye(len(G)) + 1e-300 * np.eye(len(G))
+        return float(b @ np.linalg.solve(G, b)) / total
+
+    found = [(explained(q, slice(None)), name, lag, q) for name, lag, q in _series(problem, part)]
+    share, name, lag, q = max(found, key=lambda one: one[0] - WORTH * (one[2] > 0.0))
+    if share < LEAST:
+        return Seen(None, 0.0, None, size, share)
+    alone = [explained(q, slice(k, k + 1)) for k in range(len(AXES))]
+    k = int(np.argmax(alone))
+    return Seen(name, lag, AXES[k] if alone[k] >= MOSTLY * share else None, size, share)
+
+
+def _series(problem: Problem, part: slice) -> Iterator[tuple[str, float, FloatArray]]:
+    """Yield each series' name, lag, and functions (m, k), about their means."""
+    survey = problem.survey
+    longest, shortest = 0.5 * float(np.ptp(survey.time)), 0.5 * survey.interval
+    lags = [lag for lag in LAGS if not lag or shortest <= lag <= longest]
+    for name, channel in survey.channels.items():
+        if name not in survey.still:
+            for lag in lags:
+                yield name, lag, _scaled(lagged(survey.time, channel.values, lag)[part])
+    yield "time", 0.0, _scaled(survey.time[part])
+    if survey.attitude is not None:
+        for name, angle in zip(
+            ("roll", "pitch", "heading"), np.radians(survey.attitude[part].T), strict=True
+        ):
+            yield name, 0.0, _scaled(np.cos(angle), np.sin(angle))
+
+
+def _scaled(*values: FloatArray) -> FloatArray:
+    q = np.stack(values, axis=1)
+    q = q - q.mean(axis=0)
+    return np.asarray(q / (q.std(axis=0) + 1e-300))
+
+
+def memory(problem: Problem, residual: FloatArray) -> Memory:
+    """Say how far from white a residual (n,), nT, is."""
+    survey = problem.survey
+    e = residual - residual.mean()
+    size = max(rms(e), 1e-300)
+    joined = survey.follows()[1:]
+    white = rms(np.diff(e)[joined]) / 2.0**0.5 if joined.any() else size
+    samples = int(np.clip(len(e) // 16, 2, 64))
+    means = e[: len(e) // samples * samples].reshape(-1, samples).mean(axis=1)
+    spectrum = np.abs(np.fft.rfft(e, 2 * len(e))) ** 2
+    correlation = np.fft.irfft(spectrum)[: len(e)]
+    below = np.flatnonzero(correlation < correlation[0] / np.e)
+    time = float(below[0] if below.size else len(e)) * survey.interval
+    return Memory(size, white, time, float(np.mean(means**2)) / size**2, samples, means.size)

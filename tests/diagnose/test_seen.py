@@ -1,0 +1,77 @@
+"""What is seen in a signal, apart from what it may be; and a residual that is far from white."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from msgspec import structs
+from posed import calibrated, surveyed, walk
+
+from magbridge.calibration.fitting.fit import fit
+from magbridge.calibration.fitting.lowpass import unfiltered
+from magbridge.calibration.fitting.observe import observations
+from magbridge.diagnose.causes.regressors import lagged
+from magbridge.diagnose.compare.problem import Problem, pose
+from magbridge.diagnose.compare.survey import Channel
+from magbridge.diagnose.run import diagnose
+from magbridge.diagnose.seen import memory, seen
+from sitl import load, simulate
+from sitl.dataset import segments
+from sitl.signals import correlated
+
+N = 3000
+
+
+@pytest.fixture(scope="module")
+def flown() -> Problem:
+    rng = np.random.default_rng(5)
+    survey = surveyed(walk(N, rng), np.sin(np.arange(N) / 30.0))
+    throttle = (rng.uniform(size=N // 20) > 0.5).repeat(20).astype(float)
+    channels = survey.channels | {"throttle": Channel(throttle, "%", ("current", "position"))}
+    return pose(replace(survey, channels=channels), calibrated(np.zeros(18)))
+
+
+@pytest.mark.parametrize(("lag", "axis"), [(0.0, "z"), (30.0, "x"), (8.0, "field")])
+def test_series_lag_axis_and_size_of_a_signal_are_told(flown: Problem, lag: float, axis: str) -> None:
+    survey = flown.survey
+    q = lagged(survey.time, survey.channels["throttle"].values, lag)
+    u = np.ones(N) if axis == "field" else -flown.slopes[:, 6 + "xyz".index(axis)] / flown.gain
+    signal = 20.0 * q * u
+    noise = np.random.default_rng(6).normal(size=N)
+    found = seen(flown, signal + noise)
+    assert (found.channel, found.lag, found.axis) == ("throttle", lag, axis)
+    assert found.size == pytest.approx(np.sqrt(np.mean(signal**2) + 1.0), rel=0.02)
+    assert found.share > 0.5
+
+
+def test_noise_follows_nothing(flown: Problem) -> None:
+    found = seen(flown, np.random.default_rng(7).normal(size=N))
+    assert found.channel is None
+    assert found.share < 0.1
+
+
+@pytest.mark.parametrize(("rho", "slow"), [(0.0, 1 / 64), (0.8, 9 / 64), (0.99, 0.8)])
+def test_how_far_from_white_a_residual_is(flown: Problem, rho: float, slow: float) -> None:
+    e = np.random.default_rng(8).normal(size=(N, 1))
+    found = memory(flown, correlated(e, rho)[:, 0] if rho else e[:, 0])
+    assert found.slow == pytest.approx(slow, rel=0.35)
+    assert found.white == pytest.approx(found.rms * np.sqrt(1.0 - rho), rel=0.35)
+    if rho:
+        assert found.correlation_time == pytest.approx(-4.0 / np.log(rho), rel=0.5)
+
+
+def test_a_residual_far_from_white_is_never_nothing() -> None:
+    """Noise of a long memory describes anything slow; a calibration that states it makes it no less."""
+    scenario = load("demo")
+    parts = segments(simulate(scenario, 2))
+    calibration = fit(
+        unfiltered(observations(parts["calibration"], ("battpos", "ballast")), scenario.instrument.corner)
+    ).calibration
+    survey = parts["survey"]
+    n = survey.sizes["time"]
+    slow = 30.0 * correlated(np.random.default_rng(9).normal(size=(n, 1)), 0.99)[:, 0]
+    loud = replace(calibration, noise=structs.replace(calibration.noise, sensor=34.0, autocorrelation=0.99))
+    found = diagnose([survey.assign(reference_field=survey["reference_field"] + slow)], loud)
+    assert found.verdict in ("unexplained", "partly_explained")
