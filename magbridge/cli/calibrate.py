@@ -51,6 +51,7 @@ def calibrate(
     vehicle: Path | None = None,
     grid: Path | None = None,
     site_bias: Annotated[float | None, Parameter(validator=validators.Number(gte=0, lte=1e5))] = None,
+    position_sigma: Annotated[float, Parameter(validator=validators.Number(gte=0, lte=1e5))] = 0.0,
     filter_corner: Annotated[float, Parameter(validator=validators.Number(gte=0, lt=inf))] = 0.0,
     heading_reference: Heading = None,
     picture: Picture = None,
@@ -88,6 +89,9 @@ def calibrate(
         the log has reference_field, the map's own sigma with --grid (20 if it states none), else 145: what
         main-field models do not reach of the crust (error model of the World Magnetic Model 2020). The
         corrected field's sigma counts it, and level_sigma says how much is common to all samples.
+    position_sigma
+        1-sigma in m by which dead-reckoned positions slowly drift, where the rock is found with the
+        calibration: the track is bent to where the rock repeats itself; 0: positions are exact.
     filter_corner
         Corner frequency in Hz of the sensor's first-order anti-alias filter, whose attenuation in turns is
         undone; 0: no filter.
@@ -144,6 +148,10 @@ def calibrate(
             complain(line)
         if filter_corner:
             data = unfiltered(data, filter_corner)
+        if position_sigma:
+            if not (data.lacks_rock and method in ("auto", "survey")):
+                raise WrongUse("--position-sigma: positions matter where the rock is found, by method survey")
+            options["position_sigma"] = position_sigma
         found, doubt = _fitted(logs, data, method, order, site_bias=site_bias, **options)
     save(found.calibration, output)
     if picture:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from math import inf
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter, validators
 
@@ -44,6 +44,7 @@ def survey(
     order: Annotated[Whole, Parameter(validator=validators.Number(gte=1, lte=6))] = 3,
     calibration: tuple[Path, ...] = (),
     save: Written = None,
+    position_sigma: Annotated[float, Parameter(validator=validators.Number(gte=0, lte=1e5))] = 0.0,
     base: Path | None = None,
     spacing: Annotated[float | None, Parameter(validator=validators.Number(gt=0, lt=inf))] = None,
     altitude: Annotated[float | None, Parameter(validator=validators.Number(gte=-1e6, lte=1e6))] = None,
@@ -77,6 +78,8 @@ def survey(
         A calibration (cal.json) to correct with instead; may be repeated, once for each raw log in order.
     save
         The calibration found, to write (cal.json).
+    position_sigma
+        As of calibrate: by how many m dead-reckoned positions slowly drift, while the calibration is found.
     base
         A base station's log (total_field): its variation is taken off.
     spacing
@@ -109,7 +112,8 @@ def survey(
     if calibration and save:
         raise WrongUse("--save: with --calibration none is found")
     with waiting("surveying"):
-        samples = _samples(logs, parameter, order, calibration, save, base, reading)
+        options: dict[str, Any] = {"position_sigma": position_sigma} if position_sigma else {}
+        samples = _samples(logs, parameter, order, calibration, save, base, options, reading)
         done = make(samples)
     for warning in done.warnings:
         complain(warning)
@@ -131,6 +135,7 @@ def _samples(
     calibration: tuple[Path, ...],
     save: Path | None,
     base: Path | None,
+    options: dict[str, Any],
     reading: Reading,
 ) -> Samples:
     """Return the corrected samples of all files."""
@@ -155,12 +160,18 @@ def _samples(
         for doubt in doubts_of(one, path):
             complain(doubt)
     if raw and not known:
-        known = [_calibrated(raw, parameters, order, save, strict=reading.strict)]
+        known = [_calibrated(raw, parameters, order, save, options, strict=reading.strict)]
     return joined([*parts, samples_of(deployments, known)])
 
 
 def _calibrated(
-    logs: list[xr.Dataset], parameters: tuple[str, ...], order: int, save: Path | None, *, strict: bool
+    logs: list[xr.Dataset],
+    parameters: tuple[str, ...],
+    order: int,
+    save: Path | None,
+    options: dict[str, Any],
+    *,
+    strict: bool,
 ) -> Calibration:
     """Return the calibration that the raw logs give themselves; write it where that is asked for."""
     from magbridge.calibration.file import save as write
@@ -171,7 +182,7 @@ def _calibrated(
 
     together = join(logs)
     require(together, parameters)
-    found = fit(observations(together, parameters), order=order)
+    found = fit(observations(together, parameters), order=order, **options)
     for warning in found.warnings:
         complain(warning)
     if strict and not found.supported:

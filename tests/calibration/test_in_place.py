@@ -123,6 +123,20 @@ def test_a_jump_in_position_is_left_out_and_told() -> None:
     assert sum(run.samples for run in found.calibration.runs) == len(data) - 3
 
 
+def test_a_track_that_drifts_is_bent_to_where_the_rock_repeats() -> None:
+    """Positions that are slowly off by 150 m: as exact ones, where the fit knows that they may be."""
+    data, true = flown(legs=20)
+    t = (data.time - data.time[0]) / np.ptp(data.time)
+    drift = 150.0 * np.stack([np.sin(2.2 * np.pi * t + 0.3), np.cos(1.7 * np.pi * t) - 1.0, 0.0 * t], axis=1)
+    off = replace(data, place=data.place + drift)
+    error = []
+    for sigma in (0.0, 100.0):
+        found = fit(off, "survey", position_sigma=sigma)
+        got = correct(found.calibration, data.field, np.empty((len(data), 0)), data.time)
+        error.append(float(np.std(got.total - true)))
+    assert error[1] < 1.1 * NOISE < 1.2 * NOISE < error[0]
+
+
 @pytest.mark.parametrize("alpha", [2, 3, 4])
 def test_prior_has_unit_variance_and_its_inverse_is_exact(alpha: int) -> None:
     """Away from edges the splines' variance is 1; blocks of the inverse are those of the dense one."""

@@ -47,7 +47,7 @@ from magbridge.calibration.fitting.nominal import check_scales, starts
 from magbridge.calibration.fitting.observations import Observations, polynomial_samples
 from magbridge.calibration.fitting.prior import PriorFamily, polynomial_prior
 from magbridge.calibration.fitting.solve import covariance_of, gauss_newton
-from magbridge.calibration.fitting.survey_samples import SurveySamples
+from magbridge.calibration.fitting.survey_samples import Drift, SurveySamples
 from magbridge.calibration.residual import Samples, residuals_of, robust_scale
 from magbridge.calibration.terms import full_order
 from magbridge.errors import CalibrationError
@@ -67,6 +67,8 @@ STILL = 0.05
 """Of the noise: a round that moves no residual by more (RMS) is the last."""
 OUTLIER = 5.0
 """Sigmas beyond which a sample is left out."""
+DRIFTING = 2700.0
+"""s, half the period of the fastest drift of a position."""
 SEARCHED = 12_000
 """Samples that the field's size and length are searched with, at most."""
 
@@ -121,7 +123,12 @@ def fit_in_place(data: Observations, order: int = 3, **options: Any) -> Fit:
 
 
 def fit_survey(
-    data: Observations, order: int = 3, *, level: float, vehicle: Vehicle | None = None
+    data: Observations,
+    order: int = 3,
+    *,
+    level: float,
+    vehicle: Vehicle | None = None,
+    position_sigma: float = 0.0,
 ) -> tuple[Fit, InPlace]:
     """Fit coefficients, level, slow changes and the field in place.
 
@@ -135,6 +142,8 @@ def fit_survey(
         nT, 1-sigma of the reference's error that is the same everywhere.
     vehicle : mapping, optional
         As for :func:`~.auto.fit_auto`.
+    position_sigma : float
+        m, by which dead-reckoned positions slowly drift; the track is then bent to where the rock repeats.
 
     Raises
     ------
@@ -155,7 +164,7 @@ def fit_survey(
     if vehicle:
         own = mounted_prior(own, exponents, ranges, vehicle)
     q = own.E.shape[1]
-    survey = SurveySamples(data, samples, _groups(data, level))
+    survey = SurveySamples(data, samples, _groups(data, level), _drift(data, position_sigma))
     found = _Rounds(survey, with_groups(own, survey.groups), q).settle()
     prior = found.family.at(found.widths.eta)
     coefficients = prior.coefficients(found.z)
@@ -174,7 +183,7 @@ def fit_survey(
         calibration=stated,
         open=(*jumped(int(far.sum())), *left_open(data, choice.field.length)),
     )
-    slow = survey.functions[:, 1:] @ found.z[q + 1 :]
+    slow = survey.steady[:, 1:] @ found.z[q + 1 : q + survey.steady.shape[1]]
     return fit, InPlace(
         choice.field, choice.ratio * sigma, found.w, found.reduced, sigma, choice.rho, found.z, covariance,
         q, survey.middle, slow, survey.kept,
@@ -188,6 +197,12 @@ def _groups(data: Observations, level: float) -> tuple[Group, ...]:
     if len(shape):
         groups.append(Group("slow change with time", waves, shape, SLOW, SLOW_SPREAD))
     return tuple(groups)
+
+
+def _drift(data: Observations, sigma: float) -> Drift | None:
+    """Return how far positions may drift with time: as a random walk of `sigma` m, north and east."""
+    waves, shape = slow_functions(data.time, DRIFTING)
+    return Drift(waves, shape, sigma) if sigma and len(shape) else None
 
 
 def _details(found: _Answer, survey: SurveySamples) -> dict[str, Any]:
@@ -281,6 +296,7 @@ class _Rounds:
         precision = reduced.quadratic.H / self.sigma**2 + self.family.at(self.eta).precision
         self.z = np.asarray(np.linalg.solve(precision, reduced.quadratic.b / self.sigma**2), float)
         self.w, self.nodes = reduced.field(self.z), choice.field.nodes
+        self.survey.bend(choice.field, self.w, self.z[self.q :])
         lacking = self._slow() + self.survey.basis(choice.field) @ self.w
         score = widths.log_evidence + reduced.log_evidence
         return _Answer(self.z, self.w, reduced, choice, widths, self.family, lacking, score)
@@ -290,13 +306,15 @@ class _Rounds:
 
     def _sums(self, field: Matern, step: int) -> Sums:
         """Return the sums of every `step`-th sample about the last answer; about none where nodes are new."""
-        B = self.survey.basis(field)
         w = self.w if field.nodes is self.nodes else np.zeros(field.nodes.size)
+        self.survey.bend(field, w, self.z[self.q :])
+        B = self.survey.basis(field)
         return add_up(self.survey.linear(self.family, self.z, self._slow() + B @ w, w, B, step))
 
     def _slow(self) -> FloatArray:
         """Return level and slow changes at every sample, nT."""
-        return np.asarray(self.survey.functions @ self.z[self.q :])
+        steady = self.survey.steady
+        return np.asarray(steady @ self.z[self.q : self.q + steady.shape[1]])
 
     def _residuals(self, answer: _Answer) -> FloatArray:
         samples = self.survey.samples

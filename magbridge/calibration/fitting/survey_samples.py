@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.sparse import csr_array, diags_array
@@ -17,10 +18,18 @@ from magbridge.calibration.fitting.prior import PriorFamily
 from magbridge.calibration.residual import Samples, jacobian, residuals
 from magbridge.field.place.matern import Matern
 
-__all__ = ["SurveySamples"]
+__all__ = ["Drift", "SurveySamples"]
 
 CHUNK = 16384
 """Rows at a time: bounded memory at any number of samples."""
+
+
+class Drift(NamedTuple):
+    """How positions drift with time: functions (n, r), their widths (r,) over `sigma`, and that, m."""
+
+    waves: FloatArray
+    shape: FloatArray
+    sigma: float
 
 
 class SurveySamples:
@@ -34,24 +43,48 @@ class SurveySamples:
         The same, with the monomials of the positions.
     groups : tuple of Group
         Unknowns beside the coefficients.
+    drift : Drift, optional
+        How positions may be off: further unknowns, which act through the field's slope.
     """
 
-    def __init__(self, data: Observations, samples: Samples, groups: tuple[Group, ...]) -> None:
+    def __init__(
+        self, data: Observations, samples: Samples, groups: tuple[Group, ...], drift: Drift | None = None
+    ) -> None:
         assert data.place is not None
         assert data.unmapped is not None
-        self.samples, self.groups = samples, groups
+        self.samples, self.drift = samples, drift
         self.unmapped = data.unmapped
-        self.place = data.place[:, :2]
+        self.place = self.as_logged = data.place[:, :2]
         self.middle = float(np.nanmedian(data.place[:, 2]))
         self.deeper = np.nan_to_num(data.place[:, 2] - self.middle)
-        self.functions = (
-            np.concatenate([group.functions for group in groups], axis=1) * self.unmapped[:, None]
-        )
+        steady = np.concatenate([group.functions for group in groups], axis=1)
+        self.steady = self.functions = steady * self.unmapped[:, None]
+        self.groups = groups
+        if drift is not None:
+            nothing = np.zeros_like(drift.waves)
+            self.groups = (
+                *groups, *(Group(f"position {way}", nothing, drift.shape, drift.sigma) for way in ("n", "e"))
+            )  # fmt: skip
+            self.functions = np.hstack([self.steady, nothing, nothing])
         self.kept = np.ones(len(samples.field), bool)
 
     def basis(self, field: Matern) -> csr_array:
         """Return what the field's coefficients add to the reference (n, nodes)."""
         return csr_array(diags_array(self.unmapped) @ field.basis(self.place, self.deeper))
+
+    def bend(self, field: Matern, w: FloatArray, latent: FloatArray) -> None:
+        """Move the track to where it is with the unknowns `latent` (p,), and take the field's slope there.
+
+        `w` (nodes,) are the field's coefficients, nT.
+        """
+        if self.drift is None:
+            return
+        r, many = len(self.drift.shape), self.steady.shape[1]
+        north, east = latent[many : many + r], latent[many + r :]
+        waves = self.drift.waves
+        self.place = self.as_logged + np.stack([waves @ north, waves @ east], axis=1)
+        slopes = [(slope @ w * self.unmapped)[:, None] * waves for slope in field.nodes.slopes(self.place)]
+        self.functions = np.hstack([self.steady, *slopes])
 
     def linear(
         self,
