@@ -12,6 +12,7 @@ the built-in that a caller who does not know magbridge would catch::
     │   └── OutOfRange (ValueError)       a date, position or grid cell outside the data
     ├── PortError (OSError)               exit 1: a port that cannot be opened, read or written
     ├── WriteError (OSError)              exit 1: a file that cannot be written; it is as it was before
+    ├── PluginError (RuntimeError)        exit 1: another package's driver or format that is faulty
     └── MissingExtra (ImportError)        exit 2: an optional dependency that is not installed
 """
 
@@ -27,6 +28,7 @@ __all__ = [
     "MagbridgeError",
     "MissingExtra",
     "OutOfRange",
+    "PluginError",
     "PortError",
     "WriteError",
     "WrongUse",
@@ -112,6 +114,14 @@ class WriteError(MagbridgeError, OSError):
     def __init__(self, file: str | Path, reason: str) -> None:
         self.file, self.reason = Path(file), reason
         super().__init__(f"{file}: cannot be written: {reason}")
+
+
+class PluginError(MagbridgeError, RuntimeError):
+    """Another package's driver, format or term that is faulty: names it, and what went wrong where."""
+
+    def __init__(self, plugin: str, fault: str) -> None:
+        self.plugin, self.fault = plugin, " ".join(fault.split())
+        super().__init__(f"{plugin}: {self.fault}")
 
 
 class MissingExtra(MagbridgeError, ImportError):

@@ -11,7 +11,6 @@ from __future__ import annotations
 from abc import ABCMeta, abstractmethod
 from collections.abc import Callable, Sequence
 from importlib import import_module
-from importlib.metadata import entry_points
 from itertools import combinations_with_replacement
 from typing import Annotated, Any, ClassVar, cast
 
@@ -22,6 +21,7 @@ from msgspec import Meta
 from magbridge.arrays import FloatArray
 from magbridge.calibration.kernel import Kernel
 from magbridge.errors import CalibrationError
+from magbridge.plugins import load, plugins
 
 __all__ = [
     "HIGHEST",
@@ -225,8 +225,8 @@ def term_class(kind: str) -> type[Term]:
         module, _, name = TERMS[kind].partition(":")
         found = getattr(import_module(module), name)
     else:
-        offers = [entry for entry in entry_points(group="magbridge.terms") if entry.name == kind]
-        if not offers:
+        offers = plugins("magbridge.terms")
+        if kind not in offers:
             raise CalibrationError(f"term {kind!r} is not known here: known are {', '.join(sorted(TERMS))}")
-        found = offers[0].load()
+        found = load(offers[kind])
     return cast("type[Term]", found)

@@ -7,7 +7,7 @@ the rest is read: rows and values by :mod:`magbridge.logs.checks`, a whole file 
 from __future__ import annotations
 
 import os
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from functools import partial
 from inspect import signature
 from itertools import accumulate, chain, pairwise
@@ -19,7 +19,7 @@ from magbridge.errors import FormatError
 from magbridge.files import existing
 from magbridge.guard import guarded
 from magbridge.logs.options import Options
-from magbridge.logs.registry import LEADS, format_of, is_bag
+from magbridge.logs.registry import LEADS, Format, format_of, is_bag
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -162,7 +162,7 @@ def _chunks(path: Path, rows: int, options: Options) -> Iterator[xr.Dataset]:
     form = format_of(path)
     chunks = form.load().chunks
     more = (options,) if "options" in signature(chunks).parameters else ()
-    pieces = partial(chunks, path, rows, *more)
+    pieces = partial(_blamed, form, partial(chunks, path, rows, *more))
     part = None
     try:
         numbered = _numbered(guarded(path, pieces) if form.guarded else pieces())
@@ -185,6 +185,15 @@ def _chunks(path: Path, rows: int, options: Options) -> Iterator[xr.Dataset]:
         raise FormatError(path, f"cannot be read: {error.strerror or error}") from error
     if part is None:
         raise FormatError(path, "expected rows, there are none")
+
+
+def _blamed(form: Format, pieces: Callable[[], Iterator[Any]]) -> Iterator[Any]:
+    """Yield the pieces of a format; what another package's code raises names that package."""
+    with form.blamed():
+        for piece in pieces():
+            if form.plugin and not hasattr(piece[0] if isinstance(piece, tuple) else piece, "sizes"):
+                raise TypeError(f"chunks: expected deployments (xarray.Dataset), not {type(piece).__name__}")
+            yield piece
 
 
 def _numbered(pieces: Iterable[Any]) -> Iterator[tuple[xr.Dataset, Sequence[int]]]:

@@ -2,7 +2,7 @@
 
 A file is what its first bytes say; its suffix counts only where they say nothing (CSV, or a log that begins
 with damage). A package adds a format with an entry point in the group ``magbridge.formats``: the suffix
-without its dot, and the module.
+without its dot, and the module (``examples/format`` is such a package).
 
 A format's module has ``chunks(path, rows)``, or ``chunks(path, rows, options)`` where
 :class:`~magbridge.logs.options.Options` make a difference to it. It yields deployments of at most `rows`
@@ -14,13 +14,15 @@ with their times and values is :mod:`magbridge.logs.checks`' business. A format 
 from __future__ import annotations
 
 import re
+from contextlib import AbstractContextManager, nullcontext
 from functools import cache
 from importlib import import_module
-from importlib.metadata import entry_points
+from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from magbridge.errors import FormatError
+from magbridge.errors import FormatError, PluginError
+from magbridge.plugins import blamed, load, plugins
 
 __all__ = ["FLIGHT", "FORMATS", "LEADS", "Format", "format_of", "is_bag", "suffixes"]
 
@@ -46,10 +48,28 @@ class Format(NamedTuple):
     """Whether it heeds itself which compass the options ask for; else its columns are looked through."""
     maps_columns: bool = False
     """Whether it heeds itself what the options declare of columns; else they are renamed when it is read."""
+    plugin: EntryPoint | None = None
+    """Where another package brings it."""
 
     def load(self) -> Any:
-        """Return the module."""
-        return import_module(self.module)
+        """Return the module.
+
+        Raises
+        ------
+        PluginError
+            Another package's cannot be imported, or has no ``chunks``.
+        """
+        if self.plugin is None:
+            return import_module(self.module)
+        module = load(self.plugin)
+        with self.blamed():
+            if not hasattr(module, "chunks"):
+                raise AttributeError(f"{self.module} lacks chunks(path, rows)")
+        return module
+
+    def blamed(self) -> AbstractContextManager[None]:
+        """Return a context in which what another package's code raises becomes a PluginError."""
+        return nullcontext() if self.plugin is None else blamed(self.plugin)
 
 
 FORMATS: dict[str, Format] = {
@@ -88,12 +108,20 @@ FORMATS: dict[str, Format] = {
 def _plugins() -> dict[str, Format]:
     """Return the formats that packages add; those that name a suffix of ours are left out."""
     ours = {suffix for one in FORMATS.values() for suffix in one.suffixes}
-    points = [(f".{point.name.lower()}", point.value) for point in entry_points(group="magbridge.formats")]
+    others = {f".{name.lower()}": point for name, point in plugins("magbridge.formats").items()}
     return {
-        suffix: Format(module, (suffix,), writes=hasattr(import_module(module), "FileWriter"))
-        for suffix, module in points
+        suffix: Format(point.value, (suffix,), writes=_writes(point), plugin=point)
+        for suffix, point in others.items()
         if suffix not in ours
     }
+
+
+def _writes(point: EntryPoint) -> bool:
+    """Tell whether a package's format can be written; a faulty one is told of when it is read."""
+    try:
+        return hasattr(load(point), "FileWriter")
+    except PluginError:
+        return False
 
 
 def suffixes(*, write: bool = False) -> list[str]:

@@ -2,7 +2,7 @@
 
 Other packages add their own by an entry point in the group ``magbridge.sensors`` whose name is the driver's
 and whose object is a class like :class:`Driver`; one that inherits from it needs no more than ``Options``,
-``feed`` and the two counters.
+``feed`` and the two counters. ``examples/driver`` is such a package.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Protocol
 
 from magbridge.errors import ConfigError
+from magbridge.plugins import load, plugins
 from magbridge.records import Reading
 from magbridge.toml import convert
 
@@ -124,11 +125,9 @@ def driver_class(name: str, source: str | Path) -> Any:
     if name in DRIVERS:
         module, attribute = DRIVERS[name]
         return getattr(import_module(module), attribute)
-    from importlib.metadata import entry_points  # noqa: PLC0415 - slow to import, and rarely needed
-
-    others = {entry.name: entry for entry in entry_points(group="magbridge.sensors")}
+    others = plugins("magbridge.sensors")
     if name not in others:
         raise ConfigError(
             source, "sensor.driver", f"expected one of {', '.join(sorted({*DRIVERS, *others}))}"
         )
-    return others[name].load()
+    return load(others[name])

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import msgspec
 
+from magbridge.plugins import plugins
 from magbridge.sensors import DRIVERS, driver_class
 
 __all__ = ["Option", "driver_names", "options_of"]
@@ -38,9 +39,7 @@ class Option(NamedTuple):
 
 def driver_names() -> list[str]:
     """Return the names of all drivers, also those that packages add."""
-    from importlib.metadata import entry_points  # noqa: PLC0415 - slow to import, and rarely needed
-
-    return sorted({*DRIVERS, *(entry.name for entry in entry_points(group="magbridge.sensors"))})
+    return sorted({*DRIVERS, *plugins("magbridge.sensors")})
 
 
 def options_of(driver: str) -> list[Option]:

@@ -8,11 +8,11 @@ point in the group ``magbridge.encoders``: the driver's name, and a class like :
 from __future__ import annotations
 
 from collections.abc import Mapping
-from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
 from magbridge.errors import ConfigError
+from magbridge.plugins import load, plugins
 from magbridge.toml import convert
 from sitl.fluxgate.ascii import AsciiEncoder
 from sitl.fluxgate.digitizer import DigitizerEncoder
@@ -48,8 +48,8 @@ def open_encoder(
     ConfigError
         No such instrument, or a wrong option.
     """
-    others = {} if name in ENCODERS else {one.name: one for one in entry_points(group="magbridge.encoders")}
+    others = {} if name in ENCODERS else plugins("magbridge.encoders")
     if name not in ENCODERS and name not in others:
         raise ConfigError(source, "sensor.driver", f"can emulate {', '.join(sorted({*ENCODERS, *others}))}")
-    encoder: type[Encoder] = ENCODERS[name] if name in ENCODERS else others[name].load()
+    encoder: type[Encoder] = ENCODERS[name] if name in ENCODERS else load(others[name])
     return encoder(convert(dict(options), encoder.Options, source, "sensor.options."), rate)

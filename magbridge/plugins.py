@@ -1,0 +1,58 @@
+"""What other packages add, by entry points: drivers, formats, terms, emulated instruments.
+
+Such code is not ours: whatever it raises ends in one line that names the plug-in, its package and the line of
+code, so that whoever installed it knows whom to tell.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from traceback import extract_tb
+from typing import TYPE_CHECKING, Any
+
+from magbridge.errors import MagbridgeError, PluginError
+
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
+
+__all__ = ["blamed", "load", "plugins"]
+
+
+def plugins(group: str) -> dict[str, EntryPoint]:
+    """Return the entry points of a group, as ``magbridge.formats``, by name."""
+    from importlib.metadata import entry_points  # noqa: PLC0415 - slow to import, and rarely needed
+
+    return {point.name: point for point in entry_points(group=group)}
+
+
+def load(point: EntryPoint) -> Any:
+    """Import what an entry point names.
+
+    Raises
+    ------
+    PluginError
+        It cannot be imported.
+    """
+    with blamed(point):
+        return point.load()
+
+
+@contextmanager
+def blamed(point: EntryPoint) -> Iterator[None]:
+    """Turn whatever a plug-in raises, but for errors of ours and of files, into a :class:`PluginError`."""
+    try:
+        yield
+    except (MagbridgeError, OSError):
+        raise
+    except Exception as error:  # code of others may raise anything
+        called = extract_tb(error.__traceback__)[-1]
+        place = f"{Path(called.filename).name}, line {called.lineno}"
+        raise PluginError(_name(point), f"{type(error).__name__}: {error} ({place})") from error
+
+
+def _name(point: EntryPoint) -> str:
+    kind = point.group.removeprefix("magbridge.").removesuffix("s")
+    package = point.dist.name if point.dist else point.value
+    return f"{kind} {point.name!r} of the package {package}"

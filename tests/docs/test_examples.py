@@ -1,0 +1,131 @@
+"""What the documentation shows is what there is: its code is run, or read as it would be."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from pages import PAGES, ROOT, Block, blocks, commands
+
+from magbridge.calibration.fitting.mounted_masses import read_vehicle
+from magbridge.cli.common import app
+from magbridge.config import load
+from magbridge.logs.mapping import declared
+from magbridge.navigate.options import Options
+from magbridge.toml import convert
+
+SHELL = blocks("sh", "bash")
+SITE = "https://magbridge.github.io/magbridge/"
+HERE = "https://github.com/magbridge/magbridge/"
+RAW = "https://raw.githubusercontent.com/magbridge/magbridge/main/"
+LEAST = {
+    "sensor": '[sensor]\ndriver = "hmr2300"\nport = "/dev/ttyUSB0"\n',
+    "link": '[link]\nurl = "udpout:192.0.2.1:14550"\n',
+}
+"""What a bridge.toml cannot do without: put before a block that shows only some of its tables."""
+
+
+def ours() -> Iterator[tuple[str, list[str]]]:
+    """Yield each command of ``magbridge`` that a page shows, with where it stands."""
+    for block in SHELL:
+        for words in commands(block):
+            if words[0].endswith("magbridge") and len(words) > 1 and words[1] in app:
+                yield f"{block} {' '.join(words[:2])}", words[1:]
+
+
+OURS = list(ours())
+
+
+@pytest.mark.parametrize("words", [words for _, words in OURS], ids=[where for where, _ in OURS])
+def test_a_command_is_one_that_the_program_takes(words: list[str], here: Path) -> None:
+    if "--help" in words:
+        assert words[0] in app
+        return
+    app.parse_args(words, exit_on_error=False, print_error=False)
+
+
+def test_the_pages_show_commands() -> None:
+    assert len(OURS) > 50
+    shown = {words[0] for _, words in OURS}
+    assert shown >= {name for name in app if not name.startswith("-")}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_a_command_in_a_sentence_has_the_options_that_it_shows(page: Path) -> None:
+    for span in re.findall(r"(?<!`)`magbridge ([^`\n]+)`(?!`)", page.read_text(encoding="utf-8")):
+        name, *words = span.split()
+        if not re.fullmatch("[a-z]+", name):
+            continue
+        assert name in app, span
+        taken = {one for argument in app[name].assemble_argument_collection() for one in argument.names}
+        assert not [w for w in words if w.startswith("--") and w not in taken | {"--help"}], span
+
+
+@pytest.mark.parametrize("block", SHELL, ids=str)
+def test_a_tool_that_is_called_is_there(block: Block) -> None:
+    for words in commands(block):
+        if words[0].startswith("python") and len(words) > 1 and words[1].startswith("tools/"):
+            text = (ROOT / words[1]).read_text(encoding="utf-8")
+            options = [word for word in words[2:] if word.startswith("--")]
+            assert not [one for one in options if one not in text and "*arguments" not in text], words
+
+
+@pytest.mark.parametrize("block", blocks("toml"), ids=str)
+def test_a_block_of_toml_is_read_by_what_reads_such_a_file(block: Block, here: Path) -> None:
+    file = here / "block.toml"
+    file.write_text(block.text, encoding="utf-8")
+    if re.search(r"^\[columns\.", block.text, re.MULTILINE):
+        assert declared((), file).columns
+    elif re.search(r"^\[mass\.", block.text, re.MULTILINE):
+        assert read_vehicle(file)
+    elif "[project]" in block.text:
+        assert not list(here.glob("*.py"))  # a package's own: tests/test_template_packages.py installs it
+    else:
+        missing = [text for table, text in LEAST.items() if f"[{table}]" not in block.text]
+        file.write_text("".join(missing) + block.text, encoding="utf-8")
+        for name in re.findall(r'^(?:file|map|signing_key) = "([^"]+)"', block.text, re.MULTILINE):
+            (here / name).touch()
+        config = load(file)
+        if config.navigation:
+            assert convert(config.navigation.options, Options, file)
+
+
+@pytest.mark.parametrize("block", blocks("json"), ids=str)
+def test_a_block_of_json_is_json(block: Block) -> None:
+    assert json.loads(block.text)
+
+
+@pytest.mark.parametrize("block", blocks("python"), ids=str)
+def test_a_block_of_python_runs(block: Block, survey_and_runs: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", block.text],
+        cwd=survey_and_runs,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert not done.returncode, f"{block}\n{done.stderr}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_an_address_of_ours_leads_somewhere(page: Path) -> None:
+    """Links that survive on a package index are absolute: what they name is in the repository."""
+    text = page.read_text(encoding="utf-8")
+    for name in re.findall(re.escape(SITE) + r"([\w/-]+)\.html", text):
+        made = name.startswith("reference/")
+        assert made or (ROOT / "docs" / f"{name}.md").is_file(), name
+    for name in re.findall(re.escape(HERE) + r"(?:blob|tree)/main/([\w./-]*[\w])", text):
+        assert (ROOT / name).exists(), name
+    for name in re.findall(re.escape(RAW) + r"([\w./-]*\w)", text):
+        assert (ROOT / name).is_file(), name
+
+
+def test_the_readme_has_no_link_that_a_package_index_would_break() -> None:
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert not re.findall(r"\]\((?!https://)[^)]+\)|(?:src|href)=\"(?!https://)", text)
+    assert len(text.splitlines()) <= 150

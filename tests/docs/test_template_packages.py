@@ -1,0 +1,122 @@
+"""The templates in ``examples/`` are installed as a contributor would install theirs, and used."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+from pages import ROOT
+
+from magbridge.sensors import open_driver
+
+TEMPLATES = sorted(path.parent for path in ROOT.glob("examples/*/pyproject.toml"))
+
+
+def install(template: Path, folder: Path) -> None:
+    """Put a template where pip would: its module and its entry points."""
+    project = tomllib.loads((template / "pyproject.toml").read_text())["project"]
+    info = folder / f"{project['name'].replace('-', '_')}-{project['version']}.dist-info"
+    info.mkdir(parents=True)
+    (info / "METADATA").write_text(
+        f"Metadata-Version: 2.1\nName: {project['name']}\nVersion: {project['version']}\n"
+    )
+    groups = project["entry-points"]
+    (info / "entry_points.txt").write_text(
+        "".join(
+            f"[{group}]\n" + "".join(f"{name} = {target}\n" for name, target in points.items())
+            for group, points in groups.items()
+        )
+    )
+    for module in template.glob("*.py"):
+        (folder / module.name).write_text(module.read_text())
+
+
+def magbridge(folder: Path, *arguments: object, code: int = 0) -> subprocess.CompletedProcess[str]:
+    """Run the program with what is in `folder` installed beside it."""
+    done = subprocess.run(
+        [sys.executable, "-m", "magbridge", *map(str, arguments)],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(folder), str(ROOT)])},
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == code, done.stderr
+    return done
+
+
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("site-packages")
+    for template in TEMPLATES:
+        install(template, folder)
+    return folder
+
+
+def test_the_driver_is_listed_and_reads_in_any_pieces(
+    installed: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(str(installed))
+    said = magbridge(installed, "drivers", "counts")
+    assert "nt_per_count" in said.stdout
+    data = b"204 -5 7\nM 16204 -5013 49187\r\nM 1 2\nM 60000 2 3\n"
+    whole, pieces = (open_driver("counts", {"nt_per_count": 2.0, "full_scale": 60_000}) for _ in range(2))
+    readings = whole.feed(data)
+    assert readings == [reading for byte in data for reading in pieces.feed(bytes([byte]))]
+    assert [one.field for one in readings] == [(32408.0, -10026.0, 98374.0), (120000.0, 4.0, 6.0)]
+    assert [one.saturated for one in readings] == [False, True]
+    assert (whole.frames_bad, whole.bytes_skipped) == (2, 13) == (pieces.frames_bad, pieces.bytes_skipped)
+    whole.feed(b"x" * 100_000)
+    assert whole.bytes_skipped == 100_013
+
+
+def test_the_format_is_read_by_every_command(installed: Path) -> None:
+    sample = ROOT / "examples" / "format" / "sample.survey"
+    magbridge(installed, "convert", sample, "-o", installed / "sample.csv")
+    head, *rows = [
+        line for line in (installed / "sample.csv").read_text().splitlines() if not line.startswith("#")
+    ]
+    assert "battpos [mm]" in head
+    assert len(rows) == 120
+
+
+def test_a_record_that_is_none_is_named(installed: Path) -> None:
+    bad = installed / "bad.survey"
+    bad.write_text("2026-05-01T10:00:00Z; 48.31; -57.93; 16204.1; -5013.0; 49187.5; 12.4\nand so on\n")
+    said = magbridge(installed, "info", bad, code=1)
+    assert "bad.survey: row 2: expected a time and 6 numbers" in said.stdout + said.stderr
+
+
+@pytest.mark.parametrize(
+    ("text", "fault"),
+    [
+        ("import nowhere_to_be_found\n", "ModuleNotFoundError: No module named 'nowhere_to_be_found'"),
+        (
+            "def chunks(path, rows):\n    yield 1 / 0\n",
+            "ZeroDivisionError: division by zero (faulty.py, line 2)",
+        ),
+        ("def chunks(path, rows):\n    yield {}\n", "expected deployments (xarray.Dataset), not dict"),
+        ("read = None\n", "lacks chunks(path, rows)"),
+    ],
+    ids=["import", "raises", "yields", "lacks"],
+)
+def test_a_faulty_format_is_one_line_and_harms_nothing_else(text: str, fault: str, tmp_path: Path) -> None:
+    info = tmp_path / "faulty-1.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: faulty\nVersion: 1\n")
+    (info / "entry_points.txt").write_text("[magbridge.formats]\nodd = faulty\n")
+    (tmp_path / "faulty.py").write_text(text)
+    (tmp_path / "log.odd").write_text("x")
+    said = magbridge(tmp_path, "convert", tmp_path / "log.odd", "-o", tmp_path / "log.csv", code=1).stderr
+    assert said.startswith("magbridge: format 'odd' of the package faulty: ")
+    assert fault in said
+    assert said.count("\n") == 1
+    assert not (tmp_path / "log.csv").exists()
+    sound = ROOT / "examples" / "format" / "sample.survey"
+    assert (
+        "ends in one of" in magbridge(tmp_path, "convert", sound, "-o", tmp_path / "log.csv", code=1).stderr
+    )
