@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ast
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -12,6 +14,7 @@ import pytest
 import magbridge as mb
 from sitl import load, simulate
 
+WORD = re.compile(r"``(\w+)``")
 ASHORE = {
     "filterpy", "harmonica", "matplotlib", "netCDF4", "pandas", "ppigrf", "pyarrow", "pymavlink", "scipy",
     "xarray",
@@ -20,10 +23,28 @@ ASHORE = {
 
 
 def test_every_public_name_is_there() -> None:
-    assert len(mb.__all__) <= 15
+    assert len(mb.__all__) <= 20
     assert not [name for name in mb.__all__ if getattr(mb, name) is None]
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):
         mb.nothing  # noqa: B018 - it is the look-up that fails
+
+
+def test_help_has_a_line_for_each_name() -> None:
+    told = {
+        name for line in mb.__doc__.splitlines() if line.startswith("``") for name in WORD.findall(line[:20])
+    }
+    assert told == {name for name in mb.__all__ if not name.startswith("_")}
+    assert set(mb.__all__) <= set(dir(mb))
+
+
+def test_a_type_checker_sees_the_same_names() -> None:
+    """They are imported for it alone; at run time each comes from the table of homes."""
+    tree = ast.parse(Path(mb.__file__).read_text())
+    (block,) = [n for n in tree.body if isinstance(n, ast.If)]
+    seen = {(a.name, n.module) for n in block.body if isinstance(n, ast.ImportFrom) for a in n.names}
+    homes = {(name, f"magbridge.{home}") for name, home in mb._HOMES.items()}
+    assert seen == homes | {("plot", "magbridge")}
+    assert {name for name, _ in seen} == set(mb.__all__)
 
 
 @pytest.mark.parametrize(

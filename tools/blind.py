@@ -18,7 +18,10 @@ from typing import Any
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # processes share the cores, not threads
 sys.path.insert(0, str(Path(__file__).parent))
 
-from distributed import Client, LocalCluster, as_completed
+try:
+    from distributed import Client, LocalCluster, as_completed
+except ImportError:
+    sys.exit("distributed is not installed: pip install '.[dev]', or python3 tools/dev.py check")
 from study.cases import PARTS, plan
 from study.figures import plot_confusion, plot_detection
 from study.table import lines

@@ -1,17 +1,19 @@
 """Pages of the documentation that are made from the code: mkdocs calls this file as a hook.
 
-The commands come from their docstrings, the messages from the dialect's XML, the columns from their table, so
-that a page cannot say otherwise than the program.
+The commands come from their docstrings, the keys of files from the records that hold them, parameters and
+columns from their tables, the messages from the dialect's XML, so that a page cannot say otherwise than the
+program.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, get_args, get_type_hints
 from xml.etree.ElementTree import Element, parse
 
 from mkdocs.structure.files import File
+from msgspec import NODEFAULT
 
 if TYPE_CHECKING:
     from mkdocs.config.defaults import MkDocsConfig
@@ -24,7 +26,9 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Add the pages made from the code."""
     pages = {
         "commands": commands(),
-        "configuration": configuration(),
+        "configuration": "\n".join(configuration()),
+        "parameters": "\n".join(parameters()),
+        "columns": "\n".join(columns()),
         "messages": "\n".join(messages()),
         "python": python(),
     }
@@ -43,19 +47,105 @@ def commands() -> str:
     return "# Commands\n\n" + page[listed:]
 
 
-def configuration() -> str:
-    """Return the page of ``bridge.toml``: its tables are documented where they are defined."""
-    tables = ("Sensor", "Link", "Telemetry", "CalibrationFile", "Align", "Log", "Navigation")
-    head = "# bridge.toml\n\nWhat every key means, its type and its default.\n"
-    return "\n".join((head, *(f"::: magbridge.config.{name}\n" for name in tables)))
+def configuration() -> Iterator[str]:
+    """Yield the page of ``bridge.toml``: its tables as they are defined, and the options of every driver."""
+    from magbridge.config import Config  # noqa: PLC0415 - imports the program only where pages are made
+    from magbridge.sensors import DRIVERS  # noqa: PLC0415
+    from magbridge.sensors.options import options_of  # noqa: PLC0415
+
+    yield "# bridge.toml\n\nWhat every key means, its type and its default. Paths are relative to the file.\n"
+    for name, held in get_type_hints(Config).items():
+        table = next((one for one in (held, *get_args(held)) if _is_table(one)), None)
+        if table is not None:
+            yield f"::: {table.__module__}.{table.__name__}\n"
+        elif name == "publish":
+            yield from ("## publish", "", "Message = rate in Hz; 0 with every sample, negative never.", "")
+    yield "## sensor.options\n\nThe keys that each driver has; `magbridge drivers NAME` prints them.\n"
+    for driver in sorted(DRIVERS):
+        rows = [(f"`{one.name}`", one.kind, _default(one.default), one.meaning) for one in options_of(driver)]
+        yield f"### {driver}\n"
+        yield from _table(("option", "type", "default", ""), rows)
+    yield "## navigation.options\n\n::: magbridge.navigate.Options\n    options: {heading_level: 3}\n"
+
+
+def _is_table(kind: object) -> bool:
+    from magbridge.toml import Table  # noqa: PLC0415
+
+    return isinstance(kind, type) and issubclass(kind, Table)
+
+
+def _default(value: object) -> str:
+    return "required" if value is NODEFAULT else f"`{value!r}`"
+
+
+def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> Iterator[str]:
+    """Yield the lines of a table in Markdown."""
+    yield from (f"| {' | '.join(head)} |", "|---" * len(head) + "|")
+    for row in rows:
+        yield f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in row)} |"
+    yield ""
+
+
+def parameters() -> Iterator[str]:
+    """Yield the page of the parameters on the link, for a bridge whose telemetry is ``battpos``."""
+    from magbridge.config import Align, Telemetry  # noqa: PLC0415
+    from magbridge.link.component import DEFAULTS, LIMITS  # noqa: PLC0415
+    from magbridge.link.parameters import alignment, file_rate, rates, telemetry_ages  # noqa: PLC0415
+
+    table = (
+        *alignment(Align()),
+        *telemetry_ages({"battpos": Telemetry("NAMED_VALUE_FLOAT", "value")}),
+        *file_rate(),
+        *rates(DEFAULTS, LIMITS),
+    )
+    yield "# MAVLink parameters\n"
+    yield (
+        "Each takes effect at once and is kept over restarts in `bridge.parameters.json`, where it overrules "
+        "the key of `bridge.toml`. All are REAL32. `MB_AGE_...` exists for each `[telemetry.NAME]`; here for "
+        "`battpos`.\n"
+    )
+    yield from _table(
+        ("parameter", "key", "unit", "default", "lowest", "highest", ""),
+        (
+            (
+                f"`{one.name}`",
+                f"`{one.key}`",
+                one.unit,
+                *(f"{x:g}" for x in (one.default, one.low, one.high)),
+                one.doc,
+            )
+            for one in table
+        ),
+    )
+
+
+def columns() -> Iterator[str]:
+    """Yield the table of the columns that have a meaning of their own, and of the flags."""
+    from magbridge.columns import COLUMNS, CORRECTED, NT_PER_UNIT  # noqa: PLC0415
+    from magbridge.records import Quality  # noqa: PLC0415
+
+    yield "# Every column\n\nWhat a user must know of them: [columns of a log](../columns.md).\n"
+    yield from _table(
+        ("column", "unit", "meaning", "written by"),
+        (
+            (f"`{name}`", one.units, one.long_name, "`correct`" if name in CORRECTED else "")
+            for name, one in COLUMNS.items()
+        ),
+    )
+    units = ", ".join(f"`{unit}`" for unit in NT_PER_UNIT)
+    yield f"A field may be declared in {units}; it is converted to nT.\n"
+    yield "## quality\n\nBits of the column `quality` and of `MAG_FIELD.flags`.\n"
+    yield from _table(("bit", "flag"), ((str(int(one)), f"`{one.names()}`") for one in Quality))
+    yield "::: magbridge.records.Quality\n    options: {heading_level: 3}\n"
 
 
 def python() -> str:
     """Return the page of the public Python names."""
     from magbridge import __all__ as names  # noqa: PLC0415
 
-    public = (name for name in names if not name.startswith("_"))
-    return "\n".join(("# Python", "", "::: magbridge\n    options: {members: false}\n", *map(_entry, public)))
+    public = (name for name in names if not name.startswith("_") and name != "plot")
+    head = "::: magbridge\n    options: {members: false}\n"
+    return "\n".join(("# Python", "", head, *map(_entry, public), "::: magbridge.plot\n"))
 
 
 def _entry(name: str) -> str:

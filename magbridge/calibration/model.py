@@ -163,6 +163,11 @@ class Calibration:
             own.setflags(write=False)
             object.__setattr__(self, name, own)
 
+    def __repr__(self) -> str:
+        ranges = (f"{one.name} {one.low:g} to {one.high:g} {one.unit}".rstrip() for one in self.parameters)
+        held = f"{len(self.coefficients)} coefficients", f"noise {self.noise.sensor:.3g} nT"
+        return f"<Calibration {self.method or 'by hand'}: {', '.join((*ranges, *held))}>"
+
     @property
     def channels(self) -> tuple[str, ...]:
         """Telemetry that correcting needs, in order: the parameters, then the channels of effects."""

@@ -100,6 +100,15 @@ def test_a_block_of_json_is_json(block: Block) -> None:
     assert json.loads(block.text)
 
 
+def test_the_page_of_a_calibration_has_its_keys(survey_and_runs: Path) -> None:
+    page = (ROOT / "docs" / "files.md").read_text(encoding="utf-8")
+    table = page[page.index("## cal.json") : page.index(":::")]
+    keys = re.findall(r"^\| `(\w+)` \|", table, re.MULTILINE)
+    written = json.loads((survey_and_runs / "cal.json").read_text())
+    assert [key for key in keys if key in written] == list(written)
+    assert set(keys) - set(written) <= {"doubts", "level"}
+
+
 @pytest.mark.parametrize("block", blocks("python"), ids=str)
 def test_a_block_of_python_runs(block: Block, survey_and_runs: Path) -> None:
     done = subprocess.run(

@@ -80,6 +80,10 @@ class Fit:
     samples: Samples
     open: tuple[str, ...] = ()
 
+    def __repr__(self) -> str:
+        doubts = f", {len(self.calibration.doubts)} doubts" if self.calibration.doubts else ""
+        return f"<Fit: {self.rms:.2f} nT RMS of {len(self.residual)} samples{doubts}; {self.calibration!r}>"
+
     @property
     def supported(self) -> bool:
         """Whether the calibration is without doubts: ``--strict`` demands it.

@@ -1,0 +1,136 @@
+"""Pictures for a notebook: each draws on axes of yours, or on new ones, and returns them.
+
+::
+
+    import magbridge as mb
+
+    axes = mb.plot.corrected(log)
+    axes.set_title("Dive 12")
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from magbridge.calibration.fitting.observations import Observations
+from magbridge.calibration.fitting.validate import in_sensor_units
+from magbridge.calibration.model import Calibration
+from magbridge.calibration.residual import rms
+from magbridge.errors import MissingExtra, WrongUse
+from magbridge.field.grid import AnomalyGrid
+
+try:
+    import matplotlib.pyplot as plt
+    from matplotlib.axes import Axes
+except ImportError:
+    raise MissingExtra("matplotlib", "analysis") from None
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+__all__ = ["corrected", "grid", "residuals"]
+
+
+def corrected(log: xr.Dataset, column: str = "total_field", ax: Axes | None = None) -> Axes:
+    """Draw a corrected log against time: the value with its 2-sigma band, flagged samples apart.
+
+    Parameters
+    ----------
+    log : Dataset (time)
+        From :func:`magbridge.correct_rows`, or a file that ``magbridge correct`` wrote.
+    column : str
+        ``total_field``, ``anomaly`` (both nT) or their ``total_field_sigma``.
+    ax : Axes, optional
+        New ones if not given.
+
+    Raises
+    ------
+    WrongUse
+        The log has no such column: it is not corrected.
+    """
+    from magbridge.logs.draw import corrected_panel  # noqa: PLC0415 - xarray is for those who draw logs
+
+    if column not in log:
+        raise WrongUse(f"the log has no column {column!r}: correct it first")
+    axes = _axes(ax)
+    corrected_panel(axes, log, column)
+    axes.legend(frameon=False, fontsize="small")
+    return axes
+
+
+def residuals(
+    calibration: Calibration, data: Observations, against: str = "time", ax: Axes | None = None
+) -> Axes:
+    """Draw what a calibration leaves of the total field: a trend is what it does not describe.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        What to correct with.
+    data : Observations
+        Of any log with a reference: :func:`magbridge.observations`.
+    against : str
+        ``time``, ``heading``, or a parameter of the data.
+    ax : Axes, optional
+        New ones if not given.
+
+    Raises
+    ------
+    WrongUse
+        The data have nothing of that name.
+    """
+    left, _ = in_sensor_units(calibration, data)
+    if against == "time":
+        x, label = (data.time - data.time[0]) / 60.0, "minutes"
+    elif against == "heading" and data.attitude is not None:
+        x, label = np.degrees(data.attitude[:, 2]) % 360.0, "heading, deg"
+    elif against in data.names:
+        number = data.names.index(against)
+        x, label = data.parameters[:, number], f"{against}, {data.units[number] or '?'}"
+    else:
+        raise WrongUse(f"against {against!r}: expected one of {', '.join(('time', 'heading', *data.names))}")
+    axes = _axes(ax)
+    noise = calibration.noise.sensor
+    axes.axhspan(-2.0 * noise, 2.0 * noise, color="0.6", alpha=0.25, lw=0, label="2 sigma of the noise")
+    axes.plot(x, left, ".", ms=2, label=f"{rms(left):.2f} nT RMS")
+    axes.set_xlabel(label)
+    axes.set_ylabel("corrected minus reference, nT")
+    axes.legend(frameon=False, fontsize="small")
+    return axes
+
+
+def grid(anomaly: AnomalyGrid, track: xr.Dataset | None = None, ax: Axes | None = None) -> Axes:
+    """Draw an anomaly grid, and a log's track on it.
+
+    Parameters
+    ----------
+    anomaly : AnomalyGrid
+        From :func:`magbridge.read_grid`.
+    track : Dataset (time), optional
+        A log with ``latitude`` and ``longitude``.
+    ax : Axes, optional
+        New ones if not given.
+    """
+    axes = _axes(ax)
+    middle = float(np.nanmedian(anomaly.anomaly))
+    reach = float(np.nanquantile(np.abs(anomaly.anomaly - middle), 0.99))
+    mesh = axes.pcolormesh(
+        anomaly.longitude, anomaly.latitude, anomaly.anomaly,
+        cmap="RdBu_r", vmin=middle - reach, vmax=middle + reach, rasterized=True,
+    )  # fmt: skip
+    axes.figure.colorbar(mesh, ax=axes, label="anomaly, nT", shrink=0.85)
+    if track is not None:
+        axes.plot(track["longitude"], track["latitude"], color="0.1", lw=1.0)
+    axes.set_aspect(1.0 / np.cos(np.radians(float(np.mean(anomaly.latitude)))))
+    axes.set_xlabel("longitude, deg")
+    axes.set_ylabel("latitude, deg")
+    return axes
+
+
+def _axes(ax: Axes | None) -> Axes:
+    if ax is not None:
+        return ax
+    _, axes = plt.subplots(figsize=(8.0, 4.0), layout="constrained")
+    return axes
