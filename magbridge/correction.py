@@ -120,7 +120,7 @@ class Correction:
             )
             quality |= self.plausibility.flags
         if sample.sigma or sample.spans or judged:
-            more = self._more(sample) + judged
+            more = judged + (self._more(sample) if sample.sigma or sample.spans else 0.0)
             sigma = sqrt(sigma * sigma + more)
             sx, sy, sz = sqrt(sx * sx + more), sqrt(sy * sy + more), sqrt(sz * sz + more)
         return sample, Corrected(F, sigma, (x, y, z), (sx, sy, sz), quality)

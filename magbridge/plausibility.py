@@ -114,7 +114,7 @@ class Plausibility:
         self.notices: list[str] = []
         self._told: set[str] = set()
         self._axes = (Axis(), Axis(), Axis())
-        self._share = 0.1
+        self._share, self._stood = 0.1, False  # of repeated numbers; whether an axis has a rail
         self._known = noise > 0.0
         self._floor = 1.5 * max(noise, QUIETEST) ** 2
         self._variance = 0.0  # of innovations, nT^2
@@ -178,6 +178,11 @@ class Plausibility:
         first, second, third = self._axes
         x, y, z = raw
         same_x, same_y, same_z = x == first.last, y == second.last, z == third.last
+        if not (same_x or same_y or same_z or self._stood):
+            first.last, second.last, third.last = x, y, z
+            first.run = second.run = third.run = 0
+            self._share += (1e-3 - self._share) / REPEATS
+            return False
         if same_x and same_y and same_z:
             return False
         stuck = self._repeats(0, first, x, same_x)
@@ -196,7 +201,7 @@ class Plausibility:
         if abs(value) != axis.rail and axis.run * log(self._share) > log(RARELY):
             self._share += (1.0 - self._share) / (3 * REPEATS)
             return False
-        axis.rail = abs(value)
+        axis.rail, self._stood = abs(value), True
         self._notify("axis", f"axis {AXES[number]} stuck at {value:.0f} nT, or clipped there")
         return True
 

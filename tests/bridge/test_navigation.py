@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
+from functools import cache
 from itertools import islice
 from math import radians
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pytest
 
 from magbridge.bridge.drive import set_up
 from magbridge.bridge.events import Event, Start
+from magbridge.bridge.pipeline import Pipeline
 from magbridge.calibration.file import save
 from magbridge.calibration.model import Noise, identity
 from magbridge.config import load
@@ -34,13 +37,12 @@ ORIGIN, ORIGIN_ALTITUDE = (49.51, -57.93), 12.0
 """deg and m: of the autopilot's local frame, on a hill beside the water."""
 QUATERNION = (0.8487626, 0.0993347, -0.1720527, 0.4900333)
 """Of 60 deg of yaw and -0.4 rad of pitch."""
+SENSOR = {"sensitivity": 5e-5, "reference_voltage": 5.0}
 CONFIG = """
 [sensor]
 driver = "digitizer"
 port = "/dev/null"
-[sensor.options]
-sensitivity = 5e-5
-reference_voltage = 5.0
+options = {sensitivity = 5e-5, reference_voltage = 5.0}
 [link]
 url = "udpout:127.0.0.1:14550"
 [calibration]
@@ -72,35 +74,42 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def events(grid: AnomalyGrid, config: Path) -> Iterator[Event]:
+@cache
+def events(folder: Path) -> tuple[Event, ...]:
     """A glider whose dead reckoning is 150 m off: an hour on one heading."""
-    autopilot, fluxgate = Codec(1, 1), open_encoder("digitizer", load(config).sensor.options)
+    return tuple(glide(read_grid(folder / "grid.nc")))
+
+
+def glide(grid: AnomalyGrid) -> Iterator[Event]:
+    autopilot, fluxgate = Codec(1, 1), open_encoder("digitizer", SENSOR)
     origin = offset(*PLACE, OFF, -OFF)  # where it is; it believes to be at PLACE
     fix = {"lat": round(PLACE[0] * 1e7), "lon": round(PLACE[1] * 1e7), "fix_type": 3, "h_acc": 200_000}
     origin_e7 = {"latitude": round(ORIGIN[0] * 1e7), "longitude": round(ORIGIN[1] * 1e7)}
     data = autopilot.pack("GPS_GLOBAL_ORIGIN", altitude=round(1e3 * ORIGIN_ALTITUDE), **origin_e7)
     yield Event(START + 4, Channel.LINK, data + autopilot.pack("GPS_RAW_INT", **fix))
-    for k in range(1, 901):
+    ahead = SPEED * 4.0 * np.arange(1, 901)
+    course = radians(HEADING)
+    places = np.array([offset(*origin, along * np.cos(course), along * np.sin(course)) for along in ahead])
+    times = START * 1e-6 + 4.0 * np.arange(1, 901)
+    main = total_field(places[:, 1], places[:, 0], 0.0, times).tolist()
+    for k, (latitude, longitude) in enumerate(places.tolist(), 1):
         time_us = START + 4_000_000 * k
         data = autopilot.pack("ATTITUDE", yaw=radians(HEADING), pitch=-0.4)
         data += autopilot.pack("VFR_HUD", airspeed=SPEED)
         data += autopilot.pack("GLOBAL_POSITION_INT", alt=round(-1e3 * DEPTH))
         yield Event(time_us, Channel.LINK, data)
-        along = SPEED * 4.0 * k
-        here = offset(*origin, along * np.cos(radians(HEADING)), along * np.sin(radians(HEADING)))
-        total = (
-            float(total_field(here[1], here[0], 0.0, time_us * 1e-6)[0])
-            + grid.look_up(here[1], here[0]).anomaly
-        )
+        total = main[k - 1] + grid.look_up(longitude, latitude).anomaly
         field = (0.4 * total, 0.3 * total, float(np.sqrt(0.75)) * total)
         yield Event(time_us + 2000, Channel.SENSOR, fluxgate.encode(Reading(field, device_time=4.0 * k)))
 
 
-def run(folder: Path, fix: str, count: int | None = None) -> list[tuple[int, bytes]]:
+def bridge(folder: Path, fix: str) -> Pipeline:
     path = folder / f"{fix}.toml"
     path.write_text(CONFIG.replace("FIX", fix))
-    pipeline = set_up(load(path), Start(START))
-    given = islice(events(read_grid(folder / "grid.nc"), path), count)
+    return set_up(load(path), Start(START))
+
+
+def feed(pipeline: Pipeline, given: Iterable[Event]) -> list[tuple[int, bytes]]:
     return [sent for event in given for sent in pipeline.feed(event)]
 
 
@@ -125,22 +134,26 @@ MESSAGES = {
 }
 
 
+class Sailed(NamedTuple):
+    """The fix, the bridge, the frames that it sent with their times, and the fixes among them."""
+
+    kind: str
+    pipeline: Pipeline
+    sent: list[tuple[int, bytes]]
+    fixes: list[Message]
+
+
 @pytest.fixture(scope="module", params=MESSAGES)
-def sailed(
-    request: pytest.FixtureRequest, folder: Path
-) -> tuple[str, list[tuple[int, bytes]], list[Message]]:
-    """The fix, the frames with their times, and the fixes among them."""
-    sent = run(folder, request.param)
+def sailed(request: pytest.FixtureRequest, folder: Path) -> Sailed:
+    pipeline = bridge(folder, request.param)
+    sent = feed(pipeline, events(folder))
     messages = heard(b"".join(frame for _, frame in sent))
-    return request.param, sent, messages[MESSAGES[request.param]]
-
-
-Sailed = tuple[str, list[tuple[int, bytes]], list[Message]]
+    return Sailed(request.param, pipeline, sent, messages[MESSAGES[request.param]])
 
 
 def test_a_fix_says_where_the_vehicle_is_when_it_is_sent(sailed: Sailed) -> None:
     """Decoded, each is within its sigma of the truth, and in its frame."""
-    kind, sent, fixes = sailed
+    kind, _, sent, fixes = sailed
     last = heard(b"".join(frame for _, frame in sent))["MAG_NAVIGATION"][-1]
     honest = np.sqrt(0.5 * (last["covariance_nn"] + last["covariance_ee"]))
     assert len(fixes) > 50
@@ -180,7 +193,7 @@ def test_a_fix_says_where_the_vehicle_is_when_it_is_sent(sailed: Sailed) -> None
 
 
 def test_no_fix_before_the_position_is_valid(sailed: Sailed) -> None:
-    _, sent, fixes = sailed
+    _, _, sent, fixes = sailed
     messages = heard(b"".join(frame for _, frame in sent))
     tracking = next(one for one in messages["MAG_NAVIGATION"] if one["state"] == TRACKING)["time_usec"]
     first_us = next(time_us for time_us, frame in sent if frame == fixes[0].frame)
@@ -194,32 +207,26 @@ def test_no_fix_before_the_position_is_valid(sailed: Sailed) -> None:
     ]
 
 
-def test_odometry_goes_on_between_updates(folder: Path) -> None:
+def test_the_same_events_give_the_same_fixes(sailed: Sailed, folder: Path) -> None:
+    if sailed.kind != "GLOBAL_POSITION_SENSOR":
+        pytest.skip("one kind is enough")
+    again = feed(bridge(folder, sailed.kind), islice(events(folder), 300))
+    assert again == sailed.sent[: len(again)]
+
+
+def test_odometry_goes_on_between_updates(sailed: Sailed, folder: Path) -> None:
     """At 5 Hz, its doubt growing; and it ends when the field does."""
-    path = folder / "ODOMETRY.toml"
-    path.write_text(CONFIG.replace("FIX", "ODOMETRY"))
-    pipeline = set_up(load(path), Start(START))
-    given = list(events(read_grid(folder / "grid.nc"), path))
-    stream = b"".join(frame for event in given for _, frame in pipeline.feed(event))
-    beat = Codec(1, 1).pack("ATTITUDE"), Codec(1, 1).pack("GLOBAL_POSITION_INT", alt=-1000)
-    silent = b"".join(
-        frame
-        for k in range(600)
-        for _, frame in pipeline.feed(Event(given[-1].time_us + 200_000 * k, Channel.LINK, b"".join(beat)))
-    )
-    times = np.array([one["time_usec"] for one in heard(stream)["ODOMETRY"]])
+    if sailed.kind != "ODOMETRY":
+        pytest.skip("the others go out with each update")
+    times = np.array([one["time_usec"] for one in sailed.fixes])
     assert np.median(np.diff(times)) == 200_000
-    after = heard(silent)["ODOMETRY"]
+    beat = Codec(1, 1).pack("ATTITUDE") + Codec(1, 1).pack("GLOBAL_POSITION_INT", alt=-1000)
+    last_us = events(folder)[-1].time_us
+    silence = [Event(last_us + 200_000 * k, Channel.LINK, beat) for k in range(600)]
+    after = heard(b"".join(frame for _, frame in feed(sailed.pipeline, silence)))["ODOMETRY"]
     grown = [one["pose_covariance"][0] for one in after]
     assert grown == sorted(grown)
     assert 2.0 < (after[-1]["time_usec"] - times[-1]) * 1e-6 < 45.0
-
-
-def test_the_same_events_give_the_same_fixes(sailed: Sailed, folder: Path) -> None:
-    if sailed[0] != "GLOBAL_POSITION_SENSOR":
-        pytest.skip("one kind is enough")
-    again = run(folder, sailed[0], 300)
-    assert again == sailed[1][: len(again)]
 
 
 @pytest.mark.parametrize(

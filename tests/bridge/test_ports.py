@@ -16,6 +16,7 @@ import tty
 from pathlib import Path
 
 import pytest
+from checks import soon
 from standstill import standstill
 
 from magbridge.bridge.events import Clock
@@ -66,7 +67,7 @@ def test_a_slow_reader_loses_whole_messages_and_stalls_nobody() -> None:
             count += 1
             assert count * len(FRAME) < 64 << 20
         taken = count * len(FRAME) - port.dropped
-        assert slowest < 0.5
+        assert slowest < soon(0.5)
         received = b""
         while len(received) < taken:
             received += drained(reader, 1)
@@ -125,7 +126,7 @@ def test_a_saturated_line_carries_what_is_new() -> None:
     while last < begun + 2.0:
         now = time.monotonic()
         free, last = min(free + (now - last) * baud / 10, 5000.0), now
-        if now > begun + (count - 200) * 0.0025:
+        while now > begun + (count - 200) * 0.0025:  # also what was due while the machine was busy
             port.write(sample(codec, count := count + 1))
         port.flush()
         if free > 100 and select.select([master], [], [], 0)[0]:

@@ -30,7 +30,7 @@ LINES = 'columns = ["x", "y", "z"]'
         (("digitizer", OPTIONS), True, 1.5),
         (("digitizer", OPTIONS), False, 1.5),
         (("ascii", LINES + "\nrate = 4.0"), True, 1.5),
-        (("ascii", LINES), False, 8.0),
+        (("ascii", LINES), False, 2.5),
     ],
 )
 def test_a_standstill_just_before_a_mass_moves(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from itertools import zip_longest
 
@@ -18,6 +19,11 @@ NOISE = np.random.default_rng(1).integers(0, 256, 4000, dtype=np.uint8).tobytes(
 def seconds(value: float) -> str:
     """Return a time as the table tells it."""
     return f"{value:.2f} s"
+
+
+def soon(limit: float) -> float:
+    """Return how long what takes `limit` (s) on a quiet machine may take on this one, as busy as it is."""
+    return 2.0 * limit * max(1.0, os.getloadavg()[0] / (os.cpu_count() or 1))
 
 
 def replays(rig: Rig) -> None:
