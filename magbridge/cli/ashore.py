@@ -42,7 +42,7 @@ def convert(
     files
         The logs to convert.
     output
-        The file to write; its suffix sets the format: .csv .nc .parquet .tlog.
+        The file to write; its suffix sets the format: .csv .mcap .nc .parquet .tlog.
     heading_reference
         What headings refer to. If not given: what the log says, else true north.
     reading

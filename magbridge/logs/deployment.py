@@ -31,6 +31,7 @@ __all__ = [
     "named_losses",
     "noted",
     "passed_over",
+    "plain_attrs",
     "same_columns",
     "sliced",
     "uncounted",
@@ -223,6 +224,11 @@ def lasting(attrs: Mapping[Any, Any]) -> dict[str, str | float]:
         for name, value in attrs.items()
         if name in MEANING or (isinstance(value, (int, float)) and str(name).startswith(SETTINGS))
     }
+
+
+def plain_attrs(attrs: Mapping[Any, Any]) -> dict[str, str | int | float]:
+    """Return the attributes that JSON can hold."""
+    return {str(name): value for name, value in attrs.items() if isinstance(value, (str, int, float))}
 
 
 def uncounted(dataset: xr.Dataset) -> xr.Dataset:

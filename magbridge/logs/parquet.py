@@ -12,7 +12,7 @@ import xarray as xr
 
 from magbridge.arrays import FloatArray
 from magbridge.errors import FormatError, MissingExtra
-from magbridge.logs.deployment import deployment
+from magbridge.logs.deployment import deployment, plain_attrs
 
 try:
     import pyarrow as pa
@@ -92,7 +92,7 @@ class FileWriter:
                 )
                 for column in columns
             ]
-            schema = pa.schema(fields, metadata={"magbridge": json.dumps(_plain(dataset.attrs))})
+            schema = pa.schema(fields, metadata={"magbridge": json.dumps(plain_attrs(dataset.attrs))})
             self._writer = pq.ParquetWriter(self._path, schema)
         arrays = [pa.array(np.asarray(column.values, dtype=np.float64)) for column in columns]
         self._writer.write_table(pa.Table.from_arrays(arrays, schema=self._writer.schema))
@@ -101,7 +101,3 @@ class FileWriter:
         """Write everything to the file and close it."""
         if self._writer is not None:
             self._writer.close()
-
-
-def _plain(attrs: dict[Any, Any]) -> dict[str, Any]:
-    return {str(key): value for key, value in attrs.items() if isinstance(value, (str, int, float))}

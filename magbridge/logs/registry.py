@@ -85,9 +85,16 @@ FORMATS: dict[str, Format] = {
     "ros": Format(
         "magbridge.logs.rosbag",
         (".bag", ".db3", ".mcap"),
-        rb"#ROSBAG V2|\x89MCAP0\r\n|SQLite format 3\0",
+        rb"#ROSBAG V2|\x89MCAP0\r\n(?!\x01.{12}magbridge)|SQLite format 3\0",
         guarded=True,
         compasses=True,
+    ),
+    "mcap": Format(
+        "magbridge.logs.mcap",
+        (".mcap",),
+        rb"\x89MCAP0\r\n\x01.{12}magbridge",  # its profile: ours, not a robot's
+        writes=True,
+        guarded=True,
     ),
     # 8 bytes of time, µs since 1970 (before 2079), then a frame of either MAVLink
     "telemetry": Format(
@@ -127,7 +134,7 @@ def _writes(point: EntryPoint) -> bool:
 def suffixes(*, write: bool = False) -> list[str]:
     """Return the endings of the file names that can be read, or written."""
     formats = [*FORMATS.values(), *_plugins().values()]
-    return sorted(suffix for one in formats for suffix in one.suffixes if one.writes or not write)
+    return sorted({suffix for one in formats for suffix in one.suffixes if one.writes or not write})
 
 
 def format_of(path: Path, *, write: bool = False) -> Format:
@@ -144,7 +151,8 @@ def format_of(path: Path, *, write: bool = False) -> Format:
         suffix = path.suffix.lower()
         if suffix not in known:
             raise FormatError(path, f"expected a file name that ends in one of {' '.join(known)}")
-        found = next(one for one in [*FORMATS.values(), *_plugins().values()] if suffix in one.suffixes)
+        formats = [*FORMATS.values(), *_plugins().values()]
+        found = next(one for one in formats if suffix in one.suffixes and (one.writes or not write))
     return found
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import tempfile
+from collections import Counter
 from pathlib import Path
 from typing import Literal
 
@@ -17,7 +19,7 @@ from magbridge.columns import CHANNEL_TIMES, COLUMNS
 from magbridge.logs.checks import APART, FIELDS, LEAST, MOST
 from magbridge.logs.deployment import deployment
 
-EXACT = [".csv", ".nc", ".parquet"]
+EXACT = [".csv", ".nc", ".parquet", ".mcap"]
 WRITABLE = [*EXACT, ".tlog"]
 T0 = 1_466_705_388.010925
 UNITS = {
@@ -273,3 +275,35 @@ def test_streams_in_bounded_memory(tmp_path: Path) -> None:
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
     assert peaks[1] < 1.3 * peaks[0] + 200_000
+
+
+def test_mcap_is_what_foxglove_opens(tmp_path: Path) -> None:
+    """By the reader of its makers: topics, schemas and messages."""
+    reader = pytest.importorskip("mcap.reader")
+    whole = example(50).fillna(2.0)
+    whole["latitude"][7] = np.nan
+    whole["quality"][9] = 2 + 128
+    logs.write(whole, tmp_path / "a.mcap")
+    with (tmp_path / "a.mcap").open("rb") as file:
+        found = [
+            (schema, channel, message.log_time, json.loads(message.data))
+            for schema, channel, message in reader.make_reader(file, validate_crcs=True).iter_messages()
+        ]
+    counts = Counter(channel.topic for _, channel, _, _ in found)
+    topics = dict.fromkeys(("/magnetometer", "/field", "/quality", "/vehicle", "/telemetry"), 50)
+    assert counts == {**topics, "/position": 49}
+    for schema, channel, stamp, body in found:
+        assert (schema.encoding, channel.message_encoding) == ("jsonschema", "json")
+        said = json.loads(schema.data)
+        assert (said["type"], said["title"]) == ("object", schema.name)
+        assert body.keys() <= said["properties"].keys()
+        assert stamp == body["timestamp"]["sec"] * 10**9 + body["timestamp"]["nsec"]
+    first = {channel.topic: body for _, channel, _, body in reversed(found)}
+    fix = first["/position"]
+    assert {schema.name for schema, channel, _, _ in found if channel.topic == "/position"} == {
+        "foxglove.LocationFix"
+    }
+    assert (fix["latitude"], fix["altitude"]) == (whole["latitude"][0], -whole["depth"][0])
+    assert first["/field"]["total_field"] == whole["total_field"][0]
+    flags = [body for _, channel, _, body in found if channel.topic == "/quality"][9]
+    assert [name for name, value in flags.items() if value is True] == ["extrapolated", "gap"]

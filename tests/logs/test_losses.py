@@ -145,7 +145,7 @@ def test_what_was_lost_is_told_in_a_few_lines(tmp_path: Path, command: Command) 
 
 def test_a_file_is_what_its_bytes_say(tmp_path: Path) -> None:
     rows = deployment("made", T0 + np.arange(5.0), {"mag_x": np.arange(5.0)})
-    for suffix in (".nc", ".parquet", ".tlog"):
+    for suffix in (".mcap", ".nc", ".parquet", ".tlog"):
         logs.write(rows, tmp_path / f"log{suffix}")
         (tmp_path / f"log{suffix}").rename(tmp_path / "log.dat")
         np.testing.assert_array_equal(logs.read(tmp_path / "log.dat")["mag_x"], rows["mag_x"])
