@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 from math import inf, isfinite
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import msgspec
 from msgspec import Meta
@@ -20,6 +20,7 @@ __all__ = [
     "Align",
     "CalibrationFile",
     "Config",
+    "Learning",
     "Link",
     "Log",
     "Navigation",
@@ -194,6 +195,27 @@ class Navigation(Table, frozen=True):
     options: dict[str, Any] = msgspec.field(default_factory=dict)
 
 
+class Learning(Table, frozen=True):
+    """``[learning]``: the calibration's coefficients are learned in flight.
+
+    Attributes
+    ----------
+    enabled : bool
+        Whether it learns from the start; ``MB_LEARN`` changes that over the link.
+    reference : str
+        What the corrected field is compared with: ``igrf``.
+    max_rate : float
+        Hz: samples that are learned from, at most.
+    keep : str or None
+        Folder for the calibrations that were learned; by default that of the calibration's file.
+    """
+
+    enabled: bool = False
+    reference: Literal["igrf"] = "igrf"
+    max_rate: Annotated[float, Meta(gt=0, le=20)] = 1.0
+    keep: Name | None = None
+
+
 class Log(Table, frozen=True):
     """``[log]``: where the telemetry log goes, and when a new file begins."""
 
@@ -219,6 +241,7 @@ class Config(Table, frozen=True):
     publish: dict[str, Rate] = msgspec.field(default_factory=lambda: {"MAG_FIELD": 0.0})
     log: Log | None = None
     navigation: Navigation | None = None
+    learning: Learning | None = None
     path: Path = Path("bridge.toml")
     digest: str = ""
 

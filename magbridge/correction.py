@@ -21,6 +21,7 @@ from magbridge.columns import AGE, CHANNELS, COLUMNS, CORRECTED, require
 from magbridge.config import Align
 from magbridge.field.igrf import magnitude
 from magbridge.field.reference import main_field
+from magbridge.learning import Learner
 from magbridge.plausibility import Plausibility
 from magbridge.records import BEYOND, Corrected, Quality, Reading
 from magbridge.toml import convert
@@ -45,9 +46,14 @@ class Correction:
         Without one every sample passes unchanged, flagged ``uncalibrated``.
     settings : Align, optional
         If not given, and what :func:`correct_rows` corrects is a bridge's own log: that bridge's.
+    learner : Learner, optional
+        Learns from the samples; what it publishes is used from the next sample on.
     """
 
-    def __init__(self, calibration: Calibration | None, settings: Align | None = None) -> None:
+    def __init__(
+        self, calibration: Calibration | None, settings: Align | None = None, learner: Learner | None = None
+    ) -> None:
+        self.learner = learner
         self._given = settings is not None
         calibration = calibration if calibration is not None else identity()
         ranges = {parameter.name: (parameter.low, parameter.high) for parameter in calibration.parameters}
@@ -81,6 +87,8 @@ class Correction:
     def telemetry(self, name: str, value: float, time_us: int, *, guessed: bool = False) -> None:
         """Take a telemetry value; arguments as :meth:`magbridge.align.Aligner.telemetry`."""
         self.aligner.telemetry(name, time_us, value, guessed=guessed)
+        if self.learner is not None:
+            self.learner.telemetry(name, value)
 
     def reading(
         self,
@@ -90,6 +98,7 @@ class Correction:
         restarted: bool = False,
         missing: int = 0,
         main_field: float = nan,
+        where: tuple[float, float] | None = None,
     ) -> tuple[Sample, Corrected]:
         """Align and correct one reading, and judge what comes out.
 
@@ -99,7 +108,11 @@ class Correction:
             As for :meth:`magbridge.align.Aligner.reading`.
         main_field : float
             nT, the main field's total where the sample was taken; NaN where that is not known.
+        where : tuple of 2 float or None
+            deg, latitude and longitude; None where not known.
         """
+        if self.learner is not None and self.learner.calibration is not self._corrector.calibration:
+            self._use(self.learner.calibration)
         if self._wants_temperature and isfinite(reading.temperature):  # not every reading need have one
             self.aligner.telemetry(TEMPERATURE, time_us, reading.temperature)
         sample = self.aligner.reading(reading, time_us, restarted=restarted, missing=missing)
@@ -119,11 +132,49 @@ class Correction:
                 self.aligner.settings.reference_sigma,
             )
             quality |= self.plausibility.flags
+        if self.learner is not None:
+            quality |= self._learn(reading, sample, quality, main_field, where, restarted=restarted)
+            judged += self.learner.variance
         if sample.sigma or sample.spans or judged:
             more = judged + (self._more(sample) if sample.sigma or sample.spans else 0.0)
             sigma = sqrt(sigma * sigma + more)
             sx, sy, sz = sqrt(sx * sx + more), sqrt(sy * sy + more), sqrt(sz * sz + more)
         return sample, Corrected(F, sigma, (x, y, z), (sx, sy, sz), quality)
+
+    def _learn(
+        self,
+        reading: Reading,
+        sample: Sample,
+        quality: int,
+        main_field: float,
+        where: tuple[float, float] | None,
+        *,
+        restarted: bool,
+    ) -> int:
+        """Let the learner have the sample; return its flags."""
+        assert self.learner is not None
+        if restarted:
+            self.learner.restarted()
+        self.learner.sample(
+            sample.time_us,
+            sample.field,
+            self._corrector.regressors,
+            sample.values,
+            quality,
+            faulty=self.plausibility is None or self.plausibility.fault,
+            reference=main_field,
+            where=where,
+            temperature=reading.temperature,
+        )
+        return self.learner.flags
+
+    def _use(self, calibration: Calibration) -> None:
+        """Correct with another calibration of the same terms from now on."""
+        by = self._corrector.replace(calibration)
+        if self._raised is not None:
+            self._raised.replace(calibration.at_level())
+        if self.plausibility is not None:
+            self.plausibility.explain(by)
 
     def level(self, sample: Sample, corrected: Corrected) -> float:
         """Return how much of a corrected sample's sigma all samples share, nT; NaN without a level."""
@@ -177,9 +228,9 @@ def correct_rows(correction: Correction, deployment: xr.Dataset) -> xr.Dataset:
     level = np.full(len(results), nan)
     results[:, CORRECTED.index("quality")] = Quality.GAP
     main_fields = magnitude(main_field(deployment))
-    known = main_fields.tolist()
+    known, places = main_fields.tolist(), _places(deployment)
     for row, reading, stamp in _readings(correction, deployment):
-        sample, one = correction.reading(reading, stamp, main_field=known[row])
+        sample, one = correction.reading(reading, stamp, main_field=known[row], where=places[row])
         level[row] = correction.level(sample, one)
         results[row] = one.total_field, one.total_field_sigma, *one.field, nan, one.quality
     _keep_late_joins(results, deployment)
@@ -192,6 +243,14 @@ def correct_rows(correction: Correction, deployment: xr.Dataset) -> xr.Dataset:
         coords={"time": deployment["time"]},
         attrs={"source": deployment.attrs.get("source", "")},
     )
+
+
+def _places(deployment: xr.Dataset) -> list[tuple[float, float] | None]:
+    """Return latitude and longitude of every row, deg; None where they are not known."""
+    if not {"latitude", "longitude"} <= set(deployment):
+        return [None] * deployment.sizes["time"]
+    both = (deployment[name].to_numpy().astype(float).tolist() for name in ("latitude", "longitude"))
+    return [(lat, lon) if isfinite(lat + lon) else None for lat, lon in zip(*both, strict=True)]
 
 
 def _keep_late_joins(results: FloatArray, deployment: xr.Dataset) -> None:
@@ -216,7 +275,8 @@ def _readings(correction: Correction, deployment: xr.Dataset) -> Iterator[tuple[
     times = np.asarray(deployment["time"].to_numpy(), float)
     stamps = (np.rint(times * 1e6).astype(np.int64) & ~3).tolist()
     delays = [np.nan_to_num(np.array(column(f"mag_time_{axis}")) - times).round(6).tolist() for axis in "xyz"]
-    telemetry = [(name, column(name), column(AGE + name)) for name in correction.names if name != TEMPERATURE]
+    wanted = [*correction.names, *(correction.learner.currents if correction.learner is not None else ())]
+    telemetry = [(name, column(name), column(AGE + name)) for name in wanted if name != TEMPERATURE]
     cycles = column("power_cycle")
     channels = zip(*(column(f"mag_{axis}") for axis in "xyz"), strict=True)
     rows = zip(stamps, channels, zip(*delays, strict=True), column(TEMPERATURE), cycles, strict=True)

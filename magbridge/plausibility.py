@@ -105,12 +105,15 @@ class Plausibility:
     ----------
     flags : int
         Of the last sample: :class:`~magbridge.records.Quality` bits.
+    fault : bool
+        The last sample is an outlier, of a sensor at fault, or not of the Earth: no level, old or new.
     notices : list of str
         What was found since the caller has last emptied it, each once.
     """
 
     def __init__(self, noise: float) -> None:
         self.flags = 0
+        self.fault = False
         self.notices: list[str] = []
         self._told: set[str] = set()
         self._axes = (Axis(), Axis(), Axis())
@@ -163,6 +166,7 @@ class Plausibility:
         """
         self.flags = 0
         stuck = self._stuck(raw)
+        self.fault = True
         if not 0.0 <= total < inf:
             return 0.0
         wrong = self._is_wrong(time_us, total, sigma, reference, reference_sigma)
@@ -171,7 +175,19 @@ class Plausibility:
             more = self._jump(time_us, values, total, sigma, learn=not (stuck or wrong))
         if stuck or wrong or time_us < self._wrong_until_us:
             self.flags = IMPLAUSIBLE
+        self.fault = self.flags != 0
         return more + self._doubt(time_us)
+
+    def explain(self, by: float) -> None:
+        """Take note that another calibration moves the total field `by` nT, and explains past jumps."""
+        if by == by:  # noqa: PLR0124 - compiled, quicker than a call
+            self._level += by
+            self._candidate += by
+            self._last += by
+            self._last_but_one += by
+        self._mark = nan
+        self._moved = self._largest = 0.0
+        self._jumps = self._until_us = 0
 
     def _stuck(self, raw: Vector) -> bool:
         """Say whether an axis repeats its number while another changes, or stands where it once stuck."""

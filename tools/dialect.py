@@ -25,6 +25,8 @@ INCLUDED = "all.xml"
 ENUMS: dict[str, tuple[str, ...]] = {
     "FIRMWARE_VERSION_TYPE": ("OFFICIAL",),
     "GLOBAL_POSITION_SRC": ("MAGNETIC",),
+    "MAG_CAUSE": (),
+    "MAG_LEARNING_STATE": (),
     "MAG_LOG_STATE": (),
     "MAG_NAVIGATION_STATE": (),
     "MAG_PORT_NAME": (),

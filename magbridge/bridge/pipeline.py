@@ -13,6 +13,7 @@ from magbridge.bridge.changes import Changes
 from magbridge.bridge.events import Event, Start
 from magbridge.bridge.head import beginning, declarations
 from magbridge.bridge.journal import Journal
+from magbridge.bridge.learning import Learning, open_learner
 from magbridge.bridge.position import Position
 from magbridge.bridge.sensor_line import SensorLine
 from magbridge.calibration.file import calibration_id
@@ -23,7 +24,7 @@ from magbridge.correction import TEMPERATURE, Correction
 from magbridge.errors import ConfigError
 from magbridge.link.authority import Sources
 from magbridge.link.component import Component, check_publish
-from magbridge.link.parameters import alignment, file_rate, telemetry_ages
+from magbridge.link.parameters import alignment, file_rate, learning, telemetry_ages
 from magbridge.link.publish import Sample
 from magbridge.link.reports import Condition
 from magbridge.link.telemetry import TelemetryMap
@@ -43,7 +44,13 @@ LINK: Final = Channel.LINK
 SENSOR: Final = Channel.SENSOR
 LATELY = 64
 """Samples over which the sample rate is computed."""
-DOUBTS = int(Quality.STALE_TELEMETRY | Quality.SATURATED | Quality.UNCALIBRATED | Quality.OFFSET_SUSPECT)
+DOUBTS = int(
+    Quality.STALE_TELEMETRY
+    | Quality.SATURATED
+    | Quality.UNCALIBRATED
+    | Quality.OFFSET_SUSPECT
+    | Quality.UNEXPLAINED
+)
 """Flags whose changes are announced; the others change with every manoeuvre."""
 
 
@@ -69,6 +76,7 @@ class Pipeline:
     sensor : SensorLine
         Holds the commands that are to be sent to the sensor.
     navigation : Navigation or None
+    learning : Learning or None
 
     Raises
     ------
@@ -94,7 +102,8 @@ class Pipeline:
         if calibration is not None:
             check(calibration, config)
         used = None if foreign else calibration
-        self._correction = Correction(used, config.align)
+        learner = open_learner(config, used)
+        self._correction = Correction(used, config.align, learner)
         self._plausibility = self._correction.plausibility
         self._calibration_id = calibration_id(used) if used else 0
         autopilot = config.link.system, config.link.autopilot
@@ -103,7 +112,12 @@ class Pipeline:
         self.component = Component(
             config.link,
             config.publish,
-            [*alignment(config.align), *telemetry_ages(config.telemetry), *file_rate()],
+            [
+                *alignment(config.align),
+                *telemetry_ages(config.telemetry),
+                *file_rate(),
+                *(learning(config.learning.enabled) if config.learning else ()),
+            ],
             start_us=start.time_us,
             signing=self.signing,
             calibration_id=self._calibration_id,
@@ -126,6 +140,7 @@ class Pipeline:
         self._changes = Changes(self.component.codec, self.component.announcer, self.sensor)
         self.journal = Journal(config.link.system, config.link.component, active=config.log is not None)
         self.navigation = navigate(self.component) if navigate else None
+        self.learning = Learning(learner, self.component) if learner is not None else None
         self._raw_rate = self.component.rates["MAG_RAW"]
         self._position = Position(self._tell_no_anomaly)
         self._samples = self._lost = self._quality = 0
@@ -198,7 +213,12 @@ class Pipeline:
         utc_offset_us = self.component.codec.utc_offset_us
         main_field = self._position.main_field(time_us, time_us + utc_offset_us)
         sample, corrected = self._correction.reading(
-            reading, time_us, restarted=restarted, missing=missing, main_field=main_field
+            reading,
+            time_us,
+            restarted=restarted,
+            missing=missing,
+            main_field=main_field,
+            where=self._position.where,
         )
         if self._plausibility is not None and self._plausibility.notices:
             self._tell_implausible()
@@ -213,6 +233,8 @@ class Pipeline:
         publisher.publish(out)
         if self.journal.active and self._raw_rate.hertz != 0:
             self.journal.raw(self.component.codec.now_us, publisher.raw_payload(out))
+        if self.learning is not None:
+            self.learning.sample(sample.time_us)
 
     def _hear_link(self, data: bytes, time_us: int) -> None:
         component = self.component
@@ -259,6 +281,8 @@ class Pipeline:
             say(f"calibration is not of a {self._config.sensor.driver}: not used", MAV_SEVERITY.ERROR)
         elif calibration is None:
             say("no calibration: raw field", MAV_SEVERITY.WARNING)
+            if self._config.learning is not None:
+                say("learning: needs a calibration to begin with", MAV_SEVERITY.WARNING)
         else:
             say(f"calibration {self._calibration_id:08x}, {calibration.method}")
             if calibration.doubts:

@@ -46,6 +46,11 @@ class Position:
             self._where = latitude, longitude, -altitude
             self._when_us, self._evaluated_us = time_us, 0
 
+    @property
+    def where(self) -> tuple[float, float] | None:
+        """Latitude and longitude, deg, of the last position; None before the first."""
+        return self._where[:2] if self._where is not None else None
+
     def main_field(self, time_us: int, utc_us: int) -> float:
         """Return the IGRF's total field in nT; NaN where the position is not known, or no model covers it.
 

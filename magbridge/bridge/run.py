@@ -17,6 +17,7 @@ from magbridge.bridge import states
 from magbridge.bridge.drive import drive, set_up
 from magbridge.bridge.events import Clock, Start
 from magbridge.bridge.file_server import FileServer
+from magbridge.bridge.learning import keep, kept_path
 from magbridge.bridge.links import open_link
 from magbridge.bridge.live import LiveEdge
 from magbridge.bridge.pipeline import Pipeline
@@ -84,6 +85,8 @@ def run(path: Path) -> None:
     parameters, requests = pipeline.component.parameters, pipeline.component.file_requests
     files = FileServer(pipeline.component.metadata, logs, lambda: 1e3 * parameters["MB_FILE_RATE"], edge.tell)
 
+    learned = kept_path(config)
+
     def after(time_us: int) -> None:
         while requests:
             files.ask(requests.popleft())
@@ -92,6 +95,12 @@ def run(path: Path) -> None:
             if messages:
                 edge.answer(station, pipeline.beside(messages))
         keeper.look(pipeline, time_us)
+        if (
+            pipeline.learning is not None
+            and learned is not None
+            and (why := keep(pipeline.learning, learned))
+        ):
+            edge.tell(states.notice(why))
         watch.look(time_us)
         if pipeline.sensor.stranger:
             pipeline.sensor.stranger = False

@@ -108,6 +108,29 @@ class Corrector:
         self._ends: list[tuple[int, int]] = []
         self._places: dict[tuple[float, ...], int] = {}
         self._there: list[Linear] = []
+        self._field = (nan, nan, nan)
+
+    @property
+    def regressors(self) -> list[float]:
+        """The regressors at the last sample: the monomials, then those of effects."""
+        return self._last
+
+    def replace(self, calibration: Calibration) -> float:
+        """Go on with other coefficients of the same terms; effects keep their state.
+
+        Returns
+        -------
+        float
+            nT, by which the total field of the last sample changes; NaN if there was none.
+        """
+        before = apply(*self._field, self._prepared, self._omega)[0] if self._last else nan
+        self.calibration, self._kernel, self._omega = calibration, calibration.kernel, _omega(calibration)
+        self._weights = [tuple(row) for row in self._kernel.weights.tolist()]
+        self._values, self._asked, self._places, self._ends, self._there = None, ((), ()), {}, [], []
+        if not self._last:
+            return nan
+        self._prepared = prepare(self._kernel.sums_of_one(self._last))
+        return apply(*self._field, self._prepared, self._omega)[0] - before
 
     def step(
         self, time_us: int, field: tuple[float, float, float], values: Sequence[float], quality: int = 0
@@ -142,7 +165,7 @@ class Corrector:
                 f"expected {self._wanted} values ({', '.join(self.calibration.channels)}), "
                 f"found {len(values)}"
             )
-        hx, hy, hz = field
+        hx, hy, hz = self._field = field
         values = tuple(values)
         if values != self._values or self._steps:
             self._values, self._flags = values, self._flags_of(values)

@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
+
+from cyclopts import Parameter
 
 from magbridge.cli.common import (
     AS_THEY_SAY,
@@ -17,6 +19,7 @@ from magbridge.cli.common import (
     check_inputs,
     complain,
     doubts_of,
+    file_to_write,
     logs_to_read,
     note_losses,
     note_missing,
@@ -26,13 +29,14 @@ from magbridge.cli.common import (
     refuse_unsuited,
 )
 from magbridge.columns import CHANNELS, CORRECTED
-from magbridge.errors import DataError
+from magbridge.errors import CalibrationError, DataError, WrongUse
 from magbridge.progress import track
 
 if TYPE_CHECKING:
     import xarray as xr
 
     from magbridge.calibration.model import Calibration
+    from magbridge.learning import Learner
 
 KEPT = (
     *("latitude", "longitude", "depth", "roll", "pitch", "heading", "run", "dive", "line", "line_type"),
@@ -47,6 +51,8 @@ def correct(
     *files: Path,
     calibration: Path,
     output: Log,
+    learn: bool = False,
+    save: Annotated[Path | None, Parameter(validator=file_to_write())] = None,
     picture: Picture = None,
     reading: Reading = AS_THEY_SAY,
     json: Json = False,
@@ -72,6 +78,10 @@ def correct(
     output
         The file to write: total field with its sigma, vector, anomaly and quality flags; beside them the
         log's position, depth, attitude and the calibration's parameters.
+    learn
+        Learn the calibration on the way, as a bridge with [learning] does; the log needs positions.
+    save
+        With --learn: where to write the calibration that was published last.
     picture
         A PNG, PDF or SVG to draw: the corrected field with its 2-sigma band, and what is flagged.
     reading
@@ -83,13 +93,17 @@ def correct(
     check_inputs((*files, output), picture)
 
     from magbridge.calibration.file import load
+    from magbridge.calibration.file import save as write_calibration
     from magbridge.correction import Correction, correct_rows
     from magbridge.logs import Writer, read_chunks
 
     known = load(calibration)
     for doubt in doubts_of(known, calibration):
         complain(doubt)
-    correction, tally, whole = Correction(known), _Tally(), False
+    if save is not None and not learn:
+        raise WrongUse("--save writes what was learned: give --learn, too")
+    learner = _learner(known, calibration) if learn else None
+    correction, tally, whole = Correction(known, learner=learner), _Tally(), False
     pieces: list[dict[str, Any]] = []
     drawn: list[xr.Dataset] = []
     with Writer(output) as writer:
@@ -102,6 +116,8 @@ def correct(
             corrected = _beside(part, correct_rows(correction, part), known, calibration)
             corrected = corrected.isel(time=sampled.any("variable").to_numpy())
             writer.append(corrected)
+            if learner is not None:
+                _tell(learner)
             if picture:
                 drawn.append(corrected[list(CORRECTED)])
             tally.add(corrected, part.sizes["time"])
@@ -121,7 +137,50 @@ def correct(
     note_settings(*pieces)
     if doubt := tally.doubt():
         complain(f"{calibration}: {doubt}")
-    print_result({"file": str(output), **tally.facts()}, f"{output}: {tally.summary()}", json)
+    facts, summary = tally.facts(), tally.summary()
+    if learner is not None:
+        facts |= _learned(learner, known)
+        summary += f"; {facts['learned_samples']} learned from, calibration {facts['calibration_id']} at last"
+        if save is not None:
+            write_calibration(learner.calibration, save)
+    print_result({"file": str(output), **facts}, f"{output}: {summary}", json)
+
+
+def _learner(known: Calibration, file: Path) -> Learner:
+    """Return a learner with a bridge's settings."""
+    from magbridge.config import Align, Learning
+    from magbridge.learning import Learner
+
+    align, settings = Align(), Learning()
+    try:
+        return Learner(
+            known,
+            spread=align.reference_sigma,
+            turn_on=align.turn_on_sigma,
+            max_rate=settings.max_rate,
+        )
+    except CalibrationError as error:
+        raise CalibrationError(f"{file}: {error}") from error
+
+
+def _tell(learner: Learner) -> None:
+    """Print what learning has changed."""
+    for notice in learner.notices:
+        complain(f"{notice.text}, {notice.date}")
+    learner.notices.clear()
+
+
+def _learned(learner: Learner, known: Calibration) -> dict[str, Any]:
+    """Return the numbers of learning to print as JSON."""
+    from magbridge.calibration.file import calibration_id
+
+    state = learner.state
+    return {
+        "learned_samples": state.learned_samples,
+        "calibration_id": f"{calibration_id(learner.calibration):08x}",
+        "changed": learner.calibration is not known,
+        "unexplained": list(state.causes),
+    }
 
 
 def _beside(log: xr.Dataset, corrected: xr.Dataset, known: Calibration, file: Path) -> xr.Dataset:

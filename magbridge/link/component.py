@@ -32,10 +32,11 @@ LIMITS = {
     "HEARTBEAT": (0.2, 10.0),
     "MAG_STATUS": (-1.0, 10.0),
     "MAG_NAVIGATION": (-1.0, 1000.0),
+    "MAG_LEARNING": (-1.0, 1000.0),
     **dict.fromkeys(PUBLISHED, (-1.0, 1000.0)),
 }
 """The messages whose rate (Hz) can be set, and within which limits."""
-DEFAULTS = {"HEARTBEAT": 1.0, "MAG_STATUS": 1.0, "MAG_NAVIGATION": 0.0}
+DEFAULTS = {"HEARTBEAT": 1.0, "MAG_STATUS": 1.0, "MAG_NAVIGATION": 0.0, "MAG_LEARNING": 0.1}
 TIMESYNC_US = 1_000_000
 VERSION_2 = 0xFD
 MOST_REQUESTS = 64
@@ -185,6 +186,10 @@ class Component:
     def peer(self) -> tuple[int, int]:
         """System and component of the autopilot."""
         return self._link.system, self._link.autopilot
+
+    def use_calibration(self, calibration_id: int) -> None:
+        """Name another calibration in every message from now on."""
+        self.publisher.calibration_id = self._reports.calibration_id = calibration_id
 
     @property
     def next_deadline(self) -> int:

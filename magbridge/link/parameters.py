@@ -10,7 +10,16 @@ import msgspec
 
 from magbridge.config import Align, Telemetry
 
-__all__ = ["Parameters", "Tunable", "alignment", "file_rate", "rate_name", "rates", "telemetry_ages"]
+__all__ = [
+    "Parameters",
+    "Tunable",
+    "alignment",
+    "file_rate",
+    "learning",
+    "rate_name",
+    "rates",
+    "telemetry_ages",
+]
 
 
 class Tunable(msgspec.Struct, frozen=True):
@@ -65,6 +74,18 @@ def file_rate() -> list[Tunable]:
     """Return the tunable for how fast files are sent."""
     doc = "at which files are sent to stations; 0 sends none"
     return [Tunable("MB_FILE_RATE", "files.rate", 250.0, 0, 10_000, "kB/s", doc)]
+
+
+def learning(enabled: bool) -> list[Tunable]:
+    """Return the tunables of ``[learning]``."""
+    rows = (
+        ("MB_LEARN", "enabled", float(enabled), 1, "whether the calibration is learned in flight"),
+        ("MB_LEARN_FREEZE", "freeze", 0.0, 1, "1: judge and doubt, but learn nothing"),
+        ("MB_LEARN_DO", "do", 0.0, 2, "1 accepts what was learned, 2 forgets it; goes back to 0"),
+    )
+    return [
+        Tunable(name, f"learning.{key}", default, 0, high, "", doc) for name, key, default, high, doc in rows
+    ]
 
 
 def telemetry_ages(telemetry: Mapping[str, Telemetry]) -> list[Tunable]:

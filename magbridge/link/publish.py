@@ -93,7 +93,7 @@ class Publisher:
         self, outbox: Outbox, rates: Mapping[str, Rate], calibration_id: int = 0, start_us: int = 0
     ) -> None:
         self._outbox, self._codec = outbox, outbox.codec
-        self._calibration_id, self._start_us = calibration_id, start_us
+        self.calibration_id, self._start_us = calibration_id, start_us
         self._messages = [(rates[name], getattr(self, method)) for name, method in PUBLISHED.items()]
         self.latest: Sample | None = None
         self.samples = 0
@@ -144,7 +144,7 @@ class Publisher:
         x_sigma, y_sigma, z_sigma = corrected.field_sigma
         payload = FIELD.struct.pack(
             sample.time_us + self._codec.utc_offset_us, corrected.total_field,
-            self.samples & MASK, self._calibration_id, corrected.total_field_sigma,
+            self.samples & MASK, self.calibration_id, corrected.total_field_sigma,
             x, y, z, x_sigma, y_sigma, z_sigma, sample.anomaly, sample.telemetry_age,
             (self._codec.now_us - sample.time_us) * 1e-6, corrected.quality, 0,
         )  # fmt: skip

@@ -90,7 +90,7 @@ class Reports:
     ) -> None:
         self._outbox, self._vehicle, self._status = outbox, vehicle, status
         self._speaking, self._general = speaking, general
-        self._start_us, self._version, self._calibration_id = start_us, version, calibration_id
+        self._start_us, self._version, self.calibration_id = start_us, version, calibration_id
 
     def heartbeat(self) -> None:
         """Send HEARTBEAT: active while readings come from the sensor, else critical."""
@@ -104,7 +104,7 @@ class Reports:
             codec.utc_us,
             round(clock.offset_us(codec.now_us)) - codec.utc_offset_us if clock.known else 0,
             (codec.now_us - self._start_us) // 1_000_000 & MASK,
-            self._calibration_id,
+            self.calibration_id,
             condition.samples & MASK,
             condition.samples_lost & MASK,
             condition.sensor_bytes_skipped & MASK,

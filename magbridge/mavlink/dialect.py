@@ -370,6 +370,7 @@ MESSAGES: dict[int, tuple[str, int, str]] = {
     60108: ("MAG_PORT", 171, "Q:time_usec:us:,I:dropped:bytes:,B:port::,B:state::,80s:reason::"),
     60109: ("MAG_COLUMN", 112, "d:scale::,d:offset::,16s:unit::,44s:message::,40s:field::,64s:match::,64s:column::"),
     60110: ("MAG_STANDSTILL", 94, "Q:time_usec:us:,I:duration:us:"),
+    60111: ("MAG_LEARNING", 201, "Q:time_usec:us:,Q:doubt_since:us:,I:calibration_id::,I:first_calibration_id::,I:samples::,f:rms_first:nT:,f:rms_published:nT:,f:rms_learned:nT:,f:better::,f:doubt_size:nT:,H:causes::,B:state::,B:sensor_id::"),
     60120: ("MAG_SIGNING_STREAM", 216, "Q:stamp::,B:link::,B:system::,B:sender::,B:ahead::"),
     60121: ("MAG_BESIDE", 49, "H:count::"),
 }
@@ -381,6 +382,23 @@ class FIRMWARE_VERSION_TYPE(IntEnum):
 
 class GLOBAL_POSITION_SRC(IntEnum):
     MAGNETIC = 5
+
+
+class MAG_CAUSE(IntEnum):
+    OFFSET_STEP = 1
+    OFFSET_DRIFT = 2
+    TEMPERATURE_OFFSET = 4
+    UNMODELLED_ACTUATOR = 8
+    CURRENT_FIELD = 16
+    CLOCK_OFFSET = 32
+    MAP_ERROR = 64
+
+
+class MAG_LEARNING_STATE(IntEnum):
+    OFF = 0
+    FROZEN = 1
+    LEARNING = 2
+    LEARNED = 3
 
 
 class MAG_LOG_STATE(IntEnum):

@@ -1,0 +1,145 @@
+"""``[learning]`` on the link: parameters in, notices, MAG_LEARNING and learned calibrations out."""
+
+from __future__ import annotations
+
+from collections import deque
+from pathlib import Path
+
+from magbridge.calibration.file import calibration_id, save
+from magbridge.calibration.model import Calibration
+from magbridge.config import Config
+from magbridge.errors import CalibrationError, ConfigError, WriteError
+from magbridge.learning import Learner
+from magbridge.learning.doubt import CAUSES
+from magbridge.link.component import Component
+from magbridge.link.rates import Rate
+from magbridge.mavlink import spec
+from magbridge.mavlink.dialect import MAG_LEARNING_STATE, MAV_SEVERITY
+
+__all__ = ["Learning", "keep", "kept_path", "open_learner"]
+
+LEARNING = spec("MAG_LEARNING")
+ACCEPT, FORGET = 1.0, 2.0
+
+
+def open_learner(config: Config, calibration: Calibration | None) -> Learner | None:
+    """Return the learner that ``[learning]`` asks for; None without that table, or without a calibration.
+
+    Raises
+    ------
+    ConfigError
+        The calibration is none that can be learned.
+    """
+    if config.learning is None or calibration is None:
+        return None
+    try:
+        return Learner(
+            calibration,
+            spread=config.align.reference_sigma,
+            turn_on=config.align.turn_on_sigma,
+            max_rate=config.learning.max_rate,
+            currents=tuple(name for name, one in config.telemetry.items() if one.unit == "A"),
+        )
+    except CalibrationError as error:
+        raise ConfigError(config.path, "learning", str(error)) from error
+
+
+def kept_path(config: Config) -> Path | None:
+    """Return where the learned calibration is kept: beside the first, or in ``learning.keep``."""
+    if config.learning is None or config.calibration is None:
+        return None
+    first = config.resolve(config.calibration.file)
+    folder = config.resolve(config.learning.keep) if config.learning.keep else first.parent
+    return folder / f"{first.stem}-learned.json"
+
+
+class Learning:
+    """Speaks for a learner.
+
+    Parameters
+    ----------
+    learner : Learner
+    component : Component
+
+    Attributes
+    ----------
+    to_keep : deque of Calibration
+        What was published since the caller last emptied it: to be written to a file.
+    """
+
+    def __init__(self, learner: Learner, component: Component) -> None:
+        self.learner, self._component = learner, component
+        self.to_keep: deque[Calibration] = deque(maxlen=4)
+        self._published = learner.calibration
+        self._first_id = self._id = calibration_id(learner.calibration)
+        self._first = learner.first
+        self._rate: Rate = component.rates["MAG_LEARNING"]
+        component.parameters.watch(self._tune)
+        self._tune("")
+
+    def _tune(self, name: str) -> None:
+        parameters = self._component.parameters
+        self.learner.enabled = parameters["MB_LEARN"] >= 0.5
+        self.learner.frozen = parameters["MB_LEARN_FREEZE"] >= 0.5
+        if name == "MB_LEARN_DO" and (asked := parameters[name]):
+            if asked == ACCEPT:
+                self.learner.accept()
+            elif asked == FORGET:
+                self.learner.forget()
+            parameters.set(name, 0.0)
+
+    def sample(self, time_us: int) -> None:
+        """Say what a sample has changed, and what is due."""
+        learner, component = self.learner, self._component
+        for notice in learner.notices:
+            severity = MAV_SEVERITY.WARNING if notice.grave else MAV_SEVERITY.NOTICE
+            component.announcer.say(notice.text, severity)
+        learner.notices.clear()
+        if learner.calibration is not self._published:
+            self._published = learner.calibration
+            self._id = calibration_id(learner.calibration)
+            component.use_calibration(self._id)
+            self.to_keep.append(learner.calibration)
+        if learner.first is not self._first:
+            self._first, self._first_id = learner.first, calibration_id(learner.first)
+        if learner.enabled and self._rate.due(time_us):
+            self._send(time_us)
+
+    def _send(self, time_us: int) -> None:
+        learner, offset_us = self.learner, self._component.codec.utc_offset_us
+        state = learner.state
+        self._component.outbox.send(
+            "MAG_LEARNING",
+            time_usec=time_us + offset_us,
+            doubt_since=state.since_us + offset_us if state.causes else 0,
+            calibration_id=self._id,
+            first_calibration_id=self._first_id,
+            samples=state.learned_samples,
+            rms_first=state.rms[0],
+            rms_published=state.rms[1],
+            rms_learned=state.rms[2],
+            better=state.better,
+            doubt_size=state.size,
+            causes=sum(1 << bit for bit, name in enumerate(CAUSES) if name in state.causes),
+            state=MAG_LEARNING_STATE.FROZEN
+            if learner.frozen
+            else MAG_LEARNING_STATE.LEARNING
+            if learner.calibration is learner.first
+            else MAG_LEARNING_STATE.LEARNED,
+        )
+
+
+def keep(learning: Learning, path: Path) -> str:
+    """Write the calibration published last, if it is new; return why that failed, or nothing.
+
+    The first calibration, gone back to, is written as well: the file is what the bridge corrects with.
+    """
+    if not learning.to_keep:
+        return ""
+    newest = learning.to_keep[-1]
+    learning.to_keep.clear()
+    try:
+        save(newest, path)
+    except WriteError as error:
+        return f"learned calibration not kept: {error}"
+    return ""

@@ -1,0 +1,226 @@
+"""``[learning]`` on the link: what a station sees, and that live, replayed and ashore are the same."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from small import CONFIG, START
+
+from magbridge import logs
+from magbridge.bridge.drive import set_up
+from magbridge.bridge.events import Event, Start
+from magbridge.bridge.learning import keep, kept_path
+from magbridge.bridge.pipeline import Pipeline
+from magbridge.calibration.file import calibration_id, load, save
+from magbridge.calibration.model import Calibration, Noise, Reference
+from magbridge.calibration.terms import Polynomial
+from magbridge.cli import main
+from magbridge.config import load as load_config
+from magbridge.errors import ConfigError
+from magbridge.learning.doubt import CAUSES
+from magbridge.logs.tlog import TlogWriter
+from magbridge.mavlink import Codec, Message
+from magbridge.mavlink.dialect import MAG_CAUSE, MAG_LEARNING_STATE, MAV_PARAM_TYPE
+from magbridge.records import Channel
+
+PLACE = (49.52, -57.87)
+SAMPLES = 700
+SHIFT = np.array([14.0, -11.0, 13.0])
+LEARNING = "[learning]\nenabled = true\n"
+
+
+def bridge(folder: Path, learning: str = LEARNING) -> Pipeline:
+    """Set up a bridge with a nominal calibration that is known to a nanotesla."""
+    cal = Calibration(
+        parameters=(),
+        terms=(Polynomial(exponents=((),)),),
+        coefficients=np.random.default_rng(1).normal(size=9) * 100.0,
+        covariance=np.eye(9),
+        noise=Noise(1.0),
+        reference=Reference(51_900.0),
+        method="nominal",
+    )
+    save(cal, folder / "cal.json")
+    config = folder / "bridge.toml"
+    head, _, _ = CONFIG.partition("[telemetry")
+    config.write_text(
+        f'{head}[log]\ndirectory = "logs"\n[publish]\nMAG_FIELD = 0\n{learning}', encoding="utf-8"
+    )
+    return set_up(load_config(config), Start(START))
+
+
+def events(folder: Path) -> list[Event]:
+    """A vehicle turns and pitches in a field as strong as the IGRF; its offset has changed."""
+    rng, autopilot = np.random.default_rng(2), Codec(1, 1)
+    cal = load(folder / "cal.json")
+    A, T = (one[0] for one in cal.matrices(np.empty((1, 0))))
+    made = []
+    for k in range(SAMPLES):
+        time_us = START + k * 4_000_000
+        frame = autopilot.pack(
+            "GLOBAL_POSITION_INT",
+            time_boot_ms=k * 4000,
+            lat=round(PLACE[0] * 1e7) + k * 120,
+            lon=round(PLACE[1] * 1e7),
+        )
+        made.append(Event(time_us - 400_000, Channel.LINK, frame))
+        yaw, pitch = (
+            0.7 * (k // 40) + 0.1 * rng.normal(),
+            (0.45 if k // 40 % 2 else -0.4) + 0.05 * rng.normal(),
+        )
+        unit = np.array([0.4 * np.cos(yaw) - 0.9 * pitch, 0.4 * np.sin(yaw), 0.9 + 0.4 * pitch * np.cos(yaw)])
+        total = 51_900.0 + 40.0 * np.sin(k / 400.0)
+        x, y, z = np.linalg.solve(A, total * unit / np.linalg.norm(unit)) + T + SHIFT + rng.normal(size=3)
+        made.append(Event(time_us, Channel.SENSOR, b"%.3f %.3f %.3f 4.0 %d 7\r\n" % (x, y, z, k)))
+    return made
+
+
+def heard(frames: list[tuple[int, bytes]]) -> list[Message]:
+    """Return the messages of frames."""
+    return [message for _, frame in frames for message in Codec(255, 190).parse(frame)]
+
+
+def named(messages: list[Message], name: str) -> list[Message]:
+    """Return those of one name."""
+    return [message for message in messages if message.name == name]
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Pipeline, list[tuple[int, bytes]]]:
+    """Fly once, with a log."""
+    folder = tmp_path_factory.mktemp("flight")
+    pipeline = bridge(folder)
+    sent = []
+    with TlogWriter(folder / "logs", head=pipeline.declarations) as log:
+        for event in events(folder):
+            sent += pipeline.feed(event)
+            log.extend(pipeline.journal.drain())
+    return folder, pipeline, sent
+
+
+def test_what_was_learned_is_announced_and_named_in_every_message(
+    flight: tuple[Path, Pipeline, list[tuple[int, bytes]]],
+) -> None:
+    """The id changes once what is learned is published, in MAG_FIELD and in MAG_STATUS alike."""
+    folder, pipeline, sent = flight
+    messages = heard(sent)
+    first = calibration_id(load(folder / "cal.json"))
+    assert pipeline.learning is not None
+    last = calibration_id(pipeline.learning.learner.calibration)
+    fields = named(messages, "MAG_FIELD")
+    assert fields[0]["calibration_id"] == first
+    assert fields[-1]["calibration_id"] == last != first
+    assert named(messages, "MAG_STATUS")[-1]["calibration_id"] == last
+    state = named(messages, "MAG_LEARNING")[-1]
+    assert (state["first_calibration_id"], state["calibration_id"]) == (first, last)
+    assert state["state"] == MAG_LEARNING_STATE.LEARNED
+    assert state["rms_published"] < 1.5 < state["rms_first"]
+    assert state["samples"] > 300
+    assert any(message["text"].startswith("learned ") for message in named(messages, "STATUSTEXT"))
+
+
+def test_the_same_events_give_the_same_bytes(
+    flight: tuple[Path, Pipeline, list[tuple[int, bytes]]], tmp_path: Path
+) -> None:
+    """Learning included."""
+    again = bridge(tmp_path)
+    assert [one for event in events(tmp_path) for one in again.feed(event)] == flight[2]
+
+
+def test_ashore_it_learns_what_it_learned_live(
+    flight: tuple[Path, Pipeline, list[tuple[int, bytes]]], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """From the bridge's own log; the IGRF is computed at every row there, and about once a second live."""
+    folder, pipeline, sent = flight
+    out, learned = folder / "out.nc", folder / "learned.json"
+    log = sorted((folder / "logs").iterdir())
+    order = ["correct", *map(str, log), "--calibration", str(folder / "cal.json"), "-o", str(out)]
+    assert main([*order, "--learn", "--save", str(learned)]) == 0
+    assert "learned from" in capsys.readouterr().out
+    total = logs.read(out)["total_field"].to_numpy()
+    live = np.array([message["total_field"] for message in named(heard(sent), "MAG_FIELD")])
+    np.testing.assert_allclose(total, live, atol=0.02)
+    assert pipeline.learning is not None
+    kept = load(learned)
+    np.testing.assert_allclose(
+        kept.coefficients, pipeline.learning.learner.calibration.coefficients, atol=0.05
+    )
+
+
+def test_it_is_kept_beside_the_first(flight: tuple[Path, Pipeline, list[tuple[int, bytes]]]) -> None:
+    """A calibration like any other, with where it comes from; only what is new is written."""
+    folder, pipeline, _ = flight
+    path = kept_path(load_config(folder / "bridge.toml"))
+    assert pipeline.learning is not None
+    assert path == folder / "cal-learned.json"
+    assert keep(pipeline.learning, path) == ""
+    kept = load(path)
+    assert calibration_id(kept) == calibration_id(pipeline.learning.learner.calibration)
+    assert any(name.startswith("calibration ") for name in kept.inputs)
+    path.unlink()
+    assert keep(pipeline.learning, path) == ""
+    assert not path.exists()
+    pipeline.learning.to_keep.append(kept)
+    assert "not kept" in keep(pipeline.learning, folder / "nowhere" / "cal-learned.json")
+
+
+def test_a_station_forgets_freezes_and_disables(tmp_path: Path) -> None:
+    """The parameter that does something goes back to 0; what was forgotten is no longer published."""
+    pipeline = bridge(tmp_path)
+    station = Codec(255, 190)
+    to = {"target_system": 1, "target_component": 191, "param_type": MAV_PARAM_TYPE.REAL32}
+    feed = events(tmp_path)
+    for event in feed[:800]:
+        pipeline.feed(event)
+    assert pipeline.learning is not None
+    learner = pipeline.learning.learner
+    assert learner.calibration is not learner.first
+    beat = station.pack("HEARTBEAT", type=6, autopilot=8, mavlink_version=3)
+    pipeline.feed(Event(feed[800].time_us, Channel.LINK, beat))
+
+    def order(name: str, value: float) -> list[Message]:
+        frame = station.pack("PARAM_SET", param_id=name, param_value=value, **to)
+        return heard(pipeline.feed(Event(feed[800].time_us + 1, Channel.LINK, frame)))
+
+    answer = named(order("MB_LEARN_DO", 2.0), "PARAM_VALUE")[-1]
+    assert (answer["param_id"], answer["param_value"]) == ("MB_LEARN_DO", 0.0)
+    assert learner.calibration is learner.first
+    assert learner.samples == 0
+    order("MB_LEARN_FREEZE", 1.0)
+    for event in feed[802:900]:
+        pipeline.feed(event)
+    assert learner.samples == 0
+    assert learner.frozen
+    order("MB_LEARN", 0.0)
+    assert not learner.enabled
+
+
+def test_it_is_off_unless_asked_for(tmp_path: Path) -> None:
+    """Without the table there is nothing; with it, it waits to be enabled."""
+    assert bridge(tmp_path, "").learning is None
+    waiting = bridge(tmp_path, "[learning]\n")
+    for event in events(tmp_path)[:300]:
+        waiting.feed(event)
+    assert waiting.learning is not None
+    assert waiting.learning.learner.samples == 0
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ('reference = "emag2"', "learning.reference"),
+        ("max_rate = 0.0", "learning.max_rate"),
+        ("speed = 3", "learning.speed"),
+    ],
+)
+def test_a_wrong_key_is_one_line(tmp_path: Path, text: str, why: str) -> None:
+    """It names the key."""
+    with pytest.raises(ConfigError, match=why):
+        bridge(tmp_path, f"[learning]\n{text}\n")
+
+
+def test_the_causes_bits_are_those_of_the_dialect() -> None:
+    """In the same order."""
+    assert [str(cause.name).lower() for cause in MAG_CAUSE] == list(CAUSES)
