@@ -167,6 +167,7 @@ def monitor(
     port: Annotated[Whole, Parameter(validator=validators.Number(gte=1, lte=65535))] = 8080,
     baudrate: Annotated[Whole, Parameter(validator=validators.Number(gt=0))] = 57600,
     signing_key: Path | None = None,
+    map: Annotated[Path | None, Parameter(name="--map")] = None,  # noqa: A002 - as the other commands name it
     show: bool = False,
 ) -> None:
     """Serve the ground station's page, which shows live what a bridge measures and announces over MAVLink.
@@ -176,20 +177,24 @@ def monitor(
     link
         The link to the bridge: udpin:HOST:PORT (or [IPV6]:PORT), udpout, tcp, tcpin, or a serial device.
     host
-        The address to serve the page at; 0.0.0.0 makes it visible to other machines.
+        The address to serve the page at; 0.0.0.0 makes it visible to other machines, to those who have the
+        token that is printed with the address.
     port
         The port to serve the page at.
     baudrate
         Baud rate of a serial link.
     signing_key
         The file of 32 bytes that the bridge has: what is sent is signed, and what is not is refused.
+    map
+        An anomaly grid to be shown beneath the track.
     show
         Open the page in a browser.
     """
     from magbridge.mavlink import load_key
-    from magbridge.monitor.page import serve
+    from magbridge.monitor.serve import serve
 
-    serve(link, baudrate, host, port, key=load_key(signing_key) if signing_key else None, show=show)
+    key = load_key(signing_key) if signing_key else None
+    serve(link, baudrate, host, port, key=key, grid=map, show=show)
 
 
 def speed_of(text: str) -> float:

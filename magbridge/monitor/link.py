@@ -9,7 +9,7 @@ from threading import Lock, Thread
 from magbridge.bridge.port import Port
 from magbridge.errors import PortError
 from magbridge.mavlink import Codec, Signing
-from magbridge.monitor.state import State
+from magbridge.monitor.fleet import Fleet
 
 __all__ = ["StationLink", "now"]
 
@@ -33,14 +33,14 @@ class StationLink:
 
     Attributes
     ----------
-    state : State
+    fleet : Fleet
         To be used with `lock` held.
     trouble : str
         Why the port is not open; empty while it is.
     """
 
     def __init__(self, port: Port, key: bytes | None = None) -> None:
-        self.port, self.state, self.lock, self.trouble = port, State(), Lock(), ""
+        self.port, self.fleet, self.lock, self.trouble = port, Fleet(), Lock(), ""
         self._signing = Signing(key) if key else None
         self._codec = Codec(255, 190, self._signing)
 
@@ -72,8 +72,8 @@ class StationLink:
         moment = now()
         with self.lock:
             for message in heard:
-                self.state.hear(message, moment)
-            requests = self.state.due(moment)
+                self.fleet.hear(message, moment)
+            requests = self.fleet.due(moment)
         for name, fields in requests:
             self.port.write(self._codec.pack(name, **fields))
         self.port.flush()

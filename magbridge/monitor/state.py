@@ -1,29 +1,33 @@
-"""What a ground station knows of a bridge: messages in, requests out. No port, no clock, no page."""
+"""What a ground station knows of one bridge: messages in, requests out. No port, no clock, no page."""
 
 from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
-from math import inf, isclose, isfinite
+from math import inf, isclose, isfinite, nan
 from typing import Any, NamedTuple
 
 from magbridge.mavlink import Message, spec
-from magbridge.mavlink.dialect import MAV_AUTOPILOT, MAV_PARAM_TYPE, MAV_SEVERITY, MAV_STATE, MAV_TYPE
+from magbridge.mavlink.dialect import MAG_NAVIGATION_STATE, MAV_PARAM_TYPE, MAV_SEVERITY
+from magbridge.monitor.alarms import Alarms
+from magbridge.monitor.history import Series, TrackPoint, Trail
 from magbridge.records import Quality
 
-__all__ = ["Parameter", "Point", "State", "Text"]
+__all__ = ["TEMPERATURE", "Parameter", "State", "Text"]
 
-BRIDGES = {spec(name).id for name in ("MAG_RAW", "MAG_FIELD", "MAG_STATUS")}
-"""A component that sends one of these is a bridge."""
 HOLD = 3.0
 """s for which a flag is still shown after it was last set."""
-WINDOW, BUCKET = 600.0, 1.0
-"""s of total field that are kept, and s of them that make one point."""
 RETRY = 1.5
 """s after which a request without an answer is repeated."""
 WAITING = "no answer yet"
-AWAY = 30.0
-"""s of silence after which another bridge that is heard takes its place."""
+SAMPLES, PARAMETERS, TELEMETRY = 3000, 512, 12
+"""Samples, parameters, and series of telemetry that are kept at most."""
+LOCATED = {MAG_NAVIGATION_STATE.TRACKING, MAG_NAVIGATION_STATE.DEAD_RECKONING}
+"""States of the position filter in which it says where the vehicle is."""
+FIX_2D = 2
+"""GPS_FIX_TYPE from which a receiver knows its place."""
+TEMPERATURE = "Temperature, °C"
+"""The series of the fluxgate's temperature, beside those of the telemetry."""
 
 
 class Text(NamedTuple):
@@ -32,17 +36,6 @@ class Text(NamedTuple):
     time: float
     severity: int
     text: str
-
-
-@dataclass
-class Point:
-    """The samples of one `BUCKET` from `time` (s): sum, number, and outline of their 2-sigma bands (nT)."""
-
-    time: float
-    sum: float = 0.0
-    count: int = 0
-    low: float = inf
-    high: float = -inf
 
 
 @dataclass
@@ -57,14 +50,19 @@ class Parameter:
 
 
 class State:
-    """All that a page shows of one bridge: the first heard; another only once that was silent for `AWAY`.
+    """All that a page shows of one bridge.
 
     Times are the receiver's, s of a clock that nobody sets.
 
+    Parameters
+    ----------
+    bridge : tuple of 2 int, optional
+        Its system and component; before any bridge was heard, none.
+    sequence : int
+        The sequence number of its message before the first.
+
     Attributes
     ----------
-    bridge : tuple of 2 int or None
-        Its system and component.
     heard, sampled, reported, navigated : float
         When its last message, MAG_FIELD, MAG_STATUS and MAG_NAVIGATION came; -inf before the first.
     interval, report_interval : float
@@ -75,27 +73,23 @@ class State:
         The last MAG_FIELD, MAG_STATUS and MAG_NAVIGATION; empty before the first.
     flags : dict of str to tuple of 2 float
         The flags shown, by their public names: since when, and when last set.
-    trace : deque of Point
-        The last ten minutes of total field.
+    samples : deque of dict
+        The last MAG_FIELDs.
+    total : Series
+        The total field over a day, nT.
+    telemetry : dict of str to Series
+        What else is measured: the fluxgate's temperature, and named values of the same vehicle, among them
+        the positions of its masses.
+    estimated, reported_track : Trail
+        Where the vehicle is by the field (MAG_NAVIGATION), and by its own navigation.
+    alarms : Alarms
     texts : deque of Text
         STATUSTEXTs, the newest first.
     parameters : dict of str to Parameter
     """
 
-    def __init__(self) -> None:
-        self._begin()
-        handlers = {
-            "MAG_FIELD": self._field,
-            "MAG_STATUS": self._status,
-            "MAG_NAVIGATION": self._navigation,
-            "STATUSTEXT": self._text,
-        }
-        self._handlers = {spec(name).id: handle for name, handle in handlers.items()}
-        self._handlers[spec("PARAM_VALUE").id] = self._value
-
-    def _begin(self) -> None:
-        """Forget everything, as before any bridge was heard."""
-        self.bridge: tuple[int, int] | None = None
+    def __init__(self, bridge: tuple[int, int] | None = None, sequence: int = -1) -> None:
+        self.bridge = bridge
         self.heard = self.sampled = self.reported = self.navigated = -inf
         self.interval = self.report_interval = 0.0
         self.received = self.lost = 0
@@ -103,23 +97,38 @@ class State:
         self.status: dict[str, Any] = {}
         self.navigation: dict[str, Any] = {}
         self.flags: dict[str, tuple[float, float]] = {}
-        self.trace: deque[Point] = deque()
+        self.samples: deque[dict[str, Any]] = deque(maxlen=SAMPLES)
+        self.total, self.telemetry = Series(), dict[str, Series]()
+        self.estimated, self.reported_track = Trail(), Trail()
+        self.alarms = Alarms()
         self.texts: deque[Text] = deque(maxlen=200)
         self.parameters: dict[str, Parameter] = {}
         self._count = self._lost_before = 0
-        self._sequence = -1
+        self._sequence = sequence
         self._piece = (0, -1)
-        self._beat = self._asked = -inf
+        self._asked = -inf
+        self._handlers = {
+            spec(name).id: handle
+            for name, handle in {
+                "MAG_FIELD": self._field,
+                "MAG_RAW": self._raw,
+                "MAG_STATUS": self._status,
+                "MAG_NAVIGATION": self._navigation,
+                "STATUSTEXT": self._text,
+                "PARAM_VALUE": self._value,
+            }.items()
+        }
+        self._overheard = {
+            spec(name).id: handle
+            for name, handle in {
+                "NAMED_VALUE_FLOAT": self._named_value,
+                "GLOBAL_POSITION_INT": self._position,
+                "GPS_RAW_INT": self._position,
+            }.items()
+        }
 
     def hear(self, message: Message, now: float) -> None:
-        """Take a message that came at `now`."""
-        sender = message.system, message.component
-        away = sender != self.bridge and now - self.heard > AWAY
-        if away and message.known and message.id in BRIDGES:
-            self._begin()
-            self.bridge, self._sequence = sender, message.sequence - 1
-        if sender != self.bridge or not message.known:
-            return
+        """Take a message of the bridge that came at `now`."""
         gap = (message.sequence - self._sequence - 1) % 256
         self.lost += gap if gap < 128 else 0  # a larger step is a message that comes late
         self._sequence, self.heard = message.sequence, now
@@ -127,18 +136,19 @@ class State:
         if handle := self._handlers.get(message.id):
             handle(message, now)
 
+    def overhear(self, message: Message, now: float) -> None:
+        """Take a message of another component of the same vehicle, such as its autopilot."""
+        if handle := self._overheard.get(message.id):
+            handle(message, now)
+
     def due(self, now: float) -> list[tuple[str, dict[str, Any]]]:
-        """Return the messages to send at `now`: our heartbeat, and requests not yet answered."""
-        requests: list[tuple[str, dict[str, Any]]] = []
-        if now - self._beat >= 1.0:
-            self._beat = now
-            kind = {"type": MAV_TYPE.GCS, "autopilot": MAV_AUTOPILOT.INVALID, "mavlink_version": 3}
-            requests.append(("HEARTBEAT", {**kind, "system_status": MAV_STATE.ACTIVE}))
+        """Return the requests to send at `now`: those not yet answered."""
         if self.bridge is None:
-            return requests
+            return []
+        requests: list[tuple[str, dict[str, Any]]] = []
         target = dict(zip(("target_system", "target_component"), self.bridge, strict=True))
         known = {one.index for one in self.parameters.values()}
-        missing = [index for index in range(self._count) if index not in known]
+        missing = [index for index in range(min(self._count, PARAMETERS)) if index not in known]
         if now - self._asked > RETRY and (missing or not known):
             self._asked = now
             requests += [("PARAM_REQUEST_READ", {**target, "param_index": index}) for index in missing[:10]]
@@ -149,6 +159,10 @@ class State:
                 value = {"param_id": name, "param_value": one.asked, "param_type": MAV_PARAM_TYPE.REAL32}
                 requests.append(("PARAM_SET", {**target, **value}))
         return requests
+
+    def time(self, now: float) -> float:
+        """Return the bridge's own time, s since 1970, of a moment of the receiver's clock; NaN before any."""
+        return self.field["time_usec"] * 1e-6 + now - self.sampled if self.field else nan
 
     def set(self, name: str, value: float) -> None:
         """Ask for another value of a parameter; the answer, or the refusal, appears in `parameters`."""
@@ -164,19 +178,26 @@ class State:
         for name in Quality(self.field["flags"]).names().split():
             self.flags[name] = self.flags.get(name, (now, now))[0], now
         self.flags = {name: times for name, times in self.flags.items() if now - times[1] <= HOLD}
-        time, total = self.field["time_usec"] * 1e-6 // BUCKET * BUCKET, self.field["total_field"]
-        two_sigma = 2 * self.field["total_field_sigma"]
-        if not isfinite(total + two_sigma):
-            return
-        if self.trace and time < self.trace[-1].time:
-            self.trace.clear()  # the bridge's clock was set back
-        if not self.trace or time > self.trace[-1].time:
-            self.trace.append(Point(time))
-        point = self.trace[-1]
-        point.sum, point.count = point.sum + total, point.count + 1
-        point.low, point.high = min(point.low, total - two_sigma), max(point.high, total + two_sigma)
-        while time - self.trace[0].time > WINDOW:
-            self.trace.popleft()
+        self.samples.append(self.field)
+        self.total.add(
+            self.field["time_usec"] * 1e-6, self.field["total_field"], 2 * self.field["total_field_sigma"]
+        )
+
+    def _raw(self, message: Message, now: float) -> None:  # noqa: ARG002 - handlers are alike
+        self._measured(TEMPERATURE, message["time_usec"] * 1e-6, message["temperature"])
+
+    def _named_value(self, message: Message, now: float) -> None:
+        self._measured(message["name"], self.time(now), message["value"])
+
+    def _measured(self, name: str, time: float, value: float) -> None:
+        if isfinite(value) and name not in self.telemetry and len(self.telemetry) < TELEMETRY:
+            self.telemetry[name] = Series()
+        if name in self.telemetry:
+            self.telemetry[name].add(time, value)
+
+    def _position(self, message: Message, now: float) -> None:  # noqa: ARG002 - handlers are alike
+        if message.fields.get("fix_type", FIX_2D) >= FIX_2D and (message["lat"] or message["lon"]):
+            self.reported_track.add(TrackPoint(message["lat"] * 1e-7, message["lon"] * 1e-7))
 
     def _status(self, message: Message, now: float) -> None:
         self.report_interval = now - self.reported if self.status else 0.0
@@ -190,6 +211,10 @@ class State:
 
     def _navigation(self, message: Message, now: float) -> None:
         self.navigation, self.navigated = message.fields, now
+        if self.navigation["state"] in LOCATED:
+            nn, ne, ee = (self.navigation[f"covariance_{axes}"] for axes in ("nn", "ne", "ee"))
+            latitude, longitude = message["lat"] * 1e-7, message["lon"] * 1e-7
+            self.estimated.add(TrackPoint(latitude, longitude, (nn, ne, ee)))
 
     def _text(self, message: Message, now: float) -> None:
         number, piece = message["id"], message["chunk_seq"]
@@ -198,6 +223,8 @@ class State:
             said = said._replace(text=self.texts.popleft().text + said.text)
         self._piece = number, piece
         self.texts.appendleft(said)
+        if said.severity <= MAV_SEVERITY.ERROR:
+            self.alarms.announce(f"text: {said.text}", said.text, now)
         name, _, reason = said.text.partition(": ")
         if name in self.parameters and said.severity <= MAV_SEVERITY.WARNING:
             self.parameters[name].error = reason
@@ -205,12 +232,16 @@ class State:
     def _value(self, message: Message, now: float) -> None:
         name, value = message["param_id"], message["param_value"]
         self._asked, self._count = now, message["param_count"]
+        if name not in self.parameters and len(self.parameters) >= PARAMETERS:
+            return
         one = self.parameters.setdefault(name, Parameter(message["param_index"], value))
         one.value = value
         if one.asked is None:
             return
         if isclose(one.asked, value, rel_tol=1e-6):
             one.error = ""
-        elif one.error in ("", WAITING):
+        elif one.error == WAITING:
+            return  # of a list that somebody asked for meanwhile; our request is repeated
+        elif not one.error:
             one.error = f"{one.asked:.7g} was not taken"
         one.asked = None

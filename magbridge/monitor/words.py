@@ -9,7 +9,7 @@ from magbridge.field.geodesy import worse_axis
 from magbridge.mavlink.dialect import MAG_LOG_STATE, MAG_NAVIGATION_STATE, MAG_PORT_STATE
 from magbridge.monitor.state import State
 
-__all__ = ["FLAGS", "ago", "health", "measured", "silence", "whereabouts"]
+__all__ = ["FLAGS", "ago", "conditions", "health", "measured", "silence", "whereabouts"]
 
 SILENT, SLOW = 3.0, 30.0
 """s of silence that are reported: `SILENT` of the bridge, which sends every second; of the field and of the
@@ -27,6 +27,10 @@ FLAGS = {
     "late_join": "Sample and telemetry may not be of one time",
     "unexplained": "The calibration no longer explains the field",
 }
+ROUTINE = {"moving", "no_boresight", "late_join"}
+"""Flags that come and go, or stay, in a mission where nothing is wrong: they are shown, and alarm nobody."""
+HUGE = 1e9
+"""No figure of the page is as large: what is, is written with its power of ten."""
 LOSSES = {
     "Samples lost at the sensor": "samples_lost",
     "Bad frames from the sensor": "sensor_frames_bad",
@@ -130,6 +134,20 @@ def whereabouts(state: State, now: float) -> dict[str, tuple[str, bool]]:
     }
 
 
+def conditions(state: State, now: float) -> dict[str, str]:
+    """Return what a person should look at, as :meth:`Alarms.update` takes it: key and words of each."""
+    wrong = {name: FLAGS[name] for name in state.flags if name not in ROUTINE}
+    if quiet := silence(state, now):
+        wrong["silence"] = quiet.split(" for ")[0].capitalize()
+    for line in ("Sensor", "Autopilot", "Log"):
+        text, _ = health(state, now)[line]
+        if state.status and text in {"silent", "lost", "failed"}:
+            wrong[line] = f"{line}: {text}"
+    if state.navigation.get("state") == MAG_NAVIGATION_STATE.LOST:
+        wrong["navigation"] = "The position by the field is lost"
+    return wrong
+
+
 def _word(states: type[IntEnum], value: int) -> str:
     """Return the word for a state; a newer bridge may have one that is not known here."""
     known = {int(state): state.name.lower().replace("_", " ") for state in states}
@@ -145,6 +163,9 @@ def _number(value: float, form: str, two_sigma: float = nan, unit: str = "") -> 
     apart = form.replace(".", ",.")
     text, doubt = (
         plain.replace(",", "\N{NARROW NO-BREAK SPACE}").rstrip()
-        for plain in (f"{value:{apart}} {unit}", f"± {two_sigma:{apart.lstrip('+')}}")
+        for plain in (
+            f"{value:{apart if abs(value) < HUGE else '.3g'}} {unit}",
+            f"± {two_sigma:{apart.lstrip('+') if abs(two_sigma) < HUGE else '.3g'}}",
+        )
     )
     return text if isfinite(value) else "–", doubt if isfinite(two_sigma) else ""

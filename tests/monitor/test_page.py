@@ -2,75 +2,28 @@
 
 from __future__ import annotations
 
-import os
-import signal
 import socket
-import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from urllib.error import URLError
-from urllib.request import urlopen
 
 import pytest
 from commands import Command
+from station import Station, get, served
 
 from magbridge.mavlink import Codec, Signing
-from magbridge.monitor.chart import reach
-from magbridge.monitor.state import Point
 
 pytest.importorskip("nicegui")
 
 
-def free(kind: socket.SocketKind) -> int:
-    with socket.socket(socket.AF_INET, kind) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
 @pytest.fixture
-def clock(tmp_path: Path) -> Path:
-    """By how many µs the page's computer's clock is set forward."""
-    offset = tmp_path / "offset"
-    offset.write_text("0")
-    return offset
-
-
-@contextmanager
-def served(clock: Path, *options: str) -> Iterator[tuple[str, tuple[str, int]]]:
-    link, port = free(socket.SOCK_DGRAM), free(socket.SOCK_STREAM)
-    launch = [sys.executable, str(Path(__file__).parents[1] / "harness" / "stepped.py"), str(clock)]
-    command = [*launch, "monitor", f"udpin:127.0.0.1:{link}", "--port", str(port), *options]
-    # NiceGUI looks at them
-    alone = {name: value for name, value in os.environ.items() if "PYTEST" not in name}
-    with subprocess.Popen(command, stderr=subprocess.PIPE, env=alone) as process:
-        assert process.stderr
-        assert b"the page is" in process.stderr.readline()
-        yield f"http://127.0.0.1:{port}/", ("127.0.0.1", link)
-        process.send_signal(signal.SIGINT)
-        assert not process.stderr.read().strip()
-    assert process.returncode == 0
-
-
-@pytest.fixture
-def page(clock: Path) -> Iterator[tuple[str, tuple[str, int]]]:
+def page(clock: Path) -> Iterator[Station]:
     with served(clock) as running:
         yield running
 
 
-def get(url: str) -> str:
-    for _ in range(150):
-        try:
-            with urlopen(url, timeout=20) as answer:
-                return str(answer.read().decode())
-        except URLError:
-            time.sleep(0.2)
-    raise TimeoutError(url)
-
-
-def test_page(page: tuple[str, tuple[str, int]]) -> None:
+def test_page(page: Station) -> None:
     url, link = page
     assert "nothing heard yet" in get(url)
     bridge = Codec(1, 191)
@@ -108,7 +61,7 @@ def test_page(page: tuple[str, tuple[str, int]]) -> None:
     assert 'href="http' not in html
 
 
-def test_a_clock_set_back_hides_no_silence(page: tuple[str, tuple[str, int]], clock: Path) -> None:
+def test_a_clock_set_back_hides_no_silence(page: Station, clock: Path) -> None:
     url, link = page
     get(url)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
@@ -158,14 +111,6 @@ def test_bad_input_is_one_line(command: Command) -> None:
 
 def test_a_missing_extra_is_named(monkeypatch: pytest.MonkeyPatch, command: Command) -> None:
     monkeypatch.setitem(sys.modules, "nicegui", None)
-    monkeypatch.delitem(sys.modules, "magbridge.monitor.page", raising=False)
+    monkeypatch.delitem(sys.modules, "magbridge.monitor.serve", raising=False)
     line = command.refuses("monitor", code=2)
     assert line == "nicegui is not installed: pip install 'magbridge[monitor]'"
-
-
-def test_the_axis_shows_the_curve_whatever_its_band() -> None:
-    near = [Point(k, 52_000.0 + k, 1, 51_998.0 + k, 52_002.0 + k) for k in range(5)]
-    assert reach(near) == {"min": 51_998.0, "max": 52_006.0}
-    wide = [Point(k, 52_000.0 + k, 1, -90_000.0, float("inf")) for k in range(5)]
-    assert reach(wide) == {"min": 51_930.0, "max": 52_080.0}
-    assert reach([Point(0.0, float("nan"), 1)]) == {}

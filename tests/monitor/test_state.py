@@ -2,16 +2,29 @@
 
 from __future__ import annotations
 
+import csv
+import json
+from io import BytesIO
 from math import inf, nan
+from random import Random
+from zipfile import ZipFile
 
 import pytest
 
 from magbridge.config import Align, Link
 from magbridge.link import Component, alignment
-from magbridge.mavlink import Codec
-from magbridge.monitor.state import State
+from magbridge.mavlink import Codec, Message, spec
+from magbridge.monitor.bundle import bundle
+from magbridge.monitor.chart import drawn
+from magbridge.monitor.fleet import MOST, Fleet
+from magbridge.monitor.history import TIERS
+from magbridge.monitor.state import TEMPERATURE, State
+from magbridge.monitor.track import series as track_series
 from magbridge.monitor.words import ago, health, measured, silence, whereabouts
 from magbridge.records import Quality
+from magbridge.version import __version__
+
+orjson = pytest.importorskip("orjson")  # how NiceGUI sends it to the browser
 
 NOW = 1_700_000_000.0
 
@@ -20,14 +33,19 @@ class Air:
     """A bridge's codec and a station's ear."""
 
     def __init__(self) -> None:
-        self.state, self.bridge, self.codec = State(), Codec(1, 191), Codec(255, 190)
+        self.fleet, self.bridge, self.codec = Fleet(), Codec(1, 191), Codec(255, 190)
+
+    @property
+    def state(self) -> State:
+        """Of the bridge that speaks."""
+        return self.fleet.states.get((self.bridge.system, self.bridge.component), State())
 
     def say(self, now: float, name: str, /, **fields: object) -> None:
         self.give(self.bridge.pack(name, **fields), now)
 
     def give(self, data: bytes, now: float) -> None:
         for message in self.codec.parse(data):
-            self.state.hear(message, now)
+            self.fleet.hear(message, now)
 
     def field(self, now: float, total: float = 52_000.0, flags: int = 0, **fields: object) -> None:
         fields = {"total_field_sigma": 1.0, "time_usec": round(now * 1e6), "anomaly": nan, **fields}
@@ -142,27 +160,27 @@ def test_what_a_newer_bridge_says_is_shown_as_far_as_it_is_known(air: Air) -> No
     assert [said.text for said in air.state.texts] == ["the end of what was not heard"]
 
 
-def test_only_the_first_bridge_is_heard(air: Air) -> None:
+def test_each_vehicle_has_a_state_of_its_own(air: Air) -> None:
     air.give(Codec(1, 1).pack("STATUSTEXT", text="autopilot", severity=4), NOW)
-    before = air.state.bridge
+    assert not air.fleet.states
     air.field(NOW, 50_000)
     air.give(Codec(2, 191).pack("MAG_FIELD", total_field=1.0), NOW)
     air.give(b"\xfd noise \xfe", NOW)
-    assert (before, air.state.bridge) == (None, (1, 191))
-    assert air.state.field["total_field"] == 50_000
+    assert list(air.fleet.states) == [(1, 191), (2, 191)]
+    assert [one.field["total_field"] for one in air.fleet.states.values()] == [50_000, 1.0]
     assert not air.state.texts
+    requests = [(name, fields.get("target_system")) for name, fields in air.fleet.due(NOW)]
+    assert requests == [("HEARTBEAT", None), ("PARAM_REQUEST_LIST", 1), ("PARAM_REQUEST_LIST", 2)]
 
 
-def test_another_bridge_takes_the_place_of_one_that_is_silent(air: Air) -> None:
-    """The vehicle was changed, or its component id: the page begins anew with what is there."""
-    air.field(NOW)
-    air.bridge = Codec(1, 192)
-    air.field(NOW + 29.0)
-    assert air.state.bridge == (1, 191)
-    air.field(NOW + 31.0, 51_000.0)
-    assert (air.state.bridge, air.state.lost, len(air.state.trace)) == ((1, 192), 0, 1)
-    assert air.state.field["total_field"] == 51_000.0
-    assert silence(air.state, NOW + 32.0) == ""
+def test_vehicles_are_bounded_and_one_that_is_silent_makes_room(air: Air) -> None:
+    for system in range(1, 100):
+        air.give(Codec(system, 191).pack("MAG_FIELD", total_field=1.0), NOW)
+    assert list(air.fleet.states) == [(system, 191) for system in range(1, 1 + MOST)]
+    air.give(Codec(3, 191).pack("MAG_FIELD", total_field=1.0), NOW + 20.0)
+    air.give(Codec(100, 191).pack("MAG_FIELD", total_field=1.0), NOW + 31.0)
+    assert (1, 191) not in air.fleet.states
+    assert {(3, 191), (100, 191)} <= set(air.fleet.states)
 
 
 def test_messages_lost_on_the_way_are_counted(air: Air) -> None:
@@ -185,20 +203,83 @@ def test_flags_stand_since_they_came(air: Air) -> None:
     assert not air.state.flags
 
 
-def test_trace_is_the_outline_of_the_last_ten_minutes(air: Air) -> None:
-    for k in range(7000):
-        air.field(
-            NOW + k / 10, 52_000.0 + (50 if k == 5005 else 0), total_field_sigma=3.0 if k == 5007 else 1.0
-        )
-    trace = air.state.trace
-    assert len(trace) == 601
-    assert {point.count for point in trace} == {10}
-    spike = next(point for point in trace if point.time == NOW + 500)
-    assert (spike.sum / spike.count, spike.low, spike.high) == pytest.approx((52_005, 51_994, 52_052))
-    air.field(NOW + 701, nan)
-    assert len(trace) == 601
-    air.field(NOW - 60)  # its clock was set back
-    assert [point.time for point in trace] == [NOW - 60]
+def test_masses_and_temperature_of_the_same_vehicle_are_kept(air: Air) -> None:
+    air.field(NOW)
+    air.say(NOW, "MAG_RAW", time_usec=round(NOW * 1e6), temperature=7.5)
+    for system, value in ((1, 0.4), (2, 9.0)):
+        named = Codec(system, 1).pack("NAMED_VALUE_FLOAT", name="battpos", value=value)
+        air.give(named, NOW + 1)
+    for k in range(100):  # bounded, whatever is named
+        air.give(Codec(1, 1).pack("NAMED_VALUE_FLOAT", name=f"n{k}", value=k), NOW + 1)
+    telemetry = air.state.telemetry
+    assert telemetry[TEMPERATURE].latest == 7.5
+    assert telemetry["battpos"].latest == pytest.approx(0.4)
+    assert telemetry["battpos"].points("10 min")[0].time == NOW + 1
+    assert len(telemetry) == 12
+
+
+def test_the_tracks_are_kept(air: Air) -> None:
+    air.field(NOW)
+    place = {"lat": 495_000_000, "lon": -579_000_000}
+    air.say(NOW, "MAG_NAVIGATION", state=1, **place)
+    assert not list(air.state.estimated)  # it searches still
+    air.say(NOW, "MAG_NAVIGATION", state=2, covariance_nn=9.0, covariance_ee=4.0, **place)
+    air.give(Codec(1, 1).pack("GPS_RAW_INT", fix_type=1, **place), NOW)
+    air.give(Codec(1, 1).pack("GLOBAL_POSITION_INT", **place), NOW)
+    assert air.state.estimated.latest.covariance == (9.0, 0.0, 4.0)
+    assert air.state.reported_track.added == 1
+
+
+def test_nothing_that_is_heard_raises(air: Air) -> None:
+    """Whatever the payload's bytes: numbers that are none or absurd, unknown flags and states, any text."""
+    extremes = (nan, inf, -inf, 1e308, -1e308, 5e-324, 0.0)
+    names = ("MAG_FIELD", "MAG_RAW", "MAG_STATUS", "MAG_NAVIGATION", "STATUSTEXT")
+    moment = NOW
+    for total in extremes:
+        for sigma in (nan, inf, 3e38, -1.0):
+            for us in (0, 10**15, 2**64 - 1):
+                air.field(moment, total, 65535, total_field_sigma=sigma, time_usec=us, x=sigma)
+    random = Random(1)
+    for name in [*names, "PARAM_VALUE", "NAMED_VALUE_FLOAT", "GLOBAL_POSITION_INT", "GPS_RAW_INT"]:
+        size = spec(name).struct.size
+        for payload in [b"\xff" * size, b"\x7f" * size, *(random.randbytes(size) for _ in range(200))]:
+            moment += 0.01
+            component = 1 if name in ("NAMED_VALUE_FLOAT", "GLOBAL_POSITION_INT", "GPS_RAW_INT") else 191
+            message = Message(spec(name).id, 1, component, 0, payload, b"", known=True)
+            air.fleet.hear(message, moment)
+            air.fleet.due(moment)
+    state = air.state
+    measured(state), health(state, moment), whereabouts(state, moment), silence(state, moment)
+    for tier in TIERS:
+        for series in (state.total, *state.telemetry.values()):
+            orjson.dumps(drawn(series.points(tier), tier))
+    shown, box = track_series(state.reported_track, state.estimated, None)
+    orjson.dumps([shown, box])
+    assert len(state.parameters) <= 512
+    assert len(state.texts) <= 200
+    assert len(list(state.alarms)) <= 100
+    assert max(len(text) for texts in measured(state).values() for text in texts) < 30
+    with ZipFile(BytesIO(bundle(state, moment, "here"))) as archive:
+        assert archive.testzip() is None
+
+
+def test_a_bug_report_holds_what_was_seen(air: Air) -> None:
+    air.field(NOW, 52_134.268)
+    air.say(NOW, "STATUSTEXT", severity=3, text='sensor lost: "unplugged", again')
+    air.say(NOW, "PARAM_VALUE", param_id="MB_SETTLE_TIME", param_value=4.0, param_count=1)
+    with ZipFile(BytesIO(bundle(air.state, NOW, "udpin:h:1"))) as archive:
+        tables = {
+            name: list(csv.reader(archive.read(name).decode().splitlines()))
+            for name in archive.namelist()
+            if name.endswith(".csv")
+        }
+        about = json.loads(archive.read("about.json"))
+    assert (about["magbridge"], about["link"], about["bridge"]) == (__version__, "udpin:h:1", [1, 191])
+    assert tables["texts.csv"][1][1:] == ["3", 'sensor lost: "unplugged", again']
+    assert tables["parameters.csv"][1] == ["MB_SETTLE_TIME", "4.0", ""]
+    sample = dict(zip(*tables["samples.csv"], strict=True))
+    assert float(sample["total_field"]) == 52_134.268
+    assert tables["alarms.csv"][1][-1] == 'sensor lost: "unplugged", again'
 
 
 def test_a_long_text_is_put_together(air: Air) -> None:
@@ -222,7 +303,7 @@ class Exchange:
         while self.now < end:
             self.now += 0.1
             us = round(self.now * 1e6)
-            for name, fields in self.air.state.due(self.now):
+            for name, fields in self.air.fleet.due(self.now):
                 if answers:
                     self.bridge.receive(self.air.codec.pack(name, **fields), us)
             self.bridge.advance(us)

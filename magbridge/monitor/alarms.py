@@ -1,0 +1,77 @@
+"""What a person should look at: conditions that began, and whether somebody has seen them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+__all__ = ["MOST", "Alarm", "Alarms"]
+
+MOST = 100
+"""Alarms that are kept at most; the oldest go first."""
+
+
+@dataclass(slots=True)
+class Alarm:
+    """Something that began at `since` (s of the receiver's clock).
+
+    Attributes
+    ----------
+    key, text : str
+        What it is, for us and for a reader.
+    since, last : float
+        When it last began, and when it was last so.
+    active : bool
+        It is so at present.
+    count : int
+        How often it has begun.
+    acknowledged : bool
+        Somebody has seen it since it last began.
+    """
+
+    key: str
+    text: str
+    since: float
+    last: float
+    active: bool = True
+    count: int = 1
+    acknowledged: bool = False
+
+
+class Alarms:
+    """The alarms of one vehicle, the newest first."""
+
+    def __init__(self) -> None:
+        self._alarms: dict[str, Alarm] = {}
+
+    def __iter__(self) -> Iterator[Alarm]:
+        """Iterate, the one that began last first."""
+        return iter(sorted(self._alarms.values(), key=lambda alarm: alarm.since, reverse=True))
+
+    @property
+    def unseen(self) -> int:
+        """Number of alarms that nobody has acknowledged."""
+        return sum(not alarm.acknowledged for alarm in self._alarms.values())
+
+    def update(self, conditions: Mapping[str, str], now: float) -> None:
+        """Take all that is wrong at `now`, its keys and its words; the other conditions are over."""
+        for key, alarm in self._alarms.items():
+            alarm.active = alarm.active and key in conditions
+        for key, text in conditions.items():
+            known = self._alarms.get(key)
+            if known is None or not known.active:
+                self.announce(key, text, now, active=True)
+            else:
+                known.text, known.last = text, now
+
+    def announce(self, key: str, text: str, now: float, *, active: bool = False) -> None:
+        """Begin an alarm, or begin it anew; one that is not `active` is an event, over at once."""
+        count = self._alarms.pop(key).count + 1 if key in self._alarms else 1
+        self._alarms[key] = Alarm(key, text, now, now, active, count)
+        while len(self._alarms) > MOST:
+            del self._alarms[next(iter(self._alarms))]
+
+    def acknowledge(self, key: str | None = None) -> None:
+        """Note that somebody has seen an alarm; without a key, all of them."""
+        for one in self._alarms.values():
+            one.acknowledged |= key in {None, one.key}

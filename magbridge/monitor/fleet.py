@@ -1,0 +1,71 @@
+"""All vehicles that a ground station hears, each with its own state."""
+
+from __future__ import annotations
+
+from math import inf
+from typing import Any
+
+from magbridge.mavlink import Message, spec
+from magbridge.mavlink.dialect import MAV_AUTOPILOT, MAV_STATE, MAV_TYPE
+from magbridge.monitor.state import State
+from magbridge.monitor.words import conditions
+
+__all__ = ["Fleet"]
+
+BRIDGES = {spec(name).id for name in ("MAG_RAW", "MAG_FIELD", "MAG_STATUS")}
+"""A component that sends one of these is a bridge."""
+MOST, AWAY = 8, 30.0
+"""Bridges that are kept at most, and s of silence after which one makes room for another."""
+CHECK = 0.5
+"""s between looks at what is wrong."""
+
+
+class Fleet:
+    """The bridges heard, and what is to be sent to them.
+
+    Attributes
+    ----------
+    states : dict of tuple of 2 int to State
+        By system and component, in the order in which they were first heard.
+    """
+
+    def __init__(self) -> None:
+        self.states: dict[tuple[int, int], State] = {}
+        self._beat = self._checked = -inf
+
+    def hear(self, message: Message, now: float) -> None:
+        """Take a message that came at `now`, s of a clock that nobody sets."""
+        if not message.known:
+            return
+        sender = message.system, message.component
+        if sender not in self.states and message.id in BRIDGES and self._room(now):
+            self.states[sender] = State(sender, message.sequence - 1)
+        if sender in self.states:
+            self.states[sender].hear(message, now)
+            return
+        for state in self.states.values():
+            if state.bridge is not None and state.bridge[0] == message.system:
+                state.overhear(message, now)
+
+    def _room(self, now: float) -> bool:
+        """Make room for one more bridge; False where all that are known still speak."""
+        if len(self.states) < MOST:
+            return True
+        silent, state = min(self.states.items(), key=lambda item: item[1].heard)
+        if now - state.heard <= AWAY:
+            return False
+        del self.states[silent]
+        return True
+
+    def due(self, now: float) -> list[tuple[str, dict[str, Any]]]:
+        """Return the messages to send at `now`: our heartbeat, and requests not yet answered."""
+        requests: list[tuple[str, dict[str, Any]]] = []
+        if now - self._beat >= 1.0:
+            self._beat = now
+            kind = {"type": MAV_TYPE.GCS, "autopilot": MAV_AUTOPILOT.INVALID, "mavlink_version": 3}
+            requests.append(("HEARTBEAT", {**kind, "system_status": MAV_STATE.ACTIVE}))
+        if now - self._checked >= CHECK:
+            self._checked = now
+            for state in self.states.values():
+                state.alarms.update(conditions(state, now), now)
+        return requests + [request for state in self.states.values() for request in state.due(now)]

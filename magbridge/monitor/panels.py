@@ -1,0 +1,185 @@
+"""The panels of figures and words: field, flags, condition, position by the field, messages, parameters."""
+
+from __future__ import annotations
+
+from functools import partial
+from math import nan
+
+from nicegui import ui
+
+from magbridge.config import Align
+from magbridge.link import alignment
+from magbridge.mavlink.dialect import MAV_SEVERITY
+from magbridge.monitor.link import StationLink
+from magbridge.monitor.state import State
+from magbridge.monitor.widgets import (
+    AMBER,
+    GREEN,
+    GRID,
+    INK,
+    MUTED,
+    RED,
+    Changes,
+    card,
+    clock,
+    fact,
+    nothing,
+)
+from magbridge.monitor.words import FLAGS, ago, health, measured, silence, whereabouts
+
+__all__ = ["Figures", "Flags", "Health", "Navigation", "Parameters", "Texts"]
+
+TUNABLES = {one.name: one for one in alignment(Align())}
+"""Parameters that every bridge has, with the unit and range that a PARAM_VALUE does not carry."""
+FADED = 0.45
+"""Opacity of figures that are not the present ones."""
+
+
+class Figures:
+    """The field in nT."""
+
+    def __init__(self, state: State) -> None:
+        with card("Field, nT ± 2σ") as self.box:
+            self._labels = [self._quantity(name) for name in measured(state)]
+
+    @staticmethod
+    def _quantity(name: str) -> tuple[ui.label, ui.label]:
+        with ui.column().classes("gap-0"):
+            ui.label(name).classes(f"text-xs {MUTED}")
+            with ui.row().classes("items-baseline gap-2"):
+                size = "text-3xl" if name == "Total field" else "text-xl"
+                return ui.label().classes(f"{size} tabular-nums"), ui.label().classes(f"{MUTED} tabular-nums")
+
+    def show(self, state: State, now: float) -> None:
+        """Show the present figures."""
+        for labels, texts in zip(self._labels, measured(state).values(), strict=True):
+            for label, text in zip(labels, texts, strict=True):
+                label.set_text(text)
+        self.box.style(f"opacity: {FADED if 'no field' in silence(state, now) else 1}")
+
+
+class Flags:
+    """The flags, and since when they stand."""
+
+    def __init__(self) -> None:
+        self._changes = Changes()
+        with card("Flags"):
+            self._box = ui.column().classes("gap-2")
+
+    def show(self, state: State, now: float) -> None:
+        """Show the flags that stand."""
+        flags = {name: f"since {clock(t)}, {ago(now - t)}" for name, (t, _) in state.flags.items()}
+        if not self._changes.new("flags", flags or bool(state.field), self._box):
+            return
+        with self._box:
+            if state.field and not flags:
+                ui.label("None").style(f"color: {GREEN}")
+            for name, since in flags.items():
+                color = AMBER if name == "no_boresight" else RED
+                with ui.column().classes("gap-0 border-l-4 pl-3").style(f"border-color: {color}"):
+                    ui.label(FLAGS[name]).classes("leading-tight")
+                    ui.label(f"{name}, {since}").classes(f"text-xs {MUTED}")
+
+
+class Health:
+    """The bridge's condition and its losses."""
+
+    def __init__(self, state: State, now: float) -> None:
+        facts = list(health(state, now))
+        with card("Bridge"):
+            self._labels = [fact(name) for name in facts[:8]]
+        with card("Losses"):
+            self._labels += [fact(name) for name in facts[8:]]
+
+    def show(self, state: State, now: float) -> None:
+        """Show the last status."""
+        opacity = FADED if "no status" in silence(state, now) else 1
+        for label, (text, well) in zip(self._labels, health(state, now).values(), strict=True):
+            label.set_text(text if state.status else "–")
+            label.style(f"color: {INK if well or not state.status else RED}; opacity: {opacity}")
+
+
+class Navigation:
+    """The position filter's condition; hidden where there is none."""
+
+    def __init__(self, state: State, now: float) -> None:
+        with (
+            ui.element().classes("w-full") as self._box,
+            card("Position by the field; innovation and bias in nT"),
+            ui.element().classes(f"{GRID} md:grid-cols-3 gap-y-1"),
+        ):
+            self._labels = [fact(name) for name in whereabouts(state, now)]
+
+    def show(self, state: State, now: float) -> None:
+        """Show the last MAG_NAVIGATION."""
+        self._box.set_visibility(bool(state.navigation))
+        for label, (text, well) in zip(self._labels, whereabouts(state, now).values(), strict=True):
+            label.set_text(text)
+            label.style(f"color: {INK if well else RED}")
+
+
+class Texts:
+    """What the bridge announced."""
+
+    def __init__(self) -> None:
+        self._changes = Changes()
+        with card("Messages, UTC"):
+            self._box = ui.column().classes("w-full max-h-60 gap-1 overflow-auto flex-nowrap")
+            self._box.props('tabindex=0 role=log aria-label="Messages"')
+
+    def show(self, state: State, _now: float) -> None:
+        """Show the texts, the newest first."""
+        if not self._changes.new("texts", list(state.texts), self._box):
+            return
+        with self._box:
+            if not state.texts:
+                nothing()
+            for said in state.texts:
+                bad, warned = said.severity <= MAV_SEVERITY.ERROR, said.severity == MAV_SEVERITY.WARNING
+                with ui.row().classes("gap-3 flex-nowrap text-sm"):
+                    ui.label(clock(said.time)).classes(f"{MUTED} tabular-nums")
+                    ui.label(said.text).style(f"color: {RED if bad else AMBER if warned else INK}")
+
+
+class Parameters:
+    """The bridge's parameters, which can be set."""
+
+    def __init__(self, station: StationLink, state: State) -> None:
+        self._station, self._state = station, state
+        self._changes, self._inputs = Changes(), dict[str, ui.number]()
+        with card("Parameters (Enter sets one)"):
+            self._box = ui.element().classes(
+                "w-full max-h-60 grid grid-cols-2 sm:grid-cols-3 content-start gap-x-4 overflow-auto"
+            )
+            self._box.props('tabindex=0 role=group aria-label="Parameters"')
+
+    def show(self, state: State, _now: float) -> None:
+        """Show values and refusals."""
+        known = state.parameters
+        if self._changes.new("names", sorted(known), self._box):
+            with self._box:
+                if not known:
+                    nothing()
+                self._inputs = {name: self._input(name) for name in sorted(known)}
+        for name, one in known.items():
+            if self._changes.new(name, (one.value, one.error, one.asked)):
+                box = self._inputs[name]
+                if one.asked is None:
+                    box.set_value(float(f"{one.value:.7g}"))
+                box.props["error"], box.props["error-message"] = bool(one.error), one.error
+                box.update()
+
+    def _input(self, name: str) -> ui.number:
+        self._changes.forget(name)
+        box = ui.number(name).props("dense stack-label").on("keydown.enter", partial(self._set, name))
+        if known := TUNABLES.get(name):
+            box.tooltip(f"{known.doc}; {known.low:g} to {known.high:g} {known.unit}")
+            box.props(f'suffix="{known.unit}"')
+        return box
+
+    def _set(self, name: str) -> None:
+        with self._station.lock:
+            if name in self._state.parameters:
+                self._changes.forget(name)  # so that the answer is shown, even if it is the same as before
+                value = self._inputs[name].value
+                self._state.set(name, nan if value is None else value)

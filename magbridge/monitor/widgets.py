@@ -1,0 +1,83 @@
+"""Small parts of which the page's panels are made, and its colours."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from nicegui import ui
+
+from magbridge.monitor.link import now
+
+__all__ = [
+    "AMBER",
+    "GREEN",
+    "GRID",
+    "INK",
+    "MUTED",
+    "RED",
+    "STYLE",
+    "Changes",
+    "card",
+    "clock",
+    "fact",
+    "nothing",
+]
+
+STYLE = """
+:root, .q-header {--ink: #1e293b; --good: #15803d; --doubt: #b45309; --bad: #b91c1c}
+body.body--dark {--ink: #e2e8f0; --good: #4ade80; --doubt: #fbbf24; --bad: #f87171}
+body.body--dark {color-scheme: dark; --q-negative: var(--bad) !important}
+[data-chart]:focus-visible {outline: 2px solid #3b82f6; outline-offset: 2px; border-radius: 4px}
+.q-header .q-btn, .q-header .q-toggle {color: white}
+"""
+"""Colours by day and, where the browser asks for it, by night; the header is the same at both."""
+INK, GREEN, AMBER, RED = "var(--ink)", "var(--good)", "var(--doubt)", "var(--bad)"
+MUTED = "text-slate-600 dark:text-slate-400"
+GRID = "w-full grid gap-4 grid-cols-1"
+
+
+class Changes:
+    """What one browser was shown, so that only what is new is sent to it."""
+
+    def __init__(self) -> None:
+        self._shown: dict[str, Any] = {}
+
+    def new(self, key: str, value: Any, box: ui.element | None = None) -> bool:
+        """Return whether `value` is new; if so, empty the `box` that showed the old one."""
+        new = key not in self._shown or bool(self._shown[key] != value)
+        self._shown[key] = value
+        if new and box is not None:
+            box.clear()
+        return new
+
+    def forget(self, key: str) -> None:
+        """Have the next value shown, even if it is the same as before."""
+        self._shown.pop(key, None)
+
+
+@contextmanager
+def card(title: str) -> Iterator[ui.card]:
+    """Make a card under a heading; what is made within is in it."""
+    with ui.card().classes("w-full gap-2 p-4 shadow-sm rounded-lg dark:bg-slate-800") as made:
+        ui.label(title).classes(f"text-sm font-semibold {MUTED}").props("role=heading aria-level=2")
+        yield made
+
+
+def fact(name: str) -> ui.label:
+    """Make a row of a name and a value, and return the value's label."""
+    with ui.row().classes("w-full justify-between text-sm gap-x-2"):
+        ui.label(name).classes(MUTED)
+        return ui.label().classes("font-medium tabular-nums")
+
+
+def nothing(text: str = "None yet") -> None:
+    """Say that there is nothing to show."""
+    ui.label(text).classes(f"text-sm {MUTED}")
+
+
+def clock(when: float) -> str:
+    """Return the UTC of a moment on the station's clock."""
+    return time.strftime("%H:%M:%S", time.gmtime(time.time() - (now() - when)))

@@ -1,0 +1,60 @@
+"""The command ``magbridge monitor`` as a process, for tests that ask it as a browser does."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from urllib.error import HTTPError, URLError
+from urllib.request import HTTPCookieProcessor, build_opener
+
+Station = tuple[str, tuple[str, int]]
+"""The page's address, and where its link listens."""
+
+
+def free(kind: socket.SocketKind) -> int:
+    """Return a port that nobody has."""
+    with socket.socket(socket.AF_INET, kind) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+@contextmanager
+def served(clock: Path, *options: str, warned: bool = False) -> Iterator[Station]:
+    """Run the page; `clock` holds by how many µs its computer's clock is set forward."""
+    link, port = free(socket.SOCK_DGRAM), free(socket.SOCK_STREAM)
+    launch = [sys.executable, str(Path(__file__).parent / "stepped.py"), str(clock)]
+    command = [*launch, "monitor", f"udpin:127.0.0.1:{link}", "--port", str(port), *options]
+    # NiceGUI looks at them
+    alone = {name: value for name, value in os.environ.items() if "PYTEST" not in name}
+    with subprocess.Popen(command, stderr=subprocess.PIPE, env=alone) as process:
+        assert process.stderr
+        line = process.stderr.readline().decode()
+        assert "the page is" in line
+        if warned:
+            assert process.stderr.readline().startswith(b"warning: the page is open to the network")
+        place = line.rpartition(" ")[2].strip().replace("0.0.0.0", "127.0.0.1")
+        yield place if "?" in place else f"{place}/", ("127.0.0.1", link)
+        process.send_signal(signal.SIGINT)
+        assert not process.stderr.read().strip()
+    assert process.returncode == 0
+
+
+def get(url: str) -> str:
+    """Return the page, once it is there."""
+    browser = build_opener(HTTPCookieProcessor())
+    for _ in range(150):
+        try:
+            with browser.open(url, timeout=20) as answer:
+                return str(answer.read().decode())
+        except HTTPError:
+            raise
+        except URLError:
+            time.sleep(0.2)
+    raise TimeoutError(url)

@@ -1,0 +1,59 @@
+"""When an alarm begins, ends, begins anew, and what acknowledging it does."""
+
+from __future__ import annotations
+
+from magbridge.mavlink import Codec
+from magbridge.monitor.alarms import MOST, Alarms
+from magbridge.monitor.fleet import Fleet
+from magbridge.records import Quality
+
+
+def test_an_alarm_stands_until_it_is_acknowledged_and_returns_when_it_begins_anew() -> None:
+    alarms = Alarms()
+    alarms.update({"gap": "Samples are missing"}, 1.0)
+    alarms.update({"gap": "Samples are missing"}, 2.0)
+    (one,) = alarms
+    assert (one.since, one.last, one.count, one.active, alarms.unseen) == (1.0, 2.0, 1, True, 1)
+    alarms.update({}, 3.0)
+    (one,) = alarms
+    assert (one.active, alarms.unseen) == (False, 1)  # it was there, and nobody has seen it
+    alarms.acknowledge("gap")
+    assert alarms.unseen == 0
+    alarms.update({"gap": "Samples are missing"}, 5.0)
+    (one,) = alarms
+    assert (one.since, one.count, one.active, alarms.unseen) == (5.0, 2, True, 1)
+
+
+def test_alarms_are_bounded_and_newest_first() -> None:
+    alarms = Alarms()
+    for k in range(1000):
+        alarms.announce(f"text: {k}", str(k), float(k))
+    assert [alarm.text for alarm in alarms][:2] == ["999", "998"]
+    assert len(list(alarms)) == MOST
+    alarms.acknowledge()
+    assert alarms.unseen == 0
+
+
+def test_what_alarms_of_what_is_heard() -> None:
+    """A mass that moves alarms nobody; a stale parameter, a lost sensor, an error and silence do."""
+    fleet, bridge = Fleet(), Codec(1, 191)
+
+    def say(now: float, name: str, **fields: object) -> None:
+        for message in Codec(255, 190).parse(bridge.pack(name, **fields)):
+            fleet.hear(message, now)
+        fleet.due(now)
+
+    say(0.0, "MAG_FIELD", flags=int(Quality.MOVING | Quality.NO_BORESIGHT))
+    alarms = fleet.states[1, 191].alarms
+    assert list(alarms) == []
+    say(1.0, "MAG_FIELD", flags=int(Quality.STALE_TELEMETRY))
+    say(2.0, "MAG_STATUS", sensor_state=3, autopilot_state=0, log_state=1)
+    say(3.0, "STATUSTEXT", severity=3, text="log failed: disk full")
+    say(3.1, "STATUSTEXT", severity=4, text="only a warning")
+    fleet.due(20.0)
+    assert {alarm.key for alarm in alarms} == {
+        "stale_telemetry",
+        "Sensor",
+        "text: log failed: disk full",
+        "silence",
+    }
