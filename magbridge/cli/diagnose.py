@@ -73,8 +73,8 @@ def diagnose(
     logs_to_read(files, output / "calibration.json", calibration)
 
     from magbridge.calibration.file import load
+    from magbridge.diagnose.assessment.weigh import unsettled
     from magbridge.diagnose.causes import CAUSES
-    from magbridge.diagnose.report.doubts import unsettled
     from magbridge.diagnose.report.findings import findings
     from magbridge.diagnose.run import diagnose as examine
     from magbridge.field.read import read_grid

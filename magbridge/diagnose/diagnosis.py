@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
 from magbridge.arrays import BoolArray, FloatArray
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.residual import rms
+from magbridge.diagnose.assessment.weigh import Assessment, assess
+from magbridge.diagnose.causes import CAUSES, Cause
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.gain import Gain
@@ -110,6 +114,8 @@ class Diagnosis:
     isolability : Isolability
     verdict : str
         As in ``findings.json``: ``explained`` only where what was left out of the fit shows a gain.
+    causes : mapping
+        The table of causes that were asked about.
     """
 
     problem: Problem
@@ -124,6 +130,17 @@ class Diagnosis:
     total: Gain
     isolability: Isolability
     verdict: str
+    causes: Mapping[str, Cause] = field(default_factory=lambda: CAUSES)
+
+    @cached_property
+    def assessment(self) -> Assessment:
+        """Every number and verdict that a reader gets beside the findings."""
+        return assess(self, self.causes)
+
+    @property
+    def counts(self) -> BoolArray:
+        """(n,) samples by which an improvement is measured."""
+        return counted(self.problem, self.wrong)
 
     @property
     def named(self) -> list[Candidate]:

@@ -52,7 +52,7 @@ def extend(problem: Problem, model: Sequence[Candidate], fit: Joint) -> Calibrat
     covariance[:K, :K] += problem.unseen
     reference = calibration.reference
     for candidate, own in zip(model, slices(model), strict=True):
-        if candidate.cause == "reference_bias":
+        if candidate.about == "constant":
             at = own.start
             sigma = float(np.sqrt(fit.effects_covariance[at, at]) * widths[at])
             reference = msgspec.structs.replace(
@@ -123,7 +123,7 @@ def with_map_error(
         return extended
     power = 0.0
     for candidate, own in zip(model, slices(model), strict=True):
-        if candidate.cause == "map_error":
+        if candidate.about == "place":
             b = fit.coefficients[own]
             power += 0.25 * float(b @ normal(candidate.columns, problem.residual)[0] @ b) / len(problem)
     s = isotropic(extended)

@@ -147,7 +147,7 @@ def _examine(
         wrong=wrong, unexplained=rest, calibration=extended, fit=fit, before=before, after=after,
         total=total,
         isolability=isolability(candidates, outcome.info, outcome.trials, len(causes), untestable),
-        verdict=_verdict(named, wrong, rest, total),
+        verdict=_verdict(named, wrong, rest, total), causes=causes,
     )  # fmt: skip
 
 

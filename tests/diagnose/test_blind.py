@@ -19,9 +19,9 @@ from study.rates import worse
 
 from magbridge.calibration.file import load
 from magbridge.calibration.model import Calibration
+from magbridge.diagnose.assessment.weigh import useful
 from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.gain import Gain
-from magbridge.diagnose.report.doubts import useful
 from magbridge.diagnose.report.findings import parameters
 from magbridge.diagnose.run import diagnose
 from sitl.dataset import corrected
@@ -203,7 +203,7 @@ def test_a_channels_name_does_not_decide(
     renamed = ds.rename({written[1]: "zz"})
     found = diagnose([renamed], calibration)
     assert found.findings[0].candidate.channel == "zz"
-    assert "do not fly it" in useful(replace(found, total=Gain(1.0, 1.0, 1.0, (0.9, 1.1))))
+    assert "do not use it" in useful(replace(found, total=Gain(1.0, 1.0, 1.0, (0.9, 1.1))))
     assert "It leaves" not in useful(found)
     first = found.findings[0]
     sun = replace(first.candidate, cause="diurnal_variation", channel=None, effects=())

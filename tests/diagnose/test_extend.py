@@ -12,6 +12,7 @@ from magbridge.calibration.correct import correct
 from magbridge.calibration.instrument_effects import RateEffect, TimeEffect
 from magbridge.calibration.mass_effects import ClockEffect, PowersEffect
 from magbridge.calibration.model import Calibration
+from magbridge.diagnose.assessment.weigh import unsettled
 from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.causes.candidates import Candidate, of_effect, since
 from magbridge.diagnose.compare.past import FAR, Past
@@ -21,7 +22,6 @@ from magbridge.diagnose.extend import MODES, extend, flyable, relinearised, with
 from magbridge.diagnose.inference.evidence import IDEAL
 from magbridge.diagnose.inference.fit_noise import fit_noise
 from magbridge.diagnose.inference.joint import Joint, fit_joint
-from magbridge.diagnose.report.doubts import unsettled
 
 
 def current(size: int) -> Candidate:

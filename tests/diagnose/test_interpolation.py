@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 from posed import right
 
+from magbridge.diagnose.assessment.numbers import delays
 from magbridge.diagnose.causes.time_dependent import offset_drift
 from magbridge.diagnose.causes.timing import channel_skew
 from magbridge.diagnose.compare.interpolation import interpolation_error
@@ -16,7 +17,7 @@ from magbridge.diagnose.compare.survey import Survey
 from magbridge.diagnose.extend import relinearised
 from magbridge.diagnose.inference.information import information
 from magbridge.diagnose.inference.joint import fit_joint
-from magbridge.diagnose.report.doubts import late
+from magbridge.diagnose.report.decision import late
 
 TAKEN = np.array([0.0, 0.16, 0.32])
 """s, of a converter that takes the channels in turn."""
@@ -61,7 +62,7 @@ def test_the_delays_are_found() -> None:
     fit = fit_joint(problem, [], 1)
     found = DELAY * (fit.z[DELAYS] - fit.z[DELAYS][0])
     np.testing.assert_allclose(found, TAKEN, atol=0.03)
-    stated = [float(x) for x in re.findall(r"([\d.]+) ± [\d.]+ s", late(problem, fit))]
+    stated = [float(x) for x in re.findall(r"([\d.]+) ± [\d.]+ s", late(delays(problem, fit)))]
     np.testing.assert_allclose(stated, found[1:], atol=1e-3)
 
 
@@ -82,7 +83,7 @@ def test_channels_taken_at_once_have_none() -> None:
     spread = fit.z[DELAYS] - np.mean(fit.z[DELAYS])
     assert np.all(np.abs(DELAY * spread) < 0.03)
     assert np.std(problem.straight(fit.z) - problem.residual) < 0.2
-    assert not late(problem, fit)
+    assert delays(problem, fit) is None
 
 
 def test_delays_that_are_not_there_leave_a_skew_its_power() -> None:

@@ -12,13 +12,13 @@ import pytest
 from posed import candidate
 from study import deployment
 
+from magbridge.diagnose.assessment.weigh import OWN, Assessment
 from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.diagnosis import Diagnosis, Finding
 from magbridge.diagnose.gain import Gain
 from magbridge.diagnose.inference.outliers import Outliers
 from magbridge.diagnose.inference.rivals import Rival
 from magbridge.diagnose.report.canvas import ends, rolling
-from magbridge.diagnose.report.decision import OWN, Decision, decide
 from magbridge.diagnose.report.glossary import MEANINGS, TRIALS, legend
 from magbridge.diagnose.report.limits import unknown, visible
 from magbridge.diagnose.report.page import report_html
@@ -38,8 +38,12 @@ def clear() -> Iterator[Diagnosis]:
     deployment.vehicle.cache_clear()
 
 
-def answer(diagnosis: Diagnosis) -> Decision:
-    return decide(diagnosis, CAUSES)
+def answer(diagnosis: Diagnosis) -> Assessment:
+    return diagnosis.assessment
+
+
+def reasons(found: Assessment) -> list[str]:
+    return [note.text for note in (*found.reasons_for, *found.reasons_against)]
 
 
 def with_(diagnosis: Diagnosis, **more: object) -> Diagnosis:
@@ -50,16 +54,16 @@ def with_(diagnosis: Diagnosis, **more: object) -> Diagnosis:
 def test_nothing_speaks_against_a_clear_case(clear: Diagnosis) -> None:
     """But that what was left out is of the same log is said even then."""
     found = answer(clear)
-    assert (found.answer, found.mark) == ("Nothing in this log speaks against it.", "good")
-    assert "corrects for what belongs to the vehicle" in found.reasons[0]
-    assert "parts of the same log" in found.reasons[-1]
-    assert len(found.reasons) == 2
+    assert (found.answer, found.fit_for_use) == ("Nothing in this log speaks against it.", "yes")
+    assert "corrects for what belongs to the vehicle" in reasons(found)[0]
+    assert "parts of the same log" in reasons(found)[-1]
+    assert len(reasons(found)) == 2
 
 
 def test_without_a_gain_it_does_not_fly(clear: Diagnosis) -> None:
     found = answer(replace(clear, total=Gain(1.0, 1.0, 1.0, (0.9, 1.1))))
-    assert (found.answer, found.mark) == ("Not on the evidence of this log.", "bad")
-    assert "do not fly it" in found.reasons[0]
+    assert (found.answer, found.fit_for_use) == ("Not on the evidence of this log.", "no")
+    assert "do not use it" in reasons(found)[0]
 
 
 def test_another_possible_cause_is_a_doubt_that_a_manoeuvre_settles(clear: Diagnosis) -> None:
@@ -67,18 +71,18 @@ def test_another_possible_cause_is_a_doubt_that_a_manoeuvre_settles(clear: Diagn
     other = Rival(candidate("offset_drift", np.ones(1)), 1.0)
     twin = Rival(candidate("current_field", np.ones(1), channel="amps_c"), 1.0)
     found = answer(with_(clear, rivals=(other,)))
-    assert (found.answer, found.mark) == ("Only once these doubts are settled.", "doubt")
-    assert CAUSES["current_field"].separated_by in found.reasons[1]
-    assert answer(with_(clear, rivals=(twin,))).mark == "good"
+    assert (found.answer, found.fit_for_use) == ("Only once these doubts are settled.", "once_settled")
+    assert CAUSES["current_field"].separated_by in reasons(found)[1]
+    assert answer(with_(clear, rivals=(twin,))).fit_for_use == "yes"
 
 
 def test_causes_that_cancel_are_a_doubt(clear: Diagnosis) -> None:
     first = clear.findings[0]
     against = replace(first, coefficients=-0.9 * first.coefficients)
     found = answer(replace(clear, findings=(first, against)))
-    assert found.mark == "doubt"
-    assert sum("largely cancel each other" in reason for reason in found.reasons) == 1
-    assert answer(replace(clear, findings=(first, first))).mark == "good"
+    assert found.fit_for_use == "once_settled"
+    assert sum("largely cancel each other" in reason for reason in reasons(found)) == 1
+    assert answer(replace(clear, findings=(first, first))).fit_for_use == "yes"
 
 
 def test_each_other_doubt_is_told(clear: Diagnosis) -> None:
@@ -87,20 +91,20 @@ def test_each_other_doubt_is_told(clear: Diagnosis) -> None:
     own = replace(clear.problem, survey=replace(survey, fitted=np.ones(len(survey), bool)))
     rest = Leftover("tone", 9.0, 1e-9, 12.0, 33.0, None)
     doubtful = {
-        "No gain of its own": with_(clear, gain=idle),
+        "No improvement of its own": with_(clear, gain=idle),
         "10 times the usual size": with_(clear, coefficients=large),
         OWN: replace(clear, problem=own),
         "S/N 9.0 is left that has no name": replace(clear, unexplained=rest),
     }
     for text, diagnosis in doubtful.items():
         found = answer(diagnosis)
-        assert found.mark == "doubt"
-        assert any(text in reason for reason in found.reasons), text
+        assert found.fit_for_use == "once_settled"
+        assert any(text in reason for reason in reasons(found)), text
 
 
 def test_where_nothing_was_added_there_is_nothing_to_fly(clear: Diagnosis) -> None:
     plain = replace(clear, findings=(), verdict="nothing_found")
-    assert answer(plain).reasons == ()
+    assert reasons(answer(plain)) == []
     assert "it holds" in answer(plain).answer
     rest = Leftover("tone", 9.0, 1e-9, 12.0, 33.0, None)
     assert "expect errors like the" in answer(replace(plain, unexplained=rest)).answer
@@ -112,7 +116,7 @@ def test_what_stays_in_the_field_is_reckoned_with(clear: Diagnosis) -> None:
     named = replace(clear.findings[0].hypothesis, candidate=sun)
     both: tuple[Finding, ...] = (clear.findings[0], replace(clear.findings[0], hypothesis=named))
     found = answer(replace(clear, findings=both))
-    (said,) = [reason for reason in found.reasons if reason.startswith("By itself it takes")]
+    (said,) = [reason for reason in reasons(found) if reason.startswith("By itself it takes")]
     before, after = (float(x) for x in re.findall(r"from ([\d.]+) to ([\d.]+) nT RMS", said)[0])
     assert before == pytest.approx(clear.total.before, rel=0.01)
     assert after < before

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from magbridge.diagnose.compare.problem import Problem, effect_columns
 __all__ = ["AXES", "Candidate", "Group", "of_effect", "of_reference", "per", "since", "slices"]
 
 AXES = ("x", "y", "z")
+About = Literal["vehicle", "constant", "place", "time"]
 Group = tuple[str, str | None]
 """A cause and its channel: candidates that share both are one grid."""
 
@@ -59,6 +60,8 @@ class Candidate:
         alternatives for their prior variances, in units of the widths squared and up to a common factor.
     since : bool
         It is absent from the logs that the calibration was fitted to.
+    about : str
+        ``vehicle`` with its sensor; or how the reference is wrong: ``constant``, by ``place`` or ``time``.
     """
 
     cause: str
@@ -78,6 +81,7 @@ class Candidate:
     parts: tuple[Candidate, ...] = ()
     spectra: FloatArray | None = None
     since: bool = False
+    about: About = "vehicle"
 
     @property
     def group(self) -> Group:
@@ -187,10 +191,11 @@ def of_reference(
     basis: Callable[[slice], FloatArray],
     width: FloatArray,
     names: tuple[str, ...],
+    about: About,
 ) -> Candidate:
     """Make a candidate of an error in the reference: the field is ``H_e + sum_k b_k basis_k(t)``, nT.
 
     `basis` gives (m, k) of m rows; `width` (k,) is the usual size of each coefficient, nT.
     """
     columns = lambda rows: problem.gain[rows, None] * basis(rows) * width  # noqa: E731 - a regressor is one line
-    return Candidate(cause, None, columns, width, names, ("nT",) * len(width))
+    return Candidate(cause, None, columns, width, names, ("nT",) * len(width), about=about)

@@ -66,7 +66,9 @@ def map_error(problem: Problem) -> list[Candidate]:
         width = ERROR * np.sqrt(variances)
         columns = Interpolated(seen, functions * width)
         names, units = tuple(f"function {k + 1}" for k in range(len(width))), ("nT",) * len(width)
-        made.append(Candidate("map_error", None, columns, width, names, units, spectra=spectra))
+        made.append(
+            Candidate("map_error", None, columns, width, names, units, spectra=spectra, about="place")
+        )
     return made
 
 

@@ -25,7 +25,7 @@ def diurnal_variation(problem: Problem) -> list[Candidate]:
 
         names = tuple(f"{f} {24 // h} h" for f in ("cos", "sin") for h in some)
         width = np.tile(20.0 / np.array(some), 2)
-        made.append(of_reference(problem, "diurnal_variation", basis, width, names))
+        made.append(of_reference(problem, "diurnal_variation", basis, width, names, "time"))
     return made
 
 
@@ -35,4 +35,8 @@ def reference_bias(problem: Problem) -> list[Candidate]:
     At 68 % of sites each component is within 73 to 114 nT (Beggan 2022, Earth Planets Space 74:17).
     """
     ones = (~problem.survey.learned[:, None]).astype(np.float64)
-    return [of_reference(problem, "reference_bias", lambda rows: ones[rows], np.array([100.0]), ("bias",))]
+    return [
+        of_reference(
+            problem, "reference_bias", lambda rows: ones[rows], np.array([100.0]), ("bias",), "constant"
+        )
+    ]

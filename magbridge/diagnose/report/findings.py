@@ -9,15 +9,20 @@ import msgspec
 import numpy as np
 
 from magbridge.arrays import plain
+from magbridge.diagnose.assessment.notes import Note
+from magbridge.diagnose.assessment.weigh import Assessment
 from magbridge.diagnose.causes import Cause
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.diagnosis import Diagnosis, Finding
 from magbridge.diagnose.gain import LEVEL, Gain
 from magbridge.diagnose.inference.design import normal
 from magbridge.diagnose.inference.rivals import Rival
-from magbridge.diagnose.seen import Seen, seen
+from magbridge.diagnose.seen import Seen
 
-__all__ = ["findings", "findings_json", "parameters"]
+__all__ = ["FORMAT", "findings", "findings_json", "parameters"]
+
+FORMAT = 1
+"""Of ``findings.json``, as ``docs/findings.schema.json`` describes it; raised when a name changes."""
 
 
 def findings(
@@ -29,6 +34,7 @@ def findings(
         listed.append(_wrong(diagnosis))
     rest = diagnosis.unexplained
     return {
+        "format": FORMAT,
         "verdict": diagnosis.verdict,
         "rms_before_nT": _round(diagnosis.total.before),
         "rms_after_nT": _round(diagnosis.total.after),
@@ -41,9 +47,11 @@ def findings(
             "signal_to_noise": _round(rest.signal_to_noise),
             "period_s": None if rest.period_s is None else _round(rest.period_s),
             "best_channel": rest.best_channel,
-            "follows": follows(seen(diagnosis.problem, diagnosis.fit.left / diagnosis.problem.gain)),
+            "follows": follows(diagnosis.assessment.follows),
+            "correlation_time_s": _round(diagnosis.assessment.residual.correlation_time),
             "alternatives": alternatives(rest.within),
         },
+        "assessment": assessment(diagnosis.assessment),
         "remarks": list(remarks),
     }
 
@@ -127,6 +135,41 @@ def _adds_up(candidate: Candidate) -> bool:
     """Tell whether coefficients of one name add up: those of one channel at several lags or onsets."""
     channels = {getattr(effect, "channel", None) for effect in candidate.effects}
     return len(channels) == 1 and not candidate.shape.keys().isdisjoint(("lag", "onset"))
+
+
+def assessment(found: Assessment) -> dict[str, Any]:
+    """Return all that the report shows beside the findings, rounded."""
+    delays, budget, left = found.delays, found.budget, found.residual
+    return {
+        "fit_for_use": found.fit_for_use,
+        "answer": found.answer,
+        "reasons_for": _notes(found.reasons_for),
+        "reasons_against": _notes(found.reasons_against),
+        "manoeuvres": list(found.manoeuvres),
+        "warnings": [_notes(some) for some in found.notes],
+        "level": found.level and {
+            "shift_nT": _round(found.level.shift), "sigma_nT": _round(found.level.sigma),
+        },
+        "channel_delays": delays and {
+            "y_s": _round(delays.later[0]), "z_s": _round(delays.later[1]),
+            "y_sigma_s": _round(delays.sigma[0]), "z_sigma_s": _round(delays.sigma[1]),
+            "rms_nT": _round(delays.rms),
+        },
+        "rms_nT": {name: None if x is None else _round(x) for name, x in budget._asdict().items()},
+        "residual": {
+            "rms_nT": _round(left.rms), "white_nT": _round(left.white),
+            "correlation_time_s": _round(left.correlation_time), "slow_share": _round(left.slow),
+            "follows": follows(found.follows),
+        },
+    }  # fmt: skip
+
+
+def _notes(some: Sequence[Note]) -> list[dict[str, Any]]:
+    numbers = [{name: _round(x) for name, x in note.numbers.items()} for note in some]
+    return [
+        {"code": note.code, "text": note.text, "numbers": given}
+        for note, given in zip(some, numbers, strict=True)
+    ]
 
 
 def follows(what: Seen) -> dict[str, Any]:

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from typing import Any
 
 from magbridge.arrays import FloatArray
 from magbridge.calibration.residual import rms
+from magbridge.diagnose.assessment.notes import Note
 from magbridge.diagnose.causes import Cause
 from magbridge.diagnose.diagnosis import Diagnosis, Finding
 from magbridge.diagnose.report import figures_of_causes
-from magbridge.diagnose.report.doubts import doubts
+from magbridge.diagnose.report.decision import paragraph
 from magbridge.diagnose.report.findings import parameters
 from magbridge.diagnose.report.glossary import MEANINGS, legend
 from magbridge.diagnose.report.words import MANY, bold, chance, figure, listed, number, physics, row, table
@@ -62,7 +63,7 @@ def found(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> list[str]:
         ]
     for k, finding in enumerate(diagnosis.findings):
         parts += [f'<h3 id="cause{k}">{bold(finding.candidate)}</h3>']
-        parts += _cause(diagnosis, finding, causes[finding.candidate.cause])
+        parts += _cause(diagnosis, finding, causes[finding.candidate.cause], diagnosis.assessment.notes[k])
     if diagnosis.wrong is not None:
         parts.append(_outliers(diagnosis.problem.survey.time[diagnosis.wrong.rows]))
     return parts
@@ -83,8 +84,8 @@ def overview(diagnosis: Diagnosis) -> str:
     return table(heads, rows) + UNITS * bool(rows)
 
 
-def _cause(diagnosis: Diagnosis, finding: Finding, cause: Cause) -> list[str]:
-    """Tell of one cause: its physics, the evidence, its numbers, and what speaks against it."""
+def _cause(diagnosis: Diagnosis, finding: Finding, cause: Cause, known: Sequence[Note]) -> list[str]:
+    """Tell of one cause: its physics, the evidence, its numbers, and what is `known` of it."""
     gain, numbers = finding.gain, parameters(finding, len(diagnosis.problem))
     terms = table(("term", "value", "1 sigma", "unit"), (row(name, **one) for name, one in numbers.items()))
     return [
@@ -98,7 +99,7 @@ def _cause(diagnosis: Diagnosis, finding: Finding, cause: Cause) -> list[str]:
         ),
         _folded(terms, numbers),
         _vague(numbers),
-        *doubts(diagnosis, finding, cause),
+        *(paragraph(note) for note in known),
     ]
 
 

@@ -12,8 +12,7 @@ import numpy as np
 from magbridge.diagnose.causes import Cause
 from magbridge.diagnose.diagnosis import Diagnosis, Finding
 from magbridge.diagnose.report import figures, figures_of_causes
-from magbridge.diagnose.report.decision import decision
-from magbridge.diagnose.report.doubts import gained, late
+from magbridge.diagnose.report.decision import decision, gained, late
 from magbridge.diagnose.report.found import found, overview
 from magbridge.diagnose.report.limits import unknown, visible
 from magbridge.diagnose.report.remaining import described, remaining
@@ -22,6 +21,8 @@ from magbridge.diagnose.report.words import bold, figure, listed, number
 __all__ = ["report_html"]
 
 STYLE = Path(__file__).with_name("style.css")
+FOLDED = 3
+"""Sections that are unfolded at once; the others wait for those who want to know more."""
 LONG = 7200.0
 """s, from which on a length is told in hours."""
 
@@ -46,9 +47,12 @@ def report_html(diagnosis: Diagnosis, causes: Mapping[str, Cause], remarks: Sequ
         "What is not known": unknown(diagnosis, causes),
         "What this log could have shown at all": visible(diagnosis),
     }
-    body = [f"<h1>{title}</h1>", *_verdict(diagnosis, causes, remarks), _contents(list(sections))]
+    body = [f"<h1>{title}</h1>", *_verdict(diagnosis, remarks), _contents(list(sections))]
     for place, (head, parts) in enumerate(sections.items()):
-        body += [f'<h2 id="part{place}">{head}</h2>', *parts]
+        titled = [f'<h2 id="part{place}">{head}</h2>', *parts]
+        if place >= FOLDED:
+            titled = ["<details><summary>", titled[0], "</summary>", *parts, "</details>"]
+        body += titled
     content = "\n".join(part for part in body if part)
     for unit in (" %", " nT", " UTC"):  # no line ends between a number and its unit
         content = content.replace(unit, f"\N{NO-BREAK SPACE}{unit[1:]}")
@@ -65,8 +69,8 @@ def _contents(heads: Sequence[str]) -> str:
     return f'<p class="faint">Below: {" · ".join(links)}</p>'
 
 
-def _verdict(diagnosis: Diagnosis, causes: Mapping[str, Cause], remarks: Sequence[str]) -> list[str]:
-    """Say what was compared, the verdict, whether the result may fly, and what a reader must know of it."""
+def _verdict(diagnosis: Diagnosis, remarks: Sequence[str]) -> list[str]:
+    """Say what was compared, the verdict, whether it is fit for use, and what a reader must know."""
     survey = diagnosis.problem.survey
     new = survey.time[~survey.learned]
     first, last = (datetime.fromtimestamp(float(t), UTC).strftime("%Y-%m-%d %H:%M") for t in new[[0, -1]])
@@ -82,7 +86,7 @@ def _verdict(diagnosis: Diagnosis, causes: Mapping[str, Cause], remarks: Sequenc
             f"{diagnosis.problem.calibration.coefficients.size} coefficients</p>"
         ),
         f'<p class="verdict">{_sentence(diagnosis)}</p>',
-        decision(diagnosis, causes),
+        decision(diagnosis.assessment),
         *(f"<p><b>Note:</b> {escape(remark)}.</p>" for remark in remarks),
         overview(diagnosis),
     ]
@@ -114,7 +118,7 @@ def _compared(diagnosis: Diagnosis) -> list[str]:
             "In time: does the difference stay about zero, within the grey band?",
             f"{after} Grey: what the calibration as given allows (noise, and its own uncertainty).{learned}",
         ),
-        late(diagnosis.problem, diagnosis.fit),
+        late(diagnosis.assessment.delays),
         '<div class="pair">',
         figure(
             figures.spectrum(diagnosis),
@@ -160,10 +164,14 @@ def _sentence(diagnosis: Diagnosis) -> str:
     names = f"Found: {'; '.join(causes)}. {worth}"
     rest = diagnosis.unexplained
     withheld = rest.within if rest else ()
-    nothing_else = "Nothing else stands out of the noise."
+    left = diagnosis.assessment.residual
+    nothing_else = (
+        f"What is left, {number(left.rms)} nT RMS, fits no description of the list better than noise that "
+        f"remembers {number(left.correlation_time, 2)} s."
+    )
     louder = rest and all(rest.signal_to_noise > one.signal_to_noise for one in diagnosis.findings)
     name = (
-        f"no name is asserted; not ruled out: {listed(withheld)}"
+        f"no name is asserted; it resembles {listed(withheld)}"
         if withheld
         else "none of the known causes explains it"
     )

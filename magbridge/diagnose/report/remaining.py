@@ -7,14 +7,12 @@ from html import escape
 
 import numpy as np
 
-from magbridge.calibration.residual import rms
 from magbridge.diagnose.causes import Cause
-from magbridge.diagnose.diagnosis import Diagnosis, counted
-from magbridge.diagnose.report.doubts import nameless
-from magbridge.diagnose.report.words import number, table
+from magbridge.diagnose.diagnosis import Diagnosis
+from magbridge.diagnose.report.words import listed, number, table
 from magbridge.diagnose.unexplained.leftover import Leftover
 
-__all__ = ["described", "remaining"]
+__all__ = ["described", "nameless", "remaining"]
 
 KINDS = {
     "switching": "Something that switches or comes and goes",
@@ -36,8 +34,32 @@ def remaining(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> list[str]:
 def _left(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> str:
     rest = diagnosis.unexplained
     if rest is None:
-        return "<p>No further structure was found: no slow curve, no steps, no function of attitude.</p>"
-    return f"<p>{described(rest)}. {nameless(rest, causes)}</p>"
+        return f"<p>No description of the list stands out of what is left. {_followed(diagnosis)}</p>"
+    return f"<p>{described(rest)}. {_followed(diagnosis)} {nameless(rest, causes)}</p>"
+
+
+def _followed(diagnosis: Diagnosis) -> str:
+    """Say how large and how slow what is left is, and what it goes with."""
+    left, goes = diagnosis.assessment.residual, diagnosis.assessment.follows
+    axis = "along the field" if goes.axis == "field" else f"mostly along {goes.axis}" if goes.axis else ""
+    with_what = f"{100 * goes.share:.0f} % of its power follows {escape(goes.channel or '')}"
+    late = f", {goes.lag:g} s late" if goes.lag else ""
+    return (
+        f"It is {number(left.rms)} nT RMS, {number(left.white)} nT from one sample to the next, and "
+        f"remembers {number(left.correlation_time, 2)} s. "
+        + (f"{with_what}{late}{', ' * bool(axis)}{axis}." if goes.channel else "It follows nothing logged.")
+    )
+
+
+def nameless(rest: Leftover, causes: Mapping[str, Cause]) -> str:
+    """Say why the rest has no name, and what would tell the possible causes apart."""
+    if not rest.within:
+        return "It fits no known cause, so it has no name."
+    return (
+        "No name is asserted: a description without a cause is likelier than any known cause, but by "
+        f"less than 20:1 and what a cause's idealised shape may miss. It resembles: {listed(rest.within)}. "
+        f"To tell: {escape(causes[rest.within[0].candidate.cause].separated_by)}."
+    )
 
 
 def described(rest: Leftover) -> str:
@@ -50,25 +72,25 @@ def described(rest: Leftover) -> str:
 
 def _budget(diagnosis: Diagnosis) -> list[str]:
     """Compare the residual that the calibration predicts with those that were found."""
-    total, parts = diagnosis.total, diagnosis.problem.survey.parts
-    counts = counted(diagnosis.problem, diagnosis.wrong)
-    fitted = rms(diagnosis.fit.left[counts])
-    extended = f"found with the extended calibration, on {parts} left out of its fit"
+    found, parts = diagnosis.assessment.budget, diagnosis.problem.survey.parts
     rows = {
-        "predicted by the calibration as given: noise and its own uncertainty": float(
-            np.sqrt(np.mean(diagnosis.problem.stated[counts]))
-        ),
-        "found with the calibration as given": total.before,
-        **({extended: total.after} if diagnosis.findings else {}),
-        "left in the fit to the whole log": fitted,
+        "predicted by the calibration as given: noise and its own uncertainty": found.predicted,
+        "found with the calibration as given": found.before,
+        f"found with the extended calibration, on {parts} left out of its fit": found.after,
+        "left in the fit to the whole log": found.fitted,
     }
-    lines = (f'<tr><td>{name}</td><td class="n">{number(size)} nT</td></tr>' for name, size in rows.items())
+    lines = (
+        f'<tr><td>{name}</td><td class="n">{number(size)} nT</td></tr>'
+        for name, size in rows.items()
+        if size is not None
+    )
+    after = found.after or 0.0
     worse = (
-        f"<p>What was left out is predicted {number(total.after / fitted, 2)} times worse than what was "
+        f"<p>What was left out is predicted {number(after / found.fitted, 2)} times worse than what was "
         "fitted: this log determines some of the new terms badly, or they act differently from part to "
         "part.</p>"
     )
-    apart = diagnosis.findings and total.after > WORSE * fitted
+    apart = after > WORSE * found.fitted
     return [table(("difference between measured and simulated", "RMS"), lines), worse if apart else ""]
 
 

@@ -7,12 +7,13 @@ from datetime import UTC, datetime
 from html import escape
 from inspect import getdoc
 from itertools import groupby
-from math import floor, isfinite, log10
+from math import isfinite
 from operator import itemgetter
 
 from magbridge.diagnose.causes import Cause
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.inference.rivals import Rival
+from magbridge.diagnose.words import label, measured, names_of, number
 
 __all__ = [
     "MANY",
@@ -34,11 +35,6 @@ MANY = 12
 """Numbers that a table shows unfolded."""
 
 
-def label(cause: str, channel: str | None) -> str:
-    """Return a cause as people read it."""
-    return cause.replace("_", " ") + (f" ({channel})" if channel else "")
-
-
 def bold(candidate: Candidate) -> str:
     """Return a candidate's cause in bold, and its channel."""
     channel = candidate.channel
@@ -47,7 +43,7 @@ def bold(candidate: Candidate) -> str:
 
 def listed(rivals: Sequence[Rival], joint: str = ", ") -> str:
     """Return causes as a list in words, the likeliest first."""
-    return joint.join(escape(label(*rival.candidate.group)) for rival in rivals)
+    return escape(names_of(rivals, joint))
 
 
 def physics(cause: Cause) -> str:
@@ -55,24 +51,6 @@ def physics(cause: Cause) -> str:
     line = escape((getdoc(cause.candidates) or "").splitlines()[0])
     parts = line.split("``")
     return "".join(f"<code>{part}</code>" if k % 2 else part for k, part in enumerate(parts))
-
-
-def number(value: float, digits: int = 3) -> str:
-    """Write a number to so many significant digits without an exponent: 1070, not 1.07e+03; 2.00, not 2."""
-    rounded = float(f"{value:.{digits}g}")
-    if not rounded or not isfinite(rounded):
-        return f"{rounded:g}"
-    places = max(digits - 1 - floor(log10(abs(rounded))), 0)
-    return f"{rounded:.{places}f}".replace("-", "\N{MINUS SIGN}")
-
-
-def measured(value: float, sigma: float | None) -> str:
-    """Write a number to the second digit of its sigma; without one (a count, a period), to four digits."""
-    if not sigma or not isfinite(sigma):
-        return f"{float(f'{value:.4g}'):g}"
-    places = 1 - floor(log10(sigma))
-    # an added 0 turns what was rounded to -0 into 0
-    return f"{round(value, places) + 0.0:.{max(places, 0)}f}".replace("-", "\N{MINUS SIGN}")
 
 
 def row(name: str, value: float, sigma: float | None, unit: str) -> str:

@@ -1,0 +1,142 @@
+"""What to know before believing a finding: a note each, none where there is nothing to say."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from magbridge.diagnose.assessment.numbers import motion, times_usual
+from magbridge.diagnose.causes import Cause
+from magbridge.diagnose.causes.candidates import Candidate
+from magbridge.diagnose.inference.rivals import Rival
+from magbridge.diagnose.words import names_of, number
+
+if TYPE_CHECKING:
+    from magbridge.diagnose.diagnosis import Diagnosis, Finding
+
+__all__ = ["IMPLAUSIBLE", "Note", "contested", "notes", "rivalled"]
+
+IMPLAUSIBLE = 5.0
+"""Multiple of its plausible size above which a cause is doubted."""
+
+
+class Note(NamedTuple):
+    """A statement: a code for programs, plain text for people, and the numbers in it."""
+
+    code: str
+    text: str
+    numbers: Mapping[str, float] = {}
+
+
+def notes(diagnosis: Diagnosis, finding: Finding, cause: Cause) -> list[Note]:
+    """List what to know of one finding; `cause` is its row in the table of causes."""
+    return [
+        *_of_shape(finding),
+        *_of_size(finding),
+        *_of_motion(diagnosis, finding),
+        *rivalled(finding.candidate, cause, finding.rivals, finding.chance_alone),
+        *_of_use(diagnosis, finding),
+    ]
+
+
+def _of_shape(finding: Finding) -> Iterator[Note]:
+    candidate = finding.candidate
+    if any(name.endswith(")") for name in candidate.names):
+        yield Note(
+            "several_terms",
+            "A number in brackets: several such terms were needed to describe the cause; they act together.",
+        )
+    variance = dict(zip(candidate.names, finding.coefficients, strict=True)).get("variance", 0.0)
+    if variance > 0.0:
+        corner = 0.5 / np.pi / float(np.sqrt(variance))
+        yield Note(
+            "attenuation",
+            f"It shortens a field that turns, as an RC filter of {number(corner, 2)} Hz does. The extended "
+            "calibration is fitted without that, as with calibrate --filter-corner. In turns the corrected "
+            "field stays too short.",
+            {"corner_Hz": corner},
+        )
+
+
+def _of_size(finding: Finding) -> Iterator[Note]:
+    """Say so when a cause is implausibly large, as if two cancelled."""
+    times = times_usual(finding.candidate, finding.coefficients)
+    if times >= IMPLAUSIBLE:
+        yield Note(
+            "implausible_size",
+            f"This is {number(times, 2)} times the usual size of such a cause. Two causes that cancel each "
+            "other can grow this large: check the extended calibration against another reference before it "
+            "is used.",
+            {"times_usual": times},
+        )
+
+
+def _of_motion(diagnosis: Diagnosis, finding: Finding) -> Iterator[Note]:
+    found = motion(diagnosis.problem, finding)
+    if found is not None:
+        yield Note(
+            "beside_moving_masses",
+            f"{100 * found.share:.0f} % of its power lies in the {100 * found.usual:.0f} % of samples next "
+            f"to which a mass moved. With {found.interval:.3g} s between rows, a mass that was not where its "
+            "row says would look the same.",
+            found._asdict(),
+        )
+
+
+def _of_use(diagnosis: Diagnosis, finding: Finding) -> Iterator[Note]:
+    candidate, rest = finding.candidate, diagnosis.unexplained
+    if any(piece.since for piece in candidate.pieces):
+        yield Note(
+            "recent",
+            "It is best described as absent from the logs that the calibration was fitted to: it may have "
+            "appeared since.",
+        )
+    if not set(candidate.effects) <= set(diagnosis.calibration.effects):
+        yield Note(
+            "not_live",
+            "It is not in the extended calibration: live, a rate of change is a backward difference, whose "
+            "noise would exceed what the correction improves.",
+        )
+    if not finding.gain.shown:
+        yield Note(
+            "no_improvement",
+            "It shows no improvement on what was left out of the fit: it may be a remnant of another effect.",
+        )
+    if rest is not None and rest.signal_to_noise >= finding.signal_to_noise:
+        yield Note(
+            "rest_is_stronger",
+            "The unexplained rest is stronger than this cause, and may have caused part of it.",
+        )
+
+
+def contested(finding: Finding) -> bool:
+    """Say whether another cause, not only another series, remains possible."""
+    return any(rival.candidate.cause != finding.candidate.cause for rival in finding.rivals)
+
+
+def rivalled(candidate: Candidate, cause: Cause, rivals: Sequence[Rival], chance: float) -> Iterator[Note]:
+    """Say which causes could take its place, what would tell them apart, and what theory expects."""
+    theory = (
+        "By theory, an effect of this size in such a log would be told from all other known causes in "
+        f"{'more than 99' if chance > 0.995 else f'{100 * chance:.0f}'} of 100 cases"
+    )
+    alone = "No other known cause explains the data nearly as well (none comes within odds of 20:1)."
+    if not rivals:
+        yield Note("alone", f"Alternatives: none. {alone} {theory}.", {"chance_alone": chance})
+    elif all(rival.candidate.cause == candidate.cause for rival in rivals):
+        series = ", ".join(str(rival.candidate.channel) for rival in rivals)
+        yield Note(
+            "series_uncertain",
+            f"Alternatives: only in the series. {alone} Which series it follows is less sure: {series} would "
+            f"do nearly as well (odds below 20:1). A log in which these differ more would tell. {theory}.",
+            {"chance_alone": chance},
+        )
+    else:
+        yield Note(
+            "contested",
+            f"Alternatives: the data cannot tell it from {names_of(rivals, ' or ')} (odds below 20:1). "
+            f"{theory}; here it was not. To tell them apart: {cause.separated_by}.",
+            {"chance_alone": chance},
+        )

@@ -1,0 +1,38 @@
+"""Names and numbers as people read them, in plain text."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import floor, isfinite, log10
+
+from magbridge.diagnose.inference.rivals import Rival
+
+__all__ = ["label", "measured", "names_of", "number"]
+
+
+def label(cause: str, channel: str | None) -> str:
+    """Return a cause as people read it."""
+    return cause.replace("_", " ") + (f" ({channel})" if channel else "")
+
+
+def names_of(rivals: Sequence[Rival], joint: str = ", ") -> str:
+    """Return causes as a list in words, the likeliest first."""
+    return joint.join(label(*rival.candidate.group) for rival in rivals)
+
+
+def number(value: float, digits: int = 3) -> str:
+    """Write a number to so many significant digits without an exponent: 1070, not 1.07e+03; 2.00, not 2."""
+    rounded = float(f"{value:.{digits}g}")
+    if not rounded or not isfinite(rounded):
+        return f"{rounded:g}"
+    places = max(digits - 1 - floor(log10(abs(rounded))), 0)
+    return f"{rounded:.{places}f}".replace("-", "\N{MINUS SIGN}")
+
+
+def measured(value: float, sigma: float | None) -> str:
+    """Write a number to the second digit of its sigma; without one (a count, a period), to four digits."""
+    if not sigma or not isfinite(sigma):
+        return f"{float(f'{value:.4g}'):g}"
+    places = 1 - floor(log10(sigma))
+    # an added 0 turns what was rounded to -0 into 0
+    return f"{round(value, places) + 0.0:.{max(places, 0)}f}".replace("-", "\N{MINUS SIGN}")
