@@ -24,6 +24,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from scipy.sparse import csr_array
 
 from magbridge.arrays import BoolArray, FloatArray
 from magbridge.calibration.fitting.crossings import far_off, jumped, left_open
@@ -69,6 +70,8 @@ OUTLIER = 5.0
 """Sigmas beyond which a sample is left out."""
 DRIFTING = 2700.0
 """s, half the period of the fastest drift of a position."""
+SHORTEST = 1e-3
+"""Part of a step, below which it is not shortened further."""
 SEARCHED = 12_000
 """Samples that the field's size and length are searched with, at most."""
 
@@ -262,7 +265,7 @@ class _Rounds:
             if self.family.renew is not None and turn:
                 self.family = self.family.renew(self.z)
             answer = self._round(turn)
-            e = self._residuals(answer)
+            e = self._residuals(answer.z, answer.lacking)
             if last is not None:
                 moved = float(np.sqrt(np.mean((e - last) ** 2)))
             last = e
@@ -294,12 +297,32 @@ class _Rounds:
         widths = maximise(reduced.quadratic, self.family, self.eta, self.sigma)
         self.eta, self.sigma = widths.eta, widths.sigma
         precision = reduced.quadratic.H / self.sigma**2 + self.family.at(self.eta).precision
-        self.z = np.asarray(np.linalg.solve(precision, reduced.quadratic.b / self.sigma**2), float)
+        step = np.linalg.solve(precision, reduced.quadratic.b / self.sigma**2) - self.z
+        B = self.survey.basis(choice.field)
+        self.z = self._damped(np.asarray(step, float), reduced, B)
         self.w, self.nodes = reduced.field(self.z), choice.field.nodes
+        lacking = self._lacking(self.z, reduced, B)
         self.survey.bend(choice.field, self.w, self.z[self.q :])
-        lacking = self._slow() + self.survey.basis(choice.field) @ self.w
         score = widths.log_evidence + reduced.log_evidence
         return _Answer(self.z, self.w, reduced, choice, widths, self.family, lacking, score)
+
+    def _damped(self, step: FloatArray, reduced: Reduced, B: csr_array) -> FloatArray:
+        """Return z after the step (q,), shortened until the fit is no worse: far off it overshoots."""
+        precision = self.family.at(self.eta).precision
+
+        def objective(z: FloatArray) -> float:
+            e = self._residuals(z, self._lacking(z, reduced, B))[self.survey.kept]
+            return float(e @ e) / self.sigma**2 + float(z @ precision @ z)
+
+        before, part = objective(self.z), 1.0
+        while part > SHORTEST and not objective(self.z + part * step) < before * (1.0 + 1e-3):
+            part *= 0.5
+        return self.z + part * step
+
+    def _lacking(self, z: FloatArray, reduced: Reduced, B: csr_array) -> FloatArray:
+        """Return what the reference lacks at every sample with z (q,) and the field that follows, nT."""
+        steady = self.survey.steady
+        return np.asarray(steady @ z[self.q : self.q + steady.shape[1]] + B @ reduced.field(z))
 
     def _few(self, field: Matern) -> Sums:
         return self._sums(field, self.step)
@@ -316,10 +339,10 @@ class _Rounds:
         steady = self.survey.steady
         return np.asarray(steady @ self.z[self.q : self.q + steady.shape[1]])
 
-    def _residuals(self, answer: _Answer) -> FloatArray:
+    def _residuals(self, z: FloatArray, lacking: FloatArray) -> FloatArray:
         samples = self.survey.samples
-        known: Samples = replace(samples, reference=samples.reference + answer.lacking)
-        return residuals_of(known, answer.family.E @ answer.z + answer.family.offset)
+        known: Samples = replace(samples, reference=samples.reference + lacking)
+        return residuals_of(known, self.family.E @ z + self.family.offset)
 
 
 def _start(survey: SurveySamples, family: PriorFamily) -> tuple[FloatArray, float]:
