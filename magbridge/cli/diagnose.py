@@ -74,7 +74,6 @@ def diagnose(
 
     from magbridge.calibration.file import load
     from magbridge.diagnose.assessment.weigh import unsettled
-    from magbridge.diagnose.causes import CAUSES
     from magbridge.diagnose.report.findings import findings
     from magbridge.diagnose.run import diagnose as examine
     from magbridge.field.read import read_grid
@@ -106,7 +105,7 @@ def diagnose(
         )
     if doubt := unsettled(found.problem, found.possible, found.calibration):
         complain(doubt)
-    facts = findings(found, CAUSES, remarks)
+    facts = findings(found, found.causes, remarks)
     said = summary(facts, "" if own else found.problem.survey.parts)
     print_result(facts, f"{said}\nreport: {output / 'report.html'}", json)
 

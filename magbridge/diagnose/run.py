@@ -15,7 +15,7 @@ from magbridge.arrays import BoolArray, FloatArray
 from magbridge.calibration.instrument_effects import TimeEffect
 from magbridge.calibration.model import Calibration
 from magbridge.diagnose.accept import accept
-from magbridge.diagnose.causes import CAUSES, Cause
+from magbridge.diagnose.causes import CAUSES, Cause, known
 from magbridge.diagnose.causes.candidates import Candidate, since, slices
 from magbridge.diagnose.compare.problem import Problem, pose
 from magbridge.diagnose.compare.survey import Survey
@@ -58,7 +58,7 @@ def diagnose(
     *,
     learned_from: Sequence[xr.Dataset] = (),
     grid: AnomalyGrid | None = None,
-    causes: Mapping[str, Cause] = CAUSES,
+    causes: Mapping[str, Cause] | None = None,
     progress: Callable[[str], object] = str,
     remarks: Sequence[str] = (),
 ) -> Diagnosis:
@@ -78,7 +78,7 @@ def diagnose(
     grid : AnomalyGrid, optional
         Added to the main field where a log has no ``reference_field``.
     causes : mapping, optional
-        The table of causes.
+        The table of causes; by default :func:`.causes.known`, with those of other packages.
     progress : callable, optional
         Told each step's name.
     remarks : sequence of str, optional
@@ -89,6 +89,7 @@ def diagnose(
     DataError
         The data do not allow it: one line that says which column is missing or too short.
     """
+    causes = known() if causes is None else causes
     # one thread: for matrices this narrow more only wait, and sums keep one order on any machine
     with threadpool_limits(1, "blas"):
         diagnosis = _examine(datasets, calibration, learned_from, grid, causes, progress)

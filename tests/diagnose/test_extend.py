@@ -170,7 +170,7 @@ def test_a_maps_error_is_in_the_level_of_what_was_fitted_to_the_same_map() -> No
     """A map that is 30 nT off along the track: half of it may be its mean."""
     whole = right(300)
     wave = 30.0 * np.sqrt(2.0) * np.sin(0.1 * np.arange(300))
-    chart = candidate("map_error", wave)
+    chart = candidate("map_error", wave, about="place")
     found = fit_joint(replace(whole, residual=whole.residual + wave), [chart.columns], 1)
     new, seen = (
         replace(whole, survey=replace(whole.survey, learned=np.full(300, learned)))

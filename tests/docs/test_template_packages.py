@@ -8,10 +8,20 @@ import sys
 import tomllib
 from pathlib import Path
 
+import numpy as np
 import pytest
 from pages import ROOT
 
+from magbridge.calibration.fitting.fit import fit
+from magbridge.calibration.fitting.lowpass import unfiltered
+from magbridge.calibration.fitting.observe import observations
+from magbridge.diagnose.causes import CAUSES, known
+from magbridge.diagnose.report.findings import findings
+from magbridge.diagnose.run import diagnose
+from magbridge.errors import PluginError
 from magbridge.sensors import open_driver
+from sitl import load, simulate
+from sitl.dataset import segments
 
 TEMPLATES = sorted(path.parent for path in ROOT.glob("examples/*/pyproject.toml"))
 
@@ -120,3 +130,35 @@ def test_a_faulty_format_is_one_line_and_harms_nothing_else(text: str, fault: st
     assert (
         "ends in one of" in magbridge(tmp_path, "convert", sound, "-o", tmp_path / "log.csv", code=1).stderr
     )
+
+
+def test_the_cause_is_put_forward_found_and_explained(
+    installed: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One row is all: the search, the report and the findings take it like any other."""
+    monkeypatch.syspath_prepend(str(installed))
+    scenario = load("demo")
+    parts = segments(simulate(scenario, 2))
+    calibration = fit(
+        unfiltered(observations(parts["calibration"], ("battpos", "ballast")), scenario.instrument.corner)
+    ).calibration
+    survey = parts["survey"]
+    heater = (np.arange(survey.sizes["time"]) // 90 % 2).astype(float)
+    hot = survey.assign(mag_z=survey["mag_z"] + 40.0 * heater, heater=("time", heater))
+    found = diagnose([hot], calibration)
+    assert set(found.causes) == {*CAUSES, "heater_field"}
+    assert "heater_field" in {one.cause for one in found.possible}
+    facts = findings(found, found.causes)
+    assert facts["findings"][0]["follows"]["channel"] == "heater"
+    assert facts["findings"][0]["follows"]["axis"] == "z"
+
+
+def test_a_cause_that_is_none_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    info = tmp_path / "odd-1.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: odd\nVersion: 1\n")
+    (info / "entry_points.txt").write_text("[magbridge.causes]\nodd = oddly:NOTHING\n")
+    (tmp_path / "oddly.py").write_text("NOTHING = 1\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    with pytest.raises(PluginError, match="cause 'odd': oddly:NOTHING is no Cause"):
+        known()

@@ -23,8 +23,13 @@ from magbridge.diagnose.causes.telemetry import (
 from magbridge.diagnose.causes.time_dependent import interference_tone, offset_drift, offset_step
 from magbridge.diagnose.causes.timing import channel_skew, clock_offset, eddy_current, filter_lag
 from magbridge.diagnose.compare.problem import Problem
+from magbridge.errors import PluginError
+from magbridge.plugins import load, plugins
 
-__all__ = ["CAUSES", "Cause"]
+__all__ = ["CAUSES", "GROUP", "Cause", "known"]
+
+GROUP = "magbridge.causes"
+"""Entry points that add a cause: each is a :class:`Cause`, and its name is that of ``findings.json``."""
 
 
 class Cause(NamedTuple):
@@ -38,31 +43,52 @@ class Cause(NamedTuple):
         What a log must contain for it to be tested.
     separated_by : str
         The manoeuvre that tells it from its rivals.
+    meaning : str
+        What it means, as a clause.
     """
 
     candidates: Callable[[Problem], list[Candidate]]
     needs: str
     separated_by: str
+    meaning: str = ""
 
 
 CAUSES: dict[str, Cause] = {
-    "temperature_offset": Cause(temperature_offset, "a temperature that varies", "pass one depth at two temperatures of the sensor, diving and climbing; or hold one depth for an hour after launch"),
-    "temperature_scale": Cause(temperature_scale, "a temperature that varies", "roll about the field at two temperatures: a scale follows the channel's reading, an offset does not"),
-    "offset_step": Cause(offset_step, "time", "log the power-cycle counter; fly one attitude before and after"),
-    "offset_drift": Cause(offset_drift, "time", "return to one place and attitude hours later"),
-    "current_field": Cause(current_field, "a current", "run the motor with its mass held, and hold the motor with its mass moved"),
-    "unmodelled_actuator": Cause(unmodelled_actuator, "the position of something that moves", "move it at one attitude"),
-    "actuator_order": Cause(actuator_order, "a calibration with parameters", "move one mass in small steps over its whole range at one attitude"),
-    "hysteresis": Cause(hysteresis, "a calibration with parameters", "approach one position from both sides"),
-    "eddy_current": Cause(eddy_current, "turns", "reverse the turn"),
-    "channel_skew": Cause(channel_skew, "turns", "reverse the turn; roll about the axis that all channels share"),
-    "filter_lag": Cause(filter_lag, "masses that move while sampled, or the calibration's own runs", "change the corner of the filter, or step an actuator"),
-    "clock_offset": Cause(clock_offset, "a calibration with parameters that move while sampled", "move an actuator at constant attitude"),
-    "nonlinearity": Cause(nonlinearity, "attitudes that take a channel through its range", "turn every channel through the whole field"),
-    "saturation": Cause(saturation, "a channel near its end", "turn the channel away from the field: saturation occurs only near full scale"),
-    "pressure_offset": Cause(pressure_offset, "depth or pressure that varies", "hold one depth for an hour: the temperature settles, the pressure effect stays"),
-    "diurnal_variation": Cause(diurnal_variation, "at least two hours", "a base station ashore"),
-    "map_error": Cause(map_error, "positions over some hundred metres", "cross the track again, at another depth too: an error of the map is the same on every pass at one depth"),
-    "reference_bias": Cause(reference_bias, "a reference", "calibrate and survey at one place, next to a proton magnetometer"),
-    "interference_tone": Cause(interference_tone, "even sampling", "change the sampling rate: an alias changes its frequency"),
+    "temperature_offset": Cause(temperature_offset, "a temperature that varies", "pass one depth at two temperatures of the sensor, diving and climbing; or hold one depth for an hour after launch", "the sensor's zero shifts with temperature"),
+    "temperature_scale": Cause(temperature_scale, "a temperature that varies", "roll about the field at two temperatures: a scale follows the channel's reading, an offset does not", "the sensor's sensitivity changes with temperature"),
+    "offset_step": Cause(offset_step, "time", "log the power-cycle counter; fly one attitude before and after", "the sensor's zero jumped, as after a power cycle or a magnetic shock"),
+    "offset_drift": Cause(offset_drift, "time", "return to one place and attitude hours later", "the sensor's zero creeps with time"),
+    "current_field": Cause(current_field, "a current", "run the motor with its mass held, and hold the motor with its mass moved", "an electric current makes a field of its own"),
+    "unmodelled_actuator": Cause(unmodelled_actuator, "the position of something that moves", "move it at one attitude", "something that moves carries iron, and the calibration does not know of it"),
+    "actuator_order": Cause(actuator_order, "a calibration with parameters", "move one mass in small steps over its whole range at one attitude", "a mass that the calibration knows acts in a finer way than it describes"),
+    "hysteresis": Cause(hysteresis, "a calibration with parameters", "approach one position from both sides", "a mass acts differently depending on where it came from: play in its drive, or steel that stays magnetised"),
+    "eddy_current": Cause(eddy_current, "turns", "reverse the turn", "currents that are induced while the vehicle turns make a field"),
+    "channel_skew": Cause(channel_skew, "turns", "reverse the turn; roll about the axis that all channels share", "the sensor's three channels were not read when the log says"),
+    "filter_lag": Cause(filter_lag, "masses that move while sampled, or the calibration's own runs", "change the corner of the filter, or step an actuator", "a filter delays the sensor's readings against the telemetry"),
+    "clock_offset": Cause(clock_offset, "a calibration with parameters that move while sampled", "move an actuator at constant attitude", "the clocks of sensor and telemetry differ"),
+    "nonlinearity": Cause(nonlinearity, "attitudes that take a channel through its range", "turn every channel through the whole field", "the sensor's response bends"),
+    "saturation": Cause(saturation, "a channel near its end", "turn the channel away from the field: saturation occurs only near full scale", "a channel clips near the end of its range"),
+    "pressure_offset": Cause(pressure_offset, "depth or pressure that varies", "hold one depth for an hour: the temperature settles, the pressure effect stays", "the sensor's zero shifts with depth or pressure"),
+    "diurnal_variation": Cause(diurnal_variation, "at least two hours", "a base station ashore", "the Earth's field itself changed during the day"),
+    "map_error": Cause(map_error, "positions over some hundred metres", "cross the track again, at another depth too: an error of the map is the same on every pass at one depth", "the map or field model that served as the truth is wrong from place to place"),
+    "reference_bias": Cause(reference_bias, "a reference", "calibrate and survey at one place, next to a proton magnetometer", "the map or field model that served as the truth is wrong by a constant"),
+    "interference_tone": Cause(interference_tone, "even sampling", "change the sampling rate: an alias changes its frequency", "something disturbs the sensor periodically"),
 }  # fmt: skip
+
+
+def known() -> dict[str, Cause]:
+    """Return the table with what other packages add to it.
+
+    Raises
+    ------
+    PluginError
+        One cannot be imported, is no cause, or has the name of one that is there.
+    """
+    added = {}
+    for name, point in plugins(GROUP).items():
+        cause = load(point)
+        if not isinstance(cause, Cause) or name in CAUSES:
+            wrong = "a cause of that name is there" if name in CAUSES else f"{point.value} is no Cause"
+            raise PluginError(f"cause {name!r}", wrong)
+        added[name] = cause
+    return CAUSES | added

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
+from html import escape
 from typing import Any
 
 from magbridge.arrays import FloatArray
@@ -14,7 +15,7 @@ from magbridge.diagnose.diagnosis import Diagnosis, Finding
 from magbridge.diagnose.report import figures_of_causes
 from magbridge.diagnose.report.decision import paragraph
 from magbridge.diagnose.report.findings import parameters
-from magbridge.diagnose.report.glossary import MEANINGS, legend
+from magbridge.diagnose.report.glossary import legend
 from magbridge.diagnose.report.words import MANY, bold, chance, figure, listed, number, physics, row, table
 
 __all__ = ["found", "overview"]
@@ -76,7 +77,7 @@ def overview(diagnosis: Diagnosis) -> str:
         size = rms(one.field(diagnosis.problem))
         rows.append(
             f'<tr><td><a href="#cause{k}">{bold(one.candidate)}</a><br>'
-            f'<span class="faint">{MEANINGS.get(one.candidate.cause, "")}</span></td>'
+            f'<span class="faint">{escape(diagnosis.causes[one.candidate.cause].meaning)}</span></td>'
             f'<td class="n">{number(size)} nT</td><td class="n">{one.signal_to_noise:.1f}</td>'
             f'<td class="n">× {1 / max(one.gain.ratio, 1e-9):.2f}</td><td>{listed(one.rivals)}</td></tr>'
         )

@@ -1,0 +1,42 @@
+"""A cause of one's own for ``magbridge diagnose``: something that is switched on and off has a field.
+
+A cause is one row, `HEATER_FIELD`, and the function in it, which lists hypotheses. Each is an effect that the
+live correction knows too (here a `ChannelEffect`), so what is found can be flown.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from magbridge.calibration.effects import ChannelEffect
+from magbridge.diagnose.causes import Cause
+from magbridge.diagnose.causes.candidates import Candidate, of_effect
+from magbridge.diagnose.compare.problem import Problem
+
+SIZE = 50.0
+"""nT, a plausible size (1-sigma): a pair of leads half a metre away that carries some amperes."""
+
+
+def heater_field(problem: Problem) -> list[Candidate]:
+    """Put forward a loop of leads: ``T += b s(t)`` (Biot and Savart), s the switch, on or off."""
+    made = []
+    for name, series in problem.survey.channels.items():
+        values = series.values
+        if np.unique(values).size != 2:
+            continue  # no switch
+
+        def phi(rows: slice, values: np.ndarray = values) -> np.ndarray:
+            return values[None, rows]
+
+        width = SIZE / float(np.abs(values).max())
+        effect = ChannelEffect(cause="heater_field", channel=name)
+        made.append(of_effect(problem, effect, width, "nT per 1", phi=phi, channel=name))
+    return made
+
+
+HEATER_FIELD = Cause(
+    candidates=heater_field,
+    needs="a series that is on or off",
+    separated_by="switch it by hand at one attitude",
+    meaning="something that is switched on and off makes a field",
+)
