@@ -80,4 +80,9 @@ def test_from_a_log_to_corrected_samples(tmp_path: Path, lacking: list[str]) -> 
     at_rest = corrected["quality"].to_numpy() == int(corrected["quality"].min())
     error = corrected["total_field"].to_numpy() - truth
     assert at_rest.mean() > 0.9
+    level = found.calibration.reference.level_sigma  # which the IGRF alone does not tell, and which is said
+    assert (level > 100.0) == bool(lacking)
+    if lacking:
+        assert abs(error[at_rest].mean()) < level
+        error -= error[at_rest].mean()
     assert np.sqrt(np.mean(error[at_rest] ** 2)) < 5.0

@@ -46,7 +46,7 @@ def test_what_is_read_is_not_written_over(deployment: Path, command: Command) ->
 
 
 def test_a_log_without_a_whole_reading_is_not_corrected(command: Command) -> None:
-    Path("log.csv").write_text("time,mag_x,mag_y,mag_z\n1,,2,3\n2,1,,\n")
+    Path("log.csv").write_text("time,mag_x,mag_y,mag_z\n1386201601,,2,3\n1386201602,1,,\n")
     save_calibration(identity(), "cal.json")
     line = command.refuses("correct", "log.csv", "--calibration", "cal.json", "-o", "x.csv")
     assert line == "log.csv: no row has all of mag_x mag_y mag_z"

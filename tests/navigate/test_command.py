@@ -95,7 +95,7 @@ def test_a_plan_is_told_what_the_map_is_worth(command: Command) -> None:
 )
 def test_a_plan_that_cannot_be_flown_is_one_line(command: Command, text: str, answer: str) -> None:
     Path("bad.csv").write_text(text)
-    assert answer in command.refuses(*BOUND, "bad.csv")
+    assert answer in command.refuses(*BOUND, "bad.csv", "--strict")
 
 
 def test_wrong_use_is_one_line(command: Command) -> None:
